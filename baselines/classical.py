@@ -8,9 +8,20 @@ shows its error.
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.method import Frames, Method
-from fpp_ml_bench.coding import Limits
-from fpp_ml_bench.decoding import Decoded, DirectionPlan, Directions, decode_stack, fewest_plans, plan_direction
+from fpp_ml_bench.baselines.method import Answer, Frames, Method
+from fpp_ml_bench.coding import Limits, PhaseShift
+from fpp_ml_bench.decoding import (
+    ASSUMED_NOISE_GREY,
+    SYSTEMATIC_RAD,
+    Decoded,
+    DirectionPlan,
+    Directions,
+    decode_stack,
+    depth_sigma_mm,
+    fewest_plans,
+    noise_by_light,
+    plan_direction,
+)
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.optics import Rig
 
@@ -55,12 +66,24 @@ class ClassicalMethod(Method):
             self.title = f"Classical {self.steps}-step, {fringes}, {gray}"
             self.settings = {**self.settings, "fewest": True}
 
-    def decode(self, frames: Frames, reasons: bool = True) -> Decoded:
+    def decode(self, frames: Frames, reasons: bool = True, details: bool = False) -> Decoded:
         """`decode_stack` of a captured sequence; frames that are not in `frames_used` may be None."""
         return decode_stack(
             frames, self.rig, direction=self.direction, steps=self.steps, threads=self.threads, reasons=reasons,
-            fewest=self.fewest,
+            fewest=self.fewest, details=details,
         )  # fmt: skip
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         return self.decode(frames, reasons=False).depth_mm
+
+    def answer(self, frames: Frames) -> Answer:
+        """Depth, and its standard uncertainty by the noise of the frames; none for a code that has none by pixel."""
+        decoded = self.decode(frames, reasons=False, details=True)
+        if not all(isinstance(self.rig.code(way), PhaseShift) for way in decoded.details):
+            return Answer(decoded.depth_mm)
+        dark, per_grey = noise_by_light(frames, self.rig) or (ASSUMED_NOISE_GREY**2, 0.0)
+        modulation = np.stack([measured.modulation for measured in decoded.details.values()]).max(axis=0)
+        noise_grey = np.sqrt(dark + per_grey * np.nan_to_num(modulation).astype(np.float64))
+        return Answer(
+            decoded.depth_mm, depth_sigma_mm(decoded, self.rig, noise_grey, self.steps, SYSTEMATIC_RAD)
+        )  # fmt: skip

@@ -17,5 +17,7 @@ from .triangulation import depth_from_coordinate as depth_from_coordinate
 from .triangulation import depth_noise_mm as depth_noise_mm
 from .triangulation import rotated_ray as rotated_ray
 from .uncertainty import ASSUMED_NOISE_GREY as ASSUMED_NOISE_GREY
+from .uncertainty import SYSTEMATIC_RAD as SYSTEMATIC_RAD
 from .uncertainty import depth_sigma_mm as depth_sigma_mm
+from .uncertainty import noise_by_light as noise_by_light
 from .uncertainty import noise_of_frames as noise_of_frames

@@ -1,6 +1,7 @@
 """Standard uncertainty of decoded depth, from the noise of the frames."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,24 +15,41 @@ from fpp_ml_bench.optics import Rig
 
 ASSUMED_NOISE_GREY = 1.0
 """Where the frames don't tell: three steps fit any three grey levels."""
-_LEAST_STEPS, _SAMPLED_PX, _LEAST_PX = 4, 50_000, 100
+_SAMPLED_PX, _LEAST_PX = 50_000, 100
+_BRIGHTNESSES = 12  # groups of as many pixels each
+_LEAST_VARIANCE = 1 / 12  # of rounding to whole grey levels
 _MEDIAN_OF_SQUARE = (0.4549, 0.6931, 0.7887, 0.8392, 0.8703, 0.8914)
 """Median of chi^2 / n for 1 to 6 degrees of freedom; (1 - 2 / (9 n))^3 for more."""
 
 
-def depth_sigma_mm(decoded: Decoded, rig: Rig, noise_grey: float) -> NDArray[np.float32]:
+SYSTEMATIC_RAD = 0.005
+"""Error of a phase that is no noise: light of further bounces, mostly. With it 68% intervals hold 68% of the pixels of
+the validation objects in the light ``paper``; larger errors are more frequent than a normal distribution has them."""
+
+
+def depth_sigma_mm(
+    decoded: Decoded, rig: Rig, noise_grey: NDArray | float, steps: int | None = None, systematic_rad: float = 0.0
+) -> NDArray[np.float32]:  # fmt: skip
     """Standard uncertainty of every decoded pixel in mm, float32 (H, W), 0 = none, from noise of ``noise_grey`` grey
-    levels a frame. Of ``decoded`` with details. It is that of the noise alone: gamma, blur, further bounces and the
-    calibration add to it. Raises `DecodeError` for a decoding without details, or noise that is none."""
+    levels a frame, one number or (H, W). Of ``decoded`` with details, and with so many ``steps`` of each direction
+    (default: all). It is that of the noise, and of an error ``systematic_rad`` of every phase: gamma, blur, further
+    bounces. The calibration adds to it. Raises `DecodeError` for a decoding without details, or noise that is none."""
     if not decoded.details:
         raise DecodeError("details: missing; decode with details=True")
-    if not (np.isfinite(noise_grey) and noise_grey > 0):
-        raise DecodeError(f"noise_grey: expected grey levels above 0, got {noise_grey!r}")
+    noise = np.asarray(noise_grey, dtype=np.float64)
+    if not (np.isfinite(noise) & (noise > 0)).all():
+        raise DecodeError(f"noise_grey: expected grey levels above 0, got {noise.min():g}")
     found = decoded.depth_mm > 0
     rays = tuple(axis[found] for axis in rig.camera.rays())
+    of_found = noise[found] if noise.ndim else noise
     precision = np.zeros(int(found.sum()))
     for direction, measured in decoded.details.items():
-        sigma_px = rig.code(direction).sigma_px(measured.modulation[found], noise_grey)
+        code, modulation = rig.code(direction), measured.modulation[found]
+        fewer, systematic_px = 1.0, 0.0
+        if isinstance(code, PhaseShift):
+            fewer = 1.0 if steps is None else steps / len(code.fringes[0].shifts_deg)
+            systematic_px = code.pitch_px * systematic_rad / (2 * np.pi)
+        sigma_px = np.hypot(code.sigma_px(modulation, of_found / np.sqrt(fewer)), systematic_px)
         slope = coordinate_slope_px_per_mm(rig, decoded.depth_mm[found], direction, (rays[0], rays[1]))
         precision += (slope / sigma_px) ** 2
     sigma_mm = np.zeros(decoded.depth_mm.shape, dtype=np.float32)
@@ -40,30 +58,55 @@ def depth_sigma_mm(decoded: Decoded, rig: Rig, noise_grey: float) -> NDArray[np.
     return sigma_mm
 
 
-def noise_of_frames(frames: Sequence[NDArray], rig: Rig) -> float | None:
+def noise_of_frames(frames: Sequence[NDArray | None], rig: Rig) -> float | None:
     """Noise of the frames in grey levels, from what their sinusoids can't explain: the median over lit pixels; None
-    where every period has three steps, which explain anything, or too few pixels are lit."""
-    estimates = []
+    where every period has three steps, which explain anything, or too few pixels are lit. A frame may be None."""
+    estimates = [_variance(squares, freedom) for _, squares, freedom in _unexplained(frames, rig)]
+    return float(np.median(np.sqrt(estimates))) if estimates else None
+
+
+def noise_by_light(frames: Sequence[NDArray | None], rig: Rig) -> tuple[float, float] | None:
+    """Variance of the noise in squared grey levels without light, and what a grey level of light adds to it: photons
+    come by chance. From the same pixels as `noise_of_frames`, by their brightness; None as there."""
+    means, variances = [], []
+    for mean, squares, freedom in _unexplained(frames, rig):
+        limits = np.quantile(mean, np.linspace(0, 1, _BRIGHTNESSES + 1))
+        for low, high in pairwise(limits):
+            here = (mean >= low) & (mean <= high)
+            means.append(float(mean[here].mean()))
+            variances.append(_variance(squares[here], freedom))
+    if not means:
+        return None
+    (per_grey, dark) = np.polynomial.Polynomial.fit(means, variances, 1).convert().coef[::-1]
+    return (float(np.median(variances)), 0.0) if per_grey <= 0 else (max(float(dark), _LEAST_VARIANCE), float(per_grey))
+
+
+def _variance(squares: NDArray[np.float64], freedom: int) -> float:
+    """Variance of normal errors from the median of what they leave, squared and over ``freedom``."""
+    known = freedom <= len(_MEDIAN_OF_SQUARE)
+    return float(np.median(squares)) / (_MEDIAN_OF_SQUARE[freedom - 1] if known else (1 - 2 / (9 * freedom)) ** 3)
+
+
+def _unexplained(
+    frames: Sequence[NDArray | None], rig: Rig
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], int]]:
+    """Of every period with four and more steps, at some of the lit pixels: mean grey level, squared residual over its
+    degrees of freedom, and these."""
     for direction in rig.directions:
         code = rig.code(direction)
         for number, fringe in enumerate(code.fringes if isinstance(code, PhaseShift) else ()):
-            steps = len(fringe.shifts_deg)
-            if steps < _LEAST_STEPS:
-                continue
             indices = [frame.index for frame in rig.sequence if frame.direction == direction
                        and frame.kind == "sinusoid" and frame.fringe == number]  # fmt: skip
-            flat = [np.asarray(frames[index]).reshape(-1) for index in indices]
+            captured = [step for step, index in enumerate(indices) if frames[index] is not None]
+            freedom = len(captured) - 3
+            if freedom < 1:
+                continue
+            flat = [np.asarray(frames[indices[step]]).reshape(-1) for step in captured]
             levels = np.stack([frame[:: max(frame.size // _SAMPLED_PX, 1)] for frame in flat]).astype(np.float64)
-            weights = phase_weights(2 * np.pi * fringe.turns)
-            mean, cosine, sine = weighted_sums(levels, weights)
+            angles = 2 * np.pi * fringe.turns[captured]
+            mean, cosine, sine = weighted_sums(levels, phase_weights(angles))
             lit = (cosine**2 + sine**2 >= MIN_MODULATION**2) & ((levels > 0) & (levels < GREY_LEVELS)).all(axis=0)
             if lit.sum() < _LEAST_PX:
                 continue
-            angles = 2 * np.pi * fringe.turns[:, None]
-            residual = levels - (mean + cosine * np.cos(angles) + sine * np.sin(angles))
-            square = (residual[:, lit] ** 2).sum(axis=0) / (steps - 3)
-            freedom = steps - 3
-            known = freedom <= len(_MEDIAN_OF_SQUARE)
-            median = _MEDIAN_OF_SQUARE[freedom - 1] if known else (1 - 2 / (9 * freedom)) ** 3
-            estimates.append(float(np.sqrt(np.median(square) / median)))
-    return float(np.median(estimates)) if estimates else None
+            residual = levels - (mean + cosine * np.cos(angles)[:, None] + sine * np.sin(angles)[:, None])
+            yield mean[lit], (residual[:, lit] ** 2).sum(axis=0) / freedom, freedom

@@ -11,6 +11,7 @@ from flat_planes import DIRECT
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import METHODS, Method, load_method
 from fpp_ml_bench.baselines.run import predict_split
+from fpp_ml_bench.decoding import noise_by_light
 from fpp_ml_bench.depth import edge_distance_px, object_mask
 from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError, PredictionError
 from fpp_ml_bench.loaders.render import BuildSettings, Studio, build, camera_noise, solid_mesh
@@ -62,6 +63,38 @@ def test_both_directions_are_better_than_either(noisy):
     assert errors["vertical"] < errors["horizontal"]  # baselines of 125 and 100 mm
     combined = 1 / np.sqrt(errors["vertical"] ** -2 + errors["horizontal"] ** -2)
     assert errors["both"] == pytest.approx(combined, rel=0.05)
+
+
+@pytest.mark.parametrize(("direction", "steps"), [("both", 18), ("vertical", 6), ("horizontal", 4)])
+def test_the_stated_uncertainty_covers_what_it_says(noisy, direction, steps):
+    """Where noise is all there is; of grazing pixels of almost no modulation only the luckier ones are decoded."""
+    classical = ClassicalMethod(noisy.rig, direction, steps)
+    deviations = []
+    for sample in noisy.samples("all"):
+        exact = noisy.depth_mm(sample, "depth_exact")
+        answer = classical.answer(noisy.frames(sample, range(len(noisy.sequence))))
+        np.testing.assert_array_equal(answer.sigma_mm > 0, answer.depth > 0)
+        white = noisy.frame(sample, noisy.sequence.white)
+        inside = object_mask(exact) & (edge_distance_px(exact) >= 3) & object_mask(answer.depth) & (white > 60)
+        deviations.append(np.abs(answer.depth.astype(np.float64) - exact)[inside] / answer.sigma_mm[inside])
+    found = np.concatenate(deviations)
+    for sigmas, nominal in ((0.9945, 0.68), (1.96, 0.95), (2.576, 0.99)):
+        assert (found < sigmas).mean() == pytest.approx(nominal, abs=0.02)
+
+
+def test_noise_that_light_brings_is_told_from_noise_in_the_dark():
+    rig, random = paper_rig(64), np.random.default_rng(3)
+    rows, columns = np.indices((64, 64))
+    bright = 10 + columns * 2.0
+    turns = rig.code("vertical").fringes[0].turns
+    frames = [None] * len(rig.sequence)
+    for index, turn in zip(rig.sequence.sinusoids("vertical"), turns, strict=True):
+        light = bright * (1 + 0.9 * np.cos(2 * np.pi * (rows / 20 + turn)))
+        frames[index] = (light + random.normal(0, np.sqrt(0.5 + 0.02 * bright), light.shape)).astype(np.float32)
+    dark, per_grey = noise_by_light(frames, rig)
+    assert dark == pytest.approx(0.5, abs=0.1)
+    assert per_grey == pytest.approx(0.02, abs=0.003)
+    assert noise_by_light([None] * len(frames), rig) is None
 
 
 @pytest.mark.parametrize("steps", [5, 7])
@@ -228,7 +261,7 @@ def test_prediction_folder(opened, tmp_path):
     run = predict_split(opened, classical, "validation", out, samples_done.append)
     assert run.samples == 6 and run.seconds_per_sample > 0 and samples_done == [1] * 6
     assert sorted(p.name for p in out.iterdir()) == sorted(
-        [*(f"mug_A{a}.npy" for a in range(0, 360, 60)), "submission.yaml"]
+        [*(f"mug_A{a}{end}" for a in range(0, 360, 60) for end in (".npy", ".sigma.npy")), "submission.yaml"]
     )
     for sample in opened.samples("validation"):
         depth = np.load(out / f"{sample}.npy")
