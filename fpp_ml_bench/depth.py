@@ -72,8 +72,8 @@ def object_near_edge(depth_mm: NDArray[np.floating], band_px: int, jump_mm: floa
 
 
 def object_box(inside: NDArray[np.bool_]) -> tuple[slice, slice] | None:
-    """Rows and columns of a mask (H, W) and one pixel around it, which hold every depth edge of an object with this mask;
-    None for an empty mask. The whole image where `skipping_enabled` says no."""
+    """Rows and columns of a mask (H, W) and one pixel around it: they hold every depth edge of an object with this
+    mask. None for an empty mask; the whole image where `skipping_enabled` says no."""
     rows = np.flatnonzero(inside.any(axis=1))
     if not rows.size:
         return None

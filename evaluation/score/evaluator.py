@@ -172,7 +172,7 @@ def _scored(
         for number in numbers:
             try:
                 outcomes[number] = work(samples[number])
-            except Exception as error:  # noqa: BLE001  raised by the caller, that of the first sample of all
+            except Exception as error:  # the caller raises that of the first sample
                 outcomes[number] = error
 
     threads = [Thread(target=take_part, daemon=True) for _ in range(min(THREADS, usable_cores()) - 1)]
