@@ -3,10 +3,10 @@
     python benchmarks/classical_error.py DATASET [--split test] [--out docs/pictures/classical_error.png]
 
 For N = 3, 4, 6, 9, 18 steps of vertical, horizontal and both fringe directions (with their Gray code), over a split of
-a built dataset, against the exact depth. Interior: measured object pixels 3 px or more from a depth edge. The table
-also gives the error with edge pixels and the share of object pixels that were not measured. Errors are means over
-samples; seconds are the median per sample on one thread, frames in memory. Prints a Markdown table and draws the
-figure.
+a built dataset, against the exact depth, without void pixels, as ``fpp-eval --target depth_exact`` scores. Interior:
+measured object pixels 3 px or more from a depth edge. The table also gives the error with edge pixels and the share of
+object pixels that were not measured. Errors are means over samples; seconds are the median per sample on one thread,
+frames in memory. Prints a Markdown table and draws the figure.
 """
 
 import argparse
@@ -21,12 +21,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.depth import edge_distance_px
+from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
 from fpp_ml_bench.evaluation.score import score_sample
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
 STEPS = (3, 4, 6, 9, 18)
-EDGE_BAND_PX = 3
 COLOURS = {"vertical": "tab:blue", "horizontal": "tab:orange", "both": "tab:green"}
 
 
@@ -57,12 +56,10 @@ def measure(dataset: DatasetFolder, split: str, direction: str, steps: int) -> P
         depth_mm = method.predict(frames)
         seconds.append(time.perf_counter() - started)
         target_mm = dataset.target_mm(sample, "depth_exact")
-        scores = score_sample(depth_mm, target_mm, EDGE_BAND_PX)
-        interior = (target_mm > 0) & (depth_mm > 0) & (edge_distance_px(target_mm) >= EDGE_BAND_PX)
-        error = np.abs(depth_mm[interior].astype(np.float64) - target_mm[interior])
+        scores = score_sample(depth_mm, target_mm, EDGE_BAND_PX, dataset.void(sample))
         rows.append(
-            (error.mean(), scores.valid.mae_mm, scores.object.mae_mm, scores.missing / scores.object.pixels,
-             scores.background.mae_mm)
+            (scores.interior_valid.mae_mm, scores.valid.mae_mm, scores.object.mae_mm,
+             scores.missing / scores.object.pixels, scores.background.mae_mm)
         )  # fmt: skip
     mean = np.mean(np.array(rows, dtype=np.float64), axis=0)
     return Point(direction, steps, len(method.frames_used), *map(float, mean), statistics.median(seconds))

@@ -4,7 +4,8 @@
     python benchmarks/frames_choice.py data/full --error-mm 1 3 5 --out docs/pictures/frames_choice.png
 
 For every view: the frames that ``fpp-bench predict phase --error-mm`` uses and the object MAE they reach, and the
-oracle: of the same levels the fewest frames whose object MAE against the exact depth is at most that error. Over
+oracle: of the same levels the fewest frames whose object MAE against the exact depth (without void pixels, as
+``fpp-eval --target depth_exact`` scores) is at most that error. Over
 budget: views whose error is larger than stated. ``--calibrate`` prints instead which share of the doubt about the order
 turned out to be a real error (`ORDER_SHARE`), over that split.
 """
@@ -23,6 +24,7 @@ from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.phase_route import PIXELWISE, FewestFrames, Measurement, PhaseMethod
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.cli.console import progress_bar
+from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
 from fpp_ml_bench.evaluation.score import score_sample
 from fpp_ml_bench.loaders.storage import DatasetFolder
@@ -55,18 +57,18 @@ class CachedMethod:
         return self._measurement
 
 
-def object_mae_mm(depth_mm: np.ndarray, target_mm: np.ndarray) -> float:
-    return float(score_sample(depth_mm, target_mm, EDGE_BAND_PX).object.mae_mm or 0.0)
+def object_mae_mm(depth_mm: np.ndarray, target_mm: np.ndarray, void: np.ndarray) -> float:
+    return float(score_sample(depth_mm, target_mm, EDGE_BAND_PX, void).object.mae_mm or 0.0)
 
 
-def level_errors(chooser: FewestFrames, frames: list, target_mm: np.ndarray) -> dict[int, float]:
+def level_errors(chooser: FewestFrames, frames: list, target_mm: np.ndarray, void: np.ndarray) -> dict[int, float]:
     """Object MAE in mm of every level that can be chosen, by its number of frames."""
     errors_mm = {}
     for count, method in chooser.methods.items():
-        errors_mm[count] = object_mae_mm(method.measure(frames).depth_mm, target_mm)
+        errors_mm[count] = object_mae_mm(method.measure(frames).depth_mm, target_mm, void)
         if count >= PIXELWISE:
             classical = ClassicalMethod(chooser.rig, chooser.options.direction, count)
-            errors_mm[count + len(chooser.gray)] = object_mae_mm(classical.predict(frames), target_mm)
+            errors_mm[count + len(chooser.gray)] = object_mae_mm(classical.predict(frames), target_mm, void)
     return dict(sorted(errors_mm.items()))
 
 
@@ -81,13 +83,14 @@ def measure_views(dataset: DatasetFolder, split: str, direction: str, errors: li
     with progress_bar(f"{direction}, {split}", len(samples), "samples") as advance:
         for sample in samples:
             frames, target_mm = captured_frames(dataset, first, sample), dataset.target_mm(sample, "depth_exact")
-            levels = level_errors(first, frames, target_mm)
+            void = dataset.void(sample)
+            levels = level_errors(first, frames, target_mm, void)
             for error, chooser in choosers.items():
                 choice = chooser.choose(frames)
                 enough = [count for count, mae in levels.items() if mae <= error]
                 oracle = enough[0] if enough else min(levels, key=lambda count: levels[count])
                 look = choice.looks[-1]
-                mae = object_mae_mm(choice.depth_mm, target_mm)
+                mae = object_mae_mm(choice.depth_mm, target_mm, void)
                 views.append(View(sample, error, look.frames, mae, look.expected_mm, oracle, levels[oracle]))
             advance(1)
     return views
@@ -102,9 +105,10 @@ def calibrate(dataset: DatasetFolder, split: str, every: int) -> None:
         with progress_bar(f"{direction}, {split}", len(samples), "samples") as advance:
             for sample in samples:
                 frames, target_mm = captured_frames(dataset, chooser, sample), dataset.target_mm(sample, "depth_exact")
+                scored = object_mask(target_mm) & ~dataset.void(sample)
                 for count, method in chooser.methods.items():
                     measurement = method.measure(frames)
-                    measured = (measurement.depth_mm > 0) & (target_mm > 0)
+                    measured = scored & (measurement.depth_mm > 0)
                     error = np.abs(measurement.depth_mm - target_mm)[measured].astype(np.float64)
                     far = error > 60
                     doubt = float(measurement.order_doubt_mm[measured].mean())

@@ -6,10 +6,10 @@
 
 Settings: the phase route with 1 to 18 fringes of one direction, without Gray code; the classical method with N fringes
 and their Gray code, one direction and both; the phase route with learned order, mask and correction. Scored as
-``fpp-eval --target depth_exact`` does: an object pixel without a prediction counts with its whole depth. Each setting's
-result is stored in ``--work`` as JSON and is not computed again; ``--settings`` selects some of them. Seconds are
-processor time of one thread, which other work on the machine lengthens little; frames are in memory. ``--from`` draws
-the figure again from its CSV file and measures nothing.
+``fpp-eval --target depth_exact`` does: void pixels count in no set, an object pixel without a prediction counts with
+its whole depth. Each setting's result is stored in ``--work`` as JSON and is not computed again; ``--settings`` selects
+some of them. Seconds are processor time of one thread, which other work on the machine lengthens little; frames are in
+memory. ``--from`` draws the figure again from its CSV file and measures nothing.
 """
 
 import argparse
@@ -28,8 +28,9 @@ import numpy as np
 from fpp_ml_bench.baselines.method import Method, load_method
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.cli.console import progress_bar
+from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import FppBenchError
-from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
+from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.score import score_sample
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
@@ -88,9 +89,11 @@ def measure(dataset: DatasetFolder, split: str, setting: str, predictor: Method)
             depth_mm = predictor.predict(frames)
             seconds.append(process_time() - started)
             target_mm = dataset.target_mm(sample, "depth_exact")
-            scores = score_sample(depth_mm, target_mm, EDGE_BAND_PX).metrics()
-            measured = (target_mm > 0) & (depth_mm > 0)
-            far = np.count_nonzero(np.abs(depth_mm - target_mm)[measured] > WRONG_MM) / np.count_nonzero(target_mm > 0)
+            void = dataset.void(sample)
+            scores = score_sample(depth_mm, target_mm, EDGE_BAND_PX, void).metrics()
+            scored = object_mask(target_mm) & ~void
+            wrong = scored & (depth_mm > 0) & (np.abs(depth_mm - target_mm) > WRONG_MM)
+            far = np.count_nonzero(wrong) / np.count_nonzero(scored)
             keys = ("object_mae_mm", "object_valid_mae_mm", "object_interior_mae_mm", "object_edge_mae_mm")
             errors_mm = [float(scores[key] or 0.0) for key in keys]
             missing = scores["object_missing_share"] or 0
@@ -115,7 +118,7 @@ def point(dataset: DatasetFolder, split: str, setting: str, work: Path) -> Point
         return None
     key = {
         "dataset": dataset.fingerprint, "split": split,
-        "settings": {option: str(value) for option, value in predictor.settings.items()},
+        "protocol": PROTOCOL_VERSION, "settings": {option: str(value) for option, value in predictor.settings.items()},
     }  # fmt: skip
     if path.is_file():
         stored = json.loads(path.read_text())

@@ -15,12 +15,22 @@ DEPTH_EDGE_JUMP_MM = 10.0
 plane); it grows with the pixel footprint at other sizes."""
 Normalisation = Literal["raw", "global", "individual"]
 NORMALISATIONS: tuple[Normalisation, ...] = ("raw", "global", "individual")
+_BLOCK = 1 << 16
 _SMALLEST, _LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 
 
 def object_mask(depth_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Pixels of the object, bool (H, W): target depth above 0 mm, for statistics, masks and scores (paper 5.3.2)."""
     return depth_mm > 0
+
+
+def extremes(values: NDArray[np.floating]) -> tuple[float, float]:
+    """The smallest and the largest value of a map (H, W) that is not empty, NaN if it holds any; read once, in blocks
+    that stay in the cache."""
+    flat = values.ravel(order="K")
+    blocks = [flat[start : start + _BLOCK] for start in range(0, flat.size, _BLOCK)]
+    ends = np.array([(block.min(), block.max()) for block in blocks], dtype=np.float64)
+    return float(ends[:, 0].min()), float(ends[:, 1].max())
 
 
 def edge_jump_mm(size_px: int) -> float:
@@ -61,40 +71,52 @@ def object_near_edge(depth_mm: NDArray[np.floating], band_px: int, jump_mm: floa
     return object_near_edges(depth_mm, (band_px,), jump_mm)[0]
 
 
+def object_box(inside: NDArray[np.bool_]) -> tuple[slice, slice] | None:
+    """Rows and columns of a mask (H, W) and one pixel around it: they hold every depth edge of an object with this
+    mask. None for an empty mask; the whole image where `skipping_enabled` says no."""
+    rows = np.flatnonzero(inside.any(axis=1))
+    if not rows.size:
+        return None
+    if not skipping_enabled():
+        return np.s_[0 : inside.shape[0], 0 : inside.shape[1]]
+    columns = np.flatnonzero(inside[rows[0] : rows[-1] + 1].any(axis=0))
+    return np.s_[max(rows[0] - 1, 0) : rows[-1] + 2, max(columns[0] - 1, 0) : columns[-1] + 2]
+
+
 def object_near_edges(depth_mm: NDArray, bands_px: Sequence[int], jump_mm: float | None = None) -> list[NDArray]:
     """`object_near_edge` for several bands; the edges are computed once."""
     near_edge = [np.zeros(depth_mm.shape, dtype=bool) for _ in bands_px]
     inside = object_mask(depth_mm)
-    rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
-    if not rows.size:
+    if (box := object_box(inside)) is None:
         return near_edge
-    # Every edge touches the object, so the object's box and one pixel around it hold all of them.
-    box = np.s_[max(rows[0] - 1, 0) : rows[-1] + 2, max(columns[0] - 1, 0) : columns[-1] + 2]
-    if not skipping_enabled():
-        box = np.s_[:, :]
     edge = depth_edges(depth_mm[box], edge_jump_mm(depth_mm.shape[1]) if jump_mm is None else jump_mm)
     for band, band_px in zip(near_edge, bands_px, strict=True):
         if band_px > 0:
-            _dilate(edge, band_px, band[box])
-            band[box] &= inside[box]
+            band[box] = _dilated(edge, band_px) & inside[box]
     return near_edge
 
 
-def _dilate(edge: NDArray[np.bool_], band_px: int, band: NDArray[np.bool_]) -> None:
-    """Mark in ``band`` the pixels nearer than ``band_px`` to a pixel of ``edge``; both (h, w)."""
+def _dilated(edge: NDArray[np.bool_], band_px: int) -> NDArray[np.bool_]:
+    """Pixels nearer than ``band_px`` to a pixel of ``edge``; both (h, w). Rows lie behind each other with a gap between
+    them that takes what a shift pushes over their ends, so that every step is over memory without jumps."""
     height, width = edge.shape
-    run, half = edge.copy(), 0  # edge, dilated sideways by half
-    reach = min(band_px - 1, height - 1)
-    for dy in range(band_px - 1, -1, -1):
+    step = width + min(band_px - 1, width - 1)
+    padded = np.zeros((height, step), dtype=bool)
+    padded[:, :width] = edge
+    source = padded.reshape(-1)
+    run, half = source.copy(), 0  # source, dilated sideways by half
+    band = np.zeros_like(source)
+    for dy in range(min(band_px, height) - 1, -1, -1):
         # Widest sideways offset still inside the open disk dx^2 + dy^2 < band^2; it grows as dy shrinks.
-        limit = math.isqrt(band_px * band_px - 1 - dy * dy)
-        while half < min(limit, width - 1):
+        limit = min(math.isqrt(band_px * band_px - 1 - dy * dy), width - 1)
+        while half < limit:
             half += 1
-            run[:, half:] |= edge[:, :-half]
-            run[:, :-half] |= edge[:, half:]
-        if dy <= reach:
-            band[: height - dy] |= run[dy:]
-            band[dy:] |= run[: height - dy]
+            run[half:] |= source[:-half]
+            run[:-half] |= source[half:]
+        down = dy * step
+        band[: band.size - down] |= run[down:]
+        band[down:] |= run[: band.size - down]
+    return band.reshape(height, step)[:, :width]
 
 
 def _check(name: str) -> None:

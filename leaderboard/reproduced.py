@@ -2,8 +2,8 @@
 numbers reported by the paper, and which of its orderings hold.
 
 An ordering *holds* where the paired difference has the paper's sign and its 95% interval leaves 0 out, is *reversed*
-where it has the opposite sign and leaves 0 out, and is *within noise* otherwise. The interval is that of
-`fpp-eval compare`: differences sample by sample, resampled over objects.
+where it has the opposite sign and leaves 0 out, and is *not decided* by these objects otherwise. The interval is
+that of `fpp-eval compare`: differences sample by sample, resampled over objects.
 """
 
 import statistics
@@ -112,8 +112,8 @@ def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: Datas
 @dataclass(frozen=True)
 class Ordering:
     """The paper reports a smaller object MAE for ``better`` than for ``worse``, by ``paper_gap_mm``; here the mean over
-    samples of worse minus better is ``gap_mm``, its 95% interval ``interval_mm`` (None with fewer than two objects).
-    ``same_track`` is False where the two rows were told different things about the test samples."""
+    samples of worse minus better is ``gap_mm``, its 95% interval over ``objects`` objects ``interval_mm`` (None with
+    fewer than two). ``same_track`` is False where the two rows were told different things about the test samples."""
 
     better: str
     worse: str
@@ -121,11 +121,12 @@ class Ordering:
     gap_mm: float
     interval_mm: tuple[float, float] | None
     same_track: bool
+    objects: int
 
     @property
-    def verdict(self) -> Literal["holds", "within noise", "reversed"]:
+    def verdict(self) -> Literal["holds", "not decided", "reversed"]:
         if self.interval_mm is None or self.interval_mm[0] <= 0 <= self.interval_mm[1]:
-            return "within noise"
+            return "not decided"
         return "holds" if self.interval_mm[0] > 0 else "reversed"
 
 
@@ -146,7 +147,8 @@ def orderings(lines: Sequence[Line]) -> list[Ordering]:
         gaps, objects = list(differences.values()), [best[sample][0] for sample in differences]
         tracks = {line.entry.result.track for line in (better, worse) if line.entry is not None}
         gap, interval = statistics.fmean(gaps), object_interval(gaps, objects)
-        judged.append(Ordering(better.label, worse.label, worse_mm - better_mm, gap, interval, len(tracks) == 1))
+        labels, count = (better.label, worse.label), len(set(objects))
+        judged.append(Ordering(*labels, worse_mm - better_mm, gap, interval, len(tracks) == 1, count))
     return judged
 
 
@@ -241,14 +243,15 @@ def table_rich(table: str, lines: Sequence[Line], preset: str) -> Table:
 
 
 def orderings_sentence(judged: Sequence[Ordering]) -> str:
-    """How many of the paper's orderings hold, in a sentence."""
+    """How many of the paper's orderings hold, by the intervals of the paired differences, in a sentence."""
     if not judged:
         return "No two rows of the paper's have been measured here yet, so none of its orderings can be judged."
     count = Counter(ordering.verdict for ordering in judged)
+    objects = max(ordering.objects for ordering in judged)
     return (
         f"The paper's pairwise orderings by object MAE, {len(judged)} among the rows measured here: {count['holds']} "
-        f"hold, {count['within noise']} within noise (the 95% interval of the paired difference holds 0), "
-        f"{count['reversed']} reversed."
+        f"hold, {count['reversed']} reversed, {count['not decided']} not decided by {objects} objects (the 95% "
+        "interval of the paired difference holds 0)."
     )
 
 

@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator
 from datetime import UTC, datetime
 from operator import attrgetter
 from pathlib import Path
-from threading import Lock
+from threading import Lock, Thread
 from typing import Any, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import split_sample_name
-from fpp_ml_bench.depth import edge_jump_mm, object_mask, object_near_edges
+from fpp_ml_bench.depth import edge_jump_mm, extremes, object_box, object_mask, object_near_edges
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import protocol, result, submission
 from fpp_ml_bench.evaluation.protocol import Mode, Units
@@ -28,7 +27,8 @@ from fpp_ml_bench.loaders.storage import DatasetFolder, benchmark_of
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by
 
-WORKERS = 4
+THREADS = 4
+"""Most threads that score, the caller's among them."""
 Outcome = tuple[list[str], list[dict[str, Any]]]
 """Problems and rows of a sample: a line for each problem and no row, or no problem and a row."""
 
@@ -129,8 +129,8 @@ def _scored(
     edge_band_px: int, sigmas: Path | None,
 ) -> Iterable[Outcome]:  # fmt: skip
     """Problems and row of each sample that has a prediction, in order; the files of its uncertainty in the folder
-    ``sigmas`` are checked. Work begins with this call, in threads, before the first outcome is taken from the
-    iterator."""
+    ``sigmas`` are checked. Work begins with this call, in threads; whoever takes the first outcome from the iterator
+    then takes part in it."""
     dataset_lock = Lock()
 
     def work(sample: str) -> Outcome:
@@ -138,7 +138,7 @@ def _scored(
             target = dataset.target_mm(sample, target_name)
             void = dataset.void(sample) if mode == "standard" else None
             unlit_mm = dataset.unlit_mm(sample) if void is not None and target_name == "depth_exact" else None
-        low, high = float(target.min()), float(target.max())
+        low, high = extremes(target)
         if not (low >= 0 and np.isfinite(high)):
             bad = "NaN, infinite or negative values"
             raise DatasetError(f"{sample}: the target depth holds {bad}; run: fpp-bench verify")
@@ -165,7 +165,30 @@ def _scored(
         row = {"sample": sample, "prediction_sha256": digest, **scores.pixels(), **scores.metrics()}
         return [], [row | {"object": split_sample_name(sample)[0], "stated": stated}]
 
-    return ThreadPoolExecutor(min(WORKERS, usable_cores())).map(work, samples)
+    numbers = iter(range(len(samples)))  # all threads take from it: a step of this iterator is not interrupted
+    outcomes: dict[int, Outcome | Exception] = {}
+
+    def take_part() -> None:
+        for number in numbers:
+            try:
+                outcomes[number] = work(samples[number])
+            except Exception as error:  # the caller raises that of the first sample
+                outcomes[number] = error
+
+    threads = [Thread(target=take_part, daemon=True) for _ in range(min(THREADS, usable_cores()) - 1)]
+    for thread in threads:
+        thread.start()
+
+    def in_order() -> Iterator[Outcome]:
+        take_part()
+        for thread in threads:
+            thread.join()
+        for _, outcome in sorted(outcomes.items()):
+            if isinstance(outcome, Exception):
+                raise outcome
+            yield outcome
+
+    return in_order()
 
 
 _TIME_KEYS = ("seconds_per_sample", "seconds_source", "hardware", "timing")
@@ -266,12 +289,6 @@ def explain_eval(dataset: DatasetFolder, split: str, target: str, edge_band_px: 
 
 
 def _box_px(inside: NDArray[np.bool_]) -> int:
-    """Pixels of the box around the object, and one pixel around it, in which `object_near_edges` searches."""
-    rows, columns = (np.flatnonzero(inside.any(axis=axis)) for axis in (1, 0))
-    if not rows.size:
-        return 0
-    height, width = (
-        min(int(line[-1]) + 2, limit) - max(int(line[0]) - 1, 0)
-        for line, limit in zip((rows, columns), inside.shape, strict=True)
-    )
-    return height * width
+    """Pixels of the box in which `object_near_edges` searches."""
+    box = object_box(inside)
+    return 0 if box is None else int(inside[box].size)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.depth import object_mask, object_near_edges
+from fpp_ml_bench.depth import edge_jump_mm, object_box, object_mask, object_near_edges
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import DISTRIBUTION, EDGE_BAND_PX, PIXEL_SETS, WIDE_BAND_PX, WITHIN_MM
@@ -95,39 +95,40 @@ def _from_sums(pixels: int, absolute: list[float], squares: list[float], errors:
     return ErrorStats(pixels, mae, math.sqrt(mean_square))
 
 
-def _background_stats(prediction: Map, target: Map, index: NDArray[np.intp]) -> ErrorStats:
-    """Statistics of every pixel but those at ``index`` (sorted; object and void), by setting their errors to 0. Not
-    overall minus object: that would leave rounding errors where the background is perfect."""
-    pixels = prediction.size - index.size
-    if pixels == 0:
-        return EMPTY
-    # A target without negative values is exactly 0 on the background: there the prediction is the error.
-    target_is_zero = bool(target.min() >= 0)
-    signed = not (target_is_zero and bool(prediction.min() >= 0))
+def _background(prediction: Map, target: Map, void: NDArray[np.bool_] | None) -> tuple[ErrorStats, NDArray[np.bool_]]:
+    """Statistics of every pixel that is neither object nor void, by setting the errors of those to 0, and the mask of
+    the object; all (n,). Not overall minus object: that would leave rounding errors where the background is perfect.
+    Everything is done block by block, while the block is in the cache."""
+    inside = np.empty(target.shape, dtype=bool)
     buffer = np.zeros((_BLOCKS_AT_ONCE, BLOCK))
     flat, step = buffer.reshape(-1), buffer.size
+    pixels = 0
     absolute: list[float] = []
     squares: list[float] = []
-    starts = range(0, prediction.size, step)
-    cuts = [*np.searchsorted(index, list(starts)).tolist(), index.size]
-    for number, start in enumerate(starts):
-        errors = flat[: min(step, prediction.size - start)]
-        np.copyto(errors, prediction[start : start + step])
-        if not target_is_zero:
-            errors -= target[start : start + step]
-        errors[index[cuts[number] : cuts[number + 1]] - start] = 0.0
+    for start in range(0, target.size, step):
+        part = slice(start, start + step)
+        excluded = inside[part] = object_mask(target[part])
+        if void is not None:
+            excluded = excluded | void[part]
+        errors = flat[: excluded.size]
+        np.copyto(errors, prediction[part])
+        # A target without negative values is exactly 0 on the background: there the prediction is the error.
+        if not target[part].min() >= 0:
+            errors -= target[part]
+        scored = excluded.size - int(np.count_nonzero(excluded))
+        if scored < excluded.size:
+            np.copyto(errors, 0.0, where=excluded)
+        pixels += scored
         flat[errors.size :] = 0.0
         squares += [float(block.dot(block)) for block in buffer]
-        if signed:
-            np.abs(buffer, out=buffer)
+        np.abs(buffer, out=buffer)
         absolute += buffer.sum(axis=1).tolist()
 
     def errors_outside() -> Errors:
-        outside = np.ones(target.shape, dtype=bool)
-        outside[index] = False
+        outside = ~inside if void is None else ~(inside | void)
         return prediction[outside].astype(np.float64) - target[outside]
 
-    return _from_sums(pixels, absolute, squares, errors_outside)
+    return _from_sums(pixels, absolute, squares, errors_outside), inside
 
 
 _EDGE, _WIDE, _MISSING = 1, 2, 4
@@ -232,23 +233,25 @@ def score_sample(
     for name, part in (("void", void), ("unlit_mm", unlit_mm)):
         if part is not None and part.shape != target_mm.shape:
             raise PredictionError(f"{name}: expected a map of {target_mm.shape}, got {part.shape}")
-    prediction, target = prediction_mm.ravel(), target_mm.ravel()
-    inside = object_mask(target)
-    excluded = index = np.flatnonzero(inside)
-    if void is not None and void.any():
-        excluded, index = np.flatnonzero(inside | void.ravel()), np.flatnonzero(inside & ~void.ravel())
+    prediction = prediction_mm.ravel()
+    flat_void = None if void is None else void.ravel()
+    background, flat_inside = _background(prediction, target_mm.ravel(), flat_void)
     void_px = None if void is None else int(np.count_nonzero(void))
     unlit = None if unlit_mm is None else _unlit_stats(prediction, unlit_mm.ravel())
-    depths = prediction.take(index)
+    nothing = SampleScores(background, {}, dict.fromkeys(DISTRIBUTION), void_px, unlit)
+    inside = flat_inside.reshape(target_mm.shape)
+    if (box := object_box(inside)) is None:
+        return nothing
+    index = np.flatnonzero(inside[box] if void is None else inside[box] & ~void[box])
+    if not index.size:
+        return nothing
+    depths = prediction_mm[box].ravel().take(index)
     errors = depths.astype(np.float64)
-    errors -= target.take(index)
+    errors -= target_mm[box].ravel().take(index)
     if not np.isfinite(errors).all():
         raise PredictionError(NOT_FINITE)
-    background = _background_stats(prediction, target, excluded)
-    if not index.size:
-        return SampleScores(background, {}, dict.fromkeys(DISTRIBUTION), void_px, unlit)
     missing = depths <= 0
-    near, wide = object_near_edges(target_mm, (edge_band_px, WIDE_BAND_PX))
+    near, wide = object_near_edges(target_mm[box], (edge_band_px, WIDE_BAND_PX), edge_jump_mm(target_mm.shape[1]))
     zone = near.ravel().take(index).view(np.uint8) * np.uint8(_EDGE)
     zone |= wide.ravel().take(index).view(np.uint8) * np.uint8(_WIDE)
     zone |= missing.view(np.uint8) * np.uint8(_MISSING)
@@ -277,8 +280,9 @@ def _distribution(errors: Errors, missing: NDArray[np.bool_]) -> dict[str, float
     offset = _quantiles(signed, 0.5)[0]
     np.subtract(errors, offset, out=signed)
     np.abs(signed, out=signed)
-    valid_bias = mean_of(errors[~missing] if missing.any() else errors)
-    values = (median, p95, largest, *within, mean_of(errors), valid_bias, mean_of(signed))
+    bias = mean_of(errors)
+    valid_bias = mean_of(errors[~missing]) if missing.any() else bias
+    values = (median, p95, largest, *within, bias, valid_bias, mean_of(signed))
     return dict(zip(DISTRIBUTION, values, strict=True))
 
 

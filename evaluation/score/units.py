@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.depth import extremes, object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import Mode, Units
@@ -19,7 +19,7 @@ MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "normalised": 1000.0}
 def value_problems(prediction: Depth, target_mm: Depth, target_max_mm: float, units: Units) -> list[str]:
     """What is wrong with the values of a prediction (H, W) in ``units``; usually an empty list. ``target_max_mm`` is
     the largest value of ``target_mm`` (H, W)."""
-    low, high = float(prediction.min()), float(prediction.max())
+    low, high = extremes(prediction)
     problems = []
     if not np.isfinite([low, high]).all():  # min and max carry NaN through
         nans, infinities = int(np.isnan(prediction).sum()), int(np.isinf(prediction).sum())

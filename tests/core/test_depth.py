@@ -14,7 +14,9 @@ from fpp_ml_bench.depth import (
     depth_edges,
     edge_distance_px,
     edge_jump_mm,
+    extremes,
     normalise,
+    object_box,
     object_mask,
     object_near_edge,
 )
@@ -32,6 +34,26 @@ def marked(text):
 def test_object_is_depth_above_zero():
     depth = np.array([[0.0, 1e-30, 1500.0, -0.0, np.nan, -5.0]], np.float32)
     assert object_mask(depth).tolist() == [[False, True, True, False, False, False]]
+
+
+def test_extremes_are_those_of_every_block_and_carry_nan():
+    values = np.random.default_rng(1).normal(0, 1, (300, 450)).astype(np.float32)  # more than two blocks
+    for order in "CF":
+        assert extremes(np.asarray(values, order=order)) == (float(values.min()), float(values.max()))
+    assert extremes(np.array([[np.inf, -np.inf]], np.float16)) == (-np.inf, np.inf)
+    values[299, 449] = np.nan
+    assert np.isnan(extremes(values)).all()
+
+
+@pytest.mark.parametrize(
+    ("pixels", "box"),
+    [([], None), ([(2, 3)], np.s_[1:4, 2:5]), ([(0, 0), (4, 6)], np.s_[0:6, 0:8]), ([(5, 7)], np.s_[4:7, 6:9])],
+)
+def test_the_box_is_one_pixel_around_the_object(pixels, box):
+    inside = np.zeros((6, 8), bool)
+    for pixel in pixels:
+        inside[pixel] = True
+    assert object_box(inside) == box
 
 
 def test_outline_of_a_square():

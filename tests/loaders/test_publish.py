@@ -81,7 +81,8 @@ for config in datasets.get_dataset_config_names("alice/fpp"):
         rows = list(rows.with_format("numpy"))
         columns = {name: np.stack([row[name] for row in rows]) for name in features}
         np.savez(f"{out}/{config}-{split}.npz", **columns, features=json.dumps(features))
-first = next(iter(datasets.load_dataset("alice/fpp", split="test", streaming=True)))
+# To the end: Arrow's threads abort the process where a stream is dropped half read (datasets issues 7467 and 7566).
+first, *_ = datasets.load_dataset("alice/fpp", split="test", streaming=True)
 assert first["frame_00"].mode == "L", first["frame_00"].mode
 np.save(f"{out}/streamed.npy", np.asarray(first["frame_00"]))
 """

@@ -147,24 +147,24 @@ def test_orderings_are_judged_by_number():
     ]
     judged = orderings(lines[::-1])
     assert [(ordering.better, ordering.worse, ordering.verdict) for ordering in judged] == [
-        ("best", "worse", "holds"), ("best", "odd", "within noise"), ("worse", "odd", "within noise"),
+        ("best", "worse", "holds"), ("best", "odd", "not decided"), ("worse", "odd", "not decided"),
     ]  # fmt: skip
     assert [ordering.paper_gap_mm for ordering in judged] == [1.0, 2.0, 1.0]
     assert judged[0].gap_mm == pytest.approx(2.0)
     turned = orderings([line("best", 1.0, views(12.0)), line("worse", 2.0, noise)])
     assert [ordering.verdict for ordering in turned] == ["reversed"]
-    assert "3 among the rows measured here: 1 hold, 2 within noise" in orderings_sentence(judged)
+    assert "measured here: 1 hold, 0 reversed, 2 not decided by 5 objects" in orderings_sentence(judged)
     assert orderings([line("a", 1.0, noise), line("b", 1.0, views(12.0))]) == []
     assert "none of its orderings" in orderings_sentence([])
 
 
 @pytest.mark.parametrize(
     ("ends", "verdict"),
-    [((0.1, 2.0), "holds"), ((0.0, 2.0), "within noise"), ((-1.0, 0.0), "within noise"), ((-2.0, -0.1), "reversed"),
-     (None, "within noise")],
+    [((0.1, 2.0), "holds"), ((0.0, 2.0), "not decided"), ((-1.0, 0.0), "not decided"), ((-2.0, -0.1), "reversed"),
+     (None, "not decided")],
 )  # fmt: skip
 def test_an_interval_that_touches_zero_decides_nothing(ends, verdict):
-    assert Ordering("a", "b", 1.0, 1.0, ends, True).verdict == verdict
+    assert Ordering("a", "b", 1.0, 1.0, ends, True, 5).verdict == verdict
 
 
 def test_the_difference_is_that_of_compare(tmp_path, dataset):

@@ -129,7 +129,7 @@ def test_same_result_twice_and_from_one_thread(dataset, predictions, monkeypatch
     from fpp_ml_bench.evaluation.score import evaluator as scoring
 
     first = evaluate(predictions, dataset)
-    monkeypatch.setattr(scoring, "WORKERS", 1)
+    monkeypatch.setattr(scoring, "THREADS", 1)
     second = evaluate(predictions, dataset)
     assert first.model_copy(update={"created": ""}) == second.model_copy(update={"created": ""})
 
@@ -288,5 +288,5 @@ def test_gpus_are_named_by_nvidia_smi(monkeypatch):
     monkeypatch.setattr(hardware, "_read", lambda path: "")
     monkeypatch.setitem(sys.modules, "torch", None)
     monkeypatch.setattr(hardware.shutil, "which", lambda name: "/usr/bin/nvidia-smi")
-    monkeypatch.setattr(hardware.subprocess, "run", lambda *a, **k: Answer)
+    monkeypatch.setattr(subprocess, "run", lambda *a, **k: Answer)
     assert hardware.describe_hardware().gpu == "2 x NVIDIA H100, NVIDIA T4"
