@@ -43,8 +43,12 @@ FRAMES = 3
 SMOOTHNESS = (
     4.0  # weight of the link between two pixels: a pixel's window shares most of its light with its neighbour's
 )
+EVIDENCE_WEIGHT = 2.0  # one carrier's phase has no error: evidence tells twice as much of the order as in one frame
 REACH_PX = 2  # of the pairs that are averaged
 SAME_PLANE_SIGMAS = 3.0
+NOT_AVERAGED = 0.2
+"""Of the noise of a pixel's own phase, what the mean over pixels leaves beside its noise: noise hides how far they are
+from a plane."""
 NOISE_SIGMAS = 3.0
 CONTINUED_PX, CONTINUED_RAD = 3, 0.2
 SYSTEMATIC_SHARE = 0.15  # phase error as a share of a misfit of the brightness that noise does not explain
@@ -61,8 +65,8 @@ def shifted_carrier(rig: Rig, name: str) -> int:
             return different.index(FRAMES)
     found = "none" if family is None else f"{len(family)} with shifts_deg {[list(pair) for pair in family.shifts_deg]}"
     raise PredictionError(
-        f"{name} --frames {FRAMES}: needs three crossed frames that shift one carrier and keep the other still; this rig "
-        f"has {found}. Build with --rig crossed, or give the rig such shifts_deg (docs/own_rig.md)"
+        f"{name} --frames {FRAMES}: needs three crossed frames that shift one carrier and keep the other still; this "
+        f"rig has {found}. Build with --rig crossed, or give the rig such shifts_deg (docs/own_rig.md)"
     )
 
 
@@ -111,7 +115,7 @@ class ThreeFrameRoute(CrossedRoute):
             different = differs((plane.residual for plane in planes), background.noise_grey)
             region = lit_object(different, modulation, background, self.shifts_rad, period_px)
             residual = wrapped(phase - self.carriers.infinity_rad[self.moved])
-            region = continued(region, first_mask(different, period_px), residual)
+            region = continued(region, first_mask(different, period_px), different, residual)
         else:
             region = modulated_region(mean, modulation, background, period_px)
             background = replace(background, share=0.0)
@@ -154,7 +158,7 @@ class ThreeFrameRoute(CrossedRoute):
         pairs = zip(links_between(inside), jump_links(residual, own, stride=1), strict=True)
         link_x, link_y = (np.float32(SMOOTHNESS) * link * smooth for link, smooth in pairs)
         index, margin, evidence = chosen(carriers, found, trust, inside, (link_x, link_y))
-        return index, margin / np.float32(SMOOTHNESS), evidence
+        return index, margin / np.float32(SMOOTHNESS), np.float32(EVIDENCE_WEIGHT) * evidence
 
     def _fit(
         self, carriers: Carriers, light: Image, inside: Mask, nearness: Image, modulation: Image,
@@ -163,11 +167,13 @@ class ThreeFrameRoute(CrossedRoute):
         """What `refinement.refined` gives for one frame, from the ``modulation`` and ``nearness`` that every pixel
         measured itself; ``light``: the mean of the frames less ambient light."""
         gain = carriers.gain[self.moved]
-        bright = np.maximum(modulation, LEAST_GREY * contrast[self.moved])
+        bright = np.maximum(modulation, np.float32(LEAST_GREY * contrast[self.moved]))
         noise_grey = phase_noise_grey(nearness * gain, bright, inside)
         # Least squares of three equal steps: both amplitudes have 2 / 3 of the variance of a grey level.
         sigma = np.float32(noise_grey * np.sqrt(2 / FRAMES)) / bright
-        psi, sigma = same_plane_mean(nearness * gain, sigma, inside)
+        own = sigma
+        psi, sigma = same_plane_mean(nearness * gain, own, inside)
+        sigma = np.hypot(sigma, np.float32(NOT_AVERAGED) * own)
         nearness, brightness = psi / gain, modulation / np.float32(contrast[self.moved])
         still = (0.0, contrast[1]) if self.moved == 0 else (contrast[0], 0.0)
         raised, slope = fringes(carriers, nearness, still)
@@ -179,16 +185,18 @@ class ThreeFrameRoute(CrossedRoute):
         return Fit(*(np.asarray(values, np.float32) for values in maps))
 
 
-def continued(inside: Mask, region: Mask, residual_rad: Image) -> Mask:
-    """Object pixels (h, w), and those of ``region`` whose ``residual_rad`` is that of `CONTINUED_PX` object pixels
-    beside them: where object and plane happen to have the same grey levels in all frames."""
-    alike = np.zeros(inside.shape, np.uint8)
+def continued(inside: Mask, region: Mask, different: Mask, residual_rad: Image) -> Mask:
+    """Object pixels (h, w), and those of ``region`` with `CONTINUED_PX` object pixels beside them that either have the
+    same ``residual_rad``, or are themselves ``different`` from the empty scene: where object and plane happen to have
+    the same grey levels in all frames, and where light from other surfaces drowns the fringe."""
+    beside, alike = np.zeros(inside.shape, np.uint8), np.zeros(inside.shape, np.uint8)
     padded, phases = np.pad(inside, 1), np.pad(residual_rad, 1)
     height, width = inside.shape
     for down, right in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2)):
         there = slice(down, down + height), slice(right, right + width)
+        beside += padded[there]
         alike += padded[there] & (np.abs(wrapped(phases[there] - residual_rad)) < CONTINUED_RAD)
-    return inside | (region & (alike >= CONTINUED_PX))
+    return inside | (region & ((alike >= CONTINUED_PX) | (different & (beside >= CONTINUED_PX))))
 
 
 def phase_noise_grey(psi: Image, modulation: Image, inside: Mask) -> float:

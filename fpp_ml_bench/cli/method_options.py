@@ -13,8 +13,8 @@ from fpp_ml_bench.loaders import render, storage
 METHOD_HELP = (
     "classical (N-step phase, Gray-code order, triangulation), phase (one fringe or a few, nothing learned), phase-net "
     "(single-shot phase; order, mask and correction learned), crossed (one frame with two fringe directions, or three, "
-    "nothing learned), crossed-net (the same, with order, mask and correction learned), constant (looks at nothing), nearest "
-    "(depth of the training sample with the nearest image), the name of weights that come with the package, a "
+    "nothing learned), crossed-net (one frame, with order, mask and correction learned), constant (looks at nothing), "
+    "nearest (depth of the training sample with the nearest image), the name of weights that come with the package, a "
     ".safetensors file, or a recipe that fpp-bench reproduce has trained (loss/l1)"
 )
 _OPTIONS: dict[str, tuple[str, ...]] = {
