@@ -165,7 +165,7 @@ class CrossedRoute:
         wrong_chance = np.where(_lost(seen), np.maximum(wrong_chance, LOST_CHANCE), wrong_chance)
         mm_per_rad = carriers.mm_per_rad(np.maximum(depth_mm, 1.0))
         apart_rad = np.abs(seen.rival - fit.nearness) * carriers.joint_gain
-        sigma_rad = np.hypot(fit.uncertainty_rad, _reaching(apart_rad, wrong_chance))
+        sigma_rad = np.hypot(fit.uncertainty_rad, reaching(apart_rad, wrong_chance))
         sigma_mm = np.where(inside, mm_per_rad * sigma_rad, 0.0)
         confidence = np.where(inside, 1 / (1 + sigma_mm / HALF_CONFIDENCE_MM), 0.0)
         reason = self._reasons(seen, inside, wrong_chance, confidence)
@@ -276,7 +276,7 @@ def _lifted(carriers: Carriers, phase_rad: Image, nearness: NDArray) -> NDArray:
     return nearness + (carriers.gain * beside).sum(axis=0) / carriers.joint_gain**2  # type: ignore[no-any-return]
 
 
-def _reaching(apart_rad: NDArray, wrong_chance: Image) -> NDArray:
+def reaching(apart_rad: NDArray, wrong_chance: Image) -> NDArray:
     """Standard uncertainty whose interval of the probability 1 - ``wrong_chance`` just reaches a rival ``apart_rad``
     away; 0 for a chance below `LEAST_WRONG`."""
     sigmas = ndtri(1 - np.clip(wrong_chance, LEAST_WRONG, MOST_WRONG) / 2)
