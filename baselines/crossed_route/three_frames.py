@@ -170,8 +170,7 @@ class ThreeFrameRoute(CrossedRoute):
         bright = np.maximum(modulation, np.float32(LEAST_GREY * contrast[self.moved]))
         noise_grey = phase_noise_grey(nearness * gain, bright, inside)
         # Least squares of three equal steps: both amplitudes have 2 / 3 of the variance of a grey level.
-        sigma = np.float32(noise_grey * np.sqrt(2 / FRAMES)) / bright
-        own = sigma
+        own: Image = (noise_grey * np.sqrt(2 / FRAMES) / bright).astype(np.float32)
         psi, sigma = same_plane_mean(nearness * gain, own, inside)
         sigma = np.hypot(sigma, np.float32(NOT_AVERAGED) * own)
         nearness, brightness = psi / gain, modulation / np.float32(contrast[self.moved])
@@ -238,4 +237,4 @@ def same_plane_mean(psi: Image, sigma: Image, inside: Mask) -> tuple[Image, Imag
         weight = np.where(alike, 4 / np.maximum(variance, np.float32(1e-12)), np.float32(0))
         total += weight * (first + second) / 2
         weights += weight
-    return total / weights, np.sqrt(1 / weights)
+    return (total / weights).astype(np.float32), np.sqrt(1 / weights).astype(np.float32)

@@ -88,7 +88,8 @@ class CalibrationLayer:
     ) -> "CalibrationLayer":
         where, device = rig.camera.rays() if rays is None else rays, rig.projector
         a = (rotated_ray(where, rig, 0), rotated_ray(where, rig, 1), rotated_ray(where, rig, 2))
-        infinity, gain = centre_rad, 0.0
+        infinity: Any = centre_rad
+        gain: Any = 0.0
         for axis, per_unit in enumerate(rad_per_unit):
             if per_unit:
                 infinity = infinity + per_unit * (a[axis] / a[2])

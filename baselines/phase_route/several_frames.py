@@ -76,7 +76,7 @@ def differs(plane_misfits: Iterable[Image], noise_grey: float) -> Mask:
     be as bright; pixels that only the square's reach beyond the silhouette adds are removed."""
     misfits, noise = list(plane_misfits), noise_grey**2
     alone = sum((misfit * misfit for misfit in misfits), np.float32(0))
-    around = sum((cv2.blur(misfit, (SQUARE_PX, SQUARE_PX)) ** 2 for misfit in misfits), np.float32(0))
+    around = np.asarray(sum((cv2.blur(misfit, (SQUARE_PX, SQUARE_PX)) ** 2 for misfit in misfits), np.float32(0)))
     square_differs = (around > _limit(noise / SQUARE_PX**2, len(misfits))).astype(np.uint8)
     without_rim = cv2.erode(square_differs, np.ones((SQUARE_PX, SQUARE_PX), np.uint8)) > 0
     return (alone > _limit(noise, len(misfits))) | without_rim
