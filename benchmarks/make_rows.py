@@ -67,6 +67,7 @@ compared with them. The middle of the range is the standoff, so it is no row of 
 
 CROSSED: dict[str, tuple[object, ...]] = {
     "crossed": ("crossed",),
+    "crossed-03": ("crossed", "--frames", 3),
     "crossed-net": ("crossed-net",),
     "crossed-constant-standoff": ("constant", "--at", "standoff"),
     "crossed-constant-training-mean": ("constant", "--at", "training-mean"),

@@ -86,7 +86,7 @@ def train_crossed_net(
     started, rig = perf_counter(), rig or crossed_rig()
     groups = groups_of(recipe.lights, recipe.views_a_light, recipe.seed)
     described = recipe.to_dict() | {"rig": rig.to_dict()}
-    fingerprint = hashlib.sha256(json.dumps([described, _described(groups)], sort_keys=True).encode()).hexdigest()
+    fingerprint = hashlib.sha256(json.dumps([described, described_groups(groups)], sort_keys=True).encode()).hexdigest()
     training.claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
     weights = out / WEIGHTS
     if weights.exists():
@@ -136,7 +136,8 @@ def train_crossed_net(
     return Trained(weights, recipe.steps, threshold, means)
 
 
-def _described(groups: list[Group]) -> list[Any]:
+def described_groups(groups: list[Group]) -> list[Any]:
+    """Plain data that tells one set of views from another."""
     return [[group.name, group.split, group.light.model_dump(mode="json"), group.views] for group in groups]
 
 

@@ -9,3 +9,4 @@ from .observation import Settings as Settings
 from .orders import JUMP_RAD as JUMP_RAD
 from .refinement import fringes as fringes
 from .route import CrossedRoute as CrossedRoute
+from .three_frames import ThreeFrameRoute as ThreeFrameRoute

@@ -1,12 +1,13 @@
-"""The crossed route as a method of ``fpp-bench predict``: one frame, nothing learned, nothing told."""
+"""The crossed route as a method of ``fpp-bench predict``: one frame or three, nothing learned, nothing told."""
 
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.crossed_route.observation import CrossedMeasurement, Settings
+from fpp_ml_bench.baselines.crossed_route.observation import CrossedMeasurement, CrossedObservation, Settings
 from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute
+from fpp_ml_bench.baselines.crossed_route.three_frames import FRAMES, ThreeFrameRoute, shifted_carrier
 from fpp_ml_bench.baselines.method import Answer, Frames, Method
 from fpp_ml_bench.coding import crossed_from_pair
 from fpp_ml_bench.errors import DecodeError, PredictionError
@@ -28,41 +29,61 @@ def frames_of(rig: Rig, name: str) -> tuple[int, ...]:
     )
 
 
-def crossed_image(frames: Frames, used: tuple[int, ...]) -> NDArray[np.uint8]:
-    """The crossed frame of a captured sequence; raises `DecodeError` for a frame that is missing."""
+def _captured(frames: Frames, used: tuple[int, ...]) -> list[NDArray[np.uint8]]:
     images = []
     for index in used:
         image = frames[index] if index < len(frames) else None
         if image is None:
-            raise DecodeError(f"frame {index} is missing: the crossed frame is made from frames {used}")
+            raise DecodeError(f"frame {index} is missing: the crossed fringes are measured in frames {used}")
         images.append(image)
+    return images
+
+
+def crossed_image(frames: Frames, used: tuple[int, ...]) -> NDArray[np.uint8]:
+    """The crossed frame of a captured sequence; raises `DecodeError` for a frame that is missing."""
+    images = _captured(frames, used)
     return images[0] if len(images) == 1 else crossed_from_pair(images[0], images[1])
 
 
 class CrossedMethod(Method):
     """Depth from one crossed frame; where the rig has none, from the mean of the first fringe of both directions, which
-    is one. ``mask``: a file (`captures.read_mask`) that says where the object is in every sample. Raises
-    `PredictionError` for a rig without such frames and for an invalid option, `CaptureError` for a mask that can't be
-    used."""
+    is one. With ``frames`` 3: from three that shift one carrier (`ThreeFrameRoute`). ``mask``: a file
+    (`captures.read_mask`) that says where the object is in every sample. Raises `PredictionError` for a rig without
+    such frames and for an invalid option, `CaptureError` for a mask that can't be used."""
 
     name = "crossed"
 
-    def __init__(self, rig: Rig, min_confidence: float = 0.0, mask: str | Path | None = None) -> None:
-        self.rig, self.frames_used = rig, frames_of(rig, self.name)
-        self.route = CrossedRoute(rig, Settings(min_confidence))
+    def __init__(self, rig: Rig, min_confidence: float = 0.0, mask: str | Path | None = None, frames: int = 1) -> None:
+        self.rig, settings = rig, Settings(min_confidence)
+        self.route: CrossedRoute
+        if frames == FRAMES:
+            moved = shifted_carrier(rig, self.name)
+            self.frames_used = rig.sequence.crossed_frames[:FRAMES]
+            self.route = ThreeFrameRoute(rig, moved, settings)
+            count = "three frames"
+        elif frames == 1:
+            self.frames_used, self.route = frames_of(rig, self.name), CrossedRoute(rig, settings)
+            count = "one frame" if len(self.frames_used) == 1 else "one frame, the mean of two"
+        else:
+            raise PredictionError(f"{self.name} --frames {frames}: expected 1 or {FRAMES} crossed frames")
         pitches = " and ".join(f"{pitch:g}" for pitch in self.route.family.pitches_px)
-        made = "" if len(self.frames_used) == 1 else ", the mean of two"
-        self.title = f"Crossed fringes of {pitches} px, one frame{made}, nothing learned"
+        self.title = f"Crossed fringes of {pitches} px, {count}, nothing learned"
         self.mask = None if mask is None else read_mask(Path(mask), (rig.camera.height, rig.camera.width))
         self.settings = {"min_confidence": min_confidence} | ({} if mask is None else {"mask": Path(mask).name})
+        self.settings |= {} if frames == 1 else {"frames": frames}
+
+    def observe(self, frames: Frames) -> CrossedObservation:
+        """What is measured before depth; frames that are not in `frames_used` may be None."""
+        if isinstance(self.route, ThreeFrameRoute):
+            return self.route.observe_frames(_captured(frames, self.frames_used), self.mask)
+        return self.route.observe(crossed_image(frames, self.frames_used), self.mask)
 
     def measure(self, frames: Frames) -> CrossedMeasurement:
         """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
-        return self.route.measure(crossed_image(frames, self.frames_used), self.mask)
+        return self.route.conclude(self.observe(frames))
 
     def crop(self, frames: Frames) -> tuple[slice, slice]:
-        seen = self.route.observe(crossed_image(frames, self.frames_used), self.mask)
-        return self.route.resampling.captured_crop(seen.carriers.crop)
+        return self.route.resampling.captured_crop(self.observe(frames).carriers.crop)
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""

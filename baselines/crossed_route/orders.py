@@ -29,11 +29,12 @@ class Candidates:
     exists: Mask
 
 
-def candidates(carriers: Carriers, phase_rad: Image, slack_mm: float) -> Candidates:
-    """All candidates of wrapped phases (2, h', w') in the range with ``slack_mm`` more at both ends."""
+def candidates(carriers: Carriers, phase_rad: Image, slack_mm: float, exact: int | None = None) -> Candidates:
+    """All candidates of wrapped phases (2, h', w') in the range with ``slack_mm`` more at both ends. Of the carrier
+    ``exact``, if one is given, the phase has no error: the orders are its orders, and it alone tells the nearness."""
     near_mm, far_mm = carriers.rig.working_range_mm
     gain = carriers.gain
-    main = int(np.median(np.abs(gain[1])) > np.median(np.abs(gain[0])))
+    main = int(np.median(np.abs(gain[1])) > np.median(np.abs(gain[0]))) if exact is None else exact
     ends = [gain[main] * carriers.nearness(end) for end in (near_mm - slack_mm, far_mm + slack_mm)]
     low, high = np.minimum(*ends), np.maximum(*ends)
     residual = wrapped(phase_rad - carriers.infinity_rad)
@@ -45,9 +46,12 @@ def candidates(carriers: Carriers, phase_rad: Image, slack_mm: float) -> Candida
     for turn in range(count):
         psi = proposing + TAU * (first + turn)
         beside = wrapped(other - psi * ratio)
-        # The point of the line nearest to the measured pair, and its distance.
-        nearness.append((gain[main] * psi + gain[1 - main] * (psi * ratio + beside)) / joint**2)
-        misfits.append(np.abs(beside * gain[main]) / joint)
+        if exact is None:  # the point of the line nearest to the measured pair, and its distance
+            nearness.append((gain[main] * psi + gain[1 - main] * (psi * ratio + beside)) / joint**2)
+            misfits.append(np.abs(beside * gain[main]) / joint)
+        else:
+            nearness.append(psi / gain[main])
+            misfits.append(np.abs(beside))
         exists.append(psi <= high)
     furthest_first = slice(None, None, 1 if float(np.median(gain[main])) > 0 else -1)
     maps = (np.stack(values)[furthest_first] for values in (nearness, misfits, exists))
@@ -55,16 +59,18 @@ def candidates(carriers: Carriers, phase_rad: Image, slack_mm: float) -> Candida
     return Candidates(q.astype(np.float32), misfit.astype(np.float32), exist)
 
 
-def chosen(carriers: Carriers, found: Candidates, trust: Image, inside: Mask) -> tuple[NDArray[np.int32], Image, Image]:
+def chosen(
+    carriers: Carriers, found: Candidates, trust: Image, inside: Mask, links: tuple[Image, Image] | None = None
+) -> tuple[NDArray[np.int32], Image, Image]:
     """Index of the candidate of least energy, int32 (h', w'), the margin of the energy (0 for a tie), and the evidence:
     the misfit of the best rival less its own, in half squared sigmas; ``trust`` (h', w'): weight of a point's evidence,
-    0 to 1."""
+    0 to 1; ``links`` along x and y: weight of the smoothness between neighbours (default: 1 on the object)."""
     most = np.float32(MOST_SIGMAS**2 / 2)
     cost = np.minimum((found.misfit_rad / np.float32(PHASE_SIGMA_RAD)) ** 2 / 2, most)
     cost = np.where(found.exists, cost * trust, LARGE).astype(np.float32)
     joint_rad = (found.nearness * carriers.joint_gain).astype(np.float32)
     unary = np.where(inside, cost, np.float32(0))
-    index, margin = least_energy(unary, joint_rad, *links_between(inside), JUMP_RAD)
+    index, margin = least_energy(unary, joint_rad, *(links or links_between(inside)), JUMP_RAD)
     evidence = np.minimum(_without(cost, index).min(axis=0) - of_choice(cost, index), most)
     return index, margin, evidence.astype(np.float32)
 

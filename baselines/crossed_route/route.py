@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
+from scipy.special import ndtri
 
 from fpp_ml_bench.baselines.crossed_route.carriers import Carriers
 from fpp_ml_bench.baselines.crossed_route.demodulation import Demodulated, Demodulator
@@ -46,8 +47,12 @@ LEAST_CONTRAST = 0.08
 CONTRAST_RIM_PERIODS = 0.5  # grid points this near to the silhouette don't measure the contrast
 WELL_LIT = 8.0  # modulation over noise from which on a window's phase counts fully
 LEAST_TRUST = 0.05
-EVIDENCE_SCALE, MARGIN_SCALE = 1.0, 4.0
-"""By how much evidence and margin of energy the odds of two orders grow e-fold."""
+EVIDENCE_SCALE, MARGIN_SCALE, EVEN_ODDS = 1.0, 4.0, 0.8
+"""By how much evidence and margin of energy the odds of two orders grow e-fold, and where they are even."""
+LEAST_WRONG, MOST_WRONG = 0.01, 0.32
+"""Chances of a wrong order between which the rival widens the stated uncertainty. Below, it lies outside of the widest
+interval in use (99%). The variance of both orders together would state several mm for a chance of 0.1%, at pixels
+whose error is a tenth of that."""
 HALF_CONFIDENCE_MM = 5.0  # expected error of a pixel whose confidence is a half
 SATURATED_SHARE = 0.02
 LOST_SHARE, LOST_CHANCE = 0.25, 0.6
@@ -155,13 +160,13 @@ class CrossedRoute:
         inside = inside & np.isfinite(depth_mm) & (depth_mm > near_mm - slack_mm) & (depth_mm < far_mm + slack_mm)
         depth_mm = np.where(inside, depth_mm, 0.0)
         if wrong_chance is None:
-            odds = seen.evidence / EVIDENCE_SCALE + seen.margin / MARGIN_SCALE
-            wrong_chance = (1 / (1 + np.exp(np.clip(odds, 0, 50)))).astype(np.float32)
+            odds = seen.evidence / EVIDENCE_SCALE + seen.margin / MARGIN_SCALE - EVEN_ODDS
+            wrong_chance = (1 / (1 + np.exp(np.clip(odds, -50, 50)))).astype(np.float32)
         wrong_chance = np.where(_lost(seen), np.maximum(wrong_chance, LOST_CHANCE), wrong_chance)
         mm_per_rad = carriers.mm_per_rad(np.maximum(depth_mm, 1.0))
         apart_rad = np.abs(seen.rival - fit.nearness) * carriers.joint_gain
-        variance = fit.uncertainty_rad**2 + wrong_chance * apart_rad**2
-        sigma_mm = np.where(inside, mm_per_rad * np.sqrt(variance), 0.0)
+        sigma_rad = np.hypot(fit.uncertainty_rad, reaching(apart_rad, wrong_chance))
+        sigma_mm = np.where(inside, mm_per_rad * sigma_rad, 0.0)
         confidence = np.where(inside, 1 / (1 + sigma_mm / HALF_CONFIDENCE_MM), 0.0)
         reason = self._reasons(seen, inside, wrong_chance, confidence)
 
@@ -269,6 +274,13 @@ def _lifted(carriers: Carriers, phase_rad: Image, nearness: NDArray) -> NDArray:
     """Nearness (h, w) of wrapped phases (2, h, w), both in the turns that are nearest to ``nearness``."""
     beside = wrapped(phase_rad - carriers.phases(nearness))
     return nearness + (carriers.gain * beside).sum(axis=0) / carriers.joint_gain**2  # type: ignore[no-any-return]
+
+
+def reaching(apart_rad: NDArray, wrong_chance: Image) -> NDArray:
+    """Standard uncertainty whose interval of the probability 1 - ``wrong_chance`` just reaches a rival ``apart_rad``
+    away; 0 for a chance below `LEAST_WRONG`."""
+    sigmas = ndtri(1 - np.clip(wrong_chance, LEAST_WRONG, MOST_WRONG) / 2)
+    return np.where(wrong_chance < LEAST_WRONG, 0.0, apart_rad / sigmas)
 
 
 def _lost(seen: CrossedObservation) -> Mask:

@@ -13,14 +13,21 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from fpp_ml_bench.baselines.diagnostics import scene_renderer as rendering
-from fpp_ml_bench.baselines.diagnostics.scene_renderer import Field, Projected, Scene, SceneRenderer, Surface
+from fpp_ml_bench.baselines.diagnostics.scene_renderer import (
+    Field,
+    MovedPhase,
+    Projected,
+    Scene,
+    SceneRenderer,
+    Surface,
+    layer_of,
+)
 from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders.render import LitPixels
 from fpp_ml_bench.loaders.storage import DatasetFolder
-from fpp_ml_bench.optics import Direction
 
 LARGEST_SHIFT_RAD = 0.4 * TAU
 SMALLEST_SHIFT_RAD = 0.05 * TAU  # where the working range allows only smaller shifts, the move is left out
@@ -81,10 +88,10 @@ class OutlineChange:
 
 @dataclass(frozen=True)
 class Counterfactuals:
-    """All scenes of a sample. ``direction``: fringe direction whose phase is moved."""
+    """All scenes of a sample. ``direction``: whose phase is moved."""
 
     original: Original
-    direction: Direction
+    direction: MovedPhase
     layer: CalibrationLayer
     moves: tuple[Move, ...]
     outline_changes: tuple[OutlineChange, ...]
@@ -96,14 +103,14 @@ class Counterfactuals:
 
 
 def counterfactuals(
-    dataset: DatasetFolder, renderer: SceneRenderer, sample: str, direction: Direction, outline_samples: Sequence[str]
+    dataset: DatasetFolder, renderer: SceneRenderer, sample: str, direction: MovedPhase, outline_samples: Sequence[str]
 ) -> Counterfactuals:
     """Every scene of ``sample``, which shows an object and may be cut to the outlines of ``outline_samples``."""
     sample_scene = original(dataset, renderer, sample)
     outlines = [object_mask(dataset.depth_mm(outline_sample)) for outline_sample in outline_samples]
     moves, changes = _moves(sample_scene, renderer, direction), outline_changes(sample_scene, renderer, outlines)
     reprojected: dict[str, Scene] = {name: replace(sample_scene.scene, projected=name) for name in REPROJECTED}
-    layer = CalibrationLayer.of(renderer.rig, direction)
+    layer = layer_of(renderer.rig, direction)
     return Counterfactuals(sample_scene, direction, layer, tuple(moves), tuple(changes), reprojected)
 
 
@@ -119,7 +126,7 @@ def fields(surface: Surface) -> dict[str, Field]:
     }
 
 
-def _moves(sample: Original, renderer: SceneRenderer, direction: Direction) -> Iterator[Move]:
+def _moves(sample: Original, renderer: SceneRenderer, direction: MovedPhase) -> Iterator[Move]:
     surface = sample.surface
     for name, field in fields(surface).items():
         for sign in (1.0, -1.0):
@@ -136,10 +143,10 @@ def _moves(sample: Original, renderer: SceneRenderer, direction: Direction) -> I
 
 
 def _largest_shift_rad(
-    surface: Surface, renderer: SceneRenderer, direction: Direction, field: Field, sign: float
+    surface: Surface, renderer: SceneRenderer, direction: MovedPhase, field: Field, sign: float
 ) -> float:
     """The largest shift, up to `LARGEST_SHIFT_RAD`, that keeps every pixel within the working range."""
-    layer = CalibrationLayer.of(renderer.rig, direction, (surface.x, surface.y))
+    layer = layer_of(renderer.rig, direction, (surface.x, surface.y))
     phase = layer.absolute_phase(surface.depth_m * MM_PER_M)
     ends = [layer.absolute_phase(end) - phase for end in renderer.rig.working_range_mm]
     low, high = np.minimum(*ends), np.maximum(*ends)
@@ -238,9 +245,9 @@ class SceneSet:
     def __init__(self, dataset: DatasetFolder, views: int = VIEWS_PER_OBJECT, split: str = "test") -> None:
         self.dataset, self.renderer = dataset, SceneRenderer.of(dataset)
         self.samples = chosen_samples(dataset, split, views)
-        self._stored: dict[tuple[str, Direction], Counterfactuals] = {}
+        self._stored: dict[tuple[str, MovedPhase], Counterfactuals] = {}
 
-    def scenes(self, direction: Direction) -> Iterator[Counterfactuals]:
+    def scenes(self, direction: MovedPhase) -> Iterator[Counterfactuals]:
         """The scenes of every sample, with the phase of ``direction`` moved."""
         for sample, outline_samples in self.samples:
             scenes = self._stored.get((sample, direction))

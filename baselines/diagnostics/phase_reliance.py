@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import Counterfactuals, Move, SceneSet
 from fpp_ml_bench.baselines.diagnostics.probe import Progress, mean_of, silent
-from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene, SceneRenderer
+from fpp_ml_bench.baselines.diagnostics.scene_renderer import MovedPhase, Scene, SceneRenderer
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.result import RELIANCE_VERSION, Reliance, RelianceParts
 from fpp_ml_bench.evaluation.score import object_interval
 from fpp_ml_bench.loaders.storage import DatasetFolder
-from fpp_ml_bench.optics import Direction
 
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.diagnostics.subjects import Subject
@@ -224,8 +223,10 @@ def measure(
     return reliance, samples
 
 
-def direction_read(frames: Sequence[int], dataset: DatasetFolder) -> Direction:
+def direction_read(frames: Sequence[int], dataset: DatasetFolder) -> MovedPhase:
     """The direction whose phase is moved for a method of these frames: their own. For both directions it is the
     vertical, whose period is the shorter in depth."""
+    if all(dataset.sequence.frames[index].kind == "crossed" for index in frames):
+        return "crossed"
     directions = {dataset.sequence.frames[index].direction for index in frames}
     return "vertical" if "vertical" in directions else "horizontal"

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,11 @@ from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders import render
 from fpp_ml_bench.loaders.sample import DEPTH, DEPTH_EXACT
 from fpp_ml_bench.loaders.storage import MESH_FOLDER, DatasetFolder
-from fpp_ml_bench.optics import Direction, Rig
+from fpp_ml_bench.optics import Direction, Maps, Rig
 
 Field = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 """A smooth function of normalised ray coordinates x, y (n,), with values (n,)."""
@@ -121,12 +122,28 @@ def plane(
     return Surface(pixels, x, y, depth_m, np.tile(normal / np.linalg.norm(normal), (pixels.size, 1)))
 
 
-def moved(surface: Surface, rig: Rig, direction: Direction, field: Field, amplitude_rad: float = 1.0) -> Surface:
+MovedPhase = Direction | Literal["crossed"]
+"""Whose phase a move is measured in: the fringes of a direction, or the carrier of crossed frames that changes faster
+with depth. The surface itself is moved, so every fringe on it moves as it must."""
+
+
+def layer_of(rig: Rig, phase: MovedPhase, rays: Maps | None = None) -> CalibrationLayer:
+    """The calibration layer of `MovedPhase` for a rig, at all pixels or at normalised ``rays`` (x, y). Raises
+    `DiagnosisError` for crossed fringes of a rig without them."""
+    if phase != "crossed":
+        return CalibrationLayer.of(rig, phase, rays)
+    if rig.crossed is None:
+        raise DiagnosisError("crossed: this rig projects no crossed frames whose phase could be moved")
+    carriers = [CalibrationLayer.of_carrier(rig, cycles, rays) for cycles in rig.crossed.cycles_per_px]
+    return max(carriers, key=lambda layer: float(np.median(np.abs(layer.gain))))
+
+
+def moved(surface: Surface, rig: Rig, direction: MovedPhase, field: Field, amplitude_rad: float = 1.0) -> Surface:
     """``surface`` moved along the camera's rays so that the phase of ``direction`` changes by ``amplitude_rad`` times
     ``field``, with its new normals; the outline stays."""
 
     def moved_m(x: NDArray[np.float64], y: NDArray[np.float64], depth_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        layer = CalibrationLayer.of(rig, direction, (x, y))
+        layer = layer_of(rig, direction, (x, y))
         phase = layer.absolute_phase(depth_m * MM_PER_M) + amplitude_rad * field(x, y)
         return layer.depth_of_residual_mm(phase - layer.infinity_rad - TAU * layer.infinity_order) / MM_PER_M
 
@@ -157,7 +174,8 @@ PITCH_FACTOR = 4 / 3  # factor of the changed pitch: 18 px become 24
 class Scene:
     """Lit pixels in front of the empty scene, and the pattern that is projected on them. ``pixels`` uint32 (n,), with
     ``lit`` in the same order. ``mask`` bool (H, W): the object mask for methods that use it. ``stream``: key of the
-    noise. With ``no fringe`` the mean light of the sequence is projected."""
+    noise. With ``no fringe`` the mean light of the sequence is projected. The other direction of crossed fringes has
+    both angles mirrored; turned by 90 degrees, a square pair would be itself."""
 
     pixels: NDArray[np.uint32]
     lit: render.LitPixels
@@ -207,7 +225,18 @@ class SceneRenderer:
     def _other_pitch(self) -> render.Exposure:
         names = ("pitch_horizontal_px", "pitch_vertical_px")
         wider = replace(self.rig, **{name: PITCH_FACTOR * getattr(self.rig, name) for name in names})
+        if (pair := self.rig.crossed) is not None:
+            pitches_px = cast(tuple[float, float], tuple(PITCH_FACTOR * pitch for pitch in pair.pitches_px))
+            wider = wider.with_crossed(replace(pair, pitches_px=pitches_px))
         return render.Exposure.of(wider, self.lamp)
+
+    @cached_property
+    def _mirrored(self) -> render.Exposure:
+        """With both carriers of crossed frames mirrored."""
+        if (pair := self.rig.crossed) is None:
+            return self.exposure
+        angles_deg = cast(tuple[float, float], tuple(-angle for angle in pair.angles_deg))
+        return render.Exposure.of(self.rig.with_crossed(replace(pair, angles_deg=angles_deg)), self.lamp)
 
     @cached_property
     def _empty(self) -> render.LitPixels:
@@ -227,7 +256,8 @@ class SceneRenderer:
 
     def frames(self, scene: Scene, indices: Sequence[int], masked: bool = False) -> list[NDArray[np.uint8] | None]:
         """Frames ``indices`` of ``scene``, uint8 (H, W), by number, else None; ``masked``: 0 outside ``scene.mask``."""
-        usual = self._other_pitch if scene.projected == "other pitch" else self.exposure
+        other = {"other pitch": lambda: self._other_pitch, "other direction": lambda: self._mirrored}
+        usual = other.get(scene.projected, lambda: self.exposure)()
         inside = self._uniform if scene.projected == "no fringe inside" else usual
         outside = self._uniform if scene.projected == "no fringe outside" else usual
         swapped = scene.projected == "other direction"

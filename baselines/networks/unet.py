@@ -58,22 +58,33 @@ class UShape(Levels):
         self.bottleneck = bottleneck
 
 
+LEAST_SPREAD = 1e-3  # of a frame that is divided by its own: a quarter of a grey level
+
+
 class UNet(UShape):
     """Channels width x (1, 2, 4, 8), bottleneck width x 16 at 1/16 of the image; 31,036,481 parameters at width 64.
 
     width: channels of the first level. dropout: rate of the channel dropout after the bottleneck (the paper's rows: 0).
-    Probe layers: enc1..enc4 (enc1 at full resolution), bottleneck, dec4..dec1 (dec1 at full resolution, ``width``
-    channels).
+    standardised: 1 to subtract each frame's own mean and divide by its standard deviation, so that no absolute grey
+    level is seen (the paper's rows: 0). Probe layers: enc1..enc4 (enc1 at full resolution), bottleneck, dec4..dec1
+    (dec1 at full resolution, ``width`` channels).
     """
 
     name = "unet"
 
-    def __init__(self, *, width: int = 64, dropout: float = 0.0) -> None:
+    def __init__(self, *, width: int = 64, dropout: float = 0.0, standardised: int = 0) -> None:
         width = base.whole(self.name, "width", width)
         dropout = base.rate(self.name, "dropout", dropout)
+        self_normalised = {"standardised": 1} if base.whole(self.name, "standardised", standardised, least=0) else {}
         bottleneck = DoubleConvolution(8 * width, 16 * width)
         base.initialise(bottleneck, "convolutions")
-        super().__init__(width, nn.Sequential(bottleneck, nn.Dropout2d(dropout)), dropout=dropout)
+        super().__init__(width, nn.Sequential(bottleneck, nn.Dropout2d(dropout)), dropout=dropout, **self_normalised)
+
+    def represent(self, fringe: Tensor) -> Tensor:
+        if "standardised" in self.options:
+            spread, mean = torch.std_mean(fringe, dim=(2, 3), keepdim=True)
+            fringe = (fringe - mean) / spread.clamp_min(LEAST_SPREAD)
+        return super().represent(fringe)
 
 
 LAYERS = 8

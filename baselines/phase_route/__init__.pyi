@@ -34,6 +34,7 @@ from .observation import Watch as Watch
 from .orders import LEAST_BRIGHTNESS as LEAST_BRIGHTNESS
 from .orders import grid_of as grid_of
 from .orders import irradiance as irradiance
+from .orders import jump_links as jump_links
 from .orders import links_between as links_between
 from .orders import of_choice as of_choice
 from .orders import repeated as repeated
@@ -42,3 +43,6 @@ from .orders import stride_of as stride_of
 from .resampling import Periods as Periods
 from .resampling import Resampling as Resampling
 from .route import PhaseRoute as PhaseRoute
+from .several_frames import differs as differs
+from .several_frames import first_mask as first_mask
+from .several_frames import lit_object as lit_object

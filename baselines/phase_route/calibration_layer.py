@@ -31,11 +31,10 @@ def wrapped(phase_rad: NDArray) -> NDArray:
 
 @dataclass(frozen=True)
 class Lens:
-    """Constants of a distorted projector: ``rays`` a (three maps), ``t`` in metres, ``axis`` across the fringes."""
+    """Constants of a distorted projector: ``rays`` a (three maps), ``t`` in metres."""
 
     rays: tuple[Any, Any, Any]
     t: tuple[float, float, float]
-    axis: int
     coefficients: Coefficients
 
 
@@ -53,14 +52,15 @@ class CalibrationLayer:
     """Constants of one rig and fringe direction for every pixel: float64 maps of the image's shape, or torch tensors.
     ``infinity_rad`` in [-pi, pi) and ``infinity_order``: absolute phase of a point infinitely far away, as wrapped
     phase and order. ``gain`` rad m, ``forward`` = a_2, ``back_m`` = t_2: psi = gain / (forward Z + back_m).
-    ``rad_per_unit``: phase of one normalised projector unit, 2 pi f_p / P."""
+    ``rad_per_unit``: phase of one normalised projector unit along u and along v, 2 pi f_p / P and 0 for fringes of one
+    direction."""
 
     infinity_rad: Any
     infinity_order: Any
     gain: Any
     forward: Any
     back_m: float
-    rad_per_unit: float
+    rad_per_unit: tuple[float, float]
     lens: Lens | None = None
 
     @classmethod
@@ -69,19 +69,36 @@ class CalibrationLayer:
         `DecodeError` for an unknown direction."""
         if direction not in DIRECTIONS:
             raise DecodeError(f"direction: expected horizontal or vertical, got {direction!r}")
-        where = rig.camera.rays() if rays is None else rays
-        axis = 0 if direction == "vertical" else 1
-        device = rig.projector
-        focal, centre = (device.fx, device.fy)[axis], (device.cx, device.cy)[axis]
+        device, pitch_px = rig.projector, rig.pitch(direction)
+        if direction == "vertical":
+            return cls._along(rig, (TAU * device.fx / pitch_px, 0.0), TAU * device.cx / pitch_px, rays)
+        return cls._along(rig, (0.0, TAU * device.fy / pitch_px), TAU * device.cy / pitch_px, rays)
+
+    @classmethod
+    def of_carrier(cls, rig: Rig, cycles_per_px: tuple[float, float], rays: Maps | None = None) -> "CalibrationLayer":
+        """The layer of a fringe of any angle, with frequencies (f_u, f_v) in cycles a projector px, as those of
+        `coding.Crossed.cycles_per_px`; its phase is 2 pi (f_u u + f_v v)."""
+        device, (along_u, along_v) = rig.projector, cycles_per_px
+        per_unit = TAU * device.fx * along_u, TAU * device.fy * along_v
+        return cls._along(rig, per_unit, TAU * (device.cx * along_u + device.cy * along_v), rays)
+
+    @classmethod
+    def _along(
+        cls, rig: Rig, rad_per_unit: tuple[float, float], centre_rad: float, rays: Maps | None
+    ) -> "CalibrationLayer":
+        where, device = rig.camera.rays() if rays is None else rays, rig.projector
         a = (rotated_ray(where, rig, 0), rotated_ray(where, rig, 1), rotated_ray(where, rig, 2))
-        per_unit = TAU * focal / rig.pitch(direction)
-        infinity = per_unit * (a[axis] / a[2]) + TAU * centre / rig.pitch(direction)
+        infinity: Any = centre_rad
+        gain: Any = 0.0
+        for axis, per_unit in enumerate(rad_per_unit):
+            if per_unit:
+                infinity = infinity + per_unit * (a[axis] / a[2])
+                gain = gain + per_unit * (rig.t[axis] - rig.t[2] * a[axis] / a[2])
         order = np.floor(infinity / TAU + 0.5)
         lens = None
         if device.is_distorted and is_distorted(device.distortion):
-            lens = Lens(a, rig.translation_m, axis, device.distortion)
-        gain = per_unit * (rig.t[axis] - rig.t[2] * a[axis] / a[2])
-        return cls(infinity - TAU * order, order, gain, a[2], float(rig.t[2]), per_unit, lens)
+            lens = Lens(a, rig.translation_m, device.distortion)
+        return cls(infinity - TAU * order, order, gain, a[2], float(rig.t[2]), rad_per_unit, lens)
 
     @property
     def maps(self) -> tuple[Any, ...]:
@@ -137,7 +154,8 @@ class CalibrationLayer:
         ahead = z * lens.rays[2] + lens.t[2]
         point = [(z * lens.rays[i] + lens.t[i]) / ahead for i in range(2)]
         moved = distortion_polynomial(point[0], point[1], lens.coefficients)
-        return self.rad_per_unit * (moved[lens.axis] - point[lens.axis])
+        shifts = zip(self.rad_per_unit, moved, point, strict=True)
+        return sum(per_unit * (after - before) for per_unit, after, before in shifts if per_unit)
 
     def orders_in_range(self, phase_rad: ArrayLike, range_mm: tuple[float, float]) -> Candidates:
         """The fringe orders that put each pixel of ``phase_rad`` (H, W) within ``range_mm``; NaN phases have none."""

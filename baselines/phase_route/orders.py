@@ -96,7 +96,7 @@ def question_of(seen: Observation) -> Question:
     trust = np.clip((fit.weight[grid] - 0.4) / 0.5, 0.05, 1) * lit**2
     exists = np.stack([k < count for k in steps])
     # Jumps between neighbours show where every pixel has a phase of its own.
-    smooth = _smooth_links(residual[0], fit.brightness[grid], stride) if seen.pixelwise else (1.0, 1.0)
+    smooth = jump_links(residual[0], fit.brightness[grid], stride) if seen.pixelwise else (1.0, 1.0)
     trust, inside = trust.astype(np.float32), seen.inside[grid]
     return Question(residual, depth, exists, light, brightness, trust, inside, stride, seen.period_px, *smooth)
 
@@ -138,7 +138,7 @@ def _drift(layer: CalibrationLayer, residual_rad: NDArray, z: Image, axis: int, 
     return (gain / residual_rad - z * forward) / layer.forward
 
 
-def _smooth_links(residual_rad: Image, brightness: Image, stride: int) -> tuple[Image, Image]:
+def jump_links(residual_rad: Image, brightness: Image, stride: int) -> tuple[Image, Image]:
     """Weights of the links along x (h, w - 1) and y (h - 1, w): less where the surface visibly jumps."""
     log_brightness = np.log(np.maximum(brightness, LEAST_GREY))
     links = []

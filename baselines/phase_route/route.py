@@ -210,7 +210,9 @@ class PhaseRoute:
         if not given:
             dark = unlit(np.maximum.reduce(greys), background, self.period_px)
             if len(greys) > 1:
-                differs = several_frames.first_mask(several_frames.differs(capture, self._scene), self.period_px)
+                misfits = several_frames.plane_misfits(capture, self._scene)
+                different = several_frames.differs(misfits, background.noise_grey)
+                differs = several_frames.first_mask(different, self.period_px)
                 region = differs if background.shown else region & differs
             inside = region & ~dark
             watch.done("mask")

@@ -6,12 +6,20 @@ leave one unknown too many, but a fringe goes down to black: its mean is its mod
 that constraint a window of a few px (`Settings.pair_window`) is enough.
 """
 
+from collections.abc import Iterable, Iterator, Sequence
+
 import cv2
 import numpy as np
 
 from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask
 from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window
-from fpp_ml_bench.baselines.phase_route.object_mask import DARKEST_GREY, EmptyScene, closed, without_small
+from fpp_ml_bench.baselines.phase_route.object_mask import (
+    DARKEST_GREY,
+    Background,
+    EmptyScene,
+    closed,
+    without_small,
+)
 from fpp_ml_bench.baselines.phase_route.observation import PIXELWISE, Capture
 from fpp_ml_bench.coding import MIN_MODULATION, choose_steps, phase_weights, wrapped_phase
 from fpp_ml_bench.errors import PredictionError
@@ -48,24 +56,30 @@ def pixel_fits(capture: Capture, scene: EmptyScene, mask: Mask | None, window: W
     fitted = wrapped_phase(capture.greys, capture.shifts_rad, np.float32)
     phase, modulation, mean = (np.asarray(values, np.float32) for values in fitted)
     capture.watch.done("phase")
-    inside = lit_object(capture, scene, modulation) if mask is None else mask
+    inside = mask
+    if inside is None:
+        different = differs(plane_misfits(capture, scene), capture.background.noise_grey)
+        inside = lit_object(different, modulation, capture.background, capture.shifts_rad, capture.period_px)
     capture.watch.done("mask")
     return inside, FringeFit(phase, modulation, window.moment(inside.astype(np.float32))), mean
 
 
-def differs(capture: Capture, scene: EmptyScene) -> Mask:
-    """Pixels (h, w) whose grey levels the empty scene does not explain. Tested for every pixel, and for means over a
-    small square, which separate the plane from an object that happens to be as bright; pixels that only the square's
-    reach beyond the silhouette adds are removed."""
-    greys, noise = capture.greys, capture.background.noise_grey**2
-    alone, around = np.zeros(greys[0].shape, np.float32), np.zeros(greys[0].shape, np.float32)
-    for grey, shift in zip(greys, capture.shifts_rad, strict=True):
-        misfit = grey - scene.predicted(capture.background, shift, capture.crop)
-        alone += misfit * misfit
-        around += cv2.blur(misfit, (SQUARE_PX, SQUARE_PX)) ** 2
-    square_differs = (around > _limit(noise / SQUARE_PX**2, len(greys))).astype(np.uint8)
+def plane_misfits(capture: Capture, scene: EmptyScene) -> Iterator[Image]:
+    """Each frame (h, w) less what the empty scene gives there, grey levels."""
+    for grey, shift in zip(capture.greys, capture.shifts_rad, strict=True):
+        yield grey - scene.predicted(capture.background, shift, capture.crop)
+
+
+def differs(plane_misfits: Iterable[Image], noise_grey: float) -> Mask:
+    """Pixels (h, w) whose grey levels the empty scene does not explain, by ``plane_misfits`` (h, w) of each frame.
+    Tested for every pixel, and for means over a small square, which separate the plane from an object that happens to
+    be as bright; pixels that only the square's reach beyond the silhouette adds are removed."""
+    misfits, noise = list(plane_misfits), noise_grey**2
+    alone = sum((misfit * misfit for misfit in misfits), np.float32(0))
+    around = np.asarray(sum((cv2.blur(misfit, (SQUARE_PX, SQUARE_PX)) ** 2 for misfit in misfits), np.float32(0)))
+    square_differs = (around > _limit(noise / SQUARE_PX**2, len(misfits))).astype(np.uint8)
     without_rim = cv2.erode(square_differs, np.ones((SQUARE_PX, SQUARE_PX), np.uint8)) > 0
-    return (alone > _limit(noise, len(greys))) | without_rim
+    return (alone > _limit(noise, len(misfits))) | without_rim
 
 
 def _limit(variance: float, count: int) -> float:
@@ -79,18 +93,19 @@ def first_mask(different: Mask, period_px: float) -> Mask:
     return closed(different, CLOSING_PERIODS * period_px, SPECK_PX)
 
 
-def lit_object(capture: Capture, scene: EmptyScene, modulation: Image) -> Mask:
-    """Object pixels (h, w): those that differ and are modulated by more than noise. Pixels that only closing has added
-    must be as bright as the object around them, otherwise they are the plane beside a corner."""
-    different = differs(capture, scene)
-    _, cosine, sine = phase_weights(capture.shifts_rad)
-    sigma = capture.background.noise_grey * np.sqrt(max(cosine @ cosine, sine @ sine))
+def lit_object(
+    different: Mask, modulation: Image, background: Background, shifts_rad: Sequence[float], period_px: float
+) -> Mask:
+    """Object pixels (h, w): those that are ``different`` (`differs`) and modulated by more than noise. Pixels that only
+    closing has added must be as bright as the object around them, otherwise they are the plane beside a corner."""
+    _, cosine, sine = phase_weights(shifts_rad)
+    sigma = background.noise_grey * np.sqrt(max(cosine @ cosine, sine @ sine))
     least_grey = min(max(DARKEST_GREY, DARK_SIGMAS * float(sigma)), MIN_MODULATION)
-    if not capture.background.shown:  # nothing else tells the object
+    if not background.shown:  # nothing else tells the object
         least_grey = MIN_MODULATION
-    region = first_mask(different, capture.period_px)
+    region = first_mask(different, period_px)
     certain = region & different & (modulation > least_grey)
-    side = 2 * round(CLOSING_PERIODS * capture.period_px) + 1
+    side = 2 * round(CLOSING_PERIODS * period_px) + 1
     weight = cv2.blur(certain.astype(np.float32), (side, side))
     around = cv2.blur(modulation * certain, (side, side)) / np.maximum(weight, 1e-6)
     alike = np.abs(modulation - around) < ALIKE * around

@@ -58,14 +58,16 @@ class TrainingRun:
 
 
 def train(
-    recipe: Recipe, dataset: str | Path, out: str | Path, *, minutes: float | None = None, show: bool = True
-) -> TrainingRun:
-    """Train ``recipe`` on a dataset folder into ``out``, from the checkpoint there; returns at once if it is finished.
+    recipe: Recipe, dataset: str | Path | tuple[FringeDepthDataset, FringeDepthDataset], out: str | Path, *,
+    minutes: float | None = None, show: bool = True,
+) -> TrainingRun:  # fmt: skip
+    """Train ``recipe`` on a dataset folder, or on training and validation pairs, into ``out``, from the checkpoint
+    there; returns at once if it is finished.
     ``minutes``: stop, with everything saved, before an epoch that would outlast them; one is always trained. ``show``:
     progress on stderr. Raises `TrainingError` for a folder of another recipe or dataset, a damaged checkpoint, a
     dataset of another image size, a loss that is not finite or has diverged (the batch's samples are named)."""
     out, started = Path(out), perf_counter()
-    data, validation = open_data(recipe, Path(dataset))
+    data, validation = dataset if isinstance(dataset, tuple) else open_data(recipe, Path(dataset))
     with PartialState().local_main_process_first():
         claim_folder(out, {"recipe": recipe.to_dict(), "fingerprint": data.source.fingerprint})
     if (finished := finished_run(out)) is not None:

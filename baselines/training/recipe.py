@@ -112,6 +112,7 @@ class Recipe(StrictModel):
         """Name of runs and weights; rows that train the same network have the same name."""
         parts = [self.network, self.normalisation, self.loss.label]
         parts += ["bgremoved"] if self.background_removed else []
+        parts += ["standardised"] if self.options.get("standardised") else []
         parts += [self.frames] if self.frames != "single_shot" else []
         return "-".join(parts)
 
@@ -120,6 +121,7 @@ class Recipe(StrictModel):
         """For people: network, normalisation, loss, and the settings that differ from the paper's usual ones."""
         parts = [_NETWORK_TITLES[self.network], self.normalisation, self.loss.label.replace("_", " ")]
         parts += ["background removed"] if self.background_removed else []
+        parts += ["input standardised"] if self.options.get("standardised") else []
         parts += [f"trained on {self.frames} frames"] if self.frames != "single_shot" else []
         return ", ".join(parts)
 

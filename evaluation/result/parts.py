@@ -275,7 +275,7 @@ class Reliance(StrictModel):
     order_free_score: Share | None
     parts: RelianceParts
     units: Literal["mm", "normalised"]
-    direction: Literal["horizontal", "vertical"]
+    direction: Literal["horizontal", "vertical", "crossed"]
     samples: Whole
     objects: Whole
     dataset_fingerprint: Sha256

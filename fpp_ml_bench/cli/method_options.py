@@ -12,9 +12,9 @@ from fpp_ml_bench.loaders import render, storage
 
 METHOD_HELP = (
     "classical (N-step phase, Gray-code order, triangulation), phase (one fringe or a few, nothing learned), phase-net "
-    "(single-shot phase; order, mask and correction learned), crossed (one frame with two fringe directions, nothing "
-    "learned), crossed-net (the same, with order, mask and correction learned), constant (looks at nothing), nearest "
-    "(depth of the training sample with the nearest image), the name of weights that come with the package, a "
+    "(single-shot phase; order, mask and correction learned), crossed (one frame with two fringe directions, or three, "
+    "nothing learned), crossed-net (one frame, with order, mask and correction learned), constant (looks at nothing), "
+    "nearest (depth of the training sample with the nearest image), the name of weights that come with the package, a "
     ".safetensors file, or a recipe that fpp-bench reproduce has trained (loss/l1)"
 )
 _OPTIONS: dict[str, tuple[str, ...]] = {
@@ -31,7 +31,7 @@ _OPTIONS: dict[str, tuple[str, ...]] = {
         "mask",
     ),
     "phase-net": ("fringe", "no_shading", "min_confidence", "weights", "white_grey", "ambient_grey"),
-    "crossed": ("min_confidence", "mask"),
+    "crossed": ("frames", "min_confidence", "mask"),
     "crossed-net": ("min_confidence", "weights"),
     "constant": ("at",),
     "nearest": ("training",),
@@ -56,7 +56,12 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add = parser.add_argument_group("phase, phase-net, crossed and crossed-net").add_argument
     add("--fringe", choices=("horizontal", "vertical"), help="direction of the fringes (default: horizontal)")
-    add("--frames", type=int, metavar="N", help="fringes of that direction, 1 to 18; no Gray code (default: 1)")
+    add(
+        "--frames",
+        type=int,
+        metavar="N",
+        help="fringes of that direction, 1 to 18; no Gray code; of crossed 1 or 3 (default: 1)",
+    )
     add("--error-mm", type=float, metavar="MM",
         help="instead of --frames: for each scene the fewest frames whose expected error is at most this, starting "
              "with a single fringe; may need the Gray code")  # fmt: skip
@@ -211,7 +216,7 @@ def _phase_net(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]
 
 
 def _crossed(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
-    return _given(min_confidence=args.min_confidence, mask=args.mask)
+    return _given(frames=args.frames, min_confidence=args.min_confidence, mask=args.mask)
 
 
 def _crossed_net(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:

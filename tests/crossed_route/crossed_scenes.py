@@ -23,21 +23,21 @@ def route(rig: Rig = RIG, family: Crossed = FAMILY) -> CrossedRoute:
 
 def frame(
     depth_mm: NDArray, rig: Rig = RIG, family: Crossed = FAMILY, white_grey: NDArray | float = 160.0,
-    ambient_grey: float = 6.0, noise_grey: float = 0.7, background_grey: float = 50.0,
+    ambient_grey: float = 6.0, noise_grey: float = 0.7, background_grey: float = 50.0, number: int = 0,
 ) -> NDArray[np.uint8]:  # fmt: skip
-    """A crossed frame uint8 (H, W) of a surface at ``depth_mm`` (H, W), 0 where the background plane is seen."""
+    """Crossed frame ``number`` uint8 (H, W) of a surface at ``depth_mm`` (H, W), 0 where the background is."""
     x, y = rig.camera.rays()
     z = np.where(depth_mm > 0, depth_mm / 1000, rig.background_m or 3.2)
     u, v = rig.project(np.stack([x * z, y * z, z], axis=-1))
     waves = [
         weight * np.cos(2 * np.pi * (along_u * u + along_v * v) + np.radians(shift))
         for weight, (along_u, along_v), shift in zip(
-            family.weights, family.cycles_per_px, family.shifts_deg[0], strict=True
+            family.weights, family.cycles_per_px, family.shifts_deg[number], strict=True
         )
     ]
     white = np.where(depth_mm > 0, white_grey, background_grey)
     grey = ambient_grey + white * (0.5 + 0.5 * (waves[0] + waves[1]))
-    noise = np.random.default_rng(7).normal(0, noise_grey, grey.shape)
+    noise = np.random.default_rng(7 + number).normal(0, noise_grey, grey.shape)
     return np.clip(np.rint(grey + noise), 0, 255).astype(np.uint8)
 
 

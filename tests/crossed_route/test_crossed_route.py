@@ -11,6 +11,7 @@ from skimage.filters import gabor_kernel
 from fpp_ml_bench.baselines import load_method
 from fpp_ml_bench.baselines.crossed_route import Carriers, CrossedReason, CrossedRoute
 from fpp_ml_bench.baselines.crossed_route.demodulation import POWERS, WINDOW_PERIODS, Demodulator, window_kernels
+from fpp_ml_bench.baselines.crossed_route.route import reaching
 from fpp_ml_bench.baselines.phase_route import wrapped
 from fpp_ml_bench.coding import Crossed, crossed_from_pair
 from fpp_ml_bench.errors import DecodeError, PredictionError
@@ -186,6 +187,16 @@ def test_the_stated_uncertainty_is_about_right() -> None:
     middle = slice(height // 2 - 30, height // 2 + 30), slice(width // 2 - 30, width // 2 + 30)
     error = np.abs(measured.depth_mm - depth_mm)[middle]
     assert 0.4 < (error < measured.sigma_mm[middle]).mean() <= 1
+
+
+def test_a_rival_widens_the_interval_as_far_as_it_is_likely() -> None:
+    apart_rad = np.full(5, 2.0)
+    chance = np.array([0.0, 0.009, 0.011, 0.05, 0.9], np.float32)
+    sigma = reaching(apart_rad, chance)
+    assert np.array_equal(sigma[:2], [0.0, 0.0])
+    # 1.1% lies just within the 99% interval, 5% at the end of the 95% interval; beyond a third it is a standard error.
+    assert sigma[2] == pytest.approx(2 / 2.54, rel=0.01)
+    assert sigma[3] == pytest.approx(2 / 1.96, rel=0.01) and sigma[4] == pytest.approx(2.0, rel=0.01)
 
 
 def test_what_is_refused() -> None:

@@ -1,9 +1,12 @@
 """Counterfactual scenes: the unchanged one is the dataset's, and a changed one differs in what it says."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from conftest import tiny_settings
 
+from fpp_ml_bench.baselines.crossed_route import Carriers
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import (
     LARGEST_SHIFT_RAD,
     chosen_samples,
@@ -12,8 +15,10 @@ from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import (
 )
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import (
     PITCH_FACTOR,
+    Scene,
     SceneRenderer,
     direct_light,
+    layer_of,
     moved,
     normals_of_depth,
     plane,
@@ -21,6 +26,7 @@ from fpp_ml_bench.baselines.diagnostics.scene_renderer import (
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders.render import build, named_light
 from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.optics import crossed_rig, paper_rig
 
 SAMPLE, OTHER = "power_drill_A0", "mug_A60"
 
@@ -111,6 +117,39 @@ def test_a_moved_plane_keeps_its_law():
     x, y = rig.camera.rays()
     normals = normals_of_depth(surface.depth_mm(x.shape), x, y)
     np.testing.assert_allclose(normals, surface.normals, atol=1e-9)
+
+
+def test_a_move_shifts_both_carriers_of_crossed_frames_as_a_change_of_depth_does():
+    rig = crossed_rig(48)
+    for bent in (rig, replace(rig, projector=replace(rig.projector, distortion=(-0.08, 0.05, 0.001, -0.001, 0.0)))):
+        surface = plane(bent, 1.8, tilt_deg=(10.0, 5.0))
+        nearer = moved(surface, bent, "crossed", lambda x, y: 1 + x, 0.3)
+        seen = [bent.project(one.points_m()) for one in (surface, nearer)]
+        shifts = [
+            2 * np.pi * (along_u * (seen[1][0] - seen[0][0]) + along_v * (seen[1][1] - seen[0][1]))
+            for along_u, along_v in bent.crossed.cycles_per_px
+        ]
+        carriers = Carriers.of(bent, bent.crossed)
+        faster = int(np.median(np.abs(carriers.gain[1])) > np.median(np.abs(carriers.gain[0])))
+        np.testing.assert_allclose(shifts[faster], 0.3 * (1 + surface.x), atol=1e-6)
+        ratio = (carriers.gain[1 - faster] / carriers.gain[faster]).ravel()
+        np.testing.assert_allclose(shifts[1 - faster], ratio * shifts[faster], atol=2e-3)
+    with pytest.raises(DiagnosisError, match="no crossed frames"):
+        layer_of(paper_rig(64), "crossed")
+
+
+def test_crossed_fringes_are_mirrored_and_widened():
+    renderer = SceneRenderer(crossed_rig(320))
+    surface = plane(renderer.rig, 1.8)
+    scene = Scene(surface.pixels.astype(np.uint32), renderer.light(surface), np.ones(renderer.shape, bool), (0,))
+    light = {name: renderer.frames(replace(scene, projected=name), [0])[0]
+             for name in ("sequence", "other direction", "other pitch")}  # fmt: skip
+    spectra = {name: np.abs(np.fft.fft2(grey - grey.mean())) for name, grey in light.items()}
+    peaks = {name: np.abs(np.fft.fftfreq(320)[list(np.unravel_index(power.argmax(), power.shape))])
+             for name, power in spectra.items()}  # fmt: skip
+    assert np.hypot(*peaks["other pitch"]) == pytest.approx(np.hypot(*peaks["sequence"]) / PITCH_FACTOR, rel=0.05)
+    mirrored = spectra["other direction"][:, 1:], spectra["sequence"][:, :0:-1]
+    assert np.corrcoef(mirrored[0].ravel(), mirrored[1].ravel())[0, 1] > 0.9
 
 
 def test_another_outline_leaves_what_is_kept_as_it_was(renderer, scenes):
