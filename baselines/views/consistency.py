@@ -3,7 +3,10 @@
 Each point is looked for in every other view. A view supports the point if it answers about the same depth there. It
 sees through the point if it answers a larger depth there, or no object at all. A point behind an answered surface is
 hidden, and the view says nothing about it. A pixel is contradicted if a view sees through its point and no view
-supports it. Flagging points that all other views hide as well found nothing more on the validation split.
+supports it. So a wrong order that puts its point on another side of the object, where some view supports it, is missed.
+
+Two more rules found no more on the validation split: to flag points that all other views hide, and to flag points behind
+a surface that two other views agree on; the latter doubled the false alarms.
 """
 
 from collections.abc import Sequence

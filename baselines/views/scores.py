@@ -68,8 +68,9 @@ def cloud_scores(points_m: Points, surface: Surface) -> Row:
 
 def flag_scores(views: Sequence[PlacedView], truths: Sequence[Truth], flags: Sequence[Flags]) -> Row:
     """Over the answered object pixels of all views that are not void: ``wrong_px``, more than a wrong order's error
-    off; ``found_share`` of them that is flagged (None without any), ``false_share`` of the others that is; the mean
-    error ``mae_mm`` of all and ``kept_mae_mm`` without the flagged ones, ``dropped_share``."""
+    off, ``found_px`` of them flagged; ``found_share`` of them (None without any) and ``false_share`` of the others
+    that is flagged, ``dropped_share`` of both; the mean error ``mae_mm`` of all, ``kept_mae_mm`` without the flagged.
+    """
     errors, flagged = [], []
     for view, truth, flag in zip(views, truths, flags, strict=True):
         scored = truth.scored.ravel()[view.pixels]
@@ -79,7 +80,8 @@ def flag_scores(views: Sequence[PlacedView], truths: Sequence[Truth], flags: Seq
     error, flag = np.concatenate(errors), np.concatenate(flagged)
     wrong = error > corruptions().wrong_order_mm
     return {
-        "scored_px": float(error.size), "wrong_px": float(wrong.sum()), "found_share": _share(flag, wrong),
+        "scored_px": float(error.size), "wrong_px": float(wrong.sum()), "found_px": float((flag & wrong).sum()),
+        "found_share": _share(flag, wrong),
         "false_share": _share(flag, ~wrong), "dropped_share": _share(flag, np.ones_like(wrong)),
         "mae_mm": _mean_error(error), "kept_mae_mm": _mean_error(error[~flag]),
     }  # fmt: skip
@@ -99,7 +101,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def means(objects: Mapping[str, Row]) -> dict[str, tuple[float | None, Interval | None]]:
-    """Of each score, numbers of pixels aside: the mean over the objects that have it, and its 95% interval over them."""
+    """Of each score but the numbers of pixels: mean over the objects that have it, and its 95% interval over them."""
     keys = [key for key in next(iter(objects.values())) if not key.endswith("_px")]
     columns = {key: [row[key] for row in objects.values()] for key in keys}
     return {key: (_mean(values), object_interval(values, list(objects))) for key, values in columns.items()}

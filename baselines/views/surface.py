@@ -21,7 +21,7 @@ _CANDIDATES = 4
 class Surface:
     """A mesh to measure clouds against, object coordinates in metres. Its samples are the same in every run."""
 
-    def __init__(self, mesh: SolidMesh, samples: int = SAMPLES) -> None:
+    def __init__(self, mesh: SolidMesh, samples: int) -> None:
         solid = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
         self._corners = np.asarray(solid.triangles, dtype=np.float64)
         points, faces = trimesh.sample.sample_surface(solid, samples, seed=0)[:2]
@@ -33,7 +33,7 @@ class Surface:
 
     def distances_mm(self, points_m: Points) -> Values:
         """Distance in mm of each of ``points_m`` (n, 3) to the surface, (n,): to the triangles of the four nearest
-        samples. It is never too small, and too large by less than the distance of neighbouring samples."""
+        samples. It is never too small, and too large only where a nearer triangle holds none of them."""
         nearest = self._faces[self._tree.query(points_m, k=_CANDIDATES)[1]]
         distances = [
             np.linalg.norm(trimesh.triangles.closest_point(self._corners[faces], points_m) - points_m, axis=1)
@@ -55,4 +55,4 @@ def surface_of(dataset: DatasetFolder, name: str) -> Surface:
     path: Path = dataset.path / MESH_FOLDER / f"{name}.ply"
     if not path.is_file():
         raise DatasetError(f"{path}: is missing, and clouds are measured against it; run: fpp-bench verify")
-    return Surface(load_user_mesh(UserMesh(name, str(path), centre=False)))
+    return Surface(load_user_mesh(UserMesh(name, str(path), centre=False)), SAMPLES)

@@ -67,10 +67,12 @@ def _print(name: str, scores: "dict[str, views.Row]") -> None:
         distance, *shares = (means[f"{prefix}_{key}"] for key in views.CLOUD_SCORES)
         table.add_row(title, _text(*distance), *(_percent(*share) for share in shares))
     show(table)
-    wrong, scored = (sum(int(row[key] or 0) for row in scores.values()) for key in ("wrong_px", "scored_px"))
-    print(f"wrong orders: {wrong:,} of {scored:,} object pixels")
-    print(f"contradicted by other views: {_percent(*means['found_share'])} of the wrong orders, "
-          f"{_percent(*means['false_share'])} of the others")  # fmt: skip
+    wrong, scored, found = (
+        sum(int(row[key] or 0) for row in scores.values()) for key in ("wrong_px", "scored_px", "found_px")
+    )
+    print(f"wrong orders: {wrong:,} of {scored:,} object pixels; other views contradict {found:,} of them")
+    print(f"contradicted: {_percent(*means['found_share'])} of the wrong orders, {_percent(*means['false_share'])} of "
+          "the others")  # fmt: skip
     print(f"object MAE: {_text(*means['mae_mm'])} mm, without contradicted pixels {_text(*means['kept_mae_mm'])} mm "
           f"({_percent(*means['dropped_share'])} dropped)")  # fmt: skip
 
