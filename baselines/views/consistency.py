@@ -5,8 +5,8 @@ sees through the point if it answers a larger depth there, or no object at all. 
 hidden, and the view says nothing about it. A pixel is contradicted if a view sees through its point and no view
 supports it. So a wrong order that puts its point on another side of the object, where some view supports it, is missed.
 
-Two more rules found no more on the validation split: to flag points that all other views hide, and to flag points behind
-a surface that two other views agree on; the latter doubled the false alarms.
+Two more rules found no more on the validation split: to flag points that all other views hide, and to flag points
+behind a surface that two other views agree on; the latter doubled the false alarms.
 """
 
 from collections.abc import Sequence
