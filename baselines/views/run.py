@@ -14,7 +14,7 @@ from fpp_ml_bench.baselines.views.fusion import CELL_MM
 from fpp_ml_bench.baselines.views.picture import clouds_png
 from fpp_ml_bench.baselines.views.placement import PlacedView, placement
 from fpp_ml_bench.baselines.views.scores import WITHIN_MM, FusedObject, Row, Truth, fuse_object, means
-from fpp_ml_bench.baselines.views.surface import surface_of
+from fpp_ml_bench.baselines.views.surface import mesh_file, surface_of
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation import submission
@@ -79,12 +79,13 @@ def fuse_split(
     predictions: str | Path, dataset: DatasetFolder, split: str, only: str | None = None, cell_mm: float = CELL_MM
 ) -> tuple[str, Iterator[FusedObject]]:
     """The method's name, and the objects of ``split`` put together one after another (``only``: a single one). Raises
-    what `prediction_maps`, `views_by_object` and `surface_of` raise."""
+    what `prediction_maps`, `views_by_object` and `mesh_file` raise."""
     if not 0 < cell_mm < 1000:
         raise PredictionError(f"--cell-mm {cell_mm:g}: expected the edge of a cell in mm, above 0 and below 1000")
     chosen = views_by_object(dataset, split, only)
     name, maps = prediction_maps(predictions, dataset, split)
-    surfaces = {obj: surface_of(dataset, obj) for obj in chosen}  # before hours of work
+    for obj in chosen:
+        mesh_file(dataset, obj)
 
     def fused() -> Iterator[FusedObject]:
         for obj, samples in chosen.items():
@@ -94,7 +95,8 @@ def fuse_split(
                 views.append(PlacedView(depth_mm, dataset.rig.camera, *placement(dataset, sample), sigma_mm))
                 exact_mm = dataset.target_mm(sample, DEPTH_EXACT)
                 truths.append(Truth(exact_mm, object_mask(exact_mm) & ~dataset.void(sample)))
-            yield fuse_object(obj, views, truths, surfaces[obj], cell_mm)
+                dataset.release(sample)
+            yield fuse_object(obj, views, truths, surface_of(dataset, obj), cell_mm)
 
     return name, fused()
 
@@ -102,8 +104,10 @@ def fuse_split(
 def write_object(out: Path, fused: FusedObject) -> list[Path]:
     """Write ``{object}.ply``, the cloud of all views without contradicted pixels (metres, object coordinates), and
     ``{object}.png``, its clouds as a picture. Raises PredictionError for a folder that can't be written."""
-    cloud = trimesh.exchange.ply.export_ply(trimesh.PointCloud(fused.kept_m))
-    return _write(out, {f"{fused.name}.ply": cloud, f"{fused.name}.png": clouds_png(fused)})
+    # A mesh without faces: trimesh can't write a PointCloud without points.
+    cloud = trimesh.Trimesh(fused.kept_m, np.zeros((0, 3), np.int64), process=False, validate=False)
+    content = trimesh.exchange.ply.export_ply(cloud, vertex_normal=False)
+    return _write(out, {f"{fused.name}.ply": content, f"{fused.name}.png": clouds_png(fused)})
 
 
 def write_scores(

@@ -50,9 +50,15 @@ class Surface:
         return float(np.isfinite(distances).mean())
 
 
-def surface_of(dataset: DatasetFolder, name: str) -> Surface:
-    """The surface of a generated dataset's object, from its mesh there. Raises `DatasetError` where it is missing."""
+def mesh_file(dataset: DatasetFolder, name: str) -> Path:
+    """The mesh of a generated dataset's object. Raises `DatasetError` where it is missing."""
     path: Path = dataset.path / MESH_FOLDER / f"{name}.ply"
     if not path.is_file():
         raise DatasetError(f"{path}: is missing, and clouds are measured against it; run: fpp-bench verify")
-    return Surface(load_user_mesh(UserMesh(name, str(path), centre=False)), SAMPLES)
+    return path
+
+
+def surface_of(dataset: DatasetFolder, name: str) -> Surface:
+    """The surface of a generated dataset's object, from its `mesh_file`."""
+    mesh = UserMesh(name, str(mesh_file(dataset, name)), centre=False)
+    return Surface(load_user_mesh(mesh), SAMPLES)

@@ -224,6 +224,16 @@ def test_the_datasets_own_depth_has_no_wrong_orders(spheres, tmp_path, capsys):
     assert "wrong orders: 0 of" in capsys.readouterr().out
 
 
+def test_a_method_without_answers_has_an_empty_cloud(spheres, predictions, tmp_path, capsys):
+    for path in predictions.glob("*.npy"):
+        np.save(path, np.zeros((SIZE, SIZE), np.float32))
+    assert fused(predictions, "--dataset", spheres, "--out", tmp_path / "out") == 0
+    scores = json.loads((tmp_path / "out" / FUSION_FILE).read_text())["objects"]["power_drill"]
+    assert scores["all_covered_share"] == 0 and scores["all_accuracy_mm"] is None and scores["mae_mm"] is None
+    assert "element vertex 0" in (tmp_path / "out/power_drill.ply").read_text()
+    assert "object MAE: - mm" in capsys.readouterr().out
+
+
 def without_a_view(spheres, predictions, folder):
     (predictions / "power_drill_A60.npy").unlink()
     return predictions, spheres
