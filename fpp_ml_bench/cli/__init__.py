@@ -43,6 +43,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "train": ("train", "train a recipe, shipped or yours, into a weights file"),
     "predict": ("predict", "run a method over a split and write predictions that fpp-eval scores"),
     "conformal": ("conformal", "scale a stated uncertainty so that its intervals hold what they say"),
+    "fuse": ("fuse", "put an object's views into one point cloud, and find the pixels that other views contradict"),
     "time": ("time", "measure a method: latency, throughput, memory, parameters, frames"),
     "tradeoff": ("tradeoff", "error against run time and captures, and how each cost grows"),
     "reproduce": ("reproduce", "train and score the rows of the paper's tables, beside its numbers"),

@@ -34,6 +34,7 @@ from .scene import modulation_at as modulation_at
 from .scene import place as place
 from .scene import preset_settings as preset_settings
 from .scene import turned as turned
+from .scene import unturned as unturned
 from .sensor import Exposure as Exposure
 from .sensor import Sensor as Sensor
 from .sensor import camera_noise as camera_noise

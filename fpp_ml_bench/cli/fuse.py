@@ -1,0 +1,89 @@
+"""``fpp-bench fuse``: an object's views in one point cloud, and the pixels that other views contradict."""
+
+import argparse
+from pathlib import Path
+
+from fpp_ml_bench.baselines import views
+from fpp_ml_bench.cli import SPLITS
+from fpp_ml_bench.evaluation import score
+from fpp_ml_bench.files import printable
+from fpp_ml_bench.loaders import storage
+
+SUMMARY = (
+    "Put the views of each object into one point cloud by their known placement, and compare them with each other."
+)
+EXAMPLES = (
+    "fpp-bench predict phase data/full --out predictions",
+    "fpp-bench fuse predictions --dataset data/full --out fused",
+    "fpp-bench fuse predictions --dataset data/full --object power_drill --out fused",
+    "fpp-bench fuse depth_exact --dataset data/full --out fused-exact          what the views can cover at best",
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add("predictions", metavar="PREDICTIONS",
+        help="predictions of a split; or depth or depth_exact, the dataset's own (a folder: ./depth)")  # fmt: skip
+    add("--dataset", type=Path, required=True, metavar="DATASET", help="folder of a generated dataset")
+    add("--split", choices=SPLITS, default="test", help="split of PREDICTIONS (default: test)")
+    add("--object", metavar="NAME", help="only this object (default: all of the split)")
+    add("--cell-mm", type=float, metavar="MM", help="edge of the cells in which points are averaged (default: 2)")
+    add("--out", type=Path, required=True, metavar="DIR",
+        help="folder for {object}.ply (metres, object coordinates), {object}.png and fusion.json")  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> int:
+    """Fuse, write, print means over objects. Raises FppBenchError for unusable predictions or data."""
+    from fpp_ml_bench.cli.console import progress_bar
+
+    dataset = storage.DatasetFolder(args.dataset)
+    cell_mm = views.CELL_MM if args.cell_mm is None else args.cell_mm
+    name, objects = views.fuse_split(args.predictions, dataset, args.split, args.object, cell_mm)
+    scores = {}
+    with progress_bar("fusing", len(views.views_by_object(dataset, args.split, args.object)), "objects") as advance:
+        for fused in objects:
+            views.write_object(args.out, fused)
+            scores[fused.name] = fused.scores
+            advance(1)
+    views.write_scores(args.out, name, dataset, args.split, cell_mm, scores)
+    _print(name, scores)
+    print(f"{args.out}: {{object}}.ply, {{object}}.png, {views.FUSION_FILE}")
+    return 0
+
+
+def _print(name: str, scores: "dict[str, views.Row]") -> None:
+    """Means over objects: the clouds, the contradicted pixels, the error with and without them."""
+    from rich.table import Table
+
+    from fpp_ml_bench.cli.console import show
+
+    means = views.means(scores)
+    objects = f"{len(scores)} object{'' if len(scores) == 1 else 's'}"
+    table = Table(title=f"{printable(name)}: {objects}, mean and 95% interval over objects", title_justify="left")
+    near = f"within {views.WITHIN_MM:g} mm"
+    for title in ("cloud", "distance to the surface, mm", f"points {near}", f"surface covered {near}"):
+        table.add_column(title, justify="left" if title == "cloud" else "right")
+    for prefix, title in (("one", "one view"), ("all", "all views"), ("kept", "all views, consistent")):
+        distance, *shares = (means[f"{prefix}_{key}"] for key in views.CLOUD_SCORES)
+        table.add_row(title, _text(*distance), *(_percent(*share) for share in shares))
+    show(table)
+    wrong, scored, found = (
+        sum(int(row[key] or 0) for row in scores.values()) for key in ("wrong_px", "scored_px", "found_px")
+    )
+    print(f"wrong orders: {wrong:,} of {scored:,} object pixels; other views contradict {found:,} of them")
+    print(f"contradicted: {_percent(*means['found_share'])} of the wrong orders, {_percent(*means['false_share'])} of "
+          "the others")  # fmt: skip
+    print(f"object MAE: {_text(*means['mae_mm'])} mm, without contradicted pixels {_text(*means['kept_mae_mm'])} mm "
+          f"({_percent(*means['dropped_share'])} dropped)")  # fmt: skip
+
+
+def _percent(share: float | None, interval: "score.Interval | None") -> str:
+    ends = None if interval is None else (100 * interval[0], 100 * interval[1])
+    return _text(None if share is None else 100 * share, ends, "%")
+
+
+def _text(mean: float | None, interval: "score.Interval | None", unit: str = "") -> str:
+    """A mean with its interval, a dash for None."""
+    digits = 1 if unit else 2
+    ends = "" if interval is None else f" ({interval[0]:.{digits}f} to {interval[1]:.{digits}f})"
+    return "-" if mean is None else f"{mean:.{digits}f}{unit}{ends}"
