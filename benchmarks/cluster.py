@@ -2,14 +2,16 @@
 
     python benchmarks/cluster.py [--objects A,B] [--size 176] [--repeats 3] [--work DIR]
 
-Starts a cluster of two nodes with a CPU each on this machine, so it has the CPUs of ``--workers 2``. Builds preset full
-(300 views) with `fpp-bench build` by the local pool, by the cluster into a folder that both nodes see, and by the cluster
-to a URL, in turns, and prints the shortest time of each. Then measures an axis of FPP-C both ways, and builds once more
-while a node is killed after a third of the shards. Exit status 1 if a byte or a score differs. Needs the extra
-``cluster``.
+Starts a cluster of two nodes with a CPU each on this machine, so it has the CPUs of ``--workers 2``. Builds preset
+full (300 views) with `fpp-bench build` by the local pool, by the cluster into a folder that both nodes see, and by the
+cluster to a URL, in turns, and prints the least seconds and processor seconds of each; the latter contain those of the
+cluster's own processes, and depend less on what else this machine does. Then measures an axis of FPP-C both ways, and
+builds once more while a node is killed after a third of the shards. Exit status 1 if a byte or a score differs. Needs
+the extra ``cluster``.
 """
 
 import argparse
+import contextlib
 import json
 import os
 import subprocess
@@ -48,11 +50,26 @@ def finish(process: subprocess.Popen) -> None:
         sys.exit(f"{' '.join(map(str, process.args))}: exit status {process.returncode}\n{errors}")
 
 
-def timed(*words: str | Path) -> float:
-    """Seconds of a command."""
-    started = time.perf_counter()
+def timed(*words: str | Path) -> tuple[float, float]:
+    """Seconds of a command, and processor seconds."""
+    started, used = time.perf_counter(), processor_seconds()
     finish(start(*words))
-    return time.perf_counter() - started
+    return time.perf_counter() - started, processor_seconds() - used
+
+
+def processor_seconds() -> float:
+    """Of this process and all below it, also those that ended."""
+    parents, ticks = {}, {}
+    for file in Path("/proc").glob("[0-9]*/stat"):
+        with contextlib.suppress(OSError):
+            fields = file.read_text().rpartition(")")[2].split()
+            pid = int(file.parent.name)
+            parents[pid], ticks[pid] = int(fields[1]), sum(map(int, fields[11:15]))
+    total, generation = 0, {os.getpid()}
+    while generation:
+        total += sum(ticks[pid] for pid in generation)
+        generation = {pid for pid, parent in parents.items() if parent in generation}
+    return total / os.sysconf("SC_CLK_TCK")
 
 
 def hashes(folder: Path) -> dict[str, str]:
@@ -63,7 +80,7 @@ def killed_build(words: list[str], folder: Path, cluster: Cluster, node: Any) ->
     """Seconds of a build during which ``node`` is killed after a third of the shards, the shards that were finished
     then, and those that the node was writing."""
     work = folder / ".build"
-    shards = len(DatasetFolder(folder.with_name("local")).manifest.shards) // 2  # data and frames
+    shards = len({(file.split, file.first_row) for file in DatasetFolder(folder.with_name("local")).manifest.shards})
     started = time.perf_counter()
     process = start(*words)
     while len(list(work.glob("*-of-*.json"))) < shards // 3:
@@ -73,11 +90,21 @@ def killed_build(words: list[str], folder: Path, cluster: Cluster, node: Any) ->
         time.sleep(0.05)
     finished = len(list(work.glob("*-of-*.json")))
     cluster.remove_node(node, allow_graceful=False)
-    time.sleep(1)
-    writers = {tuple(path.name.split(".")[:2]) for path in work.glob("*.tmp") if path.name.count(".") == 3}
-    lost = [shard for shard, pid in writers if not Path("/proc", pid).exists()]
+    lost: set[str] = set()
+    while process.poll() is None:
+        time.sleep(0.2)
+        # A shard's unfinished file is SHARD.PID.GROUP.tmp; where its process is dead, nobody will finish it.
+        names = [path.name.split(".") for path in work.glob("*-of-*.tmp")]
+        lost |= {shard for shard, pid, *_ in names if not alive(pid)}
     finish(process)
     return time.perf_counter() - started, finished, len(lost)
+
+
+def alive(pid: str) -> bool:
+    try:
+        return Path("/proc", pid, "stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 def rows(folder: Path) -> dict[str, Any]:
@@ -106,7 +133,7 @@ def main() -> int:
         ways = {
             "local": ["--workers", "2"], "cluster": ["--cluster", address], "url": ["--cluster", address],
         }  # fmt: skip
-        seconds: dict[str, list[float]] = {way: [] for way in ways}
+        seconds: dict[str, list[tuple[float, float]]] = {way: [] for way in ways}
         prints: dict[str, dict[str, str]] = {}
         for repeat in range(args.repeats):
             for way, options in ways.items():
@@ -119,11 +146,12 @@ def main() -> int:
                     subprocess.run(["rm", "-r", str(folder)], check=True)
         views = sum(len(part) for part in DatasetFolder(work / "local").splits.values())
         print(f"{views} views of {args.size} px, {len(prints['local'])} files")
-        for way, found in seconds.items():
-            more = 100 * (min(found) / min(seconds["local"]) - 1)
+        least = {way: [min(values) for values in zip(*runs, strict=True)] for way, runs in seconds.items()}
+        for way, (wall_s, processor_s) in least.items():
+            more = [f"{100 * (mine / local - 1):+.1f}%" for mine, local in zip(least[way], least["local"], strict=True)]
             equal = "the same bytes" if prints[way] == prints["local"] else "OTHER BYTES"
-            runs = ", ".join(f"{value:.1f}" for value in found)
-            print(f"{way}: {min(found):.1f} s ({runs}), {more:+.1f}%, {equal}", flush=True)
+            print(f"{way}: {wall_s:.1f} s {more[0]}, {processor_s:.1f} processor s {more[1]}, {equal}; all runs:",
+                  *(f"{wall:.1f} ({processor:.1f})" for wall, processor in seconds[way]), flush=True)  # fmt: skip
 
         words = [
             "robustness",
@@ -136,8 +164,8 @@ def main() -> int:
             "--no-cache",
             "--out",
         ]
-        local_s = timed(*words, work / "fppc", "--workers", "2")
-        cluster_s = timed(*words, (work / "fppc-url").as_uri(), "--cluster", address)
+        local_s, _ = timed(*words, work / "fppc", "--workers", "2")
+        cluster_s, _ = timed(*words, (work / "fppc-url").as_uri(), "--cluster", address)
         equal = rows(work / "fppc") == rows(work / "fppc-url") != {}
         same &= equal
         print(
