@@ -8,7 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 from uuid import uuid4
 
-from fpp_ml_bench.errors import RemoteError
+from fpp_ml_bench.errors import FppBenchError, RemoteError
 
 TEMPORARY = ".tmp"
 """Suffix of a file that is not yet whole."""
@@ -100,6 +100,9 @@ def working_copy(folder: Path | RemoteFolder) -> Iterator[tuple[Path, Callable[[
 
         try:
             yield copy, save
+        except FppBenchError as error:
+            error.args = tuple(str(arg).replace(str(copy), folder.url) for arg in error.args)
+            raise
         finally:
             save()
 
