@@ -1,6 +1,6 @@
 """Builds and FPP-C on a Ray cluster against the local pool: bytes, overhead, and a node that dies in the middle.
 
-    python benchmarks/cluster.py [--objects A,B] [--size 176] [--repeats 3] [--work DIR]
+    python benchmarks/cluster.py [--objects A,B] [--size 176] [--frames all] [--repeats 3] [--client] [--work DIR]
 
 Starts a cluster of two nodes with a CPU each on this machine, so it has the CPUs of ``--workers 2``. Builds preset
 full (300 views) with `fpp-bench build` by the local pool, by the cluster into a folder that both nodes see, and by the
@@ -14,6 +14,7 @@ import argparse
 import contextlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -26,14 +27,14 @@ from ray.cluster_utils import Cluster
 from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
-NODE = {"num_cpus": 1, "object_store_memory": 1 << 28, "include_dashboard": False}
+NODE = {"num_cpus": 1, "object_store_memory": 1 << 28, "include_dashboard": False, "include_log_monitor": False}
 CLIENT_PORT = 25001
 COMMAND = [sys.executable, "-m", "fpp_ml_bench"]
 
 
-def start_cluster() -> tuple[Cluster, Any]:
-    """A cluster of two nodes, and the one without the head."""
-    head = {**NODE, "ray_client_server_port": CLIENT_PORT}
+def start_cluster(client: bool) -> tuple[Cluster, Any]:
+    """A cluster of two nodes, and the one without the head; ``client``: it answers to ``ray://``, too."""
+    head = {**NODE, "no_monitor": True, **({"ray_client_server_port": CLIENT_PORT} if client else {})}
     cluster = Cluster(initialize_head=True, head_node_args=head)
     node = cluster.add_node(**NODE)
     cluster.wait_for_nodes()
@@ -120,13 +121,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--objects", metavar="A,B", help="objects (default: all 50)")
     parser.add_argument("--size", type=int, default=176, metavar="PX", help="image size (default: 176)")
+    parser.add_argument("--frames", default="all", help="frames to store (default: all)")
     parser.add_argument("--repeats", type=int, default=3, metavar="N", help="builds of each kind (default: 3)")
+    parser.add_argument("--client", action="store_true", help="connect by ray://, as from outside of the cluster")
     parser.add_argument("--work", type=Path, help="folder to work in (default: a temporary one, removed afterwards)")
     args = parser.parse_args()
     os.environ["RAY_USAGE_STATS_ENABLED"] = "0"
-    settings = ["--preset", "full", "--size", str(args.size), *(["--objects", args.objects] if args.objects else [])]
-    cluster, node = start_cluster()
-    address = f"ray://127.0.0.1:{CLIENT_PORT}"
+    settings = ["--preset", "full", "--size", str(args.size), "--frames", args.frames]
+    settings += ["--objects", args.objects] if args.objects else []
+    cluster, node = start_cluster(args.client)
+    address = f"ray://127.0.0.1:{CLIENT_PORT}" if args.client else cluster.address
     same = True
     with tempfile.TemporaryDirectory(dir=args.work) as temporary:
         work = Path(temporary)
@@ -140,30 +144,21 @@ def main() -> int:
                 folder = work / (way if repeat == args.repeats - 1 else f"{way}-{repeat}")
                 out = folder.as_uri() if way == "url" else str(folder)
                 seconds[way].append(timed("build", out, *settings, *options))
+                print(f"{way}: {seconds[way][-1][0]:.1f} s, {seconds[way][-1][1]:.1f} processor s", flush=True)
                 prints[way] = hashes(folder)
                 same &= prints[way] == prints["local"]
                 if way != "local" or repeat < args.repeats - 1:
-                    subprocess.run(["rm", "-r", str(folder)], check=True)
+                    shutil.rmtree(folder)
         views = sum(len(part) for part in DatasetFolder(work / "local").splits.values())
         print(f"{views} views of {args.size} px, {len(prints['local'])} files")
         least = {way: [min(values) for values in zip(*runs, strict=True)] for way, runs in seconds.items()}
         for way, (wall_s, processor_s) in least.items():
             more = [f"{100 * (mine / local - 1):+.1f}%" for mine, local in zip(least[way], least["local"], strict=True)]
             equal = "the same bytes" if prints[way] == prints["local"] else "OTHER BYTES"
-            print(f"{way}: {wall_s:.1f} s {more[0]}, {processor_s:.1f} processor s {more[1]}, {equal}; all runs:",
-                  *(f"{wall:.1f} ({processor:.1f})" for wall, processor in seconds[way]), flush=True)  # fmt: skip
+            print(f"least of {way}: {wall_s:.1f} s {more[0]}, {processor_s:.1f} processor s {more[1]}, {equal}")
 
-        words = [
-            "robustness",
-            "constant",
-            "--quick",
-            "--axes",
-            "gloss",
-            "--size",
-            str(args.size),
-            "--no-cache",
-            "--out",
-        ]
+        size = str(args.size)
+        words = ["robustness", "constant", "--quick", "--axes", "gloss", "--size", size, "--no-cache", "--out"]
         local_s, _ = timed(*words, work / "fppc", "--workers", "2")
         cluster_s, _ = timed(*words, (work / "fppc-url").as_uri(), "--cluster", address)
         equal = rows(work / "fppc") == rows(work / "fppc-url") != {}
