@@ -95,7 +95,7 @@ def _on_cluster(address: str, work: object) -> Iterator[Map]:
 
         yield mapped
     except ray.exceptions.RayTaskError as error:
-        raise getattr(error, "cause", None) or error from None
+        raise error.cause from error
     except (ray.exceptions.RayError, ConnectionError) as error:
         reason = str(error).strip().partition("\n")[0]
         raise PoolError(
