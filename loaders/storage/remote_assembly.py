@@ -53,9 +53,12 @@ def assemble_remote(
     `PoolError`."""
     with TemporaryDirectory(prefix="fpp-bench-") as temporary:
         folder, sizes = Path(temporary), remote.sizes()
+        begun = {name for name in sizes if name.startswith(f"{WORK_FOLDER}/")}
         if MANIFEST in sizes:
-            return _finished(remote, assembly, folder, sizes)
-        begun = [name for name in sizes if name.startswith(f"{WORK_FOLDER}/")]
+            manifest = _finished(remote, assembly, folder, sizes)
+            if begun:  # stopped between the manifest and the end
+                remote.remove(WORK_FOLDER)
+            return manifest
         if sizes and not begun:
             raise BuildError(f"{remote}: holds other files and no dataset; give another URL")
         for name in sizes:
@@ -70,7 +73,8 @@ def assemble_remote(
         written = {plan.name: _read(scratch / f"{plan.name}.json", plan, sizes) for plan in assembly.plans}
         missing = [plan for plan in assembly.plans if written[plan.name] is None]
         progress(sum(len(plan.samples) for plan in assembly.plans if written[plan.name] is not None))
-        with mapping(RemoteWork(assembly, remote), min(workers, max(1, len(missing))), cluster) as mapped:
+        workers, cluster = min(workers, max(1, len(missing))), cluster if missing else None
+        with mapping(RemoteWork(assembly, remote), workers, cluster) as mapped:
             for plan, receipt in zip(missing, mapped(_write_shard, missing), strict=True):
                 written[plan.name] = receipt
                 progress(len(plan.samples))
@@ -83,7 +87,7 @@ def _finished(remote: RemoteFolder, assembly: Assembly, folder: Path, sizes: Map
     manifest = read_manifest(folder)
     damaged = [file.path for file in manifest.files if sizes.get(file.path) != file.bytes]
     if damaged:
-        raise BuildError(f"{remote}: {damaged[0]} is missing or cut off; remove {MANIFEST} there, and build again")
+        raise BuildError(f"{remote}: {damaged[0]} is missing or cut off; remove all there, and build again")
     compare(remote, replace(assembly, manifest=manifest).key(), assembly.key())
     return manifest
 

@@ -51,7 +51,10 @@ def test_a_url_gets_the_same_files(local, remote, tmp_path):
     advanced = []
     manifest = assemble_remote(remote, noise(), progress=advanced.append)
     assert file_bytes(tmp_path / "remote") == local and advanced == [0, *SHARDS]
+    (tmp_path / "remote/.build").mkdir()
+    (tmp_path / "remote/.build/settings.json").write_text("{}")
     assert assemble_remote(remote, noise()) == manifest  # finished
+    assert file_bytes(tmp_path / "remote") == local
     with pytest.raises(BuildError, match=r"other settings: seed \(there 42, now 7\)"):
         assemble_remote(remote, noise(7))
     (tmp_path / "remote/meshes/mug.ply").unlink()
