@@ -7,7 +7,6 @@ names them. A resumed run trusts a receipt when every file it names is there in 
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -113,32 +112,22 @@ class RemoteWork:
     assembly: Assembly
     remote: RemoteFolder
 
-    @cached_property
-    def scratch(self) -> TemporaryDirectory:
-        """Holds a shard at a time; removed with the process."""
-        return TemporaryDirectory(prefix="fpp-bench-")
-
-    @cached_property
-    def here(self) -> ShardWork:
-        folder = Path(self.scratch.name)
-        return ShardWork(self.assembly, folder, folder)
-
 
 def _write_shard(work: RemoteWork, plan: ShardPlan) -> Written:
-    """Write a shard in the scratch folder and copy it to the URL."""
+    """Write a shard in a scratch folder and copy it to the URL."""
     if not work.remote.has(f"{WORK_FOLDER}/{SETTINGS}"):
         raise BuildError(without_files(work.remote))
-    folder = work.here.folder
-    files, rows = work.here.write(plan)
-    meshes = [describe_file(folder, folder / name) for name in work.assembly.mesh_paths(rows)]
-    for name in [file.path for file in files] + [mesh.path for mesh in meshes]:
-        work.remote.put(folder / name, name)
-        (folder / name).unlink()
-    content: dict[str, Any] = {"files": files, "meshes": meshes}
-    content = {name: [asdict(entry) for entry in entries] for name, entries in content.items()} | {"rows": rows}
-    receipt = folder / f"{plan.name}.json"
-    write_atomically(receipt, json.dumps(content).encode())
-    work.remote.put(receipt, f"{WORK_FOLDER}/{receipt.name}")
+    with TemporaryDirectory(prefix="fpp-bench-") as temporary:
+        folder = Path(temporary)
+        files, rows = ShardWork(work.assembly, folder, folder).write(plan)
+        meshes = [describe_file(folder, folder / name) for name in work.assembly.mesh_paths(rows)]
+        for name in [file.path for file in files] + [mesh.path for mesh in meshes]:
+            work.remote.put(folder / name, name)
+        content: dict[str, Any] = {"files": files, "meshes": meshes}
+        content = {name: [asdict(entry) for entry in entries] for name, entries in content.items()} | {"rows": rows}
+        receipt = folder / f"{plan.name}.json"
+        write_atomically(receipt, json.dumps(content).encode())
+        work.remote.put(receipt, f"{WORK_FOLDER}/{receipt.name}")
     return (files, rows), meshes
 
 
