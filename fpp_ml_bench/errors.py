@@ -76,5 +76,13 @@ class StabilityError(FppBenchError, ValueError):
     """An unknown group of stability cases."""
 
 
+class PoolError(FppBenchError):
+    """Worker processes or a cluster that died, or a cluster that can't be used."""
+
+
+class RemoteError(FppBenchError):
+    """A URL that can't be read or written."""
+
+
 class PublishError(FppBenchError):
     """Data or results that can't be published: no token, no network, refused by the Hub, or incomplete."""

@@ -5,6 +5,7 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from fake_ray import fake_ray  # noqa: F401  a fixture
 
 # Before `datasets` is imported: it gets caches for this run only, and must not use the network.
 _CACHE = tempfile.TemporaryDirectory(prefix="fpp-bench-tests-")

@@ -48,7 +48,8 @@ class SyntheticRows:
         )
 
 
-def make(folder, splits=SPLITS, views=VIEWS, origin="generated", **changes):
+def assembly(splits=SPLITS, views=VIEWS, origin="generated", **changes):
+    """A dataset of noise to be written."""
     plans = []
     for split, names in splits.items():
         plans += plan_shards(split, {name: [(f"{name}_{v}", name, v) for v in views] for name in names})
@@ -56,5 +57,10 @@ def make(folder, splits=SPLITS, views=VIEWS, origin="generated", **changes):
         origin=origin, generator={"name": "test", "version": "0"}, settings={}, rig=paper_rig().to_dict(), size=SIZE,
         stored="single_shot", exact=True, samples={}, shards=[],
     )  # fmt: skip
-    assemble(folder, Assembly(plans, SyntheticRows(**changes), manifest), workers=1)
+    return Assembly(plans, SyntheticRows(**changes), manifest)
+
+
+def make(folder, *words, **changes):
+    """Write it; the folder."""
+    assemble(folder, assembly(*words, **changes), workers=1)
     return folder

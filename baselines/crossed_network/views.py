@@ -7,10 +7,8 @@ are the validation objects in two lights of the benchmark.
 
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from math import exp, log
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +19,7 @@ from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.loaders.render import BuildSettings, Light, Studio, named_light, solid_mesh
 from fpp_ml_bench.loaders.sample import VOID
 from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.pool import mapping
 
 VALIDATION_LIGHTS = ("paper", "workshop")
 
@@ -110,17 +109,13 @@ def render(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise TrainingError(f"{folder}: can't be written ({error.strerror})") from error
-    jobs = [(group, rig, folder) for group in missing]
-    if workers == 1:
-        for job in jobs:
-            progress(_render_group(*job))
-        return
-    with ProcessPoolExecutor(workers, get_context("spawn")) as pool:
-        for count in pool.map(_render_group, *zip(*jobs, strict=True)):
+    with mapping((rig, folder), workers) as mapped:
+        for count in mapped(_render_group, missing):
             progress(count)
 
 
-def _render_group(group: Group, rig: Rig, folder: Path) -> int:
+def _render_group(work: tuple[Rig, Path], group: Group) -> int:
+    rig, folder = work
     objects = tuple(sorted({name for name, _ in group.views}))
     studio = Studio(BuildSettings(rig=rig, objects=objects, light=group.light))
     (frame, *_) = rig.sequence.crossed_frames

@@ -1,13 +1,8 @@
 """Measuring a method axis by axis: predictions of disturbed views in processes, a file for each finished axis."""
 
 import json
-import signal
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from multiprocessing import get_context
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -20,7 +15,7 @@ from fpp_ml_bench.baselines.robustness.scores import score
 from fpp_ml_bench.constants import sample_name
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.files import exclusive, write_atomically
-from fpp_ml_bench.machine import single_threaded_algebra
+from fpp_ml_bench.pool import mapping
 
 QUICK_SEVERITIES = (1, 3, 5)
 SEVERITIES = (1, 2, 3, 4, 5)
@@ -78,11 +73,12 @@ class Setup:
 
 def measure(
     setup: Setup, out: Path, axes: Sequence[str] = (), workers: int = 1, cache: Path | None = None,
-    progress: Progress = lambda axis, views: None,
+    progress: Progress = lambda axis, views: None, cluster: str | None = None, saved: Callable[[], None] = lambda: None,
 ) -> dict[str, list[View]]:  # fmt: skip
     """The rows of every view by axis, and a file ``out/AXIS.json`` for each axis as soon as it is finished; files that
-    an earlier run of the same setup left are read instead. ``progress`` is called with an axis and a number of views.
-    Raises PredictionError for files of another setup, `BuildError` where another process is at it."""
+    an earlier run of the same setup left are read instead. Views are predicted and scored by so many processes, or by
+    the Ray cluster at an address. ``progress`` is called with an axis and a number of views, ``saved`` after each file.
+    Raises PredictionError for files of another setup, `BuildError` where another process is at it, `PoolError`."""
     with exclusive(out / ".lock", out, "measuring there"):
         rows: dict[str, list[View]] = {}
         missing = []
@@ -94,16 +90,16 @@ def measure(
                 rows[axis] = kept
                 progress(axis, len(kept))
         if missing:
-            _measure_missing(setup, out, missing, workers, FrameCache(cache), rows, progress)
+            _measure_missing(setup, out, missing, workers, FrameCache(cache), rows, progress, cluster, saved)
         return {axis: rows[axis] for axis in setup.axes(axes)}
 
 
 def _measure_missing(
     setup: Setup, out: Path, axes: Sequence[str], workers: int, cache: FrameCache, rows: dict[str, list[View]],
-    progress: Progress,
+    progress: Progress, cluster: str | None, saved: Callable[[], None],
 ) -> None:  # fmt: skip
     work = setup.method, setup.conditions(CLEAN)[0], cache, setup.views
-    with _mapping(workers, work, out) as mapped:
+    with mapping(work, workers, cluster) as mapped:
         for axis in axes:
             conditions = setup.conditions(axis)
             frame_bytes = len(setup.method.frames_used) * setup.size**2
@@ -115,41 +111,13 @@ def _measure_missing(
                 progress(axis, len(views))
             content = {"setup": setup.key(), "axis": axis, "views": found}
             write_atomically(out / f"{axis}.json", (json.dumps(content, indent=1) + "\n").encode())
+            saved()
             rows[axis] = found
 
 
-_WORK: list[Work] = []
-"""What this process is at."""
-
-
-@contextmanager
-def _mapping(workers: int, work: Work, out: Path) -> Iterator[Callable[..., Iterable[list[View]]]]:
-    """``map`` over so many processes, or in this one."""
-    if workers == 1:
-        _WORK[:] = [work]
-        yield map
-        return
-    with single_threaded_algebra():
-        pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (work,))
-        try:
-            yield pool.map
-        except BrokenProcessPool as error:
-            raise PredictionError(
-                f"{out}: a worker process died (out of memory?); run the same command again, it resumes; --workers 1 "
-                "needs the least memory"
-            ) from error
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def _begin(work: Work) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _WORK[:] = [work]
-
-
-def _measure_object(condition: Condition, name: str) -> list[View]:
+def _measure_object(work: Work, condition: Condition, name: str) -> list[View]:
     """The rows of an object's views in a condition, in a worker process."""
-    method, clean, cache, views = _WORK[0]
+    method, clean, cache, views = work
     rules, rows = corruptions(), []
     for view in views:
         frames, truth = cache.frames(condition, name, view, method.frames_used), cache.truth(clean, name, view)

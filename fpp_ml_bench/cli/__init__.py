@@ -14,7 +14,8 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.errors import FppBenchError
+from fpp_ml_bench.errors import FppBenchError, PoolError
+from fpp_ml_bench.machine import usable_cores
 
 OK, CHECK_FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 SPLITS = ("train", "validation", "test", "all")
@@ -26,6 +27,7 @@ EXTRAS = {
     "diagnose": ("captum", "mpmath"),
     "published": ("h5py",),
     "onnx": ("onnx", "onnxruntime", "onnxscript"),
+    "cluster": ("ray",),
 }
 """The optional parts of the package (pyproject.toml) and the libraries that only they need."""
 
@@ -75,6 +77,25 @@ def count(most: int = 100_000) -> Callable[[str], int]:
         return int(text)
 
     return parsed
+
+
+def add_pool_options(parser: argparse.ArgumentParser) -> None:
+    """``--workers`` and ``--cluster``, for `workers_of`."""
+    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: as many as there are processors)")
+    parser.add_argument("--cluster", metavar="ADDRESS",
+                        help="all CPUs of a Ray cluster instead: ray://HOST:10001, or HOST:6379 on one of its nodes; "
+                             "they must share the output folder, or write to a URL (docs/scale.md)")  # fmt: skip
+
+
+def workers_of(args: argparse.Namespace) -> int:
+    """Processes of this machine. Raises `PoolError` for less than one, or beside a cluster."""
+    if args.workers is None:
+        return usable_cores()
+    if args.workers < 1:
+        raise PoolError(f"--workers {args.workers}: expected 1 or more")
+    if args.cluster is not None:
+        raise PoolError("--workers counts processes of this machine, --cluster takes a cluster; give one of them")
+    return int(args.workers)
 
 
 _FORMATTER = partial(argparse.RawDescriptionHelpFormatter, max_help_position=30, width=110)

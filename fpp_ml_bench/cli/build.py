@@ -6,12 +6,13 @@ from pathlib import Path
 from time import perf_counter
 
 from fpp_ml_bench import coding, optics
+from fpp_ml_bench.cli import add_pool_options, workers_of
 from fpp_ml_bench.cli.console import gigabytes, progress_bar, say_benchmark
 from fpp_ml_bench.cli.explain import add_explain_options, as_asked, explain
 from fpp_ml_bench.constants import CONFIGS, PRESETS
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders import render, storage
-from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.remote import place
 
 SUMMARY = "Generate the benchmark: virtual rig, objects, six views each, decoded and exact ground truth."
 EXAMPLES = (
@@ -24,12 +25,14 @@ EXAMPLES = (
     "fpp-bench build data/workshop --preset full --light workshop     the same views under a workshop's light",
     "fpp-bench build data/mine --mesh part.stl --size 960         a mesh of yours (metres)",
     "fpp-bench build data/lab --decode-with found.yaml            ground truth by the rig that a calibration found",
+    "fpp-bench build s3://bucket/full --preset full --cluster ray://head:10001    on all nodes of a Ray cluster",
     "fpp-bench build data/pen --objects pen --explain             what was left out, and what it saved",
 )
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("out", type=Path, metavar="OUT", help="new folder, or one whose build was interrupted")
+    parser.add_argument("out", type=place, metavar="OUT",
+                        help="new folder, or one whose build was interrupted; or a URL: s3://bucket/set")  # fmt: skip
     parser.add_argument("--preset", choices=tuple(PRESETS), default="mini", help="objects and size (default: mini)")
     parser.add_argument("--size", type=int, metavar="PX", help="image width and height (default: the preset's)")
     parser.add_argument("--objects", metavar="A,B", help="objects by name, comma separated (default: the preset's)")
@@ -37,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
                         help="all objects at the standoff, or a distance drawn per view")  # fmt: skip
     parser.add_argument("--frames", choices=CONFIGS, help="frames to store (default: all; with --rig crossed: crossed)")
     parser.add_argument("--seed", type=int, default=42, help="seed of noise and placement (default: 42)")
-    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: as many as there are processors)")
+    add_pool_options(parser)
     parser.add_argument("--rig", default="paper", metavar="paper|crossed|FILE",
                         help="the paper's, the same with crossed fringes, or a rig file (default: paper)")  # fmt: skip
     parser.add_argument("--decode-with", type=Path, metavar="FILE",
@@ -100,9 +103,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _run(args: argparse.Namespace) -> int:
     settings = settings_of(args)
-    workers = usable_cores() if args.workers is None else args.workers
-    if workers < 1:
-        raise BuildError(f"--workers {workers}: expected 1 or more")
+    workers = workers_of(args)
     assembly = render.assembly_of(settings)
     rows = sum(len(plan.samples) for plan in assembly.plans)
     frames = len(assembly.manifest.stored_frames)
@@ -114,7 +115,7 @@ def _run(args: argparse.Namespace) -> int:
             steps.append(finished)
             advance(finished)
 
-        manifest = render.build(args.out, settings, workers, count)
+        manifest = render.build(args.out, settings, workers, count, args.cluster)
     seconds = perf_counter() - started
     # The first step is what an interrupted run had left: it took no time now.
     made = sum(steps[1:]) * frames
@@ -125,6 +126,7 @@ def _run(args: argparse.Namespace) -> int:
     for line in storage.ground_truth_summary(manifest):
         print(f"  {line}")
     say_benchmark(manifest)
-    print(f"next: fpp-bench info {args.out}")
+    if isinstance(args.out, Path):
+        print(f"next: fpp-bench info {args.out}")
     explain(args, lambda: render.explain_build(manifest, settings))
     return 0

@@ -9,6 +9,7 @@ from fpp_ml_bench.cli.explain import add_explain_options, as_asked, explain
 from fpp_ml_bench.cli.method_options import METHOD_HELP, add_method_options, chosen_method
 from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.machine import limit_threads
+from fpp_ml_bench.remote import place, working_copy
 
 SUMMARY = "Run a method over a split and write predictions that fpp-eval scores."
 EXAMPLES = (
@@ -26,7 +27,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("method", metavar="METHOD", help=METHOD_HELP)
     add("dataset", type=Path, metavar="DATASET", help="dataset folder")
     add("--split", default="test", choices=SPLITS, help="default: test")
-    add("--out", type=Path, required=True, metavar="DIR", help="new or empty folder; a run that was stopped continues")
+    add("--out", type=place, required=True, metavar="DIR",
+        help="new or empty folder, or a URL, written at the end; a run that was stopped continues")  # fmt: skip
     add_method_options(parser)
     add_explain_options(parser)
 
@@ -39,14 +41,18 @@ def run(args: argparse.Namespace) -> int:
         opened = storage.DatasetFolder(args.dataset)
         method = chosen_method(args, opened)
         samples = len(opened.samples(args.split))
-        with progress_bar(f"{args.method}, {args.split}", samples, "samples") as advance:
-            finished = baselines.predict_split(opened, method, args.split, args.out, advance)
+        bar = progress_bar(f"{args.method}, {args.split}", samples, "samples")
+        with working_copy(args.out) as (out, _), bar as advance:
+            finished = baselines.predict_split(opened, method, args.split, out, advance)
         print(
             f"{args.out}: {finished.samples} predictions by {method.title}; {len(method.frames_used)} frames and "
             f"{finished.seconds_per_sample:.3f} s a sample (median)"
         )
         how = f"--dataset {args.dataset} --split {args.split}{_scoring(method, opened)}"
-        print(f"next: fpp-eval {args.out} {how} --json result.json")
+        if isinstance(args.out, Path):
+            print(f"next: fpp-eval {args.out} {how} --json result.json")
+        else:
+            print(f"next: copy {args.out} to a disk, then: fpp-eval COPY {how} --json result.json")
         explain(args, lambda: baselines.explain_predict(opened, method, args.split))
     return 0
 

@@ -9,13 +9,15 @@ from rich.table import Column, Table
 
 from fpp_ml_bench import optics
 from fpp_ml_bench.baselines import robustness
+from fpp_ml_bench.cli import add_pool_options, workers_of
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.method_options import METHOD_HELP, add_method_options, chosen_method
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation import report
 from fpp_ml_bench.loaders import render, storage
-from fpp_ml_bench.machine import limit_threads, usable_cores
+from fpp_ml_bench.machine import limit_threads
+from fpp_ml_bench.remote import place, working_copy
 
 SUMMARY = (
     "Measure what breaks a method: scenes disturbed axis by axis, at five severities each, in the image formation."
@@ -26,6 +28,7 @@ EXAMPLES = (
     "fpp-bench robustness classical --steps 6 --set unseen --axes motion,gloss --out robustness-unseen",
     "fpp-bench robustness phase-net --out robustness --into leaderboard/rows/phase-net-horizontal.json",
     "fpp-bench robustness unet-global-rmse --size 224 --out robustness-224",
+    "fpp-bench robustness phase --out s3://bucket/robustness --cluster ray://head:10001",
 )
 
 CROSSED = "crossed", "crossed-net"
@@ -35,16 +38,17 @@ CROSSED = "crossed", "crossed-net"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("method", metavar="METHOD", help=METHOD_HELP)
-    add("--out", type=Path, required=True, metavar="DIR",
-        help="folder of measurements: each method has its own below it, and one page shows all")  # fmt: skip
+    add("--out", type=place, required=True, metavar="DIR",
+        help="folder of measurements: each method has its own below it, and one page shows all; or a URL")  # fmt: skip
     add("--axes", default="", metavar="A,B", help="only these axes (default: all that apply to the method)")
     add("--set", dest="objects", default="test", choices=("test", "unseen"), help="objects (default: test)")
     add("--size", type=int, default=FULL_SIZE, metavar="PX", help=f"image size (default: {FULL_SIZE})")
     add("--quick", action="store_true", help="one view of each object and three severities, for a look")
     add("--into", type=Path, metavar="FILE",
         help="write the block into this result or row of the same method (.json); needs all axes")  # fmt: skip
-    add("--workers", type=int, default=usable_cores(), metavar="N", help="processes (default: one for each core)")
-    add("--cache", type=Path, metavar="DIR", help="rendered frames, at most 10 GB (default: the user's cache folder)")
+    add_pool_options(parser)
+    add("--cache", type=Path, metavar="DIR",
+        help="rendered frames, at most 10 GB (default: the user's cache folder; with --cluster none)")  # fmt: skip
     add("--no-cache", action="store_true", help="render every frame anew, keep none")
     add_method_options(parser)
 
@@ -55,8 +59,7 @@ def run(args: argparse.Namespace) -> int:
     from fpp_ml_bench.leaderboard.measured import check_same_method, write_robustness
     from fpp_ml_bench.leaderboard.rows import read_entry
 
-    if args.workers < 1:
-        raise PredictionError(f"--workers {args.workers}: expected 1 or more")
+    workers = workers_of(args)
     names = [name.strip() for name in args.axes.split(",") if name.strip()]
     if args.into is not None and (names or args.quick):
         raise PredictionError("--into: needs all axes and severities; leave out --axes and --quick")
@@ -66,12 +69,17 @@ def run(args: argparse.Namespace) -> int:
     if entry is not None:
         check_same_method(entry, method)
     setup = robustness.Setup(method, args.objects, args.size, args.quick, rig)
-    folder, cache = args.out / slug(setup), None if args.no_cache else args.cache or robustness.CACHE
+    # The nodes of a cluster have folders of their own, which nobody would keep small.
+    cache = None if args.no_cache else args.cache or (None if args.cluster else robustness.CACHE)
     views = sum(len(c.objects) * len(setup.views) for axis in setup.axes(names) for c in setup.conditions(axis))
-    with progress_bar(f"{args.method}, {args.objects}", views, "views") as advance:
-        rows = robustness.measure(setup, folder, names, args.workers, cache, lambda axis, count: advance(count))
-    robustness.write_worst(setup, rows, folder, cache)
-    page = robustness.write_page(args.out)
+    with working_copy(args.out) as (out, save):
+        folder = out / slug(setup)
+        with progress_bar(f"{args.method}, {args.objects}", views, "views") as advance:
+            rows = robustness.measure(
+                setup, folder, names, workers, cache, lambda axis, count: advance(count), args.cluster, save
+            )
+        robustness.write_worst(setup, rows, folder, cache)
+        page = f"{args.out}/{robustness.write_page(out).name}"
     if entry is not None:
         write_robustness(entry, robustness.robustness(setup, rows))
     show(_table(setup, rows))

@@ -17,6 +17,7 @@ from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.sample import Row
 from fpp_ml_bench.loaders.storage import MESH_FOLDER, Assembly, Manifest, Progress, ShardPlan
+from fpp_ml_bench.remote import RemoteFolder
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by
 
 
@@ -64,10 +65,16 @@ def assembly_of(settings: BuildSettings) -> Assembly:
     return Assembly(plan_build(settings), PhotographedRows(settings), manifest, MESH_FOLDER)
 
 
-def build(folder: Path, settings: BuildSettings, workers: int, progress: Progress = lambda rows: None) -> Manifest:
-    """Build a dataset into ``folder``, or go on with one that was interrupted. Same settings, same bytes. Raises
-    `BuildError` (folder in use, other settings, disk full) and `MeshError` (an object does not fit)."""
-    return storage.assemble(folder, assembly_of(settings), workers, progress)
+def build(
+    folder: Path | RemoteFolder, settings: BuildSettings, workers: int, progress: Progress = lambda rows: None,
+    cluster: str | None = None,
+) -> Manifest:  # fmt: skip
+    """Build a dataset into ``folder``, or go on with one that was interrupted, by so many processes or by the Ray
+    cluster at an address. Same settings, same bytes. Raises `BuildError` (folder in use, other settings, disk full),
+    `MeshError` (an object does not fit), and `PoolError` and `RemoteError` for a cluster or URL that fails."""
+    if isinstance(folder, RemoteFolder):
+        return storage.assemble_remote(folder, assembly_of(settings), workers, cluster, progress)
+    return storage.assemble(folder, assembly_of(settings), workers, progress, cluster)
 
 
 def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:

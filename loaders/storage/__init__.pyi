@@ -28,6 +28,7 @@ from .parquet import data_shards as data_shards
 from .parquet import preview as preview
 from .parquet import write_parquet as write_parquet
 from .parquet import write_shard as write_shard
+from .remote_assembly import assemble_remote as assemble_remote
 from .shards import ShardPlan as ShardPlan
 from .shards import ShardWriter as ShardWriter
 from .shards import depth_range_mm as depth_range_mm

@@ -4,6 +4,7 @@ receipt in the work folder. A resumed run trusts a receipt only when every file 
 
 import json
 import os
+import platform
 import shutil
 import signal
 import threading
@@ -12,6 +13,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from multiprocessing import connection, get_context, parent_process
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -25,6 +27,8 @@ from fpp_ml_bench.loaders.storage.manifest import MANIFEST, WORK_FOLDER, Manifes
 from fpp_ml_bench.loaders.storage.shards import Receipt, ShardPlan, ShardWriter
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import single_threaded_algebra
+from fpp_ml_bench.pool import mapping
+from fpp_ml_bench.remote import RemoteFolder
 
 SETTINGS = "settings.json"
 RowSource = Callable[[ShardPlan, Path], Iterable[Row]]
@@ -60,18 +64,44 @@ class Assembly:
         content = self.manifest
         return ShardWriter(folder, scratch, content.sequence, content.stored, content.exact, content.size)
 
+    def filled(self, receipts: list[Receipt]) -> Manifest:
+        """The manifest with rows and shards, from the receipts of all plans in order."""
+        samples: dict[str, list[dict[str, Any]]] = {}
+        for plan, (_, rows) in zip(self.plans, receipts, strict=True):
+            samples.setdefault(plan.split, []).extend(rows)
+        return replace(self.manifest, samples=samples, shards=[file for files, _ in receipts for file in files])
 
-def assemble(folder: Path, assembly: Assembly, workers: int, progress: Progress = lambda rows: None) -> Manifest:
-    """Write or finish the dataset, and return its manifest. ``progress`` is called with numbers of finished rows, first
-    those of an interrupted run; not for a finished dataset. Raises `BuildError` when the folder is in use, holds other
-    files, or can't be written."""
+
+@dataclass(frozen=True)
+class ShardWork:
+    """What a process needs to write shards into ``folder``; it keeps one for all of them."""
+
+    assembly: Assembly
+    folder: Path
+    scratch: Path
+
+    @cached_property
+    def writer(self) -> ShardWriter:
+        return self.assembly.writer(self.folder, self.scratch)
+
+    def write(self, plan: ShardPlan, row_done: Callable[[], None] = lambda: None) -> Receipt:
+        return self.writer.write(plan, self.assembly.rows(plan, self.folder), row_done)
+
+
+def assemble(
+    folder: Path, assembly: Assembly, workers: int, progress: Progress = lambda rows: None, cluster: str | None = None
+) -> Manifest:
+    """Write or finish the dataset, and return its manifest, by so many processes or by the Ray cluster at an address,
+    whose nodes must share the folder. ``progress`` is called with numbers of finished rows, first those of an
+    interrupted run; not for a finished dataset. Raises `BuildError` when the folder is in use, holds other files, or
+    can't be written, and `PoolError` as `mapping`."""
     try:
         with writing(folder) as scratch:
             if (folder / MANIFEST).exists():
                 manifest = DatasetFolder(folder).manifest  # every file is there, in full length
-                _compare(folder, replace(assembly, manifest=manifest).key(), assembly.key())
+                compare(folder, replace(assembly, manifest=manifest).key(), assembly.key())
                 return manifest
-            return _assemble(folder, scratch, assembly, workers, progress)
+            return _assemble(folder, scratch, assembly, workers, progress, cluster)
     except OSError as error:
         raise BuildError(
             f"{folder}: writing failed ({error}); remove the cause (on a full disk: free some space), then run the "
@@ -119,8 +149,10 @@ def _changed_after(path: Path, moment: Path) -> bool:
     return max(status.st_ctime_ns, status.st_mtime_ns) > moment.stat().st_mtime_ns
 
 
-def _assemble(folder: Path, scratch: Path, assembly: Assembly, workers: int, progress: Progress) -> Manifest:
-    _check_settings(folder, scratch, assembly)
+def _assemble(
+    folder: Path, scratch: Path, assembly: Assembly, workers: int, progress: Progress, cluster: str | None
+) -> Manifest:
+    check_settings(folder, scratch, assembly)
     for leftover in (*scratch.glob("*.tmp"), *folder.rglob(".*.tmp")):  # of a run that was killed while writing
         leftover.unlink(missing_ok=True)  # the two patterns overlap
     receipts = {}
@@ -131,11 +163,13 @@ def _assemble(folder: Path, scratch: Path, assembly: Assembly, workers: int, pro
     missing = [plan for plan in assembly.plans if plan.name not in receipts]
     progress(sum(len(plan.samples) for plan in assembly.plans if plan.name in receipts))
     _check_space(folder, assembly, missing)
-    if workers > 1 and len(missing) > 1:
-        written = _write_in_processes(folder, scratch, assembly, missing, workers, progress)
+    work = ShardWork(assembly, folder, scratch)
+    if cluster is not None and missing:
+        written = _write_on_cluster(work, missing, cluster, progress)
+    elif workers > 1 and len(missing) > 1:
+        written = _write_in_processes(work, missing, workers, progress)
     else:
-        write = assembly.writer(folder, scratch).write
-        written = ((plan, write(plan, assembly.rows(plan, folder), lambda: progress(1))) for plan in missing)
+        written = ((plan, work.write(plan, lambda: progress(1))) for plan in missing)
     with closing(written):
         for plan, (files, rows) in written:
             content = {"files": [asdict(file) for file in files], "rows": rows}
@@ -144,7 +178,8 @@ def _assemble(folder: Path, scratch: Path, assembly: Assembly, workers: int, pro
     return _finish(folder, assembly, [receipts[plan.name] for plan in assembly.plans])
 
 
-def _check_settings(folder: Path, scratch: Path, assembly: Assembly) -> None:
+def check_settings(folder: Path | RemoteFolder, scratch: Path, assembly: Assembly) -> None:
+    """Write the settings into the work folder ``scratch``, or raise `BuildError` where it holds others."""
     path = scratch / SETTINGS
     # Another version may make other bytes: its finished dataset is valid, but a dataset must not mix two versions.
     settings = {**assembly.key(), "generator": assembly.manifest.generator}
@@ -153,11 +188,11 @@ def _check_settings(folder: Path, scratch: Path, assembly: Assembly) -> None:
             begun_settings = json.loads(path.read_text(encoding="utf-8"))
         except ValueError as error:
             raise BuildError(f"{path}: damaged; delete {folder} and start again") from error
-        _compare(folder, begun_settings, settings)
+        compare(folder, begun_settings, settings)
     write_atomically(path, json.dumps(settings, indent=1).encode())
 
 
-def _compare(folder: Path, stored: dict[str, Any], requested: dict[str, Any]) -> None:
+def compare(folder: Path | RemoteFolder, stored: dict[str, Any], requested: dict[str, Any]) -> None:
     """Raise `BuildError` naming the differences between the folder's settings and the requested settings."""
     stored, requested = json.loads(json.dumps(stored)), json.loads(json.dumps(requested))
     differing = []
@@ -182,12 +217,21 @@ def _short(value: object) -> str:
 
 def _receipt(folder: Path, scratch: Path, plan: ShardPlan) -> Receipt | None:
     """Receipt of a shard that is finished and whose files are intact, else None."""
+    receipt = planned_receipt(scratch / f"{plan.name}.json", plan)
     try:
-        content = json.loads((scratch / f"{plan.name}.json").read_text(encoding="utf-8"))
+        intact = receipt and all(file_hash(folder / file.path) == file.xxh3_128 for file in receipt[0])
+    except OSError:
+        intact = False
+    return receipt if intact else None
+
+
+def planned_receipt(file: Path, plan: ShardPlan) -> Receipt | None:
+    """What a receipt says; None for one that is absent, damaged or not of this plan."""
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
         files, rows = [ShardFile(**entry) for entry in content["files"]], content["rows"]
-        intact = all(file_hash(folder / file.path) == file.xxh3_128 for file in files)
         planned = [name for name, _, _ in plan.samples]
-        return (files, rows) if intact and [row["sample"] for row in rows] == planned else None
+        return (files, rows) if [row["sample"] for row in rows] == planned else None
     except (OSError, ValueError, KeyError, TypeError):
         return None
 
@@ -202,8 +246,30 @@ def _check_space(folder: Path, assembly: Assembly, missing: list[ShardPlan]) -> 
         )
 
 
+def _write_on_cluster(
+    work: ShardWork, plans: list[ShardPlan], cluster: str, progress: Progress
+) -> Generator[tuple[ShardPlan, Receipt], None, None]:
+    """Write the shards as tasks of a Ray cluster whose nodes share the folder."""
+    with mapping(work, cluster=cluster) as mapped:
+        for plan, receipt in zip(plans, mapped(_write_shared, plans), strict=True):
+            progress(len(plan.samples))
+            yield plan, receipt
+
+
+def _write_shared(work: ShardWork, plan: ShardPlan) -> Receipt:
+    if not (work.scratch / SETTINGS).is_file():
+        raise BuildError(without_files(work.folder))
+    return work.write(plan)
+
+
+def without_files(folder: Path | RemoteFolder) -> str:
+    """What to say where a task does not find what the command wrote."""
+    node = platform.node()
+    return f"{folder}: node {node} does not find the build there; give a folder that all nodes share, or a URL"
+
+
 def _write_in_processes(
-    folder: Path, scratch: Path, assembly: Assembly, plans: list[ShardPlan], workers: int, progress: Progress
+    work: ShardWork, plans: list[ShardPlan], workers: int, progress: Progress
 ) -> Generator[tuple[ShardPlan, Receipt], None, None]:
     """Write the shards in processes that each go from shard to shard; yields each when it is finished, in any order."""
     context = get_context("spawn")
@@ -216,7 +282,7 @@ def _write_in_processes(
             for _ in range(min(workers, len(plans))):
                 pipe, end = context.Pipe()
                 pipes.append(pipe)
-                processes.append(context.Process(target=_work, args=(end, rows_done, folder, scratch, assembly)))
+                processes.append(context.Process(target=_work, args=(end, rows_done, work)))
                 processes[-1].start()
                 end.close()  # the worker's copy is the only one left: when the worker dies, the pipe ends
         busy = {}
@@ -238,7 +304,7 @@ def _write_in_processes(
                 yield plan, result
     except (EOFError, ConnectionError) as error:
         raise BuildError(
-            f"{folder}: a worker process died (out of memory?); run the same command again, it resumes; with "
+            f"{work.folder}: a worker process died (out of memory?); run the same command again, it resumes; with "
             "--workers 1 it needs the least memory"
         ) from error
     finally:
@@ -248,11 +314,10 @@ def _write_in_processes(
             process.join()
 
 
-def _work(pipe: Connection, rows_done: Any, folder: Path, scratch: Path, assembly: Assembly) -> None:
+def _work(pipe: Connection, rows_done: Any, work: ShardWork) -> None:
     """Write the shards whose plans come through ``pipe``, counting rows in memory shared with the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    writer = assembly.writer(folder, scratch)
 
     def row_done() -> None:
         with rows_done.get_lock():
@@ -263,7 +328,7 @@ def _work(pipe: Connection, rows_done: Any, folder: Path, scratch: Path, assembl
             plan = pipe.recv()
             result: Receipt | Exception
             try:
-                result = writer.write(plan, assembly.rows(plan, folder), row_done)
+                result = work.write(plan, row_done)
             except Exception as error:
                 error.add_note(traceback.format_exc())
                 result = error
@@ -279,12 +344,8 @@ def _end_with_parent() -> None:
 
 
 def _finish(folder: Path, assembly: Assembly, receipts: list[Receipt]) -> Manifest:
-    samples: dict[str, list[dict[str, Any]]] = {}
-    for plan, (_, rows) in zip(assembly.plans, receipts, strict=True):
-        samples.setdefault(plan.split, []).extend(rows)
-    shards = [file for files, _ in receipts for file in files]
-    manifest = replace(assembly.manifest, samples=samples, shards=shards)
-    rows = [row for part in samples.values() for row in part]
+    manifest = assembly.filled(receipts)
+    rows = [row for part in manifest.samples.values() for row in part]
     # Only files written here are listed: `fpp-bench verify` reports any other file in the folder as foreign.
     names = [*write_card(folder, manifest), *assembly.mesh_paths(rows)]
     manifest = replace(manifest, others=[describe_file(folder, folder / name) for name in sorted(names)])

@@ -11,6 +11,7 @@ from flat_planes import DIRECT
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import METHODS, Method, load_method
 from fpp_ml_bench.baselines.run import predict_split
+from fpp_ml_bench.cli import main
 from fpp_ml_bench.decoding import noise_by_light
 from fpp_ml_bench.depth import edge_distance_px, object_mask
 from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError, PredictionError
@@ -272,6 +273,15 @@ def test_prediction_folder(opened, tmp_path):
     assert submission["uses_ground_truth_range"] is False and submission["seconds_source"] == "measured"
     assert submission["settings"] == {"direction": "vertical", "steps": 4, "threads": 1}
     assert submission["seconds_per_sample"] == pytest.approx(run.seconds_per_sample, rel=1e-4)
+
+
+def test_predictions_at_a_url(tiny, tmp_path, capsys):
+    url = (tmp_path / "there").as_uri()
+    words = ["predict", "constant", str(tiny), "--split", "validation", "--out", url]
+    assert main(words) == 0 and f"next: copy {url} to a disk" in capsys.readouterr().out
+    names = sorted([*(f"mug_A{a}.npy" for a in range(0, 360, 60)), "submission.yaml"])
+    assert sorted(path.name for path in (tmp_path / "there").iterdir()) == names
+    assert main(words) == 2 and f"{url}: already holds submission.yaml and more" in capsys.readouterr().err
 
 
 def test_method_sees_copies_and_no_other_frame(opened, tmp_path):

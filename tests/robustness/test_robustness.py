@@ -191,13 +191,19 @@ def test_measuring_resumes_axis_by_axis_and_refuses_another_methods_folder(tmp_p
         measure(setup, tmp_path, ["ambient-light"])
 
 
-def test_processes_give_the_same_rows_as_one(tmp_path):
+def test_processes_and_a_cluster_give_the_same_rows_as_one(tmp_path, fake_ray):
     setup = Setup(ConstantMethod(paper_rig(SIZE)), "test", SIZE, quick=True)
     one, two = (measure(setup, tmp_path / str(n), ["ambient-light"], workers=n) for n in (1, 2))
-    for rows in (*one.values(), *two.values()):
+    saved = []
+    three = measure(
+        setup, tmp_path / "3", ["ambient-light"], cluster=fake_ray.address,
+        saved=lambda: saved.append(sorted(file.name for file in (tmp_path / "3").glob("*.json"))),
+    )  # fmt: skip
+    assert saved == [["clean.json"], ["ambient-light.json", "clean.json"]]
+    for rows in (*one.values(), *two.values(), *three.values()):
         for row in rows:
             del row["seconds"]
-    assert one == two
+    assert one == two == three
 
 
 def test_the_cache_is_used_mended_and_kept_small(tmp_path, monkeypatch):

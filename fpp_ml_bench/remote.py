@@ -1,0 +1,113 @@
+"""Folders at a URL of any kind that fsspec knows: ``s3://bucket/set``, ``gs://``, ``file:///net/set``."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from tempfile import TemporaryDirectory
+from typing import Any
+from uuid import uuid4
+
+from fpp_ml_bench.errors import FppBenchError, RemoteError
+
+TEMPORARY = ".tmp"
+"""Suffix of a file that is not yet whole."""
+
+
+@dataclass(frozen=True)
+class RemoteFolder:
+    """A folder at ``url``; every process that holds one opens its own connection. Files are named relative to the
+    folder, with ``/``. All methods raise `RemoteError` where the service or the network refuses."""
+
+    url: str
+
+    def __str__(self) -> str:
+        return self.url
+
+    def sizes(self) -> dict[str, int]:
+        """Bytes of every file below the folder by name; empty where there is no folder."""
+        with self._opened("can't be read") as (files, root):
+            files.invalidate_cache()
+            found = files.find(root, detail=True)
+            return {path.removeprefix(root).lstrip("/"): int(info["size"]) for path, info in found.items()}
+
+    def has(self, name: str) -> bool:
+        """Whether a file is there."""
+        with self._opened("can't be read") as (files, root):
+            return bool(files.exists(f"{root}/{name}"))
+
+    def put(self, file: Path, name: str) -> None:
+        """Copy a file there. Under its name it is there whole or not at all."""
+        with self._opened("can't be written") as (files, root):
+            target = PurePosixPath(root) / name
+            temporary = str(target.with_name(f".{target.name}.{uuid4().hex}{TEMPORARY}"))
+            files.makedirs(str(target.parent), exist_ok=True)
+            files.put_file(str(file), temporary)
+            files.mv(temporary, str(target))
+
+    def get(self, name: str, file: Path) -> None:
+        """Copy a file from there; its folder is made."""
+        file.parent.mkdir(parents=True, exist_ok=True)
+        with self._opened("can't be read") as (files, root):
+            files.get_file(f"{root}/{name}", str(file))
+
+    def remove(self, name: str) -> None:
+        """Remove a file, or a folder with all below it."""
+        with self._opened("can't be written") as (files, root):
+            files.rm(f"{root}/{name}", recursive=True)
+
+    @contextmanager
+    def _opened(self, failure: str) -> Iterator[tuple[Any, str]]:
+        """The file system, and the folder's path in it."""
+        from fsspec.core import url_to_fs
+
+        try:
+            files, root = url_to_fs(self.url)
+            yield files, root.rstrip("/")
+        except Exception as error:  # each service raises errors of its own library
+            reason = str(error).strip().partition("\n")[0] or type(error).__name__
+            raise RemoteError(f"{self.url}: {failure} ({reason})") from error
+
+
+def place(text: str) -> Path | RemoteFolder:
+    """The folder that a command's argument names: a path, or a URL."""
+    return RemoteFolder(text.rstrip("/")) if "://" in text else Path(text)
+
+
+@contextmanager
+def working_copy(folder: Path | RemoteFolder) -> Iterator[tuple[Path, Callable[[], None]]]:
+    """A local folder to work in, and a function that saves what changed there; a local ``folder`` is itself. Of a
+    remote one it is a temporary copy, saved at the end in any case, in the order in which files were written. Hidden
+    files are not saved."""
+    if isinstance(folder, Path):
+        yield folder, lambda: None
+        return
+    with TemporaryDirectory(prefix="fpp-bench-") as temporary:
+        copy = Path(temporary)
+        for name in folder.sizes():
+            folder.get(name, copy / name)
+        saved = _stamps(copy)
+
+        def save() -> None:
+            stamps = _stamps(copy)
+            for name in sorted(stamps, key=lambda name: stamps[name]):
+                if saved.get(name) != stamps[name]:
+                    folder.put(copy / name, name)
+            for name in saved.keys() - stamps.keys():
+                folder.remove(name)
+            saved.clear()
+            saved.update(stamps)
+
+        try:
+            yield copy, save
+        except FppBenchError as error:
+            error.args = tuple(str(arg).replace(str(copy), folder.url) for arg in error.args)
+            raise
+        finally:
+            save()
+
+
+def _stamps(folder: Path) -> dict[str, tuple[int, int]]:
+    """Time of change, ns, and bytes of every file below a folder that is not hidden."""
+    paths = [path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".")]
+    return {path.relative_to(folder).as_posix(): (path.stat().st_mtime_ns, path.stat().st_size) for path in paths}
