@@ -105,9 +105,10 @@ class Geometry:
 class Scene:
     """The part ``crop`` of an image, maps (h, w) in the image's own orientation. ``light``: captured light without the
     ambient light, and ``plane_light``: the empty scene's prediction of it, both as multiples of a plane like the
-    background at the standoff, or of the object's median brightness; ``noise`` in the same unit; ``inside``: mask of the measured route; ``phase_rad`` in [-pi, pi] and
-    ``order``: the base order; ``bright``: half the modulation, in units of light; ``weight``: of the fit's window;
-    ``slopes`` of the residual phase, rad a px along x and y; ``middle_rad``: median residual phase of the object."""
+    background at the standoff, or of the object's median brightness; ``noise`` in the same unit; ``inside``: mask of
+    the measured route; ``phase_rad`` in [-pi, pi] and ``order``: the base order; ``bright``: half the modulation, in
+    units of light; ``weight``: of the fit's window; ``slopes`` of the residual phase, rad a px along x and y;
+    ``middle_rad``: median residual phase of the object."""
 
     crop: phase_route.Crop
     light: Image

@@ -79,12 +79,12 @@ def _shipped(albedo: str) -> str:
 
 class PhaseNetMethod(Method):
     """Depth from the first sinusoid of one ``direction``. ``albedo``: "one", where all surfaces have the background's,
-    so that brightness tells the order, or "any", where it is ambiguous unless range and shape tell it; or ``weights``, a
-    shipped name or a file, which say what they learned. ``min_confidence``: pixels below it are masked; ``white_grey`` and ``ambient_grey``: as of `Settings`, for images without a lit background. Raises `WeightsError`
+    so that brightness tells the order, or "any", where it is ambiguous unless range and shape tell it; or
+    ``weights``, a shipped name or a file, which say what they learned. ``min_confidence``: pixels below it are masked;
+    ``white_grey`` and ``ambient_grey``: as of `Settings`, for images without a lit background. Raises `WeightsError`
     for weights that can't be used, and `PredictionError` for an invalid option."""
 
     name = "phase-net"
-    target = "depth"
     packages = ("numpy", "numba", "torch")
 
     def __init__(
@@ -129,9 +129,10 @@ class PhaseNetMethod(Method):
         told = "order by range; mask" if self.by_range else "order, mask"
         self.title = f"Phase route, one {direction} fringe, {learned} albedo; {told} and correction learned{more}"
         self.settings = {
-            "direction": direction, "albedo": learned, "shading": shading, "order_by_range": self.by_range, "min_confidence": min_confidence, "weights": config.name,
-            "weights_sha256": self.file.sha256, "mask_threshold": config.threshold, "order_lead": config.lead, "temperature": config.temperature, "doubted": config.doubted,
-            "threads": threads, "white_grey": white_grey, "ambient_grey": ambient_grey,
+            "direction": direction, "albedo": learned, "shading": shading, "order_by_range": self.by_range,
+            "min_confidence": min_confidence, "weights": config.name, "weights_sha256": self.file.sha256,
+            "mask_threshold": config.threshold, "order_lead": config.lead, "temperature": config.temperature,
+            "doubted": config.doubted, "threads": threads, "white_grey": white_grey, "ambient_grey": ambient_grey,
         }  # fmt: skip
 
     @property

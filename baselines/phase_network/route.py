@@ -19,7 +19,7 @@ from fpp_ml_bench.baselines.phase_network.answers import (
 from fpp_ml_bench.baselines.phase_network.inputs import LEAST_WEIGHT, STEPS, Geometry, Scene, channels
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.odds import Odds, margin_of, wrong_chance
-from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask, Measurement, Observation, Settings, of_choice, wrapped
+from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask, Measurement, Observation, Settings, wrapped
 from fpp_ml_bench.optics import Rig
 
 OPEN_MARGIN = 0.1  # least margin of an order that gets a depth where brightness can't tell it
@@ -47,9 +47,9 @@ def decided_mask(answers: Answers, scene: Scene, threshold: float) -> Mask:
 @dataclass(frozen=True)
 class Levers:
     """Which of the network's answers are used; False: the measured route's own value stays. ``order``, ``mask``,
-    ``phase``; ``shading``: whether network and base order use brightness, as the network learned to; ``graph``: weight of smoothness between
-    neighbours in a least-energy labelling of the orders (depth may jump), 0: the most likely order of each pixel alone;
-    ``bound_rad``: corrections are clipped there, None: the network's own bound."""
+    ``phase``; ``shading``: whether network and base order use brightness, as the network learned to; ``graph``: weight
+    of smoothness between neighbours in a least-energy labelling of the orders (depth may jump), 0: the most likely
+    order of each pixel alone; ``bound_rad``: corrections are clipped there, None: the network's own bound."""
 
     order: bool = True
     mask: bool = True

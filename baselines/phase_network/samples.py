@@ -36,8 +36,8 @@ def sample_of(
     image: NDArray[np.uint8], depth_mm: Image, void: Mask, name: str, group: str, geometry: Geometry,
     shading: bool = True,
 ) -> Sample | None:  # fmt: skip
-    """Sample of an image uint8 (H, W), its true depth in mm, 0 = background, and its ``void`` pixels (H, W), whose depth
-    counts nowhere; None where nothing calibrates its brightness. ``shading``: as of `Scene.of`."""
+    """Sample of an image uint8 (H, W), its true depth in mm, 0 = background, and its ``void`` pixels (H, W), which
+    count nowhere; None where nothing calibrates its brightness. ``shading``: as of `Scene.of`."""
     observation = geometry.route.observe(image)
     if not observation.background.calibrated or not observation.inside.any():
         return None

@@ -47,6 +47,8 @@ class Recipe(WindowRecipe):
     learns from, one frame each; every ``textured_every``-th of the drawn lights has albedo maps and gloss;
     ``validation_lights``: drawn ones for validation objects; ``vary``: how its windows are varied."""
 
+    steps: int = 3000
+    validate_every: int = 250
     albedo: Albedo = "one"
     directions: tuple[Direction, ...] = DIRECTIONS
     textured_every: int = 3
@@ -96,8 +98,8 @@ def mean_scores(
 def score(answers: Answers, sample: Sample, geometry: Geometry, threshold: float = 0.0) -> dict[str, float]:
     """Scores of one whole image with ``threshold`` on the mask's logit. ``object_mae_mm`` counts a missed pixel with
     its whole depth; ``right_mae_mm``: MAE of pixels with the right order; ``wrong_percent`` and ``missed_percent``:
-    shares of the object's pixels; ``invented_kpx``: background pixels with a depth, in thousands; ``within_percent``: errors of the phase
-    within the stated standard uncertainty, 68 of a normal distribution."""
+    shares of the object's pixels; ``invented_kpx``: background pixels with a depth, in thousands; ``within_percent``:
+    errors of the phase within the stated standard uncertainty, 68 of a normal distribution."""
     scene = sample.scene.single()
     layer = geometry.layer.at(scene.crop)
     steps, inside = np.array(STEPS, np.int32)[answers.logits.argmax(axis=0)], decided_mask(answers, scene, threshold)

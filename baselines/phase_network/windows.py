@@ -45,7 +45,7 @@ class Variation:
 class Window:
     """One training example: ``x`` (C, n, n) float32, ``exists`` (3, n, n); ``order`` int64 (n, n), 0 to 2 or `IGNORED`;
     ``correction_rad`` and ``fitted`` (n, n): error of the phase beside the order, and where it counts; ``target`` bool
-    (n, n): object; ``mask_valid``: where the mask's loss counts: not on void pixels, nor for an object that was moved."""
+    (n, n): object; ``mask_valid``: where the mask's loss counts, not on void pixels, nor for an object that moved."""
 
     x: Image
     exists: Mask

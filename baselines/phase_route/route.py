@@ -137,9 +137,9 @@ class PhaseRoute:
         least_margin: float = 0.0,
     ) -> Measurement:  # fmt: skip
         """The measurement that follows from an ``order`` int32 for each pixel of the observation's crop (h, w);
-        ``margin`` (h, w): how clearly that order won, 0 for a tie, 1 or more for a clear choice (see `orders.Chooser`). A pixel
-        of less than ``least_margin`` has no depth, as always a tie in light that nothing calibrates.
-        Raises `DecodeError` for shapes that are not the crop's."""
+        ``margin`` (h, w): how clearly that order won, 0 for a tie, 1 or more for a clear choice (see `orders.Chooser`).
+        A pixel of less than ``least_margin`` has no depth, as always a tie in light that nothing calibrates. Raises
+        `DecodeError` for shapes that are not the crop's."""
         inside, watch = observation.inside, observation.watch
         if np.shape(order) != inside.shape or np.shape(margin) != inside.shape:
             raise DecodeError(

@@ -83,9 +83,9 @@ class ModelConfig:
 class NetConfig:
     """What a phase network is, how its answers are used, and what it was trained on. ``options``: arguments of
     `PhaseNet`; ``threshold``: logit from which on a pixel is object; ``lead``: what is added to the logit of the base
-    order, ``temperature`` by which logits are divided and ``doubted`` as of `phase_network.Odds`, all chosen on validation
-    views; ``period_px``: image px per fringe period of the training images, by
-    direction; ``steps`` trained; the others as in `ModelConfig`."""
+    order, ``temperature`` and ``doubted`` as of `phase_network.Odds`, all chosen on validation views; ``period_px``:
+    image px per fringe period of the training images, by direction; ``steps`` trained; the others as in
+    `ModelConfig`."""
 
     name: Text
     title: Text

@@ -63,10 +63,10 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     add("--prior", choices=("none", "standoff"),
         help="standoff: assume that objects are near the rig's standoff, true of fixed placement (default: none)",
     )  # fmt: skip
-    add("--no-shading", action="store_const", const=True, help="choose the fringe order without brightness")
+    add("--no-shading", action="store_const", const=True, help="phase: choose the fringe order without brightness")
     add("--albedo", choices=("one", "any"),
-        help="phase-net: one, where all surfaces have the background's albedo, so that brightness tells the fringe order, "
-             "or any, where the order is ambiguous unless range and shape tell it (default: one)")  # fmt: skip
+        help="phase-net: one, where all surfaces have the background's albedo, so that brightness tells the order, or "
+             "any, where the order is ambiguous unless range and shape tell it (default: one)")  # fmt: skip
     add("--min-confidence", type=float, metavar="C",
         help="mask pixels of less confidence, 0 to 1 (default: 0, dense)")  # fmt: skip
     add("--white-grey", type=float, metavar="GREY",

@@ -103,9 +103,7 @@ def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
     return {name: getattr(args, name) for name in names if name != "start" and getattr(args, name) is not None}
 
 
-def _window_training_said(
-    args: argparse.Namespace, steps: int, trained: "phase_network.Trained"
-) -> int:  # fmt: skip
+def _window_training_said(args: argparse.Namespace, steps: int, trained: "phase_network.Trained") -> int:
     """Print how the training of phase-net or crossed-net ended; the exit status."""
     if trained.weights is None:
         done = f"{trained.steps} of {steps} steps"
