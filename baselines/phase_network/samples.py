@@ -37,7 +37,8 @@ def sample_of(
     shading: bool = True,
 ) -> Sample | None:  # fmt: skip
     """Sample of an image uint8 (H, W), its true depth in mm, 0 = background, and its ``void`` pixels (H, W), which
-    count nowhere; None where nothing calibrates its brightness. ``shading``: as of `Scene.of`."""
+    count nowhere; None where nothing calibrates its brightness, or no object is
+    seen. ``shading``: as of `Scene.of`."""
     observation = geometry.route.observe(image)
     if not observation.background.calibrated or not observation.inside.any():
         return None
@@ -45,6 +46,8 @@ def sample_of(
     scene = Scene.of(observation, order, shading)
     crop_depth_mm, crop_void = depth_mm[observation.crop], void[observation.crop]
     target = object_mask(crop_depth_mm) & ~crop_void
+    if not target.any():
+        return None
     true_phase = observation.layer.absolute_phase(np.where(target, crop_depth_mm, 1000.0))
     missing = np.where(target, true_phase - observation.phase_rad - TAU * order, 0.0)
     places = np.argwhere(depth_edges(crop_depth_mm)).astype(np.int32)

@@ -89,17 +89,22 @@ def answers_of(
 def mean_scores(
     answers: Iterable[Answers], samples: list[Sample], geometries: Geometries, threshold: float = 0.0
 ) -> dict[str, float]:
-    """Means of `score` over the samples."""
+    """Means of each `score` over the samples that have it."""
     pairs = zip(answers, samples, strict=True)
     rows = [score(answer, sample, geometries[sample.direction], threshold) for answer, sample in pairs]
-    return {key: float(np.mean([row[key] for row in rows])) for key in rows[0]} if rows else {}
+    means: dict[str, float] = {}
+    for key in rows[0] if rows else ():
+        values = [row[key] for row in rows if row[key] is not None]
+        means |= {key: float(np.mean(values))} if values else {}
+    return means
 
 
-def score(answers: Answers, sample: Sample, geometry: Geometry, threshold: float = 0.0) -> dict[str, float]:
+def score(answers: Answers, sample: Sample, geometry: Geometry, threshold: float = 0.0) -> dict[str, float | None]:
     """Scores of one whole image with ``threshold`` on the mask's logit. ``object_mae_mm`` counts a missed pixel with
     its whole depth; ``right_mae_mm``: MAE of pixels with the right order; ``wrong_percent`` and ``missed_percent``:
     shares of the object's pixels; ``invented_kpx``: background pixels with a depth, in thousands; ``within_percent``:
-    errors of the phase within the stated standard uncertainty, 68 of a normal distribution."""
+    errors of the phase within the stated standard uncertainty, 68 of a normal distribution. Both are None where no order is
+    right."""
     scene = sample.scene.single()
     layer = geometry.layer.at(scene.crop)
     steps, inside = np.array(STEPS, np.int32)[answers.logits.argmax(axis=0)], decided_mask(answers, scene, threshold)
@@ -113,12 +118,13 @@ def score(answers: Answers, sample: Sample, geometry: Geometry, threshold: float
     wrong = (np.abs(phase_error) > np.pi)[target]
     within = np.abs(phase_error) < answers.sigma_rad
     detected = inside[target]
+    right = detected & ~wrong
     return {
         "object_mae_mm": float(error.mean()),
-        "right_mae_mm": float(error[detected & ~wrong].mean()),
+        "right_mae_mm": float(error[right].mean()) if right.any() else None,
         "wrong_percent": 100 * float(wrong.mean()),
         "missed_percent": 100 * float((~detected).mean()),
-        "within_percent": 100 * float(within[target][detected & ~wrong].mean()),
+        "within_percent": 100 * float(within[target][right].mean()) if right.any() else None,
         "invented_kpx": float((inside & ~target & ~sample.void).sum()) / 1000,
     }
 
