@@ -103,8 +103,8 @@ def score(answers: Answers, sample: Sample, geometry: Geometry, threshold: float
     """Scores of one whole image with ``threshold`` on the mask's logit. ``object_mae_mm`` counts a missed pixel with
     its whole depth; ``right_mae_mm``: MAE of pixels with the right order; ``wrong_percent`` and ``missed_percent``:
     shares of the object's pixels; ``invented_kpx``: background pixels with a depth, in thousands; ``within_percent``:
-    errors of the phase within the stated standard uncertainty, 68 of a normal distribution. Both are None where no order is
-    right."""
+    errors of the phase within the stated standard uncertainty, 68 of a normal distribution. Both are None where no
+    order is right."""
     scene = sample.scene.single()
     layer = geometry.layer.at(scene.crop)
     steps, inside = np.array(STEPS, np.int32)[answers.logits.argmax(axis=0)], decided_mask(answers, scene, threshold)

@@ -165,6 +165,7 @@ class WindowTraining(training.Training):
         network = recipe.network()
         network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         if start is not None:
+            start = start.stating_scale()
             if start.options != network.options:
                 raise TrainingError(f"weights to start from: expected {network.options}, got {start.options}")
             network.load_state_dict(start.state_dict())
