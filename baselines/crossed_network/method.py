@@ -61,7 +61,7 @@ class CrossedNetMethod(Method):
     @property
     def learned_from(self) -> dict[str, Any]:
         """Views that its training renders of the training objects."""
-        return rendered_data(self.weights_config)
+        return rendered_data(self.file.config)
 
     def measure(self, frames: Frames) -> CrossedMeasurement:
         """All maps of a captured sequence; frames that are not in `frames_used` may be None."""

@@ -138,7 +138,7 @@ class PhaseNetMethod(Method):
     @property
     def learned_from(self) -> dict[str, Any]:
         """Views that its training renders of the training objects."""
-        return rendered_data(self.weights_config)
+        return rendered_data(self.file.config)
 
     def measure(self, frames: Frames) -> Measurement:
         """All maps of a captured sequence; frames that are not in `frames_used` may be None."""

@@ -21,6 +21,8 @@ DOUBTED = (0.2, 0.1, 0.05, 0.02, 0.01, 5e-3, 2e-3, 1e-3, 5e-4, 2e-4, 1e-4, 5e-5,
 MOST_CONFIDENT = 0.0005  # share of a light's object pixels that may be wrong and not doubted: half of what is aimed at
 EDGES = (0, 1e-5, 1e-4, 1e-3, 3e-3, 1e-2, 3e-2, 0.1, 0.2, 0.3, 0.4, 0.5, 1.01)  # of the bins of the reliability curve
 
+Lines = dict[str, tuple[Sequence[float], Sequence[float]]]
+
 
 @dataclass(frozen=True)
 class Odds:
@@ -103,9 +105,10 @@ def draw_reliability(path: Path, judged: Sequence[Judged], temperature: float) -
     """Picture of `reliability`: how often orders are wrong over how often they are said to be, in percent."""
     rows = reliability(judged, temperature)
     stated, seen, share = ([100 * row[column] for row in rows] for column in range(3))
-    curve = {"validation": (stated, seen), "calibrated": ([0, 60], [0, 60])}
+    curve: Lines = {"validation": (stated, seen), "calibrated": ([0, 60], [0, 60])}
+    shares: Lines = {"_": (stated, share)}
     panels = [
         Panel("wrong orders, %", "stated chance of a wrong order, %", curve),
-        Panel("share of the object pixels, %", "stated chance of a wrong order, %", {"_": (stated, share)}, log=True),
+        Panel("share of the object pixels, %", "stated chance of a wrong order, %", shares, log=True),
     ]
     draw_curves(path, "How often an order is wrong, and how often it is said to be", panels)

@@ -120,7 +120,7 @@ class NetworkRoute:
             order = order + np.rint((moved - phase) / TAU).astype(np.int32)
         uncertainty = np.float32(EXPECTED_SHARE) * answers.sigma_rad if levers.phase else observation.uncertainty_rad
         seen = replace(observation, inside=inside, phase_rad=phase, uncertainty_rad=uncertainty)
-        least_margin = OPEN_MARGIN if levers.order and not levers.shading else 0.0
+        least_margin = OPEN_MARGIN if levers.order and not levers.shading else -np.inf
         return route.conclude(seen, order, margin, least_margin)
 
     def _order(

@@ -94,7 +94,7 @@ def mean_scores(
     rows = [score(answer, sample, geometries[sample.direction], threshold) for answer, sample in pairs]
     means: dict[str, float] = {}
     for key in rows[0] if rows else ():
-        values = [row[key] for row in rows if row[key] is not None]
+        values = [value for row in rows if (value := row[key]) is not None]
         means |= {key: float(np.mean(values))} if values else {}
     return means
 

@@ -134,7 +134,7 @@ class PhaseRoute:
 
     def conclude(
         self, observation: Observation, order: NDArray[np.int32], margin: NDArray[np.floating],
-        least_margin: float = 0.0,
+        least_margin: float = -np.inf,
     ) -> Measurement:  # fmt: skip
         """The measurement that follows from an ``order`` int32 for each pixel of the observation's crop (h, w);
         ``margin`` (h, w): how clearly that order won, 0 for a tie, 1 or more for a clear choice (see `orders.Chooser`).
