@@ -32,9 +32,9 @@ class Answers:
         return replace(self, logits=self.logits + np.array([0, lead, 0], np.float32)[:, None, None])
 
 
-def probabilities(logits: Image, temperature: float = 1.0) -> Image:
+def probabilities(logits: Image) -> Image:
     """Of the three candidates, (3, ...), from their logits (3, ...)."""
-    chances = np.exp((logits - logits.max(axis=0)) / np.float32(temperature))
+    chances = np.exp(logits - logits.max(axis=0))
     return chances / chances.sum(axis=0)  # type: ignore[no-any-return]
 
 

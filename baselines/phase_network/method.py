@@ -115,7 +115,7 @@ class PhaseNetMethod(Method):
         bounds = trained_period_px / PERIOD_TOLERANCE, trained_period_px * PERIOD_TOLERANCE
         periods = Periods(bounds[0], trained_period_px, bounds[1])
         config = self.file.config
-        odds = Odds(config.temperature, config.doubted)
+        odds = Odds(config.temperature, config.offset, config.doubted)
         self.route = NetworkRoute(
             rig, self.options, self.file.network, config.threshold, replace(levers or Levers(), shading=shading),
             config.lead, odds, periods,
@@ -132,6 +132,7 @@ class PhaseNetMethod(Method):
             "direction": direction, "albedo": learned, "shading": shading, "order_by_range": self.by_range,
             "min_confidence": min_confidence, "weights": config.name, "weights_sha256": self.file.sha256,
             "mask_threshold": config.threshold, "order_lead": config.lead, "temperature": config.temperature,
+            "offset": config.offset,
             "doubted": config.doubted, "threads": threads, "white_grey": white_grey, "ambient_grey": ambient_grey,
         }  # fmt: skip
 

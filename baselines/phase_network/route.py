@@ -22,7 +22,8 @@ from fpp_ml_bench.baselines.phase_network.odds import Odds, margin_of, wrong_cha
 from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask, Measurement, Observation, Settings, wrapped
 from fpp_ml_bench.optics import Rig
 
-OPEN_MARGIN = 0.1  # least margin of an order that gets a depth where brightness can't tell it
+OPEN_MARGIN = 1e-6
+"""Least margin of an order that gets a depth where brightness can't tell it: a wrong one is less likely than not."""
 EXPECTED_SHARE = float(np.sqrt(2 / np.pi))  # expected size of a normal error, in standard deviations
 DENIED = 5.0  # a pixel of the measured route's mask stays object unless its logit is this far below the threshold
 

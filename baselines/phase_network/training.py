@@ -222,11 +222,12 @@ def train_phase_net(
         pairs = zip(led, validation, strict=True)
         seen = [judged(one, sample, geometries[sample.direction], threshold) for one, sample in pairs]
     odds = chosen_odds(seen)
-    draw_reliability(out / RELIABILITY, seen, odds.temperature)
+    draw_reliability(out / RELIABILITY, seen, odds)
     means["confident_percent"] = 100 * max(confident_shares(seen, odds).values())
     config = training.NetConfig(
         name=recipe.weights_name, title=f"Fringe order, mask and bounded phase correction, {recipe.albedo} albedo",
-        options=network.options, threshold=threshold, lead=lead, temperature=odds.temperature, doubted=odds.doubted,
+        options=network.options, threshold=threshold, lead=lead, temperature=odds.temperature, offset=odds.offset,
+        doubted=odds.doubted,
         period_px={direction: g.route.period_px for direction, g in geometries.items()},
         dataset_fingerprint=fingerprint, benchmark=training.TrainingBenchmark("phase-net views", 1),
         steps=recipe.steps, recipe=described, validation=dict(means),
