@@ -37,8 +37,8 @@ def sample_of(
     shading: bool = True,
 ) -> Sample | None:  # fmt: skip
     """Sample of an image uint8 (H, W), its true depth in mm, 0 = background, and its ``void`` pixels (H, W), which
-    count nowhere; None where nothing calibrates its brightness, or no object is
-    seen. ``shading``: as of `Scene.of`."""
+    count nowhere; None where nothing calibrates its brightness, or no object is seen. ``shading``: as of
+    `Scene.of`."""
     observation = geometry.route.observe(image)
     if not observation.background.calibrated or not observation.inside.any():
         return None
