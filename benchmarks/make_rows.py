@@ -49,7 +49,11 @@ METHODS: dict[str, tuple[object, ...]] = {
     **{
         f"phase-{n:02d}-{direction}": ("phase", "--frames", n, "--fringe", direction) for n, direction in SEVERAL_FRAMES
     },
-    **{f"phase-net-{direction}": ("phase-net", "--fringe", direction) for direction in ("horizontal", "vertical")},
+    **{
+        f"phase-net{suffix}-{direction}": ("phase-net", "--fringe", direction, *words)
+        for suffix, words in {"": (), "-any": ("--albedo", "any")}.items()
+        for direction in ("horizontal", "vertical")
+    },
     **{
         f"{name}{against}": words
         for against in ("", "-exact")

@@ -19,7 +19,7 @@ from phase_pictures import draw_panels
 from phase_route_stages import SHOWN
 
 from fpp_ml_bench.baselines.networks import load
-from fpp_ml_bench.baselines.phase_network import DEFAULT, AnsweredObservation, Levers, NetworkRoute, PhaseNetMethod
+from fpp_ml_bench.baselines.phase_network import AnsweredObservation, Levers, NetworkRoute, PhaseNetMethod
 from fpp_ml_bench.baselines.phase_route import TAU, Measurement
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.loaders.storage import DatasetFolder
@@ -40,7 +40,7 @@ VARIANTS: dict[str, Levers] = {
     "the same, correction within pi / 4": Levers(bound_rad=np.pi / 4),
     "the same, correction within pi / 8": Levers(bound_rad=np.pi / 8),
 }
-BLIND = "the same, without brightness"
+BLIND = "weights for any albedo"
 HYBRID = "order from a UNet's depth (unet-global-rmse, 224 px), nothing else learned"
 COLUMNS = ("mean", "median view", "wrong order %", "right-order", "missed %", "background", "CPU seconds")
 
@@ -139,19 +139,19 @@ def main() -> None:
     parser.add_argument("dataset", type=Path)
     parser.add_argument("--split", default="test")
     parser.add_argument("--fringe", default="horizontal", choices=("horizontal", "vertical"))
-    parser.add_argument("--weights", metavar="NAME|FILE", help="default: phase-net, as shipped")
+    parser.add_argument("--weights", metavar="NAME|FILE", help="default: those for one albedo, as shipped")
     parser.add_argument("--per-object", action="store_true")
     parser.add_argument("--brief", action="store_true", help="only phase-net and the same with nothing learned")
     parser.add_argument("--hybrid", action="store_true", help="also the order from the depth of a UNet")
-    parser.add_argument("--blind", action="store_true", help="also without brightness")
+    parser.add_argument("--blind", action="store_true", help="also the weights for any albedo")
     parser.add_argument("--every", type=int, default=1, help="only every n-th sample")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="also write the pictures there")
     args = parser.parse_args()
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     dataset = DatasetFolder(args.dataset)
-    method = PhaseNetMethod(dataset.rig, args.fringe, args.weights or DEFAULT)
-    blind = PhaseNetMethod(dataset.rig, args.fringe, method.file, shading=False) if args.blind else None
+    method = PhaseNetMethod(dataset.rig, args.fringe, args.weights)
+    blind = PhaseNetMethod(dataset.rig, args.fringe, albedo="any") if args.blind else None
     predict_depth = unet(dataset.size) if args.hybrid else None
     variants = {title: VARIANTS[title] for title in ((NOTHING_LEARNED, FULL) if args.brief else VARIANTS)}
     rows: dict[str, list[dict[str, float]]] = {}

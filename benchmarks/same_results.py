@@ -69,8 +69,8 @@ METHODS = (
     "phase mini --prior standoff", "phase mini --no-shading", "phase mini --min-confidence 0.5",
     "phase three --split all", "phase shadows", "phase varied", "phase noisy", "phase own-mesh --split all",
     "phase vertical --fringe vertical",
-    "phase-net mini", "phase-net mini --fringe vertical", "phase-net mini --no-shading",
-    "phase-net mini --weights phase-net", "phase-net mini --frames 2", "phase-net three", "phase-net noisy",
+    "phase-net mini", "phase-net mini --fringe vertical", "phase-net mini --albedo any",
+    "phase-net mini --weights phase-net-one-albedo", "phase-net mini --frames 2", "phase-net three", "phase-net noisy",
     "phase-net deep --min-confidence 0.5", "unet-global-rmse small", "unet-global-rmse mini",
     "unet-global-rmse small --range mean", "unet-individual-rmse small", "unet-individual-rmse small --range oracle",
     "unet-individual-rmse small --range mean", "unet-individual-rmse three --split all --frame 20",
@@ -222,10 +222,9 @@ def train(recorder: Recorder) -> None:
             model = recorder.work / out / "model.safetensors"
             weights = "model" if model.exists() else "weights"
             recorder.predict("train", f"{out}/{weights}.safetensors small", number)
-    for name, options in {"plain": "--unions 0", "unions": "--unions 1 --rate 0.002 --extra varied"}.items():
-        out = f"runs/phase-net-{name}"
-        recorder.run("train", f"fpp-bench train phase-net small --steps 2 {options} --out {out}", out)
-    recorder.predict("train", "phase-net small --weights runs/phase-net-plain/phase-net.safetensors", 99)
+    out = "runs/phase-net"
+    recorder.run("train", f"fpp-bench train phase-net --steps 2 --lights 0 --unions 0 --out {out}", out)
+    recorder.predict("train", f"phase-net small --weights {out}/phase-net-one-albedo.safetensors", 99)
     recorder.run("train", "fpp-bench train loss/l1 mini --out runs/refused")
     recorder.run("train", "fpp-bench train loss/none small --out runs/refused")
     recorder.run("train", "fpp-bench reproduce --list", output=True)

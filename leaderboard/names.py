@@ -79,8 +79,10 @@ def _phase(submission: Submission) -> str:
 
 
 def _phase_net(submission: Submission) -> str:
-    shading = "" if submission.settings["shading"] else ", no shading"
-    return f"{printable(submission.settings['weights'])}, 1 {_direction(submission)}{shading}"
+    settings = submission.settings
+    weights, albedo = str(settings["weights"]), settings.get("albedo", "one")
+    name = printable(weights.removesuffix(f"-{albedo}-albedo"))
+    return f"{name}, 1 {_direction(submission)}" + ("" if settings["shading"] else f", {albedo} albedo")
 
 
 def _crossed(submission: Submission) -> str:

@@ -11,7 +11,7 @@ from fpp_ml_bench.baselines.crossed_network.route import CrossedNetRoute
 from fpp_ml_bench.baselines.crossed_route import CrossedMeasurement, Settings, crossed_image, frames_of
 from fpp_ml_bench.baselines.method import Answer, Frames, Method
 from fpp_ml_bench.baselines.networks import torch_threads
-from fpp_ml_bench.baselines.phase_network import NetFile, load_net
+from fpp_ml_bench.baselines.phase_network import NetFile, load_net, rendered_data
 from fpp_ml_bench.baselines.phase_route import Periods
 from fpp_ml_bench.baselines.training import NetConfig
 from fpp_ml_bench.errors import PredictionError
@@ -61,9 +61,7 @@ class CrossedNetMethod(Method):
     @property
     def learned_from(self) -> dict[str, Any]:
         """Views that its training renders of the training objects."""
-        recipe = self.weights_config.recipe
-        lights = f"training objects in the light paper and {recipe.get('lights')} drawn ones, seed {recipe.get('seed')}"
-        return {"data": "generated", "versions": [lights]}
+        return rendered_data(self.file.config)
 
     def measure(self, frames: Frames) -> CrossedMeasurement:
         """All maps of a captured sequence; frames that are not in `frames_used` may be None."""

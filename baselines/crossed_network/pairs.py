@@ -4,8 +4,6 @@ A control: the paper's networks in the same drawn lights. Their input is standar
 absolute grey level reaches them either.
 """
 
-import hashlib
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -13,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines import training
-from fpp_ml_bench.baselines.crossed_network.training import CrossedRecipe, described_groups
-from fpp_ml_bench.baselines.crossed_network.views import View, groups_of, read, render
+from fpp_ml_bench.baselines.crossed_network.training import CrossedRecipe
+from fpp_ml_bench.baselines.training import View
 from fpp_ml_bench.depth import Normalisation, object_mask
 from fpp_ml_bench.errors import RecipeError
 from fpp_ml_bench.loaders.training import FringeDepthDataset
@@ -27,10 +25,10 @@ class ViewSource:
     def __init__(self, views: list[View], fingerprint: str) -> None:
         self.fingerprint = fingerprint
         self._views = {f"{view.group}-{view.name}": view for view in views}
-        self.samples, self.size = list(self._views), views[0].grey.shape
+        self.samples, self.size = list(self._views), views[0].depth_mm.shape
 
     def frame(self, sample: str, index: int) -> NDArray[np.uint8]:
-        return self._views[sample].grey
+        return self._views[sample].frames[index]
 
     def depth_mm(self, sample: str) -> NDArray[np.float32]:
         return self._views[sample].depth_mm
@@ -67,14 +65,13 @@ def view_pairs(
     """Training and validation pairs of ``recipe.size`` px in ``folder``, rendered where it lacks them, in the lights
     of ``views`` (default: those of crossed-net). Raises `TrainingError` for a folder that can't be used."""
     drawn, rig = views or CrossedRecipe(), crossed_rig(recipe.size)
-    groups = groups_of(drawn.lights, drawn.views_a_light, drawn.seed)
-    told = {"rig": rig.to_dict(), "groups": described_groups(groups)}
-    fingerprint = hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+    groups = training.groups_of(drawn.lights, drawn.views_a_light, drawn.seed)
+    fingerprint = training.fingerprint_of({"rig": rig.to_dict()}, groups)
     training.claim_folder(folder, {"views": "crossed", "dataset_fingerprint": fingerprint})
     with training.Display("rendering views", sum(len(group.views) for group in groups), show) as display:
-        render(groups, rig, folder, workers, display.advance)
+        training.render_views(groups, rig, rig.sequence.crossed_frames[:1], folder, workers, display.advance)
     learnt, checked = (
-        ViewPairs(ViewSource(list(read(folder, groups, split)), fingerprint), recipe.normalisation)
+        ViewPairs(ViewSource(list(training.read_views(folder, groups, split)), fingerprint), recipe.normalisation)
         for split in ("train", "validation")
     )
     return learnt, checked

@@ -1,10 +1,8 @@
 """The learned crossed route: measured candidates, the network's order, mask, bounded correction and its scale."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
@@ -17,68 +15,33 @@ from fpp_ml_bench.baselines.crossed_route import (
     CrossedRoute,
     Settings,
 )
-from fpp_ml_bench.baselines.phase_network import PhaseNet
-from fpp_ml_bench.baselines.phase_route import (
-    LARGE,
-    Image,
-    Mask,
-    Periods,
-    least_energy,
-    links_between,
-    of_choice,
-    repeated,
-)
+from fpp_ml_bench.baselines.phase_network import Answers, PhaseNet, answers_of_maps, least_energy_order, probabilities
+from fpp_ml_bench.baselines.phase_route import Image, Mask, Periods, of_choice
 from fpp_ml_bench.optics import Rig
 
-GRAPH = 3.0  # weight of smoothness between neighbours in the labelling of the orders
 DENIED = 6.0  # a pixel of the measured mask stays object unless its logit is this far below the threshold
 WEAK, STRONG = 10.0, 40.0
 """Strengths of a scene (see `Scene`) from which on its mask's threshold is `SPREAD` below or above the network's."""
 SPREAD = 1.5
 PERHAPS = 4.0  # a pixel whose logit is this far below the threshold still takes part in the labelling of orders
 LEAST_CHANCE = 1e-6  # of a wrong order, whatever the network answers
-SCALE_TO_SIGMA = float(np.sqrt(2))  # of a Laplace distribution
 STATED_FLOOR_RAD, STATED_SHARE, LEAST_STATED = 0.02, 0.8, 0.45
 """Of the network's scale as a sigma: what it states even where its error is a third of that, since it learned in lights
 most of which are noisier; the share of the rest that is right; and the least share of it that is stated. Chosen on
 validation views for the weights that come with the package."""
 
 
-@dataclass(frozen=True)
-class Answers:
-    """The network's answers, maps (h, w) of the scene's crop: ``logits`` (3, h, w) of the turn further, the base and
-    the turn nearer, -inf where there is none; ``object_logit``; ``correction_rad`` of the joint phase; ``sigma_rad``:
-    its standard uncertainty."""
-
-    logits: Image
-    object_logit: Image
-    correction_rad: Image
-    sigma_rad: Image
-
-
 def network_answers(network: PhaseNet, scene: Scene, carriers: Carriers, lead: float = 0.0) -> Answers:
-    """Run ``network`` on a scene; ``lead`` is added to the base's logit: training makes up wrong base orders, so that
-    the network holds the base wrong more often than it is."""
-    x, exists = channels(scene, carriers)
-    _, height, width = x.shape
-    padded = np.pad(x, ((0, 0), (0, -height % network.stride), (0, -width % network.stride)))
-    with torch.inference_mode():
-        batch = torch.from_numpy(padded)[None].contiguous(memory_format=torch.channels_last)
-        order, inside, correction, scale = (out[0, ..., :height, :width].numpy() for out in network(batch))
-    answers = Answers(np.where(exists, order, -np.inf), inside, correction, stated_rad(scale))
-    return with_lead(answers, lead)
+    """Run ``network`` on a scene; ``lead``: see `Answers.with_lead`."""
+    answers = answers_of_maps(network, *channels(scene, carriers))
+    return replace(answers, sigma_rad=stated_rad(answers.sigma_rad)).with_lead(lead)
 
 
-def stated_rad(log_scale: Image) -> Image:
-    """Standard uncertainty in rad of the joint phase from the network's logarithm of its scale."""
-    sigma = np.float32(SCALE_TO_SIGMA) * np.exp(log_scale)
-    least = (np.float32(LEAST_STATED) * sigma) ** 2
-    return np.float32(STATED_SHARE) * np.sqrt(np.maximum(sigma**2 - np.float32(STATED_FLOOR_RAD**2), least))
-
-
-def with_lead(answers: Answers, lead: float) -> Answers:
-    """``answers`` with ``lead`` added to the base's logit."""
-    return replace(answers, logits=answers.logits + np.array([0, lead, 0], np.float32)[:, None, None])
+def stated_rad(sigma_rad: Image) -> Image:
+    """Standard uncertainty in rad of the joint phase from that of the network's scale."""
+    least = (np.float32(LEAST_STATED) * sigma_rad) ** 2
+    rest = np.maximum(sigma_rad**2 - np.float32(STATED_FLOOR_RAD**2), least)
+    return np.float32(STATED_SHARE) * np.sqrt(rest)  # type: ignore[no-any-return]
 
 
 def threshold_in(scene: Scene, threshold: float) -> float:
@@ -95,31 +58,11 @@ def decided_mask(answers: Answers, scene: Scene, threshold: float) -> Mask:
     return (logit > threshold) | (scene.inside & (logit > threshold - DENIED))
 
 
-def probabilities(answers: Answers) -> Image:
-    """Of the three orders, (3, h, w)."""
-    chances = np.exp(answers.logits - answers.logits.max(axis=0))
-    return chances / chances.sum(axis=0)  # type: ignore[no-any-return]
-
-
 def decided_order(answers: Answers, scene: Scene, carriers: Carriers, inside: Mask, stride: int) -> NDArray[np.intp]:
-    """Index of each pixel's order by least energy on a grid of every ``stride``-th pixel, (h, w)."""
-    chances = probabilities(answers)
-    weight, size, grid = inside.astype(np.float32), (stride, stride), slice(None, None, stride)
-    cost = np.stack([cv2.blur((-np.log(p + 1e-9) * weight).astype(np.float32), size) for p in chances])
-    cost = (cost / np.maximum(cv2.blur(weight, size), 1e-3))[:, grid, grid] * np.float32(stride**2)
-    points = inside[grid, grid]
-    psi = (scene.nearness * carriers.at(scene.crop).joint_gain)[grid, grid]
-    further, nearer = scene.step_rad[:, grid, grid]
-    phases = np.stack([psi + further, psi, psi + nearer]).astype(np.float32)
-    link_x, link_y = (link * np.float32(GRAPH * stride) for link in links_between(points))
-    cost = np.where(points, np.minimum(cost, LARGE), 0).astype(np.float32)
-    choice, _ = least_energy(cost, phases, link_x, link_y, JUMP_RAD)
-    # A pixel takes the turn that is nearest to what its grid point chose.
-    chosen_rad = repeated(of_choice(phases, choice), stride, inside.shape)
-    own = scene.nearness * carriers.at(scene.crop).joint_gain
-    offered = np.stack([own + scene.step_rad[0], own, own + scene.step_rad[1]])
-    apart = np.where(np.isfinite(answers.logits), np.abs(offered - chosen_rad), np.inf)
-    return apart.argmin(axis=0)
+    """Index of each pixel's order (h, w): `least_energy_order` of the joint phase."""
+    psi = scene.nearness * carriers.at(scene.crop).joint_gain
+    offers = np.stack([psi + scene.step_rad[0], psi, psi + scene.step_rad[1]])
+    return least_energy_order(probabilities(answers.logits), offers, inside, stride, JUMP_RAD)
 
 
 class CrossedNetRoute:
@@ -155,7 +98,7 @@ class CrossedNetRoute:
         if known.any() and not known[inside].all():  # beyond the reach of any window: as the nearest pixel within it
             y, x = distance_transform_edt(~known, return_distances=False, return_indices=True)
             nearness = nearness[y, x]
-        chances = probabilities(answers)
+        chances = probabilities(answers.logits)
         wrong = np.clip(1 - of_choice(chances, choice), LEAST_CHANCE, 1)
         np.put_along_axis(chances, choice[None], -1, axis=0)
         rival = (scene.nearness + of_choice(offers, chances.argmax(axis=0)) / joint).astype(np.float32)

@@ -1,10 +1,5 @@
-"""Training samples of crossed-net: the measured route's scene of each view, with the truth; and windows of them.
+"""Training samples of crossed-net: the measured route's scene of each view, with the truth; and windows of them."""
 
-Views in one light are also united: the nearest surface of two or three objects at every pixel, for depth jumps and
-creases that no single object has.
-"""
-
-from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -13,10 +8,10 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.crossed_network import inputs
 from fpp_ml_bench.baselines.crossed_network.inputs import Scene
-from fpp_ml_bench.baselines.crossed_network.views import View
 from fpp_ml_bench.baselines.crossed_route import Carriers, CrossedRoute
-from fpp_ml_bench.baselines.phase_network import IGNORED, Window, companions, place_of, united
+from fpp_ml_bench.baselines.phase_network import IGNORED, Window, place_of
 from fpp_ml_bench.baselines.phase_route import Image, Mask
+from fpp_ml_bench.baselines.training import View
 from fpp_ml_bench.depth import depth_edges
 
 EDGE_POINTS = 2000  # pixels near depth edges that a sample holds, as centres of training windows
@@ -40,7 +35,7 @@ class Sample:
 
 def sample_of(view: View, route: CrossedRoute) -> Sample:
     """The sample of a view; its void pixels are no target, and no background either."""
-    seen = route.observe(view.grey)
+    seen = route.observe(view.frames[0])
     crop = seen.carriers.crop
     depth_mm, void = view.depth_mm[crop], view.void[crop]
     target = (depth_mm > 0) & ~void
@@ -50,42 +45,6 @@ def sample_of(view: View, route: CrossedRoute) -> Sample:
     sampled = np.random.default_rng(0).permutation(len(places))[:EDGE_POINTS]
     scene = Scene.of(seen).single(np.float16)
     return Sample(view.name, scene, np.clip(missing, -100, 100).astype(np.float16), target, void, places[sampled])
-
-
-def samples_of(
-    views: Iterable[View], route: CrossedRoute, unions: int, seed: int, progress: Callable[[int], None] = lambda n: None
-) -> list[Sample]:
-    """Samples of ``views``, group after group, and ``unions`` for each with others of its group."""
-    samples: list[Sample] = []
-    group: list[View] = []
-
-    def unite() -> None:
-        objects = {view.name: view.object_name for view in group}
-        by_name = {view.name: view for view in group}
-        for number, view in enumerate(group):
-            for copy in range(unions):
-                random = np.random.default_rng([seed, len(samples), number, copy])
-                members = [view, *(by_name[name] for name in companions(objects, view.name, random))]
-                if len(members) > 1:
-                    samples.append(sample_of(_union(members), route))
-                progress(1)
-        group.clear()
-
-    for view in views:
-        if group and view.group != group[-1].group:
-            unite()
-        group.append(view)
-        samples.append(sample_of(view, route))
-        progress(1)
-    unite()
-    return samples
-
-
-def _union(members: list[View]) -> View:
-    grey, depth_mm = united([view.grey for view in members], [view.depth_mm for view in members])
-    ranges = np.stack([np.where(view.depth_mm > 0, view.depth_mm, np.inf) for view in members])
-    void = np.take_along_axis(np.stack([view.void for view in members]), ranges.argmin(axis=0)[None], axis=0)[0]
-    return View("+".join(view.name for view in members), members[0].object_name, members[0].group, grey, depth_mm, void)
 
 
 @dataclass(frozen=True)

@@ -4,26 +4,30 @@
 stopped training continues at every stage.
 """
 
-import hashlib
-import json
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
 from fpp_ml_bench.baselines import training
 from fpp_ml_bench.baselines.crossed_network.inputs import CHANNELS
-from fpp_ml_bench.baselines.crossed_network.route import Answers, decided_mask, network_answers, with_lead
-from fpp_ml_bench.baselines.crossed_network.samples import Sample, Variation, draw, samples_of
-from fpp_ml_bench.baselines.crossed_network.views import Group, groups_of, read, render
+from fpp_ml_bench.baselines.crossed_network.route import decided_mask, network_answers
+from fpp_ml_bench.baselines.crossed_network.samples import Sample, Variation, draw, sample_of
 from fpp_ml_bench.baselines.crossed_route import Carriers, CrossedRoute
-from fpp_ml_bench.baselines.phase_network import TYPICAL_MM, PhaseNet, WindowRecipe, WindowTraining, load_net, save_net
+from fpp_ml_bench.baselines.phase_network import (
+    TYPICAL_MM,
+    Answers,
+    PhaseNet,
+    Trained,
+    WindowRecipe,
+    WindowTraining,
+    load_net,
+    save_net,
+)
 from fpp_ml_bench.baselines.phase_route import of_choice
-from fpp_ml_bench.errors import RecipeError
 from fpp_ml_bench.optics import Rig, crossed_rig
 
 WEIGHTS, VIEWS = "crossed-net.safetensors", "views"
@@ -37,44 +41,18 @@ VALIDATED_SHARE = 3  # every so many-th validation view is scored during trainin
 
 @dataclass(frozen=True)
 class CrossedRecipe(WindowRecipe):
-    """``lights`` that are drawn, ``views_a_light`` of training objects in each, and ``unions`` for every view (see
-    `views` and `samples`); ``weight_scale``: of the loss of the stated uncertainty; ``vary``: how windows vary."""
+    """``vary``: how windows vary; the others as of `WindowRecipe`."""
 
     name: str = "crossed-net"
     steps: int = 6000
     lights: int = 48
     views_a_light: int = 10
-    unions: int = 1
     weight_mask: float = 1.0
-    weight_scale: float = 0.1
     vary: Variation = field(default_factory=Variation)
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if not (self.lights >= 0 and 1 <= self.views_a_light <= 40 and 0 <= self.unions <= 100):
-            raise RecipeError(
-                f"lights {self.lights!r}, views_a_light {self.views_a_light!r}, unions {self.unions!r}: expected 0 and "
-                "more, 1 to 40, 0 to 100"
-            )
-
     @property
-    def weights(self) -> dict[str, float]:
-        return super().weights | {"scale": self.weight_scale}
-
-    def network(self) -> PhaseNet:
-        return PhaseNet(
-            self.widths, self.fine, self.squeezed, self.order_widths, self.bound_rad, len(CHANNELS), uncertain=True
-        )
-
-
-@dataclass(frozen=True)
-class Trained:
-    """The weights file (None for a training that stopped because its minutes were over) and validation scores."""
-
-    weights: Path | None
-    steps: int
-    threshold: float
-    validation: dict[str, float]
+    def channels(self) -> int:
+        return len(CHANNELS)
 
 
 def train_crossed_net(
@@ -84,9 +62,9 @@ def train_crossed_net(
     """Train for ``rig`` (default: `optics.crossed_rig`); the same call resumes a training that was stopped. ``show``:
     progress on stderr. Raises `TrainingError` for a folder of another recipe or rig."""
     started, rig = perf_counter(), rig or crossed_rig()
-    groups = groups_of(recipe.lights, recipe.views_a_light, recipe.seed)
+    groups = training.groups_of(recipe.lights, recipe.views_a_light, recipe.seed)
     described = recipe.to_dict() | {"rig": rig.to_dict()}
-    fingerprint = hashlib.sha256(json.dumps([described, described_groups(groups)], sort_keys=True).encode()).hexdigest()
+    fingerprint = training.fingerprint_of(described, groups)
     training.claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
     weights = out / WEIGHTS
     if weights.exists():
@@ -95,14 +73,16 @@ def train_crossed_net(
         return Trained(weights, finished.steps, finished.threshold, known)
     views = sum(len(group.views) for group in groups)
     with training.Display("rendering views", views, show) as display:
-        render(groups, rig, out / VIEWS, workers, display.advance)
+        (frame, *_) = rig.sequence.crossed_frames
+        training.render_views(groups, rig, (frame,), out / VIEWS, workers, display.advance)
     route = CrossedRoute(rig)
     learnt = sum(len(group.views) for group in groups if group.split == "train")
     with training.Display("measuring views", views + learnt * recipe.unions, show) as display:
-        samples = samples_of(
-            read(out / VIEWS, groups, "train"), route, recipe.unions, recipe.seed, display.advance
-        )  # fmt: skip
-        validation = samples_of(read(out / VIEWS, groups, "validation"), route, 0, recipe.seed, display.advance)
+        learned = training.read_views(out / VIEWS, groups, "train")
+        united = training.with_unions(learned, recipe.unions, recipe.seed, display.advance)
+        samples = [sample_of(view, route) for view in united]
+        kept = training.with_unions(training.read_views(out / VIEWS, groups, "validation"), 0, 0, display.advance)
+        validation = [sample_of(view, route) for view in kept]
     carriers = route.carriers
 
     def scores(network: PhaseNet) -> dict[str, float]:
@@ -123,7 +103,7 @@ def train_crossed_net(
         learned = [network_answers(network, sample.scene.single(), carriers) for sample in some]
         threshold = chosen_threshold(answers + learned, validation + some, pixels)
         lead = chosen_lead(answers, validation, carriers)
-        led = [with_lead(one, lead) for one in answers]
+        led = [one.with_lead(lead) for one in answers]
         means = _mean([score(one, s, carriers, threshold) for one, s in zip(led, validation, strict=True)])
     config = training.NetConfig(
         name=recipe.name, title="Fringe order, mask and bounded phase correction of a crossed frame",
@@ -134,11 +114,6 @@ def train_crossed_net(
     save_net(weights, network, config)
     (out / training.CHECKPOINT).unlink(missing_ok=True)
     return Trained(weights, recipe.steps, threshold, means)
-
-
-def described_groups(groups: list[Group]) -> list[Any]:
-    """Plain data that tells one set of views from another."""
-    return [[group.name, group.split, group.light.model_dump(mode="json"), group.views] for group in groups]
 
 
 def score(answers: Answers, sample: Sample, carriers: Carriers, threshold: float = 0.0) -> dict[str, float]:
@@ -184,7 +159,7 @@ def chosen_threshold(answers: list[Answers], samples: list[Sample], pixels: int)
 def chosen_lead(answers: list[Answers], samples: list[Sample], carriers: Carriers) -> float:
     """The lead out of `LEADS` with the fewest wrong orders, mean over the samples."""
     of_leads = [
-        _mean([score(with_lead(one, lead), s, carriers) for one, s in zip(answers, samples, strict=True)])
+        _mean([score(one.with_lead(lead), s, carriers) for one, s in zip(answers, samples, strict=True)])
         for lead in LEADS
     ]
     return LEADS[int(np.argmin([means["wrong_percent"] for means in of_leads]))]

@@ -1,3 +1,7 @@
+from .answers import Answers as Answers
+from .answers import answers_of_maps as answers_of_maps
+from .answers import least_energy_order as least_energy_order
+from .answers import probabilities as probabilities
 from .inputs import LARGEST_RAD as LARGEST_RAD
 from .inputs import SIDE_PERIODS as SIDE_PERIODS
 from .inputs import SIDES as SIDES
@@ -6,13 +10,13 @@ from .method import DEFAULT as DEFAULT
 from .method import NetFile as NetFile
 from .method import PhaseNetMethod as PhaseNetMethod
 from .method import load_net as load_net
+from .method import rendered_data as rendered_data
 from .method import save_net as save_net
 from .network import PhaseNet as PhaseNet
+from .odds import Odds as Odds
 from .route import AnsweredObservation as AnsweredObservation
 from .route import Levers as Levers
 from .route import NetworkRoute as NetworkRoute
-from .samples import companions as companions
-from .samples import united as united
 from .training import TYPICAL_MM as TYPICAL_MM
 from .training import Recipe as Recipe
 from .training import Trained as Trained

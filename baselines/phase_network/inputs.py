@@ -34,7 +34,8 @@ CHANNELS = (
 FIRST_SIDE = CHANNELS.index("first guess") + 1
 FIRST_MISFIT = FIRST_SIDE + len(SIDES)
 """First of the misfit channels: of no correction, and of each proposed correction."""
-SHADING = (6, 11, 12, 13)  # channels that assume one albedo for all surfaces; 0 for predictions without brightness
+SHADING = (1, 6, 11, 12, 13)
+"""Channels that assume one albedo for all surfaces; 0 for predictions without brightness."""
 LEAST_WEIGHT = 0.02  # least share of the fit's window that must lie on the object for the fit to count
 RELIEF_RAD = 1.5  # unit of the channel ``relief``, small enough that the corrections show in it
 SINE_FLOOR = 0.1
@@ -103,10 +104,11 @@ class Geometry:
 @dataclass(frozen=True)
 class Scene:
     """The part ``crop`` of an image, maps (h, w) in the image's own orientation. ``light``: captured light without the
-    ambient light, and ``plane_light``: the empty scene's prediction of it, both as multiples of a white plane at the
-    standoff; ``noise`` in the same unit; ``inside``: mask of the measured route; ``phase_rad`` in [-pi, pi] and
-    ``order``: the base order; ``bright``: half the modulation, in units of light; ``weight``: of the fit's window;
-    ``slopes`` of the residual phase, rad a px along x and y; ``middle_rad``: median residual phase of the object."""
+    ambient light, and ``plane_light``: the empty scene's prediction of it, both as multiples of a plane like the
+    background at the standoff, or of the object's median brightness; ``noise`` in the same unit; ``inside``: mask of
+    the measured route; ``phase_rad`` in [-pi, pi] and ``order``: the base order; ``bright``: half the modulation, in
+    units of light; ``weight``: of the fit's window; ``slopes`` of the residual phase, rad a px along x and y;
+    ``middle_rad``: median residual phase of the object."""
 
     crop: phase_route.Crop
     light: Image
@@ -121,13 +123,14 @@ class Scene:
     middle_rad: float
 
     @classmethod
-    def of(cls, observation: Observation, order: NDArray[np.int32]) -> "Scene":
-        """From an observation of the measured route, with that route's ``order`` (h, w) as the base order."""
+    def of(cls, observation: Observation, order: NDArray[np.int32], shading: bool = True) -> "Scene":
+        """From an observation of the measured route, with that route's ``order`` (h, w) as the base order. ``shading``:
+        whether the unit of light is that of the background, which tells distances of surfaces with its albedo."""
         background, fit = observation.background, observation.fit
         standoff_m2, on_fringe = observation.rig.standoff_m**2, observation.inside & (fit.brightness > 0)
-        # Without a calibration the object itself is taken for a white plane at the standoff; orders are ambiguous then.
         typical = float(np.median(fit.brightness[on_fringe])) if on_fringe.any() else 1.0
-        unit = np.float32(standoff_m2 / (background.strength / 2) if background.calibrated else 1.0 / typical)
+        by_background = shading and background.calibrated
+        unit = np.float32(standoff_m2 / (background.strength / 2) if by_background else 1.0 / max(typical, 1.0))
         light = (observation.greys[0] - np.float32(background.ambient_grey)) * unit
         residual = observation.layer.residual_phase(observation.phase_rad, order)
         on_object = observation.inside & np.isfinite(residual)
@@ -161,8 +164,9 @@ def coarse_irradiance(scene: Scene, geometry: Geometry, residuals_rad: Sequence[
 
 
 def channels(scene: Scene, geometry: Geometry, shading: bool = True) -> tuple[Image, Mask]:
-    """Input of the network (`CHANNELS`, h', w') float32, rotated, and which candidates exist, bool (3, h', w'): the
-    base order always does, also outside the working range. Without ``shading`` those that assume one albedo are 0."""
+    """Input of the network (`CHANNELS`, h', w') float32, rotated, and which candidates exist, bool (3, h', w'): those
+    in the working range, so that a single one settles the order, or the base where none is. Without ``shading`` the
+    maps that assume one albedo are 0."""
     rig, rotation, layer = geometry.rig, geometry.rotation, geometry.layer.at(scene.crop)
     residual = layer.residual_phase(scene.phase_rad, scene.order)
     candidates = [residual + rotation.sign * TAU * step for step in STEPS]
@@ -171,7 +175,7 @@ def channels(scene: Scene, geometry: Geometry, shading: bool = True) -> tuple[Im
         light = coarse_irradiance(scene, geometry, [candidate.astype(np.float32) for candidate in candidates])
         exists = geometry.in_range(np.stack([layer.depth_of_residual_mm(candidate) for candidate in candidates]))
     expected = phase_route.repeated((light * rig.standoff_m**2).astype(np.float32), STEP_PX, scene.light.shape)
-    exists[1] = True
+    exists[1] |= ~exists.any(axis=0)
     floor = np.float32(phase_route.LEAST_BRIGHTNESS * rig.standoff_m**2)
     bright = np.maximum(scene.bright, floor)
     with np.errstate(invalid="ignore"):

@@ -1,7 +1,8 @@
 """The learned route as a method of ``fpp-bench predict``: one captured fringe, metric depth, no range given."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.method import Answer, Frames, Method
 from fpp_ml_bench.baselines.networks import torch_threads
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
+from fpp_ml_bench.baselines.phase_network.odds import Odds
 from fpp_ml_bench.baselines.phase_network.route import Levers, NetworkRoute
 from fpp_ml_bench.baselines.phase_route import Measurement, Periods, Settings
 from fpp_ml_bench.baselines.training import PHASE_NETWORKS, NetConfig, read_file, weights_path, write_file
@@ -18,7 +20,7 @@ from fpp_ml_bench.files import printable
 from fpp_ml_bench.optics import Direction, Rig
 
 SHIPPED = Path(__file__).resolve().parent / "weights"  # folder of the weights that come with the package
-DEFAULT = "phase-net"
+DEFAULT = "phase-net-one-albedo"
 PERIOD_TOLERANCE = 2.2
 """Factor by which an image's fringe period in px may differ from that of the training images; beyond, the image is
 resampled to theirs."""
@@ -32,6 +34,13 @@ class NetFile:
     config: NetConfig
     network: PhaseNet
     sha256: str
+
+
+def rendered_data(config: NetConfig) -> dict[str, Any]:
+    """`Method.learned_from` of weights whose training renders its own views."""
+    recipe = config.recipe
+    lights = f"training objects in the light paper and {recipe.get('lights')} drawn ones, seed {recipe.get('seed')}"
+    return {"data": "generated", "versions": [lights]}
 
 
 def save_net(path: Path, network: PhaseNet, config: NetConfig) -> str:
@@ -62,26 +71,40 @@ def load_net(name_or_path: str | Path = DEFAULT, folded: bool = True, shipped: P
     return NetFile(path, config, network.folded() if folded else network, digest)
 
 
+def _shipped(albedo: str) -> str:
+    if albedo not in ("one", "any"):
+        raise PredictionError(f"albedo {albedo!r}: expected one or any")
+    return f"phase-net-{albedo}-albedo"
+
+
 class PhaseNetMethod(Method):
-    """Depth from the first sinusoid of one ``direction`` by the weights ``weights`` (a shipped name or a file).
-    ``min_confidence``: pixels below it are masked; ``shading`` False: orders without brightness, for painted objects;
+    """Depth from the first sinusoid of one ``direction``. ``albedo``: "one", where all surfaces have the background's,
+    so that brightness tells the order, or "any", where it is ambiguous unless range and shape tell it; or
+    ``weights``, a shipped name or a file, which say what they learned. ``min_confidence``: pixels below it are masked;
     ``white_grey`` and ``ambient_grey``: as of `Settings`, for images without a lit background. Raises `WeightsError`
     for weights that can't be used, and `PredictionError` for an invalid option."""
 
     name = "phase-net"
-    target = "depth"
     packages = ("numpy", "numba", "torch")
 
     def __init__(
-        self, rig: Rig, direction: Direction = "horizontal", weights: str | Path | NetFile = DEFAULT,
-        min_confidence: float = 0.0, shading: bool = True, levers: Levers | None = None, threads: int = 1,
+        self, rig: Rig, direction: Direction = "horizontal", weights: str | Path | NetFile | None = None,
+        min_confidence: float = 0.0, albedo: str | None = None, levers: Levers | None = None, threads: int = 1,
         white_grey: float | None = None, ambient_grey: float | None = None,
     ) -> None:  # fmt: skip
+        self.file = weights if isinstance(weights, NetFile) else load_net(weights or _shipped(albedo or "one"))
+        learned = self.file.config.recipe.get("albedo")
+        if learned not in ("one", "any") or not self.file.network.uncertain:
+            raise PredictionError(
+                f"{self.file.path}: expected weights that this version's fpp-bench train phase-net wrote"
+            )
+        if albedo not in (None, learned):
+            raise PredictionError(f"{self.file.path}: learned {learned} albedo, not {albedo}; leave --albedo out")
+        shading = learned == "one"
         self.options = Settings(
             direction=direction, min_confidence=min_confidence, shading=shading, white_grey=white_grey,
             ambient_grey=ambient_grey,
         )  # fmt: skip
-        self.file = weights if isinstance(weights, NetFile) else load_net(weights)
         self.rig, self.threads = rig, threads
         trained_period_px = self.file.config.period_px.get(direction)
         if trained_period_px is None:
@@ -92,21 +115,31 @@ class PhaseNetMethod(Method):
         bounds = trained_period_px / PERIOD_TOLERANCE, trained_period_px * PERIOD_TOLERANCE
         periods = Periods(bounds[0], trained_period_px, bounds[1])
         config = self.file.config
-        route_levers = levers or Levers(shading=shading)
+        odds = Odds(config.temperature, config.offset, config.doubted)
         self.route = NetworkRoute(
-            rig, self.options, self.file.network, config.threshold, route_levers, config.lead, periods
-        )
+            rig, self.options, self.file.network, config.threshold, replace(levers or Levers(), shading=shading),
+            config.lead, odds, periods,
+        )  # fmt: skip
         self.weights_config = config
         self.parameters = sum(parameter.numel() for parameter in self.file.network.parameters())
         self.frames_used = (rig.sequence.sinusoids(direction)[0],)
-        more = "" if config.name == DEFAULT else f" ({config.name})"
-        blind = "" if shading else ", without brightness"
-        self.title = f"Phase route, one {direction} fringe; order, mask and correction learned{more}{blind}"
+        more = "" if config.name == f"phase-net-{learned}-albedo" else f" ({config.name})"
+        # With a range under a period, most pixels have one order in it, whatever the network says.
+        self.by_range = rig.periods_in_range(direction) < 1
+        told = "order by range; mask" if self.by_range else "order, mask"
+        self.title = f"Phase route, one {direction} fringe, {learned} albedo; {told} and correction learned{more}"
         self.settings = {
-            "direction": direction, "shading": shading, "min_confidence": min_confidence, "weights": config.name,
-            "weights_sha256": self.file.sha256, "mask_threshold": config.threshold, "order_lead": config.lead,
-            "threads": threads, "white_grey": white_grey, "ambient_grey": ambient_grey,
+            "direction": direction, "albedo": learned, "shading": shading, "order_by_range": self.by_range,
+            "min_confidence": min_confidence, "weights": config.name, "weights_sha256": self.file.sha256,
+            "mask_threshold": config.threshold, "order_lead": config.lead, "temperature": config.temperature,
+            "offset": config.offset,
+            "doubted": config.doubted, "threads": threads, "white_grey": white_grey, "ambient_grey": ambient_grey,
         }  # fmt: skip
+
+    @property
+    def learned_from(self) -> dict[str, Any]:
+        """Views that its training renders of the training objects."""
+        return rendered_data(self.file.config)
 
     def measure(self, frames: Frames) -> Measurement:
         """All maps of a captured sequence; frames that are not in `frames_used` may be None."""

@@ -96,6 +96,16 @@ class PhaseNet(nn.Module):
                     block[number + 1] = nn.Identity()
         return network.to(memory_format=torch.channels_last)  # type: ignore[no-any-return,call-overload]
 
+    def stating_scale(self) -> "PhaseNet":
+        """The same network with an output for the scale of the phase error, untrained if it had none."""
+        if self.uncertain:
+            return self
+        network, weights = PhaseNet(**{**self.options, "uncertain": True}), self.state_dict()
+        for name in ("answer.weight", "answer.bias"):
+            weights[name] = torch.cat([weights[name], torch.zeros_like(weights[name][:1])])
+        network.load_state_dict(weights)
+        return network
+
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         if x.shape[-2] % self.stride or x.shape[-1] % self.stride:
             raise NetworkError(f"height and width: expected multiples of {self.stride}, got {tuple(x.shape[-2:])}")

@@ -5,55 +5,36 @@ The network can't give any other depth.
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines import phase_route
+from fpp_ml_bench.baselines.phase_network.answers import (
+    GRAPH,
+    Answers,
+    answers_of_maps,
+    least_energy_order,
+    probabilities,
+)
 from fpp_ml_bench.baselines.phase_network.inputs import LEAST_WEIGHT, STEPS, Geometry, Scene, channels
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask, Measurement, Observation, Settings, of_choice, wrapped
+from fpp_ml_bench.baselines.phase_network.odds import Odds, margin_of, wrong_chance
+from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask, Measurement, Observation, Settings, wrapped
 from fpp_ml_bench.optics import Rig
 
-LEAST_ODDS = 1e-6  # least probability of a wrong order, whatever the network answers
-CORRECTED_SHARE = 0.3  # share of a correction that counts as uncertainty of the phase
-IMPOSSIBLE = -np.inf  # logit of an order that puts its pixel out of the working range
+OPEN_MARGIN = 1e-6
+"""Least margin of an order that gets a depth where brightness can't tell it: a wrong one is less likely than not."""
+EXPECTED_SHARE = float(np.sqrt(2 / np.pi))  # expected size of a normal error, in standard deviations
 DENIED = 5.0  # a pixel of the measured route's mask stays object unless its logit is this far below the threshold
 
 
-@dataclass(frozen=True)
-class Answers:
-    """The network's answers in the image's own orientation, maps (h, w) of the scene's crop; ``logits`` (3, h, w): of
-    the base order minus one, the base order, and plus one; ``correction_rad``: to be added to the wrapped phase."""
-
-    logits: Image
-    object_logit: Image
-    correction_rad: Image
-
-
-def network_answers(
-    network: PhaseNet, scene: Scene, geometry: Geometry, shading: bool = True, lead: float = 0.0
-) -> Answers:
-    """Run ``network`` on a scene. ``lead`` is added to the base order's logit. Training windows get made-up wrong base
-    orders (see `windows`), so the network holds the base order wrong more often than it is; the lead, chosen on the
-    validation split, makes up for that."""
-    x, exists = channels(scene, geometry, shading)
-    _, height, width = x.shape
-    padded = np.pad(x, ((0, 0), (0, -height % network.stride), (0, -width % network.stride)))
-    with torch.inference_mode():
-        batch = torch.from_numpy(padded)[None].contiguous(memory_format=torch.channels_last)
-        order, inside, correction = (out[0, ..., :height, :width].numpy() for out in network(batch))
-    order = np.where(exists, order, np.float32(IMPOSSIBLE))
-    sign = geometry.rotation.sign
-    order, inside, correction = (np.ascontiguousarray(geometry.rotation.back(m)) for m in (order, inside, correction))
-    order = order if sign > 0 else np.ascontiguousarray(order[::-1])
-    return with_lead(Answers(order, inside, correction * np.float32(sign)), lead)
-
-
-def with_lead(answers: Answers, lead: float) -> Answers:
-    """``answers`` with ``lead`` added to the base order's logit."""
-    return replace(answers, logits=answers.logits + np.array([0, lead, 0], np.float32)[:, None, None])
+def network_answers(network: PhaseNet, scene: Scene, geometry: Geometry, shading: bool, lead: float = 0.0) -> Answers:
+    """Run ``network`` on a scene; ``lead``: see `Answers.with_lead`."""
+    turned = answers_of_maps(network, *channels(scene, geometry, shading))
+    back, sign = geometry.rotation.back, geometry.rotation.sign
+    logits, inside, correction, sigma = (np.ascontiguousarray(back(maps)) for maps in vars(turned).values())
+    logits = logits if sign > 0 else np.ascontiguousarray(logits[::-1])
+    return Answers(logits, inside, correction * np.float32(sign), sigma).with_lead(lead)
 
 
 def decided_mask(answers: Answers, scene: Scene, threshold: float) -> Mask:
@@ -67,15 +48,15 @@ def decided_mask(answers: Answers, scene: Scene, threshold: float) -> Mask:
 @dataclass(frozen=True)
 class Levers:
     """Which of the network's answers are used; False: the measured route's own value stays. ``order``, ``mask``,
-    ``phase``; ``shading``: whether network and base order use brightness; ``graph``: weight of smoothness between
-    neighbours in a least-energy labelling of the orders (depth may jump), 0: the most likely order of each pixel alone;
-    ``bound_rad``: corrections are clipped there, None: the network's own bound."""
+    ``phase``; ``shading``: whether network and base order use brightness, as the network learned to; ``graph``: weight
+    of smoothness between neighbours in a least-energy labelling of the orders (depth may jump), 0: the most likely
+    order of each pixel alone; ``bound_rad``: corrections are clipped there, None: the network's own bound."""
 
     order: bool = True
     mask: bool = True
     phase: bool = True
     shading: bool = True
-    graph: float = 3.0
+    graph: float = GRAPH
     bound_rad: float | None = None
 
 
@@ -98,11 +79,11 @@ class NetworkRoute:
 
     def __init__(
         self, rig: Rig, settings: Settings, network: PhaseNet, threshold: float = 0.0, levers: Levers | None = None,
-        lead: float = 0.0, periods: phase_route.Periods | None = None,
+        lead: float = 0.0, odds: Odds | None = None, periods: phase_route.Periods | None = None,
     ) -> None:  # fmt: skip
         self.levers = levers or Levers()
         self.geometry = Geometry.of(rig, replace(settings, shading=self.levers.shading), periods)
-        self.network, self.threshold, self.lead = network, threshold, lead
+        self.network, self.threshold, self.lead, self.odds = network, threshold, lead, odds or Odds()
 
     def measure(self, image: NDArray[np.uint8]) -> Measurement:
         """Everything about one captured fringe uint8 (H, W). Raises `DecodeError` for another dtype or shape."""
@@ -116,7 +97,7 @@ class NetworkRoute:
         observation.watch.done("order")
         scene = answers = None
         if observation.background.calibrated and observation.inside.any():
-            scene = Scene.of(observation, base)
+            scene = Scene.of(observation, base, self.levers.shading)
             answers = network_answers(self.network, scene, geometry, self.levers.shading, self.lead)
             observation.watch.done("network")
         return AnsweredObservation(observation, base, margin, scene, answers)
@@ -138,38 +119,28 @@ class NetworkRoute:
             moved = observation.phase_rad + correction
             phase = wrapped(moved).astype(np.float32)
             order = order + np.rint((moved - phase) / TAU).astype(np.int32)
-        uncertainty = (observation.uncertainty_rad + CORRECTED_SHARE * np.abs(correction)).astype(np.float32)
+        uncertainty = np.float32(EXPECTED_SHARE) * answers.sigma_rad if levers.phase else observation.uncertainty_rad
         seen = replace(observation, inside=inside, phase_rad=phase, uncertainty_rad=uncertainty)
-        return route.conclude(seen, order, margin)
+        least_margin = OPEN_MARGIN if levers.order and not levers.shading else -np.inf
+        return route.conclude(seen, order, margin, least_margin)
 
     def _order(
         self, answers: Answers, scene: Scene, inside: Mask, observation: Observation, graph: float
     ) -> tuple[NDArray[np.int32], Image]:
         """Order of every pixel, and its margin, from the network's probability that the order is wrong."""
-        probabilities = np.exp(answers.logits - answers.logits.max(axis=0))
-        probabilities /= probabilities.sum(axis=0)
-        candidate = answers.logits.argmax(axis=0)
-        if graph > 0:
-            candidate = self._labelled(probabilities, scene, inside, observation, graph)
-        probability = np.clip(of_choice(probabilities, candidate), LEAST_ODDS, 1 - LEAST_ODDS)
-        margin = np.float32(phase_route.MARGIN_SCALE) * np.log(probability / (1 - probability))
-        return scene.order + np.array(STEPS, np.int32)[candidate], np.maximum(margin, 0).astype(np.float32)
+        choice = decided_order(answers, scene, inside, self.geometry, graph)
+        margin = margin_of(wrong_chance(answers.logits, choice, self.odds))
+        return scene.order + np.array(STEPS, np.int32)[choice], margin
 
-    def _labelled(
-        self, probabilities: NDArray, scene: Scene, inside: Mask, observation: Observation, graph: float
-    ) -> NDArray[np.intp]:
-        """Index of each pixel's order, by least energy on a grid of every few pixels."""
-        stride = phase_route.stride_of(observation.period_px)
-        grid, size = phase_route.grid_of(stride), (stride, stride)
-        weight = inside.astype(np.float32)
-        cost = np.stack([cv2.blur((-np.log(p + 1e-9) * weight).astype(np.float32), size) for p in probabilities])
-        cost = (cost / np.maximum(cv2.blur(weight, size), 1e-3))[:, *grid] * np.float32(stride**2)
-        grid_inside = inside[grid]
-        coarse = (observation.layer.residual_phase(observation.phase_rad, 0.0) + TAU * scene.order)[grid]
-        phases = np.stack([coarse + TAU * step for step in STEPS]).astype(np.float32)
-        link_x, link_y = (link * np.float32(graph * stride) for link in phase_route.links_between(grid_inside))
-        cost = np.where(grid_inside, np.minimum(cost, phase_route.LARGE), 0).astype(np.float32)
-        choice, margin = phase_route.least_energy(cost, phases, link_x, link_y, self.geometry.route.settings.jump_rad)
-        order, _ = phase_route.spread_over_pixels(observation, of_choice(phases, choice), margin, grid_inside)
-        candidate = np.clip(order - scene.order, -1, 1) + 1
-        return np.where(of_choice(probabilities, candidate) > 0, candidate, probabilities.argmax(axis=0))
+
+def decided_order(
+    answers: Answers, scene: Scene, inside: Mask, geometry: Geometry, graph: float = GRAPH
+) -> NDArray[np.intp]:
+    """Index of each pixel's candidate (h, w): the likeliest for a ``graph`` of 0, else `least_energy_order`."""
+    if graph <= 0:
+        return answers.logits.argmax(axis=0)
+    base = geometry.layer.at(scene.crop).residual_phase(scene.phase_rad, scene.order)
+    phases = np.stack([base + TAU * step for step in STEPS]).astype(np.float32)
+    stride = phase_route.stride_of(geometry.route.period_px)
+    jump_rad = geometry.route.settings.jump_rad
+    return least_energy_order(probabilities(answers.logits), phases, inside, stride, jump_rad, graph)

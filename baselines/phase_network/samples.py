@@ -1,111 +1,76 @@
-"""Training samples: the measured route's scene of each image, with the true phase, in half precision.
+"""Training samples: the measured route's scene of each view, with the true phase, in half precision."""
 
-Unions are several training objects in one image, for depth jumps and creases that no single object has. All share
-rig and light: the image whose surface is nearer, at every pixel, is what the rig would capture of
-all of them together (they may intersect), except for the shadows that they cast on one another.
-"""
-
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_network.inputs import Geometry, Scene
-from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask, of_choice
+from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask
+from fpp_ml_bench.baselines.training import View
 from fpp_ml_bench.depth import depth_edges, object_mask
-from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Direction
 
 EDGE_POINTS = 2000  # pixels near depth edges that a sample holds, as centres of training windows
-SHADOW_GREY = 6.0
-"""Grey levels by which a background must be darker than the other to count as an object's shadow on the plane."""
-MOST_OBJECTS = 3  # objects in one union, at most
 
 
 @dataclass(frozen=True)
 class Sample:
     """An image of a training set: the ``scene`` and its ground truth. ``missing_rad`` float16 (h, w): true absolute
-    phase minus that of the base order, 0 outside the object; ``target``: object pixels; ``edges`` int32 (n, 2): rows
-    and columns beside depth edges and silhouettes."""
+    phase minus that of the base order, 0 outside the object; ``target``: object pixels that are not ``void``, which are
+    neither object nor background; ``edges`` int32 (n, 2): rows and columns beside depth edges and silhouettes;
+    ``group``: the light it is of."""
 
     name: str
+    group: str
     direction: Direction
     scene: Scene
     missing_rad: NDArray[np.float16]
     target: Mask
+    void: Mask
     edges: NDArray[np.int32]
 
 
-def sample_of(image: NDArray[np.uint8], depth_mm: Image, name: str, geometry: Geometry) -> Sample:
-    """Sample of an image uint8 (H, W) and its true depth in mm, 0 = background."""
+def sample_of(
+    image: NDArray[np.uint8], depth_mm: Image, void: Mask, name: str, group: str, geometry: Geometry,
+    shading: bool = True,
+) -> Sample | None:  # fmt: skip
+    """Sample of an image uint8 (H, W), its true depth in mm, 0 = background, and its ``void`` pixels (H, W), which
+    count nowhere; None where nothing calibrates its brightness, or no object is seen. ``shading``: as of
+    `Scene.of`."""
     observation = geometry.route.observe(image)
+    if not observation.background.calibrated or not observation.inside.any():
+        return None
     order, _ = geometry.route.choose(observation)
-    scene = Scene.of(observation, order)
-    crop_depth_mm = depth_mm[observation.crop]
-    target = object_mask(crop_depth_mm)
+    scene = Scene.of(observation, order, shading)
+    crop_depth_mm, crop_void = depth_mm[observation.crop], void[observation.crop]
+    target = object_mask(crop_depth_mm) & ~crop_void
+    if not target.any():
+        return None
     true_phase = observation.layer.absolute_phase(np.where(target, crop_depth_mm, 1000.0))
     missing = np.where(target, true_phase - observation.phase_rad - TAU * order, 0.0)
     places = np.argwhere(depth_edges(crop_depth_mm)).astype(np.int32)
     sampled = np.random.default_rng(0).permutation(len(places))[:EDGE_POINTS]
     direction, half = geometry.route.settings.direction, np.nan_to_num(missing).astype(np.float16)
-    return Sample(name, direction, scene.single(np.float16, np.int16), half, target, places[sampled])
+    scene = scene.single(np.float16, np.int16)
+    return Sample(name, group, direction, scene, half, target, crop_void, places[sampled])
 
 
 def samples_of(
-    opened: DatasetFolder, names: Sequence[str], geometry: Geometry, progress: Callable[[int], None] = lambda n: None
-) -> list[Sample]:
-    """Samples of ``names``, in their order."""
-    samples = []
-    for name in names:
-        samples.append(sample_of(_image(opened, name, geometry), opened.depth_mm(name), name, geometry))
-        progress(1)
-    return samples
-
-
-def _image(opened: DatasetFolder, name: str, geometry: Geometry) -> NDArray[np.uint8]:
-    """The first fringe of a sample, a copy of its own."""
-    return np.array(opened.frame(name, opened.sequence.sinusoids(geometry.route.settings.direction)[0]))
-
-
-def united(
-    images: Sequence[NDArray[np.uint8]], depths_mm: Sequence[NDArray[np.floating]]
-) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Image uint8 (H, W) and depth in mm float32 (H, W), 0 = background, of all objects together. The nearest surface
-    counts; without one, the first image's background, or another image's where it is in shadow."""
-    ranges, stacked = np.stack([np.where(depth > 0, depth, np.inf) for depth in depths_mm]), np.stack(images)
-    nearest = ranges.argmin(axis=0)
-    depth, image, darkest = of_choice(ranges, nearest), of_choice(stacked, nearest), stacked.min(axis=0)
-    empty = np.isinf(depth)
-    shadow = empty & (darkest + SHADOW_GREY < image)
-    return np.where(shadow, darkest, image), np.where(empty, 0.0, depth).astype(np.float32)
-
-
-def companions(objects: Mapping[str, str], sample: str, random: np.random.Generator) -> list[str]:
-    """One or two samples of objects that differ from that of ``sample`` and from each other; fewer if there are none.
-    ``objects``: the object of every sample to choose from."""
-    members = [sample]
-    for _ in range(int(random.integers(1, MOST_OBJECTS))):
-        shown = {objects[member] for member in members}
-        candidates = [member for member, object_name in objects.items() if object_name not in shown]
-        if candidates:
-            members.append(candidates[int(random.integers(len(candidates)))])
-    return members[1:]
-
-
-def unions_of(
-    opened: DatasetFolder, names: Sequence[str], geometry: Geometry, count: int, seed: int,
-    progress: Callable[[int], None] = lambda n: None,
+    views: Iterable[View], geometries: Mapping[Direction, Geometry], shading: bool
 ) -> list[Sample]:  # fmt: skip
-    """``count`` unions of each of ``names`` with others of them, the same objects for both fringe directions."""
-    objects = {name: str(opened.measured(name)["object"]) for name in names}
-    samples = []
-    for number, name in enumerate(names):
-        for copy in range(count):
-            members = [name, *companions(objects, name, np.random.default_rng([seed, number, copy]))]
-            if len(members) > 1:
-                images = [_image(opened, member, geometry) for member in members]
-                image, depth_mm = united(images, [opened.depth_mm(member) for member in members])
-                samples.append(sample_of(image, depth_mm, "+".join(members), geometry))
-            progress(1)
+    """Samples of ``views``, whose frames are the first fringes of the directions of ``geometries``, in their order; of
+    a union for one direction alone, in turn. A view whose light the background does not calibrate is left out, since
+    the network is not used on it."""
+    samples: list[Sample] = []
+    unions = 0
+    for view in views:
+        pairs = list(zip(geometries.values(), view.frames, strict=True))
+        if view.united:
+            pairs = [pairs[unions % len(pairs)]]
+            unions += 1
+        for geometry, frame in pairs:
+            sample = sample_of(frame, view.depth_mm, view.void, view.name, view.group, geometry, shading)
+            samples += [] if sample is None else [sample]
     return samples

@@ -1,91 +1,110 @@
-"""Training phase-net, from dataset to weights file: windows of images, three losses, validation in mm on whole images.
+"""Training phase-net: views in drawn lights are rendered, measured, and cut into windows; no dataset is needed.
 
-``out`` holds the files of the engine and, at the end, phase-net.safetensors instead of the checkpoint.
+``out`` holds ``views/``, the files of the engine and, at the end, phase-net.safetensors instead of the checkpoint, and
+reliability.png. A stopped training continues at every stage.
 """
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from time import perf_counter
+from typing import Literal, get_args
 
 import numpy as np
 
 from fpp_ml_bench.baselines import training
+from fpp_ml_bench.baselines.phase_network.answers import Answers
 from fpp_ml_bench.baselines.phase_network.inputs import STEPS, Geometry
 from fpp_ml_bench.baselines.phase_network.method import load_net, save_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.phase_network.route import Answers, decided_mask, network_answers, with_lead
-from fpp_ml_bench.baselines.phase_network.samples import Sample, samples_of, unions_of
+from fpp_ml_bench.baselines.phase_network.odds import Judged, chosen_odds, confident_shares, draw_reliability
+from fpp_ml_bench.baselines.phase_network.route import decided_mask, decided_order, network_answers
+from fpp_ml_bench.baselines.phase_network.samples import Sample, samples_of
 from fpp_ml_bench.baselines.phase_network.window_training import WindowRecipe, WindowTraining
 from fpp_ml_bench.baselines.phase_network.windows import Variation, draw
 from fpp_ml_bench.baselines.phase_route import TAU, Settings
-from fpp_ml_bench.errors import RecipeError, TrainingError
-from fpp_ml_bench.loaders.storage import DatasetFolder
-from fpp_ml_bench.optics import DIRECTIONS, Direction
+from fpp_ml_bench.errors import RecipeError
+from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig, paper_rig
 
-WEIGHTS = "phase-net.safetensors"
-VALIDATED_SHARE = 5  # every so many-th validation image is scored during training
+Albedo = Literal["one", "any"]
+VIEWS, RELIABILITY = "views", "reliability.png"
+VALIDATED_SHARE = 5  # every so many-th validation sample is scored during training
+JUDGED_PX = 3  # the stated chances are calibrated on every so many-th pixel
 THRESHOLDS = tuple(float(value) for value in np.arange(-5, 3.01, 0.5))
 """Mask logits that are tried on the validation split."""
 LEADS = tuple(float(value) for value in range(8))
-"""Leads of the base order (see `network_answers`) that are tried on the validation split."""
+"""Leads of the base order (see `Answers.with_lead`) that are tried on the validation views."""
 TYPICAL_MM, _TOLERANCE_MM = 1800.0, 0.1
 """Depth error that a missed or invented pixel counts with; errors this close to the least count as equal."""
+
+Geometries = Mapping[Direction, Geometry]
 
 
 @dataclass(frozen=True)
 class Recipe(WindowRecipe):
-    """``directions``: the fringes it learns from, one frame each; ``unions``: images that join several objects, made
-    from each sample (see `unions_of`); ``vary``: how its windows are varied."""
+    """``albedo``: "one", with brightness as a cue for the order, or "any", without; ``directions``: the fringes it
+    learns from, one frame each; every ``textured_every``-th of the drawn lights has albedo maps and gloss;
+    ``validation_lights``: drawn ones for validation objects; ``vary``: how its windows are varied."""
 
+    steps: int = 3000
+    validate_every: int = 250
+    albedo: Albedo = "one"
     directions: tuple[Direction, ...] = DIRECTIONS
-    unions: int = 1
+    textured_every: int = 3
+    validation_lights: int = 6
     vary: Variation = field(default_factory=Variation)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0 <= self.unions <= 100:
-            raise RecipeError(f"unions {self.unions!r}: expected 0 to 100 for every sample")
+        if self.albedo not in get_args(Albedo):
+            raise RecipeError(f"albedo {self.albedo!r}: expected {' or '.join(get_args(Albedo))}")
         if not self.directions or any(direction not in DIRECTIONS for direction in self.directions):
             raise RecipeError(f"directions {self.directions}: expected some of {', '.join(DIRECTIONS)}")
+        if not (self.textured_every >= 1 and self.validation_lights >= 0):
+            raise RecipeError(
+                f"textured_every {self.textured_every!r}, validation_lights {self.validation_lights!r}: expected 1 and "
+                "more, 0 and more"
+            )
+
+    @property
+    def shading(self) -> bool:
+        """Whether brightness is a cue for the order."""
+        return self.albedo == "one"
+
+    @property
+    def weights_name(self) -> str:
+        """Of the file, and of the weights that come with the package."""
+        return f"{self.name}-{self.albedo}-albedo"
 
 
-class PhaseNetTraining(WindowTraining):
-    """Training on windows drawn from ``samples``, validated on whole images; the others as of `WindowTraining`."""
-
-    def __init__(
-        self, recipe: Recipe, samples: list[Sample], validation: list[Sample], geometries: dict[Direction, Geometry],
-        out: Path, start: PhaseNet | None = None, print_line: Callable[[str], None] = lambda line: None,
-    ) -> None:  # fmt: skip
-        def scores(network: PhaseNet) -> dict[str, float]:
-            if not validation:
-                return {}
-            return mean_scores(answers_of(network, validation, geometries), validation, geometries)
-
-        one_window = partial(draw, samples, geometries, recipe.window, recipe.vary)
-        super().__init__(recipe, one_window, scores, out, start, print_line)
-
-
-def answers_of(network: PhaseNet, samples: list[Sample], geometries: dict[Direction, Geometry]) -> Iterator[Answers]:
+def answers_of(
+    network: PhaseNet, samples: list[Sample], geometries: Geometries, shading: bool
+) -> Iterator[Answers]:  # fmt: skip
     """The network's answers for each sample."""
     for sample in samples:
-        yield network_answers(network, sample.scene.single(), geometries[sample.direction])
+        yield network_answers(network, sample.scene.single(), geometries[sample.direction], shading)
 
 
 def mean_scores(
-    answers: Iterable[Answers], samples: list[Sample], geometries: dict[Direction, Geometry], threshold: float = 0.0
+    answers: Iterable[Answers], samples: list[Sample], geometries: Geometries, threshold: float = 0.0
 ) -> dict[str, float]:
-    """Means of `score` over the samples."""
+    """Means of each `score` over the samples that have it."""
     pairs = zip(answers, samples, strict=True)
     rows = [score(answer, sample, geometries[sample.direction], threshold) for answer, sample in pairs]
-    return {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
+    means: dict[str, float] = {}
+    for key in rows[0] if rows else ():
+        values = [value for row in rows if (value := row[key]) is not None]
+        means |= {key: float(np.mean(values))} if values else {}
+    return means
 
 
-def score(answers: Answers, sample: Sample, geometry: Geometry, threshold: float = 0.0) -> dict[str, float]:
+def score(answers: Answers, sample: Sample, geometry: Geometry, threshold: float = 0.0) -> dict[str, float | None]:
     """Scores of one whole image with ``threshold`` on the mask's logit. ``object_mae_mm`` counts a missed pixel with
     its whole depth; ``right_mae_mm``: MAE of pixels with the right order; ``wrong_percent`` and ``missed_percent``:
-    shares of the object's pixels; ``invented_kpx``: background pixels with a depth, in thousands."""
+    shares of the object's pixels; ``invented_kpx``: background pixels with a depth, in thousands; ``within_percent``:
+    errors of the phase within the stated standard uncertainty, 68 of a normal distribution. Both are None where no
+    order is right."""
     scene = sample.scene.single()
     layer = geometry.layer.at(scene.crop)
     steps, inside = np.array(STEPS, np.int32)[answers.logits.argmax(axis=0)], decided_mask(answers, scene, threshold)
@@ -97,13 +116,16 @@ def score(answers: Answers, sample: Sample, geometry: Geometry, threshold: float
     phase_error = phase_change - sample.missing_rad
     error = np.where(inside, np.minimum(np.abs(predicted_mm - true_mm), true_mm), true_mm)[target]
     wrong = (np.abs(phase_error) > np.pi)[target]
+    within = np.abs(phase_error) < answers.sigma_rad
     detected = inside[target]
+    right = detected & ~wrong
     return {
         "object_mae_mm": float(error.mean()),
-        "right_mae_mm": float(error[detected & ~wrong].mean()),
+        "right_mae_mm": float(error[right].mean()) if right.any() else None,
         "wrong_percent": 100 * float(wrong.mean()),
         "missed_percent": 100 * float((~detected).mean()),
-        "invented_kpx": float((inside & ~target).sum()) / 1000,
+        "within_percent": 100 * float(within[target][right].mean()) if right.any() else None,
+        "invented_kpx": float((inside & ~target & ~sample.void).sum()) / 1000,
     }
 
 
@@ -117,22 +139,35 @@ def chosen_threshold(answers: list[Answers], samples: list[Sample], pixels: int)
         inside = max(int(sample.target.sum()), 1)
         for number, threshold in enumerate(THRESHOLDS):
             is_object = decided_mask(answer, scene, threshold)
-            missed, invented = (sample.target & ~is_object).sum(), (is_object & ~sample.target).sum()
+            missed = (sample.target & ~is_object).sum()
+            invented = (is_object & ~sample.target & ~sample.void).sum()
             costs[number] += TYPICAL_MM * (missed / inside + invented / (pixels - inside))
     means = costs / len(samples)
     return THRESHOLDS[int(np.flatnonzero(means < means.min() + _TOLERANCE_MM)[0])]
 
 
-def chosen_lead(answers: list[Answers], samples: list[Sample], geometries: dict[Direction, Geometry]) -> float:
+def chosen_lead(answers: list[Answers], samples: list[Sample], geometries: Geometries) -> float:
     """The lead out of `LEADS` with the fewest wrong orders, mean over the samples."""
-    means = (mean_scores((with_lead(one, lead) for one in answers), samples, geometries) for lead in LEADS)
+    means = (mean_scores((one.with_lead(lead) for one in answers), samples, geometries) for lead in LEADS)
     return LEADS[int(np.argmin([mean["wrong_percent"] for mean in means]))]
+
+
+def judged(answers: Answers, sample: Sample, geometry: Geometry, threshold: float) -> Judged:
+    """Every `JUDGED_PX`-th object pixel of a sample, with the order that the method would choose."""
+    scene = sample.scene.single()
+    inside = decided_mask(answers, scene, threshold)
+    choice = decided_order(answers, scene, inside, geometry)
+    change = TAU * np.array(STEPS, np.int32)[choice] + answers.correction_rad
+    wrong = np.abs(change - sample.missing_rad) > np.pi
+    places = np.nonzero((sample.target & inside)[::JUDGED_PX, ::JUDGED_PX])
+    row, column = (JUDGED_PX * place for place in places)
+    return Judged(sample.group, answers.logits[:, row, column], choice[row, column], wrong[row, column])
 
 
 @dataclass(frozen=True)
 class Trained:
-    """The weights file, scores on the whole validation split, and the mask threshold that was chosen there.
-    ``weights`` is None for a training that stopped because its minutes were over."""
+    """The weights file (None for a training that stopped because its minutes were over), validation scores, and the
+    mask threshold that was chosen there."""
 
     weights: Path | None
     steps: int
@@ -141,46 +176,60 @@ class Trained:
 
 
 def train_phase_net(
-    recipe: Recipe, dataset: Path, out: Path, *, extra: Path | None = None, start: Path | None = None,
-    minutes: float | None = None, show: bool = False, print_line: Callable[[str], None] = lambda line: None,
+    recipe: Recipe, out: Path, *, rig: Rig | None = None, start: Path | None = None, minutes: float | None = None,
+    workers: int = 1, show: bool = False, print_line: Callable[[str], None] = lambda line: None,
 ) -> Trained:  # fmt: skip
-    """Train on the dataset's training split, and on that of ``extra``, starting from the weights in ``start`` or from
-    random ones; the same call resumes a training that was stopped. ``show``: progress on stderr; ``print_line`` is
-    given a line for every validation. Raises `DatasetError` for a dataset without the frames in question,
-    `TrainingError` for a folder of another recipe or dataset."""
-    started = perf_counter()
-    opened = DatasetFolder(dataset)
-    extra_data = None if extra is None else DatasetFolder(extra)
-    if extra_data is not None and extra_data.rig != opened.rig:
-        raise TrainingError(f"{extra}: was made by another rig than {dataset}; build both with the same one")
+    """Train for ``rig`` (default: `optics.paper_rig`), starting from the weights in ``start`` or from random ones; the
+    same call resumes a training that was stopped. ``show``: progress on stderr; ``print_line`` is given a line for
+    every validation. Raises `TrainingError` for a folder of another recipe or rig."""
+    started, rig = perf_counter(), rig or paper_rig()
+    groups = training.groups_of(
+        recipe.lights, recipe.views_a_light, recipe.seed, recipe.textured_every, recipe.validation_lights
+    )
     start_weights = None if start is None else load_net(start, folded=False)
-    described = recipe.to_dict() | ({} if extra_data is None else {"extra_fingerprint": extra_data.fingerprint})
+    described = recipe.to_dict() | {"rig": rig.to_dict()}
     described |= {} if start_weights is None else {"start_sha256": start_weights.sha256}
-    training.claim_folder(out, {"recipe": described, "dataset_fingerprint": opened.fingerprint})
-    weights = out / WEIGHTS
+    fingerprint = training.fingerprint_of(described, groups)
+    training.claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
+    weights = out / f"{recipe.weights_name}.safetensors"
     if weights.exists():
         finished = load_net(weights).config
         scores = {key: float(value or 0) for key, value in finished.validation.items()}
         return Trained(weights, finished.steps, finished.threshold, scores)
-    geometries = {direction: Geometry.of(opened.rig, Settings(direction=direction)) for direction in recipe.directions}
-    folders = [opened] if extra_data is None else [opened, extra_data]
-    samples, validation = _samples(recipe, folders, geometries, show)
-    with training.reproducible(cpu=True):
+    geometries = {
+        direction: Geometry.of(rig, Settings(direction=direction, shading=recipe.shading))
+        for direction in recipe.directions
+    }
+    samples, validation = _samples(recipe, groups, rig, geometries, out / VIEWS, workers, show)
+
+    def scores_of(network: PhaseNet) -> dict[str, float]:
         scored = validation[::VALIDATED_SHARE]
+        return mean_scores(answers_of(network, scored, geometries, recipe.shading), scored, geometries)
+
+    with training.reproducible(cpu=True):
+        one_window = partial(draw, samples, geometries, recipe.window, recipe.vary, recipe.shading)
         first = None if start_weights is None else start_weights.network
-        ongoing = PhaseNetTraining(recipe, samples, scored, geometries, out, first, print_line)
+        ongoing = WindowTraining(recipe, one_window, scores_of, out, first, print_line)
         ongoing.run(started, minutes, show)
         if not ongoing.over:
             return Trained(None, ongoing.steps_done, 0.0, {})
         network = ongoing.network
-        answers = list(answers_of(network, validation, geometries))
-        threshold = chosen_threshold(answers, validation, opened.size[0] * opened.size[1])
+        answers = list(answers_of(network, validation, geometries, recipe.shading))
+        threshold = chosen_threshold(answers, validation, rig.camera.width * rig.camera.height)
         lead = chosen_lead(answers, validation, geometries)
-        means = mean_scores((with_lead(one, lead) for one in answers), validation, geometries, threshold)
+        led = [one.with_lead(lead) for one in answers]
+        means = mean_scores(led, validation, geometries, threshold)
+        pairs = zip(led, validation, strict=True)
+        seen = [judged(one, sample, geometries[sample.direction], threshold) for one, sample in pairs]
+    odds = chosen_odds(seen)
+    draw_reliability(out / RELIABILITY, seen, odds)
+    means["confident_percent"] = 100 * max(confident_shares(seen, odds).values())
     config = training.NetConfig(
-        name=recipe.name, title="Fringe order, mask and bounded phase correction", options=network.options,
-        threshold=threshold, lead=lead, period_px={direction: g.route.period_px for direction, g in geometries.items()},
-        dataset_fingerprint=opened.fingerprint, benchmark=training.training_benchmark(opened.fingerprint),
+        name=recipe.weights_name, title=f"Fringe order, mask and bounded phase correction, {recipe.albedo} albedo",
+        options=network.options, threshold=threshold, lead=lead, temperature=odds.temperature, offset=odds.offset,
+        doubted=odds.doubted,
+        period_px={direction: g.route.period_px for direction, g in geometries.items()},
+        dataset_fingerprint=fingerprint, benchmark=training.TrainingBenchmark("phase-net views", 1),
         steps=recipe.steps, recipe=described, validation=dict(means),
     )  # fmt: skip
     save_net(weights, network, config)
@@ -189,18 +238,18 @@ def train_phase_net(
 
 
 def _samples(
-    recipe: Recipe, folders: list[DatasetFolder], geometries: dict[Direction, Geometry], show: bool
-) -> tuple[list[Sample], list[Sample]]:
-    """Training samples and unions of all ``folders``, and validation samples of the first."""
-    train = [(folder, folder.samples("train")) for folder in folders]
-    names = folders[0].samples("validation")
-    images = (1 + recipe.unions) * sum(len(of_folder) for _, of_folder in train) + len(names)
-    samples: list[Sample] = []
-    validation: list[Sample] = []
-    with training.Display("phase of the samples", images * len(geometries), show) as display:
-        for geometry in geometries.values():
-            for folder, of_folder in train:
-                samples += samples_of(folder, of_folder, geometry, display.advance)
-                samples += unions_of(folder, of_folder, geometry, recipe.unions, recipe.seed, display.advance)
-            validation += samples_of(folders[0], names, geometry, display.advance)
-    return samples, validation
+    recipe: Recipe, groups: list[training.Group], rig: Rig, geometries: Geometries, folder: Path, workers: int,
+    show: bool,
+) -> tuple[list[Sample], list[Sample]]:  # fmt: skip
+    """Training samples with unions, and validation samples; views that ``folder`` lacks are rendered."""
+    views = sum(len(group.views) for group in groups)
+    frames = tuple(rig.sequence.sinusoids(direction)[0] for direction in recipe.directions)
+    with training.Display("rendering views", views, show) as display:
+        training.render_views(groups, rig, frames, folder, workers, display.advance)
+    learnt = sum(len(group.views) for group in groups if group.split == "train")
+    with training.Display("measuring views", views + learnt * recipe.unions, show) as display:
+        learned = training.read_views(folder, groups, "train")
+        united = training.with_unions(learned, recipe.unions, recipe.seed, display.advance)
+        samples = samples_of(united, geometries, recipe.shading)
+        kept = training.with_unions(training.read_views(folder, groups, "validation"), 0, 0, display.advance)
+        return samples, samples_of(kept, geometries, recipe.shading)

@@ -1,4 +1,4 @@
-"""Training a network on windows of images: three or four losses, a moving average of the weights, resumable."""
+"""Training a network on windows of images: four losses, a moving average of the weights, resumable."""
 
 import hashlib
 import json
@@ -17,6 +17,7 @@ from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from fpp_ml_bench.baselines import training
+from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.windows import IGNORED, Window
 from fpp_ml_bench.baselines.training import Panel, Record
@@ -30,8 +31,10 @@ LARGEST_GRADIENT = 50.0
 @dataclass(frozen=True)
 class WindowRecipe:
     """``steps`` of ``batch`` windows of ``window`` px; AdamW at ``rate``, after ``warm_up`` steps falling as a cosine.
-    ``widths`` to ``bound_rad`` make the network; ``weight_*``: of the losses; ``averaged``: decay of the moving average
-    of the weights, which is what the weights file holds. Raises `RecipeError` for values that train nothing."""
+    ``widths`` to ``bound_rad`` make the network; ``weight_*``: of the losses, ``weight_scale`` that of the stated
+    uncertainty; ``averaged``: decay of the moving average of the weights, which is what the weights file holds;
+    ``lights`` that are drawn, ``views_a_light`` of training objects in each, and ``unions`` for every view (see
+    `training.groups_of`). Raises `RecipeError` for values that train nothing."""
 
     name: str = "phase-net"
     steps: int = 5000
@@ -50,7 +53,11 @@ class WindowRecipe:
     weight_order: float = 2.0
     weight_mask: float = 0.5
     weight_phase: float = 10.0
+    weight_scale: float = 0.1
     validate_every: int = 500
+    lights: int = 30
+    views_a_light: int = 8
+    unions: int = 1
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "window", "validate_every"):
@@ -58,15 +65,28 @@ class WindowRecipe:
                 raise RecipeError(f"{name} {getattr(self, name)!r}: expected 1 or more")
         if not self.rate > 0 or not 0 <= self.averaged < 1:
             raise RecipeError(f"expected rate above 0 and averaged 0 to below 1, got {self.rate} and {self.averaged}")
+        if not (self.lights >= 0 and 1 <= self.views_a_light <= 40 and 0 <= self.unions <= 100):
+            raise RecipeError(
+                f"lights {self.lights!r}, views_a_light {self.views_a_light!r}, unions {self.unions!r}: expected 0 and "
+                "more, 1 to 40, 0 to 100"
+            )
 
     @property
     def weights(self) -> dict[str, float]:
         """Of the losses, by name."""
-        return {"order": self.weight_order, "mask": self.weight_mask, "phase": self.weight_phase}
+        weights = {"order": self.weight_order, "mask": self.weight_mask, "phase": self.weight_phase}
+        return weights | {"scale": self.weight_scale}
+
+    @property
+    def channels(self) -> int:
+        """Input maps of the network."""
+        return len(CHANNELS)
 
     def network(self) -> PhaseNet:
         """The network, untrained."""
-        return PhaseNet(self.widths, self.fine, self.squeezed, self.order_widths, self.bound_rad)
+        return PhaseNet(
+            self.widths, self.fine, self.squeezed, self.order_widths, self.bound_rad, self.channels, uncertain=True
+        )
 
     def rate_at(self, step: int) -> float:
         """Learning rate of step 0, 1, ..."""
@@ -95,8 +115,8 @@ def batch_of(windows: list[Window]) -> Batch:
 
 def losses(network: torch.nn.Module, batch: Batch, bound_rad: float) -> dict[str, Tensor]:
     """``order``: cross-entropy over the candidates; ``mask``: binary cross-entropy; ``phase``: smooth L1 in rad;
-    ``scale``, of a network that states one: negative log-likelihood of its phase error under a Laplace distribution."""
-    order, inside, correction, *scales = network(batch["x"])
+    ``scale``: negative log-likelihood of its phase error under a Laplace distribution."""
+    order, inside, correction, scale = network(batch["x"])
     logits = torch.where(batch["exists"], order, torch.tensor(IMPOSSIBLE))
     pixels = batch["fitted"].sum().clamp(min=1)
     by_order = functional.cross_entropy(logits, batch["order"], ignore_index=IGNORED, reduction="sum") / pixels
@@ -104,12 +124,10 @@ def losses(network: torch.nn.Module, batch: Batch, bound_rad: float) -> dict[str
     by_mask = (by_pixel * batch["mask_valid"]).sum() / batch["mask_valid"].sum().clamp(min=1)
     target_rad = batch["correction_rad"].clamp(-bound_rad, bound_rad)
     by_phase = functional.smooth_l1_loss(correction, target_rad, beta=SMALL_RAD, reduction="none")
-    parts = {"order": by_order, "mask": by_mask, "phase": (by_phase * batch["fitted"]).sum() / pixels}
-    if scales:
-        error = (correction.detach() - batch["correction_rad"]).abs()
-        by_scale = error * torch.exp(-scales[0]) + scales[0]
-        parts["scale"] = (by_scale * batch["fitted"]).sum() / pixels
-    return parts
+    error = (correction.detach() - batch["correction_rad"]).abs()
+    by_scale = ((error * torch.exp(-scale) + scale) * batch["fitted"]).sum() / pixels
+    phase = (by_phase * batch["fitted"]).sum() / pixels
+    return {"order": by_order, "mask": by_mask, "phase": phase, "scale": by_scale}
 
 
 class WindowObjective:
@@ -147,6 +165,7 @@ class WindowTraining(training.Training):
         network = recipe.network()
         network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         if start is not None:
+            start = start.stating_scale()
             if start.options != network.options:
                 raise TrainingError(f"weights to start from: expected {network.options}, got {start.options}")
             network.load_state_dict(start.state_dict())

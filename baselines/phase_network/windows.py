@@ -2,10 +2,10 @@
 
 Whole objects are moved to another distance, with the light that the calibrated lamp would give and the measured route's
 errors as they were. Wrong base orders are made up in patches and whole windows, because the training objects have few.
-Columns are mirrored, as with a projector on the other side. Brightness varies a little, and sometimes the brightness
-channels are 0, so that the network also works without them.
+Columns are mirrored, as with a projector on the other side. Brightness varies a little.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -28,15 +28,16 @@ _SWAPPED = [FIRST_SIDE + n for n in _PARTNERS] + [FIRST_MISFIT] + [FIRST_MISFIT 
 
 @dataclass(frozen=True)
 class Variation:
-    """How often (0 to 1) and how much windows are varied; with 0 throughout they stay as captured."""
+    """How often (0 to 1) and how much windows are varied; with 0 throughout they stay as captured. ``shift_blind``: how
+    often objects are moved for a network without brightness, so that it does not learn where objects mostly stand."""
 
     near_edge: float = 0.7
     shift: float = 0.5
+    shift_blind: float = 0.8
     margin_mm: float = 60.0
     brightness: float = 0.04
     wrong_window: float = 0.15
     wrong_patch: float = 0.3
-    no_shading: float = 0.1
     mirror: float = 0.5
 
 
@@ -44,7 +45,7 @@ class Variation:
 class Window:
     """One training example: ``x`` (C, n, n) float32, ``exists`` (3, n, n); ``order`` int64 (n, n), 0 to 2 or `IGNORED`;
     ``correction_rad`` and ``fitted`` (n, n): error of the phase beside the order, and where it counts; ``target`` bool
-    (n, n): object; ``mask_valid``: where the mask's loss counts, False for an object that was moved."""
+    (n, n): object; ``mask_valid``: where the mask's loss counts, not on void pixels, nor for an object that moved."""
 
     x: Image
     exists: Mask
@@ -56,22 +57,23 @@ class Window:
 
 
 def draw(
-    samples: list[Sample], geometries: dict[Direction, Geometry], size: int, vary: Variation,
+    samples: list[Sample], geometries: Mapping[Direction, Geometry], size: int, vary: Variation, shading: bool,
     random: np.random.Generator,
 ) -> Window:  # fmt: skip
-    """A random window of ``size`` px of one of ``samples``."""
+    """A random window of ``size`` px of one of ``samples``; ``shading``: as of `inputs.channels`."""
     sample = samples[random.integers(len(samples))]
     geometry = geometries[sample.direction]
     rows, columns = place_of(sample.edges, sample.target.shape, size, random.random() < vary.near_edge, random)
     scene, missing = sample.scene.window(rows, columns).single(), sample.missing_rad[rows, columns].astype(np.float32)
-    target = sample.target[rows, columns]
-    moved = random.random() < vary.shift and target.any()
+    target, void = sample.target[rows, columns], sample.void[rows, columns]
+    moved = random.random() < (vary.shift if shading else vary.shift_blind) and target.any()
     if moved:
         scene = _moved(scene, missing, target, geometry, vary, random)
     scene, missing = _wrong(scene, missing, geometry, vary, random)
-    x, exists = inputs.channels(scene, geometry, shading=random.random() >= vary.no_shading)
-    missing = geometry.rotation.turn(missing) * np.float32(geometry.rotation.sign)
-    window = _labelled(x, exists, missing, geometry.rotation.turn(target), size, mask_valid=not moved)
+    x, exists = inputs.channels(scene, geometry, shading)
+    turn = geometry.rotation.turn
+    missing = turn(missing) * np.float32(geometry.rotation.sign)
+    window = _labelled(x, exists, missing, turn(target), size, turn(~void & (not moved)))
     return _mirrored(window) if random.random() < vary.mirror else window
 
 
@@ -139,7 +141,7 @@ def _wrong(
     return changed, missing - np.float32(TAU) * off
 
 
-def _labelled(x: Image, exists: Mask, missing: Image, target: Mask, size: int, mask_valid: bool) -> Window:
+def _labelled(x: Image, exists: Mask, missing: Image, target: Mask, size: int, mask_valid: Mask) -> Window:
     steps = np.rint(missing / TAU).astype(np.int64)
     possible = target & (np.abs(steps) <= 1)
     place = np.clip(steps, -1, 1) + 1
@@ -152,7 +154,7 @@ def _labelled(x: Image, exists: Mask, missing: Image, target: Mask, size: int, m
         np.pad(x, deep), np.pad(exists, deep, constant_values=True),
         np.pad(np.where(possible, place, IGNORED), pad, constant_values=IGNORED),
         np.pad(correction, pad), np.pad(possible, pad), np.pad(target, pad),
-        np.pad(np.full(target.shape, mask_valid), pad),
+        np.pad(mask_valid, pad),
     )  # fmt: skip
 
 

@@ -132,10 +132,14 @@ class PhaseRoute:
         chosen_rad = orders.of_choice(question.residual_rad, choice)
         return orders.spread_over_pixels(observation, chosen_rad, margin, question.inside)
 
-    def conclude(self, observation: Observation, order: NDArray[np.int32], margin: NDArray[np.floating]) -> Measurement:
+    def conclude(
+        self, observation: Observation, order: NDArray[np.int32], margin: NDArray[np.floating],
+        least_margin: float = -np.inf,
+    ) -> Measurement:  # fmt: skip
         """The measurement that follows from an ``order`` int32 for each pixel of the observation's crop (h, w);
         ``margin`` (h, w): how clearly that order won, 0 for a tie, 1 or more for a clear choice (see `orders.Chooser`).
-        Raises `DecodeError` for shapes that are not the crop's."""
+        A pixel of less than ``least_margin`` has no depth, as always a tie in light that nothing calibrates. Raises
+        `DecodeError` for shapes that are not the crop's."""
         inside, watch = observation.inside, observation.watch
         if np.shape(order) != inside.shape or np.shape(margin) != inside.shape:
             raise DecodeError(
@@ -153,6 +157,7 @@ class PhaseRoute:
         reason = confidence.reasons(observation, margin, sureness, depth_mm, self.settings)
         if not observation.background.calibrated:
             depth_mm[margin == 0] = 0.0  # a guess
+        depth_mm[margin < least_margin] = 0.0
         watch.done("confidence")
 
         def paste(part: NDArray, dtype: type, outside: float) -> NDArray:

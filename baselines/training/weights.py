@@ -83,8 +83,9 @@ class ModelConfig:
 class NetConfig:
     """What a phase network is, how its answers are used, and what it was trained on. ``options``: arguments of
     `PhaseNet`; ``threshold``: logit from which on a pixel is object; ``lead``: what is added to the logit of the base
-    order, both chosen on the validation split; ``period_px``: image px per fringe period of the training images, by
-    direction; ``steps`` trained; the others as in `ModelConfig`."""
+    order, ``temperature``, ``offset`` and ``doubted`` as of `phase_network.Odds`, all chosen on validation views;
+    ``period_px``: image px per fringe period of the training images, by direction; ``steps`` trained; the others as in
+    `ModelConfig`."""
 
     name: Text
     title: Text
@@ -94,6 +95,9 @@ class NetConfig:
     dataset_fingerprint: Fingerprint
     benchmark: TrainingBenchmark | None = None
     lead: Finite = 0.0
+    temperature: Finite = 1.0
+    offset: Finite = 0.0
+    doubted: Finite = 1.0
     steps: Count = 0
     recipe: dict[Text, Any] = field(default_factory=dict)
     validation: dict[Text, Scalar] = field(default_factory=dict)

@@ -30,7 +30,7 @@ _OPTIONS: dict[str, tuple[str, ...]] = {
         "ambient_grey",
         "mask",
     ),
-    "phase-net": ("fringe", "no_shading", "min_confidence", "weights", "white_grey", "ambient_grey"),
+    "phase-net": ("fringe", "albedo", "min_confidence", "weights", "white_grey", "ambient_grey"),
     "crossed": ("frames", "min_confidence", "mask"),
     "crossed-net": ("min_confidence", "weights"),
     "constant": ("at",),
@@ -68,7 +68,10 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     add("--prior", choices=("none", "standoff"),
         help="standoff: assume that objects are near the rig's standoff, true of fixed placement (default: none)",
     )  # fmt: skip
-    add("--no-shading", action="store_const", const=True, help="choose the fringe order without brightness")
+    add("--no-shading", action="store_const", const=True, help="phase: choose the fringe order without brightness")
+    add("--albedo", choices=("one", "any"),
+        help="phase-net: one, where all surfaces have the background's albedo, so that brightness tells the order, or "
+             "any, where the order is ambiguous unless range and shape tell it (default: one)")  # fmt: skip
     add("--min-confidence", type=float, metavar="C",
         help="mask pixels of less confidence, 0 to 1 (default: 0, dense)")  # fmt: skip
     add("--white-grey", type=float, metavar="GREY",
@@ -211,8 +214,8 @@ def _phase(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
 
 
 def _phase_net(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
-    options = {name: getattr(args, name) for name in ("threads", "weights", *_SHARED)}
-    return _given(direction=args.fringe, shading=None if args.no_shading is None else False, **options)
+    options = {name: getattr(args, name) for name in ("threads", "weights", "albedo", *_SHARED)}
+    return _given(direction=args.fringe, **options)
 
 
 def _crossed(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from fpp_ml_bench.baselines import crossed_network, networks, phase_network, training
 from fpp_ml_bench.cli import CHECK_FAILED
@@ -11,13 +12,15 @@ from fpp_ml_bench.machine import usable_cores
 SUMMARY = "Train one recipe, a shipped one or a YAML file of yours, into a weights file that predict takes."
 EXAMPLES = (
     "fpp-bench train loss/hybrid_l1_0.7 data/cpu224 --out runs/mine",
-    "fpp-bench train phase-net data/full --out runs/phase-net      the network of the phase route",
-    "fpp-bench train crossed-net --out runs/crossed-net      the network of crossed fringes; it renders its own views",
+    "fpp-bench train phase-net --out runs/phase-net      the network of the phase route; it renders its own views",
+    "fpp-bench train phase-net --albedo any --out runs/phase-net-any      without brightness",
+    "fpp-bench train crossed-net --out runs/crossed-net      the network of crossed fringes; the same",
     "fpp-bench train mine.yaml data/full --preset paper --out runs/big --minutes 10     in pieces",
     "fpp-bench train normalization/individual --views views --out runs/crossed-unet      a control on crossed frames",
     "accelerate launch -m fpp_ml_bench train mine.yaml data/full --preset paper --out runs/big      several GPUs",
     "fpp-bench predict runs/mine/model.safetensors data/cpu224 --out predictions",
 )
+_OPTIONS = "steps", "unions", "rate", "lights", "albedo", "start"  # of phase-net and crossed-net
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,12 +28,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("recipe", metavar="RECIPE", help="a name like loss/l1 (fpp-bench reproduce --list), a .yaml, phase-net, or "
         "crossed-net")  # fmt: skip
     add("dataset", type=Path, metavar="DATASET", nargs="?",
-        help="dataset folder, of the preset's image size (crossed-net: none, it renders its own views)")  # fmt: skip
+        help="dataset folder, of the preset's image size (phase-net and crossed-net: none)")  # fmt: skip
     add("--out", type=Path, required=True, metavar="DIR", help="new folder, or that of a training to resume")
     add("--preset", choices=training.PRESETS, default="cpu", help="what a shipped recipe is scaled to (default: cpu)")
     add("--minutes", type=float, metavar="M",
         help="stop before an epoch that would not finish in time, everything saved")  # fmt: skip
-    add("--extra", type=Path, metavar="DATASET", help="phase-net: another dataset whose training split is added")
     add("--views", type=Path, metavar="DIR",
         help="instead of DATASET, for a unet: crossed frames in the lights that crossed-net learns from, rendered into "
              "DIR at the preset's size where it lacks them; the input is standardised by the frame itself")  # fmt: skip
@@ -39,7 +41,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--unions", type=int, metavar="N",
         help="the same: images that join several objects, made from each sample (default: as the shipped weights)",
     )  # fmt: skip
+    add("--lights", type=int, metavar="N", help="the same: lights that are drawn (default: as the shipped weights)")
     add("--rate", type=float, metavar="R", help="the same: largest learning rate (default: as the shipped weights)")
+    add("--albedo", choices=("one", "any"),
+        help="phase-net: one, with brightness as a cue for the order, or any, without (default: one)")  # fmt: skip
     add("--start", type=Path, metavar="FILE", help="phase-net: weights to start from (default: none)")
 
 
@@ -49,15 +54,18 @@ def run(args: argparse.Namespace) -> int:
         raise RecipeError(f"--minutes {args.minutes}: expected a number above 0")
     if args.views is not None and (args.dataset is not None or args.recipe in ("crossed-net", "phase-net")):
         raise RecipeError("--views takes the place of DATASET for a recipe of a unet; give one of them")
-    if args.recipe == "crossed-net":
-        return _crossed_net(args)
+    if args.recipe in ("phase-net", "crossed-net"):
+        import cv2
+
+        if args.dataset is not None:
+            raise RecipeError(
+                f"{args.dataset}: {args.recipe} renders what it learns from, and takes none; leave it out"
+            )
+        cv2.setNumThreads(1)
+        return _phase_net(args) if args.recipe == "phase-net" else _crossed_net(args)
     if args.dataset is None and args.views is None:
         raise RecipeError(f"{args.recipe}: expected a dataset folder to train on, got none")
-    if args.recipe == "phase-net":
-        return _phase_net(args)
-    for option in ("extra", "start", "steps", "unions", "rate"):
-        if getattr(args, option) is not None:
-            raise RecipeError(f"--{option} is an option of phase-net; leave it out")
+    _given(args)
     from accelerate import PartialState
 
     recipe = training.load_recipe(args.recipe, args.preset)
@@ -82,36 +90,30 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _phase_net(args: argparse.Namespace) -> int:
-    import cv2
-
-    cv2.setNumThreads(1)
-    given = {name: getattr(args, name) for name in ("steps", "unions", "rate") if getattr(args, name) is not None}
-    recipe = phase_network.Recipe(**given)
+    recipe = phase_network.Recipe(**_given(args, "steps", "unions", "rate", "lights", "albedo", "start"))
     trained = phase_network.train_phase_net(
-        recipe, args.dataset, args.out, extra=args.extra, start=args.start, minutes=args.minutes, show=True,
-        print_line=print,
+        recipe, args.out, start=args.start, minutes=args.minutes, workers=usable_cores(), show=True, print_line=print,
     )  # fmt: skip
     return _window_training_said(args, recipe.steps, trained)
 
 
 def _crossed_net(args: argparse.Namespace) -> int:
-    import cv2
-
-    for option in ("dataset", "extra", "start"):
-        if getattr(args, option) is not None:
-            raise RecipeError(f"{option}: crossed-net renders what it learns from, and takes none; leave it out")
-    cv2.setNumThreads(1)
-    given = {name: getattr(args, name) for name in ("steps", "unions", "rate") if getattr(args, name) is not None}
-    recipe = crossed_network.CrossedRecipe(**given)
+    recipe = crossed_network.CrossedRecipe(**_given(args, "steps", "unions", "rate", "lights"))
     trained = crossed_network.train_crossed_net(
         recipe, args.out, minutes=args.minutes, workers=usable_cores(), show=True, print_line=print,
     )  # fmt: skip
     return _window_training_said(args, recipe.steps, trained)
 
 
-def _window_training_said(
-    args: argparse.Namespace, steps: int, trained: "phase_network.Trained | crossed_network.Trained"
-) -> int:
+def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """The options that were given; the others are refused."""
+    for option in _OPTIONS:
+        if option not in names and getattr(args, option) is not None:
+            raise RecipeError(f"--{option} is no option of {args.recipe}; leave it out")
+    return {name: getattr(args, name) for name in names if name != "start" and getattr(args, name) is not None}
+
+
+def _window_training_said(args: argparse.Namespace, steps: int, trained: "phase_network.Trained") -> int:
     """Print how the training of phase-net or crossed-net ended; the exit status."""
     if trained.weights is None:
         done = f"{trained.steps} of {steps} steps"
@@ -119,6 +121,5 @@ def _window_training_said(
         return CHECK_FAILED
     scores = ", ".join(f"{key} {value:.3g}" for key, value in trained.validation.items())
     print(f"{trained.weights}: {trained.steps} steps, mask threshold {trained.threshold:g}; validation: {scores}")
-    dataset = args.dataset or "DATASET"
-    print(f"next: fpp-bench predict {args.recipe} {dataset} --weights {trained.weights} --out predictions")
+    print(f"next: fpp-bench predict {args.recipe} DATASET --weights {trained.weights} --out predictions")
     return 0

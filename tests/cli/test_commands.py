@@ -151,10 +151,12 @@ def test_examples_in_the_help_are_accepted_by_their_parsers():
         (["predict", "classical", "TINY", "--out", "OUT", "--direction", "up"], "--direction"),
         (["predict", "classical", "TINY", "--out", "TINY"], "already holds"),
         (["predict", "classical", "OUT", "--out", "OUT2"], "no such folder"),
-        (["train", "phase-net", "TINY", "--out", "OUT", "--unions", "-1"], "unions -1"),
-        (["train", "phase-net", "TINY", "--out", "OUT", "--rate", "nan"], "rate above 0"),
-        (["train", "phase-net", "TINY", "--out", "OUT", "--steps", "0"], "steps 0"),
-        (["train", "loss/l1", "TINY", "--out", "OUT", "--rate", "0.1"], "--rate is an option of phase-net"),
+        (["train", "phase-net", "--out", "OUT", "--unions", "-1"], "unions -1"),
+        (["train", "phase-net", "--out", "OUT", "--rate", "nan"], "rate above 0"),
+        (["train", "phase-net", "--out", "OUT", "--steps", "0"], "steps 0"),
+        (["train", "phase-net", "--out", "OUT", "--albedo", "two"], "--albedo"),
+        (["train", "phase-net", "TINY", "--out", "OUT"], "renders what it learns from"),
+        (["train", "loss/l1", "TINY", "--out", "OUT", "--rate", "0.1"], "--rate is no option of loss/l1"),
     ],
 )
 def test_bad_input_exits_2_with_a_message_and_makes_nothing(tiny, tmp_path, monkeypatch, capsys, arguments, message):

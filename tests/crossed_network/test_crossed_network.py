@@ -9,20 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from fpp_ml_bench.baselines import load_method
-from fpp_ml_bench.baselines.crossed_network import CrossedRecipe, inputs, pairs, train_crossed_net, training, views
+from fpp_ml_bench.baselines import load_method, training
+from fpp_ml_bench.baselines.crossed_network import CrossedRecipe, inputs, pairs, train_crossed_net
 from fpp_ml_bench.baselines.crossed_network.method import CrossedNetMethod
-from fpp_ml_bench.baselines.crossed_network.route import (
-    Answers,
-    CrossedNetRoute,
-    decided_mask,
-    stated_rad,
-    threshold_in,
-)
-from fpp_ml_bench.baselines.crossed_network.samples import Sample, Variation, draw, sample_of, samples_of
+from fpp_ml_bench.baselines.crossed_network.route import CrossedNetRoute, decided_mask, stated_rad, threshold_in
+from fpp_ml_bench.baselines.crossed_network.samples import Sample, Variation, draw, sample_of
 from fpp_ml_bench.baselines.crossed_route import CrossedRoute
 from fpp_ml_bench.baselines.networks import load
-from fpp_ml_bench.baselines.phase_network import IGNORED, load_net
+from fpp_ml_bench.baselines.phase_network import IGNORED, Answers, load_net
 from fpp_ml_bench.baselines.training import load_recipe, train
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import PredictionError, RecipeError, TrainingError, WeightsError
@@ -31,8 +25,8 @@ from fpp_ml_bench.optics import crossed_rig, paper_rig
 
 SIZE = 240
 GROUPS = [
-    views.Group("paper", named_light("paper"), (("wood_block", "A0"), ("duct_tape", "A60"))),
-    views.Group("validation-paper", named_light("paper"), (("mug", "A0"),), "validation"),
+    training.Group("paper", named_light("paper"), (("wood_block", "A0"), ("duct_tape", "A60"))),
+    training.Group("validation-paper", named_light("paper"), (("mug", "A0"),), "validation"),
 ]
 STILL = Variation(near_edge=0.5, wrong_window=0, wrong_patch=0, no_plane=0)
 
@@ -45,35 +39,18 @@ def route() -> CrossedRoute:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("views")
-    views.render(GROUPS, crossed_rig(SIZE), out, workers=1)
+    training.render_views(GROUPS, crossed_rig(SIZE), (0,), out, workers=1)
     return out
 
 
 @pytest.fixture(scope="module")
 def samples(folder: Path) -> list[Sample]:
-    return samples_of(views.read(folder, GROUPS, "train"), route(), unions=1, seed=1)
-
-
-def test_drawn_lights_differ_and_repeat() -> None:
-    lights = [views.drawn_light(np.random.default_rng([3, n])) for n in range(40)]
-    assert lights[0] == views.drawn_light(np.random.default_rng([3, 0]))
-    exposures = [light.camera.exposure for light in lights]
-    assert min(exposures) < 0.35 and max(exposures) > 1.5
-    assert {light.surface.textures for light in lights} == {"none", "by_kind", "checks"}
-    assert any(light.bounces.shadows for light in lights) and any(light.projector.response != 1 for light in lights)
-
-
-def test_groups_keep_the_splits_apart() -> None:
-    groups = views.groups_of(lights=3, views_a_light=4, seed=0)
-    splits = "train", "validation"
-    shown = {split: {name for g in groups if g.split == split for name, _ in g.views} for split in splits}
-    assert len(shown["train"]) == 40 and len(shown["validation"]) == 5
-    assert not shown["train"] & shown["validation"]
-    assert all(len({name for name, _ in g.views}) == 4 for g in groups if g.name.startswith("drawn"))
+    learned = training.with_unions(training.read_views(folder, GROUPS, "train"), unions=1, seed=1)
+    return [sample_of(view, route()) for view in learned]
 
 
 def test_the_truth_of_a_sample_is_the_exact_depth(samples: list[Sample], folder: Path) -> None:
-    sample, view = samples[0], next(views.read(folder, GROUPS, "train"))
+    sample, view = samples[0], next(training.read_views(folder, GROUPS, "train"))
     part = route().carriers.at(sample.scene.crop)
     truth = sample.scene.nearness + sample.missing_rad.astype(np.float32) / part.joint_gain
     exact = view.depth_mm[sample.scene.crop]
@@ -141,9 +118,9 @@ def test_a_training_in_small_is_resumed_and_predicts(
         train_crossed_net(replace(recipe, steps=3), out, rig=rig)
     method = load_method("crossed-net", rig, weights=trained.weights)
     assert isinstance(method, CrossedNetMethod) and method.frames_used == (0,)
-    view = next(views.read(folder, GROUPS, "train"))
+    view = next(training.read_views(folder, GROUPS, "train"))
     frames = [None] * len(rig.sequence)
-    frames[0] = view.grey
+    frames[0] = view.frames[0]
     answer = method.answer(frames)
     assert answer.depth.dtype == np.float32 and np.isfinite(answer.depth).all()
     assert np.array_equal(answer.sigma_mm > 0, answer.depth > 0)
@@ -153,9 +130,9 @@ def test_a_training_in_small_is_resumed_and_predicts(
 def test_the_papers_unet_learns_from_the_same_views(
     tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pairs, "groups_of", lambda *args: GROUPS)
-    rendered = lambda groups, rig, out, *rest: shutil.copytree(folder, out, dirs_exist_ok=True)  # noqa: E731
-    monkeypatch.setattr(pairs, "render", rendered)
+    monkeypatch.setattr(pairs.training, "groups_of", lambda *args: GROUPS)
+    rendered = lambda groups, rig, frames, out, *rest: shutil.copytree(folder, out, dirs_exist_ok=True)  # noqa: E731
+    monkeypatch.setattr(pairs.training, "render_views", rendered)
     recipe = load_recipe("normalization/individual", "cpu").model_copy(
         update={"size": SIZE, "width": 2, "max_epochs": 2}
     )
@@ -163,8 +140,8 @@ def test_the_papers_unet_learns_from_the_same_views(
     learnt, checked = pairs.view_pairs(recipe, tmp_path / "views")
     assert len(learnt) == 2 and len(checked) == 1
     item = learnt[0]
-    view = next(views.read(folder, GROUPS, "train"))
-    assert np.array_equal(np.rint(item.fringe[0].numpy() * 255), view.grey)
+    view = next(training.read_views(folder, GROUPS, "train"))
+    assert np.array_equal(np.rint(item.fringe[0].numpy() * 255), view.frames[0])
     assert item.depth.max() == 1 and not item.depth[0].numpy()[view.depth_mm == 0].any()
     first = train(recipe, (learnt, checked), tmp_path / "run", minutes=1e-9, show=False)
     assert not first.finished and first.epochs == 1
@@ -181,8 +158,8 @@ def test_the_papers_unet_learns_from_the_same_views(
 def test_depths_lie_on_measured_candidates_whatever_the_network_says(folder: Path) -> None:
     recipe = CrossedRecipe(widths=(4, 4), order_widths=(4, 4), fine=4, squeezed=4)
     learned = CrossedNetRoute(crossed_rig(SIZE), recipe.network().eval(), threshold=0.0, lead=0.0)
-    view = next(views.read(folder, GROUPS, "train"))
-    seen = learned.route.observe(view.grey)
+    view = next(training.read_views(folder, GROUPS, "train"))
+    seen = learned.route.observe(view.frames[0])
     scene = inputs.Scene.of(seen)
     shape = scene.light.shape
     rng = np.random.default_rng(0)
@@ -201,8 +178,8 @@ def test_depths_lie_on_measured_candidates_whatever_the_network_says(folder: Pat
 
 
 def test_the_least_that_the_network_states_is_taken_off() -> None:
-    logs = np.linspace(-6, 1, 50, dtype=np.float32)
-    stated, sigma = stated_rad(logs), np.sqrt(2) * np.exp(logs)
+    sigma = (np.sqrt(2) * np.exp(np.linspace(-6, 1, 50))).astype(np.float32)
+    stated = stated_rad(sigma)
     assert (np.diff(stated) > 0).all() and (stated < sigma).all() and (stated >= 0.359 * sigma).all()
     assert stated[-1] == pytest.approx(0.8 * sigma[-1], rel=1e-3)
 
@@ -214,13 +191,17 @@ def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
         load_method("crossed-net", paper_rig(SIZE), weights=str(tmp_path / "none.safetensors"))
     assert main(["train", "crossed-net", str(tmp_path), "--out", str(tmp_path / "x")]) == 2
     assert "takes none" in capsys.readouterr().err
-    assert main(["train", "phase-net", "--out", str(tmp_path / "x")]) == 2
+    assert main(["train", "crossed-net", "--albedo", "any", "--out", str(tmp_path / "x")]) == 2
+    assert "--albedo is no option of crossed-net" in capsys.readouterr().err
+    assert main(["train", "loss/l1", "--out", str(tmp_path / "x")]) == 2
     assert "expected a dataset folder" in capsys.readouterr().err
-    view = views.View("x", "x", "x", np.zeros((SIZE, SIZE), np.uint8), np.zeros((SIZE, SIZE), np.float32),
-                      np.zeros((SIZE, SIZE), bool))  # fmt: skip
+    view = training.View(
+        "x", "x", "x", np.zeros((1, SIZE, SIZE), np.uint8), np.zeros((SIZE, SIZE), np.float32),
+        np.zeros((SIZE, SIZE), bool),
+    )  # fmt: skip
     assert not sample_of(view, route()).target.any()
     with pytest.raises(TrainingError, match=r"delete it"):
-        next(views.read(tmp_path, GROUPS, "train"))
+        next(training.read_views(tmp_path, GROUPS, "train"))
 
 
 def test_the_mask_asks_for_less_in_a_weak_frame(samples: list[Sample]) -> None:

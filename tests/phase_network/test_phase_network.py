@@ -27,7 +27,7 @@ def part_of(rig: Rig, size: int) -> Rig:
 def wild(bound_rad: float) -> PhaseNet:
     """A network that says anything, loudly."""
     torch.manual_seed(3)
-    network = PhaseNet((8, 8), 4, 6, (6, 8), bound_rad)
+    network = PhaseNet((8, 8), 4, 6, (6, 8), bound_rad, uncertain=True)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=1.0)
     return network.eval()
@@ -35,7 +35,8 @@ def wild(bound_rad: float) -> PhaseNet:
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 def test_random_weights_stay_on_the_candidates(direction: str) -> None:
-    """Every depth is a candidate of the working range, moved by at most the bound, whatever the weights."""
+    """Every depth is a candidate of the working range, moved by at most the bound, whatever the weights; where there is
+    one candidate, its order is that one."""
     bound = 0.5
     settings = Settings(direction=direction)
     network_route = NetworkRoute(RIG, settings, wild(bound), threshold=-1e9)
@@ -49,10 +50,9 @@ def test_random_weights_stay_on_the_candidates(direction: str) -> None:
     correction = (absolute - observation.phase_rad - TAU * order)[on_object]
     assert np.abs(correction).max() < bound + 1e-3
     assert np.abs(correction).max() > 0.9 * bound  # it did try
-    allowed = (order >= observation.candidates.first) & (
-        order < observation.candidates.first + observation.candidates.count
-    )
-    allowed |= order == answered.base
+    first, count = observation.candidates.first, observation.candidates.count
+    allowed = (order >= first) & (order < first + count)
+    allowed |= (order == answered.base) & (count == 0)
     assert allowed[on_object].all()
     assert len(np.unique((order - answered.base)[on_object])) > 1
 
@@ -68,6 +68,51 @@ def test_without_its_levers_it_is_the_measured_route() -> None:
     assert np.array_equal(measurement.depth_mm, measured.depth_mm)
     assert np.array_equal(measurement.order, measured.order)
     assert np.array_equal(measurement.confidence, measured.confidence)
+
+
+@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
+def test_a_range_under_one_period_settles_the_order(direction: str) -> None:
+    """Of a rig whose range is shorter than a period, the order is the measured candidate, whatever the network says."""
+    short = replace(RIG, working_range_mm=(1700.0, 1900.0))
+    assert short.periods_in_range(direction) < 1  # type: ignore[arg-type]
+    image = photograph("cork", "A60").frames[FIRST[direction]]
+    answered = (route := NetworkRoute(short, Settings(direction=direction), wild(0.5), threshold=-1e9)).observe(image)
+    measurement = route.conclude(answered)
+    crop, candidates = answered.observation.crop, answered.observation.candidates
+    one = (candidates.count == 1) & (measurement.depth_mm[crop] > 0)
+    absolute = answered.observation.layer.absolute_phase(np.where(one, measurement.depth_mm[crop], 1000.0))
+    order = np.rint((absolute - answered.observation.phase_rad) / TAU)
+    assert one.sum() > 300 and (order == candidates.first)[one].all()
+    assert measurement.order_doubt_mm[crop][one].max() < 0.01
+    assert "order by range" in PhaseNetMethod(short, direction).title  # type: ignore[arg-type]
+    assert PhaseNetMethod(short, direction).settings["order_by_range"] is True  # type: ignore[arg-type]
+    assert PhaseNetMethod(RIG, direction).settings["order_by_range"] is False  # type: ignore[arg-type]
+
+
+def test_any_albedo_says_what_it_cannot_tell() -> None:
+    """Without brightness most orders are ambiguous, and a wrong one is not denied by the uncertainty."""
+    row = photograph("cracker_box", "A60")
+    measurement = PhaseNetMethod(RIG, albedo="any").route.measure(row.frames[0])
+    given = (measurement.depth_mm > 0) & (row.depth_mm > 0)
+    several = given & (measurement.candidates.count > 1)
+    assert (measurement.reason[several] == Reason.AMBIGUOUS).mean() > 0.5
+    error = np.abs(measurement.depth_mm - row.depth_mm)
+    denied = given & (error > 150) & (measurement.sigma_mm < 0.25 * error)
+    assert denied.sum() < 0.001 * given.sum()
+
+
+def test_brighter_or_darker_frames_have_the_same_depth() -> None:
+    """No absolute grey level enters the network: its input is relative to the frame's own light."""
+    image = photograph("cork", "A60").frames[0]
+    method = PhaseNetMethod(RIG)
+    full = method.route.measure(image)
+    # Light above the ambient grey level, halved; what is rounded to whole grey levels is noise of half a level.
+    background = method.route.observe(image).observation.background
+    half_grey = background.ambient_grey + (image - background.ambient_grey) / 2
+    half = method.route.measure(np.rint(half_grey).astype(np.uint8))
+    both = (full.depth_mm > 0) & (half.depth_mm > 0)
+    assert both.sum() > 0.95 * (full.depth_mm > 0).sum()
+    assert np.median(np.abs(full.depth_mm - half.depth_mm)[both]) < 1.0
 
 
 def test_an_empty_scene_has_no_depth() -> None:
@@ -128,6 +173,8 @@ def test_method_is_registered_and_reports_itself() -> None:
     phase_net = load_method("phase-net", RIG, direction="vertical")
     assert phase_net.frames_used == (18,) and phase_net.uses_ground_truth_range is False
     assert "learned" in phase_net.title and phase_net.settings["weights_sha256"] == load_net().sha256
+    assert "one albedo" in phase_net.title and phase_net.settings["shading"] is True
+    assert load_method("phase-net", RIG, albedo="any").settings["weights"] == "phase-net-any-albedo"
     assert 100_000 < phase_net.parameters < 1_000_000  # type: ignore[attr-defined]
     frames: list = [None] * 52
     frames[18] = photograph("cork", "A60").frames[18]
@@ -140,6 +187,10 @@ def test_refusals_name_what_came() -> None:
         PhaseNetMethod(RIG).predict([None] * 52)
     with pytest.raises(PredictionError, match="both"):
         PhaseNetMethod(RIG, "both")  # type: ignore[arg-type]
+    with pytest.raises(PredictionError, match="expected one or any"):
+        PhaseNetMethod(RIG, albedo="both")
+    with pytest.raises(PredictionError, match="learned one albedo"):
+        PhaseNetMethod(RIG, weights=load_net(), albedo="any")
     with pytest.raises(NetworkError, match="multiples of 16"):
         PhaseNet().forward(torch.zeros(1, len(CHANNELS), 40, 32))
     with pytest.raises(NetworkError, match="bound_rad"):

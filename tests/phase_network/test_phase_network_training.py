@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 
@@ -10,20 +11,23 @@ import pytest
 import torch
 from flat_planes import DIRECT, USERS_WORD, plane_depth_m, plane_fringe
 
+from fpp_ml_bench.baselines import load_method, training
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, Geometry, Rotation
 from fpp_ml_bench.baselines.phase_network.method import load_net, save_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.phase_network.samples import Sample, companions, sample_of, united
-from fpp_ml_bench.baselines.phase_network.training import PhaseNetTraining, Recipe
+from fpp_ml_bench.baselines.phase_network.samples import Sample, sample_of, samples_of
+from fpp_ml_bench.baselines.phase_network.training import Recipe, answers_of, mean_scores, train_phase_net
+from fpp_ml_bench.baselines.phase_network.window_training import WindowTraining
 from fpp_ml_bench.baselines.phase_network.windows import Variation, draw
 from fpp_ml_bench.baselines.phase_route import Settings
-from fpp_ml_bench.baselines.training import CHECKPOINT, SHIPPED, NetConfig, reproducible
+from fpp_ml_bench.baselines.training import CHECKPOINT, SHIPPED, Group, NetConfig, read_views, reproducible
 from fpp_ml_bench.errors import RecipeError, TrainingError, WeightsError
+from fpp_ml_bench.loaders.render import named_light
 from fpp_ml_bench.optics import paper_rig
 
 RIG = paper_rig(240)
-AS_CAPTURED = Variation(near_edge=0, shift=0, wrong_window=0, wrong_patch=0, no_shading=0, mirror=0, brightness=0)
-OPTIONS = {"widths": [4, 6], "fine": 4, "squeezed": 6, "order_widths": [4, 6], "bound_rad": 1.0}
+AS_CAPTURED = Variation(near_edge=0, shift=0, wrong_window=0, wrong_patch=0, mirror=0, brightness=0)
+OPTIONS = {"widths": [4, 6], "fine": 4, "squeezed": 6, "order_widths": [4, 6], "bound_rad": 1.0, "uncertain": True}
 SMALL = Recipe(
     steps=4, batch=2, window=48, warm_up=1, widths=(4, 6), fine=4, squeezed=6, order_widths=(4, 6), bound_rad=1.0,
     validate_every=2, directions=("horizontal",),
@@ -44,7 +48,10 @@ def plane(distance_m: float, direction: str = "horizontal") -> Sample:
     tilt = (0.1, -0.1)
     depth_m = plane_depth_m(RIG, distance_m, tilt)
     image = plane_fringe(RIG, 0 if direction == "horizontal" else 18, depth_m, tilt, noise=0.3, light=DIRECT)
-    return sample_of(image, (1000 * depth_m).astype(np.float32), "plane_A0", geometry(direction))
+    nothing = np.zeros(depth_m.shape, bool)
+    sample = sample_of(image, (1000 * depth_m).astype(np.float32), nothing, "plane_A0", "paper", geometry(direction))
+    assert sample is not None
+    return sample
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
@@ -53,8 +60,8 @@ def test_an_object_that_is_moved_looks_as_if_it_stood_there(direction: str) -> N
     own_geometry = geometry(direction)
     moved = replace(AS_CAPTURED, shift=1.0, margin_mm=300.0)  # the range's middle: 1.8 m
     random = [np.random.default_rng(1) for _ in range(2)]
-    moved_window = draw([plane(1.7, direction)], {direction: own_geometry}, 240, moved, random[0])
-    captured_window = draw([plane(1.8, direction)], {direction: own_geometry}, 240, AS_CAPTURED, random[1])
+    moved_window = draw([plane(1.7, direction)], {direction: own_geometry}, 240, moved, True, random[0])
+    captured_window = draw([plane(1.8, direction)], {direction: own_geometry}, 240, AS_CAPTURED, True, random[1])
     lit = moved_window.fitted & captured_window.fitted & (moved_window.x[CHANNELS.index("window share")] > 0.9)
     lit &= moved_window.x[CHANNELS.index("brightness")] > -0.5  # the projector's field ends before the camera's
     assert lit.mean() > 0.5
@@ -72,51 +79,13 @@ def test_wrong_first_orders_are_labelled_as_such() -> None:
     samples, geometries = [plane(1.8)], {"horizontal": geometry()}
     orders = []
     for seed in range(4):
-        window = draw(samples, geometries, 96, vary, np.random.default_rng(seed))
+        window = draw(samples, geometries, 96, vary, True, np.random.default_rng(seed))
         assert np.take_along_axis(window.exists, np.maximum(window.order, 0)[None], 0)[0][window.fitted].all()
         orders += [window.order[window.fitted]]
     labels = np.unique(np.concatenate(orders))
     assert {0, 2} & set(labels.tolist())
-    captured = draw(samples, geometries, 96, AS_CAPTURED, np.random.default_rng(0))
+    captured = draw(samples, geometries, 96, AS_CAPTURED, True, np.random.default_rng(0))
     assert (captured.order[captured.fitted] == 1).mean() > 0.95
-
-
-def test_a_union_is_what_the_rig_captures_of_both() -> None:
-    """Two tilted surfaces through each other before a plane, all in the benchmark's own light."""
-    rows, columns = np.indices((RIG.camera.height, RIG.camera.width))
-    behind, tilts = 2.1, [(0.1, -0.1), (-0.3, 0.2)]
-    depths = [
-        np.where(rows < 160, plane_depth_m(RIG, 1.7, tilts[0]), 0),
-        np.where(columns > 90, plane_depth_m(RIG, 1.72, tilts[1]), 0),
-    ]
-    empty = plane_fringe(RIG, 0, np.full(rows.shape, behind), (0.0, 0.0), noise=0)
-    images = [
-        np.where(depth > 0, plane_fringe(RIG, 0, np.where(depth > 0, depth, behind), tilt, noise=0), empty)
-        for depth, tilt in zip(depths, tilts, strict=True)
-    ]
-    images[1][-1, 0] = 0  # a shadow on the plane stays
-    image, depth_mm = united(images, [1000 * depth_m for depth_m in depths])
-    first = (depths[0] > 0) & ((depths[1] == 0) | (depths[0] <= depths[1]))
-    second = (depths[1] > 0) & ~first
-    assert (first & (depths[1] > 0)).mean() > 0.05 and (second & (depths[0] > 0)).mean() > 0.05
-    expected = np.where(first, images[0], np.where(second, images[1], empty))
-    expected[-1, 0] = 0
-    assert np.array_equal(image, expected)
-    # float32 numbers from 1024 to 2048 mm are 2**-13 mm apart.
-    np.testing.assert_allclose(depth_mm, 1000 * np.where(first, depths[0], depths[1]), rtol=0, atol=2**-14)
-    assert image.dtype == np.uint8 and depth_mm.dtype == np.float32
-
-
-def test_companions_are_other_objects() -> None:
-    objects = {f"{view}_{name}": name for name in ("mug", "large_clamp", "pen") for view in (0, 60)}
-    counts = set()
-    for seed in range(40):
-        names = companions(objects, "60_mug", np.random.default_rng(seed))
-        shown = [objects[name] for name in names]
-        assert "mug" not in shown and len(set(shown)) == len(shown)
-        counts.add(len(names))
-    assert counts == {1, 2}
-    assert companions({"0_mug": "mug", "60_mug": "mug"}, "0_mug", np.random.default_rng(0)) == []
 
 
 def test_turning_for_the_network_and_back() -> None:
@@ -131,10 +100,14 @@ def test_turning_for_the_network_and_back() -> None:
 def test_stopping_and_going_on_gives_the_same_weights(tmp_path: Path) -> None:
     samples, geometries = [plane(1.7), plane(1.9)], {"horizontal": geometry()}
 
-    def trained(name: str, recipe: Recipe = SMALL, minutes: float | None = None) -> PhaseNetTraining:
+    def scores(network: PhaseNet) -> dict[str, float]:
+        return mean_scores(answers_of(network, samples[:1], geometries, True), samples[:1], geometries)
+
+    def trained(name: str, recipe: Recipe = SMALL, minutes: float | None = None) -> WindowTraining:
         (tmp_path / name).mkdir(exist_ok=True)
         with reproducible(cpu=True):
-            training = PhaseNetTraining(recipe, samples, samples[:1], geometries, tmp_path / name)
+            one_window = partial(draw, samples, geometries, recipe.window, recipe.vary, True)
+            training = WindowTraining(recipe, one_window, scores, tmp_path / name)
             training.run(perf_counter(), minutes, show=False)
         return training
 
@@ -151,7 +124,10 @@ def test_stopping_and_going_on_gives_the_same_weights(tmp_path: Path) -> None:
 
 
 def test_recipes_that_train_nothing_are_refused() -> None:
-    for wrong in ({"steps": 0}, {"unions": -1}, {"rate": 0.0}, {"directions": ("both",)}, {"averaged": 1.0}):
+    for wrong in (
+        {"steps": 0}, {"unions": -1}, {"rate": 0.0}, {"directions": ("both",)}, {"averaged": 1.0},
+        {"albedo": "two"}, {"textured_every": 0}, {"lights": -1},
+    ):  # fmt: skip
         with pytest.raises(RecipeError):
             replace(SMALL, **wrong)  # type: ignore[arg-type]
     assert SMALL.digest != replace(SMALL, rate=1e-3).digest
@@ -201,3 +177,30 @@ def test_weights_that_are_none_are_refused(tmp_path: Path) -> None:
         save_net(path, bad, CONFIG)
     header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
     assert header["__metadata__"]["format"] == "fpp-ml-bench phase-net"
+
+
+def test_a_training_in_small_is_resumed_and_predicts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From its own views to weights that a method takes; views whose light nothing calibrates are left out."""
+    rig = paper_rig(320)
+    groups = [
+        Group("paper", named_light("paper"), (("wood_block", "A0"), ("duct_tape", "A60"))),
+        Group("validation-paper", named_light("paper"), (("mug", "A0"),), "validation"),
+    ]
+    monkeypatch.setattr(training, "groups_of", lambda *args: groups)
+    out, recipe = tmp_path / "run", replace(SMALL, steps=2, validate_every=1, batch=1, albedo="any")
+    first = train_phase_net(recipe, out, rig=rig, minutes=1e-9)
+    assert first.weights is None and first.steps == 1
+    trained = train_phase_net(recipe, out, rig=rig)
+    assert trained.weights is not None and 0 <= trained.validation["missed_percent"] <= 100
+    assert (out / "reliability.png").stat().st_size > 1000
+    assert train_phase_net(recipe, out, rig=rig) == trained
+    with pytest.raises(TrainingError, match="another training"):
+        train_phase_net(replace(recipe, albedo="one"), out, rig=rig)
+    method = load_method("phase-net", rig, weights=trained.weights)
+    assert "any albedo" in method.title and method.settings["shading"] is False
+    view = next(read_views(out / "views", groups, "validation"))
+    answer = method.answer([view.frames[0]] + [None] * (len(rig.sequence) - 1))
+    assert answer.depth.dtype == np.float32 and np.array_equal(answer.sigma_mm > 0, answer.depth > 0)
+    dark = replace(view, frames=view.frames // 50)
+    geometries = {"horizontal": Geometry.of(rig, Settings())}
+    assert len(samples_of([view], geometries, True)) == 1 and samples_of([dark], geometries, True) == []

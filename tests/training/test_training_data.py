@@ -24,7 +24,7 @@ from fpp_ml_bench.cli import main
 from fpp_ml_bench.loaders.storage import Benchmark, benchmark
 
 OLD = "a" * 64
-NET_OPTIONS = {"widths": [4, 6], "fine": 4, "squeezed": 6, "order_widths": [4, 6], "bound_rad": 1.0}
+NET_OPTIONS = {"widths": [4, 6], "fine": 4, "squeezed": 6, "order_widths": [4, 6], "bound_rad": 1.0, "uncertain": True}
 
 
 @pytest.fixture
@@ -37,7 +37,8 @@ def benchmarks(monkeypatch, opened):
 
 def phase_net_config(**changes):
     content = {"name": "phase-net", "title": "Small", "options": NET_OPTIONS, "threshold": -1.0,
-               "period_px": {"horizontal": 5.6}, "dataset_fingerprint": "0" * 64}  # fmt: skip
+               "period_px": {"horizontal": 5.6}, "dataset_fingerprint": "0" * 64,
+               "recipe": {"albedo": "one"}}  # fmt: skip
     return NetConfig(**{**content, **changes})
 
 
@@ -58,7 +59,7 @@ def test_a_file_without_the_entry_is_read(tmp_path):
     """The shipped networks are older than the entry; phase-net names the version that it was trained on."""
     for name in shipped_names():
         assert open_weights(SHIPPED / f"{name}.safetensors").config.benchmark is None
-    assert load_net().config.benchmark == TrainingBenchmark("fpp-bench-full", 1)
+    assert load_net().config.benchmark == TrainingBenchmark("phase-net views", 1)
     path = tmp_path / "net.safetensors"
     save_net(path, PhaseNet(**NET_OPTIONS), phase_net_config(benchmark=TrainingBenchmark("tiny", 1)))
     data = path.read_bytes()
