@@ -100,8 +100,8 @@ def train_crossed_net(
         answers = [network_answers(network, sample.scene.single(), carriers) for sample in validation]
         pixels = rig.camera.width * rig.camera.height
         some = samples[::CHOSEN_SHARE]
-        learned = [network_answers(network, sample.scene.single(), carriers) for sample in some]
-        threshold = chosen_threshold(answers + learned, validation + some, pixels)
+        of_some = [network_answers(network, sample.scene.single(), carriers) for sample in some]
+        threshold = chosen_threshold(answers + of_some, validation + some, pixels)
         lead = chosen_lead(answers, validation, carriers)
         led = [one.with_lead(lead) for one in answers]
         means = _mean([score(one, s, carriers, threshold) for one, s in zip(led, validation, strict=True)])
