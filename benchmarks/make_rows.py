@@ -6,6 +6,8 @@
     python benchmarks/make_rows.py data/unseen --work rows-unseen --training data/full
     fpp-bench build data/crossed --preset full --rig crossed
     python benchmarks/make_rows.py data/crossed --work rows-crossed
+    fpp-bench build data/crossed-hard --preset full --rig crossed --light hard --objects power_drill,large_clamp,...
+    python benchmarks/make_rows.py data/crossed-hard --work rows-hard --suffix=-hard --only crossed crossed-net
     fpp-bench leaderboard --readme README.md
     fpp-bench leaderboard --page page
 
@@ -129,6 +131,7 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True, help="new or empty folder for predictions and results")
     parser.add_argument("--out", type=Path, default=ROWS, help="folder for the rows")
     parser.add_argument("--only", nargs="+", choices=METHODS | CROSSED, metavar="NAME", help="only these rows")
+    parser.add_argument("--suffix", help="of the rows' names (default: -unseen for a dataset without a training split)")
     parser.add_argument("--training", type=Path, help="for nearest: the dataset with the training split")
     parser.add_argument("--repeats", type=int, default=40, help="timed runs of each method")
     args = parser.parse_args()
@@ -137,7 +140,7 @@ def main() -> None:
     args.work.mkdir(parents=True, exist_ok=True)
     args.out.mkdir(parents=True, exist_ok=True)
     opened = DatasetFolder(args.dataset)
-    suffix = "" if "train" in opened.splits else "-unseen"
+    suffix = args.suffix if args.suffix is not None else "" if "train" in opened.splits else "-unseen"
     for name in args.only or (METHODS if opened.rig.crossed is None else CROSSED):
         row = args.out / f"{name}{suffix}.json"
         make_row(args.dataset, args.work, row, name, args.repeats, args.training)
