@@ -15,14 +15,18 @@ from fpp_ml_bench.baselines.crossed_route import (
     CrossedRoute,
     Settings,
 )
-from fpp_ml_bench.baselines.phase_network import Answers, PhaseNet, answers_of_maps, least_energy_order, probabilities
+from fpp_ml_bench.baselines.phase_network import (
+    Answers,
+    PhaseNet,
+    answers_of_maps,
+    least_energy_order,
+    probabilities,
+    threshold_at,
+)
 from fpp_ml_bench.baselines.phase_route import Image, Mask, Periods, of_choice
 from fpp_ml_bench.optics import Rig
 
 DENIED = 6.0  # a pixel of the measured mask stays object unless its logit is this far below the threshold
-WEAK, STRONG = 10.0, 40.0
-"""Strengths of a scene (see `Scene`) from which on its mask's threshold is `SPREAD` below or above the network's."""
-SPREAD = 1.5
 PERHAPS = 4.0  # a pixel whose logit is this far below the threshold still takes part in the labelling of orders
 LEAST_CHANCE = 1e-6  # of a wrong order, whatever the network answers
 STATED_FLOOR_RAD, STATED_SHARE, LEAST_STATED = 0.02, 0.8, 0.45
@@ -44,17 +48,10 @@ def stated_rad(sigma_rad: Image) -> Image:
     return np.float32(STATED_SHARE) * np.sqrt(rest)  # type: ignore[no-any-return]
 
 
-def threshold_in(scene: Scene, threshold: float) -> float:
-    """The threshold of the mask's logit in a scene: ``threshold`` at a strength of 20. In a weak frame the network is
-    less sure of everything, and a missed pixel costs more than an invented one."""
-    place = np.log(max(scene.strength, 1e-3) / WEAK) / np.log(STRONG / WEAK)
-    return threshold + SPREAD * float(np.clip(2 * place - 1, -1, 1))
-
-
 def decided_mask(answers: Answers, scene: Scene, threshold: float) -> Mask:
-    """Object pixels (h, w): those whose logit is above the `threshold_in` the scene, and those of the measured route's
-    mask whose logit is at most `DENIED` below it."""
-    logit, threshold = answers.object_logit, threshold_in(scene, threshold)
+    """Object pixels (h, w): those whose logit is above the `threshold_at` the scene's strength, and those of the
+    measured route's mask whose logit is at most `DENIED` below it."""
+    logit, threshold = answers.object_logit, threshold_at(scene.strength, threshold)
     return (logit > threshold) | (scene.inside & (logit > threshold - DENIED))
 
 
@@ -90,7 +87,7 @@ class CrossedNetRoute:
         joint = seen.carriers.joint_gain
         inside = decided_mask(answers, scene, self.threshold)
         # Orders are labelled on all that may be object: a hole in the mask must not part a surface.
-        perhaps = scene.inside | (answers.object_logit > threshold_in(scene, self.threshold) - PERHAPS)
+        perhaps = scene.inside | (answers.object_logit > threshold_at(scene.strength, self.threshold) - PERHAPS)
         choice = decided_order(answers, scene, self.route.carriers, perhaps, self.route.stride)
         offers = np.stack([scene.step_rad[0], np.zeros_like(joint), scene.step_rad[1]])
         nearness = scene.nearness + (of_choice(offers, choice) + answers.correction_rad) / joint

@@ -2,6 +2,7 @@ from .answers import Answers as Answers
 from .answers import answers_of_maps as answers_of_maps
 from .answers import least_energy_order as least_energy_order
 from .answers import probabilities as probabilities
+from .answers import threshold_at as threshold_at
 from .inputs import LARGEST_RAD as LARGEST_RAD
 from .inputs import SIDE_PERIODS as SIDE_PERIODS
 from .inputs import SIDES as SIDES

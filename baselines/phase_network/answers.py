@@ -13,6 +13,10 @@ from fpp_ml_bench.baselines.phase_route import LARGE, Image, Mask, least_energy,
 
 GRAPH = 3.0  # weight of smoothness between neighbours in the labelling of the orders
 SCALE_TO_SIGMA = float(np.sqrt(2))  # of a Laplace distribution
+WEAK, STRONG = 10.0, 40.0
+"""Strengths, an object's median modulation in sigmas of the noise, from which on its mask's threshold is `SPREAD` below
+or above the network's."""
+SPREAD = 1.5
 
 
 @dataclass(frozen=True)
@@ -30,6 +34,13 @@ class Answers:
         """The same with ``lead`` added to the base's logit. Training makes up wrong base orders, so the network holds
         the base wrong more often than it is; the lead, chosen on the validation views, makes up for that."""
         return replace(self, logits=self.logits + np.array([0, lead, 0], np.float32)[:, None, None])
+
+
+def threshold_at(strength: float, threshold: float) -> float:
+    """The threshold of the mask's logit in a scene: ``threshold`` at a strength of 20. In a weak frame the network is
+    less sure of everything, and a missed pixel costs more than an invented one."""
+    place = np.log(max(strength, 1e-3) / WEAK) / np.log(STRONG / WEAK)
+    return threshold + SPREAD * float(np.clip(2 * place - 1, -1, 1))
 
 
 def probabilities(logits: Image) -> Image:

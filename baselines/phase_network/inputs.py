@@ -141,6 +141,12 @@ class Scene:
             slopes=observation.slopes, middle_rad=float(np.median(residual[on_object])) if on_object.any() else 0.0,
         )  # fmt: skip
 
+    @property
+    def strength(self) -> float:
+        """The object's median modulation in sigmas of the noise."""
+        lit = self.bright[self.inside & (self.bright > 0)]
+        return float(np.median(lit)) / self.noise if lit.size else 0.0
+
     def window(self, rows: slice, columns: slice) -> "Scene":
         """A part of this scene; slices of its maps, with start and stop."""
         top, left = self.crop[0].start, self.crop[1].start

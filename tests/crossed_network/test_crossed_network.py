@@ -12,11 +12,11 @@ import torch
 from fpp_ml_bench.baselines import load_method, training
 from fpp_ml_bench.baselines.crossed_network import CrossedRecipe, inputs, pairs, train_crossed_net
 from fpp_ml_bench.baselines.crossed_network.method import CrossedNetMethod
-from fpp_ml_bench.baselines.crossed_network.route import CrossedNetRoute, decided_mask, stated_rad, threshold_in
+from fpp_ml_bench.baselines.crossed_network.route import CrossedNetRoute, decided_mask, stated_rad
 from fpp_ml_bench.baselines.crossed_network.samples import Sample, Variation, draw, sample_of
 from fpp_ml_bench.baselines.crossed_route import CrossedRoute
 from fpp_ml_bench.baselines.networks import load
-from fpp_ml_bench.baselines.phase_network import IGNORED, Answers, load_net
+from fpp_ml_bench.baselines.phase_network import IGNORED, Answers, load_net, threshold_at
 from fpp_ml_bench.baselines.training import load_recipe, train
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import PredictionError, RecipeError, TrainingError, WeightsError
@@ -207,7 +207,7 @@ def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
 def test_the_mask_asks_for_less_in_a_weak_frame(samples: list[Sample]) -> None:
     scene = samples[0].scene.single()
     assert scene.strength > 25  # the light paper
-    limits = [threshold_in(replace(scene, strength=strength), -0.5) for strength in (0.0, 5.0, 20.0, 40.0, 200.0)]
+    limits = [threshold_at(strength, -0.5) for strength in (0.0, 5.0, 20.0, 40.0, 200.0)]
     assert limits == pytest.approx([-2.0, -2.0, -0.5, 1.0, 1.0])
     logit = np.full(scene.inside.shape, -1.0, np.float32)
     answers = Answers(np.zeros((3, *logit.shape), np.float32), logit, 0 * logit, 0 * logit)
