@@ -40,7 +40,8 @@ def network_answers(network: PhaseNet, scene: Scene, geometry: Geometry, shading
 
 def decided_mask(answers: Answers, scene: Scene, threshold: float) -> Mask:
     """Object pixels (h, w): those whose logit is above the `threshold_at` the scene's strength, and those of the
-    measured route's mask whose logit is at most `DENIED` below it; only where enough of the local fit's window lies on the object."""
+    measured route's mask whose logit is at most `DENIED` below it; only where enough of the local fit's window lies on
+    the object."""
     logit, threshold = answers.object_logit, threshold_at(scene.strength, threshold)
     is_object = (logit > threshold) | (scene.inside & (logit > threshold - DENIED))
     return is_object & (scene.weight > LEAST_WEIGHT)

@@ -46,7 +46,7 @@ def anchor(group: Group) -> str:
 
 def _link(group: Group, of_data: Sequence[Group]) -> str:
     """What is said of a table where it is one of those of its dataset: in which it differs from the others."""
-    parts = [group.key.frames]
+    parts = [group.key.frames.partition(",")[0]]
     parts += [group.key.track] if len({other.key.track for other in of_data}) > 1 else []
     parts += [group.key.against.split()[0]] if len({other.key.target for other in of_data}) > 1 else []
     return ", ".join(parts)
