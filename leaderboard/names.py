@@ -86,7 +86,7 @@ def _phase_net(submission: Submission) -> str:
 
 
 def _crossed(submission: Submission) -> str:
-    frames = "1 frame" if len(submission.frames_used) == 1 else "mean of 2"
+    frames = {1: "1 frame", 2: "mean of 2"}.get(len(submission.frames_used), f"{len(submission.frames_used)} frames")
     return f"{printable(submission.settings.get('weights', 'Crossed'))}, {frames}"
 
 
