@@ -3,12 +3,13 @@
 from fpp_ml_bench.evaluation.result import Result
 
 _TOLD_OF = {"range": "depth range", "mask": "object mask", "order": "fringe order"}
-ASSUMED = "one albedo, a lit background"
-_ASSUMES = (
-    "Assumes one albedo for all surfaces and a lit background, which shows how strong the lamp is: the brightness of "
-    "the fringe image decides the fringe order."
-)
-"""What the phase route and the learned one assume, in a few words and as a sentence, unless ``shading`` is off."""
+ASSUMED, ASSUMED_BY_ANY = "one albedo, a lit background", "a lit background"
+_ASSUMES = {
+    ASSUMED: "Assumes one albedo for all surfaces and a lit background, which shows how strong the lamp is: the "
+    "brightness of the fringe image decides the fringe order.",
+    ASSUMED_BY_ANY: "Assumes a lit background; not one albedo, so that little tells the fringe order.",
+}
+"""What the phase route and the learned one assume, in few words and as a sentence; the second with ``shading`` off."""
 
 
 def told(track: str) -> str:
@@ -26,13 +27,16 @@ def told(track: str) -> str:
 def assumption(result: Result) -> str:
     """In a few words; empty where a method assumes nothing of the scene, or is not of this package."""
     method, shading = result.submission.method, result.submission.settings.get("shading")
-    return ASSUMED if method in ("phase", "phase-net") and shading is True else ""
+    if method not in ("phase", "phase-net"):
+        return ""
+    return {True: ASSUMED, False: ASSUMED_BY_ANY if method == "phase-net" else ""}.get(shading, "")
 
 
 def assumption_sentences(result: Result) -> str:
     """For the row's own page: what the method assumes, and what it was told of the samples that it is scored on."""
     given = told(result.track)
-    return " ".join([*([_ASSUMES] if assumption(result) else []), *([f"Told {given}."] if given else [])])
+    assumed = assumption(result)
+    return " ".join([*([_ASSUMES[assumed]] if assumed else []), *([f"Told {given}."] if given else [])])
 
 
 def learned_from(result: Result) -> str:
