@@ -27,9 +27,9 @@ def told(track: str) -> str:
 def assumption(result: Result) -> str:
     """In a few words; empty where a method assumes nothing of the scene, or is not of this package."""
     method, shading = result.submission.method, result.submission.settings.get("shading")
-    if method not in ("phase", "phase-net"):
-        return ""
-    return {True: ASSUMED, False: ASSUMED_BY_ANY if method == "phase-net" else ""}.get(shading, "")
+    if method in ("phase", "phase-net") and shading is True:
+        return ASSUMED
+    return ASSUMED_BY_ANY if method == "phase-net" and shading is False else ""
 
 
 def assumption_sentences(result: Result) -> str:
