@@ -4,13 +4,13 @@ import os
 import re
 import stat
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import IO, Any
 
-from fpp_ml_bench.errors import BuildError, PredictionError
+from fpp_ml_bench.errors import BuildError, FppBenchError, PredictionError
 
 NAME_LIMIT = 200
 """Longest text a submission may hold in any one value, in characters."""
@@ -89,6 +89,18 @@ def write_atomically(path: Path, content: bytes) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def write_files(folder: Path, contents: Mapping[str, bytes], error_type: type[FppBenchError]) -> list[Path]:
+    """Write ``contents`` by file name into ``folder``, which is made if it is missing; returns their paths. Raises
+    ``error_type`` for a folder that can't be written."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for name, content in contents.items():
+            write_atomically(folder / name, content)
+    except OSError as error:
+        raise error_type(f"{folder}: can't be written ({error.strerror or error}); choose another folder") from error
+    return [folder / name for name in contents]
 
 
 def file_hash(path: Path) -> str:

@@ -4,7 +4,6 @@ Imports neither NumPy nor torch. Compiled kernels are imported only when `numba_
 function that gives the same numbers (but for ray casting, always compiled). ``FPP_BENCH_NUMBA=0`` selects NumPy.
 """
 
-import atexit
 import ctypes
 import gc
 import os
@@ -113,18 +112,11 @@ def keep_freed_memory() -> None:
         set_option(_TRIM_THRESHOLD, (1 << 31) - 1)
 
 
-_SWITCH_S = 2e-4
-
-
 def prepare_process() -> None:
     """Keep freed memory, look for no pydantic plugins (a search of every installed package), and collect no cyclic
-    garbage, nor search for any at the end of the process: the collector visits every imported object again and again,
-    and scoring leaves no reference cycles. Threads that score wait `_SWITCH_S` for the interpreter while another one
-    imports, instead of the 5 ms that are Python's default and as long as half a sample takes."""
+    garbage: the collector visits every imported object again and again, and scoring leaves no reference cycles."""
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     gc.disable()
-    atexit.register(gc.freeze)
-    sys.setswitchinterval(_SWITCH_S)
     keep_freed_memory()
 
 

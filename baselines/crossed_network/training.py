@@ -18,13 +18,15 @@ from fpp_ml_bench.baselines.crossed_network.route import decided_mask, network_a
 from fpp_ml_bench.baselines.crossed_network.samples import Sample, Variation, draw, sample_of
 from fpp_ml_bench.baselines.crossed_route import Carriers, CrossedRoute
 from fpp_ml_bench.baselines.phase_network import (
-    TYPICAL_MM,
     Answers,
     PhaseNet,
     Trained,
     WindowRecipe,
     WindowTraining,
+    chosen_lead,
+    chosen_threshold,
     load_net,
+    mean_scores,
     save_net,
 )
 from fpp_ml_bench.baselines.phase_route import of_choice
@@ -71,40 +73,42 @@ def train_crossed_net(
         finished = load_net(weights).config
         known = {key: float(value or 0) for key, value in finished.validation.items()}
         return Trained(weights, finished.steps, finished.threshold, known)
-    views = sum(len(group.views) for group in groups)
-    with training.Display("rendering views", views, show) as display:
-        (frame, *_) = rig.sequence.crossed_frames
-        training.render_views(groups, rig, (frame,), out / VIEWS, workers, display.advance)
-    route = CrossedRoute(rig)
-    learnt = sum(len(group.views) for group in groups if group.split == "train")
-    with training.Display("measuring views", views + learnt * recipe.unions, show) as display:
-        learned = training.read_views(out / VIEWS, groups, "train")
-        united = training.with_unions(learned, recipe.unions, recipe.seed, display.advance)
-        samples = [sample_of(view, route) for view in united]
-        kept = training.with_unions(training.read_views(out / VIEWS, groups, "validation"), 0, 0, display.advance)
-        validation = [sample_of(view, route) for view in kept]
+    route, frame = CrossedRoute(rig), rig.sequence.crossed_frames[0]
+    samples, validation = training.measured_views(
+        groups, rig, (frame,), out / VIEWS, lambda views: [sample_of(view, route) for view in views], recipe.unions,
+        recipe.seed, workers, show,
+    )  # fmt: skip
     carriers = route.carriers
 
-    def scores(network: PhaseNet) -> dict[str, float]:
+    def answers_of(network: PhaseNet, some: list[Sample]) -> list[Answers]:
+        return [network_answers(network, sample.scene.single(), carriers) for sample in some]
+
+    def scores_of(answers: list[Answers], some: list[Sample], threshold: float = 0.0) -> dict[str, float]:
+        return mean_scores(score(one, sample, carriers, threshold) for one, sample in zip(answers, some, strict=True))
+
+    def validated(network: PhaseNet) -> dict[str, float]:
         scored = validation[::VALIDATED_SHARE]
-        answers = (network_answers(network, sample.scene.single(), carriers) for sample in scored)
-        return _mean([score(one, sample, carriers) for one, sample in zip(answers, scored, strict=True)])
+        return scores_of(answers_of(network, scored), scored)
 
     with training.reproducible(cpu=True):
         one_window = partial(draw, samples, carriers, recipe.window, recipe.vary)
-        ongoing = WindowTraining(recipe, one_window, scores, out, print_line=print_line)
+        ongoing = WindowTraining(recipe, one_window, validated, out, print_line=print_line)
         ongoing.run(started, minutes, show)
         if not ongoing.over:
             return Trained(None, ongoing.steps_done, 0.0, {})
         network = ongoing.network
-        answers = [network_answers(network, sample.scene.single(), carriers) for sample in validation]
-        pixels = rig.camera.width * rig.camera.height
-        some = samples[::CHOSEN_SHARE]
-        of_some = [network_answers(network, sample.scene.single(), carriers) for sample in some]
-        threshold = chosen_threshold(answers + of_some, validation + some, pixels)
-        lead = chosen_lead(answers, validation, carriers)
-        led = [one.with_lead(lead) for one in answers]
-        means = _mean([score(one, s, carriers, threshold) for one, s in zip(led, validation, strict=True)])
+        answers, some = answers_of(network, validation), samples[::CHOSEN_SHARE]
+        masks = [
+            (sample, partial(decided_mask, one, sample.scene.single()))
+            for one, sample in zip(answers + answers_of(network, some), validation + some, strict=True)
+        ]
+        threshold = chosen_threshold(masks, THRESHOLDS, rig.camera.width * rig.camera.height)
+
+        def wrong_percent(lead: float) -> float:
+            return scores_of([one.with_lead(lead) for one in answers], validation)["wrong_percent"]
+
+        lead = chosen_lead(wrong_percent, LEADS)
+        means = scores_of([one.with_lead(lead) for one in answers], validation, threshold)
     config = training.NetConfig(
         name=recipe.name, title="Fringe order, mask and bounded phase correction of a crossed frame",
         options=network.options, threshold=threshold, lead=lead, period_px={"crossed": carriers.period_px},
@@ -116,11 +120,12 @@ def train_crossed_net(
     return Trained(weights, recipe.steps, threshold, means)
 
 
-def score(answers: Answers, sample: Sample, carriers: Carriers, threshold: float = 0.0) -> dict[str, float]:
+def score(answers: Answers, sample: Sample, carriers: Carriers, threshold: float = 0.0) -> dict[str, float | None]:
     """Scores of a view, each pixel's likeliest order taken. ``object_mae_mm`` counts a missed pixel with its whole
     depth; ``right_mae_mm``: MAE of pixels with the right order; ``wrong_percent`` and ``missed_percent``: shares of the
     object; ``invented_kpx``: background pixels with a depth, in thousands; ``within_percent``: errors of the joint
-    phase within the stated standard uncertainty, 68 of a normal distribution."""
+    phase within the stated standard uncertainty, 68 of a normal distribution. Where no order is right, it and
+    ``right_mae_mm`` are None."""
     scene, target = sample.scene.single(), sample.target
     part = carriers.at(scene.crop)
     joint = part.joint_gain
@@ -135,35 +140,10 @@ def score(answers: Answers, sample: Sample, carriers: Carriers, threshold: float
     error = np.where(detected, np.minimum(error, true_mm), true_mm)
     right = detected & ~wrong
     return {
-        "object_mae_mm": float(error.mean()), "right_mae_mm": float(error[right].mean()),
-        "wrong_percent": 100 * float(wrong.mean()), "missed_percent": 100 * float((~detected).mean()),
+        "object_mae_mm": float(error.mean()),
+        "right_mae_mm": float(error[right].mean()) if right.any() else None,
+        "wrong_percent": 100 * float(wrong.mean()),
+        "missed_percent": 100 * float((~detected).mean()),
+        "within_percent": 100 * float((apart < answers.sigma_rad[target])[right].mean()) if right.any() else None,
         "invented_kpx": float((inside & ~target & ~sample.void).sum()) / 1000,
-        "within_percent": 100 * float((apart < answers.sigma_rad[target])[right].mean()),
-    }  # fmt: skip
-
-
-def chosen_threshold(answers: list[Answers], samples: list[Sample], pixels: int) -> float:
-    """The threshold out of `THRESHOLDS` with the least sum of object and background error: a missed object pixel and an
-    invented background pixel are off by the same distance, each divided by the number of pixels of its kind."""
-    costs = np.zeros(len(THRESHOLDS))
-    for answer, sample in zip(answers, samples, strict=True):
-        scene, object_px = sample.scene.single(), max(int(sample.target.sum()), 1)
-        for number, threshold in enumerate(THRESHOLDS):
-            inside = decided_mask(answer, scene, threshold)
-            invented = (inside & ~sample.target & ~sample.void).sum()
-            missed = (sample.target & ~inside).sum()
-            costs[number] += TYPICAL_MM * (missed / object_px + invented / (pixels - object_px))
-    return THRESHOLDS[int(costs.argmin())]
-
-
-def chosen_lead(answers: list[Answers], samples: list[Sample], carriers: Carriers) -> float:
-    """The lead out of `LEADS` with the fewest wrong orders, mean over the samples."""
-    of_leads = [
-        _mean([score(one.with_lead(lead), s, carriers) for one, s in zip(answers, samples, strict=True)])
-        for lead in LEADS
-    ]
-    return LEADS[int(np.argmin([means["wrong_percent"] for means in of_leads]))]
-
-
-def _mean(rows: list[dict[str, float]]) -> dict[str, float]:
-    return {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
+    }

@@ -18,10 +18,12 @@ from .odds import Odds as Odds
 from .route import AnsweredObservation as AnsweredObservation
 from .route import Levers as Levers
 from .route import NetworkRoute as NetworkRoute
-from .training import TYPICAL_MM as TYPICAL_MM
 from .training import Recipe as Recipe
 from .training import Trained as Trained
 from .training import train_phase_net as train_phase_net
+from .validation import chosen_lead as chosen_lead
+from .validation import chosen_threshold as chosen_threshold
+from .validation import mean_scores as mean_scores
 from .window_training import WindowRecipe as WindowRecipe
 from .window_training import WindowTraining as WindowTraining
 from .windows import IGNORED as IGNORED

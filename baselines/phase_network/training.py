@@ -21,6 +21,7 @@ from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.odds import Judged, chosen_odds, confident_shares, draw_reliability
 from fpp_ml_bench.baselines.phase_network.route import decided_mask, decided_order, network_answers
 from fpp_ml_bench.baselines.phase_network.samples import Sample, samples_of
+from fpp_ml_bench.baselines.phase_network.validation import chosen_lead, chosen_threshold, mean_scores
 from fpp_ml_bench.baselines.phase_network.window_training import WindowRecipe, WindowTraining
 from fpp_ml_bench.baselines.phase_network.windows import Variation, draw
 from fpp_ml_bench.baselines.phase_route import TAU, Settings
@@ -32,11 +33,9 @@ VIEWS, RELIABILITY = "views", "reliability.png"
 VALIDATED_SHARE = 5  # every so many-th validation sample is scored during training
 JUDGED_PX = 3  # the stated chances are calibrated on every so many-th pixel
 THRESHOLDS = tuple(float(value) for value in np.arange(-5, 3.01, 0.5))
-"""Mask logits that are tried on the validation split."""
+"""Mask logits that are tried on the validation views; sums of errors this close to the least count as equal:"""
+TOLERANCE_MM = 0.1
 LEADS = tuple(float(value) for value in range(8))
-"""Leads of the base order (see `Answers.with_lead`) that are tried on the validation views."""
-TYPICAL_MM, _TOLERANCE_MM = 1800.0, 0.1
-"""Depth error that a missed or invented pixel counts with; errors this close to the least count as equal."""
 
 Geometries = Mapping[Direction, Geometry]
 
@@ -86,17 +85,12 @@ def answers_of(
         yield network_answers(network, sample.scene.single(), geometries[sample.direction], shading)
 
 
-def mean_scores(
+def scores_of(
     answers: Iterable[Answers], samples: list[Sample], geometries: Geometries, threshold: float = 0.0
 ) -> dict[str, float]:
     """Means of each `score` over the samples that have it."""
     pairs = zip(answers, samples, strict=True)
-    rows = [score(answer, sample, geometries[sample.direction], threshold) for answer, sample in pairs]
-    means: dict[str, float] = {}
-    for key in rows[0] if rows else ():
-        values = [value for row in rows if (value := row[key]) is not None]
-        means |= {key: float(np.mean(values))} if values else {}
-    return means
+    return mean_scores(score(answer, sample, geometries[sample.direction], threshold) for answer, sample in pairs)
 
 
 def score(answers: Answers, sample: Sample, geometry: Geometry, threshold: float = 0.0) -> dict[str, float | None]:
@@ -127,29 +121,6 @@ def score(answers: Answers, sample: Sample, geometry: Geometry, threshold: float
         "within_percent": 100 * float(within[target][right].mean()) if right.any() else None,
         "invented_kpx": float((inside & ~target & ~sample.void).sum()) / 1000,
     }
-
-
-def chosen_threshold(answers: list[Answers], samples: list[Sample], pixels: int) -> float:
-    """The threshold out of `THRESHOLDS` with the least sum of object and background error: a missed object pixel and an
-    invented background pixel are off by the same distance, each divided by the number of pixels of its kind. Among the
-    thresholds within 0.1 mm of the least, the lowest: it misses the fewest pixels."""
-    costs = np.zeros(len(THRESHOLDS))
-    for answer, sample in zip(answers, samples, strict=True):
-        scene = sample.scene.single()
-        inside = max(int(sample.target.sum()), 1)
-        for number, threshold in enumerate(THRESHOLDS):
-            is_object = decided_mask(answer, scene, threshold)
-            missed = (sample.target & ~is_object).sum()
-            invented = (is_object & ~sample.target & ~sample.void).sum()
-            costs[number] += TYPICAL_MM * (missed / inside + invented / (pixels - inside))
-    means = costs / len(samples)
-    return THRESHOLDS[int(np.flatnonzero(means < means.min() + _TOLERANCE_MM)[0])]
-
-
-def chosen_lead(answers: list[Answers], samples: list[Sample], geometries: Geometries) -> float:
-    """The lead out of `LEADS` with the fewest wrong orders, mean over the samples."""
-    means = (mean_scores((one.with_lead(lead) for one in answers), samples, geometries) for lead in LEADS)
-    return LEADS[int(np.argmin([mean["wrong_percent"] for mean in means]))]
 
 
 def judged(answers: Answers, sample: Sample, geometry: Geometry, threshold: float) -> Judged:
@@ -200,25 +171,37 @@ def train_phase_net(
         direction: Geometry.of(rig, Settings(direction=direction, shading=recipe.shading))
         for direction in recipe.directions
     }
-    samples, validation = _samples(recipe, groups, rig, geometries, out / VIEWS, workers, show)
+    frames = tuple(rig.sequence.sinusoids(direction)[0] for direction in recipe.directions)
+    measure = partial(samples_of, geometries=geometries, shading=recipe.shading)
+    samples, validation = training.measured_views(
+        groups, rig, frames, out / VIEWS, measure, recipe.unions, recipe.seed, workers, show
+    )
 
-    def scores_of(network: PhaseNet) -> dict[str, float]:
+    def validated(network: PhaseNet) -> dict[str, float]:
         scored = validation[::VALIDATED_SHARE]
-        return mean_scores(answers_of(network, scored, geometries, recipe.shading), scored, geometries)
+        return scores_of(answers_of(network, scored, geometries, recipe.shading), scored, geometries)
 
     with training.reproducible(cpu=True):
         one_window = partial(draw, samples, geometries, recipe.window, recipe.vary, recipe.shading)
         first = None if start_weights is None else start_weights.network
-        ongoing = WindowTraining(recipe, one_window, scores_of, out, first, print_line)
+        ongoing = WindowTraining(recipe, one_window, validated, out, first, print_line)
         ongoing.run(started, minutes, show)
         if not ongoing.over:
             return Trained(None, ongoing.steps_done, 0.0, {})
         network = ongoing.network
         answers = list(answers_of(network, validation, geometries, recipe.shading))
-        threshold = chosen_threshold(answers, validation, rig.camera.width * rig.camera.height)
-        lead = chosen_lead(answers, validation, geometries)
+        masks = [
+            (sample, partial(decided_mask, one, sample.scene.single()))
+            for one, sample in zip(answers, validation, strict=True)
+        ]
+        threshold = chosen_threshold(masks, THRESHOLDS, rig.camera.width * rig.camera.height, TOLERANCE_MM)
+
+        def wrong_percent(lead: float) -> float:
+            return scores_of((one.with_lead(lead) for one in answers), validation, geometries)["wrong_percent"]
+
+        lead = chosen_lead(wrong_percent, LEADS)
         led = [one.with_lead(lead) for one in answers]
-        means = mean_scores(led, validation, geometries, threshold)
+        means = scores_of(led, validation, geometries, threshold)
         pairs = zip(led, validation, strict=True)
         seen = [judged(one, sample, geometries[sample.direction], threshold) for one, sample in pairs]
     odds = chosen_odds(seen)
@@ -235,21 +218,3 @@ def train_phase_net(
     save_net(weights, network, config)
     (out / training.CHECKPOINT).unlink(missing_ok=True)
     return Trained(weights, recipe.steps, threshold, means)
-
-
-def _samples(
-    recipe: Recipe, groups: list[training.Group], rig: Rig, geometries: Geometries, folder: Path, workers: int,
-    show: bool,
-) -> tuple[list[Sample], list[Sample]]:  # fmt: skip
-    """Training samples with unions, and validation samples; views that ``folder`` lacks are rendered."""
-    views = sum(len(group.views) for group in groups)
-    frames = tuple(rig.sequence.sinusoids(direction)[0] for direction in recipe.directions)
-    with training.Display("rendering views", views, show) as display:
-        training.render_views(groups, rig, frames, folder, workers, display.advance)
-    learnt = sum(len(group.views) for group in groups if group.split == "train")
-    with training.Display("measuring views", views + learnt * recipe.unions, show) as display:
-        learned = training.read_views(folder, groups, "train")
-        united = training.with_unions(learned, recipe.unions, recipe.seed, display.advance)
-        samples = samples_of(united, geometries, recipe.shading)
-        kept = training.with_unions(training.read_views(folder, groups, "validation"), 0, 0, display.advance)
-        return samples, samples_of(kept, geometries, recipe.shading)

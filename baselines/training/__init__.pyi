@@ -31,6 +31,7 @@ from .views import companions as companions
 from .views import drawn_light as drawn_light
 from .views import fingerprint_of as fingerprint_of
 from .views import groups_of as groups_of
+from .views import measured_views as measured_views
 from .views import read_views as read_views
 from .views import render_views as render_views
 from .views import united as united

@@ -14,11 +14,12 @@ from dataclasses import dataclass
 from hashlib import sha256
 from math import exp, log
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.baselines.training.records import Display
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M, OBJECTS, VIEWS, split_of
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.loaders.render import BuildSettings, Light, Studio, named_light, solid_mesh
@@ -26,6 +27,7 @@ from fpp_ml_bench.loaders.sample import VOID
 from fpp_ml_bench.optics import Rig
 from fpp_ml_bench.pool import mapping
 
+Measured = TypeVar("Measured")
 VALIDATION_LIGHTS = ("paper", "workshop")
 DRAWN_VALIDATION_VIEWS = 3  # of validation objects in each light that is drawn for them
 SHADOW_GREY = 6.0
@@ -180,6 +182,23 @@ def read_views(folder: Path, groups: list[Group], split: str) -> Iterator[View]:
                 words = f"can't be read ({error}); delete it and run the same command again"
                 raise TrainingError(f"{file}: {words}") from None
             yield View(f"{name}_{view}", name, group.name, *maps)
+
+
+def measured_views(
+    groups: list[Group], rig: Rig, frames: tuple[int, ...], folder: Path,
+    measure: Callable[[Iterable[View]], list[Measured]], unions: int, seed: int, workers: int, show: bool,
+) -> tuple[list[Measured], list[Measured]]:  # fmt: skip
+    """What ``measure`` makes of the training views, with ``unions`` for each, and of the validation views; those that
+    ``folder`` lacks are rendered first. ``show``: progress on stderr. Raises `TrainingError` as `render_views` and
+    `read_views`."""
+    views = sum(len(group.views) for group in groups)
+    with Display("rendering views", views, show) as display:
+        render_views(groups, rig, frames, folder, workers, display.advance)
+    learnt = sum(len(group.views) for group in groups if group.split == "train")
+    with Display("measuring views", views + learnt * unions, show) as display:
+        learned = with_unions(read_views(folder, groups, "train"), unions, seed, display.advance)
+        kept = with_unions(read_views(folder, groups, "validation"), 0, 0, display.advance)
+        return measure(learned), measure(kept)
 
 
 def _file(folder: Path, group: Group, name: str, view: str) -> Path:

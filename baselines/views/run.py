@@ -20,7 +20,7 @@ from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation import submission
 from fpp_ml_bench.evaluation.protocol import TARGETS
 from fpp_ml_bench.evaluation.score import check_folder, scored_pair
-from fpp_ml_bench.files import printable, write_atomically
+from fpp_ml_bench.files import printable, write_files
 from fpp_ml_bench.loaders.sample import DEPTH_EXACT
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
@@ -107,7 +107,7 @@ def write_object(out: Path, fused: FusedObject) -> list[Path]:
     # A mesh without faces: trimesh can't write a PointCloud without points.
     cloud = trimesh.Trimesh(fused.kept_m, np.zeros((0, 3), np.int64), process=False, validate=False)
     content = trimesh.exchange.ply.export_ply(cloud, vertex_normal=False)
-    return _write(out, {f"{fused.name}.ply": content, f"{fused.name}.png": clouds_png(fused)})
+    return write_files(out, {f"{fused.name}.ply": content, f"{fused.name}.png": clouds_png(fused)}, PredictionError)
 
 
 def write_scores(
@@ -119,14 +119,5 @@ def write_scores(
         "method": name, "dataset": dataset.fingerprint, "split": split, "cell_mm": cell_mm, "within_mm": WITHIN_MM,
         "tolerance_mm": TOLERANCE_MM, "mean_over_objects": summary, "objects": dict(objects),
     }  # fmt: skip
-    return _write(out, {FUSION_FILE: (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()})
-
-
-def _write(out: Path, contents: Mapping[str, bytes]) -> list[Path]:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        for file, content in contents.items():
-            write_atomically(out / file, content)
-    except OSError as error:
-        raise PredictionError(f"{out}: can't be written ({error.strerror or error}); choose another folder") from error
-    return [out / file for file in contents]
+    content = (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
+    return write_files(out, {FUSION_FILE: content}, PredictionError)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from operator import attrgetter
 from pathlib import Path
-from threading import Lock, Thread
+from threading import Lock
 from typing import Any, cast, get_args
 
 import numpy as np
@@ -27,8 +28,7 @@ from fpp_ml_bench.loaders.storage import DatasetFolder, benchmark_of
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by
 
-THREADS = 4
-"""Most threads that score, the caller's among them."""
+WORKERS = 4
 Outcome = tuple[list[str], list[dict[str, Any]]]
 """Problems and rows of a sample: a line for each problem and no row, or no problem and a row."""
 
@@ -129,8 +129,8 @@ def _scored(
     edge_band_px: int, sigmas: Path | None,
 ) -> Iterable[Outcome]:  # fmt: skip
     """Problems and row of each sample that has a prediction, in order; the files of its uncertainty in the folder
-    ``sigmas`` are checked. Work begins with this call, in threads; whoever takes the first outcome from the iterator
-    then takes part in it."""
+    ``sigmas`` are checked. Work begins with this call, in threads, before the first outcome is taken from the
+    iterator."""
     dataset_lock = Lock()
 
     def work(sample: str) -> Outcome:
@@ -165,30 +165,7 @@ def _scored(
         row = {"sample": sample, "prediction_sha256": digest, **scores.pixels(), **scores.metrics()}
         return [], [row | {"object": split_sample_name(sample)[0], "stated": stated}]
 
-    numbers = iter(range(len(samples)))  # all threads take from it: a step of this iterator is not interrupted
-    outcomes: dict[int, Outcome | Exception] = {}
-
-    def take_part() -> None:
-        for number in numbers:
-            try:
-                outcomes[number] = work(samples[number])
-            except Exception as error:  # the caller raises that of the first sample
-                outcomes[number] = error
-
-    threads = [Thread(target=take_part, daemon=True) for _ in range(min(THREADS, usable_cores()) - 1)]
-    for thread in threads:
-        thread.start()
-
-    def in_order() -> Iterator[Outcome]:
-        take_part()
-        for thread in threads:
-            thread.join()
-        for _, outcome in sorted(outcomes.items()):
-            if isinstance(outcome, Exception):
-                raise outcome
-            yield outcome
-
-    return in_order()
+    return ThreadPoolExecutor(min(WORKERS, usable_cores())).map(work, samples)
 
 
 _TIME_KEYS = ("seconds_per_sample", "seconds_source", "hardware", "timing")

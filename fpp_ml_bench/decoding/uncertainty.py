@@ -24,7 +24,8 @@ _MEDIAN_OF_SQUARE = (0.4549, 0.6931, 0.7887, 0.8392, 0.8703, 0.8914)
 
 SYSTEMATIC_RAD = 0.005
 """Error of a phase that is no noise: light of further bounces, mostly. With it 68% intervals hold 68% of the pixels of
-the validation objects in the light ``paper``; larger errors are more frequent than a normal distribution has them."""
+the validation objects in the light ``paper`` (`fpp-bench predict classical DATASET --split validation` and `fpp-eval`
+with ``--split validation --target depth_exact``); larger errors are more frequent than in a normal distribution."""
 
 
 def depth_sigma_mm(

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import CaptureError
-from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.files import write_files
 from fpp_ml_bench.loaders.published import matrix_bytes
 from fpp_ml_bench.optics import Pinhole
 
@@ -70,14 +70,7 @@ def export_capture(
             contents["points.ply"] = _ply(depth, camera, normals, shade, np.zeros((0, 3), np.int64))
         else:
             contents["mesh.ply"] = _ply(depth, camera, normals, shade, triangles(depth, camera, step_mm))
-    place = Path(folder)
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-        for name, content in contents.items():
-            write_atomically(place / name, content)
-    except OSError as error:
-        raise CaptureError(f"{place}: can't be written ({error.strerror or error}); choose another folder") from error
-    return [place / name for name in contents]
+    return write_files(Path(folder), contents, CaptureError)
 
 
 def pixel_normals(depth_mm: ArrayLike, camera: Pinhole, step_mm: float | None = None) -> NDArray[np.float64]:

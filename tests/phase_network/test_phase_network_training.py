@@ -16,7 +16,7 @@ from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, Geometry, Rota
 from fpp_ml_bench.baselines.phase_network.method import load_net, save_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.samples import Sample, sample_of, samples_of
-from fpp_ml_bench.baselines.phase_network.training import Recipe, answers_of, mean_scores, train_phase_net
+from fpp_ml_bench.baselines.phase_network.training import Recipe, answers_of, scores_of, train_phase_net
 from fpp_ml_bench.baselines.phase_network.window_training import WindowTraining
 from fpp_ml_bench.baselines.phase_network.windows import Variation, draw
 from fpp_ml_bench.baselines.phase_route import Settings
@@ -101,7 +101,7 @@ def test_stopping_and_going_on_gives_the_same_weights(tmp_path: Path) -> None:
     samples, geometries = [plane(1.7), plane(1.9)], {"horizontal": geometry()}
 
     def scores(network: PhaseNet) -> dict[str, float]:
-        return mean_scores(answers_of(network, samples[:1], geometries, True), samples[:1], geometries)
+        return scores_of(answers_of(network, samples[:1], geometries, True), samples[:1], geometries)
 
     def trained(name: str, recipe: Recipe = SMALL, minutes: float | None = None) -> WindowTraining:
         (tmp_path / name).mkdir(exist_ok=True)

@@ -129,7 +129,7 @@ def test_same_result_twice_and_from_one_thread(dataset, predictions, monkeypatch
     from fpp_ml_bench.evaluation.score import evaluator as scoring
 
     first = evaluate(predictions, dataset)
-    monkeypatch.setattr(scoring, "THREADS", 1)
+    monkeypatch.setattr(scoring, "WORKERS", 1)
     second = evaluate(predictions, dataset)
     assert first.model_copy(update={"created": ""}) == second.model_copy(update={"created": ""})
 
