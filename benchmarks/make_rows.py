@@ -6,8 +6,10 @@
     python benchmarks/make_rows.py data/unseen --work rows-unseen --training data/full
     fpp-bench build data/crossed --preset full --rig crossed
     python benchmarks/make_rows.py data/crossed --work rows-crossed
-    fpp-bench build data/crossed-hard --preset full --rig crossed --light hard --objects power_drill,large_clamp,...
-    python benchmarks/make_rows.py data/crossed-hard --work rows-hard --suffix=-hard --only crossed crossed-net
+    fpp-bench build data/crossed-hard --preset test --rig crossed --light hard
+    python benchmarks/make_rows.py data/crossed-hard --work rows-crossed-hard --suffix=-hard
+    fpp-bench build data/hard --preset test --light hard
+    python benchmarks/make_rows.py data/hard --work rows-hard --suffix=-hard --only phase-net-horizontal ...
     fpp-bench leaderboard --readme README.md
     fpp-bench leaderboard --page page
 

@@ -52,6 +52,7 @@ MINI_SIZE = 480
 FULL_SIZE = 960
 PRESETS: dict[str, tuple[tuple[str, ...], int]] = {
     "mini": (MINI_OBJECTS, MINI_SIZE), "full": (OBJECTS, FULL_SIZE), "unseen": (UNSEEN, FULL_SIZE),
+    "test": (tuple(name for name in OBJECTS if name in TEST_OBJECTS), FULL_SIZE),
 }  # fmt: skip
 """Objects and image width of each."""
 

@@ -11,7 +11,7 @@ from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.score import Interval, object_interval
 from fpp_ml_bench.leaderboard.pairs import Pair
 from fpp_ml_bench.leaderboard.rows import Entry
-from fpp_ml_bench.loaders.storage import EARLIER, benchmark_of, current_benchmark
+from fpp_ml_bench.loaders.storage import BENCHMARKS, EARLIER, benchmark_of, current_benchmark
 from fpp_ml_bench.optics import DIRECTIONS, PAPER_SEQUENCE
 
 LEGACY_FINGERPRINTS = (
@@ -77,6 +77,14 @@ class GroupKey:
         return benchmark in EARLIER if benchmark is not None else self.fingerprint in LEGACY_FINGERPRINTS
 
     @property
+    def other_light(self) -> str:
+        """The light of a benchmark that is not in the light ``paper``, in words: ``workshop``, ``crossed, hard``."""
+        benchmark = benchmark_of(self.fingerprint)
+        if benchmark is None or benchmark.light == "paper":
+            return ""
+        return benchmark.light if benchmark.rig == "paper" else f"{benchmark.rig}, {benchmark.light}"
+
+    @property
     def notes(self) -> list[str]:
         """Why the rows are not comparable with today's results; empty where they are."""
         earlier = self.protocol_version != PROTOCOL_VERSION
@@ -84,13 +92,14 @@ class GroupKey:
 
     @property
     def order(self) -> tuple[object, ...]:
-        """Sort key of the groups: named benchmarks, other data, earlier protocols, legacy data; the larger images
-        first, then the fewer frames, the metric track before the others."""
-        named = benchmark_of(self.fingerprint) is not None
-        data = 3 if self.is_legacy else 2 if self.protocol_version != PROTOCOL_VERSION else 0 if named else 1
+        """Sort key of the groups: named benchmarks as they are listed, other data, earlier protocols, legacy data; the
+        larger images first, then the fewer frames, the metric track before the others."""
+        benchmark = benchmark_of(self.fingerprint)
+        data = 3 if self.is_legacy else 2 if self.protocol_version != PROTOCOL_VERSION else 0 if benchmark else 1
+        place = BENCHMARKS.index(benchmark) if benchmark in BENCHMARKS else len(BENCHMARKS)
         return (
-            data, -self.size[0] * self.size[1], self.fingerprint, self.protocol_version, CLASSES.index(self.frames),
-            self.track != "metric", self,
+            data, -self.size[0] * self.size[1], place, self.fingerprint, self.protocol_version,
+            CLASSES.index(self.frames), self.track != "metric", self,
         )  # fmt: skip
 
     @property

@@ -1,4 +1,4 @@
-"""Rows that were typed in: the paper's own, in ``paper_rows.json``, and those of other publications on its dataset, in
+"""Rows that were typed in: the paper's own (`fpp_ml_bench.paper`), and those of other publications on its dataset, in
 ``reported_rows.json``. This package did not measure them, and they are never ranked with measured rows."""
 
 import json
@@ -10,6 +10,7 @@ from typing import Any
 from fpp_ml_bench.baselines.training import TABLES
 from fpp_ml_bench.leaderboard.assumptions import told
 from fpp_ml_bench.leaderboard.rows import BY_ITS_AUTHORS, BY_THE_PAPER
+from fpp_ml_bench.paper import paper_rows
 
 REPORTED_HEADING = "Reported by others on other data (not measured here)"
 SHOWN_BY_DEFAULT = ("architecture", "normalization", "oracle_order")
@@ -29,49 +30,50 @@ class ReportedRow:
 
 @dataclass(frozen=True)
 class ReportedTable:
-    """A table of the paper, its rows in the paper's order, or of another ``source``."""
+    """A table of the paper, its rows in the paper's order, or of another ``source``. ``figure``: the ``object`` of the
+    figure beside the table, and ``object_mae_mm`` of one sample of it by row."""
 
     name: str
     title: str
     rows: tuple[ReportedRow, ...]
     source: str = BY_THE_PAPER
+    figure: dict[str, Any] | None = None
 
     @property
     def note(self) -> str:
         """Below the table: who measured, on what, and what the methods of its tracks were told."""
         given = [f"{track}: told {told(track)}." for track in sorted({row.track for row in self.rows}) if told(track)]
-        return " ".join(
-            [f"{self.source[0].upper()}{self.source[1:]}. Other data, not ranked with the rows above.", *given]
-        )
-
-
-def _read(file: str) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads(Path(__file__).with_name(file).read_text(encoding="utf-8"))
-    return content
+        said = [f"{self.source[0].upper()}{self.source[1:]}. Other data, not ranked with the rows above.", *given]
+        if self.figure is not None:
+            errors = ", ".join(f"{row} {error:g}" for row, error in self.figure["object_mae_mm"].items())
+            said.append(f"Its figure, one sample of {self.figure['object']}, object MAE in mm: {errors}.")
+        return " ".join(said)
 
 
 @cache
 def paper_tables() -> dict[str, ReportedTable]:
     """Every table of the paper by name, in the order of `TABLES`."""
-    content = _read("paper_rows.json")
+    content = paper_rows()
     tables = {}
     for table in content["tables"]:
-        for row in table["rows"]:
-            row["errors_mm"] = dict(zip(content["columns"], row["errors_mm"], strict=True))
-        rows = tuple(ReportedRow(**row) for row in table["rows"])
-        tables[table["name"]] = ReportedTable(table["name"], table["title"], rows)
+        rows = tuple(
+            ReportedRow(**row | {"errors_mm": dict(zip(content["columns"], row["errors_mm"], strict=True))})
+            for row in table["rows"]
+        )
+        tables[table["name"]] = ReportedTable(table["name"], table["title"], rows, figure=table.get("figure"))
     return {name: tables[name] for name in TABLES}
 
 
 @cache
 def other_tables() -> dict[str, ReportedTable]:
     """The tables of other publications by name."""
+    content = json.loads(Path(__file__).with_name("reported_rows.json").read_text(encoding="utf-8"))
     return {
         table["name"]: ReportedTable(
             table["name"], table["title"], tuple(ReportedRow(**row) for row in table["rows"]),
             f"{BY_ITS_AUTHORS} ({table['source']})",
         )
-        for table in _read("reported_rows.json")["tables"]
+        for table in content["tables"]
     }  # fmt: skip
 
 

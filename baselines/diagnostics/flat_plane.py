@@ -16,12 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import original
+from fpp_ml_bench.baselines.diagnostics.plane_attention import (
+    attention_table,
+    draw_attention,
+    plane_heat,
+    shares_within,
+)
 from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene, SceneRenderer, plane
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.paper import paper_rows
 
 TILTS_DEG = ((0.0, 0.0), (20.0, 0.0), (0.0, 20.0))
 DISTANCES_M = (1.6, 1.8, 2.0)
@@ -31,7 +38,8 @@ OUTLINES, QUICK_OUTLINES = 5, 2
 FRAME, RECTANGLE, SILHOUETTE = "fills the frame", "rectangle", "silhouette"
 """Kinds of outlines; a silhouette is named by its sample."""
 STREAM = (0, "plane", "")
-PAPER_MEAN, PAPER_DISTANCE_M = 0.088, 1.8
+PAPER = paper_rows()["probes"]["flat_plane"]
+PAPER_DISTANCE_M = PAPER["distance_m"]
 Row = Mapping[str, Any]
 
 
@@ -108,8 +116,14 @@ class FlatPlane(Probe):
         control = control_of(subject, dataset, renderer, list(outlines), scale)
         rows, range_mm = [one.statistics(scale) for one in planes], [low, high] if normalised else None
         values = {"planes": rows, "objects": control, "range_mm": range_mm, "collapse_below": scale.limit}
-        figure = draw(planes, normalised, folder)
-        return self.finding(summary(rows, control, normalised), values, tables(rows, control, normalised), figure)
+        found, figures = tables(rows, control, normalised), [draw(planes, normalised, folder)]
+        if subject.network is not None:
+            shown = next(p for p in planes if (p.outline, p.distance_m) == (RECTANGLE, PAPER_DISTANCE_M))
+            heat = plane_heat(subject, shown.frame)
+            values["grad_cam"] = shares = shares_within(heat, shown.mask)
+            found.append(attention_table(shares))
+            figures.append(draw_attention(shown.frame, heat, folder))
+        return self.finding(summary(rows, control, normalised), values, found, *figures)
 
 
 def kind_of(outline: str) -> str:
@@ -180,14 +194,17 @@ def summary(rows: Sequence[Row], control: Mapping[str, float], normalised: bool)
     facing = [row for row in rows if row["outline"] == RECTANGLE and row["tilt_deg"] == [0.0, 0.0]]
     paper = next(row for row in facing if row["distance_m"] == PAPER_DISTANCE_M)
     mean_text = (
-        f"{paper['answer_mean']:.3f} of the range (paper: {PAPER_MEAN})" if normalised else f"{paper['mean_mm']:.0f} mm"
+        f"{paper['answer_mean']:.3f} of the range (paper: {PAPER['answer_mean']})"
+        if normalised
+        else f"{paper['mean_mm']:.0f} mm"
     )
     text = (
         f"Predicted as background: {shares[RECTANGLE]:.0%} of a rectangular plane, {shares[FRAME]:.0%} of a plane that "
         f"fills the frame, {shares[SILHOUETTE]:.0%} of a plane in an object's outline; "
         f"{control['collapsed_share']:.0%} of real objects ({control['collapsed_share_true']:.0%} in truth). The "
         f"prediction for the rectangle at 1.8 m has a mean of {mean_text} and a spread of {paper['answer_std']:.3g}, "
-        f"from {paper['answer_min']:.3g} to {paper['answer_max']:.3g}."
+        f"from {paper['answer_min']:.3g} to {paper['answer_max']:.3g}"
+        f"{' (paper: {:g} to {:g})'.format(*PAPER['answer_range']) if normalised else ''}."
     )
     if not normalised:
         means = ", ".join(f"{row['mean_mm']:.0f}" for row in facing)

@@ -26,16 +26,13 @@ from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.score import Interval, object_interval
 from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.paper import AVERAGE, LAYERS, paper_layers, said_by_paper
 
 Image = NDArray[np.float32]
 
-PAPER_LAYERS = {
-    "enc3": "enc3", "enc4": "enc4", "bottleneck": "bottleneck", "dec4": "dec1", "dec2": "dec3", "dec1": "dec4",
-}  # fmt: skip
-"""The six layers of the paper's table by our names (dec4 is the coarsest), with the paper's names (dec1 is)."""
+PAPER = "grad_cam"
 SAMPLES, QUICK_SAMPLES = 30, 6
 SEEDS = 2
-PAPER_RATIO = 1.28
 EDGES, FRINGES, OWN = "edges", "fringes", "own"
 _LEAST_SPREAD = 1e-12
 _EXAMPLES = 3
@@ -70,8 +67,8 @@ class GradCam(probe.Probe):
 
 def cam_layers(subject: Subject) -> tuple[str, ...]:
     """The paper's six layers where the subject has them, else all its probed layers."""
-    six = tuple(name for name in subject.layer_names if name in PAPER_LAYERS)
-    return six if len(six) == len(PAPER_LAYERS) else subject.layer_names
+    six = tuple(name for name in subject.layer_names if name in paper_layers(PAPER))
+    return six if set(six) | {AVERAGE} == set(paper_layers(PAPER)) else subject.layer_names
 
 
 def heatmaps(network: nn.Module, layers: dict[str, nn.Module], fringe: Tensor) -> dict[str, Tensor]:
@@ -228,10 +225,10 @@ def summary(correlations: Correlations) -> str:
     """The result in a few sentences."""
     edges, fringes = correlations.average(EDGES), correlations.average(FRINGES)
     random = [text_of(correlations.average(target, trained=False).r, None) for target in (EDGES, FRINGES)]
-    own = correlations.average(OWN, trained=False).r
+    own, paper = correlations.average(OWN, trained=False).r, said_by_paper(PAPER, AVERAGE)
     text = (
         f"Over the layers, heatmaps correlate with edges by {text_of(edges.r, None)} and with fringe variation by "
-        f"{text_of(fringes.r, None)}, {ratio_text(edges, fringes)} (paper: 0.136, 0.107, {PAPER_RATIO}). Random "
+        f"{text_of(fringes.r, None)}, {ratio_text(edges, fringes)} (paper: {paper}). Random "
         f"weights: {random[0]} and {random[1]}; edges and fringe variation themselves correlate by "
         f"{text_of(correlations.references.r, None)}, because both are strong where the object is."
     )
@@ -249,18 +246,21 @@ def ratio_text(edges: Mean, fringes: Mean) -> str:
 
 def tables(correlations: Correlations) -> list[Table]:
     """The paper's table with random weights beside it, and the sanity check."""
-    has_paper_layers = set(correlations.layers) == set(PAPER_LAYERS)
+    beside = {*correlations.layers, AVERAGE} == set(paper_layers(PAPER))
     pairs = {}
     for layer in correlations.layers:
-        renamed = has_paper_layers and PAPER_LAYERS[layer] != layer
-        name = f"{layer} (paper's {PAPER_LAYERS[layer]})" if renamed else layer
-        pairs[name] = [correlations.mean(layer, target) for target in (EDGES, FRINGES)]
-    for name, trained in (("Average", True), ("Average, random weights", False)):
-        pairs[name] = [correlations.average(target, trained) for target in (EDGES, FRINGES)]
+        name = f"{layer} (paper's {LAYERS[layer]})" if beside and LAYERS[layer] != layer else layer
+        pairs[name] = layer, [correlations.mean(layer, target) for target in (EDGES, FRINGES)]
+    for name, place, trained in (("Average", AVERAGE, True), ("Average, random weights", "", False)):
+        pairs[name] = place, [correlations.average(target, trained) for target in (EDGES, FRINGES)]
     rows: list[tuple[probe.Cell, ...]] = [
-        (name, *(text_of(*mean[:2]) for mean in pair), ratio(pair[0].r, pair[1].r)) for name, pair in pairs.items()
-    ]
-    rows.append(("Edges with fringes", text_of(*correlations.references[:2]), None, None))
+        (
+            name, *(text_of(*mean[:2]) for mean in pair), ratio(pair[0].r, pair[1].r),
+            said_by_paper(PAPER, layer) if beside else None,
+        )
+        for name, (layer, pair) in pairs.items()
+    ]  # fmt: skip
+    rows.append(("Edges with fringes", text_of(*correlations.references[:2]), None, None, None))
     random = []
     for layer in correlations.layers:
         means = (correlations.mean(layer, target, trained=False) for target in (EDGES, FRINGES, OWN))
@@ -268,7 +268,8 @@ def tables(correlations: Correlations) -> list[Table]:
     count, header = len(correlations.objects), ("Layer", "r(CAM, edges)", "r(CAM, fringes)")
     title = f"Correlation of Grad-CAM with edges and fringes, {count} test samples (the paper's table)"
     sanity = "Sanity check: the same with random weights"
-    return [Table(title, (*header, "Ratio"), rows), Table(sanity, (*header, "r(CAM, trained CAM)"), random)]
+    compared = Table(title, (*header, "Ratio", "Paper: edges, fringes, ratio"), rows)
+    return [compared, Table(sanity, (*header, "r(CAM, trained CAM)"), random)]
 
 
 def _draw_bars(correlations: Correlations, folder: Path) -> Figure:

@@ -9,8 +9,9 @@ import numpy as np
 from fpp_ml_bench.baselines.diagnostics.fits import INPUT
 from fpp_ml_bench.baselines.diagnostics.probe import Cell, Figure, Sheet, Table, with_interval
 from fpp_ml_bench.evaluation.score import object_interval
+from fpp_ml_bench.paper import AVERAGE, LAYERS, paper_layers, said_by_paper
 
-PAPER_RATIO = 2.82
+PAPER = "linear_probing"
 TITLES = {
     "edges": "edges", "depth": "depth, whole image", "distance": "depth in mm, object", "phase": "wrapped phase",
     "order": "fringe order",
@@ -76,8 +77,9 @@ def summary(linear: Scores, spatial: Scores) -> str:
     trained, raw = spatial[TRAINED], spatial[CONTROLS]
     edges, depth = (mean_over(trained, target, "r2") for target in ("edges", "depth"))
     easier = "edges are" if edges > depth else "depth is"
+    papers = paper_layers(PAPER)[AVERAGE]["ratio"]
     text = (
-        f"The paper's ratio, depth MSE over edge MSE, is {mean_ratio(trained):.2f} (paper: {PAPER_RATIO}). The raw "
+        f"The paper's ratio, depth MSE over edge MSE, is {mean_ratio(trained):.2f} (paper: {papers:.2f}). The raw "
         f"input alone gives {mean_ratio(raw):.2f}, and a probe that predicts each target's mean "
         f"{ratio_of_means(raw[INPUT]):.2f}, because the two errors have different units. As a share of the explained "
         f"variance, {easier} easier to read on average over layers (R2 {edges:.2f} for edges, {depth:.2f} for depth)."
@@ -98,10 +100,16 @@ def tables(linear: Scores, spatial: Scores) -> list[Table]:
     rows = {layer: {layer: targets} for layer, targets in trained.items()}
     rows |= {"Average": trained, "Average, random weights": untrained, "Raw input": spatial[CONTROLS]}
     keys = ("edges", "depth")
+    beside = {*trained, AVERAGE} == set(paper_layers(PAPER))
     errors: list[tuple[Cell, ...]] = [
-        (name, *(mean_over(row, key) for key in keys), mean_ratio(row)) for name, row in rows.items()
-    ]
-    errors.append(("Predicting the mean", *(raw[key]["mse_of_mean"] for key in keys), ratio_of_means(raw)))
+        (
+            f"{name} (paper's {LAYERS[name]})" if beside and LAYERS.get(name, name) != name else name,
+            *(mean_over(row, key) for key in keys), mean_ratio(row),
+            said_by_paper(PAPER, name.lower()) if beside else None,
+        )
+        for name, row in rows.items()
+    ]  # fmt: skip
+    errors.append(("Predicting the mean", *(raw[key]["mse_of_mean"] for key in keys), ratio_of_means(raw), None))
 
     def r2(one: Score) -> str:
         return with_interval(one["r2"], one["r2_interval"])
@@ -115,7 +123,7 @@ def tables(linear: Scores, spatial: Scores) -> list[Table]:
     for layer, scores in linear[CONTROLS].items():
         cells = ((f"{scores[target]['r2']:.3f}", None) for target in targets)
         one_by_one.append([_CONTROLS[layer], *(cell for pair in cells for cell in pair)])
-    paper = ("Layer", "Edges MSE", "Depth MSE", "Ratio depth / edges")
+    paper = ("Layer", "Edges MSE", "Depth MSE", "Ratio depth / edges", "Paper: edges, depth, ratio")
     both = ("Layer", "Edges R2", "random weights", "Depth R2", "random weights")
     each = ["Layer", *(title for target in targets for title in (TITLES[target], "random"))]
     of_raw = ("Raw input", r2(raw["edges"]), None, r2(raw["depth"]), None)

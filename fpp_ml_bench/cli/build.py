@@ -23,6 +23,7 @@ EXAMPLES = (
     "fpp-bench build data/train --preset full --frames single_shot    frame 0 and depth only",
     "fpp-bench build data/hard --preset mini --placement varied   no distance prior helps",
     "fpp-bench build data/workshop --preset full --light workshop     the same views under a workshop's light",
+    "fpp-bench build data/test --preset test --light hard         the test objects alone, to score in that light",
     "fpp-bench build data/mine --mesh part.stl --size 960         a mesh of yours (metres)",
     "fpp-bench build data/lab --decode-with found.yaml            ground truth by the rig that a calibration found",
     "fpp-bench build s3://bucket/full --preset full --cluster ray://head:10001    on all nodes of a Ray cluster",

@@ -2,6 +2,7 @@ from .assembly import Assembly as Assembly
 from .assembly import Progress as Progress
 from .assembly import assemble as assemble
 from .assembly import forget_outdated as forget_outdated
+from .benchmark import BENCHMARKS as BENCHMARKS
 from .benchmark import EARLIER as EARLIER
 from .benchmark import Benchmark as Benchmark
 from .benchmark import benchmark_of as benchmark_of

@@ -73,6 +73,41 @@ BENCHMARKS = (
         "b197093e8930f767ccab588ea8772de7e1256f045a0239ff9013d3050fedc9bc",
         rig="crossed",
     ),
+    # The test objects alone, to score methods in lights that nothing here is trained in.
+    Benchmark(
+        "fpp-bench-test-workshop",
+        1,
+        "test",
+        FULL_SIZE,
+        "7d2b42bb8e89330dd8e62190fb33b9622d73f5bdff94303edad30a01acf6a323",
+        "workshop",
+    ),
+    Benchmark(
+        "fpp-bench-test-hard",
+        1,
+        "test",
+        FULL_SIZE,
+        "ae15c33431eb62c8f938e4ac22b0b8bf746f9b509840bdb37d73249252a26ab8",
+        "hard",
+    ),
+    Benchmark(
+        "fpp-bench-test-crossed-workshop",
+        1,
+        "test",
+        FULL_SIZE,
+        "ec64e96ac523335ec5bf7be0a2c132651a7cba0d63c747901f3bb7a0b38633e6",
+        "workshop",
+        "crossed",
+    ),
+    Benchmark(
+        "fpp-bench-test-crossed-hard",
+        1,
+        "test",
+        FULL_SIZE,
+        "1b681c74c7f3b56f606b279d1e05fce427a3821dd8a6acb465ca9075691d3615",
+        "hard",
+        "crossed",
+    ),
 )
 """The current version of each. ``fpp-bench-full-224`` is what `fpp-bench reproduce --preset cpu` trains on."""
 EARLIER = (

@@ -1,14 +1,22 @@
 """Flat planes: what a right, a collapsed and a template answer look like in the numbers."""
 
+import copy
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from fpp_ml_bench.baselines.diagnostics import flat_plane
 from fpp_ml_bench.baselines.diagnostics.counterfactual import Counterfactual
 from fpp_ml_bench.baselines.diagnostics.diagnosis import save_finding
 from fpp_ml_bench.baselines.diagnostics.flat_plane import FlatPlane, Scale
+from fpp_ml_bench.baselines.diagnostics.plane_attention import (
+    attention_table,
+    draw_attention,
+    plane_heat,
+    shares_within,
+)
 from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, silent
 from fpp_ml_bench.baselines.diagnostics.subjects import subject_of_method
 from fpp_ml_bench.baselines.method import load_method
@@ -19,6 +27,7 @@ def answering(dataset, answer, units="mm"):
     return SimpleNamespace(
         name="known", units=units, normalisation=None, uses_ground_truth_mask=False, frames_used=(51,),
         image_size=dataset.size, predict=lambda frames: answer(frames).astype(np.float32), weights_sha256=None,
+        network=None,
     )  # fmt: skip
 
 
@@ -78,3 +87,28 @@ def test_the_counterfactual_probe_reports_and_draws(opened, tmp_path):
     assert "does not follow the phase" in finding.summary
     assert all((tmp_path / figure.file).stat().st_size > 5000 for figure in finding.figures)
     save_finding(tmp_path, "key", finding, 1.0)
+
+
+def test_heat_on_the_plane_is_where_a_linear_network_looks(tmp_path):
+    """Of out = 2 (0.5 x) the heatmap is the image over the number of pixels; random weights here look away from it."""
+    network = torch.nn.Sequential(torch.nn.Conv2d(1, 1, 1, bias=False), torch.nn.Conv2d(1, 1, 1, bias=False))
+    for layer, weight in zip(network, (0.5, 2.0), strict=True):
+        layer.weight.data.fill_(weight)
+    away = copy.deepcopy(network)
+    away[1].weight.data.fill_(-2.0)
+    subject = SimpleNamespace(
+        frames_used=(3,), layer_names=("first",), networks=lambda: (network, lambda seed: away),
+        layers_of=lambda one: {"first": one[0]},
+        input_batch=lambda stacks: torch.from_numpy(stacks[0][3][None, None].astype(np.float32) / 255),
+    )  # fmt: skip
+    frame = np.random.default_rng(0).integers(0, 256, (24, 32), dtype=np.uint8)
+    mask = np.zeros((24, 32), bool)
+    mask[5:20, 8:30] = True
+    heat = plane_heat(subject, frame)
+    shares = shares_within(heat, mask)
+    assert shares["area"] == pytest.approx(15 * 22 / (24 * 32))
+    expected = frame[mask].sum(dtype=np.int64) / frame.sum(dtype=np.int64)
+    assert shares["trained"]["first"] == pytest.approx(expected, rel=64 * U32)
+    assert shares["untrained"]["first"] is None
+    assert attention_table(shares).rows == [("first", shares["trained"]["first"], None)]
+    assert (tmp_path / draw_attention(frame, heat, tmp_path).file).stat().st_size > 3000

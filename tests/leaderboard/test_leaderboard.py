@@ -4,6 +4,7 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from scored_dataset import make_dataset, write_predictions
 
@@ -15,6 +16,7 @@ from fpp_ml_bench.leaderboard import ranking, rows
 from fpp_ml_bench.leaderboard.names import cut_at_word
 from fpp_ml_bench.leaderboard.reported import SHOWN_BY_DEFAULT, paper_tables
 from fpp_ml_bench.leaderboard.tables import markdown_text
+from fpp_ml_bench.paper import AVERAGE, paper_layers, said_by_paper
 
 
 @pytest.fixture(scope="module")
@@ -153,6 +155,24 @@ def test_paper_rows_are_the_papers():
         inside, outside = row.errors_mm["object_mae_mm"], row.errors_mm["background_mae_mm"]
         assert min(inside, outside) < row.errors_mm["overall_mae_mm"] < max(inside, outside)
     assert rows["multi_frame", "all"].test_samples == 1560
+
+
+def test_probes_and_figures_of_the_paper():
+    """Averages and ratios of Tables 7 and 8 follow from their layers, up to the printed digits."""
+    for probe, above, below, digit in (
+        ("linear_probing", "depth_mse", "edges_mse", 1e-6), ("grad_cam", "r_edges", "r_fringes", 1e-3),
+    ):  # fmt: skip
+        layers = paper_layers(probe)
+        average = layers.pop(AVERAGE)
+        for key in (above, below):
+            assert average[key] == pytest.approx(np.mean([row[key] for row in layers.values()]), abs=digit)
+        assert average["ratio"] == pytest.approx(average[above] / average[below], abs=0.01)
+    # "strongest in the final decoder layer", which is our dec1
+    assert max(paper_layers("grad_cam"), key=lambda name: paper_layers("grad_cam")[name]["r_edges"]) == "dec1"
+    assert said_by_paper("grad_cam", "dec2") == "-0.007, 0.007, -0.72" and said_by_paper("grad_cam", "dec3") is None
+    note = paper_tables()["loss"].note
+    assert "power_drill" in note and "hybrid_l1_0.7 12.21" in note
+    assert paper_tables()["multi_frame"].figure is None
 
 
 @pytest.mark.parametrize("choice", [*TABLES, "all", "none"])
