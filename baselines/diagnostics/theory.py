@@ -3,7 +3,8 @@
 *A single fringe does not determine depth*: surfaces a whole period apart on every ray give the same frame of that
 direction, noise included, if at each pixel the brighter one gets a lower albedo (in direct light from a projector in
 focus at both: its blur would be a hint). *An error of one period costs Z^2*,
-and along the camera's axis Z^2 kappa / (1 -+ Z kappa), one sign for each side, with kappa = P / (f_p b).
+and along the camera's axis Z^2 kappa / (1 -+ Z kappa), one sign for each side, with kappa = P / (f_p b). And which of
+two depths a loss chooses where both share an image (`loss_choice`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import Original, original
+from fpp_ml_bench.baselines.diagnostics.loss_choice import choices, choices_table
 from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import SceneRenderer, Surface, constant, moved
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
@@ -83,7 +85,8 @@ class Theory(Probe):
         curves = error_curves(dataset.rig, twins.direction)
         keys = "name", "periods", "exponent", "fitted_m", "quadratic_m"
         shown = [{key: curve[key] for key in keys} for curve in curves]
-        values = {"twins": twins.to_dict(), "kappa_per_m": kappa_per_m(dataset.rig, twins.direction), "curves": shown}
+        values = {"twins": twins.to_dict(), "kappa_per_m": kappa_per_m(dataset.rig, twins.direction), "curves": shown,
+                  "choices": choices(twins.depths_mm)}  # fmt: skip
         figures = _draw_twins(twins, folder), _draw_curves(curves, folder)
         return self.finding(summary(values), values, tables(values, curves), *figures)
 
@@ -221,6 +224,7 @@ def tables(values: Mapping[str, Any], curves: Sequence[Curve]) -> list[Table]:
     header = ("Phase error", "Fitted exponent", "Fitted over", "Within 1% of 2")
     return [
         Table("Two scenes, one frame", ("What", "Value"), [(what, values["twins"][key]) for what, key in same.items()]),
+        choices_table(values["choices"]),
         Table("Exponent of distance in the depth error", header, exponents),
         Table("Depth error, mm", ("Phase error", *(f"{z:g} m" for z in _SHOWN_M)), errors),
     ]

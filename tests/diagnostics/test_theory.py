@@ -1,13 +1,18 @@
 """The two theorems: frames that are the same bytes at two depths, and exponents against closed forms."""
 
 from dataclasses import replace
+from math import comb
 
 import numpy as np
 import pytest
+import torch
+from scipy.optimize import minimize
 
+from fpp_ml_bench.baselines.diagnostics.loss_choice import choice_of
 from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, silent
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import SceneRenderer
 from fpp_ml_bench.baselines.diagnostics.theory import Theory, depth_error_mm, error_curves, kappa_per_m, twins_of
+from fpp_ml_bench.baselines.training import loss_function
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.optics import paper_rig
 
@@ -62,3 +67,47 @@ def test_the_probe_needs_no_model(opened, tmp_path):
     assert finding.values["twins"]["differing_pixels"] == 0
     assert all((tmp_path / figure.file).stat().st_size > 5000 for figure in finding.figures)
     assert "0 of the image's pixels differ" in finding.summary
+
+
+def test_what_a_loss_chooses_of_two_depths():
+    random = np.random.default_rng(0)
+    first = np.zeros((30, 40))
+    first[5:25, 8:30] = random.uniform(1600, 1700, (20, 22))
+    second = np.where(first > 0, first + 300, 0)
+    pair = [first, second]
+    for loss, alpha in (("l1", None), ("masked_l1", None), ("hybrid_l1", 0.7)):
+        for batch in (1, 4):  # a median, in batches of any size
+            assert [choice_of(pair, loss, chance, batch, alpha) for chance in (0.25, 0.5, 0.75)] == [
+                (0.0, 0.0), (0.0, 1.0), (1.0, 1.0)
+            ]  # fmt: skip
+    # The root of one image's mean square is its distance, so a batch of one image is a median too.
+    assert choice_of(pair, "rmse", 0.25, 1) == (0.0, 0.0)
+    # In batches of n: least sum over k of C(n, k) q^k (1 - q)^(n - k) sqrt(k (1 - c)^2 + (n - k) c^2).
+    for batch, chance in ((4, 0.25), (4, 0.75), (9, 0.3)):
+        places = np.linspace(0, 1, 100_001)
+        expected = sum(
+            comb(batch, k) * chance**k * (1 - chance) ** (batch - k)
+            * np.sqrt(k * (1 - places) ** 2 + (batch - k) * places**2)
+            for k in range(batch + 1)
+        )  # fmt: skip
+        low, high = choice_of(pair, "rmse", chance, batch)
+        assert low - 0.01 <= places[expected.argmin()] <= high + 0.01 and high - low < 0.05
+    low, high = choice_of(pair, "rmse", 0.3, 40)  # large batches: the mean
+    assert low - 0.02 <= 0.3 <= high + 0.02
+
+
+def test_a_free_answer_for_each_pixel_ends_where_one_number_for_all_does():
+    """By gradient descent over every pixel, for the batches of two images with one of each scene."""
+    random = np.random.default_rng(1)
+    first = random.uniform(1.6, 1.7, (1, 1, 6, 7))
+    target = torch.from_numpy(np.concatenate([first, first + 0.3]))
+
+    def loss_and_gradient(x):
+        answer = torch.from_numpy(x).view(1, 1, 6, 7).requires_grad_(True)
+        loss = loss_function("rmse")(answer.expand_as(target), target)
+        loss.backward()
+        return loss.item(), answer.grad.numpy().ravel()
+
+    found = minimize(loss_and_gradient, np.full(42, 1.5), jac=True, method="BFGS", options={"gtol": 1e-9})
+    # The gradient of sqrt(0.15^2 + mean x^2) is x / (0.15 * 42): below 1e-9 where x is below 1e-8.
+    np.testing.assert_allclose(found.x, first.ravel() + 0.15, rtol=0, atol=1e-7)
