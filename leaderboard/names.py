@@ -12,7 +12,8 @@ LONGEST_NAME = 36
 """Characters of a short name."""
 
 _DIRECTIONS = ("horizontal", "vertical", "both")
-_NETWORKS = {"unet": "UNet", "resunet": "ResUNet", "transunet": "TransUNet", "pix2pix": "pix2pixHD"}
+_NETWORKS = {"unet": "UNet", "resunet": "ResUNet", "transunet": "TransUNet", "pix2pix": "pix2pixHD",
+             "pix2pix_unet": "Pix2Pix"}  # fmt: skip
 _LOSSES = {"rmse": "RMSE", "l1": "L1", "gan": "GAN"}
 _RANGES = {"oracle": "", "mean": "mean range", "predicted": "pred. range", None: ""}
 """By the setting ``depth_range``. That the range was told is the group's track."""

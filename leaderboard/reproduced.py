@@ -31,7 +31,7 @@ from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEASURED_HERE, Entry, re
 from fpp_ml_bench.leaderboard.tables import markdown_rows, markdown_text
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
-_NOT_IN_THE_PAPER = {"hformer": "Hformer"}
+_NOT_IN_THE_PAPER = {"pix2pixhd": "pix2pixHD", "hformer": "Hformer"}
 _TRACKS_DIFFER = "*"
 
 

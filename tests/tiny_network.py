@@ -17,6 +17,7 @@ SMALL: dict[str, dict[str, int | float]] = {
     "resunet": {"width": 4},
     "hformer": {"width": 8},
     "pix2pix": {"width": 4},
+    "pix2pix_unet": {"width": 4, "levels": 3},
 }
 RECIPE: dict[str, Any] = {
     "preset": "cpu", "seed": 42, "max_epochs": 3, "loss": {"name": "hybrid_l1", "alpha": 0.7}, "batch": 4,

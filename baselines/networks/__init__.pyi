@@ -16,6 +16,7 @@ from .network_method import NetworkMethod as NetworkMethod
 from .onnx_export import export_onnx as export_onnx
 from .pix2pix import Discriminator as Discriminator
 from .pix2pix import Pix2Pix as Pix2Pix
+from .pix2pix import Pix2PixUNet as Pix2PixUNet
 from .range_heads import save_with_heads as save_with_heads
 from .registry import NETWORKS as NETWORKS
 from .registry import build as build

@@ -1,5 +1,12 @@
-"""pix2pixHD (paper section 5.6, Wang et al. 2018): the global generator and the two-scale discriminator."""
+"""Generators and discriminator of conditional GANs (paper section 5.6).
 
+The paper's text names a U-Net generator (Isola et al. 2017) and a PatchGAN discriminator, "adapted from NVIDIA
+Pix2Pix-HD"; the authors' published code has pix2pixHD itself (Wang et al. 2018), whose global generator has residual
+blocks and no skips. Both are here. The paper gives no sizes: those of pix2pixHD are of the authors' code, those of the
+U-Net generator of Isola et al., with as many levels as divide the image.
+"""
+
+import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -74,6 +81,64 @@ class Pix2Pix(FringeNetwork):
         layers |= {f"down{level}": layer for level, layer in enumerate(self.generator.down, 1)}
         layers["bottleneck"] = self.generator.bottleneck
         return layers | {f"up{DOWNSAMPLINGS - step}": layer for step, layer in enumerate(self.generator.up)}
+
+    def represent(self, fringe: Tensor) -> Tensor:
+        return (self.generator(2.0 * fringe - 1.0) + 1.0) / 2.0
+
+
+class UNetGenerator(nn.Module):
+    """The bare U-Net generator, (B, 1, H, W) in [-1, 1] -> the same. A level halves the image by a 4x4 convolution, and
+    a transposed one brings it back beside the encoder's features of that size. Channels: width x (1, 2, 4, 8, 8, ...).
+    As pix2pixHD it ends in a 7x7 convolution at full resolution, and has no dropout: a measurement is no draw."""
+
+    def __init__(self, width: int, levels: int) -> None:
+        super().__init__()
+        widths = [width * min(2**level, 8) for level in range(levels)]
+        self.down = nn.ModuleList()
+        for level, channels in enumerate(widths):
+            layers: list[nn.Module] = [nn.Conv2d(widths[level - 1] if level else 1, channels, 4, 2, 1)]
+            layers += [InstanceNorm(channels)] if 0 < level < levels - 1 else []
+            self.down.append(nn.Sequential(*layers, nn.LeakyReLU(LEAK)))
+        self.up = nn.ModuleList()
+        for level in reversed(range(levels)):
+            given = widths[level] if level == levels - 1 else 2 * widths[level]
+            channels = widths[level - 1] if level else width
+            convolution = nn.ConvTranspose2d(given, channels, 4, 2, 1)
+            self.up.append(nn.Sequential(convolution, InstanceNorm(channels), nn.ReLU(inplace=True)))
+        self.head = nn.Sequential(_convolution(width, 1, 7, reflect=True), nn.Tanh())
+
+    def forward(self, x: Tensor) -> Tensor:
+        features = []
+        for layer in self.down:
+            x = layer(x)
+            features.append(x)
+        x = self.up[0](features.pop())
+        for layer in self.up[1:]:
+            x = layer(torch.cat([features.pop(), x], dim=1))
+        return in_full_precision(self.head, x)
+
+
+class Pix2PixUNet(FringeNetwork):
+    """The U-Net generator in [0, 1] on both sides, as `Pix2Pix`; 29,367,809 parameters at width 64 and 6 levels. width:
+    channels of the first level. levels: halvings of the image. Convolutions start from N(0, 0.02). Probe layers:
+    down1..downN (down1 at half the resolution), of which the last is bottleneck, upN..up1 (up1 at full resolution,
+    ``width`` channels)."""
+
+    name = "pix2pix_unet"
+    last_layer = "up1"
+
+    def __init__(self, *, width: int = 64, levels: int = 6) -> None:
+        width, levels = base.whole(self.name, "width", width), base.whole(self.name, "levels", levels, least=2)
+        super().__init__(width=width, levels=levels)
+        self.stride = 2**levels
+        self.generator = UNetGenerator(width, levels)
+        base.initialise(self, "gan")
+
+    @property
+    def probe_layers(self) -> dict[str, nn.Module]:
+        *down, bottleneck = self.generator.down
+        layers = {f"down{level}": layer for level, layer in enumerate(down, 1)} | {"bottleneck": bottleneck}
+        return layers | {f"up{len(down) + 1 - step}": layer for step, layer in enumerate(self.generator.up)}
 
     def represent(self, fringe: Tensor) -> Tensor:
         return (self.generator(2.0 * fringe - 1.0) + 1.0) / 2.0

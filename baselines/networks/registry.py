@@ -8,6 +8,7 @@ from fpp_ml_bench.errors import NetworkError
 
 _CLASSES = {
     "unet": "UNet", "transunet": "TransUNet", "resunet": "ResUNet", "hformer": "Hformer", "pix2pix": "Pix2Pix",
+    "pix2pix_unet": "Pix2PixUNet",
 }  # fmt: skip
 NETWORKS = tuple(_CLASSES)
 
@@ -23,7 +24,7 @@ def build(name: str, **options: int | float) -> "networks.FringeNetwork":
 
 
 def discriminator(**options: int | float) -> "networks.Discriminator":
-    """The two-scale discriminator that trains against pix2pix (`pix2pix.Discriminator`); `NetworkError` as `build`."""
+    """The two-scale discriminator of a GAN (`pix2pix.Discriminator`); `NetworkError` as `build`."""
     return _constructed("the discriminator", networks.Discriminator, options)
 
 

@@ -26,7 +26,7 @@ NETWORKS = Group("networks", "Richardson's extrapolated differences", "differenc
 ALPHA = 0.7
 SMALL = {
     "unet": {"width": 4}, "transunet": {"width": 16, "map_size": 4, "patch": 2}, "resunet": {"width": 4},
-    "hformer": {"width": 8}, "pix2pix": {"width": 4},
+    "hformer": {"width": 8}, "pix2pix": {"width": 4}, "pix2pix_unet": {"width": 4, "levels": 3},
 }  # fmt: skip
 """Widths of the networks here: small, with the paper's layers. For images of 64 px one thread is faster."""
 _SHAPE = (2, 1, 24, 32)

@@ -24,7 +24,7 @@ from torch.utils.data import DataLoader
 from fpp_ml_bench.baselines import networks
 from fpp_ml_bench.baselines.training.engine import DIVERGED, Training, claim_folder, reproducible
 from fpp_ml_bench.baselines.training.epochs import EpochSampler, Schedule, open_data, spread, training_loader
-from fpp_ml_bench.baselines.training.losses import Adversarial, Regression
+from fpp_ml_bench.baselines.training.losses import Adversarial, AdversarialSettings, Regression
 from fpp_ml_bench.baselines.training.recipe import Linear, Recipe
 from fpp_ml_bench.baselines.training.records import CURVE_FILE, LOG_FILE, Panel, Record
 from fpp_ml_bench.baselines.training.tables import GAN
@@ -111,7 +111,8 @@ class DepthTraining(Training):
         self.name, self.title = recipe.name, recipe.title
         network = networks.build(recipe.network, width=recipe.width, **recipe.options)
         if recipe.loss.name == GAN:
-            self.objective = Adversarial(network, networks.discriminator(width=recipe.width))
+            settings = AdversarialSettings.of(recipe.loss.alpha)
+            self.objective = Adversarial(network, networks.discriminator(width=recipe.width), settings)
         else:
             self.objective = Regression(network, recipe.loss.name, recipe.loss.alpha)
         self.bare = dict(self.objective.modules)

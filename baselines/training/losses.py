@@ -161,15 +161,23 @@ class Regression:
 
 @dataclass(frozen=True)
 class AdversarialSettings:
-    """Weights of the generator's terms; the defaults are those of the paper's pix2pixHD baseline. ``l1`` and
-    ``gradient_l1`` weigh differences in [-1, 1], ``scale_invariant_log`` logarithms of depths in [0, 1]. Raises
-    `RecipeError` for a weight that is negative or not finite."""
+    """Weights of the generator's terms; the defaults are those of the authors' pix2pixHD. ``l1`` and ``gradient_l1``
+    weigh differences in [-1, 1], ``scale_invariant_log`` logarithms of depths in [0, 1], ``hybrid_l1`` that loss with
+    ``alpha`` in [0, 1]. Raises `RecipeError` for a weight that is negative or not finite."""
 
     adversarial: float = 1.0
     feature_matching: float = 10.0
     l1: float = 10.0
     gradient_l1: float = 5.0
     scale_invariant_log: float = 2.0
+    hybrid_l1: float = 0.0
+    alpha: float = 0.7
+
+    @classmethod
+    def of(cls, alpha: float | None) -> "AdversarialSettings":
+        """The defaults for None. Else Isola et al.'s objective with the hybrid L1 in the place of their L1, of weight
+        100 for differences in [-1, 1], so 200 here; and the feature matching of pix2pixHD, which it is adapted from."""
+        return cls() if alpha is None else cls(1.0, 10.0, 0.0, 0.0, 0.0, 200.0, alpha)
 
     def __post_init__(self) -> None:
         for name, weight in asdict(self).items():
@@ -196,8 +204,11 @@ class Adversarial:
         yield self._generator_step(prediction, generated, real, batch.depth)
 
     def validation_losses(self, prediction: Tensor, batch: FringeDepth) -> Tensor:
-        """The L1 of depth alone, in [0, 1]: a GAN's other terms depend on how good the discriminator is by then."""
-        return sample_losses("l1", None, prediction, batch.depth)
+        """The L1 of depth alone, or the hybrid L1, in [0, 1]: a GAN's other terms depend on how good the discriminator
+        is by then."""
+        hybrid = self.settings.hybrid_l1 > 0
+        name, alpha = ("hybrid_l1", self.settings.alpha) if hybrid else ("l1", None)
+        return sample_losses(name, alpha, prediction, batch.depth)
 
     def _discriminator_step(self, generated: Tensor, real: Tensor) -> Step:
         # Both in one call: a discriminator spread over processes expects one backward for each forward.
@@ -220,8 +231,10 @@ class Adversarial:
             "l1": l1(generated[:, 1:], real[:, 1:]),
             "gradient_l1": gradient_l1(generated[:, 1:], real[:, 1:]),
             "scale_invariant_log": scale_invariant_log(prediction, depth),
+            "hybrid_l1": loss_function("hybrid_l1", self.settings.alpha)(prediction, depth),
         }
         weights = asdict(self.settings)
+        terms = {name: term for name, term in terms.items() if weights[name] > 0 or name != "hybrid_l1"}
         loss = torch.stack([weights[name] * term for name, term in terms.items()]).sum()
         return "network", loss, {name: value.detach() for name, value in {"loss": loss, **terms}.items()}
 

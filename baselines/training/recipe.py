@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from fpp_ml_bench.baselines.networks import NETWORKS
-from fpp_ml_bench.baselines.training.tables import GAN, PRESETS, ROWS, TABLES, check_loss
+from fpp_ml_bench.baselines.training.tables import GAN, GENERATORS, PRESETS, ROWS, TABLES, check_loss
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import RecipeError, SubmissionError
@@ -23,6 +23,7 @@ RECIPES = Path(__file__).resolve().parent.parent / "recipes"
 _LONGEST_CHAIN = 8
 _NETWORK_TITLES = {
     "unet": "UNet", "transunet": "TransUNet", "resunet": "ResUNet", "hformer": "Hformer", "pix2pix": "pix2pixHD",
+    "pix2pix_unet": "Pix2Pix",
 }  # fmt: skip
 
 
@@ -53,14 +54,15 @@ class Linear(StrictModel):
 
 
 class Loss(StrictModel):
-    """A name of `fpp_ml_bench.baselines.training.tables.LOSSES` or ``gan``; hybrids need ``alpha``."""
+    """A name of `fpp_ml_bench.baselines.training.tables.LOSSES` or ``gan``. Hybrids need ``alpha``; a GAN with it has
+    the hybrid L1 instead of pix2pixHD's depth terms."""
 
     name: Text
     alpha: Annotated[float, Field(ge=0, le=1)] | None = None
 
     @model_validator(mode="after")
     def _check(self) -> "Loss":
-        if self.name != GAN or self.alpha is not None:
+        if self.name != GAN:
             check_loss(self.name, self.alpha)
         return self
 
@@ -101,10 +103,10 @@ class Recipe(StrictModel):
             raise ValueError("options: width and network are keys of their own, and no options")
         if self.frames not in CONFIGS:
             raise ValueError(f"frames: expected one of {', '.join(CONFIGS)}, got {self.frames!r}")
-        if (self.loss.name == GAN) != (self.network == "pix2pix"):
-            raise ValueError("loss gan and network pix2pix belong together")
-        if self.network == "pix2pix" and self.normalisation != "individual":
-            raise ValueError("network pix2pix answers in [0, 1], so its normalisation must be individual")
+        if (self.loss.name == GAN) != (self.network in GENERATORS):
+            raise ValueError(f"loss gan and network {' or '.join(GENERATORS)} belong together")
+        if self.network in GENERATORS and self.normalisation != "individual":
+            raise ValueError(f"network {self.network} answers in [0, 1], so its normalisation must be individual")
         return self
 
     @property

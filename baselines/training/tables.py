@@ -10,13 +10,15 @@ ROWS: dict[str, tuple[str, ...]] = {
         "rmse", "l1", "masked_rmse", "masked_l1", "hybrid_rmse_0.5", "hybrid_rmse_0.7", "hybrid_rmse_0.9",
         "hybrid_l1_0.5", "hybrid_l1_0.7", "hybrid_l1_0.9",
     ),
-    "architecture": ("unet", "transunet", "resunet", "pix2pix", "hformer"),
+    "architecture": ("unet", "transunet", "resunet", "pix2pix", "pix2pixhd", "hformer"),
 }  # fmt: skip
-"""The paper's order; ``hformer`` is the conference version's."""
+"""The paper's order; ``pix2pixhd`` is the authors' code, ``hformer`` the conference version's."""
 TABLES = tuple(ROWS)
 PRESETS = ("cpu", "paper")
 LOSSES = ("rmse", "l1", "masked_rmse", "masked_l1", "hybrid_rmse", "hybrid_l1")
 GAN = "gan"
+GENERATORS = "pix2pix", "pix2pix_unet"
+"""Networks that a GAN trains."""
 
 
 def check_loss(name: str, alpha: float | None) -> None:

@@ -104,7 +104,7 @@ def test_an_output_that_is_no_number(tmp_path, fringe):
         load(path).predict(fringe)
 
 
-@pytest.mark.parametrize("name", ["unet", "transunet", "resunet", "hformer", "pix2pix"])
+@pytest.mark.parametrize("name", ["unet", "transunet", "resunet", "hformer", "pix2pix", "pix2pix_unet"])
 def test_every_network_comes_back_as_it_was(tmp_path, name):
     width = {"hformer": 8, "transunet": 4}.get(name, 2)
     if name == "transunet":

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from itertools import pairwise
 
 import pytest
 import torch
@@ -21,8 +22,24 @@ PARAMETERS = {
     "resunet": 88_941_841,
     "hformer": 4_655_993,
     "pix2pix": 182_430_721,
+    # Not published. 4x4 convolutions with biases between 1, 64, 128, 256, 512, 512 and 512 channels, back from twice as
+    # many (from 512 at the bottom), and a 7x7 head; instance normalisation has no weights here.
+    "pix2pix_unet": 16 * sum(a * b for a, b in pairwise((1, 64, 128, 256, 512, 512, 512)))
+    + 64
+    + 128
+    + 256
+    + 3 * 512
+    + 16 * (512 * 512 + 1024 * 512 + 1024 * 256 + 512 * 128 + 256 * 64 + 128 * 64)
+    + 512
+    + 512
+    + 256
+    + 128
+    + 64
+    + 64
+    + 49 * 64
+    + 1,
 }
-STRIDES = {"unet": 16, "transunet": 16, "resunet": 8, "hformer": 32, "pix2pix": 16}
+STRIDES = {"unet": 16, "transunet": 16, "resunet": 8, "hformer": 32, "pix2pix": 16, "pix2pix_unet": 8}
 
 
 @pytest.fixture(autouse=True)
@@ -46,7 +63,10 @@ def test_full_width_runs_at_960_px_on_the_meta_device(name):
     with torch.device("meta"):
         network = build(name)
         shapes = _probed(network, torch.empty(1, 1, 960, 960))
-    paper = {"unet": (1024, 60), "transunet": (1024, 60), "resunet": (960, 120), "hformer": (256, 30)}
+    paper = {
+        "unet": (1024, 60), "transunet": (1024, 60), "resunet": (960, 120), "hformer": (256, 30),
+        "pix2pix_unet": (512, 15),
+    }  # fmt: skip
     channels, side = paper.get(name, (1024, 60))
     assert shapes["bottleneck"] == (1, channels, side, side)
     assert shapes[network.last_layer][2:] == (960, 960)
@@ -105,7 +125,7 @@ def test_probe_layers(name):
     assert list(shapes) == list(network.probe_layers)  # forward order
     assert network.last_layer == list(shapes)[-1]
     assert shapes[network.last_layer] == (2, width // 4 if name == "hformer" else width, SIZE, SIZE)
-    channels = {"resunet": 8 * width, "hformer": 8 * width}.get(name, 16 * width)
+    channels = {"resunet": 8 * width, "hformer": 8 * width, "pix2pix_unet": 4 * width}.get(name, 16 * width)
     assert shapes["bottleneck"] == (2, channels, SIZE // network.stride, SIZE // network.stride)
 
 
@@ -164,6 +184,7 @@ def test_input_that_is_no_fringe_image(name, fringe):
         ("hformer", {"width": 6}, "multiple of 4"),
         ("hformer", {"drop_path": -0.1}, "drop_path"),
         ("pix2pix", {"dropout": 0.1}, "no option"),
+        ("pix2pix_unet", {"levels": 1}, "levels must be a whole number, at least 2"),
     ],
 )
 def test_refused_names_and_options(name, options, match):
@@ -191,15 +212,16 @@ def test_importing_the_package_leaves_torch_out():
 def test_no_batch_or_sample_leaks_into_another():
     """Networks with instance normalisation treat samples one by one, so a batch equals its samples."""
     x = torch.rand(3, 1, SIZE, SIZE)
-    for name in ("unet", "transunet", "pix2pix"):
+    for name in ("unet", "transunet", "pix2pix", "pix2pix_unet"):
         network = build(name, **SMALL[name])
         with torch.no_grad():
             together, alone = network(x)[1:2], network(x[1:2])
         torch.testing.assert_close(together, alone, rtol=0, atol=rounding_error(network, alone))
 
 
-def test_pix2pix_stays_between_zero_and_one():
-    network = build("pix2pix", width=4)
+@pytest.mark.parametrize("name", ["pix2pix", "pix2pix_unet"])
+def test_pix2pix_stays_between_zero_and_one(name):
+    network = build(name, **SMALL[name])
     for parameter in network.parameters():
         nn.init.normal_(parameter)
     depth = network(torch.rand(1, 1, SIZE, SIZE))

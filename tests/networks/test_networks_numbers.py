@@ -116,11 +116,11 @@ def test_first_weights_have_the_spread_they_should():
     assert not pix2pix.generator.stem[0].bias.any()
 
 
-@pytest.mark.parametrize("name", ["unet", "resunet", "hformer", "pix2pix"])
+@pytest.mark.parametrize("name", ["unet", "resunet", "hformer", "pix2pix", "pix2pix_unet"])
 def test_under_bfloat16_the_last_layer_is_in_float32(name):
     """bfloat16 has 8 significant bits: at 1.8 m its steps are 8 mm."""
     torch.manual_seed(0)
-    network = build(name, width=4).eval()
+    network = build(name, width=4, **({"levels": 3} if name == "pix2pix_unet" else {})).eval()
     with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16):
         answer = network(torch.rand(1, 1, 64, 64))
     assert answer.dtype == torch.float32

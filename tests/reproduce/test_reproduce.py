@@ -299,7 +299,7 @@ def test_all_frames_of_one_frame_is_the_evaluators_score(opened, tmp_path):
 
 def test_list_and_help_do_not_train(run, trainer, capsys):
     assert main(["reproduce", "--list"]) == 0
-    assert "23 trainings fill 26 rows" in capsys.readouterr().out
+    assert "24 trainings fill 27 rows" in capsys.readouterr().out
     assert main(["reproduce"]) == 2
     assert "expected a table" in capsys.readouterr().err
     for words in (["nonsense"], [TABLE, "--minutes", "0"], [TABLE, "--minutes", "nan"]):

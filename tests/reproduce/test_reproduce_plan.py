@@ -43,7 +43,7 @@ def test_the_command_knows_the_recipes_tables_and_presets():
 def test_rows_of_one_recipe_are_one_training(preset):
     jobs = planned(TABLES, preset)
     rows = [row for job in jobs for row in job.rows]
-    assert len(rows) == len(set(rows)) == 3 + 3 + 5 + 10 + 5 and len(jobs) == 23
+    assert len(rows) == len(set(rows)) == 3 + 3 + 5 + 10 + 6 and len(jobs) == 24
     shared = [set(job.rows) for job in jobs if len(job.rows) > 1]
     assert shared == [
         {"normalization/individual", "multi_frame/frame0", "loss/rmse"},
@@ -62,7 +62,7 @@ def test_lines_hold_the_papers_numbers(tmp_path, dataset):
         for row in paper_tables()[table].rows:
             assert (by_row[row.row].paper_mm, by_row[row.row].label) == (row.errors_mm, row.label)
         extra = [line.label for line in by_row.values() if line.paper_mm is None]
-        assert extra == (["Hformer"] if table == "architecture" else [])
+        assert extra == (["pix2pixHD", "Hformer"] if table == "architecture" else [])
         assert all(line.scores is line.entry is None for line in by_row.values())
 
 
