@@ -3,19 +3,12 @@ Generated and imported datasets are written alike; only the source of their rows
 receipt in the work folder. A resumed run trusts a receipt only when every file it names has the hash it states."""
 
 import json
-import os
 import platform
 import shutil
-import signal
-import threading
-import traceback
-from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
-from multiprocessing import connection, get_context, parent_process
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +17,9 @@ from fpp_ml_bench.files import exclusive, file_hash, write_atomically
 from fpp_ml_bench.loaders.sample import Row
 from fpp_ml_bench.loaders.storage.card import write_card
 from fpp_ml_bench.loaders.storage.manifest import MANIFEST, WORK_FOLDER, Manifest, ShardFile, describe_file
+from fpp_ml_bench.loaders.storage.shard_processes import write_in_processes
 from fpp_ml_bench.loaders.storage.shards import Receipt, ShardPlan, ShardWriter
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.machine import single_threaded_algebra
 from fpp_ml_bench.pool import mapping
 from fpp_ml_bench.remote import RemoteFolder
 
@@ -36,7 +29,6 @@ RowSource = Callable[[ShardPlan, Path], Iterable[Row]]
 its shards, and may hold what they share in it."""
 Progress = Callable[[int], None]
 _RESERVE_BYTES = 1 << 26
-_POLL_S = 0.2
 
 
 @dataclass(frozen=True)
@@ -167,7 +159,7 @@ def _assemble(
     if cluster is not None and missing:
         written = _write_on_cluster(work, missing, cluster, progress)
     elif workers > 1 and len(missing) > 1:
-        written = _write_in_processes(work, missing, workers, progress)
+        written = write_in_processes(work, missing, workers, progress)
     else:
         written = ((plan, work.write(plan, lambda: progress(1))) for plan in missing)
     with closing(written):
@@ -266,81 +258,6 @@ def without_files(folder: Path | RemoteFolder) -> str:
     """What to say where a task does not find what the command wrote."""
     node = platform.node()
     return f"{folder}: node {node} does not find the build there; give a folder that all nodes share, or a URL"
-
-
-def _write_in_processes(
-    work: ShardWork, plans: list[ShardPlan], workers: int, progress: Progress
-) -> Generator[tuple[ShardPlan, Receipt], None, None]:
-    """Write the shards in processes that each go from shard to shard; yields each when it is finished, in any order."""
-    context = get_context("spawn")
-    rows_done, reported = context.Value("q", 0), 0
-    # The longest shards first, so that no worker is left with a long shard at the end.
-    waiting = deque(sorted(plans, key=lambda plan: -len(plan.samples)))
-    pipes, processes = [], []
-    try:
-        with single_threaded_algebra():
-            for _ in range(min(workers, len(plans))):
-                pipe, end = context.Pipe()
-                pipes.append(pipe)
-                processes.append(context.Process(target=_work, args=(end, rows_done, work)))
-                processes[-1].start()
-                end.close()  # the worker's copy is the only one left: when the worker dies, the pipe ends
-        busy = {}
-        for pipe in pipes:
-            busy[pipe] = waiting.popleft()
-            pipe.send(busy[pipe])
-        while busy:
-            ready = connection.wait(list(busy), timeout=_POLL_S)
-            done = rows_done.value
-            progress(done - reported)
-            reported = done
-            for pipe in (pipe for pipe in pipes if pipe in ready):
-                plan, result = busy.pop(pipe), pipe.recv()
-                if isinstance(result, Exception):
-                    raise result
-                if waiting:
-                    busy[pipe] = waiting.popleft()
-                    pipe.send(busy[pipe])
-                yield plan, result
-    except (EOFError, ConnectionError) as error:
-        raise BuildError(
-            f"{work.folder}: a worker process died (out of memory?); run the same command again, it resumes; with "
-            "--workers 1 it needs the least memory"
-        ) from error
-    finally:
-        for pipe in pipes:
-            pipe.close()  # a worker ends when it has finished its shard
-        for process in processes:
-            process.join()
-
-
-def _work(pipe: Connection, rows_done: Any, work: ShardWork) -> None:
-    """Write the shards whose plans come through ``pipe``, counting rows in memory shared with the parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-    def row_done() -> None:
-        with rows_done.get_lock():
-            rows_done.value += 1
-
-    with suppress(EOFError, ConnectionError):  # the parent wants no more
-        while True:
-            plan = pipe.recv()
-            result: Receipt | Exception
-            try:
-                result = work.write(plan, row_done)
-            except Exception as error:
-                error.add_note(traceback.format_exc())
-                result = error
-            pipe.send(result)
-
-
-def _end_with_parent() -> None:
-    """End this process when its parent ends: an orphan would write into an unlocked folder."""
-    parent = parent_process()
-    if parent is not None:
-        connection.wait([parent.sentinel])
-        os._exit(1)
 
 
 def _finish(folder: Path, assembly: Assembly, receipts: list[Receipt]) -> Manifest:
