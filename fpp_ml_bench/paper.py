@@ -4,7 +4,7 @@ measured by this package."""
 import json
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 LAYERS = {
     **{name: name for name in ("enc1", "enc2", "enc3", "enc4", "bottleneck")},
@@ -21,15 +21,15 @@ def paper_rows() -> dict[str, Any]:
     return content
 
 
-def paper_layers(probe: Literal["linear_probing", "grad_cam"]) -> dict[str, dict[str, float]]:
-    """The values of Table 7 or 8 by our names of the layers, and their `AVERAGE`: ``edges_mse``, ``depth_mse``, or
+def paper_layers(probe: str) -> dict[str, dict[str, float]]:
+    """The values of Table 7 (``linear_probing``) or 8 (``grad_cam``) by our names of the layers, and their `AVERAGE`: ``edges_mse``, ``depth_mse``, or
     ``r_edges``, ``r_fringes``; and ``ratio``."""
     table = paper_rows()["probes"][probe]
     ours = {theirs: name for name, theirs in LAYERS.items()} | {AVERAGE: AVERAGE}
     return {ours[name]: dict(zip(table["columns"], row, strict=True)) for name, row in table["layers"].items()}
 
 
-def said_by_paper(probe: Literal["linear_probing", "grad_cam"], layer: str) -> str | None:
+def said_by_paper(probe: str, layer: str) -> str | None:
     """A layer's values in a table's cell; None where the paper has none."""
     values = paper_layers(probe).get(layer)
     return None if values is None else ", ".join(f"{value:g}" for value in values.values())

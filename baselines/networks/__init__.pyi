@@ -14,6 +14,8 @@ from .model import represent as represent
 from .network_method import DepthRange as DepthRange
 from .network_method import NetworkMethod as NetworkMethod
 from .onnx_export import export_onnx as export_onnx
+from .phase_guide import PhaseGuide as PhaseGuide
+from .phase_guide import re_projection_loss as re_projection_loss
 from .pix2pix import Discriminator as Discriminator
 from .pix2pix import Pix2Pix as Pix2Pix
 from .pix2pix import Pix2PixUNet as Pix2PixUNet

@@ -10,6 +10,7 @@ from torch.nn import functional
 
 from fpp_ml_bench.baselines.networks import base
 from fpp_ml_bench.baselines.networks.base import DoubleConvolution, FringeNetwork, Join, ResidualBlock
+from fpp_ml_bench.baselines.networks.phase_guide import CHANNELS, PhaseGuide
 from fpp_ml_bench.errors import NetworkError
 
 
@@ -48,10 +49,10 @@ class UShape(Levels):
 
     stride = 16
 
-    def __init__(self, width: int, bottleneck: nn.Module, **options: int | float) -> None:
+    def __init__(self, width: int, bottleneck: nn.Module, channels: int = 1, **options: int | float) -> None:
         super().__init__(width=width, **options)
         widths = [width * 2**level for level in range(4)]
-        self.encoder = nn.ModuleList(DoubleConvolution(c_in, c_out) for c_in, c_out in pairwise([1, *widths]))
+        self.encoder = nn.ModuleList(DoubleConvolution(c_in, c_out) for c_in, c_out in pairwise([channels, *widths]))
         self.decoder = nn.ModuleList(Join(2 * c, c, DoubleConvolution(2 * c, c)) for c in reversed(widths))
         self.head = nn.Conv2d(width, 1, 1)
         base.initialise(self, "convolutions")
@@ -66,25 +67,29 @@ class UNet(UShape):
 
     width: channels of the first level. dropout: rate of the channel dropout after the bottleneck (the paper's rows: 0).
     standardised: 1 to subtract each frame's own mean and divide by its standard deviation, so that no absolute grey
-    level is seen (the paper's rows: 0). Probe layers: enc1..enc4 (enc1 at full resolution), bottleneck, dec4..dec1
-    (dec1 at full resolution, ``width`` channels).
+    level is seen (the paper's rows: 0). guided: 1 for phase and candidate depths as further input channels
+    (`phase_guide`), only for the paper's rig (the paper's rows: 0). Probe layers: enc1..enc4 (enc1 at full resolution),
+    bottleneck, dec4..dec1 (dec1 at full resolution, ``width`` channels).
     """
 
     name = "unet"
 
-    def __init__(self, *, width: int = 64, dropout: float = 0.0, standardised: int = 0) -> None:
+    def __init__(self, *, width: int = 64, dropout: float = 0.0, standardised: int = 0, guided: int = 0) -> None:
         width = base.whole(self.name, "width", width)
         dropout = base.rate(self.name, "dropout", dropout)
-        self_normalised = {"standardised": 1} if base.whole(self.name, "standardised", standardised, least=0) else {}
+        flags = {"standardised": standardised, "guided": guided}
+        given = {name: 1 for name, flag in flags.items() if base.whole(self.name, name, flag, least=0)}
         bottleneck = DoubleConvolution(8 * width, 16 * width)
         base.initialise(bottleneck, "convolutions")
-        super().__init__(width, nn.Sequential(bottleneck, nn.Dropout2d(dropout)), dropout=dropout, **self_normalised)
+        deepest = nn.Sequential(bottleneck, nn.Dropout2d(dropout))
+        super().__init__(width, deepest, CHANNELS if guided else 1, dropout=dropout, **given)
+        self.guide = PhaseGuide() if guided else None
 
     def represent(self, fringe: Tensor) -> Tensor:
         if "standardised" in self.options:
             spread, mean = torch.std_mean(fringe, dim=(2, 3), keepdim=True)
             fringe = (fringe - mean) / spread.clamp_min(LEAST_SPREAD)
-        return super().represent(fringe)
+        return super().represent(fringe if self.guide is None else self.guide(fringe))
 
 
 LAYERS = 8

@@ -7,7 +7,7 @@ files a folder holds ``weights.safetensors`` and, at the end, ``done.json``.
 
 import json
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -22,6 +22,7 @@ from torch.optim import RMSprop
 from torch.utils.data import DataLoader
 
 from fpp_ml_bench.baselines import networks
+from fpp_ml_bench.baselines.phase_route import CalibrationLayer
 from fpp_ml_bench.baselines.training.engine import DIVERGED, Training, claim_folder, reproducible
 from fpp_ml_bench.baselines.training.epochs import EpochSampler, Schedule, open_data, spread, training_loader
 from fpp_ml_bench.baselines.training.losses import Adversarial, AdversarialSettings, Regression
@@ -29,6 +30,7 @@ from fpp_ml_bench.baselines.training.recipe import Linear, Recipe
 from fpp_ml_bench.baselines.training.records import CURVE_FILE, LOG_FILE, Panel, Record
 from fpp_ml_bench.baselines.training.tables import GAN
 from fpp_ml_bench.baselines.training.weights import ModelConfig, save_weights, training_benchmark
+from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.evaluation.protocol import Mode, Units
@@ -114,7 +116,7 @@ class DepthTraining(Training):
             settings = AdversarialSettings.of(recipe.loss.alpha)
             self.objective = Adversarial(network, networks.discriminator(width=recipe.width), settings)
         else:
-            self.objective = Regression(network, recipe.loss.name, recipe.loss.alpha)
+            self.objective = Regression(network, recipe.loss.name, recipe.loss.alpha, self._physics(data))
         self.bare = dict(self.objective.modules)
         modules: dict[str, Any] = dict(self.bare)
         if on_gpu := self.accelerator.device.type == "cuda":
@@ -135,6 +137,20 @@ class DepthTraining(Training):
             prepared = self.accelerator.prepare(module, self.optimizers[name])
             self.objective.modules[name], self.optimizers[name] = prepared
         self.resume()
+
+    def _physics(self, data: FringeDepthDataset) -> Callable[[Tensor, Tensor], Tensor] | None:
+        """The re-projection term of the recipe's loss for a dataset's rig, None where the recipe has none."""
+        weight = self.recipe.loss.physics
+        if weight is None:
+            return None
+        rig = data.source.rig
+        layer = CalibrationLayer.of(rig, "horizontal").tensors(device=self.accelerator.device)
+        unit_mm, nearest_mm = MM_PER_M if self.recipe.normalisation == "global" else 1.0, rig.working_range_mm[0] / 2
+
+        def term(prediction: Tensor, target: Tensor) -> Tensor:
+            return weight * networks.re_projection_loss(layer, prediction * unit_mm, target * unit_mm, nearest_mm)
+
+        return term
 
     @property
     def epoch(self) -> int:

@@ -144,16 +144,25 @@ class Objective(Protocol):
 
 
 class Regression:
-    """A network with one of the paper's losses on its output; `RecipeError` as `loss_function`."""
+    """A network with one of the paper's losses on its output, and maybe a ``further`` term of output and target, (B, 1,
+    H, W) each; `RecipeError` as `loss_function`."""
 
-    def __init__(self, network: nn.Module, loss_name: str, alpha: float | None = None) -> None:
+    def __init__(
+        self, network: nn.Module, loss_name: str, alpha: float | None = None,
+        further: Callable[[Tensor, Tensor], Tensor] | None = None,
+    ) -> None:  # fmt: skip
         self.modules: dict[str, nn.Module] = {"network": network}
-        self.loss_name, self.alpha = loss_name, alpha
+        self.loss_name, self.alpha, self.further = loss_name, alpha, further
         self.loss = loss_function(loss_name, alpha)
 
     def steps(self, batch: FringeDepth) -> Iterator[Step]:
-        loss = self.loss(self.modules["network"](batch.fringe), batch.depth)
-        yield "network", loss, {"loss": loss.detach()}
+        prediction = self.modules["network"](batch.fringe)
+        loss = self.loss(prediction, batch.depth)
+        logged = {"loss": loss.detach()}
+        if self.further is not None:
+            further = self.further(_wide(prediction), _wide(batch.depth))
+            loss, logged = loss + further, logged | {"further": further.detach()}
+        yield "network", loss, logged
 
     def validation_losses(self, prediction: Tensor, batch: FringeDepth) -> Tensor:
         return sample_losses(self.loss_name, self.alpha, prediction, batch.depth)

@@ -55,20 +55,25 @@ class Linear(StrictModel):
 
 class Loss(StrictModel):
     """A name of `fpp_ml_bench.baselines.training.tables.LOSSES` or ``gan``. Hybrids need ``alpha``; a GAN with it has
-    the hybrid L1 instead of pix2pixHD's depth terms."""
+    the hybrid L1 instead of pix2pixHD's depth terms. ``physics``: weight of
+    the re-projection of depth to phase (`networks.re_projection_loss`)."""
 
     name: Text
     alpha: Annotated[float, Field(ge=0, le=1)] | None = None
+    physics: Annotated[float, Field(gt=0)] | None = None
 
     @model_validator(mode="after")
     def _check(self) -> "Loss":
         if self.name != GAN:
             check_loss(self.name, self.alpha)
+        elif self.physics is not None:
+            raise ValueError("loss gan takes no physics")
         return self
 
     @property
     def label(self) -> str:
-        return self.name if self.alpha is None else f"{self.name}_{self.alpha:g}"
+        label = self.name if self.alpha is None else f"{self.name}_{self.alpha:g}"
+        return label if self.physics is None else f"{label}_physics_{self.physics:g}"
 
 
 class Recipe(StrictModel):
@@ -105,6 +110,10 @@ class Recipe(StrictModel):
             raise ValueError(f"frames: expected one of {', '.join(CONFIGS)}, got {self.frames!r}")
         if (self.loss.name == GAN) != (self.network in GENERATORS):
             raise ValueError(f"loss gan and network {' or '.join(GENERATORS)} belong together")
+        if self.loss.physics is not None and (self.normalisation == "individual" or self.frames != "single_shot"):
+            raise ValueError(
+                "loss: physics needs depth in mm or m, of frame 0 (normalisation raw or global, frames single_shot)"
+            )
         if self.network in GENERATORS and self.normalisation != "individual":
             raise ValueError(f"network {self.network} answers in [0, 1], so its normalisation must be individual")
         return self
@@ -114,7 +123,7 @@ class Recipe(StrictModel):
         """Name of runs and weights; rows that train the same network have the same name."""
         parts = [self.network, self.normalisation, self.loss.label]
         parts += ["bgremoved"] if self.background_removed else []
-        parts += ["standardised"] if self.options.get("standardised") else []
+        parts += [flag for flag in ("standardised", "guided") if self.options.get(flag)]
         parts += [self.frames] if self.frames != "single_shot" else []
         return "-".join(parts)
 
@@ -124,11 +133,16 @@ class Recipe(StrictModel):
         parts = [_NETWORK_TITLES[self.network], self.normalisation, self.loss.label.replace("_", " ")]
         parts += ["background removed"] if self.background_removed else []
         parts += ["input standardised"] if self.options.get("standardised") else []
+        parts += ["guided by phase"] if self.options.get("guided") else []
         parts += [f"trained on {self.frames} frames"] if self.frames != "single_shot" else []
         return ", ".join(parts)
 
     def to_dict(self) -> dict[str, Any]:
-        return self.model_dump(mode="json")
+        """Without ``physics`` where there is none: digests of recipes without it stay what they were."""
+        content = self.model_dump(mode="json")
+        if content["loss"]["physics"] is None:
+            del content["loss"]["physics"]
+        return content
 
     @property
     def digest(self) -> str:

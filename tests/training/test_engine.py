@@ -95,6 +95,13 @@ def test_a_gan_paused_is_the_same_too(name, more, tiny, tmp_path):
     assert ("hybrid_l1" in curve_of(whole)[0]) == (name == "pix2pix")
 
 
+@pytest.mark.parametrize("name", ["guided", "physics"])
+def test_further_directions_train(name, tiny, tmp_path):
+    (record,) = curve_of(train(small(f"further/{name}", max_epochs=1), tiny, tmp_path / "run", show=False))
+    assert ("further" in record) == (name == "physics")
+    assert all(np.isfinite(value) for value in record.values())
+
+
 def validation_of(weights, dataset, recipe):
     """What a log must say of ``weights``, by `score_sample` and NumPy: the mean loss and the scores in mm."""
     data = FringeDepthDataset(dataset, "validation", recipe.frames, recipe.normalisation)

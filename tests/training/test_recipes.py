@@ -18,6 +18,23 @@ from fpp_ml_bench.leaderboard.reported import paper_tables
 NAMES = [f"{table}/{row}" for table in TABLES for row in table_rows(table)]
 
 
+FURTHER = ["further/guided", "further/physics"]
+
+
+def test_further_directions_differ_from_the_plain_unet_in_one_thing():
+    plain = load_recipe("normalization/global").to_dict()
+    assert "physics" not in plain["loss"]  # digests of earlier recipes stay
+    for name, changed in zip(FURTHER, ("options", "loss"), strict=True):
+        other = load_recipe(name).to_dict()
+        assert {key for key in other if other[key] != plain[key]} == {changed}
+    assert load_recipe("further/guided").name == "unet-global-rmse-guided"
+    assert load_recipe("further/physics").name == "unet-global-rmse_physics_0.05"
+    with pytest.raises(RecipeError, match="physics needs depth in mm or m"):
+        recipe_from_dict({**load_recipe("further/physics").to_dict(), "normalisation": "individual"})
+    with pytest.raises(RecipeError, match="gan takes no physics"):
+        recipe_from_dict({**load_recipe("architecture/pix2pix").to_dict(), "loss": {"name": "gan", "physics": 1.0}})
+
+
 def test_every_row_of_the_paper_has_a_recipe():
     assert {table: len(table_rows(table)) for table in TABLES} == {
         "normalization": 3, "background_removed": 3, "multi_frame": 5, "loss": 10, "architecture": 6,
@@ -27,7 +44,7 @@ def test_every_row_of_the_paper_has_a_recipe():
             row for row in table_rows(name) if row not in ("hformer", "pix2pixhd")
         ]
     shipped = sorted(str(path.relative_to(RECIPES).with_suffix("")) for path in RECIPES.glob("*/*.yaml"))
-    assert shipped == sorted([*NAMES, *(f"presets/{preset}" for preset in PRESETS)])
+    assert shipped == sorted([*NAMES, *FURTHER, *(f"presets/{preset}" for preset in PRESETS)])
 
 
 def test_the_papers_recipe():
