@@ -22,8 +22,8 @@ def paper_rows() -> dict[str, Any]:
 
 
 def paper_layers(probe: str) -> dict[str, dict[str, float]]:
-    """The values of Table 7 (``linear_probing``) or 8 (``grad_cam``) by our names of the layers, and their `AVERAGE`: ``edges_mse``, ``depth_mse``, or
-    ``r_edges``, ``r_fringes``; and ``ratio``."""
+    """The values of Table 7 (``linear_probing``) or 8 (``grad_cam``) by our names of the layers, and their `AVERAGE`:
+    ``edges_mse``, ``depth_mse``, or ``r_edges``, ``r_fringes``; and ``ratio``."""
     table = paper_rows()["probes"][probe]
     ours = {theirs: name for name, theirs in LAYERS.items()} | {AVERAGE: AVERAGE}
     return {ours[name]: dict(zip(table["columns"], row, strict=True)) for name, row in table["layers"].items()}
