@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from statistics import fmean
 
+from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.evaluation.protocol import HEADLINE, METRICS, PROTOCOL_VERSION, Track
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.score import Interval, object_interval
@@ -77,12 +78,15 @@ class GroupKey:
         return benchmark in EARLIER if benchmark is not None else self.fingerprint in LEGACY_FINGERPRINTS
 
     @property
-    def other_light(self) -> str:
-        """The light of a benchmark that is not in the light ``paper``, in words: ``workshop``, ``crossed, hard``."""
+    def aside(self) -> str:
+        """What sets a benchmark apart from those that are shown first, in words: another light or a small image, as
+        ``workshop``, ``crossed, hard``, ``224 px``; empty for the others."""
         benchmark = benchmark_of(self.fingerprint)
-        if benchmark is None or benchmark.light == "paper":
+        if benchmark is None or (benchmark.light == "paper" and benchmark.size == FULL_SIZE):
             return ""
-        return benchmark.light if benchmark.rig == "paper" else f"{benchmark.rig}, {benchmark.light}"
+        words = [benchmark.rig, benchmark.light, f"{benchmark.size} px"]
+        usual = "paper", "paper", f"{FULL_SIZE} px"
+        return ", ".join(word for word, other in zip(words, usual, strict=True) if word != other)
 
     @property
     def notes(self) -> list[str]:

@@ -101,7 +101,9 @@ def _network(submission: Submission) -> str:
     if trained_frames not in CONFIGS:
         raise ValueError("unknown frames")
     frames = {"single_shot": "", "all": " all frames"}.get(trained_frames, f" {trained_frames}")
-    parts = [f"{network}{normalisation} {_loss(str(settings['loss']))}{frames}"]
+    loss, _, weight = str(settings["loss"]).partition("_physics_")
+    parts = [f"{network}{normalisation} {_loss(loss)}{f' + physics {float(weight):g}' if weight else ''}{frames}"]
+    parts += ["guided" if ", guided by phase" in submission.name else ""]
     parts += ["no background" if settings["background_removed"] else "", _RANGES[settings.get("depth_range")]]  # type: ignore[index]
     return ", ".join(filter(None, parts))
 

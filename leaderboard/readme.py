@@ -38,12 +38,12 @@ _COLUMNS = (
 
 
 def readme_block(groups: Sequence[Group]) -> str:
-    """What is between README's markers: the best `SHOWN` rows of each group in the light ``paper`` or in an unknown
-    one, and the paper's architectures."""
+    """What is between README's markers: the best `SHOWN` rows of each group that is not `GroupKey.aside`, and the
+    paper's architectures."""
     if not groups:
         return f"No row yet. {_MADE_BY}\n"
-    others = list(dict.fromkeys(group.key.other_light for group in groups if group.key.other_light))
-    groups, lines = [group for group in groups if not group.key.other_light], []
+    others = list(dict.fromkeys(group.key.aside for group in groups if group.key.aside))
+    groups, lines = [group for group in groups if not group.key.aside], []
     for group in more_than_trivial(groups):
         machines = sorted({device(row.entry) for row in group.rows if row.entry.time_measured})
         timed = f"; measured on {', '.join(machines)}" if machines else ""
@@ -54,7 +54,7 @@ def readme_block(groups: Sequence[Group]) -> str:
     results = [row.entry.result for group in groups for row in group.rows]
     assuming = sorted({result.submission.method for result in results if assumption(result)})
     notes = [_NOTE] + ([f"{' and '.join(assuming)} assume {ASSUMED}."] if assuming else [])
-    notes += [f"Rows in other lights ({'; '.join(others)}) are on the page."] if others else []
+    notes += [f"Rows of other data ({'; '.join(others)}) are on the page."] if others else []
     notes += dict.fromkeys(note for group in groups for note in (group.unranked, *group.key.notes) if note)
     keys, titles = ("object_mae_mm", "object_rmse_mm", "overall_mae_mm"), [column.title for column in _ERRORS]
     reported = [
