@@ -201,7 +201,7 @@ def test_labels_of_the_shipped_pictures_are_apart_and_whole(browser, shipped_pag
     browser.open(shipped_page, width)
     browser.run("document.querySelectorAll('details').forEach(part => part.open = true)")
     pictures = browser.run(_LABEL_BOXES)
-    assert len(pictures) == 16  # two of each dataset, and the two of the trade-off
+    assert len(pictures) == 18  # two of each dataset, and the two of the trade-off
     for picture in pictures:
         left, top, right, bottom = picture["frame"]
         boxes = picture["labels"]
