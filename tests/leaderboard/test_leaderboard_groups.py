@@ -82,6 +82,20 @@ def test_shipped_rows_are_of_a_benchmark_or_legacy(shipped):
         assert group.key.is_legacy or benchmark_of(group.key.fingerprint) is not None
 
 
+def test_what_stands_aside(shipped):
+    """Lights that nothing is trained in, and small images: on the page in one line, in README not at all."""
+    groups = [group for group in rank(shipped) if not group.key.is_legacy]
+    aside = {benchmark_of(group.key.fingerprint).name: group.key.aside for group in groups}
+    assert aside == {
+        "fpp-bench-full": "", "fpp-bench-crossed": "", "fpp-bench-full-224": "224 px",
+        "fpp-bench-test-workshop": "workshop", "fpp-bench-test-hard": "hard",
+        "fpp-bench-test-crossed-workshop": "crossed, workshop", "fpp-bench-test-crossed-hard": "crossed, hard",
+    }  # fmt: skip
+    block = readme_block(rank(shipped))
+    assert "fpp-bench-crossed version 1" in block and "test-workshop" not in block
+    assert "Rows of other data (workshop; hard; crossed, workshop; crossed, hard; 224 px) are on the page." in block
+
+
 def test_short_names_of_shipped_rows(shipped):
     names = {}
     for group in rank(shipped):
