@@ -4,6 +4,7 @@ submission keeps its own name, cut at a word."""
 from collections.abc import Sequence
 from operator import index
 
+from fpp_ml_bench.baselines.training import NETWORK_TITLES
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.evaluation.submission import Submission
 from fpp_ml_bench.files import printable
@@ -12,8 +13,6 @@ LONGEST_NAME = 36
 """Characters of a short name."""
 
 _DIRECTIONS = ("horizontal", "vertical", "both")
-_NETWORKS = {"unet": "UNet", "resunet": "ResUNet", "transunet": "TransUNet", "pix2pix": "pix2pixHD",
-             "pix2pix_unet": "Pix2Pix"}  # fmt: skip
 _LOSSES = {"rmse": "RMSE", "l1": "L1", "gan": "GAN"}
 _RANGES = {"oracle": "", "mean": "mean range", "predicted": "pred. range", None: ""}
 """By the setting ``depth_range``. That the range was told is the group's track."""
@@ -93,7 +92,7 @@ def _crossed(submission: Submission) -> str:
 
 def _network(submission: Submission) -> str:
     settings = submission.settings
-    network = _NETWORKS[str(settings["network"])]
+    network = NETWORK_TITLES[str(settings["network"])]
     if not submission.name.startswith(f"{network}, "):
         raise ValueError("a name of its own")
     normalisation = {"individual": "", "raw": " raw", "global": " global"}[str(settings["normalisation"])]

@@ -38,7 +38,7 @@ class _Constants:
 def _constants(size: int, device: torch.device) -> _Constants:
     rig = paper_rig(size)
     layer = CalibrationLayer.of(rig, "horizontal").tensors(device=device)
-    standoff = layer.gain / (layer.forward * rig.standoff_m + layer.back_m)
+    standoff = layer.residual_of_depth(rig.standoff_m * MM_PER_M)
     sigma = WINDOW_PERIODS * rig.image_px_per_period("horizontal")
     half = int(3 * sigma) + 1
     kernel = torch.exp(-0.5 * (torch.arange(-half, half + 1, device=device) / sigma) ** 2)
@@ -79,8 +79,6 @@ def re_projection_loss(layer: CalibrationLayer, prediction_mm: Tensor, target_mm
     object (target above 0); 0 without one. It does not see a whole period: as far as a fringe tells. Predictions count
     as ``nearest_mm`` and more, so that they have a phase."""
     mask = target_mm > 0
-    phases = [
-        layer.gain / (layer.forward * (depth / MM_PER_M) + layer.back_m)
-        for depth in (prediction_mm.clamp_min(nearest_mm), torch.where(mask, target_mm, nearest_mm))
-    ]
-    return ((1 - torch.cos(phases[0] - phases[1])) * mask).sum() / mask.sum().clamp_min(1)
+    predicted = layer.residual_of_depth(prediction_mm.clamp_min(nearest_mm))
+    true = layer.residual_of_depth(torch.where(mask, target_mm, nearest_mm))
+    return ((1 - torch.cos(predicted - true)) * mask).sum() / mask.sum().clamp_min(1)

@@ -130,11 +130,14 @@ class CalibrationLayer:
 
     def absolute_phase(self, depth_mm: ArrayLike) -> NDArray[np.float64]:
         """Absolute phase Phi in rad that a point at ``depth_mm`` on each pixel's ray shows, float64 (NumPy only)."""
-        z = np.asarray(depth_mm, dtype=np.float64) / MM_PER_M
+        residual = self.residual_of_depth(np.asarray(depth_mm, dtype=np.float64))
+        return residual + self.infinity_rad + TAU * self.infinity_order  # type: ignore[no-any-return]
+
+    def residual_of_depth(self, depth_mm: Any) -> Any:
+        """psi in rad of a point at ``depth_mm`` on each pixel's ray: an array or a tensor, as the maps."""
+        z = depth_mm / MM_PER_M
         residual = self.gain / (self.forward * z + self.back_m)
-        if self.lens is not None:
-            residual = residual + self._lens_shift(self.lens, z)
-        return residual + self.infinity_rad + TAU * self.infinity_order
+        return residual if self.lens is None else residual + self._lens_shift(self.lens, z)
 
     def depth_mm(self, phase_rad: Any, order: Any) -> Any:
         """Depth in mm, the camera's z, from wrapped phase in rad and fringe order: arrays or tensors of the maps' shape

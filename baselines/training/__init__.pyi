@@ -23,6 +23,7 @@ from .records import Panel as Panel
 from .records import Record as Record
 from .records import draw_curves as draw_curves
 from .tables import LOSSES as LOSSES
+from .tables import NETWORK_TITLES as NETWORK_TITLES
 from .tables import PRESETS as PRESETS
 from .tables import TABLES as TABLES
 from .views import Group as Group

@@ -234,6 +234,7 @@ class Adversarial:
             on_generated = discriminator(generated)
             with torch.no_grad():
                 on_real = discriminator(real)
+        # A term without weight is still logged.
         terms = {
             "adversarial": scores_against(on_generated, real=True),
             "feature_matching": feature_matching(on_generated, on_real),
@@ -243,7 +244,6 @@ class Adversarial:
             "hybrid_l1": loss_function("hybrid_l1", self.settings.alpha)(prediction, depth),
         }
         weights = asdict(self.settings)
-        terms = {name: term for name, term in terms.items() if weights[name] > 0 or name != "hybrid_l1"}
         loss = torch.stack([weights[name] * term for name, term in terms.items()]).sum()
         return "network", loss, {name: value.detach() for name, value in {"loss": loss, **terms}.items()}
 

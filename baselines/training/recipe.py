@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, ValidationError, model_validator
 
 from fpp_ml_bench.baselines.networks import NETWORKS
-from fpp_ml_bench.baselines.training.tables import GAN, GENERATORS, PRESETS, ROWS, TABLES, check_loss
+from fpp_ml_bench.baselines.training.tables import GAN, GENERATORS, NETWORK_TITLES, PRESETS, ROWS, TABLES, check_loss
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import RecipeError, SubmissionError
@@ -21,10 +21,6 @@ from fpp_ml_bench.schema import Positive, StrictModel, Text, problems_of
 
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"
 _LONGEST_CHAIN = 8
-_NETWORK_TITLES = {
-    "unet": "UNet", "transunet": "TransUNet", "resunet": "ResUNet", "hformer": "Hformer", "pix2pix": "pix2pixHD",
-    "pix2pix_unet": "Pix2Pix",
-}  # fmt: skip
 
 
 class RmsProp(StrictModel):
@@ -130,7 +126,7 @@ class Recipe(StrictModel):
     @property
     def title(self) -> str:
         """For people: network, normalisation, loss, and the settings that differ from the paper's usual ones."""
-        parts = [_NETWORK_TITLES[self.network], self.normalisation, self.loss.label.replace("_", " ")]
+        parts = [NETWORK_TITLES[self.network], self.normalisation, self.loss.label.replace("_", " ")]
         parts += ["background removed"] if self.background_removed else []
         parts += ["input standardised"] if self.options.get("standardised") else []
         parts += ["guided by phase"] if self.options.get("guided") else []

@@ -17,6 +17,10 @@ TABLES = tuple(ROWS)
 PRESETS = ("cpu", "paper")
 LOSSES = ("rmse", "l1", "masked_rmse", "masked_l1", "hybrid_rmse", "hybrid_l1")
 GAN = "gan"
+NETWORK_TITLES = {
+    "unet": "UNet", "transunet": "TransUNet", "resunet": "ResUNet", "hformer": "Hformer", "pix2pix": "pix2pixHD",
+    "pix2pix_unet": "Pix2Pix",
+}  # fmt: skip
 GENERATORS = "pix2pix", "pix2pix_unet"
 """Networks that a GAN trains."""
 

@@ -232,9 +232,18 @@ def test_the_generators_loss_is_the_weighted_sum():
     halves = parts["discriminator_generated"] + parts["discriminator_real"]
     assert discriminator_loss.item() == pytest.approx(halves.item() / 2)
     expected = {"adversarial": 1, "feature_matching": 10, "l1": 10, "gradient_l1": 5, "scale_invariant_log": 2}
+    expected |= {"hybrid_l1": 0}  # logged, of no weight for pix2pixHD
     assert set(terms) == {"loss", *expected}
     assert loss.item() == pytest.approx(sum(weight * terms[name].item() for name, weight in expected.items()))
     assert terms["loss"] == loss.detach()
+
+
+def test_with_alpha_the_hybrid_l1_takes_the_place_of_the_depth_terms():
+    objective = Adversarial(Generator(), Discriminator(), AdversarialSettings.of(0.7))
+    _, (_, loss, terms) = objective.steps(batch())
+    expected = {"adversarial": 1, "feature_matching": 10, "hybrid_l1": 200}
+    assert loss.item() == pytest.approx(sum(weight * terms[name].item() for name, weight in expected.items()))
+    assert AdversarialSettings.of(None) == AdversarialSettings()
 
 
 def test_validation_looks_at_depth_alone():
