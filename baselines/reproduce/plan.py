@@ -95,8 +95,8 @@ def differing(first: dict, second: dict, words: str = "{} and {}") -> str:
 
 
 def default_folder(preset: str, size: int) -> Path:
-    """``data/full`` for the benchmark's own size, else named after preset and size, like ``data/cpu224``."""
-    return Path("data") / ("full" if size == FULL_SIZE else f"{preset}{size}")
+    """``data/full`` for the benchmark's own size, else named after machine and size, like ``data/cpu224``."""
+    return Path("data") / ("full" if size == FULL_SIZE else f"{preset.partition('-')[0]}{size}")
 
 
 def open_dataset(folder: Path | None, jobs: list[Job], folders: Folders, report: Report) -> DatasetFolder:

@@ -34,7 +34,7 @@ REASON_LENGTH = 400
 class ReproduceSettings:
     """Settings of a run. ``leaderboard`` (`fpp_ml_bench.leaderboard.reproduced`) keeps the rows; ``minutes`` limits the
     whole run; ``command`` continues it; ``anyway`` trains the paper's preset without a GPU; ``only_missing`` keeps rows
-    that are up to date; ``report`` takes a line of progress."""
+    that are up to date; ``report`` takes a line of progress; ``row``: the only row of the table to make, "" for all."""
 
     tables: Sequence[str]
     folders: Folders
@@ -45,6 +45,11 @@ class ReproduceSettings:
     minutes: float | None = None
     anyway: bool = False
     report: Report = print
+    row: str = ""
+
+    def wants(self, job: Job) -> bool:
+        """Whether a job is to be done."""
+        return not self.row or f"{self.tables[0]}/{self.row}" in job.rows
 
 
 @dataclass
@@ -67,8 +72,9 @@ def reproduce(settings: ReproduceSettings) -> Outcome:
     folder; and what predicting and scoring raise."""
     folders = settings.folders
     jobs = plan.planned(settings.tables, folders.preset)
-    check_run_folders(jobs, folders)
-    check_machine(jobs, folders, settings.anyway, settings.command)
+    wanted = [job for job in jobs if settings.wants(job)]
+    check_run_folders(wanted, folders)
+    check_machine(wanted, folders, settings.anyway, settings.command)
     with exclusive(folders.runs / "lock", folders.runs, "reproducing into this folder"):
         opened = plan.open_dataset(settings.data, jobs, folders, settings.report)
         outcome = Outcome(opened, jobs)
@@ -82,7 +88,8 @@ def reproduce(settings: ReproduceSettings) -> Outcome:
 
 def _work(settings: ReproduceSettings, outcome: Outcome) -> None:
     """Every job in turn, until the minutes run out."""
-    jobs, folders = outcome.jobs, settings.folders
+    folders = settings.folders
+    jobs = [job for job in outcome.jobs if settings.wants(job)]
     started = perf_counter()
     training_seconds: list[float] = []
     for number, job in enumerate(jobs, 1):

@@ -230,7 +230,11 @@ def _merge(below: dict[str, Any], above: dict[str, Any], pick: bool = False) -> 
 def _preset(name: str) -> dict[str, Any]:
     if name not in PRESETS:
         raise RecipeError(f"expected a preset out of {', '.join(PRESETS)}, got {printable(name)!r}")
-    return _read(RECIPES / "presets" / f"{name}.yaml")
+    content = _read(RECIPES / "presets" / f"{name}.yaml")
+    if "extends" not in content:
+        return content
+    below = _preset(content.pop("extends"))
+    return {**below, **{key: _merge(below[key], value) for key, value in content.items()}}
 
 
 def _read(path: Path) -> dict[Any, Any]:

@@ -14,7 +14,7 @@ ROWS: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 """The paper's order; ``pix2pixhd`` is the authors' code, ``hformer`` the conference version's."""
 TABLES = tuple(ROWS)
-PRESETS = ("cpu", "paper")
+PRESETS = ("cpu", "cpu-long", "paper")
 LOSSES = ("rmse", "l1", "masked_rmse", "masked_l1", "hybrid_rmse", "hybrid_l1")
 GAN = "gan"
 NETWORK_TITLES = {

@@ -9,24 +9,33 @@ from datetime import datetime
 from pathlib import Path
 
 from fpp_ml_bench.baselines import reproduce
-from fpp_ml_bench.baselines.training import PRESETS, TABLES
+from fpp_ml_bench.baselines.training import PRESETS, TABLES, table_rows
 from fpp_ml_bench.errors import RecipeError, TrainingError
+from fpp_ml_bench.files import printable
 
 SUMMARY = "Train, predict, time and score the rows of the paper's tables, and show them beside its numbers."
 EXAMPLES = (
     "fpp-bench reproduce --list",
     "fpp-bench reproduce normalization                      the small preset: 224 px, for a laptop",
+    "fpp-bench reproduce loss/hybrid_l1_0.7 --preset cpu-long      one row, to the paper's stopping rule",
     "fpp-bench reproduce all --only-missing                 every table; up-to-date rows are kept",
     "fpp-bench reproduce loss --preset paper --minutes 10   the paper's own settings, on a GPU, in pieces",
 )
 ALL = "all"
+EMPTY_BECAUSE = {
+    "cpu": "a training takes 2 to 7 minutes on two cores",
+    "cpu-long": "a training takes 1 to 2 hours on a core",
+    "paper": "a training needs a GPU (weeks without)",
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("table", nargs="?", choices=(*TABLES, ALL), metavar="TABLE", help=f"{', '.join(TABLES)} or {ALL}")
+    add("table", nargs="?", metavar="TABLE",
+        help=f"{', '.join(TABLES)} or {ALL}; or one row, like loss/l1")  # fmt: skip
     add("--preset", choices=PRESETS, default="cpu",
-        help="cpu: 224 px and narrow networks (default); paper: 960 px and full width, needs a GPU")  # fmt: skip
+        help="cpu: 224 px, narrow networks, 8 epochs (default); cpu-long: the same until the rate is at its minimum; "
+             "paper: 960 px and full width, needs a GPU")  # fmt: skip
     add("--data", type=Path, metavar="DIR", help="dataset, built when missing (default: data/cpu224 or data/full)")
     add("--runs", type=Path, default=Path("runs"), metavar="DIR",
         help="trainings, predictions and tables go below DIR/PRESET (default: runs)")  # fmt: skip
@@ -58,7 +67,10 @@ def run(args: argparse.Namespace) -> int:
 
     below = args.runs / args.preset
     folders = reproduce.Folders(args.preset, below, below / "rows" if args.rows is None else args.rows)
-    tables = TABLES if args.table in (None, ALL) else (args.table,)
+    table, slash, row = (args.table or ALL).partition("/")
+    tables = TABLES if table == ALL else (table,)
+    if slash and row not in table_rows(table):
+        raise RecipeError(f"{table} has no row {printable(row)!r}; it has {', '.join(table_rows(table))}")
     if args.list:
         _list(tables, folders)
         return OK
@@ -70,7 +82,7 @@ def run(args: argparse.Namespace) -> int:
         print(f"{datetime.now():%H:%M:%S} {line}", file=sys.stderr, flush=True)
 
     command, options = _command(args), (args.data, args.only_missing, args.minutes, args.anyway)
-    settings = reproduce.ReproduceSettings(tables, folders, command, reproduced, *options, report)
+    settings = reproduce.ReproduceSettings(tables, folders, command, reproduced, *options, report, row=row)
     outcome = reproduce.reproduce(settings)
     for table, path in zip(tables, outcome.tables, strict=True):
         lines = reproduced.table_lines(table, outcome.jobs, folders, outcome.opened)
@@ -105,9 +117,14 @@ def _list(tables: tuple[str, ...], folders: reproduce.Folders) -> None:
     jobs = reproduce.planned(tables, folders.preset)
     columns = [Column(title, overflow="fold") for title in ("Row", "Training", "State", "Rows written")]
     table = Table(*columns, title=f"preset {folders.preset}, {folders.runs}", title_justify="left")
+    empty = 0
     for job in jobs:
         row_files = [folders.row(job.recipe, depth_range) for depth_range in reproduce.variants(job.recipe)]
-        written = f"{sum(path.is_file() for path in row_files)} of {len(row_files)}"
+        made = sum(path.is_file() for path in row_files)
+        empty += len(job.rows) if made < len(row_files) else 0
+        written = f"{made} of {len(row_files)}"
         table.add_row("\n".join(job.rows), job.recipe.name, reproduce.state_of(folders.training(job.recipe)), written)
     show(table)
     print(f"{len(jobs)} trainings fill {sum(len(job.rows) for job in jobs)} rows.")
+    if empty:
+        print(f"Empty: {empty} of them; {EMPTY_BECAUSE[folders.preset]} (docs/networks.md says which were made).")

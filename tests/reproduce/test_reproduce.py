@@ -299,13 +299,23 @@ def test_all_frames_of_one_frame_is_the_evaluators_score(opened, tmp_path):
 
 def test_list_and_help_do_not_train(run, trainer, capsys):
     assert main(["reproduce", "--list"]) == 0
-    assert "24 trainings fill 27 rows" in capsys.readouterr().out
+    listed = capsys.readouterr().out
+    assert "24 trainings fill 27 rows" in listed and "Empty: 27 of them; a training takes" in listed
     assert main(["reproduce"]) == 2
     assert "expected a table" in capsys.readouterr().err
-    for words in (["nonsense"], [TABLE, "--minutes", "0"], [TABLE, "--minutes", "nan"]):
+    for table, problem in (("nonsense", "expected a table"), ("loss/l2", "no row 'l2'"), ("loss/", "no row ''")):
+        assert main(["reproduce", table]) == 2
+        assert problem in capsys.readouterr().err
+    for words in ([TABLE, "--minutes", "0"], [TABLE, "--minutes", "nan"]):
         with pytest.raises(SystemExit):
             main(["reproduce", *words])
     assert trainer.trained == []
+
+
+def test_one_row_of_a_table(run, trainer, unscored, tmp_path):
+    assert run(f"{TABLE}/global") == 0
+    assert trainer.trained == ["unet-global-rmse"]
+    assert "individual" in (tmp_path / "runs" / "cpu" / f"{TABLE}.md").read_text()
 
 
 def test_rows_of_another_dataset_are_not_overwritten(run, tmp_path, tiny, capsys, trainer):
