@@ -32,7 +32,7 @@ U64, U32, UB16 = 2.0**-53, 2.0**-24, 2.0**-8
 """Unit round-offs."""
 
 MODULES = {
-    "phase": "phase_order", "order": "phase_order", "triangulation": "triangulation_rig", "rig": "triangulation_rig",
+    "phase": "phase", "order": "order", "triangulation": "triangulation", "rig": "rig",
     "normalisation": "scores", "metrics": "scores", "networks": "networks", "scenes": "scenes",
     "crossed": "crossed_fringes",
 }  # fmt: skip
