@@ -78,12 +78,16 @@ class ClassicalMethod(Method):
 
     def answer(self, frames: Frames) -> Answer:
         """Depth, and its standard uncertainty by the noise of the frames; none for a code that has none by pixel."""
+        return self.measure(frames)[0]
+
+    def measure(self, frames: Frames) -> tuple[Answer, NDArray[np.float32]]:
+        """`answer`, and the modulation in grey levels (H, W), the larger of both directions; 0 where there is none."""
         decoded = self.decode(frames, reasons=False, details=True)
+        measured = np.stack([measured.modulation for measured in decoded.details.values()]).max(axis=0)
+        modulation = np.nan_to_num(measured).astype(np.float32)
         if not all(isinstance(self.rig.code(way), PhaseShift) for way in decoded.details):
-            return Answer(decoded.depth_mm)
+            return Answer(decoded.depth_mm), modulation
         dark, per_grey = noise_by_light(frames, self.rig) or (ASSUMED_NOISE_GREY**2, 0.0)
-        modulation = np.stack([measured.modulation for measured in decoded.details.values()]).max(axis=0)
-        noise_grey = np.sqrt(dark + per_grey * np.nan_to_num(modulation).astype(np.float64))
-        return Answer(
-            decoded.depth_mm, depth_sigma_mm(decoded, self.rig, noise_grey, self.steps, SYSTEMATIC_RAD)
-        )  # fmt: skip
+        noise_grey = np.sqrt(dark + per_grey * modulation.astype(np.float64))
+        sigma_mm = depth_sigma_mm(decoded, self.rig, noise_grey, self.steps, SYSTEMATIC_RAD)
+        return Answer(decoded.depth_mm, sigma_mm), modulation

@@ -12,7 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench import __version__, baselines
-from fpp_ml_bench.baselines import crossed_network, crossed_route, networks, phase_network, phase_route, training
+from fpp_ml_bench.baselines import (
+    classical_network,
+    crossed_network,
+    crossed_route,
+    networks,
+    phase_network,
+    phase_route,
+    training,
+)
 from fpp_ml_bench.coding import PhaseShift
 from fpp_ml_bench.errors import PredictionError, WeightsError
 from fpp_ml_bench.evaluation.protocol import Mode, Target, Units
@@ -101,6 +109,7 @@ class Method(ABC):
 
 METHODS: Mapping[str, Callable[..., Method]] = {
     "classical": lambda rig, **options: baselines.ClassicalMethod(rig, **options),
+    "classical-net": lambda rig, **options: classical_network.ClassicalNetMethod(rig, **options),
     "phase": lambda rig, **options: (phase_route.FewestFrames if "error_mm" in options else phase_route.PhaseMethod)(
         rig, **_fringe_options("phase", rig, options)
     ),

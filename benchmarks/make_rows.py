@@ -49,6 +49,7 @@ METHODS: dict[str, tuple[object, ...]] = {
         f"classical-{n:02d}-{direction}": ("classical", "--steps", n, "--direction", direction)
         for n, direction in CLASSICAL
     },
+    "classical-net-03-vertical": ("classical-net",),
     **{f"phase-{direction}": ("phase", "--fringe", direction) for direction in ("horizontal", "vertical")},
     **{
         f"phase-{n:02d}-{direction}": ("phase", "--frames", n, "--fringe", direction) for n, direction in SEVERAL_FRAMES
@@ -100,7 +101,7 @@ def make_row(dataset: Path, work: Path, row: Path, name: str, repeats: int, trai
     settings = [method, dataset, *options]
     run("fpp-bench", "predict", *settings, "--split", "test", "--out", predictions)
     run("fpp-bench", "time", *settings, "--repeats", repeats, "--into", predictions / "submission.yaml")
-    exact = method == "classical" or name.endswith("-exact") or name in CROSSED
+    exact = method in ("classical", "classical-net") or name.endswith("-exact") or name in CROSSED
     target = "depth_exact" if exact else "depth"
     run("fpp-eval", predictions, "--dataset", dataset, "--target", target, "--json", result)
     before = read_entry(row) if row.exists() else None

@@ -21,7 +21,11 @@ from PIL import Image
 
 from fpp_ml_bench import calibration, coding, decoding, optics
 from fpp_ml_bench.baselines import robustness
+from fpp_ml_bench.baselines.classical import ClassicalMethod
+from fpp_ml_bench.baselines.classical_network import ClassicalNetMethod
+from fpp_ml_bench.baselines.crossed_network import CrossedNetMethod
 from fpp_ml_bench.baselines.crossed_route import CrossedRoute
+from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.phase_route import PhaseMethod
 from fpp_ml_bench.constants import MAD_TO_SIGMA
 from fpp_ml_bench.loaders import captures, render
@@ -61,7 +65,16 @@ def main() -> int:
             for who, found in (("authors", theirs), ("ours", ours)):
                 rig = rig_of(found, name, Path(scratch))
                 decode(args.captures / name, rig, theirs.camera, cloud, f"{name}, calibration: {who}")
-        twin(args.captures / "skull_2x3", rig_of(theirs, "skull_2x3", Path(scratch)), Path(scratch))
+        skull = rig_of(theirs, "skull_2x3", Path(scratch))
+        decode(
+            args.captures / "skull_2x3",
+            skull,
+            theirs.camera,
+            cloud,
+            "skull_2x3, classical-net",
+            ClassicalNetMethod(skull),
+        )
+        twin(args.captures / "skull_2x3", skull, Path(scratch))
         one_frame(args.captures / "skull_2x3", rig_of(theirs, "skull_2x3", Path(scratch)), Path(scratch))
         crossed_frames(args.captures / "calibration", rig_of(theirs, "board", Path(scratch)))
     return 0
@@ -126,16 +139,19 @@ def rig_of(found: "optics.OpenCvCalibration", name: str, scratch: Path) -> "opti
     return optics.load_rig(scratch / "rig.yaml")
 
 
-def decode(folder: Path, rig: "optics.Rig", camera: "optics.Pinhole", cloud: NDArray, title: str) -> None:
-    """Decode a capture and compare with the authors' cloud, which lies on the undistorted grid of their ``camera``: in
-    depth, and as points after a rigid motion, since another principal point turns the camera's frame."""
+def decode(
+    folder: Path, rig: "optics.Rig", camera: "optics.Pinhole", cloud: NDArray, title: str, method: Method | None = None
+) -> None:
+    """Decode a capture (by ``method``) and compare with the authors' cloud, which lies on the undistorted grid of their
+    ``camera``: in depth, and as points after a rigid motion, since another principal point turns the camera's frame."""
     frames = captures.read_frames(folder, count=len(rig.sequence)).frames
+    method = method or ClassicalMethod(rig, threads=2)
     started = perf_counter()
-    decoded = decoding.decode_stack(frames, rig, threads=2)
+    answer = method.answer(frames)
     seconds = perf_counter() - started
     theirs = cloud[np.isfinite(cloud).all(axis=-1)]
     columns, rows = (np.rint(axis).astype(int) for axis in camera.project(theirs / 1000))
-    depth_mm = decoded.depth_mm[rows, columns].astype(np.float64)
+    depth_mm = answer.depth[rows, columns].astype(np.float64)
     both = depth_mm > 0
     difference = depth_mm[both] - theirs[both][:, 2]
     median = float(np.median(difference))
@@ -144,8 +160,8 @@ def decode(folder: Path, rig: "optics.Rig", camera: "optics.Pinhole", cloud: NDA
     x, y = (axis[rows, columns][both] for axis in rig.camera.rays())
     apart, scale = after_motion(np.stack([x, y, np.ones_like(x)], axis=1) * depth_mm[both, None], theirs[both])
     print(f"{title:<34} {both.sum():,} of {len(theirs):,} px: median {median:+.3f} mm, robust sigma {sigma:.3f} mm, "
-          f"{100 * within:.2f}% within 2 mm; {seconds:.1f} s; after a rigid motion: median distance {apart:.3f} mm, "
-          f"their size / ours {scale:.5f}")  # fmt: skip
+          f"{100 * within:.2f}% within 2 mm; noise {bend_noise_mm(answer.depth):.3f} mm; {seconds:.1f} s; after a "
+          f"rigid motion: median distance {apart:.3f} mm, their size / ours {scale:.5f}")  # fmt: skip
 
 
 def after_motion(points: NDArray[np.float64], target: NDArray[np.float64]) -> tuple[float, float]:
@@ -163,8 +179,7 @@ def after_motion(points: NDArray[np.float64], target: NDArray[np.float64]) -> tu
 
 
 def twin(folder: Path, rig: "optics.Rig", scratch: Path) -> None:
-    """Render a ball before the same rig by the light `paper`, and compare modulation and noise with the real frames:
-    noise of depth from second differences along the rows, which a smooth surface has not."""
+    """Render a ball before the same rig by the light `paper`, and compare modulation and noise with the real frames."""
     import trimesh
 
     trimesh.creation.icosphere(subdivisions=5, radius=0.04).export(scratch / "ball.stl")
@@ -176,15 +191,20 @@ def twin(folder: Path, rig: "optics.Rig", scratch: Path) -> None:
     real = list(captures.read_frames(folder, count=len(rig.sequence)).frames)
     for title, frames in (("twin, light paper", rendered), ("real frames", real)):
         decoded = decoding.decode_stack(frames, virtual if title != "real frames" else rig, details=True, threads=2)
-        found = decoded.depth_mm > 0
-        depth_mm = np.where(found, decoded.depth_mm.astype(np.float64), np.nan)
-        bends = depth_mm[:, 2:] - 2 * depth_mm[:, 1:-1] + depth_mm[:, :-2]
-        bends = bends[np.isfinite(bends) & (np.abs(bends) < 3)]
-        noise_mm = MAD_TO_SIGMA * float(np.median(np.abs(bends - np.median(bends)))) / np.sqrt(6)
+        found, noise_mm = decoded.depth_mm > 0, bend_noise_mm(decoded.depth_mm)
         modulation = float(np.median(decoded.details["vertical"].modulation[found]))
         print(
             f"{title:<20} {found.sum():,} px: modulation {modulation:.1f} grey levels, noise of depth {noise_mm:.3f} mm"
         )
+
+
+def bend_noise_mm(depth_mm: NDArray[np.float32]) -> float:
+    """Noise of a depth map, of which 0 is none: from second differences along the rows, which a smooth surface has not.
+    Neighbours are taken for independent: an average over neighbours reads lower than its error is."""
+    depth = np.where(depth_mm > 0, depth_mm.astype(np.float64), np.nan)
+    bends = depth[:, 2:] - 2 * depth[:, 1:-1] + depth[:, :-2]
+    bends = bends[np.isfinite(bends) & (np.abs(bends) < 3)]
+    return MAD_TO_SIGMA * float(np.median(np.abs(bends - np.median(bends)))) / float(np.sqrt(6))
 
 
 def one_frame(folder: Path, rig: "optics.Rig", scratch: Path) -> None:
@@ -220,8 +240,9 @@ def one_frame(folder: Path, rig: "optics.Rig", scratch: Path) -> None:
 
 
 def crossed_frames(folder: Path, rig: "optics.Rig") -> None:
-    """The crossed route on the mean of a vertical and a horizontal fringe of each board pose: a frame with both, on a
-    printed checkerboard. Against the depth that all twelve frames give, in the range that the board spans."""
+    """The crossed route, and crossed-net with its own mask, on the mean of a vertical and a horizontal fringe of each
+    board pose: a frame with both, on a printed checkerboard. Against the depth that all twelve frames give, in the
+    range that the board spans."""
     for number in range(1, 7):
         frames = captures.read_frames(folder / f"calseq{number}", count=len(rig.sequence)).frames
         decoded = decoding.decode_stack(frames, rig, threads=2)
@@ -231,17 +252,19 @@ def crossed_frames(folder: Path, rig: "optics.Rig") -> None:
         route = CrossedRoute(ranged)
         vertical, horizontal = (np.ascontiguousarray(frames[rig.sequence.sinusoids(way)[0]])
                                 for way in ("vertical", "horizontal"))  # fmt: skip
-        started = perf_counter()
         measured = route.measure(coding.crossed_from_pair(horizontal, vertical), on_board)
-        seconds = perf_counter() - started
-        both = on_board & (measured.depth_mm > 0)
-        error = np.abs(measured.depth_mm - decoded.depth_mm)[both]
-        wrong = error > WRONG_ORDER_MM
-        confident = wrong & (measured.sigma_mm[both] < robustness.corruptions().confident_below * error)
-        print(f"one crossed frame, pose {number}, {ranged.working_range_mm[0]:.0f} to {ranged.working_range_mm[1]:.0f} "
-              f"mm: answered {100 * both.sum() / on_board.sum():.1f}% of {on_board.sum():,} px, median error "
-              f"{np.median(error):.2f} mm, wrong orders {100 * wrong.mean():.2f}%, confident errors "
-              f"{100 * confident.mean():.3f}%; {seconds:.1f} s")  # fmt: skip
+        learned = CrossedNetMethod(ranged).answer(frames)
+        assert learned.sigma_mm is not None
+        for title, depth_mm, sigma_mm in (("crossed", measured.depth_mm, measured.sigma_mm),
+                                          ("crossed-net", learned.depth, learned.sigma_mm)):  # fmt: skip
+            both = on_board & (depth_mm > 0)
+            error = np.abs(depth_mm - decoded.depth_mm)[both]
+            wrong = error > WRONG_ORDER_MM
+            confident = wrong & (sigma_mm[both] < robustness.corruptions().confident_below * error)
+            print(f"one crossed frame, pose {number}, {ranged.working_range_mm[0]:.0f} to "
+                  f"{ranged.working_range_mm[1]:.0f} mm, {title}: answered {100 * both.sum() / on_board.sum():.1f}% of "
+                  f"{on_board.sum():,} px, median error {np.median(error):.2f} mm, wrong orders "
+                  f"{100 * wrong.mean():.2f}%, confident errors {100 * confident.mean():.3f}%")  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -66,6 +66,10 @@ def _classical(submission: Submission) -> str:
     return f"Classical {steps}, {direction}, {f'{gray} Gray' if gray else 'no Gray'}"
 
 
+def _classical_net(submission: Submission) -> str:
+    return printable(submission.settings["weights"]) + _classical(submission).removeprefix("Classical")
+
+
 def _phase(submission: Submission) -> str:
     settings, direction = submission.settings, _direction(submission)
     if "error_mm" in settings:
@@ -118,6 +122,7 @@ def _loss(label: str) -> str:
 
 _METHODS = {
     "classical": ("Classical ", _classical),
+    "classical-net": ("Classical ", _classical_net),
     "phase": ("Phase route, ", _phase),
     "phase-net": ("Phase route, ", _phase_net),
     "crossed": ("Crossed fringes ", _crossed),

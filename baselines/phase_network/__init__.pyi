@@ -1,3 +1,4 @@
+from .answers import SCALE_TO_SIGMA as SCALE_TO_SIGMA
 from .answers import Answers as Answers
 from .answers import answers_of_maps as answers_of_maps
 from .answers import least_energy_order as least_energy_order
@@ -11,9 +12,12 @@ from .method import DEFAULT as DEFAULT
 from .method import NetFile as NetFile
 from .method import PhaseNetMethod as PhaseNetMethod
 from .method import load_net as load_net
+from .method import read_net as read_net
 from .method import rendered_data as rendered_data
 from .method import save_net as save_net
 from .network import PhaseNet as PhaseNet
+from .network import UNet as UNet
+from .network import fold as fold
 from .odds import Odds as Odds
 from .route import AnsweredObservation as AnsweredObservation
 from .route import Levers as Levers
@@ -24,6 +28,8 @@ from .training import train_phase_net as train_phase_net
 from .validation import chosen_lead as chosen_lead
 from .validation import chosen_threshold as chosen_threshold
 from .validation import mean_scores as mean_scores
+from .window_training import Batch as Batch
+from .window_training import StepRecipe as StepRecipe
 from .window_training import WindowRecipe as WindowRecipe
 from .window_training import WindowTraining as WindowTraining
 from .windows import IGNORED as IGNORED

@@ -45,6 +45,14 @@ class UNet(nn.Module):
         return deep
 
 
+def fold(body: UNet) -> None:
+    """Fold the normalisation of ``body`` into its convolutions, for inference: less to compute."""
+    for block in (*body.encoder, *body.decoder):
+        for number in (0, 3):
+            block[number] = fuse_conv_bn_eval(block[number], block[number + 1])
+            block[number + 1] = nn.Identity()
+
+
 class PhaseNet(nn.Module):
     """(B, C, H, W) -> order logits (B, 3, H, W), mask logits (B, H, W), phase correction in rad (B, H, W). The
     correction is a weighted average of the corrections that a pixel's surroundings propose (`inputs.SIDES`) and of
@@ -87,13 +95,10 @@ class PhaseNet(nn.Module):
         self.answer.bias = nn.Parameter(bias)
 
     def folded(self) -> "PhaseNet":
-        """The same network for inference, with the normalisation folded into the convolutions: less to compute."""
+        """The same network for inference, with the normalisation folded into the convolutions."""
         network = deepcopy(self).eval()
         for body in (network.body, network.order_body):
-            for block in (*body.encoder, *body.decoder):
-                for number in (0, 3):
-                    block[number] = fuse_conv_bn_eval(block[number], block[number + 1])
-                    block[number + 1] = nn.Identity()
+            fold(body)
         return network.to(memory_format=torch.channels_last)  # type: ignore[no-any-return,call-overload]
 
     def stating_scale(self) -> "PhaseNet":

@@ -3,12 +3,13 @@
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterator
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -19,7 +20,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from fpp_ml_bench.baselines import training
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.phase_network.windows import IGNORED, Window
+from fpp_ml_bench.baselines.phase_network.windows import IGNORED
 from fpp_ml_bench.baselines.training import Panel, Record
 from fpp_ml_bench.errors import RecipeError, TrainingError
 
@@ -29,14 +30,13 @@ LARGEST_GRADIENT = 50.0
 
 
 @dataclass(frozen=True)
-class WindowRecipe:
-    """``steps`` of ``batch`` windows of ``window`` px; AdamW at ``rate``, after ``warm_up`` steps falling as a cosine.
-    ``widths`` to ``bound_rad`` make the network; ``weight_*``: of the losses, ``weight_scale`` that of the stated
-    uncertainty; ``averaged``: decay of the moving average of the weights, which is what the weights file holds;
-    ``lights`` that are drawn, ``views_a_light`` of training objects in each, and ``unions`` for every view (see
-    `training.groups_of`). Raises `RecipeError` for values that train nothing."""
+class StepRecipe(ABC):
+    """``steps`` of ``batch`` windows of ``window`` px; AdamW at ``rate``, after ``warm_up`` steps falling as a cosine;
+    ``averaged``: decay of the moving average of the weights, which is what the weights file holds; ``lights`` that are
+    drawn, ``views_a_light`` of training objects in each, and ``unions`` for every view (see `training.groups_of`). A
+    subclass says which network learns what. Raises `RecipeError` for values that train nothing."""
 
-    name: str = "phase-net"
+    name: str = ""
     steps: int = 5000
     batch: int = 6
     window: int = 160
@@ -45,19 +45,15 @@ class WindowRecipe:
     decay: float = 1e-4
     averaged: float = 0.995
     seed: int = 42
-    widths: tuple[int, ...] = (24, 32, 48, 64)
-    fine: int = 14
-    squeezed: int = 20
-    order_widths: tuple[int, ...] = (32, 48, 64)
-    bound_rad: float = math.pi / 2
-    weight_order: float = 2.0
-    weight_mask: float = 0.5
-    weight_phase: float = 10.0
-    weight_scale: float = 0.1
     validate_every: int = 500
     lights: int = 30
     views_a_light: int = 8
     unions: int = 1
+
+    main_loss: ClassVar[str]
+    """Which is shown while it trains."""
+    scores: ClassVar[dict[str, dict[str, str]]]
+    """What its curve shows beside the losses: titles, and scores with their labels."""
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "window", "validate_every"):
@@ -72,21 +68,17 @@ class WindowRecipe:
             )
 
     @property
+    @abstractmethod
     def weights(self) -> dict[str, float]:
         """Of the losses, by name."""
-        weights = {"order": self.weight_order, "mask": self.weight_mask, "phase": self.weight_phase}
-        return weights | {"scale": self.weight_scale}
 
-    @property
-    def channels(self) -> int:
-        """Input maps of the network."""
-        return len(CHANNELS)
-
-    def network(self) -> PhaseNet:
+    @abstractmethod
+    def network(self) -> nn.Module:
         """The network, untrained."""
-        return PhaseNet(
-            self.widths, self.fine, self.squeezed, self.order_widths, self.bound_rad, self.channels, uncertain=True
-        )
+
+    @abstractmethod
+    def losses(self, network: nn.Module, batch: "Batch") -> dict[str, Tensor]:
+        """Of ``network`` on a batch, by the names of `weights`."""
 
     def rate_at(self, step: int) -> float:
         """Learning rate of step 0, 1, ..."""
@@ -103,11 +95,52 @@ class WindowRecipe:
         return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
 
 
-Batch = dict[str, Tensor]  # the fields of `Window` with a leading axis B
+@dataclass(frozen=True)
+class WindowRecipe(StepRecipe):
+    """Of a `PhaseNet`: ``widths`` to ``bound_rad`` make the network; ``weight_*``: of the losses, ``weight_scale`` that
+    of the stated uncertainty."""
+
+    name: str = "phase-net"
+    widths: tuple[int, ...] = (24, 32, 48, 64)
+    fine: int = 14
+    squeezed: int = 20
+    order_widths: tuple[int, ...] = (32, 48, 64)
+    bound_rad: float = math.pi / 2
+    weight_order: float = 2.0
+    weight_mask: float = 0.5
+    weight_phase: float = 10.0
+    weight_scale: float = 0.1
+
+    main_loss: ClassVar[str] = "phase"
+    scores: ClassVar[dict[str, dict[str, str]]] = {
+        "validation MAE, mm": {"object_mae_mm": "object", "right_mae_mm": "right order"},
+        "validation, % of object pixels": {"wrong_percent": "wrong order", "missed_percent": "missed"},
+    }
+
+    @property
+    def weights(self) -> dict[str, float]:
+        weights = {"order": self.weight_order, "mask": self.weight_mask, "phase": self.weight_phase}
+        return weights | {"scale": self.weight_scale}
+
+    @property
+    def channels(self) -> int:
+        """Input maps of the network."""
+        return len(CHANNELS)
+
+    def network(self) -> PhaseNet:
+        return PhaseNet(
+            self.widths, self.fine, self.squeezed, self.order_widths, self.bound_rad, self.channels, uncertain=True
+        )
+
+    def losses(self, network: nn.Module, batch: "Batch") -> dict[str, Tensor]:
+        return losses(network, batch, self.bound_rad)
 
 
-def batch_of(windows: list[Window]) -> Batch:
-    fields = Window.__dataclass_fields__
+Batch = dict[str, Tensor]  # the fields of a window with a leading axis B
+
+
+def batch_of(windows: Sequence[Any]) -> Batch:
+    fields = windows[0].__dataclass_fields__
     batch = {name: torch.from_numpy(np.stack([getattr(window, name) for window in windows])) for name in fields}
     batch["x"] = batch["x"].contiguous(memory_format=torch.channels_last)
     return batch
@@ -131,23 +164,23 @@ def losses(network: torch.nn.Module, batch: Batch, bound_rad: float) -> dict[str
 
 
 class WindowObjective:
-    """The weighted losses of a `PhaseNet`, and the moving average of its weights, updated after every step."""
+    """The weighted losses of a recipe's network, and the moving average of its weights, updated after every step."""
 
-    def __init__(self, network: PhaseNet, recipe: WindowRecipe) -> None:
+    def __init__(self, network: nn.Module, recipe: StepRecipe) -> None:
         self.modules: dict[str, nn.Module] = {"network": network}
-        self.bound_rad, self.weights = recipe.bound_rad, recipe.weights
+        self.recipe, self.weights = recipe, recipe.weights
         self.averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(recipe.averaged), use_buffers=True)
 
     def steps(self, batch: Batch) -> Iterator[tuple[str, Tensor, dict[str, Tensor]]]:
-        parts = losses(self.modules["network"], batch, self.bound_rad)
+        parts = self.recipe.losses(self.modules["network"], batch)
         total = torch.stack([self.weights[name] * parts[name] for name in self.weights]).sum()
         yield "network", total, {name: value.detach() for name, value in parts.items()}
         self.averaged.update_parameters(self.modules["network"])
 
 
 class WindowTraining(training.Training):
-    """Training in intervals between two validations, on the processor. ``draw`` gives a random window; ``validate``:
-    scores of a network, among them ``object_mae_mm``, ``right_mae_mm``, ``wrong_percent`` and ``missed_percent``, or
+    """Training in intervals between two validations, on the processor. ``draw`` gives a random window, a dataclass of
+    arrays with the network's input ``x``; ``validate``: scores of a network, those of ``recipe.scores`` among them, or
     nothing. ``start``: the network whose weights it starts from (None: random ones). ``print_line`` is given a line for
     every new record. Raises `TrainingError` where ``start`` is another network than the recipe's, and for a checkpoint
     of another recipe."""
@@ -155,8 +188,8 @@ class WindowTraining(training.Training):
     largest_gradient = LARGEST_GRADIENT
 
     def __init__(
-        self, recipe: WindowRecipe, draw: Callable[[np.random.Generator], Window],
-        validate: Callable[[PhaseNet], dict[str, float]], out: Path, start: PhaseNet | None = None,
+        self, recipe: StepRecipe, draw: Callable[[np.random.Generator], Any],
+        validate: Callable[[Any], dict[str, float]], out: Path, start: PhaseNet | None = None,
         print_line: Callable[[str], None] = lambda line: None,
     ) -> None:  # fmt: skip
         super().__init__(out, {"recipe": recipe.digest}, recipe.seed, cpu=True)
@@ -177,10 +210,9 @@ class WindowTraining(training.Training):
         self.resume()
 
     @property
-    def network(self) -> PhaseNet:
+    def network(self) -> Any:
         """The averaged network, to be used."""
-        averaged: PhaseNet = self.windows.averaged.module.eval()  # type: ignore[assignment]
-        return averaged
+        return self.windows.averaged.module.eval()
 
     @property
     def steps_done(self) -> int:
@@ -231,14 +263,13 @@ class WindowTraining(training.Training):
         self.print_line("  ".join(f"{key} {value:.4g}" for key, value in record.items()))
 
     def progress(self) -> str:
-        return f"step {self.steps_done}/{self.recipe.steps}  phase {self.history[-1]['loss_phase']:.4g}"
+        shown = self.recipe.main_loss
+        return f"step {self.steps_done}/{self.recipe.steps}  {shown} {self.history[-1][f'loss_{shown}']:.4g}"
 
     def panels(self) -> list[Panel]:
         def panel(title: str, labels: dict[str, str], log: bool = False) -> Panel:
             return Panel.of(title, self.history, "step", labels, log)
 
-        return [
-            panel("training losses", {f"loss_{name}": name for name in ("order", "mask", "phase")}, log=True),
-            panel("validation MAE, mm", {"object_mae_mm": "object", "right_mae_mm": "right order"}),
-            panel("validation, % of object pixels", {"wrong_percent": "wrong order", "missed_percent": "missed"}),
-        ]
+        shown = {f"loss_{name}": name for name in self.recipe.weights if name != "scale"}  # a log-likelihood
+        scores = [panel(title, labels) for title, labels in self.recipe.scores.items()]
+        return [panel("training losses", shown, log=True), *scores]

@@ -38,9 +38,11 @@ from .views import render_views as render_views
 from .views import united as united
 from .views import with_unions as with_unions
 from .weights import DEPTH_NETWORKS as DEPTH_NETWORKS
+from .weights import FILTER_NETWORKS as FILTER_NETWORKS
 from .weights import PHASE_NETWORKS as PHASE_NETWORKS
 from .weights import SHIPPED as SHIPPED
 from .weights import SUFFIX as SUFFIX
+from .weights import Family as Family
 from .weights import ModelConfig as ModelConfig
 from .weights import NetConfig as NetConfig
 from .weights import TrainingBenchmark as TrainingBenchmark

@@ -118,6 +118,10 @@ DEPTH_NETWORKS = Family(
     "fpp-ml-bench", TypeAdapter(ModelConfig), "a weights file", f"{SUFFIX} file",
     "a safetensors file of something else holds no configuration to rebuild the network from",
 )  # fmt: skip
+FILTER_NETWORKS = Family(
+    "fpp-ml-bench classical-net", TypeAdapter(NetConfig), "classical-net weights", "classical-net weights",
+    "give a file that fpp-bench train classical-net wrote",
+)  # fmt: skip
 PHASE_NETWORKS = Family(
     "fpp-ml-bench phase-net", TypeAdapter(NetConfig), "phase-net weights", "phase-net weights",
     "give a file that fpp-bench train phase-net wrote",

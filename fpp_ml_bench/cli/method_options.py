@@ -11,7 +11,8 @@ from fpp_ml_bench.errors import PredictionError, RecipeError, WeightsError
 from fpp_ml_bench.loaders import render, storage
 
 METHOD_HELP = (
-    "classical (N-step phase, Gray-code order, triangulation), phase (one fringe or a few, nothing learned), phase-net "
+    "classical (N-step phase, Gray-code order, triangulation), classical-net (the same; noise and missed pixels "
+    "learned), phase (one fringe or a few, nothing learned), phase-net "
     "(single-shot phase; order, mask and correction learned), crossed (one frame with two fringe directions, or three, "
     "nothing learned), crossed-net (one frame, with order, mask and correction learned), constant (looks at nothing), "
     "nearest (depth of the training sample with the nearest image), the name of weights that come with the package, a "
@@ -19,6 +20,7 @@ METHOD_HELP = (
 )
 _OPTIONS: dict[str, tuple[str, ...]] = {
     "classical": ("steps", "direction", "fewest", "depth_noise"),
+    "classical-net": ("steps", "direction", "weights"),
     "phase": (
         "fringe",
         "frames",
@@ -45,8 +47,9 @@ _SHARED = "min_confidence", "white_grey", "ambient_grey"
 def add_method_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--threads`` and the options of each kind of method."""
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads a sample (default: 1)")
-    add = parser.add_argument_group("classical").add_argument
-    add("--steps", type=int, metavar="N", help="phase steps a direction, 3 to 18, with Gray code (default: all)")
+    add = parser.add_argument_group("classical and classical-net").add_argument
+    add("--steps", type=int, metavar="N",
+        help="phase steps a direction, 3 to 18, with Gray code (default: all; classical-net: 3)")  # fmt: skip
     add("--direction", choices=("horizontal", "vertical", "both"),
         help="fringes to use: one direction is enough for a depth (default: all that the rig codes)")  # fmt: skip
     add("--fewest", action="store_const", const=True,
@@ -84,8 +87,8 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         help="object mask of phase or crossed: an image of the frames' size, above 0 on the object in every sample "
              "(default: found in each image)")  # fmt: skip
     add("--weights", metavar="FILE",
-        help="weights of phase-net or crossed-net: a file, such as training writes (default: those that come with the "
-             "package)")  # fmt: skip
+        help="weights of classical-net, phase-net or crossed-net: a file, such as training writes (default: those that "
+             "come with the package)")  # fmt: skip
     add = parser.add_argument_group("constant").add_argument
     add("--at", metavar="DEPTH", help="standoff, middle (of the range), training-mean, or mm (default: standoff)")
     add = parser.add_argument_group("nearest").add_argument
@@ -206,6 +209,10 @@ def _steps_for(args: argparse.Namespace, opened: Photographed) -> int:
     return steps
 
 
+def _classical_net(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
+    return _given(direction=args.direction, steps=args.steps, weights=args.weights, threads=args.threads)
+
+
 def _phase(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
     if args.frames is not None and args.error_mm is not None:
         raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
@@ -240,6 +247,6 @@ def _nearest(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
 
 
 _MAKERS = {
-    "classical": _classical, "phase": _phase, "phase-net": _phase_net, "crossed": _crossed, "crossed-net": _crossed_net,
-    "constant": _constant, "nearest": _nearest,
+    "classical": _classical, "classical-net": _classical_net, "phase": _phase, "phase-net": _phase_net,
+    "crossed": _crossed, "crossed-net": _crossed_net, "constant": _constant, "nearest": _nearest,
 }  # fmt: skip

@@ -9,7 +9,7 @@ from datetime import datetime
 from pathlib import Path
 
 from fpp_ml_bench.baselines import reproduce
-from fpp_ml_bench.baselines.training import PRESETS, TABLES, table_rows
+from fpp_ml_bench.baselines.training import PRESETS, TABLES
 from fpp_ml_bench.errors import RecipeError, TrainingError
 from fpp_ml_bench.files import printable
 
@@ -62,6 +62,7 @@ def _minutes(text: str) -> float:
 
 def run(args: argparse.Namespace) -> int:
     """Do what is missing, print the tables. Raises FppBenchError where a step can't be done or a training failed."""
+    from fpp_ml_bench.baselines.training import table_rows
     from fpp_ml_bench.cli import CHECK_FAILED, OK
     from fpp_ml_bench.cli.console import show
 

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from fpp_ml_bench.baselines import crossed_network, networks, phase_network, training
+from fpp_ml_bench.baselines import classical_network, crossed_network, networks, phase_network, training
 from fpp_ml_bench.cli import CHECK_FAILED
 from fpp_ml_bench.errors import RecipeError
 from fpp_ml_bench.machine import usable_cores
@@ -15,20 +15,22 @@ EXAMPLES = (
     "fpp-bench train phase-net --out runs/phase-net      the network of the phase route; it renders its own views",
     "fpp-bench train phase-net --albedo any --out runs/phase-net-any      without brightness",
     "fpp-bench train crossed-net --out runs/crossed-net      the network of crossed fringes; the same",
+    "fpp-bench train classical-net --out runs/classical-net      noise and missed pixels of three steps; the same",
     "fpp-bench train mine.yaml data/full --preset paper --out runs/big --minutes 10     in pieces",
     "fpp-bench train normalization/individual --views views --out runs/crossed-unet      a control on crossed frames",
     "accelerate launch -m fpp_ml_bench train mine.yaml data/full --preset paper --out runs/big      several GPUs",
     "fpp-bench predict runs/mine/model.safetensors data/cpu224 --out predictions",
 )
-_OPTIONS = "steps", "unions", "rate", "lights", "albedo", "start"  # of phase-net and crossed-net
+_OPTIONS = "steps", "unions", "rate", "lights", "albedo", "start"  # of those that render their own views
+_OWN_VIEWS = "classical-net", "phase-net", "crossed-net"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("recipe", metavar="RECIPE", help="a name like loss/l1 (fpp-bench reproduce --list), a .yaml, phase-net, or "
-        "crossed-net")  # fmt: skip
+    add("recipe", metavar="RECIPE", help="a name like loss/l1 (fpp-bench reproduce --list), a .yaml, or "
+        f"{', '.join(_OWN_VIEWS)}")  # fmt: skip
     add("dataset", type=Path, metavar="DATASET", nargs="?",
-        help="dataset folder, of the preset's image size (phase-net and crossed-net: none)")  # fmt: skip
+        help="dataset folder, of the preset's image size (those three: none)")  # fmt: skip
     add("--out", type=Path, required=True, metavar="DIR", help="new folder, or that of a training to resume")
     add("--preset", choices=training.PRESETS, default="cpu", help="what a shipped recipe is scaled to (default: cpu)")
     add("--minutes", type=float, metavar="M",
@@ -37,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="instead of DATASET, for a unet: crossed frames in the lights that crossed-net learns from, rendered into "
              "DIR at the preset's size where it lacks them; the input is standardised by the frame itself")  # fmt: skip
     add("--steps", type=int, metavar="N",
-        help="phase-net and crossed-net: training steps (default: as the shipped weights)")  # fmt: skip
+        help="those three: training steps (default: as the shipped weights)")  # fmt: skip
     add("--unions", type=int, metavar="N",
         help="the same: images that join several objects, made from each sample (default: as the shipped weights)",
     )  # fmt: skip
@@ -52,9 +54,9 @@ def run(args: argparse.Namespace) -> int:
     """Train, add range heads where the weights need them, and print the result. Raises FppBenchError."""
     if args.minutes is not None and not 0 < args.minutes < 1e6:
         raise RecipeError(f"--minutes {args.minutes}: expected a number above 0")
-    if args.views is not None and (args.dataset is not None or args.recipe in ("crossed-net", "phase-net")):
+    if args.views is not None and (args.dataset is not None or args.recipe in _OWN_VIEWS):
         raise RecipeError("--views takes the place of DATASET for a recipe of a unet; give one of them")
-    if args.recipe in ("phase-net", "crossed-net"):
+    if args.recipe in _OWN_VIEWS:
         import cv2
 
         if args.dataset is not None:
@@ -62,7 +64,8 @@ def run(args: argparse.Namespace) -> int:
                 f"{args.dataset}: {args.recipe} renders what it learns from, and takes none; leave it out"
             )
         cv2.setNumThreads(1)
-        return _phase_net(args) if args.recipe == "phase-net" else _crossed_net(args)
+        train = dict(zip(_OWN_VIEWS, (_classical_net, _phase_net, _crossed_net), strict=True))[args.recipe]
+        return train(args)
     if args.dataset is None and args.views is None:
         raise RecipeError(f"{args.recipe}: expected a dataset folder to train on, got none")
     _given(args)
@@ -97,6 +100,14 @@ def _phase_net(args: argparse.Namespace) -> int:
     return _window_training_said(args, recipe.steps, trained)
 
 
+def _classical_net(args: argparse.Namespace) -> int:
+    recipe = classical_network.FilterRecipe(**_given(args, "steps", "unions", "rate", "lights"))
+    trained = classical_network.train_classical_net(
+        recipe, args.out, minutes=args.minutes, workers=usable_cores(), show=True, print_line=print,
+    )  # fmt: skip
+    return _window_training_said(args, recipe.steps, trained)
+
+
 def _crossed_net(args: argparse.Namespace) -> int:
     recipe = crossed_network.CrossedRecipe(**_given(args, "steps", "unions", "rate", "lights"))
     trained = crossed_network.train_crossed_net(
@@ -114,7 +125,7 @@ def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
 
 
 def _window_training_said(args: argparse.Namespace, steps: int, trained: "phase_network.Trained") -> int:
-    """Print how the training of phase-net or crossed-net ended; the exit status."""
+    """Print how a training of windows ended; the exit status."""
     if trained.weights is None:
         done = f"{trained.steps} of {steps} steps"
         print(f"{args.out}: stopped after {done}, all saved; run the same command to resume")

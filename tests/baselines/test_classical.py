@@ -242,7 +242,9 @@ def test_the_phase_route_takes_the_only_direction_that_a_rig_has():
 
 
 def test_methods_by_name(opened):
-    assert tuple(METHODS) == ("classical", "phase", "phase-net", "crossed", "crossed-net", "constant", "nearest")
+    assert tuple(METHODS) == (
+        "classical", "classical-net", "phase", "phase-net", "crossed", "crossed-net", "constant", "nearest",
+    )  # fmt: skip
     assert load_method("classical", opened.rig, steps=4).title == "Classical 4-step + Gray code, both directions"
     network = load_method("unet-individual-rmse", opened.rig, device="cpu", depth_range="oracle")
     assert (network.frames_used, network.units, network.mode) == ((0,), "normalised", "paper")

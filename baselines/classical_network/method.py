@@ -1,0 +1,82 @@
+"""classical-net as a method of ``fpp-bench predict``: classical frames, averaged and filled by a small network."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.baselines.classical import ClassicalMethod
+from fpp_ml_bench.baselines.classical_network.network import DepthFilter
+from fpp_ml_bench.baselines.classical_network.route import decided, filtered, written
+from fpp_ml_bench.baselines.classical_network.scene import DepthScene
+from fpp_ml_bench.baselines.method import Answer, Frames, Method
+from fpp_ml_bench.baselines.networks import torch_threads
+from fpp_ml_bench.baselines.phase_network import read_net, rendered_data
+from fpp_ml_bench.baselines.training import FILTER_NETWORKS, weights_path
+from fpp_ml_bench.coding import PhaseShift
+from fpp_ml_bench.decoding import Directions
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.optics import Rig
+
+SHIPPED = Path(__file__).resolve().parent / "weights"  # folder of the weights that come with the package
+DEFAULT = "classical-net"
+STEPS = 3
+"""Phase steps where a rig's code leaves the choice and no others are asked for: noise is what it takes away."""
+
+
+class ClassicalNetMethod(Method):
+    """`ClassicalMethod` of one ``direction`` (default: the one it learned) and ``steps`` (default: 3). The weights
+    ``weights`` (a shipped name or a file) average its depth over neighbours, by at most three stated standard
+    uncertainties, and fill it where it has none. Raises `WeightsError` for weights that can't be used, and
+    `PredictionError` for a code whose uncertainty is not known."""
+
+    name = "classical-net"
+    packages = ("numpy", "numba", "torch")
+
+    def __init__(
+        self, rig: Rig, direction: Directions | None = None, steps: int | None = None, weights: str | Path = DEFAULT,
+        threads: int = 1,
+    ) -> None:  # fmt: skip
+        path = weights_path(weights, SHIPPED)
+        config, network, digest = read_net(path, DepthFilter, FILTER_NETWORKS)
+        self.network = network.folded()
+        learned = str(config.recipe.get("direction", "vertical"))
+        way: Any = direction or (learned if learned in rig.directions else rig.directions[0])
+        codes = [rig.code(one) for one in (rig.directions if way == "both" else (way,))]
+        fringes = [code for code in codes if isinstance(code, PhaseShift)]
+        if len(fringes) < len(codes):
+            raise PredictionError(
+                f"classical-net: needs the uncertainty of every pixel, which {codes[0].title} does not give; use "
+                "classical"
+            )
+        if steps is None and all(code.is_plain for code in fringes):
+            steps = STEPS
+        self.classical = ClassicalMethod(rig, way, steps, threads)
+        self.rig, self.threads, self.frames_used = rig, threads, self.classical.frames_used
+        self.config = self.weights_config = config
+        self.parameters = sum(parameter.numel() for parameter in network.parameters())
+        more = "" if config.name == DEFAULT else f" ({config.name})"
+        self.title = f"{self.classical.title}; noise and missed pixels learned{more}"
+        self.settings = {
+            **self.classical.settings, "weights": config.name, "weights_sha256": digest,
+            "mask_threshold": config.threshold,
+        }  # fmt: skip
+
+    @property
+    def learned_from(self) -> dict[str, Any]:
+        """Views that its training renders of the training objects."""
+        return rendered_data(self.config)
+
+    def predict(self, frames: Frames) -> NDArray[np.float32]:
+        return self.answer(frames).depth
+
+    def answer(self, frames: Frames) -> Answer:
+        """Depth, and the standard uncertainty that the network expects."""
+        decoded, modulation = self.classical.measure(frames)
+        scene = None if decoded.sigma_mm is None else DepthScene.of(decoded.depth, decoded.sigma_mm, modulation)
+        if scene is None:
+            return decoded
+        with torch_threads(self.threads):
+            answer = filtered(self.network, scene)
+        return Answer(*written(answer, scene, decided(answer, scene, self.config.threshold), decoded.depth.shape))
