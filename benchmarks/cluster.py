@@ -4,14 +4,12 @@
 
 Starts a cluster of two nodes with a CPU each on this machine, so it has the CPUs of ``--workers 2``. Builds preset
 full (300 views) with `fpp-bench build` by the local pool, by the cluster into a folder that both nodes see, and by the
-cluster to a URL, in turns, and prints the least seconds and processor seconds of each; the latter contain those of the
-cluster's own processes, and depend less on what else this machine does. Then measures an axis of FPP-C both ways, and
-builds once more while a node is killed after a third of the shards. Exit status 1 if a byte or a score differs. Needs
-the extra ``cluster``.
+cluster to a URL, in turns, and prints the least seconds of each; the machine should have nothing else to do. Then
+measures an axis of FPP-C both ways, and builds once more while a node is killed after a third of the shards. Exit
+status 1 if a byte or a score differs. Needs the extra ``cluster``.
 """
 
 import argparse
-import contextlib
 import json
 import os
 import shutil
@@ -51,26 +49,11 @@ def finish(process: subprocess.Popen) -> None:
         sys.exit(f"{' '.join(map(str, process.args))}: exit status {process.returncode}\n{errors}")
 
 
-def timed(*words: str | Path) -> tuple[float, float]:
-    """Seconds of a command, and processor seconds."""
-    started, used = time.perf_counter(), processor_seconds()
+def timed(*words: str | Path) -> float:
+    """Seconds of a command."""
+    started = time.perf_counter()
     finish(start(*words))
-    return time.perf_counter() - started, processor_seconds() - used
-
-
-def processor_seconds() -> float:
-    """Of this process and all below it, also those that ended."""
-    parents, ticks = {}, {}
-    for file in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            fields = file.read_text().rpartition(")")[2].split()
-            pid = int(file.parent.name)
-            parents[pid], ticks[pid] = int(fields[1]), sum(map(int, fields[11:15]))
-    total, generation = 0, {os.getpid()}
-    while generation:
-        total += sum(ticks[pid] for pid in generation)
-        generation = {pid for pid, parent in parents.items() if parent in generation}
-    return total / os.sysconf("SC_CLK_TCK")
+    return time.perf_counter() - started
 
 
 def hashes(folder: Path) -> dict[str, str]:
@@ -137,30 +120,29 @@ def main() -> int:
         ways = {
             "local": ["--workers", "2"], "cluster": ["--cluster", address], "url": ["--cluster", address],
         }  # fmt: skip
-        seconds: dict[str, list[tuple[float, float]]] = {way: [] for way in ways}
+        seconds: dict[str, list[float]] = {way: [] for way in ways}
         prints: dict[str, dict[str, str]] = {}
         for repeat in range(args.repeats):
             for way, options in ways.items():
                 folder = work / (way if repeat == args.repeats - 1 else f"{way}-{repeat}")
                 out = folder.as_uri() if way == "url" else str(folder)
                 seconds[way].append(timed("build", out, *settings, *options))
-                print(f"{way}: {seconds[way][-1][0]:.1f} s, {seconds[way][-1][1]:.1f} processor s", flush=True)
+                print(f"{way}: {seconds[way][-1]:.1f} s", flush=True)
                 prints[way] = hashes(folder)
                 same &= prints[way] == prints["local"]
                 if way != "local" or repeat < args.repeats - 1:
                     shutil.rmtree(folder)
         views = sum(len(part) for part in DatasetFolder(work / "local").splits.values())
         print(f"{views} views of {args.size} px, {len(prints['local'])} files")
-        least = {way: [min(values) for values in zip(*runs, strict=True)] for way, runs in seconds.items()}
-        for way, (wall_s, processor_s) in least.items():
-            more = [f"{100 * (mine / local - 1):+.1f}%" for mine, local in zip(least[way], least["local"], strict=True)]
+        for way, values in seconds.items():
+            more = 100 * (min(values) / min(seconds["local"]) - 1)
             equal = "the same bytes" if prints[way] == prints["local"] else "OTHER BYTES"
-            print(f"least of {way}: {wall_s:.1f} s {more[0]}, {processor_s:.1f} processor s {more[1]}, {equal}")
+            print(f"least of {way}: {min(values):.1f} s, {more:+.1f}%, {equal}")
 
         size = str(args.size)
         words = ["robustness", "constant", "--quick", "--axes", "gloss", "--size", size, "--no-cache", "--out"]
-        local_s, _ = timed(*words, work / "fppc", "--workers", "2")
-        cluster_s, _ = timed(*words, (work / "fppc-url").as_uri(), "--cluster", address)
+        local_s = timed(*words, work / "fppc", "--workers", "2")
+        cluster_s = timed(*words, (work / "fppc-url").as_uri(), "--cluster", address)
         equal = rows(work / "fppc") == rows(work / "fppc-url") != {}
         same &= equal
         print(
