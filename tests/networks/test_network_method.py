@@ -184,7 +184,7 @@ def test_predict_score_and_time_on_the_command_line(dataset, weights, tmp_path, 
 @pytest.mark.parametrize(
     "arguments, words",
     [
-        (["magic"], "unknown method 'magic'; there are classical, phase"),
+        (["magic"], "unknown method 'magic'; there are classical, classical-net, phase"),
         (["no-such.safetensors"], "expected a weights file (*.safetensors), found nothing"),
         (["recipe.yaml"], "recipe.yaml"),
         (["{w}/raw.safetensors", "--range", "mean"], "leave out the depth range 'mean'"),
