@@ -254,7 +254,6 @@ def crossed_frames(folder: Path, rig: "optics.Rig") -> None:
                                 for way in ("vertical", "horizontal"))  # fmt: skip
         measured = route.measure(coding.crossed_from_pair(horizontal, vertical), on_board)
         learned = CrossedNetMethod(ranged).answer(frames)
-        assert learned.sigma_mm is not None
         for title, depth_mm, sigma_mm in (("crossed", measured.depth_mm, measured.sigma_mm),
                                           ("crossed-net", learned.depth, learned.sigma_mm)):  # fmt: skip
             both = on_board & (depth_mm > 0)

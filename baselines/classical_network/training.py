@@ -105,9 +105,7 @@ def train_classical_net(
     training.claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
     weights = out / WEIGHTS
     if weights.exists():
-        finished = read_net(weights, DepthFilter, training.FILTER_NETWORKS)[0]
-        known = {key: float(value or 0) for key, value in finished.validation.items()}
-        return Trained(weights, finished.steps, finished.threshold, known)
+        return Trained.before(weights, read_net(weights, DepthFilter, training.FILTER_NETWORKS)[0])
 
     def measured(views: Iterable[training.View]) -> list[Sample]:
         return [sample for view in views if (sample := sample_of(view, method)) is not None]

@@ -70,9 +70,7 @@ def train_crossed_net(
     training.claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
     weights = out / WEIGHTS
     if weights.exists():
-        finished = load_net(weights).config
-        known = {key: float(value or 0) for key, value in finished.validation.items()}
-        return Trained(weights, finished.steps, finished.threshold, known)
+        return Trained.before(weights, load_net(weights).config)
     route, frame = CrossedRoute(rig), rig.sequence.crossed_frames[0]
     samples, validation = training.measured_views(
         groups, rig, (frame,), out / VIEWS, lambda views: [sample_of(view, route) for view in views], recipe.unions,

@@ -145,6 +145,12 @@ class Trained:
     threshold: float
     validation: dict[str, float]
 
+    @classmethod
+    def before(cls, weights: Path, config: training.NetConfig) -> "Trained":
+        """Of a training that an earlier call finished."""
+        scores = {key: float(value or 0) for key, value in config.validation.items()}
+        return cls(weights, config.steps, config.threshold, scores)
+
 
 def train_phase_net(
     recipe: Recipe, out: Path, *, rig: Rig | None = None, start: Path | None = None, minutes: float | None = None,
@@ -164,9 +170,7 @@ def train_phase_net(
     training.claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
     weights = out / f"{recipe.weights_name}.safetensors"
     if weights.exists():
-        finished = load_net(weights).config
-        scores = {key: float(value or 0) for key, value in finished.validation.items()}
-        return Trained(weights, finished.steps, finished.threshold, scores)
+        return Trained.before(weights, load_net(weights).config)
     geometries = {
         direction: Geometry.of(rig, Settings(direction=direction, shading=recipe.shading))
         for direction in recipe.directions

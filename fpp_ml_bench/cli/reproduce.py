@@ -24,7 +24,7 @@ EXAMPLES = (
 ALL = "all"
 EMPTY_BECAUSE = {
     "cpu": "a training takes 2 to 7 minutes on two cores",
-    "cpu-long": "a training takes 1 to 2 hours on a core",
+    "cpu-long": "a training takes half an hour and more on a core",
     "paper": "a training needs a GPU (weeks without)",
 }
 
