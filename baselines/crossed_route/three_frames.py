@@ -1,16 +1,19 @@
 """Three crossed frames that shift one carrier and keep the other still: depth from each pixel's own phase.
 
 The shifted carrier's phase is the three-step least squares of `fpp_ml_bench.coding`, pixel by pixel, so that nothing
-mixes two surfaces at an edge. In the mean of the frames that carrier cancels; a window finds the other one there, which
-only chooses the order. A phase of three frames has the noise of the camera. It is averaged over pairs of pixels that
-lie opposite each other, where noise explains that all three lie on one plane; no other pixel takes part.
+mixes two surfaces at an edge. In the mean of the frames that carrier cancels and the other one is left, which only
+chooses the order: by its phase in a window, and by the light of each pixel itself, since the first carrier's modulation
+says how bright the pixel is. A phase of three frames has the noise of the camera. It is averaged over pairs of pixels
+that lie opposite each other, where noise explains that all three lie on one plane; no other pixel takes part.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
 from fpp_ml_bench.baselines.crossed_route.carriers import LEAST_RANGE_RAD, Carriers
 from fpp_ml_bench.baselines.crossed_route.empty_scene import EmptySceneFit
@@ -20,6 +23,8 @@ from fpp_ml_bench.baselines.crossed_route.refinement import LEAST_GREY, WINDOW_P
 from fpp_ml_bench.baselines.crossed_route.route import LEAST_TRUST, WELL_LIT, CrossedRoute
 from fpp_ml_bench.baselines.phase_route import (
     FLOOR_NOISE_GREY,
+    LARGE,
+    Background,
     Image,
     Mask,
     Watch,
@@ -40,9 +45,16 @@ from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.optics import Rig
 
 FRAMES = 3
-SMOOTHNESS = (
-    4.0  # weight of the link between two pixels: a pixel's window shares most of its light with its neighbour's
-)
+SMOOTHNESS = 33.0
+"""Weight of the link between two pixels: a pixel's window shares most of its light with its neighbour's, and one
+pixel's light may be that of two surfaces."""
+LIGHT_SIGMA, LIGHT_NOISE, MOST_LIGHT = 0.06, 1.2, 6.5
+"""Of a pixel's light over its brightness: standard uncertainty of the model, what noise over brightness adds, and the
+largest cost."""
+INDIRECT_PERIODS, MOST_INDIRECT = 1.0, 0.4
+"""Light from other surfaces changes slowly: the window of its median, and its largest share of the brightness."""
+MEDIAN_STEP = 0.005
+LEAST_BRIGHT = 1.0  # grey levels
 EVIDENCE_WEIGHT = 2.0  # one carrier's phase has no error: evidence tells twice as much of the order as in one frame
 REACH_PX = 2  # of the pairs that are averaged
 SAME_PLANE_SIGMAS = 3.0
@@ -132,10 +144,13 @@ class ThreeFrameRoute(CrossedRoute):
         modulations = repeated(modulations, self.stride, (2, *inside.shape))
         modulations[self.moved] = modulation[crop]
         found = candidates(carriers, phases, self.settings.slack_mm, exact=self.moved)
-        index, margin, evidence = self._ordered(carriers, found, phases, modulations, inside, background.noise_grey)
+        light = mean[crop] - np.float32(background.ambient_grey)
+        by_light = self._light_cost(carriers, found, light, modulations[self.moved], contrast, inside, background)
+        index, margin, evidence = self._ordered(
+            carriers, found, phases, modulations, inside, background.noise_grey, by_light
+        )
         beside = neighbours(found, index)
         watch.done("order")
-        light = mean[crop] - np.float32(background.ambient_grey)
         nearness = of_choice(found.nearness, index)
         fit = self._fit(carriers, light, inside, nearness, modulations[self.moved], contrast)
         watch.done("fit")
@@ -147,17 +162,36 @@ class ThreeFrameRoute(CrossedRoute):
             rival=rival(found, index), candidates=beside, clipped_share=clipped.astype(np.float32), watch=watch,
         )  # fmt: skip
 
+    def _light_cost(
+        self, carriers: Carriers, found: Candidates, light: Image, modulation: Image, contrast: tuple[float, float],
+        inside: Mask, background: Background,
+    ) -> Image:  # fmt: skip
+        """Cost of every candidate (K, h, w) in half squared sigmas: how far the still carrier is at its depth from what
+        ``light``, the mean of the frames less ambient light, shows over the brightness that the own ``modulation``
+        tells. Light from other surfaces is what the candidates of least misfit leave, in the median around a pixel."""
+        still = 1 - self.moved
+        bright = np.maximum(modulation / np.float32(contrast[self.moved]), np.float32(LEAST_BRIGHT))
+        expected = np.cos(carriers.infinity_rad[still] + carriers.gain[still] * found.nearness)
+        left = light / bright - 1 - np.float32(contrast[still]) * expected
+        likely = np.where(found.exists, found.misfit_rad, LARGE).argmin(axis=0)
+        indirect = local_median(of_choice(left, likely), inside, INDIRECT_PERIODS * self.carriers.period_px)
+        left -= np.minimum(indirect, np.float32(MOST_INDIRECT))
+        sigma = np.hypot(np.float32(LIGHT_SIGMA), np.float32(LIGHT_NOISE * background.noise_grey) / bright)
+        cost: Image = np.minimum((left / sigma) ** 2 / 2, np.float32(MOST_LIGHT)).astype(np.float32)
+        return cost
+
     def _ordered(
-        self, carriers: Carriers, found: Candidates, phases: Image, modulations: Image, inside: Mask, noise_grey: float
-    ) -> tuple[NDArray[np.int32], Image, Image]:
-        """As `orders.chosen`, for every pixel; neighbours between which the own phase or modulation jumps hardly
-        count for each other."""
+        self, carriers: Carriers, found: Candidates, phases: Image, modulations: Image, inside: Mask, noise_grey: float,
+        by_light: Image,
+    ) -> tuple[NDArray[np.int32], Image, Image]:  # fmt: skip
+        """As `orders.chosen`, for every pixel, with the costs ``by_light``; neighbours between which the own phase or
+        modulation jumps hardly count for each other."""
         own = modulations[self.moved]
         trust = np.clip(modulations[1 - self.moved] / np.float32(WELL_LIT * noise_grey), LEAST_TRUST, 1)
         residual = wrapped(phases[self.moved] - carriers.infinity_rad[self.moved])
         pairs = zip(links_between(inside), jump_links(residual, own, stride=1), strict=True)
         link_x, link_y = (np.float32(SMOOTHNESS) * link * smooth for link, smooth in pairs)
-        index, margin, evidence = chosen(carriers, found, trust, inside, (link_x, link_y))
+        index, margin, evidence = chosen(carriers, found, trust, inside, (link_x, link_y), by_light)
         return index, margin / np.float32(SMOOTHNESS), np.float32(EVIDENCE_WEIGHT) * evidence
 
     def _fit(
@@ -182,6 +216,18 @@ class ThreeFrameRoute(CrossedRoute):
         weight = Window(WINDOW_PERIODS * self.carriers.period_px).moment(inside.astype(np.float32))
         maps = (nearness, brightness, misfit, slope, weight, uncertainty)
         return Fit(*(np.asarray(values, np.float32) for values in maps))
+
+
+def local_median(values: Image, inside: Mask, window_px: float) -> Image:
+    """Median of ``values`` (h, w) over the square of ``window_px`` around each pixel, in steps of `MEDIAN_STEP` between
+    -127 and 127 of them; beyond ``inside`` they are those of the nearest pixel within."""
+    levels = np.clip(np.rint(values / np.float32(MEDIAN_STEP)), -127, 127).astype(np.int16)
+    if inside.any() and not inside.all():
+        y, x = distance_transform_edt(~inside, return_distances=False, return_indices=True)
+        levels = levels[y, x]
+    size = 2 * int(window_px / 2) + 1
+    median = cv2.medianBlur((levels + 128).astype(np.uint8), size)
+    return (median.astype(np.float32) - 128) * np.float32(MEDIAN_STEP)
 
 
 def continued(inside: Mask, region: Mask, different: Mask, residual_rad: Image) -> Mask:

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 from crossed_scenes import FAMILY, NO_PLANE, RIG, frame, slab
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from fpp_ml_bench.baselines import load_method
 from fpp_ml_bench.baselines.crossed_route import CrossedMeasurement, ThreeFrameRoute
-from fpp_ml_bench.baselines.crossed_route.three_frames import continued, phase_noise_grey, same_plane_mean
+from fpp_ml_bench.baselines.crossed_route.three_frames import continued, local_median, phase_noise_grey, same_plane_mean
 from fpp_ml_bench.coding import Crossed
 from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.optics import Rig, crossed_rig, paper_rig
@@ -62,6 +63,30 @@ def test_without_a_known_plane_and_on_paint() -> None:
     answered = inside & (found.depth_mm > 0)
     assert answered.sum() > 0.97 * inside.sum()
     assert np.median(np.abs(found.depth_mm - depth_mm)[answered]) < 0.5
+
+
+@pytest.mark.parametrize("indirect_grey", [0.0, 20.0])
+def test_a_bar_much_narrower_than_a_window_has_the_right_order(indirect_grey: float) -> None:
+    """A window on it shows the slab behind; its order is told by each pixel's own light, that of other surfaces off."""
+    depth_mm, (y, x) = slab(CUT, 1900.0), np.indices((320, 320))
+    bar = (depth_mm > 0) & (np.abs(x - 160 + 0.4 * (y - 160)) < 4)
+    depth_mm = np.where(bar, 1650.0, depth_mm)
+    ambient = np.where(depth_mm > 0, 6.0 + indirect_grey, 6.0)
+    found = measured([depth_mm] * 3, ambient_grey=ambient)  # type: ignore[arg-type]
+    assert (np.abs(found.depth_mm - depth_mm) > 20)[bar].mean() < 0.01
+
+
+def test_the_local_median_is_that_of_the_object_and_of_its_nearest_pixel_beyond() -> None:
+    random = np.random.default_rng(4)
+    values = random.uniform(-0.5, 0.5, (40, 50)).astype(np.float32)
+    whole = np.ones(values.shape, bool)
+    found, exact = local_median(values, whole, 9.0), median_filter(values, 9, mode="nearest")
+    assert np.abs(found - exact).max() < 0.0026  # half a step
+    half = whole.copy()
+    half[:, 25:] = False
+    beyond = local_median(np.where(half, values, 9.0).astype(np.float32), half, 9.0)
+    alone = local_median(np.repeat(values[:, 24:25], 50, axis=1), whole, 9.0)
+    assert np.array_equal(beyond[:, 40:], alone[:, 40:])
 
 
 def test_an_object_that_moves_between_frames_keeps_its_order() -> None:
