@@ -18,7 +18,6 @@ from fpp_ml_bench.leaderboard.page import page_files
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.readme import BEGIN, END, SHOWN, readme_block
 from fpp_ml_bench.leaderboard.rows import picture_of, read_entry, write_row
-from fpp_ml_bench.leaderboard.trivial import is_trivial, more_than_trivial
 
 
 @pytest.fixture(scope="module")
@@ -237,11 +236,8 @@ def test_unnamed_results_get_into_neither_page_nor_readme(readme, files, tmp_pat
     assert "Fast and rough" not in (tmp_path / "page" / "index.html").read_text()
 
 
-def test_shipped_rows_make_a_page():
+def test_shipped_rows_are_timed_and_have_intervals():
     entries = read_entries(shipped_rows())
     assert entries and {entry.provenance for entry in entries} <= set(rows.PROVENANCES)
-    shown = more_than_trivial(rank(entries))
-    assert len(page_files(rank(entries), [])) == 3 + sum(len(group.rows) for group in shown)
-    assert all(is_trivial(row) for group in rank(entries) if group not in shown for row in group.rows)
     for entry in entries:
         assert entry.result.timing is not None and entry.interval("object_mae_mm") is not None

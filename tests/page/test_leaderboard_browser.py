@@ -1,6 +1,7 @@
 """The page in headless Chromium: sorting, filters, keyboard, both colour schemes, a phone, and hostile rows."""
 
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +13,9 @@ from scored_dataset import make_dataset
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.leaderboard.page import page as page_module
 from fpp_ml_bench.leaderboard.page import write_page
-from fpp_ml_bench.leaderboard.ranking import rank, read_entries
+from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.reported import chosen_tables
+from fpp_ml_bench.leaderboard.trivial import is_trivial, more_than_trivial
 from fpp_ml_bench.loaders.storage import Benchmark, benchmark
 
 HOSTILE = "</script><script>window.hacked = 1</script><img src=x onerror='window.hacked = 1'>"
@@ -185,6 +187,19 @@ def shipped_page(tmp_path_factory):
     out = tmp_path_factory.mktemp("shipped") / "page"
     assert main(["leaderboard", "--page", str(out)]) == 0
     return out / "index.html"
+
+
+def test_the_shipped_page_has_all_rows_and_the_papers_errors_apart(shipped_page):
+    groups = rank(read_entries(shipped_rows()))
+    shown = more_than_trivial(groups)
+    pages = sum(path.is_file() for path in shipped_page.parent.rglob("*"))
+    assert pages == 3 + sum(len(group.rows) for group in shown)
+    assert all(is_trivial(row) for group in groups if group not in shown for row in group.rows)
+    index = shipped_page.read_text(encoding="utf-8")
+    paper = index[index.index('<section id="reported">') :]
+    assert "14.54" in paper and "told the test sample" in paper and "Other data, not ranked" in paper
+    above = index[: index.index('<section id="reported">')]
+    assert not re.search(r"(?<![\d.])14\.54", above)  # 214.54 is a place in a picture
 
 
 @pytest.mark.parametrize("width", [390, 1240])
