@@ -5,10 +5,12 @@ elsewhere. Ray (extra ``cluster``) is imported only for a cluster.
 """
 
 import logging
+import os
 import pickle
 import platform
 import signal
 import socket
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -16,7 +18,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
 from importlib import metadata
-from multiprocessing import get_context
+from multiprocessing import connection, get_context, parent_process
 from typing import Any
 from urllib.parse import urlsplit
 from uuid import uuid4
@@ -63,8 +65,22 @@ def mapping(work: object, workers: int = 1, cluster: str | None = None) -> Itera
 
 def _begin(work: object) -> None:
     global _work
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    begin_worker()
     _work = "", work
+
+
+def begin_worker() -> None:
+    """In a new worker process: its parent alone is interrupted from the keyboard, and when the parent ends, however it
+    does, so does this process: an orphan would stay for ever, or write into an unlocked folder."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = parent_process()
+    if parent is not None:
+        connection.wait([parent.sentinel])
+        os._exit(1)
 
 
 def _call(function: Callable[..., Any], *items: Any) -> Any:

@@ -1,13 +1,10 @@
 """Shards written by processes of this machine, which go from shard to shard and end with their parent."""
 
-import os
-import signal
-import threading
 import traceback
 from collections import deque
 from collections.abc import Callable, Generator
 from contextlib import suppress
-from multiprocessing import connection, get_context, parent_process
+from multiprocessing import connection, get_context
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Protocol
@@ -15,6 +12,7 @@ from typing import Any, Protocol
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.storage.shards import Receipt, ShardPlan
 from fpp_ml_bench.machine import single_threaded_algebra
+from fpp_ml_bench.pool import begin_worker
 
 _POLL_S = 0.2
 
@@ -75,8 +73,7 @@ def write_in_processes(
 
 def _work(pipe: Connection, rows_done: Any, work: Work) -> None:
     """Write the shards whose plans come through ``pipe``, counting rows in memory shared with the parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    begin_worker()
 
     def row_done() -> None:
         with rows_done.get_lock():
@@ -92,11 +89,3 @@ def _work(pipe: Connection, rows_done: Any, work: Work) -> None:
                 error.add_note(traceback.format_exc())
                 result = error
             pipe.send(result)
-
-
-def _end_with_parent() -> None:
-    """End this process when its parent ends: an orphan would write into an unlocked folder."""
-    parent = parent_process()
-    if parent is not None:
-        connection.wait([parent.sentinel])
-        os._exit(1)

@@ -1,6 +1,7 @@
 """Maps: in this process and on a cluster, whose place a stand-in takes; the errors of each."""
 
 import socket
+import subprocess
 import sys
 
 import pytest
@@ -42,6 +43,30 @@ def test_an_error_of_a_task_is_raised_as_it_is(fake_ray):
     with pytest.raises(MeshError, match="does not fit"), mapping(Work(), cluster=fake_ray.address) as mapped:
         list(mapped(half_of, [1, 1], [1, -1]))
     assert not fake_ray.open
+
+
+_WAITING = """
+import os, time
+from fpp_ml_bench.pool import mapping
+
+def sleep(work, number):
+    print(os.getpid(), flush=True)
+    time.sleep(120)
+
+if __name__ == "__main__":
+    with mapping(None, 2) as mapped:
+        list(mapped(sleep, range(2)))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="processes are killed by a signal")
+def test_no_worker_outlives_its_parent(tmp_path):
+    (tmp_path / "waiting.py").write_text(_WAITING)
+    parent = subprocess.Popen([sys.executable, "waiting.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
+    for _ in range(2):
+        parent.stdout.readline()  # both are at work
+    parent.kill()
+    assert parent.communicate(timeout=30)[0] == ""  # returns when the last worker has closed its end
 
 
 def test_a_task_that_dies_on_every_node_is_an_error_that_says_so(fake_ray):
