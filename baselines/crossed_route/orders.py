@@ -61,14 +61,16 @@ def candidates(carriers: Carriers, phase_rad: Image, slack_mm: float, exact: int
 
 def chosen(
     carriers: Carriers, found: Candidates, trust: Image, inside: Mask, links: tuple[Image, Image] | None = None,
-    more_cost: Image | float = 0.0,
+    more_cost: Image | None = None,
 ) -> tuple[NDArray[np.int32], Image, Image]:  # fmt: skip
     """Index of the candidate of least energy, int32 (h', w'), the margin of the energy (0 for a tie), and the evidence:
     the cost of the best rival less its own, in half squared sigmas; ``trust`` (h', w'): weight of a point's evidence,
     0 to 1; ``links`` along x and y: weight of the smoothness between neighbours (default: 1 on the object);
     ``more_cost`` (K, h', w'): of the candidates, beside that of their misfit, in half squared sigmas."""
     most = np.float32(MOST_SIGMAS**2 / 2)
-    cost = np.minimum((found.misfit_rad / np.float32(PHASE_SIGMA_RAD)) ** 2 / 2, most) + more_cost
+    cost = np.minimum((found.misfit_rad / np.float32(PHASE_SIGMA_RAD)) ** 2 / 2, most)
+    if more_cost is not None:
+        cost = cost + more_cost
     cost = np.where(found.exists, cost * trust, LARGE).astype(np.float32)
     joint_rad = (found.nearness * carriers.joint_gain).astype(np.float32)
     unary = np.where(inside, cost, np.float32(0))
