@@ -64,7 +64,7 @@ def test_no_worker_outlives_its_parent(tmp_path):
     (tmp_path / "waiting.py").write_text(_WAITING)
     parent = subprocess.Popen([sys.executable, "waiting.py"], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
     for _ in range(2):
-        parent.stdout.readline()  # both are at work
+        assert int(parent.stdout.readline()) != parent.pid  # both are at work
     parent.kill()
     assert parent.communicate(timeout=30)[0] == ""  # returns when the last worker has closed its end
 
