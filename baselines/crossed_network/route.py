@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from fpp_ml_bench.baselines.crossed_network.inputs import LEAST_SHARE, Scene, channels
 from fpp_ml_bench.baselines.crossed_route import (
@@ -23,7 +22,7 @@ from fpp_ml_bench.baselines.phase_network import (
     probabilities,
     threshold_at,
 )
-from fpp_ml_bench.baselines.phase_route import Image, Mask, Periods, of_choice
+from fpp_ml_bench.baselines.phase_route import Image, Mask, Periods, nearest_inside, of_choice
 from fpp_ml_bench.optics import Rig
 
 DENIED = 6.0  # a pixel of the measured mask stays object unless its logit is this far below the threshold
@@ -92,9 +91,8 @@ class CrossedNetRoute:
         offers = np.stack([scene.step_rad[0], np.zeros_like(joint), scene.step_rad[1]])
         nearness = scene.nearness + (of_choice(offers, choice) + answers.correction_rad) / joint
         known = scene.share > LEAST_SHARE
-        if known.any() and not known[inside].all():  # beyond the reach of any window: as the nearest pixel within it
-            y, x = distance_transform_edt(~known, return_distances=False, return_indices=True)
-            nearness = nearness[y, x]
+        if not known[inside].all():  # beyond the reach of any window: as the nearest pixel within it
+            nearness = nearness[nearest_inside(known)]
         chances = probabilities(answers.logits)
         wrong = np.clip(1 - of_choice(chances, choice), LEAST_CHANCE, 1)
         np.put_along_axis(chances, choice[None], -1, axis=0)

@@ -6,7 +6,6 @@ from functools import cached_property
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 from scipy.special import ndtri
 
 from fpp_ml_bench.baselines.crossed_route.carriers import Carriers
@@ -30,6 +29,7 @@ from fpp_ml_bench.baselines.phase_route import (
     Watch,
     Window,
     modulated_region,
+    nearest_inside,
     object_region,
     of_choice,
     repeated,
@@ -128,11 +128,9 @@ class CrossedRoute:
 
         def spread(values: NDArray) -> NDArray:
             """Values of the grid at all pixels, each that of its grid point or of the nearest one inside."""
-            return repeated(values[..., nearest[0], nearest[1]], self.stride, (*values.shape[:-2], *grey.shape))
+            return repeated(values[..., *nearest], self.stride, (*values.shape[:-2], *grey.shape))
 
-        nearest: tuple[NDArray, ...] = tuple(np.indices(points.shape))
-        if points.any() and not points.all():
-            nearest = tuple(distance_transform_edt(~points, return_distances=False, return_indices=True))
+        nearest = nearest_inside(points)
         phase_rad = self.demodulator.phases_at(seen, carriers)
         start = _lifted(carriers, phase_rad, spread(of_choice(found.nearness, index)))
         light = grey - np.float32(background.ambient_grey)

@@ -13,7 +13,6 @@ from dataclasses import replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from fpp_ml_bench.baselines.crossed_route.carriers import LEAST_RANGE_RAD, Carriers
 from fpp_ml_bench.baselines.crossed_route.empty_scene import EmptySceneFit
@@ -35,6 +34,7 @@ from fpp_ml_bench.baselines.phase_route import (
     links_between,
     lit_object,
     modulated_region,
+    nearest_inside,
     of_choice,
     repeated,
     wrapped,
@@ -222,9 +222,7 @@ def local_median(values: Image, inside: Mask, window_px: float) -> Image:
     """Median of ``values`` (h, w) over the square of ``window_px`` around each pixel, in steps of `MEDIAN_STEP` between
     -127 and 127 of them; beyond ``inside`` they are those of the nearest pixel within."""
     levels = np.clip(np.rint(values / np.float32(MEDIAN_STEP)), -127, 127).astype(np.int16)
-    if inside.any() and not inside.all():
-        y, x = distance_transform_edt(~inside, return_distances=False, return_indices=True)
-        levels = levels[y, x]
+    levels = levels[nearest_inside(inside)]
     size = 2 * int(window_px / 2) + 1
     median = cv2.medianBlur((levels + 128).astype(np.uint8), size)
     return (median.astype(np.float32) - 128) * np.float32(MEDIAN_STEP)

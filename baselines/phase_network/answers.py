@@ -6,10 +6,18 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.phase_route import LARGE, Image, Mask, least_energy, links_between, of_choice, repeated
+from fpp_ml_bench.baselines.phase_route import (
+    LARGE,
+    Image,
+    Mask,
+    least_energy,
+    links_between,
+    nearest_inside,
+    of_choice,
+    repeated,
+)
 
 GRAPH = 3.0  # weight of smoothness between neighbours in the labelling of the orders
 SCALE_TO_SIGMA = float(np.sqrt(2))  # of a Laplace distribution
@@ -76,8 +84,6 @@ def least_energy_order(
     cost = np.where(points, np.minimum(cost, LARGE), 0).astype(np.float32)
     choice, _ = least_energy(cost, phases, link_x, link_y, jump_rad)
     chosen_rad = of_choice(phases, choice)
-    if points.any() and not points.all():
-        y, x = distance_transform_edt(~points, return_distances=False, return_indices=True)
-        chosen_rad = chosen_rad[y, x]
+    chosen_rad = chosen_rad[nearest_inside(points)]
     apart = np.abs(phases_rad - repeated(chosen_rad, stride, inside.shape))
     return np.where(chances > 0, apart, np.inf).argmin(axis=0)

@@ -36,6 +36,7 @@ from .orders import grid_of as grid_of
 from .orders import irradiance as irradiance
 from .orders import jump_links as jump_links
 from .orders import links_between as links_between
+from .orders import nearest_inside as nearest_inside
 from .orders import of_choice as of_choice
 from .orders import repeated as repeated
 from .orders import spread_over_pixels as spread_over_pixels

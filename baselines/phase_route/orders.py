@@ -190,14 +190,22 @@ def repeated(coarse: NDArray, stride: int, shape: tuple[int, ...]) -> NDArray:
     return coarse.repeat(stride, axis=-2).repeat(stride, axis=-1)[..., : shape[-2], : shape[-1]]
 
 
+def nearest_inside(inside: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns (h, w) of the pixel of ``inside`` that is nearest to every pixel; every pixel's own where
+    ``inside`` has none."""
+    places: NDArray = np.indices(inside.shape)
+    if inside.any() and not inside.all():
+        places = distance_transform_edt(~inside, return_distances=False, return_indices=True)
+    return places[0], places[1]
+
+
 def spread_over_pixels(
     seen: Observation, chosen_rad: Image, margin: Image, inside: Mask
 ) -> tuple[NDArray[np.int32], Image]:
     """Order of every pixel, int32 (H, W), and its margin: the order whose residual phase is nearest to that which was
     chosen at the grid point; ``inside``: object on the grid."""
-    if inside.any() and not inside.all():
-        y, x = distance_transform_edt(~inside, return_distances=False, return_indices=True)
-        chosen_rad, margin = chosen_rad[y, x], margin[y, x]
+    nearest = nearest_inside(inside)
+    chosen_rad, margin = chosen_rad[nearest], margin[nearest]
     residual_at_zero_rad = seen.layer.residual_phase(seen.phase_rad, 0.0)
     stride, shape = stride_of(seen.period_px), residual_at_zero_rad.shape
     order = np.rint((repeated(chosen_rad, stride, shape) - residual_at_zero_rad) / TAU).astype(np.int32)

@@ -11,11 +11,11 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
 from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer, Candidates, Image, Mask
 from fpp_ml_bench.baselines.phase_route.object_mask import Crop
 from fpp_ml_bench.baselines.phase_route.observation import Measurement, Reason
+from fpp_ml_bench.baselines.phase_route.orders import nearest_inside
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.optics import Direction, Rig
 
@@ -102,13 +102,11 @@ class Resampling:
         """A phase in rad without wraps, (h, w), at the captured pixels: where they are object, the phase (H, W), and
         how any map is taken from the nearest object pixel. The phase is interpolated, but not across jumps."""
         size = self.captured.camera.width, self.captured.camera.height
-        y, x = np.indices(inside.shape)
-        if inside.any():
-            y, x = distance_transform_edt(~inside, return_distances=False, return_indices=True)
+        places = nearest_inside(inside)
 
         def nearest(image: NDArray) -> NDArray:
             """From the nearest object pixel."""
-            return cv2.resize(image[y, x], size, interpolation=cv2.INTER_NEAREST_EXACT)
+            return cv2.resize(image[places], size, interpolation=cv2.INTER_NEAREST_EXACT)
 
         psi = np.where(inside, psi, 0.0)
         weight, total = (cv2.resize(v, size, interpolation=cv2.INTER_LINEAR) for v in (inside.astype(np.float64), psi))
