@@ -46,7 +46,7 @@ class Recipe(WindowRecipe):
     learns from, one frame each; every ``textured_every``-th of the drawn lights has albedo maps and gloss;
     ``validation_lights``: drawn ones for validation objects; ``vary``: how its windows are varied."""
 
-    steps: int = 3000
+    steps: int = 9000
     validate_every: int = 250
     albedo: Albedo = "one"
     directions: tuple[Direction, ...] = DIRECTIONS

@@ -28,13 +28,13 @@ _SWAPPED = [FIRST_SIDE + n for n in _PARTNERS] + [FIRST_MISFIT] + [FIRST_MISFIT 
 
 @dataclass(frozen=True)
 class Variation:
-    """How often (0 to 1) and how much windows are varied; with 0 throughout they stay as captured. ``shift_blind``: how
-    often objects are moved for a network without brightness, so that it does not learn where objects mostly stand."""
+    """How often (0 to 1) and how much windows are varied; with 0 throughout they stay as captured. ``shift``: how often
+    objects are moved to any distance of the working range; ``shift_blind``: the same for a network without brightness,
+    so that it does not learn where they mostly stand."""
 
     near_edge: float = 0.7
     shift: float = 0.5
     shift_blind: float = 0.8
-    margin_mm: float = 60.0
     brightness: float = 0.04
     wrong_window: float = 0.15
     wrong_patch: float = 0.3
@@ -101,7 +101,7 @@ def _moved(
     true_rad = (layer.residual_phase(scene.phase_rad, scene.order) + missing).astype(np.float32)
     middle = float(np.median(true_rad[target]))
     gain, forward = float(np.median(layer.gain)), float(np.median(layer.forward))
-    depth_m = random.uniform(near + vary.margin_mm, far - vary.margin_mm) / MM_PER_M
+    depth_m = random.uniform(near, far) / MM_PER_M
     delta = np.float32(gain / (forward * depth_m + layer.back_m) - middle)
     with np.errstate(all="ignore"):
         before, after = np.maximum(inputs.coarse_irradiance(scene, geometry, (true_rad, true_rad + delta)), 1e-3)
