@@ -193,8 +193,9 @@ def repeated(coarse: NDArray, stride: int, shape: tuple[int, ...]) -> NDArray:
 def nearest_inside(inside: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows and columns (h, w) of the pixel of ``inside`` that is nearest to every pixel; every pixel's own where
     ``inside`` has none."""
-    places: NDArray = np.indices(inside.shape)
-    if inside.any() and not inside.all():
+    if inside.all() or not inside.any():
+        places: NDArray = np.indices(inside.shape)
+    else:
         places = distance_transform_edt(~inside, return_distances=False, return_indices=True)
     return places[0], places[1]
 
