@@ -244,7 +244,8 @@ def claim_folder(out: Path, content: dict[str, Any]) -> None:
 @contextmanager
 def reproducible(precision: str = "fp32", cpu: bool = False) -> Iterator[None]:
     """Within: deterministic kernels on the CPU, the fastest ones on a GPU, and freed memory kept for the next step.
-    ``cpu``: the training within is one on the processor, whatever GPUs there are."""
+    Floats below 1e-38 count as zero on the CPU: a network whose gradients fade (Hformer) trains six times slower with
+    them. ``cpu``: the training within is one on the processor, whatever GPUs there are."""
     # A process may train in fp32 after bf16, or on a GPU after the processor, but accelerate's shared state allows only
     # one precision and device.
     AcceleratorState._reset_state(cpu)
@@ -254,6 +255,7 @@ def reproducible(precision: str = "fp32", cpu: bool = False) -> Iterator[None]:
     deterministic = torch.are_deterministic_algorithms_enabled()
     before = cudnn.benchmark, matmul.allow_tf32, cudnn.allow_tf32
     torch.use_deterministic_algorithms(not on_gpu)
+    torch.set_flush_denormal(True)
     cudnn.benchmark = on_gpu
     if precision == "fp32":
         matmul.allow_tf32 = cudnn.allow_tf32 = False
@@ -261,6 +263,7 @@ def reproducible(precision: str = "fp32", cpu: bool = False) -> Iterator[None]:
         yield
     finally:
         torch.use_deterministic_algorithms(deterministic)
+        torch.set_flush_denormal(False)
         cudnn.benchmark, matmul.allow_tf32, cudnn.allow_tf32 = before
         if cpu:
             AcceleratorState._reset_state(True)
