@@ -22,10 +22,11 @@ EXAMPLES = (
     "fpp-bench reproduce loss --preset paper --minutes 10   the paper's own settings, on a GPU, in pieces",
 )
 ALL = "all"
+NOT_PUBLISHED = "-"
 EMPTY_BECAUSE = {
     "cpu": "a training takes 2 to 7 minutes on two cores",
-    "cpu-long": "a training takes half an hour and more on a core",
-    "paper": "a training needs a GPU (weeks without)",
+    "cpu-long": "a training takes half an hour to two hours on a core",
+    "paper": "a training needs a GPU (weeks without), and none was at hand",
 }
 
 
@@ -114,18 +115,34 @@ def _list(tables: tuple[str, ...], folders: reproduce.Folders) -> None:
     from rich.table import Column, Table
 
     from fpp_ml_bench.cli.console import show
+    from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS
 
     jobs = reproduce.planned(tables, folders.preset)
-    columns = [Column(title, overflow="fold") for title in ("Row", "Training", "State", "Rows written")]
+    titles = "Row", "Training", "State", "Rows written", "Published: object MAE"
+    columns = [Column(title, overflow="fold") for title in titles]
     table = Table(*columns, title=f"preset {folders.preset}, {folders.runs}", title_justify="left")
     empty = 0
     for job in jobs:
         row_files = [folders.row(job.recipe, depth_range) for depth_range in reproduce.variants(job.recipe)]
-        made = sum(path.is_file() for path in row_files)
-        empty += len(job.rows) if made < len(row_files) else 0
-        written = f"{made} of {len(row_files)}"
-        table.add_row("\n".join(job.rows), job.recipe.name, reproduce.state_of(folders.training(job.recipe)), written)
+        written = f"{sum(path.is_file() for path in row_files)} of {len(row_files)}"
+        published = _published(SHIPPED_ROWS / row_files[0].name)
+        empty += len(job.rows) if published is None else 0
+        state = reproduce.state_of(folders.training(job.recipe))
+        table.add_row("\n".join(job.rows), job.recipe.name, state, written, published or NOT_PUBLISHED)
     show(table)
-    print(f"{len(jobs)} trainings fill {sum(len(job.rows) for job in jobs)} rows.")
+    rows = sum(len(job.rows) for job in jobs)
+    print(f"{len(jobs)} trainings fill {rows} rows; {rows - empty} of them come with the package.")
     if empty:
-        print(f"Empty: {empty} of them; {EMPTY_BECAUSE[folders.preset]} (docs/networks.md says which were made).")
+        print(f"The other {empty} are not measured yet: {EMPTY_BECAUSE[folders.preset]}.")
+
+
+def _published(path: Path) -> str | None:
+    """The error of the row that comes with the package, with the version of its benchmark; None where there is none."""
+    from fpp_ml_bench.leaderboard.rows import read_entry
+
+    if not path.is_file():
+        return None
+    result = read_entry(path).result
+    benchmark, error_mm = result.dataset.benchmark, result.metrics.object_mae_mm
+    data = "an earlier build" if benchmark is None else f"version {benchmark.version}"
+    return f"{'-' if error_mm is None else f'{error_mm:.1f} mm'}, {data}"

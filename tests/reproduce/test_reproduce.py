@@ -292,10 +292,15 @@ def test_all_frames_of_one_frame_is_the_evaluators_score(opened, tmp_path):
         assert value == pytest.approx(getattr(result.metrics, key), rel=1e-12)
 
 
-def test_list_and_help_do_not_train(run, trainer, capsys):
+def test_list_and_help_do_not_train(run, trainer, capsys, tmp_path, monkeypatch):
+    assert main(["reproduce", "loss", "--list"]) == 0
+    listed = capsys.readouterr().out
+    assert "10 trainings fill 10 rows; 10 of them come with the package" in listed and "70.4 mm" in listed
+    monkeypatch.setattr("fpp_ml_bench.leaderboard.rows.SHIPPED_ROWS", tmp_path / "none")
     assert main(["reproduce", "--list"]) == 0
     listed = capsys.readouterr().out
-    assert "24 trainings fill 27 rows" in listed and "Empty: 27 of them; a training takes" in listed
+    assert "24 trainings fill 27 rows; 0 of them come with the package" in listed
+    assert "The other 27 are not measured yet: a training takes" in listed
     assert main(["reproduce"]) == 2
     assert "expected a table" in capsys.readouterr().err
     for table, problem in (("nonsense", "expected a table"), ("loss/l2", "no row 'l2'"), ("loss/", "no row ''")):
