@@ -67,7 +67,7 @@ def test_the_same_bits_again(uninterrupted, tiny, tmp_path):
 
 
 def test_faded_gradients_are_zero_within_a_training_only():
-    """Floats below 1e-38 cost a processor many times as much as others; Hformer's gradients fade into them."""
+    """Floats below 1e-38 cost a processor many times as much as others; gradients fade into them."""
     faded = torch.full((64,), 1e-39)
     with reproducible(cpu=True):
         assert not (faded * 0.5).any()
