@@ -1,8 +1,5 @@
 """The weights in the package: small, readable, and what their names say."""
 
-from pathlib import Path
-
-import numpy as np
 import pytest
 
 from fpp_ml_bench.baselines import load
@@ -23,19 +20,15 @@ def test_there_are_some_and_they_are_small():
     assert sum(path.stat().st_size for path in SHIPPED.iterdir()) < 20e6
 
 
-def scene_of(benchmark):
-    """One test view as the data of a row had it: fringe, decoded depth, void pixels. Version 0 is no longer built."""
-    if benchmark is None:
-        with np.load(Path(__file__).parent / f"version_0_{SAMPLE}.npz") as stored:
-            return stored["fringe"], stored["depth_mm"], None
-    name, view = split_sample_name(SAMPLE)
-    studio = Studio(BuildSettings(rig=paper_rig(224), objects=(name,)))
-    row = studio.photograph(solid_mesh(name), view)
-    return row.frames[0], row.depth_mm, void_pixels(row.flags, row.depth_mm, row.depth_exact_mm)
+@pytest.fixture(scope="module")
+def view():
+    """A test view, rendered as in the benchmark of the weights."""
+    name, pose = split_sample_name(SAMPLE)
+    return Studio(BuildSettings(rig=paper_rig(224), objects=(name,))).photograph(solid_mesh(name), pose)
 
 
 @pytest.mark.parametrize("name", shipped_names())
-def test_each_is_its_recipe_and_gives_the_score_of_its_row(name):
+def test_each_is_its_recipe_and_gives_the_score_of_its_row(name, view):
     """Against the leaderboard's row of the same weights, whose per-sample scores come from the full set."""
     model = load(name)
     assert model.config.name == name == recipe_from_dict(model.config.recipe).name
@@ -43,8 +36,8 @@ def test_each_is_its_recipe_and_gives_the_score_of_its_row(name):
     row = read_entry(SHIPPED_ROWS / f"{model.config.recipe['preset']}-{name}{suffix}.json").result
     assert row.submission.settings["weights_sha256"] == model.sha256
     (expected,) = [scores for scores in row.per_sample if scores.sample == SAMPLE]
-    fringe, truth, void = scene_of(row.dataset.benchmark)
-    scores = score_sample(model.predict(fringe), truth, void=void)
+    void = void_pixels(view.flags, view.depth_mm, view.depth_exact_mm)
+    scores = score_sample(model.predict(view.frames[0]), view.depth_mm, void=void)
     # A pixel on the mask's threshold may fall to the other side on another processor.
     assert scores.object.mae_mm == pytest.approx(expected.object_mae_mm, rel=0.01)
     assert scores.background.mae_mm == pytest.approx(expected.background_mae_mm, rel=0.01)
