@@ -134,6 +134,18 @@ def torch_threads(threads: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+@contextmanager
+def tiny_floats_are_zero() -> Iterator[None]:
+    """Within: floats below 1e-38 count as zero on the CPU, which is many times slower with them. Fading gradients,
+    RMSprop's averages of them and the weights that they leave fall below: epochs were four (UNet) to six times
+    (Hformer) slower, predictions of that UNet twice."""
+    torch.set_flush_denormal(True)
+    try:
+        yield
+    finally:
+        torch.set_flush_denormal(False)
+
+
 MEAN_ROUNDINGS = 16
 """Roundings of a mean over a map, in units of the last place of its value."""
 RECENTRED_FROM = 1e-6

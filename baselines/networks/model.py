@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.networks.base import FringeNetwork
+from fpp_ml_bench.baselines.networks.base import FringeNetwork, tiny_floats_are_zero
 from fpp_ml_bench.baselines.networks.registry import build
 from fpp_ml_bench.baselines.training import ModelConfig, open_weights, weights_path
 from fpp_ml_bench.depth import denormalise
@@ -240,14 +240,14 @@ class Model:
                 "heads to make mm of it; use predict_representation, or fit them with "
                 "fpp_ml_bench.baselines.networks.range_heads.fit_heads and save them with the weights"
             )
-        with torch.inference_mode(), probed(self.network) as probe:
+        with torch.inference_mode(), tiny_floats_are_zero(), probed(self.network) as probe:
             depth = self.heads.depth_mm(self._output(fringes), probe, depth_range)
         return depth[:, 0].cpu().numpy()
 
     def predict_representation(self, fringes: Sequence[Fringe]) -> NDArray[np.float32]:
         """The network's own output float32 (B, H, W) for images (B, H, W), in the representation it was trained on
         (`fpp_ml_bench.depth`). Raises `PredictionError` as `predict`."""
-        with torch.inference_mode():
+        with torch.inference_mode(), tiny_floats_are_zero():
             return self._output(fringes)[:, 0].float().cpu().numpy()
 
     def _output(self, fringes: Sequence[Fringe]) -> Tensor:

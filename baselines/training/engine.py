@@ -21,6 +21,7 @@ from accelerate.utils import broadcast_object_list, gather_object, set_seed
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from fpp_ml_bench.baselines.networks.base import tiny_floats_are_zero
 from fpp_ml_bench.baselines.training import records
 from fpp_ml_bench.baselines.training.losses import Objective
 from fpp_ml_bench.baselines.training.records import Display, Panel, Record
@@ -244,9 +245,7 @@ def claim_folder(out: Path, content: dict[str, Any]) -> None:
 @contextmanager
 def reproducible(precision: str = "fp32", cpu: bool = False) -> Iterator[None]:
     """Within: deterministic kernels on the CPU, the fastest ones on a GPU, and freed memory kept for the next step.
-    Floats below 1e-38 count as zero on the CPU: fading gradients, and RMSprop's averages of them, fall below, and make
-    epochs four (UNet) to six times (Hformer) slower. ``cpu``: the training within is one on the processor, whatever
-    GPUs there are."""
+    ``cpu``: the training within is one on the processor, whatever GPUs there are."""
     # A process may train in fp32 after bf16, or on a GPU after the processor, but accelerate's shared state allows only
     # one precision and device.
     AcceleratorState._reset_state(cpu)
@@ -256,15 +255,14 @@ def reproducible(precision: str = "fp32", cpu: bool = False) -> Iterator[None]:
     deterministic = torch.are_deterministic_algorithms_enabled()
     before = cudnn.benchmark, matmul.allow_tf32, cudnn.allow_tf32
     torch.use_deterministic_algorithms(not on_gpu)
-    torch.set_flush_denormal(True)
     cudnn.benchmark = on_gpu
     if precision == "fp32":
         matmul.allow_tf32 = cudnn.allow_tf32 = False
     try:
-        yield
+        with tiny_floats_are_zero():
+            yield
     finally:
         torch.use_deterministic_algorithms(deterministic)
-        torch.set_flush_denormal(False)
         cudnn.benchmark, matmul.allow_tf32, cudnn.allow_tf32 = before
         if cpu:
             AcceleratorState._reset_state(True)

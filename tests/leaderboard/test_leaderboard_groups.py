@@ -115,6 +115,8 @@ def test_short_names_of_shipped_rows(shipped):
         "cpu-unet-individual-rmse-range-mean": "UNet RMSE, mean range",
         "cpu-transunet-individual-hybrid_l1_0.7-range-predicted": "TransUNet hybrid L1 0.7, pred. range",
         "cpu-unet-individual-rmse-all": "UNet RMSE all frames",
+        "cpu-long-unet-global-rmse": "UNet global RMSE",
+        "cpu40-unet-global": "UNet global RMSE, 40 epochs",
         "cpu40-unet-guided": "UNet global RMSE, guided",
         "cpu40-unet-physics": "UNet global RMSE + physics 0.05",
         "cpu-unet-raw-rmse-bgremoved": "UNet raw RMSE, no background",
