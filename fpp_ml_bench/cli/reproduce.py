@@ -22,7 +22,6 @@ EXAMPLES = (
     "fpp-bench reproduce loss --preset paper --minutes 10   the paper's own settings, on a GPU, in pieces",
 )
 ALL = "all"
-NOT_PUBLISHED = "-"
 EMPTY_BECAUSE = {
     "cpu": "a training takes 2 to 7 minutes on two cores",
     "cpu-long": "a training takes half an hour to two hours on a core",
@@ -128,7 +127,7 @@ def _list(tables: tuple[str, ...], folders: reproduce.Folders) -> None:
         published = _published(SHIPPED_ROWS / row_files[0].name)
         empty += len(job.rows) if published is None else 0
         state = reproduce.state_of(folders.training(job.recipe))
-        table.add_row("\n".join(job.rows), job.recipe.name, state, written, published or NOT_PUBLISHED)
+        table.add_row("\n".join(job.rows), job.recipe.name, state, written, published or "-")
     show(table)
     rows = sum(len(job.rows) for job in jobs)
     print(f"{len(jobs)} trainings fill {rows} rows; {rows - empty} of them come with the package.")
