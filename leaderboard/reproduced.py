@@ -42,11 +42,16 @@ def write_measured(result: Result, path: Path) -> None:
 
 def row_that_holds(path: Path, opened: DatasetFolder, weights_sha256: str) -> Entry | None:
     """The row in ``path`` if it is sound, of this dataset, these weights and today's protocol; else None."""
+    return _row_with(path, opened, "weights_sha256", weights_sha256)
+
+
+def _row_with(path: Path, opened: DatasetFolder, setting: str, value: str) -> Entry | None:
+    """The row in ``path`` if it is sound, of this dataset, today's protocol and this value of a setting."""
     if (entry := _sound_row(path)) is None:
         return None
-    data, settings, protocol = entry.result.dataset, entry.result.submission.settings, entry.result.protocol_version
-    found = (data.fingerprint, settings.get("weights_sha256"), protocol)
-    return entry if found == (opened.fingerprint, weights_sha256, PROTOCOL_VERSION) else None
+    result = entry.result
+    found = (result.dataset.fingerprint, result.protocol_version, result.submission.settings.get(setting))
+    return entry if found == (opened.fingerprint, PROTOCOL_VERSION, value) else None
 
 
 def check_row_is_of(path: Path, opened: DatasetFolder) -> None:
@@ -82,20 +87,20 @@ class Line:
 
 
 def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) -> list[Line]:
-    """Lines of ``table`` in the paper's order. Rows of other weights or another dataset are left empty. Where the paper
-    scores every frame (multi-frame), a training's first line does too, and a second line is its row in the leaderboard:
-    the first frame only, without a number of the paper."""
+    """Lines of ``table`` in the paper's order. Rows of other weights or another dataset are left empty. Where a
+    training was not begun below ``folders``, its rows may be of another machine: those of the same recipe are shown.
+    Where the paper scores every frame (multi-frame), a training's first line does too, and a second line is its row in
+    the leaderboard: the first frame only, without a number of the paper."""
     reported = {row.row: row for row in paper_tables()[table].rows}
     recipes = {name: job.recipe for job in jobs for name in job.rows}
     lines = []
     for row in table_rows(table):
         recipe, paper = recipes[f"{table}/{row}"], reported.get(row)
         label, paper_mm = (paper.label, paper.errors_mm) if paper else (_NOT_IN_THE_PAPER.get(row, row), None)
-        weights = reproduce.current_weights(recipe, folders)
-        if weights is None:
+        sha256 = _weights_sha256(recipe, folders, opened)
+        if sha256 is None:
             lines.append(Line(row, label, recipe, None, None, paper_mm))
             continue
-        sha256 = reproduce.file_sha256(weights)
         rows = {name: row_that_holds(folders.row(recipe, name), opened, sha256) for name in reproduce.variants(recipe)}
         entry, *_ = rows.values()
         twins = {str(name): twin for name, twin in list(rows.items())[1:] if twin is not None}
@@ -107,6 +112,20 @@ def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: Datas
         lines.append(Line(row, label, recipe, every, entry, paper_mm))
         lines.append(Line(row, f"{label}, its first frame only", recipe, first, entry, None, twins))
     return lines
+
+
+def _weights_sha256(recipe: Recipe, folders: Folders, opened: DatasetFolder) -> str | None:
+    """The weights whose rows are shown: those trained below ``folders``; where no training was begun there, those of
+    the main row, if that is of this recipe; else None."""
+    weights = reproduce.current_weights(recipe, folders)
+    if weights is not None:
+        return reproduce.file_sha256(weights)
+    if reproduce.state_of(folders.training(recipe)) != "missing":
+        return None
+    main_row = folders.row(recipe, reproduce.variants(recipe)[0])
+    entry = _row_with(main_row, opened, "recipe_digest", recipe.digest)
+    sha256 = None if entry is None else entry.result.submission.settings.get("weights_sha256")
+    return sha256 if isinstance(sha256, str) else None
 
 
 @dataclass(frozen=True)

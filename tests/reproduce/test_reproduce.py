@@ -1,6 +1,7 @@
 """`fpp-bench reproduce` from trainings to tables, with trainings that take no time: what is made, kept and refused."""
 
 import json
+import shutil
 from functools import cache
 
 import numpy as np
@@ -180,6 +181,23 @@ def test_rows_of_other_weights_are_made_again_and_not_shown(run, trainer, tmp_pa
     assert run(TABLE, "--only-missing") == 0
     weights_after = read_entry(below / "rows" / f"{TWINS[0]}.json").result.submission.settings["weights_sha256"]
     assert weights_before != weights_after and len(trainer.trained) == 4
+
+
+def test_rows_of_another_machine_are_shown_if_of_the_same_recipe(run, trainer, tmp_path):
+    def lines():
+        return [line for line in (below / f"{TABLE}.md").read_text().splitlines() if line.startswith("| individual |")]
+
+    below = tmp_path / "runs" / "cpu"
+    assert run(TABLE) == 0
+    made_here = lines()
+    shutil.rmtree(below / "unet-individual-rmse")
+    assert run(f"{TABLE}/raw") == 0 and len(trainer.trained) == 3
+    assert len(made_here) == 3 and lines() == made_here
+    row = below / "rows" / f"{NAMES[2]}.json"
+    digest = read_entry(row).result.submission.settings["recipe_digest"]
+    row.write_text(row.read_text().replace(digest, 64 * "0"))
+    assert run(f"{TABLE}/raw") == 0
+    assert "Not measured here: individual. To fill" in (below / f"{TABLE}.md").read_text()
 
 
 def test_when_minutes_run_out_the_same_command_goes_on(run, trainer, unscored, tmp_path, capsys):
