@@ -257,7 +257,7 @@ def compare(first: "str | Path | result.Result", second: "str | Path | result.Re
     Parameters
     ----------
     first, second : str, Path or Result
-        Result files, or what `evaluate` gives.
+        Result files, row files of the leaderboard, or what `evaluate` gives.
 
     Returns
     -------
@@ -311,4 +311,6 @@ def rank(results: "Iterable[str | Path]", sort: str = "object_mae_mm") -> "list[
 
 
 def _result(given: "str | Path | result.Result") -> "result.Result":
-    return result.read_result(Path(given)) if isinstance(given, (str, Path)) else given
+    from fpp_ml_bench.leaderboard.rows import read_entry
+
+    return read_entry(Path(given)).result if isinstance(given, (str, Path)) else given

@@ -22,7 +22,7 @@ EXAMPLES = (
     "fpp-eval predictions --dataset data/mini --split test --target depth_exact --report report",
     "fpp-eval init predictions",
     "fpp-eval check predictions",
-    "fpp-eval compare a.json b.json",
+    "fpp-eval compare result.json leaderboard/rows/phase-net-vertical.json",
     "fpp-eval verify result.json predictions --dataset data/mini",
     "fpp-eval schema",
 )
@@ -102,7 +102,7 @@ def _check_outputs(file: Path | None, page: Path | None, folder: Path) -> None:
 
 def _compare_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("first", type=Path, metavar="A.json", help="a result of fpp-eval --json")
+    add("first", type=Path, metavar="A.json", help="a result of fpp-eval --json, or a row of the leaderboard")
     add("second", type=Path, metavar="B.json",
         help="a result of another method on the same data, split, target and track")  # fmt: skip
     add("--json", type=Path, metavar="FILE", help="write the comparison here, each sample's included")
@@ -111,8 +111,9 @@ def _compare_arguments(parser: argparse.ArgumentParser) -> None:
 def _compare(args: argparse.Namespace) -> int:
     """Print the table and the sentence. Raises SubmissionError for results that can't be compared."""
     from fpp_ml_bench.cli.console import show
+    from fpp_ml_bench.leaderboard.rows import read_entry
 
-    comparison = report.compare(result.read_result(args.first), result.read_result(args.second))
+    comparison = report.compare(read_entry(args.first).result, read_entry(args.second).result)
     if args.json is not None:
         result.write_json(comparison.model_dump(mode="json"), args.json)
     show(report.comparison_table(comparison))
@@ -136,14 +137,17 @@ LISTED = 20
 
 
 def _verify_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("result", type=Path, metavar="RESULT.json", help="a result of fpp-eval --json")
-    parser.add_argument("folder", type=Path, metavar="DIR", help="the predictions it was made from")
-    parser.add_argument("--dataset", type=Path, required=True, metavar="DATASET", help="folder of the dataset")
+    add = parser.add_argument
+    add("result", type=Path, metavar="RESULT.json", help="a result of fpp-eval --json, or a row of the leaderboard")
+    add("folder", type=Path, metavar="DIR", help="the predictions it was made from")
+    add("--dataset", type=Path, required=True, metavar="DATASET", help="folder of the dataset")
 
 
 def _verify(args: argparse.Namespace) -> int:
     """Say verified or not, and what differs. Raises FppBenchError where nothing can be recomputed at all."""
-    scored = result.read_result(args.result)
+    from fpp_ml_bench.leaderboard.rows import read_entry
+
+    scored = read_entry(args.result).result
     problems = score.differences(scored, args.folder, storage.DatasetFolder(args.dataset))
     file = printable(str(args.result), 500)
     if not problems:

@@ -11,6 +11,7 @@ from board_rows import some_rows, timing, write_result_file
 from scored_dataset import make_dataset
 
 from fpp_ml_bench.cli import main
+from fpp_ml_bench.cli.evaluate import main as fpp_eval
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.report import palette_png
 from fpp_ml_bench.leaderboard import rows
@@ -38,6 +39,15 @@ def test_a_row_holds_the_result_and_its_provenance(files, tmp_path, capsys):
     assert entry.provenance == "verified" and entry.result == bare.result and bare.provenance == rows.LOCAL
     write_row(entry, "verified", tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == row.read_bytes()
+
+
+def test_fpp_eval_compares_a_result_with_a_row(files, tmp_path, capsys):
+    row = tmp_path / "row.json"
+    write_row(read_entry(files[0]), "verified", row)
+    for first, second in ((files[0], files[1]), (row, files[1])):
+        assert fpp_eval(["compare", str(first), str(second)]) == 0
+    of_file, of_row = capsys.readouterr().out.split("first:")[1:]
+    assert of_file.strip() == of_row.strip() and "sign-flip test" in of_row
 
 
 def test_a_bare_result_in_the_rows_folder_is_self_reported(files, tmp_path, monkeypatch):
