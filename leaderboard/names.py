@@ -116,6 +116,8 @@ def _network(submission: Submission) -> str:
 def _loss(label: str) -> str:
     """``hybrid_l1_0.7`` as ``hybrid L1 0.7``; the weight is checked to be a number."""
     kind, _, rest = label.partition("_")
+    if kind == "gan" and rest:
+        return f"{_LOSSES[kind]} {float(rest):g}"
     if kind == "hybrid":
         loss, _, weight = rest.partition("_")
         return f"hybrid {_LOSSES[loss]} {float(weight):g}"

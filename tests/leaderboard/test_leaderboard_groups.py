@@ -116,6 +116,7 @@ def test_short_names_of_shipped_rows(shipped):
         "cpu-transunet-individual-hybrid_l1_0.7-range-predicted": "TransUNet hybrid L1 0.7, pred. range",
         "cpu-unet-individual-rmse-all": "UNet RMSE all frames",
         "cpu-long-unet-global-rmse": "UNet global RMSE",
+        "cpu-long-pix2pix_unet-individual-gan_0.7": "Pix2Pix GAN 0.7",
         "cpu40-unet-global": "UNet global RMSE, 40 epochs",
         "cpu40-unet-guided": "UNet global RMSE, guided",
         "cpu40-unet-physics": "UNet global RMSE + physics 0.05",
