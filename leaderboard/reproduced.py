@@ -228,7 +228,8 @@ def write_table(table: str, settings: reproduce.ReproduceSettings, outcome: repr
     """Write the page of a table from the rows that there are; its path. SubmissionError where it can't be written."""
     folders = settings.folders
     lines = table_lines(table, outcome.jobs, folders, outcome.opened)
-    text = table_markdown(table, lines, folders.preset, settings.command, outcome.failed)
+    command = settings.command.replace(f"{table}/{settings.row}", table, 1) if settings.row else settings.command
+    text = table_markdown(table, lines, folders.preset, command, outcome.failed)
     write_file(text.encode("utf-8"), folders.table(table))
     return folders.table(table)
 

@@ -333,7 +333,8 @@ def test_list_and_help_do_not_train(run, trainer, capsys, tmp_path, monkeypatch)
 def test_one_row_of_a_table(run, trainer, unscored, tmp_path):
     assert run(f"{TABLE}/global") == 0
     assert trainer.trained == ["unet-global-rmse"]
-    assert "individual" in (tmp_path / "runs" / "cpu" / f"{TABLE}.md").read_text()
+    text = (tmp_path / "runs" / "cpu" / f"{TABLE}.md").read_text()
+    assert f"raw, global, individual. To fill: `fpp-bench reproduce {TABLE} --preset cpu" in text
 
 
 def test_rows_of_another_dataset_are_not_overwritten(run, tmp_path, tiny, capsys, trainer):
