@@ -133,8 +133,9 @@ def test_from_trainings_to_a_table(run, trainer, tmp_path, tiny, capsys):
     for name, entry in entries.items():
         assert len(picture_of(entry)) < 100_000
         assert entry.result.timing.parameters == sum(p.numel() for p in build("unet", width=1).parameters())
-        folders = str(below / "results" / f"{name}.json"), str(below / "predictions" / name)
-        assert fpp_eval(["verify", *folders, "--dataset", str(tiny)]) == 0
+        for folder in ("results", "rows"):
+            files = str(below / folder / f"{name}.json"), str(below / "predictions" / name)
+            assert fpp_eval(["verify", *files, "--dataset", str(tiny)]) == 0
     text = (below / f"{TABLE}.md").read_text()
     lines = {
         line.split(" | ")[0].strip("| "): line for line in text.split("## ")[0].splitlines() if line.startswith("| ")
