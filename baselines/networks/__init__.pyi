@@ -4,6 +4,7 @@ from .base import InstanceNorm as InstanceNorm
 from .base import in_full_precision as in_full_precision
 from .base import parameter_count as parameter_count
 from .base import torch_threads as torch_threads
+from .base import trains_channels_last as trains_channels_last
 from .hformer import Hformer as Hformer
 from .model import TWINS as TWINS
 from .model import Model as Model

@@ -101,6 +101,14 @@ def parameter_count(module: nn.Module) -> int:
     return sum(p.numel() for p in module.parameters() if p.requires_grad)
 
 
+def trains_channels_last(module: nn.Module) -> bool:
+    """Whether ``module`` may be trained in channels-last layout on a CPU: not with a 1 x 1 convolution that has a
+    stride, for whose weights' gradient oneDNN writes past a buffer's end (github.com/uxlfoundation/oneDNN/issues/6035).
+    """
+    convolutions = (layer for layer in module.modules() if isinstance(layer, nn.Conv2d))
+    return not any(layer.kernel_size == (1, 1) and layer.stride != (1, 1) for layer in convolutions)
+
+
 _CONVOLUTIONS = (nn.Conv2d, nn.ConvTranspose2d)
 
 

@@ -119,11 +119,12 @@ class DepthTraining(Training):
             self.objective = Regression(network, recipe.loss.name, recipe.loss.alpha, self._physics(data))
         self.bare = dict(self.objective.modules)
         modules: dict[str, Any] = dict(self.bare)
-        if on_gpu := self.accelerator.device.type == "cuda":
-            for module in self.bare.values():
+        on_gpu = self.accelerator.device.type == "cuda"
+        for module in self.bare.values():
+            if on_gpu or networks.trains_channels_last(module):
                 module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-            if recipe.compile:
-                modules = {name: torch.compile(module) for name, module in modules.items()}
+        if on_gpu and recipe.compile:
+            modules = {name: torch.compile(module) for name, module in modules.items()}
         rule = recipe.optimizer
         self.optimizers = {
             name: RMSprop(module.parameters(), rule.learning_rate, alpha=rule.alpha, weight_decay=rule.weight_decay)

@@ -7,7 +7,7 @@ import pytest
 import torch
 import yaml
 from scored_dataset import make_dataset, write_predictions
-from tiny_network import config_of, rounding_error, tiny_network
+from tiny_network import config_of, one_thread, rounding_error, tiny_network  # noqa: F401
 
 from fpp_ml_bench.baselines.networks.model import fringe_batch, load
 from fpp_ml_bench.baselines.networks.network_method import NetworkMethod

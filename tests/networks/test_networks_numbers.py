@@ -6,7 +6,7 @@ from tiny_network import SMALL, one_thread  # noqa: F401
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.networks import NETWORKS, build
+from fpp_ml_bench.baselines.networks import NETWORKS, build, trains_channels_last
 from fpp_ml_bench.baselines.networks.base import Attention, DoubleConvolution, DropPath, InstanceNorm, Join
 
 
@@ -35,6 +35,24 @@ def test_every_parameter_learns(name):
     network(torch.rand(2, 1, 64, 64)).square().mean().backward()
     still = [key for key, p in network.named_parameters() if p.grad is None or not p.grad.any()]
     assert still == []
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_training_in_channels_last_has_the_gradients_of_float64(name):
+    network = build(name, **SMALL[name]).eval()  # without DropPath; normalisation over the batch by its first values
+    assert trains_channels_last(network) == (name != "resunet")  # 1 x 1 convolutions with a stride
+    fringe, target = torch.rand(2, 1, 64, 64), torch.rand(2, 1, 64, 64)
+
+    def gradient(kind: torch.dtype) -> Tensor:
+        loss = (network.to(kind)(fringe.to(kind)) - target.to(kind)).square().mean()
+        parts = torch.autograd.grad(loss, list(network.parameters()))
+        return torch.cat([part.double().flatten() for part in parts])
+
+    exact = gradient(torch.float64)
+    if trains_channels_last(network):
+        network.to(memory_format=torch.channels_last)
+    # A ReLU whose input is a rounding from 0 may fall on the other side: single weights may be off by more.
+    assert (gradient(torch.float32) - exact).norm() < 1e-2 * exact.norm()
 
 
 @pytest.mark.parametrize("affine", [False, True])
