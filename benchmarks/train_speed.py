@@ -12,6 +12,7 @@ itself (``fpp-bench build``, ``fpp-bench export --mat``), each in its own proces
   bfloat16, channels_last and torch.compile as the paper's preset says, on a processor in float32.
 - plain: torch's ``Dataset`` and ``DataLoader`` over PNG (cv2) and .mat (scipy), torch's default settings, float32,
   ``loss.item()`` after every step. With ``--loader-workers N`` once more with that many reading processes.
+- ours, in torch's default layout: what channels_last gains.
 
 "epoch" is the time of whole epochs without synchronisation, in ms a step; the ratio is taken of it. "data" and
 "compute" come from further epochs, in which the GPU is synchronised after each part. Medians over epochs without the
@@ -37,7 +38,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import torch
-from train_ways import Epoch, Job, Ours, Plain, PngAndMat, run_epoch, start, step_seconds, surround
+from train_ways import Contiguous, Epoch, Job, Ours, Plain, PngAndMat, run_epoch, start, step_seconds, surround
 
 from fpp_ml_bench.constants import OBJECTS, VALIDATION_OBJECTS, split_of
 from fpp_ml_bench.loaders.training import FringeDepthDataset
@@ -88,7 +89,7 @@ def compare(args: argparse.Namespace, scratch: Path) -> None:
     if args.loader_workers:
         name = f"plain loop, {args.loader_workers} reading processes"
         loops.append((name, Plain, job._replace(data=tree, loader_workers=args.loader_workers)))
-    loops.append(("ours", Ours, job))
+    loops += [("ours, in torch's default layout", Contiguous, job), ("ours", Ours, job)]
     whole: list[list[Epoch]] = [[] for _ in loops]
     apart: list[list[Epoch]] = [[] for _ in loops]
     with contextlib.ExitStack() as stack:

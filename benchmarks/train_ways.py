@@ -63,6 +63,15 @@ class Ours:
         return self.engine.step(batch)["loss"]
 
 
+class Contiguous(Ours):
+    """The engine with its networks in torch's default layout."""
+
+    def __init__(self, job: Job) -> None:
+        super().__init__(job._replace(scratch=job.scratch / "contiguous"))
+        for module in self.engine.bare.values():
+            module.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+
+
 class Plain:
     """A plain PyTorch loop: RMSprop, default settings, the loss read after every step."""
 
