@@ -2,6 +2,7 @@
 normalisation; TransUNet (section 5.6), the UNet with a vision transformer for its bottleneck; and ResUNet (section
 5.6), of residual blocks on four levels, with batch normalisation."""
 
+from functools import partial
 from itertools import pairwise
 
 import torch
@@ -49,11 +50,13 @@ class UShape(Levels):
 
     stride = 16
 
-    def __init__(self, width: int, bottleneck: nn.Module, channels: int = 1, **options: int | float) -> None:
+    def __init__(
+        self, width: int, bottleneck: nn.Module, channels: int = 1, over_batch: bool = False, **options: int | float
+    ) -> None:
         super().__init__(width=width, **options)
-        widths = [width * 2**level for level in range(4)]
-        self.encoder = nn.ModuleList(DoubleConvolution(c_in, c_out) for c_in, c_out in pairwise([channels, *widths]))
-        self.decoder = nn.ModuleList(Join(2 * c, c, DoubleConvolution(2 * c, c)) for c in reversed(widths))
+        widths, block = [width * 2**level for level in range(4)], partial(DoubleConvolution, over_batch=over_batch)
+        self.encoder = nn.ModuleList(block(c_in, c_out) for c_in, c_out in pairwise([channels, *widths]))
+        self.decoder = nn.ModuleList(Join(2 * c, c, block(2 * c, c)) for c in reversed(widths))
         self.head = nn.Conv2d(width, 1, 1)
         base.initialise(self, "convolutions")
         self.bottleneck = bottleneck
@@ -68,21 +71,26 @@ class UNet(UShape):
     width: channels of the first level. dropout: rate of the channel dropout after the bottleneck (the paper's rows: 0).
     standardised: 1 to subtract each frame's own mean and divide by its standard deviation, so that no absolute grey
     level is seen (the paper's rows: 0). guided: 1 for phase and candidate depths as further input channels
-    (`phase_guide`), only for the paper's rig (the paper's rows: 0). Probe layers: enc1..enc4 (enc1 at full resolution),
-    bottleneck, dec4..dec1 (dec1 at full resolution, ``width`` channels).
+    (`phase_guide`), only for the paper's rig (the paper's rows: 0). batch_normalised: 1 to normalise over the batch
+    instead of each image, which keeps absolute levels (the paper's rows: 0). Probe layers: enc1..enc4 (enc1 at full
+    resolution), bottleneck, dec4..dec1 (dec1 at full resolution, ``width`` channels).
     """
 
     name = "unet"
 
-    def __init__(self, *, width: int = 64, dropout: float = 0.0, standardised: int = 0, guided: int = 0) -> None:
+    def __init__(
+        self, *, width: int = 64, dropout: float = 0.0, standardised: int = 0, guided: int = 0,
+        batch_normalised: int = 0,
+    ) -> None:  # fmt: skip
         width = base.whole(self.name, "width", width)
         dropout = base.rate(self.name, "dropout", dropout)
-        flags = {"standardised": standardised, "guided": guided}
+        flags = {"standardised": standardised, "guided": guided, "batch_normalised": batch_normalised}
         given = {name: 1 for name, flag in flags.items() if base.whole(self.name, name, flag, least=0)}
-        bottleneck = DoubleConvolution(8 * width, 16 * width)
+        over_batch = bool(batch_normalised)
+        bottleneck = DoubleConvolution(8 * width, 16 * width, over_batch)
         base.initialise(bottleneck, "convolutions")
         deepest = nn.Sequential(bottleneck, nn.Dropout2d(dropout))
-        super().__init__(width, deepest, CHANNELS if guided else 1, dropout=dropout, **given)
+        super().__init__(width, deepest, CHANNELS if guided else 1, over_batch, dropout=dropout, **given)
         self.guide = PhaseGuide() if guided else None
 
     def represent(self, fringe: Tensor) -> Tensor:

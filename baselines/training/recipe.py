@@ -21,6 +21,10 @@ from fpp_ml_bench.schema import Positive, StrictModel, Text, problems_of
 
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"
 _LONGEST_CHAIN = 8
+_OPTION_TITLES = {
+    "standardised": "input standardised", "guided": "guided by phase", "batch_normalised": "batch normalisation",
+}  # fmt: skip
+"""What the UNet's options are called in a title; in a name they stand as they are."""
 
 
 class RmsProp(StrictModel):
@@ -119,7 +123,7 @@ class Recipe(StrictModel):
         """Name of runs and weights; rows that train the same network have the same name."""
         parts = [self.network, self.normalisation, self.loss.label]
         parts += ["bgremoved"] if self.background_removed else []
-        parts += [flag for flag in ("standardised", "guided") if self.options.get(flag)]
+        parts += [flag for flag in _OPTION_TITLES if self.options.get(flag)]
         parts += [self.frames] if self.frames != "single_shot" else []
         return "-".join(parts)
 
@@ -128,8 +132,7 @@ class Recipe(StrictModel):
         """For people: network, normalisation, loss, and the settings that differ from the paper's usual ones."""
         parts = [NETWORK_TITLES[self.network], self.normalisation, self.loss.label.replace("_", " ")]
         parts += ["background removed"] if self.background_removed else []
-        parts += ["input standardised"] if self.options.get("standardised") else []
-        parts += ["guided by phase"] if self.options.get("guided") else []
+        parts += [title for flag, title in _OPTION_TITLES.items() if self.options.get(flag)]
         parts += [f"trained on {self.frames} frames"] if self.frames != "single_shot" else []
         return ", ".join(parts)
 
