@@ -17,6 +17,8 @@ _DIRECTIONS = ("horizontal", "vertical", "both")
 _LOSSES = {"rmse": "RMSE", "l1": "L1", "gan": "GAN"}
 _RANGES = {"oracle": "", "mean": "mean range", "predicted": "pred. range", None: ""}
 """By the setting ``depth_range``. That the range was told is the group's track."""
+_OPTIONS = {"input standardised": "standardised", "guided by phase": "guided", "batch normalisation": "batch norm"}
+"""A recipe's title and the short name of each option of a network."""
 
 
 def short_names(submissions: Sequence[Submission]) -> list[str]:
@@ -107,7 +109,7 @@ def _network(submission: Submission) -> str:
     frames = {"single_shot": "", "all": " all frames"}.get(trained_frames, f" {trained_frames}")
     loss, _, weight = str(settings["loss"]).partition("_physics_")
     parts = [f"{network}{normalisation} {_loss(loss)}{f' + physics {float(weight):g}' if weight else ''}{frames}"]
-    parts += ["guided" if ", guided by phase" in submission.name else ""]
+    parts += [word for words, word in _OPTIONS.items() if f", {words}" in submission.name]
     parts += re.findall(r"(?<=, )\d+ epochs", submission.name)
     parts += ["no background" if settings["background_removed"] else "", _RANGES[settings.get("depth_range")]]  # type: ignore[index]
     return ", ".join(filter(None, parts))

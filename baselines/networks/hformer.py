@@ -1,5 +1,6 @@
 """Hformer (Zhu et al. 2022, as the benchmark's conference version ran it): a convolutional backbone of four branches
-without exchange between them, then a U of global transformers over the branches' pixels."""
+without exchange between them, then a U of global transformers over the branches' pixels. All sizes are those of the
+authors' published code (AnushLak/fpp-ml-bench)."""
 
 from collections.abc import Sequence
 

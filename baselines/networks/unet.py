@@ -1,6 +1,9 @@
 """The U-shaped networks: UNet, the paper's baseline (section 5.3.1), with four levels down, four up and instance
 normalisation; TransUNet (section 5.6), the UNet with a vision transformer for its bottleneck; and ResUNet (section
-5.6), of residual blocks on four levels, with batch normalisation."""
+5.6), of residual blocks on four levels, with batch normalisation.
+
+The paper gives TransUNet's sizes and the UNet's levels and number of parameters. The UNet's widths, norm and first
+weights, and ResUNet's widths, blocks and norm are those of the authors' published code (AnushLak/fpp-ml-bench)."""
 
 from functools import partial
 from itertools import pairwise

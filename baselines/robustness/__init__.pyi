@@ -3,6 +3,8 @@ from .axes import SETS as SETS
 from .axes import Corruptions as Corruptions
 from .axes import SetName as SetName
 from .axes import corruptions as corruptions
+from .report import Measured as Measured
+from .report import draw_curves as draw_curves
 from .report import write_page as write_page
 from .report import write_worst as write_worst
 from .run import Setup as Setup

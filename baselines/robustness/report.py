@@ -80,7 +80,7 @@ def _means(views: Sequence[View]) -> dict[int, dict[str, float | None]]:
 def write_page(out: Path) -> Path:
     """Curves and page of all methods below ``out``; the page's path."""
     measured = read_measured(out)
-    curves = _curves(measured)
+    curves = draw_curves(measured)
     write_atomically(out / CURVES, curves)
     worst = [(one.setup["title"], data_uri((one.folder / WORST).read_bytes())) for one in measured
              if (one.folder / WORST).is_file()]  # fmt: skip
@@ -92,7 +92,7 @@ def write_page(out: Path) -> Path:
     return out / PAGE
 
 
-def _curves(measured: Sequence[Measured]) -> bytes:
+def draw_curves(measured: Sequence[Measured]) -> bytes:
     """A plot for each axis: mean error against severity, a line a method; PNG."""
     import matplotlib
 

@@ -132,6 +132,12 @@ def submission(name, method="mine", **settings):
     )  # fmt: skip
 
 
+UNET = {
+    "network": "unet", "normalisation": "global", "loss": "rmse", "trained_frames": "single_shot",
+    "background_removed": False,
+}  # fmt: skip
+
+
 @pytest.mark.parametrize(
     ("name", "method", "changes", "short"),
     [
@@ -143,6 +149,9 @@ def submission(name, method="mine", **settings):
         ("Phase route, mine", "phase", {"frames": "9"}, "Phase route, mine"),
         ("A better phase route", "phase", {}, "A better phase route"),
         ("UNet, mine", "unet", {"network": "unet", "loss": "hybrid_l1_x"}, "UNet, mine"),
+        ("UNet, global, rmse", "unet", UNET, "UNet global RMSE"),
+        ("UNet, global, rmse, batch normalisation", "unet", UNET, "UNet global RMSE, batch norm"),
+        ("UNet, global, rmse, input standardised", "unet", UNET, "UNet global RMSE, standardised"),
     ],
 )
 def test_only_rows_of_the_packages_methods_get_a_name_from_settings(name, method, changes, short):
