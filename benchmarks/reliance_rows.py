@@ -122,7 +122,7 @@ class Materials:
             raise FppBenchError("a trivial method: it looks at no fringe")
         if about.method in METHODS:
             scenes = self.scenes_of(entry, anywhere=True)
-            return load_method(about.method, scenes.dataset.rig, **_options(about.settings)), scenes
+            return load_method(about.method, scenes.dataset.rig, **_options(about.method, about.settings)), scenes
         weights_sha256 = about.settings.get("weights_sha256")
         if not isinstance(weights_sha256, str) or weights_sha256 not in self.weights:
             raise FppBenchError("its weights are missing" if weights_sha256 else "not a method of this package")
@@ -133,12 +133,15 @@ class Materials:
         return SharingMethod(shared, settings.get("depth_range"), settings.get("frame")), scenes
 
 
-_NO_OPTIONS = ("weights_sha256", "device", "mask_threshold", "order_lead")
-"""Settings that describe the weights and are no options of the method."""
+_NO_OPTIONS = {
+    "weights_sha256", "device", "mask_threshold", "order_lead", "order_by_range", "temperature", "offset", "doubted",
+}  # fmt: skip
+"""Settings that describe the weights and are no options of the method; of phase-net ``shading`` is one, too."""
 
 
-def _options(settings: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in settings.items() if key not in _NO_OPTIONS}
+def _options(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    described = _NO_OPTIONS | ({"shading"} if method == "phase-net" else set())
+    return {key: value for key, value in settings.items() if key not in described}
 
 
 def fill(materials: Materials, path: Path, again: bool) -> str:
