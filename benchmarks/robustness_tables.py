@@ -21,7 +21,7 @@ from fpp_ml_bench.evaluation.result import Robustness
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.leaderboard.groups import GroupKey
 from fpp_ml_bench.leaderboard.names import short_names
-from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, read_entry
+from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, Entry, read_entry
 from fpp_ml_bench.leaderboard.tables import markdown_rows, markdown_text
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "robustness.md"
@@ -36,10 +36,14 @@ TITLES = ("method", "mean, mm", "95% interval", "clean, mm", "ratio", "wrong ord
 Row = tuple[str, Robustness]
 
 
-def rows_of(name: SetName, folder: Path) -> list[Row]:
-    """Names and blocks of a set, the least error first."""
+def rows_in(folder: Path) -> dict[SetName, list[Row]]:
+    """Names and blocks of each set, the least error first."""
     entries = [entry for entry in map(read_entry, sorted(folder.glob("*.json"))) if entry.result.robustness]
     entries = [entry for entry in entries if not GroupKey.of(entry.result).is_legacy]
+    return {name: _of_set(name, entries) for name in SETS}
+
+
+def _of_set(name: SetName, entries: Sequence[Entry]) -> list[Row]:
     blocks = [(entry, block) for entry in entries if (block := (entry.result.robustness or {}).get(name))]
     names = short_names([entry.result.submission for entry, _ in blocks])
     found = [(f"{short}, {block.size_px} px" if block.size_px != FULL_SIZE else short, block)
@@ -96,7 +100,7 @@ def main() -> int:
     parser.add_argument("--page", type=Path, default=PAGE, help="Markdown with the markers")
     args = parser.parse_args()
     try:
-        rows = {name: rows_of(name, args.rows) for name in SETS}
+        rows = rows_in(args.rows)
         text = filled(args.page.read_text(encoding="utf-8"), rows)
     except (FppBenchError, OSError, ValueError) as error:
         print(f"{args.page}: {error}", file=sys.stderr)
