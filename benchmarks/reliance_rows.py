@@ -7,14 +7,15 @@
 
 A network's row is measured on the data it was scored on, with the weights file whose SHA-256 it names (below ``--runs``
 or shipped with the package). A classical or phase row is measured on its own data where given, else on the first
-dataset of ``--data``, which the row then names. Rows that have a reliance of the same version, data and weights are
-skipped, so an interrupted run continues. Rows of other methods, or of weights that are missing, are named and skipped.
+dataset of ``--data``, which the row then names. Rows that have a reliance of the same version, data (these or their
+own) and weights are skipped, so an interrupted run continues. Rows of other methods, or of weights that are missing,
+are named and skipped. Without ``--data`` nothing is measured, and ``--table`` writes what the rows hold.
 """
 
 import argparse
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from hashlib import blake2b, sha256
 from pathlib import Path
 from typing import Any
@@ -47,6 +48,7 @@ from fpp_ml_bench.leaderboard.measured import check_same_method, write_reliance
 from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, Entry, read_entry
 from fpp_ml_bench.leaderboard.tables import markdown_rows, markdown_text
 from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.optics import Rig
 
 REFUSED = 2
 
@@ -122,7 +124,7 @@ class Materials:
             raise FppBenchError("a trivial method: it looks at no fringe")
         if about.method in METHODS:
             scenes = self.scenes_of(entry, anywhere=True)
-            return load_method(about.method, scenes.dataset.rig, **_options(about.method, about.settings)), scenes
+            return built(entry, scenes.dataset.rig), scenes
         weights_sha256 = about.settings.get("weights_sha256")
         if not isinstance(weights_sha256, str) or weights_sha256 not in self.weights:
             raise FppBenchError("its weights are missing" if weights_sha256 else "not a method of this package")
@@ -139,9 +141,12 @@ _NO_OPTIONS = {
 """Settings that describe the weights and are no options of the method; of phase-net ``shading`` is one, too."""
 
 
-def _options(method: str, settings: Mapping[str, Any]) -> dict[str, Any]:
-    described = _NO_OPTIONS | ({"shading"} if method == "phase-net" else set())
-    return {key: value for key, value in settings.items() if key not in described}
+def built(entry: Entry, rig: Rig) -> Method:
+    """The method of the package that made the row, by the row's settings, for images of ``rig``."""
+    about = entry.result.submission
+    described = _NO_OPTIONS | ({"shading"} if about.method == "phase-net" else set())
+    options = {key: value for key, value in about.settings.items() if key not in described}
+    return load_method(about.method, rig, **options)
 
 
 def fill(materials: Materials, path: Path, again: bool) -> str:
@@ -152,8 +157,8 @@ def fill(materials: Materials, path: Path, again: bool) -> str:
     weights = row_method.settings.get("weights_sha256")
     stored = entry.result.reliance
     if stored is not None and not again:
-        same = (stored.version, stored.dataset_fingerprint, stored.weights_sha256)
-        if same == (RELIANCE_VERSION, scenes.dataset.fingerprint, weights):
+        known = stored.dataset_fingerprint in (scenes.dataset.fingerprint, entry.result.dataset.fingerprint)
+        if known and (stored.version, stored.weights_sha256) == (RELIANCE_VERSION, weights):
             return f"{stored.score:.3f}, unchanged"
     started = time.perf_counter()
     reliance, _ = measure(row_method, scenes, weights if isinstance(weights, str) else None)
@@ -196,7 +201,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__.split("\n", 1)[0], formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
-    parser.add_argument("--data", type=Path, nargs="+", required=True, help="dataset folders with all frames")
+    parser.add_argument("--data", type=Path, nargs="+", default=[], help="dataset folders with all frames")
     parser.add_argument("--runs", type=Path, nargs="+", default=[Path("runs")], help="folders with trained weights")
     parser.add_argument("--rows", type=Path, default=SHIPPED_ROWS, help="folder of the rows")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="only these rows, by file name without .json")
@@ -204,12 +209,15 @@ def main() -> int:
     parser.add_argument("--table", type=Path, metavar="FILE", help="write the rows' reliance as Markdown here")
     parser.add_argument("--again", action="store_true", help="measure all rows again")
     args = parser.parse_args()
-    materials = Materials(args.data, args.runs, args.views)
+    if not args.data and args.table is None:
+        parser.error("expected --data to measure, or --table to write what the rows hold; got neither")
     paths = [path for path in sorted(args.rows.glob("*.json")) if not args.only or path.stem in args.only]
-    unmeasured = _each(paths, lambda path: fill(materials, path, args.again))
+    if args.data:
+        materials = Materials(args.data, args.runs, args.views)
+        unmeasured = _each(paths, lambda path: fill(materials, path, args.again))
+        print(f"{len(paths) - unmeasured} rows have a phase reliance, {unmeasured} do not")
     if args.table is not None:
         write_atomically(args.table, table([read_entry(path) for path in paths]).encode("utf-8"))
-    print(f"{len(paths) - unmeasured} rows have a phase reliance, {unmeasured} do not")
     return 0 if paths else REFUSED
 
 

@@ -36,11 +36,10 @@ TITLES = ("method", "mean, mm", "95% interval", "clean, mm", "ratio", "wrong ord
 Row = tuple[str, Robustness]
 
 
-def rows_in(folder: Path) -> dict[SetName, list[Row]]:
+def rows_in(entries: Iterable[Entry]) -> dict[SetName, list[Row]]:
     """Names and blocks of each set, the least error first."""
-    entries = [entry for entry in map(read_entry, sorted(folder.glob("*.json"))) if entry.result.robustness]
-    entries = [entry for entry in entries if not GroupKey.of(entry.result).is_legacy]
-    return {name: _of_set(name, entries) for name in SETS}
+    todays = [entry for entry in entries if entry.result.robustness and not GroupKey.of(entry.result).is_legacy]
+    return {name: _of_set(name, todays) for name in SETS}
 
 
 def _of_set(name: SetName, entries: Sequence[Entry]) -> list[Row]:
@@ -100,7 +99,7 @@ def main() -> int:
     parser.add_argument("--page", type=Path, default=PAGE, help="Markdown with the markers")
     args = parser.parse_args()
     try:
-        rows = rows_in(args.rows)
+        rows = rows_in(map(read_entry, sorted(args.rows.glob("*.json"))))
         text = filled(args.page.read_text(encoding="utf-8"), rows)
     except (FppBenchError, OSError, ValueError) as error:
         print(f"{args.page}: {error}", file=sys.stderr)

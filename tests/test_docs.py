@@ -33,13 +33,17 @@ def test_named_files_and_modules_are_there(page):
             break
 
 
-def test_robustness_tables_are_those_of_the_rows(monkeypatch):
+def test_tables_are_those_of_the_rows(monkeypatch):
     monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    from reliance_rows import table
     from robustness_tables import PAGE, filled, rows_in
 
-    from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS
+    from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, read_entry
+
+    entries = [read_entry(path) for path in sorted(SHIPPED_ROWS.glob("*.json"))]
+    assert (ROOT / "docs/tables/reliance.md").read_text(encoding="utf-8") == table(entries)
 
     text = PAGE.read_text(encoding="utf-8")
-    assert filled(text, rows_in(SHIPPED_ROWS)) == text
+    assert filled(text, rows_in(entries)) == text
     with pytest.raises(ValueError, match="markers <!-- test:begin -->"):
         filled("a page without them", {"test": []})

@@ -2,6 +2,7 @@
 
 import json
 import re
+from pathlib import Path
 
 import pytest
 from board_rows import write_result_file
@@ -22,7 +23,8 @@ from fpp_ml_bench.leaderboard.measured import check_same_method, write_reliance
 from fpp_ml_bench.leaderboard.page import page_files
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.leaderboard.readme import readme_block
-from fpp_ml_bench.leaderboard.rows import read_entry
+from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, read_entry
+from fpp_ml_bench.optics import paper_rig
 
 SHA = "a" * 64
 
@@ -154,3 +156,14 @@ def test_the_command_measures_and_writes(tiny, tmp_path, capsys, dataset):
     assert main(["reliance", "classical", str(tiny), "--steps", "6", "--into", str(row)]) == 2
     assert "very method that was scored" in capsys.readouterr().err
     assert main(["reliance", "classical", str(tiny), "--views", "7"]) == 2
+
+
+@pytest.mark.parametrize(
+    "row", ["classical-18-both", "classical-net-03-vertical", "phase-horizontal", "phase-net-any-vertical"]
+)
+def test_a_row_names_what_builds_its_method_again(row, monkeypatch):
+    monkeypatch.syspath_prepend(Path(__file__).resolve().parents[2] / "benchmarks")
+    from reliance_rows import built
+
+    entry = read_entry(SHIPPED_ROWS / f"{row}.json")
+    check_same_method(entry, built(entry, paper_rig(960)))
