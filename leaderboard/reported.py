@@ -61,7 +61,7 @@ def paper_tables() -> dict[str, ReportedTable]:
             for row in table["rows"]
         )
         tables[table["name"]] = ReportedTable(table["name"], table["title"], rows, figure=table.get("figure"))
-    return {name: tables[name] for name in TABLES}
+    return {name: tables[name] for name in TABLES if name in tables}
 
 
 @cache

@@ -1,4 +1,4 @@
-"""The tables of the paper and their rows, the presets and the losses: names only, so that help needs no torch."""
+"""The tables of rows to reproduce, the presets and the losses: names only, so that help needs no torch."""
 
 from fpp_ml_bench.errors import RecipeError
 
@@ -11,8 +11,10 @@ ROWS: dict[str, tuple[str, ...]] = {
         "hybrid_l1_0.5", "hybrid_l1_0.7", "hybrid_l1_0.9",
     ),
     "architecture": ("unet", "transunet", "resunet", "pix2pix", "pix2pixhd", "hformer"),
+    "further": ("plain", "guided", "physics"),
 }  # fmt: skip
-"""The paper's order; ``pix2pixhd`` is the authors' code, ``hformer`` the conference version's."""
+"""The paper's order; ``pix2pixhd`` is the authors' code, ``hformer`` the conference version's. ``further`` is no table
+of the paper: two of its further directions, and the network without them."""
 TABLES = tuple(ROWS)
 PRESETS = ("cpu", "cpu-long", "paper")
 LOSSES = ("rmse", "l1", "masked_rmse", "masked_l1", "hybrid_rmse", "hybrid_l1")

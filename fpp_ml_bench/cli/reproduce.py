@@ -1,4 +1,4 @@
-"""``fpp-bench reproduce``: the paper's tables, trained and scored here."""
+"""``fpp-bench reproduce``: the paper's tables and its further directions, trained and scored here."""
 
 from __future__ import annotations
 
@@ -87,8 +87,7 @@ def run(args: argparse.Namespace) -> int:
     outcome = reproduce.reproduce(settings)
     for table, path in zip(tables, outcome.tables, strict=True):
         lines = reproduced.table_lines(table, outcome.jobs, folders, outcome.opened)
-        orderings = reproduced.orderings_sentence(reproduced.orderings(lines))
-        show(reproduced.table_rich(table, lines, args.preset), orderings)
+        show(reproduced.table_rich(table, lines, args.preset), reproduced.conclusion(table, lines))
         print(f"Written: {path}")
     if outcome.failed:
         each = "\n".join(f"  {name}: {why}" for name, why in outcome.failed.items())

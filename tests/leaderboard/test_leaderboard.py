@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scored_dataset import make_dataset, write_predictions
 
-from fpp_ml_bench.baselines.training import TABLES
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.result import write_result
 from fpp_ml_bench.evaluation.score import evaluate
@@ -175,11 +174,11 @@ def test_probes_and_figures_of_the_paper():
     assert paper_tables()["multi_frame"].figure is None
 
 
-@pytest.mark.parametrize("choice", [*TABLES, "all", "none"])
+@pytest.mark.parametrize("choice", [*paper_tables(), "all", "none"])
 def test_paper_tables_by_choice(choice, capsys, tmp_path):
     out = board(capsys, "--paper", choice, "--markdown", tmp_path / "t.md")
-    expected = TABLES if choice == "all" else () if choice == "none" else (choice,)
-    for name in TABLES:
+    expected = paper_tables() if choice == "all" else () if choice == "none" else (choice,)
+    for name in paper_tables():
         assert (f"{name}: " in out) == (name in expected)
         assert (f"{name}&#58; ".replace("_", "&#95;") in (tmp_path / "t.md").read_text()) == (name in expected)
     assert SHOWN_BY_DEFAULT == ("architecture", "normalization", "oracle_order")

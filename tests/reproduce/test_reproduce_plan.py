@@ -18,6 +18,7 @@ from fpp_ml_bench.leaderboard.reported import paper_tables
 from fpp_ml_bench.leaderboard.reproduced import (
     Line,
     Ordering,
+    conclusion,
     orderings,
     orderings_sentence,
     table_lines,
@@ -43,9 +44,10 @@ def test_the_command_knows_the_recipes_tables_and_presets():
 def test_rows_of_one_recipe_are_one_training(preset):
     jobs = planned(TABLES, preset)
     rows = [row for job in jobs for row in job.rows]
-    assert len(rows) == len(set(rows)) == 3 + 3 + 5 + 10 + 6 and len(jobs) == 24
+    assert len(rows) == len(set(rows)) == 3 + 3 + 5 + 10 + 6 + 3 and len(jobs) == 26
     shared = [set(job.rows) for job in jobs if len(job.rows) > 1]
     assert shared == [
+        {"normalization/global", "further/plain"},
         {"normalization/individual", "multi_frame/frame0", "loss/rmse"},
         {"loss/hybrid_l1_0.7", "architecture/unet"},
     ]
@@ -59,10 +61,11 @@ def test_lines_hold_the_papers_numbers(tmp_path, dataset):
     jobs = planned(TABLES, "cpu")
     for table in TABLES:
         by_row = {line.row: line for line in table_lines(table, jobs, folders(tmp_path), dataset)}
-        for row in paper_tables()[table].rows:
+        for row in paper_tables()[table].rows if table in paper_tables() else ():
             assert (by_row[row.row].paper_mm, by_row[row.row].label) == (row.errors_mm, row.label)
-        extra = [line.label for line in by_row.values() if line.paper_mm is None]
-        assert extra == (["pix2pixHD", "Hformer"] if table == "architecture" else [])
+        extra = [name for name, line in by_row.items() if line.paper_mm is None]
+        not_the_papers = {"architecture": ["pix2pixhd", "hformer"], "further": ["plain", "guided", "physics"]}
+        assert extra == not_the_papers.get(table, [])
         assert all(line.scores is line.entry is None for line in by_row.values())
 
 
@@ -187,6 +190,25 @@ def test_the_difference_is_that_of_compare(tmp_path, dataset):
     assert not orderings(lines)[0].same_track
     text = table_markdown("loss", lines, "cpu", "fpp-bench reproduce loss", {})
     assert "of different tracks" in text
+
+
+def test_a_table_that_the_paper_does_not_have_is_compared_with_its_first_line(tmp_path, dataset):
+    results = [
+        evaluate(write_predictions(tmp_path / str(offset), dataset, offset_mm=offset, noise_mm=2.0 * offset), dataset)
+        for offset in (1.0, 3.0)
+    ]
+    lines = [
+        replace(line(name, None, {}, Entry(tmp_path / "x.json", result)), scores=result)
+        for name, result in zip(("the image alone", "guided"), results, strict=True)
+    ]
+    difference = compare(*results).differences["object_mae_mm"]
+    low, high = difference.interval_mm
+    said = conclusion("further", lines)
+    assert f"against the image alone, sample by sample: guided {difference.mean_mm:+.2f} mm" in said
+    assert f"{low:+.2f} to {high:+.2f}" in said and conclusion("further", lines[:1]) == ""
+    text = table_markdown("further", lines, "cpu", "fpp-bench reproduce further", {})
+    assert text.startswith("# Further directions") and said in text
+    assert "reported by the paper" not in text.lower() and "Range predicted" not in text
 
 
 def test_rows_that_were_not_measured_stay_empty():

@@ -1,0 +1,12 @@
+from .lines import Line as Line
+from .lines import check_row_is_of as check_row_is_of
+from .lines import row_that_holds as row_that_holds
+from .lines import table_lines as table_lines
+from .lines import write_measured as write_measured
+from .orderings import Ordering as Ordering
+from .orderings import conclusion as conclusion
+from .orderings import orderings as orderings
+from .orderings import orderings_sentence as orderings_sentence
+from .tables import table_markdown as table_markdown
+from .tables import table_rich as table_rich
+from .tables import write_table as write_table
