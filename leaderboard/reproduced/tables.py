@@ -141,7 +141,7 @@ def _about(lines: Sequence[Line], in_the_paper: bool) -> list[str]:
     here = (
         f"{MEASURED_HERE.capitalize()}: {data.split} split of {markdown_text(data.name)} ({data.fingerprint[:8]}), "
         f"{data.samples} samples of {objects} objects, {width} x {height} px, against decoded depth; times on "
-        f"{markdown_text(device(entry))}."
+        f"{markdown_text(_devices(lines))}."
     )
     paper = (
         f" {BY_THE_PAPER.capitalize()}: its own data at 960 x 960 px, its authors' code; the two are shown beside each "
@@ -149,6 +149,15 @@ def _about(lines: Sequence[Line], in_the_paper: bool) -> list[str]:
         "in the paper, and score the background in units of that range."
     )
     return ["", here + paper if in_the_paper else here]
+
+
+def _devices(lines: Sequence[Line]) -> str:
+    """Where the rows were timed, with their labels where that differs."""
+    labels: dict[str, list[str]] = {}
+    for line in lines:
+        if line.entry is not None:
+            labels.setdefault(device(line.entry), []).append(line.label)
+    return "; ".join(name if len(labels) == 1 else f"{name} ({', '.join(rows)})" for name, rows in labels.items())
 
 
 def _missing(lines: Sequence[Line], command: str, failed: dict[str, str]) -> list[str]:
