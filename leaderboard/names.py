@@ -1,7 +1,6 @@
 """Short names of a table's rows. Rows of this package's methods get theirs from the method's settings; every other
 submission keeps its own name, cut at a word."""
 
-import re
 from collections.abc import Sequence
 from operator import index
 
@@ -110,7 +109,6 @@ def _network(submission: Submission) -> str:
     loss, _, weight = str(settings["loss"]).partition("_physics_")
     parts = [f"{network}{normalisation} {_loss(loss)}{f' + physics {float(weight):g}' if weight else ''}{frames}"]
     parts += [word for words, word in _OPTIONS.items() if f", {words}" in submission.name]
-    parts += re.findall(r"(?<=, )\d+ epochs", submission.name)
     parts += ["no background" if settings["background_removed"] else "", _RANGES[settings.get("depth_range")]]  # type: ignore[index]
     return ", ".join(filter(None, parts))
 

@@ -117,9 +117,8 @@ def test_short_names_of_shipped_rows(shipped):
         "cpu-unet-individual-rmse-all": "UNet RMSE all frames",
         "cpu-long-unet-global-rmse": "UNet global RMSE",
         "cpu-long-pix2pix_unet-individual-gan_0.7": "Pix2Pix GAN 0.7",
-        "cpu40-unet-global": "UNet global RMSE, 40 epochs",
-        "cpu40-unet-guided": "UNet global RMSE, guided",
-        "cpu40-unet-physics": "UNet global RMSE + physics 0.05",
+        "cpu-long-unet-global-rmse-guided": "UNet global RMSE, guided",
+        "cpu-long-unet-global-rmse_physics_0.05": "UNet global RMSE + physics 0.05",
         "cpu-unet-raw-rmse-bgremoved": "UNet raw RMSE, no background",
     }
     assert {stem: names[stem] for stem in expected} == expected
