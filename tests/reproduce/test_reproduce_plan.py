@@ -5,6 +5,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+from board_rows import HARDWARE
 from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.baselines.reproduce import Folders, plan, planned, variants
@@ -171,11 +172,19 @@ def test_an_interval_that_touches_zero_decides_nothing(ends, verdict):
     assert Ordering("a", "b", 1.0, 1.0, ends, True, 5).verdict == verdict
 
 
-def test_the_difference_is_that_of_compare(tmp_path, dataset):
-    results = [
-        evaluate(write_predictions(tmp_path / str(offset), dataset, offset_mm=offset, noise_mm=2.0 * offset), dataset)
-        for offset in (1.0, 3.0)
+def two_results(tmp_path, dataset):
+    """Timed on two machines."""
+    folders = [
+        write_predictions(
+            tmp_path / cpu, dataset, offset_mm=offset, noise_mm=2.0 * offset, hardware={**HARDWARE, "cpu": cpu}
+        )
+        for cpu, offset in (("first", 1.0), ("second", 3.0))
     ]
+    return [evaluate(folder, dataset) for folder in folders]
+
+
+def test_the_difference_is_that_of_compare(tmp_path, dataset):
+    results = two_results(tmp_path, dataset)
     entries = [Entry(tmp_path / "x.json", result) for result in results]
     lines = [
         replace(line(str(n), float(n), {"a_A0": 1.0}, entry), scores=entry.result) for n, entry in enumerate(entries, 1)
@@ -193,10 +202,7 @@ def test_the_difference_is_that_of_compare(tmp_path, dataset):
 
 
 def test_a_table_that_the_paper_does_not_have_is_compared_with_its_first_line(tmp_path, dataset):
-    results = [
-        evaluate(write_predictions(tmp_path / str(offset), dataset, offset_mm=offset, noise_mm=2.0 * offset), dataset)
-        for offset in (1.0, 3.0)
-    ]
+    results = two_results(tmp_path, dataset)
     lines = [
         replace(line(name, None, {}, Entry(tmp_path / "x.json", result)), scores=result)
         for name, result in zip(("the image alone", "guided"), results, strict=True)
@@ -208,6 +214,7 @@ def test_a_table_that_the_paper_does_not_have_is_compared_with_its_first_line(tm
     assert f"{low:+.2f} to {high:+.2f}" in said and conclusion("further", lines[:1]) == ""
     text = table_markdown("further", lines, "cpu", "fpp-bench reproduce further", {})
     assert text.startswith("# Further directions") and said in text
+    assert "times on first, 2 cores (the image alone)&#59; second, 2 cores (guided)." in text
     assert "reported by the paper" not in text.lower() and "Range predicted" not in text
 
 
