@@ -31,6 +31,11 @@ def text_problem(value: str, limit: int = NAME_LIMIT) -> str | None:
     return None
 
 
+def cause_of(error: Exception) -> str:
+    """An error as text, that of the operating system without its number and path."""
+    return getattr(error, "strerror", None) or str(error)
+
+
 def printable(value: object, limit: int = NAME_LIMIT) -> str:
     """``value`` as text that is safe in a terminal: control characters escaped, cut at ``limit`` characters."""
     text = value if isinstance(value, str) else repr(value)

@@ -47,7 +47,10 @@ class Levels(NamedTuple):
 
 def levels_of(frames: Sequence[NDArray], maps: Sequence[NDArray[np.float64]], pose: Pose, rig: Rig) -> Levels | None:
     """Sinusoid levels and grey levels at bright pixels of a pose's board; ``maps``: columns and rows of the projector,
-    (H, W) px, NaN where not decoded. None where too few pixels are left."""
+    (H, W) px, NaN where not decoded. None where too few pixels are left,
+    or a direction has no sinusoids."""
+    if len(rig.fringe_directions) < len(AXES):
+        return None
     x, y = pose.corners_px[np.isfinite(pose.corners_px).all(axis=1)].T
     rows = slice(max(int(y.min()), 0), int(y.max()) + 1)
     columns = slice(max(int(x.min()), 0), int(x.max()) + 1)

@@ -120,8 +120,11 @@ def run_command(command: Command, prog: str, argv: Sequence[str]) -> int:
         # The reader of the output closed it (`| head`). That is no error, and flushing at exit must not raise one.
         sys.stdout = None  # type: ignore[assignment]
         return BAD_INPUT
-    except (FppBenchError, OSError) as error:
+    except FppBenchError as error:
         return _refused(prog, error)
+    except OSError as error:
+        named = error.filename is not None and error.strerror
+        return _refused(prog, f"{error.filename}: {error.strerror}" if named else error)
     except ModuleNotFoundError as error:
         library = (error.name or "").partition(".")[0]
         extra = next((extra for extra, libraries in EXTRAS.items() if library in libraries), None)

@@ -89,6 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--range", type=working_range, metavar="NEAR,FAR", help="working range in mm (default: the boards', and 10%%)")
     add("--bits", type=int, metavar="N", help="bits of the camera, where files of 16 bits hold fewer")
     add("--colour", metavar="NAME", help="of colour images: luminance, mean, red, green, blue")
+    add("--anyway", action="store_true", help="use poses whose frames the examination refuses, too")
     add("--opencv", type=Path, metavar="FILE", help="also write OpenCV's calibration file (.xml, .yml, .json)")
     virtual = parser.add_argument_group("virtual")
     add = virtual.add_argument
@@ -175,7 +176,9 @@ def _from_board(
     """Calibrate, print and write; the rig, with standoff and background of ``like``."""
     lenses = _lenses(args)
     with progress_bar("finding the board", len(captures.pose_folders(folder)), "poses") as advance:
-        poses, rig, response = captures.board_poses(folder, board, sequence, args.bits, args.colour, advance)
+        poses, rig, response = captures.board_poses(
+            folder, board, sequence, args.bits, args.colour, advance, args.anyway
+        )
     lenses = lenses if len(poses) > 3 else lenses[:1]  # models are compared by poses left out
     sizes = (poses[0].size, (rig.projector.width, rig.projector.height))
     options = {"estimate_board": args.estimate_board, "baseline_mm": args.baseline}
@@ -195,6 +198,7 @@ def _from_board(
     rig = captures.calibrated_rig(best, rig, range_mm or args.range)
     if like is not None:
         rig = replace(rig, standoff_m=like.standoff_m, background_m=like.background_m)
+    optics.check_lengths(rig, "the spacing of --board, in mm,")
     print_calibration(best)
     if response is not None:
         print(f"response        gamma {response.gamma:.3f} +- {response.sigma:.4f} of projector and camera together; "

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 
 from rich.console import Console, RenderableType
 
+from fpp_ml_bench.examination import Examination
 from fpp_ml_bench.loaders import storage
 
 WIDTH_IN_PIPES = 140
@@ -63,6 +64,15 @@ def say_benchmark(manifest: "storage.Manifest") -> None:
     """Print which benchmark a dataset is; a warning on standard error where it should be one and is not."""
     as_expected, sentence = storage.benchmark_sentence(manifest)
     print(f"benchmark: {sentence}" if as_expected else f"warning: {sentence}", file=None if as_expected else sys.stderr)
+
+
+def say_findings(examination: Examination, where: str = "") -> None:
+    """Print what an examination found, on standard error, and what it could not check."""
+    for finding in examination.findings:
+        level = "note" if finding.severity == "note" else "warning"
+        print(f"{level}: {where}{finding}", file=sys.stderr)
+    if examination.not_checked:
+        print(f"not checked     {where}{'; '.join(examination.not_checked)}")
 
 
 def output_width() -> int:

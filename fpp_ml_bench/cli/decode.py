@@ -8,8 +8,9 @@ from time import perf_counter
 from rich.table import Column, Table
 
 from fpp_ml_bench import optics
-from fpp_ml_bench.cli.console import progress_bar, show, working_range
+from fpp_ml_bench.cli.console import progress_bar, say_findings, show, working_range
 from fpp_ml_bench.errors import CaptureError, DecodeError
+from fpp_ml_bench.examination import RefusedCapture
 from fpp_ml_bench.loaders import captures
 from fpp_ml_bench.machine import usable_cores
 
@@ -40,6 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--bits", type=int, metavar="N", help="bits of the camera, 8 to 16, where files of 16 bits hold fewer")
     add("--colour", metavar="NAME", help="of colour images: luminance, mean, red, green, blue")
     add("--forms", metavar="A,B", help="what to write of npy, mat, png, ply, mesh (default: all)")
+    add("--anyway", action="store_true", help="decode a capture that its examination refuses")
     add("--threads", type=int, default=usable_cores(), metavar="N", help="threads (default: one for each core)")
 
 
@@ -51,23 +53,29 @@ def run(args: argparse.Namespace) -> int:
         raise CaptureError(f"--forms {args.forms}: expected some of {', '.join(captures.FORMS)}")
     if args.threads < 1:
         raise DecodeError(f"--threads {args.threads}: expected 1 or more")
-    if args.out.is_dir() and any(args.out.iterdir()) and not (args.out / captures.REPORT).is_file():
-        raise CaptureError(f"{args.out}: not empty, and no earlier decoding; give a new folder")
+    captures.check_outputs(args.out)
     rig = optics.load_rig(args.rig)
     if args.range is not None:
         rig = rig.with_range(args.range)
+        optics.check_lengths(rig, args.rig.name)
     started = perf_counter()
     with progress_bar("decoding", 4, "steps") as advance:
         capture = captures.read_frames(args.frames, count=len(rig.sequence), bits=args.bits, colour=args.colour)
         advance(1)
         mask = None if args.mask is None else captures.read_mask(args.mask, capture.frames.shape[1:])
         least = {} if args.min_modulation is None else {"min_modulation": args.min_modulation}
-        result = captures.decode_capture(
-            capture, rig, args.direction, mask=mask, noise_grey=args.noise, threads=args.threads, **least
-        )
+        try:
+            result = captures.decode_capture(
+                capture, rig, args.direction, mask=mask, noise_grey=args.noise, threads=args.threads,
+                anyway=args.anyway, **least
+            )  # fmt: skip
+        except RefusedCapture as refused:
+            captures.write_refusal(args.out, capture, rig, refused.examination)
+            raise
         advance(2)
         captures.write_capture(args.out, capture, rig, result, forms)
         advance(1)
+    say_findings(result.examination)
     for note in result.notes:
         print(f"note: {note}", file=sys.stderr)
     _print(result)

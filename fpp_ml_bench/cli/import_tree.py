@@ -34,7 +34,7 @@ EXAMPLES = (
     "of a single view: as many images as the rig's sequence has, in the order of their names. The rig decodes them",
     "into the ground truth. splits.yaml lists the objects under train, validation and test.",
 )
-_CAPTURE_OPTIONS = "splits", "bits", "colour", "min_modulation", "max_clipped_steps", "max_disagreement"
+_CAPTURE_OPTIONS = "splits", "bits", "colour", "min_modulation", "max_clipped_steps", "max_disagreement", "anyway"
 _MOST_SHOWN = 30
 
 
@@ -60,6 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="least modulation of a pixel with depth, grey levels of 255 (default: 5)")  # fmt: skip
     add("--max-clipped-steps", type=int, metavar="N",
         help="phase steps that may be saturated at a pixel (default: a ninth of them)")  # fmt: skip
+    add("--anyway", action="store_true", default=None, help="import captures that their examination refuses, too")
     add("--max-disagreement", type=float, metavar="PX",
         help="largest distance of both directions' coordinates from the epipolar line (default: 1.5)")  # fmt: skip
 
@@ -83,7 +84,9 @@ def _run_captures(args: argparse.Namespace, workers: int) -> int:
              "max_disagreement_px": args.max_disagreement}  # fmt: skip
     limits = coding.Limits(**{name: value for name, value in given.items() if value is not None})
     splits = None if args.splits is None else captures.read_splits(args.splits)
-    plan = captures.plan_captures(args.tree, optics.load_rig(args.rig), splits, limits, args.bits, args.colour)
+    plan = captures.plan_captures(
+        args.tree, optics.load_rig(args.rig), splits, limits, args.bits, args.colour, bool(args.anyway)
+    )
     count, images = len(plan.reader.captures), len(plan.reader.rig.sequence)
     started = perf_counter()
     with progress_bar("importing", count, "images", images) as advance:

@@ -34,8 +34,16 @@ class Code(ABC):
     """The code of one direction; a frozen dataclass whose fields are the entries of a rig file."""
 
     scheme: ClassVar[str]
-    needs_flat: bool = False
-    """Whether decoding also needs a black and a white frame."""
+
+    @property
+    def needs_flat(self) -> bool:
+        """Whether decoding also needs a black and a white frame."""
+        return False
+
+    @property
+    def step_px(self) -> float:
+        """Largest error of a coordinate without noise, in projector px."""
+        return 0.0
 
     @property
     @abstractmethod

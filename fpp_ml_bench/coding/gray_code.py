@@ -38,12 +38,12 @@ def cell_of(position_px: ArrayLike, pitch_px: float) -> NDArray[np.int64]:
     return np.floor(np.asarray(position_px, dtype=np.float64) / (pitch_px / 2)).astype(np.int64)
 
 
-def cell_count(length_px: int, pitch_px: float) -> int:
+def cell_count(length_px: float, pitch_px: float) -> int:
     """Gray-code cells of half a period on a pattern ``length_px`` long."""
     return int(cell_of(length_px - 1, pitch_px)) + 1
 
 
-def bits_needed(length_px: int, pitch_px: float) -> int:
+def bits_needed(length_px: float, pitch_px: float) -> int:
     """Gray bits that tell all cells of a pattern apart: ceil(log2(cells)), at least 1."""
     return max(1, (cell_count(length_px, pitch_px) - 1).bit_length())
 

@@ -44,46 +44,64 @@ class DecodedCells(NamedTuple):
 
 @dataclass(frozen=True)
 class GrayCells:
-    """Gray-code frames: cells of ``cell_px``, ``bits`` most significant first, without inverse frames, or each followed
-    by its inverse, or all of them followed by all inverses."""
+    """Gray-code frames: cells of ``cell_px``, ``bits`` most significant first (or ``least_first``), without inverse
+    frames, or each followed by its inverse, or all of them followed by all inverses. ``origin_px``: where cell 0
+    begins, 0 or less: codes for a power of two that is larger than the projector are often centred on it."""
 
     cell_px: float
     bits: int
     inverse: Inverse = "none"
+    origin_px: float = 0.0
+    least_first: bool = False
 
     @classmethod
     def from_entries(cls, entries: Any, length_px: int, cell_px: float | None = None) -> "GrayCells":
         """From a rig file's mapping, whose keys are the fields; ``cell_px`` by default as given here, ``bits`` as many
         as the pattern needs. Raises `RigError`."""
         if not isinstance(entries, Mapping):
-            raise RigError(f"gray: expected a mapping with some of cell_px, bits, inverse; got {entries!r}")
-        check_keys(entries, ("cell_px", "bits", "inverse"))
+            raise RigError(
+                f"gray: expected a mapping with some of cell_px, bits, inverse, origin_px, least_first; got {entries!r}"
+            )
+        check_keys(entries, ("cell_px", "bits", "inverse", "origin_px", "least_first"))
         size = real(entries.get("cell_px", cell_px), "cell_px")
         if not size >= 1:
             raise RigError(f"cell_px: expected 1 px and more, got {size:g}")
-        bits = whole(entries.get("bits", bits_needed(length_px, 2 * size)), "bits", 1, 15)
+        origin_px, least_first = real(entries.get("origin_px", 0.0), "origin_px"), entries.get("least_first", False)
+        if not isinstance(least_first, bool):
+            raise RigError(f"least_first: expected true or false, got {least_first!r}")
+        bits = whole(entries.get("bits", bits_needed(length_px - origin_px, 2 * size)), "bits", 1, 15)
         inverse = entries.get("inverse", "none")
         if inverse not in ("none", "after each", "after all"):
             raise RigError(f"inverse: expected none, after each or after all, got {inverse!r}")
-        return cls(size, bits, inverse)
+        return cls(size, bits, inverse, origin_px, least_first)
 
     def to_dict(self) -> dict[str, Any]:
-        return asdict(self)
+        usual = {"origin_px": 0.0, "least_first": False}
+        return {key: value for key, value in asdict(self).items() if usual.get(key) != value}
 
     @property
     def shown(self) -> tuple[Shown, ...]:
-        plain = [Shown("gray", bit) for bit in range(self.bits)]
-        inverse = [Shown("gray", bit, inverse=True) for bit in range(self.bits)]
+        order = range(self.bits)[:: -1 if self.least_first else 1]
+        plain, inverse = ([Shown("gray", bit, inverse=way) for bit in order] for way in (False, True))
         if self.inverse == "none":
             return tuple(plain)
         pairs = zip(plain, inverse, strict=True)
         return (*plain, *inverse) if self.inverse == "after all" else tuple(one for pair in pairs for one in pair)
 
+    @property
+    def rows(self) -> tuple[list[int], list[int]]:
+        """Rows of the plain and of the inverse frames, most significant bit first."""
+        shown = self.shown
+        ranked = sorted(range(len(shown)), key=lambda row: shown[row].step)
+        return [row for row in ranked if not shown[row].inverse], [row for row in ranked if shown[row].inverse]
+
     def check(self, length_px: int) -> None:
-        """Raise `RigError` where the bits are too few for a pattern ``length_px`` long."""
-        needed = bits_needed(length_px, 2 * self.cell_px)
+        """Raise `RigError` where the bits are too few for a pattern ``length_px`` long, or begin within it."""
+        if self.origin_px > 0:
+            raise RigError(f"origin_px: expected 0 or less, for every pixel to have a code, got {self.origin_px:g}")
+        needed = bits_needed(length_px - self.origin_px, 2 * self.cell_px)
         if self.bits < needed:
-            cells = cell_count(length_px, 2 * self.cell_px)
+            cells = cell_count(length_px - self.origin_px, 2 * self.cell_px)
             raise RigError(
                 f"bits: {length_px} px hold {cells} Gray cells of {self.cell_px:g} px, which need {needed} bits, got "
                 f"{self.bits}"
@@ -91,13 +109,18 @@ class GrayCells:
 
     def profiles(self, length_px: int) -> NDArray[np.uint8]:
         """The frames along the coordinate, uint8 (frames, length_px)."""
-        code = binary_to_gray(cell_of(np.arange(length_px), 2 * self.cell_px))
+        code = binary_to_gray(cell_of(np.arange(length_px) - self.origin_px, 2 * self.cell_px))
         rows = [(code >> (self.bits - 1 - shown.step) & 1) ^ shown.inverse for shown in self.shown]
         return (np.array(rows) * GREY_LEVELS).astype(np.uint8)
 
     def centre_px(self, number: NDArray[np.integer], length_px: int) -> NDArray[np.float64]:
         """Middle of the pixels of cells ``number``; NaN for a cell that the pattern does not hold."""
         centres = cell_centres_rad(length_px, 2 * self.cell_px) * (2 * self.cell_px / (2 * np.pi))
+        if self.origin_px:
+            count = cell_count(length_px - self.origin_px, 2 * self.cell_px)
+            edges = np.ceil(np.arange(count + 1) * self.cell_px + self.origin_px)
+            first, last = np.maximum(edges[:-1], 0), np.minimum(edges[1:], length_px) - 1
+            centres = np.where(first <= last, (first + last) / 2, np.nan)
         return np.append(centres, np.nan)[np.minimum(number, len(centres))]
 
     def decode(
@@ -105,10 +128,10 @@ class GrayCells:
     ) -> DecodedCells:
         """Cells of n pixels from grey levels (frames, n). ``threshold`` and ``modulation`` (n,): mean and amplitude of
         what the bits swing between; with inverse frames a bit is the half difference of its pair."""
-        shown = self.shown
-        bits = levels[[i for i, one in enumerate(shown) if not one.inverse]].astype(np.float64)
+        plain, inverse = self.rows
+        bits = levels[plain].astype(np.float64)
         if self.inverse != "none":
-            bits = threshold + (bits - levels[[i for i, one in enumerate(shown) if one.inverse]]) / 2
+            bits = threshold + (bits - levels[inverse]) / 2
         number, trusted = decode_cells(bits, threshold, modulation, ambiguous_fraction)
         doubtful = np.abs(bits - threshold) < ambiguous_fraction * modulation
         if not doubtful.any():
@@ -119,12 +142,19 @@ class GrayCells:
 
 @dataclass(frozen=True)
 class GrayOnly(Code):
-    """Gray code alone, with a black and a white frame as its threshold: a coordinate to a cell, and to the edge of two
-    where a bit is ambiguous there."""
+    """Gray code alone, with a black and a white frame as its threshold, or with inverse frames: a coordinate to a cell,
+    and to the edge of two where a bit is ambiguous there."""
 
     scheme: ClassVar[str] = "gray"
     cells: GrayCells
-    needs_flat = True
+
+    @property
+    def needs_flat(self) -> bool:
+        return self.cells.inverse == "none"
+
+    @property
+    def step_px(self) -> float:
+        return self.cells.cell_px / 2
 
     @classmethod
     def from_entries(cls, entries: Mapping[str, Any], length_px: int) -> "GrayOnly":
@@ -152,10 +182,15 @@ class GrayOnly(Code):
         return self.cells.profiles(length_px)
 
     def decode(self, levels: NDArray, length_px: int, limits: Limits) -> Coordinates:
-        black, white = levels[-2].astype(np.float64), levels[-1].astype(np.float64)
+        if self.needs_flat:
+            black, white = levels[-2].astype(np.float64), levels[-1].astype(np.float64)
+        else:
+            plain, inverse = (levels[rows].astype(np.float64) for rows in self.cells.rows)
+            black = np.minimum(plain, inverse).max(axis=0)
+            white = black + np.abs(plain - inverse).max(axis=0)  # the finest bits lose contrast to blur
         threshold, modulation = (white + black) / 2, (white - black) / 2
         fraction = min(limits.ambiguous_fraction, AMBIGUOUS_ALONE)
-        cells = self.cells.decode(levels[:-2], threshold, modulation, fraction)
+        cells = self.cells.decode(levels[: len(self.shown)], threshold, modulation, fraction)
         centre_px, other_px = (self.cells.centre_px(n, length_px) for n in (cells.number, cells.other))
         coordinate_px = np.where(np.isnan(other_px), centre_px, (centre_px + other_px) / 2)
         inconsistent = ~cells.trusted | np.isnan(centre_px)

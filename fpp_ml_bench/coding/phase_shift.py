@@ -131,7 +131,7 @@ class PhaseShift(Code):
         """Whether it is the paper's kind: equal steps of one period from pixel 0, Gray code in half periods."""
         (first, *others), gray = self.fringes, self.gray
         plain = not others and first.equal_steps and len(first.shifts_deg) >= 3 and self.origin_px == 0.0
-        return plain and gray is not None and gray.cell_px == first.pitch_px / 2 and gray.inverse == "none"
+        return plain and gray is not None and gray == GrayCells(first.pitch_px / 2, gray.bits)
 
     def check(self, length_px: int) -> None:
         for number, fringe in enumerate(self.fringes):

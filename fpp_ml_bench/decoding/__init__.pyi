@@ -1,5 +1,6 @@
 from .blocks import DirectionPlan as DirectionPlan
 from .blocks import decode_direction as decode_direction
+from .blocks import depth_and_reason as depth_and_reason
 from .blocks import plain_plan as plain_plan
 from .blocks import plan_direction as plan_direction
 from .checks import check_limits as check_limits
@@ -9,7 +10,6 @@ from .decode import decode_stack as decode_stack
 from .fewest import fewest_gray_bits as fewest_gray_bits
 from .fewest import fewest_plans as fewest_plans
 from .fewest import fewest_steps as fewest_steps
-from .frame_order import exchanged_frames as exchanged_frames
 from .triangulation import FIXED_POINT_STEPS as FIXED_POINT_STEPS
 from .triangulation import coordinate_slope_px_per_mm as coordinate_slope_px_per_mm
 from .triangulation import depth_from_both as depth_from_both

@@ -7,7 +7,7 @@ that can't be decoded has depth 0 and a reason.
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -208,6 +208,10 @@ def decode_stack(
             "crossed fringes alone can't be decoded pixel by pixel; project the horizontal or vertical code too, or "
             "use a method for crossed fringes"
         )
+    if len(directions) == 2:
+        # A code in cells misses the epipolar line by up to its own step.
+        step_px = float(np.hypot(*(rig.code(name).step_px for name in directions)))
+        limits = replace(limits, max_disagreement_px=limits.max_disagreement_px + step_px)
     plans, joint = [blocks.plan_direction(rig, name, steps, limits) for name in directions], None
     if fewest:
         plans, joint = fewest_plans(rig, plans)

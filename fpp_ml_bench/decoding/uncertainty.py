@@ -1,6 +1,6 @@
 """Standard uncertainty of decoded depth, from the noise of the frames."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -18,6 +18,7 @@ ASSUMED_NOISE_GREY = 1.0
 _SAMPLED_PX, _LEAST_PX = 50_000, 100
 _BRIGHTNESSES = 12  # groups of as many pixels each
 _LEAST_VARIANCE = 1 / 12  # of rounding to whole grey levels
+_HIGHEST_HARMONIC, _LEAST_HARMONIC = 4, 0.01
 _MEDIAN_OF_SQUARE = (0.4549, 0.6931, 0.7887, 0.8392, 0.8703, 0.8914)
 """Median of chi^2 / n for 1 to 6 degrees of freedom; (1 - 2 / (9 n))^3 for more."""
 
@@ -29,12 +30,14 @@ with ``--split validation --target depth_exact``); larger errors are more freque
 
 
 def depth_sigma_mm(
-    decoded: Decoded, rig: Rig, noise_grey: NDArray | float, steps: int | None = None, systematic_rad: float = 0.0
+    decoded: Decoded, rig: Rig, noise_grey: NDArray | float, steps: int | None = None,
+    systematic_rad: float | Mapping[str, float] = 0.0,
 ) -> NDArray[np.float32]:  # fmt: skip
     """Standard uncertainty of every decoded pixel in mm, float32 (H, W), 0 = none, from noise of ``noise_grey`` grey
     levels a frame, one number or (H, W). Of ``decoded`` with details, and with so many ``steps`` of each direction
-    (default: all). It is that of the noise, and of an error ``systematic_rad`` of every phase: gamma, blur, further
-    bounces. The calibration adds to it. Raises `DecodeError` for a decoding without details, or noise that is none."""
+    (default: all). It is that of the noise, and of an error ``systematic_rad`` of every phase, one for all or by
+    direction: gamma, blur, further bounces. The calibration adds to it. Raises `DecodeError` for a decoding without
+    details, or noise that is none."""
     if not decoded.details:
         raise DecodeError("details: missing; decode with details=True")
     noise = np.asarray(noise_grey, dtype=np.float64)
@@ -49,7 +52,8 @@ def depth_sigma_mm(
         fewer, systematic_px = 1.0, 0.0
         if isinstance(code, PhaseShift):
             fewer = 1.0 if steps is None else steps / len(code.fringes[0].shifts_deg)
-            systematic_px = code.pitch_px * systematic_rad / (2 * np.pi)
+            rad = systematic_rad if isinstance(systematic_rad, float) else systematic_rad.get(direction, 0.0)
+            systematic_px = code.pitch_px * rad / (2 * np.pi)
         sigma_px = np.hypot(code.sigma_px(modulation, of_found / np.sqrt(fewer)), systematic_px)
         slope = coordinate_slope_px_per_mm(rig, decoded.depth_mm[found], direction, (rays[0], rays[1]))
         precision += (slope / sigma_px) ** 2
@@ -110,4 +114,20 @@ def _unexplained(
             if lit.sum() < _LEAST_PX:
                 continue
             residual = levels - (mean + cosine * np.cos(angles)[:, None] + sine * np.sin(angles)[:, None])
+            residual[:, lit] -= _harmonics(residual[:, lit], cosine[lit], sine[lit], angles)
             yield mean[lit], (residual[:, lit] ** 2).sum(axis=0) / freedom, freedom
+
+
+def _harmonics(residual: NDArray, cosine: NDArray, sine: NDArray, angles: NDArray) -> NDArray[np.float64]:
+    """The part of residuals (N, n) that higher harmonics make, which all pixels share as a share of their modulation
+    (gamma), and that is no noise; 0 where the share is below `_LEAST_HARMONIC`, as in straight light."""
+    phase, modulation, part = np.arctan2(-sine, cosine), np.hypot(cosine, sine), np.zeros_like(residual)
+    for harmonic in range(2, min(len(angles) // 2, _HIGHEST_HARMONIC) + 1):
+        turned = harmonic * (phase + angles[:, None])
+        shares = []
+        for wave in (modulation * np.cos(turned), modulation * np.sin(turned)):
+            power = float((wave * wave).sum())
+            shares.append((float((residual * wave).sum()) / power if power > 0 else 0.0, wave))
+        if np.hypot(shares[0][0], shares[1][0]) > _LEAST_HARMONIC:
+            part += sum(share * wave for share, wave in shares)
+    return part

@@ -20,6 +20,7 @@ from .pinhole import is_distorted as is_distorted
 from .pinhole import undistort as undistort
 from .rig import Rig as Rig
 from .rig import rotation_matrix as rotation_matrix
+from .rig_file import check_lengths as check_lengths
 from .rig_file import load_projection as load_projection
 from .rig_file import load_rig as load_rig
 from .rig_file import rig_from_dict as rig_from_dict

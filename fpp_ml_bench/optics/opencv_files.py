@@ -188,7 +188,11 @@ def _matrix(nodes: dict[str, Any], what: str, *shapes: tuple[int, int] | None) -
     """The finite matrix of one of ``shapes``, or any vector for None, that the nodes hold under one of its names."""
     names = [name for name in _NAMES[what] if name in nodes]
     expected = f"{what}: expected a node {' or '.join(_NAMES[what])}"
-    require(names, f"{expected}, found {printable(', '.join(nodes)) or 'no nodes'}; rename it, or calibrate again")
+    require(
+        names,
+        f"{expected}, found {printable(', '.join(nodes)) or 'no nodes'}; if the file "
+        "is of another tool, write its numbers into the rig file (camera, projector, rotation, translation_m)",
+    )
     require(len(names) == 1, f"{expected}, found {' and '.join(names)}; keep one of them")
     node = nodes[names[0]]
     require(isinstance(node, dict), f"{names[0]} ({what}): expected a matrix, found {printable(node)}")
@@ -238,6 +242,13 @@ def _parsed(path: str) -> dict[str, Any]:
 
     def value(node: Any) -> Any:
         if node.isMap():
+            keys = node.keys()
+            if not {"rows", "cols", "data"} <= set(keys):  # well-formed, and no matrix: of another tool
+                return f"a mapping with the keys {', '.join(keys)}"
+            if "dt" not in keys:  # written by other tools
+                shape = [int(node.getNode(name).real()) for name in ("rows", "cols")]
+                data = np.array(value(node.getNode("data")), dtype=np.float64)
+                return {"shape": shape if data.size == shape[0] * shape[1] else data.shape, "data": data.tolist()}
             matrix = node.mat()
             matrix = np.zeros((0, 0)) if matrix is None else np.asarray(matrix, dtype=np.float64)
             return {"shape": matrix.shape, "data": matrix.ravel().tolist()}

@@ -17,7 +17,7 @@ The sequence above is the paper's. Any other is a code for one direction or both
       order: [white, vertical]                      # as captured; by default horizontal, vertical
       vertical: {scheme: phase-shift, pitches_px: [114, 1824], steps: 3, sign: -1}
       # or      {scheme: phase-shift, pitch_px: 36, shifts_deg: [0, 90, 180, 270], gray: {cell_px: 18, bits: 6}}
-      # or      {scheme: gray, cell_px: 2, inverse: after each}
+      # or      {scheme: gray, cell_px: 2, inverse: after each}; least_first: true, origin_px: -56 (where cell 0 begins)
       # or      {scheme: composite, pitches_px: [18, 22]}: one frame, the sum
 
 Crossed fringes are two carriers in a frame (`fpp_ml_bench.coding.Crossed`), beside codes or alone::
@@ -42,8 +42,9 @@ from typing import Any
 import numpy as np
 import yaml
 
+from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.files import strict_yaml
+from fpp_ml_bench.files import cause_of, strict_yaml
 from fpp_ml_bench.optics.opencv_files import read_opencv_calibration
 from fpp_ml_bench.optics.pinhole import Pinhole, numbers, require
 from fpp_ml_bench.optics.rig import Rig, middle_m, rotation_matrix
@@ -51,6 +52,8 @@ from fpp_ml_bench.optics.sequence import CODED_KEYS, DIRECTIONS, Direction, sequ
 
 _RIG_KEYS = ("camera", "projector", "rotation", "translation_m", "pitch_px", "sequence", "working_range_mm")
 _OPTIONAL_RIG_KEYS = ("standoff_m", "background_m")
+BASELINES_M, LEAST_FAR_MM, MOST_NEAR_MM = (0.005, 20.0), 10.0, 1e6
+"""Lengths of rigs: what lies outside is another unit. A wide limit: microscopes have 10 mm, halls 10 m."""
 
 
 def _mapping(value: object, keys: Iterable[str], name: str, optional: Iterable[str] = ()) -> dict[str, Any]:
@@ -111,7 +114,29 @@ def _is_json(path: Path) -> bool:
 
 def load_rig(path: str | Path) -> Rig:
     """Read a rig from a YAML or JSON file; raises `RigError` naming the file and the key that is wrong."""
-    return _loaded(Path(path), lambda data: rig_from_dict(_with_calibration(data, Path(path).parent)))
+
+    def build(data: object) -> Rig:
+        rig = rig_from_dict(_with_calibration(data, Path(path).parent))
+        named = isinstance(data, Mapping) and "calibration" in data
+        check_lengths(rig, "calibration.unit" if named else "translation_m")
+        return rig
+
+    return _loaded(Path(path), build)
+
+
+def check_lengths(rig: Rig, entry: str = "translation_m") -> None:
+    """Raise `RigError` for a baseline or a working range that no rig has, and name the unit that would fit. ``entry``:
+    where the baseline's unit is said."""
+    (least, most), (near, far) = BASELINES_M, rig.working_range_mm
+    baseline = rig.baseline_m
+    if not least <= baseline <= most:
+        read, unit, factor = ("mm", "m", MM_PER_M) if baseline < least else ("m", "mm", 1 / MM_PER_M)
+        fits = least <= baseline * factor <= most
+        hint = f"; read in {unit} it would be {MM_PER_M * factor * baseline:.4g} mm: say so ({entry})" if fits else ""
+        raise RigError(f"{entry}: a baseline of {MM_PER_M * baseline:.4g} mm, read in {read}, which no rig has{hint}")
+    if far < LEAST_FAR_MM or near > MOST_NEAR_MM:
+        metres = "; they look like metres: write them in mm" if far < LEAST_FAR_MM else ""
+        raise RigError(f"working_range_mm: {near:g} to {far:g} mm, where no rig looks{metres}")
 
 
 def load_projection(path: str | Path, camera_size: tuple[int, int] | None = None) -> Rig:
@@ -175,7 +200,7 @@ def _loaded(file: Path, build: Callable[[object], Rig]) -> Rig:
     except RigError as error:
         raise RigError(f"{file}: {error}") from error
     except (OSError, UnicodeDecodeError) as error:
-        raise RigError(f"{file}: can't be read as text: {error}") from error
+        raise RigError(f"{file}: can't be read as text: {cause_of(error)}") from error
     except (json.JSONDecodeError, yaml.YAMLError, RecursionError) as error:
         problem = str(error) or "nested too deeply"
         raise RigError(f"{file}: malformed {'JSON' if as_json else 'YAML'}: {problem}") from error

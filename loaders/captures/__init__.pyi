@@ -1,12 +1,16 @@
 from .board_poses import board_poses as board_poses
 from .board_poses import calibrated_rig as calibrated_rig
 from .board_poses import pose_folders as pose_folders
-from .decoding import REPORT as REPORT
 from .decoding import DecodedCapture as DecodedCapture
 from .decoding import decode_capture as decode_capture
+from .decoding import examine_capture as examine_capture
 from .decoding import read_mask as read_mask
 from .decoding import write_capture as write_capture
+from .decoding import write_refusal as write_refusal
 from .exports import FORMS as FORMS
+from .exports import REPORT as REPORT
+from .exports import check_outputs as check_outputs
+from .exports import clear_outputs as clear_outputs
 from .exports import export_capture as export_capture
 from .exports import pixel_normals as pixel_normals
 from .exports import triangles as triangles

@@ -5,10 +5,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fpp_ml_bench.calibration import Board, Calibration, Pose, Response, fit_response, levels_of, measure_pose
+from fpp_ml_bench.calibration import Board, Calibration, Levels, Pose, Response, fit_response, levels_of, measure_pose
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.errors import CalibrationError
+from fpp_ml_bench.examination import RefusedCapture, examine
 from fpp_ml_bench.loaders.captures.images import read_frames
 from fpp_ml_bench.optics import AXES, Rig, load_projection, rotation_matrix
 
@@ -31,12 +33,13 @@ def pose_folders(captures: Path) -> list[Path]:
 
 def board_poses(
     captures: Path, board: Board, sequence: Path, bits: int | None = None, colour: str | None = None,
-    progress: Callable[[int], None] = lambda poses: None,
+    progress: Callable[[int], None] = lambda poses: None, anyway: bool = False,
 ) -> tuple[list[Pose], Rig, Response | None]:  # fmt: skip
     """The board's points in every pose folder of ``captures``, in camera and projector px, a rig with the sequence of
     the rig file ``sequence`` that stands in for the one sought (`optics.load_projection`), and the response of
-    projector and camera where the captures tell it. ``bits`` and ``colour`` as in `read_frames`. Raises FppBenchError
-    naming the pose or file."""
+    projector and camera where the captures tell it. ``bits`` and ``colour`` as in `read_frames`. The
+    frames of every pose are examined; ``anyway`` takes those that are refused, too. Raises FppBenchError naming the
+    pose or file."""
     rig = load_projection(sequence)
     if len(rig.directions) < 2:
         coded = " and ".join(rig.directions) or "crossed fringes"
@@ -45,15 +48,21 @@ def board_poses(
             "project both directions on the board"
         )
     poses: list[Pose] = []
-    levels = []
+    levels: list[Levels] = []
+    seen: dict[int, tuple[Path, int]] = {}
     for folder in pose_folders(captures):
-        frames = read_frames(folder, count=len(rig.sequence), bits=bits, colour=colour).frames
+        capture = read_frames(folder, count=len(rig.sequence), bits=bits, colour=colour)
+        frames, names = capture.frames, [file.name for file in capture.files]
         height, width = frames.shape[1:]
         if not poses:
             rig = load_projection(sequence, (width, height))
         elif poses[0].size != (width, height):
             expected = f"{poses[0].size[0]} x {poses[0].size[1]} px as in {poses[0].name}"
             raise CalibrationError(f"{folder}: images of {width} x {height} px, expected {expected}")
+        _check_copies(folder, frames, seen)
+        examination = examine(frames, rig, names, calibrated=False)
+        if examination.refused and not anyway:
+            raise RefusedCapture(str(folder), examination)
         details = decode_stack(frames, rig, details=True).details
         white = rig.sequence.white
         lit = frames.mean(axis=0, dtype=np.float64) if white is None else frames[white]
@@ -63,6 +72,20 @@ def board_poses(
         levels += [] if measured is None else [measured]
         progress(1)
     return poses, rig, fit_response(levels)
+
+
+def _check_copies(folder: Path, frames: NDArray, seen: dict[int, tuple[Path, int]]) -> None:
+    """Raise `CalibrationError` for an image that an earlier pose holds, too, byte for byte; ``seen`` is filled."""
+    for index, frame in enumerate(frames):
+        if np.ptp(frame) == 0:
+            continue
+        key = hash(frame.tobytes())
+        other, of_other = seen.setdefault(key, (folder, index))
+        if other != folder:
+            raise CalibrationError(
+                f"{folder}: image {index} is that of {other.name} (image {of_other}), byte for byte: two poses "
+                "can't share an image; put this pose's own frames there, or remove it"
+            )
 
 
 def calibrated_rig(found: Calibration, stand_in: Rig, range_mm: tuple[float, float] | None = None) -> Rig:

@@ -2,7 +2,7 @@
 
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -16,32 +16,40 @@ from fpp_ml_bench.decoding import (
     ASSUMED_NOISE_GREY,
     Decoded,
     Directions,
+    check_limits,
     decode_stack,
     depth_sigma_mm,
-    exchanged_frames,
     noise_of_frames,
 )
 from fpp_ml_bench.errors import CaptureError, DecodeError
-from fpp_ml_bench.files import write_atomically
-from fpp_ml_bench.loaders.captures.exports import FORMS, export_capture
+from fpp_ml_bench.examination import Examination, RefusedCapture, examine
+from fpp_ml_bench.files import cause_of, write_atomically
+from fpp_ml_bench.loaders.captures.exports import FORMS, REPORT, clear_outputs, export_capture
 from fpp_ml_bench.loaders.captures.images import CapturedFrames, read_frames
 from fpp_ml_bench.loaders.captures.picture import capture_picture
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics import Direction, Rig
 
-REPORT = "decode.json"
 CLIPPED_SHARE = 0.02
 """A frame in which more of the lit pixels than this are at full scale is named."""
-_CURES = {
-    "outside_range": "the depths lie outside the range: --range",
-    "low_modulation": "the fringes are too faint: exposure, or --min-modulation",
-    "inconsistent_order": "the code contradicts itself: check the rig's sequence (sign, order, periods)",
+CAUSES = {
+    Reason.NO_RAY: "the rig's lens model or pose is not this scanner's",
+    Reason.LOW_MODULATION: "the fringes are too faint (too dark, overexposed, --min-modulation), or the frames are not "
+    "in the order of the rig's sequence",
+    Reason.SATURATED: "the frames are overexposed",
+    Reason.INCONSISTENT_ORDER: "the sequence (order, steps, sign, pitches, Gray code) is not what was projected",
+    Reason.OUTSIDE_PATTERN: "the sequence (order, sign, pitches) or the projector's size is not what was projected",
+    Reason.DIRECTIONS_DISAGREE: "the rig's pose is not this scanner's, or the directions are swapped",
+    Reason.OUTSIDE_RANGE: "working_range_mm does not hold the object (--range), or the rig's pose or unit is not this "
+    "scanner's",
 }
+"""Why nothing is decoded, by the reason of most pixels."""
 
 
 @dataclass(frozen=True)
 class DecodedCapture:
     """A decoded capture: maps (H, W) of standard uncertainty by noise in mm (0 = no depth), modulation and mean of the
-    frames in grey levels; the noise of a frame, and whether the frames told it; ``notes`` are sentences."""
+    frames in grey levels; the noise of a frame, and whether the frames told it; ``notes`` are sentences;
+    ``examination``: what the frames say about themselves."""
 
     decoded: Decoded
     sigma_mm: NDArray[np.float32]
@@ -50,29 +58,21 @@ class DecodedCapture:
     noise_grey: float
     noise_measured: bool
     notes: tuple[str, ...]
+    examination: Examination
 
 
 def decode_capture(
     capture: CapturedFrames, rig: Rig, direction: Directions = "both", *, mask: NDArray[np.bool_] | None = None,
-    min_modulation: float = MIN_MODULATION, noise_grey: float | None = None, threads: int = 1,
+    min_modulation: float = MIN_MODULATION, noise_grey: float | None = None, threads: int = 1, anyway: bool = False,
 ) -> DecodedCapture:  # fmt: skip
     """Depth of a capture and what goes with it; arguments as in `decode_stack`. ``noise_grey``: of a frame, by default
-    measured where there are four steps and more, else `ASSUMED_NOISE_GREY`. Raises `CaptureError` for images of another
-    size than the rig's and frames that changed places, `DecodeError` where nothing can be decoded."""
+    measured where there are four steps and more, else `ASSUMED_NOISE_GREY`. The frames are examined first: raises
+    `RefusedCapture` where a finding makes the depth untrustworthy, unless ``anyway``; `CaptureError` for images of
+    another size than the rig's, `DecodeError` where nothing can be decoded."""
     frames, names = capture.frames, [file.name for file in capture.files]
-    if frames.shape[1:] != (rig.camera.height, rig.camera.width):
-        height, width = frames.shape[1:]
-        raise CaptureError(
-            f"{capture.files[0].parent}: images of {width} x {height} px, and the rig has a camera of "
-            f"{rig.camera.width} x {rig.camera.height} px; give the rig that these images were captured with"
-        )
-    pair = exchanged_frames(list(frames), rig)
-    if pair is not None:
-        shown = [rig.sequence.frames[index].title.partition(": ")[2] for index in pair]
-        raise CaptureError(
-            f"{names[pair[0]]} and {names[pair[1]]} seem to have changed places ({shown[0]}, {shown[1]}): as they are, "
-            "most lit pixels contradict the code, and exchanged they fit; rename them, or correct the rig's sequence"
-        )
+    examination = examine_capture(capture, rig, direction, mask=mask, min_modulation=min_modulation)
+    if examination.refused and not anyway:
+        raise RefusedCapture(str(capture.files[0].parent), examination)
     limits = Limits(min_modulation=min_modulation)
     decoded = decode_stack(frames, rig, direction, mask=mask, limits=limits, details=True, threads=threads)
     modulation = np.nanmax([measured.modulation for measured in decoded.details.values()], axis=0)
@@ -83,13 +83,38 @@ def decode_capture(
         notes.append(f"three steps can't tell their noise; {noise:g} grey level assumed, --noise sets it")
     notes += _clipped(frames, names, modulation >= min_modulation)
     if not decoded.depth_mm.any():
-        causes = {name: pixels for name, pixels in decoded.counts.items() if name != "not_asked"}
-        cause = max(causes, key=lambda name: causes[name])
-        cure = _CURES.get(cause, "check the rig and its sequence")
-        raise DecodeError(f"no pixel could be decoded; of most pixels: {cause.replace('_', ' ')}; {cure}")
-    sigma_mm = depth_sigma_mm(decoded, rig, noise)
+        cause = main_reason(decoded)
+        name = cause.name.lower().replace("_", " ")
+        raise DecodeError(f"no pixel could be decoded; of most pixels: {name}; probably {CAUSES[cause]}")
+    sigma_mm = depth_sigma_mm(decoded, rig, noise, systematic_rad=examination.systematic_rad)
     grey = frames.mean(axis=0, dtype=np.float64).astype(np.float32)
-    return DecodedCapture(decoded, sigma_mm, modulation, grey, noise, measured_grey is not None, tuple(notes))
+    return DecodedCapture(
+        decoded, sigma_mm, modulation, grey, noise, measured_grey is not None, tuple(notes), examination
+    )
+
+
+def examine_capture(
+    capture: CapturedFrames, rig: Rig, direction: Directions = "both", *, mask: NDArray[np.bool_] | None = None,
+    min_modulation: float = MIN_MODULATION,
+) -> Examination:  # fmt: skip
+    """What the frames of a capture say about themselves (`fpp_ml_bench.examination`), before they are decoded. Raises
+    `CaptureError` for images of another size than the rig's, `RigError` for a direction that it does not code."""
+    height, width = capture.frames.shape[1:]
+    if (height, width) != (rig.camera.height, rig.camera.width):
+        raise CaptureError(
+            f"{capture.files[0].parent}: frames of {width} x {height} px, and the rig has a camera of "
+            f"{rig.camera.width} x {rig.camera.height} px; give the rig that took them"
+        )
+    directions: tuple[Direction, ...] = rig.directions if direction == "both" else (direction,)
+    limits = Limits(min_modulation=min_modulation)
+    check_limits(limits)
+    names = [file.name for file in capture.files]
+    return examine(capture.frames, rig, names, directions=directions, mask=mask, limits=limits)
+
+
+def main_reason(decoded: Decoded) -> Reason:
+    """The reason of most pixels without depth."""
+    return max(CAUSES, key=lambda reason: decoded.counts[reason.name.lower()])
 
 
 def _clipped(frames: NDArray, names: Sequence[str], lit: NDArray[np.bool_]) -> list[str]:
@@ -109,7 +134,7 @@ def read_mask(file: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
         try:
             values = np.load(file, allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
-            raise CaptureError(f"{file}: expected a mask as .npy, can't be read: {error}") from error
+            raise CaptureError(f"{file}: expected a mask as .npy, can't be read: {cause_of(error)}") from error
     else:
         values = read_frames(file).frames[0]
     if values.shape != shape:
@@ -123,8 +148,9 @@ def read_mask(file: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
 def write_capture(
     folder: Path, capture: CapturedFrames, rig: Rig, result: DecodedCapture, forms: Sequence[str] = FORMS
 ) -> None:
-    """Write a decoded capture: the ``forms`` of `export_capture`, maps as .npy, `REPORT`, and with matplotlib a
-    picture."""
+    """Write a decoded capture in place of what an earlier decoding left in ``folder``: the ``forms`` of
+    `export_capture`, maps as .npy, with matplotlib a picture, and `REPORT` at last."""
+    clear_outputs(folder)
     decoded, found = result.decoded, result.decoded.depth_mm > 0
     export_capture(folder, decoded.depth_mm, rig.camera, result.grey, forms)
     for name, values in (("sigma_mm", result.sigma_mm), ("modulation", result.modulation), ("reason", decoded.reason)):
@@ -134,11 +160,26 @@ def write_capture(
     if find_spec("matplotlib"):  # of the extra page
         title = f"{capture.files[0].parent.name}: {100 * found.mean():.1f}% of the pixels with depth"
         maps = result.grey, decoded.depth_mm, result.sigma_mm, result.modulation, decoded.reason
-        write_atomically(folder / "picture.png", capture_picture(title, *maps))
+        findings = result.examination.findings
+        write_atomically(folder / "picture.png", capture_picture(title, *maps, [str(one) for one in findings]))
     content = {
-        "rig": rig.to_dict(), "frames": [file.name for file in capture.files], "full_scale": capture.full_scale,
         "pixels": decoded.counts, "noise_grey": result.noise_grey, "noise_measured": result.noise_measured,
         "median_sigma_mm": float(np.median(result.sigma_mm[found])), "notes": list(result.notes),
         "reasons": {reason.name.lower(): int(reason) for reason in Reason},
     }  # fmt: skip
-    write_atomically(folder / REPORT, (json.dumps(content, indent=1) + "\n").encode())
+    _write_report(folder, capture, rig, result.examination, content)
+
+
+def write_refusal(folder: Path, capture: CapturedFrames, rig: Rig, examination: Examination) -> None:
+    """Write `REPORT` alone, in place of what an earlier decoding left in ``folder``."""
+    clear_outputs(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_report(folder, capture, rig, examination, {})
+
+
+def _write_report(
+    folder: Path, capture: CapturedFrames, rig: Rig, examination: Examination, content: Mapping[str, object]
+) -> None:
+    report = {"rig": rig.to_dict(), "frames": [file.name for file in capture.files], "full_scale": capture.full_scale,
+              "examination": examination.to_dict(), **content}  # fmt: skip
+    write_atomically(folder / REPORT, (json.dumps(report, indent=1) + "\n").encode())

@@ -4,6 +4,7 @@ Points are in mm in the camera's frame (x right, y down, z forward), their norma
 """
 
 import io
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,6 +18,12 @@ from fpp_ml_bench.loaders.published import matrix_bytes
 from fpp_ml_bench.optics import Pinhole
 
 FORMS = ("npy", "mat", "png", "ply", "mesh")
+REPORT = "decode.json"
+_WRITTEN = re.compile(
+    r"\.?(decode\.json|(depth|sigma_mm|modulation|reason)\.npy|depth\.mat|depth_[0-9.]+mm\.png|(points|mesh)\.ply|picture\.png)"
+    r"(\.[0-9]+\.tmp)?"
+)
+"""Names that a decoding writes, and the temporary files of one that was killed."""
 STEEPEST = 5.0
 """Neighbouring pixels are one surface where depth changes by at most this many times their distance across the ray: a
 surface inclined by up to 79 degrees."""
@@ -199,3 +206,28 @@ def _ply(
         colours = np.stack([shade, shade, shade, np.full_like(shade, 255)], axis=-1)
         solid.visual = trimesh.visual.ColorVisuals(solid, vertex_colors=colours)
     return trimesh.exchange.ply.export_ply(solid, vertex_normal=True)
+
+
+def check_outputs(folder: Path) -> None:
+    """Raise `CaptureError` for a folder that holds files which no decoding writes, or a file in its place."""
+    if folder.exists() and not folder.is_dir():
+        raise CaptureError(f"{folder}: expected a folder for the results, found a file; give another name")
+    if not folder.is_dir():
+        return
+    others = sorted(path.name for path in folder.iterdir() if not _WRITTEN.fullmatch(path.name))
+    if others:
+        listed = ", ".join(others[:4]) + (f" and {len(others) - 4} more" if len(others) > 4 else "")
+        raise CaptureError(f"{folder}: not empty, and holds what no decoding writes ({listed}); give a new folder")
+
+
+def clear_outputs(folder: Path) -> None:
+    """Remove what an earlier decoding left in ``folder``, also one that was killed; its report first, without which the
+    rest is no result. Raises `CaptureError` as `check_outputs`, and where a file can't be removed."""
+    check_outputs(folder)
+    if not folder.is_dir():
+        return
+    try:
+        for path in sorted(folder.iterdir(), key=lambda path: path.name != REPORT):
+            path.unlink()
+    except OSError as error:
+        raise CaptureError(f"{error.filename}: can't be removed ({error.strerror}); give a new folder") from error

@@ -10,7 +10,7 @@ from pydantic import Field
 
 from fpp_ml_bench.constants import SPLITS, sample_name
 from fpp_ml_bench.errors import BuildError, CaptureError
-from fpp_ml_bench.files import strict_yaml
+from fpp_ml_bench.files import cause_of, strict_yaml
 from fpp_ml_bench.loaders.captures.images import SUFFIXES, frame_files, natural_key
 from fpp_ml_bench.schema import StrictModel, Text, validate
 
@@ -47,7 +47,7 @@ def read_splits(file: Path) -> Splits:
     try:
         content = strict_yaml(file.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        raise BuildError(f"{file}: can't be read as YAML: {error}") from error
+        raise BuildError(f"{file}: can't be read as YAML: {cause_of(error)}") from error
     return validate(Splits, content, file, f"list of {', '.join(SPLITS)}", BuildError)
 
 

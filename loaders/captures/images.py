@@ -8,7 +8,7 @@ import io
 import re
 import struct
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -36,6 +36,12 @@ _WHOLE_BITS = (8, 10, 12, 14, 16)
 _LARGEST_BYTES = 1 << 30
 _BITS_PER_SAMPLE, _PHOTOMETRIC = 258, 262
 _THREADS = 4
+_ORIENTATION = 274
+_UPRIGHT: dict[int, Callable[[NDArray[Any]], NDArray[Any]]] = {
+    2: np.fliplr, 3: lambda levels: np.rot90(levels, 2), 4: np.flipud, 5: lambda levels: np.swapaxes(levels, 0, 1),
+    6: lambda levels: np.rot90(levels, -1), 7: lambda levels: np.swapaxes(np.rot90(levels, 2), 0, 1), 8: np.rot90,
+}  # fmt: skip
+"""What makes an image upright, by its EXIF orientation."""
 
 
 @dataclass(frozen=True)
@@ -200,9 +206,10 @@ def _read(file: Path, colour: str | None) -> _Image:
         if getattr(image, "n_frames", 1) != 1:
             raise CaptureError(f"{file}: expected one image, found {image.n_frames}; write each frame to its own file")  # type: ignore[attr-defined]
         _check_complete(content, image.format, file)
+        orientation = image.getexif().get(_ORIENTATION, 1)
         image.load()
         bits = _stored_bits(image, content)
-        levels = _levels(image, content, bits, file)
+        levels = _levels(image, content, bits, orientation, file)
     except CaptureError:
         raise
     except Exception as error:  # Pillow's readers raise errors of any kind on damaged files
@@ -236,8 +243,10 @@ def _stored_bits(image: Any, content: bytes) -> int:
     return 5 if pixel_bits == 16 else min(pixel_bits, 8)
 
 
-def _levels(image: Any, content: bytes, bits: int, file: Path) -> NDArray[Any]:
-    """Stored levels uint8 or uint16 (H, W), or (H, W, 3) red, green, blue; opaque alpha dropped."""
+def _levels(image: Any, content: bytes, bits: int, orientation: int, file: Path) -> NDArray[Any]:
+    """Stored levels uint8 or uint16 (H, W), or (H, W, 3) red, green, blue, upright by the EXIF ``orientation``; opaque
+    alpha dropped."""
+    upright = _UPRIGHT.get(orientation, lambda levels: levels)
     if image.mode not in _GREY_MODES + _COLOUR_MODES or not 8 <= bits <= 16:
         kind = f"mode {image.mode} of {bits} bits; write whole grey levels"
         raise CaptureError(f"{file}: expected grey levels or RGB of 8 to 16 bits, found {kind}")
@@ -250,12 +259,13 @@ def _levels(image: Any, content: bytes, bits: int, file: Path) -> NDArray[Any]:
         import cv2
 
         stored = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-        if stored is None or stored.dtype != np.uint16 or stored.shape[:2] != (image.height, image.width):
+        if stored is None or stored.dtype != np.uint16 or sorted(stored.shape[:2]) != sorted(image.size):
             raise CaptureError(f"{file}: colour of {bits} bits that OpenCV can't decode; write it as grey levels")
-        levels = stored[..., [2, 1, 0, *range(3, stored.shape[2])]]
+        levels = upright(stored[..., [2, 1, 0, *range(3, stored.shape[2])]])
     else:
         shown = image.convert("RGBA" if image.mode == "PA" else "RGB") if image.mode in ("P", "PA") else image
         levels = np.asarray(shown).astype(np.uint16 if bits > 8 else np.uint8)
+        levels = levels if image.format == "TIFF" else upright(levels)  # Pillow has turned a TIFF already
     if levels.ndim == 3 and levels.shape[2] in (2, 4):
         opaque = (1 << bits) - 1
         if not (levels[..., -1] == opaque).all():

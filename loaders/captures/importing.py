@@ -14,7 +14,9 @@ from fpp_ml_bench import __version__
 from fpp_ml_bench.coding import Limits, Reason
 from fpp_ml_bench.decoding import Decoded, check_limits, decode_stack
 from fpp_ml_bench.errors import CaptureError, DecodeError
+from fpp_ml_bench.examination import RefusedCapture
 from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.loaders.captures.decoding import CAUSES, examine_capture, main_reason
 from fpp_ml_bench.loaders.captures.folders import Capture, Splits, find_captures, split_captures
 from fpp_ml_bench.loaders.captures.images import CapturedFrames, check_options, read_frames
 from fpp_ml_bench.loaders.sample import Row
@@ -23,22 +25,7 @@ from fpp_ml_bench.optics import Rig
 
 LEAST_DECODED_SHARE = 0.005
 """Of a capture's pixels. Below it nothing was measured but noise that passed by chance."""
-LEAST_AGREEING_SHARE = 0.5
-"""Of the pixels with a clear signal. With a wrong rig or order of the frames, some get a depth by chance."""
-_CONTRADICTIONS = (
-    Reason.NO_RAY, Reason.INCONSISTENT_ORDER, Reason.OUTSIDE_PATTERN, Reason.DIRECTIONS_DISAGREE,
-)  # fmt: skip
 _CHECK_THREADS = 2
-_CAUSES = {
-    Reason.NO_RAY: "the rig's lens model or pose is not this scanner's",
-    Reason.LOW_MODULATION: "the frames are too dark, overexposed, or not in the order of the rig's sequence",
-    Reason.SATURATED: "the frames are overexposed",
-    Reason.INCONSISTENT_ORDER: "the sequence (order, steps, sign, pitches, Gray code) is not what was projected",
-    Reason.OUTSIDE_PATTERN: "the sequence (order, sign, pitches) or the projector's size is not what was projected",
-    Reason.DIRECTIONS_DISAGREE: "the rig's pose is not this scanner's, or the directions are swapped",
-    Reason.OUTSIDE_RANGE: "working_range_mm does not hold the object, or the rig's pose or unit is not this scanner's",
-}
-"""Why nothing is decoded, by the reason of most pixels."""
 
 
 @dataclass(frozen=True)
@@ -50,6 +37,7 @@ class CaptureReader:
     limits: Limits
     bits: int | None
     colour: str | None
+    anyway: bool = False
 
     def __call__(self, plan: ShardPlan, folder: Path) -> Iterator[Row]:
         for sample, _, _ in plan.samples:
@@ -68,27 +56,24 @@ class CaptureReader:
 
     def read(self, capture: Capture) -> Row:
         """The capture's row: frames of 8 bits, and depth from the frames as they were captured. Raises `CaptureError`
-        for frames that can't be read, that are of another size than the rig's camera, and that give almost no depth."""
+        for frames that can't be read, that are of another size than the rig's camera, that the examination refuses
+        (unless ``anyway``), and that give almost no depth."""
         captured = read_frames(capture.files, bits=self.bits, colour=self.colour)
-        height, width = captured.frames[0].shape
-        camera = self.rig.camera
-        if (height, width) != (camera.height, camera.width):
-            raise CaptureError(
-                f"{capture.folder}: frames of {width} x {height} px, and the rig's camera has {camera.width} x "
-                f"{camera.height} px; give the rig that took them"
-            )
+        examination = examine_capture(captured, self.rig, min_modulation=self.limits.min_modulation)
+        if examination.refused and not self.anyway:
+            raise RefusedCapture(str(capture.folder), examination)
         try:
             decoded = decode_stack(captured.frames, self.rig, limits=self.limits, details=True)
         except DecodeError as error:
             raise CaptureError(f"{capture.folder}: {error}") from error
-        measured = _measured(decoded, captured)
+        measured = _measured(decoded, captured) | {"findings": [str(finding) for finding in examination.findings]}
         if measured["decoded_share"] < LEAST_DECODED_SHARE:
-            reason = max(_CAUSES, key=lambda reason: decoded.counts[reason.name.lower()])
+            reason = main_reason(decoded)
             share = decoded.counts[reason.name.lower()] / decoded.reason.size
             raise CaptureError(
                 f"{capture.folder}: only {100 * measured['decoded_share']:.2f}% of the pixels can be decoded, expected "
                 f"at least {100 * LEAST_DECODED_SHARE:g}%; {100 * share:.0f}% are refused as "
-                f"{reason.name.lower().replace('_', ' ')}: probably {_CAUSES[reason]}"
+                f"{reason.name.lower().replace('_', ' ')}: probably {CAUSES[reason]}"
             )
         frames = {index: _eight_bits(frame) for index, frame in enumerate(captured.frames)}
         names = capture.sample, capture.object, capture.view
@@ -130,12 +115,13 @@ class CapturePlan(NamedTuple):
 
 def plan_captures(
     root: Path, rig: Rig, splits: Splits | None = None, limits: Limits | None = None, bits: int | None = None,
-    colour: str | None = None,
+    colour: str | None = None, anyway: bool = False,
 ) -> CapturePlan:  # fmt: skip
     """Find the captures ``root/{object}/{view}/`` or ``root/{object}/``, each a folder of all frames of
     ``rig.sequence``. ``splits``: which objects are in which; None puts all into ``test``. ``limits``: of the decoder;
-    ``bits`` and ``colour``: see `read_frames`. Raises `CaptureError` with a line for each folder that is no capture,
-    `BuildError` for splits that are not of these objects, `DecodeError` for an impossible limit."""
+    ``bits`` and ``colour``: see `read_frames`; ``anyway``: captures that the examination refuses too.
+    Raises `CaptureError` with a line for each folder that is no capture, `BuildError` for splits that are not of these
+    objects, `DecodeError` for an impossible limit."""
     check_options(bits, colour)
     check_limits(limits := limits or Limits())
     captures = find_captures(root, len(rig.sequence))
@@ -151,7 +137,7 @@ def plan_captures(
     }  # fmt: skip
     generator = {"name": "fpp-ml-bench", "version": __version__}
     manifest = Manifest(CAPTURED, generator, settings, rig.to_dict(), size, "all", exact=False)
-    reader = CaptureReader({capture.sample: capture for capture in captures}, rig, limits, bits, colour)
+    reader = CaptureReader({capture.sample: capture for capture in captures}, rig, limits, bits, colour, anyway)
     return CapturePlan(reader, Assembly(plans, reader, manifest))
 
 
@@ -182,11 +168,5 @@ def capture_notes(manifest: Manifest) -> list[str]:
     if len(scales) > 1:
         listed = ", ".join(map(str, scales))
         notes.append(f"white was taken as different levels ({listed}); give the camera's --bits to read all alike")
-    for row in rows:
-        wrong = sum(row["refused_share"].get(reason.name.lower(), 0.0) for reason in _CONTRADICTIONS)
-        if row["decoded_share"] < LEAST_AGREEING_SHARE * (row["decoded_share"] + wrong):
-            notes.append(
-                f"warning: {row['sample']}: more pixels contradict the rig ({100 * wrong:.1f}%) than have a depth "
-                f"({100 * row['decoded_share']:.1f}%), so the depth may be chance; check the rig and the frames' order"
-            )
+    notes += [f"{row['sample']}: {finding}" for row in rows for finding in row["findings"]]
     return notes

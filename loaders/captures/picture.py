@@ -1,6 +1,8 @@
 """A decoded capture as a picture: a frame, depth, its uncertainty, modulation, and why pixels have no depth."""
 
 import io
+from collections.abc import Sequence
+from textwrap import wrap
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,20 +15,24 @@ _REASONS = {
     Reason.OUTSIDE_PATTERN: "outside the pattern", Reason.DIRECTIONS_DISAGREE: "directions disagree",
     Reason.OUTSIDE_RANGE: "outside the range", Reason.NOT_ASKED: "not asked",
 }  # fmt: skip
+_COLUMNS = 250
 _COLOURS = ("#3ca951", "#9498a0", "#22252b", "#ff725c", "#efb118", "#a463f2", "#ff8ab7", "#4269d0", "#ffffff")
 
 
 def capture_picture(
     title: str, grey: NDArray, depth_mm: NDArray[np.float32], sigma_mm: NDArray[np.float32], modulation: NDArray,
-    reason: NDArray[np.uint8],
+    reason: NDArray[np.uint8], findings: Sequence[str] = (),
 ) -> bytes:  # fmt: skip
     """PNG of maps (H, W): a frame in grey levels, depth and standard uncertainty in mm (0 = none), modulation in grey
-    levels, and `Reason` codes."""
+    levels, and `Reason` codes; the ``findings`` stand below it."""
     from matplotlib.colors import ListedColormap
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    figure = Figure(figsize=(17, 3.9), dpi=100, layout="constrained")
+    lines = [line for finding in findings for line in wrap(finding, _COLUMNS)]
+    figure = Figure(figsize=(17, 3.9 + 0.17 * len(lines)), dpi=100, layout="constrained")
+    if lines:
+        figure.supxlabel("\n".join(lines), fontsize=8, x=0.01, ha="left", color="#b00020")
     figure.suptitle(title, fontsize=11)
     found = depth_mm > 0
     low, high = np.quantile(depth_mm[found], (0.005, 0.995)) if found.any() else (0.0, 1.0)

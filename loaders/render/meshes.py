@@ -12,7 +12,7 @@ import yaml
 
 from fpp_ml_bench.constants import OBJECTS, SPLITS, UNSEEN
 from fpp_ml_bench.errors import MeshError
-from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.files import cause_of, write_atomically
 from fpp_ml_bench.loaders.render.mesh_files import MESH_SUFFIXES, content_hash, read_mesh
 from fpp_ml_bench.loaders.render.objects import object_mesh
 from fpp_ml_bench.loaders.render.scene import SolidMesh, UserMesh
@@ -65,7 +65,7 @@ def read_mesh_list(path: Path) -> tuple[UserMesh, ...]:
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise MeshError(f"{path}: can't be read as YAML ({error})") from error
+        raise MeshError(f"{path}: can't be read as YAML ({cause_of(error)})") from error
     if not isinstance(content, list) or not content:
         raise MeshError(f"{path}: expected a list of meshes, each with name and path, got {type(content).__name__}")
     meshes = tuple(_entry(entry, f"{path}, entry {i + 1}", path.parent) for i, entry in enumerate(content))

@@ -10,7 +10,7 @@ from typing import Any
 
 from fpp_ml_bench.constants import SCHEMA_VERSION, SPLITS
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.files import file_hash, write_atomically
+from fpp_ml_bench.files import cause_of, file_hash, write_atomically
 from fpp_ml_bench.loaders.sample import stored_frames
 from fpp_ml_bench.optics import AnySequence, rig_from_dict
 
@@ -125,7 +125,7 @@ def read_manifest(folder: Path) -> Manifest:
             raise DatasetError(f"{path}: unknown split {sorted(unknown)[0]!r}, expected {', '.join(SPLITS)}")
         actual = manifest.fingerprint
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise DatasetError(f"{path}: damaged ({error}); build or import the dataset again") from error
+        raise DatasetError(f"{path}: damaged ({cause_of(error)}); build or import the dataset again") from error
     if actual != claimed:
         raise DatasetError(f"{path}: damaged, its fingerprint does not match its content; build the dataset again")
     return manifest

@@ -101,8 +101,11 @@ def test_frames_that_changed_places_are_named(capture, tmp_path, capsys, pair):
     frames[pair[0]], frames[pair[1]] = frames[pair[1]], frames[pair[0]]
     assert decode(folder, written(folder, frames, tmp_path), tmp_path / "out") == 2
     said = capsys.readouterr().err
-    assert f"frame_{pair[0]}.png and frame_{pair[1]}.png seem to have changed places" in said
-    assert not (tmp_path / "out").exists()
+    titles = [load_rig(folder / "rig.yaml").sequence.frames[index].title for index in pair]
+    assert f"frames that changed places: {titles[0]} and {titles[1]}" in said
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["decode.json"]
+    report = json.loads((tmp_path / "out" / "decode.json").read_text())
+    assert report["examination"]["findings"][0]["severity"] == "refuse" and "pixels" not in report
 
 
 def test_saturated_frames_are_named(capture, tmp_path, capsys):
@@ -126,7 +129,7 @@ def test_twelve_bits_decode_more_finely(capture, tmp_path):
 @pytest.mark.parametrize(
     "words, said",
     [
-        (["--range", "1,2"], "outside the range: --range"),
+        (["--range", "1,2"], "1 to 2 mm, where no rig looks"),
         (["--min-modulation", "200"], "too faint"),
         (["--min-modulation", "0"], "min_modulation: expected a positive"),
         (["--direction", "horizontal"], "no horizontal"),

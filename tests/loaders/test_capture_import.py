@@ -225,15 +225,17 @@ def test_shards_hold_few_large_images():
     assert len(plan_rows("test", samples, 1 << 28)) == 60
 
 
-def test_a_depth_by_chance_is_warned_of(scanned, capsys):
+def test_frames_in_another_order_are_refused_and_imported_anyway(scanned, capsys):
     """The frames in the opposite order: some pixels get a depth all the same."""
     files = sorted((scanned / "scans" / "bolt").iterdir())
     contents = [file.read_bytes() for file in files]
     for file, content in zip(files, reversed(contents), strict=True):
         file.write_bytes(content)
-    assert importing(scanned) == 0
-    warnings = [line for line in capsys.readouterr().out.splitlines() if "warning" in line]
-    assert len(warnings) == 1 and "bolt_single: more pixels contradict the rig" in warnings[0]
+    assert importing(scanned) == 2
+    assert "bolt: another reading fits" in (said := capsys.readouterr().err) and "in the opposite order" in said
+    assert importing(scanned, "--anyway") == 0
+    assert "bolt_single: another reading fits" in capsys.readouterr().out
+    assert "another reading fits" in DatasetFolder(scanned / "set").measured("bolt_single")["findings"][0]
 
 
 def of_many(folder):
@@ -310,7 +312,7 @@ BAD = {
     "unreadable image": (of_many, r"(?s)bolt/frame_3\.png.*\n.*front/frame_2\.png"),
     "lossy image": (changed(jpeg), r"frame_3\.jpg.*JPEG"),
     "frames of two sizes": (changed(other_size), "91 x 70 px"),
-    "another size": (of_frames(lambda image: image[:60]), "bolt: frames of 90 x 60 px, .*has 90 x 70 px"),
+    "another size": (of_frames(lambda image: image[:60]), "bolt: frames of 90 x 60 px, .*camera of 90 x 70 px"),
     "colour": (of_frames(lambda image: np.stack([image, image // 2, image], -1)), "colour channels differ"),
     "empty object": (changed(in_scans("empty")), "empty: expected a folder with images"),
     "empty view": (changed(in_scans("gear_wheel/top")), "top: expected a folder with images"),
@@ -328,9 +330,9 @@ BAD = {
     "splits that are no list": (splits("{test: bolt}"), "test: .*list"),
     "malformed splits": (splits("{test: ["), "can't be read as YAML"),
     "no splits file": (lambda f: ("--splits", f / "none.yaml"), "none.yaml: can't be read"),
-    "dark": (of_frames(lambda image: image // 40), "refused as low modulation: probably the frames are too dark"),
+    "dark": (of_frames(lambda image: image // 40), "refused as low modulation: probably the fringes are too faint"),
     "overexposed": (of_frames(lambda image: np.minimum(image.astype(int) * 5 + 170, 255)), "refused as .*: probably"),
-    "another range": (of_rig(working_range_mm=[900, 1000], standoff_m=0.95), "probably working_range_mm"),
+    "another range": (of_rig(working_range_mm=[900, 1000], standoff_m=0.95), "nothing in the range: .*another working"),
     "impossible bits": (lambda f: ("--bits", 20), "bits: expected a whole number from 8 to 16"),
     "bits of deeper images": (lambda f: ("--bits", 12), "found images of 8 bits"),
     "unknown colour": (lambda f: ("--colour", "cyan"), "colour: expected luminance"),

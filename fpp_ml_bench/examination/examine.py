@@ -1,0 +1,271 @@
+"""The examination of a capture: before it is decoded, on some of its lines, from all that its frames and rig tell."""
+
+import math
+from collections.abc import Sequence
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.coding import Limits, PhaseShift
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.examination.findings import Examination, Finding
+from fpp_ml_bench.examination.lines import Lines, take_lines
+from fpp_ml_bench.examination.readings import AS_GIVEN, Fit, fit, search
+from fpp_ml_bench.examination.signals import (
+    LEAST_PX,
+    Edges,
+    FringeSet,
+    equal_frames,
+    fringe_sets,
+    gray_edges,
+    ripples,
+    step_errors,
+)
+from fpp_ml_bench.optics import Direction, Rig
+
+SIGMAS = 6.0
+"""Standard errors above which a figure is none of chance."""
+OFFSET_TURNS, OFFSET_EDGES = 0.02, 100
+"""Smallest common offset of phase and Gray code that is a finding: 0.4 px of 18 px, which no light of ours makes by
+more than chance; and the edges that are needed to measure it."""
+RIPPLE_RAD, STEP_RAD = 0.012, 0.1
+"""Smallest ripple of twice the phase and smallest error of a shift that are findings: one of 18 frames twice makes
+0.019 and 0.35; flicker of 1% in our hardest light 0.01 and 0.05."""
+RESPONSE_RAD = 0.006
+"""Smallest ripple of N times the phase that is named: patterns of 8 bits make 0.003."""
+TRIED, IN_RANGE = 0.1, 0.05
+"""Other readings are tried where more of the lit pixels contradict the code, or twice as many neighbours each other, or
+almost none lies in the range."""
+CONTRADICTING, DOUBTFUL = 0.6, 0.4
+"""Shares of the lit pixels that contradict the code and make depth untrustworthy or doubtful."""
+MOVED_SHARE = 0.3
+_FINEST, _SCORED_PX = 2.0, 4000
+_UNITS = ((1000.0, "metres were read as mm"), (100.0, "metres were read as cm"), (10.0, "cm were read as mm"),
+          (0.1, "mm were read as cm"), (0.001, "mm were read as metres"))  # fmt: skip
+
+
+def examine(
+    frames: NDArray | Sequence[NDArray], rig: Rig, names: Sequence[str] | None = None, *,
+    directions: Sequence[Direction] | None = None, mask: NDArray[np.bool_] | None = None, limits: Limits | None = None,
+    calibrated: bool = True,
+) -> Examination:  # fmt: skip
+    """Examine the ``frames`` (F, H, W) of a rig's sequence, grey levels of 0 to 255; ``names`` are their files'.
+
+    ``directions``: those that will be decoded (all). Pixels outside ``mask`` (H, W) don't count. ``calibrated`` False:
+    the rig's lenses, pose and range are placeholders, and only the code is looked at."""
+    limits, directions = limits or Limits(), tuple(directions or rig.directions)
+    titles = [frame.title for frame in rig.sequence] if names is None else list(names)
+    lines = take_lines(frames, mask)
+    not_checked = _not_checked(rig, directions, calibrated)
+    if lines.lit.sum() < LEAST_PX:
+        return Examination((), (*not_checked, f"anything: only {lines.lit.sum()} pixels looked at are lit"))
+    sets = fringe_sets(lines, rig, directions)
+    pairs = equal_frames(lines, sets, rig)
+    findings = [_equal(pairs, titles)] if pairs else []
+    findings += _exchanged_flat(lines, rig)
+    if findings:
+        return Examination(tuple(findings), not_checked)
+    edges = {
+        one.direction: gray_edges(lines, one, rig, limits.ambiguous_fraction) for one in sets if _is_finest(one, rig)
+    }
+    part = lines.part(_SCORED_PX)
+    given = fit(part, rig, directions, limits, AS_GIVEN, calibrated)
+    measured = {
+        "coherent_share": given.coherent,
+        "in_range_share": given.fitting,
+        "contradicting_share": given.contradicting,
+    }
+    systematic: dict[str, float] = {}
+    for one in sets:
+        findings += _steps_and_response(lines, one, rig, titles, measured, systematic)
+    for way, found in edges.items():
+        if found is not None:
+            measured[f"{way}_offset_turns"] = found.offset_turns.value
+            # A frame that is late shifts all phases, too.
+            if _is_offset(found) and not any(finding.severity == "refuse" for finding in findings):
+                return Examination((_offset(found, rig, way),), not_checked, measured)
+    if given.contradicting > TRIED or given.agreeing < 1 - 2 * TRIED or given.fitting < IN_RANGE * given.coherent:
+        other = _other_readings(lines, rig, directions, limits, given, calibrated)
+        if other:
+            return Examination(tuple(other), not_checked, measured)
+    findings += _moved(sets)
+    if given.contradicting > DOUBTFUL:
+        findings.append(_contradictions(given))
+    elif calibrated and given.fitting == 0.0 and given.depth_mm is not None:
+        if len(given.depth_mm) > part.levels.shape[1] / 5:  # fewer come by chance
+            findings.append(_out_of_range(given.depth_mm, rig))
+    findings.sort(key=lambda finding: ("refuse", "warn", "note").index(finding.severity))
+    return Examination(tuple(findings), not_checked, measured, systematic)
+
+
+def _not_checked(rig: Rig, directions: Sequence[Direction], calibrated: bool) -> tuple[str, ...]:
+    """What frames of such a rig can't tell, whatever they show."""
+    parts = []
+    if len(directions) < 2:
+        parts.append(
+            "images mirrored along the fringes, and a rig whose pose is inverted: one direction of fringes can't tell"
+        )
+    for way in directions:
+        code = rig.code(way)
+        if isinstance(code, PhaseShift):
+            if code.gray is None:
+                parts.append(f"a common offset of all {way} phases: no Gray code tells")
+            if max(len(fringe.shifts_deg) for fringe in code.fringes) == 3:
+                parts.append(f"noise of the {way} frames: three steps fit any three grey levels")
+    if not calibrated:
+        parts.append("depth: the rig is not calibrated yet")
+    return tuple(parts)
+
+
+def _is_finest(one: FringeSet, rig: Rig) -> bool:
+    return one.pitch_px <= _FINEST * rig.pitch(one.direction)
+
+
+def _equal(pairs: Sequence[tuple[int, int]], titles: Sequence[str]) -> Finding:
+    listed = ", ".join(f"{titles[i]} and {titles[j]}" for i, j in pairs[:4]) + (" and others" if len(pairs) > 4 else "")
+    return Finding(
+        "equal frames", "refuse", f"{listed} show the same image, and their patterns differ",
+        "the camera delivered a frame twice, or a pattern was not shown in time, or a file was copied",
+        "capture again: trigger the camera by the projector, or wait longer after each pattern",
+    )  # fmt: skip
+
+
+def _exchanged_flat(lines: Lines, rig: Rig) -> list[Finding]:
+    black, white = rig.sequence.black, rig.sequence.white
+    if black is None or white is None:
+        return []
+    dark, bright = (lines.levels[index][lines.lit].astype(np.float64).mean() for index in (black, white))
+    if bright >= dark:
+        return []
+    return [Finding(
+        "white and black", "refuse", f"white has {bright:.0f} grey levels, and black {dark:.0f}",
+        "they changed places, or the frames are in another order", "rename the files, or correct the sequence's order",
+    )]  # fmt: skip
+
+
+def _is_offset(found: Edges) -> bool:
+    offset, sigma = abs(found.offset_turns.value), found.offset_turns.sigma
+    clear = found.count >= OFFSET_EDGES and found.agreeing > 0.8 and found.forward > 0.8
+    return clear and offset > OFFSET_TURNS and offset > SIGMAS * sigma
+
+
+def _offset(found: Edges, rig: Rig, direction: Direction) -> Finding:
+    code = rig.code(direction)
+    pitch, turns = rig.pitch(direction), found.offset_turns
+    origin_px = (code.origin_px if isinstance(code, PhaseShift) else 0.0) - turns.value * pitch
+    return Finding(
+        "phase and Gray code", "refuse",
+        f"the {direction} phase at the edges of the Gray cells is {360 * turns.value:.1f} +- "
+        f"{360 * turns.sigma:.1f} degrees off, {abs(turns.value) * pitch:.2f} projector px, "
+        f"at {100 * found.agreeing:.0f}% of {found.count} edges",
+        "the sinusoids begin elsewhere than at the Gray code's first pixel (another origin, or sine for cosine)",
+        f"if the Gray code begins at the pattern's first pixel: origin_px: {origin_px:.2f} ({direction}), or "
+        f"{360 * turns.value:+.1f} degrees to every shift in shifts_deg",
+    )  # fmt: skip
+
+
+def _other_readings(
+    lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits, given: Fit, calibrated: bool
+) -> list[Finding]:
+    found = search(lines, rig, directions, limits, given, calibrated)
+    if not found:
+        return []
+    listed = "; or ".join(f"{reading.what} ({100 * fits.fitting:.0f}%)" for reading, fits in found[:4])
+    alike = " (these frames can't tell which)" if len(found) > 1 else ""
+    changes = "; or ".join(dict.fromkeys(reading.change for reading, _ in found[:4]))
+    return [Finding(
+        "another reading fits", "refuse",
+        f"{100 * given.fitting:.0f}% of the lit pixels fit as the rig file says, and far more fit another reading",
+        f"{listed}{alike}", changes,
+    )]  # fmt: skip
+
+
+def _steps_and_response(
+    lines: Lines,
+    one: FringeSet,
+    rig: Rig,
+    titles: Sequence[str],
+    measured: dict[str, float],
+    systematic: dict[str, float],
+) -> list[Finding]:
+    """A step that is not what it should be, and the response, which is no fault of the capture."""
+    findings: list[Finding] = []
+    waves = ripples(lines, one) if _is_finest(one, rig) else {}
+    step, twice = step_errors(lines, one), waves.get(2)
+    name = f"{one.direction} fringes of {one.pitch_px:g} px"
+    wrong_step = step is not None and abs(step[1].value) > max(STEP_RAD, SIGMAS * step[1].sigma)
+    wrong_wave = twice is not None and twice.value > max(RIPPLE_RAD, SIGMAS * twice.sigma)
+    if twice is not None:
+        measured[f"{one.direction}_{one.pitch_px:g}px_ripple_rad"] = twice.value
+    if wrong_step or wrong_wave:
+        evidence = []
+        if step is not None and wrong_step:
+            which = f"of {titles[one.frames[step[0]]]}" if one.steps > 4 else "of one of four steps"
+            evidence.append(f"the shift {which} is {abs(np.rad2deg(step[1].value)):.0f} degrees off")
+        if twice is not None and wrong_wave:
+            evidence.append(f"the phase has an error of {twice.value:.3f} rad that repeats twice a period")
+        findings.append(Finding(
+            "wrong step", "refuse", f"{name}: {', and '.join(evidence)}, which neither noise nor gamma explains",
+            "a frame that was exposed while the pattern changed, came late, or was shown at another brightness",
+            "capture again: trigger the camera by the projector, or wait longer after each pattern",
+        ))  # fmt: skip
+    bent = waves.get(one.steps) if one.steps > 2 else None
+    if bent is not None and bent.value > max(RESPONSE_RAD, SIGMAS * bent.sigma) and not findings:
+        error_rad = bent.value / math.sqrt(2)
+        systematic[one.direction] = max(systematic.get(one.direction, 0.0), error_rad)
+        findings.append(Finding(
+            "response", "note",
+            f"{name}: the phase has an error of {bent.value:.3f} rad that repeats {one.steps} times a period",
+            "the response of projector and camera is not straight (gamma)",
+            "the stated uncertainty holds it; set projector and camera to gamma 1, or use more steps",
+        ))  # fmt: skip
+    return findings
+
+
+def _moved(sets: Sequence[FringeSet]) -> list[Finding]:
+    """Sets of sinusoids whose mean images differ: all of them show the scene under the same mean light."""
+    for one, other in combinations(sets, 2):
+        both = one.good & other.good
+        if both.sum() < LEAST_PX:
+            continue
+        gain = float(np.median(other.mean[both]) / max(float(np.median(one.mean[both])), 1e-9))
+        apart = np.abs(other.mean[both] - gain * one.mean[both]) > 0.25 * one.modulation[both] + 6.0
+        if apart.mean() > MOVED_SHARE:
+            return [Finding(
+                "scene moved", "refuse",
+                f"the mean images of the {one.direction} fringes of {one.pitch_px:g} px and the {other.direction} ones "
+                f"of {other.pitch_px:g} px differ at {100 * apart.mean():.0f}% of the lit pixels",
+                "object or camera moved between them, the frames are of two captures, or a frame failed",
+                "put the frames of one capture, of a scene at rest, into the folder",
+            )]  # fmt: skip
+    return []
+
+
+def _contradictions(given: Fit) -> Finding:
+    return Finding(
+        "contradictions", "refuse" if given.contradicting > CONTRADICTING else "warn",
+        f"{100 * given.contradicting:.0f}% of the lit pixels contradict the code, and no other reading tried fits",
+        "the rig file's sequence, projector size or pose is not what captured this, or the scene moved",
+        "compare the first and last image with the sequence's first and last pattern (fpp-bench patterns)",
+    )  # fmt: skip
+
+
+def _out_of_range(depth_mm: NDArray[np.float64], rig: Rig) -> Finding:
+    low, middle, high = np.quantile(depth_mm, (0.02, 0.5, 0.98))
+    near, far = rig.working_range_mm
+    units = [f"{why} ({factor:g} times)" for factor, why in _UNITS if near <= factor * middle <= far]
+    cause = (
+        f"a wrong unit of the rig's translation: {units[0]}" if units else "another working range than the rig file's"
+    )
+    change = (
+        "correct the translation or the calibration's unit"
+        if units
+        else f"give the range: --range {low:.0f},{high:.0f}"
+    )
+    baseline = MM_PER_M * rig.baseline_m
+    return Finding(
+        "nothing in the range", "refuse",
+        f"depths of {low:.4g} to {high:.4g} mm, a baseline of {baseline:.4g} mm, and a range of {near:g} to {far:g} mm",
+        cause, change,
+    )  # fmt: skip

@@ -1,0 +1,59 @@
+"""What an examination finds, as data: a name, how bad it is, the evidence, the likely cause, and what to change."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+from fpp_ml_bench.errors import CaptureError
+
+Severity = Literal["refuse", "warn", "note"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """``severity`` "refuse": the depth can't be trusted; "warn": it is
+    doubtful; "note": it is worth knowing. ``evidence`` says what was measured,
+    ``cause`` what most likely made it, ``change`` what to do, a clause each."""
+
+    name: str
+    severity: Severity
+    evidence: str
+    cause: str
+    change: str
+
+    def __str__(self) -> str:
+        return f"{self.name}: {self.evidence}; probably {self.cause}; {self.change}"
+
+
+@dataclass(frozen=True)
+class Examination:
+    """The ``findings``, worst first; what the frames of this rig can't tell (``not_checked``); ``measured`` figures by
+    name; ``systematic_rad``, by direction, the RMS error of the finest phase that the response of projector and camera
+    causes (0 where none shows)."""
+
+    findings: tuple[Finding, ...] = ()
+    not_checked: tuple[str, ...] = ()
+    measured: Mapping[str, float] = field(default_factory=dict)
+    systematic_rad: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def refused(self) -> tuple[Finding, ...]:
+        return tuple(finding for finding in self.findings if finding.severity == "refuse")
+
+    def to_dict(self) -> dict[str, Any]:
+        return {
+            "findings": [asdict(finding) for finding in self.findings], "not_checked": list(self.not_checked),
+            "measured": dict(self.measured), "systematic_rad": dict(self.systematic_rad),
+        }  # fmt: skip
+
+
+class RefusedCapture(CaptureError):
+    """A capture whose depth can't be trusted, by its ``examination``; ``where`` names it."""
+
+    def __init__(self, where: str, examination: Examination) -> None:
+        self.where, self.examination = where, examination
+        listed = "\n  ".join(map(str, examination.refused))
+        super().__init__(f"{where}: {listed}\n  --anyway goes on all the same; its depth is not to be trusted")
+
+    def __reduce__(self) -> tuple[type["RefusedCapture"], tuple[str, Examination]]:
+        return type(self), (self.where, self.examination)  # from worker processes, too

@@ -1,0 +1,319 @@
+"""Other readings of a capture: the same images in another order, seen another way round, with bits read another way.
+
+Each is tried on some thousand pixels. It fits by the share of the lit pixels that get a depth in the range, times what
+neighbours say: phases go on at the edges of Gray cells, and on a surface that both devices see the projector's
+coordinates grow along the image as they do on a plane (the ordering constraint of stereo vision).
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import combinations, permutations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.coding import GrayOnly, Limits, Reason
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.decoding import depth_and_reason, plan_direction
+from fpp_ml_bench.examination.lines import Lines
+from fpp_ml_bench.examination.signals import fringe_sets, gray_edges
+from fpp_ml_bench.optics import AXES, Direction, Frame, Rig
+
+LARGEST_MISFIT = 0.2
+"""Largest RMS distance of grey levels from their sinusoid, in modulations, where four steps and more tell."""
+CLEARLY_LIT_GREY = 30.0
+LARGEST_DISAGREEMENT_PX = 8.0
+"""Distance across the epipolar line from which a pixel contradicts: less is a calibration's error."""
+GOOD, FEWER = 0.8, 3.0
+"""A reading is named that fits so well, and leaves so many times fewer pixels that contradict it than the one given."""
+_FIRST_PX, _SECOND_PX, _FEWEST_PAIRS, _KEPT = 600, 4000, 40, 8
+_BACKGROUND_SHARE = 0.03
+_WIDE_MM = (1e-6, 1e12)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """A way to read the images: ``what`` is different from the rig file, ``change`` to do; the place of every frame of
+    the sequence in the capture, a change of the grey levels, a way to turn the image, and another rig."""
+
+    what: str
+    change: str
+    frames: tuple[int, ...] | None = None
+    levels: Callable[[NDArray], NDArray] | None = None
+    flips: tuple[bool, bool] = (False, False)
+    rig: Rig | None = None
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Shares of the lit pixels: ``coherent`` with the code and their neighbours, and so and in the range, ``fitting``;
+    ``contradicting`` the code. ``agreeing``: what neighbours say, 1 or less. ``depth_mm``: of coherent
+    pixels, whatever the range."""
+
+    coherent: float = 0.0
+    fitting: float = 0.0
+    contradicting: float = 0.0
+    agreeing: float = 1.0
+    depth_mm: NDArray[np.float64] | None = None
+
+
+AS_GIVEN = Reading("as the rig file says", "")
+
+
+def fit(lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits, reading: Reading, solid: bool) -> Fit:
+    """How well the reading fits; without ``solid`` (a rig that is not calibrated) depth and order don't count."""
+    rig = reading.rig or rig
+    levels = lines.levels if reading.frames is None else lines.levels[list(reading.frames)]
+    levels = levels if reading.levels is None else reading.levels(levels)
+    seen = replace(lines, levels=levels)
+    measured, edges = {}, 1.0
+    for direction in directions:
+        plan = plan_direction(rig, direction, None, limits)
+        measured[direction] = plan.decode(np.ascontiguousarray(levels[list(plan.rows)]), limits)
+    reasons = np.stack([coordinates.reason for coordinates in measured.values()])
+    reason = np.where(reasons == 0, np.uint8(Reason.NOT_ASKED), reasons).min(axis=0)
+    reason[reason == Reason.NOT_ASKED] = 0
+    saturated = reason == Reason.SATURATED
+    lit = (reason != Reason.LOW_MODULATION) & ~saturated
+    # Gray code alone has no second opinion: a doubtful bit there is blur.
+    alone = all(isinstance(rig.code(way), GrayOnly) for way in directions)
+    contradicting = lit & (reason != 0) & ~(alone & (reason == Reason.INCONSISTENT_ORDER))
+    for one in fringe_sets(seen, rig, directions):
+        if one.steps > 3:
+            shown = one.mean + np.cos(one.shifts_rad)[:, None] * one.cosine + np.sin(one.shifts_rad)[:, None] * one.sine
+            misfit = ((levels[list(one.frames)] - shown) ** 2).mean(axis=0)
+            reason[(reason == 0) & (misfit > (LARGEST_MISFIT * one.modulation) ** 2)] = Reason.INCONSISTENT_ORDER
+        found = gray_edges(seen, one, rig, limits.ambiguous_fraction)
+        edges *= 1.0 if found is None or found.count < _FEWEST_PAIRS else min(found.agreeing, found.forward)
+    # Pixels that change so much have to be lit by any reading.
+    counted = (lit | (np.ptp(levels, axis=0) >= CLEARLY_LIT_GREY)) & ~saturated
+    if not counted.any():
+        return Fit()
+    if not solid:
+        share = edges * float((reason[counted] == 0).mean())
+        return Fit(share, share, float(contradicting.sum() / max(int((lit | saturated).sum()), 1)), edges)
+    width, height = rig.camera.width, rig.camera.height
+    column = width - 1 - lines.column if reading.flips[0] else lines.column
+    row = height - 1 - lines.row if reading.flips[1] else lines.row
+    rays = tuple(axis[row, column] for axis in rig.camera.rays())
+    forward = min(
+        (_forward(lines, rays, measured[way].coordinate_px, reason == 0, rig, way) for way in directions), default=1.0
+    )
+    apart_px = LARGEST_DISAGREEMENT_PX + float(np.hypot.reduce([rig.code(way).step_px for way in directions]))
+    wide, loose = rig.with_range(_WIDE_MM), replace(limits, max_disagreement_px=apart_px)
+    depth_mm, of_depth = depth_and_reason(measured, (rays[0], rays[1]), wide, loose)
+    good = (reason == 0) & (of_depth == 0)
+    contradicting |= lit & (reason == 0) & (of_depth != 0)
+    near, far = rig.working_range_mm
+    inside = (depth_mm >= near) & (depth_mm <= far)
+    if rig.background_m is not None:
+        inside |= np.abs(depth_mm - rig.background_m * MM_PER_M) < _BACKGROUND_SHARE * rig.background_m * MM_PER_M
+    coherent, fitting = float(good[counted].mean()), float((good & inside)[counted].mean())
+    weight, against = edges * min(1.0, 2 * forward), float(contradicting.sum() / max(int((lit | saturated).sum()), 1))
+    return Fit(weight * coherent, weight * fitting, against, weight, depth_mm[good].astype(np.float64))
+
+
+def _forward(
+    lines: Lines,
+    rays: Sequence[NDArray],
+    coordinate_px: NDArray,
+    known: NDArray[np.bool_],
+    rig: Rig,
+    direction: Direction,
+) -> float:
+    """Share of neighbours between which the coordinate grows as it does on a plane in the middle of the range."""
+    middle_m = sum(rig.working_range_mm) / 2 / MM_PER_M
+    points = np.stack([rays[0] * middle_m, rays[1] * middle_m, np.full_like(rays[0], middle_m)], axis=-1)
+    on_plane, change = np.diff(rig.project(points)[AXES.index(direction)]), np.diff(coordinate_px)
+    with np.errstate(invalid="ignore"):
+        used = lines.joined[:-1] & known[:-1] & known[1:] & (change != 0) & np.isfinite(on_plane)
+        if used.sum() < _FEWEST_PAIRS:
+            return 1.0
+        used &= np.abs(on_plane) > 0.5 * np.quantile(np.abs(on_plane[used]), 0.9)
+    if not used.any():
+        return 1.0
+    near = np.abs(change[used]) < 4 * np.abs(on_plane[used]) + 3 * rig.code(direction).step_px
+    return float((near & (np.sign(change[used]) == np.sign(on_plane[used]))).mean())
+
+
+def search(
+    lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits, given: Fit, solid: bool
+) -> list[tuple[Reading, Fit]]:
+    """The readings that fit far better than the one ``given``, best first; none where none does."""
+    few, more = lines.part(_FIRST_PX), lines.part(_SECOND_PX)
+    for candidates in (_single(rig, solid), _exchanges(rig)):
+        first = [(reading, fit(few, rig, directions, limits, reading, solid)) for reading in candidates]
+        first.sort(key=lambda pair: -pair[1].fitting)
+        second = [(reading, fit(more, rig, directions, limits, reading, solid)) for reading, _ in first[:_KEPT]]
+        needed = max(GOOD, 1 - (1 - given.fitting) / FEWER)
+        named = sorted((pair for pair in second if pair[1].fitting >= needed), key=lambda pair: -pair[1].fitting)
+        if named:
+            best = named[0][1].fitting
+            return [pair for pair in named if 1 - pair[1].fitting <= FEWER * (1 - best) + 0.02]
+    return []
+
+
+def _runs(rig: Rig) -> list[list[int]]:
+    """Frame indices of every run of one kind, direction and period."""
+    runs: list[list[int]] = []
+    last: object = None
+    for frame in rig.sequence:
+        key = frame.kind, frame.direction, frame.fringe
+        runs.append([]) if key != last else None
+        runs[-1].append(frame.index)
+        last = key
+    return runs
+
+
+def _placed(rig: Rig, captured: Sequence[int]) -> tuple[int, ...]:
+    """Where each frame of the sequence is, when the capture holds the frames ``captured`` in this order."""
+    place = {index: position for position, index in enumerate(captured)}
+    return tuple(place[index] for index in range(len(rig.sequence)))
+
+
+def _single(rig: Rig, solid: bool) -> Iterator[Reading]:
+    """All readings but exchanges of two frames."""
+    frames, runs = rig.sequence.frames, _runs(rig)
+    everything = list(range(len(frames)))
+    if solid:
+        for flips, name in (
+            ((True, False), "mirrored left to right"), ((False, True), "mirrored top to bottom"),
+            ((True, True), "turned by 180 degrees"),
+        ):  # fmt: skip
+            change = f"write the images as the calibrated camera sees them: they are {name}"
+            yield Reading(f"images that are {name}", change, flips=flips)
+        turned: Any = tuple(tuple(column) for column in rig.R.T.tolist())
+        inverse = replace(rig, rotation=turned, translation_m=tuple((-rig.R.T @ rig.t).tolist()))
+        change = "invert rotation and translation of the rig"
+        yield Reading("a pose that goes from the projector to the camera", change, rig=inverse)
+    for ways in _direction_sets(rig):
+        of = f"{' and '.join(ways)} " if len(ways) < len(rig.directions) else ""
+        for what, change, frames_or_levels in _of_code(rig, runs, ways):
+            if callable(frames_or_levels):
+                yield Reading(of + what, change, levels=frames_or_levels)
+            else:
+                yield Reading(of + what, change, frames_or_levels)
+    yield Reading("all frames inverted (black for white)", "invert the images", levels=_inverted)
+    change = "rename the files in the opposite order"
+    yield Reading("all frames in the opposite order", change, _placed(rig, everything[::-1]))
+    for shift in range(1, len(frames)):
+        change = f"rename the files: the first {len(frames) - shift} are the sequence's last ones"
+        captured = everything[shift:] + everything[:shift]
+        yield Reading(f"a capture that starts with frame {frames[shift].title}", change, _placed(rig, captured))
+    done = {tuple(everything)}
+    for captured in _orders(frames, runs):
+        if tuple(captured) not in done:
+            done.add(tuple(captured))
+            change = "write this order in the rig file's sequence, or rename the files"
+            yield Reading(f"frames in the order {', '.join(_names(frames, captured))}", change, _placed(rig, captured))
+
+
+def _of_code(
+    rig: Rig, runs: list[list[int]], ways: Sequence[Direction]
+) -> Iterator[tuple[str, str, tuple[int, ...] | Callable[[NDArray], NDArray]]]:
+    """What may be different in the codes of ``ways``: what, what to change, and where each frame is, or a change of the
+    grey levels."""
+    frames, everything = rig.sequence.frames, list(range(len(rig.sequence)))
+    own = [run for run in runs if frames[run[0]].direction in ways]
+    sinusoids = [run for run in own if frames[run[0]].kind == "sinusoid" and len(run) > 2]
+    bits = [run for run in own if frames[run[0]].kind == "gray"]
+    if sinusoids:
+        flipped = _moved(everything, sinusoids, lambda run: [run[0], *run[:0:-1]])
+        yield "phase shifts of the other sign", "change the entry sign of the sequence (1, -1)", flipped
+        for quarters in (1, 2, 3):
+            if all(quarters * len(run) % 4 == 0 for run in sinusoids):
+                turned = _moved(everything, sinusoids, lambda run, q=quarters: _turned(run, -q))  # type: ignore[misc]
+                what = f"phases that are {90 * quarters} degrees further (sine for cosine)"
+                yield what, "give shifts_deg with this angle added", turned
+        backward = _moved(everything, sinusoids, lambda run: run[::-1])
+        yield "phase steps in the opposite order", "rename the files, or give shifts_deg in this order", backward
+    if bits:
+        backward = _moved(everything, bits, lambda run: run[::-1])
+        yield "Gray code with the least significant bit first", "write least_first: true", backward
+        change = "project it as the rig file says, or exchange white and black of its images"
+        yield "Gray code that is inverted (black for white)", change, partial(_gray_levels, bits, True)
+        change = "project Gray code: at the edges of binary numbers several bits change at once"
+        yield "binary numbers for Gray code", change, partial(_gray_levels, bits, False)
+
+
+def _direction_sets(rig: Rig) -> list[tuple[Direction, ...]]:
+    return [rig.directions, *((way,) for way in rig.directions if len(rig.directions) > 1)]
+
+
+def _moved(everything: list[int], runs: list[list[int]], change: Callable[[list[int]], list[int]]) -> tuple[int, ...]:
+    """``everything`` with the frames of each run in another order."""
+    place = list(everything)
+    for run in runs:
+        for index, other in zip(run, change(run), strict=True):
+            place[index] = other
+    return tuple(place)
+
+
+def _turned(run: list[int], quarters: int) -> list[int]:
+    start = quarters * len(run) // 4
+    return run[start:] + run[:start]
+
+
+def _inverted(levels: NDArray) -> NDArray:
+    return levels.max(axis=0) + (levels.min(axis=0) - levels)  # unsigned grey levels wrap twice, and come out right
+
+
+def _gray_levels(runs: list[list[int]], invert: bool, levels: NDArray) -> NDArray:
+    """Grey levels with the Gray frames inverted, or turned from binary numbers into Gray code."""
+    result, low, high = levels.copy(), levels.min(axis=0), levels.max(axis=0)
+    for run in runs:
+        if invert:
+            result[run] = low + (high - levels[run])
+            continue
+        bits = levels[run] > (low.astype(np.float64) + high) / 2
+        bits[1:] ^= bits[:-1].copy()
+        result[run] = np.where(bits, high, low)
+    return result
+
+
+def _orders(frames: Sequence[Frame], runs: list[list[int]]) -> Iterator[list[int]]:
+    """Other orders of the runs: by kind and direction, and with one run at another place."""
+    directions = list(dict.fromkeys(frames[run[0]].direction for run in runs if frames[run[0]].direction))
+    kinds = list(dict.fromkeys(frames[run[0]].kind for run in runs))
+    for kind_order in permutations(kinds):
+        for way_order in permutations(directions):
+            ranks = {
+                run[0]: (kind_order.index(frames[run[0]].kind), [None, *way_order].index(frames[run[0]].direction))
+                for run in runs
+            }
+            for first in (0, 1):
+                ordered = sorted(runs, key=lambda run: (ranks[run[0]][first], ranks[run[0]][1 - first]))
+                yield [index for run in ordered for index in run]
+    for number, run in enumerate(runs):
+        others = runs[:number] + runs[number + 1 :]
+        for place in range(len(runs)):
+            yield [index for part in (*others[:place], run, *others[place:]) for index in part]
+
+
+def _names(frames: Sequence[Frame], captured: Sequence[int]) -> list[str]:
+    """The runs of a capture in words."""
+    names: list[str] = []
+    for index in captured:
+        frame = frames[index]
+        kind = {"sinusoid": "sinusoids", "gray": "Gray code"}.get(frame.kind, frame.kind)
+        period = (
+            f" of period {frame.fringe}" if any(other.fringe for other in frames) and frame.kind == "sinusoid" else ""
+        )
+        name = f"{frame.direction} {kind}{period}" if frame.direction else kind
+        if not names or names[-1] != name:
+            names.append(name)
+    return names
+
+
+def _exchanges(rig: Rig) -> Iterator[Reading]:
+    frames = rig.sequence.frames
+    coded = [frame.index for frame in frames if frame.direction is not None]
+    for first, second in combinations(coded, 2):
+        place = list(range(len(frames)))
+        place[first], place[second] = second, first
+        titles = [frames[index].title for index in (first, second)]
+        yield Reading(
+            f"frames that changed places: {titles[0]} and {titles[1]}", "rename these two files", tuple(place)
+        )

@@ -1,0 +1,274 @@
+"""What sinusoids and Gray code say about a capture: equal frames, wrong steps, ripples of the phase, common offsets.
+
+A frame that shows another step than it should leaves a residual in the first harmonic of its set, and a ripple of twice
+the phase in the decoded phase. A response that is not straight leaves higher harmonics, and a ripple of N times the
+phase with N steps (K. Hibino et al., Phase shifting for nonsinusoidal waveforms with phase-shift errors, JOSA A 1995).
+Both are measured from what neighbours can't have in common with the scene: a surface is smooth within a few periods.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations, pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.coding import MIN_MODULATION, PhaseShift, minus_atan2, phase_weights, weighted_sums
+from fpp_ml_bench.constants import GREY_LEVELS
+from fpp_ml_bench.examination.lines import Lines
+from fpp_ml_bench.optics import Direction, Rig
+
+TAU = 2 * math.pi
+LEAST_PX = 200
+WINDOW_PERIODS = 2.5
+"""Length of the windows in which a surface is taken for a parabola; a period must be seen by 4 px and more."""
+SHORTEST_PERIOD_PX, LONGEST_WINDOW_PX, FEWEST_WINDOWS = 4.0, 400, 30
+WHITE_RATIO, EQUAL_SHARE, GAIN = 1.8, 0.35, 0.1
+"""Two frames are equal where their difference is white (its mean square below so many times that of noise), below a
+share of what their steps would make, and their gain within this of 1."""
+_EQUAL_PX = 30_000
+
+
+class Estimate(NamedTuple):
+    """A ``value`` and its standard error ``sigma``."""
+
+    value: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class FringeSet:
+    """The sinusoids of one period: ``frames`` their indices, ``shifts_rad`` (N,), mean, modulation and phase (n,) of
+    the lines' pixels, and ``good`` pixels: modulated and never saturated."""
+
+    direction: Direction
+    number: int
+    pitch_px: float
+    frames: tuple[int, ...]
+    shifts_rad: NDArray[np.float64]
+    mean: NDArray[np.float64]
+    cosine: NDArray[np.float64]
+    sine: NDArray[np.float64]
+    phase: NDArray[np.float64]
+    modulation: NDArray[np.float64]
+    good: NDArray[np.bool_]
+
+    @property
+    def steps(self) -> int:
+        return len(self.frames)
+
+
+def fringe_sets(lines: Lines, rig: Rig, directions: Sequence[Direction]) -> list[FringeSet]:
+    """The sets of three and more steps, with what the lines show of them."""
+    sets = []
+    for direction in directions:
+        code = rig.code(direction)
+        for number, fringe in enumerate(code.fringes if isinstance(code, PhaseShift) else ()):
+            frames = tuple(
+                frame.index for frame in rig.sequence
+                if frame.direction == direction and frame.kind == "sinusoid" and frame.fringe == number
+            )  # fmt: skip
+            if len(frames) < 3:
+                continue
+            shifts, levels = TAU * fringe.turns, lines.levels[list(frames)]
+            mean, cosine, sine = weighted_sums(levels, phase_weights(shifts))
+            modulation = np.sqrt(cosine * cosine + sine * sine)
+            good = lines.lit & (modulation >= MIN_MODULATION) & (levels < GREY_LEVELS).all(axis=0)
+            phase = minus_atan2(sine, cosine)
+            sets.append(FringeSet(direction, number, fringe.pitch_px, frames, shifts, mean, cosine, sine, phase,
+                                  modulation, good))  # fmt: skip
+    return sets
+
+
+def equal_frames(lines: Lines, sets: Sequence[FringeSet], rig: Rig) -> list[tuple[int, int]]:
+    """Pairs of frames that should differ and show the same, but for noise and a few percent of brightness."""
+    found = []
+    for one in sets:
+        picked = np.flatnonzero(one.good)[:: max(1, int(one.good.sum() // _EQUAL_PX))]
+        if len(picked) < LEAST_PX:
+            continue
+        joined = lines.joined[picked] & np.append(np.diff(picked) == 1, False)
+        middle = float(np.median(one.modulation[picked]))
+        for i, j in combinations(range(one.steps), 2):
+            first, second = (lines.levels[one.frames[k]][picked].astype(np.float64) for k in (i, j))
+            expected = 2 * middle * abs(math.sin((one.shifts_rad[i] - one.shifts_rad[j]) / 2)) / math.sqrt(2)
+            if expected > 0 and _same(first, second, joined, EQUAL_SHARE * expected):
+                found.append((one.frames[i], one.frames[j]))
+    frames = rig.sequence.frames
+    lit = np.flatnonzero(lines.lit)[:: max(1, int(lines.lit.sum() // _EQUAL_PX))]
+    if len(lit) < LEAST_PX:
+        return found
+    levels = lines.levels[:, lit].astype(np.float64)
+    low, high = levels.min(axis=0), levels.max(axis=0)
+    bright = (levels > (low + high) / 2).mean(axis=1)
+    span = float(np.median(high - low))
+    for first_frame, second_frame in pairwise(frames):
+        i, j = first_frame.index, second_frame.index
+        alike = first_frame.kind == second_frame.kind == "sinusoid"
+        same_set = alike and (first_frame.direction, first_frame.fringe) == (
+            second_frame.direction,
+            second_frame.fringe,
+        )
+        # A frame that is bright or dark all over may well be followed by another one.
+        varied = all(0.05 < bright[k] < 0.95 for k in (i, j))
+        apart = np.abs(levels[i] - levels[j])
+        if not same_set and varied and np.median(apart) < 0.02 * span and (apart < 0.1 * span).mean() > 0.98:
+            found.append((i, j))
+    return found
+
+
+def _same(first: NDArray, second: NDArray, joined: NDArray[np.bool_], most: float) -> bool:
+    if np.array_equal(first, second):
+        return True
+    gain = float(np.cov(first, second)[0, 1] / max(first.var(), 1e-12))
+    if abs(gain - 1) > GAIN:
+        return False
+    rest = second - second.mean() - gain * (first - first.mean())
+    steps = np.diff(rest)[joined[:-1]]
+    if len(steps) < LEAST_PX:
+        return False
+    size, noise = _trimmed(rest**2), max(_trimmed(steps**2) / 2, 1 / 12)
+    return size < min(most**2, WHITE_RATIO * noise)
+
+
+def _trimmed(values: NDArray) -> float:
+    """Mean without the largest tenth: edges of the scene count for nothing."""
+    return float(np.sort(values)[: -(-9 * len(values) // 10)].mean())
+
+
+def step_errors(lines: Lines, one: FringeSet) -> tuple[int, Estimate] | None:
+    """Of four steps and more: the position of the step whose shift is farthest from the rig file's, and by how many rad
+    (with four, all are as far). None where too little tells, and where a narrow range of phases can't tell it from
+    other faults."""
+    picked = np.flatnonzero(one.good)[:: max(1, int(one.good.sum() // _EQUAL_PX))]
+    if one.steps < 4 or len(picked) < LEAST_PX:
+        return None
+    levels = lines.levels[list(one.frames)][:, picked].astype(np.float64)
+    mean, cosine, sine, modulation = (part[picked] for part in (one.mean, one.cosine, one.sine, one.modulation))
+    weights = phase_weights(one.shifts_rad)
+    model = np.stack([np.ones(one.steps), np.cos(one.shifts_rad), np.sin(one.shifts_rad)], axis=1)
+    influence = np.einsum("ij,ji->i", model, weights)
+    worst: tuple[int, Estimate] | None = None
+    for n, shift in enumerate(one.shifts_rad):
+        residual = levels[n] - mean - cosine * math.cos(shift) - sine * math.sin(shift)
+        turned = 2 * (one.phase[picked] + shift)
+        terms = np.stack([mean, cosine, sine, modulation * np.cos(turned), modulation * np.sin(turned)], axis=1)
+        scaled = terms / np.maximum(np.linalg.norm(terms, axis=0), 1e-12)
+        if np.linalg.cond(scaled) > 60:
+            return None
+        kept = np.abs(residual) < 6 * np.median(np.abs(residual)) + 1.0
+        solution = np.linalg.lstsq(terms[kept], residual[kept], rcond=None)[0] / (1 - influence[n])
+        error = residual[kept] / (1 - influence[n]) - terms[kept] @ solution
+        covariance = np.linalg.inv(terms[kept].T @ terms[kept]) * error.var() * 4  # neighbours share their errors
+        along = np.array([0, -math.sin(shift), math.cos(shift), 0, 0])
+        estimate = Estimate(float(along @ solution), float(np.sqrt(along @ covariance @ along)))
+        if worst is None or abs(estimate.value) > abs(worst[1].value):
+            worst = n, estimate
+    return worst
+
+
+def ripples(lines: Lines, one: FringeSet) -> dict[int, Estimate]:
+    """Amplitude in rad, by harmonic, of the error of the phase that goes with twice and N times the phase; none where
+    the image shows too few windows of two periods and more."""
+    best: tuple[float, NDArray] | None = None
+    for across in (True, False):
+        pixels = one.good & (lines.across == across)
+        pairs = np.flatnonzero(pixels[:-1] & pixels[1:] & lines.joined[:-1])
+        if len(pairs) < LEAST_PX:
+            continue
+        slope = float(np.median(np.abs(_wrapped(one.phase[pairs + 1] - one.phase[pairs]))))
+        if best is None or slope > best[0]:
+            best = slope, pixels
+    if best is None or best[0] <= 0 or not SHORTEST_PERIOD_PX <= TAU / best[0] <= LONGEST_WINDOW_PX / WINDOW_PERIODS:
+        return {}
+    period = TAU / best[0]
+    windows = _windows(best[1], lines.joined, math.ceil(WINDOW_PERIODS * period))
+    if len(windows) < FEWEST_WINDOWS:
+        return {}
+    phase = np.unwrap(one.phase[windows], axis=1)
+    harmonics = [1, 2, *([one.steps] if 2 < one.steps <= period / 2.5 else [])]
+    place = np.linspace(-1, 1, phase.shape[1])
+    surface = np.linalg.qr(np.stack([np.ones_like(place), place, place**2, place**3], axis=1))[0]
+
+    def flat(values: NDArray) -> NDArray:
+        return values - (values @ surface) @ surface.T
+
+    rest = flat(phase)
+    terms = np.stack([flat(wave(h * phase)) for h in harmonics for wave in (np.cos, np.sin)], axis=-1)
+    size = np.sqrt((rest**2).mean(axis=1))
+    kept = size <= min(3 * float(np.median(size)), 1.0)
+    solution = np.zeros(terms.shape[-1])
+    for _ in range(3):
+        design, target = terms[kept].reshape(-1, terms.shape[-1]), rest[kept].ravel()
+        solution = np.linalg.lstsq(design, target, rcond=None)[0]
+        size = np.sqrt(((rest - terms @ solution) ** 2).mean(axis=1))
+        kept = size <= 2.5 * float(np.median(size))
+    # Each window is one observation of the coefficients: its own errors go together.
+    bread = np.linalg.pinv(design.T @ design)
+    scores = np.einsum("wlt,wl->wt", terms[kept], (rest - terms @ solution)[kept])
+    covariance = bread @ (scores.T @ scores) @ bread
+    found = {}
+    for k, harmonic in enumerate(harmonics):
+        pair = solution[2 * k : 2 * k + 2]
+        sigma = float(np.sqrt(np.trace(covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]) / 2))
+        found[harmonic] = Estimate(float(np.hypot(*pair)), sigma)
+    return found
+
+
+def _windows(pixels: NDArray[np.bool_], joined: NDArray[np.bool_], length: int) -> NDArray[np.intp]:
+    """Indices (w, length) of windows of neighbours that are all in ``pixels``."""
+    run = np.cumsum(np.append(True, ~(joined[:-1] & pixels[:-1] & pixels[1:])))
+    index = np.flatnonzero(pixels)
+    _, first, inverse = np.unique(run[index], return_index=True, return_inverse=True)
+    position = np.arange(len(index)) - first[inverse]
+    count = np.bincount(inverse)[inverse]
+    starts = index[(position % length == 0) & (position + length <= count)]
+    return starts[:, None] + np.arange(length)
+
+
+def _wrapped(angle: NDArray) -> NDArray[np.float64]:
+    return angle - TAU * np.rint(angle / TAU)
+
+
+class Edges(NamedTuple):
+    """At the edges of Gray cells: the common ``offset_turns`` of the phase there, the share of edges within an eighth
+    of a period of it (``agreeing``), the share at which phase and cells grow the same way, and how many."""
+
+    offset_turns: Estimate
+    agreeing: float
+    forward: float
+    count: int
+
+
+def gray_edges(lines: Lines, one: FringeSet, rig: Rig, ambiguous_fraction: float) -> Edges | None:
+    """What the edges of the Gray cells say about the phase of the set; None without Gray code or with few edges."""
+    code = rig.code(one.direction)
+    if not isinstance(code, PhaseShift) or code.gray is None or one.number != code.finest:
+        return None
+    length, levels = rig.pattern_length(one.direction), lines.levels[list(rig.sequence.gray(one.direction))]
+    cells = code.gray.decode(levels, one.mean, one.modulation, ambiguous_fraction)
+    usable = one.good & cells.trusted
+    first = np.flatnonzero(usable[:-1] & usable[1:] & lines.joined[:-1])
+    first = first[np.abs(cells.number[first + 1] - cells.number[first]) == 1]
+    step = _wrapped(one.phase[first + 1] - one.phase[first])
+    kept = np.abs(step) < TAU / 4
+    first, step = first[kept], step[kept]
+    edge_px = (
+        code.gray.centre_px(cells.number[first], length) + code.gray.centre_px(cells.number[first + 1], length)
+    ) / 2
+    offset = _wrapped(one.phase[first] + step / 2 - TAU * (edge_px - code.origin_px) / code.pitch_px)
+    known = np.isfinite(offset)
+    if known.sum() < 40:
+        return None
+    first, step, offset = first[known], step[known], offset[known]
+    grows = (cells.number[first + 1] > cells.number[first]) == (step > 0)
+    middle = float(np.angle(np.mean(np.exp(1j * offset))))
+    for _ in range(3):  # the circular median
+        middle += float(np.median(_wrapped(offset - middle)))
+    away = np.abs(_wrapped(offset - middle))
+    sigma = 1.2533 * 1.4826 * float(np.median(away)) / math.sqrt(len(first) / 4)
+    middle = float(_wrapped(np.array(middle)))
+    offset_turns = Estimate(middle / TAU, sigma / TAU)
+    return Edges(offset_turns, float(np.mean(away < TAU / 8)), float(grows.mean()), len(first))
