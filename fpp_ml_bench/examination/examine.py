@@ -39,7 +39,7 @@ TRIED, IN_RANGE = 0.1, 0.05
 almost none lies in the range."""
 CONTRADICTING, DOUBTFUL = 0.6, 0.4
 """Shares of the lit pixels that contradict the code and make depth untrustworthy or doubtful."""
-MOVED_SHARE = 0.3
+MOVED_SHARE = 0.05
 _FINEST, _SCORED_PX = 2.0, 4000
 _UNITS = ((1000.0, "metres were read as mm"), (100.0, "metres were read as cm"), (10.0, "cm were read as mm"),
           (0.1, "mm were read as cm"), (0.001, "mm were read as metres"))  # fmt: skip
@@ -93,8 +93,8 @@ def examine(
     if given.contradicting > DOUBTFUL:
         findings.append(_contradictions(given))
     elif calibrated and given.fitting == 0.0 and given.depth_mm is not None:
-        if len(given.depth_mm) > part.levels.shape[1] / 5:  # fewer come by chance
-            findings.append(_out_of_range(given.depth_mm, rig))
+        # Fewer come by chance.
+        findings += [_out_of_range(given.depth_mm, rig)] if len(given.depth_mm) > part.levels.shape[1] / 5 else []
     findings.sort(key=lambda finding: ("refuse", "warn", "note").index(finding.severity))
     return Examination(tuple(findings), not_checked, measured, systematic)
 

@@ -194,11 +194,12 @@ class Studio:
 
     def _of_white(self, bounced: NDArray[np.float32]) -> NDArray[np.float32]:
         """What white light would bring, of what each frame's brings, float32 (F, n): without a white frame twice the
-        mean of the fringes, whose steps add up to half of it."""
+        mean of the fringes, whose steps add up to half of it, or of Gray frames and their inverses."""
         sequence = self.rig.sequence
         if sequence.white is not None:
             return bounced[sequence.white]  # type: ignore[no-any-return]
-        fringes = list(sequence.sinusoids(self.rig.fringe_directions[0]))
+        way = (self.rig.fringe_directions or self.rig.directions)[0]
+        fringes = list(sequence.sinusoids(way) or sequence.gray(way))
         return 2 * bounced[fringes].mean(axis=0)  # type: ignore[no-any-return]
 
     def ground_truth_mm(self, seen: NDArray[np.bool_]) -> NDArray[np.float32]:

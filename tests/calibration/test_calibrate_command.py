@@ -76,6 +76,10 @@ def test_from_captures_a_wrong_spacing_scales_the_rig(virtual, tmp_path):
         (("TWO", "--board", "BOARD", "--sequence", "TRUE"), "at least 3 poses of the board, found 2"),
         (("SIZES", "--board", "BOARD", "--sequence", "TRUE"), "expected 240 x 240 px as in pose_00"),
         (("MIRRORED", "--board", "BOARD", "--sequence", "TRUE"), "mirrored"),
+        (("FLAT", "--board", "BOARD", "--sequence", "TRUE"), "pose_01: white and black: white has"),
+        (("COPIED", "--board", "BOARD", "--sequence", "TRUE"), "pose_02: image 0 is that of pose_01 (image 0)"),
+        (("MIXED", "--board", "BOARD", "--sequence", "TRUE"), "scene moved"),
+        (("BOARDS", "--board", "circles:5x9:0.05:0.015", "--sequence", "TRUE"), "of --board, in mm,: a baseline of"),
         (("--virtual", "boards", "--size", "20"), "--size 20: expected 64"),
         (("--virtual", "boards", "--size", "240", "--board", "circles:5x9:500:150"), "does not fit"),
     ],
@@ -87,7 +91,18 @@ def test_bad_input_is_a_sentence_and_no_rig_is_written(virtual, tmp_path, monkey
     one = {"projector": {"width": 912, "height": 1140}, "sequence": {"vertical": vertical}}
     (tmp_path / "one.yaml").write_text(yaml.safe_dump(one))
     boards = virtual / "boards"
+    other = {"frame_20.png": "frame_21.png", "frame_21.png": "frame_20.png"}  # black and white
+    moved = {f"frame_{index:02d}.png" for index in (3, 4, 5, *range(13, 20))}  # all of the vertical code
+
+    def copied(name, pose):
+        return lambda file, of: shutil.copy(boards / (file.with_name(name(file)) if of == pose else file), file)
+
     changed = {
+        "FLAT": copied(lambda file: other.get(file.name, file.name), 1),
+        "COPIED": lambda file, pose: shutil.copy(boards / ("pose_01" if pose == 2 else file.parent) / file.name, file),
+        "MIXED": lambda file, pose: write(
+            file, boards, lambda image: np.roll(image, 60, axis=1) if pose == 1 and file.name in moved else image
+        ),
         "TWO": lambda file, pose: pose < 2 and shutil.copy(boards / file, file),
         "SIZES": lambda file, pose: write(file, boards, lambda image: image[:200] if pose == 2 else image),
         "MIRRORED": lambda file, pose: write(file, boards, lambda image: np.ascontiguousarray(image[:, ::-1])),
@@ -111,3 +126,17 @@ def test_bad_input_is_a_sentence_and_no_rig_is_written(virtual, tmp_path, monkey
 
 def write(file, boards, change):
     cv2.imwrite(str(file), change(cv2.imread(str(boards / file), cv2.IMREAD_UNCHANGED)))
+
+
+def test_gray_code_alone_calibrates(tmp_path, capsys):
+    """Cells of 2 px in both directions: no sinusoid, and so no response is measured."""
+    data = paper_rig(SIZE).to_dict()
+    del data["pitch_px"]
+    code = {"scheme": "gray", "cell_px": 2}
+    codes = {"order": ["vertical", "horizontal", "white", "black"], "vertical": code, "horizontal": dict(code)}
+    (tmp_path / "true.yaml").write_text(yaml.safe_dump({**data, "sequence": codes}))
+    words = ("--true-rig", tmp_path / "true.yaml", "--poses", 4, "--lens", "none", "--out", tmp_path / "rig.yaml")
+    assert calibrate("--virtual", tmp_path / "boards", *words) == 0
+    said = capsys.readouterr().out
+    assert "response" not in said and "against truth" in said
+    assert load_rig(tmp_path / "rig.yaml").baseline_m == pytest.approx(paper_rig().baseline_m, rel=0.02)

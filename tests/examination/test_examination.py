@@ -1,0 +1,201 @@
+"""The examination on captures by our own light, right ones and each with one fault."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from captures import capture, tilted
+
+from fpp_ml_bench.examination import examine
+from fpp_ml_bench.loaders.render import BuildSettings, Studio, named_light, solid_mesh
+from fpp_ml_bench.optics import paper_rig, rig_from_dict
+
+SIZE = 200
+FOUR = {"scheme": "phase-shift", "pitch_px": 57, "steps": 4, "gray": {}}
+UNIT = {"scheme": "phase-shift", "pitches_px": [912, 57], "steps": 4}
+PAPER = {"steps": 5, "bits_horizontal": 7, "bits_vertical": 7}
+TWO = {"order": ["vertical", "horizontal", "white", "black"], "vertical": UNIT,
+       "horizontal": UNIT | {"pitches_px": [1140, 57]}}  # fmt: skip
+
+
+def rig_of(sequence, size=SIZE, **changes):
+    data = {**paper_rig(size).to_dict(), **changes}
+    if "steps" not in sequence:
+        del data["pitch_px"]
+    return rig_from_dict({**data, "sequence": sequence})
+
+
+def vertical(code, **changes):
+    return rig_of({"order": ["vertical"], "vertical": code}, **changes)
+
+
+def frames_of(rig, **light):
+    return np.stack(capture(rig, tilted(rig), **light))
+
+
+def said(frames, rig, **options):
+    """Names and texts of what refuses or warns."""
+    found = examine(frames, rig, **options)
+    return [(finding.name, str(finding)) for finding in found.findings if finding.severity != "note"]
+
+
+def photographed(rig, light, name="mug", view="A60", **changes):
+    """Frames of an object by the renderer."""
+    light = light if not isinstance(light, str) else named_light(light)
+    row = Studio(BuildSettings(rig, (name,), light=light.model_copy(update=changes))).photograph(solid_mesh(name), view)
+    return np.stack([row.frames[index] for index in range(len(rig.sequence))])
+
+
+@pytest.mark.parametrize("light", ["paper", "workshop", "hard"])
+@pytest.mark.parametrize("sequence", [
+    PAPER, PAPER | {"steps": 3}, PAPER | {"steps": 18}, TWO, {"order": ["vertical"], "vertical": FOUR},
+    {"order": ["vertical", "white", "black"], "vertical": {"scheme": "gray", "cell_px": 4}},
+    {"order": ["vertical"], "vertical": {"scheme": "gray", "cell_px": 4, "inverse": "after each"}},
+    {"order": ["vertical"], "vertical": UNIT | {"steps": 3}},
+])  # fmt: skip
+def test_what_decodes_right_is_not_refused_nor_warned_of(sequence, light):
+    rig = rig_of(sequence)
+    assert said(photographed(rig, light), rig) == []
+
+
+@pytest.mark.parametrize("steps", [3, 4, 6, 9])
+@pytest.mark.parametrize("gamma, noise", [(1.0, 4.0), (1.5, 1.0), (2.2, 1.0)])
+def test_gamma_and_noise_are_no_faults_and_gamma_is_named_where_it_shows(steps, gamma, noise):
+    rig = vertical(FOUR | {"steps": steps})
+    light = frames_of(rig, noise=0.0).astype(np.float64)
+    bent = 255 * (light / 255) ** gamma + np.random.default_rng(1).normal(0, noise, light.shape)
+    found = examine(np.clip(np.rint(bent), 0, 255).astype(np.uint8), rig)
+    assert not [finding for finding in found.findings if finding.severity != "note"]
+    assert ("response" in [finding.name for finding in found.findings]) == (gamma > 1 and steps <= 4)
+
+
+@pytest.mark.parametrize("steps", [3, 4, 6, 8, 18])
+@pytest.mark.parametrize("copied", [True, False])
+def test_a_frame_delivered_twice_is_named(steps, copied):
+    rig = vertical(FOUR | {"steps": steps})
+    frames, others = frames_of(rig), frames_of(rig, seed=1)
+    frames[steps - 1] = (frames if copied else others)[steps - 2]
+    ((name, text),) = said(frames, rig)
+    assert name == "equal frames" and f"step {steps - 2} and {steps - 1}: vertical sinusoid" in text
+
+
+@pytest.mark.parametrize("steps", [3, 4, 6, 8])
+def test_a_late_frame_is_a_wrong_step_and_no_response(steps):
+    rig = vertical(FOUR | {"steps": steps})
+    frames = frames_of(rig)
+    frames[steps - 1] = np.rint((frames[steps - 1].astype(float) + frames[steps - 2]) / 2).astype(np.uint8)
+    assert [name for name, _ in said(frames, rig)] == ["wrong step"]
+
+
+def test_the_last_sinusoid_once_more_in_place_of_the_first_gray_frame():
+    rig = vertical(FOUR | {"gray": {"least_first": True}})
+    frames = frames_of(rig)
+    frames[4] = frames_of(rig, seed=1)[3]
+    assert said(frames, rig)[0][0] == "equal frames"
+
+
+@pytest.mark.parametrize("degrees", [-30, 10, 30, 45, 90, 180])
+def test_the_common_offset_of_phase_and_gray_code_is_measured(degrees):
+    shown = vertical(FOUR | {"origin_px": 57 * degrees / 360})
+    assert said(frames_of(shown), shown) == []
+    rig = vertical(FOUR)
+    ((name, text),) = said(frames_of(shown), rig)
+    assert name == "phase and Gray code"
+    origin_px = float(text.split("origin_px: ")[1].split()[0])
+    assert abs((origin_px - 57 * degrees / 360 + 28.5) % 57 - 28.5) < 0.3
+
+
+def moved(order):
+    return lambda frames: frames[order]
+
+
+BITS = 5
+NINE = 4 + BITS
+READINGS = {
+    "Gray code first": (FOUR, moved([*range(4, NINE), *range(4)]), "order vertical Gray code, vertical sinusoids"),
+    "rotated": (FOUR, lambda frames: np.roll(frames, 2, axis=0), "starts with frame"),
+    "backward": (FOUR, lambda frames: frames[::-1], "all frames in the opposite order"),
+    "least bit first": (FOUR, moved([0, 1, 2, 3, *range(NINE - 1, 3, -1)]), "least significant bit first"),
+    "inverse": (FOUR, lambda frames: 255 - frames, "all frames inverted"),
+    "inverse bits": (FOUR, lambda frames: np.concatenate([frames[:4], 160 - frames[4:].clip(0, 160)]), "is inverted"),
+    "other sign": (FOUR, moved([0, 3, 2, 1, *range(4, NINE)]), "shifts of the other sign"),
+    "mirrored": (FOUR, lambda frames: frames[:, :, ::-1], "mirrored left to right"),
+    "turned": (FOUR, lambda frames: frames[:, ::-1, ::-1], "turned by 180 degrees"),
+    "two frames exchanged": (UNIT, moved([0, 6, 2, 3, 4, 5, 1, 7]), "frames that changed places"),
+    "periods exchanged": (UNIT, moved([4, 5, 6, 7, 0, 1, 2, 3]), "of period 1, vertical sinusoids of period 0"),
+    "other sign of both": (UNIT, moved([0, 3, 2, 1, 4, 7, 6, 5]), "shifts of the other sign"),
+    "sine for cosine": (UNIT, moved([1, 2, 3, 0, 5, 6, 7, 4]), "sine for cosine"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", READINGS)
+@pytest.mark.parametrize("range_mm", [(1500, 2100), (600, 6000)])
+def test_the_reading_that_fits_is_named(name, range_mm):
+    code, change, text = READINGS[name]
+    rig = vertical(code).with_range(range_mm)
+    ((found, says),) = said(np.ascontiguousarray(change(frames_of(rig))), rig)
+    assert found == "another reading fits" and text in says
+
+
+def test_binary_numbers_for_gray_code():
+    rig = vertical(FOUR)
+    frames = frames_of(rig)
+    cells = np.arange(912) // 28.5
+    for bit in range(BITS):
+        levels = (cells.astype(int) >> (BITS - 1 - bit) & 1) * 255.0
+        x, y = rig.camera.rays()
+        u, _ = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * tilted(rig)[..., None])
+        frames[4 + bit] = np.rint(4 + 0.45 * np.interp(u, np.arange(912), levels))
+    assert "binary numbers" in said(frames, rig)[0][1]
+
+
+def test_two_directions_tell_more():
+    rig = rig_of(TWO)
+    frames = frames_of(rig)
+    for change, text in (
+        (lambda f: f[[*range(8, 16), *range(8), 16, 17]], "order horizontal"),
+        (lambda f: f[:, ::-1], "mirrored top to bottom"),
+        (lambda f: f[[*range(8), 8, 11, 10, 9, 12, 15, 14, 13, 16, 17]], "horizontal phase shifts of the other sign"),
+        (lambda f: f[[*range(16), 17, 16]], "white and black"),
+    ):
+        assert text in said(np.ascontiguousarray(change(frames)), rig)[0][1]
+
+
+def test_the_scene_of_two_captures_is_named():
+    rig = rig_of(TWO)
+    texture = 0.2 + 0.6 * (np.indices((SIZE, SIZE)).sum(axis=0) // 25 % 2)
+    one, other = (np.rint(frames_of(rig) * part).astype(np.uint8) for part in (texture, 1 - texture))
+    assert said(one, rig) == []
+    assert "scene moved" in [name for name, _ in said(np.concatenate([one[:8], other[8:]]), rig)]
+
+
+def test_depths_out_of_the_range_name_the_range_or_the_unit():
+    rig = vertical(FOUR)
+    frames = frames_of(rig)
+    text = said(frames, rig.with_range((500, 900)))[0][1]
+    near, far = (float(end) for end in text.split("--range ")[1].split()[0].split(","))
+    assert near < 1800 < far and "another working range" in text
+    tenth = replace(rig, translation_m=tuple(length / 10 for length in rig.translation_m))
+    text = said(frames, tenth)[0][1]
+    assert "cm were read as mm (10 times)" in text and "--range" not in text
+
+
+def test_what_a_rig_can_not_tell_is_listed():
+    one, both = vertical(UNIT | {"steps": 3}), rig_of(PAPER)
+    listed = " ".join(examine(frames_of(one), one).not_checked)
+    assert "one direction" in listed and "no Gray code" in listed and "three steps" in listed
+    assert examine(frames_of(both), both).not_checked == ()
+
+
+def test_only_what_is_asked_for_is_looked_at():
+    rig = rig_of(TWO)
+    frames = frames_of(rig)
+    frames[9] = frames[8]  # of the horizontal fringes
+    assert said(frames, rig) and said(frames, rig, directions=("vertical",)) == []
+    mask = np.zeros((SIZE, SIZE), bool)
+    mask[:50] = True
+    frames = frames_of(rig)
+    frames[3, 50:] = frames[2, 50:]
+    assert said(frames, rig) and said(frames, rig, mask=mask) == []
+    dark = examine(frames // 60, rig)
+    assert dark.findings == () and "pixels looked at are lit" in dark.not_checked[-1]
