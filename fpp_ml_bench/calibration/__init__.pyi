@@ -23,6 +23,5 @@ from .result import Calibration as Calibration
 from .result import Device as Device
 from .result import FittedPose as FittedPose
 from .solve import calibrate as calibrate
-from .solve import compare_lenses as compare_lenses
 from .volume import VolumeError as VolumeError
 from .volume import volume_error_mm as volume_error_mm

@@ -1,6 +1,6 @@
 """From board poses to a calibrated rig: start by OpenCV, joint refinement, circle bias, what each pose does to it."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -10,7 +10,7 @@ from fpp_ml_bench.calibration.boards import Board
 from fpp_ml_bench.calibration.bundle import Bundle, spread
 from fpp_ml_bench.calibration.checks import check_poses, check_solution, check_start
 from fpp_ml_bench.calibration.circles import without_bias
-from fpp_ml_bench.calibration.lens import MODELS, Lens
+from fpp_ml_bench.calibration.lens import Lens
 from fpp_ml_bench.calibration.projector_points import Pose
 from fpp_ml_bench.calibration.relabel import same_labels
 from fpp_ml_bench.calibration.result import Calibration, Device, FittedPose
@@ -58,24 +58,6 @@ def calibrate(
     check_solution(bundle, x, np.linalg.norm(root, axis=1))
     held_out = _held_out(bundle, x) if hold_out and len(poses) > 3 else [float("nan")] * len(poses)
     return _result(bundle, x, root, free.shape[1], alone, held_out, board, sizes, baseline_mm)
-
-
-def compare_lenses(
-    poses: Sequence[Pose],
-    board: Board,
-    camera_size: tuple[int, int],
-    projector_size: tuple[int, int],
-    lenses: Iterable[Lenses] = tuple(MODELS),
-    *,
-    estimate_board: bool = False,
-    baseline_mm: float | None = None,
-) -> list[Calibration]:
-    """`calibrate` with each of the ``lenses``; smallest held-out error first. Needs four poses."""
-    if len(poses) < 4:
-        raise CalibrationError(f"comparing lens models needs at least 4 poses, got {len(poses)}; name the model")
-    sizes, options = (camera_size, projector_size), {"estimate_board": estimate_board, "baseline_mm": baseline_mm}
-    found = [calibrate(poses, board, *sizes, lens, **options) for lens in lenses]  # type: ignore[arg-type]
-    return sorted(found, key=lambda calibration: calibration.held_out_rms_px)
 
 
 def _pair(lens: Lenses) -> tuple[Lens, Lens]:

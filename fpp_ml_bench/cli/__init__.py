@@ -15,6 +15,7 @@ from typing import Any
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.errors import FppBenchError, PoolError
+from fpp_ml_bench.files import cause_of
 from fpp_ml_bench.machine import usable_cores
 
 OK, CHECK_FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -123,8 +124,8 @@ def run_command(command: Command, prog: str, argv: Sequence[str]) -> int:
     except FppBenchError as error:
         return _refused(prog, error)
     except OSError as error:
-        named = error.filename is not None and error.strerror
-        return _refused(prog, f"{error.filename}: {error.strerror}" if named else error)
+        named = "" if error.filename is None else f"{error.filename}: "
+        return _refused(prog, f"{named}{cause_of(error)}")
     except ModuleNotFoundError as error:
         library = (error.name or "").partition(".")[0]
         extra = next((extra for extra, libraries in EXTRAS.items() if library in libraries), None)

@@ -5,6 +5,7 @@ coordinates (paper Section 2.1). Frames are read once, in blocks; nothing is fil
 that can't be decoded has depth 0 and a reason.
 """
 
+import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -210,7 +211,7 @@ def decode_stack(
         )
     if len(directions) == 2:
         # A code in cells misses the epipolar line by up to its own step.
-        step_px = float(np.hypot(*(rig.code(name).step_px for name in directions)))
+        step_px = math.hypot(*(rig.code(name).step_px for name in directions))
         limits = replace(limits, max_disagreement_px=limits.max_disagreement_px + step_px)
     plans, joint = [blocks.plan_direction(rig, name, steps, limits) for name in directions], None
     if fewest:

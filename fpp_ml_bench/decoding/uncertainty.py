@@ -100,8 +100,7 @@ def _unexplained(
     for direction in rig.directions:
         code = rig.code(direction)
         for number, fringe in enumerate(code.fringes if isinstance(code, PhaseShift) else ()):
-            indices = [frame.index for frame in rig.sequence if frame.direction == direction
-                       and frame.kind == "sinusoid" and frame.fringe == number]  # fmt: skip
+            indices = rig.sequence.period(direction, number)
             captured = [step for step, index in enumerate(indices) if frames[index] is not None]
             freedom = len(captured) - 3
             if freedom < 1:

@@ -37,7 +37,7 @@ RESPONSE_RAD = 0.006
 TRIED, IN_RANGE = 0.1, 0.05
 """Other readings are tried where more of the lit pixels contradict the code, or twice as many neighbours each other, or
 almost none lies in the range."""
-CONTRADICTING, DOUBTFUL = 0.6, 0.4
+CONTRADICTING, DOUBTFUL = 0.6, 0.5
 """Shares of the lit pixels that contradict the code and make depth untrustworthy or doubtful."""
 MOVED_SHARE = 0.05
 _FINEST, _SCORED_PX = 2.0, 4000
@@ -67,24 +67,20 @@ def examine(
     if findings:
         return Examination(tuple(findings), not_checked)
     edges = {
-        one.direction: gray_edges(lines, one, rig, limits.ambiguous_fraction) for one in sets if _is_finest(one, rig)
+        way: found for way, found in ((one.direction, gray_edges(lines, one, rig, limits)) for one in sets) if found
     }
     part = lines.part(_SCORED_PX)
     given = fit(part, rig, directions, limits, AS_GIVEN, calibrated)
-    measured = {
-        "coherent_share": given.coherent,
-        "in_range_share": given.fitting,
-        "contradicting_share": given.contradicting,
-    }
+    shares = {"coherent": given.coherent, "in_range": given.fitting, "contradicting": given.contradicting}
+    measured = {f"{name}_share": share for name, share in shares.items()}
     systematic: dict[str, float] = {}
     for one in sets:
         findings += _steps_and_response(lines, one, rig, titles, measured, systematic)
     for way, found in edges.items():
-        if found is not None:
-            measured[f"{way}_offset_turns"] = found.offset_turns.value
-            # A frame that is late shifts all phases, too.
-            if _is_offset(found) and not any(finding.severity == "refuse" for finding in findings):
-                return Examination((_offset(found, rig, way),), not_checked, measured)
+        measured[f"{way}_offset_turns"] = found.offset_turns.value
+        # A frame that is late shifts all phases, too.
+        if _is_offset(found) and not any(finding.severity == "refuse" for finding in findings):
+            return Examination((_offset(found, rig, way),), not_checked, measured)
     if given.contradicting > TRIED or given.agreeing < 1 - 2 * TRIED or given.fitting < IN_RANGE * given.coherent:
         other = _other_readings(lines, rig, directions, limits, given, calibrated)
         if other:
@@ -146,7 +142,7 @@ def _exchanged_flat(lines: Lines, rig: Rig) -> list[Finding]:
 
 def _is_offset(found: Edges) -> bool:
     offset, sigma = abs(found.offset_turns.value), found.offset_turns.sigma
-    clear = found.count >= OFFSET_EDGES and found.agreeing > 0.8 and found.forward > 0.8
+    clear = found.edges >= OFFSET_EDGES and found.agreeing > 0.8 and found.forward > 0.8
     return clear and offset > OFFSET_TURNS and offset > SIGMAS * sigma
 
 
@@ -158,7 +154,7 @@ def _offset(found: Edges, rig: Rig, direction: Direction) -> Finding:
         "phase and Gray code", "refuse",
         f"the {direction} phase at the edges of the Gray cells is {360 * turns.value:.1f} +- "
         f"{360 * turns.sigma:.1f} degrees off, {abs(turns.value) * pitch:.2f} projector px, "
-        f"at {100 * found.agreeing:.0f}% of {found.count} edges",
+        f"at {100 * found.agreeing:.0f}% of {found.edges} edges",
         "the sinusoids begin elsewhere than at the Gray code's first pixel (another origin, or sine for cosine)",
         f"if the Gray code begins at the pattern's first pixel: origin_px: {origin_px:.2f} ({direction}), or "
         f"{360 * turns.value:+.1f} degrees to every shift in shifts_deg",

@@ -5,6 +5,7 @@ neighbours say: phases go on at the edges of Gray cells, and on a surface that b
 coordinates grow along the image as they do on a plane (the ordering constraint of stereo vision).
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -85,8 +86,8 @@ def fit(lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits,
             shown = one.mean + np.cos(one.shifts_rad)[:, None] * one.cosine + np.sin(one.shifts_rad)[:, None] * one.sine
             misfit = ((levels[list(one.frames)] - shown) ** 2).mean(axis=0)
             reason[(reason == 0) & (misfit > (LARGEST_MISFIT * one.modulation) ** 2)] = Reason.INCONSISTENT_ORDER
-        found = gray_edges(seen, one, rig, limits.ambiguous_fraction)
-        edges *= 1.0 if found is None or found.count < _FEWEST_PAIRS else min(found.agreeing, found.forward)
+        found = gray_edges(seen, one, rig, limits)
+        edges *= 1.0 if found is None or found.edges < _FEWEST_PAIRS else min(found.agreeing, found.forward)
     # Pixels that change so much have to be lit by any reading.
     counted = (lit | (np.ptp(levels, axis=0) >= CLEARLY_LIT_GREY)) & ~saturated
     if not counted.any():
@@ -101,7 +102,7 @@ def fit(lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits,
     forward = min(
         (_forward(lines, rays, measured[way].coordinate_px, reason == 0, rig, way) for way in directions), default=1.0
     )
-    apart_px = LARGEST_DISAGREEMENT_PX + float(np.hypot.reduce([rig.code(way).step_px for way in directions]))
+    apart_px = LARGEST_DISAGREEMENT_PX + math.hypot(*(rig.code(way).step_px for way in directions))
     wide, loose = rig.with_range(_WIDE_MM), replace(limits, max_disagreement_px=apart_px)
     depth_mm, of_depth = depth_and_reason(measured, (rays[0], rays[1]), wide, loose)
     good = (reason == 0) & (of_depth == 0)
@@ -286,10 +287,10 @@ def _orders(frames: Sequence[Frame], runs: list[list[int]]) -> Iterator[list[int
             for first in (0, 1):
                 ordered = sorted(runs, key=lambda run: (ranks[run[0]][first], ranks[run[0]][1 - first]))
                 yield [index for run in ordered for index in run]
-    for number, run in enumerate(runs):
-        others = runs[:number] + runs[number + 1 :]
-        for place in range(len(runs)):
-            yield [index for part in (*others[:place], run, *others[place:]) for index in part]
+    for first, second in combinations(range(len(runs)), 2):
+        ordered = list(runs)
+        ordered[first], ordered[second] = runs[second], runs[first]
+        yield [index for run in ordered for index in run]
 
 
 def _names(frames: Sequence[Frame], captured: Sequence[int]) -> list[str]:

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding import MIN_MODULATION, PhaseShift, minus_atan2, phase_weights, weighted_sums
+from fpp_ml_bench.coding import MIN_MODULATION, Limits, PhaseShift, minus_atan2, phase_weights, weighted_sums
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.examination.lines import Lines
 from fpp_ml_bench.optics import Direction, Rig
@@ -66,10 +66,7 @@ def fringe_sets(lines: Lines, rig: Rig, directions: Sequence[Direction]) -> list
     for direction in directions:
         code = rig.code(direction)
         for number, fringe in enumerate(code.fringes if isinstance(code, PhaseShift) else ()):
-            frames = tuple(
-                frame.index for frame in rig.sequence
-                if frame.direction == direction and frame.kind == "sinusoid" and frame.fringe == number
-            )  # fmt: skip
+            frames = rig.sequence.period(direction, number)
             if len(frames) < 3:
                 continue
             shifts, levels = TAU * fringe.turns, lines.levels[list(frames)]
@@ -239,16 +236,16 @@ class Edges(NamedTuple):
     offset_turns: Estimate
     agreeing: float
     forward: float
-    count: int
+    edges: int
 
 
-def gray_edges(lines: Lines, one: FringeSet, rig: Rig, ambiguous_fraction: float) -> Edges | None:
+def gray_edges(lines: Lines, one: FringeSet, rig: Rig, limits: Limits) -> Edges | None:
     """What the edges of the Gray cells say about the phase of the set; None without Gray code or with few edges."""
     code = rig.code(one.direction)
     if not isinstance(code, PhaseShift) or code.gray is None or one.number != code.finest:
         return None
     length, levels = rig.pattern_length(one.direction), lines.levels[list(rig.sequence.gray(one.direction))]
-    cells = code.gray.decode(levels, one.mean, one.modulation, ambiguous_fraction)
+    cells = code.gray.decode(levels, one.mean, one.modulation, limits.ambiguous_fraction)
     usable = one.good & cells.trusted
     first = np.flatnonzero(usable[:-1] & usable[1:] & lines.joined[:-1])
     first = first[np.abs(cells.number[first + 1] - cells.number[first]) == 1]

@@ -11,16 +11,18 @@ process), so it runs in a process of its own.
 import json
 import subprocess
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.files import printable, write_atomically
+from fpp_ml_bench.files import printable, strict_yaml, write_atomically
 from fpp_ml_bench.optics.pinhole import Pinhole, require
 from fpp_ml_bench.optics.rig import Matrix3
 
@@ -29,6 +31,8 @@ UNITS = {"mm": MM_PER_M, "m": 1.0}
 SUFFIXES = (".xml", ".yaml", ".yml", ".json")
 LARGEST_BYTES = 1 << 24
 TIMEOUT_S = 60
+_LONGEST_YAML = 1 << 18
+"""Characters that are looked at for the cause where OpenCV can't read a file: parsing YAML in Python is slow."""
 ROUNDED = 1e-5
 """Largest accepted |R R^T - I|: a rotation that was rounded to float32 or to six digits."""
 EXACT = 1e-14
@@ -42,6 +46,10 @@ _NAMES = {
     "rotation": ("R", "Rp"),
     "translation": ("T", "Tp"),
 }
+_CURE = (
+    "give the numbers in the rig file's own entries (camera, projector, rotation, translation_m), or write the file by "
+    "cv2.FileStorage"
+)
 _SIZES = {"camera": ("imageSize1", "imageSize"), "projector": ("imageSize2",)}
 _WIDTH_AND_HEIGHT = {"camera": ("frameWidth", "frameHeight"), "projector": ("screenResX", "screenResY")}
 _ERRORS = ("cam_error", "proj_error", "stereo_error")
@@ -78,6 +86,7 @@ def read_opencv_calibration(
         require(not twice, f"{path}: {twice} is also in another of the files; give one calibration only")
         nodes.update(content)
     file = ", ".join(map(str, paths))
+    require(any(name in nodes for names in _NAMES.values() for name in names), f"{file}: {_other_layout(nodes)}")
     try:
         translation = _matrix(nodes, "translation", (3, 1), (1, 3)).ravel()
         require(np.any(translation), "the translation is zero, so no depth can be triangulated; calibrate again")
@@ -190,12 +199,12 @@ def _matrix(nodes: dict[str, Any], what: str, *shapes: tuple[int, int] | None) -
     expected = f"{what}: expected a node {' or '.join(_NAMES[what])}"
     require(
         names,
-        f"{expected}, found {printable(', '.join(nodes)) or 'no nodes'}; if the file "
-        "is of another tool, write its numbers into the rig file (camera, projector, rotation, translation_m)",
+        f"{expected}, found {printable(', '.join(nodes)) or 'no nodes'}; if the file is of another tool, {_CURE}",
     )
     require(len(names) == 1, f"{expected}, found {' and '.join(names)}; keep one of them")
     node = nodes[names[0]]
-    require(isinstance(node, dict), f"{names[0]} ({what}): expected a matrix, found {printable(node)}")
+    no_matrix = f"{names[0]} ({what}): expected a matrix, found {printable(node)}; {_CURE}"
+    require(isinstance(node, dict), no_matrix)
     values = np.array(node["data"], dtype=np.float64).reshape(node["shape"])
     if shapes == (None,):
         require(values.size == max(values.shape), f"{names[0]} ({what}): expected a vector, found shape {values.shape}")
@@ -214,16 +223,33 @@ def _nodes(path: Path) -> dict[str, Any]:
         size = path.stat().st_size
         require(size > 0, f"{path}: the file is empty; {cure}")
         require(size <= LARGEST_BYTES, f"{path}: {size} bytes are too many for a calibration; {cure}")
-        path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8")
     except UnicodeDecodeError:
         raise RigError(f"{path}: expected text, found other bytes; {cure}") from None
     except OSError as error:
         raise RigError(f"{path}: can't be read: {error.strerror or error}") from error
     answer = _parsed_elsewhere(str(path.resolve()))
     if "nodes" not in answer:
+        if keys := _keys(text, path.suffix.lower()):
+            raise RigError(f"{path}: {_other_layout(keys)}")
         reason = f": {printable(answer['problem'])}" if "problem" in answer else ""
         raise RigError(f"{path}: the file is damaged or of another format, OpenCV can't read it{reason}; {cure}")
     return answer["nodes"]
+
+
+def _other_layout(keys: Iterable[str]) -> str:
+    expected = "expected the nodes M1, D1, M2, D2, R, T (OpenCV's matrices)"
+    found = printable(", ".join(keys)) or "none"
+    return f"is well-formed, but of another layout: {expected}, found the keys {found}; {_CURE}"
+
+
+def _keys(text: str, suffix: str) -> list[str]:
+    """The keys of a JSON or YAML mapping in ``text``, none where it is anything else."""
+    try:
+        content = json.loads(text) if suffix == ".json" else strict_yaml(text[:_LONGEST_YAML])
+    except (ValueError, yaml.YAMLError, RecursionError):
+        return []
+    return list(content) if isinstance(content, dict) else []
 
 
 def _parsed_elsewhere(path: str) -> dict[str, Any]:

@@ -117,26 +117,36 @@ def load_rig(path: str | Path) -> Rig:
 
     def build(data: object) -> Rig:
         rig = rig_from_dict(_with_calibration(data, Path(path).parent))
-        named = isinstance(data, Mapping) and "calibration" in data
-        check_lengths(rig, "calibration.unit" if named else "translation_m")
+        if not isinstance(data, Mapping) or "calibration" not in data:
+            check_lengths(rig, "translation_m", "m")
+            return rig
+        named = data["calibration"]
+        given = named if isinstance(named, Mapping) else {"file": named}
+        unit = given.get("unit", "mm")
+        cure = f"write calibration: {{file: ..., unit: {'m' if unit == 'mm' else 'mm'}}}"
+        check_lengths(rig, f"{given['file']}: the translation", unit, cure)
         return rig
 
     return _loaded(Path(path), build)
 
 
-def check_lengths(rig: Rig, entry: str = "translation_m") -> None:
+def check_lengths(rig: Rig, entry: str = "the pose", unit: str | None = None, cure: str | None = None) -> None:
     """Raise `RigError` for a baseline or a working range that no rig has, and name the unit that would fit. ``entry``:
-    where the baseline's unit is said."""
-    (least, most), (near, far) = BASELINES_M, rig.working_range_mm
-    baseline = rig.baseline_m
+    what gives the baseline; ``unit``: mm or m, in which it was read, by default the one that leads to such a baseline;
+    ``cure``: what to do where the other unit fits, by default to multiply or divide by 1000."""
+    (least, most), (near, far), baseline = BASELINES_M, rig.working_range_mm, rig.baseline_m
     if not least <= baseline <= most:
-        read, unit, factor = ("mm", "m", MM_PER_M) if baseline < least else ("m", "mm", 1 / MM_PER_M)
-        fits = least <= baseline * factor <= most
-        hint = f"; read in {unit} it would be {MM_PER_M * factor * baseline:.4g} mm: say so ({entry})" if fits else ""
-        raise RigError(f"{entry}: a baseline of {MM_PER_M * baseline:.4g} mm, read in {read}, which no rig has{hint}")
+        in_mm = unit == "mm" if unit else baseline < least
+        other, step, factor = ("metres", "multiply", MM_PER_M) if in_mm else ("mm", "divide", 1 / MM_PER_M)
+        hint = "check its numbers and their unit"
+        if least <= baseline * factor <= most:
+            hint = f"as {other} it would be {MM_PER_M * baseline * factor:.5g} mm: {cure or f'{step} by 1000'}"
+        length = f"{MM_PER_M * baseline:.3g} mm" if baseline < least else f"{baseline:.5g} m"
+        raise RigError(f"{entry} gives a baseline of {length}, which no rig has; {hint}")
     if far < LEAST_FAR_MM or near > MOST_NEAR_MM:
-        metres = "; they look like metres: write them in mm" if far < LEAST_FAR_MM else ""
-        raise RigError(f"working_range_mm: {near:g} to {far:g} mm, where no rig looks{metres}")
+        as_metres = f"looks like metres: write [{MM_PER_M * near:g}, {MM_PER_M * far:g}]"
+        hint = as_metres if far < LEAST_FAR_MM else "check its unit, mm"
+        raise RigError(f"working_range_mm: {near:g} to {far:g} mm, where no rig looks; {hint}")
 
 
 def load_projection(path: str | Path, camera_size: tuple[int, int] | None = None) -> Rig:
@@ -200,7 +210,7 @@ def _loaded(file: Path, build: Callable[[object], Rig]) -> Rig:
     except RigError as error:
         raise RigError(f"{file}: {error}") from error
     except (OSError, UnicodeDecodeError) as error:
-        raise RigError(f"{file}: can't be read as text: {cause_of(error)}") from error
+        raise RigError(f"{file}: can't be read: {cause_of(error)}") from error
     except (json.JSONDecodeError, yaml.YAMLError, RecursionError) as error:
         problem = str(error) or "nested too deeply"
         raise RigError(f"{file}: malformed {'JSON' if as_json else 'YAML'}: {problem}") from error

@@ -95,14 +95,17 @@ class AnySequence(ABC):
 
     def sinusoids(self, direction: Direction) -> tuple[int, ...] | range:
         """Frame indices of a direction's finest sinusoids, in the order of their steps; none where it has none."""
-        finest = self._finest(direction)
+        return self.period(direction, self._finest(direction))
+
+    def period(self, direction: Direction, fringe: int) -> tuple[int, ...]:
+        """Frame indices of a direction's sinusoids of the ``fringe``-th period, in the order of their steps."""
         return tuple(
             frame.index for frame in self.frames
-            if frame.kind == "sinusoid" and frame.direction == direction and frame.fringe == finest
+            if frame.kind == "sinusoid" and frame.direction == direction and frame.fringe == fringe
         )  # fmt: skip
 
     def gray(self, direction: Direction) -> tuple[int, ...] | range:
-        """Frame indices of a direction's Gray code, most significant bit first; none where it has none."""
+        """Frame indices of a direction's Gray code, in the order of its frames; none where it has none."""
         return tuple(f.index for f in self.frames if f.kind == "gray" and f.direction == direction)
 
     @property
@@ -253,8 +256,7 @@ class CodedSequence(AnySequence):
             code = self.code(direction)
             for number, fringe in enumerate(code.fringes if isinstance(code, PhaseShift) else ()):
                 steps = len(fringe.shifts_deg)
-                indices = tuple(f.index for f in self.frames if f.direction == direction and f.kind == "sinusoid"
-                                and f.fringe == number)  # fmt: skip
+                indices = self.period(direction, number)
                 for sign in (1, -1):
                     if steps >= 3 and fringe.shifts_deg == equal_shifts(steps, sign):
                         found.append((direction, indices, sign * np.arange(steps) / steps))

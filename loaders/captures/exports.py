@@ -19,10 +19,11 @@ from fpp_ml_bench.optics import Pinhole
 
 FORMS = ("npy", "mat", "png", "ply", "mesh")
 REPORT = "decode.json"
-_WRITTEN = re.compile(
-    r"\.?(decode\.json|(depth|sigma_mm|modulation|reason)\.npy|depth\.mat|depth_[0-9.]+mm\.png|(points|mesh)\.ply|picture\.png)"
-    r"(\.[0-9]+\.tmp)?"
+_NAMES = (
+    r"(decode\.json|(depth|sigma_mm|modulation|reason)\.npy|depth\.mat|depth_[0-9.]+mm\.png|(points|mesh)\.ply"
+    r"|picture\.png)"
 )
+_WRITTEN = re.compile(rf"{_NAMES}|\.{_NAMES}\.[0-9]+\.tmp")
 """Names that a decoding writes, and the temporary files of one that was killed."""
 STEEPEST = 5.0
 """Neighbouring pixels are one surface where depth changes by at most this many times their distance across the ray: a
@@ -214,10 +215,10 @@ def check_outputs(folder: Path) -> None:
         raise CaptureError(f"{folder}: expected a folder for the results, found a file; give another name")
     if not folder.is_dir():
         return
-    others = sorted(path.name for path in folder.iterdir() if not _WRITTEN.fullmatch(path.name))
+    others = sorted(p.name for p in folder.iterdir() if p.is_dir() or not _WRITTEN.fullmatch(p.name))
     if others:
         listed = ", ".join(others[:4]) + (f" and {len(others) - 4} more" if len(others) > 4 else "")
-        raise CaptureError(f"{folder}: not empty, and holds what no decoding writes ({listed}); give a new folder")
+        raise CaptureError(f"{folder}: holds files that no decoding writes: {listed}; give a new folder")
 
 
 def clear_outputs(folder: Path) -> None:

@@ -259,13 +259,14 @@ def _levels(image: Any, content: bytes, bits: int, orientation: int, file: Path)
         import cv2
 
         stored = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-        if stored is None or stored.dtype != np.uint16 or sorted(stored.shape[:2]) != sorted(image.size):
+        if stored is None or stored.dtype != np.uint16 or stored.shape[:2] != image.size[::-1]:
             raise CaptureError(f"{file}: colour of {bits} bits that OpenCV can't decode; write it as grey levels")
-        levels = upright(stored[..., [2, 1, 0, *range(3, stored.shape[2])]])
+        levels = stored[..., [2, 1, 0, *range(3, stored.shape[2])]]
     else:
         shown = image.convert("RGBA" if image.mode == "PA" else "RGB") if image.mode in ("P", "PA") else image
         levels = np.asarray(shown).astype(np.uint16 if bits > 8 else np.uint8)
-        levels = levels if image.format == "TIFF" else upright(levels)  # Pillow has turned a TIFF already
+    if image.format != "TIFF":  # Pillow and OpenCV turn a TIFF themselves
+        levels = upright(levels)
     if levels.ndim == 3 and levels.shape[2] in (2, 4):
         opaque = (1 << bits) - 1
         if not (levels[..., -1] == opaque).all():

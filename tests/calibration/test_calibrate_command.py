@@ -79,7 +79,7 @@ def test_from_captures_a_wrong_spacing_scales_the_rig(virtual, tmp_path):
         (("FLAT", "--board", "BOARD", "--sequence", "TRUE"), "pose_01: white and black: white has"),
         (("COPIED", "--board", "BOARD", "--sequence", "TRUE"), "pose_02: image 0 is that of pose_01 (image 0)"),
         (("MIXED", "--board", "BOARD", "--sequence", "TRUE"), "scene moved"),
-        (("BOARDS", "--board", "circles:5x9:0.05:0.015", "--sequence", "TRUE"), "of --board, in mm,: a baseline of"),
+        (("BOARDS", "--board", "circles:5x9:0.05:0.015", "--sequence", "TRUE"), "--board, in mm, gives a baseline of"),
         (("--virtual", "boards", "--size", "20"), "--size 20: expected 64"),
         (("--virtual", "boards", "--size", "240", "--board", "circles:5x9:500:150"), "does not fit"),
     ],

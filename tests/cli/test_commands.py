@@ -170,13 +170,21 @@ def test_bad_input_exits_2_with_a_message_and_makes_nothing(tiny, tmp_path, monk
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_unexpected_system_errors_are_messages(tiny, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    ("error", "message"),
+    [
+        (PermissionError(13, "Permission denied", "/somewhere"), "/somewhere: Permission denied"),
+        (OSError(28, "No space left on device"), "No space left on device"),
+        (OSError("the stream ended"), "the stream ended"),
+    ],
+)
+def test_unexpected_system_errors_are_messages(tiny, monkeypatch, capsys, error, message):
     def fail(manifest):
-        raise PermissionError(13, "Permission denied", "/somewhere")
+        raise error
 
     monkeypatch.setattr("fpp_ml_bench.loaders.storage.split_statistics", fail)
     assert call("info", tiny) == 2
-    assert "Permission denied: '/somewhere'" in capsys.readouterr().err
+    assert capsys.readouterr().err == f"fpp-bench info: error: {message}\n"
 
 
 def test_ctrl_c_is_130(tiny, monkeypatch, capsys):

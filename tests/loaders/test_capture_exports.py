@@ -1,6 +1,7 @@
 """Depth of a capture as files: read back by other programs' readers, and compared with a plane and a sphere."""
 
 import re
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ import trimesh
 from PIL import Image
 
 from fpp_ml_bench.errors import CaptureError
-from fpp_ml_bench.loaders.captures import export_capture, pixel_normals, triangles
+from fpp_ml_bench.loaders.captures import check_outputs, clear_outputs, export_capture, pixel_normals, triangles
 from fpp_ml_bench.optics import Pinhole
 
 CAMERA = Pinhole(64, 48, 90.0, 92.0, 30.3, 24.1, (-0.05, 0.01, 0.001, -0.001, 0.0))
@@ -198,3 +199,46 @@ def test_pixels_without_a_ray_have_no_point(tmp_path):
     (file,) = export_capture(tmp_path, np.full((5, 101), 500.0), camera, forms=["ply"])
     count = np.isfinite(camera.rays()[0]).sum()
     assert 0 < count < 505 and len(trimesh.load(file).vertices) == count
+
+
+def _filled(folder, *others):
+    """A folder with all that a decoding writes and what a killed one leaves, and ``others``."""
+    export_capture(folder, PLANE_MM, CAMERA)
+    names = ("decode.json", "sigma_mm.npy", "modulation.npy", "reason.npy", "picture.png", ".depth_0.01mm.png.31.tmp")
+    for name in (*names, ".decode.json.7.tmp", *others):
+        (folder / name).write_text("")
+    return folder
+
+
+def test_what_a_decoding_wrote_is_removed_the_report_first(tmp_path, monkeypatch):
+    removed, unlink = [], Path.unlink
+    monkeypatch.setattr(Path, "unlink", lambda path, **options: (removed.append(path.name), unlink(path, **options))[0])
+    folder = _filled(tmp_path / "out")
+    removed.clear()
+    clear_outputs(folder)
+    assert removed[0] == "decode.json" and len(removed) == 12 and not list(folder.iterdir())
+    clear_outputs(folder)
+    clear_outputs(tmp_path / "absent")
+    assert not (tmp_path / "absent").exists()
+
+
+@pytest.mark.parametrize("name", ["notes.txt", "depth.npy.bak", ".depth.npy", "depth.npy.7.tmp", "depth_mm.npy"])
+def test_other_files_are_named_before_anything_is_removed(tmp_path, name):
+    folder = _filled(tmp_path / "out", name)
+    before = sorted(folder.iterdir())
+    for refuse in (check_outputs, clear_outputs):
+        expected = f"{folder}: holds files that no decoding writes: {name}; give a new folder"
+        with pytest.raises(CaptureError, match=f"^{re.escape(expected)}$"):
+            refuse(folder)
+    assert sorted(folder.iterdir()) == before
+
+
+def test_a_file_or_a_folder_in_the_place_of_the_results_is_refused(tmp_path):
+    (tmp_path / "file").write_text("")
+    (tmp_path / "out" / "depth.npy").mkdir(parents=True)
+    for refuse in (check_outputs, clear_outputs):
+        with pytest.raises(CaptureError, match="file: expected a folder for the results, found a file"):
+            refuse(tmp_path / "file")
+        with pytest.raises(CaptureError, match=r"no decoding writes: depth\.npy"):
+            refuse(tmp_path / "out")
+    check_outputs(tmp_path / "absent")

@@ -1,11 +1,13 @@
 """Captured images: what is read, in which order and scale, and what is refused."""
 
 import io
+import struct
+from zlib import crc32
 
 import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageOps
 
 from fpp_ml_bench.errors import CaptureError
 from fpp_ml_bench.loaders.captures import frame_files, read_frames
@@ -76,6 +78,39 @@ def test_more_than_eight_bits(tmp_path, stored, bits, full_scale, note, suffix):
     read = read_frames(tmp_path, bits=bits)
     assert read.frames.dtype == np.float32 and (read.full_scale, read.note) == (full_scale, note)
     np.testing.assert_allclose(read.frames, stored * (255 / full_scale), rtol=1e-7)
+
+
+def _turned(image, suffix, orientation):
+    """A PNG with the chunk eXIf, or a TIFF, that asks for ``orientation``; in colour as OpenCV writes it."""
+    content = _bytes(image, suffix)
+    tag = struct.pack("<HHIHH", 274, 3, 1, orientation, 0)
+    if suffix == ".png":
+        chunk = b"eXIfII*\0" + struct.pack("<IH", 8, 1) + tag + bytes(4)
+        return content[:33] + struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", crc32(chunk)) + content[33:]
+    (start,) = struct.unpack_from("<I", content, 4)
+    (count,) = struct.unpack_from("<H", content, start)
+    tags = [content[place : place + 12] for place in range(start + 2, start + 2 + 12 * count, 12)]
+    tags = sorted([tag, *(t for t in tags if t[:2] != tag[:2])], key=lambda t: struct.unpack_from("<H", t))
+    padded = content + bytes(len(content) % 2)
+    return (padded[:4] + struct.pack("<I", len(padded)) + padded[8:]
+            + struct.pack("<H", len(tags)) + b"".join(tags) + bytes(4))  # fmt: skip
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_images_are_upright_by_their_orientation(tmp_path, orientation, dtype, channels):
+    image = RNG.integers(0, 256, (30, 41, channels), np.uint8).squeeze().astype(dtype)
+    marked = Image.fromarray((image if channels == 1 else image[..., 1]).astype(np.uint8))
+    marked.getexif()[274] = orientation
+    upright = np.asarray(ImageOps.exif_transpose(marked))
+    if orientation in (3, 6):  # by definition
+        assert np.array_equal(upright, np.rot90(np.asarray(marked), 2 if orientation == 3 else -1))
+    for suffix in (".png", ".tif"):
+        file = tmp_path / f"a{suffix}"
+        file.write_bytes(_turned(image, suffix, orientation))
+        read = read_frames(file, colour="green", bits=8)
+        assert read.full_scale == 255 and np.array_equal(read.frames[0], upright)
 
 
 def test_white_is_exactly_255(tmp_path):

@@ -165,7 +165,7 @@ SHORT = '<R type_id="opencv-matrix"><rows>3</rows><cols>3</cols><dt>d</dt><data>
         (b"%YAML:1.0\n---\nM1: [1, 2", "OpenCV can't read it"),
         (b'{"M1": ', "OpenCV can't read it"),
         (b"[1, 2]", "no named nodes"),
-        (b"{}", "camera matrix: expected a node|no named nodes|translation: expected a node"),
+        (b"{}", "another layout.*found the keys none"),
         (b'<?xml version="1.0"?>\n<opencv_storage>', "OpenCV can't read it|expected a node"),
         (
             f'<?xml version="1.0"?>\n<opencv_storage>{SHORT}</opencv_storage>'.encode(),
@@ -179,6 +179,27 @@ def test_files_that_are_no_calibration_are_refused(tmp_path, content, message):
     with pytest.raises(RigError, match=message) as caught:
         read_opencv_calibration(path)
     assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "keys"),
+    [
+        ("ros.yaml", "image_width: 640\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [8, 0, 3, 0, 8, 2, 0, 0, 1]\n",
+         "image_width, camera_matrix"),
+        ("flow.yml", "camera: {K: [800, 0, 320, 0, 800, 240, 0, 0, 1], D: [0, 0, 0, 0, 0]}\n", "camera"),
+        ("block.yml", "camera:\n  K:\n  - [800, 0, 320]\nlens model: none\n", "camera, lens model"),
+        ("alone.json", '{\n\t"camera": {"K": [[800, 0], [0]], "D": null}}', "camera"),
+    ],
+)  # fmt: skip
+def test_a_sound_file_of_another_layout_is_not_called_damaged(tmp_path, name, content, keys):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(RigError) as caught:
+        read_opencv_calibration(tmp_path / name)
+    assert str(caught.value) == (
+        f"{tmp_path / name}: is well-formed, but of another layout: expected the nodes M1, D1, M2, D2, R, T (OpenCV's "
+        f"matrices), found the keys {keys}; give the numbers in the rig file's own entries (camera, projector, "
+        "rotation, translation_m), or write the file by cv2.FileStorage"
+    )
 
 
 def test_arguments_that_contradict_or_make_no_sense_are_refused(sound, tmp_path):

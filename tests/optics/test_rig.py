@@ -10,7 +10,18 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.optics import Pinhole, Rig, load_rig, paper_rig, rig_from_dict, rotation_matrix, save_rig
+from fpp_ml_bench.optics import (
+    OpenCvCalibration,
+    Pinhole,
+    Rig,
+    check_lengths,
+    load_rig,
+    paper_rig,
+    rig_from_dict,
+    rotation_matrix,
+    save_rig,
+    write_opencv_calibration,
+)
 from fpp_ml_bench.optics.pinhole import distort, fold_radius_squared, undistort
 from fpp_ml_bench.optics.sequence import Sequence
 
@@ -198,7 +209,7 @@ def test_an_invalid_rig_is_refused_naming_file_and_key(tmp_path, path, value, me
         ("rig.yaml", b"1: 2", "text as key"),
         ("rig.yaml", b"camera: 1\ncamera: 2", "'camera' is given twice"),
         ("rig.json", b'{"camera": 1, "camera": 2}', "camera is given twice"),
-        ("rig.yaml", b"\xff\xfe\x00", "can't be read as text"),
+        ("rig.yaml", b"\xff\xfe\x00", "can't be read: 'utf-8' codec"),
         ("rig.txt", b"camera: 1", "ending in .yaml"),
     ],
 )
@@ -210,10 +221,63 @@ def test_unreadable_files_are_refused(tmp_path, name, content, message):
 
 
 def test_missing_file_and_unwritable_folder_are_rig_errors(tmp_path):
-    with pytest.raises(RigError, match=r"absent.yaml.*can't be read"):
+    with pytest.raises(RigError, match=r"absent.yaml: can't be read: No such file or directory$"):
         load_rig(tmp_path / "absent.yaml")
     with pytest.raises(RigError, match="can't be written"):
         save_rig(paper_rig(), tmp_path / "no" / "rig.yaml")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"translation_m": [200, 0, 0]},
+         "translation_m gives a baseline of 200 m, which no rig has; as mm it would be 200 mm: divide by 1000"),
+        ({"translation_m": [0.0002, 0, 0]}, "translation_m gives a baseline of 0.2 mm, .*; check its numbers"),
+        ({"translation_m": [1e6, 0, 0]}, "translation_m gives a baseline of 1e.06 m, .*; check its numbers"),
+        ({"working_range_mm": [0.5, 1.5]}, r"working_range_mm: 0.5 to 1.5 mm, .*like metres: write \[500, 1500\]"),
+        ({"working_range_mm": [2e6, 3e6]}, r"working_range_mm: 2e\+06 to 3e\+06 mm, .*; check its unit, mm"),
+    ],
+)  # fmt: skip
+def test_lengths_in_a_unit_that_no_rig_has_are_refused(tmp_path, changes, message):
+    data = {**paper_rig().to_dict(), "background_m": None, **changes}
+    near, far = data["working_range_mm"]
+    data["standoff_m"] = (near + far) / 2000
+    (tmp_path / "rig.json").write_text(json.dumps(data))
+    with pytest.raises(RigError, match=rf"rig.json: {message}"):
+        load_rig(tmp_path / "rig.json")
+    rig_from_dict(data)  # only files are checked
+
+
+@pytest.mark.parametrize(
+    ("stored", "unit", "message"),
+    [
+        ("m", "", "gives a baseline of 0.2 mm, which no rig has; as metres it would be 200 mm: "
+         "write calibration: {file: ..., unit: m}"),
+        ("mm", ", unit: m", "gives a baseline of 200 m, which no rig has; as mm it would be 200 mm: "
+         "write calibration: {file: ..., unit: mm}"),
+    ],
+)  # fmt: skip
+def test_a_calibration_read_in_the_wrong_unit_is_refused(tmp_path, stored, unit, message):
+    rig = paper_rig()
+    calibration = OpenCvCalibration(rig.camera, rig.projector, np.eye(3).tolist(), (0.2, 0.0, 0.0))
+    write_opencv_calibration(calibration, tmp_path / "cal.yml", stored)
+    rest = {key: rig.to_dict()[key] for key in ("sequence", "pitch_px", "working_range_mm")}
+    file = tmp_path / "rig.yaml"
+    file.write_text(f"calibration: {{file: cal.yml{unit}}}\n{yaml.safe_dump(rest)}")
+    with pytest.raises(RigError) as caught:
+        load_rig(file)
+    assert str(caught.value) == f"{file}: cal.yml: the translation {message}"
+    file.write_text(f"calibration: {{file: cal.yml, unit: {stored}}}\n{yaml.safe_dump(rest)}")
+    assert load_rig(file).baseline_m == 0.2
+
+
+def test_a_calibrated_rig_is_checked_by_what_gave_its_lengths():
+    data = {**paper_rig().to_dict(), "translation_m": [0.0002, 0, 0]}
+    expected = "^the spacing gives a baseline of 0.2 mm, .* as metres it would be 200 mm: multiply by 1000$"
+    with pytest.raises(RigError, match=expected):
+        check_lengths(rig_from_dict(data), "the spacing")
+    for length in (0.005, 20.0):
+        check_lengths(rig_from_dict({**data, "translation_m": [length, 0, 0]}))
 
 
 def test_a_projector_that_looks_away_is_refused():
