@@ -6,6 +6,7 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 
 from fpp_ml_bench.coding import Limits, PhaseShift
 from fpp_ml_bench.constants import MM_PER_M
@@ -39,7 +40,7 @@ TRIED, IN_RANGE = 0.1, 0.05
 almost none lies in the range."""
 CONTRADICTING, DOUBTFUL = 0.6, 0.5
 """Shares of the lit pixels that contradict the code and make depth untrustworthy or doubtful."""
-MOVED_SHARE = 0.05
+MOVED_SHARE, NEIGHBOURS_PX = 0.05, 9
 _FINEST, _SCORED_PX = 2.0, 4000
 _UNITS = ((1000.0, "metres were read as mm"), (100.0, "metres were read as cm"), (10.0, "cm were read as mm"),
           (0.1, "mm were read as cm"), (0.001, "mm were read as metres"))  # fmt: skip
@@ -226,7 +227,9 @@ def _moved(sets: Sequence[FringeSet]) -> list[Finding]:
         if both.sum() < LEAST_PX:
             continue
         gain = float(np.median(other.mean[both]) / max(float(np.median(one.mean[both])), 1e-9))
-        apart = np.abs(other.mean[both] - gain * one.mean[both]) > 0.25 * one.modulation[both] + 6.0
+        # Over some neighbours, which share no noise.
+        difference = uniform_filter1d(other.mean - gain * one.mean, NEIGHBOURS_PX)[both]
+        apart = np.abs(difference) > 0.25 * one.modulation[both] + 6.0
         if apart.mean() > MOVED_SHARE:
             return [Finding(
                 "scene moved", "refuse",

@@ -126,6 +126,63 @@ def test_twelve_bits_decode_more_finely(capture, tmp_path):
     assert both.sum() > 0.98 * (expected > 0).sum() and np.abs(depth_mm - expected)[both].max() < 1
 
 
+def test_findings_are_told_and_anyway_decodes(capture, tmp_path, capsys):
+    folder, row = capture
+    frames = list(row.frames.values())
+    frames[3] = frames[2]
+    scan = written(folder, frames, tmp_path)
+    assert decode(folder, folder / "scan", tmp_path / "out") == 0
+    said = capsys.readouterr()
+    assert "not checked" in said.out and "warning" not in said.err
+    assert decode(folder, scan, tmp_path / "out") == 2
+    assert "frame_2.png and frame_3.png show the same image" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["decode.json"]  # of the refused capture
+    assert decode(folder, scan, tmp_path / "out", "--anyway", "--forms", "npy") == 0
+    assert "warning: equal frames" in capsys.readouterr().err
+    report = json.loads((tmp_path / "out" / "decode.json").read_text())
+    assert report["examination"]["findings"][0]["name"] == "equal frames"
+    assert report["pixels"] and not (tmp_path / "out" / "depth.mat").exists()
+
+
+def test_a_decoding_killed_in_the_middle_leaves_nothing_that_the_next_refuses(capture, tmp_path, monkeypatch):
+    folder, _ = capture
+
+    def killed(*_):
+        raise KeyboardInterrupt
+
+    assert decode(folder, folder / "scan", tmp_path / "out", "--forms", "png") == 0
+    monkeypatch.setattr("fpp_ml_bench.loaders.captures.decoding._write_report", killed)
+    assert decode(folder, folder / "scan", tmp_path / "out", "--forms", "npy") == 130
+    assert not (tmp_path / "out" / "decode.json").exists()  # what is there is no result
+    (tmp_path / "out" / ".mesh.ply.31.tmp").write_bytes(b"cut off")
+    monkeypatch.undo()
+    assert decode(folder, folder / "scan", tmp_path / "out", "--forms", "mat") == 0
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"decode.json", "depth.mat"} <= names and not {"depth.npy", ".mesh.ply.31.tmp"} & names
+
+
+@pytest.mark.parametrize("gamma", [1.0, 1.5, 2.2])
+@pytest.mark.parametrize("steps", [3, 4, 6])
+def test_the_stated_uncertainty_holds_the_error_of_gamma(steps, gamma):
+    from pathlib import Path
+
+    from fpp_ml_bench.loaders.captures import CapturedFrames, decode_capture
+
+    rig = vertical_rig({"scheme": "phase-shift", "pitch_px": 57, "steps": steps, "gray": {}})
+    x, y = rig.camera.rays()
+    depth_m = 1.8 / (1.0 - 0.4 * x + 0.25 * y)
+    u_px, _ = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * depth_m[..., None])
+    profiles = [*rig.code("vertical").profiles(912), np.full(912, 255), np.zeros(912)]
+    light = np.stack([np.interp(u_px, np.arange(912), row) / 255 for row in profiles]) ** gamma
+    frames = 12 + 180 * light + np.random.default_rng(3).normal(0, 1, light.shape)
+    files = tuple(Path(f"scan/{index}.png") for index in range(len(frames)))
+    result = decode_capture(CapturedFrames(np.rint(frames).astype(np.uint8), files), rig)
+    found = result.decoded.depth_mm > 0
+    error_mm = np.abs(result.decoded.depth_mm - 1000 * depth_m)[found]
+    assert found.mean() > 0.9 and (error_mm > 100).mean() < 0.001  # of wrong orders no uncertainty is stated
+    assert 1 / 3 < 0.6745 * np.median(result.sigma_mm[found]) / np.median(error_mm) < 3
+
+
 @pytest.mark.parametrize(
     "words, said",
     [
