@@ -42,8 +42,8 @@ CONTRADICTING, DOUBTFUL = 0.6, 0.5
 """Shares of the lit pixels that contradict the code and make depth untrustworthy or doubtful."""
 MOVED_SHARE, NEIGHBOURS_PX = 0.05, 9
 _FINEST, _SCORED_PX = 2.0, 4000
-_UNITS = ((1000.0, "metres were read as mm"), (100.0, "metres were read as cm"), (10.0, "cm were read as mm"),
-          (0.1, "mm were read as cm"), (0.001, "mm were read as metres"))  # fmt: skip
+_UNITS = {1000.0: "metres were read as mm", 10.0: "cm were read as mm", 0.01: "cm were read as metres",
+          0.001: "mm were read as metres"}  # fmt: skip
 
 
 def examine(
@@ -56,6 +56,8 @@ def examine(
     ``directions``: those that will be decoded (all). Pixels outside ``mask`` (H, W) don't count. ``calibrated`` False:
     the rig's lenses, pose and range are placeholders, and only the code is looked at."""
     limits, directions = limits or Limits(), tuple(directions or rig.directions)
+    if not directions:
+        return Examination((), ("anything: no direction is coded pixel by pixel",))
     titles = [frame.title for frame in rig.sequence] if names is None else list(names)
     lines = take_lines(frames, mask)
     not_checked = _not_checked(rig, directions, calibrated)
@@ -63,10 +65,9 @@ def examine(
         return Examination((), (*not_checked, f"anything: only {lines.lit.sum()} pixels looked at are lit"))
     sets = fringe_sets(lines, rig, directions)
     pairs = equal_frames(lines, sets, rig)
-    findings = [_equal(pairs, titles)] if pairs else []
-    findings += _exchanged_flat(lines, rig)
-    if findings:
-        return Examination(tuple(findings), not_checked)
+    if pairs:
+        return Examination((_equal(pairs, titles),), not_checked)
+    findings: list[Finding] = []
     edges = {
         way: found for way, found in ((one.direction, gray_edges(lines, one, rig, limits)) for one in sets) if found
     }
@@ -86,7 +87,7 @@ def examine(
         other = _other_readings(lines, rig, directions, limits, given, calibrated)
         if other:
             return Examination(tuple(other), not_checked, measured)
-    findings += _moved(sets)
+    findings += _exchanged_flat(lines, rig) or _moved(sets)
     if given.contradicting > DOUBTFUL:
         findings.append(_contradictions(given))
     elif calibrated and given.fitting == 0.0 and given.depth_mm is not None:
@@ -107,7 +108,7 @@ def _not_checked(rig: Rig, directions: Sequence[Direction], calibrated: bool) ->
         code = rig.code(way)
         if isinstance(code, PhaseShift):
             if code.gray is None:
-                parts.append(f"a common offset of all {way} phases: no Gray code tells")
+                parts.append(f"an offset of the {way} phases by whole fringes, or of all alike: no Gray code tells")
             if max(len(fringe.shifts_deg) for fringe in code.fringes) == 3:
                 parts.append(f"noise of the {way} frames: three steps fit any three grey levels")
     if not calibrated:
@@ -253,7 +254,7 @@ def _contradictions(given: Fit) -> Finding:
 def _out_of_range(depth_mm: NDArray[np.float64], rig: Rig) -> Finding:
     low, middle, high = np.quantile(depth_mm, (0.02, 0.5, 0.98))
     near, far = rig.working_range_mm
-    units = [f"{why} ({factor:g} times)" for factor, why in _UNITS if near <= factor * middle <= far]
+    units = [f"{why} ({factor:g} times)" for factor, why in _UNITS.items() if near <= factor * middle <= far]
     cause = (
         f"a wrong unit of the rig's translation: {units[0]}" if units else "another working range than the rig file's"
     )
