@@ -9,9 +9,10 @@ from rich.table import Column, Table
 
 from fpp_ml_bench import calibration, optics
 from fpp_ml_bench.cli import count
-from fpp_ml_bench.cli.console import progress_bar, show, working_range
+from fpp_ml_bench.cli.console import progress_bar, say_findings, show, working_range
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import CalibrationError, RigError
+from fpp_ml_bench.examination import Examination
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders import captures, published, render
 from fpp_ml_bench.machine import usable_cores
@@ -175,10 +176,13 @@ def _from_board(
 ) -> "optics.Rig":  # fmt: skip
     """Calibrate, print and write; the rig, with standoff and background of ``like``."""
     lenses = _lenses(args)
+    examined: dict[str, Examination] = {}
     with progress_bar("finding the board", len(captures.pose_folders(folder)), "poses") as advance:
         poses, rig, response = captures.board_poses(
-            folder, board, sequence, args.bits, args.colour, advance, args.anyway
+            folder, board, sequence, args.bits, args.colour, advance, args.anyway, examined.__setitem__
         )
+    for name, examination in examined.items():
+        say_findings(examination, f"{name}: ")
     lenses = lenses if len(poses) > 3 else lenses[:1]  # models are compared by poses left out
     sizes = (poses[0].size, (rig.projector.width, rig.projector.height))
     options = {"estimate_board": args.estimate_board, "baseline_mm": args.baseline}

@@ -67,12 +67,10 @@ def say_benchmark(manifest: "storage.Manifest") -> None:
 
 
 def say_findings(examination: Examination, where: str = "") -> None:
-    """Print what an examination found, on standard error, and what it could not check."""
+    """Print on standard error what an examination found."""
     for finding in examination.findings:
         level = "note" if finding.severity == "note" else "warning"
         print(f"{level}: {where}{finding}", file=sys.stderr)
-    if examination.not_checked:
-        print(f"not checked     {where}{'; '.join(examination.not_checked)}")
 
 
 def output_width() -> int:

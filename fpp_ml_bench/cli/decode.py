@@ -100,4 +100,6 @@ def _print(result: "captures.DecodedCapture") -> None:
     source = "measured" if result.noise_measured else "given or assumed"
     print(f"depth           {depths.min():.1f} to {depths.max():.1f} mm, median {np.median(depths):.1f} mm")
     noise = f"noise of {result.noise_grey:.2f} grey levels, {source}"
+    if result.examination.not_checked:
+        print(f"not checked     {'; '.join(result.examination.not_checked)}")
     print(f"uncertainty     {np.median(sigmas):.3f} mm (standard, median over pixels; by {noise})")

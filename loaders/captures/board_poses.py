@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.calibration import Board, Calibration, Levels, Pose, Response, fit_response, levels_of, measure_pose
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.errors import CalibrationError
-from fpp_ml_bench.examination import RefusedCapture, examine
+from fpp_ml_bench.examination import Examination, RefusedCapture, examine
 from fpp_ml_bench.loaders.captures.images import read_frames
 from fpp_ml_bench.optics import AXES, Rig, load_projection, rotation_matrix
 
@@ -34,11 +34,13 @@ def pose_folders(captures: Path) -> list[Path]:
 def board_poses(
     captures: Path, board: Board, sequence: Path, bits: int | None = None, colour: str | None = None,
     progress: Callable[[int], None] = lambda poses: None, anyway: bool = False,
+    examined: Callable[[str, Examination], None] = lambda name, examination: None,
 ) -> tuple[list[Pose], Rig, Response | None]:  # fmt: skip
     """The board's points in every pose folder of ``captures``, in camera and projector px, a rig with the sequence of
     the rig file ``sequence`` that stands in for the one sought (`optics.load_projection`), and the response of
     projector and camera where the captures tell it. ``bits`` and ``colour`` as in `read_frames`. The
-    frames of every pose are examined; ``anyway`` takes those that are refused, too. Raises FppBenchError naming the
+    frames of every pose are examined; ``anyway`` takes those that are refused, too, and ``examined`` is called with a
+    pose's name and what was found. Raises FppBenchError naming the
     pose or file."""
     rig = load_projection(sequence)
     if len(rig.directions) < 2:
@@ -63,6 +65,7 @@ def board_poses(
         examination = examine(frames, rig, names, calibrated=False)
         if examination.refused and not anyway:
             raise RefusedCapture(str(folder), examination)
+        examined(folder.name, examination)
         details = decode_stack(frames, rig, details=True).details
         white = rig.sequence.white
         lit = frames.mean(axis=0, dtype=np.float64) if white is None else frames[white]

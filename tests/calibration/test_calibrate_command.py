@@ -128,6 +128,29 @@ def write(file, boards, change):
     cv2.imwrite(str(file), change(cv2.imread(str(boards / file), cv2.IMREAD_UNCHANGED)))
 
 
+def test_poses_that_are_refused_calibrate_anyway_and_are_named(virtual, tmp_path, capsys):
+    boards = tmp_path / "boards"
+    shutil.copytree(virtual / "boards", boards)
+    frames = [boards / "pose_03" / f"frame_{index:02d}.png" for index in (1, 2)]
+    frames[1].write_bytes(frames[0].read_bytes())
+    board = yaml.safe_load((boards / "board.yaml").read_text())["board"]
+    words = (
+        boards,
+        "--board",
+        board,
+        "--sequence",
+        boards / "rig.yaml",
+        "--lens",
+        "none",
+        "--out",
+        tmp_path / "r.yaml",
+    )
+    assert calibrate(*words) == 2
+    assert "pose_03: equal frames: frame_01.png and frame_02.png" in capsys.readouterr().err
+    assert calibrate(*words, "--anyway") == 0
+    assert "warning: pose_03: equal frames" in capsys.readouterr().err
+
+
 def test_gray_code_alone_calibrates(tmp_path, capsys):
     """Cells of 2 px in both directions: no sinusoid, and so no response is measured."""
     data = paper_rig(SIZE).to_dict()
