@@ -37,7 +37,7 @@ RESPONSE_RAD = 0.006
 """Smallest ripple of N times the phase that is named: patterns of 8 bits make 0.003."""
 TRIED, IN_RANGE = 0.1, 0.05
 """Other readings are tried where more of the lit pixels contradict the code, or twice as many neighbours each other, or
-almost none lies in the range."""
+fewer fit it, or almost none lies in the range."""
 CONTRADICTING, DOUBTFUL = 0.6, 0.5
 """Shares of the lit pixels that contradict the code and make depth untrustworthy or doubtful."""
 MOVED_SHARE, NEIGHBOURS_PX = 0.05, 9
@@ -83,7 +83,8 @@ def examine(
         # A frame that is late shifts all phases, too.
         if _is_offset(found) and not any(finding.severity == "refuse" for finding in findings):
             return Examination((_offset(found, rig, way),), not_checked, measured)
-    if given.contradicting > TRIED or given.agreeing < 1 - 2 * TRIED or given.fitting < IN_RANGE * given.coherent:
+    doubtful = given.contradicting > TRIED or given.agreeing < 1 - 2 * TRIED or given.coherent < TRIED
+    if doubtful or given.fitting < IN_RANGE * given.coherent:
         other = _other_readings(lines, rig, directions, limits, given, calibrated)
         if other:
             return Examination(tuple(other), not_checked, measured)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding import GrayOnly, Limits, Reason
+from fpp_ml_bench.coding import Code, GrayCells, GrayOnly, Limits, Reason
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.decoding import depth_and_reason, plan_direction
 from fpp_ml_bench.examination.lines import Lines
@@ -231,8 +231,14 @@ def _of_code(
         backward = _moved(everything, sinusoids, lambda run: run[::-1])
         yield "phase steps in the opposite order", "rename the files, or give shifts_deg in this order", backward
     if bits:
-        backward = _moved(everything, bits, lambda run: run[::-1])
-        yield "Gray code with the least significant bit first", "write least_first: true", backward
+        cells = _cells(rig.code(ways[0]))
+        other = replace(cells, least_first=not cells.least_first)
+        what = f"Gray code with the {'least' if other.least_first else 'most'} significant bit first"
+        yield what, f"write least_first: {str(other.least_first).lower()}", _shown_as(everything, bits, cells, other)
+        if cells.inverse != "none":
+            other = replace(cells, inverse="after all" if cells.inverse == "after each" else "after each")
+            what = f"Gray code whose inverse frames come {other.inverse}"
+            yield what, f"write inverse: {other.inverse}", _shown_as(everything, bits, cells, other)
         change = "project it as the rig file says, or exchange white and black of its images"
         yield "Gray code that is inverted (black for white)", change, partial(_gray_levels, bits, True)
         change = "project Gray code: at the edges of binary numbers several bits change at once"
@@ -250,6 +256,19 @@ def _moved(everything: list[int], runs: list[list[int]], change: Callable[[list[
         for index, other in zip(run, change(run), strict=True):
             place[index] = other
     return tuple(place)
+
+
+def _cells(code: Code) -> GrayCells:
+    """The Gray frames of a code that has some."""
+    cells: GrayCells = code.cells if isinstance(code, GrayOnly) else vars(code)["gray"]
+    return cells
+
+
+def _shown_as(everything: list[int], runs: list[list[int]], cells: GrayCells, other: GrayCells) -> tuple[int, ...]:
+    """Where each frame is, when the Gray frames of ``cells`` were captured in the order of ``other``."""
+    place = [other.shown.index(frame) for frame in cells.shown]
+    runs = [run for run in runs if len(run) == len(place)]
+    return _moved(everything, runs, lambda run: [run[position] for position in place])
 
 
 def _turned(run: list[int], quarters: int) -> list[int]:

@@ -111,7 +111,10 @@ def moved(order):
 
 BITS = 5
 NINE = 4 + BITS
+PAIRS = {"scheme": "gray", "cell_px": 8, "inverse": "after each"}  # 7 bits
 READINGS = {
+    "pairs least first": (PAIRS, moved([12, 13, 10, 11, 8, 9, 6, 7, 4, 5, 2, 3, 0, 1]), "least significant bit first"),
+    "inverse after all": (PAIRS, moved([*range(0, 14, 2), *range(1, 14, 2)]), "inverse frames come after all"),
     "Gray code first": (FOUR, moved([*range(4, NINE), *range(4)]), "order vertical Gray code, vertical sinusoids"),
     "rotated": (FOUR, lambda frames: np.roll(frames, 2, axis=0), "starts with frame"),
     "backward": (FOUR, lambda frames: frames[::-1], "all frames in the opposite order"),
