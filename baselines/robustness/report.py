@@ -45,6 +45,10 @@ class Measured:
     def mae_mm(self) -> float | None:
         return self.mean("mae_mm")
 
+    def axis_mae_mm(self, axis: str) -> float | None:
+        """Mean over the severities of an axis that were measured."""
+        return _mean([scores["mae_mm"] for scores in self.means.get(axis, {}).values()])
+
     def mean(self, key: str) -> float | None:
         """Mean of a score over all axes and severities that were measured."""
         found = [s[key] for axis, by in self.means.items() if axis != CLEAN for s in by.values()]

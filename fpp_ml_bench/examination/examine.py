@@ -30,9 +30,9 @@ SIGMAS = 6.0
 OFFSET_TURNS, OFFSET_EDGES = 0.02, 100
 """Smallest common offset of phase and Gray code that is a finding: 0.4 px of 18 px, which no light of ours makes by
 more than chance; and the edges that are needed to measure it."""
-RIPPLE_RAD, STEP_RAD = 0.012, 0.1
-"""Smallest ripple of twice the phase and smallest error of a shift that are findings: one of 18 frames twice makes
-0.019 and 0.35; flicker of 1% in our hardest light 0.01 and 0.05."""
+RIPPLE_RAD, STEP_RAD = 0.02, 0.1
+"""Smallest ripple of twice the phase and smallest error of a shift that are findings: one of 8 frames half late makes
+0.05 and 0.37, one of 18 0.01 and 0.17; lamps that flicker by 2% make 0.012 with three steps, and turn no shift."""
 RESPONSE_RAD = 0.006
 """Smallest ripple of N times the phase that is named: patterns of 8 bits make 0.003."""
 TRIED, IN_RANGE = 0.1, 0.05
