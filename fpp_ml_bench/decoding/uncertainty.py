@@ -66,7 +66,7 @@ def depth_sigma_mm(
 def noise_of_frames(frames: Sequence[NDArray | None], rig: Rig) -> float | None:
     """Noise of the frames in grey levels, from what their sinusoids can't explain: the median over lit pixels; None
     where every period has three steps, which explain anything, or too few pixels are lit. A frame may be None."""
-    estimates = [_variance(squares, freedom) for _, squares, freedom in _unexplained(frames, rig)]
+    estimates = [_variance(squares, freedom) for _, squares, freedom in _unexplained(frames, rig, straight=True)]
     return float(np.median(np.sqrt(estimates))) if estimates else None
 
 
@@ -93,10 +93,10 @@ def _variance(squares: NDArray[np.float64], freedom: int) -> float:
 
 
 def _unexplained(
-    frames: Sequence[NDArray | None], rig: Rig
+    frames: Sequence[NDArray | None], rig: Rig, straight: bool = False
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], int]]:
     """Of every period with four and more steps, at some of the lit pixels: mean grey level, squared residual over its
-    degrees of freedom, and these."""
+    degrees of freedom, and these. ``straight``: without what a response that is not straight adds (`_harmonics`)."""
     for direction in rig.directions:
         code = rig.code(direction)
         for number, fringe in enumerate(code.fringes if isinstance(code, PhaseShift) else ()):
@@ -113,7 +113,8 @@ def _unexplained(
             if lit.sum() < _LEAST_PX:
                 continue
             residual = levels - (mean + cosine * np.cos(angles)[:, None] + sine * np.sin(angles)[:, None])
-            residual[:, lit] -= _harmonics(residual[:, lit], cosine[lit], sine[lit], angles)
+            if straight:
+                residual[:, lit] -= _harmonics(residual[:, lit], cosine[lit], sine[lit], angles)
             yield mean[lit], (residual[:, lit] ** 2).sum(axis=0) / freedom, freedom
 
 
