@@ -47,8 +47,7 @@ class Levels(NamedTuple):
 
 def levels_of(frames: Sequence[NDArray], maps: Sequence[NDArray[np.float64]], pose: Pose, rig: Rig) -> Levels | None:
     """Sinusoid levels and grey levels at bright pixels of a pose's board; ``maps``: columns and rows of the projector,
-    (H, W) px, NaN where not decoded. None where too few pixels are left,
-    or a direction has no sinusoids."""
+    (H, W) px, NaN where not decoded. None where too few pixels are left, or a direction has no sinusoids."""
     if len(rig.fringe_directions) < len(AXES):
         return None
     x, y = pose.corners_px[np.isfinite(pose.corners_px).all(axis=1)].T

@@ -86,7 +86,7 @@ class GrayCells:
         if self.inverse == "none":
             return tuple(plain)
         pairs = zip(plain, inverse, strict=True)
-        return (*plain, *inverse) if self.inverse == "after all" else tuple(one for pair in pairs for one in pair)
+        return (*plain, *inverse) if self.inverse == "after all" else tuple(frame for pair in pairs for frame in pair)
 
     @property
     def rows(self) -> tuple[list[int], list[int]]:

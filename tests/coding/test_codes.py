@@ -1,6 +1,7 @@
 """Coding schemes: patterns in, coordinates out, against `fringes`-free closed forms, OpenCV, and themselves."""
 
 import math
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -23,6 +24,14 @@ CODES = {
     "origin": {"scheme": "phase-shift", "pitches_px": [60, 920], "steps": 4, "origin_px": -3.5},
     "gray alone": {"scheme": "gray", "cell_px": 2},
     "gray with inverses": {"scheme": "gray", "inverse": "after all", "bits": 11},
+    "gray in pairs": {"scheme": "gray", "cell_px": 4, "inverse": "after each", "least_first": True},
+    "gray centred": {"scheme": "gray", "cell_px": 1, "bits": 10, "origin_px": -56},
+    "cells of another origin": {
+        "scheme": "phase-shift",
+        "pitch_px": 18,
+        "steps": 6,
+        "gray": {"origin_px": -4.5, "least_first": True},
+    },
     "the paper's": {"scheme": "phase-shift", "pitch_px": 18, "steps": 18, "gray": {}},
 }
 
@@ -52,6 +61,7 @@ def test_a_code_gives_its_own_pixels_back(name):
     bound = code.cells.cell_px / 2 if isinstance(code, GrayOnly) else 0.05
     assert np.abs(found.coordinate_px - pixels)[good].max() <= bound
     assert len(code.shown) == len(code.profiles(LENGTH))
+    assert code.step_px == (bound if isinstance(code, GrayOnly) else 0)
 
 
 @pytest.mark.parametrize("name", [name for name in CODES if not name.startswith("gray")])
@@ -87,6 +97,42 @@ def test_gray_frames_are_opencvs():
     assert done
     columns = np.array([pattern[0] for pattern in patterns[:20]])
     assert np.array_equal(frames, columns)
+
+
+def test_cells_begin_at_their_origin_and_either_bit_comes_first():
+    centred, usual = GrayCells(1, 10, origin_px=-56).profiles(912), GrayCells(1, 10).profiles(1024)
+    assert np.array_equal(centred, usual[:, 56:968])
+    assert np.array_equal(GrayCells(1, 10, least_first=True).profiles(1024), usual[::-1])
+    pairs = [GrayCells(1, 10, "after each", least_first=least).profiles(912) for least in (False, True)]
+    assert np.array_equal(pairs[1].reshape(10, 2, -1), pairs[0].reshape(10, 2, -1)[::-1])
+    # 3 px per cell from -4: pixels 0 and 1 are the rest of cell 1, and the last pixel is alone in cell 305.
+    cells = GrayCells.from_entries({"cell_px": 3, "origin_px": -4}, LENGTH)
+    assert cells.bits == 9 and cells.centre_px(np.array([0, 1, 2, 305, 306]), LENGTH)[1:4].tolist() == [0.5, 3, 911]
+    assert np.isnan(cells.centre_px(np.array([0, 306]), LENGTH)).all()
+    assert GrayCells.from_entries({"origin_px": -113}, LENGTH, 1.0).bits == 11  # 1025 cells
+
+
+def test_a_rig_dictionary_names_only_what_is_unusual():
+    assert GrayCells(2, 9).to_dict() == {"cell_px": 2, "bits": 9, "inverse": "none"}
+    assert GrayCells(2, 9, "none", -3.0, True).to_dict() == {
+        "cell_px": 2, "bits": 9, "inverse": "none", "origin_px": -3.0, "least_first": True,
+    }  # fmt: skip
+    plain = code_of("the paper's")
+    for change in ({"origin_px": -9.0}, {"least_first": True}):
+        assert not replace(plain, gray=replace(plain.gray, **change)).is_plain
+
+
+def test_pairs_need_no_white_and_black():
+    rig = rig_from_dict(coded_rig(vertical=CODES["gray in pairs"], order=["vertical"]))
+    code = rig.code("vertical")
+    assert len(rig.sequence) == 16 and not code.needs_flat and code_of("gray alone").needs_flat
+    levels = seen(code, np.full(4, 301.5))
+    levels[:, 0] = 100.0  # no light of the projector
+    levels[:, 1] = 255.0
+    levels[:2, 2] = 255.0  # both of one pair
+    found = code.decode(levels, LENGTH, LIMITS)
+    assert found.reason.tolist() == [Reason.LOW_MODULATION, Reason.LOW_MODULATION, Reason.SATURATED, Reason.DECODED]
+    assert found.coordinate_px[3] == 301.5 and found.modulation[3] == pytest.approx(100)
 
 
 def test_dark_saturated_and_contradicting_pixels_have_their_reason():
@@ -172,6 +218,9 @@ def test_single_frames_are_described_and_made_but_not_decoded_pixel_by_pixel():
         ({"vertical": {"scheme": "phase-shift", "pitch_px": 18, "steps": 3, "gray": {"cell_px": 20}}}, "exceed"),
         ({"vertical": {"scheme": "gray", "inverse": "yes"}, "order": ["vertical"]}, "inverse: expected none"),
         ({"vertical": {"scheme": "gray"}, "order": ["vertical"]}, "black, white missing"),
+        ({"vertical": {"scheme": "gray", "origin_px": 1}}, "vertical.origin_px: expected 0 or less"),
+        ({"vertical": {"scheme": "gray", "origin_px": -113, "bits": 10}}, "hold 1025 Gray cells.*need 11 bits"),
+        ({"vertical": {"scheme": "gray", "least_first": 1}}, "least_first: expected true or false"),
         ({"vertical": CODES["unit cue"], "order": ["vertical", "vertical"]}, "at most once"),
         ({"vertical": CODES["unit cue"], "order": "vertical"}, "expected a list of names"),
         ({"vertical": CODES["unit cue"], "order": ["horizontal"]}, "expected each of vertical, black, white"),

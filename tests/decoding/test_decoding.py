@@ -11,9 +11,10 @@ from captures import LENSES, PAPER, TURNED, capture, tilted
 from fpp_ml_bench.baselines.stability import coded_rig, plane_stack
 from fpp_ml_bench.coding import Limits, Reason
 from fpp_ml_bench.decoding.decode import decode_stack
-from fpp_ml_bench.decoding.triangulation import depth_noise_mm
+from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm, depth_noise_mm
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.machine import NUMBA_SWITCH, numba_enabled
+from fpp_ml_bench.optics import DIRECTIONS, rig_from_dict
 
 MODULATION = 0.45 * 127.5
 RIGS = pytest.mark.parametrize("rig", [PAPER, TURNED, LENSES], ids=["paper", "turned", "lenses"])
@@ -55,6 +56,36 @@ def test_error_follows_one_over_root_n(direction):
     mean = np.mean(list(errors.values()))
     # N = 4 of 18 is not quite even: its shifts are 0, 100, 180 and 280 degrees.
     assert all(error == pytest.approx(mean, rel=0.08) for error in errors.values()), errors
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        *({"cell_px": cell} for cell in (2, 4, 8, 16)),
+        *({"cell_px": cell, "inverse": inverse} for cell in (2, 16) for inverse in ("after each", "after all")),
+        {"cell_px": 1, "origin_px": -56},
+        {"cell_px": 4, "origin_px": -3, "least_first": True},
+        {"cell_px": 4, "inverse": "after each", "least_first": True},
+    ],
+    ids=str,
+)
+def test_gray_code_alone_answers_within_its_cells(code):
+    codes = {direction: {"scheme": "gray", **code} for direction in DIRECTIONS}
+    order = [*codes, *(() if "inverse" in code else ("black", "white"))]
+    data = {key: value for key, value in PAPER.to_dict().items() if key != "pitch_px"}
+    rig = rig_from_dict({**data, "sequence": {"order": order, **codes}})
+    depth = tilted(rig)
+    decoded = decode_stack(capture(rig, depth), rig)
+    x, y = rig.camera.rays()
+    u, v = rig.project(np.stack([x * depth, y * depth, depth], axis=-1))
+    lit = (u > 2) & (u < rig.projector.width - 3) & (v > 2) & (v < rig.projector.height - 3)
+    assert lit.mean() > 0.8 and (decoded.reason[lit] == Reason.DECODED).mean() >= 0.97
+    slopes = [coordinate_slope_px_per_mm(rig, depth * 1000, direction, rig.camera.rays()) for direction in DIRECTIONS]
+    sigma_mm = code["cell_px"] / np.sqrt(12) / np.hypot(*slopes)
+    answered = lit & (decoded.depth_mm > 0)
+    ratio = (np.abs(decoded.depth_mm - depth * 1000) / sigma_mm)[answered]
+    # 0.6745 for a normal distribution, 0.72 for the sum of two equal uniform ones.
+    assert np.median(ratio) < 0.8
 
 
 @pytest.mark.parametrize("steps", [5, 7, 8, 10, 11, 13, 17])
