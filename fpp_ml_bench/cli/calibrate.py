@@ -182,7 +182,7 @@ def _from_board(
             folder, board, sequence, args.bits, args.colour, advance, args.anyway, examined.__setitem__
         )
     for name, examination in examined.items():
-        say_findings(examination, f"{name}: ")
+        say_findings(examination, f"{name}: ", notes=False)  # the response is measured over all poses
     lenses = lenses if len(poses) > 3 else lenses[:1]  # models are compared by poses left out
     sizes = (poses[0].size, (rig.projector.width, rig.projector.height))
     options = {"estimate_board": args.estimate_board, "baseline_mm": args.baseline}

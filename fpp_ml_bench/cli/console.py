@@ -66,11 +66,12 @@ def say_benchmark(manifest: "storage.Manifest") -> None:
     print(f"benchmark: {sentence}" if as_expected else f"warning: {sentence}", file=None if as_expected else sys.stderr)
 
 
-def say_findings(examination: Examination, where: str = "") -> None:
-    """Print on standard error what an examination found."""
+def say_findings(examination: Examination, where: str = "", notes: bool = True) -> None:
+    """Print on standard error what an examination found, with or without ``notes``."""
     for finding in examination.findings:
         level = "note" if finding.severity == "note" else "warning"
-        print(f"{level}: {where}{finding}", file=sys.stderr)
+        if notes or level == "warning":
+            print(f"{level}: {where}{finding}", file=sys.stderr)
 
 
 def output_width() -> int:

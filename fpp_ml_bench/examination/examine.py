@@ -41,6 +41,7 @@ fewer fit it, or almost none lies in the range."""
 CONTRADICTING, DOUBTFUL = 0.6, 0.5
 """Shares of the lit pixels that contradict the code and make depth untrustworthy or doubtful."""
 MOVED_SHARE, NEIGHBOURS_PX = 0.05, 9
+"""Share of the lit pixels at which mean images differ, averaged over so many neighbours, where the scene moved."""
 _FINEST, _SCORED_PX = 2.0, 4000
 _UNITS = {1000.0: "metres were read as mm", 10.0: "cm were read as mm", 0.01: "cm were read as metres",
           0.001: "mm were read as metres"}  # fmt: skip
@@ -64,7 +65,7 @@ def examine(
     if lines.lit.sum() < LEAST_PX:
         return Examination((), (*not_checked, f"anything: only {lines.lit.sum()} pixels looked at are lit"))
     sets = fringe_sets(lines, rig, directions)
-    pairs = equal_frames(lines, sets, rig)
+    pairs = equal_frames(lines, sets, rig, directions)
     if pairs:
         return Examination((_equal(pairs, titles),), not_checked)
     findings: list[Finding] = []

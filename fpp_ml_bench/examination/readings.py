@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding import Code, GrayCells, GrayOnly, Limits, Reason
+from fpp_ml_bench.coding import GrayCells, GrayOnly, Limits, Reason
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.decoding import depth_and_reason, plan_direction
 from fpp_ml_bench.examination.lines import Lines
@@ -25,6 +25,7 @@ from fpp_ml_bench.optics import AXES, Direction, Frame, Rig
 LARGEST_MISFIT = 0.2
 """Largest RMS distance of grey levels from their sinusoid, in modulations, where four steps and more tell."""
 CLEARLY_LIT_GREY = 30.0
+"""Pixels whose grey levels differ by so much from frame to frame have to be lit by any reading."""
 LARGEST_DISAGREEMENT_PX = 8.0
 """Distance across the epipolar line from which a pixel contradicts: less is a calibration's error."""
 GOOD, FEWER = 0.8, 3.0
@@ -88,13 +89,13 @@ def fit(lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits,
             reason[(reason == 0) & (misfit > (LARGEST_MISFIT * one.modulation) ** 2)] = Reason.INCONSISTENT_ORDER
         found = gray_edges(seen, one, rig, limits)
         edges *= 1.0 if found is None or found.edges < _FEWEST_PAIRS else min(found.agreeing, found.forward)
-    # Pixels that change so much have to be lit by any reading.
+    bright = max(int((lit | saturated).sum()), 1)
     counted = (lit | (np.ptp(levels, axis=0) >= CLEARLY_LIT_GREY)) & ~saturated
     if not counted.any():
         return Fit()
     if not solid:
         share = edges * float((reason[counted] == 0).mean())
-        return Fit(share, share, float(contradicting.sum() / max(int((lit | saturated).sum()), 1)), edges)
+        return Fit(share, share, float(contradicting.sum()) / bright, edges)
     width, height = rig.camera.width, rig.camera.height
     column = width - 1 - lines.column if reading.flips[0] else lines.column
     row = height - 1 - lines.row if reading.flips[1] else lines.row
@@ -112,7 +113,7 @@ def fit(lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits,
     if rig.background_m is not None:
         inside |= np.abs(depth_mm - rig.background_m * MM_PER_M) < _BACKGROUND_SHARE * rig.background_m * MM_PER_M
     coherent, fitting = float(good[counted].mean()), float((good & inside)[counted].mean())
-    weight, against = edges * min(1.0, 2 * forward), float(contradicting.sum() / max(int((lit | saturated).sum()), 1))
+    weight, against = edges * min(1.0, 2 * forward), float(contradicting.sum()) / bright
     return Fit(weight * coherent, weight * fitting, against, weight, depth_mm[good].astype(np.float64))
 
 
@@ -231,14 +232,15 @@ def _of_code(
         backward = _moved(everything, sinusoids, lambda run: run[::-1])
         yield "phase steps in the opposite order", "rename the files, or give shifts_deg in this order", backward
     if bits:
-        cells = _cells(rig.code(ways[0]))
-        other = replace(cells, least_first=not cells.least_first)
-        what = f"Gray code with the {'least' if other.least_first else 'most'} significant bit first"
-        yield what, f"write least_first: {str(other.least_first).lower()}", _shown_as(everything, bits, cells, other)
-        if cells.inverse != "none":
-            other = replace(cells, inverse="after all" if cells.inverse == "after each" else "after each")
-            what = f"Gray code whose inverse frames come {other.inverse}"
-            yield what, f"write inverse: {other.inverse}", _shown_as(everything, bits, cells, other)
+        for key, value, what in (
+            ("least_first", True, "with the least significant bit first"),
+            ("least_first", False, "with the most significant bit first"),
+            ("inverse", "after each", "whose inverse frames come after each"),
+            ("inverse", "after all", "whose inverse frames come after all"),
+        ):
+            place = _rearranged(rig, bits, **{key: value})
+            if place != tuple(everything):
+                yield f"Gray code {what}", f"write {key}: {str(value).lower()}", place
         change = "project it as the rig file says, or exchange white and black of its images"
         yield "Gray code that is inverted (black for white)", change, partial(_gray_levels, bits, True)
         change = "project Gray code: at the edges of binary numbers several bits change at once"
@@ -258,17 +260,18 @@ def _moved(everything: list[int], runs: list[list[int]], change: Callable[[list[
     return tuple(place)
 
 
-def _cells(code: Code) -> GrayCells:
-    """The Gray frames of a code that has some."""
-    cells: GrayCells = code.cells if isinstance(code, GrayOnly) else vars(code)["gray"]
-    return cells
+def _rearranged(rig: Rig, runs: list[list[int]], **changes: Any) -> tuple[int, ...]:
+    """Where each frame is, when the Gray frames of ``runs`` were captured as with ``changes`` of their `GrayCells`."""
 
+    def captured(run: list[int]) -> list[int]:
+        code: Any = rig.code(rig.sequence.frames[run[0]].direction or "vertical")
+        cells: GrayCells = code.cells if isinstance(code, GrayOnly) else code.gray
+        if "inverse" in changes and cells.inverse == "none":
+            return run
+        shown = replace(cells, **changes).shown
+        return [run[shown.index(frame)] for frame in cells.shown]
 
-def _shown_as(everything: list[int], runs: list[list[int]], cells: GrayCells, other: GrayCells) -> tuple[int, ...]:
-    """Where each frame is, when the Gray frames of ``cells`` were captured in the order of ``other``."""
-    place = [other.shown.index(frame) for frame in cells.shown]
-    runs = [run for run in runs if len(run) == len(place)]
-    return _moved(everything, runs, lambda run: [run[position] for position in place])
+    return _moved(list(range(len(rig.sequence))), runs, captured)
 
 
 def _turned(run: list[int], quarters: int) -> list[int]:
@@ -294,7 +297,7 @@ def _gray_levels(runs: list[list[int]], invert: bool, levels: NDArray) -> NDArra
 
 
 def _orders(frames: Sequence[Frame], runs: list[list[int]]) -> Iterator[list[int]]:
-    """Other orders of the runs: by kind and direction, and with one run at another place."""
+    """Other orders of the runs: by kind and direction, and with two runs exchanged."""
     directions = list(dict.fromkeys(frames[run[0]].direction for run in runs if frames[run[0]].direction))
     kinds = list(dict.fromkeys(frames[run[0]].kind for run in runs))
     for kind_order in permutations(kinds):

@@ -23,7 +23,7 @@ from fpp_ml_bench.optics import Direction, Rig
 TAU = 2 * math.pi
 LEAST_PX = 200
 WINDOW_PERIODS = 2.5
-"""Length of the windows in which a surface is taken for a parabola; a period must be seen by 4 px and more."""
+"""Length of the windows in which a surface is taken for a cubic; a period must be seen by 4 px and more."""
 SHORTEST_PERIOD_PX, LONGEST_WINDOW_PX, FEWEST_WINDOWS = 4.0, 400, 30
 WHITE_RATIO, EQUAL_SHARE, GAIN = 1.8, 0.35, 0.1
 """Two frames are equal where their difference is white (its mean square below so many times that of noise), below a
@@ -79,8 +79,11 @@ def fringe_sets(lines: Lines, rig: Rig, directions: Sequence[Direction]) -> list
     return sets
 
 
-def equal_frames(lines: Lines, sets: Sequence[FringeSet], rig: Rig) -> list[tuple[int, int]]:
-    """Pairs of frames that should differ and show the same, but for noise and a few percent of brightness."""
+def equal_frames(
+    lines: Lines, sets: Sequence[FringeSet], rig: Rig, directions: Sequence[Direction]
+) -> list[tuple[int, int]]:
+    """Pairs of frames that should differ and show the same, but for noise and a few percent of brightness: within a
+    set, and one after the other."""
     found = []
     for one in sets:
         picked = np.flatnonzero(one.good)[:: max(1, int(one.good.sum() // _EQUAL_PX))]
@@ -93,7 +96,7 @@ def equal_frames(lines: Lines, sets: Sequence[FringeSet], rig: Rig) -> list[tupl
             expected = 2 * middle * abs(math.sin((one.shifts_rad[i] - one.shifts_rad[j]) / 2)) / math.sqrt(2)
             if expected > 0 and _same(first, second, joined, EQUAL_SHARE * expected):
                 found.append((one.frames[i], one.frames[j]))
-    frames = rig.sequence.frames
+    frames = [frame for frame in rig.sequence if frame.direction is None or frame.direction in directions]
     lit = np.flatnonzero(lines.lit)[:: max(1, int(lines.lit.sum() // _EQUAL_PX))]
     if len(lit) < LEAST_PX:
         return found
@@ -103,11 +106,7 @@ def equal_frames(lines: Lines, sets: Sequence[FringeSet], rig: Rig) -> list[tupl
     span = float(np.median(high - low))
     for first_frame, second_frame in pairwise(frames):
         i, j = first_frame.index, second_frame.index
-        alike = first_frame.kind == second_frame.kind == "sinusoid"
-        same_set = alike and (first_frame.direction, first_frame.fringe) == (
-            second_frame.direction,
-            second_frame.fringe,
-        )
+        same_set = any({i, j} <= set(one.frames) for one in sets)
         # A frame that is bright or dark all over may well be followed by another one.
         varied = all(0.05 < bright[k] < 0.95 for k in (i, j))
         apart = np.abs(levels[i] - levels[j])

@@ -172,6 +172,21 @@ def test_two_directions_tell_more():
         assert text in said(np.ascontiguousarray(change(frames)), rig)[0][1]
 
 
+def test_directions_of_different_codes_have_readings_of_their_own():
+    """One without Gray code, and two with 5 and 8 bits: each is rearranged by its own code."""
+    mixed = rig_of(
+        {"order": ["horizontal", "vertical"], "horizontal": UNIT | {"pitches_px": [1140, 57]}, "vertical": FOUR}
+    )
+    frames = frames_of(mixed)
+    order = [*range(12), *range(16, 11, -1)]
+    assert "vertical Gray code with the least" in said(frames[order], mixed)[0][1]
+    fine = {"scheme": "phase-shift", "pitch_px": 16, "steps": 4, "gray": {}}
+    both = rig_of({"order": ["horizontal", "vertical"], "horizontal": fine, "vertical": FOUR}, size=400)
+    order = [0, 1, 2, 3, *range(11, 3, -1), 12, 13, 14, 15, *range(20, 15, -1)]
+    text = said(frames_of(both)[order], both)[0][1]
+    assert "another reading" in text and "Gray code with the least significant bit first" in text
+
+
 def test_the_scene_of_two_captures_is_named():
     rig = rig_of(TWO)
     texture = 0.2 + 0.6 * (np.indices((SIZE, SIZE)).sum(axis=0) // 25 % 2)

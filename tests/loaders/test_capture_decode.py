@@ -1,6 +1,7 @@
 """The commands patterns and decode, on captures that the renderer makes of a rig with vertical codes alone."""
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.coding import Reason
 from fpp_ml_bench.decoding import coordinate_slope_px_per_mm, decode_stack, depth_sigma_mm, noise_of_frames
+from fpp_ml_bench.loaders.captures import CapturedFrames, decode_capture
 from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
 from fpp_ml_bench.optics import load_rig, paper_rig, rig_from_dict, save_rig
 
@@ -164,10 +166,6 @@ def test_a_decoding_killed_in_the_middle_leaves_nothing_that_the_next_refuses(ca
 @pytest.mark.parametrize("gamma", [1.0, 1.5, 2.2])
 @pytest.mark.parametrize("steps", [3, 4, 6])
 def test_the_stated_uncertainty_holds_the_error_of_gamma(steps, gamma):
-    from pathlib import Path
-
-    from fpp_ml_bench.loaders.captures import CapturedFrames, decode_capture
-
     rig = vertical_rig({"scheme": "phase-shift", "pitch_px": 57, "steps": steps, "gray": {}})
     x, y = rig.camera.rays()
     depth_m = 1.8 / (1.0 - 0.4 * x + 0.25 * y)
