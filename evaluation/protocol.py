@@ -74,11 +74,11 @@ UNCERTAINTY = (
 LARGEST_MM = 1e30
 """Magnitudes above this are refused: the numerical contract of the scores ends there (see PROTOCOL.md)."""
 
-METRES_BELOW = 10.0
-MILLIMETRES_ABOVE = 1000.0
-"""A prediction whose largest value is under METRES_BELOW, for a target above MILLIMETRES_ABOVE, is not in mm."""
+METRES_BELOW, UNITS_APART = 10.0, 30.0
+"""A prediction whose largest value is under METRES_BELOW, and UNITS_APART times smaller than the depths that there are,
+is not in mm: it is nearer to a thousandth of them. One in m whose median is as many times larger is in mm."""
 METRES_AT_MOST = 100.0
-"""A prediction in m whose median over the object is above this is in mm."""
+"""Where no rig and no target are known, larger values than this are hardly metres."""
 NORMALISED_AT_MOST = 1.2
 """A normalised prediction whose median over the object is above this can't be a share of the sample's range."""
 

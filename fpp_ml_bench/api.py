@@ -187,13 +187,13 @@ def evaluate(
 @overload
 def evaluate(
     predictions: "Maps", dataset: "Maps", *, flags: "Maps | None" = None, sigma: "Maps | None" = None,
-    objects: Sequence[str] | None = None, edge_band_px: int = EDGE_BAND_PX,
+    objects: Sequence[str] | None = None, units: str | None = None, edge_band_px: int = EDGE_BAND_PX,
 ) -> "result.ArrayScores": ...  # fmt: skip
 
 
 def evaluate(
     predictions: Any, dataset: Any, split: str = "test", target: str = "depth", *, mode: str = "standard",
-    edge_band_px: int = EDGE_BAND_PX, flags: Any = None, sigma: Any = None, objects: Any = None,
+    edge_band_px: int = EDGE_BAND_PX, flags: Any = None, sigma: Any = None, objects: Any = None, units: Any = None,
 ) -> "result.Result | result.ArrayScores":  # fmt: skip
     """Score a folder of predictions, as ``fpp-eval`` does, or arrays in memory by the same rules.
 
@@ -203,7 +203,8 @@ def evaluate(
         Folder with a ``submission.yaml`` and a prediction for each sample of the split. Or depth in mm, 0 = not
         measured: floats (N, H, W), or a list of maps (H, W).
     dataset : str, Path or DatasetFolder, or array
-        What was predicted. For arrays, the true depth in mm, 0 = background, in the form of the predictions.
+        What was predicted. For arrays, the true depth in mm, 0 = background, in the form of the predictions; pixels
+        that a masked array masks count in no score.
     split : {"train", "validation", "test"}
         Of a folder: its samples must all be there, and no others.
     target : {"depth", "depth_exact"}
@@ -213,11 +214,13 @@ def evaluate(
     edge_band_px : int
         Object pixels nearer than this to a depth edge count as edge.
     flags : array, optional
-        Of arrays: uint8, the column ``flags`` of the data; unlit and mixed pixels are void.
+        Of arrays: whole numbers, the column ``flags`` of the data; unlit and mixed pixels are void.
     sigma : array, optional
         Of arrays: the stated standard uncertainty in mm, 0 where none is stated.
     objects : sequence of str, optional
         Of arrays: what each sample shows; intervals are over objects. By default, each sample is an object of its own.
+    units : {"mm", "m"}, optional
+        Of arrays: the unit of all depths and sigma. Must be said where a target reaches less than 10.
 
     Returns
     -------
@@ -240,7 +243,7 @@ def evaluate(
     >>> fpp.evaluate(truth + 2.0, truth).metrics.object_mae_mm
     2.0
     """
-    in_memory = {"flags": flags, "sigma": sigma, "objects": objects}
+    in_memory = {"flags": flags, "sigma": sigma, "objects": objects, "units": units}
     if not isinstance(predictions, (str, Path)):
         if isinstance(dataset, (str, Path, storage.DatasetFolder)):
             raise PredictionError("predictions in memory need the targets as arrays; or give a folder and a dataset")

@@ -2,6 +2,7 @@
 
 import doctest
 
+import numpy as np
 import pytest
 from conftest import TINY_SIZE
 
@@ -37,3 +38,22 @@ def test_a_result_file_does_as_well_as_a_result(folder):
     assert fpp_ml_bench.compare("result.json", result).differences["object_mae_mm"].mean_mm == 0
     with pytest.raises(FppBenchError, match=r"no\.json"):
         fpp_ml_bench.rank(["no.json"])
+
+
+@pytest.mark.parametrize("method", ["phase", "crossed", "classical"])
+def test_frames_as_datasets_gives_them_are_decoded_alike(method, tiny):
+    """``with_format("numpy")`` turns uint8 columns into int64."""
+    dataset = fpp_ml_bench.open_dataset(tiny)
+    row = fpp_ml_bench.load_dataset(tiny, "all", split="test").with_format("numpy")[0]
+    frames = [row[frame.column] for frame in dataset.sequence.frames]
+    assert frames[0].dtype == np.int64
+    predict = fpp_ml_bench.load_method(method, dataset).predict
+    assert np.array_equal(predict(frames), predict(dataset.frames(row["sample"], range(52))))
+    with pytest.raises(FppBenchError, match="int64"):
+        predict([frame * 300 for frame in frames])
+
+
+def test_columns_as_datasets_gives_them_are_scored(tiny):
+    rows = fpp_ml_bench.load_dataset(tiny, "single_shot", split="test").with_format("numpy")[:2]
+    scores = fpp_ml_bench.evaluate(rows["depth"], rows["depth_exact"], flags=rows["flags"])
+    assert scores.metrics.void_share > 0

@@ -10,6 +10,7 @@ from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute
 from fpp_ml_bench.baselines.crossed_route.three_frames import FRAMES, ThreeFrameRoute, shifted_carrier
 from fpp_ml_bench.baselines.method import Answer, Frames, Method
 from fpp_ml_bench.coding import crossed_from_pair
+from fpp_ml_bench.decoding import grey_levels
 from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.loaders.captures import read_mask
 from fpp_ml_bench.optics import DIRECTIONS, Rig
@@ -35,7 +36,7 @@ def _captured(frames: Frames, used: tuple[int, ...]) -> list[NDArray[np.uint8]]:
         image = frames[index] if index < len(frames) else None
         if image is None:
             raise DecodeError(f"frame {index} is missing: the crossed fringes are measured in frames {used}")
-        images.append(image)
+        images.append(grey_levels(image))
     return images
 
 

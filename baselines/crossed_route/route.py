@@ -39,6 +39,7 @@ from fpp_ml_bench.baselines.phase_route import (
 )
 from fpp_ml_bench.coding import MIN_MODULATION, Crossed
 from fpp_ml_bench.constants import GREY_LEVELS
+from fpp_ml_bench.decoding import grey_levels
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.optics import Rig
 
@@ -249,7 +250,7 @@ class CrossedRoute:
     def _checked(self, image: NDArray) -> Image:
         camera = self.resampling.captured.camera
         shape = camera.height, camera.width
-        given = np.asarray(image)
+        given = grey_levels(image)
         if given.dtype not in (np.uint8, np.float32) or given.shape != shape:
             raise DecodeError(
                 f"expected a crossed frame of uint8 grey levels, shape (H, W) = {shape} of the rig's camera, got "

@@ -16,6 +16,7 @@ from torch.nn import functional
 from fpp_ml_bench.baselines.networks.base import FringeNetwork, tiny_floats_are_zero
 from fpp_ml_bench.baselines.networks.registry import build
 from fpp_ml_bench.baselines.training import ModelConfig, open_weights, weights_path
+from fpp_ml_bench.decoding import grey_levels
 from fpp_ml_bench.depth import denormalise
 from fpp_ml_bench.errors import PredictionError, WeightsError
 from fpp_ml_bench.loaders.training import unit_range
@@ -27,7 +28,7 @@ def fringe_batch(fringes: Sequence[Fringe] | Fringe, size: tuple[int, int], trai
     """Images (B, H, W), uint8 or float in [0, 1], as the network's input: float32 (B, 1, H, W) in [0, 1], on the CPU.
     ``size`` (H, W): what the network ``trained_on`` was trained at. `PredictionError` for another size, shape or dtype,
     and for values that are NaN or outside [0, 1]."""
-    images = [np.asarray(image) for image in fringes]
+    images = [grey_levels(image) for image in fringes]
     if not images:
         raise PredictionError("expected at least one fringe image, got none")
     batch = torch.empty(len(images), 1, *size)

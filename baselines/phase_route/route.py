@@ -35,6 +35,7 @@ from fpp_ml_bench.baselines.phase_route.observation import Capture, Measurement,
 from fpp_ml_bench.baselines.phase_route.resampling import Periods, Resampling
 from fpp_ml_bench.coding import MIN_MODULATION
 from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.decoding import grey_levels
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.optics import Rig
 
@@ -187,16 +188,17 @@ class PhaseRoute:
 
     def _checked(self, image: Frames) -> list[NDArray[np.uint8]]:
         """The frames, as many as the settings say."""
-        images = [image] if isinstance(image, np.ndarray) and image.ndim == 2 else list(image)
+        given = [image] if isinstance(image, np.ndarray) and image.ndim == 2 else list(image)
+        images = [grey_levels(frame) for frame in given]
         captured = self.resampling.captured.camera
         shape = (captured.height, captured.width)
         if len(images) != len(self.steps):
             raise DecodeError(f"expected {len(self.steps)} fringes, those of steps {self.steps}, got {len(images)}")
         for frame in images:
-            if np.asarray(frame).dtype != np.uint8 or np.shape(frame) != shape:
+            if frame.dtype != np.uint8 or frame.shape != shape:
                 raise DecodeError(
                     f"expected a fringe of uint8 grey levels, shape (H, W) = {shape} of the rig's camera, got "
-                    f"{np.asarray(frame).dtype} {np.shape(frame)}; use rig.scaled(width) for a resized image"
+                    f"{frame.dtype} {frame.shape}; use rig.scaled(width) for a resized image"
                 )
         return images
 

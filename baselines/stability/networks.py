@@ -311,7 +311,7 @@ def phase_output(name: str, image: str) -> Outcome:
 @NETWORKS.family("training metric", "relative", refuses=PredictionError, scale=(1.0, 1e-30, 1e30, 1e-160, 1e-300))
 def metric_scale(scale: float) -> Outcome:
     """mean RMSE of 50 samples as a torchmetrics metric; against exactly rounded sums; bound: gamma of 460 roundings"""
-    metric, target = DepthScores(), torch.zeros((1, 20, 20), dtype=torch.float64)
+    metric, target = DepthScores("mm"), torch.zeros((1, 20, 20), dtype=torch.float64)
     target[:, 5:15, 5:15] = 4096 * scale
     errors = scale * torch.randint(1, 999, (50, 20, 20), generator=_seeded(14)).double()
     for error in errors:

@@ -222,7 +222,7 @@ class DepthTraining(Training):
         indices = pairs[accelerator.process_index :: accelerator.num_processes]
         units, mode = SCORING[self.recipe.normalisation]
         network.eval()
-        metric = DepthScores()
+        metric = DepthScores("mm")
         if accelerator.device.type == "cuda":  # NCCL adds up tensors on a GPU only
             metric.to(accelerator.device)
         losses: list[float] = []

@@ -19,6 +19,7 @@ from torchmetrics import Metric
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.protocol import DISTRIBUTION, HEADLINE, WITHIN, WITHIN_MM
 from fpp_ml_bench.evaluation.score.sample_scores import NOT_FINITE
+from fpp_ml_bench.evaluation.score.units import MM_PER_UNIT, declared_units, not_in_mm
 
 KEYS = (*HEADLINE, "object_valid_mae_mm", "object_missing_share", *DISTRIBUTION)
 SQUARES_VANISH = 1e-140
@@ -28,10 +29,11 @@ SQUARES_VANISH = 1e-140
 class DepthScores(Metric):
     """Means over samples of the keys in `KEYS`, in mm and shares, as `fpp-eval` reports them.
 
-    ``update(prediction_mm, target_mm, void=None)`` takes (B, H, W) or (B, 1, H, W) real floats in mm, 0 = background,
-    on any device, and bool (B, H, W), true for pixels in no set. ``compute()`` gives a dict of float64 scalars, NaN
-    where no sample has the pixels for a score. Samples without these pixels are left out of the mean and never count as
-    0.
+    ``update(prediction, target, void=None)`` takes (B, H, W) or (B, 1, H, W) real floats, 0 = background, on any
+    device, and bool (B, H, W), true for pixels in no set. They are in mm; ``units="m"`` takes metres. Where units are
+    not said, a target below 10 and a prediction that looks like metres are refused; say ``units="mm"`` for a network
+    that may predict that early in training. ``compute()`` gives a dict of float64 scalars, NaN where no sample has the
+    pixels for a score. Samples without these pixels are left out of the mean and never count as 0.
 
     The scores have no gradient (``is_differentiable`` is False). Lower is better, except for the shares within a
     tolerance. ``half()`` and ``float()`` leave the state in float64."""
@@ -43,19 +45,21 @@ class DepthScores(Metric):
     sums: Tensor
     counts: Tensor
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, units: str | None = None, **options: Any) -> None:
         super().__init__(**options)
+        declared_units(0.0, units)
+        self.units = units
         self.add_state("sums", torch.zeros(len(KEYS), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("counts", torch.zeros(len(KEYS), dtype=torch.float64), dist_reduce_fx="sum")
 
-    def update(self, prediction_mm: Tensor, target_mm: Tensor, void: Tensor | None = None) -> None:
-        """Add a batch. Raises PredictionError for other shapes or dtypes, and for errors that are not finite."""
-        prediction, target = _maps(prediction_mm, target_mm)
-        scored = torch.ones(target.shape, dtype=torch.bool) if void is None else ~void
-        if scored.shape != target.shape:
-            raise PredictionError(f"void: expected {tuple(target.shape)} (B, H, W), got {tuple(scored.shape)}")
+    def update(self, prediction: Tensor, target: Tensor, void: Tensor | None = None) -> None:
+        """Add a batch. Raises PredictionError for other shapes or dtypes, for errors that are not finite, for negative
+        targets, and for depths that look like another unit."""
+        prediction, target = _maps(prediction, target)
+        scored = torch.ones(target.shape, dtype=torch.bool) if void is None else ~_checked_void(void, target.shape)
         for predicted, truth, pixels in zip(prediction, target, scored.to(target.device), strict=True):
-            scores = _sample_scores(predicted[pixels], truth[pixels])
+            mm_per_unit = _mm_per_unit(float(predicted.max()), float(truth.max()), self.units)
+            scores = _sample_scores(predicted[pixels] * mm_per_unit, truth[pixels] * mm_per_unit)
             values = [predicted.new_zeros(()) if (score := scores[key]) is None else score for key in KEYS]
             self.sums += torch.stack(values).to(self.sums.device)
             self.counts += torch.tensor([scores[key] is not None for key in KEYS], device=self.counts.device)
@@ -66,20 +70,47 @@ class DepthScores(Metric):
         return dict(zip(KEYS, means, strict=True))
 
 
-def _maps(prediction_mm: Tensor, target_mm: Tensor) -> tuple[Tensor, Tensor]:
-    shape, given = tuple(target_mm.shape), tuple(prediction_mm.shape)
+def _maps(prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """Both as float64 (B, H, W)."""
+    for name, values in (("prediction", prediction), ("target", target)):
+        if not isinstance(values, Tensor):
+            raise PredictionError(f"{name}: expected a tensor, got {type(values).__name__}")
+    shape, given = tuple(target.shape), tuple(prediction.shape)
     if given != shape:
         raise PredictionError(f"expected a prediction of the target's shape {shape}, got {given}")
-    if not (prediction_mm.is_floating_point() and target_mm.is_floating_point()):
-        raise PredictionError(f"expected real floats, got {prediction_mm.dtype} against {target_mm.dtype}")
-    if target_mm.dim() == 4 and shape[1] == 1:
-        prediction_mm, target_mm = prediction_mm[:, 0], target_mm[:, 0]
-    if target_mm.dim() != 3 or target_mm[:1].numel() == 0:
+    if not (prediction.is_floating_point() and target.is_floating_point()):
+        raise PredictionError(f"expected real floats, got {prediction.dtype} against {target.dtype}")
+    if target.dim() == 4 and shape[1] == 1:
+        prediction, target = prediction[:, 0], target[:, 0]
+    if target.dim() != 3 or target[:1].numel() == 0:
         raise PredictionError(f"expected (B, H, W) or (B, 1, H, W), got {shape}")
-    prediction, target = prediction_mm.detach(), target_mm.detach()
+    prediction, target = prediction.detach(), target.detach()
     if prediction.device.type == "mps":  # Apple's GPUs have no float64
         prediction, target = prediction.cpu(), target.cpu()
-    return prediction.to(torch.float64), target.to(prediction.device, torch.float64)
+    prediction, target = prediction.to(torch.float64), target.to(prediction.device, torch.float64)
+    if not bool(torch.isfinite(target).all() and (target >= 0).all()):
+        raise PredictionError("target: expected finite depths of 0 and more")
+    return prediction, target
+
+
+def _checked_void(void: Tensor, shape: torch.Size) -> Tensor:
+    if not isinstance(void, Tensor) or void.dtype != torch.bool:
+        got = getattr(void, "dtype", type(void).__name__)
+        raise PredictionError(f"void: expected bool, true for pixels in no set, got {got}; of flags: (flags & 3) != 0")
+    if void.shape != shape:
+        raise PredictionError(f"void: expected {tuple(shape)} (B, H, W), got {tuple(void.shape)}")
+    return void
+
+
+def _mm_per_unit(largest: float, target_max: float, units: str | None) -> float:
+    """What one unit of a sample's depths is in mm; raises PredictionError where ``units`` can't be true."""
+    scale = MM_PER_UNIT[declared_units(target_max, units)]
+    if units is None and not_in_mm(largest, target_max):
+        raise PredictionError(
+            f"the prediction looks like another unit than the target: its largest value is {largest:.4g}, the target's "
+            f"{target_max:.4g}; give both in the same"
+        )
+    return scale
 
 
 def _sample_scores(prediction: Tensor, target: Tensor) -> Mapping[str, Tensor | None]:

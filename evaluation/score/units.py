@@ -7,18 +7,43 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import extremes, object_mask
-from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import Mode, Units
+from fpp_ml_bench.files import printable
 
 Depth = NDArray[np.floating[Any]]
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "normalised": 1000.0}
 """Upper bound in mm of one declared unit; for normalised depth, that no working range is above 1 m."""
 
 
-def value_problems(prediction: Depth, target_mm: Depth, target_max_mm: float, units: Units) -> list[str]:
-    """What is wrong with the values of a prediction (H, W) in ``units``; usually an empty list. ``target_max_mm`` is
-    the largest value of ``target_mm`` (H, W)."""
+def declared_units(target_max: float, units: str | None) -> Units:
+    """The units of arrays, which know no rig: ``mm``, unless ``units`` says ``m``. Raises PredictionError for other
+    units, and where they are not said and the largest depth of a target, ``target_max``, could as well be metres."""
+    if units not in (None, "mm", "m"):
+        raise PredictionError(f"units: expected mm or m, got {printable(str(units))}")
+    if units is None and 0 < target_max < protocol.METRES_BELOW:
+        raise PredictionError(
+            f"targets: the largest depth is {target_max:.4g}, which could be metres; say units='m', or units='mm' "
+            f"where depths below {protocol.METRES_BELOW:g} mm are meant"
+        )
+    return "m" if units == "m" else "mm"
+
+
+def in_mm(values: Any, units: Units) -> Any:
+    """Depths in mm or m (an array) in mm; those in mm are not copied."""
+    return values.astype(np.float64) * MM_PER_M if units == "m" else values
+
+
+def not_in_mm(largest: float, reach_mm: float) -> bool:
+    """Whether depths up to ``largest`` can't be mm where there are depths up to ``reach_mm``, but metres or shares."""
+    return 0 < largest < min(protocol.METRES_BELOW, reach_mm / protocol.UNITS_APART)
+
+
+def value_problems(prediction: Depth, target_mm: Depth, reach_mm: float, units: Units) -> list[str]:
+    """What is wrong with the values of a prediction (H, W) in ``units``; usually an empty list. ``reach_mm``: up to
+    which depth there is something to measure, the far end of the rig's working range, or the largest target; 0 where
+    that is not known."""
     low, high = extremes(prediction)
     problems = []
     if not np.isfinite([low, high]).all():  # min and max carry NaN through
@@ -33,31 +58,30 @@ def value_problems(prediction: Depth, target_mm: Depth, target_max_mm: float, un
     if max(high, -low) > largest:
         values = f"values up to {max(high, -low):.3g} {units} in magnitude"
         problems.append(f"holds {values}; the limit is {largest:g}; write 0 where nothing was measured")
-    wrong_unit = _unit_problem(prediction, target_mm, units, high, target_max_mm)
+    wrong_unit = _unit_problem(prediction, target_mm, units, high, reach_mm)
     return [*problems, wrong_unit] if wrong_unit else problems
 
 
-def _unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, target_max_mm: float) -> str | None:
+def _unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, reach_mm: float) -> str | None:
     """Why ``values`` (H, W), finite and at most ``high``, can't be in ``units``; None where they can. Where mm are
     declared, the largest value shows whether the values are metres or shares of the range. Where m or normalised depth
     is declared, a single stray pixel must not decide, so the median over the object is compared."""
+    reach = f"its largest value is {high:.4g}, and there are depths up to {reach_mm / MM_PER_M:.4g} m"
     if units == "mm":
-        if 0 < high < protocol.METRES_BELOW and target_max_mm > protocol.MILLIMETRES_ABOVE:
-            reach = f"its largest value is {high:.4g}, the target reaches {target_max_mm:.0f} mm"
-            advice = "convert it to mm, or declare units: m or normalised in submission.yaml"
-            return f"looks like metres or normalised depth: {reach}; {advice}"
+        if not_in_mm(high, reach_mm):
+            return (
+                f"looks like metres or normalised depth: {reach}; convert it to mm, or declare units: m or normalised"
+            )
         return None
     depths = values[object_mask(target_mm) & (values > 0)]
     if not depths.size:
         return None
     typical = float(np.median(depths))
     median = f"its median over the object is {typical:.4g}"
-    if units == "m" and typical > protocol.METRES_AT_MOST:
-        return f"does not look like metres: {median}; if it is in mm, declare units: mm in submission.yaml"
-    if units == "m" and high < 1 and target_max_mm > protocol.MILLIMETRES_ABOVE:
-        reach = f"its largest value is {high:.4g}, the target reaches {target_max_mm / MM_PER_M:.2f} m"
-        advice = "if it is normalised, declare units: normalised in submission.yaml"
-        return f"does not look like metres: {reach}; {advice}"
+    if units == "m" and typical * MM_PER_M > reach_mm * protocol.UNITS_APART:
+        return f"does not look like metres: {median}; if it is in mm, declare units: mm"
+    if units == "m" and high < min(1.0, reach_mm / MM_PER_M / 2):
+        return f"does not look like metres: {reach}; if it is normalised, declare units: normalised"
     if units == "normalised" and typical > protocol.NORMALISED_AT_MOST:
         advice = "if it is in m or mm, declare that in submission.yaml"
         return f"does not look like normalised depth: {median}, the target's is at most 1; {advice}"

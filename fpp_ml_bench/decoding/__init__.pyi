@@ -4,6 +4,7 @@ from .blocks import depth_and_reason as depth_and_reason
 from .blocks import plain_plan as plain_plan
 from .blocks import plan_direction as plan_direction
 from .checks import check_limits as check_limits
+from .checks import grey_levels as grey_levels
 from .decode import Decoded as Decoded
 from .decode import Directions as Directions
 from .decode import decode_stack as decode_stack

@@ -41,6 +41,15 @@ def check_limits(limits: Limits) -> None:
         raise DecodeError(f"max_clipped_steps: expected 0 or more, got {limits.max_clipped_steps!r}")
 
 
+def grey_levels(image: NDArray) -> NDArray:
+    """An image as an array; whole numbers of another dtype, as ``datasets`` gives them ``with_format("numpy")``, as
+    uint8 where none of them changes."""
+    levels = np.asarray(image)
+    if levels.dtype.kind in "iu" and levels.size and 0 <= levels.min() <= levels.max() <= GREY_LEVELS:
+        return levels.astype(np.uint8, copy=False)
+    return levels
+
+
 def flat_frames(frames: Sequence[NDArray | None] | NDArray, used: tuple[int, ...], rig: Rig) -> dict[int, NDArray]:
     """The frames at the indices ``used``, checked and flattened to uint8 or float32 (H * W,), all of one dtype."""
     expected = (rig.camera.height, rig.camera.width)
@@ -54,7 +63,7 @@ def flat_frames(frames: Sequence[NDArray | None] | NDArray, used: tuple[int, ...
         frame, title = frames[index], f"frame {rig.sequence.frames[index].title}"
         if frame is None:
             raise DecodeError(f"{title}: expected an image, got None; this decoding needs the frame, capture it")
-        image = np.asarray(frame)
+        image = grey_levels(frame)
         if image.dtype not in (np.uint8, np.float32):
             raise DecodeError(
                 f"{title}: expected uint8 grey levels, or float32 of 0 to 255 for deeper images, got {image.dtype}"

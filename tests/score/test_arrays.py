@@ -58,6 +58,35 @@ def test_a_perfect_prediction_and_maps_of_different_sizes():
 
 
 TRUE = np.full((2, 4, 5), 1800.0)
+VOID = np.zeros(TRUE.shape, bool)
+VOID[:, :2] = True
+OFF = np.where(VOID, 900.0, TRUE + 2)
+ACCEPTED = {
+    "masked target": ((OFF, np.ma.masked_array(TRUE, VOID)), {}),
+    "nothing masked": ((np.ma.masked_array(TRUE + 2), TRUE), {}),
+    "flags as uint8": ((OFF, TRUE), {"flags": VOID.astype(np.uint8)}),
+    "flags as int64, as datasets gives them": ((OFF, TRUE), {"flags": VOID.astype(np.int64) * Flag.MIXED}),
+    "metres": (((TRUE + 2) / 1000, TRUE / 1000), {"units": "m"}),
+    "close by": ((np.full((1, 4, 5), 7.0), np.full((1, 4, 5), 5.0)), {"units": "mm"}),
+}
+
+
+@pytest.mark.parametrize("case", ACCEPTED)
+def test_what_is_answered(case):
+    arguments, options = ACCEPTED[case]
+    scores = fpp_ml_bench.evaluate(*arguments, **options)
+    assert scores.metrics.object_mae_mm == pytest.approx(2.0, rel=1e-12)
+    assert scores.metrics.overall_mae_mm == pytest.approx(2.0, rel=1e-12)
+
+
+def test_sigma_is_in_the_same_units():
+    stated = [
+        fpp_ml_bench.evaluate((TRUE + 2) / k, TRUE / k, sigma=np.full(TRUE.shape, 3 / k), units=units).uncertainty
+        for k, units in ((1, "mm"), (1000, "m"))
+    ]
+    assert stated[1].metrics.sigma_mean_mm == pytest.approx(stated[0].metrics.sigma_mean_mm) == pytest.approx(3.0)
+
+
 REFUSED = {
     "number": ((TRUE[:1], TRUE), {}, "predictions: expected 2, one for each target, got 1"),
     "one map": ((TRUE[0], TRUE[0]), {}, r"targets: expected an array \(N, H, W\) .* got one map \(4, 5\)"),
@@ -68,7 +97,19 @@ REFUSED = {
     "metres": ((TRUE / 1000, TRUE), {}, "sample 0: the prediction looks like metres"),
     "bad target": ((TRUE, -TRUE), {}, "sample 0: targets: expected finite mm of 0 and more"),
     "bad sigma": ((TRUE, TRUE), {"sigma": TRUE * np.nan}, "sample 0: sigma: expected finite mm"),
-    "flags": ((TRUE, TRUE), {"flags": TRUE}, "sample 0: flags: expected uint8"),
+    "flags": ((TRUE, TRUE), {"flags": TRUE}, "sample 0: flags: expected whole numbers .* got float64"),
+    "flags as a mask": ((TRUE, TRUE), {"flags": TRUE > 0}, "flags: expected whole numbers .* got bool"),
+    "flags of valid pixels": ((TRUE, TRUE), {"flags": np.uint8(255) * (TRUE > 0)}, "expected sums of 1 .* got 255"),
+    "flags that wrap": ((TRUE, TRUE), {"flags": np.uint16(256) * (TRUE > 0)}, "expected sums of .* got 256"),
+    "negative flags": ((TRUE, TRUE), {"flags": np.int64(-1) * (TRUE > 0)}, "expected sums of .* got -1"),
+    "masked prediction": ((np.ma.masked_equal(TRUE, 1800), TRUE), {}, "predictions: a masked array"),
+    "both in metres": ((TRUE / 1000, TRUE / 1000), {}, "largest depth is 1.8, which could be metres; say units"),
+    "target in metres": ((TRUE, TRUE / 1000), {}, "targets: the largest depth is 1.8"),
+    "metres close by": ((TRUE / 4500, TRUE / 4.5), {}, "the prediction looks like metres"),
+    "mm for metres": ((TRUE, TRUE / 1000), {"units": "m"}, "the prediction does not look like metres"),
+    "other units": ((TRUE, TRUE), {"units": "inch"}, "units: expected mm or m, got inch"),
+    "ragged": (([[[1800.0], [1.0, 2.0]]], TRUE[:1]), {}, "predictions: expected an array"),
+    "units of a folder": (("folder", "data"), {"units": "m"}, "units: belongs to arrays"),
     "objects": ((TRUE, TRUE), {"objects": ["mug"]}, "objects: expected 2"),
     "objects as text": ((TRUE, TRUE), {"objects": "ab"}, "objects: expected .* got str"),
     "a dataset": ((TRUE, "data"), {}, "need the targets as arrays"),

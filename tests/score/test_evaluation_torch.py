@@ -127,3 +127,32 @@ def test_gradients_are_not_held_and_bad_batches_are_refused():
         metric.update(prediction.detach().long(), target)
     with pytest.raises(PredictionError, match=r"\(B, H, W\)"):
         metric.update(prediction[0], target[0])
+
+
+DEPTH = torch.full((1, 4, 5), 1800.0)
+BATCHES = {
+    "void as uint8": ({}, (DEPTH, DEPTH, (DEPTH > 0).to(torch.uint8)), "void: expected bool.* got torch.uint8"),
+    "void as int64": ({}, (DEPTH, DEPTH, (DEPTH > 0).long()), "void: expected bool.* got torch.int64"),
+    "void of another shape": ({}, (DEPTH, DEPTH, DEPTH[0] > 0), "void: expected .1, 4, 5."),
+    "an array": ({}, (DEPTH.numpy(), DEPTH), "prediction: expected a tensor, got ndarray"),
+    "both in metres": ({}, (DEPTH / 1000, DEPTH / 1000), "the largest depth is 1.8, which could be metres"),
+    "metres": ({}, (DEPTH / 1000, DEPTH), "looks like another unit than the target"),
+    "metres close by": ({}, (DEPTH / 5000, DEPTH / 5), "looks like another unit than the target"),
+    "negative target": ({}, (DEPTH, -DEPTH), "target: expected finite depths of 0 and more"),
+    "unknown units": ({"units": "inch"}, None, "units: expected mm or m"),
+}
+
+
+@pytest.mark.parametrize("case", BATCHES)
+def test_what_could_mean_something_else_is_refused(case):
+    options, batch, message = BATCHES[case]
+    with pytest.raises(PredictionError, match=message):
+        DepthScores(**options).update(*batch)
+
+
+def test_units_that_are_said_are_taken():
+    metres, untrained = DepthScores(units="m"), DepthScores(units="mm")
+    metres.update(DEPTH / 1000 + 0.002, DEPTH / 1000)
+    assert float(metres.compute()["object_mae_mm"]) == pytest.approx(2.0, rel=1e-4)  # float32 metres
+    untrained.update(torch.full_like(DEPTH, 1.0), DEPTH)
+    assert float(untrained.compute()["object_mae_mm"]) == 1799.0
