@@ -18,13 +18,18 @@ TRIVIAL = "constant", "nearest"
 STANDOFF, MIDDLE, TRAINING_MEAN = "standoff", "middle", "training-mean"
 TRAINING_MEAN_MM, TRAINING_MEAN_DATA = 1743.75, "fpp-bench-full version 1"
 """Mean exact depth over the object pixels of the training split of that benchmark."""
+RANGE_SHARES = {"range-middle": 0.5, "range-training": 0.287}
+"""Constants as shares of a given depth range: its middle, and that with the least mean object MAE on the training split
+of `RANGE_DATA` (a median weighted by range over pixels)."""
+RANGE_DATA = "fpp-bench-full-224 version 1"
 BLOCKS = 60
 """Blocks along an image's shorter side, by whose means `NearestMethod` compares images."""
 
 
 class ConstantMethod(Method):
     """One depth at every pixel: ``at`` the rig's standoff, the middle of its working range, the mean of the benchmark's
-    training split, or so many mm. Raises PredictionError for anything else."""
+    training split, or so many mm. Or one of `RANGE_SHARES` of the sample's depth range, which it is then given, as a
+    network of the oracle range track is: normalised depth. Raises PredictionError for anything else."""
 
     name = "constant"
     packages = ("numpy",)
@@ -32,25 +37,28 @@ class ConstantMethod(Method):
     def __init__(self, rig: Rig, at: str | float = STANDOFF) -> None:
         known = {
             STANDOFF: rig.standoff_m * MM_PER_M, MIDDLE: sum(rig.working_range_mm) / 2, TRAINING_MEAN: TRAINING_MEAN_MM,
+            **RANGE_SHARES,
         }  # fmt: skip
         try:
-            self.depth_mm = float(known.get(at, at) if isinstance(at, str) else at)
+            self.value = float(known.get(at, at) if isinstance(at, str) else at)
         except ValueError:
-            self.depth_mm = -1.0
-        if not 0 < self.depth_mm < 1e6:
+            self.value = -1.0
+        if not 0 < self.value < 1e6:
             raise PredictionError(f"at {at!r}: expected {', '.join(known)}, or a depth in mm above 0")
         self.shape = rig.camera.height, rig.camera.width
         self.frames_used = rig.sequence.config("single_shot")
         self.title = f"Constant depth, {at} mm" if at not in known else f"Constant depth: {at}"
-        self.settings = {"at": at, "depth_mm": self.depth_mm}
+        if at in RANGE_SHARES:
+            self.uses_ground_truth_range, self.units, self.mode, self.target = True, "normalised", "paper", "depth"
+        self.settings = {"at": at, "share" if at in RANGE_SHARES else "depth_mm": self.value}
 
     @property
     def learned_from(self) -> dict[str, Any]:
-        train_split = {"data": "train-split", "versions": [TRAINING_MEAN_DATA]}
-        return train_split if self.settings["at"] == TRAINING_MEAN else super().learned_from
+        data = {TRAINING_MEAN: TRAINING_MEAN_DATA, "range-training": RANGE_DATA}.get(str(self.settings["at"]))
+        return {"data": "train-split", "versions": [data]} if data else super().learned_from
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
-        return np.full(self.shape, self.depth_mm, dtype=np.float32)
+        return np.full(self.shape, self.value, dtype=np.float32)
 
 
 class NearestMethod(Method):

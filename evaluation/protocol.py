@@ -5,10 +5,11 @@ different protocol versions are never ranked together."""
 from typing import Literal, get_args
 
 PROTOCOL_VERSION = "2.0.0"
-SchemaVersion = Literal["2.0.0", "2.1.0", "2.2.0", "2.3.0"]
-RESULT_SCHEMA_VERSION: SchemaVersion = "2.3.0"
+SchemaVersion = Literal["2.0.0", "2.1.0", "2.2.0", "2.3.0", "2.4.0"]
+RESULT_SCHEMA_VERSION: SchemaVersion = "2.4.0"
 """What is written. 2.1.0 adds the optional ``dataset.benchmark``, 2.2.0 the optional ``robustness``, 2.3.0 the keys of
-protocol 2: void and unlit pixels, ``uncertainty`` and ``submission.learned_from``; every `SchemaVersion` is read."""
+protocol 2: void and unlit pixels, ``uncertainty`` and ``submission.learned_from``, 2.4.0 `RANGE_SHARE`; every
+`SchemaVersion` is read."""
 
 Target = Literal["depth", "depth_exact"]
 Track = Literal[
@@ -50,12 +51,18 @@ DISTRIBUTION = (
 (the MAE once the median error has been subtracted)."""
 WIDE_BAND = ("object_wide_band_mae_mm", "object_wide_interior_mae_mm", "object_wide_band_share")
 
-SINCE_2 = ("void_share", "unlit_mae_mm", "unlit_rmse_mm", "unlit_valid_mae_mm", "unlit_missing_share")
-"""Since protocol 2: the share of the image that counts in no set, and scores of its unlit pixels, against
-``depth_exact`` only. Left out of a result where no sample has them."""
+RANGE_SHARE = "object_mae_range_share"
+"""Object MAE over the depth range of the sample's scored object pixels, the only share that may exceed 1."""
+SINCE_2 = ("void_share", "unlit_mae_mm", "unlit_rmse_mm", "unlit_valid_mae_mm", "unlit_missing_share", RANGE_SHARE)
+"""Since protocol 2: the share of the image that counts in no set, scores of its unlit pixels, against ``depth_exact``
+only, and `RANGE_SHARE`. Left out of a result where no sample has them."""
 
 METRICS = HEADLINE + BESIDE + DISTRIBUTION + WIDE_BAND + SINCE_2
 HIGHER_IS_BETTER = WITHIN
+HELPED_BY_MISSING = (
+    "object_valid_mae_mm", "object_interior_valid_mae_mm", "unlit_valid_mae_mm", *SIGNED, "object_shift_free_mae_mm",
+)  # fmt: skip
+"""Scores that a method can improve by answering fewer pixels; nothing is ranked or sorted by them."""
 
 COVERED = (68, 95, 99)
 NOMINAL = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.68, 0.7, 0.8, 0.9, 0.95, 0.99)

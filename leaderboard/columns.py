@@ -3,8 +3,9 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from statistics import fmean
 
-from fpp_ml_bench.evaluation.protocol import HEADLINE
+from fpp_ml_bench.evaluation.protocol import HEADLINE, RANGE_SHARE
 from fpp_ml_bench.evaluation.report import millimetres, percent, seconds
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.assumptions import assumption, learned_from
@@ -19,7 +20,8 @@ RANK_NOTE = (
     "worst: all ranked rows without those behind it."
 )
 RATIO_NOTE = (
-    "x trivial: object MAE over that of the best method that looks at nothing, or only for the nearest training image."
+    "x trivial: object MAE over that of the best method that looks at nothing, or only for the nearest training image, "
+    "and is told no more than the track's methods. Of depth range: object MAE over the depth range of each sample."
 )
 NOTE = (
     f"Errors in mm, mean over samples; 95% interval from a bootstrap over objects. {RANK_NOTE} {RATIO_NOTE} "
@@ -69,6 +71,7 @@ def columns(sort: str) -> list[Column]:
             errors.append(Column("95% interval", ends, from_width=MIDDLE))
         if key == "object_mae_mm":
             errors += [replace(PARTS[0], from_width=MIDDLE), replace(PARTS[1], from_width=MIDDLE), RATIO]
+            errors.append(replace(RANGE, from_width=MIDDLE))
     return [
         RANK, METHOD, *errors, Column("s/sample", _seconds), FRAMES, replace(RELIANCE, from_width=WIDE),
         replace(ROBUSTNESS, from_width=WIDEST), *(replace(column, from_width=WIDEST) for column in UNCERTAINTY),
@@ -100,9 +103,13 @@ def ratio(row: Ranked) -> str:
 
 
 def uncertainty(entry: Entry) -> tuple[float | None, float | None]:
-    """Share of object pixels within the stated 95% interval, and AUSE in mm; None where no uncertainty was scored."""
-    block = getattr(entry.result, "uncertainty", None)
-    return (None, None) if block is None else (block.metrics.coverage_95, block.metrics.ause_mae_mm)
+    """Share of object pixels within the stated 95% interval, to which those that state none do not belong, and AUSE in
+    mm; None where no uncertainty was scored."""
+    if (block := entry.result.uncertainty) is None:
+        return None, None
+    samples = [scores for scores in block.per_sample.values() if scores.unstated_share is not None]
+    covered = [(scores.coverage_95 or 0.0) * (1 - (scores.unstated_share or 0.0)) for scores in samples]
+    return fmean(covered) if covered else None, block.metrics.ause_mae_mm
 
 
 def _seconds(row: Ranked) -> str:
@@ -159,6 +166,7 @@ PARTS = tuple(
     for title, part in (("On test", TEST), ("On unseen", UNSEEN))
 )
 """Both errors of a row that joins the two sets."""
+RANGE = Column("Of depth range", partial(error, RANGE_SHARE), present=lambda row: row.value(RANGE_SHARE) is not None)
 RATIO = Column("x trivial", ratio, present=lambda row: row.ratio is not None)
 RELIANCE = Column("Phase reliance", lambda row: reliance(row.entry))
 ROBUSTNESS = Column("Disturbed, mm", lambda row: robustness(row.entry))

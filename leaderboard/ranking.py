@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import HIGHER_IS_BETTER, METRICS
+from fpp_ml_bench.evaluation.protocol import HELPED_BY_MISSING, HIGHER_IS_BETTER, METRICS
 from fpp_ml_bench.evaluation.score import FEWEST_OBJECTS
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import rows
@@ -18,7 +18,7 @@ from fpp_ml_bench.leaderboard.rows import Entry, read_entry
 from fpp_ml_bench.leaderboard.trivial import with_ratios
 
 DEFAULT_SORT = "object_mae_mm"
-SORT_KEYS = (*METRICS, "seconds_per_sample", "frames_used")
+SORT_KEYS = (*(key for key in METRICS if key not in HELPED_BY_MISSING), "seconds_per_sample", "frames_used")
 
 
 def discover(here: Path) -> list[Path]:
@@ -56,6 +56,8 @@ def rank(entries: Iterable[Entry], sort: str = DEFAULT_SORT) -> list[Group]:
     """Groups in the order of `GroupKey.order`, their rows by rank in ``sort``, then the best value first, unknown
     values last. Equal values are ordered by name, so the order of the files changes nothing. Raises SubmissionError
     where a group holds a name twice."""
+    if sort in HELPED_BY_MISSING:
+        raise SubmissionError(f"{sort}: a method could lead by answering few pixels; sort by {DEFAULT_SORT}")
     if sort not in SORT_KEYS:
         raise SubmissionError(f"expected a sort key out of {', '.join(SORT_KEYS)}, got {printable(sort)!r}")
     members: dict[GroupKey, list[Entry]] = {}
@@ -74,8 +76,8 @@ def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
     methods = [joined(parts) for parts in by_name.values()]
     names = short_names([entry.result.submission for entry, _ in methods])
     rows = [Ranked(entry, name, unseen) for (entry, unseen), name in zip(methods, names, strict=True)]
-    # Smaller is better: a tolerance share with its sign turned, a bias without its sign.
-    turned = operator.neg if sort in HIGHER_IS_BETTER else abs
+    # Smaller is better: a tolerance share with its sign turned.
+    turned = operator.neg if sort in HIGHER_IS_BETTER else operator.pos
 
     def by_rank(row: Ranked) -> tuple[object, ...]:
         value = row.value(sort)

@@ -32,8 +32,8 @@ _ERRORS = (
 )  # fmt: skip
 _COLUMNS = (
     columns.RANK, columns.METHOD, _ERRORS[0], Column("95% interval", partial(interval, between=" - ")), *columns.PARTS,
-    columns.RATIO, *_ERRORS[1:], Column("Time, ms", columns.milliseconds_text), columns.FRAMES, columns.RELIANCE,
-    columns.ROBUSTNESS, columns.PROVENANCE,
+    columns.RATIO, columns.RANGE, *_ERRORS[1:], Column("Time, ms", columns.milliseconds_text), columns.FRAMES,
+    columns.RELIANCE, columns.ROBUSTNESS, columns.PROVENANCE,
 )  # fmt: skip
 
 

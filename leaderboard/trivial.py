@@ -22,21 +22,27 @@ def more_than_trivial(groups: Sequence[Group]) -> list[Group]:
 
 
 def with_ratios(groups: Sequence[Group]) -> list[Group]:
-    """``groups`` whose rows have their ``ratio``: object MAE over the smallest that a trivial row on the same data has
-    on the row's objects. Trivial rows need at most one frame and are told nothing, so they count in all classes and
-    tracks."""
-    trivial: dict[tuple[object, ...], list[dict[str, float]]] = {}
+    """``groups`` whose rows have their ``ratio``: object MAE over the smallest that a trivial row by the same rules has
+    on the row's objects. Trivial rows need at most one frame, so they count in all classes; a row that is told
+    something of the ground truth counts in the tracks that are told no less."""
+    trivial: dict[tuple[object, ...], list[tuple[set[str], dict[str, float]]]] = {}
     for group in groups:
         for row in filter(is_trivial, group.rows):
-            trivial.setdefault(_data(group.key), []).append(row.object_means(_KEY))
-    return [
-        replace(group, rows=tuple(replace(r, ratio=_ratio(r, trivial.get(_data(group.key), []))) for r in group.rows))
-        for group in groups
-    ]
+            trivial.setdefault(_data(group.key), []).append((_given(group.key), row.object_means(_KEY)))
+    with_ratio = []
+    for group in groups:
+        means = [own for given, own in trivial.get(_data(group.key), []) if given <= _given(group.key)]
+        with_ratio.append(replace(group, rows=tuple(replace(row, ratio=_ratio(row, means)) for row in group.rows)))
+    return with_ratio
+
+
+def _given(key: GroupKey) -> set[str]:
+    """What of the ground truth the track's methods are told, in the words of `Track`."""
+    return set(key.track.removeprefix("oracle ").split(" + ")) - {"metric"}
 
 
 def _data(key: GroupKey) -> tuple[object, ...]:
-    return key.fingerprint, key.size, key.split, key.target, key.edge_band_px, key.protocol_version
+    return key.fingerprint, key.size, key.split, key.target, key.mode, key.edge_band_px, key.protocol_version
 
 
 def _ratio(row: Ranked, trivial: Sequence[Mapping[str, float]]) -> float | None:

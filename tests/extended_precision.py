@@ -61,6 +61,8 @@ def sample_scores(prediction, target, band, void, unlit):
     dark = unlit > 0
     far = np.abs(prediction.astype(LONG) - unlit.astype(LONG))
     lit = dark & (prediction > 0)
+    if inside.any() and (span := target[inside].astype(LONG).max() - target[inside].astype(LONG).min()) > 0:
+        scores["object_mae_range_share"] = mae(inside) / span
     scores["void_share"] = LONG(np.count_nonzero(void)) / void.size
     if dark.any():
         scores |= {"unlit_mae_mm": far[dark].mean(), "unlit_rmse_mm": np.sqrt((far[dark] ** 2).mean())}

@@ -22,7 +22,8 @@ _PLACES = (("Best", 0.0), ("Worst", 1.0), ("Median", 0.5), ("Lower quartile", 0.
 """The samples that are shown and their place by error, in the order in which they are chosen where there are few."""
 _ON_SHEET = ("Best", "Median", "Worst")
 _TITLES = {
-    "object_mae_mm": "Object MAE", "object_rmse_mm": "Object RMSE", "overall_mae_mm": "Overall MAE",
+    "object_mae_mm": "Object MAE", "object_mae_range_share": "Object MAE, share of its depth range",
+    "object_rmse_mm": "Object RMSE", "overall_mae_mm": "Overall MAE",
     "overall_rmse_mm": "Overall RMSE", "background_mae_mm": "Background MAE", "background_rmse_mm": "Background RMSE",
     "object_median_mm": "Object, median error", "object_p95_mm": "Object, 95th percentile",
     "object_max_mm": "Object, largest error", "object_within_1mm_share": "Object within 1 mm",
@@ -142,10 +143,11 @@ def score_table(result: Result) -> str:
 
 
 _UNCERTAINTY_TITLES = {
-    **{f"coverage_{level}": f"Pixels in their {level}% interval" for level in COVERED},
+    "unstated_share": "Object without a sigma",
+    **{f"coverage_{level}": f"Pixels with a sigma in their {level}% interval" for level in COVERED},
     "sigma_mean_mm": "Mean sigma", "sigma_median_mm": "Median sigma", "nll": "Negative log-likelihood, nats",
     "ause_mae_mm": "AUSE, MAE", "ause_rmse_mm": "AUSE, RMSE", "sure_mae_mm": "MAE of the surest 95%",
-    "sure_rmse_mm": "RMSE of the surest 95%", "unstated_share": "Object without a sigma",
+    "sure_rmse_mm": "RMSE of the surest 95%",
 }  # fmt: skip
 """Every key of `UNCERTAINTY` in the order of the page."""
 

@@ -69,7 +69,8 @@ def _notes(result: Result) -> Text:
     within = ", ".join(f"{limit} mm {percent(share)}" for limit, share in shares)
     lines = [
         f"Object: |error| median {millimetres(scores.object_median_mm)}, 95th percentile "
-        f"{millimetres(scores.object_p95_mm)}, maximum {millimetres(scores.object_max_mm)} mm; pixels within {within}.",
+        f"{millimetres(scores.object_p95_mm)}, maximum {millimetres(scores.object_max_mm)} mm; pixels within {within}. "
+        f"MAE {percent(scores.object_mae_range_share)} of each sample's depth range.",
         f"Bias {signed(scores.object_bias_mm)} mm ({signed(scores.object_valid_bias_mm)} mm where measured); MAE "
         f"{millimetres(scores.object_shift_free_mae_mm)} mm once each sample's best single offset is removed.",
         f"MAE {millimetres(scores.object_wide_band_mae_mm)} mm within {WIDE_BAND_PX} px of depth edges, "
@@ -109,18 +110,18 @@ def _notes(result: Result) -> Text:
 def _uncertainty(result: Result) -> Table | None:
     if (block := result.uncertainty) is None:
         return None
-    titles = [*(f"In {level}%\ninterval" for level in COVERED), "Sigma\nmean", "Sigma\nmedian", "NLL", "AUSE\nMAE"]
+    titles = ["Not\nstated", *(f"In {level}%\ninterval" for level in COVERED), "Sigma\nmean", "Sigma\nmedian", "NLL"]
     table = _table(
-        "Stated uncertainty", [*titles, "MAE of the\nsurest 95%", "Not\nstated"],
-        caption="mm; pixels within Gaussian intervals of sigma, means over samples; AUSE: area between the "
-        "sparsification curves by sigma and by error",
+        "Stated uncertainty", [*titles, "AUSE\nMAE", "MAE of the\nsurest 95%"],
+        caption="mm; of the pixels that state a sigma, those within its Gaussian intervals, means over samples; AUSE: "
+        "area between the sparsification curves by sigma and by error, over all object pixels",
     )  # fmt: skip
     for name, scores in {"all": block.metrics, **block.per_object}.items():
-        cells = [percent(getattr(scores, f"coverage_{level}")) for level in COVERED]
+        cells = [percent(scores.unstated_share), *(percent(getattr(scores, f"coverage_{lv}")) for lv in COVERED)]
         cells += map(millimetres, (scores.sigma_mean_mm, scores.sigma_median_mm))
         cells += [signed(scores.nll, plus=""), millimetres(scores.ause_mae_mm), millimetres(scores.sure_mae_mm)]
         style = "bold" if name == "all" else None
-        table.add_row(Text(printable(name)), *cells, percent(scores.unstated_share), style=style)
+        table.add_row(Text(printable(name)), *cells, style=style)
     return table
 
 

@@ -67,6 +67,7 @@ class Metrics(Headline, SparseModel):
     unlit_rmse_mm: NonNegative | None = None
     unlit_valid_mae_mm: NonNegative | None = None
     unlit_missing_share: Share | None = None
+    object_mae_range_share: NonNegative | None = None
 
 
 class SampleResult(Metrics):

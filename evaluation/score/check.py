@@ -76,14 +76,14 @@ def check_folder(folder: str | Path, dataset: DatasetFolder | None = None, split
     size = _declared_size(folder, listing) if dataset is None else dataset.size
     level_mm = None if description is None else description.png_mm_per_level
     units = "mm" if description is None else description.units
-    largest, reach_mm = 0.0, 0.0 if dataset is None else dataset.rig.working_range_mm[1]
+    largest = 0.0
     if listing.form != ".png" or level_mm is not None:
         reader = submission.reader_for(listing.form, folder, listing.present, size, level_mm)
         for sample in listing.present:
             try:
                 values, _ = reader.read(sample)
                 largest = max(largest, float(values.max()))
-                found = value_problems(values, np.zeros(size), reach_mm, units)
+                found = value_problems(values, np.zeros(size), 0.0, units)
             except PredictionError as error:
                 found = [str(error)]
             problems += [f"{printable(reader.named(sample))}: {problem}" for problem in found]

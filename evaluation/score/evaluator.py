@@ -144,7 +144,7 @@ def _scored(
             raise DatasetError(f"{sample}: the target depth holds {bad}; run: fpp-bench verify")
         try:
             values, digest = reader.read(sample)
-            problems = value_problems(values, target, dataset.rig.working_range_mm[1], units)
+            problems = value_problems(values, target, dataset.rig.working_range_mm[1] if high else 0.0, units)
             if not problems:
                 pair = scored_pair(values, target, units, mode, sample)
                 scores = score_sample(*pair, edge_band_px, void, unlit_mm)

@@ -149,13 +149,14 @@ class SampleScores:
     A zone's number is a sum of 1 (nearer to a depth edge than the edge band), 2 (nearer than the wide band) and 4 (not
     measured: predicted 0 mm or less); every MAE and RMSE of the object is that of a union of zones. ``void``: pixels in
     no set, None by rules without void. ``unlit``: statistics of the unlit pixels and of those that were measured; None
-    where they are not scored."""
+    where they are not scored. ``range_mm``: largest minus smallest depth of the object."""
 
     background: ErrorStats
     zones: dict[int, ErrorStats]
     distribution: dict[str, float | None]
     void: int | None = None
     unlit: tuple[ErrorStats, ErrorStats] | None = None
+    range_mm: float = 0.0
 
     object = _zones(0, 0)
     interior, edge = _zones(_EDGE, 0), _zones(_EDGE, _EDGE)
@@ -191,6 +192,7 @@ class SampleScores:
             "void_share": None if self.void is None else void / (whole + self.background.pixels + void),
             "unlit_mae_mm": unlit.mae_mm, "unlit_rmse_mm": unlit.rmse_mm, "unlit_valid_mae_mm": measured.mae_mm,
             "unlit_missing_share": _share(unlit.pixels - measured.pixels, unlit.pixels),
+            protocol.RANGE_SHARE: _share(sets["object"].mae_mm or 0.0, self.range_mm),
         }  # fmt: skip
         optional = {key for key in protocol.SINCE_2 if values[key] is None}
         return {key: values[key] for key in protocol.METRICS if key not in optional}
@@ -202,7 +204,7 @@ class SampleScores:
         return {f"{name}_pixels": count for name, count in counts.items()}
 
 
-def _share(part: int, whole: int) -> float | None:
+def _share(part: float, whole: float) -> float | None:
     return part / whole if whole else None
 
 
@@ -247,7 +249,8 @@ def score_sample(
         return nothing
     depths = prediction_mm[box].ravel().take(index)
     errors = depths.astype(np.float64)
-    errors -= target_mm[box].ravel().take(index)
+    true_mm = target_mm[box].ravel().take(index)
+    errors -= true_mm
     if not np.isfinite(errors).all():
         raise PredictionError(NOT_FINITE)
     missing = depths <= 0
@@ -257,7 +260,9 @@ def score_sample(
     zone |= missing.view(np.uint8) * np.uint8(_MISSING)
     within = {code: zone == code for code in range(_EDGE + _WIDE + _MISSING + 1)}
     zones = {code: stats_of(errors[pixels]) for code, pixels in within.items() if pixels.any()}
-    return SampleScores(background, zones, _distribution(errors, missing), void_px, unlit)
+    range_mm = float(true_mm.max()) - float(true_mm.min())
+    range_mm = range_mm if range_mm > 1e-150 else 0.0  # else an error may exceed it by more than a float64 can hold
+    return SampleScores(background, zones, _distribution(errors, missing), void_px, unlit, range_mm)
 
 
 def _unlit_stats(prediction: Map, unlit_mm: Map) -> tuple[ErrorStats, ErrorStats]:

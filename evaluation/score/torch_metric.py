@@ -17,11 +17,11 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.protocol import DISTRIBUTION, HEADLINE, WITHIN, WITHIN_MM
+from fpp_ml_bench.evaluation.protocol import DISTRIBUTION, HEADLINE, RANGE_SHARE, WITHIN, WITHIN_MM
 from fpp_ml_bench.evaluation.score.sample_scores import NOT_FINITE
 from fpp_ml_bench.evaluation.score.units import MM_PER_UNIT, declared_units, not_in_mm
 
-KEYS = (*HEADLINE, "object_valid_mae_mm", "object_missing_share", *DISTRIBUTION)
+KEYS = (*HEADLINE, "object_valid_mae_mm", "object_missing_share", *DISTRIBUTION, RANGE_SHARE)
 SQUARES_VANISH = 1e-140
 """Errors below this have squares below the smallest normal float64."""
 
@@ -141,6 +141,8 @@ def _sample_scores(prediction: Tensor, target: Tensor) -> Mapping[str, Tensor | 
         scores[key] = (ascending <= limit).to(torch.float64).mean()
     scores["object_bias_mm"] = errors.mean()
     scores["object_shift_free_mae_mm"] = (errors - offset).abs().mean()
+    if (range_mm := target[inside].max() - target[inside].min()) > 0:
+        scores[RANGE_SHARE] = errors.abs().mean() / range_mm
     return scores
 
 

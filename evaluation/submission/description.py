@@ -46,7 +46,7 @@ class Submission(SparseModel):
     method: Text
     units: Units
     png_mm_per_level: Positive | None = None
-    frames_used: list[Count]
+    frames_used: list[Count] = Field(min_length=1)
     uses_ground_truth_range: bool
     uses_ground_truth_mask: bool = False
     uses_ground_truth_order: bool = False

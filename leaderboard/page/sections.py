@@ -15,7 +15,7 @@ from fpp_ml_bench.leaderboard.page.pictures import drawn, overview_figures
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
 from fpp_ml_bench.loaders.storage import benchmark_of
 
-_SPARSE = (*columns.PARTS, columns.RATIO, *columns.UNCERTAINTY)
+_SPARSE = (*columns.PARTS, columns.RATIO, columns.RANGE, *columns.UNCERTAINTY)
 _TRADEOFF_PICTURE = 430, 380
 _SHADES = 6
 

@@ -114,7 +114,7 @@ def test_five_objects_have_no_ranks_and_say_why(base, capsys, tmp_path):
 
 def test_ranks_by_other_scores_and_none_by_cost(base):
     entries = entries_of(base, {"a": [4.0] * 8, "b": [1.0] * 8})
-    for key in ("object_rmse_mm", "overall_mae_mm", "object_bias_mm"):
+    for key in ("object_rmse_mm", "overall_mae_mm", "object_median_mm"):
         assert [(row.ranks, row.entry.name) for row in rank(entries, key)[0].rows] == [("1", "b"), ("2", "a")]
     (group,) = rank(entries, "frames_used")
     assert {row.ranks for row in group.rows} == {"-"} and "No ranks by frames_used" in group.unranked
@@ -228,13 +228,18 @@ def test_what_a_result_says_beyond_its_scores(base, monkeypatch):
     assert learned_from(base.result) == "" and uncertainty(base) == (None, None)
     shown = [column.title for column in columns("object_mae_mm") if column.shown_for([row])]
     assert not {"In 95%", "AUSE", "Learned from", "Rank", "x trivial", "On unseen"} & set(shown)
-    scores = SimpleNamespace(coverage_95=0.9, ause_mae_mm=1.5)
+    scores = SimpleNamespace(coverage_95=0.9, ause_mae_mm=1.5, unstated_share=0.0)
+    samples = {
+        "all pixels state a sigma": scores, "half of them": SimpleNamespace(coverage_95=1.0, unstated_share=0.5),
+        "none": SimpleNamespace(coverage_95=None, unstated_share=1.0),
+        "no object": SimpleNamespace(coverage_95=None, unstated_share=None),
+    }  # fmt: skip
     stated = SimpleNamespace(
-        uncertainty=SimpleNamespace(metrics=scores),
+        uncertainty=SimpleNamespace(metrics=scores, per_sample=samples),
         submission=SimpleNamespace(learned_from=SimpleNamespace(data="train-split")),
     )
     assert learned_from(stated) == "train-split"
-    assert uncertainty(SimpleNamespace(result=stated)) == (0.9, 1.5)
+    assert uncertainty(SimpleNamespace(result=stated)) == (pytest.approx((0.9 + 0.5 + 0.0) / 3), 1.5)
 
 
 def test_a_submission_may_say_that_it_was_given_the_order(base):

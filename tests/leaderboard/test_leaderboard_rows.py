@@ -13,6 +13,7 @@ from scored_dataset import make_dataset
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli.evaluate import main as fpp_eval
 from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.protocol import HELPED_BY_MISSING
 from fpp_ml_bench.evaluation.report import palette_png
 from fpp_ml_bench.leaderboard import rows
 from fpp_ml_bench.leaderboard.page import page_files
@@ -128,10 +129,13 @@ def test_more_within_a_tolerance_is_better(dataset, tmp_path):
     assert [row.entry.name for row in ranked][-1] == "off by 20.0"
 
 
-def test_a_bias_counts_by_its_size(dataset, tmp_path):
-    paths = [write_result_file(tmp_path / f"{o}.json", dataset, o, name=f"bias {o}") for o in (-3.0, 1.0, 2.0)]
-    ranked = rank(read_entries(paths), "object_bias_mm")[0].rows
-    assert [row.entry.name for row in ranked] == ["bias 1.0", "bias 2.0", "bias -3.0"]
+@pytest.mark.parametrize("key", HELPED_BY_MISSING)
+def test_no_rank_by_what_missing_pixels_improve(key, dataset, tmp_path, capsys):
+    path = write_result_file(tmp_path / "a.json", dataset, 1.0)
+    assert main(["leaderboard", str(path), "--sort", key]) == 2
+    assert "a method could lead by answering few pixels" in capsys.readouterr().err
+    with pytest.raises(SubmissionError, match=key):
+        rank(read_entries([path]), key)
 
 
 def _png(height: int, width: int) -> bytes:

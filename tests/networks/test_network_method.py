@@ -238,7 +238,7 @@ def test_a_given_mask_is_never_ranked_with_honest_rows(dataset, tmp_path, capsys
 def test_the_key_changes_no_file_without_it(dataset, tmp_path):
     folder = write_predictions(tmp_path / "p", dataset)
     result = evaluate(folder, dataset)
-    assert b"uses_ground_truth_mask" not in result_json(result) and result.schema_version == "2.3.0"
+    assert b"uses_ground_truth_mask" not in result_json(result) and result.schema_version == "2.4.0"
     # A result that hides the mask, and one that claims it, both differ from their predictions.
     masked = result.model_copy(
         update={"submission": Submission(**{**result.submission.model_dump(), "uses_ground_truth_mask": True})}

@@ -82,7 +82,7 @@ def test_settings_of_a_benchmark_with_other_bytes_are_warned_of(dataset, tmp_pat
 def test_a_file_of_schema_2_0_0_is_read_and_stays_as_it_is(named, tmp_path):
     path = result_file(named, tmp_path)
     change_dataset(path, benchmark=None)
-    old = path.read_bytes().replace(b'"schema_version": "2.3.0"', b'"schema_version": "2.0.0"')
+    old = path.read_bytes().replace(b'"schema_version": "2.4.0"', b'"schema_version": "2.0.0"')
     assert old != path.read_bytes()
     path.write_bytes(old)
     result = read_result(path)
@@ -146,7 +146,7 @@ def test_the_schema_describes_the_key(named, tmp_path, capsys):
 
     assert main(["schema"]) == 0
     schema = json.loads(capsys.readouterr().out)
-    assert "2.3.0" in schema["title"] and set(schema["$defs"]["BenchmarkInfo"]["required"]) == {"name", "version"}
+    assert "2.4.0" in schema["title"] and set(schema["$defs"]["BenchmarkInfo"]["required"]) == {"name", "version"}
     content = json.loads(result_file(named, tmp_path).read_text())
     jsonschema.validate(content, schema)
     del content["dataset"]["benchmark"]

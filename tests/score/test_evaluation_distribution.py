@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from scored_dataset import disk_depth
 
-from fpp_ml_bench.evaluation.protocol import METRICS, SIGNED, SINCE_2
+from fpp_ml_bench.evaluation.protocol import HELPED_BY_MISSING, METRICS, SIGNED, SINCE_2, WITHIN
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 
 
@@ -92,3 +92,22 @@ def test_wide_band_is_eight_pixels_whatever_the_edge_band_is():
     for key in ("object_wide_band_mae_mm", "object_wide_interior_mae_mm", "object_wide_band_share"):
         assert narrow[key] == pytest.approx(wide[key], rel=1e-14)
     assert wide["object_wide_band_mae_mm"] == wide["object_edge_mae_mm"] != narrow["object_edge_mae_mm"]
+
+
+def test_only_the_scores_that_say_so_are_improved_by_missing_pixels():
+    """A bad answer everywhere against its best pixel alone: the errors that count every pixel are larger then."""
+    rng = np.random.default_rng(0)
+    target = np.full((40, 40), 0.0)
+    target[5:35, 5:35] = 1800 + rng.uniform(0, 5, (30, 30))
+    unlit = np.zeros(target.shape)
+    unlit[5:10, 5:35], target[5:10, 5:35] = target[5:10, 5:35], 0
+    answer = np.where(target + unlit > 0, target + unlit + 200 + rng.normal(0, 30, target.shape), 0.0)
+    single = np.zeros(target.shape)
+    for pixels in (target > 0, unlit > 0):
+        best = np.unravel_index(np.where(pixels, np.abs(answer - target - unlit), np.inf).argmin(), target.shape)
+        single[best] = answer[best]
+    whole, few = (score_sample(values, target, void=unlit > 0, unlit_mm=unlit).metrics() for values in (answer, single))
+    better = {key for key in METRICS if (few[key] > whole[key] if key in WITHIN else abs(few[key]) < abs(whole[key]))}
+    assert better <= set(HELPED_BY_MISSING) and "object_valid_mae_mm" in better and "unlit_valid_mae_mm" in better
+    assert {"object_shift_free_mae_mm", "object_valid_bias_mm"} <= better
+    assert few["object_mae_range_share"] == pytest.approx(few["object_mae_mm"] / np.ptp(target[target > 0]), rel=1e-12)
