@@ -22,6 +22,7 @@ from fpp_ml_bench.baselines import (
     training,
 )
 from fpp_ml_bench.coding import PhaseShift
+from fpp_ml_bench.depth import RangeRule
 from fpp_ml_bench.errors import PredictionError, WeightsError
 from fpp_ml_bench.evaluation.protocol import Mode, Target, Units
 from fpp_ml_bench.optics import Rig
@@ -46,6 +47,7 @@ class Method(ABC):
     name: what it is called on the command line. title: name of the submission, with the settings that matter.
     frames_used: frames that must be captured, ascending. settings: everything needed to run it again.
     uses_ground_truth_range: whether it is given depth_min and depth_max of the sample it predicts.
+    range_rule: by which range normalised depth is.
     uses_ground_truth_mask: whether it is given frames that are 0 outside the object.
     mode, target: what its row is scored in and against; for a network the decoded depth, which it was trained on.
     packages: those whose versions matter. parameters: numbers that were learned. weights_config: what its weights file
@@ -61,6 +63,7 @@ class Method(ABC):
     uses_ground_truth_range: bool = False
     uses_ground_truth_mask: bool = False
     units: Units = "mm"
+    range_rule: RangeRule = "object"
     mode: Mode = "standard"
     target: Target = "depth_exact"
     packages: tuple[str, ...] = ("numpy", "numba")

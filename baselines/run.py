@@ -135,6 +135,7 @@ def _described(method: Method) -> dict[str, Any]:
     return {
         "name": method.title, "method": method.name, "units": method.units, "frames_used": list(method.frames_used),
         "uses_ground_truth_range": method.uses_ground_truth_range,
+        **({"range_rule": method.range_rule} if method.range_rule != "object" else {}),
         **({"uses_ground_truth_mask": True} if method.uses_ground_truth_mask else {}),
         "learned_from": method.learned_from,
         "hardware": describe_hardware().to_dict(), "software": method.software,

@@ -15,6 +15,8 @@ DEPTH_EDGE_JUMP_MM = 10.0
 plane); it grows with the pixel footprint at other sizes."""
 Normalisation = Literal["raw", "global", "individual"]
 NORMALISATIONS: tuple[Normalisation, ...] = ("raw", "global", "individual")
+RangeRule = Literal["object", "valid"]
+"""The pixels over which a sample's depth range is taken: all of the object, as in the paper, or those not void."""
 _BLOCK = 1 << 16
 _SMALLEST, _LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 
@@ -117,6 +119,17 @@ def _dilated(edge: NDArray[np.bool_], band_px: int) -> NDArray[np.bool_]:
         band[: band.size - down] |= run[down:]
         band[down:] |= run[: band.size - down]
     return band.reshape(height, step)[:, :width]
+
+
+def depth_range_mm(depth_mm: NDArray[np.floating], void: NDArray[np.bool_] | None = None) -> tuple[float, float]:
+    """Least and greatest depth of the object in a map (H, W), in mm, of its pixels that are not ``void`` if there are
+    any. Raises ``ValueError`` for a map without an object."""
+    inside = object_mask(depth_mm)
+    valid = inside if void is None else inside & ~void
+    depths = depth_mm[valid if valid.any() else inside]
+    if not depths.size:
+        raise ValueError("the depth map holds no object, so it has no depth range")
+    return float(depths.min()), float(depths.max())
 
 
 def _check(name: str) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
 from fpp_ml_bench.constants import CONFIGS, GREY_LEVELS
-from fpp_ml_bench.depth import NORMALISATIONS, Normalisation, normalise, object_mask
+from fpp_ml_bench.depth import NORMALISATIONS, Normalisation, RangeRule, depth_range_mm, normalise, object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import njit, numba_enabled
@@ -35,6 +35,9 @@ class FringeDepthDataset(Dataset[FringeDepth]):
     ``all``. The full set has 240, 4,320, 4,320, 8,640 and 12,480 training pairs.
     ``normalisation``: ``raw`` (mm), ``global`` (m) or ``individual`` ([0, 1] from the sample's own D_min and D_max).
     ``background_removed``: set the fringe to 0 where the depth is 0 (paper Section 5.3.4).
+    ``range_rule``: D_min and D_max are those of the object's pixels that are not void (``valid``), or of all of them
+    (``object``: the stored columns, and the paper's). Void pixels often are wrong by centimetres, and an end of the
+    range is then; by ``valid``, individual depth beyond it is cut to [0, 1].
 
     Works with ``torch.utils.data.DataLoader`` and any number of workers: each maps the files itself. In a single
     process `batches` is faster, as it reuses its buffers. Raises `DatasetError` for a missing folder, split or config.
@@ -42,7 +45,7 @@ class FringeDepthDataset(Dataset[FringeDepth]):
 
     def __init__(
         self, folder: str | Path, split: str, config: str = "single_shot", normalisation: Normalisation = "individual",
-        background_removed: bool = False,
+        background_removed: bool = False, range_rule: RangeRule = "valid",
     ) -> None:  # fmt: skip
         self.source = DatasetFolder(folder)
         if config not in CONFIGS or config not in self.source.configs:
@@ -53,6 +56,8 @@ class FringeDepthDataset(Dataset[FringeDepth]):
         self.frames = self.source.sequence.config(config)
         self.normalisation: Normalisation = normalisation
         self.background_removed = background_removed
+        self.range_rule: RangeRule = range_rule
+        self._ranges_mm: dict[str, tuple[float, float]] = {}
 
     def __len__(self) -> int:
         return len(self.samples) * len(self.frames)
@@ -77,15 +82,27 @@ class FringeDepthDataset(Dataset[FringeDepth]):
             row, frame = self.pair(index)
             sample = self.samples[row]
             depth_mm = self.source.depth_mm(sample)
-            measured = self.source.measured(sample)
-            low, high = measured["depth_min_mm"], measured["depth_max_mm"]
+            low, high = self.depth_range_mm(sample)
             unit_range(self.source.frame(sample, frame), fringes[position, 0])
             if self.background_removed:
                 fringes[position, 0] *= object_mask(depth_mm)
             normalise(depth_mm, self.normalisation, low, high, out=depths[position, 0])
+            if self.normalisation == "individual" and self.range_rule == "valid":
+                np.clip(depths[position, 0], 0, 1, out=depths[position, 0])
             batch.depth_range_mm[position, 0], batch.depth_range_mm[position, 1] = low, high
             batch.row[position], batch.frame[position] = row, frame
         return batch
+
+    def depth_range_mm(self, sample: str) -> tuple[float, float]:
+        """D_min and D_max of a sample by ``range_rule``; read once."""
+        if sample not in self._ranges_mm:
+            measured = self.source.measured(sample)
+            stored = measured["depth_min_mm"], measured["depth_max_mm"]
+            # A sample without an object has none; its stored range is 0 to 0.
+            by_rule = self.range_rule == "object" or not stored[1]
+            void = None if by_rule else self.source.void(sample)
+            self._ranges_mm[sample] = stored if by_rule else depth_range_mm(self.source.depth_mm(sample), void)
+        return self._ranges_mm[sample]
 
     def empty(self, size: int) -> FringeDepth:
         """Buffers for a batch of ``size`` items."""

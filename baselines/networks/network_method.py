@@ -55,6 +55,7 @@ class NetworkMethod(Method):
         self.uses_ground_truth_mask = config.background_removed
         if self.depth_range == "oracle":
             self.uses_ground_truth_range, self.units, self.mode = True, "normalised", "paper"
+            self.range_rule = config.range_rule
         of_range = "" if self.depth_range is None else f"{self.depth_range} range"
         parts = [config.title, of_range, "" if self.frame == usual_frame else f"frame {self.frame}"]
         self.title = ", ".join(part for part in parts if part) + (f" ({remark})" if remark else "")

@@ -71,7 +71,9 @@ class _Pairs:
         self, network: FringeNetwork, probe: Probe, config: ModelConfig, folder: str | Path, split: str, cap: int,
         progress: Callable[[int], None],
     ) -> None:  # fmt: skip
-        self.data = FringeDepthDataset(folder, split, config.data_config, "individual", config.background_removed)
+        self.data = FringeDepthDataset(
+            folder, split, config.data_config, "individual", config.background_removed, config.range_rule
+        )
         source = self.data.source
         if source.size != config.image_size or source.fingerprint != config.dataset_fingerprint:
             raise WeightsError(

@@ -21,6 +21,7 @@ from fpp_ml_bench.baselines.reproduce.plan import Folders
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.baselines.timing import time_method, write_timing
 from fpp_ml_bench.constants import split_sample_name
+from fpp_ml_bench.depth import RangeRule
 from fpp_ml_bench.errors import PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE, PROTOCOL_VERSION, Mode, Units
 from fpp_ml_bench.evaluation.report import write_sheet
@@ -90,21 +91,23 @@ class AllFrames(StrictModel):
 
 def score_all_frames(
     opened: DatasetFolder, predict: Callable[[NDArray[np.uint8]], NDArray[np.float32]], frames: Sequence[int],
-    scoring: tuple[Units, Mode], about: Mapping[str, str],
+    scoring: tuple[Units, Mode], about: Mapping[str, str], rule: RangeRule = "object",
 ) -> AllFrames:  # fmt: skip
-    """Score ``predict`` (a frame (H, W) in, depth (H, W) in the units of ``scoring`` out) on every test sample and
-    frame. ``about``: ``recipe`` and ``weights_sha256`` of the network. Raises PredictionError for a prediction that is
-    not finite, and what `scored_pair` raises."""
+    """Score ``predict`` (a frame (H, W) in, depth (H, W) in the units of ``scoring`` out, normalised by
+    ``rule``) on every test sample and frame. ``about``: ``recipe`` and ``weights_sha256`` of the network. Raises
+    PredictionError for a prediction that is not finite, and what `scored_pair` raises."""
     samples = opened.samples(SPLIT)
     scores: dict[tuple[str, int], Scores] = {}
     for sample in samples:
         target_mm = opened.target_mm(sample)
         void = opened.void(sample) if scoring[1] == "standard" else None
+        left_out = opened.left_out(sample, rule)
         for frame in frames:
             values = predict(opened.frame(sample, frame))
             if not np.isfinite(values).all():
                 raise PredictionError(f"{sample}, frame {frame}: the network gave values that are not finite")
-            metrics = score_sample(*scored_pair(values, target_mm, *scoring, sample), void=void).metrics()
+            pair = scored_pair(values, target_mm, *scoring, sample, left_out)
+            metrics = score_sample(*pair, void=void).metrics()
             scores[sample, frame] = {key: metrics[key] for key in HEADLINE}
     rows = [_mean([scores[sample, frame] for frame in frames]) for sample in samples]
     of_frames = [_mean([scores[sample, frame] for sample in samples]) for frame in frames]

@@ -155,7 +155,12 @@ def _score_all_frames(recipe: Recipe, model: Model, settings: ReproduceSettings,
         return
     frames, about = opened.sequence.config(recipe.frames), {"recipe": recipe.name, "weights_sha256": model.sha256}
     scores = scoring.score_all_frames(
-        opened, lambda frame: model.predict_representation([frame])[0], frames, SCORING[recipe.normalisation], about
+        opened,
+        lambda frame: model.predict_representation([frame])[0],
+        frames,
+        SCORING[recipe.normalisation],
+        about,
+        model.config.range_rule,
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(scores.model_dump(mode="json"), path)

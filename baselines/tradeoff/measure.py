@@ -109,7 +109,8 @@ def _figures(setting: Setting, rules: Rules) -> dict[str, Any]:
         seconds.append(run_s)
         if setting.scored:
             void = views.void(name) if method.mode == "standard" else None
-            pair = scored_pair(depth, views.target_mm(name), method.units, method.mode, name)
+            left_out = views.void(name) if method.range_rule == "valid" else None
+            pair = scored_pair(depth, views.target_mm(name), method.units, method.mode, name, left_out)
             sample = score_sample(*pair, void=void)
             missing_share = sample.missing / max(sample.object.pixels, 1)
             scores.append((sample.object.mae_mm, sample.valid.mae_mm, missing_share))

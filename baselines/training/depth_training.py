@@ -236,7 +236,8 @@ class DepthTraining(Training):
                 if not np.isfinite(values).all():
                     raise TrainingError(f"{self.out}: the network's answer to {sample} is not finite; it has diverged")
                 source = self.validation.source
-                pair = scored_pair(values, source.depth_mm(sample), units, mode, sample)
+                left_out = source.left_out(sample, self.validation.range_rule)
+                pair = scored_pair(values, source.depth_mm(sample), units, mode, sample, left_out)
                 maps = (*pair, source.void(sample)) if mode == "standard" else pair
                 metric.update(*(torch.tensor(pixels)[None] for pixels in maps))
         losses = gather_object(losses)
@@ -279,6 +280,6 @@ def model_config(recipe: Recipe, network: nn.Module, fingerprint: str, epoch: in
         name=recipe.name, title=recipe.title, network=recipe.network,
         options=dict(network.options),  # type: ignore[arg-type, call-overload]
         normalisation=recipe.normalisation, image_size=(recipe.size, recipe.size), dataset_fingerprint=fingerprint,
-        benchmark=training_benchmark(fingerprint), data_config=recipe.frames,
+        benchmark=training_benchmark(fingerprint), data_config=recipe.frames, range_rule="valid",
         background_removed=recipe.background_removed, recipe=recipe.to_dict(), epoch=epoch, validation=scores,
     )  # fmt: skip

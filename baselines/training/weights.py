@@ -18,7 +18,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from fpp_ml_bench.baselines import networks
 from fpp_ml_bench.constants import CONFIGS
-from fpp_ml_bench.depth import Normalisation
+from fpp_ml_bench.depth import Normalisation, RangeRule
 from fpp_ml_bench.errors import FppBenchError, WeightsError
 from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.loaders.storage import Manifest, benchmark_of, intended_benchmark
@@ -57,7 +57,8 @@ class ModelConfig:
 
     ``network`` and ``options`` are what ``networks.build`` takes; ``normalisation`` is what it puts out, ``image_size``
     (H, W) in px the only size it is meant for. ``data_config`` names the frames it was trained on,
-    ``background_removed`` says that its input is 0 outside the object. ``benchmark`` is None for a dataset of the
+    ``background_removed`` says that its input is 0 outside the object, ``range_rule`` by which depth range it was
+    normalised (``object`` in older files). ``benchmark`` is None for a dataset of the
     user's own, and in older files; ``recipe`` the resolved recipe, ``validation`` the scores of these weights."""
 
     name: Text
@@ -70,6 +71,7 @@ class ModelConfig:
     benchmark: TrainingBenchmark | None = None
     data_config: Text = "single_shot"
     background_removed: bool = False
+    range_rule: RangeRule = "object"
     recipe: dict[Text, Any] = field(default_factory=dict)
     epoch: Count = 0
     validation: dict[Text, Scalar] = field(default_factory=dict)

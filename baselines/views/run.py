@@ -48,7 +48,8 @@ def prediction_maps(predictions: str | Path, dataset: DatasetFolder, split: str)
 
     def read(sample: str) -> tuple[Map, Map | None]:
         target_mm = dataset.target_mm(sample, DEPTH_EXACT)
-        depth_mm, _ = scored_pair(reader.read(sample)[0], target_mm, described.units, "standard", sample)
+        left_out = dataset.left_out(sample, described.range_rule)
+        depth_mm, _ = scored_pair(reader.read(sample)[0], target_mm, described.units, "standard", sample, left_out)
         sigma_mm = submission.read_sigma(folder, sample, dataset.size) if checked.sigmas else None
         return np.array(depth_mm), sigma_mm
 

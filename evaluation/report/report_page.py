@@ -110,7 +110,8 @@ def _panels(result: Result, dataset: DatasetFolder, folder: Path) -> Iterator[tu
             named = reader.named(row.sample)
             raise PredictionError(f"{named}: is not the file that was scored; score the folder again")
         target_mm = dataset.target_mm(row.sample, result.target)
-        prediction_mm, target = scored_pair(values, target_mm, submission.units, result.mode, row.sample)
+        left_out = dataset.left_out(row.sample, submission.range_rule)
+        prediction_mm, target = scored_pair(values, target_mm, submission.units, result.mode, row.sample, left_out)
         try:
             fringe = dataset.frame(row.sample, used[0] if used else 0)
         except DatasetError:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import split_sample_name
-from fpp_ml_bench.depth import edge_jump_mm, extremes, object_box, object_mask, object_near_edges
+from fpp_ml_bench.depth import RangeRule, edge_jump_mm, extremes, object_box, object_mask, object_near_edges
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import protocol, result, submission
 from fpp_ml_bench.evaluation.protocol import Mode, Units
@@ -57,6 +57,7 @@ def evaluate(
     split_of = {sample: name for name, names in dataset.splits.items() for sample in names}
     listing = submission.list_folder(folder, samples, split, split_of)
     units, level_mm = (content or {}).get("units", "mm"), (content or {}).get("png_mm_per_level")
+    rule = "valid" if (content or {}).get("range_rule") == "valid" else "object"
     # What is no number is refused with the description, which is checked while the first files are scored, for pydantic
     # takes long to import: `result` and `submission` are packages that load what is used of them.
     level_mm = float(level_mm) if isinstance(level_mm, int | float) and not isinstance(level_mm, bool) else None
@@ -66,7 +67,9 @@ def evaluate(
     if units in get_args(Units):
         reader = submission.reader_for(listing.form, folder, listing.present, dataset.size, level_mm)
         sigmas = folder if listing.sigmas else None
-        outcomes = _scored(reader, listing.present, dataset, target, units, cast(Mode, mode), edge_band_px, sigmas)
+        outcomes = _scored(
+            reader, listing.present, dataset, target, units, rule, cast(Mode, mode), edge_band_px, sigmas
+        )
     description = None
     if content is not None:
         try:
@@ -125,8 +128,8 @@ def _samples(folder: Path, dataset: DatasetFolder, split: str, target: str, mode
 
 
 def _scored(
-    reader: submission.Reader, samples: list[str], dataset: DatasetFolder, target_name: str, units: Units, mode: Mode,
-    edge_band_px: int, sigmas: Path | None,
+    reader: submission.Reader, samples: list[str], dataset: DatasetFolder, target_name: str, units: Units,
+    rule: RangeRule, mode: Mode, edge_band_px: int, sigmas: Path | None,
 ) -> Iterable[Outcome]:  # fmt: skip
     """Problems and row of each sample that has a prediction, in order; the files of its uncertainty in the folder
     ``sigmas`` are checked. Work begins with this call, in threads, before the first outcome is taken from the
@@ -137,6 +140,7 @@ def _scored(
         with dataset_lock:  # reading the dataset need not be thread-safe
             target = dataset.target_mm(sample, target_name)
             void = dataset.void(sample) if mode == "standard" else None
+            left_out = dataset.left_out(sample, rule) if units == "normalised" else None
             unlit_mm = dataset.unlit_mm(sample) if void is not None and target_name == "depth_exact" else None
         low, high = extremes(target)
         if not (low >= 0 and np.isfinite(high)):
@@ -146,7 +150,7 @@ def _scored(
             values, digest = reader.read(sample)
             problems = value_problems(values, target, dataset.rig.working_range_mm[1] if high else 0.0, units)
             if not problems:
-                pair = scored_pair(values, target, units, mode, sample)
+                pair = scored_pair(values, target, units, mode, sample, left_out)
                 scores = score_sample(*pair, edge_band_px, void, unlit_mm)
         except PredictionError as error:
             problems = [str(error)]

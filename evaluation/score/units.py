@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.depth import extremes, object_mask
+from fpp_ml_bench.depth import depth_range_mm, extremes, object_mask
 from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import Mode, Units
@@ -99,8 +99,11 @@ def unit_note(largest: float, units: Units) -> str | None:
     return f"units: {units}, but the largest value of all samples is {largest:.4g}; {question}" if wrong else None
 
 
-def scored_pair(values: Depth, target_mm: Depth, units: Units, mode: Mode, sample: str) -> tuple[Depth, Depth]:
-    """Prediction and target (H, W) in mm, such that scoring them is scoring ``values`` by the rules of ``mode``.
+def scored_pair(
+    values: Depth, target_mm: Depth, units: Units, mode: Mode, sample: str, left_out: NDArray[np.bool_] | None = None
+) -> tuple[Depth, Depth]:
+    """Prediction and target (H, W) in mm, such that scoring them is scoring ``values`` by the rules of ``mode``. Pixels
+    ``left_out`` (bool (H, W)) do not count in the range of normalised values (`fpp_ml_bench.depth.RangeRule`).
 
     ``standard``: depth in mm, 0 = background. Normalised values go back through the sample's own range,
     D = v (D_max - D_min) + D_min, except for an exact 0, which stays 0: background, or not measured.
@@ -121,7 +124,7 @@ def scored_pair(values: Depth, target_mm: Depth, units: Units, mode: Mode, sampl
             return values, target_mm
         no_range = "the target holds no object, so normalised depth has no range to go back through"
         raise DatasetError(f"{sample}: {no_range}; submit mm")
-    low, high = (float(edge(target_mm[inside])) for edge in (np.min, np.max))
+    low, high = depth_range_mm(target_mm, left_out)
     if mode == "standard":
         depth = values.astype(np.float64) * (high - low) + low
         depth[values == 0] = 0.0
@@ -129,4 +132,6 @@ def scored_pair(values: Depth, target_mm: Depth, units: Units, mode: Mode, sampl
     if high == low:
         flat = "the target is one flat plane, and individual normalisation divides by its range, 0"
         raise DatasetError(f"{sample}: {flat}; score it with --mode standard")
+    if left_out is not None:  # pixels that are left out may be nearer than D_min, and stay object
+        return values.astype(np.float64) * (high - low) + np.where(inside, low, 0.0), target_mm
     return values.astype(np.float64) * (high - low), np.where(inside, target_mm.astype(np.float64) - low, 0.0)

@@ -6,6 +6,7 @@ from typing import Any, Literal, cast
 import yaml
 from pydantic import Field, model_validator
 
+from fpp_ml_bench.depth import RangeRule
 from fpp_ml_bench.evaluation.protocol import Track, Units
 from fpp_ml_bench.evaluation.result import HardwareInfo, Timing
 from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE, read_plain
@@ -34,13 +35,13 @@ class Submission(SparseModel):
 
     ``units`` of the prediction files; ``png_mm_per_level`` is what one level of a 16-bit PNG is in mm.
     ``uses_ground_truth_range`` is true when the method was given depth_min and depth_max of the samples it is scored
-    on, ``uses_ground_truth_mask`` when it was given which of their pixels are object (for example an input that is
-    black outside the object), ``uses_ground_truth_order`` when it was given their true fringe orders; false is never
-    written of these two, so that files without the keys stay as they are. ``learned_from`` is absent where it is
-    unknown.
+    on, by ``range_rule`` (`fpp_ml_bench.depth.RangeRule`); ``uses_ground_truth_mask`` when it was given which of their
+    pixels are object (for example an input that is black outside the object), ``uses_ground_truth_order`` when it was
+    given their true fringe orders; defaults of these three are never written, so that files without the keys stay as
+    they are. ``learned_from`` is absent where it is unknown.
     ``seconds_per_sample`` is null when unknown; a number needs ``hardware`` and ``seconds_source`` beside it."""
 
-    SPARSE = ("uses_ground_truth_mask", "uses_ground_truth_order", "learned_from")
+    SPARSE = ("range_rule", "uses_ground_truth_mask", "uses_ground_truth_order", "learned_from")
 
     name: Text
     method: Text
@@ -48,6 +49,7 @@ class Submission(SparseModel):
     png_mm_per_level: Positive | None = None
     frames_used: list[Count] = Field(min_length=1)
     uses_ground_truth_range: bool
+    range_rule: RangeRule = "object"
     uses_ground_truth_mask: bool = False
     uses_ground_truth_order: bool = False
     learned_from: LearnedFrom | None = None
@@ -67,6 +69,8 @@ class Submission(SparseModel):
             why = "normalised depth only becomes mm through the range of the very samples it is scored on"
             needs = "units: normalised needs uses_ground_truth_range: true"
             raise ValueError(f"{needs}, for {why}; submit mm for the metric track")
+        if self.range_rule != "object" and self.units != "normalised":
+            raise ValueError("range_rule is that of normalised depth, so units must be normalised; remove it")
         if self.png_mm_per_level is not None and self.units != "mm":
             raise ValueError("png_mm_per_level gives PNG levels in mm, so units must be mm")
         if self.seconds_per_sample is not None and (self.seconds_source is None or self.hardware is None):

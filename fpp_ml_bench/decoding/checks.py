@@ -42,11 +42,11 @@ def check_limits(limits: Limits) -> None:
 
 
 def grey_levels(image: NDArray) -> NDArray:
-    """An image as an array; whole numbers of another dtype, as ``datasets`` gives them ``with_format("numpy")``, as
-    uint8 where none of them changes."""
+    """An image as an array; int64, which ``datasets`` makes of uint8 ``with_format("numpy")``, as uint8 again where no
+    value changes. Not uint16: a dark image of a deeper camera has small values, too."""
     levels = np.asarray(image)
-    if levels.dtype.kind in "iu" and levels.size and 0 <= levels.min() <= levels.max() <= GREY_LEVELS:
-        return levels.astype(np.uint8, copy=False)
+    if levels.dtype == np.int64 and levels.size and 0 <= levels.min() <= levels.max() <= GREY_LEVELS:
+        return levels.astype(np.uint8)
     return levels
 
 

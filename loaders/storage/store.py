@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import CONFIGS, SPLITS
-from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.depth import RangeRule, object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders import sample as layout
 from fpp_ml_bench.loaders.sample import (
@@ -162,6 +162,10 @@ class DatasetFolder:
         if not self.has_exact:
             return np.zeros(self.size, dtype=bool)
         return void_pixels(self.flags(sample), self.depth_mm(sample), self.depth_mm(sample, DEPTH_EXACT))
+
+    def left_out(self, sample: str, rule: RangeRule) -> NDArray[np.bool_] | None:
+        """Pixels that the depth range by ``rule`` leaves out, bool (H, W): the void ones; None for none."""
+        return self.void(sample) if rule == "valid" else None
 
     def unlit_mm(self, sample: str) -> NDArray[np.float32]:
         """Exact depth of the surface that the camera sees and the projector does not light, or too weakly to decode it

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 from conftest import TINY_SIZE
-from flat_planes import DIRECT
+from flat_planes import DIRECT, RIG, plane_depth_m, plane_fringe
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import METHODS, Method, load_method
@@ -170,6 +170,21 @@ def test_without_a_mask_background_is_not_in_range(opened):
     both = object_mask(depth) & object_mask(decoded)
     assert both.sum() > 0.97 * object_mask(decoded).sum()
     np.testing.assert_array_equal(depth[both], decoded[both])  # all steps, both directions: the same process
+
+
+@pytest.mark.parametrize(("name", "options"), [("classical", {"steps": 3, "direction": "vertical"}),
+    ("classical", {"steps": 3, "fewest": True}), ("classical-net", {})])  # fmt: skip
+def test_beyond_the_end_of_the_range_there_is_no_depth(name, options):
+    method, exact_m = load_method(name, RIG, **options), plane_depth_m(RIG, 2.1, (0.025, 0.0))
+    frames = [
+        plane_fringe(RIG, index, exact_m, (0.025, 0.0)) if index in method.frames_used else None
+        for index in range(len(RIG.sequence))
+    ]
+    answer, exact_mm = method.answer(frames), exact_m * 1000
+    assert answer.depth.max() <= 2100 and not answer.sigma_mm[answer.depth == 0].any()
+    assert (answer.depth[exact_mm > 2106] == 0).mean() > 0.999
+    lit = exact_mm[:, 60:-60] < 2094  # the projector's field ends before the camera's
+    assert (np.abs(answer.depth - exact_mm)[:, 60:-60][lit] < 8).mean() > 0.8
 
 
 @pytest.mark.parametrize("steps", [2, 19, 0, -3])

@@ -10,6 +10,7 @@ from fpp_ml_bench.baselines import ConstantMethod, NearestMethod, predict_split
 from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import paper_rig
 
@@ -78,3 +79,18 @@ def test_what_can_not_be_searched_is_refused(dataset, tmp_path, capsys):
 def test_a_constant_is_one_depth(at, depth_mm):
     depth = ConstantMethod(paper_rig(16), at).predict([])
     assert depth.shape == (16, 16) and depth.dtype == np.float32 and np.unique(depth).tolist() == [depth_mm]
+
+
+@pytest.mark.parametrize(("at", "share"), [("range-middle", 0.5), ("range-training", 0.287)])
+def test_a_constant_that_is_told_the_range_is_a_share_of_it(at, share, dataset, tmp_path):
+    method = ConstantMethod(dataset.rig, at)
+    assert np.unique(method.predict([])).tolist() == [np.float32(share)] and method.units == "normalised"
+    assert method.learned_from["data"] == ("none" if at == "range-middle" else "train-split")
+    predict_split(dataset, method, "test", tmp_path / "p")
+    result = evaluate(tmp_path / "p", dataset, mode="paper")
+    assert result.track == "oracle range"
+    for row in result.per_sample:
+        depth = dataset.depth_mm(row.sample).astype(np.float64)
+        low, high = depth[depth > 0].min(), depth.max()
+        error = np.abs(depth[depth > low] - (low + np.float32(share) * (high - low)))
+        assert row.object_mae_mm == pytest.approx(error.mean(), rel=1e-6)

@@ -16,15 +16,16 @@ from fpp_ml_bench.machine import NUMBA_SWITCH as SWITCH
 from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
 
 
-def paper(depth_mm, name):
-    """Section 3.3 in float64, from nothing but the depth map."""
+def paper(depth_mm, name, counted=True):
+    """Section 3.3 in float64, from nothing but the depth map; the range is that of the pixels ``counted``."""
     d = depth_mm.astype(np.float64)
     if name == "raw":
         return d
     if name == "global":
         return d / 1000
-    low, high = d[d > 0].min(), d[d > 0].max()
-    return np.where(d > 0, (d - low) / (high - low), 0)
+    ends = d[(d > 0) & counted]
+    low, high = ends.min(), ends.max()
+    return np.where(d > 0, ((d - low) / (high - low)).clip(0, 1), 0)
 
 
 @pytest.mark.parametrize(
@@ -58,8 +59,10 @@ def test_pairs_are_all_frames_of_a_row_then_the_next(tiny, config):
 
 @pytest.mark.parametrize("normalisation", ["raw", "global", "individual"])
 @pytest.mark.parametrize("background_removed", [False, True])
-def test_tensors_are_the_papers(tiny, opened, normalisation, background_removed):
-    dataset = FringeDepthDataset(tiny, "test", "vertical", normalisation, background_removed)
+@pytest.mark.parametrize("rule", ["object", "valid"])
+def test_tensors_are_the_papers(tiny, opened, normalisation, background_removed, rule):
+    """By the rule ``valid`` the range is that of the pixels that are not void; depths beyond it are cut to it."""
+    dataset = FringeDepthDataset(tiny, "test", "vertical", normalisation, background_removed, rule)
     for index in (0, 17, 40, 107):
         item = dataset[index]
         row, frame = divmod(index, 18)
@@ -71,8 +74,11 @@ def test_tensors_are_the_papers(tiny, opened, normalisation, background_removed)
         assert item.fringe.dtype == item.depth.dtype == torch.float32
         assert item.fringe.shape == item.depth.shape == (1, *opened.size)
         np.testing.assert_allclose(item.fringe[0].numpy(), fringe, rtol=2**-23)
-        np.testing.assert_allclose(item.depth[0].numpy(), paper(depth, normalisation), rtol=2**-22)
-        assert item.depth_range_mm.tolist() == [depth[depth > 0].min(), depth.max()]
+        counted = ~opened.void(sample) if rule == "valid" else np.full(depth.shape, True)
+        np.testing.assert_allclose(item.depth[0].numpy(), paper(depth, normalisation, counted), rtol=2**-22)
+        inside = depth[(depth > 0) & counted]
+        assert item.depth_range_mm.tolist() == [inside.min(), inside.max()]
+        assert (inside.size < np.count_nonzero(depth)) == (rule == "valid")
         assert (int(item.row), int(item.frame)) == (row, 18 + frame)
         assert item.fringe.min() >= 0 and item.fringe.max() <= 1
         if background_removed:
@@ -101,7 +107,7 @@ def test_flat_sample_is_zero_throughout(tiny, monkeypatch):
     flat[50:90, 60:80] = 1800
     source = SimpleNamespace(
         size=dataset.source.size, frame=dataset.source.frame, depth_mm=lambda sample: flat,
-        measured=lambda sample: {"depth_min_mm": 1800.0, "depth_max_mm": 1800.0},
+        measured=lambda sample: {"depth_min_mm": 1800.0, "depth_max_mm": 1800.0}, void=lambda sample: flat < 0,
     )  # fmt: skip
     dataset.source = source
     item = dataset[0]

@@ -74,7 +74,7 @@ def test_what_is_no_fringe_of_this_model(folder, fringe):
         (fringe.T, "got 48x32"),
         (fringe[..., None], r"one fringe image \(H, W\), got shape \(32, 48, 1\)"),
         (fringe.astype(np.uint16), "got uint16"),
-        (fringe.astype(np.int64), "got int64"),
+        (fringe.astype(np.int64) * 2, "got int64"),
         (fringe > 7, "got bool"),
         (fringe.astype(np.complex64), "got complex64"),
         (fringe.astype(np.float32), r"within \[0, 1\], got values from 0 to 255"),

@@ -4,14 +4,15 @@ import json
 
 import numpy as np
 import pytest
-from scored_dataset import make_dataset, write_description, write_predictions
+from scored_dataset import disk_depth, make_dataset, write_description, write_predictions
 
 from fpp_ml_bench.cli.evaluate import main
 from fpp_ml_bench.depth import denormalise, normalise
-from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation.result import read_result, write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.units import scored_pair
+from fpp_ml_bench.loaders.sample import Flag
 
 ORACLE = {"units": "normalised", "uses_ground_truth_range": True}
 
@@ -136,3 +137,37 @@ def test_a_target_without_range_is_refused_by_sample():
     with pytest.raises(DatasetError, match="s: the target is one flat plane"):
         scored_pair(values, flat, "normalised", "paper", "s")
     assert np.array_equal(scored_pair(values, flat, "normalised", "standard", "s")[0], flat)
+
+
+@pytest.mark.parametrize("mode", ["standard", "paper"])
+def test_a_range_without_void_pixels(mode, tmp_path):
+    """A void pixel 300 mm behind the object widens the range of ``object``, not that of ``valid``."""
+
+    def flagged(depth):
+        flags = np.zeros(depth.shape, np.uint8)
+        flags[depth == depth.max()] = Flag.MIXED
+        return flags
+
+    def scene(seed):
+        depth = disk_depth((32, 40), seed)
+        depth.flat[np.flatnonzero(depth)[5]] += 300
+        return np.full(depth.shape, seed, np.uint8), depth
+
+    dataset = make_dataset(tmp_path / "data", flagged=flagged, scene=scene)
+    scores = {}
+    for rule in ("object", "valid"):
+        folder = tmp_path / rule
+        folder.mkdir()
+        for sample in dataset.samples("test"):
+            depth, void = dataset.depth_mm(sample).astype(np.float64), dataset.void(sample)
+            low, high = span_of(np.where(void, 0, depth) if rule == "valid" else depth)
+            np.save(folder / f"{sample}.npy", np.where(depth > 0, (depth + 2 - low) / (high - low), 0))
+        write_description(folder, **ORACLE, **({"range_rule": rule} if rule == "valid" else {}))
+        scores[rule] = evaluate(folder, dataset, mode=mode)
+        assert scores[rule].metrics.object_mae_mm == pytest.approx(2.0, abs=1e-9)
+    assert (
+        scores["valid"].submission.range_rule == "valid" and "range_rule" not in scores["object"].submission.to_yaml()
+    )
+    write_description(folder, range_rule="valid")
+    with pytest.raises(PredictionError, match="range_rule is that of normalised depth"):
+        evaluate(folder, dataset, mode=mode)

@@ -119,9 +119,7 @@ def validation_of(weights, dataset, recipe):
         target = data.source.depth_mm(data.samples[int(item.row)]).astype(np.float64)
         low, high = (float(v) for v in item.depth_range_mm)
         if recipe.normalisation == "individual":
-            inside = item.depth[0].numpy() > 0
-            prediction = denormalise(values, "individual", low, high) - low
-            target = np.where(inside, target - low, 0.0)
+            prediction = denormalise(values, "individual", low, high) - np.where(target > 0, 0.0, low)
         else:
             prediction = denormalise(values, recipe.normalisation, low, high)
         void = None if recipe.normalisation == "individual" else data.source.void(data.samples[int(item.row)])
