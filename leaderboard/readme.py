@@ -10,7 +10,7 @@ from fpp_ml_bench.leaderboard import columns
 from fpp_ml_bench.leaderboard.assumptions import ASSUMED, assumption, told
 from fpp_ml_bench.leaderboard.columns import RANK_NOTE, RATIO_NOTE, SELF_REPORTED, Column, device, error, interval
 from fpp_ml_bench.leaderboard.groups import Group
-from fpp_ml_bench.leaderboard.reported import REPORTED_HEADING, chosen_tables
+from fpp_ml_bench.leaderboard.reported import PAPER_DEPTHS, REPORTED_HEADING, chosen_tables
 from fpp_ml_bench.leaderboard.tables import markdown_columns, markdown_rows, markdown_text
 from fpp_ml_bench.leaderboard.trivial import more_than_trivial
 
@@ -65,7 +65,7 @@ def readme_block(groups: Sequence[Group]) -> str:
     rows = [list(map(markdown_text, cells)) for cells in reported]
     lines += [f"**{REPORTED_HEADING}, not ranked with the rows above**", ""]
     lines += [*markdown_rows(["Method", *titles, "Note"], (False, True, True, True, False), rows), ""]
-    return "\n".join([*lines, " ".join(notes)]) + "\n"
+    return "\n".join([*lines, " ".join([PAPER_DEPTHS, *notes])]) + "\n"
 
 
 def update_readme(path: Path, groups: Sequence[Group], check: bool) -> bool:
