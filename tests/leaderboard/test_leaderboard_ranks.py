@@ -196,6 +196,20 @@ def test_every_class_is_compared_with_the_best_trivial_row(base):
     assert {row.ratio for group in rank(rows) for row in group.rows} == {None}
 
 
+def test_a_track_is_compared_with_trivial_rows_that_are_told_no_more(base):
+    def row(name, error, **given):
+        return entry_with_errors(base, dict.fromkeys(EIGHT, error), name, **given)
+
+    told_range, told_both = (
+        {f"uses_ground_truth_{key}": True for key in keys} for keys in (["range"], ["range", "mask"])
+    )
+    trivial = [row("c", 40.0, method="constant"), row("c, range", 20.0, method="constant", **told_range)]
+    rows = [row("a", 10.0), row("b", 10.0, **told_range), row("d", 10.0, **told_both)]
+    rows.append(row("e", 10.0, uses_ground_truth_order=True))
+    ratios = {r.entry.name: r.ratio for group in rank([*trivial, *rows]) for r in group.rows}
+    assert [ratios[name] for name in "abde"] == [0.25, 0.5, 0.5, 0.25]
+
+
 def test_files_have_the_pairs_and_the_rows(base, tmp_path, capsys, monkeypatch):
     entries = entries_of(base, {"=HYPERLINK(a)": [1.0] * 8, "b, c": [2.0] * 8})
     paths = [tmp_path / f"{n}.json" for n in range(2)]
