@@ -57,7 +57,7 @@ def evaluate(
     split_of = {sample: name for name, names in dataset.splits.items() for sample in names}
     listing = submission.list_folder(folder, samples, split, split_of)
     units, level_mm = (content or {}).get("units", "mm"), (content or {}).get("png_mm_per_level")
-    rule = "valid" if (content or {}).get("range_rule") == "valid" else "object"
+    rule: RangeRule = "valid" if (content or {}).get("range_rule") == "valid" else "object"
     # What is no number is refused with the description, which is checked while the first files are scored, for pydantic
     # takes long to import: `result` and `submission` are packages that load what is used of them.
     level_mm = float(level_mm) if isinstance(level_mm, int | float) and not isinstance(level_mm, bool) else None
