@@ -79,4 +79,6 @@ class ClassicalNetMethod(Method):
             return decoded
         with torch_threads(self.threads):
             answer = filtered(self.network, scene)
-        return Answer(*written(answer, scene, decided(answer, scene, self.config.threshold), decoded.depth.shape))
+        inside = decided(answer, scene, self.config.threshold)
+        inside &= self.rig.in_range(answer.depth_mm + np.float32(scene.middle_mm))
+        return Answer(*written(answer, scene, inside, decoded.depth.shape))

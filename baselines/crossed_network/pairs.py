@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines import training
 from fpp_ml_bench.baselines.crossed_network.training import CrossedRecipe
 from fpp_ml_bench.baselines.training import View
-from fpp_ml_bench.depth import Normalisation, object_mask
+from fpp_ml_bench.depth import Normalisation, RangeRule, object_mask
 from fpp_ml_bench.errors import RecipeError
 from fpp_ml_bench.loaders.training import FringeDepthDataset
 from fpp_ml_bench.optics import crossed_rig
@@ -36,6 +36,9 @@ class ViewSource:
     def void(self, sample: str) -> NDArray[np.bool_]:
         return self._views[sample].void
 
+    def left_out(self, sample: str, rule: RangeRule) -> NDArray[np.bool_] | None:
+        return self.void(sample) if rule == "valid" else None
+
     def measured(self, sample: str) -> Mapping[str, float]:
         depth_mm = self.depth_mm(sample)
         inside = depth_mm[object_mask(depth_mm)]
@@ -49,6 +52,7 @@ class ViewPairs(FringeDepthDataset):
         self.source = source  # type: ignore[assignment]
         self.samples, self.frames = source.samples, (0,)
         self.normalisation, self.background_removed = normalisation, False
+        self.range_rule, self._ranges_mm = "valid", {}
 
 
 def view_recipe(recipe: training.Recipe) -> training.Recipe:

@@ -15,8 +15,8 @@ from fpp_ml_bench.errors import PredictionError
 
 @dataclass(frozen=True)
 class Settings:
-    """``min_confidence``: pixels below it are 0 (0: dense); ``slack_mm`` widens the working range for noise at its
-    ends. Raises `PredictionError`."""
+    """``min_confidence``: pixels below it are 0 (0: dense); ``slack_mm`` widens the range in which orders are chosen,
+    as that of `phase_route.Settings`. Raises `PredictionError`."""
 
     min_confidence: float = 0.0
     slack_mm: float = 15.0
@@ -29,6 +29,7 @@ class Settings:
 class CrossedReason(IntEnum):
     """Why a pixel should not be trusted; of several reasons the lowest. BACKGROUND: the empty scene explains it.
     LOW_MODULATION: too dark for fringes, in shadow or turned away. SATURATED: clipped grey levels in the window.
+    OUT_OF_RANGE: its depth is not in the working range, and is left out.
     ONE_DIRECTION: one carrier is not to be seen, so that nothing decides the order. TEXTURE: what the window shows is
     no crossed fringe: stripes near a carrier's period, or a depth edge. AMBIGUOUS: a rival order is as likely. UNSURE:
     the expected error alone is too large."""
@@ -37,10 +38,11 @@ class CrossedReason(IntEnum):
     BACKGROUND = 1
     LOW_MODULATION = 2
     SATURATED = 3
-    ONE_DIRECTION = 4
-    TEXTURE = 5
-    AMBIGUOUS = 6
-    UNSURE = 7
+    OUT_OF_RANGE = 4
+    ONE_DIRECTION = 5
+    TEXTURE = 6
+    AMBIGUOUS = 7
+    UNSURE = 8
 
 
 @dataclass(frozen=True)

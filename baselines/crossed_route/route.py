@@ -154,10 +154,8 @@ class CrossedRoute:
         default from the observation's evidence and margin."""
         carriers, fit, watch, inside = seen.carriers, seen.fit, seen.watch, seen.inside
         depth_mm = carriers.depth_mm(fit.nearness)
-        near_mm, far_mm = self.rig.working_range_mm
-        slack_mm = 4 * self.settings.slack_mm  # a fit may move a pixel out of the range that its order was chosen in
-        inside = inside & np.isfinite(depth_mm) & (depth_mm > near_mm - slack_mm) & (depth_mm < far_mm + slack_mm)
-        depth_mm = np.where(inside, depth_mm, 0.0)
+        found = inside & self.rig.in_range(depth_mm)  # a fit may leave the range that its order was chosen in
+        depth_mm = np.where(found, depth_mm, 0.0)
         if wrong_chance is None:
             odds = seen.evidence / EVIDENCE_SCALE + seen.margin / MARGIN_SCALE - EVEN_ODDS
             wrong_chance = (1 / (1 + np.exp(np.clip(odds, -50, 50)))).astype(np.float32)
@@ -165,9 +163,9 @@ class CrossedRoute:
         mm_per_rad = carriers.mm_per_rad(np.maximum(depth_mm, 1.0))
         apart_rad = np.abs(seen.rival - fit.nearness) * carriers.joint_gain
         sigma_rad = np.hypot(fit.uncertainty_rad, reaching(apart_rad, wrong_chance))
-        sigma_mm = np.where(inside, mm_per_rad * sigma_rad, 0.0)
-        confidence = np.where(inside, 1 / (1 + sigma_mm / HALF_CONFIDENCE_MM), 0.0)
-        reason = self._reasons(seen, inside, wrong_chance, confidence)
+        sigma_mm = np.where(found, mm_per_rad * sigma_rad, 0.0)
+        confidence = np.where(found, 1 / (1 + sigma_mm / HALF_CONFIDENCE_MM), 0.0)
+        reason = self._reasons(seen, found, wrong_chance, confidence)
 
         def paste(part: NDArray, dtype: type = np.float32, outside: float = 0) -> NDArray:
             whole: NDArray = np.full(seen.shape, outside, dtype=dtype)
@@ -199,31 +197,35 @@ class CrossedRoute:
         unit = float(np.median(joint))
         on_object, psi, nearest = self.resampling.restored_phase((nearness * unit).astype(np.float64), known)
         depth_mm = self._captured.depth_mm(psi / unit)
+        found = on_object & self.resampling.captured.in_range(depth_mm)
 
         def restored(values: Image) -> Image:
-            return np.where(on_object, nearest(values), 0).astype(np.float32)
+            return np.where(found, nearest(values), 0).astype(np.float32)
 
-        reason = nearest(measured.reason)
-        reason[~on_object] = CrossedReason.BACKGROUND
+        # The nearest depth says nothing of a pixel that has none for a reason of its own.
+        own = np.where(known, np.uint8(CrossedReason.BACKGROUND), measured.reason)
+        own = cv2.resize(own, found.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
+        reason = np.select([found, on_object], [nearest(measured.reason), CrossedReason.OUT_OF_RANGE], own)
         counts = np.bincount(reason.ravel(), minlength=len(CrossedReason))
         return replace(
-            measured, depth_mm=np.where(on_object, np.nan_to_num(depth_mm), 0).astype(np.float32), reason=reason,
+            measured, depth_mm=np.where(found, depth_mm, 0).astype(np.float32), reason=reason.astype(np.uint8),
             counts={code.name.lower(): int(counts[code]) for code in CrossedReason},
             sigma_mm=restored(measured.sigma_mm), confidence=restored(measured.confidence),
             wrong_chance=restored(measured.wrong_chance), brightness_grey=restored(measured.brightness_grey),
         )  # fmt: skip
 
     def _reasons(
-        self, seen: CrossedObservation, inside: Mask, wrong_chance: Image, confidence: NDArray
+        self, seen: CrossedObservation, found: Mask, wrong_chance: Image, confidence: NDArray
     ) -> NDArray[np.uint8]:
         fit = seen.fit
         bright = np.maximum(fit.brightness, 0.5)
         window = Window(WINDOW_PERIODS * self.carriers.period_px)
         misfit = window.moment((fit.misfit_grey**2 * seen.inside).astype(np.float32)) / np.maximum(fit.weight, 1e-3)
         by_reason = {
-            CrossedReason.BACKGROUND: ~inside,
+            CrossedReason.BACKGROUND: ~seen.inside,
             CrossedReason.LOW_MODULATION: fit.brightness < MIN_MODULATION,
             CrossedReason.SATURATED: seen.clipped_share > SATURATED_SHARE,
+            CrossedReason.OUT_OF_RANGE: ~found,
             CrossedReason.ONE_DIRECTION: _lost(seen),
             CrossedReason.TEXTURE: (np.sqrt(misfit) > TEXTURE_SHARE * bright)
             | (seen.candidates.misfit_rad[1] > TEXTURE_RAD),

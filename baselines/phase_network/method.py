@@ -23,7 +23,7 @@ from fpp_ml_bench.optics import Direction, Rig
 
 SHIPPED = Path(__file__).resolve().parent / "weights"  # folder of the weights that come with the package
 DEFAULT = "phase-net-one-albedo"
-PERIOD_TOLERANCE = 2.2
+PERIOD_TOLERANCE = 1.4
 """Factor by which an image's fringe period in px may differ from that of the training images; beyond, the image is
 resampled to theirs."""
 

@@ -74,7 +74,7 @@ def clipped_share(capture: Capture, fit: FringeFit, inside: Mask, window: Window
 def expected_error_mm(observation: Observation, margin: Image, depth_mm: NDArray) -> tuple[Image, Image]:
     """Expected absolute error of ``depth_mm`` (h, w) in mm, float32, and the order's part of it; 0 outside the mask."""
     layer = observation.layer
-    z = np.maximum(depth_mm, 1.0) / MM_PER_M
+    z = np.maximum(depth_mm, observation.rig.working_range_mm[0]) / MM_PER_M
     ahead = layer.forward * z + layer.back_m
     mm_per_rad = np.abs(ahead**2 / (layer.gain * layer.forward)) * MM_PER_M
     wrong_chance = 1 / (1 + np.exp(np.clip(margin / MARGIN_SCALE, 0, 50)))
@@ -88,10 +88,8 @@ def expected_error_mm(observation: Observation, margin: Image, depth_mm: NDArray
 def reasons(
     observation: Observation, margin: Image, confidence: Image, depth_mm: NDArray, settings: Settings
 ) -> NDArray[np.uint8]:
-    """A `Reason` for every pixel (h, w), masked or not: `Reason.MEASURED` for a pixel that can be trusted. A chooser
-    that corrects the phase can leave the range that its orders were chosen for."""
-    near, far = observation.rig.working_range_mm
-    outside = (depth_mm < near - settings.slack_mm) | (depth_mm > far + settings.slack_mm)
+    """A `Reason` for every pixel (h, w), masked or not: `Reason.MEASURED` for a pixel that can be trusted.
+    ``depth_mm`` is 0 where it is not in the working range."""
     slopes, period_px = observation.slopes, observation.period_px
     axis = 0 if settings.direction == "vertical" else 1
     # The carrier of a plane square to the axis advances by one period every period_px; slopes come on top.
@@ -104,7 +102,7 @@ def reasons(
         Reason.BACKGROUND: ~observation.inside,
         Reason.LOW_MODULATION: observation.fit.brightness < MIN_MODULATION,
         Reason.SATURATED: observation.clipped_share > SATURATED_SHARE,
-        Reason.OUT_OF_RANGE: (observation.candidates.count == 0) | outside,
+        Reason.OUT_OF_RANGE: depth_mm == 0,
         Reason.THIN: ~thick,
         Reason.TOO_STEEP: (frequency < SLOWEST) | (frequency > FASTEST),
         Reason.AMBIGUOUS: margin < LEAST_MARGIN,

@@ -30,7 +30,8 @@ class Settings:
     Windows, in fringe periods: of the first fit, of the second, of the last one to two frames, and of the slopes. Costs
     (no unit): ``shading_cost`` a pixel for each ``shading_spread`` of log brightness, up to ``shading_limit`` of them;
     ``prior_cost`` a pixel for each 100 mm; ``jump_rad``: a jump of phase between neighbours from which on it costs no
-    more. ``slack_mm`` widens the working range for noise at its ends. ``white_grey`` and ``ambient_grey``, if given,
+    more. ``slack_mm`` widens the range in which orders are chosen, for noise at its ends: a depth
+    beyond them is left out, and no other order is taken to be within. ``white_grey`` and ``ambient_grey``, if given,
     calibrate brightness (see `EmptyScene`); without them it is taken from the lit background, and where the image
     shows none, range and continuity settle the order, or it is ambiguous and has no depth (see `continuity`).
     """
@@ -122,9 +123,9 @@ class Observation(Capture):
 class Reason(IntEnum):
     """Why a pixel should not be trusted; of several reasons the lowest. BACKGROUND: the empty scene explains it.
     LOW_MODULATION: too dark for a fringe, in shadow or turned away. SATURATED: clipped grey levels in the window.
-    OUT_OF_RANGE: no order puts it in the working range. THIN: the object is thinner than half a period there.
-    TOO_STEEP: the fringe is compressed or stretched beyond what a window resolves. AMBIGUOUS: the candidate orders
-    can't be told apart. UNSURE: the expected error alone is too large."""
+    OUT_OF_RANGE: its depth is not in the working range, and is left out. THIN: the object is thinner than half a period
+    there. TOO_STEEP: the fringe is compressed or stretched beyond what a window resolves. AMBIGUOUS: the candidate
+    orders can't be told apart. UNSURE: the expected error alone is too large."""
 
     MEASURED = 0
     BACKGROUND = 1

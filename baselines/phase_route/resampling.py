@@ -136,7 +136,8 @@ class Resampling:
         phase = (absolute - TAU * order).astype(np.float32)
         with np.errstate(divide="ignore", invalid="ignore"):
             depth_mm = part.depth_of_residual_mm(residual)
-        depth_mm[~(np.isfinite(depth_mm) & (depth_mm > 0)) | (nearest(measured.depth_mm)[on_object] == 0)] = 0.0
+        outside = ~self.captured.in_range(depth_mm)
+        depth_mm[outside | (nearest(measured.depth_mm)[on_object] == 0)] = 0.0
         allowed = part.orders_in_range(phase, range_mm)
 
         def paste(values: NDArray, dtype: type, outside: float = 0) -> NDArray:
@@ -147,7 +148,9 @@ class Resampling:
         def pasted(image: Image) -> Image:
             return paste(nearest(image)[on_object], np.float32)
 
-        reason = paste(nearest(measured.reason)[on_object], np.uint8, Reason.BACKGROUND)
+        reasons = nearest(measured.reason)[on_object]
+        reasons[outside & ((reasons == Reason.MEASURED) | (reasons > Reason.OUT_OF_RANGE))] = Reason.OUT_OF_RANGE
+        reason = paste(reasons, np.uint8, Reason.BACKGROUND)
         counts = np.bincount(reason.ravel(), minlength=len(Reason))
         return replace(
             measured, wrapped_phase_rad=paste(phase, np.float32, np.nan), order=paste(order, np.int32),

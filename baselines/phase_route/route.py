@@ -151,7 +151,7 @@ class PhaseRoute:
             margin = margin_by_range(observation, order)
         watch.done("order")
         depth_mm = np.where(inside, observation.layer.depth_mm(observation.phase_rad, order), 0.0)
-        depth_mm[~(np.isfinite(depth_mm) & (depth_mm > 0))] = 0.0
+        depth_mm[~observation.rig.in_range(depth_mm)] = 0.0
         watch.done("depth")
         error_mm, doubt_mm = confidence.expected_error_mm(observation, margin, depth_mm)
         sureness = (1 / (1 + error_mm / HALF_CONFIDENCE_MM)).astype(np.float32)

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.baselines.networks import NETWORKS as NAMES
 from fpp_ml_bench.baselines.networks import RECENTRED_FROM, InstanceNorm, build, in_full_precision, torch_threads
-from fpp_ml_bench.baselines.phase_route import CalibrationLayer, Reason, Settings
+from fpp_ml_bench.baselines.phase_route import CalibrationLayer, Reason
 from fpp_ml_bench.baselines.stability.cases import U32, U64, UB16, Group, Outcome, gamma, worst, wrong
 from fpp_ml_bench.baselines.training import EPSILON, LOSSES, loss_function, sample_losses
 from fpp_ml_bench.errors import FppBenchError, PredictionError
@@ -290,8 +290,7 @@ def network_half(name: str, dtype: str) -> Outcome:
                  image=("black", "white", "constant", "noise", "checkerboard"))  # fmt: skip
 @torch_threads(1)
 def phase_output(name: str, image: str) -> Outcome:
-    """depth of an image without an object; against a depth in the working range and its slack of 15 mm, or a reason why
-    it is invalid; bound: exact: no other depth may count as measured"""
+    """depth of an image without an object; against a depth in the working range, or none; bound: exact"""
     rig = paper_rig(480)
     shape = (rig.camera.width, rig.camera.width)
     levels = {
@@ -302,9 +301,8 @@ def phase_output(name: str, image: str) -> Outcome:
     frames: list[NDArray[np.uint8] | None] = [None] * len(rig.sequence)
     frames[phase_method.frames_used[0]] = np.broadcast_to(np.asarray(levels), shape).astype(np.uint8)
     measurement = phase_method.measure(frames)  # type: ignore[attr-defined]
-    near, far = rig.working_range_mm
-    slack, depth = Settings().slack_mm * (1 + U32), measurement.depth_mm
-    legal = np.isfinite(depth) & ((depth == 0) | ((depth >= near - slack) & (depth <= far + slack)))
+    depth = measurement.depth_mm
+    legal = (depth == 0) | rig.in_range(depth)
     return worst(np.where(legal, 0.0, np.inf), 0.0, measurement.reason != Reason.MEASURED)
 
 

@@ -178,11 +178,8 @@ def depth_and_reason(
         else:
             depth_mm, disagreement_px = depth_from_both(rays, u, v, rig, *(weight * weight for weight in weights))
         reason[(reason == 0) & (disagreement_px > limits.max_disagreement_px)] = Reason.DIRECTIONS_DISAGREE
-    near, far = rig.working_range_mm
     missing = np.isnan(depth_mm)
-    with np.errstate(invalid="ignore"):
-        outside = ~missing & ((depth_mm < near) | (depth_mm > far))
-    reason[(reason == 0) & outside] = Reason.OUTSIDE_RANGE
+    reason[(reason == 0) & ~missing & ~rig.in_range(depth_mm)] = Reason.OUTSIDE_RANGE
     reason[((reason == 0) & missing) | np.isnan(rays[0])] = Reason.NO_RAY
     return np.where(reason == 0, depth_mm, 0.0).astype(np.float32), reason
 

@@ -248,6 +248,13 @@ class Rig:
         require(np.all(np.isfinite(seen)), unseen)
         return seen
 
+    def in_range(self, depth_mm: ArrayLike) -> NDArray[np.bool_]:
+        """Whether a depth in mm lies in the working range, its ends included; of the shape of ``depth_mm``. What does
+        not, NaN too, is no depth: every method that measures asks this of its final depth, without any tolerance."""
+        near, far = self.working_range_mm
+        depth = np.asarray(depth_mm)
+        return (depth >= near) & (depth <= far)
+
     def periods_in_range(self, direction: Direction) -> float:
         """Fringe periods that the central camera pixel's ray crosses within the working range (2.4 and 1.9 here)."""
         near, far = self._central_coordinate(direction, np.array(self.working_range_mm) / MM_PER_M)

@@ -48,12 +48,15 @@ from fpp_ml_bench.files import cause_of, strict_yaml
 from fpp_ml_bench.optics.opencv_files import read_opencv_calibration
 from fpp_ml_bench.optics.pinhole import Pinhole, numbers, require
 from fpp_ml_bench.optics.rig import Rig, middle_m, rotation_matrix
-from fpp_ml_bench.optics.sequence import CODED_KEYS, DIRECTIONS, Direction, sequence_from_dict
+from fpp_ml_bench.optics.sequence import AXES, CODED_KEYS, DIRECTIONS, Direction, sequence_from_dict
 
 _RIG_KEYS = ("camera", "projector", "rotation", "translation_m", "pitch_px", "sequence", "working_range_mm")
 _OPTIONAL_RIG_KEYS = ("standoff_m", "background_m")
 BASELINES_M, LEAST_FAR_MM, MOST_NEAR_MM = (0.005, 20.0), 10.0, 1e6
 """Lengths of rigs: what lies outside is another unit. A wide limit: microscopes have 10 mm, halls 10 m."""
+CALIBRATED_PX, MOST_SHARE = 0.1, 0.05
+"""Projector px by which a good calibration is wrong, more than the noise of a phase, and the share of the depth that
+this may be, at the far end of the range, where the rig measures best: no more than a twentieth."""
 
 
 def _mapping(value: object, keys: Iterable[str], name: str, optional: Iterable[str] = ()) -> dict[str, Any]:
@@ -131,9 +134,10 @@ def load_rig(path: str | Path) -> Rig:
 
 
 def check_lengths(rig: Rig, entry: str = "the pose", unit: str | None = None, cure: str | None = None) -> None:
-    """Raise `RigError` for a baseline or a working range that no rig has, and name the unit that would fit. ``entry``:
-    what gives the baseline; ``unit``: mm or m, in which it was read, by default the one that leads to such a baseline;
-    ``cure``: what to do where the other unit fits, by default to multiply or divide by 1000."""
+    """Raise `RigError` for a baseline or a working range that no rig has, and name the unit that would fit, and for a
+    baseline that is no use for the range. ``entry``: what gives the baseline; ``unit``: mm or m, in which it was read,
+    by default the one that leads to such a baseline; ``cure``: what to do where the other unit fits, by default to
+    multiply or divide by 1000."""
     (least, most), (near, far), baseline = BASELINES_M, rig.working_range_mm, rig.baseline_m
     if not least <= baseline <= most:
         in_mm = unit == "mm" if unit else baseline < least
@@ -147,6 +151,26 @@ def check_lengths(rig: Rig, entry: str = "the pose", unit: str | None = None, cu
         as_metres = f"looks like metres: write [{MM_PER_M * near:g}, {MM_PER_M * far:g}]"
         hint = as_metres if far < LEAST_FAR_MM else "check its unit, mm"
         raise RigError(f"working_range_mm: {near:g} to {far:g} mm, where no rig looks; {hint}")
+    if (error := CALIBRATED_PX * _depth_share_of_px(rig)) > MOST_SHARE:
+        coded = " and ".join(rig.directions) or "crossed"
+        raise RigError(
+            f"{entry} gives a baseline that tells no depth: with the {coded} frames an error of {CALIBRATED_PX:g} "
+            f"projector px, which a good calibration has, moves the depth at the range's far end, {far:g} mm, by "
+            f"{100 * error:.3g}% of it or more; expected at most {100 * MOST_SHARE:g}%. Check the length of the "
+            "baseline, whether the coded direction runs along it, and the range"
+        )
+
+
+def _depth_share_of_px(rig: Rig) -> float:
+    """Least change of depth, relative to the far end of the working range, that moves the coded projector coordinates
+    by a px there; of rays all over the image, 0 where the projector looks at none of them."""
+    lengths = rig.camera.width, rig.camera.height
+    x, y = rig.camera.normalised(*np.meshgrid(*(np.linspace(0, length - 1, 9) for length in lengths)))
+    ends = rig.working_range_mm[1] / MM_PER_M * np.array([0.99, 1.01])
+    seen = np.array([rig.project(np.stack([x * z, y * z, np.full_like(x, z)], axis=-1)) for z in ends])
+    moved_px = (seen[1] - seen[0])[[AXES.index(direction) for direction in rig.directions or DIRECTIONS]]
+    most_px = float(np.fmax.reduce(np.linalg.norm(moved_px, axis=0), axis=None))
+    return 0.0 if np.isnan(most_px) else 0.02 / max(most_px, 1e-12)
 
 
 def load_projection(path: str | Path, camera_size: tuple[int, int] | None = None) -> Rig:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M, VIEW_DEGREES, VIEWS, sample_name
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import object_mask, object_near_edge
+from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.illumination import LitPixels
 from fpp_ml_bench.loaders.render.lighting import Lighting
 from fpp_ml_bench.loaders.render.pixels import MixedPixels, blur_image, mixed_pixels, vignetting
@@ -68,6 +69,7 @@ class Studio:
     def photograph(self, mesh: SolidMesh, view: str) -> Row:
         """Sample of ``mesh`` in ``view``. Its frames are views of memory that the next call overwrites.
 
+        Raises `MeshError` for an object that is on no pixel, `BuildError` where none of its pixels can be decoded.
         Frames that are stored are exposed whole. Those that only the ground truth needs are exposed at the object's
         pixels alone, and decoded there alone: the bytes there, and so the decoded depth, are the same either way. With
         skipping off (`fpp_ml_bench.skipping`) every frame is exposed and decoded whole.
@@ -77,6 +79,14 @@ class Studio:
         exact_mm = np.zeros(self._frames.shape[1:], dtype=np.float32)
         exact_mm.ravel()[scene.hits.pixels] = scene.hits.depth_m * MM_PER_M
         depth_mm = self.ground_truth_mm(object_mask(exact_mm))
+        if not depth_mm.any():
+            counts = decode_stack(self._frames, self.settings.stated_rig, mask=object_mask(exact_mm)).counts
+            counts["not_asked"] = 0
+            told = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts.items() if count)
+            raise BuildError(
+                f"sample {sample_name(mesh.name, view)!r}: none of its {len(scene.hits.pixels)} object pixels can be "
+                f"decoded ({told}); check the rig's pose and code, and how bright --light is"
+            )
         flags, cover = self.flags(scene)
         measured = {"distance_mm": scene.distance_m * MM_PER_M, "shadow_rays": shadow_rays}
         measured["mixed_rays"] = 0 if scene.mixed is None else len(scene.mixed.points_m)
@@ -93,6 +103,13 @@ class Studio:
             vertices_m, offset_m = vertices_m + moved_m, offset_m + moved_m
         traced = TracedObject(mesh, vertices_m)
         hits = traced.primary(PixelRays.of(rig.camera))
+        if not hits.pixels.size:
+            size_mm = MM_PER_M * float(np.ptp(vertices_m, axis=0).max())
+            pixel_mm = MM_PER_M * distance_m / rig.camera.fx
+            raise MeshError(
+                f"object {mesh.name!r} is on no pixel in view {view}: it is {size_mm:.3g} mm large, and a pixel "
+                f"{distance_m:g} m from the camera is {pixel_mm:.3g} mm; scale it up, or build with more px (--size)"
+            )
         stream = (settings.seed, mesh.name, view)
         object_light = self.lighting.upon(mesh, traced, VIEW_DEGREES[VIEWS.index(view)], offset_m)
         x, y = (axis.ravel()[hits.pixels] for axis in rig.camera.rays())

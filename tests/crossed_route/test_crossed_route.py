@@ -62,6 +62,20 @@ def test_a_slab_at_any_distance(rig: Rig, middle_mm: float) -> None:
     assert np.percentile(error, 95) < 12
 
 
+@pytest.mark.parametrize(("name", "options"), [("crossed", {}), ("crossed", {"frames": 3}), ("crossed-net", {})])
+def test_beyond_the_end_of_the_range_there_is_no_depth(name: str, options: dict[str, int]) -> None:
+    depth_mm = slab(middle_mm=2100.0, slope=0.1)
+    frames = [frame(depth_mm, number=number) for number in range(3)] + [None] * (len(RIG.sequence) - 3)
+    measured = load_method(name, RIG, **options).measure(frames)  # type: ignore[attr-defined]
+    within, beyond = (depth_mm > 0) & (depth_mm < 2095), depth_mm > 2105
+    assert measured.depth_mm.max() <= 2100
+    assert (np.abs(measured.depth_mm - depth_mm)[within] < 8).mean() > 0.98
+    assert (measured.depth_mm[beyond] == 0).mean() > 0.97
+    assert (measured.reason[beyond] == CrossedReason.OUT_OF_RANGE).mean() > 0.97
+    without = measured.depth_mm == 0
+    assert not measured.sigma_mm[without].any() and not measured.confidence[without].any()
+
+
 @pytest.mark.parametrize("white_grey", [40.0, 110.0, 240.0])
 def test_exposure_does_not_matter(white_grey: float) -> None:
     depth_mm = slab()

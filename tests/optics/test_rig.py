@@ -1,6 +1,7 @@
 """The rig: compared with OpenCV's camera model, its files, and values that must be refused."""
 
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -23,6 +24,7 @@ from fpp_ml_bench.optics import (
     write_opencv_calibration,
 )
 from fpp_ml_bench.optics.pinhole import distort, fold_radius_squared, undistort
+from fpp_ml_bench.optics.rig_file import _depth_share_of_px
 from fpp_ml_bench.optics.sequence import Sequence
 
 DISTORTION = (-0.21, 0.11, 0.0013, -0.0021, -0.02)
@@ -278,6 +280,43 @@ def test_a_calibrated_rig_is_checked_by_what_gave_its_lengths():
         check_lengths(rig_from_dict(data), "the spacing")
     for length in (0.005, 20.0):
         check_lengths(rig_from_dict({**data, "translation_m": [length, 0, 0]}))
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"translation_m": [0.0, 0.0, 0.005]}, "translation_m gives a baseline that tells no depth: .*, by 7.8"),
+        ({"working_range_mm": [2e5, 3e5], "standoff_m": 250.0, "background_m": None}, "far end, 300000 mm, by 1"),
+    ],
+    ids=["short, on the axis", "far away"],
+)
+def test_a_baseline_that_tells_no_depth_is_refused(tmp_path, change, says):
+    file = tmp_path / "rig.yaml"
+    file.write_text(yaml.safe_dump({**paper_rig().to_dict(), **change}))
+    with pytest.raises(RigError, match=f"{file}: .*{says}"):
+        load_rig(file)
+
+
+@pytest.mark.parametrize(("baseline_m", "along_m"), [(0.0, 0.05), (1e-6, -0.16), (0.006, 0.0)])
+def test_an_error_of_a_tenth_px_is_that_share_of_the_depth(tmp_path, baseline_m, along_m):
+    """Also of a projector on the camera's axis, which is no worse than others at the rim of the image."""
+    rig = replace(paper_rig(), translation_m=(baseline_m, 0.0, along_m))
+    save_rig(rig, tmp_path / "rig.yaml")
+    assert load_rig(tmp_path / "rig.yaml") == rig
+    x, y = 479.5 / rig.camera.fx, 479.5 / rig.camera.fy
+    z = 2.1
+    across, down = baseline_m - along_m * np.array([-x, x]), along_m * y
+    most_px = z * 1824 * np.hypot(across, down).max() / (z + along_m) ** 2
+    assert _depth_share_of_px(rig) == pytest.approx(1 / most_px, rel=1e-3)
+
+
+def test_a_code_along_the_baseline_alone_is_refused():
+    data = paper_rig().to_dict()
+    code = {"scheme": "phase-shift", "pitch_px": 18, "steps": 4}
+    del data["pitch_px"]
+    rig = rig_from_dict({**data, "sequence": {"horizontal": code}, "translation_m": [0.16, 0, 0]})
+    with pytest.raises(RigError, match="with the horizontal frames an error"):
+        check_lengths(rig)
 
 
 def test_a_projector_that_looks_away_is_refused():

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -35,7 +36,7 @@ def route(direction: str, rig: Rig = RIG, **options: object) -> PhaseRoute:
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
-@pytest.mark.parametrize("distance_m", [1.5, 1.8, 2.1])
+@pytest.mark.parametrize("distance_m", [1.52, 1.8, 2.08])
 @pytest.mark.parametrize("rig", [RIG, OTHER_RIG], ids=["paper", "other"])
 def test_a_plane_that_fills_the_frame(rig: Rig, distance_m: float, direction: str) -> None:
     tilt = (0.1, -0.06)
@@ -46,7 +47,29 @@ def test_a_plane_that_fills_the_frame(rig: Rig, distance_m: float, direction: st
         assert lit.mean() > 0.7  # the projector's field ends before the camera's
         error = np.abs(measurement.depth_mm - exact_m * 1000)[lit]
         assert error.mean() < 1.0
-        assert (measurement.depth_mm[lit] > 0).all()
+        given = measurement.depth_mm[lit] > 0  # at the end of the projector's field a depth may lie beyond the range
+        assert given.mean() > 0.9999 and (measurement.reason[lit][~given] == Reason.OUT_OF_RANGE).all()
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3])
+@pytest.mark.parametrize("rig", [RIG, replace(RIG, pitch_horizontal_px=90.0)], ids=["captured", "resampled"])
+def test_beyond_the_end_of_the_range_there_is_no_depth(rig: Rig, frames: int) -> None:
+    """A plane that leaves the range in the middle of the image, by 11 mm at most: exact up to the end, none beyond."""
+    tilt = (0.025, 0.0)
+    exact_m = plane_depth_m(rig, 2.1, tilt)
+    method = PhaseMethod(rig, frames=frames, **USERS_WORD)
+    assert method.route.resampling.needed == (rig is not RIG)
+    images: list[Any] = [None] * len(rig.sequence)
+    for number in method.frames_used:
+        images[number] = plane_fringe(rig, number, exact_m, tilt)
+    measurement = method.measure(images)
+    depth_mm, exact_mm, lit = measurement.depth_mm, exact_m * 1000, measurement.modulation_grey > 5
+    assert (depth_mm <= 2100).all() and (measurement.sigma_mm[depth_mm == 0] == 0).all()
+    within, beyond = lit & (exact_mm < 2094), lit & (exact_mm > 2106)
+    assert within.sum() > 30_000 and beyond.sum() > 30_000
+    assert (np.abs(depth_mm - exact_mm)[within] < 8).mean() > 0.99
+    assert (depth_mm[beyond] == 0).mean() > 0.98
+    assert (measurement.reason[beyond] == Reason.OUT_OF_RANGE).mean() > 0.98
 
 
 def test_a_projector_that_is_turned_and_ahead() -> None:

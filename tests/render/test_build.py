@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from conftest import TINY_CONFIGS, TINY_OBJECTS, TINY_SIZE, file_bytes, tiny_settings
 
+from fpp_ml_bench.cli import main
 from fpp_ml_bench.constants import (
     MINI_OBJECTS,
     OBJECTS,
@@ -122,6 +123,21 @@ def test_object_that_does_not_fit_ends_the_build_by_name(tmp_path):
     settings = BuildSettings(paper_rig(TINY_SIZE), ("cork", "huge"), user_meshes=(mesh,), stored="single_shot")
     with pytest.raises(MeshError, match=r"'huge'.*scale it"):
         build(tmp_path / "set", settings, workers=2)  # through a worker process, with the whole message
+
+
+def test_a_view_without_an_object_pixel_ends_the_build_with_its_cause(tmp_path, capsys):
+    """An object smaller than a pixel of the image, and the same in a light that leaves none to decode."""
+    trimesh.creation.box((4e-4,) * 3).export(tmp_path / "tiny.stl")
+    trimesh.creation.box((0.2,) * 3).export(tmp_path / "box.stl")
+    (tmp_path / "dark.yaml").write_text("name: dark\ncamera: {exposure: 0.01}\n")
+    words = ["--size", "224", "--frames", "single_shot", "--workers", "1"]
+    assert main(["build", str(tmp_path / "a"), "--mesh", str(tmp_path / "tiny.stl"), *words]) == 2
+    said = capsys.readouterr().err
+    assert "object 'tiny' is on no pixel in view A0: it is 0.4 mm large" in said and "scale it up" in said
+    words += ["--light", str(tmp_path / "dark.yaml")]
+    assert main(["build", str(tmp_path / "b"), "--mesh", str(tmp_path / "box.stl"), *words]) == 2
+    said = capsys.readouterr().err
+    assert "sample 'box_A0': none of its" in said and "(low modulation" in said and "--light" in said
 
 
 # ---- plans and presets
