@@ -159,10 +159,16 @@ def load_method(name_or_path: str | Path, rig: Rig, **options: Any) -> Method:
 
     Raises `PredictionError` for an unknown name, and what the method refuses: unusable weights, invalid options.
     """
-    if name_or_path in METHODS:
-        return METHODS[str(name_or_path)](rig, **options)
-    model = networks.load(known_weights(name_or_path), options.pop("device", None))
-    return networks.NetworkMethod(model, sequence=rig.sequence, **options)
+    try:
+        if name_or_path in METHODS:
+            return METHODS[str(name_or_path)](rig, **options)
+        model = networks.load(known_weights(name_or_path), options.pop("device", None))
+        return networks.NetworkMethod(model, sequence=rig.sequence, **options)
+    except TypeError as error:
+        if "unexpected keyword argument" not in str(error):
+            raise
+        option = str(error).rsplit(" ", 1)[-1]
+        raise PredictionError(f"{name_or_path}: has no option {option}; fpp-bench predict --help lists them") from None
 
 
 def known_weights(name_or_path: str | Path) -> Path:

@@ -41,8 +41,9 @@ def load_dataset(folder: str | Path, config: str = "single_shot", split: str | N
     ----------
     folder : str or Path
         Dataset written by ``fpp-bench build`` or ``fpp-bench import``.
-    config : {"single_shot", "horizontal", "vertical", "sinusoidal", "all"}
-        Which frames: the first one, those of a direction, all sinusoids, or the whole sequence.
+    config : {"single_shot", "crossed", "horizontal", "vertical", "sinusoidal", "all"}
+        Which frames: the first one, the crossed ones of a rig that has them, those of a direction, all sinusoids, or
+        the whole sequence.
     split : {"train", "validation", "test"}, optional
         None for all of them, as a ``DatasetDict``.
 
@@ -104,11 +105,13 @@ def load_method(name: str | Path, dataset: "storage.DatasetFolder", **options: A
     Parameters
     ----------
     name : str or Path
-        ``classical``, ``phase``, ``phase-net``, shipped weights, or a ``.safetensors`` file.
+        ``classical``, ``phase``, ``crossed`` and the other methods of ``fpp-bench predict``, shipped weights, or a
+        ``.safetensors`` file.
     dataset : DatasetFolder
         What it is to run on; see `open_dataset`.
     **options
-        The method's settings, as ``fpp-bench predict`` takes them: ``steps=4``, ``frames=3``, ``fringe="vertical"``.
+        The method's settings: ``steps=4`` (classical), ``frames=3`` (phase), ``direction="vertical"`` (both; the
+        command calls it ``--fringe`` for phase), ``depth_range="predicted"`` (networks).
 
     Returns
     -------
@@ -159,7 +162,8 @@ def decode(
     Returns
     -------
     Decoded
-        ``depth_mm`` float32 (H, W), 0 where nothing was measured, and ``reasons`` (uint8 (H, W), see `Reason`).
+        ``depth_mm`` float32 (H, W), 0 where nothing was measured, and ``reason`` (uint8 (H, W), codes of
+        `fpp_ml_bench.coding.Reason`).
 
     Raises
     ------

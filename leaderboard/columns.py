@@ -28,7 +28,7 @@ NOTE = (
     f"{SELF_REPORTED} time as reported by its author, not measured here."
 )
 MIDDLE, WIDE, WIDEST = 100, 140, 170
-"""Characters of a terminal from which on more columns fit."""
+"""Where a terminal is too narrow, columns of a larger number are left out first."""
 ONLY_IN_FILES = 1_000_000
 _DEVICE_WIDTH, _LONGEST_NAME = 40, 90
 _ERRORS = {
@@ -40,13 +40,13 @@ _ERRORS = {
     "object_interior_mae_mm": ("Interior MAE", WIDEST),
     "object_edge_mae_mm": ("Edge MAE", WIDEST),
 }
-"""Title of each error's column, and the width from which on it is shown."""
+"""Title of each error's column, and its ``from_width``."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """``text`` makes the cell; ``right``: aligned to the right, as numbers are. A terminal of fewer than ``from_width``
-    characters leaves the column out. A table has it where ``present`` holds of any row."""
+    """``text`` makes the cell; ``right``: aligned to the right, as numbers are. Where a terminal is too narrow, columns
+    of the largest ``from_width`` are left out first. A table has it where ``present`` holds of any row."""
 
     title: str
     text: Callable[[Ranked], str]

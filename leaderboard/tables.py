@@ -2,17 +2,17 @@
 
 import re
 from collections.abc import Iterable, Sequence
-from typing import Literal
+from functools import partial
 
-from rich.table import Table
 from rich.text import Text
 
 from fpp_ml_bench.evaluation.report import interval_text, millimetres
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.leaderboard.columns import NOTE, ONLY_IN_FILES, Column, columns
+from fpp_ml_bench.leaderboard.columns import METHOD, NOTE, ONLY_IN_FILES, Column, columns
 from fpp_ml_bench.leaderboard.groups import Group, Ranked
 from fpp_ml_bench.leaderboard.pairs import Pair
 from fpp_ml_bench.leaderboard.reported import REPORTED_HEADING, ReportedRow, ReportedTable
+from fpp_ml_bench.tables import Table
 
 NO_RESULTS = """\
 No results here yet. Score predictions, and their row appears:
@@ -28,6 +28,9 @@ PAPER_TITLES = (
 PAPER_TEXT_COLUMNS = 2
 PAIR_TITLES = ("First", "Second", "Second - first", "95% interval", "p", "p, Holm", "Objects", "Verdict")
 PAIR_TEXT_COLUMNS = 2
+PAIRS_FIRST_OUT = ("Objects", "p", "95% interval", "p, Holm")
+LAST_OUT = ("Frames", "s/sample", "x trivial", "Object MAE")
+"""In a narrow terminal, the columns of a ranking that are left out after all others of their width, in this order."""
 _PLAIN = frozenset(" -,+()/%=.")
 
 
@@ -47,33 +50,43 @@ def pair_cells(pair: Pair) -> list[str]:
     ]  # fmt: skip
 
 
-def group_tables(groups: Sequence[Group], sort: str, width: int, with_pairs: bool = False) -> list[Table | Text]:
-    """A table for each group, for a terminal of ``width`` characters, ``with_pairs`` a second one of its pairs; without
-    groups, how to begin. Submitted text goes in as `Text`: it is never markup."""
+def group_tables(groups: Sequence[Group], sort: str, with_pairs: bool = False) -> list[Table | Text]:
+    """A table for each group, ``with_pairs`` a second one of its pairs; without groups, how to begin. Submitted text
+    goes in as `Text`: it is never markup."""
     if not groups:
         return [Text(NO_RESULTS)]
     parts: list[Table | Text] = []
     for group in groups:
-        shown = [column for column in columns(sort) if column.from_width <= width and column.shown_for(group.rows)]
-        # Titles in two lines leave more width for the names.
-        titles = [column.title.replace(" ", "\n", 1) for column in shown]
-        rows = [[column.text(row) for column in shown] for row in group.rows]
-        parts.append(_rich_table(group.title, titles, [column.right for column in shown], rows))
-        parts.append(Text("".join(f"{note}\n" for note in (group.unranked, *group.key.notes) if note)))
+        shown = [c for c in columns(sort) if c.from_width < ONLY_IN_FILES and c.shown_for(group.rows)]
+        titles = [(_two_lines(column.title), column.right) for column in shown]
+        table = _rich_table(group.title, titles, [[column.text(row) for column in shown] for row in group.rows])
+        table.names = 1 + shown.index(METHOD)
+        shown.reverse()  # of equal importance, the rightmost is left out first
+        table.first_out = [_two_lines(column.title) for column in sorted(shown, key=partial(_importance, sort))]
+        parts += [table, Text("".join(f"{note}\n" for note in (group.unranked, *group.key.notes) if note))]
         if with_pairs and group.pairs:
-            right = [number >= PAIR_TEXT_COLUMNS for number in range(len(PAIR_TITLES))]
-            parts.append(_rich_table("Pairs of these rows", PAIR_TITLES, right, map(pair_cells, group.pairs)))
-    every = [column for column in columns(sort) if any(column.shown_for(group.rows) for group in groups)]
-    left_out = [column.title for column in every if width < column.from_width < ONLY_IN_FILES]
-    hint = f" In a wider terminal, --markdown and --json: {', '.join(left_out)}." if left_out else ""
-    return [*parts, Text(NOTE + hint + "\n")]
+            titles = [(title, number >= PAIR_TEXT_COLUMNS) for number, title in enumerate(PAIR_TITLES)]
+            table = _rich_table("Pairs of these rows", titles, map(pair_cells, group.pairs))
+            table.names, table.first_out, table.elsewhere = PAIR_TEXT_COLUMNS, PAIRS_FIRST_OUT, "--json FILE"
+            parts.append(table)
+    return [*parts, Text(f"{NOTE}\n")]
 
 
-def _rich_table(title: str, titles: Sequence[str], right: Sequence[bool], rows: Iterable[Sequence[str]]) -> Table:
-    table = Table(title=Text(title), title_justify="left")
-    for name, to_right in zip(titles, right, strict=True):
-        justify: Literal["right", "left"] = "right" if to_right else "left"
-        table.add_column(name, justify=justify, overflow="fold", no_wrap=to_right)
+def _two_lines(title: str) -> str:
+    return title.replace(" ", "\n", 1)  # leaves more width for the names
+
+
+def _importance(sort: str, column: Column) -> tuple[bool, int, int]:
+    """Sort key of the columns: those of a low importance are left out first. What rows are sorted by stays longest."""
+    is_sorted_by = getattr(column.text, "args", None) == (sort,)
+    return is_sorted_by, -column.from_width, LAST_OUT.index(column.title) if column.title in LAST_OUT else -1
+
+
+def _rich_table(title: str, titles: Iterable[tuple[str, bool]], rows: Iterable[Sequence[str]]) -> Table:
+    """``titles`` of columns, and whether they are numbers."""
+    table = Table(title=Text(title), elsewhere="--markdown FILE")
+    for name, right in titles:
+        table.add_column(name, justify="right" if right else "left")
     for cells in rows:
         table.add_row(*map(Text, cells))
     return table
@@ -82,12 +95,9 @@ def _rich_table(title: str, titles: Sequence[str], right: Sequence[bool], rows: 
 def paper_rich_tables(tables: Sequence[ReportedTable]) -> list[Table | Text]:
     """The tables of others under their heading."""
     parts: list[Table | Text] = [Text(REPORTED_HEADING, style="bold")] if tables else []
+    titles = [(title, number >= PAPER_TEXT_COLUMNS) for number, title in enumerate(PAPER_TITLES)]
     for paper in tables:
-        table = Table(title=f"{paper.name}: {paper.title}, mm", title_justify="left")
-        for number, title in enumerate(PAPER_TITLES):
-            table.add_column(title, justify="left" if number < PAPER_TEXT_COLUMNS else "right")
-        for row in paper.rows:
-            table.add_row(*paper_cells(row))
+        table = _rich_table(f"{paper.name}: {paper.title}, mm", titles, map(paper_cells, paper.rows))
         parts += [table, Text(f"{paper.note}\n")]
     return parts
 

@@ -1,16 +1,22 @@
 """Docs name only files and modules that are there."""
 
 import re
+import shlex
 from importlib import import_module
 from pathlib import Path
 
 import pytest
+from conftest import tiny_settings
+
+from fpp_ml_bench.cli import COMMANDS, evaluate, parser_for
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted(
     {*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), ROOT / "evaluation/PROTOCOL.md"} - {ROOT / "CHANGELOG.md"}
 )
 TO_BE_WRITTEN = {"leaderboard/rows/my-method.json", "leaderboard/rows/NAME.json"}
+OF_OTHER_PROGRAMS = {"--all-files", "--dist", "--cpu", "--num_machines", "--num_processes"}
+"""Of pre-commit, pytest and accelerate."""
 TOP = "fpp_ml_bench|loaders|evaluation|baselines|leaderboard|tests|benchmarks|docs"
 
 
@@ -47,3 +53,96 @@ def test_tables_are_those_of_the_rows(monkeypatch):
     assert filled(text, rows_in(entries)) == text
     with pytest.raises(ValueError, match="markers <!-- test:begin -->"):
         filled("a page without them", {"test": []})
+
+
+FENCED = re.compile(r"^ *```(\w*)\n(.*?)^ *```$", flags=re.DOTALL | re.MULTILINE)
+ENDS_A_COMMAND = {"|", "||", "&&", ";", ">", ">>", "<"}
+
+
+def _parser_and_words(words):
+    """The parser of a command line, and the words that it parses."""
+    program, first = [*words, ""][:2]
+    if program == "fpp-eval":
+        command = evaluate.SUBCOMMANDS.get(first)
+        return parser_for(command or evaluate, program), words[2:] if command else words[1:]
+    module = import_module(f"fpp_ml_bench.cli.{COMMANDS[first][0]}")
+    return parser_for(module, f"fpp-bench {first}"), words[2:]
+
+
+def _options(parser):
+    for action in parser._actions:
+        yield from action.option_strings
+        if isinstance(action.choices, dict):  # subcommands
+            for inner in action.choices.values():
+                yield from _options(inner)
+
+
+def _commands(text):
+    """The command lines of this package in fenced blocks, as words."""
+    for _, block in FENCED.findall(text):
+        for line in block.replace("\\\n", " ").splitlines():
+            if begin := re.search(r"(?<![\w./-])fpp-(?:bench|eval) ", line):
+                words = shlex.split(line[begin.start() :], comments=True)
+                end = next((n for n, word in enumerate(words) if word in ENDS_A_COMMAND or word[:2] == "2>"), None)
+                yield words[:end]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_commands_of_a_page_are_accepted_by_their_parsers(page):
+    for words in _commands(page.read_text(encoding="utf-8")):
+        parser, rest = _parser_and_words(words)
+        try:
+            parser.parse_args(rest)
+        except SystemExit:
+            pytest.fail(f"{page.name}: {' '.join(words)}")
+
+
+def test_commands_are_found_in_the_pages():
+    """The test above sees the commands, and would see a wrong one."""
+    readme = list(_commands((ROOT / "README.md").read_text(encoding="utf-8")))
+    assert len(readme) >= 30 and ["fpp-bench", "leaderboard", "result.json"] in readme
+    ((wrong,),) = [list(_commands("```bash\nx && fpp-bench predict phase d --fringes both | cat # why\n```\n"))]
+    assert wrong == ["fpp-bench", "predict", "phase", "d", "--fringes", "both"]
+    parser, rest = _parser_and_words(wrong)
+    with pytest.raises(SystemExit):
+        parser.parse_args(rest)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_options_named_in_the_text_of_a_page_exist(page):
+    """Options beside their command are options of this command; those alone are options of some command or script."""
+    text = FENCED.sub("", page.read_text(encoding="utf-8"))
+    for span in re.findall(r"`(fpp-(?:bench|eval) [^`]*)`", text):
+        words = span.split()
+        if words[0] == "fpp-eval" or words[1] in COMMANDS:
+            known = set(_options(_parser_and_words(words)[0]))
+            assert set(re.findall(r"(?<![\w-])--[a-z][\w-]*", span)) <= known, span
+    parsers = [_parser_and_words(["fpp-bench", name])[0] for name in COMMANDS]
+    parsers += [_parser_and_words(["fpp-eval", name])[0] for name in ("", *evaluate.SUBCOMMANDS)]
+    known = {option for parser in parsers for option in _options(parser)}
+    scripts = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "benchmarks").glob("*.py"))
+    known |= set(re.findall(r"--[a-z][\w-]*", scripts)) | OF_OTHER_PROGRAMS
+    assert set(re.findall(r"(?<![\w-])--[a-z][\w-]*", text)) <= known
+
+
+def test_options_in_the_readmes_table_of_commands_are_options_of_their_command():
+    rows = re.findall(r"^\| `(fpp-(?:bench|eval) [^`]*)`[^|]*\|(.*)\|$", (ROOT / "README.md").read_text(), re.MULTILINE)
+    assert len(rows) >= len(COMMANDS)
+    for command, does in rows:
+        known = set(_options(_parser_and_words(command.split())[0]))
+        assert set(re.findall(r"`(--[a-z][\w-]*)", does)) <= known, command
+
+
+def test_python_of_the_readme_runs(tiny, tmp_path, monkeypatch):
+    """Block by block, with small datasets in the place of the named ones."""
+    from fpp_ml_bench.loaders.render import build
+    from fpp_ml_bench.optics import paper_rig
+
+    monkeypatch.chdir(tmp_path)
+    Path("data").mkdir()
+    Path("data/mini").symlink_to(tiny)
+    build(Path("data/small"), tiny_settings(rig=paper_rig(224), objects=("power_drill",)), workers=1)
+    blocks = [code for kind, code in FENCED.findall((ROOT / "README.md").read_text()) if kind == "python"]
+    assert len(blocks) == 4
+    for code in blocks:
+        exec(compile(code.replace("num_workers=2", "num_workers=0"), "README.md", "exec"), {})

@@ -1,5 +1,6 @@
 """Packaging: every package folder is installed, and the checkout works as the current folder too."""
 
+import ast
 import re
 import subprocess
 import sys
@@ -8,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from fpp_ml_bench.cli import EXTRAS
+from fpp_ml_bench.cli import COMMANDS, EXTRAS
+from fpp_ml_bench.cli.evaluate import SUBCOMMANDS
 
 ROOT = Path(__file__).resolve().parent.parent
 SUBPACKAGES = ("loaders", "evaluation", "baselines", "leaderboard")
@@ -124,8 +126,9 @@ def test_the_main_job_needs_no_extra(tiny, tmp_path):
     for words in (
         ("build", "built", "--objects", "cork", "--size", "176"),
         ("predict", "classical", tiny, "--out", "predictions"),
-        ("fpp-eval", "predictions", "--dataset", tiny, "--json", "result.json"),
+        ("fpp-eval", "predictions", "--dataset", tiny, "--json", "result.json", "--report", "report"),
         ("leaderboard", "result.json"),
+        ("leaderboard", "result.json", "--page", "page"),
     ):
         done = _without_extras(tmp_path, *words)
         assert done.returncode == 0, done.stderr
@@ -135,7 +138,10 @@ def test_the_main_job_needs_no_extra(tiny, tmp_path):
     ("words", "library", "extra"),
     [
         (("train", "loss/l1", "DATA", "--out", "run"), "(torch|accelerate)", "train"),
-        (("leaderboard", "--page", "page"), "(jinja2|matplotlib)", "page"),
+        (("predict", "phase-net", "DATA", "--out", "predictions"), "torch", "train"),
+        (("tradeoff", "DATA", "--quick", "--out", "tradeoff"), "torch", "train"),
+        (("diagnose", "unet-individual-rmse", "DATA", "--quick", "--out", "report"), "torch", "train"),
+        (("build", "more", "--objects", "cork", "--size", "176", "--cluster", "127.0.0.1:1"), "ray", "cluster"),
         (("stability", "--quick", "--out", "out"), "(mpmath|torch)", "(diagnose|train)"),
     ],
 )
@@ -151,6 +157,35 @@ def test_every_extra_lists_its_libraries():
     extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     for extra, libraries in EXTRAS.items():
         assert set(libraries) <= {re.split(r"[>=\[]", line)[0] for line in extras[extra]}
+
+
+def test_every_imported_library_is_a_dependency():
+    """What the package imports is of the standard library, a base dependency, or of an extra that `EXTRAS` names."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    names = {"yaml": "pyyaml", "PIL": "pillow", "cv2": "opencv-contrib-python-headless"}
+    base = {re.split(r"[>=\[]", line)[0].lower() for line in project["dependencies"]}
+    imported = set()
+    for top in ("fpp_ml_bench", *SUBPACKAGES):
+        for path in (ROOT / top).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text())):
+                if isinstance(node, ast.Import):
+                    imported |= {alias.name.partition(".")[0] for alias in node.names}
+                elif isinstance(node, ast.ImportFrom) and not node.level:
+                    imported.add(str(node.module).partition(".")[0])
+    outside = imported - set(sys.stdlib_module_names) - {"fpp_ml_bench"} - set(sum(EXTRAS.values(), ()))
+    needed = {names.get(name, name).lower().replace("_", "-") for name in outside}
+    assert needed <= base, needed - base
+    assert base <= needed, "a dependency that nothing imports"
+
+
+def test_ci_runs_every_command_without_extras():
+    """The script that CI runs in an environment without extras runs every command, not just its help."""
+    script = (ROOT / ".ci/without_extras").read_text()
+    for name in set(COMMANDS) - {"publish"}:  # which needs the network
+        assert re.search(rf"^ *(needs \w+ )?fpp-bench {name} ", script, flags=re.MULTILINE), name
+    for name in SUBCOMMANDS:
+        assert f"fpp-eval {name} " in script
+    assert ".ci/without_extras" in (ROOT / ".ci/run").read_text()
 
 
 def test_nothing_else_of_a_checkout_is_importable():

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import matplotlib
 from matplotlib.figure import Figure
-from rich.table import Table
 
 from fpp_ml_bench.baselines.tradeoff import points as results
 from fpp_ml_bench.baselines.tradeoff.drawing import Mark, Scatter, log_axes
@@ -16,6 +15,7 @@ from fpp_ml_bench.baselines.tradeoff.settings import Plan
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result import write_json
 from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.tables import Table
 
 ERRORS: dict[ErrorKey, str] = {
     "object_mae_mm": "object MAE (mm); a missing pixel costs its whole depth",
@@ -220,12 +220,7 @@ def _csv(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
 
 
 def _table(title: str, texts: Sequence[str], numbers: Sequence[str] = ()) -> Table:
-    table = Table(title=title, title_justify="left")
-    for column in texts:
-        table.add_column(column, overflow="fold")
-    for column in numbers:
-        table.add_column(column, justify="right")
-    return table
+    return Table(*texts, numbers=numbers, names=2, title=title)
 
 
 def plan_table(plan: Plan) -> Table:

@@ -3,8 +3,9 @@ text from a submission is shown as plain text, never as markup."""
 
 from __future__ import annotations
 
+from functools import partial
+
 from rich.console import Group
-from rich.table import Table
 from rich.text import Text
 
 from fpp_ml_bench.evaluation import report
@@ -13,17 +14,10 @@ from fpp_ml_bench.evaluation.report.html import interval_text, millimetres, perc
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.score import SIGNIFICANT, caution
 from fpp_ml_bench.files import printable
+from fpp_ml_bench.tables import Table
 
 WORST = 5
-
-
-def _table(first: str, titles: list[str], **options: str) -> Table:
-    """A table whose first column is text, and all others are numbers."""
-    table = Table(caption_justify="left", title_justify="left", **options)  # type: ignore[arg-type]
-    table.add_column(first)
-    for title in titles:
-        table.add_column(title, justify="right", no_wrap=True)
-    return table
+_table = partial(Table, elsewhere="--json FILE")
 
 
 def result_table(result: Result) -> Group:
@@ -41,9 +35,11 @@ def result_table(result: Result) -> Group:
 
 def _scores(result: Result) -> Table:
     objects, errors = len(result.per_object), ("mae", "rmse")
+    values = ("mean", "95% interval", "median", "pooled")
     table = _table(
         "Pixel set",
-        [f"{error.upper()}\n{title}" for error in errors for title in ("mean", "95% interval", "median", "pooled")],
+        numbers=[f"{error.upper()}\n{value}" for error in errors for value in values],
+        first_out=[f"{error.upper()}\n{value}" for value in reversed(values) for error in reversed(errors)],
         caption="mm; mean and median over samples, pooled over all pixels; 95% intervals of the means from a bootstrap "
         f"over {objects} {'object' if objects == 1 else 'objects'}",
     )
@@ -112,7 +108,8 @@ def _uncertainty(result: Result) -> Table | None:
         return None
     titles = ["Not\nstated", *(f"In {level}%\ninterval" for level in COVERED), "Sigma\nmean", "Sigma\nmedian", "NLL"]
     table = _table(
-        "Stated uncertainty", [*titles, "AUSE\nMAE", "MAE of the\nsurest 95%"],
+        "Stated uncertainty", numbers=[*titles, "AUSE\nMAE", "MAE of the\nsurest 95%"],
+        first_out=["Sigma\nmedian", "NLL", "In 99%\ninterval", "MAE of the\nsurest 95%"],
         caption="mm; of the pixels that state a sigma, those within its Gaussian intervals, means over samples; AUSE: "
         "area between the sparsification curves by sigma and by error, over all object pixels",
     )  # fmt: skip
@@ -130,7 +127,9 @@ def _worst(result: Result) -> Table | None:
     if not rows:
         return None
     titles = ["Object\nMAE", "Object\nRMSE", "Background\nMAE", "Near\nedges", "Not\nmeasured"]
-    table = _table("Sample", titles, title=f"Largest object MAE, {min(WORST, len(rows))} of {len(rows)} samples")
+    table = _table(
+        "Sample", numbers=titles, title=f"Largest object MAE, {min(WORST, len(rows))} of {len(rows)} samples"
+    )
     for row in sorted(rows, key=lambda row: (-(row.object_mae_mm or 0.0), row.sample))[:WORST]:
         errors = (row.object_mae_mm, row.object_rmse_mm, row.background_mae_mm)
         shares = (row.object_edge_share, row.object_missing_share)
@@ -142,7 +141,7 @@ def comparison_table(compared: report.Comparison) -> Group:
     """The comparison as rich tables."""
     titles = ["Second - first", "95% interval", "p", "Second lower in", "Second higher in", "Samples", "Objects"]
     about = "mm; mean of second - first over samples, 95% interval and p value of a sign-flip test over objects"
-    table = _table("Error", titles, caption=about)
+    table = _table("Error", numbers=titles, caption=about)
     for key, row in compared.differences.items():
         pixels, error = key.removesuffix("_mm").split("_")
         counts = (row.lower, row.higher, row.samples, row.objects)

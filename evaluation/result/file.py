@@ -22,6 +22,13 @@ from fpp_ml_bench.machine import describe_hardware
 from fpp_ml_bench.schema import validate
 
 MAX_BYTES = 64 * 1024 * 1024
+_OTHER_FILES = {
+    "shards": "the manifest of a dataset", "row_schema_version": "a row file of the leaderboard",
+    "groups": "a ranking, as fpp-bench leaderboard --json writes it",
+    "differences": "a comparison, as fpp-eval compare --json writes it",
+    "tradeoff_schema_version": "what fpp-bench tradeoff measured",
+}  # fmt: skip
+"""JSON files of this package that are no results, by a key that only they have."""
 
 
 def result_content(result: Result) -> dict[str, Any]:
@@ -90,7 +97,11 @@ def read_json(path: Path) -> Any:
 def parse_result(content: Any, path: Path) -> Result:
     """``content`` of the file ``path`` as a result that agrees with itself, or SubmissionError."""
     file = printable(str(path), 500)
-    version = content.get("schema_version") if isinstance(content, dict) else None
+    keys = content if isinstance(content, dict) else {}
+    for key, what in _OTHER_FILES.items():
+        if key in keys:
+            raise SubmissionError(f"{file} is not a result file but {what}; expected what fpp-eval --json writes")
+    version = keys.get("schema_version")
     if version not in get_args(SchemaVersion):
         given = "no schema_version" if version is None else f"schema_version {printable(version, 40)}"
         expected = f"expected a result file with schema_version {' or '.join(get_args(SchemaVersion))}, got {given}"

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 def draw_residuals(calibration: Calibration) -> bytes:
     """PNG of a calibration: for camera and projector the residuals by pose and the points in the image, and the RMS of
-    each pose. Needs matplotlib (the extra ``page``)."""
+    each pose."""
     from matplotlib import colormaps
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure

@@ -24,7 +24,6 @@ Command = ModuleType | SimpleNamespace
 
 EXTRAS = {
     "train": ("torch", "torchmetrics", "accelerate", "safetensors"),
-    "page": ("jinja2", "matplotlib"),
     "diagnose": ("captum", "mpmath"),
     "published": ("h5py",),
     "onnx": ("onnx", "onnxruntime", "onnxscript"),

@@ -2,10 +2,7 @@
 
 import argparse
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
-
-from rich.table import Column, Table
 
 from fpp_ml_bench import calibration, optics
 from fpp_ml_bench.cli import count
@@ -16,6 +13,7 @@ from fpp_ml_bench.examination import Examination
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders import captures, published, render
 from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.tables import Table
 
 SUMMARY = (
     "Find the rig that took captures: camera, projector and pose, from poses of a board or from frames with depth."
@@ -192,7 +190,7 @@ def _from_board(
             found.append(calibration.calibrate(poses, board, *sizes, lens, **options))
             advance(1)
     if len(found) > 1:
-        compared = Table("lens model", *(Column(name, justify="right") for name in ("RMS, px", "left out, px", "BIC")))
+        compared = Table("lens model", numbers=("RMS, px", "left out, px", "BIC"))
         for one in found:
             compared.add_row(
                 str(one.camera.lens), f"{one.stereo_rms_px:.4f}", f"{one.held_out_rms_px:.4f}", f"{one.bic:.0f}"
@@ -208,10 +206,8 @@ def _from_board(
         print(f"response        gamma {response.gamma:.3f} +- {response.sigma:.4f} of projector and camera together; "
               f"white on the board: {response.white_grey:.0f} of 255 grey levels")  # fmt: skip
     optics.save_rig(rig, args.out)
-    written = [args.out]
-    if find_spec("matplotlib"):  # of the extra page
-        written.append(args.out.with_suffix(".png"))
-        write_atomically(written[-1], calibration.draw_residuals(best))
+    written = [args.out, args.out.with_suffix(".png")]
+    write_atomically(written[-1], calibration.draw_residuals(best))
     if args.opencv is not None:
         errors = (best.camera_rms_px, best.projector_rms_px, best.stereo_rms_px)
         content = optics.OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m, *errors)
@@ -233,8 +229,8 @@ def _lenses(args: argparse.Namespace) -> list[tuple["calibration.Lens", "calibra
 
 def print_calibration(found: "calibration.Calibration") -> None:
     """Print the errors of every pose, and the rig with its standard uncertainties."""
-    columns = [Column(name, justify="right") for name in ("camera", "projector", "both", "left out")]
-    table = Table("", *columns, title="reprojection error (RMS, px; no point rejected)", title_justify="left")
+    columns = "camera", "projector", "both", "left out"
+    table = Table("", numbers=columns, title="reprojection error (RMS, px; no point rejected)")
     for pose in found.poses:
         errors = (pose.camera_rms_px, pose.projector_rms_px, pose.stereo_rms_px, pose.held_out_rms_px)
         named = f"{pose.name} (!)" if pose.name in found.spoilers else pose.name
@@ -261,10 +257,10 @@ def print_calibration(found: "calibration.Calibration") -> None:
 
 def print_fit(rig: "optics.Rig", fit: "calibration.DepthFit") -> None:
     """Print a fitted rig and its residuals: of all views together, and of the views with the largest RMS."""
-    columns = [Column(name, justify="right") for name in ("pixels", "no depth", "median", "sigma", "RMS", "RMS, px")]
+    columns = "pixels", "no depth", "median", "sigma", "RMS", "RMS, px"
     shown = sorted(fit.views, key=lambda view: -view.rms_mm if view.pixels else float("-inf"))[:_MOST_SHOWN]
     more = f", the worst {len(shown)} of {len(fit.views)} views" if len(shown) < len(fit.views) else ""
-    table = Table("", *columns, title=f"depth by the rig minus the depth given, mm{more}", title_justify="left")
+    table = Table("", numbers=columns, title=f"depth by the rig minus the depth given, mm{more}")
     for view in (*shown, fit.total):
         table.add_row(*_cells(view), end_section=view is shown[-1])
     projector, (x, y, z) = rig.projector, (MM_PER_M * shift for shift in rig.translation_m)

@@ -5,14 +5,13 @@ import sys
 from pathlib import Path
 from time import perf_counter
 
-from rich.table import Column, Table
-
 from fpp_ml_bench import optics
 from fpp_ml_bench.cli.console import progress_bar, say_findings, show, working_range
 from fpp_ml_bench.errors import CaptureError, DecodeError
 from fpp_ml_bench.examination import RefusedCapture
 from fpp_ml_bench.loaders import captures
 from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.tables import Table
 
 SUMMARY = "Decode captured frames: depth, point cloud, uncertainty, and the reason for every pixel without depth."
 EXAMPLES = (
@@ -89,7 +88,7 @@ def _print(result: "captures.DecodedCapture") -> None:
 
     counts, decoded = result.decoded.counts, result.decoded
     lit = decoded.reason.size - counts["low_modulation"] - counts["not_asked"]
-    table = Table("", Column("pixels", justify="right"), Column("of the lit", justify="right"))
+    table = Table("", numbers=("pixels", "of the lit"))
     for name, pixels in counts.items():
         if pixels:
             share = "" if name in ("low_modulation", "not_asked") else f"{100 * pixels / lit:.2f}%"

@@ -4,12 +4,11 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from rich.table import Column, Table
-
 from fpp_ml_bench import coding, design, optics
 from fpp_ml_bench.cli.console import show, working_range
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.tables import Table
 
 SUMMARY = "Find two carriers for crossed fringes whose phases agree at the true depth alone, and say what they cost."
 EXAMPLES = (
@@ -96,7 +95,7 @@ def _print(
           f"{near_mm:g} mm, window {assumed.window_px:g} px, projector blur {assumed.blur_px:g} px")  # fmt: skip
     names = ("projector px", "degrees", "image px", "rival, rad", "background", "error", "noise, mm", "wrong orders",
              "periods in range")  # fmt: skip
-    table = Table(*(Column(name, justify="right") for name in names), "")
+    table = Table("", numbers=names, names=3)
     front = [candidate for candidate in found.front if candidate.wrong_share <= MOST_WRONG]
     every = max(-(-len(front) // ROWS), 1)
     shown = {id(candidate): candidate for candidate in (*front[::every], found.proposed)}
@@ -105,9 +104,9 @@ def _print(
         crossed = candidate.crossed
         background = "-" if candidate.background_rad is None else f"{candidate.background_rad:.2f}"
         table.add_row(
-            _two(crossed.pitches_px, "g"), _two(crossed.angles_deg, "g"), _two(candidate.image_px, ".1f"),
+            about, _two(crossed.pitches_px, "g"), _two(crossed.angles_deg, "g"), _two(candidate.image_px, ".1f"),
             f"{candidate.rival_rad:.2f}", background, f"{candidate.sigma_rad:.2f}", f"{candidate.noise_mm:.3f}",
-            f"{100 * candidate.wrong_share:.3f}%", _two(candidate.turns, ".2f"), about,
+            f"{100 * candidate.wrong_share:.3f}%", _two(candidate.turns, ".2f"),
         )  # fmt: skip
     show(table)
     for candidate, about in others:

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from rich import progress as bar
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from fpp_ml_bench.baselines import diagnostics
@@ -14,6 +13,7 @@ from fpp_ml_bench.cli import count
 from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.machine import limit_threads, usable_cores
+from fpp_ml_bench.tables import Table
 
 SUMMARY = (
     "Diagnose a network or method with the paper's probes and further ones; writes an HTML report and a JSON file."
@@ -77,10 +77,7 @@ def run(args: argparse.Namespace) -> int:
             )
 
         results = diagnostics.diagnose(model, dataset, probe_names, settings, args.out, progress, _command(args))
-    table = Table(title=Text(model.title), title_justify="left")
-    table.add_column("Probe")
-    table.add_column("Summary", overflow="fold")
-    table.add_column("Seconds", justify="right")
+    table = Table("Probe", "Summary", numbers=("Seconds",), title=Text(model.title))
     for result in results:
         text = f"not run: {result.finding.skipped}" if result.finding.skipped else result.finding.summary
         table.add_row(result.probe.name, Text(text), "reused" if result.reused else f"{result.seconds:.1f}")

@@ -34,20 +34,18 @@ def explain(args: argparse.Namespace, account: Callable[[], Explanation]) -> Non
     if not (args.explain or args.explain_json):
         return
     explanation = account()
-    from rich.console import Console
-    from rich.table import Table
     from rich.text import Text
 
-    from fpp_ml_bench.cli.console import gigabytes
+    from fpp_ml_bench.cli.console import gigabytes, show
+    from fpp_ml_bench.tables import Table
 
     state = "left out" if explanation.skipping else "nothing left out (skipping is off); it would have been"
     rules = list(dict.fromkeys(line.rule for line in explanation.lines))
     table = Table(
-        title=Text(f"{explanation.command}: {state} ({explanation.subject})"), title_justify="left",
-        caption=Text("\n".join(f"[{number}] {rule}" for number, rule in enumerate(rules, 1))), caption_justify="left",
+        "what", "unit", numbers=("done", "left out", "share", "bytes", "seconds"),
+        title=Text(f"{explanation.command}: {state} ({explanation.subject})"), elsewhere="--explain-json FILE",
+        caption=Text("\n".join(f"[{number}] {rule}" for number, rule in enumerate(rules, 1))),
     )  # fmt: skip
-    for name in ("what", "unit", "done", "left out", "share", "bytes", "seconds"):
-        table.add_column(name, justify="left" if name in ("what", "unit") else "right")
     for line in explanation.lines:
         saved = line.seconds_saved
         seconds = "-" if saved is None else f"{saved:,.2g}" if abs(saved) < 10 else f"{saved:,.0f}"
@@ -56,7 +54,7 @@ def explain(args: argparse.Namespace, account: Callable[[], Explanation]) -> Non
             "-" if line.bytes_saved is None else gigabytes(line.bytes_saved),
             Text(f"{seconds} [{rules.index(line.rule) + 1}]"),
         )  # fmt: skip
-    Console().print(table)
+    show(table)
     if args.explain_json is not None:
         text = json.dumps(explanation.to_dict(), indent=1, allow_nan=False)
         write_atomically(args.explain_json, (text + "\n").encode("utf-8"))

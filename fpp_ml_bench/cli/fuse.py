@@ -53,16 +53,15 @@ def run(args: argparse.Namespace) -> int:
 
 def _print(name: str, scores: "dict[str, views.Row]") -> None:
     """Means over objects: the clouds, the contradicted pixels, the error with and without them."""
-    from rich.table import Table
-
     from fpp_ml_bench.cli.console import show
+    from fpp_ml_bench.tables import Table
 
     means = views.means(scores)
     objects = f"{len(scores)} object{'' if len(scores) == 1 else 's'}"
-    table = Table(title=f"{printable(name)}: {objects}, mean and 95% interval over objects", title_justify="left")
     near = f"within {views.WITHIN_MM:g} mm"
-    for title in ("cloud", "distance to the surface, mm", f"points {near}", f"surface covered {near}"):
-        table.add_column(title, justify="left" if title == "cloud" else "right")
+    columns = "distance to the surface, mm", f"points {near}", f"surface covered {near}"
+    title = f"{printable(name)}: {objects}, mean and 95% interval over objects"
+    table = Table("cloud", numbers=columns, title=title)
     for prefix, title in (("one", "one view"), ("all", "all views"), ("kept", "all views, consistent")):
         distance, *shares = (means[f"{prefix}_{key}"] for key in views.CLOUD_SCORES)
         table.add_row(title, _text(*distance), *(_percent(*share) for share in shares))

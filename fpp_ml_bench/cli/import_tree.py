@@ -5,14 +5,13 @@ import sys
 from pathlib import Path
 from time import perf_counter
 
-from rich.table import Column, Table
-
 from fpp_ml_bench import calibration, coding, optics
 from fpp_ml_bench.cli.calibrate import print_fit
 from fpp_ml_bench.cli.console import gigabytes, progress_bar, show
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders import captures, published, storage
 from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.tables import Table
 
 SUMMARY = (
     "Read a published tree (PNG fringes, .mat depth, raw scans), or the captures of a scanner, into the same dataset\n\
@@ -104,8 +103,7 @@ def _print_captures(manifest: "storage.Manifest") -> None:
     reasons = [name for name in reasons if any(name in row["refused_share"] for row in shown)]
     more = f", the {len(shown)} of {len(rows)} captures with the least decoded" if len(shown) < len(rows) else ""
     titles = "decoded", "modulation", *(name.replace("_", " ") for name in reasons)
-    table = Table("", *(Column(title, justify="right") for title in titles), title_justify="left",
-                  title=f"pixels decoded, their median modulation, and pixels refused{more}")  # fmt: skip
+    table = Table("", numbers=titles, title=f"pixels decoded, their median modulation, and pixels refused{more}")
     for row in shown:
         refused = (f"{100 * row['refused_share'].get(name, 0.0):.1f}%" for name in reasons)
         table.add_row(row["sample"], f"{100 * row['decoded_share']:.1f}%", f"{row['median_modulation']:.1f}", *refused)

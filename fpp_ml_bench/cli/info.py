@@ -6,13 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
 from fpp_ml_bench import calibration, optics
-from fpp_ml_bench.cli.console import gigabytes, millimetres
+from fpp_ml_bench.cli.console import gigabytes, millimetres, show
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.loaders import render, storage
+from fpp_ml_bench.tables import Table
 
 SUMMARY = "What a dataset holds: sizes, configurations, splits, rig, and how exact its ground truth is."
 EXAMPLES = ("fpp-bench info data/mini", "fpp-bench info data/mini --json | jq .splits")
@@ -71,13 +69,11 @@ def run(args: argparse.Namespace) -> int:
         print(line)
     print(f"settings        {', '.join(f'{key} {value}' for key, value in settings.items())}")
     title = "lengths in mm, means over samples; ground-truth error: decoded - exact depth"
-    table = Table("", title=title, title_justify="left")
     statistics = [*statistics, storage.whole_statistics(manifest)]
-    for split in statistics:
-        table.add_column(split["split"], justify="right")
+    table = Table("", numbers=[split["split"] for split in statistics], title=title, elsewhere="--json")
     for row_title, cell in _ROWS:
         table.add_row(row_title, *map(cell, statistics))
-    Console().print(table)
+    show(table)
     return 0
 
 

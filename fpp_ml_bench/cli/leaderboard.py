@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also print every pair of ranked rows: difference, interval, p value, who is behind")  # fmt: skip
     add("--paper", nargs="?", choices=_TABLES, const="all", metavar="TABLE",
         help=f"tables of the paper and of others: {', '.join(_TABLES)} (default: architecture, normalization, "
-             "oracle_order; without TABLE: all)",
+             "oracle_order, in the terminal only where no results are named; without TABLE: all)",
     )  # fmt: skip
     add("--page", type=Path, metavar="DIR",
         help="write the static page of the shipped rows, or of those given: index.html and a page for each submission",
@@ -63,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Rank, write the requested files, print the tables. Raises SubmissionError naming a file that is not valid."""
-    from fpp_ml_bench.cli.console import output_width, show
+    from fpp_ml_bench.cli.console import show
 
     if args.check and args.readme is None:
         raise SubmissionError("--check checks a README; give it with --readme FILE")
@@ -102,6 +102,10 @@ def run(args: argparse.Namespace) -> int:
         written = page.write_page(leaderboard.rank(entries), papers, args.page, settings)
         print(f"{args.page}: {len(written)} files; open {written[0]}")
         return 0
-    tables = leaderboard.group_tables(groups, args.sort, output_width(), args.pairs)
-    show(*tables, *leaderboard.paper_rich_tables(papers))
+    not_shown = len(papers) if args.results and args.paper is None else 0
+    tables = leaderboard.group_tables(groups, args.sort, args.pairs)
+    show(*tables, *leaderboard.paper_rich_tables(papers[not_shown:]))
+    if not_shown:
+        print(f"Not shown: {not_shown} tables that others reported on other data (--paper), and the leaderboard's own "
+              f"{len(leaderboard.shipped_rows())} rows (fpp-bench leaderboard without a file).")  # fmt: skip
     return 0

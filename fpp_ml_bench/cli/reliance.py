@@ -3,7 +3,6 @@
 import argparse
 from pathlib import Path
 
-from rich.table import Column, Table
 from rich.text import Text
 
 from fpp_ml_bench.baselines import diagnostics
@@ -13,6 +12,7 @@ from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation import result
 from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.machine import limit_threads
+from fpp_ml_bench.tables import Table
 
 SUMMARY = "Measure phase reliance: does the predicted depth follow the fringe's phase, or the object's outline?"
 EXAMPLES = (
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _table(title: str, reliance: "result.Reliance") -> Table:
     heading = Text(f"{title}: {reliance.samples} samples of {reliance.objects} objects")
-    table = Table("", Column("value", justify="right"), title=heading, title_justify="left")
+    table = Table("", numbers=("value",), title=heading)
     low, high = reliance.interval
     interval = "" if low is None or high is None else f" ({low:.2f} to {high:.2f})"
     table.add_row("phase reliance, 0 to 1", f"{reliance.score:.3f}{interval}")

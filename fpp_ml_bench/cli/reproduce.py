@@ -110,15 +110,14 @@ def _command(args: argparse.Namespace) -> str:
 
 
 def _list(tables: tuple[str, ...], folders: reproduce.Folders) -> None:
-    from rich.table import Column, Table
-
     from fpp_ml_bench.cli.console import show
     from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS
+    from fpp_ml_bench.tables import Table
 
     jobs = reproduce.planned(tables, folders.preset)
     titles = "Row", "Training", "State", "Rows written", "Published: object MAE"
-    columns = [Column(title, overflow="fold") for title in titles]
-    table = Table(*columns, title=f"preset {folders.preset}, {folders.runs}", title_justify="left")
+    first_out = "Rows written", "Published: object MAE", "Training"
+    table = Table(*titles, first_out=first_out, title=f"preset {folders.preset}, {folders.runs}")
     empty = 0
     for job in jobs:
         row_files = [folders.row(job.recipe, depth_range) for depth_range in reproduce.variants(job.recipe)]

@@ -5,8 +5,6 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from rich.table import Column, Table
-
 from fpp_ml_bench import optics
 from fpp_ml_bench.baselines import robustness
 from fpp_ml_bench.cli import add_pool_options, workers_of
@@ -18,6 +16,7 @@ from fpp_ml_bench.evaluation import report
 from fpp_ml_bench.loaders import render, storage
 from fpp_ml_bench.machine import limit_threads
 from fpp_ml_bench.remote import place, working_copy
+from fpp_ml_bench.tables import Table
 
 SUMMARY = (
     "Measure what breaks a method: scenes disturbed axis by axis, at five severities each, in the image formation."
@@ -125,10 +124,9 @@ def slug(setup: "robustness.Setup") -> str:
 def _table(setup: "robustness.Setup", rows: "dict[str, list[robustness.View]]") -> Table:
     """Errors by axis, clean and at each severity; shares at the last severity."""
     severities = (0, *setup.severities)
-    columns = [Column("axis", no_wrap=True)]
-    columns += [Column(f"severity {severity}" if severity else "clean", justify="right") for severity in severities]
-    columns += [Column(title, justify="right") for title in ("wrong orders", "unanswered", "confident errors")]
-    table = Table(*columns, title=f"{setup.method.title}: object MAE in mm", title_justify="left")
+    columns = [f"severity {severity}" if severity else "clean" for severity in severities]
+    columns += ["wrong orders", "unanswered", "confident errors"]
+    table = Table("axis", numbers=columns, title=f"{setup.method.title}: object MAE in mm")
     for axis, found in rows.items():
         means = robustness.by_severity(found)
         last = means[max(means)]

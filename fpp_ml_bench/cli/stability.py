@@ -55,14 +55,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _show(rows: Sequence[stability.Row]) -> None:
-    from rich.table import Table
     from rich.text import Text
 
     from fpp_ml_bench.cli.console import show
+    from fpp_ml_bench.tables import Table
 
-    table = Table()
-    for title in ("group", "cases", "within bound", "flagged", "FAIL", "largest error / bound", "CPU s"):
-        table.add_column(title, justify="left" if title == "group" else "right")
+    numbers = "cases", "within bound", "flagged", "FAIL", "largest error / bound", "CPU s"
+    table = Table("group", numbers=numbers, elsewhere="--json")
     for group, part in stability.summary(rows).items():
         *counts, ratio, cpu_s = part.values()
         text = ratio if isinstance(ratio, str) else stability.short(ratio)

@@ -20,8 +20,7 @@ _PLACES = np.linspace(0.0, 1.0, 400)
 
 def draw_design(rig: Rig, proposed: Candidate, other: Candidate, assumed: Assumptions) -> bytes:
     """PNG of the ``proposed`` pair beside an ``other`` one on ``rig``: both lines on the torus, the distance of the
-    nearest rival over depth, and that distance for all pairs of periods at the proposed angles. Needs matplotlib (the
-    extra ``page``)."""
+    nearest rival over depth, and that distance for all pairs of periods at the proposed angles."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

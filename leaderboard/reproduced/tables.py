@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from rich.table import Table
 from rich.text import Text
 
 from fpp_ml_bench.baselines import reproduce
@@ -11,7 +10,7 @@ from fpp_ml_bench.baselines.reproduce import MAIN_KEY
 from fpp_ml_bench.evaluation.report import percent
 from fpp_ml_bench.evaluation.result import Headline, write_file
 from fpp_ml_bench.leaderboard.columns import device
-from fpp_ml_bench.leaderboard.reported import paper_tables
+from fpp_ml_bench.leaderboard.reported import PAPER_DEPTHS, paper_tables
 from fpp_ml_bench.leaderboard.reproduced.lines import Line, table_lines
 from fpp_ml_bench.leaderboard.reproduced.orderings import (
     Ordering,
@@ -22,6 +21,7 @@ from fpp_ml_bench.leaderboard.reproduced.orderings import (
 )
 from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEASURED_HERE
 from fpp_ml_bench.leaderboard.tables import markdown_rows, markdown_text
+from fpp_ml_bench.tables import Table
 
 _TITLES = {"further": "Further directions of the paper (UNet, global normalisation, RMSE loss, frame 0)"}
 """Of the tables that the paper does not have."""
@@ -123,9 +123,9 @@ def table_rich(table: str, lines: Sequence[Line], preset: str) -> Table:
     title = f"{_title(table)}\nMAE / RMSE in mm. here: {MEASURED_HERE}, {preset} preset"
     if table in paper_tables():
         title += f"; paper: {BY_THE_PAPER}. Range predicted: object MAE / of its measured pixels / missing pixels"
-    rich_table = Table(title=Text(title), title_justify="left")
+    rich_table = Table(title=Text(title), elsewhere="the page below")
     for number, short in shown:
-        rich_table.add_column(Text(short), justify="right" if number > 1 else "left", overflow="fold")
+        rich_table.add_column(Text(short), justify="right" if number > 1 else "left")
     for row in cells:
         rich_table.add_row(*(Text(row[number]) for number, _ in shown))
     return rich_table
@@ -146,7 +146,7 @@ def _about(lines: Sequence[Line], in_the_paper: bool) -> list[str]:
     paper = (
         f" {BY_THE_PAPER.capitalize()}: its own data at 960 x 960 px, its authors' code; the two are shown beside each "
         "other, not ranked together. Rows of the oracle range track were given the test samples' depth range, here as "
-        "in the paper, and score the background in units of that range."
+        f"in the paper, and score the background in units of that range. {PAPER_DEPTHS}"
     )
     return ["", here + paper if in_the_paper else here]
 

@@ -4,7 +4,6 @@ import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -149,7 +148,7 @@ def write_capture(
     folder: Path, capture: CapturedFrames, rig: Rig, result: DecodedCapture, forms: Sequence[str] = FORMS
 ) -> None:
     """Write a decoded capture in place of what an earlier decoding left in ``folder``: the ``forms`` of
-    `export_capture`, maps as .npy, with matplotlib a picture, and `REPORT` at last."""
+    `export_capture`, maps as .npy, a picture, and `REPORT` at last."""
     clear_outputs(folder)
     decoded, found = result.decoded, result.decoded.depth_mm > 0
     export_capture(folder, decoded.depth_mm, rig.camera, result.grey, forms)
@@ -157,11 +156,10 @@ def write_capture(
         buffer = io.BytesIO()
         np.save(buffer, values)
         write_atomically(folder / f"{name}.npy", buffer.getvalue())
-    if find_spec("matplotlib"):  # of the extra page
-        title = f"{capture.files[0].parent.name}: {100 * found.mean():.1f}% of the pixels with depth"
-        maps = result.grey, decoded.depth_mm, result.sigma_mm, result.modulation, decoded.reason
-        findings = result.examination.findings
-        write_atomically(folder / "picture.png", capture_picture(title, *maps, [str(one) for one in findings]))
+    title = f"{capture.files[0].parent.name}: {100 * found.mean():.1f}% of the pixels with depth"
+    maps = result.grey, decoded.depth_mm, result.sigma_mm, result.modulation, decoded.reason
+    findings = [str(finding) for finding in result.examination.findings]
+    write_atomically(folder / "picture.png", capture_picture(title, *maps, findings))
     content = {
         "pixels": decoded.counts, "noise_grey": result.noise_grey, "noise_measured": result.noise_measured,
         "median_sigma_mm": float(np.median(result.sigma_mm[found])), "notes": list(result.notes),

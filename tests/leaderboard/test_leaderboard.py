@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from scored_dataset import make_dataset, write_predictions
 
+from fpp_ml_bench.baselines.tradeoff import points
 from fpp_ml_bench.cli import main
+from fpp_ml_bench.cli.evaluate import main as evaluate_main
 from fpp_ml_bench.evaluation.result import write_result
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.leaderboard import ranking, rows
@@ -253,6 +255,56 @@ def test_unsound_files_are_refused_by_name(make, capsys, tmp_path):
         assert captured.out == "" and not (tmp_path / "t.md").exists()
 
 
+@pytest.mark.parametrize(
+    ("content", "what"),
+    [
+        ('{"shards": [], "samples": {}, "schema_version": "2.0.0"}', "the manifest of a dataset"),
+        ('{"sorted_by": "object_mae_mm", "groups": []}', "a ranking"),
+        ('{"differences": {}, "per_sample": []}', "a comparison"),
+        ('{"tradeoff_schema_version": "1.0.0"}', "what fpp-bench tradeoff measured"),
+    ],
+)
+def test_another_file_is_called_by_what_it_is_in_one_line(content, what, make, capsys):
+    good = make("good.json", 1.0)
+    Path("other.json").write_text(content)
+    for command in (["leaderboard", "other.json"], ["leaderboard", str(good), "other.json"]):
+        assert main(command) == 2
+        line = capsys.readouterr().err
+        assert line.count("\n") == 1 and f"other.json is not a result file but {what}" in line
+    for words in (["compare", str(good), "other.json"], ["verify", "other.json", "predictions", "--dataset", "data"]):
+        assert evaluate_main(words) == 2
+        assert f"other.json is not a result file but {what}" in capsys.readouterr().err
+
+
+def test_the_files_that_this_package_writes_are_told_apart(tiny, make, capsys, tmp_path):
+    first, second = make("a.json", 1.0, name="a"), make("b.json", 2.0, name="b")
+    board(capsys, first, second, "--json", "board.json")
+    assert evaluate_main(["compare", str(first), str(second), "--json", "comparison.json"]) == 0
+    measured = Path(points.__file__).with_name("tradeoff.json")
+    for path in (tiny / "manifest.json", "board.json", "comparison.json", measured):
+        capsys.readouterr()
+        assert main(["leaderboard", str(path)]) == 2
+        assert "is not a result file but " in capsys.readouterr().err
+    board(capsys, first, "--row", "row.json")
+    assert evaluate_main(["compare", "row.json", str(second)]) == 0
+
+
+def test_named_results_are_shown_without_tables_of_others(make, capsys):
+    first = make("a.json", 1.0)
+    out = board(capsys, first)
+    assert "Reported by others" not in out and out.count("┡") == 1
+    assert out.endswith(
+        "Not shown: 3 tables that others reported on other data (--paper), and the leaderboard's own 0 rows "
+        "(fpp-bench leaderboard without a file).\n"
+    )
+    assert out.count("Not shown") == 1
+    for shown in (board(capsys), board(capsys, first, "--paper"), board(capsys, first, "--paper", "loss")):
+        assert "Reported by others" in shown and "Not shown" not in shown
+    assert "Not shown" not in board(capsys, first, "--paper", "none")
+    board(capsys, first, "--markdown", "board.md")
+    assert "Reported by others" in Path("board.md").read_text()
+
+
 def test_repetition_is_refused(make, capsys, tmp_path):
     first, second = make("first.json", 1.0), make("second.json", 2.0)
     assert main(["leaderboard", str(first), str(second)]) == 2
@@ -280,11 +332,14 @@ def test_unwritable_output_is_an_error(make, capsys, tmp_path):
     assert "can't be written" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("width", [80, 99, 100, 140, 200])
+@pytest.mark.parametrize("width", [80, 99, 100, 140, 200, 300])
 def test_numbers_stay_whole_in_narrow_terminals(width, make, capsys, monkeypatch):
     path = make("a.json", 1234.5, name="A rather long name of a method, with both directions and 18 steps")
     monkeypatch.setenv("COLUMNS", str(width))
     out = board(capsys, path, "--sort", "object_edge_mae_mm", "--paper", "none")
     assert all(len(line) <= width for line in out.splitlines())
-    assert out.count("1234.500") == {80: 4, 99: 4, 100: 4, 140: 5, 200: 6}[width]
-    assert ("In a wider terminal" in " ".join(out.split())) == (width < 170)
+    assert f"│ {cut_at_word('A rather long name of a method, with both directions and 18 steps')} │" in out
+    assert out.count("1234.500") == {80: 2, 99: 4, 100: 4, 140: 5, 200: 6, 300: 6}[width]
+    header = out.split("┡")[0]
+    assert "Edge" in header, "the rows are sorted by it"
+    assert ("Left out at" in out) == (width < 300)
