@@ -90,8 +90,12 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         help="weights of classical-net, phase-net or crossed-net: a file, such as training writes (default: those that "
              "come with the package)")  # fmt: skip
     add = parser.add_argument_group("constant").add_argument
-    add("--at", metavar="DEPTH", help="standoff, middle (of the working range), training-mean, or mm; range-middle or "
-        "range-training: a share of the sample's depth range, which it is given (default: standoff)")
+    add(
+        "--at",
+        metavar="DEPTH",
+        help="standoff, middle (of the working range), training-mean, or mm; range-middle or "
+        "range-training: a share of the sample's depth range, which it is given (default: standoff)",
+    )
     add = parser.add_argument_group("nearest").add_argument
     add("--training", type=Path, metavar="FOLDER", help="dataset with the training split (default: DATASET itself)")
     add = parser.add_argument_group("trained networks").add_argument
