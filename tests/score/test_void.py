@@ -8,7 +8,7 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE, RANGE_SHARE, SINCE_2
 from fpp_ml_bench.evaluation.report import compare, result_table, score_table
 from fpp_ml_bench.evaluation.result import parse_result, read_result, result_content, write_result
-from fpp_ml_bench.evaluation.score import DepthScores, evaluate, score_sample
+from fpp_ml_bench.evaluation.score import DepthScores, differences, evaluate, score_sample
 from fpp_ml_bench.loaders.sample import VOID, Flag, void_pixels
 
 
@@ -124,3 +124,14 @@ def test_results_of_protocol_1_are_read_and_keep_their_rules(dataset, tmp_path):
         parse_result({**content, "mode": "paper"}, tmp_path / "r.json")
     with pytest.raises(SubmissionError, match="void_pixels is missing"):
         parse_result({**content, "protocol_version": "2.0.0"}, tmp_path / "r.json")
+
+
+def test_a_result_of_an_earlier_schema_is_verified(dataset, tmp_path):
+    """Before schema 2.4.0 there was no object MAE over depth range."""
+    result = evaluate(write_predictions(tmp_path / "p", dataset, noise_mm=1.0), dataset)
+    content = {**result_content(result), "schema_version": "2.3.0"}
+    for block in (content["metrics"], content["median"], *content["per_sample"]):
+        del block[RANGE_SHARE]
+    for row in content["per_object"]:
+        del row["metrics"][RANGE_SHARE], row["spread"][RANGE_SHARE]
+    assert differences(parse_result(content, tmp_path / "r.json"), tmp_path / "p", dataset) == []
