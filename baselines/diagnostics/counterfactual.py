@@ -37,6 +37,7 @@ class Counterfactual(Probe):
 
     name = "counterfactual"
     title = "Counterfactual scenes"
+    version = 2
     question = "Does the predicted depth follow the fringe's phase, or the object's outline?"
 
     def run(

@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from difflib import get_close_matches
+from functools import cache
 from hashlib import sha256
 from importlib import import_module
 from importlib.metadata import version
@@ -54,7 +55,7 @@ def diagnose(
     ``command``. Raises `DiagnosisError` if ``out`` holds other files, and errors of probes; earlier findings stay."""
     _prepare(out)
     selected = checked_names(probe_names)
-    results = []
+    results, nothing = [], cache(lambda: subject.predicts_nothing(dataset))
     for name in PROBES:
         if name not in selected and not (out / f"{name}.json").is_file():
             continue
@@ -65,8 +66,8 @@ def diagnose(
             results.append(ProbeResult(probe, *stored, reused=True))
         elif name in selected:
             started = perf_counter()
-            if reason := probe.applies_to(subject):
-                finding = Finding(probe.name, probe.title, "", skipped=reason)
+            if reason := probe.applies_to(subject) or (nothing() if probe.asks_subject else None):
+                finding = probe.skip(reason)
             else:
                 finding = probe.run(subject, dataset, settings, out, progress(probe))
             seconds = round(perf_counter() - started, 2)

@@ -25,7 +25,12 @@ from fpp_ml_bench.optics import Direction, Rig
 
 Image = NDArray[np.float32]
 Source = tuple[str, str]  # a network, or `INPUT`, and a layer
-INPUT = "input"  # name of the raw input, which is probed like a layer as a control
+INPUT, SILHOUETTE, POSITION = "input", "silhouette", "position"
+"""Controls, which are probed like layers: the raw input, the object's mask (0 or 1), and the pixel's position as six
+features (1, x, y, x^2, x y, y^2), which uses no image."""
+OBJECT_DEPTH = "object_depth"  # depth on object pixels
+MEASURED = {"edges": ("edges", "image"), "depth": ("depth", "image"), OBJECT_DEPTH: ("depth", "object")}
+"""What is measured of the four-convolution probes: the target that they are trained on, and where they are compared."""
 RIDGE = 1e-6
 """Ridge strength per pixel for standardised channels; it only makes constant or duplicate channels solvable."""
 WIDTH = 16
@@ -205,6 +210,11 @@ class Moments:
         return mean.float(), factor.float()
 
 
+def mean_square(errors: Tensor, where: Tensor) -> list[float]:
+    """Mean square of each sample's ``errors`` over ``where``, both (B, 1, h, w)."""
+    return ((errors.double().square() * where).sum((1, 2, 3)) / where.sum((1, 2, 3))).tolist()
+
+
 class ConvolutionProbe(nn.Module):
     """Four convolutions from activations (B, C, h, w) to a target (B, 1, h, w); untrained they give ``target_mean``.
     The first is narrow so that layers of 8 and of 1024 channels get probes of similar capacity. The receptive field is
@@ -258,9 +268,12 @@ class ProbeSet:
     def errors(
         self, features: Mapping[Source, Tensor], targets: Mapping[str, Tensor]
     ) -> dict[tuple[Source, str, int], list[float]]:
-        """Mean squared error of every probe on each sample of a batch."""
+        """Mean squared error of every probe on each sample of a batch, by the names in `MEASURED`, which also names the
+        masks (B, 1, h, w) that ``targets`` holds."""
         errors = {}
         for (source, target, seed), probe in self.probes.items():
-            squared = (probe(features[source]) - targets[target]).double().square().mean((1, 2, 3))
-            errors[source, target, seed] = squared.tolist()
+            difference = probe(features[source]) - targets[target]
+            for name, (compared, where) in MEASURED.items():
+                if compared == target:
+                    errors[source, name, seed] = mean_square(difference, targets[where])
         return errors

@@ -2,13 +2,15 @@
 
 The paper shows a network a plane at 1.8 m in front of the background. Here planes have several distances and tilts,
 each filling the frame (no edge at all), as a rectangle in front of the background (the paper's scene), and cut to the
-silhouettes of test objects. For an individually normalised network the prediction is its own output, without range
-heads, converted to mm by the mean D_min and D_max of the test split: a facing plane has no depth range of its own.
+silhouettes of test objects. The paper does not give the size of its rectangle, so a facing one grows until it fills the
+frame. For an individually normalised network the prediction is its own output, without range heads, converted to mm by
+the mean D_min and D_max of the test split: a facing plane has no depth range of its own.
 """
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +26,7 @@ from fpp_ml_bench.baselines.diagnostics.plane_attention import (
 )
 from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene, SceneRenderer, plane
-from fpp_ml_bench.baselines.diagnostics.subjects import Subject
+from fpp_ml_bench.baselines.diagnostics.subjects import Subject, background_below
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.loaders.storage import DatasetFolder
@@ -32,11 +34,12 @@ from fpp_ml_bench.paper import paper_rows
 
 TILTS_DEG = ((0.0, 0.0), (20.0, 0.0), (0.0, 20.0))
 DISTANCES_M = (1.6, 1.8, 2.0)
-RECTANGLE_SIDE = 0.5  # side of the rectangle, as a share of the image's side
-NORMALISED_BACKGROUND = 0.1
 OUTLINES, QUICK_OUTLINES = 5, 2
 FRAME, RECTANGLE, SILHOUETTE = "fills the frame", "rectangle", "silhouette"
 """Kinds of outlines; a silhouette is named by its sample."""
+GROWING = {f"{RECTANGLE}, side {side:g}": side for side in (0.3, 0.45, 0.5, 0.6, 0.7, 0.8, 0.9, 0.96, 1.0)}
+"""Sides, as shares of the image's, of rectangles that face the camera at the paper's distance."""
+SIDES = {FRAME: 1.0, RECTANGLE: 0.5, **GROWING}
 STREAM = (0, "plane", "")
 PAPER = paper_rows()["probes"]["flat_plane"]
 PAPER_DISTANCE_M = PAPER["distance_m"]
@@ -57,8 +60,8 @@ class Scale:
 
     @property
     def limit(self) -> float:
-        """Predictions below it, which are nearer to background than to any object, collapsed to background."""
-        return NORMALISED_BACKGROUND if self.normalised else self.near_mm / 2
+        """Predictions below it collapsed to background."""
+        return background_below(self.normalised, self.near_mm)
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,7 @@ class FlatPlane(Probe):
 
     name = "flat-plane"
     title = "Flat plane"
+    version = 2
     question = "Is a plane without features predicted at its distance, or as background?"
 
     def applies_to(self, subject: Subject) -> str | None:
@@ -105,10 +109,10 @@ class FlatPlane(Probe):
         records = [dataset.measured(sample) for sample in dataset.samples("test")]
         ranges = [(record["depth_min_mm"], record["depth_max_mm"]) for record in records if record.get("depth_max_mm")]
         low, high = (float(np.mean(ends)) for ends in zip(*ranges, strict=True))
-        normalised = subject.units == "normalised" or subject.normalisation == "individual"
+        normalised = subject.answers_normalised
         scale = Scale(normalised, (low, high), renderer.rig.working_range_mm[0])
         outlines = outlines_of(dataset, settings)
-        total = len(DISTANCES_M) * len(TILTS_DEG) * (2 + len(outlines)) + len(outlines)
+        total = sum(len(poses_of(outline, settings.quick)) for outline in (*SIDES, *outlines))
         planes: list[PlanePrediction] = []
         for one in predict_planes(subject, renderer, outlines, settings.quick):
             planes.append(one)
@@ -116,7 +120,7 @@ class FlatPlane(Probe):
         control = control_of(subject, dataset, renderer, list(outlines), scale)
         rows, range_mm = [one.statistics(scale) for one in planes], [low, high] if normalised else None
         values = {"planes": rows, "objects": control, "range_mm": range_mm, "collapse_below": scale.limit}
-        found, figures = tables(rows, control, normalised), [draw(planes, normalised, folder)]
+        found, figures = tables(rows, control, normalised), [draw(planes, rows, normalised, folder)]
         if subject.network is not None:
             shown = next(p for p in planes if (p.outline, p.distance_m) == (RECTANGLE, PAPER_DISTANCE_M))
             heat = plane_heat(subject, shown.frame)
@@ -127,18 +131,17 @@ class FlatPlane(Probe):
 
 
 def kind_of(outline: str) -> str:
-    """`FRAME`, `RECTANGLE` or `SILHOUETTE`."""
-    return outline if outline in (FRAME, RECTANGLE) else SILHOUETTE
+    """A name in `SIDES`, or `SILHOUETTE`."""
+    return outline if outline in SIDES else SILHOUETTE
 
 
 def shown_to(
     subject: Subject, renderer: SceneRenderer, scene: Scene
 ) -> tuple[NDArray[np.uint8] | None, NDArray[np.float32]]:
-    """The first frame of ``scene`` that the subject uses, and its prediction (H, W) in mm, or the network's own output
-    where it is normalised. Range heads, which would convert it to mm, are not part of the paper's probe."""
+    """The first frame of ``scene`` that the subject uses, and its prediction (H, W) in mm, or normalised
+    (`Subject.answer`)."""
     frames = renderer.frames(scene, subject.frames_used, subject.uses_ground_truth_mask)
-    predict = subject.represent if subject.normalisation == "individual" else subject.predict
-    return frames[subject.frames_used[0]], predict(frames)
+    return frames[subject.frames_used[0]], subject.answer(frames)
 
 
 def outlines_of(dataset: DatasetFolder, settings: ProbeSettings) -> dict[str, NDArray[np.bool_]]:
@@ -151,24 +154,35 @@ def outlines_of(dataset: DatasetFolder, settings: ProbeSettings) -> dict[str, ND
     return {name: mask for name, mask in masks.items() if mask.any()}
 
 
+def poses_of(outline: str, quick: bool) -> list[tuple[tuple[float, float], float]]:
+    """Tilts in degrees and distances in m of the planes with ``outline``."""
+    facing = outline in GROWING
+    tilts, distances = TILTS_DEG[: 1 if quick or facing else None], (PAPER_DISTANCE_M,) if facing else DISTANCES_M
+    return list(product(tilts, distances))
+
+
+def rectangle(shape: tuple[int, int], side: float) -> NDArray[np.bool_]:
+    """Mask of ``shape`` (H, W) of a central rectangle whose sides are the share ``side`` of the image's."""
+    mask = np.zeros(shape, dtype=bool)
+    down, across = (round(length * (1 - side) / 2) for length in shape)
+    mask[down : shape[0] - down, across : shape[1] - across] = True
+    return mask
+
+
 def predict_planes(
     subject: Subject, renderer: SceneRenderer, outlines: dict[str, NDArray[np.bool_]], quick: bool = False
 ) -> Iterator[PlanePrediction]:
     """Every plane, rendered and predicted."""
-    height, width = renderer.shape
-    rectangle = np.zeros(renderer.shape, dtype=bool)
-    down, across = (round(side * (1 - RECTANGLE_SIDE) / 2) for side in renderer.shape)
-    rectangle[down : height - down, across : width - across] = True
-    for outline, mask in {FRAME: np.ones(renderer.shape, dtype=bool), RECTANGLE: rectangle, **outlines}.items():
-        for tilt in TILTS_DEG[: 1 if quick else None]:
-            for distance_m in DISTANCES_M:
-                surface = plane(renderer.rig, distance_m, tilt, mask)
-                lit, seen = renderer.light(surface), mask.copy()
-                seen.ravel()[surface.pixels] &= lit.gain > 0  # no fringe beyond the projector's field
-                scene = Scene(surface.pixels.astype(np.uint32), lit, seen, STREAM)
-                frame, answer = shown_to(subject, renderer, scene)
-                depth_mm = surface.depth_mm(renderer.shape)
-                yield PlanePrediction(outline, distance_m, tilt, seen, depth_mm, np.asarray(frame), answer)
+    masks = {outline: rectangle(renderer.shape, side) for outline, side in SIDES.items()} | outlines
+    for outline, mask in masks.items():
+        for tilt, distance_m in poses_of(outline, quick):
+            surface = plane(renderer.rig, distance_m, tilt, mask)
+            lit, seen = renderer.light(surface), mask.copy()
+            seen.ravel()[surface.pixels] &= lit.gain > 0  # no fringe beyond the projector's field
+            scene = Scene(surface.pixels.astype(np.uint32), lit, seen, STREAM)
+            frame, answer = shown_to(subject, renderer, scene)
+            depth_mm = surface.depth_mm(renderer.shape)
+            yield PlanePrediction(outline, distance_m, tilt, seen, depth_mm, np.asarray(frame), answer)
 
 
 def control_of(
@@ -188,7 +202,8 @@ def control_of(
 
 
 def summary(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) -> str:
-    """The share that collapsed in each outline, the mean at the paper's distance, and for mm those at all distances."""
+    """The share that collapsed in each outline and by size, the mean at the paper's distance, and for mm those at all
+    distances."""
     shares = {kind: float(np.mean([row["collapsed_share"] for row in rows if kind_of(row["outline"]) == kind]))
               for kind in (RECTANGLE, FRAME, SILHOUETTE)}  # fmt: skip
     facing = [row for row in rows if row["outline"] == RECTANGLE and row["tilt_deg"] == [0.0, 0.0]]
@@ -203,9 +218,12 @@ def summary(rows: Sequence[Row], control: Mapping[str, float], normalised: bool)
         f"fills the frame, {shares[SILHOUETTE]:.0%} of a plane in an object's outline; "
         f"{control['collapsed_share']:.0%} of real objects ({control['collapsed_share_true']:.0%} in truth). The "
         f"prediction for the rectangle at 1.8 m has a mean of {mean_text} and a spread of {paper['answer_std']:.3g}, "
-        f"from {paper['answer_min']:.3g} to {paper['answer_max']:.3g}"
+        f"from {paper['answer_min']:.4g} to {paper['answer_max']:.4g}"
         f"{' (paper: {:g} to {:g})'.format(*PAPER['answer_range']) if normalised else ''}."
     )
+    collapsed = {GROWING[row["outline"]]: row["collapsed_share"] for row in rows if row["outline"] in GROWING}
+    sizes = ", ".join(f"{share:.0%} at {side:g}" for side, share in collapsed.items())
+    text += f" Share of a facing rectangle there predicted as background, by its side relative to the image's: {sizes}."
     if not normalised:
         means = ", ".join(f"{row['mean_mm']:.0f}" for row in facing)
         distances = ", ".join(f"{1000 * row['distance_m']:.0f}" for row in facing)
@@ -217,7 +235,7 @@ def tables(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) 
     """A row per plane; silhouettes as means over objects."""
     unit = "of range" if normalised else "mm"
     poses = defaultdict(list)
-    for row in rows:  # frame, rectangle, then silhouettes
+    for row in rows:  # in the order of `SIDES`, then silhouettes
         poses[kind_of(row["outline"]), row["distance_m"], *row["tilt_deg"]].append(row)
     lines = []
     for (kind, distance_m, across, down), same_pose in poses.items():
@@ -237,12 +255,13 @@ def tables(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) 
     return [Table(title, header, lines), Table("Share of background: the control", ("Pixels of", "Share"), shares)]
 
 
-def draw(planes: Sequence[PlanePrediction], normalised: bool, folder: Path) -> Figure:
-    """The paper's figure, input and prediction, for each outline at 1.8 m, and the distribution of the predictions."""
+def draw(planes: Sequence[PlanePrediction], rows: Sequence[Row], normalised: bool, folder: Path) -> Figure:
+    """The paper's figure, input and prediction, for each outline at 1.8 m, and the distribution of the predictions,
+    and what changes with distance and size."""
     facing = [shown for shown in planes if shown.distance_m == PAPER_DISTANCE_M and shown.tilt_deg == (0.0, 0.0)]
     examples = [next(shown for shown in facing if shown.outline == kind) for kind in (FRAME, RECTANGLE)]
     examples += [shown for shown in facing if kind_of(shown.outline) == SILHOUETTE][:1]
-    sheet = Sheet(2, len(examples) + 1, 11, 5.2, width_ratios=[1] * len(examples) + [1.5])
+    sheet = Sheet(2, len(examples) + 2, 13.5, 5.2, width_ratios=[1] * len(examples) + [1.5, 1.5])
     low, high = (-0.2, 1.2) if normalised else (0.0, 2400.0)
     unit, digits = ("share of range", 2) if normalised else ("mm", 0)
     for (above, below), shown in zip(sheet.axes.T, examples, strict=False):
@@ -253,18 +272,23 @@ def draw(planes: Sequence[PlanePrediction], normalised: bool, folder: Path) -> F
         image = sheet.picture(below, shown.prediction, title, "viridis", low, high)
     sheet.scale(image, sheet.axes[1, : len(examples)], fraction=0.05, pad=0.02, label=unit)
     _against_distance(sheet, planes, normalised)
-    axis, bins = sheet.axes[1, -1], np.linspace(low, high, 57)
+    axis, bins = sheet.axes[1, -2], np.linspace(low, high, 57)
     for shown in examples:
         values = np.clip(shown.prediction[shown.mask], low, high)
         axis.hist(values, bins, histtype="step", weights=np.full(values.size, 1 / values.size), label=shown.outline)
     sheet.tidy(axis, "Predictions at 1.8 m (end bins: beyond)", unit, "share of pixels")
     axis.legend(fontsize=7, frameon=False)
-    alt = "Fringes on planes in three outlines, the predictions, their means against the distance, and their spread"
+    sizes = [row for row in rows if row["outline"] in GROWING]
+    lines = ("answer_mean", "Mean prediction", unit), ("collapsed_share", "Predicted as background", "share of pixels")
+    for axis, (key, title, label) in zip(sheet.axes[:, -1], lines, strict=True):
+        axis.plot(list(GROWING.values()), [row[key] for row in sizes], "s-", markersize=5)
+        sheet.tidy(axis, f"{title}, 1.8 m", "side of the rectangle, share of the image's", label)
+    alt = "Fringes on planes in three outlines, the predictions, and their means against distance and size"
     return sheet.save(folder, "flat_plane.png", "Flat planes", alt)
 
 
 def _against_distance(sheet: Sheet, planes: Sequence[PlanePrediction], normalised: bool) -> None:
-    axis, scale = sheet.axes[0, -1], 1.0 if normalised else 1000.0
+    axis, scale = sheet.axes[0, -2], 1.0 if normalised else 1000.0
     for kind, mark in ((FRAME, "o"), (RECTANGLE, "s"), (SILHOUETTE, "^")):
         points = defaultdict(list)
         for shown in planes:

@@ -46,6 +46,7 @@ class GradCam(probe.Probe):
     title = "Grad-CAM"
     question = "Which pixels change the mean prediction: those at edges, or those with fringes?"
     without_network = "it has no gradient to follow"
+    version = 2
 
     def run(
         self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, folder: Path, progress: Progress
@@ -56,6 +57,8 @@ class GradCam(probe.Probe):
         seeds = settings.seeds or (1 if settings.quick else SEEDS)
         layers = cam_layers(subject)
         correlations = measure(subject, dataset, samples, layers, seeds, progress)
+        if correlations.average(EDGES).r is None:
+            return self.skip(f"the heatmaps of every layer of {subject.name} ({', '.join(layers)}) are constant.")
         protocol = {
             "split": "test", "samples": len(samples), "seeds": seeds, "layers": list(layers),
             "score": "mean prediction", "heatmap": "ReLU, bilinear to the image",

@@ -1,7 +1,8 @@
 """Linear probing (paper Section 7.1), extended by a linear probe, the phase and order as targets, and controls.
 
 Probes of two kinds (`fpp_ml_bench.baselines.diagnostics.fits`) are fitted to the layers of a network, of the same
-network with random weights, and to controls: the raw input and the pixel's position.
+network with random weights, and to controls: the raw input, the object's mask and the pixel's position. Background has
+depth 0, so the mask alone explains much of an image's depth; therefore depth is measured on object pixels too.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -12,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from fpp_ml_bench.baselines.diagnostics import fits, linear_report
+from fpp_ml_bench.baselines.diagnostics.fits import INPUT, MEASURED, OBJECT_DEPTH, POSITION, SILHOUETTE
 from fpp_ml_bench.baselines.diagnostics.linear_report import CONTROLS, TRAINED, UNTRAINED, Scores, score
 from fpp_ml_bench.baselines.diagnostics.probe import Finding, Probe, ProbeSettings, Progress
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
@@ -23,14 +25,13 @@ from fpp_ml_bench.loaders.storage import DatasetFolder
 SAMPLES, QUICK_SAMPLES, QUICK_EPOCHS = 120, 24, 4
 """Training samples of the probes, and training samples and epochs of a quick run."""
 SEEDS = 2
-POSITION = "position"  # the pixel's position as six features (1, x, y, x^2, x y, y^2): a control that uses no image
 PIXELS = 1024  # pixels drawn with replacement from each sample: so many over the image, and as many within the object
 TARGETS: dict[str, tuple[str, ...]] = {
-    "edges": ("edges",), "depth": ("depth",), "distance": ("depth_mm",), "phase": ("sine", "cosine"),
-    "order": ("order",),
+    "edges": ("edges",), "depth": ("depth",), OBJECT_DEPTH: ("depth",), "distance": ("depth_mm",),
+    "phase": ("sine", "cosine"), "order": ("order",),
 }  # fmt: skip
 """Targets of the linear probe, by the names in `fits.truth`; the phase is an angle and so has two."""
-INSIDE = ("distance", "phase", "order")  # targets on object pixels only
+INSIDE = (OBJECT_DEPTH, "distance", "phase", "order")  # targets on object pixels only
 FRINGE = ("phase", "order")  # targets that need fringes of a single direction
 SPATIAL = ("edges", "depth")  # targets of the four-convolution probes, as in the paper
 
@@ -46,6 +47,7 @@ class LinearProbing(Probe):
     title = "Linear probing"
     question = "What can be read from each layer: edges, depth, the fringe's phase, its order?"
     without_network = "it has no layers to probe"
+    version = 2
 
     def run(
         self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, folder: Path, progress: Progress
@@ -62,7 +64,12 @@ class LinearProbing(Probe):
             progress(done, total, activity)
 
         experiment = Experiment(subject, dataset, train, validation, tick)
-        linear, spatial = experiment.linear_scores(seeds), experiment.spatial_scores(seeds, epochs)
+        linear = experiment.linear_scores(seeds)
+        # A linear probe of constant features is the mean itself.
+        if not any(target["r2"] for layer in linear[TRAINED].values() for target in layer.values()):
+            layers = ", ".join(subject.layer_names)
+            return self.skip(f"every probed layer of {subject.name} ({layers}) is constant, so it holds nothing.")
+        spatial = experiment.spatial_scores(seeds, epochs)
         protocol = {
             "training_samples": len(train), "validation_samples": len(validation), "seeds": seeds,
             "epochs": epochs, "batch": fits.BATCH, "probe_width": fits.WIDTH,
@@ -132,10 +139,10 @@ class Experiment:
     def linear_scores(self, seeds: int) -> Scores:
         """Scores of the linear probes: of the network, of ``seeds`` untrained copies, and of the controls."""
         network, untrained = self.subject.networks()
-        scores: Scores = {TRAINED: {}, UNTRAINED: {}, CONTROLS: {}}
         errors, reference = self.linear_errors(network, controls=True)
+        scores: Scores = {TRAINED: {}, UNTRAINED: {}, CONTROLS: {}}
         for (layer, target), sample_errors in errors.items():
-            source = CONTROLS if layer in (fits.INPUT, POSITION) else TRAINED
+            source = CONTROLS if layer in linear_report.CONTROL_TITLES else TRAINED
             scores[source].setdefault(layer, {})[target] = score([sample_errors], reference[target], self.objects)
         random_errors = [self.linear_errors(untrained(seed))[0] for seed in range(seeds)]
         for layer, target in random_errors[0]:
@@ -145,7 +152,7 @@ class Experiment:
 
     def linear_errors(self, network: nn.Module, controls: bool = False) -> tuple[Errors, dict[str, list[float]]]:
         """Errors of the 1 x 1 probes of ``network``'s layers, and those of predicting the mean, by target. With
-        ``controls`` the raw input and the position are probed like layers."""
+        ``controls`` these are probed like layers."""
         equations: dict[tuple[str, bool], fits.NormalEquations] = {}
         for layer, key, features, targets in self._pixel_batches(network, self.train, "training", controls):
             if (layer, key) not in equations:
@@ -182,7 +189,8 @@ class Experiment:
 
             activations = fits.activations_of(network, layers, fringe, take, self.subject.name)
             if controls:
-                activations[fits.INPUT] = take(fringe)
+                masks = np.stack([[object_mask(self.dataset.depth_mm(name))] for name in names], dtype=np.float32)
+                activations[INPUT], activations[SILHOUETTE] = take(fringe), take(torch.from_numpy(masks))
                 activations[POSITION] = torch.stack([_position(chosen, size) for chosen in pixels.values()])
             for layer, of_sets in activations.items():
                 for key, features in zip(pixels, of_sets, strict=True):
@@ -190,66 +198,70 @@ class Experiment:
             self.tick(len(names), f"{activity} linear probes")
 
     def spatial_scores(self, seeds: int, epochs: int) -> Scores:
-        """Scores of the four-convolution probes: of the network, of an untrained copy, and of the raw input."""
+        """Scores of the four-convolution probes: of the network, of an untrained copy, and of the controls."""
         network, untrained = self.subject.networks()
         # Each seed of the untrained network costs another forward pass per batch, so there is one.
-        seed_counts = {TRAINED: seeds, fits.INPUT: seeds, UNTRAINED: 1}
+        seed_counts = {TRAINED: seeds, CONTROLS: seeds, UNTRAINED: 1}
         errors, reference = self.spatial_errors({TRAINED: network, UNTRAINED: untrained(0)}, seed_counts, epochs)
         scores: Scores = {TRAINED: {}, UNTRAINED: {}, CONTROLS: {}}
         for (source, layer), target in dict.fromkeys(key[:2] for key in errors):
             seed_errors = [errors[(source, layer), target, seed] for seed in range(seed_counts[source])]
-            layer_scores = scores[CONTROLS if source == fits.INPUT else source].setdefault(layer, {})
-            layer_scores[target] = score(seed_errors, reference[target], self.objects)
+            scores[source].setdefault(layer, {})[target] = score(seed_errors, reference[target], self.objects)
         return scores
 
     def spatial_errors(
         self, networks: Mapping[str, nn.Module], seeds: Mapping[str, int], epochs: int
     ) -> tuple[dict[tuple[fits.Source, str, int], list[float]], dict[str, list[float]]]:
-        """Errors of the four-convolution probes, trained for ``epochs``, by network and layer, target and seed; and
-        those of predicting the mean, by target. The raw input has `INPUT` as network and layer; ``seeds``: number of
-        seeds of each network and the input."""
+        """Errors of the four-convolution probes, trained for ``epochs``, by network and layer, name in `MEASURED` and
+        seed; and those of predicting the mean, by that name. Controls are layers of the network `CONTROLS`; ``seeds``:
+        number of seeds of each network."""
         moments: dict[fits.Source, fits.Moments] = {}
-        sums, counts = dict.fromkeys(SPATIAL, 0.0), dict.fromkeys(SPATIAL, 0)
+        sums, sizes = dict.fromkeys(MEASURED, 0.0), dict.fromkeys(MEASURED, 0.0)
         for features, targets in self._map_batches(networks, self.train, "spread of the activations"):
             for source, maps in features.items():
                 moments.setdefault(source, fits.Moments()).add(maps)
-            for target, values in targets.items():
-                sums[target] += float(values.double().sum())
-                counts[target] += values.numel()
-        means = {target: sums[target] / counts[target] for target in SPATIAL}
+            for name, (target, where) in MEASURED.items():
+                sums[name] += float((targets[target] * targets[where]).double().sum())
+                sizes[name] += float(targets[where].double().sum())
+        means = {name: sums[name] / sizes[name] for name in MEASURED}
         steps = epochs * -(-len(self.train) // fits.BATCH)
-        probes = fits.ProbeSet(moments, means, {source: seeds[source[0]] for source in moments}, steps)
+        starts = {target: means[target] for target in SPATIAL}
+        probes = fits.ProbeSet(moments, starts, {source: seeds[source[0]] for source in moments}, steps)
         for epoch in range(epochs):
             shuffled = [self.train[index] for index in np.random.default_rng([1, epoch]).permutation(len(self.train))]
             for features, targets in self._map_batches(networks, shuffled, "training four-convolution probes"):
                 probes.step(features, targets)
         errors: dict[tuple[fits.Source, str, int], list[float]] = {}
-        reference: dict[str, list[float]] = {target: [] for target in SPATIAL}
+        reference: dict[str, list[float]] = {name: [] for name in MEASURED}
         for features, targets in self._map_batches(networks, self.validation, "validating four-convolution probes"):
             for probe, sample_errors in probes.errors(features, targets).items():
                 errors.setdefault(probe, []).extend(sample_errors)
-            for target, values in targets.items():
-                reference[target] += (values.double() - means[target]).square().mean((1, 2, 3)).tolist()
+            for name, (target, where) in MEASURED.items():
+                reference[name] += fits.mean_square(targets[target].double() - means[name], targets[where])
         return errors, reference
 
     def _map_batches(
         self, networks: Mapping[str, nn.Module], samples: Sequence[str], activity: str
     ) -> Iterator[tuple[dict[fits.Source, Tensor], dict[str, Tensor]]]:
-        """Activations (B, C, h, w) of every layer and targets (B, 1, h, w), on one grid."""
+        """Activations (B, C, h, w) of every layer, and targets and masks (B, 1, h, w) of `MEASURED`, on one grid."""
         (height, width), step = self.subject.image_size, fits.grid_step(self.subject.image_size)
         side = max(1, height // step), max(1, width // step)
         for names, fringe in self.subject.batches(self.dataset, samples, fits.BATCH):
-            features = {(fits.INPUT, fits.INPUT): fits.at_size(fringe, side)}
+            depths = [self.dataset.depth_mm(name) for name in names]
+            map_of = {"edges": fits.edge_map, "depth": fits.normalised_depth, "object": object_mask}
+            stacks = {key: np.stack(list(map(make, depths)), dtype=np.float32) for key, make in map_of.items()}
+            targets = {key: fits.at_size(torch.from_numpy(maps)[:, None], side) for key, maps in stacks.items()}
+            share = targets["object"]  # of the object in each grid cell
+            features = {(CONTROLS, INPUT): fits.at_size(fringe, side), (CONTROLS, SILHOUETTE): share}
             for source, network in networks.items():
                 layers = self.subject.layers_of(network)
                 activations = fits.activations_of(
                     network, layers, fringe, lambda maps: fits.at_size(maps, side), self.subject.name
                 )
                 features |= {(source, layer): activations[layer] for layer in layers}
-            depths = [self.dataset.depth_mm(name) for name in names]
-            map_of = {"edges": fits.edge_map, "depth": fits.normalised_depth}
-            stacks = {key: np.stack([make(depth_mm) for depth_mm in depths]) for key, make in map_of.items()}
-            yield features, {key: fits.at_size(torch.from_numpy(maps)[:, None], side) for key, maps in stacks.items()}
+            # Cells across the outline mix depth with background; of a tiny object those with the largest share count.
+            targets["object"] = (share == share.amax((2, 3), keepdim=True)).float()
+            yield features, {**targets, "image": torch.ones_like(share)}
             self.tick(len(names), activity)
 
 

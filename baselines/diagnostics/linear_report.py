@@ -6,19 +6,18 @@ from typing import Any
 
 import numpy as np
 
-from fpp_ml_bench.baselines.diagnostics.fits import INPUT
+from fpp_ml_bench.baselines.diagnostics.fits import INPUT, MEASURED, OBJECT_DEPTH, POSITION, SILHOUETTE
 from fpp_ml_bench.baselines.diagnostics.probe import Cell, Figure, Sheet, Table, with_interval
 from fpp_ml_bench.evaluation.score import object_interval
 from fpp_ml_bench.paper import AVERAGE, LAYERS, paper_layers, said_by_paper
 
 PAPER = "linear_probing"
 TITLES = {
-    "edges": "edges", "depth": "depth, whole image", "distance": "depth in mm, object", "phase": "wrapped phase",
-    "order": "fringe order",
+    "edges": "edges", "depth": "depth, whole image", OBJECT_DEPTH: "depth, object", "distance": "depth in mm, object",
+    "phase": "wrapped phase", "order": "fringe order",
 }  # fmt: skip
-_CONTROLS = {INPUT: "raw input", "position": "pixel's position alone"}
-_BAR = 0.38
-
+CONTROL_TITLES = {INPUT: "raw input", SILHOUETTE: "object's mask alone", POSITION: "pixel's position alone"}
+_LINES = dict(zip(CONTROL_TITLES, (":", "-.", "--"), strict=True))
 
 TRAINED, UNTRAINED, CONTROLS = "trained", "untrained", "controls"
 Score = dict[str, Any]
@@ -74,15 +73,19 @@ def ratio_of_means(layer: Mapping[str, Score]) -> float:
 
 def summary(linear: Scores, spatial: Scores) -> str:
     """The result in a few sentences."""
-    trained, raw = spatial[TRAINED], spatial[CONTROLS]
-    edges, depth = (mean_over(trained, target, "r2") for target in ("edges", "depth"))
-    easier = "edges are" if edges > depth else "depth is"
+    trained, controls = spatial[TRAINED], spatial[CONTROLS]
+    raw, mask = controls[INPUT], controls[SILHOUETTE]
+    edges, depth, on_object = (mean_over(trained, target, "r2") for target in MEASURED)
     papers = paper_layers(PAPER)[AVERAGE]["ratio"]
     text = (
         f"The paper's ratio, depth MSE over edge MSE, is {mean_ratio(trained):.2f} (paper: {papers:.2f}). The raw "
-        f"input alone gives {mean_ratio(raw):.2f}, and a probe that predicts each target's mean "
-        f"{ratio_of_means(raw[INPUT]):.2f}, because the two errors have different units. As a share of the explained "
-        f"variance, {easier} easier to read on average over layers (R2 {edges:.2f} for edges, {depth:.2f} for depth)."
+        f"input alone gives {mean_ratio({INPUT: raw}):.2f}, and a probe that predicts each target's mean "
+        f"{ratio_of_means(raw):.2f}, because the two errors have different units. On average over layers R2 is "
+        f"{edges:.2f} for edges and {depth:.2f} for depth. The object's mask alone gives {mask['edges']['r2']:.2f} and "
+        f"{mask['depth']['r2']:.2f}, so R2 over the whole image can come from the outline and does not show which of "
+        f"the two is easier to read. For depth on object pixels R2 is {on_object:.2f} (random weights "
+        f"{mean_over(spatial[UNTRAINED], OBJECT_DEPTH, 'r2'):.2f}, raw input {raw[OBJECT_DEPTH]['r2']:.2f}, mask "
+        f"{mask[OBJECT_DEPTH]['r2']:.2f})."
     )
     if "phase" in linear[CONTROLS][INPUT]:
         r2 = {layer: scores["phase"]["r2"] for layer, scores in linear[TRAINED].items()}
@@ -98,66 +101,66 @@ def tables(linear: Scores, spatial: Scores) -> list[Table]:
     """The paper's table first, then the same probes as shares of variance, then the linear probes; with controls."""
     trained, untrained, raw = spatial[TRAINED], spatial[UNTRAINED], spatial[CONTROLS][INPUT]
     rows = {layer: {layer: targets} for layer, targets in trained.items()}
-    rows |= {"Average": trained, "Average, random weights": untrained, "Raw input": spatial[CONTROLS]}
-    keys = ("edges", "depth")
+    rows |= {"Average": trained, "Average, random weights": untrained}
+    rows |= {CONTROL_TITLES[name]: {name: targets} for name, targets in spatial[CONTROLS].items()}
     beside = {*trained, AVERAGE} == set(paper_layers(PAPER))
     errors: list[tuple[Cell, ...]] = [
         (
             f"{name} (paper's {LAYERS[name]})" if beside and LAYERS.get(name, name) != name else name,
-            *(mean_over(row, key) for key in keys), mean_ratio(row),
+            *(mean_over(row, key) for key in MEASURED), mean_ratio(row),
             said_by_paper(PAPER, name.lower()) if beside else None,
         )
         for name, row in rows.items()
     ]  # fmt: skip
-    errors.append(("Predicting the mean", *(raw[key]["mse_of_mean"] for key in keys), ratio_of_means(raw), None))
+    errors.append(("Predicting the mean", *(raw[key]["mse_of_mean"] for key in MEASURED), ratio_of_means(raw), None))
 
-    def r2(one: Score) -> str:
-        return with_interval(one["r2"], one["r2_interval"])
-
-    shares = [(layer, *(r2(one[layer][key]) for key in keys for one in (trained, untrained))) for layer in trained]
-    targets = list(next(iter(linear[TRAINED].values())))
-    one_by_one: list[list[str | None]] = []
-    for layer, scores in linear[TRAINED].items():
-        pairs = ((scores[target], linear[UNTRAINED][layer][target]) for target in targets)
-        one_by_one.append([layer, *(f"{one['r2']:.3f}" for pair in pairs for one in pair)])
-    for layer, scores in linear[CONTROLS].items():
-        cells = ((f"{scores[target]['r2']:.3f}", None) for target in targets)
-        one_by_one.append([_CONTROLS[layer], *(cell for pair in cells for cell in pair)])
-    paper = ("Layer", "Edges MSE", "Depth MSE", "Ratio depth / edges", "Paper: edges, depth, ratio")
-    both = ("Layer", "Edges R2", "random weights", "Depth R2", "random weights")
-    each = ["Layer", *(title for target in targets for title in (TITLES[target], "random"))]
-    of_raw = ("Raw input", r2(raw["edges"]), None, r2(raw["depth"]), None)
+    paper = ("Layer", *(TITLES[key] for key in MEASURED), "Ratio depth / edges", "Paper: edges, depth, ratio")
     return [
         Table("Four-convolution probes, validation MSE (the paper's table; lower is easier to read)", paper, errors),
-        Table("The same probes, share of variance explained (R2)", both, [*shares, of_raw]),
-        Table("Linear (1 x 1) probes, R2, and that of random weights (intervals: figure and JSON)", each, one_by_one),
+        _shares("The same probes, share of variance explained (R2)", spatial, intervals=True),
+        _shares("Linear (1 x 1) probes, R2 (intervals: figure and JSON)", linear, intervals=False),
     ]
+
+
+def _shares(title: str, scores: Scores, intervals: bool) -> Table:
+    """R2 of each layer beside that of random weights, and of the controls, by target."""
+    targets = list(next(iter(scores[CONTROLS].values())))
+    rows = [(layer, of_layer, scores[UNTRAINED][layer]) for layer, of_layer in scores[TRAINED].items()]
+    rows += [(CONTROL_TITLES[name], of_control, {}) for name, of_control in scores[CONTROLS].items()]
+
+    def r2(one: Score | None) -> str | None:
+        return None if one is None else with_interval(one["r2"], one["r2_interval"] if intervals else None)
+
+    lines = [(name, *(r2(one.get(key)) for key in targets for one in pair)) for name, *pair in rows]
+    return Table(title, ["Layer", *(text for key in targets for text in (TITLES[key], "random weights"))], lines)
 
 
 def draw_four_convolutions(spatial: Scores, folder: Path) -> Figure:
     """The paper's figure, and the same probes as shares of variance."""
-    layers, raw = list(spatial[TRAINED]), spatial[CONTROLS][INPUT]
-    sheet = Sheet(1, 2, 10, 3.6)
-    for axis, key, title in (
-        (sheet.axes[0, 0], "mse", "Validation MSE: the paper's figure (different units!)"),
-        (sheet.axes[0, 1], "r2", "The same probes: share of variance explained"),
+    layers = list(spatial[TRAINED])
+    sheet = Sheet(1, 2, 11, 4.0)
+    for axis, key, targets, title in (
+        (sheet.axes[0, 0], "mse", ("edges", "depth"), "Validation MSE: the paper's figure (different units!)"),
+        (sheet.axes[0, 1], "r2", tuple(MEASURED), "The same probes: share of variance explained"),
     ):
-        for shift, target in ((-1, "edges"), (1, "depth")):
-            positions, colour = np.arange(len(layers)) + shift * _BAR / 2, sheet.COLOURS[target]
+        width = 0.78 / len(targets)
+        for number, target in enumerate(targets):
+            positions = np.arange(len(layers)) + (number - (len(targets) - 1) / 2) * width
+            colour = sheet.COLOURS[target]
             scores = [spatial[TRAINED][layer][target] for layer in layers]
             bars = [(one[key], one[f"{key}_interval"]) for one in scores]
-            sheet.bars(axis, positions, bars, width=_BAR, color=colour, label=target)
+            sheet.bars(axis, positions, bars, width=width, color=colour, label=TITLES[target])
             random = [spatial[UNTRAINED][layer][target][key] for layer in layers]
-            label = "random weights" if shift > 0 else None
-            mark = {"marker": "_", "markersize": 9, "markeredgewidth": 2, "color": "black", "label": label}
+            label = None if number else "random weights"
+            mark = {"marker": "_", "markersize": 7, "markeredgewidth": 2, "color": "black", "label": label}
             axis.plot(positions, random, linestyle="none", **mark)
-            style = {"color": colour, "linewidth": 1, "linestyle": ":"}
-            axis.axhline(raw[target][key], label=f"raw input, {target}", **style)
+            for control, of_target in spatial[CONTROLS].items():
+                style = {"color": colour, "linewidth": 1, "linestyle": _LINES[control]}
+                axis.axhline(of_target[target][key], label=f"{CONTROL_TITLES[control]}: {TITLES[target]}", **style)
         _name_layers(axis, layers)
         sheet.tidy(axis, title, y="MSE" if key == "mse" else "R2")
-    handles, labels = sheet.axes[0, 0].get_legend_handles_labels()
-    sheet.figure.legend(handles, labels, fontsize=8, frameon=False, ncols=5, loc="outside lower center")
-    alt = "Edge and depth probe error and of variance explained for each layer, with random weights and raw input"
+    sheet.legend(sheet.axes[0, 1], 4)
+    alt = "Error and share of variance explained of edge and depth probes by layer, with random weights and controls"
     return sheet.save(folder, "linear_four_convolutions.png", "Four-convolution probes by layer", alt)
 
 
@@ -179,20 +182,16 @@ def draw_one_by_one(linear: Scores, folder: Path) -> Figure:
         for x, one in zip(positions, trained, strict=True):
             if one["r2_interval"] is not None:
                 axis.plot([x, x], one["r2_interval"], color=colour, linewidth=1)
-        for control, label, line in ((INPUT, "raw input", ":"), ("position", "pixel's position", "--")):
-            r2 = linear[CONTROLS][control][target]["r2"]
-            axis.axhline(r2, color="black", linewidth=1, linestyle=line, label=label)
+        for control, scores in linear[CONTROLS].items():
+            style = {"linestyle": _LINES[control], "label": CONTROL_TITLES[control]}
+            axis.axhline(scores[target]["r2"], color="black", linewidth=1, **style)
         axis.axhline(0, color=sheet.GRID, linewidth=1)
         axis.set_ylim(min(-0.1, max(-0.5, min(one["r2"] for one in trained) - 0.05)), 1.02)
         _name_layers(axis, layers)
         sheet.tidy(axis, TITLES[target], y="R2")
     for axis in sheet.axes.flat[len(targets) :]:
         axis.axis("off")
-    if len(targets) < rows * columns:
-        handles, labels = sheet.axes.flat[0].get_legend_handles_labels()
-        sheet.axes.flat[-1].legend(handles, labels, fontsize=8, frameon=False, loc="center")
-    else:
-        sheet.axes.flat[0].legend(fontsize=7, frameon=False)
+    sheet.legend(sheet.axes.flat[0], 5)
     alt = f"R2 of linear probes for {', '.join(TITLES[target] for target in targets)} by layer, with controls"
     return sheet.save(folder, "linear_one_by_one.png", "Linear (1 x 1) probes by layer and target", alt)
 

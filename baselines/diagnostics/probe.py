@@ -112,13 +112,14 @@ class Finding:
 
 class Probe(ABC):
     """A test of a model. ``version`` goes up when its result for the same model changes. ``without_network``: what a
-    method without a network lacks for this probe, or None."""
+    method without a network lacks for this probe, or None. ``asks_subject``: whether the result is about the model."""
 
     name: str
     title: str
     question: str
     version = 1
     without_network: str | None = None
+    asks_subject = True
 
     def applies_to(self, subject: Subject) -> str | None:
         """None where the probe can run, else the reason why it can't, for the report."""
@@ -131,6 +132,10 @@ class Probe(ABC):
         self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, folder: Path, progress: Progress
     ) -> Finding:
         """Measure ``subject``; pictures are written into ``folder``, which exists."""
+
+    def skip(self, reason: str) -> Finding:
+        """Why this probe has no result."""
+        return Finding(self.name, self.title, "", skipped=reason)
 
     def finding(self, summary: str, values: Mapping[str, Any], tables: Sequence[Table], *figures: Figure) -> Finding:
         """The result of this probe."""
@@ -152,8 +157,8 @@ class Sheet:
     ``subplots``. ``axes``: an array of that shape."""
 
     COLOURS: ClassVar = {
-        "edges": "#2e8b57", "depth": "#c0392b", "distance": "#c0392b", "phase": "#1b5bb8", "order": "#8a4b00",
-        "raw": "#59616b", "random": "#9aa3ad",
+        "edges": "#2e8b57", "depth": "#c0392b", "object_depth": "#e08e79", "distance": "#c0392b", "phase": "#1b5bb8",
+        "order": "#8a4b00", "raw": "#59616b", "random": "#9aa3ad",
     }  # fmt: skip
     """Colours of the targets, edges and depth as in the paper's figure; of the raw input, and of random weights."""
     INK, GRID = "#191c20", "#dfe1e5"
@@ -193,6 +198,11 @@ class Sheet:
         for x, (value, interval) in zip(positions, bars, strict=True):
             if value is not None and interval is not None:
                 axes.plot([x, x], interval, color=self.INK, linewidth=1)
+
+    def legend(self, axes: Axes, columns: int) -> None:
+        """The legend of ``axes`` below the figure."""
+        handles, labels = axes.get_legend_handles_labels()
+        self.figure.legend(handles, labels, fontsize=8, frameon=False, ncols=columns, loc="outside lower center")
 
     def save(self, folder: Path, file: str, title: str, alt: str) -> Figure:
         """Write ``file`` with 256 colours, a third of the size; the bytes are reproducible."""

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from fpp_ml_bench.baselines.diagnostics.probe import spread
 from fpp_ml_bench.baselines.method import METHODS, Frames, Method, load_method
 from fpp_ml_bench.baselines.networks import NetworkMethod, build, fringe_batch, load
 from fpp_ml_bench.baselines.training import shipped_names, weights_path
@@ -30,6 +31,10 @@ NORMALISATION_OF: dict[str, Normalisation] = {"mm": "raw", "m": "global", "norma
 FACTORY_MARK = ".py:"
 BATCH = 8
 PIXELS_AT_ONCE = BATCH * 224 * 224  # most images in a batch, and most pixels: at 960 px a batch is one image
+NORMALISED_BACKGROUND = 0.1
+SAMPLES_ASKED = 6  # to find out whether a model predicts anything
+_LEAST_SPREAD = 1e-3  # relative: predictions that differ by less are the same
+_STRAY = 0.001  # share of pixels at either end that may differ
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +90,32 @@ class Subject:
             raise DiagnosisError(f"{self.name}: its prediction holds NaN or infinity, so it can't be diagnosed")
         return depth.astype(np.float32, copy=False)
 
+    @property
+    def answers_normalised(self) -> bool:
+        """Whether `answer` is normalised, and not in mm."""
+        return self.units == "normalised" or self.normalisation == "individual"
+
+    def answer(self, frames: Frames) -> NDArray[np.float32]:
+        """`predict`, or the network's own output where it is normalised: range heads, which would convert it to mm, are
+        not part of the paper's probes."""
+        return self.represent(frames) if self.normalisation == "individual" else self.predict(frames)
+
+    def predicts_nothing(self, dataset: DatasetFolder) -> str | None:
+        """How the subject predicts nothing for `SAMPLES_ASKED` samples of all splits: background, or the same value, on
+        all object pixels but stray ones. None for a subject that predicts something."""
+        samples = spread(dataset.samples("all"), SAMPLES_ASKED)
+        answers = [self.answer(self.captured(dataset, name))[object_mask(dataset.depth_mm(name))] for name in samples]
+        values = np.concatenate(answers)
+        if not values.size:
+            return None
+        low, high = np.quantile(values, (_STRAY, 1 - _STRAY))
+        what = f"{low:.4g}{' of the depth range' if self.answers_normalised else ' mm'}"
+        if max(-low, high) < background_below(self.answers_normalised, dataset.rig.working_range_mm[0]):
+            what = "background"
+        elif high - low > _LEAST_SPREAD * abs(high):
+            return None
+        return f"{self.name} predicts nothing but {what} on the object pixels of {len(samples)} samples."
+
     def input_batch(self, stacks: Sequence[Frames]) -> Tensor:
         """Input of ``network``, float32 (B, 1, H, W) in [0, 1]. Raises `DiagnosisError` without its frame."""
         return _input_batch(stacks, self.frames_used[0], self.image_size, self.name)
@@ -110,6 +141,12 @@ class Subject:
         batch = self.input_batch([frames])
         with torch.inference_mode():
             return checked_output(network(batch), batch, self.name)[0, 0].numpy()
+
+
+def background_below(normalised: bool, near_mm: float) -> float:
+    """Predictions below it, normalised or in mm, are nearer to background than to any object, of which none is nearer
+    than ``near_mm``."""
+    return NORMALISED_BACKGROUND if normalised else near_mm / 2
 
 
 def _input_batch(stacks: Sequence[Frames], index: int, size: tuple[int, int], name: str) -> Tensor:

@@ -74,6 +74,7 @@ class Theory(Probe):
 
     name = "theory"
     title = "Theory in numbers"
+    asks_subject = False
     question = "Can two depths give the same fringe, and how large is the depth error of one period at each distance?"
 
     def run(

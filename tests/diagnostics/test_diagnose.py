@@ -26,12 +26,15 @@ import torch
 from torch import nn
 
 class Net(nn.Module):
-    def __init__(self):
+    def __init__(self, weight=None, bias=0.0):
         super().__init__()
         self.encoder = nn.Sequential(nn.Conv2d(1, 4, 3, padding=1), nn.ReLU())
         self.decoder = nn.Sequential(nn.Conv2d(4, 4, 3, padding=1), nn.ReLU())
         self.head = nn.Conv2d(4, 1, 1)
         self.unused = nn.Conv2d(4, 1, 1)
+        if weight is not None:
+            nn.init.constant_(self.head.weight, weight)
+            nn.init.constant_(self.head.bias, bias)
     def forward(self, x):
         return self.head(self.decoder(self.encoder(x)))
 
@@ -46,6 +49,24 @@ class Odd(Net):
         return {"shape": y[:, :, ::2], "nan": y / 0 * 0, "tuple": (y, y)}[self.how]
 
 def make(): return Net()
+def silent(): return Net(0.0)
+def constant(): return Net(0.0, 0.5)
+def far(): return Net(0.0, 1.8)
+def dead():
+    net = Net()
+    nn.init.zeros_(net.decoder[0].weight)
+    nn.init.constant_(net.decoder[0].bias, -1.0)
+    nn.init.constant_(net.head.bias, 0.5)
+    return net
+def nearly_nothing():
+    net = Net()
+    nn.init.constant_(net.head.weight, 1e-4)
+    nn.init.zeros_(net.head.bias)
+    return net
+def beside_a_dead_layer():
+    net = dead()
+    net.forward = lambda x: net.head(net.decoder(net.encoder(x))) + x
+    return net
 def shape(): return Odd("shape")
 def nan(): return Odd("nan")
 def several(): return Odd("tuple")
@@ -84,8 +105,10 @@ def test_a_module_of_the_users_is_diagnosed_and_nothing_is_run_twice(tiny, modul
     assert content["subject"]["layers"] == ["encoder", "decoder"]
     values = content["findings"]["linear"]["values"]
     assert set(values["linear"]["trained"]) == {"encoder", "decoder"}
-    assert set(values["linear"]["controls"]) == {"input", "position"}
-    assert set(values["linear"]["untrained"]["encoder"]) == {"edges", "depth", "distance", "phase", "order"}
+    assert set(values["linear"]["controls"]) == {"input", "silhouette", "position"}
+    targets = {"edges", "depth", "object_depth", "distance", "phase", "order"}
+    assert set(values["linear"]["untrained"]["encoder"]) == targets
+    assert set(values["four_convolutions"]["controls"]) == {"input", "silhouette"}
     layer = values["four_convolutions"]["trained"]["encoder"]
     assert layer["edges"]["r2"] == pytest.approx(1 - layer["edges"]["mse"] / layer["edges"]["mse_of_mean"])
     page = (out / "index.html").read_text()
@@ -108,6 +131,40 @@ def test_a_method_without_a_network_says_why_layers_are_not_looked_into(tiny, tm
     content = json.loads((out / "diagnose.json").read_text())
     assert all("without a network" in finding["skipped"] for finding in content["findings"].values())
     assert "Not run: classical is a method without a network" in (out / "index.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("network", "units", "what"),
+    [
+        ("silent", "normalised", "background"),
+        ("silent", "mm", "background"),
+        ("constant", "normalised", "0.5 of the depth range"),
+        ("far", "m", "1800 mm"),
+        ("dead", "normalised", "0.5 of the depth range"),
+        ("nearly_nothing", "normalised", "background"),
+    ],
+)
+def test_a_network_that_predicts_nothing_gets_a_sentence_and_no_ratio(
+    tiny, module_file, tmp_path, capsys, network, units, what
+):
+    out = tmp_path / "report"
+    assert call(f"{module_file}:{network}", tiny, "--out", out, "--units", units) == 0
+    findings = json.loads((out / "diagnose.json").read_text())["findings"]
+    sentence = f"my_net predicts nothing but {what} on the object pixels of 6 samples."
+    for name in set(PROBES) - {"theory"}:
+        assert findings[name]["skipped"] == sentence and findings[name]["values"] == {}
+    assert findings["theory"]["skipped"] is None
+    assert (out / "index.html").read_text().count(f"Not run: {sentence}") == 4
+    assert "R2" not in capsys.readouterr().out
+
+
+def test_layers_that_are_constant_get_a_sentence_though_the_network_predicts(tiny, module_file, tmp_path):
+    out = tmp_path / "report"
+    model, probes = f"{module_file}:beside_a_dead_layer", ("--probe", "linear", "--probe", "grad-cam", "--quick")
+    assert call(model, tiny, "--out", out, "--layers", "decoder", "--samples", 4, *probes) == 0
+    findings = json.loads((out / "diagnose.json").read_text())["findings"]
+    assert "every probed layer of my_net (decoder) is constant" in findings["linear"]["skipped"]
+    assert "the heatmaps of every layer of my_net (decoder) are constant" in findings["grad-cam"]["skipped"]
 
 
 @pytest.mark.parametrize(
@@ -153,7 +210,7 @@ def test_a_folder_with_something_else_in_it_is_not_written_into(tiny, module_fil
 
 
 class Counted:
-    name, title, question, version = "linear", "Counted", "How often?", 1
+    name, title, question, version, asks_subject = "linear", "Counted", "How often?", 1, True
 
     def __init__(self) -> None:
         self.runs = 0

@@ -24,10 +24,12 @@ from fpp_ml_bench.baselines.stability import U32
 
 
 def answering(dataset, answer, units="mm"):
+    def predict(frames):
+        return answer(frames).astype(np.float32)
+
     return SimpleNamespace(
-        name="known", units=units, normalisation=None, uses_ground_truth_mask=False, frames_used=(51,),
-        image_size=dataset.size, predict=lambda frames: answer(frames).astype(np.float32), weights_sha256=None,
-        network=None,
+        name="known", units=units, answers_normalised=units == "normalised", answer=predict, predict=predict,
+        uses_ground_truth_mask=False, frames_used=(51,), image_size=dataset.size, weights_sha256=None, network=None,
     )  # fmt: skip
 
 
@@ -42,7 +44,7 @@ def test_the_exact_decoder_finds_every_plane(decoded):
     finding, folder = decoded
     planes = finding.values["planes"]
     assert {row["distance_m"] for row in planes} == {1.6, 1.8, 2.0}
-    assert {row["outline"] for row in planes} == {"fills the frame", "rectangle", "power_drill_A0"}
+    assert {row["outline"] for row in planes} == {*flat_plane.SIDES, "power_drill_A0"}
     for row in planes:
         assert row["collapsed_share"] == 0 and row["mae_mm"] < 1
         assert row["mean_mm"] == pytest.approx(1000 * row["distance_m"], abs=0.5)
@@ -64,6 +66,22 @@ def test_background_everywhere_is_a_collapse(opened, tmp_path, monkeypatch):
     assert finding.values["planes"][0]["mean_mm"] == pytest.approx(low + 0.05 * (high - low), abs=U32 * (high - low))
     assert finding.values["objects"]["collapsed_share"] == 1 > finding.values["objects"]["collapsed_share_true"]
     assert "100% of a rectangular plane" in finding.summary
+
+
+def test_the_rectangle_grows_and_a_collapse_from_a_side_on_is_told(opened, tmp_path, monkeypatch):
+    """A model that predicts background where less than half of its image is lit."""
+    monkeypatch.setattr(flat_plane, "draw", lambda *arguments: [])
+    half_lit = answering(opened, lambda frames: np.full(frames[51].shape, (frames[51] < 60).mean()), "normalised")
+    finding = FlatPlane().run(half_lit, opened, ProbeSettings(quick=True), tmp_path, silent)
+    sizes = [row for row in finding.values["planes"] if row["outline"] in flat_plane.GROWING]
+    height, width = opened.size
+    assert len(sizes) == 9
+    for side, row in zip((0.3, 0.45, 0.5, 0.6), sizes, strict=False):
+        assert row["pixels"] == pytest.approx(side**2 * height * width, rel=0.05)
+        assert (row["distance_m"], row["tilt_deg"]) == (1.8, [0.0, 0.0])
+    shares = [row["collapsed_share"] for row in sizes]
+    assert shares == sorted(shares) and {shares[0], shares[-1]} == {0, 1}
+    assert "0% at 0.3, " in finding.summary and "100% at 1." in finding.summary
 
 
 def test_collapse_is_nearer_to_background_than_to_any_object():

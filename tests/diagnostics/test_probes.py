@@ -11,6 +11,7 @@ from torch.nn import functional
 from fpp_ml_bench.baselines.diagnostics import fits, linear
 from fpp_ml_bench.baselines.diagnostics.fits import (
     INPUT,
+    SILHOUETTE,
     NormalEquations,
     activations_of,
     apply,
@@ -20,7 +21,7 @@ from fpp_ml_bench.baselines.diagnostics.fits import (
     truth,
 )
 from fpp_ml_bench.baselines.diagnostics.grad_cam import fringe_variation
-from fpp_ml_bench.baselines.diagnostics.linear_report import score
+from fpp_ml_bench.baselines.diagnostics.linear_report import CONTROLS, score
 from fpp_ml_bench.baselines.stability import U32
 from fpp_ml_bench.coding import wrapped_phase
 from fpp_ml_bench.decoding import depth_from_coordinate
@@ -187,7 +188,8 @@ def test_a_four_convolution_probe_starts_at_the_mean_and_learns_what_is_there():
     def batch():
         features = {"here/a": torch.randn(8, 3, 12, 12), "else/b": torch.randn(8, 3, 12, 12)}
         bumps = features["here/a"][:, :1].abs()
-        return features, {"edges": functional.avg_pool2d(bumps, 3, 1, 1, count_include_pad=False)}
+        edges = functional.avg_pool2d(bumps, 3, 1, 1, count_include_pad=False)
+        return features, {"image": torch.ones_like(bumps), "edges": edges}
 
     features, target = batch()
     moments = {name: fits.Moments() for name in features}
@@ -250,8 +252,38 @@ def test_the_layer_of_an_identity_is_the_raw_input(opened):
 
 def test_spatial_probes_of_an_edge_reader_read_edges(opened):
     subject = oracle(opened, ("edges",))
-    networks, seeds = {"trained": subject.network}, {"trained": 1, INPUT: 1}
+    networks, seeds = {"trained": subject.network}, {"trained": 1, CONTROLS: 1}
     errors, reference = experiment_of(subject, opened, 3).spatial_errors(networks, seeds, 25)
     remaining = {key[:2]: np.mean(sample_errors) / np.mean(reference[key[1]]) for key, sample_errors in errors.items()}
-    trained, raw = remaining[("trained", "out"), "edges"], remaining[(INPUT, INPUT), "edges"]
+    trained, raw = remaining[("trained", "out"), "edges"], remaining[(CONTROLS, INPUT), "edges"]
     assert trained < 0.25 and trained < raw
+
+
+def test_a_layer_that_holds_the_mask_alone_is_the_silhouette_control(opened):
+    subject = oracle(opened, ("inside",))
+    r2 = linear_r2(subject, opened)
+    for target in linear.TARGETS:
+        assert r2["out", target] == pytest.approx(r2[SILHOUETTE, target], abs=1e-12)
+    assert r2[SILHOUETTE, "depth"] > 0.5  # of the whole image's depth: what a silhouette says
+    for target in linear.INSIDE:
+        assert r2[SILHOUETTE, target] == 0  # and of the depth within it nothing
+    networks, seeds = {"trained": subject.network}, {"trained": 1, CONTROLS: 1}
+    errors, reference = experiment_of(subject, opened, 3).spatial_errors(networks, seeds, 2)
+    for name in fits.MEASURED:
+        assert errors[("trained", "out"), name, 0] == pytest.approx(errors[(CONTROLS, SILHOUETTE), name, 0])
+        assert len(reference[name]) == len(opened.samples("validation"))
+
+
+def test_depth_on_the_object_is_compared_there_and_with_the_mean_there(opened):
+    experiment = experiment_of(oracle(opened, ("depth",)), opened, 3)
+    _, reference = experiment.spatial_errors({}, {CONTROLS: 1}, 1)
+    side = tuple(length // fits.grid_step(opened.size) for length in opened.size)
+
+    def within(name):
+        depth_mm = opened.depth_mm(name)
+        full = at_size(torch.from_numpy(object_mask(depth_mm)[None, None].astype(np.float32)), side).numpy() == 1
+        return at_size(torch.from_numpy(fits.normalised_depth(depth_mm)[None, None]), side).numpy()[full].astype(float)
+
+    mean = np.concatenate([within(name) for name in experiment.train]).mean()
+    expected = [np.mean((within(name) - mean) ** 2) for name in experiment.validation]
+    assert reference[fits.OBJECT_DEPTH] == pytest.approx(expected)
