@@ -212,6 +212,7 @@ DESCRIPTIONS = {
     "fraction of a frame": ({"frames_used": [0.5]}, r"frames_used\.0: .*integer"),
     "negative frame": ({"frames_used": [-1]}, r"frames_used\.0: .*greater"),
     "frame twice": ({"frames_used": [1, 1]}, "frames_used names a frame twice"),
+    "empty frames": ({"frames_used": []}, "frames_used: .*at least 1 item"),
     "frame outside": ({"frames_used": [3, 52]}, r"frames_used: expected indices from 0 to 51 .*got \[52\]"),
     "negative time": ({"seconds_per_sample": -1.0}, "seconds_per_sample: .*greater"),
     "no time": ({"seconds_per_sample": 0.0}, "seconds_per_sample: .*greater"),
