@@ -91,7 +91,7 @@ def compare(scratch: Path, args: argparse.Namespace) -> None:
 
     plain = datasets.load_dataset(str(folder), "single_shot", split="train")
     plain = plain.select_columns(["frame_00", "depth"]).with_format("torch", dtype=torch.float32)
-    ours = FringeDepthDataset(folder, "train", "single_shot", "raw")
+    ours = FringeDepthDataset(folder, "train", "single_shot", "raw", range_rule="object")
 
     def through_datasets() -> Iterator[Batch]:
         for start in range(0, len(plain), args.batch):
