@@ -17,6 +17,7 @@ units: mm                    # of the files: mm, m or normalised (then uses_grou
 
 frames_used: [0]             # indices into the dataset's frame sequence, from 0
 uses_ground_truth_range: false   # was the method given depth_min and depth_max of the scored samples?
+# range_rule: object         # with units: normalised only: over which pixels that range is, object or valid (not void)
 # uses_ground_truth_mask: true   # was it given which pixels of the scored samples are object?
 # uses_ground_truth_order: true  # was it given their true fringe orders?
 # learned_from:              # what data it learned from
