@@ -56,7 +56,12 @@ def run(args: argparse.Namespace) -> int:
         result.write_json(reliance.model_dump(mode="json"), args.json)
     if entry is not None:
         write_reliance(entry, reliance)
-    show(_table(method.title, reliance))
+    moved = [value for key, value in reliance.parts if not key.startswith("answered")]
+    if any(moved):
+        show(_table(method.title, reliance))
+    else:
+        print(f"{method.title}: gives the same answer whatever phase, light and outline of {reliance.samples} samples "
+              "are, so it reads nothing of them. Phase reliance 0.")  # fmt: skip
     return 0
 
 

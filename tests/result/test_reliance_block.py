@@ -156,6 +156,11 @@ def test_the_command_measures_and_writes(tiny, tmp_path, capsys, dataset):
     assert main(["reliance", "classical", str(tiny), "--steps", "6", "--into", str(row)]) == 2
     assert "very method that was scored" in capsys.readouterr().err
     assert main(["reliance", "classical", str(tiny), "--views", "7"]) == 2
+    capsys.readouterr()
+    assert main(["reliance", "constant", str(tiny), "--views", "1"]) == 0
+    out = capsys.readouterr().out
+    assert "Constant depth: standoff: gives the same answer whatever phase, light and outline" in out
+    assert "follows" not in out and "changes" not in out
 
 
 @pytest.mark.parametrize(
