@@ -193,6 +193,7 @@ def step_seconds(job: Job) -> float | None:
 
     class Nothing:
         source = SimpleNamespace(fingerprint="")
+        range_rule = "valid"
 
         def __len__(self) -> int:
             return job.batch

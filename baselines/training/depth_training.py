@@ -8,7 +8,7 @@ files a folder holds ``weights.safetensors`` and, at the end, ``done.json``.
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -108,6 +108,8 @@ class DepthTraining(Training):
 
     def __init__(self, recipe: Recipe, data: FringeDepthDataset, validation: FringeDepthDataset, out: Path) -> None:
         identity = {"recipe": recipe.digest, "fingerprint": data.source.fingerprint}
+        if recipe.normalisation == "individual":
+            identity["range_rule"] = data.range_rule
         super().__init__(out, identity, recipe.seed, recipe.precision)
         self.recipe, self.data, self.validation = recipe, data, validation
         self.name, self.title = recipe.name, recipe.title
@@ -251,7 +253,8 @@ class DepthTraining(Training):
         if self.best is record and self.accelerator.is_main_process:
             scores = {key: value for key, value in record.items() if key.endswith("_mm") or key == "validation_loss"}
             network, data = self.bare["network"], self.data.source.fingerprint
-            save_weights(self.out / WEIGHTS, network, model_config(self.recipe, network, data, record["epoch"], scores))
+            config = model_config(self.recipe, network, data, record["epoch"], scores)
+            save_weights(self.out / WEIGHTS, network, replace(config, range_rule=self.data.range_rule))
 
     def state(self) -> dict[str, Any]:
         return {"schedule": self.schedule.state()}
@@ -280,6 +283,6 @@ def model_config(recipe: Recipe, network: nn.Module, fingerprint: str, epoch: in
         name=recipe.name, title=recipe.title, network=recipe.network,
         options=dict(network.options),  # type: ignore[arg-type, call-overload]
         normalisation=recipe.normalisation, image_size=(recipe.size, recipe.size), dataset_fingerprint=fingerprint,
-        benchmark=training_benchmark(fingerprint), data_config=recipe.frames, range_rule="valid",
+        benchmark=training_benchmark(fingerprint), data_config=recipe.frames,
         background_removed=recipe.background_removed, recipe=recipe.to_dict(), epoch=epoch, validation=scores,
     )  # fmt: skip

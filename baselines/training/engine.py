@@ -159,7 +159,7 @@ class Training(ABC):
         if (path := self.out / CHECKPOINT).exists():
             tensors, state = records.read_checkpoint(path)
             if any(state.get(key) != value for key, value in self.identity.items()):
-                raise TrainingError(f"{path}: belongs to another recipe or dataset; give a new folder")
+                raise TrainingError(f"{path}: belongs to another recipe, dataset or depth range; give a new folder")
             for name, module in self.bare.items():
                 prefix = f"module.{name}."
                 module.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})

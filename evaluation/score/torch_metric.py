@@ -58,8 +58,9 @@ class DepthScores(Metric):
         prediction, target = _maps(prediction, target)
         scored = torch.ones(target.shape, dtype=torch.bool) if void is None else ~_checked_void(void, target.shape)
         for predicted, truth, pixels in zip(prediction, target, scored.to(target.device), strict=True):
-            mm_per_unit = _mm_per_unit(float(predicted.max()), float(truth.max()), self.units)
-            scores = _sample_scores(predicted[pixels] * mm_per_unit, truth[pixels] * mm_per_unit)
+            counted = predicted[pixels], truth[pixels]  # what a void pixel holds, as NaN, does not matter
+            mm_per_unit = _mm_per_unit(*counted, self.units)
+            scores = _sample_scores(*(depths * mm_per_unit for depths in counted))
             values = [predicted.new_zeros(()) if (score := scores[key]) is None else score for key in KEYS]
             self.sums += torch.stack(values).to(self.sums.device)
             self.counts += torch.tensor([scores[key] is not None for key in KEYS], device=self.counts.device)
@@ -87,10 +88,7 @@ def _maps(prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     prediction, target = prediction.detach(), target.detach()
     if prediction.device.type == "mps":  # Apple's GPUs have no float64
         prediction, target = prediction.cpu(), target.cpu()
-    prediction, target = prediction.to(torch.float64), target.to(prediction.device, torch.float64)
-    if not bool(torch.isfinite(target).all() and (target >= 0).all()):
-        raise PredictionError("target: expected finite depths of 0 and more")
-    return prediction, target
+    return prediction.to(torch.float64), target.to(prediction.device, torch.float64)
 
 
 def _checked_void(void: Tensor, shape: torch.Size) -> Tensor:
@@ -102,8 +100,12 @@ def _checked_void(void: Tensor, shape: torch.Size) -> Tensor:
     return void
 
 
-def _mm_per_unit(largest: float, target_max: float, units: str | None) -> float:
-    """What one unit of a sample's depths is in mm; raises PredictionError where ``units`` can't be true."""
+def _mm_per_unit(prediction: Tensor, target: Tensor, units: str | None) -> float:
+    """What one unit of a sample's depths (n,) is in mm; raises PredictionError for a target that is no depth, and where
+    ``units`` can't be true."""
+    if not bool(torch.isfinite(target).all() and (target >= 0).all()):
+        raise PredictionError("target: expected finite depths of 0 and more")
+    largest, target_max = (float(depths.max()) if depths.numel() else 0.0 for depths in (prediction, target))
     scale = MM_PER_UNIT[declared_units(target_max, units)]
     if units is None and not_in_mm(largest, target_max):
         raise PredictionError(

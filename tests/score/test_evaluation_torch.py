@@ -156,3 +156,16 @@ def test_units_that_are_said_are_taken():
     assert float(metres.compute()["object_mae_mm"]) == pytest.approx(2.0, rel=1e-4)  # float32 metres
     untrained.update(torch.full_like(DEPTH, 1.0), DEPTH)
     assert float(untrained.compute()["object_mae_mm"]) == 1799.0
+
+
+def test_what_a_void_pixel_holds_does_not_matter():
+    target, prediction = DEPTH.clone(), DEPTH + 2
+    target[0, 0], prediction[0, 1] = float("nan"), float("nan")
+    void = target.isnan() | prediction.isnan()
+    metric = DepthScores()
+    metric.update(prediction, target, void)
+    assert float(metric.compute()["object_mae_mm"]) == 2.0
+    with pytest.raises(PredictionError, match="target: expected finite depths"):
+        metric.update(prediction, target)
+    metric.update(prediction, target, torch.ones_like(void))  # no pixel counts
+    assert float(metric.compute()["object_mae_mm"]) == 2.0

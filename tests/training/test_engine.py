@@ -17,7 +17,7 @@ from fpp_ml_bench.baselines.training.depth_training import DONE, WEIGHTS, train
 from fpp_ml_bench.baselines.training.engine import CHECKPOINT, reproducible
 from fpp_ml_bench.baselines.training.epochs import Schedule, epoch_order, spread
 from fpp_ml_bench.baselines.training.recipe import Linear, Plateau, load_recipe, recipe_from_dict
-from fpp_ml_bench.baselines.training.records import CURVE_FILE, Display
+from fpp_ml_bench.baselines.training.records import CURVE_FILE, Display, read_checkpoint, save_checkpoint
 from fpp_ml_bench.depth import denormalise
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.evaluation.result import over_samples
@@ -298,3 +298,15 @@ def test_a_linear_schedule_is_constant_and_then_falls_to_zero():
         rates.append(schedule.rate)
         schedule.step(0.0)
     assert rates == pytest.approx([1e-4, 1e-4, 1e-4, 0.75e-4, 0.5e-4, 0.25e-4])
+
+
+def test_the_rule_of_the_range_is_recorded_and_a_run_of_another_is_not_continued(tiny, tmp_path):
+    """Runs of before the rule hold none; their range was that of all object pixels."""
+    recipe = small("normalization/individual", max_epochs=2)
+    paused = train(recipe, tiny, tmp_path / "run", minutes=1e-6, show=False)
+    assert load(paused.weights).config.range_rule == "valid"
+    tensors, state = read_checkpoint(tmp_path / "run" / CHECKPOINT)
+    assert state.pop("range_rule") == "valid"
+    save_checkpoint(tmp_path / "run" / CHECKPOINT, tensors, state)
+    with pytest.raises(TrainingError, match="another recipe, dataset or depth range; give a new folder"):
+        train(recipe, tiny, tmp_path / "run", show=False)
