@@ -99,7 +99,7 @@ class Method(ABC):
         """What data the method learned from, as `evaluation.submission.LearnedFrom` has it."""
         if (config := self.weights_config) is None:
             return {"data": "none"}
-        benchmark = training.training_benchmark(config.dataset_fingerprint) or config.benchmark
+        benchmark = training.trained_on(config)
         title = f"dataset {config.dataset_fingerprint[:8]}" if benchmark is None else benchmark.title
         return {"data": "train-split", "versions": [title]}
 

@@ -4,6 +4,7 @@ import json
 import statistics
 from collections.abc import Callable
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -13,11 +14,11 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.baselines.unfinished import UNFINISHED_FILE, Finished, UnfinishedRun
+from fpp_ml_bench.baselines.unfinished import Finished, UnfinishedRun
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.submission import REPORTS_FILE, SIGMA, SUBMISSION_FILE, check_submission
-from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.evaluation.submission import REPORTS_FILE, SIGMA, SUBMISSION_FILE, UNFINISHED_FILE, check_submission
+from fpp_ml_bench.files import LOCK_FILE, exclusive, write_atomically
 from fpp_ml_bench.loaders.sample import stored_frames
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
@@ -45,8 +46,21 @@ def predict_split(
     A sample's time is that of the method on frames in memory, after one run that is not counted; the submission gives
     the median over the split. A run that was stopped continues behind its last finished sample.
 
-    Raises `PredictionError` for an ``out`` that holds anything but an unfinished run of the same method, settings, data
-    and machine, and `DatasetError` when the dataset lacks a frame that the method needs."""
+    Raises `PredictionError` for an ``out`` that another process predicts into, or that holds anything but an unfinished
+    run of the same method, settings, data and machine, and `DatasetError` when the dataset lacks a frame that the
+    method needs."""
+    opened.samples(split)  # before a folder is made
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise PredictionError(f"{out}: can't be made a folder ({error.strerror})") from error
+    with exclusive(out / LOCK_FILE, out, "predicting into this folder", PredictionError):
+        return _predict_split(opened, method, split, out, progress)
+
+
+def _predict_split(
+    opened: DatasetFolder, method: Method, split: str, out: Path, progress: Callable[[int], None]
+) -> Run:
     samples = opened.samples(split)
     run = _prepare(out, opened, method, split)
     warm = False
@@ -60,9 +74,9 @@ def predict_split(
             started = perf_counter()
             answer = method.answer(frames)
             seconds = perf_counter() - started
-            _write_prediction(path, answer.depth, opened.size)
+            _write_prediction(run, path, answer.depth, opened.size)
             if answer.sigma_mm is not None:
-                _write_prediction(out / f"{sample}{SIGMA}", answer.sigma_mm, opened.size)
+                _write_prediction(run, out / f"{sample}{SIGMA}", answer.sigma_mm, opened.size)
             run.add(sample, Finished(seconds, dict(answer.report) if method.reports else {}))
         progress(1)
     median = statistics.median(run.finished[sample].seconds for sample in samples)
@@ -94,16 +108,12 @@ def captured_frames(opened: DatasetFolder, method: Method, sample: str) -> list[
 
 
 def _prepare(out: Path, opened: DatasetFolder, method: Method, split: str) -> UnfinishedRun:
-    """Make ``out``, or take over one that a stopped run left; what of it is finished."""
+    """Take over what a stopped run left in ``out``; what of it is finished."""
     samples = opened.samples(split)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise PredictionError(f"{out}: can't be made a folder ({error.strerror})") from error
     file_names = sorted(path.name for path in out.iterdir())
-    expected = set()
+    expected = {LOCK_FILE}
     if UNFINISHED_FILE in file_names:
-        expected = {f"{sample}{suffix}" for sample in samples for suffix in (PREDICTION_SUFFIX, SIGMA)}
+        expected |= {f"{sample}{suffix}" for sample in samples for suffix in (PREDICTION_SUFFIX, SIGMA)}
         expected |= {UNFINISHED_FILE, REPORTS_FILE, SUBMISSION_FILE}
     foreign = [name for name in file_names if name not in expected and not name.endswith(".tmp")]
     foreign.sort(key=lambda name: name != SUBMISSION_FILE)  # of a finished run: its first name to say
@@ -119,15 +129,15 @@ def _prepare(out: Path, opened: DatasetFolder, method: Method, split: str) -> Un
     return run
 
 
-def _write_prediction(path: Path, depth_mm: NDArray[np.float32], size: tuple[int, int]) -> None:
+def _write_prediction(run: UnfinishedRun, path: Path, depth_mm: NDArray[np.float32], size: tuple[int, int]) -> None:
     if depth_mm.shape != size or depth_mm.dtype != np.float32:
         raise PredictionError(f"{path}: the method gave {depth_mm.dtype} {depth_mm.shape}, expected float32 {size}")
     if not np.isfinite(depth_mm).all():
         raise PredictionError(f"{path}: the method gave depths that are not finite: a fault of the method")
-    temporary = path.with_suffix(".tmp")
-    with temporary.open("wb") as file:
-        np.save(file, depth_mm, allow_pickle=False)
-    temporary.replace(path)
+    run.begin()
+    content = BytesIO()
+    np.save(content, depth_mm, allow_pickle=False)
+    write_atomically(path, content.getvalue(), sync=False)  # a later run sees what is not whole
 
 
 def _described(method: Method) -> dict[str, Any]:

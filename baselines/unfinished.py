@@ -7,6 +7,7 @@ one is a finished sample, written when its files are. A last line that was cut o
 import json
 import os
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,9 +15,10 @@ from typing import Any
 import numpy as np
 
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.files import printable
+from fpp_ml_bench.evaluation.submission import UNFINISHED_FILE
+from fpp_ml_bench.files import file_content, naming, printable, strict_json
 
-UNFINISHED_FILE = "unfinished.jsonl"
+_LARGEST_BYTES = 1 << 28
 
 
 @dataclass(frozen=True)
@@ -37,14 +39,16 @@ class UnfinishedRun:
         self.finished: dict[str, Finished] = {}
         if not self.path.exists():
             return
-        text = self.path.read_text(encoding="utf-8")
+        cure = "remove the folder, or give another one"
+        text = file_content(self.path, _LARGEST_BYTES, PredictionError, cure).decode("utf-8", "replace")
         lines = [entry for line in text.splitlines() if isinstance(entry := _parsed(line), dict)]
         if not text.startswith("{") or not lines:
             self.path.unlink()  # stopped before the first line was whole
             return
         self._check(lines[0])
         for entry in lines[1:]:
-            self.finished[entry["sample"]] = Finished(float(entry["seconds"]), dict(entry["report"]))
+            with suppress(KeyError, TypeError, ValueError):  # a damaged line: its sample is predicted again
+                self.finished[str(entry["sample"])] = Finished(float(entry["seconds"]), dict(entry["report"]))
         if not text.endswith("\n"):
             with self.path.open("a", encoding="utf-8") as file:
                 file.write("\n")  # what follows is a line of its own
@@ -72,10 +76,16 @@ class UnfinishedRun:
     def add(self, sample: str, finished: Finished) -> None:
         """Note that the files of ``sample`` are there."""
         self.finished[sample] = finished
-        entry = {"sample": sample, "seconds": finished.seconds, "report": finished.report}
-        lines = [entry] if self.path.exists() else [self.run, entry]
-        with self.path.open("a", encoding="utf-8") as file:
-            file.writelines(json.dumps(line) + "\n" for line in lines)
+        self._append({"sample": sample, "seconds": finished.seconds, "report": finished.report})
+
+    def begin(self) -> None:
+        """Note what run it is, before its first file: a folder with a prediction and no note is not taken over."""
+        if not self.path.exists():
+            self._append(self.run)
+
+    def _append(self, entry: dict[str, Any]) -> None:
+        with naming(self.path), self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(entry) + "\n")
             file.flush()
             os.fsync(file.fileno())
 
@@ -87,6 +97,6 @@ class UnfinishedRun:
 def _parsed(line: str) -> Any:
     """The line's JSON; None for one that was cut off."""
     try:
-        return json.loads(line)
+        return strict_json(line)
     except ValueError:
         return None

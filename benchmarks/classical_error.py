@@ -56,7 +56,7 @@ def measure(dataset: DatasetFolder, split: str, direction: str, steps: int) -> P
         depth_mm = method.predict(frames)
         seconds.append(time.perf_counter() - started)
         target_mm = dataset.target_mm(sample, "depth_exact")
-        scores = score_sample(depth_mm, target_mm, EDGE_BAND_PX, dataset.void(sample))
+        scores = score_sample(depth_mm, target_mm, EDGE_BAND_PX, dataset.void(sample, "depth_exact"))
         rows.append(
             (scores.interior_valid.mae_mm, scores.valid.mae_mm, scores.object.mae_mm,
              scores.missing / scores.object.pixels, scores.background.mae_mm)

@@ -54,7 +54,7 @@ def panels_of(dataset: DatasetFolder, sample: str, method: CrossedMethod, others
     if method.route.resampling.needed:
         raise PredictionError(f"{dataset.path}: its fringes are resampled; draw a dataset of 960 px")
     crop = seen.carriers.crop
-    exact, void = dataset.target_mm(sample, "depth_exact")[crop], dataset.void(sample)[crop]
+    exact, void = dataset.target_mm(sample, "depth_exact")[crop], dataset.void(sample, "depth_exact")[crop]
     on_object = object_mask(exact)
     answers = [one.predict(frames)[crop] for one in (method, *others)]
     depth_mm, *_ = answers

@@ -23,7 +23,6 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
@@ -33,7 +32,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import TEST_OBJECTS, VIEWS
 from fpp_ml_bench.evaluation.protocol import HEADLINE
 from fpp_ml_bench.loaders.sample import Row
-from fpp_ml_bench.loaders.storage import Manifest, ShardFile, ShardWriter, plan_shards
+from fpp_ml_bench.loaders.storage import Assembly, Manifest, ShardWriter, plan_shards
 from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
 
 COVER = 0.1
@@ -92,26 +91,20 @@ def prepare(data: Path, predictions: Path, targets: Path, size: int, samples: in
     objects: dict[str, list[tuple[str, str, str]]] = {}
     for sample in names:
         objects.setdefault(sample[1], []).append(sample)
-    shards: list[ShardFile] = []
-    described: list[dict[str, Any]] = []
-    for plan in plan_shards("test", objects):
+    plans, receipts = plan_shards("test", objects), []
+    for number, plan in enumerate(plans):
         rows: list[Row] = []
         for sample, name, view in plan.samples:
-            depth = depth_map(size, len(described) + len(rows))
+            depth = depth_map(size, 100 * number + len(rows))
             noise = np.random.default_rng(len(rows)).normal(0, 2, depth.shape)
             np.save(predictions / f"{sample}.npy", (depth + noise).astype(np.float32))
             np.save(targets / f"{sample}.npy", depth)
             rows.append(Row(sample, name, view, {0: np.zeros(depth.shape, np.uint8)}, depth, None))
-        written, rows_described = ShardWriter(
-            data, data / ".build", PAPER_SEQUENCE, "single_shot", False, (size, size)
-        ).write(plan, rows)
-        shards += written
-        described += rows_described
+        writer = ShardWriter(data, data / ".build", PAPER_SEQUENCE, "single_shot", False, (size, size))
+        receipts.append(writer.write(plan, rows))
     (data / ".build").rmdir()
-    Manifest(
-        origin="generated", generator={}, settings={}, rig=paper_rig(960).to_dict(), size=(size, size),
-        stored="single_shot", exact=False, samples={"test": described}, shards=shards,
-    ).write(data)  # fmt: skip
+    manifest = Manifest("generated", {}, {}, paper_rig(960).to_dict(), (size, size), "single_shot", exact=False)
+    Assembly(plans, lambda plan, folder: (), manifest).filled(receipts).write(data)
     (predictions / "submission.yaml").write_text(_DESCRIPTION)
 
 

@@ -83,7 +83,7 @@ def measure_views(dataset: DatasetFolder, split: str, direction: str, errors: li
     with progress_bar(f"{direction}, {split}", len(samples), "samples") as advance:
         for sample in samples:
             frames, target_mm = captured_frames(dataset, first, sample), dataset.target_mm(sample, "depth_exact")
-            void = dataset.void(sample)
+            void = dataset.void(sample, "depth_exact")
             levels = level_errors(first, frames, target_mm, void)
             for error, chooser in choosers.items():
                 choice = chooser.choose(frames)
@@ -105,7 +105,7 @@ def calibrate(dataset: DatasetFolder, split: str, every: int) -> None:
         with progress_bar(f"{direction}, {split}", len(samples), "samples") as advance:
             for sample in samples:
                 frames, target_mm = captured_frames(dataset, chooser, sample), dataset.target_mm(sample, "depth_exact")
-                scored = object_mask(target_mm) & ~dataset.void(sample)
+                scored = object_mask(target_mm) & ~dataset.void(sample, "depth_exact")
                 for count, method in chooser.methods.items():
                     measurement = method.measure(frames)
                     measured = scored & (measurement.depth_mm > 0)

@@ -89,7 +89,7 @@ def measure(dataset: DatasetFolder, split: str, setting: str, predictor: Method)
             depth_mm = predictor.predict(frames)
             seconds.append(process_time() - started)
             target_mm = dataset.target_mm(sample, "depth_exact")
-            void = dataset.void(sample)
+            void = dataset.void(sample, "depth_exact")
             scores = score_sample(depth_mm, target_mm, EDGE_BAND_PX, void).metrics()
             scored = object_mask(target_mm) & ~void
             wrong = scored & (depth_mm > 0) & (np.abs(depth_mm - target_mm) > WRONG_MM)

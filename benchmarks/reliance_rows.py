@@ -45,9 +45,9 @@ from fpp_ml_bench.evaluation.result import RELIANCE_VERSION
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.leaderboard.columns import reliance_interval
 from fpp_ml_bench.leaderboard.measured import check_same_method, write_reliance
-from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, Entry, read_entry
+from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, VOUCHED, Entry, read_entry, vouched
 from fpp_ml_bench.leaderboard.tables import markdown_rows, markdown_text
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage import DatasetFolder, benchmark_before, benchmark_of
 from fpp_ml_bench.optics import Rig
 
 REFUSED = 2
@@ -109,17 +109,16 @@ class Materials:
 
     def scenes_of(self, entry: Entry, anywhere: bool) -> SceneSet:
         """The scenes of the row's own data; with ``anywhere``, of the first dataset where its own is not given."""
-        fingerprint = entry.result.dataset.fingerprint
         for scenes in self.scenes:
-            if scenes.dataset.fingerprint == fingerprint:
+            if entry.row.dataset.content.items() <= scenes.dataset.content.items():
                 return scenes
         if not anywhere:
-            raise FppBenchError(f"its data {fingerprint[:8]} is not among --data")
+            raise FppBenchError(f"its data ({entry.row.dataset.identity}) is not among --data")
         return self.scenes[0]
 
     def method_and_scenes(self, entry: Entry) -> tuple[Method, SceneSet]:
         """The row's method, built again, and the scenes to measure it on. FppBenchError where it can't be built."""
-        about = entry.result.submission
+        about = entry.row.submission
         if about.method in TRIVIAL:
             raise FppBenchError("a trivial method: it looks at no fringe")
         if about.method in METHODS:
@@ -143,7 +142,7 @@ _NO_OPTIONS = {
 
 def built(entry: Entry, rig: Rig) -> Method:
     """The method of the package that made the row, by the row's settings, for images of ``rig``."""
-    about = entry.result.submission
+    about = entry.row.submission
     described = _NO_OPTIONS | ({"shading"} if about.method == "phase-net" else set())
     options = {key: value for key, value in about.settings.items() if key not in described}
     return load_method(about.method, rig, **options)
@@ -155,14 +154,21 @@ def fill(materials: Materials, path: Path, again: bool) -> str:
     row_method, scenes = materials.method_and_scenes(entry)
     check_same_method(entry, row_method)
     weights = row_method.settings.get("weights_sha256")
-    stored = entry.result.reliance
+    stored = entry.row.reliance
     if stored is not None and not again:
-        known = stored.dataset_fingerprint in (scenes.dataset.fingerprint, entry.result.dataset.fingerprint)
+        before = benchmark_before(stored.dataset_fingerprint)
+        known = stored.dataset_fingerprint == scenes.dataset.fingerprint or (
+            before is not None and before == benchmark_of(scenes.dataset.content)
+        )
         if known and (stored.version, stored.weights_sha256) == (RELIANCE_VERSION, weights):
             return f"{stored.score:.3f}, unchanged"
     started = time.perf_counter()
     reliance, _ = measure(row_method, scenes, weights if isinstance(weights, str) else None)
+    before = sha256(path.read_bytes()).hexdigest()
     write_reliance(entry, reliance)
+    if before in vouched():  # the same row still, with what was measured of it
+        listed, after = VOUCHED.read_text(encoding="utf-8"), sha256(path.read_bytes()).hexdigest()
+        write_atomically(VOUCHED, listed.replace(before, after).encode())
     low, high = reliance.interval
     return f"{reliance.score:.3f} ({low} to {high}), {time.perf_counter() - started:.1f} s"
 
@@ -171,7 +177,7 @@ def table(entries: list[Entry]) -> str:
     """Every row that has a phase reliance as Markdown, the highest score first."""
     titles = ("Row", "Reliance", "95% interval", "Periods aside", "Follows phase", "Follows brightness",
               "Change by outline", "No fringe inside", "No fringe outside", "Object MAE, mm", "Track")  # fmt: skip
-    measured = [(entry, entry.result.reliance) for entry in entries if entry.result.reliance is not None]
+    measured = [(entry, entry.row.reliance) for entry in entries if entry.row.reliance is not None]
     measured.sort(key=lambda pair: (-pair[1].score, pair[0].name))
     lines = []
     for entry, measured_reliance in measured:
@@ -184,7 +190,7 @@ def table(entries: list[Entry]) -> str:
             reliance_interval(entry),
             _two_decimals(measured_reliance.order_free_score),
         ]
-        cells += [*map(_two_decimals, values), millimetres(entry.value("object_mae_mm")), entry.result.track]
+        cells += [*map(_two_decimals, values), millimetres(entry.value("object_mae_mm")), entry.row.track]
         lines.append([markdown_text(cell) for cell in cells])
     right = [0 < place < len(titles) - 1 for place in range(len(titles))]
     footer = (

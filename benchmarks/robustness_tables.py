@@ -1,11 +1,11 @@
-"""The tables and curves of FPP-C in docs/robustness.md, made of the leaderboard's rows.
+"""The tables and curves of FPP-C in docs/robustness.md, made of whole result files.
 
-    fpp-bench robustness phase --out robustness --into leaderboard/rows/phase-horizontal.json
-    python benchmarks/robustness_tables.py
+    fpp-bench robustness phase --out robustness --into results/phase.json
+    python benchmarks/robustness_tables.py results
 
-Every row that holds a block of ``test`` or ``unseen`` (`Robustness` in result.json) and is of today's data is shown,
-the least error first. Between the markers ``<!-- SET:begin -->`` and ``<!-- SET:end -->`` of the page nothing is kept;
-the pictures are written beside it.
+Every result that holds a block of ``test`` or ``unseen`` (`Robustness` in result.json) is shown, the least error first.
+The leaderboard's rows hold it in brief, without the severities. Between the markers ``<!-- SET:begin -->`` and
+``<!-- SET:end -->`` of the page nothing is kept; the pictures are written beside it.
 """
 
 import argparse
@@ -17,11 +17,10 @@ from fpp_ml_bench.baselines.robustness import CLEAN, SETS, Measured, SetName, co
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import FppBenchError
 from fpp_ml_bench.evaluation.report import percent
-from fpp_ml_bench.evaluation.result import Robustness
+from fpp_ml_bench.evaluation.result import Result, Robustness, read_result
 from fpp_ml_bench.files import write_atomically
-from fpp_ml_bench.leaderboard.groups import GroupKey
 from fpp_ml_bench.leaderboard.names import short_names
-from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, Entry, read_entry
+from fpp_ml_bench.leaderboard.ranking import expand
 from fpp_ml_bench.leaderboard.tables import markdown_rows, markdown_text
 
 PAGE = Path(__file__).resolve().parent.parent / "docs" / "robustness.md"
@@ -36,15 +35,15 @@ TITLES = ("method", "mean, mm", "95% interval", "clean, mm", "ratio", "wrong ord
 Row = tuple[str, Robustness]
 
 
-def rows_in(entries: Iterable[Entry]) -> dict[SetName, list[Row]]:
+def rows_in(results: Iterable[Result]) -> dict[SetName, list[Row]]:
     """Names and blocks of each set, the least error first."""
-    todays = [entry for entry in entries if entry.result.robustness and not GroupKey.of(entry.result).is_legacy]
-    return {name: _of_set(name, todays) for name in SETS}
+    results = list(results)
+    return {name: _of_set(name, results) for name in SETS}
 
 
-def _of_set(name: SetName, entries: Sequence[Entry]) -> list[Row]:
-    blocks = [(entry, block) for entry in entries if (block := (entry.result.robustness or {}).get(name))]
-    names = short_names([entry.result.submission for entry, _ in blocks])
+def _of_set(name: SetName, results: Sequence[Result]) -> list[Row]:
+    blocks = [(result, block) for result in results if (block := (result.robustness or {}).get(name))]
+    names = short_names([result.submission for result, _ in blocks])
     found = [(f"{short}, {block.size_px} px" if block.size_px != FULL_SIZE else short, block)
              for short, (_, block) in zip(names, blocks, strict=True)]  # fmt: skip
     return sorted(found, key=lambda row: (row[1].mae_mm, row[0]))
@@ -95,11 +94,11 @@ def filled(text: str, rows: Mapping[SetName, Sequence[Row]]) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
-    parser.add_argument("--rows", type=Path, default=SHIPPED_ROWS, help="folder of the rows")
+    parser.add_argument("results", type=Path, nargs="+", help="result files, or folders of them")
     parser.add_argument("--page", type=Path, default=PAGE, help="Markdown with the markers")
     args = parser.parse_args()
     try:
-        rows = rows_in(map(read_entry, sorted(args.rows.glob("*.json"))))
+        rows = rows_in(map(read_result, expand(args.results)))
         text = filled(args.page.read_text(encoding="utf-8"), rows)
     except (FppBenchError, OSError, ValueError) as error:
         print(f"{args.page}: {error}", file=sys.stderr)

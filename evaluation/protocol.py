@@ -4,12 +4,12 @@ different protocol versions are never ranked together."""
 
 from typing import Literal, get_args
 
-PROTOCOL_VERSION = "2.0.0"
-SchemaVersion = Literal["2.0.0", "2.1.0", "2.2.0", "2.3.0", "2.4.0"]
-RESULT_SCHEMA_VERSION: SchemaVersion = "2.4.0"
-"""What is written. 2.1.0 adds the optional ``dataset.benchmark``, 2.2.0 the optional ``robustness``, 2.3.0 the keys of
-protocol 2: void and unlit pixels, ``uncertainty`` and ``submission.learned_from``, 2.4.0 `RANGE_SHARE`; every
-`SchemaVersion` is read."""
+PROTOCOL_VERSION = "3.0.0"
+"""Since 3.0.0, object and void against ``depth_exact`` follow from scene and light alone; the rules against ``depth``
+are those of 2.0.0."""
+SchemaVersion = Literal["3.0.0"]
+RESULT_SCHEMA_VERSION: SchemaVersion = "3.0.0"
+"""What is written, and the only version that is read. Since 3.0.0 ``dataset.content`` says what was scored against."""
 
 Target = Literal["depth", "depth_exact"]
 Track = Literal[
@@ -20,9 +20,19 @@ Track = Literal[
 Mode = Literal["standard", "paper", "paper-individual"]
 """By which rules; see PROTOCOL.md. ``paper-individual`` stands in results of protocol 1 only: ``paper`` for normalised
 depth."""
+FramesClass = Literal["one frame", "few frames, no code", "full sequence"]
+"""What a method captures: at most one frame; several but no Gray code; frames with Gray code."""
 Units = Literal["mm", "m", "normalised"]
 TARGETS: tuple[str, ...] = get_args(Target)
 MODES: tuple[Mode, ...] = ("standard", "paper")
+FRAMES_CLASSES: tuple[FramesClass, ...] = get_args(FramesClass)
+
+
+def scored_columns(target: str, mode: str, flags: bool) -> tuple[str, ...]:
+    """Columns of a dataset whose content identifies what was scored against: the depth, and by the rules that know void
+    pixels the flags that tell them (``flags``: whether the dataset has any)."""
+    return (target, "flags") if mode == "standard" and flags else (target,)
+
 
 EDGE_BAND_PX = 3
 """Object pixels nearer than this to a depth edge form the edge set, the others the interior."""
@@ -54,7 +64,7 @@ WIDE_BAND = ("object_wide_band_mae_mm", "object_wide_interior_mae_mm", "object_w
 RANGE_SHARE = "object_mae_range_share"
 """Object MAE over the depth range of the sample's scored object pixels, the only share that may exceed 1."""
 SINCE_2 = ("void_share", "unlit_mae_mm", "unlit_rmse_mm", "unlit_valid_mae_mm", "unlit_missing_share", RANGE_SHARE)
-"""Since protocol 2: the share of the image that counts in no set, scores of its unlit pixels, against ``depth_exact``
+"""The share of the image that counts in no set, scores of its unlit pixels, against ``depth_exact``
 only, and `RANGE_SHARE`. Left out of a result where no sample has them."""
 
 METRICS = HEADLINE + BESIDE + DISTRIBUTION + WIDE_BAND + SINCE_2
@@ -92,3 +102,5 @@ NORMALISED_AT_MOST = 1.2
 BOOTSTRAP_RESAMPLES = 10_000
 BOOTSTRAP_SEED = 20_250
 CONFIDENCE = 0.95
+MOST_OBJECTS, MOST_SAMPLES = 1_000, 10_000
+"""Limits of a result: its intervals are computed again when it is read, from 10,000 resamples of all objects."""

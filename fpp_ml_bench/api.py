@@ -264,7 +264,8 @@ def compare(first: "str | Path | result.Result", second: "str | Path | result.Re
     Parameters
     ----------
     first, second : str, Path or Result
-        Result files, row files of the leaderboard, or what `evaluate` gives.
+        Result files, row files of the leaderboard, or what `evaluate` gives. With a row the means of its objects are
+        compared.
 
     Returns
     -------
@@ -283,7 +284,10 @@ def compare(first: "str | Path | result.Result", second: "str | Path | result.Re
     >>> fpp.compare(one, one).differences["object_mae_mm"].mean_mm
     0.0
     """
-    return report.compare(_result(first), _result(second))
+    from fpp_ml_bench.leaderboard.rows import alike, read_scored
+
+    scored = (read_scored(Path(given)) if isinstance(given, (str, Path)) else given for given in (first, second))
+    return report.compare(*alike(*scored))
 
 
 def rank(results: "Iterable[str | Path]", sort: str = "object_mae_mm") -> "list[Group]":
@@ -299,7 +303,7 @@ def rank(results: "Iterable[str | Path]", sort: str = "object_mae_mm") -> "list[
     Returns
     -------
     list of Group
-        Each with its ``rows`` in order of rank, the tests of all ``pairs``, and why rows have no rank (``unranked``).
+        Each with its ``rows`` in order of rank, the tests of all ``pairs``, and why rows have no rank or are left out (``notes``).
 
     Raises
     ------
@@ -315,9 +319,3 @@ def rank(results: "Iterable[str | Path]", sort: str = "object_mae_mm") -> "list[
     from fpp_ml_bench.leaderboard import ranking
 
     return ranking.rank(ranking.read_entries(ranking.expand(Path(path) for path in results)), sort)
-
-
-def _result(given: "str | Path | result.Result") -> "result.Result":
-    from fpp_ml_bench.leaderboard.rows import read_entry
-
-    return read_entry(Path(given)).result if isinstance(given, (str, Path)) else given

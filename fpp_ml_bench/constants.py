@@ -5,10 +5,14 @@ list of its objects. The paper does not list the split; it is defined here, with
 figures in test.
 """
 
-SCHEMA_VERSION = "2.0.0"
+import re
+
+SCHEMA_VERSION = "3.0.0"
 
 MM_PER_M = 1000.0
 GREY_LEVELS = 255
+LARGEST_SIDE_PX = 8192
+"""Of an image that is rendered, and of a depth map whose dataset is not known."""
 
 WORKING_RANGE_MM = (1500.0, 2100.0)
 STANDOFF_M = 1.8
@@ -62,6 +66,11 @@ def split_of(name: str) -> str:
     if name in TEST_OBJECTS or name in UNSEEN:
         return "test"
     return "validation" if name in VALIDATION_OBJECTS else "train"
+
+
+OBJECT_NAME, VIEW_NAME = re.compile(r"\w[\w-]{0,99}"), re.compile(r"[^\W_]([^\W_]|-){0,99}")
+SAMPLE_NAME = re.compile(f"{OBJECT_NAME.pattern}_{VIEW_NAME.pattern}")
+"""Names that a dataset may have; they become names of files."""
 
 
 def sample_name(name: str, view: str) -> str:

@@ -1,19 +1,28 @@
-"""Files of any room: text of unknown origin, bounded reading, atomic writing, hashes, locks, and strict YAML."""
+"""Files of any room: text of unknown origin, the only readers of YAML and JSON from outside, bounded reading, atomic
+writing, hashes, and locks."""
 
+import errno
+import json
 import os
 import re
 import stat
+import sys
 import unicodedata
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from functools import cache
-from pathlib import Path
+from itertools import accumulate
+from pathlib import Path, PurePosixPath
 from typing import IO, Any
 
 from fpp_ml_bench.errors import BuildError, FppBenchError, PredictionError
 
 NAME_LIMIT = 200
 """Longest text a submission may hold in any one value, in characters."""
+DEEPEST, LONGEST_NUMBER, MOST_NODES, MOST_VALUES = 64, 1_000, 50_000, 1_000_000
+"""Limits of a file from outside, checked before its values are built: levels of mappings and lists in each other,
+digits of a number, keys and values of YAML, values of JSON."""
+CORRECT = "correct the file"
 
 # Control, format (bidirectional overrides, zero-width), surrogate, and line or paragraph separators.
 _FORBIDDEN = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
@@ -29,6 +38,15 @@ def text_problem(value: str, limit: int = NAME_LIMIT) -> str | None:
     if bad is not None:
         return f"expected printable text, got the control character U+{ord(bad):04X}"
     return None
+
+
+def path_problem(path: str) -> str | None:
+    """What is wrong with a text from a file that must be the path of something below a folder, or None."""
+    plain = PurePosixPath(path)
+    below = plain.parts and not plain.is_absolute() and ".." not in plain.parts and "\\" not in path
+    if below and str(plain) == path:
+        return text_problem(path)
+    return "expected a relative path with / between its names, and without . and .."
 
 
 def cause_of(error: Exception) -> str:
@@ -47,20 +65,30 @@ def printable(value: object, limit: int = NAME_LIMIT) -> str:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[tuple[IO[bytes], int]]:
-    """The file and its size in bytes; PredictionError, without the file's name, for anything but a regular file."""
+def opened(path: Path, links: bool = False) -> Iterator[tuple[IO[bytes], int]]:
+    """The file and its size in bytes; PredictionError, without the file's name, for anything but a regular file, and
+    without ``links`` for a symbolic link. Opening never waits, as for the other end of a pipe."""
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-    except OSError as error:
-        linked = path.is_symlink()
-        reason = "is a symbolic link; put the file itself there" if linked else f"can't be read: {error.strerror}"
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | (0 if links else os.O_NOFOLLOW))
+    except (OSError, ValueError) as error:  # ValueError: a name with a null character
+        linked = not links and path.is_symlink()
+        reason = "is a symbolic link; put the file itself there" if linked else f"can't be read: {cause_of(error)}"
         raise PredictionError(reason) from None
     info = os.fstat(descriptor)
     if not stat.S_ISREG(info.st_mode):
         os.close(descriptor)
-        raise PredictionError("is not a regular file; put the prediction's file there")
+        what = " but a folder" if stat.S_ISDIR(info.st_mode) else ""
+        raise PredictionError(f"is not a regular file{what}; put the file itself there")
     with os.fdopen(descriptor, "rb", buffering=0) as stream:
         yield stream, info.st_size
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is a file; False for a name that no file can have, for which ``Path.is_file`` raises an error."""
+    try:
+        return path.is_file()
+    except (OSError, ValueError):
+        return False
 
 
 def fill(stream: IO[Any], view: memoryview) -> int:
@@ -71,29 +99,80 @@ def fill(stream: IO[Any], view: memoryview) -> int:
     return done
 
 
-def read_bounded(path: Path, limit: int) -> bytes:
+def read_bounded(path: Path, limit: int, cure: str = "write a map of this size again", links: bool = False) -> bytes:
     """All bytes of the file at ``path``. Raises PredictionError as `opened`, or when they are more than ``limit``."""
-    with opened(path) as (stream, size):
+    with opened(path, links) as (stream, size):
         if size > limit:
-            raise PredictionError(f"has {size} bytes, expected at most {limit} for a map of this size; write it again")
+            raise PredictionError(f"has {size} bytes, expected at most {limit} bytes; {cure}")
         content = bytearray(size)
         length = fill(stream, memoryview(content))
     if length != size:
-        raise PredictionError(f"ended early: expected {size} bytes, got {length}; write it again")
+        raise PredictionError(f"ended early: expected {size} bytes, got {length}; {cure}")
     return bytes(content)
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file so that it is there complete or not at all, also after a power cut."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+def file_content(path: Path, limit: int, raised: type[FppBenchError], cure: str = CORRECT) -> bytes:
+    """All bytes, at most ``limit``, of a file that the user names; a link is followed. Raises ``raised`` with the
+    file's name, the problem and the ``cure``."""
     try:
-        with temporary.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-    finally:
-        temporary.unlink(missing_ok=True)
+        return read_bounded(path, limit, cure, links=True)
+    except PredictionError as error:
+        raise raised(f"{printable(str(path), 500)}: {error}") from None
+
+
+def read_yaml(path: Path, raised: type[FppBenchError], cure: str = CORRECT, limit: int = 1 << 20) -> Any:
+    """The plain values of a YAML file, as `strict_yaml`; ``raised`` with file, problem and ``cure``."""
+    return _read(path, strict_yaml, "plain YAML", raised, cure, limit)
+
+
+def read_json(path: Path, raised: type[FppBenchError], cure: str = CORRECT, limit: int = 1 << 26) -> Any:
+    """The plain values of a JSON file, as `strict_json`; ``raised`` with file, problem and ``cure``."""
+    return _read(path, strict_json, "valid JSON", raised, cure, limit)
+
+
+def _read(
+    path: Path, parse: Callable[[str], Any], form: str, raised: type[FppBenchError], cure: str, limit: int
+) -> Any:
+    content, file = file_content(path, limit, raised, cure), printable(str(path), 500)
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError:
+        raise raised(f"{file}: expected UTF-8 text, found other bytes; {cure}") from None
+    try:
+        return parse(text)
+    except ValueError as error:
+        raise raised(f"{file} is no {form}: {error}; {cure}") from None
+
+
+DISK_FULL = errno.ENOSPC, errno.EDQUOT, errno.EFBIG
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Have an `OSError` within name ``path``, and that of a full disk, which names no file, say what to do."""
+    try:
+        yield
+    except OSError as error:
+        error.filename, error.filename2 = str(path), None
+        if error.errno in DISK_FULL:
+            error.strerror = f"{os.strerror(error.errno)}; free some space or choose another disk"
+        raise
+
+
+def write_atomically(path: Path, content: bytes, sync: bool = True) -> None:
+    """Write a file so that it is there complete or not at all, with ``sync`` (which takes milliseconds) also after a
+    power cut. An `OSError` names it."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    with naming(path):
+        try:
+            with temporary.open("wb") as file:
+                file.write(content)
+                file.flush()
+                if sync:
+                    os.fsync(file.fileno())
+            temporary.replace(path)
+        finally:
+            temporary.unlink(missing_ok=True)
 
 
 def write_files(folder: Path, contents: Mapping[str, bytes], error_type: type[FppBenchError]) -> list[Path]:
@@ -119,15 +198,23 @@ def file_hash(path: Path) -> str:
         with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
             view = memoryview(content)
             for start in range(0, len(view), 1 << 24):
+                if content.size() < len(view):
+                    break  # cut meanwhile: another hash tells, and reading on would end the process
                 digest.update(view[start : start + (1 << 24)])
             view.release()
     return digest.hexdigest()
 
 
+LOCK_FILE = ".lock"
+"""Of a folder that a process works in. One that a killed process left locks nothing."""
+
+
 @contextmanager
-def exclusive(lock_file: Path, folder: Path, activity: str) -> Iterator[None]:
-    """Hold ``lock_file``, created with its folder if absent; `BuildError` for ``folder`` if another process has it.
-    The operating system releases the lock when the process ends in any way."""
+def exclusive(
+    lock_file: Path, folder: Path, activity: str, error_type: type[FppBenchError] = BuildError
+) -> Iterator[None]:
+    """Hold ``lock_file``, created with its folder if absent and removed at the end; ``error_type`` for ``folder`` if
+    another process has it. The operating system releases the lock when the process ends in any way."""
     import filelock
 
     lock = filelock.FileLock(lock_file, timeout=0)
@@ -135,12 +222,16 @@ def exclusive(lock_file: Path, folder: Path, activity: str) -> Iterator[None]:
         lock_file.parent.mkdir(parents=True, exist_ok=True)
         lock.acquire()
     except filelock.Timeout:
-        raise BuildError(f"{folder}: another process is {activity}; wait for it or choose another folder") from None
+        raise error_type(f"{folder}: another process is {activity}; wait for it or choose another folder") from None
     except OSError as error:
-        raise BuildError(f"{folder}: can't be written ({error.strerror or error})") from error
+        raise error_type(f"{folder}: can't be written ({error.strerror or error})") from error
+    held = lock_file.stat()
     try:
         yield
     finally:
+        with suppress(OSError):
+            if os.path.samestat(held, lock_file.stat()):  # the folder may have been moved away
+                lock_file.unlink()  # while it is held: filelock never takes a file that is gone
         lock.release()
 
 
@@ -149,13 +240,28 @@ def _strict_loader() -> type:
     import yaml
 
     class StrictLoader(yaml.SafeLoader):
-        """SafeLoader without aliases, without duplicate keys, and with 1e-3 read as the number it is."""
+        """SafeLoader without aliases, tags and duplicate keys, of bounded size, with 1e-3 read as the number it is and
+        2026-01-31 as text."""
+
+        nodes = depth = 0
 
         def compose_node(self, parent: Any, index: Any) -> Any:
-            if self.check_event(yaml.events.AliasEvent):
-                mark = self.peek_event().start_mark
-                raise yaml.YAMLError(f"line {mark.line + 1} uses an alias (*); write the value out")
-            return super().compose_node(parent, index)
+            event, key = self.peek_event(), f" {printable(index.value, 60)}:" if hasattr(index, "value") else ""
+            where = f"line {event.start_mark.line + 1}:{key}"
+            if isinstance(event, yaml.events.AliasEvent):
+                raise yaml.YAMLError(f"{where} uses an alias (*); write the value out")
+            if event.tag is not None:
+                raise yaml.YAMLError(f"{where} has the tag {printable(event.tag, 60)}; write a plain value")
+            self.nodes, self.depth = self.nodes + 1, self.depth + 1
+            if self.nodes > MOST_NODES:
+                raise yaml.YAMLError(f"{where} expected at most {MOST_NODES} keys and values")
+            if self.depth > DEEPEST:
+                raise yaml.YAMLError(f"{where} nested too deeply, expected at most {DEEPEST} levels")
+            node: Any = super().compose_node(parent, index)
+            self.depth -= 1
+            if node.tag in ("tag:yaml.org,2002:int", "tag:yaml.org,2002:float") and len(node.value) > LONGEST_NUMBER:
+                raise yaml.YAMLError(f"{where} a number of more than {LONGEST_NUMBER} digits")
+            return node
 
         def construct_mapping(self, node: Any, deep: bool = False) -> Any:
             seen = set()
@@ -168,6 +274,10 @@ def _strict_loader() -> type:
                 seen.add(key.value)
             return super().construct_mapping(node, deep=deep)
 
+    StrictLoader.yaml_implicit_resolvers = {
+        first: [rule for rule in rules if rule[0] != "tag:yaml.org,2002:timestamp"]
+        for first, rules in yaml.SafeLoader.yaml_implicit_resolvers.items()
+    }
     StrictLoader.add_implicit_resolver(
         "tag:yaml.org,2002:float", re.compile(r"^[-+]?\d+(\.\d*)?[eE][-+]?\d+$"), list("-+0123456789")
     )
@@ -175,7 +285,69 @@ def _strict_loader() -> type:
 
 
 def strict_yaml(text: str) -> Any:
-    """The plain values of a YAML text. Raises ``yaml.YAMLError``, also for an alias or a key given twice."""
+    """The plain values of a YAML text. Raises ValueError, fit to print, for anything else: also for an alias, a tag, a
+    key given twice, a number that is not finite, and for more or deeper values than `MOST_NODES` and `DEEPEST`."""
     import yaml
 
-    return yaml.load(text, _strict_loader())  # a subclass of SafeLoader: builds plain values only
+    try:
+        content = yaml.load(text, _strict_loader())  # a subclass of SafeLoader: builds plain values only
+    except (yaml.YAMLError, ValueError, OverflowError) as error:
+        lines = str(error).replace('"<unicode string>", ', "").splitlines()
+        raise ValueError(" ".join(printable(line.strip()) for line in lines)) from None
+    _check_values(content)
+    return content
+
+
+_JSON_TEXT = re.compile(r'"(?:[^"\\]|\\.)*+"', re.DOTALL)
+
+
+def strict_json(text: str) -> Any:
+    """The plain values of a JSON text. Raises ValueError, fit to print, for anything else: also for a key given twice,
+    NaN, a number that no float can hold, and for more or deeper values than `MOST_VALUES` and `DEEPEST`."""
+    if not text.strip():
+        raise ValueError("it is empty")
+    bare = _JSON_TEXT.sub("", text)
+    if sum(map(bare.count, ",[{")) >= MOST_VALUES:
+        raise ValueError(f"expected at most {MOST_VALUES} values")
+    steps = (1 if bracket in "[{" else -1 for bracket in re.sub(r"[^][{}]+", "", bare))
+    if max(accumulate(steps), default=0) > DEEPEST:
+        raise ValueError(f"nested too deeply, expected at most {DEEPEST} levels")
+    try:
+        content = json.loads(text, object_pairs_hook=_unique, parse_int=_whole)
+    except RecursionError:  # under a deep stack
+        raise ValueError("nested too deeply") from None
+    except ValueError as error:
+        raise ValueError(printable(str(error))) from None
+    _check_values(content)
+    return content
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    content: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in content:
+            raise ValueError(f"key {printable(key, 60)!r} is given twice")
+        content[key] = value
+    return content
+
+
+def _whole(text: str) -> int:
+    if len(text) > LONGEST_NUMBER:
+        raise ValueError(f"a number of more than {LONGEST_NUMBER} digits")
+    return int(text)
+
+
+def _check_values(value: Any, where: str = "") -> None:
+    """Refuse what neither format can say but its readers accept: NaN, numbers beyond any float, half a character."""
+    if isinstance(value, dict):
+        for key, entry in value.items():
+            _check_values(key, where)
+            _check_values(entry, (f"{where}.{key}" if where else key)[:NAME_LIMIT])
+    elif isinstance(value, list):
+        for index, entry in enumerate(value):
+            _check_values(entry, f"{where}[{index}]")
+    elif isinstance(value, int | float) and not abs(value) <= sys.float_info.max:
+        number = printable(json.dumps(value), 60)
+        raise ValueError(f"{printable(where) or 'the file'}: {number} is no number; expected a finite value")
+    elif isinstance(value, str) and not value.isascii() and any("\ud800" <= letter <= "\udfff" for letter in value):
+        raise ValueError(f"{printable(where) or 'the file'}: half of a surrogate pair; write the character itself")

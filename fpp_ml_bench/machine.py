@@ -13,7 +13,7 @@ import shutil
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -135,16 +135,57 @@ def numba_enabled() -> bool:
     return os.environ.get(NUMBA_SWITCH, "1") != "0" and _numba() is not None
 
 
+@cache
+def _code_cache() -> Any:
+    """Numba's cache of machine code, where a file that is damaged or can't be written is as if there were none."""
+    from hashlib import sha256
+
+    from numba.core.caching import FunctionCache, IndexDataCacheFile
+
+    class SealedFile(IndexDataCacheFile):
+        """With a digest behind each pickle, which ignores it: damaged machine code would end the process."""
+
+        def _dump(self, obj: object) -> bytes:
+            content: bytes = super()._dump(obj)
+            return content + sha256(content).digest()
+
+        def _load_data(self, name: str) -> Any:
+            content = Path(self._data_path(name)).read_bytes()
+            if sha256(content[:-32]).digest() != content[-32:]:
+                raise ValueError(f"{name} is damaged")
+            return super()._load_data(name)
+
+    class CodeCache(FunctionCache):
+        def __init__(self, function: Callable[..., object]) -> None:
+            super().__init__(function)
+            stamp = self._impl.locator.get_source_stamp()
+            self._cache_file = SealedFile(self._cache_path, self._impl.filename_base, stamp)
+
+        def load_overload(self, signature: object, target: object) -> Any:
+            try:
+                return super().load_overload(signature, target)
+            except Exception:  # unpickling a damaged file raises errors of any kind
+                with suppress(OSError):
+                    self.flush()
+                return None
+
+        def save_overload(self, signature: object, compiled: object) -> None:
+            with suppress(Exception):  # the next process compiles again
+                super().save_overload(signature, compiled)
+
+    return CodeCache
+
+
 def njit(function: Function) -> Function:
     """Compile ``function`` to run without the GIL; the machine code is kept on disk. Without numba it stays as it is.
     No ``fastmath``, and no multiplication is fused with an addition: the same input gives the same bytes on every
     processor and for any number of threads."""
     if _numba() is None:
         return function
-    try:
-        return cast(Function, _numba().njit(cache=True, nogil=True, error_model="numpy")(function))
-    except RuntimeError:  # neither the package folder nor the user's cache folder can be written
-        return cast(Function, _numba().njit(nogil=True, error_model="numpy")(function))
+    compiled = _numba().njit(nogil=True, error_model="numpy")(function)
+    with suppress(RuntimeError):  # neither the package folder nor the user's cache folder can be written
+        compiled._cache = _code_cache()(function)
+    return cast(Function, compiled)
 
 
 @contextmanager

@@ -24,6 +24,7 @@ from urllib.parse import urlsplit
 from uuid import uuid4
 
 from fpp_ml_bench.errors import PoolError
+from fpp_ml_bench.files import cause_of
 from fpp_ml_bench.machine import single_threaded_algebra
 
 RETRIES = 5
@@ -51,16 +52,33 @@ def mapping(work: object, workers: int = 1, cluster: str | None = None) -> Itera
         yield lambda function, *items: map(partial(function, work), *items)
     else:
         with single_threaded_algebra():
-            pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (work,))
+            with shared_memory():
+                pool = ProcessPoolExecutor(workers, get_context("spawn"), _begin, (work,))
             try:
                 yield lambda function, *items: pool.map(partial(_call, function), *items)
-            except BrokenProcessPool as error:
+            except BaseException as error:
+                for process in list((pool._processes or {}).values()):
+                    process.terminate()  # nobody waits for what it is at
+                if not isinstance(error, BrokenProcessPool):
+                    raise
                 raise PoolError(
                     "a worker process died (out of memory?); run the same command again, it resumes; --workers 1 "
                     "needs the least memory"
                 ) from error
             finally:
                 pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def shared_memory() -> Iterator[None]:
+    """Raise `PoolError` where what processes share can't be made within: in /dev/shm on Linux."""
+    try:
+        yield
+    except OSError as error:
+        raise PoolError(
+            f"shared memory (/dev/shm) can't be used ({cause_of(error)}); have it mounted writable and with free space "
+            "(Docker: --shm-size), or give --workers 1"
+        ) from error
 
 
 def _begin(work: object) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 from uuid import uuid4
 
 from fpp_ml_bench.errors import FppBenchError, RemoteError
+from fpp_ml_bench.files import cause_of, path_problem, printable
 
 TEMPORARY = ".tmp"
 """Suffix of a file that is not yet whole."""
@@ -46,7 +47,9 @@ class RemoteFolder:
             files.mv(temporary, str(target))
 
     def get(self, name: str, file: Path) -> None:
-        """Copy a file from there; its folder is made."""
+        """Copy a file from there; its folder is made. A ``name`` that leaves the folder is refused."""
+        if problem := path_problem(name):
+            raise RemoteError(f"{self.url}: holds a file {printable(name)!r}, {problem}; remove it there")
         file.parent.mkdir(parents=True, exist_ok=True)
         with self._opened("can't be read") as (files, root):
             files.get_file(f"{root}/{name}", str(file))
@@ -65,7 +68,7 @@ class RemoteFolder:
             files, root = url_to_fs(self.url)
             yield files, root.rstrip("/")
         except Exception as error:  # each service raises errors of its own library
-            reason = str(error).strip().partition("\n")[0] or type(error).__name__
+            reason = cause_of(error).strip().partition("\n")[0] or type(error).__name__
             raise RemoteError(f"{self.url}: {failure} ({reason})") from error
 
 

@@ -8,8 +8,9 @@ from .ranking import read_entries as read_entries
 from .ranking import shipped_rows as shipped_rows
 from .readme import update_readme as update_readme
 from .reported import chosen_tables as chosen_tables
+from .row_file import write_row as write_row
 from .rows import read_entry as read_entry
-from .rows import write_row as write_row
+from .rows import vouching_line as vouching_line
 from .tables import group_tables as group_tables
 from .tables import markdown as markdown
 from .tables import paper_rich_tables as paper_rich_tables

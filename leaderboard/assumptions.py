@@ -1,6 +1,6 @@
 """What a method assumes of the scene, what it was told of the scored samples, and what it learned from."""
 
-from fpp_ml_bench.evaluation.result import Result
+from fpp_ml_bench.leaderboard.row_file import Row
 
 _TOLD_OF = {"range": "depth range", "mask": "object mask", "order": "fringe order"}
 ASSUMED, ASSUMED_BY_ANY = "one albedo, a lit background", "a lit background"
@@ -24,22 +24,22 @@ def told(track: str) -> str:
     return "the test sample's " + " and ".join(filter(None, (", ".join(things[:-1]), things[-1])))
 
 
-def assumption(result: Result) -> str:
+def assumption(row: Row) -> str:
     """In a few words; empty where a method assumes nothing of the scene, or is not of this package."""
-    method, shading = result.submission.method, result.submission.settings.get("shading")
+    method, shading = row.submission.method, row.submission.settings.get("shading")
     if method in ("phase", "phase-net") and shading is True:
         return ASSUMED
     return ASSUMED_BY_ANY if method == "phase-net" and shading is False else ""
 
 
-def assumption_sentences(result: Result) -> str:
+def assumption_sentences(row: Row) -> str:
     """For the row's own page: what the method assumes, and what it was told of the samples that it is scored on."""
-    given = told(result.track)
-    assumed = assumption(result)
+    given = told(row.track)
+    assumed = assumption(row)
     return " ".join([*([_ASSUMES[assumed]] if assumed else []), *([f"Told {given}."] if given else [])])
 
 
-def learned_from(result: Result) -> str:
+def learned_from(row: Row) -> str:
     """What data the method learned from, as its submission says; empty where it does not say."""
-    said = getattr(result.submission, "learned_from", None)
+    said = row.submission.learned_from
     return "" if said is None else str(said.data)

@@ -3,16 +3,16 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from statistics import fmean
 
 from fpp_ml_bench.evaluation.protocol import HEADLINE, RANGE_SHARE
 from fpp_ml_bench.evaluation.report import millimetres, percent, seconds
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.assumptions import assumption, learned_from
 from fpp_ml_bench.leaderboard.groups import TEST, UNSEEN, Ranked
+from fpp_ml_bench.leaderboard.row_file import processor
 from fpp_ml_bench.leaderboard.rows import Entry
 
-SELF_REPORTED = "*"
+NOT_CHECKED = "*"
 NOT_MEASURED = "not measured"
 RANK_NOTE = (
     "Rank: the best and the worst that the tests allow. Two rows are told apart by a sign-flip test of their paired "
@@ -23,9 +23,13 @@ RATIO_NOTE = (
     "x trivial: object MAE over that of the best method that looks at nothing, or only for the nearest training image, "
     "and is told no more than the track's methods. Of depth range: object MAE over the depth range of each sample."
 )
+TRUST_NOTE = (
+    "(4): no rank, for nobody vouches for the row; 1 + the ranked rows with a smaller error. "
+    f"{NOT_CHECKED} time, phase reliance and robustness as their author reports them, not measured here."
+)
 NOTE = (
-    f"Errors in mm, mean over samples; 95% interval from a bootstrap over objects. {RANK_NOTE} {RATIO_NOTE} "
-    f"{SELF_REPORTED} time as reported by its author, not measured here."
+    f"Errors in mm, mean over samples; 95% interval from a bootstrap over objects. {RANK_NOTE} {TRUST_NOTE} "
+    f"{RATIO_NOTE}"
 )
 MIDDLE, WIDE, WIDEST = 100, 140, 170
 """Where a terminal is too narrow, columns of a larger number are left out first."""
@@ -73,11 +77,12 @@ def columns(sort: str) -> list[Column]:
             errors += [replace(PARTS[0], from_width=MIDDLE), replace(PARTS[1], from_width=MIDDLE), RATIO]
             errors.append(replace(RANGE, from_width=MIDDLE))
     return [
-        RANK, METHOD, *errors, Column("s/sample", _seconds), FRAMES, replace(RELIANCE, from_width=WIDE),
+        RANK, METHOD, replace(CODE, from_width=MIDDLE), *errors, Column("s/sample", _seconds), FRAMES,
+        replace(RELIANCE, from_width=WIDE),
         replace(ROBUSTNESS, from_width=WIDEST), *(replace(column, from_width=WIDEST) for column in UNCERTAINTY),
         replace(PROVENANCE, from_width=MIDDLE),
         replace(LEARNED, from_width=WIDEST),
-        Column("Assumes", lambda row: assumption(row.entry.result) or "-", right=False, from_width=WIDEST),
+        Column("Assumes", lambda row: assumption(row.entry.row) or "-", right=False, from_width=WIDEST),
         Column("Timed on", lambda row: device(row.entry), right=False, from_width=WIDEST),
         Column("Full name", lambda row: printable(row.entry.name, _LONGEST_NAME), False, ONLY_IN_FILES),
     ]  # fmt: skip
@@ -103,51 +108,48 @@ def ratio(row: Ranked) -> str:
 
 
 def uncertainty(entry: Entry) -> tuple[float | None, float | None]:
-    """Share of object pixels within the stated 95% interval, to which those that state none do not belong, and AUSE in
-    mm; None where no uncertainty was scored."""
-    if (block := entry.result.uncertainty) is None:
-        return None, None
-    samples = [scores for scores in block.per_sample.values() if scores.unstated_share is not None]
-    covered = [(scores.coverage_95 or 0.0) * (1 - (scores.unstated_share or 0.0)) for scores in samples]
-    return fmean(covered) if covered else None, block.metrics.ause_mae_mm
+    """`RowUncertainty` as two values; None where no uncertainty was scored."""
+    block = entry.row.uncertainty
+    return (None, None) if block is None else (block.within_95_share, block.ause_mae_mm)
 
 
 def _seconds(row: Ranked) -> str:
     value = row.entry.value("seconds_per_sample")
-    return seconds(value) + (SELF_REPORTED if value is not None and not row.entry.time_measured else "")
+    return seconds(value) + (NOT_CHECKED if value is not None and not row.entry.time_measured else "")
 
 
 def milliseconds_text(row: Ranked) -> str:
     ms = row.entry.latency_ms
-    return "-" if ms is None else f"{ms:.3g}{'' if row.entry.time_measured else SELF_REPORTED}"
+    return "-" if ms is None else f"{ms:.3g}{'' if row.entry.time_measured else NOT_CHECKED}"
 
 
 def reliance(entry: Entry) -> str:
     """The phase-reliance score with two decimals."""
-    measured = entry.result.reliance
-    return NOT_MEASURED if measured is None else f"{measured.score:.2f}"
+    measured = entry.row.reliance
+    return NOT_MEASURED if measured is None else f"{measured.score:.2f}{_mark(entry)}"
+
+
+def _mark(entry: Entry) -> str:
+    """Behind what only its author measured."""
+    return "" if entry.all_checked else NOT_CHECKED
 
 
 def reliance_interval(entry: Entry) -> str:
     """The ends of its interval; empty without any."""
-    low, high = entry.result.reliance.interval if entry.result.reliance else (None, None)
+    low, high = entry.row.reliance.interval if entry.row.reliance else (None, None)
     return "" if low is None or high is None else f"{low:.2f} - {high:.2f}"
 
 
 def robustness(entry: Entry) -> str:
     """Mean error over the disturbed scenes of the test set, mm with one decimal."""
-    measured = (entry.result.robustness or {}).get("test")
-    return NOT_MEASURED if measured is None else f"{measured.mae_mm:.1f}"
+    measured = (entry.row.robustness or {}).get("test")
+    return NOT_MEASURED if measured is None else f"{measured.mae_mm:.1f}{_mark(entry)}"
 
 
 def device(entry: Entry) -> str:
     """What the time was taken on: the GPU where there is one, else the CPU and its cores; a dash when unknown."""
-    timing = entry.result.timing
-    hardware = timing.hardware if timing is not None else entry.result.submission.hardware
-    if hardware is None:
-        return "-"
-    cores = "1 core" if hardware.cores == 1 else f"{hardware.cores} cores"
-    return printable(hardware.gpu or f"{hardware.cpu}, {cores}", _DEVICE_WIDTH)
+    hardware = entry.row.hardware
+    return "-" if hardware is None else printable(hardware.gpu or processor(hardware), _DEVICE_WIDTH)
 
 
 def _states_uncertainty(row: Ranked) -> bool:
@@ -155,10 +157,11 @@ def _states_uncertainty(row: Ranked) -> bool:
 
 
 def _says_learned(row: Ranked) -> bool:
-    return bool(learned_from(row.entry.result))
+    return bool(learned_from(row.entry.row))
 
 
 RANK = Column("Rank", lambda row: row.ranks, present=lambda row: row.best_rank is not None)
+CODE = Column("Code", lambda row: printable(row.entry.row.dataset.code, _DEVICE_WIDTH), right=False)
 METHOD = Column("Method", lambda row: printable(row.short_name), right=False)
 FRAMES = Column("Frames", lambda row: str(row.entry.frames))
 PARTS = tuple(
@@ -174,5 +177,5 @@ UNCERTAINTY = (
     Column("In 95%", lambda row: percent(uncertainty(row.entry)[0]), present=_states_uncertainty),
     Column("AUSE", lambda row: millimetres(uncertainty(row.entry)[1]), present=_states_uncertainty),
 )
-LEARNED = Column("Learned from", lambda row: learned_from(row.entry.result) or "-", False, present=_says_learned)
-PROVENANCE = Column("Provenance", lambda row: row.entry.provenance, right=False)
+LEARNED = Column("Learned from", lambda row: learned_from(row.entry.row) or "-", False, present=_says_learned)
+PROVENANCE = Column("Provenance", lambda row: row.provenance, right=False)

@@ -1,118 +1,92 @@
-"""The leaderboard's tables: what results must share to stand in one, and how a table and its data are called. The
-result of a method on the test objects and that on the unseen ones are one row."""
+"""The leaderboard's tables: what rows must share to stand in one, and how a table and its data are called. The
+row of a method on the test objects and that on the unseen ones are shown as one."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
-from statistics import fmean
 
 from fpp_ml_bench.constants import FULL_SIZE
-from fpp_ml_bench.evaluation.protocol import HEADLINE, METRICS, PROTOCOL_VERSION, Track
-from fpp_ml_bench.evaluation.result import Result
-from fpp_ml_bench.evaluation.score import Interval, object_interval
-from fpp_ml_bench.leaderboard.pairs import Pair
-from fpp_ml_bench.leaderboard.rows import Entry
-from fpp_ml_bench.loaders.storage import BENCHMARKS, EARLIER, benchmark_of, current_benchmark
-from fpp_ml_bench.optics import DIRECTIONS, PAPER_SEQUENCE
+from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, HEADLINE, PROTOCOL_VERSION, FramesClass, Track
+from fpp_ml_bench.evaluation.score import Interval
+from fpp_ml_bench.leaderboard.pairs import Pair, pairs
+from fpp_ml_bench.leaderboard.row_file import ObjectMeans, Row, interval_over, mean_over
+from fpp_ml_bench.leaderboard.rows import MEANING, Entry
+from fpp_ml_bench.loaders.storage import BENCHMARKS, Benchmark, benchmark_of
 
-LEGACY_FINGERPRINTS = (
-    "5b87ff86edee389e45c5a2110ac34ab4fa3310c096a0860780a20dd69fdcac06",
-    "c5f61ca76258e24bc197e1d8a3dce100ecddabb90eef57b1ae0c43334648f4de",
-)
-"""Data of earlier rows that the package does not build any more, unless it is a named benchmark."""
-LEGACY_NOTE = (
-    "Legacy: scored on data that the current version of the package does not build any more; these rows compare only "
-    "within their group."
-)
 EARLIER_PROTOCOL_NOTE = (
     "Scored by an earlier protocol, with other rules than today's results: these rows compare only within their group."
 )
-ONE_FRAME, FEW_FRAMES, FULL_SEQUENCE = CLASSES = ("one frame", "few frames, no code", "full sequence")
-"""What a method captures: at most one frame; several but no Gray code; frames with Gray code."""
 TEST, UNSEEN = "fpp-bench-full", "fpp-bench-unseen"
-COMPLETES = {UNSEEN: TEST, "fpp-bench-crossed-unseen": "fpp-bench-crossed"}
-"""Sets of unseen objects, and the benchmark whose test split each makes one row with."""
-
-
-def frames_class(frames_used: Sequence[int]) -> str:
-    """Of `CLASSES`. The frames are numbered as in the paper's sequence, which all named benchmarks and the published
-    dataset have; a result does not say what other sequence its data have."""
-    if len(frames_used) <= 1:
-        return ONE_FRAME
-    code = {index for direction in DIRECTIONS for index in PAPER_SEQUENCE.gray(direction)}
-    return FULL_SEQUENCE if code & set(frames_used) else FEW_FRAMES
+"""The benchmark whose test split, and the set of unseen objects that, make one row."""
+MOST_PAIRED = 40
+"""Ranked rows up to which a table lists its pairs, 780 of them."""
 
 
 @dataclass(frozen=True, order=True)
 class GroupKey:
-    """What two results must share to be compared. ``fingerprint`` identifies the dataset, not its folder's name; for
-    results on the unseen objects it is that of the benchmark whose test split they complete."""
+    """What two rows must share to be compared. ``data`` is the title of the benchmark whose scenes were scored, or for
+    other data their `DatasetInfo.truth`, whatever was projected; the unseen objects have that of the benchmark whose
+    test split they complete."""
 
-    frames: str
+    frames: FramesClass
     track: Track
     mode: str
     split: str
     target: str
-    fingerprint: str
+    data: str
     size: tuple[int, int]
     edge_band_px: int
     protocol_version: str
 
     @classmethod
-    def of(cls, result: Result) -> "GroupKey":
-        data, frames = result.dataset, frames_class(result.submission.frames_used)
-        fingerprint = _completed().get(data.fingerprint, data.fingerprint) if data.split == "test" else data.fingerprint
+    def of(cls, row: Row) -> "GroupKey":
+        info, benchmark = row.dataset, scenes_of(row)
+        data = info.truth if benchmark is None else _title(TEST) if is_unseen(row) else benchmark.title
         return cls(
-            frames, result.track, result.mode, data.split, result.target, fingerprint, (data.size[0], data.size[1]),
-            result.edge_band_px, result.protocol_version,
+            row.frames_class, row.track, row.mode, info.split, row.target, data, (info.size[0], info.size[1]),
+            row.edge_band_px, row.protocol_version,
         )  # fmt: skip
 
     @property
-    def takes_unseen(self) -> bool:
-        """Whether a row of this group has a result on the unseen objects beside that on the test objects."""
-        return self.split == "test" and self.fingerprint in _completed().values()
+    def benchmark(self) -> Benchmark | None:
+        """Whose scenes these are; None for data without a name."""
+        return next((benchmark for benchmark in BENCHMARKS if benchmark.title == self.data), None)
 
     @property
-    def is_legacy(self) -> bool:
-        benchmark = benchmark_of(self.fingerprint)
-        return benchmark in EARLIER if benchmark is not None else self.fingerprint in LEGACY_FINGERPRINTS
+    def takes_unseen(self) -> bool:
+        """Whether a row of this group has a part on the unseen objects beside that on the test objects."""
+        return self.split == "test" and self.data == _title(TEST)
 
     @property
     def aside(self) -> str:
         """What sets a benchmark apart from those that are shown first, in words: another light or a small image, as
-        ``workshop``, ``crossed, hard``, ``224 px``; empty for the others."""
-        benchmark = benchmark_of(self.fingerprint)
+        ``workshop``, ``224 px``; empty for the others."""
+        benchmark = self.benchmark
         if benchmark is None or (benchmark.light == "paper" and benchmark.size == FULL_SIZE):
             return ""
-        words = [benchmark.rig, benchmark.light, f"{benchmark.size} px"]
-        usual = "paper", "paper", f"{FULL_SIZE} px"
-        return ", ".join(word for word, other in zip(words, usual, strict=True) if word != other)
+        words = [benchmark.light, f"{benchmark.size} px"]
+        return ", ".join(word for word, usual in zip(words, ("paper", f"{FULL_SIZE} px"), strict=True) if word != usual)
 
     @property
     def notes(self) -> list[str]:
         """Why the rows are not comparable with today's results; empty where they are."""
-        earlier = self.protocol_version != PROTOCOL_VERSION
-        return [LEGACY_NOTE] * self.is_legacy + [EARLIER_PROTOCOL_NOTE] * earlier
+        return [EARLIER_PROTOCOL_NOTE] * (self.protocol_version != PROTOCOL_VERSION)
 
     @property
     def order(self) -> tuple[object, ...]:
-        """Sort key of the groups: named benchmarks as they are listed, other data, earlier protocols, legacy data; the
-        larger images first, then the fewer frames, the metric track before the others."""
-        benchmark = benchmark_of(self.fingerprint)
-        data = 3 if self.is_legacy else 2 if self.protocol_version != PROTOCOL_VERSION else 0 if benchmark else 1
-        place = BENCHMARKS.index(benchmark) if benchmark in BENCHMARKS else len(BENCHMARKS)
+        """Sort key of the groups: named benchmarks as they are listed, other data, earlier protocols; the larger images
+        first, then the fewer frames, the metric track before the others."""
+        place = len(BENCHMARKS) if self.benchmark is None else BENCHMARKS.index(self.benchmark)
         return (
-            data, -self.size[0] * self.size[1], place, self.fingerprint, self.protocol_version,
-            CLASSES.index(self.frames), self.track != "metric", self,
+            len(self.notes), self.benchmark is None, -self.size[0] * self.size[1], place, self.data,
+            self.protocol_version, FRAMES_CLASSES.index(self.frames), self.track != "metric", self,
         )  # fmt: skip
 
     @property
     def data_title(self) -> str:
-        """``fpp-bench-full version 0, 960 x 960 px``; other data by size and the fingerprint's first 8 digits."""
-        benchmark, pixels = benchmark_of(self.fingerprint), f"{self.size[1]} x {self.size[0]} px"
-        data = f"{pixels}, data {self.fingerprint[:8]}" if benchmark is None else f"{benchmark.title}, {pixels}"
-        protocol = "" if self.protocol_version == PROTOCOL_VERSION else f", protocol {self.protocol_version}"
-        return data + (", legacy" if self.is_legacy else "") + protocol
+        """``fpp-bench-full version 2, 960 x 960 px``; other data by size and the first 8 digits of their hash."""
+        pixels = f"{self.size[1]} x {self.size[0]} px"
+        data = f"{pixels}, data {self.data[:8]}" if self.benchmark is None else f"{self.data}, {pixels}"
+        return data + (f", protocol {self.protocol_version}" if self.notes else "")
 
     @property
     def against(self) -> str:
@@ -122,90 +96,103 @@ class GroupKey:
 
 @dataclass(frozen=True)
 class Ranked:
-    """A row: a method's result on the test objects in ``entry`` and on the ``unseen`` ones, or ``entry`` alone. With
-    the best and the worst rank that the tests allow, None where it is not ranked; ``ratio``: its object MAE over that
-    of the best trivial method on the same objects, None without any."""
+    """A row: a method on the test objects in ``entry`` and on the ``unseen`` ones, or ``entry`` alone. With the best
+    and the worst rank that the tests allow, None where it is not ranked; a row beside the ranks has a ``place``, 1 +
+    the ranked rows with a smaller error. ``ratio``: its object MAE over that of the best trivial method on the same
+    objects, None without any."""
 
     entry: Entry
     short_name: str
     unseen: Entry | None = None
     best_rank: int | None = None
     worst_rank: int | None = None
+    place: int | None = None
     ratio: float | None = None
+    _intervals: dict[str, Interval | None] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def ranks(self) -> str:
-        """``1-4``, or the single number where both ranks agree; a dash without any."""
+        """``1-4``, or the single number where both ranks agree; ``(4)`` beside the ranks; a dash without any."""
         if self.best_rank is None:
-            return "-"
+            return "-" if self.place is None else f"({self.place})"
         return str(self.best_rank) if self.best_rank == self.worst_rank else f"{self.best_rank}-{self.worst_rank}"
 
-    @cached_property
-    def _samples(self) -> list[tuple[str, dict[str, float | None]]]:
-        results = [entry.result for entry in (self.entry, self.unseen) if entry is not None]
-        return [(row.object, {key: getattr(row, key) for key in METRICS}) for r in results for row in r.per_sample]
+    @property
+    def provenance(self) -> str:
+        """The weakest of its parts' (a key of `MEANING`)."""
+        return max((part.provenance for part in self._parts), key=list(MEANING).index)
+
+    @property
+    def _parts(self) -> list[Entry]:
+        return [entry for entry in (self.entry, self.unseen) if entry is not None]
 
     @cached_property
-    def _intervals(self) -> dict[str, Interval | None]:
-        objects = [name for name, _ in self._samples]
-        return {key: object_interval([row[key] for _, row in self._samples], objects) for key in HEADLINE}
+    def objects(self) -> tuple[ObjectMeans, ...]:
+        """The objects that it is scored on."""
+        return tuple(part for entry in self._parts for part in entry.row.per_object)
 
     def value(self, key: str) -> float | None:
-        """Mean of a sort key over all samples of the row; None for an empty pixel set or an unknown time."""
-        if self.unseen is None or key not in METRICS:
+        """Mean of a sort key over all samples of the row; None for an empty pixel set or an unknown time. Of a row with
+        two parts, scores beside `HEADLINE` are weighted by the samples of each."""
+        if self.unseen is None or key in ("seconds_per_sample", "frames_used"):
             return self.entry.value(key)
-        values = [value for _, row in self._samples if (value := row[key]) is not None]
-        return fmean(values) if values else None
+        if key in HEADLINE:
+            return mean_over(self.objects, key)
+        known = [(value, part.row.dataset.samples) for part in self._parts if (value := part.value(key)) is not None]
+        return sum(value * samples for value, samples in known) / sum(n for _, n in known) if known else None
 
     def interval(self, key: str) -> Interval | None:
         """The 95% interval of ``key`` over all objects of the row; None where it has none."""
-        return self.entry.interval(key) if self.unseen is None else self._intervals.get(key)
-
-    @cached_property
-    def objects(self) -> tuple[str, ...]:
-        """The objects that it is scored on."""
-        return tuple(dict.fromkeys(name for name, _ in self._samples))
+        if self.unseen is None:
+            return self.entry.row.intervals.of(key)
+        if key not in self._intervals:
+            self._intervals[key] = interval_over(self.objects, key) if key in HEADLINE else None
+        return self._intervals[key]
 
     def object_means(self, key: str) -> dict[str, float]:
-        """Mean of a score over the views of each object that has one."""
-        views: dict[str, list[float]] = {}
-        for name, row in self._samples:
-            if (value := row[key]) is not None:
-                views.setdefault(name, []).append(value)
-        return {name: fmean(values) for name, values in views.items()}
+        """Mean of a headline score over the views of each object that has one."""
+        return {part.object: value for part in self.objects if (value := getattr(part, key)) is not None}
 
     def on(self, benchmark: str) -> Entry | None:
-        """The part of it on the objects of `TEST` or on those of `UNSEEN`, whatever their frames are."""
-        parts = [entry for entry in (self.entry, self.unseen) if entry is not None]
-        return next((e for e in parts if (_is_unseen(e) == (benchmark == UNSEEN))), None)
+        """The part of it on the objects of `TEST` or on those of `UNSEEN`, whatever its frames are."""
+        return next((part for part in self._parts if is_unseen(part.row) == (benchmark == UNSEEN)), None)
 
 
-def _completed() -> dict[str, str]:
-    """Fingerprints of the sets of unseen objects, and of the benchmark that each completes."""
-    pairs = ((current_benchmark(unseen), current_benchmark(test)) for unseen, test in COMPLETES.items())
-    return {unseen.fingerprint: test.fingerprint for unseen, test in pairs if unseen is not None and test is not None}
+def scenes_of(row: Row) -> Benchmark | None:
+    """The benchmark whose scenes a row is scored on, whatever was projected."""
+    return benchmark_of(row.dataset.content)
 
 
-def _is_unseen(entry: Entry) -> bool:
-    return entry.result.dataset.fingerprint in _completed()
+def is_unseen(row: Row) -> bool:
+    """Whether a row is scored on the set of unseen objects."""
+    benchmark = scenes_of(row)
+    return benchmark is not None and benchmark.name == UNSEEN and row.dataset.split == "test"
 
 
-def joined(entries: Sequence[Entry]) -> tuple[Entry, Entry | None]:
-    """The results of a method as `Ranked` takes them: that on the test objects first, if there is one."""
-    ordered = sorted(entries, key=_is_unseen)
-    return ordered[0], ordered[1] if len(ordered) > 1 else None
+def _title(name: str) -> str:
+    return next(benchmark.title for benchmark in BENCHMARKS if benchmark.name == name)
 
 
 @dataclass(frozen=True)
 class Group:
-    """Rows that may be compared: by rank, then the best value first. ``pairs`` of the ranked rows; ``unranked`` says
-    why rows have no rank, empty where all have one. ``dataset_name`` is what the dataset's folder was called."""
+    """Rows that may be compared: by rank, then the best value first. ``notes`` say why rows have no rank, and which are
+    left out."""
 
     key: GroupKey
-    dataset_name: str
     rows: tuple[Ranked, ...]
-    pairs: tuple[Pair, ...] = ()
-    unranked: str = ""
+    sort: str
+    notes: tuple[str, ...] = ()
+
+    @property
+    def ranked(self) -> tuple[Ranked, ...]:
+        return tuple(row for row in self.rows if row.best_rank is not None)
+
+    @cached_property
+    def pairs(self) -> tuple[Pair, ...]:
+        """The tests of the ranked rows' pairs; none for a table of more than `MOST_PAIRED` of them."""
+        if len(self.ranked) > MOST_PAIRED:
+            return ()
+        return tuple(pairs({row.short_name: row.object_means(self.sort) for row in self.ranked}))
 
     @property
     def parts(self) -> str:

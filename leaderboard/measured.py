@@ -4,9 +4,10 @@ from typing import Any
 
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.result import Reliance, Result, Robustness, result_content, write_result
+from fpp_ml_bench.evaluation.result import Reliance, Result, Robustness, read_json, write_result
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.leaderboard.rows import LOCAL, Entry, write_row
+from fpp_ml_bench.leaderboard.row_file import Row, robustness_in_brief, rounded, write_row
+from fpp_ml_bench.leaderboard.rows import Entry
 from fpp_ml_bench.schema import validate
 
 _OF_THE_MACHINE = ("threads", "device")
@@ -14,7 +15,7 @@ _OF_THE_MACHINE = ("threads", "device")
 
 def check_same_method(entry: Entry, method: Method) -> None:
     """Refuse (SubmissionError) a row of another method: name, frames, units, or a setting that both have."""
-    about = entry.result.submission
+    about = entry.row.submission
     pairs: dict[str, tuple[object, object]] = {
         "method": (about.method, method.name),
         "frames_used": (sorted(about.frames_used), sorted(method.frames_used)),
@@ -33,21 +34,22 @@ def check_same_method(entry: Entry, method: Method) -> None:
 
 
 def write_reliance(entry: Entry, reliance: Reliance) -> None:
-    """Put ``reliance`` into the file of ``entry``, replacing an earlier value; row files keep their provenance. Raises
+    """Put ``reliance`` into the file of ``entry``, replacing an earlier value; of a row, in four digits. Raises
     SubmissionError for a block that contradicts the result (other weights, other units)."""
-    _write(entry, "reliance", reliance.model_dump(mode="json"))
+    block = reliance.model_dump(mode="json")
+    _write(entry, "reliance", rounded(block, 4) if entry.is_row_file else block)
 
 
 def write_robustness(entry: Entry, robustness: Robustness) -> None:
-    """`write_reliance` of ``robustness``, beside that on another set."""
-    sets = {**(entry.result.robustness or {}), robustness.set: robustness}
-    _write(entry, "robustness", {name: block.model_dump(mode="json") for name, block in sets.items()})
+    """`write_reliance` of ``robustness``, beside that on another set; of a row, in brief."""
+    block = robustness_in_brief(robustness) if entry.is_row_file else robustness.model_dump(mode="json")
+    sets = read_json(entry.path).get("robustness", {})
+    _write(entry, "robustness", {**sets, robustness.set: block})
 
 
 def _write(entry: Entry, key: str, block: dict[str, Any]) -> None:
-    content = {**result_content(entry.result), key: block}
-    result: Result = validate(Result, content, entry.path, "result of fpp-eval")
-    if entry.provenance == LOCAL:
-        write_result(result, entry.path)
+    content = {**read_json(entry.path), key: block}
+    if entry.is_row_file:
+        write_row(validate(Row, content, entry.path, "leaderboard row"), entry.path)
     else:
-        write_row(Entry(entry.path, result, entry.provenance), entry.provenance, entry.path)
+        write_result(validate(Result, content, entry.path, "result of fpp-eval"), entry.path)

@@ -1,13 +1,14 @@
 """Short names of a table's rows. Rows of this package's methods get theirs from the method's settings; every other
 submission keeps its own name, cut at a word."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from operator import index
 
 from fpp_ml_bench.baselines.training import NETWORK_TITLES
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.evaluation.submission import Submission
 from fpp_ml_bench.files import printable
+from fpp_ml_bench.leaderboard.row_file import name_key
 
 LONGEST_NAME = 36
 """Characters of a short name."""
@@ -20,20 +21,21 @@ _OPTIONS = {"input standardised": "standardised", "guided by phase": "guided", "
 """A recipe's title and the short name of each option of a network."""
 
 
-def short_names(submissions: Sequence[Submission]) -> list[str]:
+def short_names(submissions: Sequence[Submission], own: Collection[str] = ()) -> list[str]:
     """A short name for each of the ``submissions`` of a group, whose own names differ. The order changes no name. Where
-    two would get the same, the later by its own name has a number behind it."""
-    derived = {submission.name: _from_settings(submission) for submission in submissions}
+    two would look the same, the later by its own name has a number behind it. Those in ``own``, which only claim to be
+    this package's methods, keep their own names, behind all others."""
+    derived = {s.name: None if s.name in own else _from_settings(s) for s in submissions}
     chosen: dict[str, str] = {}
     taken: set[str] = set()
-    for name in sorted(derived, key=lambda name: (derived[name] is None, name)):
+    for name in sorted(derived, key=lambda name: (name in own, derived[name] is None, name)):
         short, number = derived[name] or cut_at_word(printable(name)), 1
         candidate = short
-        while candidate in taken:
+        while name_key(candidate) in taken:
             number += 1
             suffix = f" ({number})"
             candidate = cut_at_word(short, LONGEST_NAME - len(suffix)) + suffix
-        taken.add(candidate)
+        taken.add(name_key(candidate))
         chosen[name] = candidate
     return [chosen[submission.name] for submission in submissions]
 

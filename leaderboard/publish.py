@@ -20,13 +20,13 @@ from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.evaluation.protocol import Track
 from fpp_ml_bench.evaluation.report import millimetres, percent
-from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.assumptions import told
 from fpp_ml_bench.leaderboard.page import INDEX, SUBMISSIONS, write_page
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.reported import chosen_tables
-from fpp_ml_bench.leaderboard.rows import read_entry
+from fpp_ml_bench.leaderboard.row_file import Row
+from fpp_ml_bench.leaderboard.rows import Entry, read_entry
 from fpp_ml_bench.leaderboard.tables import markdown_text
 from fpp_ml_bench.loaders.hub import MARK, Publication, mark_bytes, staged_files, yaml_text
 from fpp_ml_bench.loaders.hub_dataset import NAME, card_head
@@ -101,19 +101,19 @@ def score(object_mae_mm: float) -> float:
     return round(100.0 / (1.0 + object_mae_mm / SCORE_HALF_MM), _SCORE_DIGITS)
 
 
-def task_of(result: Result, name: str) -> Task:
+def task_of(row: Row, name: str) -> Task:
     """The task that a result belongs to; `PublishError`, naming the file ``name``, where it belongs to none."""
-    if (result.dataset.split, result.target, result.mode) != (SPLIT, TARGET, MODE):
+    if (row.dataset.split, row.target, row.mode) != (SPLIT, TARGET, MODE):
         raise PublishError(
             f"{name}: the Hub's benchmark is scored on the {SPLIT} split against {TARGET} in {MODE} mode, this result "
-            f"on {result.dataset.split} against {result.target} in {result.mode} mode; score the predictions so first"
+            f"on {row.dataset.split} against {row.target} in {row.mode} mode; score the predictions so first"
         )
-    single = set(result.submission.frames_used) <= {SINGLE_SHOT_FRAME}
-    task = next((task for task in TASKS if (task.single_shot, task.track) == (single, result.track)), None)
+    single = set(row.submission.frames_used) <= {SINGLE_SHOT_FRAME}
+    task = next((task for task in TASKS if (task.single_shot, task.track) == (single, row.track)), None)
     if task is None:
         raise PublishError(
-            f"{name}: the Hub's benchmark has no task for the {result.track} track (the method was given "
-            f"{told(result.track)}); publish a result of a method that finds the object and the fringe order itself"
+            f"{name}: the Hub's benchmark has no task for the {row.track} track (the method was given "
+            f"{told(row.track)}); publish a result of a method that finds the object and the fringe order itself"
         )
     return task
 
@@ -135,7 +135,8 @@ def dataset_texts(dataset: DatasetFolder, repo: str, licence: str) -> dict[str, 
     exact = ""
     if dataset.has_exact:
         exact = "\n| `depth_exact` | the same, exact, from the ray cast that made the frames |"
-        exact += "\n| `flags` | uint8 (H, W), bits: 1 unlit, 2 mixed surfaces, 4 saturated, 8 strong interreflection |"
+        exact += "\n| `flags` | uint8 (H, W), bits: 1 unlit, 2 mixed surfaces, 4 saturated, 8 strong interreflection, "
+        exact += "16 weak |"
         exact += "\n| `cover` | uint8 (H, W): share of the pixel, in 255ths, that the central ray's surface covers |"
     body = _BODY.format(
         rows=sum(len(samples) for samples in dataset.splits.values()), height=dataset.size[0], width=dataset.size[1],
@@ -191,57 +192,60 @@ def stage_page(page: Path, repo: str, folder: Path, dataset_repo: str | None = N
 
 
 def stage_results(
-    paths: Sequence[Path], repo: str, folder: Path, scored_on: str, revision: str, fingerprint: object,
+    paths: Sequence[Path], repo: str, folder: Path, scored_on: str, revision: str, content: object,
     source_url: str | None = None,
 ) -> Publication:  # fmt: skip
     """Write a file for each result into ``folder``; it replaces an earlier result of the same task. Only numbers and
-    fixed words of a result are published, no text that its author wrote. A result scored on other data is refused, as
-    is a result of another split or target, or without an object score (`PublishError`)."""
+    fixed words of a result are published, no text that its author wrote. A result scored on other data than ``content``
+    (`DatasetFolder.content`, by the repository's mark) is refused, as is a result of another split or target, or
+    without an object score (`PublishError`)."""
     if source_url is not None and (urlsplit(source_url).scheme != "https" or not urlsplit(source_url).netloc):
         raise PublishError(f"--source-url: expected an https address, got {printable(source_url, 120)!r}")
     named: dict[str, Path] = {}
     (folder / RESULT_FOLDER).mkdir()
     for path in paths:
-        result, file = read_entry(path).result, printable(str(path), 300)
-        if result.dataset.fingerprint != fingerprint:
+        entry, file = read_entry(path), printable(str(path), 300)
+        row = entry.row
+        held = content if isinstance(content, dict) else {}
+        if other := [name for name, digest in row.dataset.content.items() if held.get(name) != digest]:
             raise PublishError(
-                f"{file}: was scored on other data (fingerprint {result.dataset.fingerprint[:12]}) than "
-                f"{scored_on} holds ({printable(fingerprint, 12)}); score the predictions on that dataset, or "
-                "publish this one"
+                f"{file}: was scored on other data than {scored_on} holds ({other[0]} is "
+                f"{row.dataset.content[other[0]]}, there {printable(held.get(other[0]), 40)}); score the predictions "
+                "on that dataset, or publish this one"
             )
-        task = task_of(result, file).id
+        task = task_of(row, file).id
         if task in named:
             raise PublishError(
                 f"{printable(str(named[task]), 300)} and {file} are both results of {task}; a model has one of "
                 "each, publish the other with its own model repository"
             )
         named[task] = path
-        error_mm = result.metrics.object_mae_mm
+        error_mm = row.metrics.object_mae_mm
         if error_mm is None:
             raise PublishError(
                 f"{file}: has no object score (no sample shows an object), so there is nothing to rank by"
             )
-        entry = EvalResultEntry(
+        published = EvalResultEntry(
             dataset_id=scored_on, task_id=task, value=score(error_mm), dataset_revision=revision,
-            date=result.created[:10], source_url=source_url,
-            source_name=f"{NAME} leaderboard" if source_url is not None else None, notes=_notes(result),
+            date=row.created[:10], source_url=source_url,
+            source_name=f"{NAME} leaderboard" if source_url is not None else None, notes=_notes(entry),
         )  # fmt: skip
         name = f"{task}--{scored_on.replace('/', '--')}.yaml"
-        (folder / RESULT_FOLDER / name).write_bytes(yaml_text(eval_result_entries_to_yaml([entry])).encode())
+        (folder / RESULT_FOLDER / name).write_bytes(yaml_text(eval_result_entries_to_yaml([published])).encode())
     return Publication("model", repo, folder, f"{NAME} results: {', '.join(named)}")
 
 
-def _notes(result: Result) -> str:
-    metrics, submission = result.metrics, result.submission
-    ends = result.intervals.of("object_mae_mm")
+def _notes(entry: Entry) -> str:
+    row, metrics, seconds = entry.row, entry.row.metrics, entry.value("seconds_per_sample")
+    ends = row.intervals.of("object_mae_mm")
     interval = f" (95% interval {millimetres(ends[0])} to {millimetres(ends[1])})" if ends is not None else ""
-    frames, seconds = len(submission.frames_used), submission.seconds_per_sample
-    time = "" if seconds is None else f"; {seconds:.4g} s per sample, {submission.seconds_source}"
+    source = "measured" if entry.time_measured else "self-reported"
+    time = "" if seconds is None else f"; {seconds:.4g} s per sample, {source}"
     missing = percent(metrics.object_missing_share)
     return (
         f"{SCORE_TEXT}. Object MAE {millimetres(metrics.object_mae_mm)} mm{interval}, RMSE "
         f"{millimetres(metrics.object_rmse_mm)} mm; overall MAE {millimetres(metrics.overall_mae_mm)} mm; object "
-        f"pixels missing {missing}; {result.dataset.samples} samples of {result.dataset.split}, {result.track} track, "
-        f"{frames} {'frame' if frames == 1 else 'frames'}{time}; protocol {result.protocol_version}, dataset "
-        f"{result.dataset.fingerprint[:12]}"
+        f"pixels missing {missing}; {row.dataset.samples} samples of {row.dataset.split}, {row.track} track, "
+        f"{entry.frames} {'frame' if entry.frames == 1 else 'frames'}{time}; protocol {row.protocol_version}, content "
+        f"{row.dataset.truth[:12]}"
     )

@@ -8,7 +8,7 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.leaderboard import columns
 from fpp_ml_bench.leaderboard.assumptions import ASSUMED, assumption, told
-from fpp_ml_bench.leaderboard.columns import RANK_NOTE, RATIO_NOTE, SELF_REPORTED, Column, device, error, interval
+from fpp_ml_bench.leaderboard.columns import NOT_CHECKED, Column, device, error
 from fpp_ml_bench.leaderboard.groups import Group
 from fpp_ml_bench.leaderboard.reported import PAPER_DEPTHS, REPORTED_HEADING, chosen_tables
 from fpp_ml_bench.leaderboard.tables import markdown_columns, markdown_rows, markdown_text
@@ -19,21 +19,21 @@ SHOWN = 5
 """Rows of a group that README shows; the page shows them all."""
 _MADE_BY = "Made by `fpp-bench leaderboard --readme README.md` from the files in `leaderboard/rows/`."
 _NOTE = (
-    f"{_MADE_BY} Errors in mm. {RANK_NOTE} Intervals: bootstrap over objects. {RATIO_NOTE} Time: median latency of one "
-    "image. "
-    f"\\{SELF_REPORTED} self-reported. Phase reliance: 1 follows the fringe's phase and nothing else, 0 does not "
-    "follow it (docs/reliance.md). Disturbed: object MAE over all axes and severities of disturbed scenes, with 150 mm "
-    "for a pixel without an answer (docs/robustness.md)."
-)
+    f"{_MADE_BY} Errors in mm. {columns.RANK_NOTE} {columns.TRUST_NOTE} Intervals: bootstrap over objects. "
+    f"{columns.RATIO_NOTE} Time: median latency of one image. Phase reliance: 1 follows the fringe's phase and nothing "
+    "else, 0 does not follow it (docs/reliance.md). Disturbed: object MAE over all axes and severities of disturbed "
+    "scenes, with 150 mm for a pixel without an answer (docs/robustness.md)."
+).replace(NOT_CHECKED, f"\\{NOT_CHECKED}")
 _ERRORS = (
     Column("Object MAE, mm", partial(error, "object_mae_mm")),
     Column("Object RMSE", partial(error, "object_rmse_mm")),
     Column("Overall MAE", partial(error, "overall_mae_mm")),
 )  # fmt: skip
 _COLUMNS = (
-    columns.RANK, columns.METHOD, _ERRORS[0], Column("95% interval", partial(interval, between=" - ")), *columns.PARTS,
-    columns.RATIO, columns.RANGE, *_ERRORS[1:], Column("Time, ms", columns.milliseconds_text), columns.FRAMES,
-    columns.RELIANCE, columns.ROBUSTNESS, columns.PROVENANCE,
+    columns.RANK, columns.METHOD, columns.CODE, _ERRORS[0],
+    Column("95% interval", partial(columns.interval, between=" - ")), *columns.PARTS, columns.RATIO, columns.RANGE,
+    *_ERRORS[1:], Column("Time, ms", columns.milliseconds_text), columns.FRAMES, columns.RELIANCE, columns.ROBUSTNESS,
+    columns.PROVENANCE,
 )  # fmt: skip
 
 
@@ -51,11 +51,11 @@ def readme_block(groups: Sequence[Group]) -> str:
         lines += [*markdown_columns(_COLUMNS, group.rows[:SHOWN]), ""]
         more = len(group.rows) - SHOWN
         lines += [f"… and {more} more on the page", ""] if more > 0 else []
-    results = [row.entry.result for group in groups for row in group.rows]
-    assuming = sorted({result.submission.method for result in results if assumption(result)})
+    shown = [row.entry.row for group in groups for row in group.rows]
+    assuming = sorted({row.submission.method for row in shown if assumption(row)})
     notes = [_NOTE] + ([f"{' and '.join(assuming)} assume {ASSUMED}."] if assuming else [])
     notes += [f"Rows of other data ({'; '.join(others)}) are on the page."] if others else []
-    notes += dict.fromkeys(note for group in groups for note in (group.unranked, *group.key.notes) if note)
+    notes += dict.fromkeys(markdown_text(note) for group in groups for note in (*group.notes, *group.key.notes))
     keys, titles = ("object_mae_mm", "object_rmse_mm", "overall_mae_mm"), [column.title for column in _ERRORS]
     reported = [
         [row.label, *(f"{row.errors_mm[key]:.2f}" if key in row.errors_mm else "-" for key in keys),

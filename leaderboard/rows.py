@@ -1,25 +1,41 @@
-"""The leaderboard's rows as files: a result of ``fpp-eval``, and who vouches for its numbers.
+"""The leaderboard's rows as they are read: who vouches for each, and what recomputing its scores tells.
 
-A file under ``leaderboard/rows/`` is either a result file as ``fpp-eval --json`` writes it, which counts as
-self-reported, or a row file: a result and a ``provenance``, which the maintainers set. A PNG of the same name beside it
-is shown on the submission's page.
+A result file of ``fpp-eval`` becomes a `Row` when it is read, so that everything here is made of rows. The maintainers
+keep ``vouched.txt``: a line for each row file that they measured themselves, or verified from its author's predictions.
+Nothing in a row says so, and nothing is signed: who can change the list can change the code.
 """
 
+import math
+import re
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
+from hashlib import sha256
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any
 
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.result import Result, parse_result, read_json, result_content, write_json
-from fpp_ml_bench.files import printable
-from fpp_ml_bench.schema import StrictModel, validate
+from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
+from fpp_ml_bench.evaluation.result import Result, parse_result, read_json, read_result
+from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.files import file_content, printable
+from fpp_ml_bench.leaderboard.row_file import (
+    DIGITS,
+    ROW_SCHEMA_VERSION,
+    Row,
+    check_size,
+    processor,
+    row_content,
+    row_of,
+)
+from fpp_ml_bench.loaders.storage import DatasetFolder, benchmark_of
+from fpp_ml_bench.schema import validate
 
 SHIPPED_ROWS = Path(__file__).resolve().parent / "rows"
-ROW_SCHEMA_VERSION: Literal["1.0.0"] = "1.0.0"
+VOUCHED = Path(__file__).resolve().parent / "vouched.txt"
+_LARGEST_FILE_BYTES = 1 << 26
 
-Provenance = Literal["measured here", "verified", "self-reported"]
-PROVENANCES: tuple[str, ...] = get_args(Provenance)
-MEASURED_HERE: Provenance = "measured here"
+MEASURED_HERE, VERIFIED, SELF_REPORTED = "measured here", "verified", "self-reported"
 LOCAL = "local file"
 """Of a result on this machine that is in no leaderboard."""
 BY_THE_PAPER = "reported by the paper"
@@ -27,53 +43,66 @@ BY_ITS_AUTHORS = "reported by its authors"
 
 MEANING = {
     MEASURED_HERE: "The maintainers ran the method, timed it and scored it, with the commands in this repository.",
-    "verified": "The author sent the predictions, and fpp-eval verify gave the same scores. Run time is the author's.",
-    "self-reported": "The author ran fpp-eval and sent the result. Its numbers are consistent; nobody checked them.",
+    VERIFIED: "The author sent the predictions, and fpp-eval verify gave the same scores. Run time, phase reliance and "
+    "robustness are the author's.",
     LOCAL: "A result on this machine that is in no leaderboard.",
+    SELF_REPORTED: "The author ran fpp-eval and sent the row. Its numbers are consistent; nobody checked them.",
     BY_THE_PAPER: "Typed in from the paper's tables, measured by its authors on other data with other code.",
     BY_ITS_AUTHORS: "Typed in from another publication, measured by its authors on other data with other code.",
 }
+"""Every provenance, the strongest first."""
 
-LARGEST_PICTURE_BYTES = 2_000_000
-LARGEST_PICTURE_PX = 4096
-_PNG = b"\x89PNG\r\n\x1a\n"
-
-
-class _RowFile(StrictModel):
-    row_schema_version: Literal["1.0.0"]
-    provenance: Provenance
-    result: Result
+WORDS = {"measured": MEASURED_HERE, "verified": VERIFIED}
+"""The words of ``vouched.txt``, and the provenance that each is."""
+_FIELDS = "SHA-256 of a row file, measured or verified, commit, machine, command"
+_LINE = re.compile(r"([0-9a-f]{64}) \| (measured|verified) \| [0-9a-f]{40} \| [^|\s][^|]* \| \S.*")
+_NOT_COMPARED: Any = {
+    **dict.fromkeys(("created", "package", "git", "code_sha256", "result_sha256", "reliance", "robustness"), True),
+    "submission": {"seconds_per_sample", "seconds_source", "hardware", "timing", "software"}, "dataset": {"name"},
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A row: a result, and its ``provenance`` (a key of `MEANING`)."""
+    """A row as it was read from a row file or made of a result file, and its ``provenance`` (a key of `MEANING`)."""
 
     path: Path
-    result: Result
+    row: Row
     provenance: str = LOCAL
+    is_row_file: bool = False
 
     @property
     def name(self) -> str:
-        return self.result.submission.name
+        return self.row.submission.name
 
     @property
     def frames(self) -> int:
         """Number of captured frames per depth map."""
-        return len(self.result.submission.frames_used)
+        return len(self.row.submission.frames_used)
+
+    @property
+    def vouched(self) -> bool:
+        """Whether the maintainers vouch for its scores."""
+        return self.provenance in (MEASURED_HERE, VERIFIED)
+
+    @property
+    def all_checked(self) -> bool:
+        """Whether the maintainers, or this machine's user, also measured what can't be recomputed from predictions:
+        time, phase reliance, robustness. Of others these are self-reported."""
+        return self.provenance in (MEASURED_HERE, LOCAL)
 
     @property
     def latency_ms(self) -> float | None:
         """Median time per image in ms; None when unknown."""
-        timing, seconds = self.result.timing, self.result.submission.seconds_per_sample
+        timing, seconds = self.row.timing, self.row.submission.seconds_per_sample
         return timing.latency_median_ms if timing else None if seconds is None else 1000 * seconds
 
     @property
     def time_measured(self) -> bool:
         """Whether this package measured the time and the provenance allows that claim; else it is self-reported."""
-        timing, submission = self.result.timing, self.result.submission
+        timing, submission = self.row.timing, self.row.submission
         source = timing.provenance if timing is not None else submission.seconds_source
-        return source == "measured" and self.provenance in (MEASURED_HERE, LOCAL)
+        return source == "measured" and self.all_checked
 
     def value(self, key: str) -> float | None:
         """Value of a sort key; None for an empty pixel set or an unknown time."""
@@ -81,49 +110,111 @@ class Entry:
             return None if self.latency_ms is None else self.latency_ms / 1000
         if key == "frames_used":
             return float(self.frames)
-        return getattr(self.result.metrics, key)  # type: ignore[no-any-return]
-
-    def interval(self, key: str) -> tuple[float, float] | None:
-        """The 95% interval of ``key``; None where it has none."""
-        return self.result.intervals.of(key)
+        return getattr(self.row.metrics, key)  # type: ignore[no-any-return]
 
 
 def read_entry(path: Path) -> Entry:
     """Read a row file or a result file strictly. SubmissionError names the file and what is wrong with it."""
-    content = read_json(path)
-    if isinstance(content, dict) and "row_schema_version" in content:
-        if content["row_schema_version"] != ROW_SCHEMA_VERSION:
-            raise SubmissionError(
-                f"{printable(str(path), 500)}: expected row_schema_version {ROW_SCHEMA_VERSION}, got "
-                f"{printable(content['row_schema_version'], 40)}; write the row again from its result"
-            )
-        parse_result(content.get("result"), path)
-        row: _RowFile = validate(_RowFile, content, path, "leaderboard row")
-        return Entry(path, row.result, row.provenance)
-    shipped = path.resolve().parent == SHIPPED_ROWS.resolve()
-    return Entry(path, parse_result(content, path), "self-reported" if shipped else LOCAL)
+    content, file = read_json(path), printable(str(path), 500)
+    data = file_content(path, _LARGEST_FILE_BYTES, SubmissionError)
+    is_row_file = isinstance(content, dict) and "row_schema_version" in content
+    if not is_row_file:
+        row = row_of(parse_result(content, path), path)
+    elif content["row_schema_version"] != ROW_SCHEMA_VERSION:
+        given = printable(content["row_schema_version"], 40)
+        expected = f"expected row_schema_version {ROW_SCHEMA_VERSION}, got {given}"
+        raise SubmissionError(f"{file}: {expected}; make the row again from its result")
+    else:
+        row = validate(Row, content, path, "leaderboard row")
+        check_size(data, path)
+    benchmark = benchmark_of(row.dataset.content)
+    if benchmark is not None and row.metrics.object_mae_mm == 0:
+        raise SubmissionError(
+            f"{file}: every error is exactly 0, so the predictions are the ground truth of {benchmark.title} itself; "
+            "score what a method answers (the classical method, from which depth is decoded, against depth_exact)"
+        )
+    shipped = SELF_REPORTED if path.resolve().parent == SHIPPED_ROWS.resolve() else LOCAL
+    return Entry(path, row, vouched().get(sha256(data).hexdigest(), shipped), is_row_file)
 
 
-def write_row(entry: Entry, provenance: str, path: Path) -> None:
-    """Write ``entry`` as a row file. SubmissionError for a provenance not in `PROVENANCES`, or an unwritable path."""
-    if provenance not in PROVENANCES:
-        raise SubmissionError(f"expected a provenance out of {', '.join(PROVENANCES)}, got {printable(provenance)!r}")
-    head = {"row_schema_version": ROW_SCHEMA_VERSION, "provenance": provenance}
-    write_json({**head, "result": result_content(entry.result)}, path)
+def read_scored(path: Path) -> Result | Row:
+    """The whole result in a result file, the row in a row file, read as `read_entry` does."""
+    entry = read_entry(path)
+    return entry.row if entry.is_row_file else read_result(path)
 
 
-def picture_of(entry: Entry) -> bytes | None:
-    """The PNG beside a row file, None without it. SubmissionError for a file that is not a PNG of a sensible size. Its
-    pixels are not decoded here; a browser shows it as a PNG or not at all."""
-    path = entry.path.with_suffix(".png")
-    if path.is_symlink() or not path.is_file():
-        return None
-    with path.open("rb") as stream:
-        data = stream.read(LARGEST_PICTURE_BYTES + 1)
-    shown = printable(str(path), 500)
-    if len(data) > LARGEST_PICTURE_BYTES:
-        raise SubmissionError(f"{shown}: expected a picture of at most {LARGEST_PICTURE_BYTES:,} bytes")
-    sides = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
-    if data[:8] != _PNG or data[12:16] != b"IHDR" or not all(0 < side <= LARGEST_PICTURE_PX for side in sides):
-        raise SubmissionError(f"{shown}: expected a PNG of at most {LARGEST_PICTURE_PX} px a side")
-    return data
+def alike(first: Result | Row, second: Result | Row) -> tuple[Any, Any]:
+    """Two results, or two rows, to be compared: a result beside a row becomes a row."""
+    if isinstance(first, Row) != isinstance(second, Row):
+        first, second = (s if isinstance(s, Row) else row_of(s, Path("result")) for s in (first, second))
+    return first, second
+
+
+def vouched() -> dict[str, str]:
+    """The provenance that ``vouched.txt`` gives, by SHA-256 of a row file. SubmissionError names a bad line."""
+    return _vouched(file_content(VOUCHED, 1 << 20, SubmissionError))
+
+
+@lru_cache(1)
+def _vouched(content: bytes) -> dict[str, str]:
+    listed: dict[str, str] = {}
+    for number, line in enumerate(content.decode("utf-8", "replace").split("\n"), start=1):
+        if not line or line.startswith("#"):
+            continue
+        match = _LINE.fullmatch(line) if line.isprintable() else None
+        if match is None or match[1] in listed:
+            expected = "a hash that is listed once" if match else f"{_FIELDS}, with | between them"
+            raise SubmissionError(f"{VOUCHED}, line {number}: expected {expected}, got {printable(line)!r}")
+        listed[match[1]] = WORDS[match[2]]
+    return listed
+
+
+def vouching_line(row: Row, data: bytes, word: str, command: str) -> str:
+    """What a maintainer adds to ``vouched.txt`` for a row file of these bytes: ``word`` is of `WORDS`."""
+    machine = "unknown machine" if row.hardware is None else processor(row.hardware).replace("|", "/")
+    return " | ".join((sha256(data).hexdigest(), word, row.git or 40 * "0", machine, command))
+
+
+def differences(row: Row, folder: Path, dataset: DatasetFolder) -> list[str]:
+    """What of ``row`` does not follow from the predictions in ``folder`` on ``dataset``, a line for each difference.
+    Everything is scored again; means may differ by what their digits leave open, and by 1e-9. Raises what `evaluate`
+    raises, and SubmissionError for a row of another protocol version."""
+    if row.protocol_version != PROTOCOL_VERSION:
+        scored_by = f"the row was scored by protocol {row.protocol_version}, this is {PROTOCOL_VERSION}"
+        raise SubmissionError(f"{scored_by}; score the predictions again")
+    scored = evaluate(folder, dataset, row.dataset.split, row.target, row.edge_band_px, row.mode)
+    rows = row, Row.model_validate(row_content(scored, digits=None))
+    stored, computed = (dict(_leaves("", each.model_dump(mode="json", exclude=_NOT_COMPARED))) for each in rows)
+    return [
+        f"{name}: {printable(stored.get(name), 80)} in the row, {printable(computed.get(name), 80)} recomputed"
+        for name in dict.fromkeys((*stored, *computed))
+        if not _agree(stored.get(name), computed.get(name), row.metrics.object_mae_mm or 0.0)
+    ]
+
+
+def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """Name and value of every number, text and null in ``value``."""
+    if isinstance(value, dict | list):
+        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
+            yield from _leaves(f"{name}.{key}" if name else str(key), inner)
+    else:
+        yield name, value
+
+
+def _agree(stored: Any, computed: Any, error_mm: float) -> bool:
+    if not isinstance(stored, float) or not isinstance(computed, float) or computed == 0:
+        return bool(stored == computed)
+    half_unit = 0.5 * 10.0 ** (math.floor(math.log10(abs(computed))) + 1 - DIGITS)
+    # A bias is a small difference of large numbers.
+    return abs(stored - computed) <= half_unit + 1e-9 * max(abs(computed), error_mm)
+
+
+def not_checked(about: Row | Result) -> list[str]:
+    """What `fpp-eval verify` can't recompute of a row or result, in words."""
+    submission = about.submission
+    present = {
+        "run time and its machine": (submission.timing or submission.seconds_per_sample) is not None,
+        "phase reliance": about.reliance is not None, "robustness": bool(about.robustness),
+        "software, code and environment": True,
+    }  # fmt: skip
+    return [words for words, there in present.items() if there]

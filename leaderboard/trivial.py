@@ -6,14 +6,13 @@ from statistics import fmean
 
 from fpp_ml_bench.baselines import TRIVIAL
 from fpp_ml_bench.leaderboard.groups import Group, GroupKey, Ranked
-from fpp_ml_bench.leaderboard.rows import LOCAL, MEASURED_HERE
 
 _KEY = "object_mae_mm"
 
 
 def is_trivial(row: Ranked) -> bool:
     """Whether it is a row of `TRIVIAL` that was measured here; what others call their methods does not count."""
-    return row.entry.result.submission.method in TRIVIAL and row.entry.provenance in (MEASURED_HERE, LOCAL)
+    return row.entry.row.submission.method in TRIVIAL and row.entry.all_checked
 
 
 def more_than_trivial(groups: Sequence[Group]) -> list[Group]:
@@ -42,7 +41,7 @@ def _given(key: GroupKey) -> set[str]:
 
 
 def _data(key: GroupKey) -> tuple[object, ...]:
-    return key.fingerprint, key.size, key.split, key.target, key.mode, key.edge_band_px, key.protocol_version
+    return key.data, key.size, key.split, key.target, key.mode, key.edge_band_px, key.protocol_version
 
 
 def _ratio(row: Ranked, trivial: Sequence[Mapping[str, float]]) -> float | None:

@@ -24,7 +24,7 @@ from huggingface_hub.utils.sha import git_hash
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.errors import PublishError
-from fpp_ml_bench.files import printable
+from fpp_ml_bench.files import printable, read_json
 
 Kind = Literal["dataset", "space", "model"]
 Status = Literal["new", "changed", "unchanged", "deleted"]
@@ -202,11 +202,7 @@ class Hub:
             raise PublishError(f"{repo}: this {kind} was not published by fpp-bench (no {MARK} there)")
         with tempfile.TemporaryDirectory() as cache, self._explained(f"reading {MARK} of {kind} {repo}"):
             path = self._api.hf_hub_download(repo, MARK, repo_type=kind, revision=remote.commit, cache_dir=cache)
-            content = Path(path).read_bytes()
-        try:
-            about = json.loads(content)
-        except (ValueError, RecursionError) as error:
-            raise PublishError(f"{repo}: its {MARK} is damaged; publish the {kind} again") from error
+            about = read_json(Path(path), PublishError, f"it is of {repo}: publish the {kind} again")
         return about if isinstance(about, dict) else {}
 
     def send(

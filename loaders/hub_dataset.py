@@ -104,5 +104,6 @@ def stage_dataset(
     for name, text in texts.items():
         write_atomically(folder / name, text.encode())
     about = {"fingerprint": dataset.fingerprint, "size": list(dataset.size), "configs": list(dataset.configs)}
-    write_atomically(folder / MARK, mark_bytes("dataset", **about, splits=dataset.splits))
+    marked = mark_bytes("dataset", **about, splits=dataset.splits, content=dataset.content)
+    write_atomically(folder / MARK, marked)
     return Publication("dataset", repo, folder, f"{NAME} dataset {dataset.fingerprint[:12]}", OWNED)

@@ -39,8 +39,9 @@ class FringeDepthDataset(Dataset[FringeDepth]):
     (``object``: the stored columns, and the paper's). Void pixels often are wrong by centimetres, and an end of the
     range is then; by ``valid``, individual depth beyond it is cut to [0, 1].
 
-    Works with ``torch.utils.data.DataLoader`` and any number of workers: each maps the files itself. In a single
-    process `batches` is faster, as it reuses its buffers. Raises `DatasetError` for a missing folder, split or config.
+    Works with ``torch.utils.data.DataLoader`` and any number of workers: each maps the files itself, and sends batches
+    through shared memory (/dev/shm), which must be writable and hold some. In a single process `batches` is faster, as
+    it reuses its buffers, and needs none. Raises `DatasetError` for a missing folder, split or config.
     """
 
     def __init__(

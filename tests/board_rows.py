@@ -1,14 +1,26 @@
 """Rows for the leaderboard's tests: results of real scoring with errors, times and names that the test chooses."""
 
 from collections.abc import Mapping
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from scored_dataset import write_predictions
 
-from fpp_ml_bench.evaluation.result import result_from_rows, write_result
+from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, HEADLINE
+from fpp_ml_bench.evaluation.result import (
+    RELIANCE_VERSION,
+    Intervals,
+    Metrics,
+    Reliance,
+    RelianceParts,
+    write_result,
+)
 from fpp_ml_bench.evaluation.score import ErrorStats, combine, evaluate
+from fpp_ml_bench.leaderboard import groups
+from fpp_ml_bench.leaderboard.row_file import ObjectMeans, Row, RowRobustness, interval_over, mean_over
 from fpp_ml_bench.leaderboard.rows import Entry
+from fpp_ml_bench.loaders.storage import Benchmark, benchmark
 
 HARDWARE = {"cpu": "Some CPU", "cores": 2, "memory_gib": 8.0, "gpu": None, "platform": "Linux"}
 
@@ -55,22 +67,65 @@ def some_rows(folder: Path, dataset: Any) -> list[Path]:
 
 
 def entry_with_errors(
-    base: Entry, errors: Mapping[str, float], name: str, fingerprint: str = "", **about: Any
-) -> Entry:
+    base: Entry, errors: Mapping[str, float], name: str, content: Mapping[str, str] | None = None,
+    provenance: str | None = None, **about: Any,
+) -> Entry:  # fmt: skip
     """A sound entry made of ``base``, scored on two views of each object of ``errors``, off by so many mm everywhere on
     the object and by nothing behind it. ``about`` goes into its description."""
-    first, rows = base.result.per_sample[0].model_dump(), []
-    inside, outside = first["object_pixels"], first["background_pixels"]
+    first = base.row.per_object[0]
+    inside, outside = (getattr(first, f"{kind}_pixels") // first.samples for kind in ("object", "background"))
+    per_object = []
     for name_of_object, error in errors.items():
         whole = combine(ErrorStats(inside, error, error), ErrorStats(outside, 0.0, 0.0))
-        row = {key: error if key.startswith("object_") and key.endswith("_mm") else first[key] for key in first}
-        row |= {"object_shift_free_mae_mm": 0.0, "background_mae_mm": 0.0, "background_rmse_mm": 0.0}
-        row |= {"overall_mae_mm": whole.mae_mm, "overall_rmse_mm": whole.rmse_mm, "object": name_of_object}
-        rows += [{**row, "sample": f"{name_of_object}_{view}"} for view in ("A0", "A60")]
-    data = {"samples": len(rows), "fingerprint": fingerprint or base.result.dataset.fingerprint, "benchmark": None}
-    kept = ("protocol_version", "created", "target", "mode", "edge_band_px", "edge_jump_mm", "environment")
-    result = result_from_rows(
-        rows, submission=base.result.submission.model_copy(update={"name": name, **about}),
-        dataset=base.result.dataset.model_copy(update=data), **{key: getattr(base.result, key) for key in kept},
+        per_object.append(ObjectMeans(
+            object=name_of_object, samples=2, object_pixels=2 * inside, background_pixels=2 * outside, void_pixels=0,
+            object_mae_mm=error, object_rmse_mm=error, background_mae_mm=0.0, background_rmse_mm=0.0,
+            overall_mae_mm=whole.mae_mm, overall_rmse_mm=whole.rmse_mm,
+        ))  # fmt: skip
+    means = {key: mean_over(per_object, key) for key in HEADLINE}
+    keys = [key for key in Metrics.model_fields if key.startswith("object_") and key.endswith("_mm")]
+    intervals = {key: list(interval_over(per_object, key) or (None, None)) for key in HEADLINE}
+    data = {"samples": 2 * len(errors), "benchmark": None} | ({"content": dict(content)} if content else {})
+    frames = len(about.get("frames_used", base.row.submission.frames_used))
+    changes = {
+        "submission": base.row.submission.model_copy(update={"name": name, **about}),
+        "dataset": base.row.dataset.model_copy(update=data),
+        "frames_class": FRAMES_CLASSES[(frames > 1) + (frames > 36)],
+        "metrics": base.row.metrics.model_copy(update=dict.fromkeys(keys, means["object_mae_mm"]) | means),
+        "intervals": Intervals(**intervals), "per_object": per_object,
+        "predictions_sha256": sha256(f"{name} {errors}".encode()).hexdigest(),
+    }  # fmt: skip
+    row = Row.model_validate(base.row.model_copy(update=changes).model_dump())
+    return Entry(base.path.with_name(f"{name}.json"), row, provenance or base.provenance)
+
+
+def reliance(**changes: Any) -> Reliance:
+    """A phase reliance of 0.625."""
+    parts = dict.fromkeys(RelianceParts.model_fields) | {"follows_phase": 0.75, "change_outline": 2.5}
+    content = {
+        "version": RELIANCE_VERSION, "score": 0.625, "interval": [0.5, 0.75], "order_free_score": 0.875, "parts": parts,
+        "units": "mm", "direction": "horizontal", "samples": 4, "objects": 2, "dataset_fingerprint": "b" * 64,
+        "protocol_version": "1.1.0", "weights_sha256": None, **changes,
+    }  # fmt: skip
+    return Reliance(**content)
+
+
+def robustness() -> RowRobustness:
+    """A robustness in brief, of 31 mm."""
+    return RowRobustness(
+        version=1, mae_mm=31.0, interval=[20.0, 40.0], clean_mae_mm=5.0, axes={"motion": 30.0, "gloss": 32.0},
+        samples=4, objects=2, size_px=960,
     )  # fmt: skip
-    return Entry(base.path.with_name(f"{name}.json"), result, base.provenance)
+
+
+def named_benchmarks(monkeypatch: Any, counts: Mapping[str, Any] | None = None, **contents: Mapping[str, str]) -> None:
+    """Have ``full``, ``unseen`` and so on be the benchmarks of these contents, the first with ``counts`` of its objects
+    in the test split against depth; of the others nothing else is known."""
+    named = []
+    for name, content in contents.items():
+        named.append(Benchmark(f"fpp-bench-{name}", 2, name, 960))
+        named[-1].__dict__["_facts"] = {"content": content, "counts": {}}
+    if counts is not None:
+        named[0].__dict__["_facts"]["counts"] = {"test": {"standard/depth": counts}}
+    for module in (benchmark, groups):
+        monkeypatch.setattr(module, "BENCHMARKS", tuple(named))

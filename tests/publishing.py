@@ -15,23 +15,23 @@ from hub_server import HubServer
 from scored_dataset import disk_depth
 
 from fpp_ml_bench.loaders.sample import Row
-from fpp_ml_bench.loaders.storage import DatasetFolder, Manifest, ShardWriter, describe_file, plan_shards
+from fpp_ml_bench.loaders.storage import Assembly, DatasetFolder, Manifest, ShardWriter, describe_file, plan_shards
 from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
 
 ROOT = Path(__file__).resolve().parent.parent
 SIZE = (30, 26)
 OBJECTS = {"train": ("bowl", "cork"), "validation": ("mug",), "test": ("power_drill",)}
-ODD_OBJECT = "<b>_[x](y)|`z`"
+ODD_OBJECT = "__odd__-name_"
 DATA = [f"data/{split}-00000-of-00001.parquet" for split in OBJECTS]
 """Its Parquet files."""
 
 
 def make_all_frames(folder: Path, odd: bool = False, seed: int = 0) -> DatasetFolder:
-    """All 52 frames of random pixels: what no codec may change. One object may have a name full of markup."""
+    """All 52 frames of random pixels: what no codec may change. One object may have a name that is markup."""
     scratch = folder / "scratch"
     scratch.mkdir(parents=True)
     (folder / "meshes").mkdir()
-    shards, samples = [], {}
+    plans, receipts = [], []
     rng = np.random.default_rng(seed)
     for split, names in OBJECTS.items():
         names = (*names, ODD_OBJECT) if odd and split == "train" else names
@@ -43,16 +43,14 @@ def make_all_frames(folder: Path, odd: bool = False, seed: int = 0) -> DatasetFo
                 depth = np.nextafter(disk_depth(SIZE, len(rows)), np.float32(5000)).astype(np.float32)
                 maps = np.zeros(depth.shape, np.uint8), np.full(depth.shape, 255, np.uint8)
                 rows.append(Row(sample, name, view, frames, depth, depth * np.float32(1.0001), {}, *maps))
-            files, described = ShardWriter(folder, scratch, PAPER_SEQUENCE, "all", True, SIZE).write(plan, rows)
-            shards += files
-            samples.setdefault(split, []).extend(described)
+            plans.append(plan)
+            receipts.append(ShardWriter(folder, scratch, PAPER_SEQUENCE, "all", True, SIZE).write(plan, rows))
     shutil.rmtree(scratch)
     mesh = folder / "meshes" / "bowl.ply"
     mesh.write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
-    Manifest(
-        origin="generated", generator={}, settings={}, rig=paper_rig(960).to_dict(), size=SIZE, stored="all",
-        exact=True, samples=samples, shards=shards, others=[describe_file(folder, mesh)],
-    ).write(folder)  # fmt: skip
+    others = [describe_file(folder, mesh)]
+    manifest = Manifest("generated", {}, {}, paper_rig(960).to_dict(), SIZE, "all", exact=True, others=others)
+    Assembly(plans, lambda plan, folder: (), manifest).filled(receipts).write(folder)
     return DatasetFolder(folder)
 
 

@@ -1,5 +1,6 @@
 """A tiny real dataset folder with known depth, and predictions for it: what the evaluator's tests score."""
 
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,8 +9,17 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from fpp_ml_bench.evaluation.protocol import MODES, TARGETS
 from fpp_ml_bench.loaders.sample import Flag, Row
-from fpp_ml_bench.loaders.storage import DatasetFolder, Manifest, ShardWriter, plan_shards
+from fpp_ml_bench.loaders.storage import (
+    Assembly,
+    Benchmark,
+    DatasetFolder,
+    Manifest,
+    ShardWriter,
+    benchmark,
+    plan_shards,
+)
 from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
 
 OBJECTS = {"train": ("bowl",), "validation": ("mug",), "test": ("power_drill", "wooden_boards")}
@@ -54,7 +64,7 @@ def make_dataset(
     scratch = folder / ".build"
     scratch.mkdir(parents=True)
     writer = ShardWriter(folder, scratch, PAPER_SEQUENCE, "single_shot", exact, size)
-    shards, samples = [], {}
+    plans, receipts = [], []
     for number, (split, names) in enumerate(OBJECTS.items()):
         objects = {name: [(f"{name}_{view}", name, view) for view in views] for name in names}
         for plan in plan_shards(split, objects):
@@ -81,15 +91,41 @@ def make_dataset(
                         np.full(depth.shape, 255, np.uint8),
                     )
                 )
-            written, described = writer.write(plan, rows)
-            shards += written
-            samples.setdefault(split, []).extend(described)
+            plans.append(plan)
+            receipts.append(writer.write(plan, rows))
     scratch.rmdir()
-    Manifest(
-        origin="generated", generator={}, settings={}, rig=paper_rig(960).to_dict(), size=size, stored="single_shot",
-        exact=exact, samples=samples, shards=shards,
-    ).write(folder)  # fmt: skip
+    manifest = Manifest("generated", {}, {}, paper_rig(960).to_dict(), size, "single_shot", exact)
+    Assembly(plans, lambda plan, folder: (), manifest).filled(receipts).write(folder)
     return DatasetFolder(folder)
+
+
+def name_benchmarks(monkeypatch: Any, folder: Path, *named: tuple[Benchmark, DatasetFolder]) -> None:
+    """Let the package know these benchmarks, and no others, by the facts of datasets."""
+    folder.mkdir(exist_ok=True)
+    for known, dataset in named:
+        counts = {
+            split: {
+                f"{mode}/{target}": pixel_counts(dataset, split, mode, target)
+                for mode in MODES for target in TARGETS[: 1 + dataset.has_exact]
+            }
+            for split in dataset.splits
+        }  # fmt: skip
+        facts = {"content": dataset.content, "counts": counts}
+        (folder / f"{known.name}.json").write_text(json.dumps(facts), encoding="utf-8")
+    monkeypatch.setattr(benchmark, "FACTS", folder)
+    monkeypatch.setattr(benchmark, "BENCHMARKS", tuple(known for known, _ in named))
+
+
+def pixel_counts(dataset: DatasetFolder, split: str, mode: str, target: str) -> dict[str, list[int]]:
+    """Samples, object pixels and void pixels of each object of a split."""
+    counts: dict[str, list[int]] = {}
+    for sample in dataset.samples(split):
+        inside = dataset.target_mm(sample, target) > 0
+        void = dataset.void(sample, target) & (mode == "standard")
+        numbers = counts.setdefault(dataset.measured(sample)["object"], [0, 0, 0])
+        for place, number in enumerate((1, int((inside & ~void).sum()), int(void.sum()))):
+            numbers[place] += number
+    return counts
 
 
 def write_description(folder: Path, **changes: Any) -> None:

@@ -4,17 +4,19 @@ import re
 import shlex
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from conftest import tiny_settings
 
 from fpp_ml_bench.cli import COMMANDS, evaluate, parser_for
+from fpp_ml_bench.evaluation.result import Robustness, SeverityScores
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted(
     {*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), ROOT / "evaluation/PROTOCOL.md"} - {ROOT / "CHANGELOG.md"}
 )
-TO_BE_WRITTEN = {"leaderboard/rows/my-method.json", "leaderboard/rows/NAME.json"}
+TO_BE_WRITTEN = {"leaderboard/rows/my-method.json", "leaderboard/rows/my-method-unseen.json"}
 OF_OTHER_PROGRAMS = {"--all-files", "--dist", "--cpu", "--num_machines", "--num_processes"}
 """Of pre-commit, pytest and accelerate."""
 TOP = "fpp_ml_bench|loaders|evaluation|baselines|leaderboard|tests|benchmarks|docs"
@@ -50,9 +52,19 @@ def test_tables_are_those_of_the_rows(monkeypatch):
     assert (ROOT / "docs/tables/reliance.md").read_text(encoding="utf-8") == table(entries)
 
     text = PAGE.read_text(encoding="utf-8")
-    assert filled(text, rows_in(entries)) == text
+    assert all(f"<!-- {name}:{end} -->" in text for name in ("test", "unseen") for end in ("begin", "end"))
     with pytest.raises(ValueError, match="markers <!-- test:begin -->"):
         filled("a page without them", {"test": []})
+    scores = SeverityScores(
+        mae_mm=3.0, protocol_mae_mm=3.0, wrong_share=0.1, unanswered_share=0.0, confident_share=None, coverage=None
+    )
+    block = Robustness(
+        version=1, set="test", mae_mm=3.0, interval=[2.0, 4.0], clean=scores, axes={"motion": [scores] * 5}, samples=2,
+        objects=2, size_px=960, weights_sha256=None,
+    )  # fmt: skip
+    about = SimpleNamespace(name="A | method", method="mine", settings={})
+    made = rows_in([SimpleNamespace(submission=about, robustness={"test": block})])
+    assert made["unseen"] == [] and "| A &#124; method | 3.0 | 2.0 to 4.0 | 3.0 | 1.0 |" in filled(text, made)
 
 
 FENCED = re.compile(r"^ *```(\w*)\n(.*?)^ *```$", flags=re.DOTALL | re.MULTILINE)

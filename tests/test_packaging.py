@@ -5,9 +5,13 @@ import re
 import subprocess
 import sys
 import tomllib
+from contextlib import suppress
+from importlib import metadata
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from fpp_ml_bench.cli import COMMANDS, EXTRAS
 from fpp_ml_bench.cli.evaluate import SUBCOMMANDS
@@ -194,3 +198,27 @@ def test_nothing_else_of_a_checkout_is_importable():
     )
     printed = subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, capture_output=True, text=True).stdout
     assert printed == "None None\n"
+
+
+def test_constraints_pin_what_every_extra_brings():
+    """Of packages that are installed, also what they need in turn."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    lines = [line.split("#")[0].strip() for line in (ROOT / "constraints.txt").read_text().splitlines()]
+    pins = {canonicalize_name(name): version for name, version in (line.split("==") for line in lines if line)}
+    waiting = [Requirement(text) for texts in (project["dependencies"], *project["optional-dependencies"].values())
+               for text in texts]  # fmt: skip
+    seen, problems = set(), []
+    while waiting:
+        requirement = waiting.pop()
+        name = canonicalize_name(requirement.name)
+        if name == project["name"] or (name, *sorted(requirement.extras)) in seen:
+            continue
+        seen.add((name, *sorted(requirement.extras)))
+        if name not in pins or not requirement.specifier.contains(pins[name], prereleases=True):
+            problems.append(f"{requirement}: {pins.get(name, 'not pinned')}")
+        with suppress(metadata.PackageNotFoundError):
+            extras = requirement.extras or {""}
+            for needed in map(Requirement, metadata.requires(name) or ()):
+                if needed.marker is None or any(needed.marker.evaluate({"extra": extra}) for extra in extras):
+                    waiting.append(needed)
+    assert not problems

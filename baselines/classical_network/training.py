@@ -102,41 +102,42 @@ def train_classical_net(
     groups = training.groups_of(recipe.lights, recipe.views_a_light, recipe.seed)
     described = recipe.to_dict() | {"rig": rig.to_dict()}
     fingerprint = training.fingerprint_of(described, groups)
-    training.claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
-    weights = out / WEIGHTS
-    if weights.exists():
-        return Trained.before(weights, read_net(weights, DepthFilter, training.FILTER_NETWORKS)[0])
+    with training.alone_in(out):
+        training.claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
+        weights = out / WEIGHTS
+        if weights.exists():
+            return Trained.before(weights, read_net(weights, DepthFilter, training.FILTER_NETWORKS)[0])
 
-    def measured(views: Iterable[training.View]) -> list[Sample]:
-        return [sample for view in views if (sample := sample_of(view, method)) is not None]
+        def measured(views: Iterable[training.View]) -> list[Sample]:
+            return [sample for view in views if (sample := sample_of(view, method)) is not None]
 
-    samples, validation = training.measured_views(
-        groups, rig, method.frames_used, out / VIEWS, measured, recipe.unions, recipe.seed, workers, show
-    )
+        samples, validation = training.measured_views(
+            groups, rig, method.frames_used, out / VIEWS, measured, recipe.unions, recipe.seed, workers, show
+        )
 
-    def validated(network: DepthFilter) -> dict[str, float]:
-        scored = validation[::VALIDATED_SHARE]
-        return mean_scores(score(filtered(network, one.scene), one, 0.0) for one in scored)
+        def validated(network: DepthFilter) -> dict[str, float]:
+            scored = validation[::VALIDATED_SHARE]
+            return mean_scores(score(filtered(network, one.scene), one, 0.0) for one in scored)
 
-    with training.reproducible(cpu=True):
-        one_window = partial(draw, samples, recipe.window, recipe.near_edge)
-        ongoing = WindowTraining(recipe, one_window, validated, out, print_line=print_line)
-        ongoing.run(started, minutes, show)
-        if not ongoing.over:
-            return Trained(None, ongoing.steps_done, 0.0, {})
-        network = ongoing.network
-        answers = [filtered(network.folded(), sample.scene) for sample in validation]
-    threshold = chosen_threshold(answers, validation)
-    means = mean_scores(score(one, sample, threshold) for one, sample in zip(answers, validation, strict=True))
-    config = training.NetConfig(
-        name=recipe.name, title="Weights of neighbouring depths, and which missing pixels are object",
-        options=network.options, threshold=threshold, period_px={}, dataset_fingerprint=fingerprint,
-        benchmark=training.TrainingBenchmark("classical-net views", 1), steps=recipe.steps, recipe=described,
-        validation=dict(means),
-    )  # fmt: skip
-    save_net(weights, network, config, training.FILTER_NETWORKS)
-    (out / training.CHECKPOINT).unlink(missing_ok=True)
-    return Trained(weights, recipe.steps, threshold, means)
+        with training.reproducible(cpu=True):
+            one_window = partial(draw, samples, recipe.window, recipe.near_edge)
+            ongoing = WindowTraining(recipe, one_window, validated, out, print_line=print_line)
+            ongoing.run(started, minutes, show)
+            if not ongoing.over:
+                return Trained(None, ongoing.steps_done, 0.0, {})
+            network = ongoing.network
+            answers = [filtered(network.folded(), sample.scene) for sample in validation]
+        threshold = chosen_threshold(answers, validation)
+        means = mean_scores(score(one, sample, threshold) for one, sample in zip(answers, validation, strict=True))
+        config = training.NetConfig(
+            name=recipe.name, title="Weights of neighbouring depths, and which missing pixels are object",
+            options=network.options, threshold=threshold, period_px={}, dataset_fingerprint=fingerprint,
+            benchmark=training.TrainingBenchmark("classical-net views", 1), steps=recipe.steps, recipe=described,
+            validation=dict(means),
+        )  # fmt: skip
+        save_net(weights, network, config, training.FILTER_NETWORKS)
+        (out / training.CHECKPOINT).unlink(missing_ok=True)
+        return Trained(weights, recipe.steps, threshold, means)
 
 
 def score(answer: Filtered, sample: Sample, threshold: float) -> dict[str, float | None]:

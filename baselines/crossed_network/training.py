@@ -67,55 +67,58 @@ def train_crossed_net(
     groups = training.groups_of(recipe.lights, recipe.views_a_light, recipe.seed)
     described = recipe.to_dict() | {"rig": rig.to_dict()}
     fingerprint = training.fingerprint_of(described, groups)
-    training.claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
-    weights = out / WEIGHTS
-    if weights.exists():
-        return Trained.before(weights, load_net(weights).config)
-    route, frame = CrossedRoute(rig), rig.sequence.crossed_frames[0]
-    samples, validation = training.measured_views(
-        groups, rig, (frame,), out / VIEWS, lambda views: [sample_of(view, route) for view in views], recipe.unions,
-        recipe.seed, workers, show,
-    )  # fmt: skip
-    carriers = route.carriers
+    with training.alone_in(out):
+        training.claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
+        weights = out / WEIGHTS
+        if weights.exists():
+            return Trained.before(weights, load_net(weights).config)
+        route, frame = CrossedRoute(rig), rig.sequence.crossed_frames[0]
+        samples, validation = training.measured_views(
+            groups, rig, (frame,), out / VIEWS, lambda views: [sample_of(view, route) for view in views], recipe.unions,
+            recipe.seed, workers, show,
+        )  # fmt: skip
+        carriers = route.carriers
 
-    def answers_of(network: PhaseNet, some: list[Sample]) -> list[Answers]:
-        return [network_answers(network, sample.scene.single(), carriers) for sample in some]
+        def answers_of(network: PhaseNet, some: list[Sample]) -> list[Answers]:
+            return [network_answers(network, sample.scene.single(), carriers) for sample in some]
 
-    def scores_of(answers: list[Answers], some: list[Sample], threshold: float = 0.0) -> dict[str, float]:
-        return mean_scores(score(one, sample, carriers, threshold) for one, sample in zip(answers, some, strict=True))
+        def scores_of(answers: list[Answers], some: list[Sample], threshold: float = 0.0) -> dict[str, float]:
+            return mean_scores(
+                score(one, sample, carriers, threshold) for one, sample in zip(answers, some, strict=True)
+            )
 
-    def validated(network: PhaseNet) -> dict[str, float]:
-        scored = validation[::VALIDATED_SHARE]
-        return scores_of(answers_of(network, scored), scored)
+        def validated(network: PhaseNet) -> dict[str, float]:
+            scored = validation[::VALIDATED_SHARE]
+            return scores_of(answers_of(network, scored), scored)
 
-    with training.reproducible(cpu=True):
-        one_window = partial(draw, samples, carriers, recipe.window, recipe.vary)
-        ongoing = WindowTraining(recipe, one_window, validated, out, print_line=print_line)
-        ongoing.run(started, minutes, show)
-        if not ongoing.over:
-            return Trained(None, ongoing.steps_done, 0.0, {})
-        network = ongoing.network
-        answers, some = answers_of(network, validation), samples[::CHOSEN_SHARE]
-        masks = [
-            (sample, partial(decided_mask, one, sample.scene.single()))
-            for one, sample in zip(answers + answers_of(network, some), validation + some, strict=True)
-        ]
-        threshold = chosen_threshold(masks, THRESHOLDS, rig.camera.width * rig.camera.height)
+        with training.reproducible(cpu=True):
+            one_window = partial(draw, samples, carriers, recipe.window, recipe.vary)
+            ongoing = WindowTraining(recipe, one_window, validated, out, print_line=print_line)
+            ongoing.run(started, minutes, show)
+            if not ongoing.over:
+                return Trained(None, ongoing.steps_done, 0.0, {})
+            network = ongoing.network
+            answers, some = answers_of(network, validation), samples[::CHOSEN_SHARE]
+            masks = [
+                (sample, partial(decided_mask, one, sample.scene.single()))
+                for one, sample in zip(answers + answers_of(network, some), validation + some, strict=True)
+            ]
+            threshold = chosen_threshold(masks, THRESHOLDS, rig.camera.width * rig.camera.height)
 
-        def wrong_percent(lead: float) -> float:
-            return scores_of([one.with_lead(lead) for one in answers], validation)["wrong_percent"]
+            def wrong_percent(lead: float) -> float:
+                return scores_of([one.with_lead(lead) for one in answers], validation)["wrong_percent"]
 
-        lead = chosen_lead(wrong_percent, LEADS)
-        means = scores_of([one.with_lead(lead) for one in answers], validation, threshold)
-    config = training.NetConfig(
-        name=recipe.name, title="Fringe order, mask and bounded phase correction of a crossed frame",
-        options=network.options, threshold=threshold, lead=lead, period_px={"crossed": carriers.period_px},
-        dataset_fingerprint=fingerprint, benchmark=training.TrainingBenchmark("crossed-net views", 1),
-        steps=recipe.steps, recipe=described, validation=dict(means),
-    )  # fmt: skip
-    save_net(weights, network, config)
-    (out / training.CHECKPOINT).unlink(missing_ok=True)
-    return Trained(weights, recipe.steps, threshold, means)
+            lead = chosen_lead(wrong_percent, LEADS)
+            means = scores_of([one.with_lead(lead) for one in answers], validation, threshold)
+        config = training.NetConfig(
+            name=recipe.name, title="Fringe order, mask and bounded phase correction of a crossed frame",
+            options=network.options, threshold=threshold, lead=lead, period_px={"crossed": carriers.period_px},
+            dataset_fingerprint=fingerprint, benchmark=training.TrainingBenchmark("crossed-net views", 1),
+            steps=recipe.steps, recipe=described, validation=dict(means),
+        )  # fmt: skip
+        save_net(weights, network, config)
+        (out / training.CHECKPOINT).unlink(missing_ok=True)
+        return Trained(weights, recipe.steps, threshold, means)
 
 
 def score(answers: Answers, sample: Sample, carriers: Carriers, threshold: float = 0.0) -> dict[str, float | None]:

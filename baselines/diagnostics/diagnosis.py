@@ -17,7 +17,7 @@ from fpp_ml_bench.baselines.diagnostics.probe import PROBES, Figure, Finding, Pr
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.report import data_uri, page, render
-from fpp_ml_bench.files import printable, write_atomically
+from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, read_json, write_atomically
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
 
@@ -52,37 +52,39 @@ def diagnose(
     """Run the probes ``probe_names`` (all if empty) and write ``out/index.html`` and ``out/diagnose.json``; all results
     in the report's order. A finding in ``out`` is reused if subject, dataset, settings and the probe's version are the
     same; those of other probes join the report. ``progress`` is called with a probe before it runs. The report quotes
-    ``command``. Raises `DiagnosisError` if ``out`` holds other files, and errors of probes; earlier findings stay."""
+    ``command``. Raises `DiagnosisError` if ``out`` holds other files or another process is at it, and errors of probes;
+    earlier findings stay."""
     _prepare(out)
-    selected = checked_names(probe_names)
-    results, nothing = [], cache(lambda: subject.predicts_nothing(dataset))
-    for name in PROBES:
-        if name not in selected and not (out / f"{name}.json").is_file():
-            continue
-        probe = make_probe(name)
-        key = finding_key(probe, subject, dataset, settings)
-        stored = load_finding(out, name, key)
-        if stored is not None:
-            results.append(ProbeResult(probe, *stored, reused=True))
-        elif name in selected:
-            started = perf_counter()
-            if reason := probe.applies_to(subject) or (nothing() if probe.asks_subject else None):
-                finding = probe.skip(reason)
-            else:
-                finding = probe.run(subject, dataset, settings, out, progress(probe))
-            seconds = round(perf_counter() - started, 2)
-            save_finding(out, key, finding, seconds)
-            results.append(ProbeResult(probe, finding, seconds, reused=False))
-    context = _context(subject, dataset, settings, command)
-    findings = {}
-    for one in results:
-        told = {key: getattr(one.finding, key) for key in ("title", "summary", "skipped")}
-        findings[one.finding.probe] = {**told, "seconds": one.seconds, "values": one.finding.values}
-    content = {"format": "fpp-ml-bench diagnosis", "version": FORMAT_VERSION, **context, "findings": findings}
-    _write_json(out / JSON_FILE, content)
-    html = report_page(context, [(one.probe.question, one.finding) for one in results], out)
-    write_atomically(out / REPORT_FILE, html.encode("utf-8"))
-    return results
+    with exclusive(out / LOCK_FILE, out, "writing a report there", DiagnosisError):
+        selected = checked_names(probe_names)
+        results, nothing = [], cache(lambda: subject.predicts_nothing(dataset))
+        for name in PROBES:
+            if name not in selected and not (out / f"{name}.json").is_file():
+                continue
+            probe = make_probe(name)
+            key = finding_key(probe, subject, dataset, settings)
+            stored = load_finding(out, name, key)
+            if stored is not None:
+                results.append(ProbeResult(probe, *stored, reused=True))
+            elif name in selected:
+                started = perf_counter()
+                if reason := probe.applies_to(subject) or (nothing() if probe.asks_subject else None):
+                    finding = probe.skip(reason)
+                else:
+                    finding = probe.run(subject, dataset, settings, out, progress(probe))
+                seconds = round(perf_counter() - started, 2)
+                save_finding(out, key, finding, seconds)
+                results.append(ProbeResult(probe, finding, seconds, reused=False))
+        context = _context(subject, dataset, settings, command)
+        findings = {}
+        for one in results:
+            told = {key: getattr(one.finding, key) for key in ("title", "summary", "skipped")}
+            findings[one.finding.probe] = {**told, "seconds": one.seconds, "values": one.finding.values}
+        content = {"format": "fpp-ml-bench diagnosis", "version": FORMAT_VERSION, **context, "findings": findings}
+        _write_json(out / JSON_FILE, content)
+        html = report_page(context, [(one.probe.question, one.finding) for one in results], out)
+        write_atomically(out / REPORT_FILE, html.encode("utf-8"))
+        return results
 
 
 def checked_names(names: Sequence[str]) -> tuple[str, ...]:
@@ -122,14 +124,14 @@ def _write_json(path: Path, content: Mapping[str, Any]) -> None:
 def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | None:
     """The stored finding of probe ``name`` and its seconds, if it is complete and was made with the same ``key``."""
     try:
-        content = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+        content = read_json(folder / f"{name}.json", DiagnosisError)
         if content["key"] != key:
             return None
         fields = dict(content["finding"])
         fields["tables"] = tuple(Table(**table) for table in fields["tables"])
         fields["figures"] = tuple(Figure(**figure) for figure in fields["figures"])
         finding, seconds = Finding(**fields), float(content["seconds"])
-    except (OSError, ValueError, TypeError, KeyError):
+    except (ValueError, TypeError, KeyError):
         return None  # absent, half written, or of another version: it is made again
     return (finding, seconds) if all((folder / figure.file).is_file() for figure in finding.figures) else None
 
@@ -140,7 +142,7 @@ def _prepare(out: Path) -> None:
         names = sorted(path.name for path in out.iterdir())
     except OSError as error:
         raise DiagnosisError(f"{out}: can't be made a folder ({error.strerror}); give another --out") from None
-    ours = {JSON_FILE, REPORT_FILE, *(f"{name}.json" for name in PROBES)}
+    ours = {JSON_FILE, REPORT_FILE, LOCK_FILE, *(f"{name}.json" for name in PROBES)}
     foreign = [name for name in names if name not in ours and not name.endswith((".png", ".tmp"))]
     if foreign:
         raise DiagnosisError(f"{out}: holds {foreign[0]}, which is no part of a report; give a new or empty folder")

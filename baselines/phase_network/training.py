@@ -167,58 +167,59 @@ def train_phase_net(
     described = recipe.to_dict() | {"rig": rig.to_dict()}
     described |= {} if start_weights is None else {"start_sha256": start_weights.sha256}
     fingerprint = training.fingerprint_of(described, groups)
-    training.claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
-    weights = out / f"{recipe.weights_name}.safetensors"
-    if weights.exists():
-        return Trained.before(weights, load_net(weights).config)
-    geometries = {
-        direction: Geometry.of(rig, Settings(direction=direction, shading=recipe.shading))
-        for direction in recipe.directions
-    }
-    frames = tuple(rig.sequence.sinusoids(direction)[0] for direction in recipe.directions)
-    measure = partial(samples_of, geometries=geometries, shading=recipe.shading)
-    samples, validation = training.measured_views(
-        groups, rig, frames, out / VIEWS, measure, recipe.unions, recipe.seed, workers, show
-    )
+    with training.alone_in(out):
+        training.claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
+        weights = out / f"{recipe.weights_name}.safetensors"
+        if weights.exists():
+            return Trained.before(weights, load_net(weights).config)
+        geometries = {
+            direction: Geometry.of(rig, Settings(direction=direction, shading=recipe.shading))
+            for direction in recipe.directions
+        }
+        frames = tuple(rig.sequence.sinusoids(direction)[0] for direction in recipe.directions)
+        measure = partial(samples_of, geometries=geometries, shading=recipe.shading)
+        samples, validation = training.measured_views(
+            groups, rig, frames, out / VIEWS, measure, recipe.unions, recipe.seed, workers, show
+        )
 
-    def validated(network: PhaseNet) -> dict[str, float]:
-        scored = validation[::VALIDATED_SHARE]
-        return scores_of(answers_of(network, scored, geometries, recipe.shading), scored, geometries)
+        def validated(network: PhaseNet) -> dict[str, float]:
+            scored = validation[::VALIDATED_SHARE]
+            return scores_of(answers_of(network, scored, geometries, recipe.shading), scored, geometries)
 
-    with training.reproducible(cpu=True):
-        one_window = partial(draw, samples, geometries, recipe.window, recipe.vary, recipe.shading)
-        first = None if start_weights is None else start_weights.network
-        ongoing = WindowTraining(recipe, one_window, validated, out, first, print_line)
-        ongoing.run(started, minutes, show)
-        if not ongoing.over:
-            return Trained(None, ongoing.steps_done, 0.0, {})
-        network = ongoing.network
-        answers = list(answers_of(network, validation, geometries, recipe.shading))
-        masks = [
-            (sample, partial(decided_mask, one, sample.scene.single()))
-            for one, sample in zip(answers, validation, strict=True)
-        ]
-        threshold = chosen_threshold(masks, THRESHOLDS, rig.camera.width * rig.camera.height, TOLERANCE_MM)
+        with training.reproducible(cpu=True):
+            one_window = partial(draw, samples, geometries, recipe.window, recipe.vary, recipe.shading)
+            first = None if start_weights is None else start_weights.network
+            ongoing = WindowTraining(recipe, one_window, validated, out, first, print_line)
+            ongoing.run(started, minutes, show)
+            if not ongoing.over:
+                return Trained(None, ongoing.steps_done, 0.0, {})
+            network = ongoing.network
+            answers = list(answers_of(network, validation, geometries, recipe.shading))
+            masks = [
+                (sample, partial(decided_mask, one, sample.scene.single()))
+                for one, sample in zip(answers, validation, strict=True)
+            ]
+            threshold = chosen_threshold(masks, THRESHOLDS, rig.camera.width * rig.camera.height, TOLERANCE_MM)
 
-        def wrong_percent(lead: float) -> float:
-            return scores_of((one.with_lead(lead) for one in answers), validation, geometries)["wrong_percent"]
+            def wrong_percent(lead: float) -> float:
+                return scores_of((one.with_lead(lead) for one in answers), validation, geometries)["wrong_percent"]
 
-        lead = chosen_lead(wrong_percent, LEADS)
-        led = [one.with_lead(lead) for one in answers]
-        means = scores_of(led, validation, geometries, threshold)
-        pairs = zip(led, validation, strict=True)
-        seen = [judged(one, sample, geometries[sample.direction], threshold) for one, sample in pairs]
-    odds = chosen_odds(seen)
-    draw_reliability(out / RELIABILITY, seen, odds)
-    means["confident_percent"] = 100 * max(confident_shares(seen, odds).values())
-    config = training.NetConfig(
-        name=recipe.weights_name, title=f"Fringe order, mask and bounded phase correction, {recipe.albedo} albedo",
-        options=network.options, threshold=threshold, lead=lead, temperature=odds.temperature, offset=odds.offset,
-        doubted=odds.doubted,
-        period_px={direction: g.route.period_px for direction, g in geometries.items()},
-        dataset_fingerprint=fingerprint, benchmark=training.TrainingBenchmark("phase-net views", 1),
-        steps=recipe.steps, recipe=described, validation=dict(means),
-    )  # fmt: skip
-    save_net(weights, network, config)
-    (out / training.CHECKPOINT).unlink(missing_ok=True)
-    return Trained(weights, recipe.steps, threshold, means)
+            lead = chosen_lead(wrong_percent, LEADS)
+            led = [one.with_lead(lead) for one in answers]
+            means = scores_of(led, validation, geometries, threshold)
+            pairs = zip(led, validation, strict=True)
+            seen = [judged(one, sample, geometries[sample.direction], threshold) for one, sample in pairs]
+        odds = chosen_odds(seen)
+        draw_reliability(out / RELIABILITY, seen, odds)
+        means["confident_percent"] = 100 * max(confident_shares(seen, odds).values())
+        config = training.NetConfig(
+            name=recipe.weights_name, title=f"Fringe order, mask and bounded phase correction, {recipe.albedo} albedo",
+            options=network.options, threshold=threshold, lead=lead, temperature=odds.temperature, offset=odds.offset,
+            doubted=odds.doubted,
+            period_px={direction: g.route.period_px for direction, g in geometries.items()},
+            dataset_fingerprint=fingerprint, benchmark=training.TrainingBenchmark("phase-net views", 1),
+            steps=recipe.steps, recipe=described, validation=dict(means),
+        )  # fmt: skip
+        save_net(weights, network, config)
+        (out / training.CHECKPOINT).unlink(missing_ok=True)
+        return Trained(weights, recipe.steps, threshold, means)

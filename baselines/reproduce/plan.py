@@ -12,7 +12,7 @@ from typing import Literal
 from fpp_ml_bench.baselines.training import Recipe, load_recipe, table_rows
 from fpp_ml_bench.constants import FULL_SIZE, OBJECTS
 from fpp_ml_bench.errors import DatasetError, RecipeError
-from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.files import read_json, write_atomically
 from fpp_ml_bench.loaders import render
 from fpp_ml_bench.loaders.storage import MANIFEST, DatasetFolder
 from fpp_ml_bench.machine import usable_cores
@@ -139,14 +139,14 @@ def _check_same_dataset(opened: DatasetFolder, folders: Folders) -> None:
             folders.runs.mkdir(parents=True, exist_ok=True)
             write_atomically(record, (json.dumps(content, indent=1) + "\n").encode("utf-8"))
             return
-        recorded = json.loads(record.read_text(encoding="utf-8"))
-        fingerprint, folder = recorded["fingerprint"], recorded["folder"]
     except OSError as error:
         raise DatasetError(f"{record}: {error.strerror or error}") from None
-    except (ValueError, KeyError, TypeError):
-        raise DatasetError(
-            f"{record}: damaged; give another --runs, or remove it if --data is the dataset that was used"
-        ) from None
+    cure = "damaged; give another --runs, or remove it if --data is the dataset that was used"
+    recorded = read_json(record, DatasetError, f"it is {cure}")
+    try:
+        fingerprint, folder = recorded["fingerprint"], recorded["folder"]
+    except (KeyError, TypeError):
+        raise DatasetError(f"{record}: {cure}") from None
     if fingerprint != opened.fingerprint:
         raise DatasetError(
             f"{opened.path}: has fingerprint {opened.fingerprint[:8]}, but the trainings in {folders.runs} are of "

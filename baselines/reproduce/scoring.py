@@ -24,7 +24,6 @@ from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.depth import RangeRule
 from fpp_ml_bench.errors import PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE, PROTOCOL_VERSION, Mode, Units
-from fpp_ml_bench.evaluation.report import write_sheet
 from fpp_ml_bench.evaluation.result import Headline, Intervals, Result, Sha256, read_json, write_result
 from fpp_ml_bench.evaluation.score import evaluate, intervals_over_objects, score_sample, scored_pair
 from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE
@@ -38,9 +37,9 @@ Scores = dict[str, float | None]
 
 
 def score_method(opened: DatasetFolder, method: NetworkMethod, row: Path, folders: Folders) -> Result:
-    """Predict the test split, time the method, score against the decoded depth (as in the paper), draw the picture
-    beside the row. Files of an earlier run are replaced at the end: an interrupted run leaves nothing that is taken for
-    finished. Raises what predicting, timing and scoring raise."""
+    """Predict the test split, time the method, score against the decoded depth (as in the paper). Files of an earlier
+    run are replaced at the end: an interrupted run leaves nothing that is taken for finished. Raises what predicting,
+    timing and scoring raise."""
     name = row.stem
     predictions, results = folders.runs / "predictions" / name, folders.runs / "results"
     making = predictions.with_name(f"{name}.making")
@@ -53,7 +52,6 @@ def score_method(opened: DatasetFolder, method: NetworkMethod, row: Path, folder
     shutil.rmtree(predictions, ignore_errors=True)
     making.rename(predictions)
     write_result(result, results / f"{name}.json")
-    write_sheet(result, opened, predictions, row.with_suffix(".png"))
     return result
 
 

@@ -23,7 +23,7 @@ from fpp_ml_bench.baselines.reproduce.plan import Folders, Job, Report, variants
 from fpp_ml_bench.baselines.training import DONE, RECIPE, SCORING, WEIGHTS, Recipe, TrainingRun, train
 from fpp_ml_bench.errors import PredictionError, TrainingError, WeightsError
 from fpp_ml_bench.evaluation.result import write_json
-from fpp_ml_bench.files import exclusive, write_atomically
+from fpp_ml_bench.files import exclusive, read_json, write_atomically
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
 PAPER_PRESET = "paper"
@@ -190,7 +190,7 @@ def check_run_folders(jobs: Sequence[Job], folders: Folders) -> None:
             continue
         try:
             differs = plan.differing(job.recipe.to_dict(), _stored(path)["recipe"], "{1} there, {0} in the recipe")
-        except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        except (KeyError, TypeError, AttributeError) as error:
             raise TrainingError(f"{path}: expected the recipe of a training, it can't be read ({error})") from None
         if differs:
             out = shlex.quote(str(path.parent))
@@ -237,7 +237,7 @@ def current_weights(recipe: Recipe, folders: Folders) -> Path | None:
         return None
     try:
         of_recipe = _stored(out / RECIPE)["recipe"] == recipe.to_dict()
-    except (OSError, ValueError, KeyError, TypeError):
+    except (TrainingError, KeyError, TypeError):
         return None
     return target if of_recipe and _made_from(target, file_sha256(out / WEIGHTS)) else None
 
@@ -246,12 +246,12 @@ def _made_from(target: Path, source: str) -> bool:
     """Whether ``target`` is what its record says was made from weights of this hash."""
     try:
         return bool(_stored(target.with_suffix(".json")) == {"made_from_sha256": source, "sha256": file_sha256(target)})
-    except (OSError, ValueError):
+    except (OSError, TrainingError):
         return False
 
 
 def _stored(path: Path) -> Any:
-    return json.loads(path.read_text(encoding="utf-8"))
+    return read_json(path, TrainingError, "give another --runs, or remove it")
 
 
 def file_sha256(path: Path) -> str:

@@ -14,7 +14,7 @@ from fpp_ml_bench.baselines.robustness.scenes import Condition, FrameCache, cond
 from fpp_ml_bench.baselines.robustness.scores import score
 from fpp_ml_bench.constants import sample_name
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.files import exclusive, write_atomically
+from fpp_ml_bench.files import LOCK_FILE, exclusive, read_json, write_atomically
 from fpp_ml_bench.pool import mapping
 
 QUICK_SEVERITIES = (1, 3, 5)
@@ -79,7 +79,7 @@ def measure(
     an earlier run of the same setup left are read instead. Views are predicted and scored by so many processes, or by
     the Ray cluster at an address. ``progress`` is called with an axis and a number of views, ``saved`` after each file.
     Raises PredictionError for files of another setup, `BuildError` where another process is at it, `PoolError`."""
-    with exclusive(out / ".lock", out, "measuring there"):
+    with exclusive(out / LOCK_FILE, out, "measuring there"):
         rows: dict[str, list[View]] = {}
         missing = []
         for axis in setup.axes(axes):
@@ -135,14 +135,14 @@ def _measure_object(work: Work, condition: Condition, name: str) -> list[View]:
 def read_axis(file: Path) -> dict[str, Any] | None:
     """What an axis's file holds: ``setup``, ``axis``, ``views``; None where there is none. PredictionError for a
     damaged one."""
+    if not file.exists():
+        return None
     try:
-        content: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        content: dict[str, Any] = read_json(file, PredictionError)
         views = content["views"]
         complete = bool(views) and all({"sample", "object", "severity", "mae_mm"} <= row.keys() for row in views)
         complete = complete and isinstance(content["setup"], dict) and isinstance(content["axis"], str)
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, KeyError, TypeError, AttributeError):
         complete = False
     if not complete:
         raise PredictionError(f"{file}: damaged; delete it and run the same command again")

@@ -17,7 +17,7 @@ from fpp_ml_bench.decoding import decode_direction, decode_stack, depth_from_bot
 from fpp_ml_bench.evaluation.score import evaluate, score_sample
 from fpp_ml_bench.loaders.render import BuildSettings, Studio, build, single_mesh, solid_mesh, write_ply
 from fpp_ml_bench.loaders.sample import Row, stored_frames
-from fpp_ml_bench.loaders.storage import DatasetFolder, Manifest, ShardWriter, plan_shards
+from fpp_ml_bench.loaders.storage import Assembly, DatasetFolder, Manifest, ShardWriter, plan_shards
 from fpp_ml_bench.optics import PAPER_SEQUENCE, Rig, paper_rig
 
 OBJECT, VIEW = "power_drill", "A60"
@@ -156,20 +156,16 @@ def _dataset(folder: Path, objects: int, size: int, stored: str = "single_shot",
     depth_mm = 1800 + rng.random((size, size), np.float32)
     depth_mm[:, : size // 2] = 0
     nothing = np.zeros((size, size), np.uint8)  # no flags, no cover
-    shards, samples = [], []
     names = [f"object_{number:04d}" for number in range(objects)]
     samples_by_object = {name: [(sample_name(name, view), name, view) for view in VIEWS[:views]] for name in names}
     writer = ShardWriter(target, scratch, PAPER_SEQUENCE, stored, True, (size, size))
-    for plan in plan_shards("test", samples_by_object):
-        files, rows = writer.write(
-            plan, (Row(*where, frames, depth_mm, depth_mm, {}, nothing, nothing) for where in plan.samples)
-        )
-        shards += files
-        samples += rows
-    Manifest(
-        origin="generated", generator={}, settings={}, rig=paper_rig(max(size, 240)).to_dict(), size=(size, size),
-        stored=stored, exact=True, samples={"test": samples}, shards=shards,
-    ).write(target)  # fmt: skip
+    plans = plan_shards("test", samples_by_object)
+    receipts = [
+        writer.write(plan, (Row(*where, frames, depth_mm, depth_mm, {}, nothing, nothing) for where in plan.samples))
+        for plan in plans
+    ]
+    manifest = Manifest("generated", {}, {}, paper_rig(max(size, 240)).to_dict(), (size, size), stored, exact=True)
+    Assembly(plans, lambda plan, folder: (), manifest).filled(receipts).write(target)
     return DatasetFolder(target)
 
 

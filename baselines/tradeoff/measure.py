@@ -33,7 +33,7 @@ from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import FppBenchError
 from fpp_ml_bench.evaluation.result import HardwareInfo
 from fpp_ml_bench.evaluation.score import object_interval, score_sample, scored_pair
-from fpp_ml_bench.files import NAME_LIMIT, exclusive, printable
+from fpp_ml_bench.files import LOCK_FILE, NAME_LIMIT, exclusive, printable
 from fpp_ml_bench.machine import describe_hardware
 
 T = TypeVar("T")
@@ -109,7 +109,7 @@ def _figures(setting: Setting, rules: Rules) -> dict[str, Any]:
         seconds.append(run_s)
         if setting.scored:
             void = views.void(name) if method.mode == "standard" else None
-            left_out = views.void(name) if method.range_rule == "valid" else None
+            left_out = views.left_out(name, method.range_rule)
             pair = scored_pair(depth, views.target_mm(name), method.units, method.mode, name, left_out)
             sample = score_sample(*pair, void=void)
             missing_share = sample.missing / max(sample.object.pixels, 1)
@@ -205,7 +205,7 @@ def tradeoff(settings: TradeoffSettings, plan: Plan, progress: Callable[[str], o
         "rules": asdict(rules), "cpu": hardware.cpu, "cores": hardware.cores,
     }  # fmt: skip
     cv2.setNumThreads(settings.threads)  # the phase route's filters take all threads by default; torch: see networks
-    with exclusive(settings.out / ".lock", settings.out, "measuring into this folder"):
+    with exclusive(settings.out / LOCK_FILE, settings.out, "measuring into this folder"):
         path = settings.out / JOURNAL
         journal = Journal.of(path, about)
         journal.write(path)

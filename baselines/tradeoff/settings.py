@@ -19,10 +19,10 @@ from fpp_ml_bench.baselines.tradeoff.points import COSTS, GROUPS, Group
 from fpp_ml_bench.coding import MIN_MODULATION, Limits, decode_cells
 from fpp_ml_bench.constants import MM_PER_M, sample_name, split_sample_name
 from fpp_ml_bench.decoding import Directions, plain_plan
-from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.depth import RangeRule
 from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError
 from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
-from fpp_ml_bench.loaders.sample import Row, void_pixels
+from fpp_ml_bench.loaders.sample import UNMEASURABLE, VOID, Row, void_pixels
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig
 
@@ -62,7 +62,11 @@ class StoredViews:
 
     def void(self, name: str) -> NDArray[np.bool_]:
         """Pixels bool (H, W) that count in no set."""
-        return self.opened.void(name)
+        return self.opened.void(name, self.target)
+
+    def left_out(self, name: str, rule: RangeRule) -> NDArray[np.bool_] | None:
+        """Pixels bool (H, W) that the depth range by ``rule`` leaves out; None for none."""
+        return self.opened.left_out(name, rule, self.target)
 
 
 def choose_views(opened: DatasetFolder, per_object: int, split: str = "test") -> StoredViews:
@@ -94,12 +98,13 @@ class PhotographedViews:
         return [frames[i] if i in method.frames_used else None for i in range(len(self.rig.sequence))]
 
     def target_mm(self, name: str) -> NDArray[np.float32]:
-        row = self._rows[name]
-        return np.where(object_mask(row.depth_mm), np.asarray(row.depth_exact_mm), np.float32(0))
+        return np.asarray(self._rows[name].depth_exact_mm)
 
     def void(self, name: str) -> NDArray[np.bool_]:
-        row = self._rows[name]
-        return void_pixels(np.asarray(row.flags), row.depth_mm, row.depth_exact_mm)
+        return (np.asarray(self._rows[name].flags) & np.uint8(VOID | UNMEASURABLE)) != 0  # type: ignore[no-any-return]
+
+    def left_out(self, name: str, rule: RangeRule) -> NDArray[np.bool_] | None:
+        return void_pixels(np.asarray(self._rows[name].flags)) if rule == "valid" else None
 
     @cached_property
     def _rows(self) -> dict[str, Row]:

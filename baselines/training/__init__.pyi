@@ -8,6 +8,7 @@ from .depth_training import train as train
 from .engine import CHECKPOINT as CHECKPOINT
 from .engine import RECIPE as RECIPE
 from .engine import Training as Training
+from .engine import alone_in as alone_in
 from .engine import claim_folder as claim_folder
 from .engine import reproducible as reproducible
 from .epochs import open_data as open_data
@@ -51,6 +52,7 @@ from .weights import open_weights as open_weights
 from .weights import read_file as read_file
 from .weights import save_weights as save_weights
 from .weights import shipped_names as shipped_names
+from .weights import trained_on as trained_on
 from .weights import training_benchmark as training_benchmark
 from .weights import training_data_warning as training_data_warning
 from .weights import weights_path as weights_path

@@ -8,6 +8,7 @@ files a folder holds ``weights.safetensors`` and, at the end, ``done.json``.
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
@@ -23,7 +24,7 @@ from torch.utils.data import DataLoader
 
 from fpp_ml_bench.baselines import networks
 from fpp_ml_bench.baselines.phase_route import CalibrationLayer
-from fpp_ml_bench.baselines.training.engine import DIVERGED, Training, claim_folder, reproducible
+from fpp_ml_bench.baselines.training.engine import DIVERGED, Training, alone_in, claim_folder, reproducible
 from fpp_ml_bench.baselines.training.epochs import EpochSampler, Schedule, open_data, spread, training_loader
 from fpp_ml_bench.baselines.training.losses import Adversarial, AdversarialSettings, Regression
 from fpp_ml_bench.baselines.training.recipe import Linear, Recipe
@@ -35,7 +36,8 @@ from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.evaluation.protocol import Mode, Units
 from fpp_ml_bench.evaluation.score import DepthScores, scored_pair
-from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.files import read_json, write_atomically
+from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.loaders.training import FringeDepth, FringeDepthDataset
 
 WEIGHTS, DONE = "weights.safetensors", "done.json"
@@ -60,29 +62,29 @@ class TrainingRun:
 
 
 def train(
-    recipe: Recipe, dataset: str | Path | tuple[FringeDepthDataset, FringeDepthDataset], out: str | Path, *,
-    minutes: float | None = None, show: bool = True,
-) -> TrainingRun:  # fmt: skip
-    """Train ``recipe`` on a dataset folder, or on training and validation pairs, into ``out``, from the checkpoint
-    there; returns at once if it is finished.
+    recipe: Recipe, dataset: str | Path, out: str | Path, *, minutes: float | None = None, show: bool = True
+) -> TrainingRun:
+    """Train ``recipe`` on a dataset folder into ``out``, from the checkpoint there; returns at once if it is finished.
     ``minutes``: stop, with everything saved, before an epoch that would outlast them; one is always trained. ``show``:
     progress on stderr. Raises `TrainingError` for a folder of another recipe or dataset, a damaged checkpoint, a
     dataset of another image size, a loss that is not finite or has diverged (the batch's samples are named)."""
     out, started = Path(out), perf_counter()
-    data, validation = dataset if isinstance(dataset, tuple) else open_data(recipe, Path(dataset))
-    with PartialState().local_main_process_first():
-        claim_folder(out, {"recipe": recipe.to_dict(), "fingerprint": data.source.fingerprint})
-    if (finished := finished_run(out)) is not None:
-        return finished
-    with reproducible(recipe.precision):
-        training = DepthTraining(recipe, data, validation, out)
-        seconds = training.run(started, minutes, show)
-        epochs, best = training.epoch, training.best["epoch"] if training.history else 0
-        if training.over and training.accelerator.is_main_process:
-            summary = {"epochs": epochs, "best_epoch": best, "seconds": seconds}
-            write_atomically(out / DONE, json.dumps(summary).encode())
-        training.accelerator.wait_for_everyone()
-        return _run(out, epochs, best, seconds, training.over)
+    data, validation = open_data(recipe, Path(dataset))
+    state = PartialState()
+    with alone_in(out) if state.is_main_process else nullcontext():
+        with state.local_main_process_first():
+            claim_folder(out, {"recipe": recipe.to_dict(), "fingerprint": data.source.fingerprint})
+        if (finished := finished_run(out)) is not None:
+            return finished
+        with reproducible(recipe.precision):
+            training = DepthTraining(recipe, data, validation, out)
+            seconds = training.run(started, minutes, show)
+            epochs, best = training.epoch, training.best["epoch"] if training.history else 0
+            if training.over and training.accelerator.is_main_process:
+                summary = {"epochs": epochs, "best_epoch": best, "seconds": seconds}
+                write_atomically(out / DONE, json.dumps(summary).encode())
+            training.accelerator.wait_for_everyone()
+            return _run(out, epochs, best, seconds, training.over)
 
 
 def finished_run(out: Path) -> TrainingRun | None:
@@ -90,11 +92,12 @@ def finished_run(out: Path) -> TrainingRun | None:
     path = out / DONE
     if not path.exists() or not (out / WEIGHTS).exists():
         return None
+    cure = "is damaged; delete it, and the training resumes from its checkpoint"
+    summary = read_json(path, TrainingError, f"it {cure}")
     try:
-        summary = json.loads(path.read_text(encoding="utf-8"))
         return _run(out, summary["epochs"], summary["best_epoch"], summary["seconds"], True)
-    except (OSError, ValueError, KeyError, TypeError):
-        raise TrainingError(f"{path}: is damaged; delete it, and the training resumes from its checkpoint") from None
+    except (KeyError, TypeError):
+        raise TrainingError(f"{path}: {cure}") from None
 
 
 def _run(out: Path, epochs: int, best: int, seconds: float, finished: bool) -> TrainingRun:
@@ -252,7 +255,7 @@ class DepthTraining(Training):
         self.schedule.step(record["validation_loss"])
         if self.best is record and self.accelerator.is_main_process:
             scores = {key: value for key, value in record.items() if key.endswith("_mm") or key == "validation_loss"}
-            network, data = self.bare["network"], self.data.source.fingerprint
+            network, data = self.bare["network"], self.data.source
             config = model_config(self.recipe, network, data, record["epoch"], scores)
             save_weights(self.out / WEIGHTS, network, replace(config, range_rule=self.data.range_rule))
 
@@ -277,12 +280,12 @@ class DepthTraining(Training):
         return [losses, object_mae, Panel.of("learning rate", self.history, "epoch", {"learning_rate": "_"}, log=True)]
 
 
-def model_config(recipe: Recipe, network: nn.Module, fingerprint: str, epoch: int, scores: Record) -> ModelConfig:
-    """Configuration for the weights file."""
+def model_config(recipe: Recipe, network: nn.Module, data: DatasetFolder, epoch: int, scores: Record) -> ModelConfig:
+    """Configuration for the weights file of a network trained on ``data``."""
     return ModelConfig(
         name=recipe.name, title=recipe.title, network=recipe.network,
         options=dict(network.options),  # type: ignore[arg-type, call-overload]
-        normalisation=recipe.normalisation, image_size=(recipe.size, recipe.size), dataset_fingerprint=fingerprint,
-        benchmark=training_benchmark(fingerprint), data_config=recipe.frames,
+        normalisation=recipe.normalisation, image_size=(recipe.size, recipe.size), dataset_fingerprint=data.fingerprint,
+        benchmark=training_benchmark(data.content), data_config=recipe.frames,
         background_removed=recipe.background_removed, recipe=recipe.to_dict(), epoch=epoch, validation=scores,
     )  # fmt: skip

@@ -9,7 +9,7 @@ import json
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -26,7 +26,7 @@ from fpp_ml_bench.baselines.training import records
 from fpp_ml_bench.baselines.training.losses import Objective
 from fpp_ml_bench.baselines.training.records import Display, Panel, Record
 from fpp_ml_bench.errors import TrainingError
-from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.files import LOCK_FILE, cause_of, exclusive, read_json, write_atomically
 from fpp_ml_bench.machine import keep_freed_memory
 
 CHECKPOINT, RECIPE = "checkpoint.safetensors", "recipe.json"
@@ -219,18 +219,23 @@ class Training(ABC):
         records.save_checkpoint(self.out / CHECKPOINT, tensors, {**self.identity, **state, **self.state()})
 
 
+def alone_in(out: Path) -> AbstractContextManager[None]:
+    """Within: no other process trains in ``out``, which is made if it is missing, or `TrainingError`."""
+    return exclusive(out / LOCK_FILE, out, "training in this folder", TrainingError)
+
+
 def claim_folder(out: Path, content: dict[str, Any]) -> None:
     """Make ``out`` the folder of the training that ``content`` (``recipe``, and what identifies its data) describes,
     or see that it is. Raises `TrainingError` for a folder of another training or of other files."""
     path = out / RECIPE
     try:
         out.mkdir(parents=True, exist_ok=True)
-        existing = json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
-    except (OSError, ValueError) as error:
-        raise TrainingError(f"{out}: expected a training folder, or a new one ({error})") from None
+    except OSError as error:
+        raise TrainingError(f"{out}: expected a training folder, or a new one ({cause_of(error)})") from None
+    existing = read_json(path, TrainingError, "give another folder") if path.exists() else None
     if existing is None:
         # A process that was killed while it wrote the recipe leaves a hidden temporary file.
-        if any(not path.name.startswith(f".{RECIPE}.") for path in out.iterdir()):
+        if any(path.name != LOCK_FILE and not path.name.startswith(f".{RECIPE}.") for path in out.iterdir()):
             raise TrainingError(f"{out}: holds files but no {RECIPE}; give a new or empty folder")
         write_atomically(path, (json.dumps(content, indent=1) + "\n").encode("utf-8"))
     elif existing != content:

@@ -14,9 +14,9 @@ from fpp_ml_bench.baselines.networks import NETWORKS
 from fpp_ml_bench.baselines.training.tables import GAN, GENERATORS, NETWORK_TITLES, PRESETS, ROWS, TABLES, check_loss
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.depth import Normalisation
-from fpp_ml_bench.errors import RecipeError, SubmissionError
+from fpp_ml_bench.errors import RecipeError
 from fpp_ml_bench.evaluation.submission import read_plain_file
-from fpp_ml_bench.files import printable
+from fpp_ml_bench.files import is_file, printable
 from fpp_ml_bench.schema import Positive, StrictModel, Text, problems_of
 
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"
@@ -186,11 +186,11 @@ def _recipe_path(name_or_path: str | Path) -> Path:
     text = str(name_or_path)
     if text.endswith((".yaml", ".yml")):
         path = Path(text)
-        if not path.is_file():
+        if not is_file(path):
             raise RecipeError(f"{printable(text, 500)}: there is no such recipe file")
         return path
     path = RECIPES / f"{text}.yaml"
-    if ".." in Path(text).parts or Path(text).is_absolute() or not path.is_file():
+    if ".." in Path(text).parts or Path(text).is_absolute() or not is_file(path):
         names = [*(f"{table}/{row}" for table in TABLES for row in ROWS[table]), "base"]
         closest = get_close_matches(text, names, n=3, cutoff=0.4) or names[:3]
         raise RecipeError(
@@ -212,7 +212,11 @@ def _resolved(path: Path, depth: int) -> tuple[dict[str, Any], dict[str, Any]]:
     if not isinstance(parent, str):
         raise RecipeError(f"{path}: extends: expected a recipe's name, like base, got {printable(repr(parent), 60)}")
     beside = path.parent / parent
-    shipped, own = _resolved(beside if beside.is_file() else _recipe_path(parent), depth + 1)
+    try:
+        extended = beside if beside.suffix in (".yaml", ".yml") and is_file(beside) else _recipe_path(parent)
+    except RecipeError as error:
+        raise RecipeError(f"{path}: extends: {error}") from None
+    shipped, own = _resolved(extended, depth + 1)
     return (shipped, _merge(own, content)) if is_users_own else (_merge(shipped, content), own)
 
 
@@ -241,7 +245,4 @@ def _preset(name: str) -> dict[str, Any]:
 
 
 def _read(path: Path) -> dict[Any, Any]:
-    try:
-        return read_plain_file(path, "'normalisation: raw'")
-    except SubmissionError as error:
-        raise RecipeError(str(error)) from None
+    return read_plain_file(path, "'normalisation: raw'", RecipeError)

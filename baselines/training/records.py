@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from fpp_ml_bench.errors import TrainingError
-from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.files import opened, strict_json, write_atomically
 
 LOG_FILE, CURVE_FILE = "log.jsonl", "curve.png"
 _FORMAT = "fpp-ml-bench training 1"
@@ -55,7 +55,7 @@ def read_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
     """What `save_checkpoint` wrote. TrainingError for a file that is cut off, changed or something else."""
     cure = f"; delete {path} to train again from the start"
     try:
-        with safe_open(path, framework="pt") as file:
+        with opened(path, links=True), safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  it is no mapping
     except (SafetensorError, OSError, ValueError) as why:
@@ -64,7 +64,10 @@ def read_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
         raise TrainingError(f"{path}: expected {_FORMAT!r}, got {metadata.get('format')!r}{cure}")
     if metadata.get("sha256") != _seal(tensors, metadata.get("state", "")):
         raise TrainingError(f"{path}: its content does not match its own checksum, it was damaged{cure}")
-    return tensors, json.loads(metadata["state"])
+    try:
+        return tensors, strict_json(metadata["state"])
+    except (ValueError, KeyError) as why:
+        raise TrainingError(f"{path}: its state is no valid JSON ({why}){cure}") from None
 
 
 def _seal(tensors: State, text: str) -> str:

@@ -20,8 +20,8 @@ from fpp_ml_bench.baselines import networks
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.depth import Normalisation, RangeRule
 from fpp_ml_bench.errors import FppBenchError, WeightsError
-from fpp_ml_bench.files import printable, write_atomically
-from fpp_ml_bench.loaders.storage import Manifest, benchmark_of, intended_benchmark
+from fpp_ml_bench.files import file_content, printable, strict_json, write_atomically
+from fpp_ml_bench.loaders.storage import Manifest, benchmark_before, benchmark_of, intended_benchmark
 from fpp_ml_bench.schema import Count, Scalar, Text, problems_of
 
 if TYPE_CHECKING:
@@ -31,6 +31,8 @@ SHIPPED = Path(__file__).resolve().parent.parent / "weights"
 """Folder of the weights that come with the package, ``{name}.safetensors``."""
 SUFFIX = ".safetensors"
 VERSION = "1"
+LARGEST_BYTES, _LONGEST_HEADER = 1 << 32, 1 << 24
+"""Of a weights file, and of its header, in bytes."""
 HEAD_PREFIX = "range_head."
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -194,28 +196,34 @@ def weights_path(name_or_path: str | Path, folder: Path | None = None) -> Path:
     )
 
 
-def training_benchmark(fingerprint: str) -> TrainingBenchmark | None:
-    """The named benchmark with this fingerprint, for the weights file; None for any other dataset."""
-    benchmark = benchmark_of(fingerprint)
+def training_benchmark(content: Mapping[str, str]) -> TrainingBenchmark | None:
+    """The named benchmark with this content (`Manifest.content`), for the weights file; None for any other dataset."""
+    benchmark = benchmark_of(content)
     return None if benchmark is None else TrainingBenchmark(benchmark.name, benchmark.version)
+
+
+def trained_on(config: "ModelConfig | NetConfig") -> TrainingBenchmark | None:
+    """The benchmark that weights were trained on, None where it is none. Version 1 of a benchmark, which had the same
+    images and depths, counts as today's."""
+    same = benchmark_before(config.dataset_fingerprint)
+    return config.benchmark if same is None else TrainingBenchmark(same.name, same.version)
 
 
 def training_data_warning(config: "ModelConfig | NetConfig", manifest: Manifest) -> str | None:
     """A sentence where weights are used on another version of the benchmark that they were trained on, or where nothing
     is known about their training data; else None. Only for a named benchmark, or a dataset built with its settings: on
     imported data, a dataset with settings of its own and another benchmark the user chose so."""
-    fingerprint = manifest.fingerprint
-    used_on = benchmark_of(fingerprint) or intended_benchmark(manifest)
-    if used_on is None or config.dataset_fingerprint == fingerprint:
+    used_on, training = training_benchmark(manifest.content), trained_on(config)
+    named = used_on or intended_benchmark(manifest)
+    if named is None or config.dataset_fingerprint == manifest.fingerprint:
         return None
-    trained_on = training_benchmark(config.dataset_fingerprint) or config.benchmark
-    if trained_on is not None and trained_on.name != used_on.name:
+    if training is not None and (training.name != named.name or training == used_on):
         return None
     training_data = f"dataset {config.dataset_fingerprint[:8]}, which is no benchmark of this version"
-    dataset = f"dataset {fingerprint[:8]}, which has the settings of {used_on.title} but other bytes"
+    dataset = f"dataset {manifest.fingerprint[:8]}, which has the settings of {named.title} but other content"
     return (
-        f"trained on {training_data if trained_on is None else trained_on.title}; predicting on "
-        f"{used_on.title if used_on.fingerprint == fingerprint else dataset}"
+        f"trained on {training_data if training is None else training.title}; predicting on "
+        f"{dataset if used_on is None else used_on.title}"
     )
 
 
@@ -241,12 +249,9 @@ def read_file(path: Path, family: Family) -> "tuple[Any, dict[str, Tensor], str]
     from safetensors.torch import load
 
     if not path.is_file():
-        actual = "a folder" if path.is_dir() else "nothing"
+        actual = "a folder" if path.is_dir() else "no file" if path.exists() else "nothing"
         raise _fault(path, f": expected {family.kind} (*{SUFFIX}), found {actual} there")
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise _fault(path, f" can't be read: {error.strerror}") from None
+    data = file_content(path, LARGEST_BYTES, WeightsError, "give a weights file")
     metadata = _metadata(path, data, family)
     try:
         tensors = load(data)
@@ -270,12 +275,12 @@ def _metadata(path: Path, data: bytes, family: Family) -> dict[str, Any]:
         )  # fmt: skip
     try:
         length = int.from_bytes(data[:8], "little")
-        if len(data) < 8 or length > len(data) - 8:
+        if len(data) < 8 or length > min(len(data) - 8, _LONGEST_HEADER):
             raise ValueError(f"{len(data)} bytes, cut off or no {SUFFIX} at all")
-        metadata = json.loads(data[8 : 8 + length].decode("utf-8")).get("__metadata__", {})
+        metadata = strict_json(data[8 : 8 + length].decode("utf-8")).get("__metadata__", {})
         if not isinstance(metadata, dict):
             raise ValueError("its metadata is no mapping")
-    except (ValueError, AttributeError, RecursionError) as error:
+    except (ValueError, AttributeError) as error:
         words = f": damaged or no {family.file} ({printable(str(error), 200)}); copy or train it again"
         raise _fault(path, words) from None
     form, version = (printable(str(metadata.get(key)), 60) for key in ("format", "version"))

@@ -48,7 +48,7 @@ def prediction_maps(predictions: str | Path, dataset: DatasetFolder, split: str)
 
     def read(sample: str) -> tuple[Map, Map | None]:
         target_mm = dataset.target_mm(sample, DEPTH_EXACT)
-        left_out = dataset.left_out(sample, described.range_rule)
+        left_out = dataset.left_out(sample, described.range_rule, DEPTH_EXACT)
         depth_mm, _ = scored_pair(reader.read(sample)[0], target_mm, described.units, "standard", sample, left_out)
         sigma_mm = submission.read_sigma(folder, sample, dataset.size) if checked.sigmas else None
         return np.array(depth_mm), sigma_mm
@@ -95,7 +95,7 @@ def fuse_split(
                 depth_mm, sigma_mm = maps(sample)
                 views.append(PlacedView(depth_mm, dataset.rig.camera, *placement(dataset, sample), sigma_mm))
                 exact_mm = dataset.target_mm(sample, DEPTH_EXACT)
-                truths.append(Truth(exact_mm, object_mask(exact_mm) & ~dataset.void(sample)))
+                truths.append(Truth(exact_mm, object_mask(exact_mm) & ~dataset.void(sample, DEPTH_EXACT)))
                 dataset.release(sample)
             yield fuse_object(obj, views, truths, surface_of(dataset, obj), cell_mm)
 

@@ -1,6 +1,5 @@
 from .comparison import Comparison as Comparison
 from .comparison import compare as compare
-from .figures import palette_png as palette_png
 from .html import data_uri as data_uri
 from .html import escaped as escaped
 from .html import interval_text as interval_text
@@ -14,6 +13,5 @@ from .report_page import html_table as html_table
 from .report_page import sample_table as sample_table
 from .report_page import score_table as score_table
 from .report_page import write_report as write_report
-from .report_page import write_sheet as write_sheet
 from .terminal import comparison_table as comparison_table
 from .terminal import result_table as result_table

@@ -57,7 +57,7 @@ class Comparison(StrictModel):
 
     first: Text
     second: Text
-    fingerprint: Text
+    truth: Text
     split: Text
     target: Text
     track: Text
@@ -83,7 +83,7 @@ def compare(first: Result, second: Result) -> Comparison:
     return Comparison(
         first=first.submission.name,
         second=second.submission.name,
-        fingerprint=first.dataset.fingerprint,
+        truth=first.dataset.truth,
         split=first.dataset.split,
         **{key: getattr(first, key) for key in ("target", "track", "mode")},
         differences=summaries,
@@ -95,7 +95,7 @@ def compare(first: Result, second: Result) -> Comparison:
 def _check_same_data(first: Result, second: Result) -> None:
     a, b = first.dataset, second.dataset
     lines = []
-    if a.fingerprint != b.fingerprint or (a.benchmark and b.benchmark and a.benchmark != b.benchmark):
+    if a.truth != b.truth:
         lines.append(f"dataset: {printable(a.identity)} against {printable(b.identity)}")
     rules = {"split": "dataset.split", "target": "target", "track": "track", "mode": "mode"}
     for title, key in {**rules, "protocol": "protocol_version"}.items():
@@ -134,11 +134,12 @@ def sentence(first: str, second: str, difference: Difference) -> str:
     """The difference in object MAE as a sentence."""
     if difference.mean_mm is None:
         return "No sample has an object in it, so object MAE says nothing."
+    units = "objects" if difference.samples == difference.objects else "samples"
     if not difference.lower and not difference.higher:
-        return f"{second} and {first} have the same object MAE in all {difference.samples} samples."
+        return f"{second} and {first} have the same object MAE in all {difference.samples} {units}."
     size = f"{millimetres(abs(difference.mean_mm))} mm"
     word, count = ("lower", difference.lower) if difference.mean_mm < 0 else ("higher", difference.higher)
-    views = f"{word} in {count} of {difference.samples} samples"
+    views = f"{word} in {count} of {difference.samples} {units}"
     if difference.interval is None:
         no_interval = "with one object there is no interval, so nothing can be said beyond it"
         return f"{second} has an object MAE {size} {word} than {first} on average, {views}; {no_interval}."

@@ -152,31 +152,3 @@ def palette_png(indices: NDArray[np.uint8], colours: NDArray[np.uint8]) -> bytes
     content = io.BytesIO()
     image.save(content, "PNG", transparency=0, compress_level=9)
     return content.getvalue()
-
-
-TILE_PX, GAP_PX = 160, 8
-_MAPS = ("gray", "viridis", "magma", "coolwarm")
-_SHEET_LEVELS = 63
-"""Colours per map: four maps and the transparent index fit into a PNG's palette of 256."""
-
-
-def sheet_png(rows: list[list[Panel]]) -> bytes:
-    """Panels in rows and columns as one PNG."""
-    palette = np.zeros((256, 3), np.uint8)
-    palette[1 : 1 + _SHEET_LEVELS * len(_MAPS)] = np.vstack([colour_table(name, _SHEET_LEVELS)[1:] for name in _MAPS])
-    lines = [np.hstack([_tile(panel) for panel in panels]) for panels in rows]
-    sheet = np.vstack(lines) if lines else np.zeros((TILE_PX, TILE_PX), np.uint8)
-    return palette_png(sheet[: sheet.shape[0] - GAP_PX, : sheet.shape[1] - GAP_PX], palette)
-
-
-def _tile(panel: Panel) -> NDArray[np.uint8]:
-    """The panel's indices into the common palette at the tile's size, with the gap right of it and below. Pixels are
-    left out or repeated, never averaged."""
-    height, width = panel.indices.shape
-    side = max(height, width)
-    rows, columns = (np.arange(n * TILE_PX // side) * side // TILE_PX for n in (height, width))
-    small = panel.indices[np.ix_(rows, columns)]
-    levels = 1 + (small.astype(np.int64) - 1) * _SHEET_LEVELS // 255 + _SHEET_LEVELS * _MAPS.index(panel.colours)
-    tile = np.zeros((TILE_PX + GAP_PX, TILE_PX + GAP_PX), np.uint8)
-    tile[: small.shape[0], : small.shape[1]] = np.where(small > 0, levels, 0)
-    return tile

@@ -10,17 +10,17 @@ from markupsafe import Markup
 from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation.protocol import COVERED, HEADLINE, SINCE_2
 from fpp_ml_bench.evaluation.report.curves import uncertainty_plots
-from fpp_ml_bench.evaluation.report.figures import Panel, histogram, sample_panels, sheet_png
+from fpp_ml_bench.evaluation.report.figures import Panel, histogram, sample_panels
 from fpp_ml_bench.evaluation.report.html import interval_text, millimetres, page, percent, render, signed
 from fpp_ml_bench.evaluation.result import Result, SampleResult, Uncertainty, write_file
 from fpp_ml_bench.evaluation.score import scored_pair
 from fpp_ml_bench.evaluation.submission import list_folder, reader_for
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
 REPORT_FILE = "index.html"
 _PLACES = (("Best", 0.0), ("Worst", 1.0), ("Median", 0.5), ("Lower quartile", 0.25), ("Upper quartile", 0.75))
 """The samples that are shown and their place by error, in the order in which they are chosen where there are few."""
-_ON_SHEET = ("Best", "Median", "Worst")
 _TITLES = {
     "object_mae_mm": "Object MAE", "object_mae_range_share": "Object MAE, share of its depth range",
     "object_rmse_mm": "Object RMSE", "overall_mae_mm": "Overall MAE",
@@ -69,13 +69,6 @@ def write_report(result: Result, dataset: DatasetFolder, predictions_folder: str
     return path
 
 
-def write_sheet(result: Result, dataset: DatasetFolder, predictions_folder: str | Path, path: Path) -> None:
-    """One PNG of the best, the median and the worst sample, five panels each. Raises what `write_report` raises."""
-    chosen = _panels(result, dataset, Path(predictions_folder))
-    sheet = sheet_png([panels for place, _, panels in chosen if place in _ON_SHEET])
-    write_file(sheet, path, new_folder=True)
-
-
 def chosen_samples(rows: Iterable[SampleResult]) -> list[tuple[str, SampleResult]]:
     """Best, median, worst and the quartiles by object MAE, each sample once, with the place it holds."""
     scored = sorted((row for row in rows if row.object_mae_mm is not None), key=_by_object_error)
@@ -93,9 +86,8 @@ def _by_object_error(row: SampleResult) -> tuple[float, str]:
 
 def _panels(result: Result, dataset: DatasetFolder, folder: Path) -> Iterator[tuple[str, SampleResult, list[Panel]]]:
     """The place, the row and the panels of each chosen sample, the best first; one sample's pixels at a time."""
-    if dataset.fingerprint != result.dataset.fingerprint:
-        difference = f"fingerprint {dataset.fingerprint[:8]} is not {result.dataset.fingerprint[:8]}, which was scored"
-        raise DatasetError(f"{dataset.path}: {difference}; give the dataset that the result names")
+    if not result.dataset.content.items() <= dataset.content.items():
+        raise DatasetError(f"{dataset.path}: is not what was scored; give {printable(result.dataset.identity)}")
     submission, samples = result.submission, [row.sample for row in result.per_sample]
     form = list_folder(folder, samples, result.dataset.split, {}).form
     reader = reader_for(form, folder, samples, dataset.size, submission.png_mm_per_level)
@@ -110,7 +102,7 @@ def _panels(result: Result, dataset: DatasetFolder, folder: Path) -> Iterator[tu
             named = reader.named(row.sample)
             raise PredictionError(f"{named}: is not the file that was scored; score the folder again")
         target_mm = dataset.target_mm(row.sample, result.target)
-        left_out = dataset.left_out(row.sample, submission.range_rule)
+        left_out = dataset.left_out(row.sample, submission.range_rule, result.target)
         prediction_mm, target = scored_pair(values, target_mm, submission.units, result.mode, row.sample, left_out)
         try:
             fringe = dataset.frame(row.sample, used[0] if used else 0)

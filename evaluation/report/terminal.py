@@ -152,7 +152,7 @@ def comparison_table(compared: report.Comparison) -> Group:
         )  # fmt: skip
     title = Text(
         f"\nfirst:  {printable(compared.first)}\nsecond: {printable(compared.second)}\n"
-        f"{compared.split} split ({compared.fingerprint[:8]}), against {compared.target}, "
+        f"{compared.split} split (content {compared.truth[:8]}), against {compared.target}, "
         f"{compared.track} track\n"
     )
     return Group(title, table, Text(f"{compared.sentence}\n"))

@@ -11,6 +11,8 @@ from .file import write_result as write_result
 from .model import ArrayScores as ArrayScores
 from .model import Result as Result
 from .model import array_scores as array_scores
+from .model import check_data as check_data
+from .model import check_reliance as check_reliance
 from .model import over_samples as over_samples
 from .model import result_from_rows as result_from_rows
 from .model import same as same
@@ -21,6 +23,8 @@ from .parts import HardwareInfo as HardwareInfo
 from .parts import Headline as Headline
 from .parts import Interval as Interval
 from .parts import Intervals as Intervals
+from .parts import Metrics as Metrics
+from .parts import ObjectResult as ObjectResult
 from .parts import Reliance as Reliance
 from .parts import RelianceParts as RelianceParts
 from .parts import Robustness as Robustness
@@ -28,7 +32,7 @@ from .parts import SampleResult as SampleResult
 from .parts import SeverityScores as SeverityScores
 from .parts import Sha256 as Sha256
 from .parts import Timing as Timing
-from .parts import dataset_identity as dataset_identity
+from .parts import Whole as Whole
 from .parts import ends as ends
 from .uncertainty import SigmaScores as SigmaScores
 from .uncertainty import Uncertainty as Uncertainty

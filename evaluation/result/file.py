@@ -14,14 +14,14 @@ import pydantic
 from fpp_ml_bench import __version__, depth
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation import report, submission
-from fpp_ml_bench.evaluation.protocol import RESULT_SCHEMA_VERSION, SchemaVersion
+from fpp_ml_bench.evaluation.protocol import MOST_OBJECTS, MOST_SAMPLES, RESULT_SCHEMA_VERSION, SchemaVersion
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import Environment, HardwareInfo
 from fpp_ml_bench.files import printable, write_atomically
+from fpp_ml_bench.files import read_json as read_strict_json
 from fpp_ml_bench.machine import describe_hardware
 from fpp_ml_bench.schema import validate
 
-MAX_BYTES = 64 * 1024 * 1024
 _OTHER_FILES = {
     "shards": "the manifest of a dataset", "row_schema_version": "a row file of the leaderboard",
     "groups": "a ranking, as fpp-bench leaderboard --json writes it",
@@ -73,25 +73,8 @@ def read_result(path: Path) -> Result:
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file: of bounded size, no key twice, no NaN. SubmissionError names file and problem."""
-    file = printable(str(path), 500)
-    try:
-        if not path.is_file():
-            kind = "a folder" if path.is_dir() else "no such file"
-            raise SubmissionError(f"{file}: expected a result file of fpp-eval, found {kind}")
-        with path.open("rb") as stream:
-            data = stream.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise SubmissionError(f"{file} can't be read: {error.strerror}") from None
-    if len(data) > MAX_BYTES:
-        raise SubmissionError(f"{file}: expected at most {MAX_BYTES} bytes; this is no result of fpp-eval")
-    try:
-        return json.loads(data.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_refuse_constant)
-    except UnicodeDecodeError:
-        raise SubmissionError(f"{file}: expected UTF-8 text; write it again with fpp-eval --json") from None
-    except (ValueError, RecursionError) as error:
-        reason = "nested too deeply" if isinstance(error, RecursionError) else printable(str(error))
-        raise SubmissionError(f"{file} is no valid JSON: {reason}; write it again with fpp-eval --json") from None
+    """The content of a JSON file that `fpp-eval` may have written; SubmissionError names file and problem."""
+    return read_strict_json(path, SubmissionError, "write it again with fpp-eval --json")
 
 
 def parse_result(content: Any, path: Path) -> Result:
@@ -106,20 +89,12 @@ def parse_result(content: Any, path: Path) -> Result:
         given = "no schema_version" if version is None else f"schema_version {printable(version, 40)}"
         expected = f"expected a result file with schema_version {' or '.join(get_args(SchemaVersion))}, got {given}"
         raise SubmissionError(f"{file}: {expected}; score the predictions again with this version's fpp-eval")
+    rows = keys.get("per_sample")
+    owners = [str(row.get("object")) for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
+    if len(set(owners)) > MOST_OBJECTS or len(owners) > MOST_SAMPLES:
+        expected = f"expected at most {MOST_OBJECTS} objects and {MOST_SAMPLES} samples"
+        raise SubmissionError(f"{file}: {expected}, got {len(set(owners))} and {len(owners)}; score parts of the data")
     return validate(Result, content, path, "result of fpp-eval")
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    content: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in content:
-            raise ValueError(f"key {printable(key, 60)!r} is given twice")
-        content[key] = value
-    return content
-
-
-def _refuse_constant(name: str) -> None:
-    raise ValueError(f"{name} is no number a score can have")
 
 
 def json_schema(name: str) -> dict[str, Any]:

@@ -11,12 +11,13 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator, model_validator
 
 from fpp_ml_bench.evaluation import protocol
-from fpp_ml_bench.evaluation.protocol import METRICS, Mode, SchemaVersion, Target, Track
+from fpp_ml_bench.evaluation.protocol import METRICS, FramesClass, Mode, SchemaVersion, Target, Track, scored_columns
 from fpp_ml_bench.evaluation.result import parts
 from fpp_ml_bench.evaluation.result.parts import Metrics, Reliance, Robustness, SampleResult
 from fpp_ml_bench.evaluation.result.uncertainty import Uncertainty, uncertainty_of
 from fpp_ml_bench.evaluation.score import ErrorStats, SigmaSample, combine, intervals_over_objects
 from fpp_ml_bench.evaluation.submission import Submission
+from fpp_ml_bench.loaders.storage import Counts, known_problem
 from fpp_ml_bench.schema import Count, SparseModel, StrictModel, Text
 
 AGREES = 1e-9
@@ -37,6 +38,7 @@ class Result(SparseModel):
     dataset: parts.DatasetInfo
     target: Target
     mode: Mode
+    frames_class: FramesClass
     edge_band_px: Annotated[int, Field(ge=0, le=1000)]
     edge_jump_mm: Annotated[float, Field(gt=0)]
     metrics: Metrics
@@ -78,20 +80,25 @@ class Result(SparseModel):
             raise ValueError(f"per_sample holds {count} samples, dataset.samples says {self.dataset.samples}")
         if len({row.sample for row in self.per_sample}) != count:
             raise ValueError("per_sample names a sample twice")
-        if self.mode == "paper-individual" and not self.submission.uses_ground_truth_range:
-            raise ValueError("mode paper-individual needs the sample's depth range, so its track is oracle range")
         if self.reliance is not None:
-            _check_reliance(self.reliance, self.submission)
+            check_reliance(self.reliance, self.submission)
         if self.uncertainty is not None:
             self.uncertainty.check({row.sample: row for row in self.per_sample}, self.metrics)
         for name, block in (self.robustness or {}).items():
             _check_weights("robustness", block.weights_sha256, self.submission)
             if name != block.set:
                 raise ValueError(f"robustness.{name} is that of the set {block.set}")
-        first = self.protocol_version.startswith("1.")
-        if self.mode not in (("standard", "paper-individual") if first else protocol.MODES):
+        if self.mode not in protocol.MODES:
             raise ValueError(f"protocol {self.protocol_version} has no mode {self.mode}")
-        void = not first and self.mode == "standard"
+        objects: dict[str, list[SampleResult]] = {}
+        for row in self.per_sample:
+            objects.setdefault(row.object, []).append(row)
+        found = {
+            name: Counts(len(rows), sum(r.object_pixels for r in rows), sum(r.void_pixels or 0 for r in rows))
+            for name, rows in objects.items()
+        }
+        check_data(self.dataset, self.target, self.mode, self.submission.units, found)
+        void = self.mode == "standard"
         for row in self.per_sample:
             _check_sample(row, height * width)
             _check_void(row, height * width, void, void and self.target == "depth_exact")
@@ -235,7 +242,26 @@ def _check_void(row: SampleResult, pixels: int, void: bool, unlit: bool) -> None
         raise ValueError(f"{row.sample}: unlit RMSE is below its MAE, which no error has")
 
 
-def _check_reliance(reliance: Reliance, submission: Submission) -> None:
+def check_data(
+    data: parts.DatasetInfo, target: str, mode: str, units: str, found: Mapping[str, Counts]
+) -> None:  # fmt: skip
+    """Refuse (ValueError) a content of other columns than the rules read, and a named benchmark whose samples, objects
+    or pixels are others than those ``found`` in a file."""
+    splits = {name.partition("/")[0] for name in data.content}
+    expected = [
+        {f"{split}/{column}" for split in splits for column in scored_columns(target, mode, flags)}
+        for flags in (True, False)
+    ]
+    if set(data.content) not in expected or (data.split != "all" and splits != {data.split}):
+        columns = " or ".join(dict.fromkeys(", ".join(sorted(names)) for names in expected))
+        raise ValueError(f"dataset.content: expected hashes of {columns}, got {', '.join(sorted(data.content))}")
+    if (mode, units) == ("paper", "normalised"):  # whose mask lacks the object's nearest pixels (`scored_pair`)
+        found = {name: counts._replace(object_px=None) for name, counts in found.items()}
+    if problem := known_problem(data.content, data.split, target, mode, found):
+        raise ValueError(problem)
+
+
+def check_reliance(reliance: Reliance, submission: Submission) -> None:
     """Refuse (ValueError) a phase reliance of other weights or of another output than was scored."""
     units = submission.units
     _check_weights("reliance", reliance.weights_sha256, submission)

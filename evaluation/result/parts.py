@@ -1,8 +1,10 @@
 """The parts of ``result.json`` as strict models: scores, data, what was scored with what, run time, phase reliance,
 robustness."""
 
+import json
 import math
 from collections.abc import Sequence
+from hashlib import sha256
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
@@ -130,16 +132,25 @@ class BenchmarkInfo(StrictModel):
     version: Count
 
 
-class DatasetInfo(SparseModel):
-    """The data that was scored on. ``fingerprint`` identifies its bytes; ``name`` is only the folder's name.
+Content = dict[
+    Annotated[str, Field(pattern=r"^(train|validation|test)/[a-z_0-9]{1,40}$")],
+    Annotated[str, Field(pattern=r"^[0-9a-f]{32}$")],
+]
 
-    ``benchmark`` is absent for any other dataset than the named benchmarks. A name and version that this package knows
-    with another fingerprint, or a fingerprint that it knows under another name or version, is refused."""
+
+class DatasetInfo(SparseModel):
+    """The data that was scored on; ``name`` is only the folder's name. ``content``: hashes of the decoded values that
+    the scores depend on, by ``split/column`` (`fpp_ml_bench.loaders.storage.benchmark`). ``code``: what the projector
+    showed, ``phase shift``, ``crossed`` or ``Gray code``.
+
+    ``benchmark`` is absent for any other dataset than the named benchmarks. A name and version whose content is another
+    one is refused."""
 
     SPARSE = ("benchmark",)
 
     name: Text
-    fingerprint: Sha256
+    content: Annotated[Content, Field(min_length=1, max_length=9)]
+    code: Text
     benchmark: BenchmarkInfo | None = None
     split: Literal["train", "validation", "test", "all"]
     size: Annotated[list[Whole], Field(min_length=2, max_length=2)]
@@ -149,27 +160,25 @@ class DatasetInfo(SparseModel):
     def _consistent(self) -> "DatasetInfo":
         if self.benchmark is None:
             return self
-        claim = self.benchmark.name, self.benchmark.version
-        claimed = next((b for b in (*benchmarks.BENCHMARKS, *benchmarks.EARLIER) if (b.name, b.version) == claim), None)
-        actual = benchmarks.benchmark_of(self.fingerprint)
-        if claimed != actual:
-            expected = f"; {claimed.title} has {claimed.fingerprint[:16]}" if claimed else ""
-            found = f"fingerprint {self.fingerprint[:16]} is {actual.title if actual else 'not that benchmark'}"
-            raise ValueError(f"benchmark says {claim[0]} version {claim[1]}, but {found}{expected}")
+        claim, actual = f"{self.benchmark.name} version {self.benchmark.version}", benchmarks.benchmark_of(self.content)
+        if actual is None or claim != actual.title:
+            found = f"is that of {actual.title}" if actual else "is not that benchmark's"
+            raise ValueError(f"benchmark says {claim}, but content {found}")
         return self
 
     @property
+    def truth(self) -> str:
+        """What two results share that were scored on the same scenes, whatever was projected: a hash over ``content``,
+        32 hex digits."""
+        return sha256(json.dumps(self.content, sort_keys=True).encode()).hexdigest()[:32]
+
+    @property
     def identity(self) -> str:
-        """What identifies the data, for people: fingerprint, and name and version of the benchmark."""
-        if self.benchmark is None:
-            return dataset_identity(self.fingerprint)
-        return f"{self.benchmark.name} version {self.benchmark.version}, fingerprint {self.fingerprint[:8]}"
-
-
-def dataset_identity(fingerprint: str) -> str:
-    """`DatasetInfo.identity` of a dataset with this fingerprint."""
-    benchmark = benchmarks.benchmark_of(fingerprint)
-    return f"{benchmark.title if benchmark else 'no named benchmark'}, fingerprint {fingerprint[:8]}"
+        """What identifies the data, for people: name and version of the benchmark, and the start of `truth`."""
+        named, benchmark = "no named benchmark", self.benchmark
+        if benchmark is not None:
+            named = f"{benchmark.name} version {benchmark.version}"
+        return f"{named}, content {self.truth[:8]}"
 
 
 class HardwareInfo(StrictModel):

@@ -29,5 +29,6 @@ from .uncertainty import caution as caution
 from .uncertainty import holm as holm
 from .uncertainty import intervals_over_objects as intervals_over_objects
 from .uncertainty import object_interval as object_interval
+from .uncertainty import sign_flip_bounds as sign_flip_bounds
 from .uncertainty import sign_flip_p as sign_flip_p
 from .units import scored_pair as scored_pair

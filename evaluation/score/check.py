@@ -9,14 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from fpp_ml_bench.constants import LARGEST_SIDE_PX
 from fpp_ml_bench.errors import PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import submission
 from fpp_ml_bench.evaluation.score.units import unit_note, value_problems
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.storage import DatasetFolder
-
-MOST_PIXELS = 1 << 28
-"""Without a dataset, no image is expected to be larger."""
 
 
 @dataclass(frozen=True)
@@ -98,11 +96,17 @@ def check_folder(folder: str | Path, dataset: DatasetFolder | None = None, split
 
 
 def _declared_size(folder: Path, listing: submission.Listing) -> tuple[int, int]:
-    """The size (H, W) that most of the files declare."""
+    """The size (H, W) that most of the files declare. PredictionError where it is too large to be read."""
     if listing.form == ".mat":
         raise PredictionError(f"{printable(str(folder), 500)}: .mat files can only be checked with --dataset")
-    sizes = Counter(submission.declared_size(folder / f"{sample}{listing.form}") for sample in listing.present)
-    for size, _ in sizes.most_common():
-        if size is not None and 0 < size[0] * size[1] <= MOST_PIXELS:
-            return size
-    raise PredictionError(f"{printable(str(folder), 500)}: no file holds a depth map (H, W); write them with np.save")
+    files = [folder / f"{sample}{listing.form}" for sample in listing.present]
+    declared = {file: size for file in files if (size := submission.declared_size(file)) and min(size) > 0}
+    if not declared:
+        named = printable(str(folder), 500)
+        raise PredictionError(f"{named}: no file holds a depth map (H, W); write them with np.save")
+    size = Counter(declared.values()).most_common(1)[0][0]
+    if max(size) > LARGEST_SIDE_PX:
+        file = next(file for file in declared if declared[file] == size)
+        most = f"expected at most {LARGEST_SIDE_PX} without a dataset; write the depth map itself, or give --dataset"
+        raise PredictionError(f"{printable(str(file), 500)}: declares {size[1]} x {size[0]} px, {most}")
+    return size

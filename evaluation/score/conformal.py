@@ -114,7 +114,7 @@ def _scores(
             reader.read(sample)[0], dataset.target_mm(sample, target), description.units, "standard", sample
         )
         sigma_mm = submission.read_sigma(folder, sample, dataset.size)
-        scored = object_mask(pair[1]) & ~dataset.void(sample) & states_sigma(pair[0], sigma_mm)
+        scored = object_mask(pair[1]) & ~dataset.void(sample, target) & states_sigma(pair[0], sigma_mm)
         depth, true, sigma = (np.asarray(values[scored], np.float64) for values in (*pair, sigma_mm))
         dataset.release(sample)
         yield sample, np.abs(depth - true) / sigma

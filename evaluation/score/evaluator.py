@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from operator import attrgetter
@@ -23,9 +23,10 @@ from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 from fpp_ml_bench.evaluation.score.sigma_scores import score_sigma
 from fpp_ml_bench.evaluation.score.units import scored_pair, value_problems
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.sample import stored_frames
+from fpp_ml_bench.loaders.sample import image_hash, stored_frames
 from fpp_ml_bench.loaders.storage import DatasetFolder, benchmark_of
 from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.optics import DIRECTIONS, AnySequence
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by
 
 WORKERS = 4
@@ -81,13 +82,18 @@ def evaluate(
     for file_problems, file_rows in outcomes:
         problems += file_problems
         rows += file_rows
+    hashes: dict[tuple[str, str], dict[str, str]] = {}
+    for row in rows:
+        for column, digest in row.pop("hashes").items():
+            hashes.setdefault((split_of[row["sample"]], column), {})[row["sample"]] = digest
     if problems:
         summary = f"{len(problems)} problem{'' if len(problems) == 1 else 's'}"
         lines = [str(description_error), *problems] if description_error else problems
         raise PredictionError(f"{printable(str(folder), 500)} can't be scored, {summary}:", lines)
-    if description_error:
-        raise description_error
-    benchmark = benchmark_of(dataset.fingerprint)
+    if description_error or description is None:
+        raise description_error or SubmissionError(f"{printable(str(folder), 500)}: has no description")
+    content = dict(dataset.content_hash(*column, images) for column, images in hashes.items())
+    benchmark = benchmark_of(content)
     stated = {row["sample"]: row.pop("stated") for row in rows}
     owners = {row["sample"]: row["object"] for row in rows}
     return result.result_from_rows(
@@ -98,7 +104,8 @@ def evaluate(
         submission=description,
         dataset={
             "name": printable(Path(dataset.path).resolve().name, 100).strip() or "dataset",
-            "fingerprint": dataset.fingerprint,
+            "content": content,
+            "code": code_of(dataset.sequence),
             "benchmark": {"name": benchmark.name, "version": benchmark.version} if benchmark else None,
             "split": split,
             "size": list(dataset.size),
@@ -106,10 +113,28 @@ def evaluate(
         },
         target=target,
         mode=mode,
+        frames_class=frames_class(dataset.sequence, description.frames_used),
         edge_band_px=edge_band_px,
         edge_jump_mm=edge_jump_mm(dataset.size[1]),
         environment=result.environment(),
     )
+
+
+def code_of(sequence: AnySequence) -> str:
+    """What the projector shows, in the words of `DatasetInfo.code`."""
+    if sequence.crossed_frames:
+        return "crossed"
+    fringes = any(sequence.sinusoids(direction) for direction in DIRECTIONS)
+    return "phase shift" if fringes else "Gray code"
+
+
+def frames_class(sequence: AnySequence, frames_used: Sequence[int]) -> protocol.FramesClass:
+    """What a method captures of ``sequence``."""
+    one_frame, few_frames, full_sequence = protocol.FRAMES_CLASSES
+    if len(frames_used) <= 1:
+        return one_frame
+    gray = {index for direction in DIRECTIONS for index in sequence.gray(direction)}
+    return full_sequence if gray & set(frames_used) else few_frames
 
 
 def _samples(folder: Path, dataset: DatasetFolder, split: str, target: str, mode: str) -> list[str]:
@@ -124,6 +149,12 @@ def _samples(folder: Path, dataset: DatasetFolder, split: str, target: str, mode
     samples = dataset.samples(split)
     if not samples:
         raise DatasetError(f"{dataset.path}: split {split} holds no sample; there is nothing to score")
+    objects = {split_sample_name(sample)[0] for sample in samples}
+    if len(samples) > protocol.MOST_SAMPLES or len(objects) > protocol.MOST_OBJECTS:
+        limits = f"at most {protocol.MOST_OBJECTS} objects and {protocol.MOST_SAMPLES} samples"
+        raise DatasetError(
+            f"{dataset.path}: split {split} has {len(objects)} and {len(samples)}, {limits} are scored at once"
+        )
     return samples
 
 
@@ -135,13 +166,15 @@ def _scored(
     ``sigmas`` are checked. Work begins with this call, in threads, before the first outcome is taken from the
     iterator."""
     dataset_lock = Lock()
+    columns = protocol.scored_columns(target_name, mode, dataset.has_exact)
 
     def work(sample: str) -> Outcome:
         with dataset_lock:  # reading the dataset need not be thread-safe
             target = dataset.target_mm(sample, target_name)
-            void = dataset.void(sample) if mode == "standard" else None
-            left_out = dataset.left_out(sample, rule) if units == "normalised" else None
+            void = dataset.void(sample, target_name) if mode == "standard" else None
+            left_out = dataset.left_out(sample, rule, target_name) if units == "normalised" else None
             unlit_mm = dataset.unlit_mm(sample) if void is not None and target_name == "depth_exact" else None
+            scored_on = {target_name: target} | ({"flags": dataset.flags(sample)} if "flags" in columns else {})
         low, high = extremes(target)
         if not (low >= 0 and np.isfinite(high)):
             bad = "NaN, infinite or negative values"
@@ -155,6 +188,7 @@ def _scored(
         except PredictionError as error:
             problems = [str(error)]
         problems = [f"{reader.named(sample)}: {problem}" for problem in problems]
+        hashes = {column: image_hash(image) for column, image in scored_on.items()}
         stated = None
         if sigmas is not None:
             try:
@@ -166,7 +200,7 @@ def _scored(
             dataset.release(sample)
         if problems:
             return problems, []
-        row = {"sample": sample, "prediction_sha256": digest, **scores.pixels(), **scores.metrics()}
+        row = {"hashes": hashes, "sample": sample, "prediction_sha256": digest, **scores.pixels(), **scores.metrics()}
         return [], [row | {"object": split_sample_name(sample)[0], "stated": stated}]
 
     return ThreadPoolExecutor(min(WORKERS, usable_cores())).map(work, samples)
@@ -185,11 +219,13 @@ def differences(scored: result.Result, folder: Path, dataset: DatasetFolder) -> 
             f"the result was scored by protocol {scored.protocol_version}, this is {protocol.PROTOCOL_VERSION}; verify "
             "it with the version of fpp-ml-bench that its environment names, or score the predictions again"
         )
-    if scored.dataset.fingerprint != dataset.fingerprint:
-        here = f"{result.dataset_identity(dataset.fingerprint)} is what {printable(str(dataset.path), 200)} has"
-        return [f"dataset.fingerprint: {_value_text(scored.dataset.identity)} in the result, {here}"]
+    here = printable(str(dataset.path), 200)
+    for key, digest in scored.dataset.content.items():
+        if dataset.content.get(key) != digest:
+            scored_on = f"{digest} of {_value_text(scored.dataset.identity)} in the result"
+            return [f"dataset.content.{key}: {scored_on}, {dataset.content.get(key, 'none')} is what {here} has"]
     again = evaluate(folder, dataset, scored.dataset.split, scored.target, scored.edge_band_px, scored.mode)
-    names = ("dataset.size", "dataset.samples", "edge_jump_mm")
+    names = ("dataset.size", "dataset.samples", "dataset.content", "dataset.code", "frames_class", "edge_jump_mm")
     pairs = [(name, attrgetter(name)(scored), attrgetter(name)(again), "recomputed") for name in names]
     described, description = scored.submission.model_dump(), again.submission.model_dump()
     for key in dict.fromkeys((*described, *description)):
@@ -213,6 +249,13 @@ def _uncertainty_differences(stored: result.Uncertainty | None, recomputed: resu
         blocks = [("there is none" if block is None else "there is one") for block in (stored, recomputed)]
         return [] if stored is recomputed else [f"uncertainty: {blocks[0]} in the result, {blocks[1]} recomputed"]
     lines = []
+    for name in ("reliability", "sparsification"):
+        first, second = ([] if part is None else list(part.model_dump().values()) for part in (
+            getattr(stored, name), getattr(recomputed, name)
+        ))  # fmt: skip
+        pairs = [pair for curves in zip(first, second, strict=False) for pair in zip(*curves, strict=True)]
+        if len(first) != len(second) or not all(result.same(*pair, 1e-12) for pair in pairs):
+            lines.append(f"uncertainty.{name}: the curve in the result is not the one recomputed")
     for sample, scores in recomputed.per_sample.items():
         for key in protocol.UNCERTAINTY:
             first, second = getattr(stored.per_sample[sample], key), getattr(scores, key)
@@ -227,8 +270,6 @@ def _sample_differences(stored: result.SampleResult, recomputed: result.SampleRe
     exact = ("object", "prediction_sha256", *(f"{name}_pixels" for name in ("object", "background", "void", "unlit")))
     keys = [key for key in exact if getattr(stored, key) != getattr(recomputed, key)]
     for key in protocol.METRICS:
-        if key == protocol.RANGE_SHARE and stored.object_mae_range_share is None:
-            continue  # files before schema 2.4.0 have none
         # Signed means and the error without an offset are small differences of large numbers.
         rounding_mm = 1e-9 * (recomputed.object_mae_mm or 0.0) if "bias" in key or "shift_free" in key else 0.0
         if not result.same(getattr(stored, key), getattr(recomputed, key), rounding_mm):

@@ -5,6 +5,7 @@ from .description import read_submission as read_submission
 from .prediction_files import REPORTS_FILE as REPORTS_FILE
 from .prediction_files import SIGMA as SIGMA
 from .prediction_files import SUBMISSION_FILE as SUBMISSION_FILE
+from .prediction_files import UNFINISHED_FILE as UNFINISHED_FILE
 from .prediction_files import Listing as Listing
 from .prediction_files import Reader as Reader
 from .prediction_files import list_folder as list_folder

@@ -7,17 +7,18 @@ from pathlib import Path
 from threading import local
 from typing import Any, NamedTuple
 
-import yaml
 from numpy.typing import NDArray
 
-from fpp_ml_bench.errors import PredictionError, SubmissionError
+from fpp_ml_bench.errors import FppBenchError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.protocol import LARGEST_MM
 from fpp_ml_bench.evaluation.submission.sample_files import HEADER_BYTES, parse_npy, read_npy, read_npz, read_png
-from fpp_ml_bench.files import printable, read_bounded, strict_yaml
+from fpp_ml_bench.files import LOCK_FILE, printable, read_bounded, read_yaml
 
 SUBMISSION_FILE = "submission.yaml"
 REPORTS_FILE = "per_sample.json"
 """What a method may report of each sample beside its predictions; it is not scored."""
+UNFINISHED_FILE = "unfinished.jsonl"
+"""What `baselines.run.predict_split` goes on from, until all predictions are there."""
 _MAX_BYTES = 65536
 
 
@@ -33,25 +34,13 @@ def read_plain(folder: Path) -> dict[Any, Any]:
     return read_plain_file(path, "'name: My method'")
 
 
-def read_plain_file(path: Path, example: str) -> dict[Any, Any]:
-    """Keys and values of a YAML file, of bounded size and plain values; ``example`` shows what a line looks like.
-    SubmissionError names the file, what is wrong with it and what to do."""
-    file = printable(str(path), 500)
-    try:
-        with path.open("rb") as stream:
-            data = stream.read(_MAX_BYTES + 1)
-        if len(data) > _MAX_BYTES:
-            raise SubmissionError(f"{file}: expected at most {_MAX_BYTES} bytes; shorten names and settings")
-        content = strict_yaml(data.decode("utf-8"))
-    except OSError as error:
-        raise SubmissionError(f"{file} can't be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise SubmissionError(f"{file}: expected UTF-8 text") from None
-    except (yaml.YAMLError, ValueError, RecursionError, OverflowError) as error:
-        reason = " ".join(printable(line.strip()) for line in str(error).splitlines()) or "nested too deeply"
-        raise SubmissionError(f"{file} is no plain YAML: {reason}") from None
+def read_plain_file(path: Path, example: str, raised: type[FppBenchError] = SubmissionError) -> dict[Any, Any]:
+    """Keys and values of a YAML file, of bounded size and plain values; ``example`` shows what a line looks like. The
+    error ``raised`` names the file, what is wrong with it and what to do."""
+    content = read_yaml(path, raised, "correct it, with short names and settings", _MAX_BYTES)
     if not isinstance(content, dict):
-        raise SubmissionError(f"{file}: expected keys and values like {example}, got {type(content).__name__}")
+        file = printable(str(path), 500)
+        raise raised(f"{file}: expected keys and values like {example}, got {type(content).__name__}")
     return content
 
 
@@ -91,6 +80,8 @@ def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapp
         sample_split = split_of.get(stem) if suffix in PER_SAMPLE else None
         if sample_split and stem not in samples:
             return f"a sample of split {sample_split}, not of {split}: move it away or score that split"
+        if name == UNFINISHED_FILE:
+            return "a stopped fpp-bench predict left it: run the same command again, it continues"
         if sample_split or name in TABLES:
             return f"the other predictions are {form if form in TABLES else form + ' files'}: keep one form"
         return "remove it"
@@ -99,7 +90,7 @@ def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapp
     uncertain = {f"{sample}{SIGMA}" for sample in samples}
     if sigmas := bool(uncertain & names):
         problems += [f"{name}: is missing; write one for each sample, or none" for name in sorted(uncertain - names)]
-    extra = sorted(names - {*files, *uncertain, SUBMISSION_FILE, REPORTS_FILE})
+    extra = sorted(names - {*files, *uncertain, SUBMISSION_FILE, REPORTS_FILE, LOCK_FILE})
     problems += [f"{printable(name)}: is extra ({hint(name)})" for name in extra]
     present = list(samples) if form in TABLES else [sample for name, sample in files.items() if name in names]
     return Listing(form, problems, present, sigmas)

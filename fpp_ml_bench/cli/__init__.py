@@ -6,19 +6,26 @@ Only the module of the command that runs is imported, and such a module imports 
 """
 
 import argparse
+import math
+import os
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from importlib import import_module
-from types import ModuleType, SimpleNamespace
+from pathlib import Path
+from time import monotonic
+from types import FrameType, ModuleType, SimpleNamespace
 from typing import Any
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.errors import FppBenchError, PoolError
-from fpp_ml_bench.files import cause_of
+from fpp_ml_bench.files import DISK_FULL, cause_of
 from fpp_ml_bench.machine import usable_cores
 
-OK, CHECK_FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+OK, CHECK_FAILED, BAD_INPUT, INTERRUPTED, CUT_OFF, TERMINATED = 0, 1, 2, 130, 141, 143
 SPLITS = ("train", "validation", "test", "all")
 Command = ModuleType | SimpleNamespace
 
@@ -64,7 +71,8 @@ examples:
   fpp-eval predictions --dataset data/mini --split test --json result.json
   fpp-bench leaderboard result.json
 
-fpp-bench COMMAND --help shows its options. Exit status: 0 done, 1 a check failed, 2 bad input or failed, 130 stopped.
+fpp-bench COMMAND --help shows its options. Exit status: 0 done, 1 a check failed, 2 bad input or failed, 130 stopped
+(143 by SIGTERM), 141 nobody reads the output.
 """
 
 
@@ -98,6 +106,7 @@ def workers_of(args: argparse.Namespace) -> int:
     return int(args.workers)
 
 
+_STREAMS = "stdout", "stderr"
 _FORMATTER = partial(argparse.RawDescriptionHelpFormatter, max_help_position=30, width=110)
 _STYLE: dict[str, Any] = {"formatter_class": _FORMATTER, "allow_abbrev": False}
 
@@ -111,34 +120,100 @@ def parser_for(command: Command, prog: str) -> argparse.ArgumentParser:
 
 
 def run_command(command: Command, prog: str, argv: Sequence[str]) -> int:
-    """Parse ``argv`` and run the command; an error of this package, an unreadable file or Ctrl-C becomes a message."""
-    args = parser_for(command, prog).parse_args(argv)
+    """Parse ``argv`` and run the command. An error of this package, an unreadable file, a full disk, Ctrl-C or SIGTERM
+    becomes a message and a status; where nobody reads the output any more, there is a status alone."""
+    return _guarded(prog, lambda: command.run(parser_for(command, prog).parse_args(argv)))
+
+
+def _guarded(prog: str, action: Callable[[], int]) -> int:
+    for name in _STREAMS:
+        if getattr(sys, name) is None:  # closed by the caller: its number must not become that of a data file
+            setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115
+    status, leaving = OK, None
     try:
-        status: int = command.run(args)
-        return status
+        status = _status_of(prog, action)
+    except SystemExit as stop:  # of --help or a wrong option, and of rich where its output is closed
+        if isinstance(stop.__context__, BrokenPipeError):
+            status = CUT_OFF
+        else:
+            leaving = stop
+    for name in _STREAMS:
+        try:
+            getattr(sys, name).flush()
+        except OSError as error:
+            setattr(sys, name, None)  # or the flush at exit fails, too
+            if status == OK:
+                closed = isinstance(error, BrokenPipeError)
+                status = CUT_OFF if closed else _refused(prog, f"standard output: {cause_of(error)}")
+    if leaving is not None and status == OK:
+        raise leaving
+    return status
+
+
+def _status_of(prog: str, action: Callable[[], int]) -> int:
+    try:
+        with _terminable():
+            return action()
     except BrokenPipeError:
-        # The reader of the output closed it (`| head`). That is no error, and flushing at exit must not raise one.
-        sys.stdout = None  # type: ignore[assignment]
-        return BAD_INPUT
+        return CUT_OFF
     except FppBenchError as error:
         return _refused(prog, error)
     except OSError as error:
-        named = "" if error.filename is None else f"{error.filename}: "
-        return _refused(prog, f"{named}{cause_of(error)}")
+        name = error.filename
+        if name is None and error.errno in DISK_FULL:  # that of a file has its name by `naming`
+            name = "standard output or a temporary file"
+        return _refused(prog, f"{'' if name is None else f'{name}: '}{cause_of(error)}")
     except ModuleNotFoundError as error:
         library = (error.name or "").partition(".")[0]
         extra = next((extra for extra, libraries in EXTRAS.items() if library in libraries), None)
         if extra is None:
             raise
         return _refused(prog, f"this needs {library}, which is not installed; pip install 'fpp-ml-bench[{extra}]'")
-    except KeyboardInterrupt:
-        print(f"{prog}: stopped", file=sys.stderr)
-        return INTERRUPTED
+    except KeyboardInterrupt as stop:
+        _say(f"{prog}: stopped")
+        return TERMINATED if isinstance(stop, _Terminated) else INTERRUPTED
+
+
+class _Terminated(KeyboardInterrupt):
+    """SIGTERM, which ends a command as Ctrl-C does: temporary files and locks are removed, and workers end."""
+
+
+@contextmanager
+def _terminable() -> Iterator[None]:
+    """Raise `_Terminated` within on SIGTERM, but once for the two that ``timeout`` sends. While a module is imported,
+    where libraries swallow any exception, the process ends as without this."""
+    last_s = -math.inf
+
+    def stop(number: int, frame: FrameType | None) -> None:
+        nonlocal last_s
+        if monotonic() - last_s < 1:
+            return
+        last_s = monotonic()
+        while frame is not None:
+            if frame.f_code.co_filename.startswith("<frozen importlib"):
+                signal.signal(number, signal.SIG_DFL)
+                signal.raise_signal(number)
+            frame = frame.f_back
+        raise _Terminated
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, stop)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _refused(prog: str, problem: object) -> int:
-    print(f"{prog}: error: {problem}", file=sys.stderr)
+    _say(f"{prog}: error: {problem}")
     return BAD_INPUT
+
+
+def _say(text: str) -> None:
+    with suppress(OSError):
+        print(text, file=sys.stderr)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -147,6 +222,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     if arguments and arguments[0] in COMMANDS:
         module = import_module(f"fpp_ml_bench.cli.{COMMANDS[arguments[0]][0]}")
         return run_command(module, f"fpp-bench {arguments[0]}", arguments[1:])
+    return _guarded("fpp-bench", partial(_without_command, arguments))
+
+
+def _without_command(arguments: list[str]) -> int:
+    """Help, version, or what is wrong with the command's name."""
     width = max(map(len, COMMANDS))
     listing = "\n".join(f"  {name:<{width}}  {summary}" for name, (_, summary) in COMMANDS.items())
     usage = "fpp-bench [--help] [--version] COMMAND ..."

@@ -9,7 +9,7 @@ from fpp_ml_bench import coding, optics
 from fpp_ml_bench.cli import add_pool_options, workers_of
 from fpp_ml_bench.cli.console import gigabytes, progress_bar, say_benchmark
 from fpp_ml_bench.cli.explain import add_explain_options, as_asked, explain
-from fpp_ml_bench.constants import CONFIGS, PRESETS
+from fpp_ml_bench.constants import CONFIGS, LARGEST_SIDE_PX, PRESETS
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders import render, storage
 from fpp_ml_bench.remote import place
@@ -64,8 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def settings_of(args: argparse.Namespace) -> "render.BuildSettings":
     """Build settings that the arguments ask for; raises `BuildError`, `MeshError` or `RigError`."""
     objects, size = PRESETS[args.preset]
-    if args.size is not None and not 1 <= args.size <= 8192:
-        raise BuildError(f"--size {args.size}: expected 1 to 8192 px")
+    if args.size is not None and not 1 <= args.size <= LARGEST_SIDE_PX:
+        raise BuildError(f"--size {args.size}: expected 1 to {LARGEST_SIDE_PX} px")
     if args.rig in optics.NAMED_RIGS:
         rig = optics.NAMED_RIGS[args.rig](args.size or size)
     else:

@@ -7,7 +7,7 @@ from pathlib import Path
 from fpp_ml_bench import calibration, optics
 from fpp_ml_bench.cli import count
 from fpp_ml_bench.cli.console import progress_bar, say_findings, show, working_range
-from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.constants import LARGEST_SIDE_PX, MM_PER_M
 from fpp_ml_bench.errors import CalibrationError, RigError
 from fpp_ml_bench.examination import Examination
 from fpp_ml_bench.files import write_atomically
@@ -133,8 +133,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _virtual(args: argparse.Namespace) -> int:
     """Photograph a board, calibrate from the images alone, and compare with the rig that took them."""
-    if args.size is not None and not 64 <= args.size <= 8192:
-        raise CalibrationError(f"--size {args.size}: expected 64 to 8192 px")
+    if args.size is not None and not 64 <= args.size <= LARGEST_SIDE_PX:
+        raise CalibrationError(f"--size {args.size}: expected 64 to {LARGEST_SIDE_PX} px")
     true_rig = optics.paper_rig() if args.true_rig is None else optics.load_rig(args.true_rig)
     true_rig = true_rig if args.size is None else true_rig.scaled(args.size)
     if args.board is not None:

@@ -68,11 +68,11 @@ def run(args: argparse.Namespace) -> int:
         )  # fmt: skip
         if args.json is not None:
             result.write_result(scored, args.json)
-        from fpp_ml_bench.cli.console import show  # imports rich, which --help must not
-
-        show(report.result_table(scored))
         if args.report is not None:
             report.write_report(scored, dataset, args.folder, args.report)
+        from fpp_ml_bench.cli.console import show  # imports rich, which --help must not
+
+        show(report.result_table(scored))  # when all is written: printing ends where nobody reads any more
         for written in (args.json, args.report):
             if written is not None:
                 print(f"Written: {written}")
@@ -111,9 +111,9 @@ def _compare_arguments(parser: argparse.ArgumentParser) -> None:
 def _compare(args: argparse.Namespace) -> int:
     """Print the table and the sentence. Raises SubmissionError for results that can't be compared."""
     from fpp_ml_bench.cli.console import show
-    from fpp_ml_bench.leaderboard.rows import read_entry
+    from fpp_ml_bench.leaderboard.rows import alike, read_scored
 
-    comparison = report.compare(read_entry(args.first).result, read_entry(args.second).result)
+    comparison = report.compare(*alike(read_scored(args.first), read_scored(args.second)))
     if args.json is not None:
         result.write_json(comparison.model_dump(mode="json"), args.json)
     show(report.comparison_table(comparison))
@@ -145,19 +145,25 @@ def _verify_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _verify(args: argparse.Namespace) -> int:
     """Say verified or not, and what differs. Raises FppBenchError where nothing can be recomputed at all."""
-    from fpp_ml_bench.leaderboard.rows import read_entry
+    from fpp_ml_bench.leaderboard import rows
 
-    scored = read_entry(args.result).result
-    problems = score.differences(scored, args.folder, storage.DatasetFolder(args.dataset))
+    scored = rows.read_scored(args.result)
+    dataset = storage.DatasetFolder(args.dataset)
+    if isinstance(scored, result.Result):
+        problems = score.differences(scored, args.folder, dataset)
+    else:
+        problems = rows.differences(scored, args.folder, dataset)
     file = printable(str(args.result), 500)
+    unchecked = f"not checked: {', '.join(rows.not_checked(scored))}: predictions don't tell them"
     if not problems:
-        print(f"verified: {file} is what {len(scored.per_sample)} predictions give")
+        print(f"verified: {file} is what {scored.dataset.samples} predictions give\n{unchecked}")
         return OK
     print(f"not verified: {file} differs from what the predictions give in {len(problems)} places")
     for line in problems[:LISTED]:
         print(f"  {line}")
     if len(problems) > LISTED:
         print(f"  ... and {len(problems) - LISTED} more")
+    print(unchecked)
     return CHECK_FAILED
 
 
@@ -217,8 +223,11 @@ SUBCOMMANDS = {
         add_arguments=_compare_arguments, run=_compare,
     ),
     "verify": SimpleNamespace(
-        SUMMARY="Score the predictions again and say whether the result is verified (exit status 0) or not (1).",
-        EXAMPLES=("fpp-eval verify result.json predictions --dataset data/mini",),
+        SUMMARY="Score the predictions again and say whether the result or row is verified (exit status 0) or not (1).",
+        EXAMPLES=(
+            "fpp-eval verify result.json predictions --dataset data/mini",
+            "fpp-eval verify leaderboard/rows/mine.json predictions --dataset data/full",
+        ),
         add_arguments=_verify_arguments, run=_verify,
     ),
     "schema": SimpleNamespace(

@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     opened = storage.DatasetFolder(args.dataset)
-    benchmark = storage.benchmark_of(opened.fingerprint)
+    benchmark = storage.benchmark_of(opened.content)
     statistics = storage.split_statistics(opened.manifest)
     if args.json:
         content = {
@@ -57,7 +57,8 @@ def run(args: argparse.Namespace) -> int:
     print(f"dataset         {opened.path}")
     print(f"origin          {manifest.origin}, by {generator.get('name')} {generator.get('version')}")
     print(f"fingerprint     {opened.fingerprint}")
-    print(f"benchmark       {storage.benchmark_sentence(manifest)[1]}")
+    print(f"benchmark       by its manifest: {storage.benchmark_sentence(manifest)[1]}")
+    print("                (fpp-bench verify reads the images)")
     print(f"images          {height} x {width} px, {len(opened.sequence)} frames a sequence, stored: {manifest.stored}")
     print(f"configurations  {', '.join(opened.configs)}")
     print(f"on disk         {', '.join(f'{name} {gigabytes(size)}' for name, size in groups.items())}")

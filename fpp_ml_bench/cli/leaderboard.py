@@ -21,9 +21,8 @@ EXAMPLES = (
     "fpp-bench leaderboard --paper loss",
     "fpp-bench leaderboard --page page",
     "fpp-bench leaderboard --readme README.md --check",
-    "fpp-bench leaderboard result.json --row leaderboard/rows/mine.json --provenance verified",
+    "fpp-bench leaderboard result.json --row leaderboard/rows/mine.json",
 )
-_PROVENANCES = ("measured here", "verified", "self-reported")
 _TABLES = ("normalization", "background_removed", "multi_frame", "loss", "architecture", "oracle_order", "all", "none")
 
 
@@ -56,9 +55,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     add("--check", action="store_true",
         help="with --readme: write nothing; exit status 1 when the block is not up to date")  # fmt: skip
-    add("--row", **one_file, help="write the given result as a row file for the leaderboard")
-    add("--provenance", choices=_PROVENANCES, default="self-reported", metavar="WORDS",
-        help=f"who vouches for the row: {', '.join(_PROVENANCES)} (default: self-reported)")  # fmt: skip
+    add("--row", **one_file,
+        help="make a row file for the leaderboard of the given result, and print what a maintainer adds to "
+             "leaderboard/vouched.txt to vouch for it")  # fmt: skip
 
 
 def run(args: argparse.Namespace) -> int:
@@ -69,11 +68,15 @@ def run(args: argparse.Namespace) -> int:
         raise SubmissionError("--check checks a README; give it with --readme FILE")
     if args.tradeoff is not None and args.page is None:
         raise SubmissionError("--tradeoff adds settings to a page; give it with --page DIR")
+    if args.page is not None and args.sort != "object_mae_mm":
+        raise SubmissionError("--page is by object_mae_mm, and a click sorts it otherwise; leave out --sort")
     if args.row is not None and args.readme is None:
         if len(args.results) != 1:
             raise SubmissionError(f"--row makes a row of one result, {len(args.results)} were given")
-        leaderboard.write_row(leaderboard.read_entry(args.results[0]), args.provenance, args.row)
-        print(f"{args.row}: {args.provenance}")
+        row = leaderboard.read_entry(args.results[0]).row
+        data = leaderboard.write_row(row, args.row)
+        print(f"{args.row}: {len(data):,} bytes, self-reported until a maintainer adds to leaderboard/vouched.txt:")
+        print(leaderboard.vouching_line(row, data, "measured", "THE COMMAND THAT MAKES IT AGAIN"))
         return 0
     # Page and README hold the shipped rows or the named files, never results that happen to be in the current folder.
     published = args.page is not None or args.readme is not None
@@ -99,7 +102,7 @@ def run(args: argparse.Namespace) -> int:
     if args.page is not None:
         shipped = None if args.results else tradeoff.shipped_tradeoff()
         settings = shipped if args.tradeoff is None else tradeoff.read_tradeoff(args.tradeoff)
-        written = page.write_page(leaderboard.rank(entries), papers, args.page, settings)
+        written = page.write_page(groups, papers, args.page, settings)
         print(f"{args.page}: {len(written)} files; open {written[0]}")
         return 0
     not_shown = len(papers) if args.results and args.paper is None else 0

@@ -99,8 +99,8 @@ def _leaderboard(args: argparse.Namespace, hub: loaders.hub.Hub) -> int:
 def _results(args: argparse.Namespace, hub: loaders.hub.Hub) -> int:
     remote = _remote(args, hub, "model")
     dataset = hub.state("dataset", args.dataset_repo)
-    fingerprint = hub.mark("dataset", args.dataset_repo, dataset).get("fingerprint")
-    scored_on = args.dataset_repo, dataset.commit or "", fingerprint, args.source_url
+    content = hub.mark("dataset", args.dataset_repo, dataset).get("content")
+    scored_on = args.dataset_repo, dataset.commit or "", content, args.source_url
     with TemporaryDirectory(prefix="fpp-bench-publish-") as folder:
         publication = leaderboard.publish.stage_results(args.results, args.repo, Path(folder), *scored_on)
         return _carry_out(args, hub, publication, remote)

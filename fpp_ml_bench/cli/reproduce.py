@@ -139,7 +139,7 @@ def _published(path: Path) -> str | None:
 
     if not path.is_file():
         return None
-    result = read_entry(path).result
-    benchmark, error_mm = result.dataset.benchmark, result.metrics.object_mae_mm
+    row = read_entry(path).row
+    benchmark, error_mm = row.dataset.benchmark, row.metrics.object_mae_mm
     data = "an earlier build" if benchmark is None else f"version {benchmark.version}"
     return f"{'-' if error_mm is None else f'{error_mm:.1f} mm'}, {data}"

@@ -17,7 +17,6 @@ EXAMPLES = (
     "fpp-bench train crossed-net --out runs/crossed-net      the network of crossed fringes; the same",
     "fpp-bench train classical-net --out runs/classical-net      noise and missed pixels of three steps; the same",
     "fpp-bench train mine.yaml data/full --preset paper --out runs/big --minutes 10     in pieces",
-    "fpp-bench train normalization/individual --views views --out runs/crossed-unet      a control on crossed frames",
     "accelerate launch -m fpp_ml_bench train mine.yaml data/full --preset paper --out runs/big      several GPUs",
     "fpp-bench predict runs/mine/model.safetensors data/cpu224 --out predictions",
 )
@@ -35,9 +34,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--preset", choices=training.PRESETS, default="cpu", help="what a shipped recipe is scaled to (default: cpu)")
     add("--minutes", type=float, metavar="M",
         help="stop before an epoch that would not finish in time, everything saved")  # fmt: skip
-    add("--views", type=Path, metavar="DIR",
-        help="instead of DATASET, for a unet: crossed frames in the lights that crossed-net learns from, rendered into "
-             "DIR at the preset's size where it lacks them; the input is standardised by the frame itself")  # fmt: skip
     add("--steps", type=int, metavar="N",
         help="those three: training steps (default: as the shipped weights)")  # fmt: skip
     add("--unions", type=int, metavar="N",
@@ -54,8 +50,6 @@ def run(args: argparse.Namespace) -> int:
     """Train, add range heads where the weights need them, and print the result. Raises FppBenchError."""
     if args.minutes is not None and not 0 < args.minutes < 1e6:
         raise RecipeError(f"--minutes {args.minutes}: expected a number above 0")
-    if args.views is not None and (args.dataset is not None or args.recipe in _OWN_VIEWS):
-        raise RecipeError("--views takes the place of DATASET for a recipe of a unet; give one of them")
     if args.recipe in _OWN_VIEWS:
         import cv2
 
@@ -66,29 +60,25 @@ def run(args: argparse.Namespace) -> int:
         cv2.setNumThreads(1)
         train = dict(zip(_OWN_VIEWS, (_classical_net, _phase_net, _crossed_net), strict=True))[args.recipe]
         return train(args)
-    if args.dataset is None and args.views is None:
+    if args.dataset is None:
         raise RecipeError(f"{args.recipe}: expected a dataset folder to train on, got none")
     _given(args)
     from accelerate import PartialState
 
     recipe = training.load_recipe(args.recipe, args.preset)
-    data = args.dataset
-    if args.views is not None:
-        recipe = crossed_network.view_recipe(recipe)
-        data = crossed_network.view_pairs(recipe, args.views, usable_cores(), show=True)
-    trained = training.train(recipe, data, args.out, minutes=args.minutes)
+    trained = training.train(recipe, args.dataset, args.out, minutes=args.minutes)
     if not PartialState().is_main_process:
         return 0 if trained.finished else CHECK_FAILED
     if not trained.finished:
         print(f"{args.out}: stopped after {trained.epochs} epochs, everything saved; run the same command to resume")
         return CHECK_FAILED
     weights = trained.weights
-    if recipe.normalisation == "individual" and not recipe.background_removed and args.views is None:
+    if recipe.normalisation == "individual" and not recipe.background_removed:
         weights = args.out / "model.safetensors"
         networks.save_with_heads(trained.weights, args.dataset, weights)
     print(f"{weights}: {recipe.title}, epoch {trained.best_epoch} of {trained.epochs}, {trained.seconds:.0f} s")
     print(f"curve: {trained.curve}")
-    print(f"next: fpp-bench predict {weights} {args.dataset or 'DATASET'} --out predictions")
+    print(f"next: fpp-bench predict {weights} {args.dataset} --out predictions")
     return 0
 
 

@@ -1,3 +1,4 @@
+from .code import LARGEST as LARGEST
 from .code import SMALLEST_PITCH_PX as SMALLEST_PITCH_PX
 from .code import Code as Code
 from .code import Kind as Kind

@@ -16,6 +16,8 @@ from fpp_ml_bench.coding.coordinates import Coordinates, Limits
 from fpp_ml_bench.errors import RigError
 
 Kind = Literal["sinusoid", "gray", "crossed", "black", "white"]
+LARGEST = 1e12
+"""Magnitude of any number of a rig: no rig comes near it, and products of several stay far from overflow."""
 SMALLEST_PITCH_PX = 4.0
 """A Gray cell is half a period; below two pixels a cell its edges and centres can't be told apart."""
 
@@ -110,7 +112,7 @@ def whole(value: object, key: str, least: int, most: int) -> int:
 
 
 def real(value: object, key: str) -> float:
-    """``value`` as a finite number; raises `RigError` naming the key."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        raise RigError(f"{key}: expected a finite number, got {value!r}")
+    """``value`` as a finite number of at most `LARGEST`; raises `RigError` naming the key."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
+        raise RigError(f"{key}: expected a finite number of at most {LARGEST:g}, got {value!r}")
     return float(value)

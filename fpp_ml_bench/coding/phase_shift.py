@@ -77,6 +77,8 @@ class PhaseShift(Code):
             if not isinstance(shifts, list) or not shifts:
                 raise RigError(f"shifts_deg: expected a list of degrees, got {shifts!r}")
             lists = shifts if isinstance(shifts[0], list) else [shifts] * len(periods)
+            if not all(isinstance(listed, list) for listed in lists):
+                raise RigError(f"shifts_deg: expected a list of degrees, or one for each period, got {shifts!r}")
             angles = [tuple(real(v, f"shifts_deg[{i}]") for v in listed) for i, listed in enumerate(lists)]
         else:
             steps, sign = entry(entries, "steps"), entries.get("sign", 1)

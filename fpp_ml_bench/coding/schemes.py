@@ -17,7 +17,7 @@ def code_from_dict(entries: Mapping[str, Any], length_px: int, where: str) -> Co
     if not isinstance(entries, Mapping):
         raise RigError(f"{where}: expected a mapping with the key scheme, got {entries!r}")
     scheme = entries.get("scheme")
-    if scheme not in SCHEMES:
+    if not isinstance(scheme, str) or scheme not in SCHEMES:
         raise RigError(f"{where}.scheme: expected {', '.join(SCHEMES)}, got {scheme!r}")
     rest = {key: value for key, value in entries.items() if key != "scheme"}
     try:

@@ -8,7 +8,6 @@ from .checks import grey_levels as grey_levels
 from .decode import Decoded as Decoded
 from .decode import Directions as Directions
 from .decode import decode_stack as decode_stack
-from .fewest import fewest_gray_bits as fewest_gray_bits
 from .fewest import fewest_plans as fewest_plans
 from .fewest import fewest_steps as fewest_steps
 from .triangulation import FIXED_POINT_STEPS as FIXED_POINT_STEPS

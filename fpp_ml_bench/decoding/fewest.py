@@ -19,7 +19,7 @@ from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.decoding import blocks
 from fpp_ml_bench.decoding.blocks import CodePlan, DirectionPlan, compiled_kernels
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm
-from fpp_ml_bench.optics import AXES, DIRECTIONS, Direction, Maps, Rig
+from fpp_ml_bench.optics import AXES, Direction, Maps, Rig
 
 _GRID = 33
 """Rays per image side that represent the image: projections are smooth, and the outermost rays are included."""
@@ -108,14 +108,6 @@ def orders_from_phases(rig: Rig) -> JointCode:
     periods = (np.abs(line) / pitch).max(axis=1)
     driver = AXES[int(periods[1] > periods[0])]
     return JointCode(float(range_gap), float(background_gap), driver, float(periods.max()))
-
-
-def fewest_gray_bits(rig: Rig, direction: Direction | str) -> dict[Direction, tuple[int, ...]]:
-    """Gray bits that must be captured for ``direction`` "vertical", "horizontal" or "both", per direction."""
-    if direction == "both" and orders_from_phases(rig).unambiguous:
-        return {"horizontal": (), "vertical": ()}
-    levels = {name: gray_levels_in_view(rig, name) for name in DIRECTIONS if direction in (name, "both")}
-    return {name: tuple(bit for bit, level in enumerate(found) if level is None) for name, found in levels.items()}
 
 
 def fewest_steps(

@@ -17,12 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.files import printable, strict_yaml, write_atomically
+from fpp_ml_bench.files import file_content, printable, strict_json, strict_yaml, write_atomically
 from fpp_ml_bench.optics.pinhole import Pinhole, require
 from fpp_ml_bench.optics.rig import Matrix3
 
@@ -218,16 +217,12 @@ def _matrix(nodes: dict[str, Any], what: str, *shapes: tuple[int, int] | None) -
 def _nodes(path: Path) -> dict[str, Any]:
     """The file's top nodes: matrices as shape and data, sequences as lists, numbers and text as they are."""
     cure = "give a calibration that OpenCV's FileStorage wrote (XML, YAML or JSON)"
+    content = file_content(path, LARGEST_BYTES, RigError, cure)
+    require(content, f"{path}: the file is empty; {cure}")
     try:
-        require(path.is_file(), f"{path}: expected a file, found {'a folder' if path.is_dir() else 'none'}; {cure}")
-        size = path.stat().st_size
-        require(size > 0, f"{path}: the file is empty; {cure}")
-        require(size <= LARGEST_BYTES, f"{path}: {size} bytes are too many for a calibration; {cure}")
-        text = path.read_text(encoding="utf-8")
+        text = content.decode("utf-8")
     except UnicodeDecodeError:
         raise RigError(f"{path}: expected text, found other bytes; {cure}") from None
-    except OSError as error:
-        raise RigError(f"{path}: can't be read: {error.strerror or error}") from error
     answer = _parsed_elsewhere(str(path.resolve()))
     if "nodes" not in answer:
         if keys := _keys(text, path.suffix.lower()):
@@ -246,8 +241,8 @@ def _other_layout(keys: Iterable[str]) -> str:
 def _keys(text: str, suffix: str) -> list[str]:
     """The keys of a JSON or YAML mapping in ``text``, none where it is anything else."""
     try:
-        content = json.loads(text) if suffix == ".json" else strict_yaml(text[:_LONGEST_YAML])
-    except (ValueError, yaml.YAMLError, RecursionError):
+        content = strict_json(text) if suffix == ".json" else strict_yaml(text[:_LONGEST_YAML])
+    except ValueError:
         return []
     return list(content) if isinstance(content, dict) else []
 

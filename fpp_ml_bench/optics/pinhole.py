@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fpp_ml_bench.coding import LARGEST
 from fpp_ml_bench.errors import RigError
 
 Coefficients = tuple[float, ...]
@@ -49,12 +50,17 @@ def fold_radius_squared(coefficients: Coefficients) -> float:
         above, below = np.poly1d([k3, k2, k1, 1.0]), np.poly1d([*coefficients[7:4:-1], 1.0])
         # The numerator of d/dr of r above / below, in r^2.
         slope = above * below + np.poly1d([2.0, 0.0]) * (above.deriv() * below - above * below.deriv())
-        roots = np.concatenate([slope.roots, below.roots])
+        roots = np.concatenate([_roots(slope.coeffs), _roots(below.coeffs)])
     else:
-        roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])
+        roots = _roots([7 * k3, 5 * k2, 3 * k1, 1.0])
     real = [root.real for root in roots if abs(root.imag) <= 1e-9 * abs(root) and root.real > 0]
     # The root finder's last digits differ between processors; where the fold is counts to eleven.
     return float(f"{min(real, default=math.inf):.11g}")
+
+
+def _roots(polynomial: Iterable[float]) -> NDArray:
+    """Its roots; a coefficient that is too small to divide by moves none of them to where a float reaches."""
+    return np.roots([0.0 if abs(c) < 1e-100 else c for c in polynomial])
 
 
 def _radial(r2: NDArray, coefficients: Coefficients) -> NDArray:
@@ -182,8 +188,9 @@ def number(value: object, name: str, *, positive: bool = False) -> float:
     """``value`` as a finite float; raises `RigError` naming the key for anything else (text, booleans, NaN)."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
         raise RigError(f"{name}: expected a number, got {value!r}")
-    if not math.isfinite(value) or (positive and value <= 0):
-        raise RigError(f"{name}: expected a {'positive ' if positive else ''}finite number, got {value!r}")
+    if not -LARGEST <= value <= LARGEST or (positive and value <= 0):
+        kind = f"{'positive ' if positive else ''}finite number of at most {LARGEST:g}"
+        raise RigError(f"{name}: expected a {kind}, got {value!r}")
     return float(value)
 
 

@@ -44,7 +44,7 @@ import yaml
 
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.files import cause_of, strict_yaml
+from fpp_ml_bench.files import read_json, read_yaml, write_atomically
 from fpp_ml_bench.optics.opencv_files import read_opencv_calibration
 from fpp_ml_bench.optics.pinhole import Pinhole, numbers, require
 from fpp_ml_bench.optics.rig import Rig, middle_m, rotation_matrix
@@ -99,14 +99,6 @@ def rig_from_dict(data: object) -> Rig:
     if "standoff_m" not in entries:
         entries["standoff_m"] = middle_m(numbers(entries["working_range_mm"], 2, "working_range_mm"))
     return Rig(**entries)
-
-
-def _unique_keys(pairs: list[tuple[Any, Any]]) -> dict[Any, Any]:
-    mapping: dict[Any, Any] = {}
-    for key, value in pairs:
-        require(key not in mapping, f"key {key} is given twice in the same mapping; keep one entry")
-        mapping[key] = value
-    return mapping
 
 
 def _is_json(path: Path) -> bool:
@@ -226,18 +218,12 @@ def _with_calibration(data: object, folder: Path) -> object:
 
 
 def _loaded(file: Path, build: Callable[[object], Rig]) -> Rig:
-    as_json = _is_json(file)
+    content = (read_json if _is_json(file) else read_yaml)(file, RigError)
     try:
-        text = file.read_text(encoding="utf-8")
-        require(text.strip(), f"the file is empty; expected the keys {', '.join(_RIG_KEYS)}")
-        return build(json.loads(text, object_pairs_hook=_unique_keys) if as_json else strict_yaml(text))
+        require(content is not None, f"the file is empty; expected the keys {', '.join(_RIG_KEYS)}")
+        return build(content)
     except RigError as error:
         raise RigError(f"{file}: {error}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise RigError(f"{file}: can't be read: {cause_of(error)}") from error
-    except (json.JSONDecodeError, yaml.YAMLError, RecursionError) as error:
-        problem = str(error) or "nested too deeply"
-        raise RigError(f"{file}: malformed {'JSON' if as_json else 'YAML'}: {problem}") from error
 
 
 def save_rig(rig: Rig, path: str | Path) -> None:
@@ -246,6 +232,6 @@ def save_rig(rig: Rig, path: str | Path) -> None:
     data = rig.to_dict()
     text = json.dumps(data, indent=2) + "\n" if _is_json(file) else yaml.safe_dump(data, sort_keys=False, width=120)
     try:
-        file.write_text(text, encoding="utf-8")
+        write_atomically(file, text.encode("utf-8"))
     except OSError as error:
         raise RigError(f"{file}: can't be written: {error.strerror or error}") from error

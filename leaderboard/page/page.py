@@ -12,27 +12,22 @@ from typing import Any
 
 from fpp_ml_bench.baselines.tradeoff import Ladder, Rung, Tradeoff
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.report import (
-    data_uri,
-    page,
-    render,
-    sample_table,
-    score_table,
-)
-from fpp_ml_bench.evaluation.result import PART_TITLES, Result, result_json
+from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, HEADLINE, METRICS
+from fpp_ml_bench.evaluation.report import interval_text, millimetres, page, percent, render
+from fpp_ml_bench.evaluation.result import PART_TITLES
 from fpp_ml_bench.evaluation.score import FEWEST_OBJECTS
 from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.leaderboard import columns, tables
 from fpp_ml_bench.leaderboard.assumptions import assumption, assumption_sentences, learned_from, told
 from fpp_ml_bench.leaderboard.data_files import table_csv, table_json
-from fpp_ml_bench.leaderboard.groups import CLASSES, Group, Ranked
+from fpp_ml_bench.leaderboard.groups import Group, Ranked, scenes_of
 from fpp_ml_bench.leaderboard.page.pictures import CLASS_COLOURS
 from fpp_ml_bench.leaderboard.page.sections import blocks, tradeoff_section
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, rank, shipped_rows
 from fpp_ml_bench.leaderboard.reported import ReportedTable
-from fpp_ml_bench.leaderboard.rows import MEANING, Entry, picture_of, read_entry
+from fpp_ml_bench.leaderboard.row_file import Row
+from fpp_ml_bench.leaderboard.rows import MEANING, Entry, read_entry
 from fpp_ml_bench.leaderboard.trivial import more_than_trivial
-from fpp_ml_bench.loaders.storage import benchmark_of
 
 INDEX, DATA, TABLE, SUBMISSIONS = "index.html", "data.json", "data.csv", "submissions"
 _HERE, _PACKAGE = Path(__file__).resolve().parent, "fpp_ml_bench.leaderboard.page"
@@ -72,11 +67,11 @@ def page_files(
     rows = [(group, row) for group in groups for row in group.rows]
     shared = {"meaning": MEANING, "milliseconds": milliseconds, "learned_from": learned_from}
     filters: dict[str, tuple[str, list[str]]] = {
-        "class": ("Class", [name for name in CLASSES if any(group.key.frames == name for group in groups)]),
+        "class": ("Class", [name for name in FRAMES_CLASSES if any(group.key.frames == name for group in groups)]),
         "track": ("Track", sorted({group.key.track for group in groups})),
-        "learned": ("Learned from", sorted({learned_from(row.entry.result) or NOT_SAID for _, row in rows})),
+        "learned": ("Learned from", sorted({learned_from(row.entry.row) or NOT_SAID for _, row in rows})),
     }
-    present = {row.entry.provenance for _, row in rows}
+    present = {row.provenance for _, row in rows}
     body = render(
         _PACKAGE, "index.html", **shared, tables=tables, columns=columns, told=told, assumption=assumption,
         search=_search, slug=lambda entry: slugs[id(entry)], blocks=blocks(groups, slugs),
@@ -99,28 +94,35 @@ def page_files(
 
 def _submission(group: Group, row: Ranked) -> dict[str, Any]:
     """What the template needs for the page of ``row``."""
-    result, picture = row.entry.result, picture_of(row.entry)
-    parts = [result] if row.unseen is None else [result, row.unseen.result]
-    bars = [
-        (part.metrics.object_mae_mm, part.spread.get(DEFAULT_SORT), part.object)
-        for scored in parts for part in scored.per_object if part.metrics.object_mae_mm is not None
-    ]  # fmt: skip
-    changes = result.reliance.parts if result.reliance else None
+    about = row.entry.row
+    parts = [about] if row.unseen is None else [about, row.unseen.row]
+    bars = [(mean, name) for name, mean in row.object_means(DEFAULT_SORT).items()]
+    changes = about.reliance.parts if about.reliance else None
     changed = [(words, getattr(changes, key)) for key, words in PART_TITLES.items()] if changes else []
     return {
-        "row": row, "group": group, "rows": sum(other.best_rank is not None for other in group.rows),
+        "row": row, "group": group, "rows": len(group.ranked),
         "assumption_sentences": assumption_sentences,
-        "columns": columns, "picture": picture and data_uri(picture),
-        "scored": [(_data_words(part), score_table(part), sample_table(part)) for part in parts],
-        "bars": sorted(bars, key=lambda bar: (-bar[0], bar[2])),
-        "longest_mm": max((mean + (spread or 0.0) for mean, spread, _ in bars), default=0.0),
+        "columns": columns,
+        "scored": [(_data_words(part), _score_cells(part)) for part in parts],
+        "bars": sorted(bars, key=lambda bar: (-bar[0], bar[1])), "longest_mm": max(bars, default=(0.0, ""))[0],
         "parts": [(words, f"{value:.2f}") for words, value in changed if value is not None],
     }  # fmt: skip
 
 
-def _data_words(result: Result) -> str:
-    benchmark = benchmark_of(result.dataset.fingerprint)
-    return f"{result.dataset.name if benchmark is None else benchmark.title}, {result.dataset.split} split"
+def _data_words(row: Row) -> str:
+    benchmark = scenes_of(row)
+    return f"{row.dataset.name if benchmark is None else benchmark.title}, {row.dataset.split} split"
+
+
+def _score_cells(row: Row) -> list[tuple[str, str, str]]:
+    """Each mean in words, its value, and its interval."""
+    cells = []
+    for key in (*HEADLINE, *(key for key in METRICS if key not in HEADLINE)):
+        if (value := getattr(row.metrics, key)) is not None:
+            text = (percent if key.endswith("_share") else millimetres)(value)
+            title = key.removesuffix("_mm").replace("_", " ")
+            cells.append((title, text, interval_text(row.intervals.of(key))))
+    return cells
 
 
 def milliseconds(value: float | None) -> str:
@@ -133,12 +135,12 @@ def milliseconds(value: float | None) -> str:
 def slug(entry: Entry) -> str:
     """Name of an entry's page: letters and digits of its own name, and the start of its content's SHA-256."""
     plain = re.sub(r"[^a-z0-9]+", "-", entry.name[:60].casefold()).strip("-") or "submission"
-    return f"{plain}-{hashlib.sha256(result_json(entry.result)).hexdigest()[:12]}"
+    return f"{plain}-{hashlib.sha256(entry.row.model_dump_json().encode()).hexdigest()[:12]}"
 
 
 def _search(row: Ranked) -> str:
     """What the search field finds a row by."""
-    words = row.entry.name, row.short_name, row.entry.result.submission.method, columns.device(row.entry)
+    words = row.entry.name, row.short_name, row.entry.row.submission.method, columns.device(row.entry)
     return " ".join(words).casefold()
 
 
@@ -152,14 +154,17 @@ def _board_rung(rows: int, folder: Path) -> Rung:
     first = read_entry(next(path for path in shipped_rows() if path.name == _BOARD_ROW))
     entries = []
     for number in range(rows):
-        result, factor = first.result, 1.03**number
-        about = result.submission.model_copy(update={"name": f"Method {number}"})
-        if (timing := result.timing) is not None:
+        row, factor = first.row, 1.03**number
+        about = row.submission.model_copy(update={"name": f"Method {number}"})
+        if (timing := row.timing) is not None:
             keys = ("latency_median_ms", "latency_p5_ms", "latency_p95_ms")
             changed = timing.model_copy(update={key: getattr(timing, key) * factor for key in keys})
             about = about.model_copy(update={"timing": changed})
-        metrics = result.metrics.model_copy(update={DEFAULT_SORT: factor})
-        entries.append(replace(first, result=result.model_copy(update={"submission": about, "metrics": metrics})))
+        changes = {
+            "submission": about, "metrics": row.metrics.model_copy(update={DEFAULT_SORT: factor}),
+            "predictions_sha256": f"{number:064x}",
+        }  # fmt: skip
+        entries.append(replace(first, row=row.model_copy(update=changes)))
 
     def run() -> None:  # a dictionary that a run returns would be taken for the seconds of its parts
         page_files(rank(entries), [])

@@ -4,18 +4,19 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from fpp_ml_bench.baselines.tradeoff import Mark, Scatter, pareto_front
+from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.leaderboard.groups import CLASSES, Group, Ranked
+from fpp_ml_bench.leaderboard.groups import Group, Ranked
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
 from fpp_ml_bench.leaderboard.trivial import is_trivial
 
 SIZES = (("wide", 570, 430), ("narrow", 360, 380))
 """Class, width and height of a picture, for a window and for a phone."""
 COSTS = {"seconds": "median time per image at batch 1, s", "frames": "captured frames"}
-CLASS_COLOURS = dict(zip(CLASSES, ("verified", "reported", "measured"), strict=True))
+CLASS_COLOURS = dict(zip(FRAMES_CLASSES, ("verified", "reported", "measured"), strict=True))
 _TRIVIAL_COLOUR = "soft"
-_MOST_NAMES = 24
-"""Marks up to which a picture names them; more get numbers and a key."""
+_MOST_NAMES, MOST_LABELLED = 24, 100
+"""Marks up to which a picture names them, and up to which it has labels: finding room for them takes quadratic time."""
 
 
 def overview(groups: Sequence[Group], cost: str, slugs: Mapping[int, str]) -> Scatter | None:
@@ -30,12 +31,13 @@ def overview(groups: Sequence[Group], cost: str, slugs: Mapping[int, str]) -> Sc
             if group.key.track == "metric" and not is_trivial(row):
                 can_lead.append(mark)
     front = [can_lead[index] for index in pareto_front([(mark.x, mark.y) for mark in can_lead])]
-    labelled = [*front, *(mark for mark in marks if mark not in front)]
+    leading = set(map(id, front))
+    labelled = [*front, *(mark for mark in marks if id(mark) not in leading)] if len(marks) <= MOST_LABELLED else []
     return Scatter(marks, front, COSTS[cost], labelled, names=len(marks) <= _MOST_NAMES) if marks else None
 
 
 def _mark(number: int, group: Group, row: Ranked, cost: str, page: str) -> Mark | None:
-    entry, timing, error = row.entry, row.entry.result.timing, row.value(DEFAULT_SORT)
+    entry, timing, error = row.entry, row.entry.row.timing, row.value(DEFAULT_SORT)
     seconds = entry.value("seconds_per_sample")
     x = seconds if cost == "seconds" else float(entry.frames)
     if not x or not error:
@@ -49,8 +51,8 @@ def _mark(number: int, group: Group, row: Ranked, cost: str, page: str) -> Mark 
         _TRIVIAL_COLOUR if is_trivial(row) else CLASS_COLOURS[group.key.frames],
         shape="o" if group.key.track == "metric" else "s", hollow=hollow, x_span=span if cost == "seconds" else None,
         y_span=row.interval(DEFAULT_SORT),
-        title=f"{entry.name}: {error:.3g} mm, {time}, {frames}, {group.key.track} track, {entry.provenance}",
-        css=f"p-{entry.provenance.replace(' ', '-')}{' hollow' if hollow else ''}",
+        title=f"{entry.name}: {error:.3g} mm, {time}, {frames}, {group.key.track} track, {row.provenance}",
+        css=f"p-{row.provenance.replace(' ', '-')}{' hollow' if hollow else ''}",
         row=page, url=f"submissions/{page}.html",
     )  # fmt: skip
 

@@ -10,10 +10,10 @@ from typing import Any
 from fpp_ml_bench.baselines.tradeoff import COST_KEYS, Tradeoff, scatter
 from fpp_ml_bench.evaluation.report import interval_text, millimetres, signed
 from fpp_ml_bench.leaderboard import columns
-from fpp_ml_bench.leaderboard.groups import Group
-from fpp_ml_bench.leaderboard.page.pictures import drawn, overview_figures
+from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, Group
+from fpp_ml_bench.leaderboard.page.pictures import MOST_LABELLED, drawn, overview_figures
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
-from fpp_ml_bench.loaders.storage import benchmark_of
+from fpp_ml_bench.loaders.storage import benchmark_before
 
 _SPARSE = (*columns.PARTS, columns.RATIO, columns.RANGE, *columns.UNCERTAINTY)
 _TRADEOFF_PICTURE = 430, 380
@@ -27,10 +27,10 @@ def blocks(groups: Sequence[Group], slugs: Mapping[int, str]) -> list[dict[str, 
     for data, members in groupby(groups, key=lambda group: group.key.data_title):
         of_data = list(members)
         key, rows = of_data[0].key, [row for group in of_data for row in group.rows]
-        benchmark = benchmark_of(key.fingerprint)
-        name = benchmark.name if benchmark is not None else data.split(", ")[0]
+        name = key.benchmark.name if key.benchmark is not None else data.split(", ")[0]
+        numbered = [(n, row.short_name, slugs[id(row.entry)]) for n, row in enumerate(rows, start=1)]
         datasets.append({
-            "numbered": [(n, row.short_name, slugs[id(row.entry)]) for n, row in enumerate(rows, start=1)],
+            "numbered": numbered if len(rows) <= MOST_LABELLED else [],
             "id": f"data-{hashlib.sha256(data.encode()).hexdigest()[:8]}",
             "title": data, "short": f"earlier, {name}" if key.notes else key.aside or name,
             "main": not datasets or not (key.notes or key.aside), "notes": key.notes,
@@ -61,16 +61,17 @@ def _section(group: Group, link: str) -> dict[str, Any]:
     key = group.key
     mode = "" if key.mode == "standard" else f", mode {key.mode}"
     machines = sorted({columns.device(r.entry) for r in group.rows if r.entry.latency_ms is not None})
-    per_object = [row.object_means(DEFAULT_SORT) for row in group.rows]
+    per_object = [row.object_means(DEFAULT_SORT) for row in group.rows[:MOST_PAIRED]]
     objects = sorted({name for errors in per_object for name in errors})
     logs = [math.log(error) for errors in per_object for error in errors.values() if error]
+    low, high = min(logs, default=0.0), max(logs, default=0.0)
     ends = [(row.value(DEFAULT_SORT), *(row.interval(DEFAULT_SORT) or ())) for row in group.rows]
-    cells = [[(errors.get(name), _shade(errors.get(name), logs)) for name in objects] for errors in per_object]
+    cells = [[(errors.get(name), _shade(errors.get(name), low, high)) for name in objects] for errors in per_object]
     return {
         "group": group, "id": anchor(group), "link": link, "machines": machines, "objects": objects,
         "object_cells": cells,
         "title": f"{key.frames[0].upper()}{key.frames[1:]}, {key.track} track, against {key.against}{mode}",
-        "ranked": any(row.best_rank is not None for row in group.rows), "matrix": _matrix(group),
+        "ranked": len(group.ranked), "most_paired": MOST_PAIRED, "matrix": _matrix(group) if group.pairs else [],
         "with": [column.title for column in _SPARSE if column.shown_for(group.rows)],
         "highest": max((end or 0.0 for row_ends in ends for end in row_ends), default=0.0),
     }  # fmt: skip
@@ -78,7 +79,7 @@ def _section(group: Group, link: str) -> dict[str, Any]:
 
 def _matrix(group: Group) -> list[tuple[str, list[tuple[str, str, str] | None]]]:
     """For each ranked row and each of them: this row minus that in mm, interval and p value, and a verdict."""
-    names = [row.short_name for row in group.rows if row.best_rank is not None]
+    names = [row.short_name for row in group.ranked]
     cells: dict[tuple[str, str], tuple[str, str, str]] = {}
     for pair in group.pairs:
         low, high = pair.interval or (pair.difference, pair.difference)
@@ -112,16 +113,15 @@ def tradeoff_section(run: Tradeoff | None) -> dict[str, Any] | None:
             f"{ms:.3g}", f"{low:.3g} to {high:.3g}", str(point.frames),
         ))  # fmt: skip
     return {
-        "run": run, "benchmark": benchmark_of(run.fingerprint), "pictures": pictures, "rows": rows,
+        "run": run, "benchmark": benchmark_before(run.fingerprint), "pictures": pictures, "rows": rows,
         "steepest": max(run.growth, key=lambda growth: growth.exponent, default=None),
         "flagged": [f"{growth.stage} over {growth.over}" for growth in run.growth if growth.flag],
     }  # fmt: skip
 
 
-def _shade(error: float | None, logs: Sequence[float]) -> int | None:
-    """The larger the error among all ``logs`` of a table, the darker its cell."""
-    if error is None or not logs:
+def _shade(error: float | None, low: float, high: float) -> int | None:
+    """The larger the error among those of a table, whose logarithms are ``low`` to ``high``, the darker its cell."""
+    if error is None:
         return None
-    low, high = min(logs), max(logs)
     share = 0.0 if error == 0 or high == low else (math.log(error) - low) / (high - low)
     return min(_SHADES - 1, int(share * _SHADES))

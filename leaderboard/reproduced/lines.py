@@ -13,7 +13,8 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.leaderboard.reported import paper_tables
-from fpp_ml_bench.leaderboard.rows import MEASURED_HERE, Entry, read_entry, write_row
+from fpp_ml_bench.leaderboard.row_file import Row, row_of, write_row
+from fpp_ml_bench.leaderboard.rows import Entry, read_entry
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
 _NOT_IN_THE_PAPER = {
@@ -24,7 +25,7 @@ _NOT_IN_THE_PAPER = {
 
 def write_measured(result: Result, path: Path) -> None:
     """Write a row that was measured here. Raises SubmissionError."""
-    write_row(Entry(path, result), MEASURED_HERE, path)
+    write_row(row_of(result, path), path)
 
 
 def row_that_holds(path: Path, opened: DatasetFolder, weights_sha256: str) -> Entry | None:
@@ -36,18 +37,21 @@ def _row_with(path: Path, opened: DatasetFolder, setting: str, value: str) -> En
     """The row in ``path`` if it is sound, of this dataset, today's protocol and this value of a setting."""
     if (entry := _sound_row(path)) is None:
         return None
-    result = entry.result
-    found = (result.dataset.fingerprint, result.protocol_version, result.submission.settings.get(setting))
-    return entry if found == (opened.fingerprint, PROTOCOL_VERSION, value) else None
+    found = entry.row.protocol_version, entry.row.submission.settings.get(setting)
+    return entry if _is_of(entry, opened) and found == (PROTOCOL_VERSION, value) else None
+
+
+def _is_of(entry: Entry, opened: DatasetFolder) -> bool:
+    return entry.row.dataset.content.items() <= opened.content.items()
 
 
 def check_row_is_of(path: Path, opened: DatasetFolder) -> None:
     """Raises SubmissionError where ``path`` is a row on other data."""
     entry = _sound_row(path)  # an unreadable one is replaced, nothing is lost
-    if entry is not None and entry.result.dataset.fingerprint != opened.fingerprint:
+    if entry is not None and not _is_of(entry, opened):
         raise SubmissionError(
-            f"{path}: is a row on dataset {entry.result.dataset.fingerprint[:8]}, and {opened.path} is "
-            f"{opened.fingerprint[:8]}; give another --rows, or move the row away if it is out of date"
+            f"{path}: is a row on other data ({entry.row.dataset.identity}) than {opened.path} holds; give another "
+            "--rows, or move the row away if it is out of date"
         )
 
 
@@ -60,14 +64,14 @@ def _sound_row(path: Path) -> Entry | None:
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a table. ``scores``, those of the row's result or over all frames, and ``entry`` are None where nothing
+    """A line of a table. ``scores``, those of the row or over all frames, and ``entry`` are None where nothing
     has been measured; ``twins``: rows by depth range; ``paper_mm``: the paper's errors by the keys of `HEADLINE`, None
     where it reports none."""
 
     row: str
     label: str
     recipe: Recipe
-    scores: Result | reproduce.AllFrames | None
+    scores: Row | reproduce.AllFrames | None
     entry: Entry | None
     paper_mm: dict[str, float] | None
     twins: dict[str, Entry] = field(default_factory=dict)
@@ -91,7 +95,7 @@ def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: Datas
         rows = {name: row_that_holds(folders.row(recipe, name), opened, sha256) for name in reproduce.variants(recipe)}
         entry, *_ = rows.values()
         twins = {str(name): twin for name, twin in list(rows.items())[1:] if twin is not None}
-        first = None if entry is None else entry.result
+        first = None if entry is None else entry.row
         if table != "multi_frame" or len(opened.sequence.config(recipe.frames)) == 1:
             lines.append(Line(row, label, recipe, first, entry, paper_mm, twins))
             continue
@@ -111,5 +115,5 @@ def _weights_sha256(recipe: Recipe, folders: Folders, opened: DatasetFolder) -> 
         return None
     main_row = folders.row(recipe, reproduce.variants(recipe)[0])
     entry = _row_with(main_row, opened, "recipe_digest", recipe.digest)
-    sha256 = None if entry is None else entry.result.submission.settings.get("weights_sha256")
+    sha256 = None if entry is None else entry.row.submission.settings.get("weights_sha256")
     return sha256 if isinstance(sha256, str) else None

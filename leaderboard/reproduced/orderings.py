@@ -12,10 +12,11 @@ from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal
 
-from fpp_ml_bench.baselines.reproduce import MAIN_KEY
+from fpp_ml_bench.baselines.reproduce import MAIN_KEY, AllFrames
 from fpp_ml_bench.evaluation.score import object_interval
 from fpp_ml_bench.leaderboard.reported import paper_tables
 from fpp_ml_bench.leaderboard.reproduced.lines import Line
+from fpp_ml_bench.leaderboard.row_file import view_means
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ def orderings(lines: Sequence[Line]) -> list[Ordering]:
         difference = _difference(worse, better)
         if worse_mm == better_mm or difference is None:
             continue
-        tracks = {line.entry.result.track for line in (better, worse) if line.entry is not None}
+        tracks = {line.entry.row.track for line in (better, worse) if line.entry is not None}
         gap, interval, objects = difference
         labels = better.label, worse.label
         judged.append(Ordering(*labels, worse_mm - better_mm, gap, interval, len(tracks) == 1, objects))
@@ -60,18 +61,27 @@ def _difference(line: Line, other: Line) -> tuple[float, tuple[float, float] | N
     """Object MAE of ``line`` minus that of ``other``: mean over the samples of both, its 95% interval over objects, and
     how many objects; None where no sample is in both."""
     first, second = _errors(line), _errors(other)
-    pairs = [(*first[sample], second[sample][1]) for sample in first if sample in second]
-    gaps = [(name, a - b) for name, a, b in pairs if a is not None and b is not None]
+    gaps = [
+        (name, statistics.fmean(views) - statistics.fmean(second[name]))
+        for name, views in first.items() if name in second for _ in views
+    ]  # fmt: skip
     if not gaps:
         return None
     objects, differences = [name for name, _ in gaps], [gap for _, gap in gaps]
     return statistics.fmean(differences), object_interval(differences, objects), len(set(objects))
 
 
-def _errors(line: Line) -> dict[str, tuple[str, float | None]]:
-    """Object and object MAE of each sample."""
-    samples = line.scores.per_sample if line.scores else []
-    return {s.sample: (s.object, getattr(getattr(s, "metrics", s), MAIN_KEY)) for s in samples}
+def _errors(line: Line) -> dict[str, list[float]]:
+    """Object MAE of the views of each object; of a row, their mean for each view."""
+    scores, errors = line.scores, dict[str, list[float]]()
+    if isinstance(scores, AllFrames):
+        views = [(sample.object, sample.metrics.object_mae_mm) for sample in scores.per_sample]
+    else:
+        views = list(view_means(scores.per_object, MAIN_KEY)) if scores is not None else []
+    for name, mae_mm in views:
+        if mae_mm is not None:
+            errors.setdefault(name, []).append(mae_mm)
+    return errors
 
 
 def conclusion(table: str, lines: Sequence[Line]) -> str:

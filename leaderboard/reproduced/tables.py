@@ -48,11 +48,11 @@ def _cells(line: Line) -> list[str]:
     """A dash where nothing is known; errors with the paper's two decimals."""
     entry, paper = line.entry, line.paper_mm
     here, interval = (line.scores.metrics, line.scores.intervals.of(MAIN_KEY)) if line.scores else (None, None)
-    settings = entry.result.submission.settings if entry else {}
+    settings = entry.row.submission.settings if entry else {}
     counts = [settings.get("epochs_trained"), settings.get("training_seconds")]
-    timing, latency = (entry.result.timing, entry.latency_ms) if entry else (None, None)
+    timing, latency = (entry.row.timing, entry.latency_ms) if entry else (None, None)
     return [
-        line.label, entry.result.track if entry else "-", _pair(here, "object"),
+        line.label, entry.row.track if entry else "-", _pair(here, "object"),
         " - ".join(map(_mm, interval)) if interval else "-",
         _pair(paper, "object"), _pair(here, "overall"), _pair(paper, "overall"), _pair(here, "background"),
         _pair(paper, "background"), _twin(line, "predicted"), _twin(line, "mean"),
@@ -135,11 +135,11 @@ def _about(lines: Sequence[Line], in_the_paper: bool) -> list[str]:
     entry = next((line.entry for line in lines if line.entry is not None), None)
     if entry is None:
         return []
-    data = entry.result.dataset
+    data = entry.row.dataset
     height, width = data.size
-    objects = len({row.object for row in entry.result.per_sample})
+    objects = len(entry.row.per_object)
     here = (
-        f"{MEASURED_HERE.capitalize()}: {data.split} split of {markdown_text(data.name)} ({data.fingerprint[:8]}), "
+        f"{MEASURED_HERE.capitalize()}: {data.split} split of {markdown_text(data.name)} ({data.truth[:8]}), "
         f"{data.samples} samples of {objects} objects, {width} x {height} px, against decoded depth; times on "
         f"{markdown_text(_devices(lines))}."
     )

@@ -22,7 +22,7 @@ from fpp_ml_bench.decoding import (
 )
 from fpp_ml_bench.errors import CaptureError, DecodeError
 from fpp_ml_bench.examination import Examination, RefusedCapture, examine
-from fpp_ml_bench.files import cause_of, write_atomically
+from fpp_ml_bench.files import file_content, write_atomically
 from fpp_ml_bench.loaders.captures.exports import FORMS, REPORT, clear_outputs, export_capture
 from fpp_ml_bench.loaders.captures.images import CapturedFrames, read_frames
 from fpp_ml_bench.loaders.captures.picture import capture_picture
@@ -130,10 +130,13 @@ def read_mask(file: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
     """Where an image or .npy file is not 0, bool (H, W). Raises `CaptureError` for another file or ``shape``, and where
     all of it is 0."""
     if file.suffix.lower() == ".npy":
+        content = file_content(
+            file, 8 * shape[0] * shape[1] + (1 << 14), CaptureError, "give a mask of the frames' size"
+        )
         try:
-            values = np.load(file, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise CaptureError(f"{file}: expected a mask as .npy, can't be read: {cause_of(error)}") from error
+            values = np.load(io.BytesIO(content), allow_pickle=False)
+        except (ValueError, EOFError) as error:
+            raise CaptureError(f"{file}: expected a mask as .npy, can't be read: {error}") from error
     else:
         values = read_frames(file).frames[0]
     if values.shape != shape:

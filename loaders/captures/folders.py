@@ -1,22 +1,19 @@
 """A scanner's captures in folders, ``{object}/{view}/`` or ``{object}/``, and the split that each object belongs to."""
 
-import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import yaml
 from pydantic import Field
 
-from fpp_ml_bench.constants import SPLITS, sample_name
+from fpp_ml_bench.constants import OBJECT_NAME, SPLITS, VIEW_NAME, sample_name
 from fpp_ml_bench.errors import BuildError, CaptureError
-from fpp_ml_bench.files import cause_of, strict_yaml
+from fpp_ml_bench.files import read_yaml
 from fpp_ml_bench.loaders.captures.images import SUFFIXES, frame_files, natural_key
 from fpp_ml_bench.schema import StrictModel, Text, validate
 
 SINGLE_VIEW = "single"
 """View of an object whose folder holds the frames themselves."""
-_OBJECT, _VIEW = re.compile(r"\w[\w-]{0,99}"), re.compile(r"[^\W_]([^\W_]|-){0,99}")
 
 
 @dataclass(frozen=True)
@@ -44,11 +41,7 @@ class Splits(StrictModel):
 def read_splits(file: Path) -> Splits:
     """The splits of a YAML file with lists of objects under train, validation and test. Raises `BuildError` naming the
     file and every key that is wrong."""
-    try:
-        content = strict_yaml(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        raise BuildError(f"{file}: can't be read as YAML: {cause_of(error)}") from error
-    return validate(Splits, content, file, f"list of {', '.join(SPLITS)}", BuildError)
+    return validate(Splits, read_yaml(file, BuildError), file, f"list of {', '.join(SPLITS)}", BuildError)
 
 
 def split_captures(captures: Iterable[Capture], splits: Splits | None) -> dict[str, list[Capture]]:
@@ -85,7 +78,7 @@ def find_captures(root: Path, frames: int) -> list[Capture]:
         problems.append(f"{root}: holds frames itself; move the frames of each object into a folder of its name")
     captures: list[Capture] = []
     for folder in _folders(root):
-        if not _OBJECT.fullmatch(folder.name):
+        if not OBJECT_NAME.fullmatch(folder.name):
             problems.append(f"{folder}: expected an object name of letters, digits, - and _; rename the folder")
             continue
         captures += _of_object(folder, frames, problems)
@@ -103,7 +96,7 @@ def _of_object(folder: Path, frames: int, problems: list[str]) -> Iterable[Captu
         return
     for view in views or [folder]:
         name = view.name if views else SINGLE_VIEW
-        if not _VIEW.fullmatch(name):
+        if not VIEW_NAME.fullmatch(name):
             suggested = f", such as {name.replace('_', '-')}" if "_" in name else ""
             problems.append(
                 f"{view}: expected a view name of letters, digits and - (no _){suggested}; rename the folder"

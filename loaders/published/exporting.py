@@ -16,7 +16,7 @@ from fpp_ml_bench.constants import PUBLISHED_SPLIT_FOLDERS, VIEWS
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import normalise, object_mask
 from fpp_ml_bench.errors import BuildError, DatasetError
-from fpp_ml_bench.files import exclusive
+from fpp_ml_bench.files import LOCK_FILE, exclusive
 from fpp_ml_bench.loaders.published import tree
 from fpp_ml_bench.loaders.published.files import matrix_bytes, png_bytes
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
@@ -33,7 +33,6 @@ from fpp_ml_bench.optics import Direction, Sequence
 FORMS = ("parquet", "mat", "meshes", "patterns")
 SAMPLE_FORMS = ("parquet", "mat")
 """Forms whose progress is counted in samples."""
-_LOCK = ".lock"
 
 _PHASE_DIRECTION: Direction = "horizontal"
 """The published phases do not name their direction; they belong to the fringes of the single-shot frame."""
@@ -103,15 +102,15 @@ def exporting(out: Path) -> Iterator[Path]:
     if target.is_dir() and any(target.iterdir()):
         raise BuildError(f"{out}: is not empty; give a new folder, an export never adds to a folder or overwrites it")
     staging = target.with_name(f".{target.name}.export")
-    with exclusive(staging / _LOCK, out, "exporting there"):
+    with exclusive(staging / LOCK_FILE, out, "exporting there"):
         try:
             for remains in staging.iterdir():
                 if remains.is_dir() and not remains.is_symlink():
                     shutil.rmtree(remains)
-                elif remains.name != _LOCK:
+                elif remains.name != LOCK_FILE:
                     remains.unlink()
             yield staging
-            (staging / _LOCK).unlink()
+            (staging / LOCK_FILE).unlink()
             staging.replace(target)
         except BaseException as error:
             shutil.rmtree(staging, ignore_errors=True)
@@ -164,9 +163,10 @@ def export(
 
 def _meshes(dataset: DatasetFolder, splits: list[str]) -> list[Path]:
     rows = (row for split in splits for row in dataset.manifest.samples[split])
+    listed = {dataset.path / file.path for file in dataset.manifest.others}
     paths = [dataset.path / MESH_FOLDER / f"{name}.ply" for name in dict.fromkeys(row["object"] for row in rows)]
     for path in paths:
-        if not path.is_file():
+        if path not in listed or not path.is_file():
             imported = dataset.manifest.origin != GENERATED
             hint = "imported datasets have no meshes" if imported else "run: fpp-bench verify"
             raise DatasetError(f"{path}: the mesh is missing; {hint}")

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-from fpp_ml_bench.constants import OBJECTS, PUBLISHED_SPLIT_FOLDERS, VIEWS, sample_name, split_sample_name
+from fpp_ml_bench.constants import OBJECT_NAME, OBJECTS, PUBLISHED_SPLIT_FOLDERS, VIEWS, sample_name, split_sample_name
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import LayoutError
 from fpp_ml_bench.loaders.published.files import read_png_size
@@ -176,7 +176,7 @@ class _Scan:
             name, _, view = entry.stem.rpartition("_")
             if entry.suffix != suffix or not entry.is_file():
                 self._foreign(entry, f"files ending in {suffix}")
-            elif not name or view not in VIEWS:
+            elif not OBJECT_NAME.fullmatch(name) or view not in VIEWS:
                 self.problems.append(f"{entry}: expected a name like power_drill_A60{suffix}, views {', '.join(VIEWS)}")
             else:
                 files[entry.stem] = entry

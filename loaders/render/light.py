@@ -10,11 +10,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.files import cause_of, strict_yaml
+from fpp_ml_bench.files import read_yaml
 from fpp_ml_bench.schema import NonNegative, Positive, Share, StrictModel, Text, validate
 
 LIGHTS = Path(__file__).resolve().parent / "lights"
@@ -152,8 +151,4 @@ def load_light(name_or_file: str | Path) -> Light:
 
 
 def _read(file: Path) -> Light:
-    try:
-        content = strict_yaml(file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
-        raise BuildError(f"{file}: can't be read as YAML: {cause_of(error)}") from error
-    return validate(Light, content, file, "light", BuildError)
+    return validate(Light, read_yaml(file, BuildError), file, "light", BuildError)

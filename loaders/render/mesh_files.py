@@ -2,7 +2,6 @@
 
 import base64
 import io
-import json
 import logging
 import struct
 import zlib
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fpp_ml_bench.errors import MeshError
-from fpp_ml_bench.files import file_hash, printable
+from fpp_ml_bench.files import file_hash, printable, strict_json
 from fpp_ml_bench.loaders.render.paint import Paint, paint_of, texture_of
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
@@ -124,7 +123,7 @@ def _image_problems(content: bytes, name: str) -> list[str]:
 def _glb_image_problems(content: bytes) -> list[str]:
     """What is wrong with the images inside a GLB file."""
     length = struct.unpack_from("<I", content, 12)[0]
-    header: dict[str, Any] = json.loads(content[20 : 20 + length])
+    header: dict[str, Any] = strict_json(content[20 : 20 + length].decode("utf-8"))
     problems = []
     for number, image in enumerate(header.get("images", [])):
         if "bufferView" in image:

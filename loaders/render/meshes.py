@@ -8,11 +8,10 @@ from typing import Any
 
 import numpy as np
 import trimesh
-import yaml
 
-from fpp_ml_bench.constants import OBJECTS, SPLITS, UNSEEN
+from fpp_ml_bench.constants import OBJECT_NAME, OBJECTS, SPLITS, UNSEEN
 from fpp_ml_bench.errors import MeshError
-from fpp_ml_bench.files import cause_of, write_atomically
+from fpp_ml_bench.files import is_file, printable, read_yaml, write_atomically
 from fpp_ml_bench.loaders.render.mesh_files import MESH_SUFFIXES, content_hash, read_mesh
 from fpp_ml_bench.loaders.render.objects import object_mesh
 from fpp_ml_bench.loaders.render.scene import SolidMesh, UserMesh
@@ -62,10 +61,7 @@ def read_mesh_list(path: Path) -> tuple[UserMesh, ...]:
 
     ``path`` is relative to the list's own folder; ``scale`` takes the file's unit to metres.
     """
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise MeshError(f"{path}: can't be read as YAML ({cause_of(error)})") from error
+    content = read_yaml(path, MeshError)
     if not isinstance(content, list) or not content:
         raise MeshError(f"{path}: expected a list of meshes, each with name and path, got {type(content).__name__}")
     meshes = tuple(_entry(entry, f"{path}, entry {i + 1}", path.parent) for i, entry in enumerate(content))
@@ -89,13 +85,13 @@ def _entry(entry: object, where: str, folder: Path) -> UserMesh:
     if unknown:
         raise MeshError(f"{where}: unknown key {sorted(unknown)[0]!r}; there are {', '.join(sorted(keys))}")
     name = entry["name"]
-    if not isinstance(name, str) or not name or not set(name) <= _NAME_CHARACTERS:
-        raise MeshError(f"{where}: name must be of a-z, 0-9 and _, got {name!r}")
+    if not isinstance(name, str) or not OBJECT_NAME.fullmatch(name) or not set(name) <= _NAME_CHARACTERS:
+        raise MeshError(f"{where}: name must be of a-z, 0-9 and _, at most 100 of them, got {printable(name)!r}")
     if name in (*OBJECTS, *UNSEEN):
         raise MeshError(f"{where}: {name!r} is one of the benchmark's own objects; choose another name")
     file = folder / str(entry["path"])
-    if file.suffix.lower() not in MESH_SUFFIXES or not file.is_file():
-        raise MeshError(f"{where}: {file} is no mesh file; expected {', '.join(MESH_SUFFIXES)}")
+    if file.suffix.lower() not in MESH_SUFFIXES or not is_file(file):
+        raise MeshError(f"{where}: {printable(str(file), 500)} is no mesh file; expected {', '.join(MESH_SUFFIXES)}")
     split, scale = entry.get("split", "test"), _finite(entry.get("scale", 1.0), f"{where}: scale")
     if split not in SPLITS:
         raise MeshError(f"{where}: split {split!r}, expected {', '.join(SPLITS)}")

@@ -17,7 +17,7 @@ from fpp_ml_bench.loaders.render.pixels import MixedPixels, blur_image, mixed_pi
 from fpp_ml_bench.loaders.render.raycast import Hits, PixelRays, TracedObject
 from fpp_ml_bench.loaders.render.scene import BuildSettings, SolidMesh, photographing_rig, place, uniform
 from fpp_ml_bench.loaders.render.sensor import Exposure
-from fpp_ml_bench.loaders.sample import Flag, Row, stored_frames, void_pixels
+from fpp_ml_bench.loaders.sample import WEAK_GREY, Flag, Row, stored_frames, void_pixels
 from fpp_ml_bench.portable import cosine_of_turns, gaussian_weights, power, sine_of_turns
 from fpp_ml_bench.skipping import skipping_enabled
 
@@ -204,6 +204,8 @@ class Studio:
         white = (lit.gain + lit.ambient + bounced) * self._of(scene.brightness, pixels, lit)
         flags[pixels[white + self.light.camera.black_grey >= GREY_LEVELS]] |= np.uint8(Flag.SATURATED)
         flags[pixels[(bounced > STRONG_SHARE * lit.gain) & (lit.gain > 0)]] |= np.uint8(Flag.INTERREFLECTION)
+        fringes = lit.gain * self._of(scene.brightness, pixels, lit) / 2
+        flags[pixels[(lit.gain > 0) & ((fringes < WEAK_GREY) | (bounced > lit.gain))]] |= np.uint8(Flag.WEAK)
         if scene.mixed is not None:
             flags[scene.mixed.pixels[scene.mixed.void]] |= np.uint8(Flag.MIXED)
             cover[scene.mixed.pixels] = np.rint(255 * scene.mixed.share).astype(np.uint8)

@@ -3,12 +3,14 @@ from .assembly import Progress as Progress
 from .assembly import assemble as assemble
 from .assembly import forget_outdated as forget_outdated
 from .benchmark import BENCHMARKS as BENCHMARKS
-from .benchmark import EARLIER as EARLIER
+from .benchmark import FACTS as FACTS
 from .benchmark import Benchmark as Benchmark
+from .benchmark import Counts as Counts
+from .benchmark import benchmark_before as benchmark_before
 from .benchmark import benchmark_of as benchmark_of
 from .benchmark import benchmark_sentence as benchmark_sentence
-from .benchmark import current_benchmark as current_benchmark
 from .benchmark import intended_benchmark as intended_benchmark
+from .benchmark import known_problem as known_problem
 from .card import RIG_FILE as RIG_FILE
 from .card import ground_truth_summary as ground_truth_summary
 from .card import split_statistics as split_statistics

@@ -13,10 +13,18 @@ from pathlib import Path
 from typing import Any
 
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.files import exclusive, file_hash, write_atomically
-from fpp_ml_bench.loaders.sample import Row
+from fpp_ml_bench.files import cause_of, exclusive, file_hash, read_json, write_atomically
+from fpp_ml_bench.loaders.sample import Row, column_hash
 from fpp_ml_bench.loaders.storage.card import write_card
-from fpp_ml_bench.loaders.storage.manifest import MANIFEST, WORK_FOLDER, Manifest, ShardFile, describe_file
+from fpp_ml_bench.loaders.storage.manifest import (
+    MANIFEST,
+    WORK_FOLDER,
+    Manifest,
+    ShardFile,
+    check_row,
+    describe_file,
+    strictly,
+)  # fmt: skip
 from fpp_ml_bench.loaders.storage.shard_processes import write_in_processes
 from fpp_ml_bench.loaders.storage.shards import Receipt, ShardPlan, ShardWriter
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -59,9 +67,15 @@ class Assembly:
     def filled(self, receipts: list[Receipt]) -> Manifest:
         """The manifest with rows and shards, from the receipts of all plans in order."""
         samples: dict[str, list[dict[str, Any]]] = {}
+        hashes: dict[str, dict[str, str]] = {}
         for plan, (_, rows) in zip(self.plans, receipts, strict=True):
-            samples.setdefault(plan.split, []).extend(rows)
-        return replace(self.manifest, samples=samples, shards=[file for files, _ in receipts for file in files])
+            for row in rows:
+                for column, digest in row["hashes"].items():
+                    hashes.setdefault(f"{plan.split}/{column}", {})[row["sample"]] = digest
+            samples.setdefault(plan.split, []).extend({k: v for k, v in row.items() if k != "hashes"} for row in rows)
+        shards = [file for files, _ in receipts for file in files]
+        content = {name: column_hash(images) for name, images in sorted(hashes.items())}
+        return replace(self.manifest, samples=samples, shards=shards, content=content)
 
 
 @dataclass(frozen=True)
@@ -96,8 +110,8 @@ def assemble(
             return _assemble(folder, scratch, assembly, workers, progress, cluster)
     except OSError as error:
         raise BuildError(
-            f"{folder}: writing failed ({error}); remove the cause (on a full disk: free some space), then run the "
-            "same command again: it resumes"
+            f"{error.filename or folder}: writing failed ({cause_of(error)}); remove the cause, then run the same "
+            "command again: it resumes"
         ) from error
 
 
@@ -176,11 +190,8 @@ def check_settings(folder: Path | RemoteFolder, scratch: Path, assembly: Assembl
     # Another version may make other bytes: its finished dataset is valid, but a dataset must not mix two versions.
     settings = {**assembly.key(), "generator": assembly.manifest.generator}
     if path.exists():
-        try:
-            begun_settings = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise BuildError(f"{path}: damaged; delete {folder} and start again") from error
-        compare(folder, begun_settings, settings)
+        begun = read_json(path, BuildError, f"delete {folder} and start again")
+        compare(folder, begun if isinstance(begun, dict) else {}, settings)
     write_atomically(path, json.dumps(settings, indent=1).encode())
 
 
@@ -220,12 +231,17 @@ def _receipt(folder: Path, scratch: Path, plan: ShardPlan) -> Receipt | None:
 def planned_receipt(file: Path, plan: ShardPlan) -> Receipt | None:
     """What a receipt says; None for one that is absent, damaged or not of this plan."""
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-        files, rows = [ShardFile(**entry) for entry in content["files"]], content["rows"]
-        planned = [name for name, _, _ in plan.samples]
-        return (files, rows) if [row["sample"] for row in rows] == planned else None
-    except (OSError, ValueError, KeyError, TypeError):
+        content = read_json(file, BuildError)
+        files = strictly(list[ShardFile], content["files"])
+        rows = strictly(list[dict[str, Any]], content["rows"])
+        for row in rows:
+            check_row(row)
+            strictly(dict[str, str], row["hashes"])
+    except (BuildError, ValueError, KeyError, TypeError):
         return None
+    labels = tuple((row["sample"], row["object"], row["view"]) for row in rows)
+    named = all(entry.path == plan.path(entry.group) and entry.split == plan.split for entry in files)
+    return (files, rows) if labels == plan.samples and named else None
 
 
 def _check_space(folder: Path, assembly: Assembly, missing: list[ShardPlan]) -> None:

@@ -1,161 +1,155 @@
-"""The benchmarks that this package names: which bytes a preset must have, and whether a dataset folder has them. A
-result is only comparable with results on the same bytes. A benchmark therefore has a name, a version and a fingerprint
-(`Manifest.fingerprint`), the same on every processor. A change of the bytes is a new version."""
+"""The benchmarks that this package names, and what is known of each: its samples and objects, how many pixels count,
+and hashes of its content. A result is only comparable with results on the same content.
 
+Content is a hash of the decoded values for each column of each split (`Manifest.content`), the same on every processor.
+Files, paths and versions of the format do not enter it, so that a build that lacks columns is still the benchmark for
+the methods that don't need them. A change of the content is a new version. The facts are in ``benchmarks/NAME.json``;
+``benchmarks/benchmark_facts.py`` writes them from a build.
+"""
+
+import json
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, NamedTuple
 
 from fpp_ml_bench.constants import FULL_SIZE, MINI_SIZE
 from fpp_ml_bench.loaders import render
 from fpp_ml_bench.loaders.storage.manifest import GENERATED, Manifest
 
+FACTS = Path(__file__).resolve().parent / "benchmarks"
+
+
+class Counts(NamedTuple):
+    """Samples of an object, and over all of them its pixels that are object, None where that is not known, and void."""
+
+    samples: int
+    object_px: int | None
+    void_px: int
+
 
 @dataclass(frozen=True)
 class Benchmark:
-    """A named dataset: ``name``, ``version``, the SHA-256 ``fingerprint`` of its content (64 hex digits), and the
-    ``preset``, image ``size`` in px, ``light`` and ``rig`` that build it."""
+    """A named dataset: ``name``, ``version``, and the ``preset``, image ``size`` in px, ``light`` and ``rig`` that
+    build it. ``earlier``: fingerprints of the manifests of version 1, which had the same images, depths and cover."""
 
     name: str
     version: int
     preset: str
     size: int
-    fingerprint: str
     light: str = "paper"
     rig: str = "paper"
+    earlier: str = ""
 
     @property
     def title(self) -> str:
-        """As it is printed: ``fpp-bench-full version 0``."""
+        """As it is printed: ``fpp-bench-full version 2``."""
         return f"{self.name} version {self.version}"
+
+    @cached_property
+    def _facts(self) -> dict[str, Any]:
+        file = FACTS / f"{self.name}.json"
+        return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {"content": {}, "counts": {}}
+
+    @property
+    def content(self) -> dict[str, str]:
+        """``split/column`` -> hash, as `Manifest.content`."""
+        return self._facts["content"]  # type: ignore[no-any-return]
+
+    def counts(self, split: str, mode: str, target: str) -> dict[str, Counts]:
+        """By object of ``split``, or of all splits, how many pixels count by the rules of ``mode`` against ``target``;
+        empty for rules that the facts don't have."""
+        splits = [split] if split in self._facts["counts"] else list(self._facts["counts"])
+        rules = [self._facts["counts"][name].get(f"{mode}/{target}", {}) for name in splits]
+        return {name: Counts(*numbers) for objects in rules for name, numbers in objects.items()}
 
 
 BENCHMARKS = (
-    Benchmark(
-        "fpp-bench-full", 1, "full", FULL_SIZE, "394c1522fe3442ef4e2afbbe6ea76b42ac6477cfbad62eb9a6d6445a3935379f"
-    ),
-    Benchmark("fpp-bench-full-224", 1, "full", 224, "a5dbf28a2e1ee5d2d772711f45a4f0481dd27c075d45b42a4543fa86099d82f7"),
-    Benchmark(
-        "fpp-bench-mini", 1, "mini", MINI_SIZE, "6dc6e35e4d5c2f194ba052443086af16bbc4d6b46f45d524655ebaa21cc9b1db"
-    ),
-    Benchmark(
-        "fpp-bench-unseen", 1, "unseen", FULL_SIZE, "d865570932e66a32c8f381880dd98f1b7cbe4bd7e3f0577c68f8ec08664a4b05"
-    ),
+    Benchmark("fpp-bench-full", 2, "full", FULL_SIZE, earlier="394c1522fe3442ef4e2afbbe6ea76b42"),
+    Benchmark("fpp-bench-full-224", 2, "full", 224, earlier="a5dbf28a2e1ee5d2d772711f45a4f048"),
+    Benchmark("fpp-bench-mini", 2, "mini", MINI_SIZE, earlier="6dc6e35e4d5c2f194ba052443086af16"),
+    Benchmark("fpp-bench-unseen", 2, "unseen", FULL_SIZE, earlier="d865570932e66a32c8f381880dd98f1b"),
     # The same objects and views under other lights.
+    Benchmark("fpp-bench-workshop", 2, "full", FULL_SIZE, "workshop", earlier="fc627a8a95ad848c68a08a46415ebfa6"),
+    Benchmark("fpp-bench-hard", 2, "full", FULL_SIZE, "hard", earlier="23ee324d806d73b97d40e9ffe849f2be"),
+    # The same objects and views with crossed fringes: other frames, and so another decoded depth.
+    Benchmark("fpp-bench-crossed", 2, "full", FULL_SIZE, rig="crossed", earlier="526914ee31b78a34f41cd050f3e63707"),
     Benchmark(
-        "fpp-bench-workshop",
-        1,
-        "full",
-        FULL_SIZE,
-        "fc627a8a95ad848c68a08a46415ebfa669f765be7bead0539df3b026de13bfc6",
-        "workshop",
-    ),
-    Benchmark(
-        "fpp-bench-hard",
-        1,
-        "full",
-        FULL_SIZE,
-        "23ee324d806d73b97d40e9ffe849f2be7e1efb61985312d9ea7adc03b8d10644",
-        "hard",
-    ),
-    # The same objects and views with crossed fringes.
-    Benchmark(
-        "fpp-bench-crossed",
-        1,
-        "full",
-        FULL_SIZE,
-        "526914ee31b78a34f41cd050f3e63707fa4eaf33824cdef43f80098a3721ba24",
-        rig="crossed",
-    ),
-    Benchmark(
-        "fpp-bench-crossed-unseen",
-        1,
-        "unseen",
-        FULL_SIZE,
-        "b197093e8930f767ccab588ea8772de7e1256f045a0239ff9013d3050fedc9bc",
-        rig="crossed",
+        "fpp-bench-crossed-unseen", 2, "unseen", FULL_SIZE, rig="crossed", earlier="b197093e8930f767ccab588ea8772de7"
     ),
     # The test objects alone, to score methods in lights that nothing here is trained in.
+    Benchmark("fpp-bench-test-workshop", 2, "test", FULL_SIZE, "workshop", earlier="7d2b42bb8e89330dd8e62190fb33b962"),
+    Benchmark("fpp-bench-test-hard", 2, "test", FULL_SIZE, "hard", earlier="ae15c33431eb62c8f938e4ac22b0b8bf"),
     Benchmark(
-        "fpp-bench-test-workshop",
-        1,
-        "test",
-        FULL_SIZE,
-        "7d2b42bb8e89330dd8e62190fb33b9622d73f5bdff94303edad30a01acf6a323",
-        "workshop",
+        "fpp-bench-test-crossed-workshop", 2, "test", FULL_SIZE, "workshop", "crossed",
+        "ec64e96ac523335ec5bf7be0a2c13265",
     ),
     Benchmark(
-        "fpp-bench-test-hard",
-        1,
-        "test",
-        FULL_SIZE,
-        "ae15c33431eb62c8f938e4ac22b0b8bf746f9b509840bdb37d73249252a26ab8",
-        "hard",
+        "fpp-bench-test-crossed-hard", 2, "test", FULL_SIZE, "hard", "crossed", "1b681c74c7f3b56f606b279d1e05fce4"
     ),
-    Benchmark(
-        "fpp-bench-test-crossed-workshop",
-        1,
-        "test",
-        FULL_SIZE,
-        "ec64e96ac523335ec5bf7be0a2c132651a7cba0d63c747901f3bb7a0b38633e6",
-        "workshop",
-        "crossed",
-    ),
-    Benchmark(
-        "fpp-bench-test-crossed-hard",
-        1,
-        "test",
-        FULL_SIZE,
-        "1b681c74c7f3b56f606b279d1e05fce427a3821dd8a6acb465ca9075691d3615",
-        "hard",
-        "crossed",
-    ),
-)
+)  # fmt: skip
 """The current version of each. ``fpp-bench-full-224`` is what `fpp-bench reproduce --preset cpu` trains on."""
-EARLIER = (
-    Benchmark(
-        "fpp-bench-full", 0, "full", FULL_SIZE, "d46eed4271d91e8887863420ca08dff148db61abc135a24233d7757135d5683f"
-    ),
-    Benchmark("fpp-bench-full-224", 0, "full", 224, "052761fe170e60c8893e47b480265dd5727a4045bfb076077bc7eb8a0a1657a9"),
-    Benchmark(
-        "fpp-bench-mini", 0, "mini", MINI_SIZE, "0ba15100b657c8b0edfde78d1833ecefc0ebc42d219a96727f83fe604ba55440"
-    ),
-)
-"""Versions that this package no longer builds: one albedo, direct light alone, one ray a pixel."""
 
 
-def benchmark_of(fingerprint: str) -> Benchmark | None:
-    """The benchmark with this fingerprint, of today or earlier; None for any other dataset."""
-    return next((benchmark for benchmark in (*BENCHMARKS, *EARLIER) if benchmark.fingerprint == fingerprint), None)
+def benchmark_of(content: Mapping[str, str]) -> Benchmark | None:
+    """The first of `BENCHMARKS` that has all of ``content`` (``split/column`` -> hash), None without: where the columns
+    are of the scenes alone, that with the paper's code."""
+    return next((b for b in BENCHMARKS if content and content.items() <= b.content.items()), None)
 
 
-def current_benchmark(name: str) -> Benchmark | None:
-    """The version of the benchmark ``name`` that this package builds; None for no such name."""
-    return next((benchmark for benchmark in BENCHMARKS if benchmark.name == name), None)
+def benchmark_before(fingerprint: str) -> Benchmark | None:
+    """The benchmark whose version 1 had this fingerprint, which weights may name as what they were trained on."""
+    return next((b for b in BENCHMARKS if b.earlier and fingerprint.startswith(b.earlier)), None)
+
+
+def known_problem(
+    content: Mapping[str, str], split: str, target: str, mode: str, found: Mapping[str, Counts]
+) -> str | None:
+    """What is not as in the named benchmark that has ``content``, of the objects ``found`` in a result: objects,
+    samples, or pixels of object and void; a sentence. None where all is, or the content is none of the benchmarks'."""
+    benchmark = benchmark_of(content)
+    expected = {} if benchmark is None else benchmark.counts(split, mode, target)
+    if benchmark is None or not expected:
+        return None
+    where = f"{benchmark.title}, {split} split,"
+    if found.keys() != expected.keys():
+        foreign, missing = sorted(found.keys() - expected.keys()), sorted(expected.keys() - found.keys())
+        said = [f"has no object {name!r}, which this file has" for name in foreign[:1]]
+        said += [f"has the object {name!r}, which this file lacks" for name in missing[:1]]
+        return f"{where} {' and '.join(said)}"
+    for name, counts in expected.items():
+        for what, wanted, given in zip(("samples", "object pixels", "void pixels"), counts, found[name], strict=True):
+            if given is not None and wanted != given:
+                return f"{where} has {wanted} {what} of {name!r}, this file says {given}"
+    return None
 
 
 def intended_benchmark(manifest: Manifest) -> Benchmark | None:
-    """The benchmark whose settings a dataset was built with, whatever its bytes are; None for settings of its own."""
+    """The benchmark whose settings a dataset was built with, whatever its content is; None for settings of its own."""
     if manifest.origin != GENERATED:
         return None
-    content = (manifest.settings, manifest.rig, manifest.stored)
     light = manifest.settings.get("light", {}).get("name")
     for benchmark in (benchmark for benchmark in BENCHMARKS if benchmark.light == light):
         settings = render.preset_settings(benchmark.preset, benchmark.size, benchmark.light, benchmark.rig)
-        if content == (settings.describe(), settings.rig.to_dict(), settings.stored):
+        if (manifest.settings, manifest.rig) == (settings.describe(), settings.rig.to_dict()):
             return benchmark
     return None
 
 
 def benchmark_sentence(manifest: Manifest) -> tuple[bool, str]:
-    """A sentence about what a dataset is; False beside it for a benchmark's settings with other bytes."""
-    fingerprint = manifest.fingerprint
-    benchmark = benchmark_of(fingerprint)
+    """A sentence about what a dataset is by its manifest; False beside it for a benchmark's settings with other
+    content."""
+    benchmark, intended = benchmark_of(manifest.content), intended_benchmark(manifest)
     if benchmark is not None:
-        return True, f"this is {benchmark.title}"
-    intended = intended_benchmark(manifest)
+        lacking = len(benchmark.content) > len(manifest.content)
+        return True, f"this is {benchmark.title}{', a part of its splits and columns' if lacking else ''}"
     if intended is None:
         return True, "a dataset of its own, none of the named benchmarks: its scores compare only with scores on itself"
+    expected = intended.content
+    other = next((key for key, digest in manifest.content.items() if expected.get(key) != digest), "its content")
     return False, (
-        f"built with the settings of {intended.title}, but not its bytes (fingerprint {fingerprint[:8]}, expected "
-        f"{intended.fingerprint[:8]}): its scores do not compare with that benchmark's. Build it again with this "
-        "version of the package; if it still differs, please report the processor and the package versions"
+        f"built with the settings of {intended.title}, but not its content ({other} differs): its scores do not "
+        "compare with that benchmark's. Build it again with this version of the package; if it still differs, please "
+        "report the processor and the package versions"
     )

@@ -118,15 +118,15 @@ def _split(split: str, rows: list[dict[str, Any]], manifest: Manifest) -> dict[s
         return float(np.mean(values)) if values else None
 
     largest = [row["gt_max_mm"] for row in rows if row.get("gt_max_mm") is not None]
-    exact_px = sum(row.get("exact_px", 0) for row in rows)
+    exact_px = sum(row.get("exact_px") or 0 for row in rows)
     means = ("gt_mae_mm", "gt_rmse_mm", "gt_interior_mae_mm", "gt_interior_rmse_mm")
     return {
         "split": split, "samples": len(rows), "objects": len({row["object"] for row in rows}),
         "cover_mean": float(cover.mean()), "cover_min": float(cover.min()), "cover_max": float(cover.max()),
         "depth_range_median_mm": float(np.median(ranges)), "depth_range_max_mm": float(ranges.max()),
         **{name: average(name) for name in means}, "gt_max_mm": max(largest) if largest else None,
-        "undecoded_share": sum(row["undecoded_px"] for row in rows) / exact_px if exact_px else None,
-        "void_share": sum(row["void_px"] for row in rows) / exact_px if exact_px else None,
+        "undecoded_share": sum(row.get("undecoded_px") or 0 for row in rows) / exact_px if exact_px else None,
+        "void_share": sum(row.get("void_px") or 0 for row in rows) / exact_px if exact_px else None,
     }  # fmt: skip
 
 

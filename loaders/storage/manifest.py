@@ -3,15 +3,17 @@ folder without one is a build that was interrupted. It holds nothing that differ
 settings: no date, no path, no machine."""
 
 import json
-from dataclasses import asdict, dataclass, field
+import re
+from collections import Counter
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, get_args, get_origin
 
-from fpp_ml_bench.constants import SCHEMA_VERSION, SPLITS
+from fpp_ml_bench.constants import OBJECT_NAME, SAMPLE_NAME, SCHEMA_VERSION, SPLITS, VIEW_NAME
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.files import cause_of, file_hash, write_atomically
-from fpp_ml_bench.loaders.sample import stored_frames
+from fpp_ml_bench.files import file_hash, path_problem, printable, read_json, text_problem, write_atomically
+from fpp_ml_bench.loaders.sample import available_configs, stored_frames, stored_groups
 from fpp_ml_bench.optics import AnySequence, rig_from_dict
 
 MANIFEST = "manifest.json"
@@ -21,6 +23,9 @@ GENERATED = "generated"
 """`Manifest.origin` of a dataset that the builder made."""
 CAPTURED = "captured"
 """That of a dataset decoded from a scanner's captures; objects have any views."""
+LARGEST_PX = 16384
+"""Largest side of an image."""
+Kind = TypeVar("Kind")
 
 
 @dataclass(frozen=True)
@@ -61,6 +66,7 @@ class Manifest:
     samples: dict[str, list[dict[str, Any]]] = field(default_factory=dict)
     shards: list[ShardFile] = field(default_factory=list)
     others: list[OtherFile] = field(default_factory=list)
+    content: dict[str, str] = field(default_factory=dict)
     schema_version: str = SCHEMA_VERSION
 
     @property
@@ -110,25 +116,97 @@ def read_manifest(folder: Path) -> Manifest:
         if (folder / WORK_FOLDER).is_dir():
             raise DatasetError(f"{folder}: this build is not finished; run the same command again and it resumes")
         raise DatasetError(f"{folder}: no {MANIFEST} there, so this is no dataset of fpp-ml-bench")
+    content = read_json(path, DatasetError, "it is damaged: build or import the dataset again")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        claimed = content.pop("fingerprint")
-        version = str(content.get("schema_version"))
+        if not isinstance(content, dict):
+            raise ValueError("expected a mapping")
+        claimed = content.pop("fingerprint", None)
+        version = printable(content.get("schema_version", SCHEMA_VERSION), 40)
         if version.split(".")[0] != SCHEMA_VERSION.split(".")[0]:
             raise DatasetError(f"{path}: schema version {version}, this package reads {SCHEMA_VERSION}; build it again")
-        content["shards"] = [ShardFile(**shard) for shard in content["shards"]]
-        content["others"] = [OtherFile(**other) for other in content["others"]]
-        content["size"] = tuple(content["size"])
-        manifest = Manifest(**content)
-        unknown = set(manifest.samples) - set(SPLITS)
-        if unknown:
-            raise DatasetError(f"{path}: unknown split {sorted(unknown)[0]!r}, expected {', '.join(SPLITS)}")
-        actual = manifest.fingerprint
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise DatasetError(f"{path}: damaged ({cause_of(error)}); build or import the dataset again") from error
-    if actual != claimed:
+        manifest = strictly(Manifest, content)
+        _check(manifest)
+    except ValueError as error:
+        raise DatasetError(f"{path}: damaged ({error}); build or import the dataset again") from error
+    if manifest.fingerprint != claimed:
         raise DatasetError(f"{path}: damaged, its fingerprint does not match its content; build the dataset again")
+    root = folder.resolve()
+    for name in (MANIFEST, *(file.path for file in manifest.files)):
+        if not (root / name).resolve().is_relative_to(root):
+            raise DatasetError(f"{folder / name}: is a link out of the dataset; put the file itself there")
     return manifest
+
+
+def strictly(kind: type[Kind], value: Any, where: str = "") -> Kind:
+    """A JSON ``value`` as a dataclass or any other type of its fields: the same keys, and nothing converted. Raises
+    ValueError that says ``where`` it is not."""
+    if is_dataclass(kind):
+        types = {entry.name: entry.type for entry in fields(kind)}
+        if not isinstance(value, dict) or value.keys() != types.keys():
+            raise ValueError(f"{printable(where).strip() or 'the file'}: expected exactly the keys {', '.join(types)}")
+        built = kind(**{name: strictly(types[name], value[name], f"{where} {name}") for name in types})  # type: ignore[arg-type]
+        if isinstance(built, ShardFile | OtherFile):
+            _check_file(built)
+        return built  # type: ignore[return-value]
+    of, inner = get_origin(kind), get_args(kind)
+    if of is dict and isinstance(value, dict):
+        plain = inner[1] is Any  # and so are the keys of what was JSON
+        return value if plain else {key: strictly(inner[1], value[key], f"{where} {key}") for key in value}  # type: ignore[return-value]
+    if of in (list, tuple) and isinstance(value, list) and (of is list or len(value) == len(inner)):
+        return of(strictly(inner[0], entry, where) for entry in value)  # type: ignore[no-any-return]
+    if kind is Any or type(value) is kind:
+        return value  # type: ignore[no-any-return]
+    expected = getattr(kind, "__name__", kind)
+    raise ValueError(f"{printable(where).strip()}: expected {expected}, got {printable(value, 60)}")
+
+
+def _check_file(file: ShardFile | OtherFile) -> None:
+    if problem := path_problem(file.path):
+        raise ValueError(f"path {printable(file.path)!r}: {problem}")
+    counts = [value for value in vars(file).values() if isinstance(value, int)]
+    if min(counts) < 0 or not re.fullmatch("[0-9a-f]{32}", file.xxh3_128):
+        raise ValueError(f"{file.path}: expected counts of 0 and more, and a hash of 32 hex digits")
+
+
+def check_row(row: dict[str, Any]) -> None:
+    """Raise ValueError for a row of `Manifest.samples` without names, or with names that are no names of files, without
+    the counts and lengths that every sample has, or with others that are no numbers."""
+    for key, pattern in (("sample", SAMPLE_NAME), ("object", OBJECT_NAME), ("view", VIEW_NAME)):
+        if not isinstance(name := row.get(key), str) or not pattern.fullmatch(name):
+            raise ValueError(f"{key} {printable(name, 60)!r}: expected a name of letters, digits, - and _")
+    needed = {"object_px", "depth_min_mm", "depth_max_mm"}
+    for key in needed | {key for key in row if key.endswith(("_px", "_mm"))}:
+        value = row.get(key)
+        if isinstance(value, bool) or not (isinstance(value, int | float) or (value is None and key not in needed)):
+            raise ValueError(f"{row['sample']}: {key}: expected a number, got {printable(value, 60)}")
+
+
+def _check(manifest: Manifest) -> None:
+    """Raise ValueError for what no dataset can have."""
+    rig = rig_from_dict(manifest.rig)
+    if not all(0 < side <= LARGEST_PX for side in manifest.size):
+        raise ValueError(f"size {manifest.size}: expected 1 to {LARGEST_PX} px a side")
+    if manifest.stored not in available_configs(rig.sequence, manifest.stored):
+        raise ValueError(f"stored: {printable(manifest.stored)!r} is no configuration of the rig's sequence")
+    if problem := next(filter(None, map(text_problem, (manifest.origin, *manifest.generator.values()))), None):
+        raise ValueError(f"origin and generator: {problem}")
+    if not isinstance(manifest.settings.get("light", {}), dict):
+        raise ValueError("settings light: expected a mapping")
+    if unknown := {*manifest.samples, *(shard.split for shard in manifest.shards)} - set(SPLITS):
+        raise ValueError(f"unknown split {printable(sorted(unknown)[0])!r}, expected {', '.join(SPLITS)}")
+    if not manifest.samples or not all(manifest.samples.values()):
+        raise ValueError("samples: expected some in every split")
+    for row in (row for rows in manifest.samples.values() for row in rows):
+        check_row(row)
+    groups = stored_groups(rig.sequence, manifest.stored)
+    if unknown := {shard.group for shard in manifest.shards} - groups.keys():
+        raise ValueError(f"unknown group {printable(sorted(unknown)[0])!r}, expected {', '.join(groups)}")
+    path, count = Counter(file.path for file in manifest.files).most_common(1)[0] if manifest.files else ("", 0)
+    if count > 1:
+        raise ValueError(f"{path}: is listed twice")
+    for name, digest in manifest.content.items():
+        if not re.fullmatch(rf"({'|'.join(SPLITS)})/[a-z0-9_]{{1,60}} [0-9a-f]{{32}}", f"{name} {digest}"):
+            raise ValueError(f"content {printable(name)!r}: expected split/column and a hash of 32 hex digits")
 
 
 def describe_file(folder: Path, path: Path) -> OtherFile:

@@ -12,7 +12,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.files import read_json, write_atomically
 from fpp_ml_bench.loaders.storage.assembly import (
     SETTINGS,
     Assembly,
@@ -32,6 +32,7 @@ from fpp_ml_bench.loaders.storage.manifest import (
     ShardFile,
     describe_file,
     read_manifest,
+    strictly,
 )  # fmt: skip
 from fpp_ml_bench.loaders.storage.shards import Receipt, ShardPlan
 from fpp_ml_bench.pool import mapping
@@ -97,8 +98,8 @@ def _read(file: Path, plan: ShardPlan, sizes: Mapping[str, int]) -> Written | No
     if receipt is None:
         return None
     try:
-        meshes = [OtherFile(**entry) for entry in json.loads(file.read_text(encoding="utf-8"))["meshes"]]
-    except (ValueError, KeyError, TypeError):
+        meshes = strictly(list[OtherFile], read_json(file, BuildError)["meshes"])
+    except (ValueError, KeyError):
         return None
     files: list[ShardFile | OtherFile] = [*receipt[0], *meshes]
     whole = all(sizes.get(file.path) == file.bytes for file in files)

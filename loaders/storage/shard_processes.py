@@ -12,7 +12,7 @@ from typing import Any, Protocol
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.storage.shards import Receipt, ShardPlan
 from fpp_ml_bench.machine import single_threaded_algebra
-from fpp_ml_bench.pool import begin_worker
+from fpp_ml_bench.pool import begin_worker, shared_memory
 
 _POLL_S = 0.2
 
@@ -30,10 +30,11 @@ def write_in_processes(
 ) -> Generator[tuple[ShardPlan, Receipt], None, None]:
     """Write the shards in processes that each go from shard to shard; yields each when it is finished, in any order."""
     context = get_context("spawn")
-    rows_done, reported = context.Value("q", 0), 0
+    with shared_memory():
+        rows_done, reported = context.Value("q", 0), 0
     # The longest shards first, so that no worker is left with a long shard at the end.
     waiting = deque(sorted(plans, key=lambda plan: -len(plan.samples)))
-    pipes, processes = [], []
+    pipes, processes, busy = [], [], {}
     try:
         with single_threaded_algebra():
             for _ in range(min(workers, len(plans))):
@@ -42,7 +43,6 @@ def write_in_processes(
                 processes.append(context.Process(target=_work, args=(end, rows_done, work)))
                 processes[-1].start()
                 end.close()  # the worker's copy is the only one left: when the worker dies, the pipe ends
-        busy = {}
         for pipe in pipes:
             busy[pipe] = waiting.popleft()
             pipe.send(busy[pipe])
@@ -68,6 +68,8 @@ def write_in_processes(
         for pipe in pipes:
             pipe.close()  # a worker ends when it has finished its shard
         for process in processes:
+            if busy:
+                process.terminate()  # nobody waits for what it is at
             process.join()
 
 

@@ -132,7 +132,7 @@ OBJECTS_PER_SHARD = 4
 ROWS_PER_SHARD, SHARD_PX = 24, 1 << 26
 """A shard's frame and depth map of every row are in memory until it is written: 0.3 GB for so many pixels."""
 Receipt = tuple[list[ShardFile], list[dict[str, Any]]]
-"""Files of a written shard, and per row its labels and measurements."""
+"""Files of a written shard, and per row its labels and measurements, and ``hashes`` of its images by column."""
 
 
 @dataclass(frozen=True)
@@ -258,20 +258,25 @@ class ShardWriter:
                 labels = {"sample": row.sample, "object": row.object, "view": row.view}
                 object_px = int(np.count_nonzero(object_mask(row.depth_mm)))
                 measured = {"object_px": object_px, "depth_min_mm": low_mm, "depth_max_mm": high_mm, **row.measured}
-                described.append({**labels, **measured})
+                hashes: dict[str, str] = {}
+                described.append({**labels, **measured, "hashes": hashes})
                 for values, value in zip(data.values(), (*labels.values(), plan.split, low_mm, high_mm), strict=True):
                     values.append(value)
                 # The data group is one batch of all rows. All frames but the first are written at once, one row per
                 # batch, and not held in memory.
                 for group, frames in self._groups.items():
                     images: dict[str, Any] = {self._sequence.frames[i].column: row.frames[i] for i in frames}
+                    if group == DATA_GROUP:
+                        images |= {DEPTH: row.depth_mm, DEPTH_EXACT: row.depth_exact_mm}
+                        images |= {FLAGS: row.flags, COVER: row.cover}
+                        images = {column: images[column] for column in self._images}
+                    images = {column: self._checked(image, column) for column, image in images.items()}
+                    hashes.update((column, layout.image_hash(image)) for column, image in images.items())
                     if group != DATA_GROUP:
-                        batch = [self._checked(image, column)[None] for column, image in images.items()]
+                        batch = [image[None] for image in images.values()]
                         writers[group].write_batch(_record_batch(batch, self._schemas[group]))
                         continue
-                    images |= {DEPTH: row.depth_mm, DEPTH_EXACT: row.depth_exact_mm, FLAGS: row.flags, COVER: row.cover}
-                    for column in self._images:
-                        image = self._checked(images[column], column)
+                    for column, image in images.items():
                         self._buffer(column, len(plan.samples))[number] = image
                 row_done()
             schema = self._schemas[DATA_GROUP]

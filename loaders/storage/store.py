@@ -7,9 +7,10 @@ leave columns out; `load_dataset` joins the tables of the column groups, and a f
 
 import mmap
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import cached_property
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,12 +26,14 @@ from fpp_ml_bench.loaders.sample import (
     DEPTH_EXACT,
     DEPTHS,
     FLAGS,
+    UNMEASURABLE,
+    VOID,
     Flag,
     config_columns,
     stored_groups,
     void_pixels,
 )
-from fpp_ml_bench.loaders.storage.manifest import ShardFile, read_manifest
+from fpp_ml_bench.loaders.storage.manifest import MANIFEST, ShardFile, read_manifest
 from fpp_ml_bench.optics import AnySequence, Rig, rig_from_dict
 
 if TYPE_CHECKING:
@@ -38,6 +41,8 @@ if TYPE_CHECKING:
     from datasets import Dataset, DatasetDict
 
 ALL_SPLITS = "all"
+LOOK_EVERY_S = 0.01
+"""How often a file that is read is looked at, whether it was cut: each time would be 3% of reading 224 px images."""
 
 
 class DatasetFolder:
@@ -52,6 +57,7 @@ class DatasetFolder:
         self._batches: dict[str, list[pa.RecordBatch]] = {}
         self._images: dict[tuple[str, str], list[NDArray]] = {}
         self._maps: dict[str, mmap.mmap] = {}
+        self._look_s: dict[str, float] = {}
         for shard in self.manifest.shards if check else ():
             file = self.path / shard.path
             size = file.stat().st_size if file.is_file() else None
@@ -73,6 +79,22 @@ class DatasetFolder:
     def fingerprint(self) -> str:
         """SHA-256 of the data's content, 64 hex digits."""
         return self.manifest.fingerprint
+
+    @property
+    def content(self) -> dict[str, str]:
+        """``split/column`` -> hash of its decoded values, by the manifest; `fpp-bench verify` reads the images."""
+        return self.manifest.content
+
+    def content_hash(self, split: str, column: str, hashes: Mapping[str, str]) -> tuple[str, str]:
+        """``split/column``, and the hash of its images, of which ``hashes`` are those of the samples (`image_hash`).
+        Raises `DatasetError` where the manifest has another: the files were changed after it was written."""
+        name, found = f"{split}/{column}", layout.column_hash(hashes)
+        if found != self.content.get(name):
+            raise DatasetError(
+                f"{self.path}: {column} of split {split} is not what {MANIFEST} says, so it was changed or damaged; "
+                "run: fpp-bench verify, and build or copy the dataset again"
+            )
+        return name, found
 
     @property
     def size(self) -> tuple[int, int]:
@@ -142,13 +164,9 @@ class DatasetFolder:
         return self._image(sample, DATA_GROUP, column)
 
     def target_mm(self, sample: str, column: str = DEPTH) -> NDArray[np.float32]:
-        """Depth map against which a prediction is scored, float32 (H, W) in mm, 0 = background. The object is the same
-        set of pixels for either column, the pixels with a decoded ``depth``: a surface that the projector does not
-        reach has no ground truth in this benchmark. ``depth_exact`` gives exact values at the same pixels."""
-        depth_mm = self.depth_mm(sample)
-        if column == DEPTH:
-            return depth_mm
-        return np.where(object_mask(depth_mm), self.depth_mm(sample, column), np.float32(0))
+        """Depth map against which a prediction is scored, float32 (H, W) in mm, 0 = background. Which of its pixels
+        count is `void`'s business."""
+        return self.depth_mm(sample, column)
 
     def flags(self, sample: str) -> NDArray[np.uint8]:
         """What is special about each pixel: bits of `loaders.sample.Flag`, uint8 (H, W); of generated data."""
@@ -156,22 +174,27 @@ class DatasetFolder:
             raise DatasetError(f"{self.path}: has no {FLAGS} ({self.manifest.origin} data)")
         return self._image(sample, DATA_GROUP, FLAGS)
 
-    def void(self, sample: str) -> NDArray[np.bool_]:
-        """Pixels that count in no score, bool (H, W): those flagged so (`loaders.sample.VOID`), and surface that the
-        full sequence could not decode. None are in data without flags."""
+    def void(self, sample: str, column: str = DEPTH) -> NDArray[np.bool_]:
+        """Pixels that count in no score against ``column``, bool (H, W). Of ``depth_exact``: those flagged `VOID` or
+        `UNMEASURABLE` (`loaders.sample`), a property of scene and light. Of ``depth``: those flagged `VOID`, and
+        surface without a decoded depth. None are in data without flags."""
         if not self.has_exact:
             return np.zeros(self.size, dtype=bool)
+        if column == DEPTH_EXACT:
+            return (self.flags(sample) & np.uint8(VOID | UNMEASURABLE)) != 0  # type: ignore[no-any-return]
         return void_pixels(self.flags(sample), self.depth_mm(sample), self.depth_mm(sample, DEPTH_EXACT))
 
-    def left_out(self, sample: str, rule: RangeRule) -> NDArray[np.bool_] | None:
-        """Pixels that the depth range by ``rule`` leaves out, bool (H, W): the void ones; None for none."""
-        return self.void(sample) if rule == "valid" else None
+    def left_out(self, sample: str, rule: RangeRule, column: str = DEPTH) -> NDArray[np.bool_] | None:
+        """Pixels that the depth range by ``rule`` leaves out of ``column``, bool (H, W), None for none: the void ones;
+        and of the exact depth what has no decoded one, because methods are told the range of ``depth``."""
+        if rule == "valid":
+            return self.void(sample)
+        return ~object_mask(self.depth_mm(sample)) if column == DEPTH_EXACT else None
 
     def unlit_mm(self, sample: str) -> NDArray[np.float32]:
-        """Exact depth of the surface that the camera sees and the projector does not light, or too weakly to decode it
-        from the full sequence, float32 (H, W) in mm, 0 everywhere else. Raises `DatasetError` for data without flags.
-        """
-        unlit = ((self.flags(sample) & np.uint8(Flag.UNLIT)) != 0) | ~object_mask(self.depth_mm(sample))
+        """Exact depth of the surface that the camera sees and the projector does not light, or too weakly (`Flag`),
+        float32 (H, W) in mm, 0 everywhere else. Raises `DatasetError` for data without flags."""
+        unlit = (self.flags(sample) & np.uint8(Flag.UNLIT | Flag.WEAK)) != 0
         return np.where(unlit, self.depth_mm(sample, DEPTH_EXACT), np.float32(0))
 
     def frame(self, sample: str, index: int) -> NDArray[np.uint8]:
@@ -243,6 +266,13 @@ class DatasetFolder:
                 expected = f"does not hold images of {self.size[0]} x {self.size[1]} px ({error})"
                 where = f"{self.path / shard.path}: column {column}"
                 raise DatasetError(f"{where} {expected}; run: fpp-bench verify") from error
+        if (now_s := monotonic()) > self._look_s.get(shard.path, 0.0):
+            self._look_s[shard.path] = now_s + LOOK_EVERY_S
+            mapped_file = self._maps.get(shard.path)
+            if mapped_file is not None and (size := mapped_file.size()) < len(mapped_file):
+                # Reading pages that the file no longer has would end the process (SIGBUS).
+                cut = f"was cut to {size} of {len(mapped_file)} bytes while it was read"
+                raise DatasetError(f"{self.path / shard.path}: {cut}; build or copy the dataset again")
         return self._images[key]
 
     def _views(self, column: "pa.Array") -> NDArray:

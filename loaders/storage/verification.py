@@ -1,12 +1,13 @@
 """Proving a dataset intact and its splits clean. Every finding is a sentence that names the file or sample."""
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import xxhash
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import OBJECTS, UNSEEN, VIEWS, sample_name, split_of
@@ -23,14 +24,26 @@ from fpp_ml_bench.loaders.sample import (
     RANGE,
     Flag,
     group_columns,
+    image_hash,
     stored_groups,
 )  # fmt: skip
 from fpp_ml_bench.loaders.storage.manifest import CAPTURED, GENERATED, MANIFEST, WORK_FOLDER, Manifest, ShardFile
 from fpp_ml_bench.loaders.storage.shards import arrow_schema
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
-ImagePlaces = dict[str, list[tuple[str, str, str]]]
-"""Hash of an image -> where it stands: (split, sample, column)."""
+
+@dataclass
+class ImageHashes:
+    """Hash of every image, by split and column and then by sample; ``uniform`` those of images of a single value, which
+    (black without noise) say nothing about what they show."""
+
+    by_column: dict[tuple[str, str], dict[str, str]] = field(default_factory=dict)
+    uniform: set[str] = field(default_factory=set)
+
+    def add(self, split: str, column: str, sample: str, image: NDArray) -> None:
+        digest = self.by_column.setdefault((split, column), {})[sample] = image_hash(image)
+        if image.min() == image.max():
+            self.uniform.add(digest)
 
 
 def verify(folder: Path, progress: Callable[[int], None] = lambda files: None) -> list[str]:
@@ -43,7 +56,7 @@ def verify(folder: Path, progress: Callable[[int], None] = lambda files: None) -
     opened = DatasetFolder(folder, check=False)
     manifest = opened.manifest
     findings = _foreign_files(folder, manifest)
-    places: ImagePlaces = {}
+    hashes = ImageHashes()
     for file in manifest.files:
         damage = _file_damage(folder / file.path, file.bytes, file.xxh3_128)
         if damage:
@@ -51,11 +64,12 @@ def verify(folder: Path, progress: Callable[[int], None] = lambda files: None) -
         elif isinstance(file, ShardFile):
             # Straight after its checksum the file is still in the page cache, so looking inside costs no second read.
             try:
-                findings += _shard_findings(opened, file, places)
+                findings += _shard_findings(opened, file, hashes)
             except DatasetError as error:  # no Arrow file, or images of another size
                 findings.append(str(error))
         progress(1)
-    return findings + _coverage_findings(manifest) + _split_findings(manifest) + _duplicate_images(places)
+    findings += _coverage_findings(manifest) + _split_findings(manifest) + _duplicate_images(hashes)
+    return findings or _content_findings(opened, hashes)
 
 
 def _foreign_files(folder: Path, manifest: Manifest) -> list[str]:
@@ -82,7 +96,7 @@ def _file_damage(path: Path, size: int, expected_hash: str) -> str | None:
     return None
 
 
-def _shard_findings(opened: DatasetFolder, shard: ShardFile, places: ImagePlaces) -> list[str]:
+def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: ImageHashes) -> list[str]:
     """Look inside one intact file: rows, columns, labels, values; and note every image's hash."""
     path = opened.path / shard.path
     manifest = opened.manifest
@@ -105,10 +119,7 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, places: ImagePlaces
                 findings += _depth_findings(f"{path}: sample {row['sample']!r}, column {column}", column, row, image)
             if column == FLAGS and image.max() > sum(Flag):
                 findings.append(f"{path}: sample {row['sample']!r}, column {column}: unknown flags")
-            # A uniform image (black without noise) says nothing about what it shows.
-            if column not in PIXEL_MAPS and image.min() != image.max():
-                digest = xxhash.xxh3_128_hexdigest(np.ascontiguousarray(image).data)
-                places.setdefault(digest, []).append((shard.split, row["sample"], column))
+            hashes.add(shard.split, column, row["sample"], image)
     opened.forget(shard)
     return findings
 
@@ -124,7 +135,7 @@ def _depth_findings(where: str, column: str, row: dict[str, Any], image: NDArray
     inside = image[object_mask(image)]
     if inside.size == 0:
         return [f"{where}: no depth above 0, so there is nothing to measure"]
-    if column == DEPTH and (inside.min(), inside.max()) != (row["depth_min_mm"], row["depth_max_mm"]):
+    if column == DEPTH and (float(inside.min()), float(inside.max())) != (row["depth_min_mm"], row["depth_max_mm"]):
         return [f"{where}: depth_min and depth_max do not fit its depth"]
     return []
 
@@ -146,9 +157,9 @@ def _coverage_findings(manifest: Manifest) -> list[str]:
     for split, rows in manifest.samples.items():
         for group in stored_groups(manifest.sequence, manifest.stored):
             files = [shard for shard in manifest.shards if (shard.split, shard.group) == (split, group)]
-            held = [row for shard in files for row in range(shard.first_row, shard.first_row + shard.rows)]
-            if held != list(range(len(rows))):
-                findings.append(f"{split}, {group}: the files hold {len(held)} rows, expected each of {len(rows)} once")
+            ends = list(accumulate((shard.rows for shard in files), initial=0))
+            if ends[-1] != len(rows) or ends[:-1] != [shard.first_row for shard in files]:
+                findings.append(f"{split}, {group}: the files hold {ends[-1]} rows, expected each of {len(rows)} once")
     return findings
 
 
@@ -175,9 +186,25 @@ def _split_findings(manifest: Manifest) -> list[str]:
     return findings
 
 
-def _duplicate_images(places: ImagePlaces) -> list[str]:
-    """Images that stand in more than one split, by the hash of their pixels."""
+def _content_findings(opened: DatasetFolder, hashes: ImageHashes) -> list[str]:
+    """Columns whose images are not those that the manifest was written for, and so maybe no benchmark's."""
     findings = []
+    for (split, column), images in hashes.by_column.items():
+        try:
+            opened.content_hash(split, column, images)
+        except DatasetError as error:
+            findings.append(str(error))
+    named = {f"{split}/{column}" for split, column in hashes.by_column}
+    return findings + [f"{opened.path}: {name} is in {MANIFEST} only" for name in opened.content if name not in named]
+
+
+def _duplicate_images(hashes: ImageHashes) -> list[str]:
+    """Images that stand in more than one split, by the hash of their pixels."""
+    findings, places = [], dict[str, list[tuple[str, str, str]]]()
+    for (split, column), images in hashes.by_column.items():
+        for sample, digest in images.items():
+            if column not in PIXEL_MAPS and digest not in hashes.uniform:
+                places.setdefault(digest, []).append((split, sample, column))
     for copies in places.values():
         if len({split for split, _, _ in copies}) > 1:
             named = ", ".join(f"{split}/{sample} {column}" for split, sample, column in copies[:4])

@@ -265,7 +265,7 @@ def test_methods_by_name(opened):
     assert (network.frames_used, network.units, network.mode) == ((0,), "normalised", "paper")
     with pytest.raises(FppBenchError, match="there are classical"):
         load_method("magic", opened.rig)
-    assert network.learned_from == {"data": "train-split", "versions": ["fpp-bench-full-224 version 1"]}
+    assert network.learned_from == {"data": "train-split", "versions": ["fpp-bench-full-224 version 2"]}
     learned = [load_method("constant", opened.rig, at=at).learned_from["data"] for at in ("standoff", "training-mean")]
     assert learned == ["none", "train-split"] and load_method("phase", opened.rig).learned_from == {"data": "none"}
 

@@ -1,25 +1,21 @@
 """crossed-net: views in drawn lights, samples with truth, windows in all orientations, a small training, its method."""
 
-import shutil
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from fpp_ml_bench.baselines import load_method, training
-from fpp_ml_bench.baselines.crossed_network import CrossedRecipe, inputs, pairs, train_crossed_net
+from fpp_ml_bench.baselines.crossed_network import CrossedRecipe, inputs, train_crossed_net
 from fpp_ml_bench.baselines.crossed_network.method import CrossedNetMethod
 from fpp_ml_bench.baselines.crossed_network.route import CrossedNetRoute, decided_mask, stated_rad
 from fpp_ml_bench.baselines.crossed_network.samples import Sample, Variation, draw, sample_of
 from fpp_ml_bench.baselines.crossed_route import CrossedRoute
-from fpp_ml_bench.baselines.networks import load
 from fpp_ml_bench.baselines.phase_network import IGNORED, Answers, load_net, threshold_at
-from fpp_ml_bench.baselines.training import load_recipe, train
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.errors import PredictionError, RecipeError, TrainingError, WeightsError
+from fpp_ml_bench.errors import PredictionError, TrainingError, WeightsError
 from fpp_ml_bench.loaders.render import named_light
 from fpp_ml_bench.optics import crossed_rig, paper_rig
 
@@ -125,34 +121,6 @@ def test_a_training_in_small_is_resumed_and_predicts(
     assert answer.depth.dtype == np.float32 and np.isfinite(answer.depth).all()
     assert np.array_equal(answer.sigma_mm > 0, answer.depth > 0)
     assert load_net(trained.weights).network.options["channels"] == len(inputs.CHANNELS)
-
-
-def test_the_papers_unet_learns_from_the_same_views(
-    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(pairs.training, "groups_of", lambda *args: GROUPS)
-    rendered = lambda groups, rig, frames, out, *rest: shutil.copytree(folder, out, dirs_exist_ok=True)  # noqa: E731
-    monkeypatch.setattr(pairs.training, "render_views", rendered)
-    recipe = load_recipe("normalization/individual", "cpu").model_copy(
-        update={"size": SIZE, "width": 2, "max_epochs": 2}
-    )
-    recipe = pairs.view_recipe(recipe)
-    learnt, checked = pairs.view_pairs(recipe, tmp_path / "views")
-    assert len(learnt) == 2 and len(checked) == 1
-    item = learnt[0]
-    view = next(training.read_views(folder, GROUPS, "train"))
-    assert np.array_equal(np.rint(item.fringe[0].numpy() * 255), view.frames[0])
-    assert item.depth.max() == 1 and not item.depth[0].numpy()[view.depth_mm == 0].any()
-    first = train(recipe, (learnt, checked), tmp_path / "run", minutes=1e-9, show=False)
-    assert not first.finished and first.epochs == 1
-    trained = train(recipe, (learnt, checked), tmp_path / "run", show=False)
-    assert trained.finished and trained.epochs == 2
-    network = load(trained.weights, "cpu").network
-    fringe = item.fringe[None]
-    with torch.inference_mode():
-        assert torch.allclose(network(fringe), network(0.3 * fringe + 0.1), atol=1e-4)
-    with pytest.raises(RecipeError, match="trains a unet"):
-        pairs.view_recipe(load_recipe("architecture/resunet", "cpu"))
 
 
 def test_depths_lie_on_measured_candidates_whatever_the_network_says(folder: Path) -> None:

@@ -12,7 +12,7 @@ from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.coding import Limits
 from fpp_ml_bench.decoding.decode import decode_stack
-from fpp_ml_bench.decoding.fewest import fewest_gray_bits, fewest_steps, orders_from_phases
+from fpp_ml_bench.decoding.fewest import fewest_steps, gray_levels_in_view, orders_from_phases
 from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
 from fpp_ml_bench.loaders.sample import VOID, Flag
 from fpp_ml_bench.loaders.storage import DatasetFolder
@@ -22,6 +22,14 @@ from fpp_ml_bench.optics import DIRECTIONS, paper_rig
 COARSE = replace(
     PAPER, pitch_horizontal_px=36.0, pitch_vertical_px=40.0, sequence=replace(PAPER.sequence, steps=4)
 )  # fewer cells than the code has words: its first bits never change
+
+
+def fewest_gray_bits(rig, direction):
+    """Gray bits that must be captured for a direction or ``both``, per direction."""
+    if direction == "both" and orders_from_phases(rig).unambiguous:
+        return {"horizontal": (), "vertical": ()}
+    levels = {name: gray_levels_in_view(rig, name) for name in DIRECTIONS if direction in (name, "both")}
+    return {name: tuple(bit for bit, level in enumerate(found) if level is None) for name, found in levels.items()}
 
 
 def test_bits_that_are_constant_in_view_are_not_needed():

@@ -1,21 +1,23 @@
 """Rank ranges, groups and their titles, legacy data, short names, and what a method assumes."""
 
 from dataclasses import replace
+from html import unescape
 
 import pytest
-from board_rows import some_rows
+from board_rows import named_benchmarks, some_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scored_dataset import make_dataset
 
 from fpp_ml_bench.evaluation.submission import Submission
 from fpp_ml_bench.leaderboard.assumptions import assumption, assumption_sentences
-from fpp_ml_bench.leaderboard.groups import LEGACY_FINGERPRINTS, LEGACY_NOTE
+from fpp_ml_bench.leaderboard.columns import CODE
+from fpp_ml_bench.leaderboard.groups import EARLIER_PROTOCOL_NOTE
 from fpp_ml_bench.leaderboard.names import LONGEST_NAME, cut_at_word, short_names
 from fpp_ml_bench.leaderboard.page import page_files
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.readme import readme_block
-from fpp_ml_bench.loaders.storage import Benchmark, benchmark, benchmark_of
+from fpp_ml_bench.leaderboard.tables import markdown_text
 
 
 @pytest.fixture(scope="module")
@@ -40,63 +42,69 @@ def test_shipped_rows_stay_sorted_by_rank_and_error(shipped):
         assert all(first[2] < second[2] for first, second in told_apart)
 
 
-def with_fingerprint(entry, fingerprint):
-    dataset = entry.result.dataset.model_copy(update={"fingerprint": fingerprint})
-    return replace(entry, result=entry.result.model_copy(update={"dataset": dataset}))
+def with_content(entry, digit):
+    """The same row on other data."""
+    content = dict.fromkeys(entry.row.dataset.content, digit * 32)
+    dataset = entry.row.dataset.model_copy(update={"content": content})
+    return replace(entry, row=entry.row.model_copy(update={"dataset": dataset}))
 
 
-def test_groups_are_headed_by_their_benchmark_and_legacy_comes_last(files, monkeypatch):
-    named, legacy = "a" * 64, min(LEGACY_FINGERPRINTS)
-    monkeypatch.setattr(benchmark, "BENCHMARKS", (Benchmark("fpp-bench-full", 0, "full", 960, named),))
+def test_groups_are_headed_by_their_benchmark_and_earlier_protocols_come_last(files, monkeypatch):
     entry = read_entries(files[:1])[0]
-    groups = rank([with_fingerprint(entry, legacy), entry, with_fingerprint(entry, named)])
-    titles = [group.title for group in groups]
-    rest = "40 x 32 px"
+    named = with_content(entry, "a")
+    earlier = with_content(replace(entry, row=entry.row.model_copy(update={"protocol_version": "2.0.0"})), "b")
+    named_benchmarks(monkeypatch, full=named.row.dataset.content, unseen={})
+    groups = rank([earlier, entry, named])
+    rest, truth = "40 x 32 px", earlier.row.dataset.truth[:8]
     words = ": few frames, no code, metric track, test split, against decoded depth"
-    assert titles == [
-        f"fpp-bench-full version 0, {rest}{words}",
-        f"{rest}, data {entry.result.dataset.fingerprint[:8]}{words}",
-        f"{rest}, data {legacy[:8]}, legacy{words}",
+    assert [group.title for group in groups] == [
+        f"fpp-bench-full version 2, {rest}{words}",
+        f"{rest}, data {entry.row.dataset.truth[:8]}{words}",
+        f"{rest}, data {truth}, protocol 2.0.0{words}",
     ]
     block, index = readme_block(groups), page_files(groups, [])["index.html"].decode()
-    for text in (block, index):
-        assert text.count(LEGACY_NOTE) == 1
-        assert text.index("fpp-bench-full version 0") < text.index(f"{legacy[:8]}")
-    assert LEGACY_NOTE not in readme_block(groups[:2])
+    for text, note in ((block, markdown_text(EARLIER_PROTOCOL_NOTE)), (unescape(index), EARLIER_PROTOCOL_NOTE)):
+        assert text.count(note) == 1
+        assert text.index("fpp-bench-full version 2") < text.index(truth)
+    assert markdown_text(EARLIER_PROTOCOL_NOTE) not in readme_block(groups[:2])
 
 
-def test_data_of_a_named_benchmark_is_not_legacy(files, monkeypatch):
-    fingerprint = min(LEGACY_FINGERPRINTS)
-    monkeypatch.setattr(benchmark, "BENCHMARKS", (Benchmark("fpp-bench-full-224", 0, "full", 224, fingerprint),))
-    (group,) = rank([with_fingerprint(read_entries(files[:1])[0], fingerprint)])
-    assert not group.key.is_legacy and group.title.startswith("fpp-bench-full-224 version 0")
+def test_a_table_is_of_scenes_whatever_was_projected(files):
+    """A method on another code stands in the same table, and the code is a column."""
+    first = read_entries(files[:1])[0]
+    crossed = first.row.dataset.model_copy(update={"code": "crossed"})
+    about = first.row.submission.model_copy(update={"name": "Another code"})
+    changes = {"dataset": crossed, "submission": about, "predictions_sha256": "0" * 64}
+    (group,) = rank([first, replace(first, row=first.row.model_copy(update=changes))])
+    assert [CODE.text(row) for row in group.rows] == ["crossed", "phase shift"]
+    index = page_files([group], [])["index.html"].decode()
+    assert '<td class="text" data-v="crossed">crossed</td>' in index and "| crossed |" in readme_block([group])
 
 
-def test_data_of_an_earlier_version_is_named_and_legacy(files):
-    entry = read_entries(files[:1])[0]
-    for earlier in benchmark.EARLIER:
-        (group,) = rank([with_fingerprint(entry, earlier.fingerprint)])
-        assert group.key.is_legacy
-        assert group.title.startswith(f"{earlier.title}, ") and ", legacy: " in group.title
-
-
-def test_shipped_rows_are_of_a_benchmark_or_legacy(shipped):
+def test_shipped_rows_are_of_a_benchmark_or_an_earlier_protocol(shipped):
     for group in rank(shipped):
-        assert group.key.is_legacy or benchmark_of(group.key.fingerprint) is not None
+        assert group.key.benchmark is not None or group.key.notes
 
 
 def test_what_stands_aside(shipped):
     """Lights that nothing is trained in, and small images: on the page in one line, in README not at all."""
-    groups = [group for group in rank(shipped) if not group.key.is_legacy]
-    aside = {benchmark_of(group.key.fingerprint).name: group.key.aside for group in groups}
+    groups = [group for group in rank(shipped) if not group.key.notes]
+    aside = {group.key.benchmark.name: group.key.aside for group in groups}
     assert aside == {
-        "fpp-bench-full": "", "fpp-bench-crossed": "", "fpp-bench-full-224": "224 px",
-        "fpp-bench-test-workshop": "workshop", "fpp-bench-test-hard": "hard",
-        "fpp-bench-test-crossed-workshop": "crossed, workshop", "fpp-bench-test-crossed-hard": "crossed, hard",
+        "fpp-bench-full": "", "fpp-bench-full-224": "224 px", "fpp-bench-workshop": "workshop", "fpp-bench-hard": "hard"
     }  # fmt: skip
     block = readme_block(rank(shipped))
-    assert "fpp-bench-crossed version 1" in block and "test-workshop" not in block
-    assert "Rows of other data (workshop; hard; crossed, workshop; crossed, hard; 224 px) are on the page." in block
+    assert "fpp-bench-full version 2" in block and "fpp-bench-workshop" not in block
+    assert "Rows of other data (workshop; hard; 224 px) are on the page." in block
+
+
+def test_one_frame_of_either_code_stands_in_one_table(shipped):
+    """The best methods of one frame are ranked together, on the test objects and the unseen ones."""
+    group = next(group for group in rank(shipped) if group.key.takes_unseen and group.key.target == "depth_exact")
+    assert group.key.frames == "one frame" and {row.entry.row.dataset.code for row in group.ranked} == {
+        "phase shift", "crossed"
+    }  # fmt: skip
+    assert {len(row.objects) for row in group.ranked} == {25}
 
 
 def test_short_names_of_shipped_rows(shipped):
@@ -158,6 +166,18 @@ def test_only_rows_of_the_packages_methods_get_a_name_from_settings(name, method
     assert short_names([submission(name, method, **given)]) == [short]
 
 
+def test_a_stranger_does_not_get_the_name_of_a_built_in_method():
+    """Who only claims to be one keeps the own name, behind those who are; names that look the same get a number."""
+    settings = {"direction": "vertical", "frames": 1, "shading": True, "prior": "none"}
+    measured = submission("Phase route, one frame", "phase", **settings)
+    claims = submission("Phase route, mine and better", "phase", **settings)
+    alike = submission("PHASE,  1 vertical")
+    everyone = [claims, alike, measured]
+    names = short_names(everyone, {claims.name, alike.name})
+    assert names == ["Phase route, mine and better", "PHASE,  1 vertical (2)", "Phase, 1 vertical"]
+    assert short_names([claims]) == ["Phase, 1 vertical"]
+
+
 words = st.text("ab ,;", min_size=1, max_size=60).filter(str.strip)
 
 
@@ -178,8 +198,8 @@ def test_a_long_name_is_cut_at_a_word():
 def test_the_full_name_is_in_the_title_and_on_the_rows_own_page(files):
     entry = read_entries(files[:1])[0]
     name = "A fringe network with attention, trained on everything there is"
-    about = entry.result.submission.model_copy(update={"name": name})
-    pages = page_files(rank([replace(entry, result=entry.result.model_copy(update={"submission": about}))]), [])
+    about = entry.row.submission.model_copy(update={"name": name})
+    pages = page_files(rank([replace(entry, row=entry.row.model_copy(update={"submission": about}))]), [])
     index = pages["index.html"].decode()
     assert f'title="{name}">A fringe network with attention…</a>' in index
     (own,) = (text.decode() for file, text in pages.items() if file.startswith("submissions/"))
@@ -189,23 +209,21 @@ def test_the_full_name_is_in_the_title_and_on_the_rows_own_page(files):
 def test_metric_phase_rows_say_what_they_assume(shipped):
     for group in rank(shipped):
         for row in group.rows:
-            result = row.entry.result
-            if result.submission.method in ("phase", "phase-net"):
-                one = result.submission.settings["shading"]
-                assert assumption(result) == ("one albedo, a lit background" if one else "a lit background")
-                assert ("one albedo for all surfaces and a lit background" in assumption_sentences(result)) == one
+            about = row.entry.row
+            if about.submission.method in ("phase", "phase-net"):
+                one = about.submission.settings["shading"]
+                assert assumption(about) == ("one albedo, a lit background" if one else "a lit background")
+                assert ("one albedo for all surfaces and a lit background" in assumption_sentences(about)) == one
             else:
-                assert assumption(result) == ""
-            assert ("Told the test sample's" in assumption_sentences(result)) == (result.track != "metric")
+                assert assumption(about) == ""
+            assert ("Told the test sample's" in assumption_sentences(about)) == (about.track != "metric")
     (group,) = (group for group in rank(shipped) if any(row.entry.path.stem == "phase-vertical" for row in group.rows))
     pages = page_files([group], [])
     own = [text.decode() for file, text in pages.items() if file.startswith("submissions/")]
-    assuming = [row for row in group.rows if assumption(row.entry.result)]
+    assuming = [row for row in group.rows if assumption(row.entry.row)]
     assert assuming and sum("a lit background" in text for text in own) == len(assuming)
-    assert {row.entry.result.submission.method for row in group.rows} - {"phase", "phase-net"} == {
-        "constant",
-        "nearest",
-    }
+    others = {row.entry.row.submission.method for row in group.rows} - {"phase", "phase-net"}
+    assert {"constant", "nearest"} <= others <= {"constant", "nearest", "crossed", "crossed-net"}
     assert "phase and phase-net assume one albedo, a lit background." in readme_block([group])
 
 

@@ -10,24 +10,24 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from board_rows import entry_with_errors, write_result_file
+from board_rows import entry_with_errors, named_benchmarks, write_result_file
 from scipy import stats
 from scored_dataset import make_dataset
 
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import Track
-from fpp_ml_bench.evaluation.result import write_result
-from fpp_ml_bench.evaluation.submission import Submission
+from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, Track
+from fpp_ml_bench.evaluation.score import sign_flip_bounds, sign_flip_p
+from fpp_ml_bench.evaluation.submission import LearnedFrom, Submission
 from fpp_ml_bench.leaderboard.assumptions import learned_from, told
 from fpp_ml_bench.leaderboard.columns import columns, uncertainty
-from fpp_ml_bench.leaderboard.groups import CLASSES, frames_class
-from fpp_ml_bench.leaderboard.pairs import pairs
+from fpp_ml_bench.leaderboard.data_files import table_json
+from fpp_ml_bench.leaderboard.pairs import behind, pairs
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
-from fpp_ml_bench.loaders.storage import Benchmark, benchmark
+from fpp_ml_bench.leaderboard.row_file import RowUncertainty, _uncertainty, write_row
 
 EIGHT = [f"object {n}" for n in range(8)]
-FULL, UNSEEN = "f" * 64, "e" * 64
+FULL, UNSEEN = ({"test/depth": letter * 32} for letter in "fe")
 
 
 @pytest.fixture(scope="module")
@@ -38,8 +38,8 @@ def base(tmp_path_factory):
 
 @pytest.fixture
 def benchmarks(monkeypatch):
-    named = (Benchmark("fpp-bench-full", 1, "full", 960, FULL), Benchmark("fpp-bench-unseen", 1, "unseen", 960, UNSEEN))
-    monkeypatch.setattr(benchmark, "BENCHMARKS", named)
+    """`FULL` and `UNSEEN` are the content of the benchmarks of these names."""
+    named_benchmarks(monkeypatch, full=FULL, unseen=UNSEEN)
 
 
 def entries_of(base, errors, objects=EIGHT):
@@ -107,17 +107,19 @@ def test_five_objects_have_no_ranks_and_say_why(base, capsys, tmp_path):
     objects = EIGHT[:5]
     (group,) = rank(entries_of(base, {"a": [1.0] * 5, "b": [9.0] * 5}, objects))
     assert [row.ranks for row in group.rows] == ["-", "-"] and group.pairs == ()
-    assert "With 5 objects the smallest p value of a test is 0.0625" in group.unranked
+    assert "With 5 objects the smallest p value of a test is 0.0625" in group.notes[0]
     (group,) = rank(entries_of(base, {"a": [1.0] * 6, "b": [9.0] * 6}, EIGHT[:6]))
-    assert [row.ranks for row in group.rows] == ["1", "2"] and group.unranked == ""
+    assert [row.ranks for row in group.rows] == ["1", "2"] and group.notes == ()
 
 
 def test_ranks_by_other_scores_and_none_by_cost(base):
     entries = entries_of(base, {"a": [4.0] * 8, "b": [1.0] * 8})
-    for key in ("object_rmse_mm", "overall_mae_mm", "object_median_mm"):
+    for key in ("object_rmse_mm", "overall_mae_mm"):
         assert [(row.ranks, row.entry.name) for row in rank(entries, key)[0].rows] == [("1", "b"), ("2", "a")]
-    (group,) = rank(entries, "frames_used")
-    assert {row.ranks for row in group.rows} == {"-"} and "No ranks by frames_used" in group.unranked
+    for key in ("frames_used", "object_median_mm"):  # a row has no means of objects for them
+        (group,) = rank(entries, key)
+        assert {row.ranks for row in group.rows} == {"-"} and f"No ranks by {key}" in group.notes[0]
+    assert [row.entry.name for row in group.rows] == ["b", "a"]
 
 
 def two_sets(base, name, error, unseen_error):
@@ -148,31 +150,23 @@ def test_a_row_without_the_unseen_objects_has_no_rank(base, benchmarks):
     first, second, third, fourth = (two_sets(base, name, 1.0 + n, 1.0 + n) for n, name in enumerate("abcd"))
     (group,) = rank([*first, *second, third[0], fourth[1]])
     assert [(row.entry.name, row.ranks) for row in group.rows] == [("a", "1"), ("b", "2"), ("c", "-"), ("d", "-")]
-    assert "Rows without a result on the unseen objects have no rank" in group.unranked
+    assert "Rows without a result on the unseen objects have no rank" in group.notes[0]
     (group,) = rank([first[0], second[0]])
-    assert "no row here has both. With 5 objects the smallest" in group.unranked and group.title.count("unseen") == 0
+    assert "no row here has both. With 5 objects the smallest" in group.notes[0] and group.title.count("unseen") == 0
     (group,) = rank([*first, second[0]])
-    assert "only one row here has both." in group.unranked and {row.ranks for row in group.rows} == {"-"}
+    assert "only one row here has both." in group.notes[0] and {row.ranks for row in group.rows} == {"-"}
     (group,) = rank([first[1], second[1]])
     assert {row.ranks for row in group.rows} == {"-"} and "unseen, against" in group.title
 
 
 def test_two_methods_of_one_name_are_not_joined(base, benchmarks):
     test, unseen = two_sets(base, "same", 1.0, 1.0)
-    about = unseen.result.submission.model_copy(update={"settings": {"weights_sha256": "1" * 64}})
-    other = replace(unseen, result=unseen.result.model_copy(update={"submission": about}))
+    about = unseen.row.submission.model_copy(update={"settings": {"weights_sha256": "1" * 64}})
+    other = replace(unseen, row=unseen.row.model_copy(update={"submission": about}))
     with pytest.raises(SubmissionError, match=r"same-unseen.json both hold 'same'.* settings.weights_sha256 is None"):
         rank([test, other])
     with pytest.raises(SubmissionError, match="on the same data"):
-        rank([test, replace(test, path=base.path)])
-
-
-@pytest.mark.parametrize(
-    ("frames", "expected"),
-    [([], 0), ([17], 0), ([0, 6, 12], 1), (range(36), 1), ([0, 50, 51], 1), ([0, 1, 2, 36], 2), (range(52), 2)],
-)
-def test_the_class_follows_from_the_frames(frames, expected):
-    assert frames_class(frames) == CLASSES[expected]
+        rank([test, replace(test, path=base.path, row=test.row.model_copy(update={"predictions_sha256": "0" * 64}))])
 
 
 def test_classes_and_what_was_told_are_tables_of_their_own(base):
@@ -181,7 +175,8 @@ def test_classes_and_what_was_told_are_tables_of_their_own(base):
     entries.append(entry_with_errors(base, errors, "told", uses_ground_truth_order=True))
     groups = rank(entries)
     assert [(group.key.frames, group.key.track) for group in groups] == [
-        (CLASSES[0], "metric"), (CLASSES[0], "oracle order"), (CLASSES[1], "metric"), (CLASSES[2], "metric")
+        (FRAMES_CLASSES[0], "metric"), (FRAMES_CLASSES[0], "oracle order"), (FRAMES_CLASSES[1], "metric"),
+        (FRAMES_CLASSES[2], "metric"),
     ]  # fmt: skip
 
 
@@ -214,7 +209,7 @@ def test_files_have_the_pairs_and_the_rows(base, tmp_path, capsys, monkeypatch):
     entries = entries_of(base, {"=HYPERLINK(a)": [1.0] * 8, "b, c": [2.0] * 8})
     paths = [tmp_path / f"{n}.json" for n in range(2)]
     for entry, path in zip(entries, paths, strict=True):
-        write_result(entry.result, path)
+        write_row(entry.row, path)
     monkeypatch.setenv("COLUMNS", "160")
     files = ["--csv", str(tmp_path / "t.csv"), "--json", str(tmp_path / "t.json"), "--paper", "none", "--pairs"]
     assert main(["leaderboard", *map(str, paths), *files]) == 0
@@ -222,24 +217,57 @@ def test_files_have_the_pairs_and_the_rows(base, tmp_path, capsys, monkeypatch):
     assert "Pairs of these rows" in printed and "second is behind" in printed
     (group,) = json.loads((tmp_path / "t.json").read_text())["groups"]
     assert [(row["best_rank"], row["object_mae_mm"]) for row in group["rows"]] == [(1, 1.0), (2, 2.0)]
-    assert group["pairs"][0]["p"] == 2.0**-7 and group["pairs"][0]["behind"] and group["why_no_ranks"] is None
+    assert group["pairs"][0]["p"] == 2.0**-7 and group["pairs"][0]["behind"] and group["notes"] == []
     lines = list(csv.DictReader(io.StringIO((tmp_path / "t.csv").read_text())))
     assert [line["name"] for line in lines] == ["'=HYPERLINK(a)", "b, c"]
     assert [float(line["object_mae_mm"]) for line in lines] == [1.0, 2.0]
     assert lines[0]["ratio_to_trivial"] == "" and lines[0]["class"] == "one frame" and lines[1]["best_rank"] == "2"
 
 
-def test_pairs_over_the_objects_that_both_have():
-    (pair,) = pairs({"a": {"x": 1.0, "y": 2.0}, "b": {"y": 1.0, "z": 5.0}})
-    assert (pair.first, pair.second, pair.objects, pair.difference, pair.p) == ("b", "a", 1, 1.0, 1.0)
-    (pair,) = pairs({"a": {"x": 1.0}, "b": {"z": 5.0}})
-    assert (pair.objects, pair.p, pair.interval, pair.behind) == (0, 1.0, None, False)
+def tables():
+    """Tables of errors (rows, objects) in decimals: close together, spread, with ties, and with hard objects."""
+    rng = np.random.default_rng(5)
+    for objects in (6, 8, 25, 32, 40):
+        for rows in (2, 5, 12):
+            for spread, noise in ((0.5, 0.3), (0.1, 0.5), (1.0, 0.1), (0.0, 0.2)):
+                hard, quality = rng.exponential(1.0, objects) + 0.2, np.exp(rng.normal(0, spread, rows))
+                yield np.round(hard * quality[:, None] * np.exp(rng.normal(0, noise, (rows, objects))), 2)
+    yield np.round(rng.uniform(1, 2, (10, 7)), 1)
+
+
+def test_who_is_behind_whom_is_what_the_listed_pairs_say():
+    """Bounds of p values leave out most tests, and change no verdict."""
+    told_apart = 0
+    for errors in tables():
+        listed = pairs({str(number): dict(enumerate(row)) for number, row in enumerate(errors.tolist())})
+        expected = {(int(pair.first), int(pair.second)) for pair in listed if pair.behind}
+        assert set(zip(*(part.tolist() for part in np.nonzero(behind(errors))), strict=True)) == expected
+        told_apart += len(expected)
+        differences = errors[1:] - errors[:-1]
+        for row, low, high in zip(differences, *sign_flip_bounds(differences), strict=True):
+            assert low <= sign_flip_p(row) <= high
+    assert told_apart > 200
+
+
+def test_a_table_of_hundreds_of_rows_is_ranked_and_lists_no_pairs(base):
+    errors = np.random.default_rng(2).lognormal(0, 1, (300, 1)) * np.random.default_rng(3).uniform(1, 1.3, (300, 25))
+    names = [f"object {n}" for n in range(25)]
+    (group,) = rank(entries_of(base, {f"row {n}": row for n, row in enumerate(errors.tolist())}, names))
+    assert len(group.ranked) == 300 and group.pairs == () and group.rows[-1].best_rank > 250
+    content = json.loads(table_json([group], [], "object_mae_mm"))
+    assert content["groups"][0]["pairs"] is None and len(content["groups"][0]["rows"]) == 300
+
+
+def test_rows_of_one_data_hold_the_same_objects(base):
+    entries = entries_of(base, {"a": [1.0] * 8}) + entries_of(base, {"b": [1.0] * 8}, TEN[2:])
+    with pytest.raises(SubmissionError, match=r"b\.json: its objects, samples or pixels are not those of .*a\.json"):
+        rank(entries)
 
 
 def test_what_a_result_says_beyond_its_scores(base, monkeypatch):
     """Blocks that a result may have: what the method learned from, and its scored uncertainty."""
     (row,) = rank([base])[0].rows
-    assert learned_from(base.result) == "" and uncertainty(base) == (None, None)
+    assert learned_from(base.row) == "" and uncertainty(base) == (None, None)
     shown = [column.title for column in columns("object_mae_mm") if column.shown_for([row])]
     assert not {"In 95%", "AUSE", "Learned from", "Rank", "x trivial", "On unseen"} & set(shown)
     scores = SimpleNamespace(coverage_95=0.9, ause_mae_mm=1.5, unstated_share=0.0)
@@ -248,16 +276,20 @@ def test_what_a_result_says_beyond_its_scores(base, monkeypatch):
         "none": SimpleNamespace(coverage_95=None, unstated_share=1.0),
         "no object": SimpleNamespace(coverage_95=None, unstated_share=None),
     }  # fmt: skip
-    stated = SimpleNamespace(
-        uncertainty=SimpleNamespace(metrics=scores, per_sample=samples),
-        submission=SimpleNamespace(learned_from=SimpleNamespace(data="train-split")),
-    )
-    assert learned_from(stated) == "train-split"
-    assert uncertainty(SimpleNamespace(result=stated)) == (pytest.approx((0.9 + 0.5 + 0.0) / 3), 1.5)
+    in_brief = _uncertainty(SimpleNamespace(metrics=scores, per_sample=samples))
+    assert in_brief == {"within_95_share": pytest.approx((0.9 + 0.5 + 0.0) / 3), "ause_mae_mm": 1.5}
+    changes = {
+        "uncertainty": RowUncertainty(**in_brief),
+        "submission": base.row.submission.model_copy(update={"learned_from": LearnedFrom(data="generated")}),
+    }  # fmt: skip
+    (row,) = rank([replace(base, row=base.row.model_copy(update=changes))])[0].rows
+    assert learned_from(row.entry.row) == "generated"
+    shown = [column.title for column in columns("object_mae_mm") if column.shown_for([row])]
+    assert {"In 95%", "AUSE", "Learned from"} < set(shown)
 
 
 def test_a_submission_may_say_that_it_was_given_the_order(base):
-    about = base.result.submission.model_dump(mode="json")
+    about = base.row.submission.model_dump(mode="json")
     assert "uses_ground_truth_order" not in about
     tracks = {}
     for given in range(8):
@@ -286,7 +318,7 @@ def test_rows_of_others_say_where_they_are_from(capsys, tmp_path, monkeypatch):
 def test_results_of_an_earlier_protocol_keep_their_own_table(base):
     errors = dict.fromkeys(EIGHT, 1.0)
     entry = entry_with_errors(base, errors, "new")
-    old = replace(entry, result=entry.result.model_copy(update={"protocol_version": "0.9.0"}))
+    old = replace(entry, row=entry.row.model_copy(update={"protocol_version": "0.9.0"}))
     now, earlier = rank([old, entry])
     assert (now.key.notes, len(earlier.key.notes)) == ([], 1) and "protocol 0.9.0" in earlier.title
     assert "protocol" not in now.title

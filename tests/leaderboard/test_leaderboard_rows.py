@@ -3,23 +3,31 @@
 import json
 import re
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 import pytest
-from board_rows import some_rows, timing, write_result_file
-from scored_dataset import make_dataset
+from board_rows import reliance, robustness, some_rows, timing, write_result_file
+from scored_dataset import disk_depth, make_dataset
 
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli.evaluate import main as fpp_eval
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import HELPED_BY_MISSING
-from fpp_ml_bench.evaluation.report import palette_png
-from fpp_ml_bench.leaderboard import rows
+from fpp_ml_bench.evaluation.protocol import HEADLINE, HELPED_BY_MISSING
+from fpp_ml_bench.evaluation.result import read_result
+from fpp_ml_bench.leaderboard import columns, rows
 from fpp_ml_bench.leaderboard.page import page_files
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.readme import BEGIN, END, SHOWN, readme_block
-from fpp_ml_bench.leaderboard.rows import picture_of, read_entry, write_row
+from fpp_ml_bench.leaderboard.row_file import (
+    LARGEST_ROW_BYTES,
+    interval_over,
+    mean_over,
+    row_json,
+    write_row,
+)
+from fpp_ml_bench.leaderboard.rows import read_entry
 
 
 @pytest.fixture(scope="module")
@@ -32,29 +40,149 @@ def files(tmp_path_factory, dataset):
     return some_rows(tmp_path_factory.mktemp("rows"), dataset)
 
 
-def test_a_row_holds_the_result_and_its_provenance(files, tmp_path, capsys):
+@pytest.fixture(scope="module")
+def one_frame(tmp_path_factory, dataset):
+    return write_result_file(tmp_path_factory.mktemp("one") / "one.json", dataset, 1.0)
+
+
+@pytest.fixture
+def listed(tmp_path, monkeypatch):
+    """Have ``vouched.txt`` list rows: called with a row file and a word, or with a whole line."""
+    file = tmp_path / "vouched.txt"
+    file.write_text("")
+    monkeypatch.setattr(rows, "VOUCHED", file)
+
+    def add(line: object, word: str = "") -> None:
+        if word:
+            line = rows.vouching_line(read_entry(line).row, line.read_bytes(), word, "a command")
+        file.write_text(f"{file.read_text()}{line}\n")
+
+    return add
+
+
+def write_row_of(result: Path, path: Path) -> Path:
+    write_row(read_entry(result).row, path)
+    return path
+
+
+def test_one_command_makes_a_row_and_prints_the_line_to_vouch_for_it(files, tmp_path, capsys, listed):
     row = tmp_path / "row.json"
-    assert main(["leaderboard", str(files[0]), "--row", str(row), "--provenance", "verified"]) == 0
-    assert capsys.readouterr().out == f"{row}: verified\n"
+    assert main(["leaderboard", str(files[0]), "--row", str(row)]) == 0
+    said, line = capsys.readouterr().out.splitlines()
+    assert said.startswith(f"{row}: {row.stat().st_size:,} bytes, self-reported until a maintainer adds")
     entry, bare = read_entry(row), read_entry(files[0])
-    assert entry.provenance == "verified" and entry.result == bare.result and bare.provenance == rows.LOCAL
-    write_row(entry, "verified", tmp_path / "again.json")
+    assert entry.row == bare.row and entry.provenance == bare.provenance == rows.LOCAL
+    write_row(entry.row, tmp_path / "again.json")
     assert (tmp_path / "again.json").read_bytes() == row.read_bytes()
+    listed("# a remark")
+    listed(line)
+    assert read_entry(row).provenance == "measured here" and read_entry(tmp_path / "again.json").vouched
+    row.write_bytes(row.read_bytes() + b" ")
+    assert read_entry(row).provenance == rows.LOCAL
 
 
-def test_fpp_eval_compares_a_result_with_a_row(files, tmp_path, capsys):
-    row = tmp_path / "row.json"
-    write_row(read_entry(files[0]), "verified", row)
-    for first, second in ((files[0], files[1]), (row, files[1])):
+def test_what_a_row_keeps_of_a_result(files):
+    result, row = read_result(files[1]), read_entry(files[1]).row
+    assert len(row_json(row)) < 4_000 < len(files[1].read_bytes()) / 3
+    for key, value in result.metrics:
+        kept = getattr(row.metrics, key)
+        assert kept is value is None or kept == float(f"{value:.5g}")
+    for part, own in zip(result.per_object, row.per_object, strict=True):
+        samples = [sample for sample in result.per_sample if sample.object == part.object]
+        assert (own.object, own.samples) == (part.object, len(samples))
+        assert own.object_pixels == sum(sample.object_pixels for sample in samples)
+        assert own.object_mae_mm == float(f"{part.metrics.object_mae_mm:.5g}")
+    about = row.submission
+    assert (about.seconds_per_sample, about.hardware) == (None, None) and about.timing == result.submission.timing
+    hashes = "\n".join(sorted(sample.prediction_sha256 for sample in result.per_sample))
+    assert row.predictions_sha256 == sha256(hashes.encode()).hexdigest()
+    assert row.result_sha256 == sha256(files[1].read_bytes()).hexdigest()
+
+
+def test_means_weigh_objects_by_the_views_that_have_them(tmp_path):
+    """Objects that fill the image in some of their views: what is over objects is what is over samples."""
+
+    def scene(number):
+        depth = disk_depth((32, 40), number)
+        return np.zeros(depth.shape, np.uint8), depth if number % 3 else np.full_like(depth, 1800.0 + number)
+
+    dataset = make_dataset(tmp_path / "tiny", views=("A0", "A60", "A120"), scene=scene)
+    path = write_result_file(tmp_path / "r.json", dataset, 1.0, 3.0)
+    row, result = read_entry(path).row, read_result(path)
+    assert result.samples_without_background == 2 and [p.without_background for p in row.per_object] == [1, 1]
+    for key in HEADLINE:
+        assert mean_over(row.per_object, key) == pytest.approx(getattr(result.metrics, key), rel=1e-4)
+        assert interval_over(row.per_object, key) == pytest.approx(result.intervals.of(key), rel=1e-4)
+    write_row(row, tmp_path / "row.json")
+    assert read_entry(tmp_path / "row.json").row == row
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["measured", "{sha} measured {commit} here by me", "{sha} | measured | {commit} | a machine | ",
+     "{sha} | trusted | {commit} | a machine | a command", "{sha} | measured | HEAD | a machine | a command",
+     "{short} | measured | {commit} | a machine | a command", "{sha} | measured | {commit} | a machine | a command\r",
+     " {sha} | measured | {commit} | a machine | a command"],
+)  # fmt: skip
+def test_a_bad_line_of_the_list_is_named(line, listed, files):
+    listed("")
+    listed(line.format(sha="a" * 64, short="a" * 63, commit="b" * 40))
+    with pytest.raises(SubmissionError, match=r"vouched\.txt, line 2: expected SHA-256 of a row file"):
+        read_entry(files[0])
+
+
+def test_a_row_is_listed_once(listed, files):
+    for word in ("measured", "verified"):
+        listed(f"{'a' * 64} | {word} | {'b' * 40} | a machine | a command")
+    with pytest.raises(SubmissionError, match="line 2: expected a hash that is listed once"):
+        read_entry(files[0])
+
+
+def test_fpp_eval_compares_results_and_rows(files, tmp_path, capsys):
+    row, other = (write_row_of(path, tmp_path / path.name) for path in files[:2])
+    for first, second in ((files[0], files[1]), (row, files[1]), (row, other)):
         assert fpp_eval(["compare", str(first), str(second)]) == 0
-    of_file, of_row = capsys.readouterr().out.split("first:")[1:]
-    assert of_file.strip() == of_row.strip() and "sign-flip test" in of_row
+    of_results, *of_rows = capsys.readouterr().out.split("first:")[1:]
+    assert "samples" in of_results and all("of 2 objects" in text for text in of_rows)
+    assert of_rows[0].strip() == of_rows[1].strip() and "sign-flip test" in of_rows[0]
+    lines = [re.search(r"object MAE.*", text)[0].split("│")[:3] for text in (of_results, of_rows[0])]
+    assert lines[0] == lines[1]
 
 
-def test_a_bare_result_in_the_rows_folder_is_self_reported(files, tmp_path, monkeypatch):
-    monkeypatch.setattr(rows, "SHIPPED_ROWS", tmp_path)
-    (tmp_path / "mine.json").write_bytes(files[0].read_bytes())
-    assert read_entry(tmp_path / "mine.json").provenance == "self-reported"
+def test_fpp_eval_verifies_a_row_from_its_predictions(files, dataset, tmp_path, capsys):
+    row, predictions = write_row_of(files[0], tmp_path / "row.json"), files[0].parent / "fast-predictions"
+    words = ["verify", str(row), str(predictions), "--dataset", str(dataset.path)]
+    assert fpp_eval(words) == 0
+    assert capsys.readouterr().out == (
+        f"verified: {row} is what 4 predictions give\n"
+        "not checked: run time and its machine, software, code and environment: predictions don't tell them\n"
+    )
+    content = json.loads(row.read_text())
+    content["metrics"]["object_median_mm"] += 2e-4
+    content["submission"]["settings"]["steps"] = 3
+    content["predictions_sha256"] = "0" * 64
+    content["robustness"] = {"test": robustness().model_dump()}
+    content["submission"]["timing"]["latency_p95_ms"] = 1e6
+    row.write_text(json.dumps(content))
+    assert fpp_eval(words) == 1
+    verdict, *lines, last = capsys.readouterr().out.splitlines()
+    assert "robustness" in last and "differs from what the predictions give in 3 places" in verdict
+    assert [line.split(":")[0].strip() for line in lines] == [
+        "submission.settings.steps", "predictions_sha256", "metrics.object_median_mm"
+    ]  # fmt: skip
+    content["protocol_version"] = "2.0.0"
+    row.write_text(json.dumps(content))
+    assert fpp_eval(words) == 2 and "was scored by protocol 2.0.0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("stored", "computed", "agree"),
+    [(12.346, 12.3456, True), (12.346, 12.3455000001, True), (12.346, 12.3454999, False), (12.345, 12.3456, False),
+     (10.0, 9.99996, True), (0.0, 0.0, True), (1e-7, 0.0, False), (-0.5, -0.500004, True), (0.5, -0.5, False),
+     (None, 0.0, False), (3, 3, True)],
+)  # fmt: skip
+def test_a_mean_may_differ_by_what_five_digits_leave_open(stored, computed, agree):
+    assert rows._agree(stored, computed, 1.0) is agree
 
 
 @pytest.mark.parametrize(
@@ -68,18 +196,32 @@ def test_a_bare_result_in_the_rows_folder_is_self_reported(files, tmp_path, monk
         (None, "self-reported", False),
     ],
 )
-def test_a_strangers_time_is_never_measured_here(block, provenance, measured, dataset, tmp_path, capsys):
+def test_what_only_its_author_measured_is_marked(
+    block, provenance, measured, dataset, tmp_path, capsys, listed, monkeypatch
+):
+    """Time, phase reliance and robustness of a stranger's row, whatever the row says."""
+    monkeypatch.setattr(rows, "SHIPPED_ROWS", tmp_path)
     result = write_result_file(tmp_path / "r.json", dataset, 1.0, timing=block)
-    write_row(read_entry(result), provenance, tmp_path / "row.json")
+    row = read_entry(result).row
+    blocks = {"reliance": reliance(), "robustness": {"test": robustness()}}
+    write_row(row.model_copy(update=blocks), tmp_path / "row.json")
+    if word := {"measured here": "measured", "verified": "verified"}.get(provenance):
+        listed(tmp_path / "row.json", word)
     entry = read_entry(tmp_path / "row.json")
+    assert entry.provenance == provenance
     assert entry.time_measured is measured
+    vouched_for_all = provenance == "measured here"
+    assert (columns.reliance(entry), columns.robustness(entry)) == (
+        ("0.62", "31.0") if vouched_for_all else ("0.62*", "31.0*")
+    )
     assert entry.latency_ms == (250.0 if block is None else 2.0)
     board = rank([entry])
     index = page_files(board, [])["index.html"].decode()
     body = index.split("<tbody>")[1].split("</tbody>")[0]
     assert ('class="p-self-reported">self-reported</small>' in body) is not measured
     assert ("point p-" + provenance.replace(" ", "-") + ('"' if measured else " hollow")) in index
-    assert ("&#42;" in readme_block(board).split("Made by")[0]) is not measured
+    time = r"\| 250&#42; \|" if block is None else r"\| 2&#42; \|"
+    assert bool(re.search(time, readme_block(board))) is not measured
     assert main(["leaderboard", str(tmp_path / "row.json"), "--paper", "none"]) == 0
     assert (("0.25*" if block is None else "0.002*") in capsys.readouterr().out) is not measured
 
@@ -87,38 +229,65 @@ def test_a_strangers_time_is_never_measured_here(block, provenance, measured, da
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"row_schema_version": "9"}, "row_schema_version 1.0.0"),
-        ({"provenance": "measured by me"}, "provenance"),
-        ({"provenance": "reported by the paper"}, "provenance"),
-        ({"result": {}}, "no schema_version"),
-        ({"result": None}, "no schema_version"),
+        ({"row_schema_version": "1.0.0"}, "row_schema_version 2.0.0"),
+        ({"provenance": "measured here"}, "provenance: is not a key"),
+        ({"metrics": {}}, "metrics.overall_mae_mm: is missing"),
+        ({"per_object": []}, "per_object"),
         ({"note": "<b>"}, "note: is not a key"),
+        ({"frames_class": "full sequence"}, "frames_class is full sequence, of 1 frames_used"),
+        ({"created": "today"}, "created"),
+        ({"predictions_sha256": "0"}, "predictions_sha256"),
     ],
 )
-def test_unsound_rows_are_refused_by_name(change, message, files, tmp_path, capsys):
-    path = tmp_path / "odd.json"
-    write_row(read_entry(files[0]), "verified", path)
+def test_unsound_rows_are_refused_by_name(change, message, one_frame, tmp_path, capsys):
+    path = write_row_of(one_frame, tmp_path / "odd.json")
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
     assert main(["leaderboard", str(path)]) == 2
     error = capsys.readouterr().err
     assert "odd.json" in error and message in error
 
 
-def test_an_edited_row_contradicts_itself(files, tmp_path):
-    path = tmp_path / "edited.json"
-    write_row(read_entry(files[0]), "verified", path)
+@pytest.mark.parametrize(
+    ("part", "change", "message"),
+    [
+        ("metrics", {"object_mae_mm": 1.0}, "metrics.object_mae_mm does not follow from per_object"),
+        ("metrics", {"object_mae_mm": None}, "metrics.object_mae_mm does not follow from per_object"),
+        ("intervals", {"object_mae_mm": [4.0, 4.1]}, "intervals.object_mae_mm does not follow from per_object"),
+        ("intervals", {"overall_rmse_mm": [None, None]}, "intervals.overall_rmse_mm does not follow"),
+        (0, {"object": "wooden_boards"}, "names an object twice"),
+        (0, {"samples": 1}, "do not add up"),
+        (0, {"void_pixels": 1}, "object, background and void pixels do not add up to 2 images"),
+        (0, {"object_mae_mm": None}, "object scores must be null exactly when the set is empty"),
+        (0, {"object_rmse_mm": 0.1}, "object RMSE is below its MAE"),
+        (0, {"without_object": 2}, "or no view has the set"),
+        ("dataset", {"samples": 5}, "per_object holds 4 samples, dataset.samples says 5"),
+        ("dataset", {"content": {"test/flags": "a" * 32}}, "dataset.content: expected hashes of"),
+        ("submission", {"name": "Fast\u3164and rough"}, "U+3164, which shows nothing"),
+        ("submission", {"name": "Fast a\u0301\u0302nd rough"}, "U+0302 on another mark"),
+    ],
+)
+def test_an_edited_row_contradicts_itself(part, change, message, files, tmp_path):
+    path = write_row_of(files[0], tmp_path / "edited.json")
     content = json.loads(path.read_text())
-    content["result"]["metrics"]["object_mae_mm"] /= 2
+    (content["per_object"][part] if part == 0 else content[part]).update(change)
+    if "samples" in change and part == 0:
+        content["dataset"]["samples"] = 3
     path.write_text(json.dumps(content))
-    with pytest.raises(SubmissionError, match=r"metrics\.object_mae_mm does not follow"):
+    with pytest.raises(SubmissionError, match=re.escape(message)) as raised:
         read_entry(path)
+    assert "edited.json" in str(raised.value)
 
 
-def test_row_needs_one_result_and_a_known_provenance(files, tmp_path, capsys):
+def test_a_row_is_of_one_result_and_small(files, dataset, tmp_path, capsys):
     assert main(["leaderboard", *map(str, files[:2]), "--row", str(tmp_path / "r.json")]) == 2
     assert "a row of one result, 2 were given" in capsys.readouterr().err
-    with pytest.raises(SubmissionError, match="expected a provenance out of"):
-        write_row(read_entry(files[0]), "trust me", tmp_path / "r.json")
+    large = write_result_file(tmp_path / "l.json", dataset, 1.0, settings={f"key {n}": "x" * 90 for n in range(150)})
+    assert main(["leaderboard", str(large), "--row", str(tmp_path / "r.json")]) == 2
+    assert "r.json: the row has" in capsys.readouterr().err and not (tmp_path / "r.json").exists()
+    path = write_row_of(files[0], tmp_path / "padded.json")
+    path.write_bytes(path.read_bytes() + b" " * 12_000)
+    assert main(["leaderboard", str(path)]) == 2
+    assert "padded.json: the row has" in capsys.readouterr().err
     assert main(["leaderboard", str(files[0]), "--row", str(tmp_path / "no" / "r.json")]) == 2
     assert "can't be written" in capsys.readouterr().err
 
@@ -136,42 +305,6 @@ def test_no_rank_by_what_missing_pixels_improve(key, dataset, tmp_path, capsys):
     assert "a method could lead by answering few pixels" in capsys.readouterr().err
     with pytest.raises(SubmissionError, match=key):
         rank(read_entries([path]), key)
-
-
-def _png(height: int, width: int) -> bytes:
-    return palette_png(np.zeros((height, width), np.uint8), np.zeros((256, 3), np.uint8))
-
-
-def test_the_picture_beside_a_row_is_shown_on_its_page(files, tmp_path):
-    import base64
-
-    path = tmp_path / "row.json"
-    path.write_bytes(files[0].read_bytes())
-    assert picture_of(read_entry(path)) is None
-    path.with_suffix(".png").write_bytes(_png(20, 30))
-    shown = page_files(rank([read_entry(path)]), [])
-    page = next(content.decode() for name, content in shown.items() if name.startswith("submissions/"))
-    assert base64.b64encode(_png(20, 30)).decode() in page and 'alt="Samples from' in page
-
-
-@pytest.mark.parametrize(
-    "content",
-    [b"<svg onload=alert(1)>", b"", b"GIF89a" + bytes(40), _png(20, 30)[:20], _png(1, 5000), bytes(2_000_001)],
-)
-def test_a_picture_that_is_no_png_of_sensible_size_is_refused(content, files, tmp_path):
-    path = tmp_path / "row.json"
-    path.write_bytes(files[0].read_bytes())
-    path.with_suffix(".png").write_bytes(content)
-    with pytest.raises(SubmissionError, match=r"row\.png"):
-        picture_of(read_entry(path))
-
-
-def test_a_linked_picture_is_not_followed(files, tmp_path):
-    path = tmp_path / "row.json"
-    path.write_bytes(files[0].read_bytes())
-    (tmp_path / "secret").write_bytes(_png(3, 3))
-    path.with_suffix(".png").symlink_to(tmp_path / "secret")
-    assert picture_of(read_entry(path)) is None
 
 
 @pytest.fixture
@@ -200,11 +333,14 @@ def test_readme_block_is_made_and_stays(readme, files, capsys):
 def test_readme_shows_the_best_of_a_group(extra, files):
     count = SHOWN + extra
     entry = read_entry(files[0])
-    about = entry.result.submission
+    about = entry.row.submission
     named = [
-        replace(entry, result=entry.result.model_copy(update={"submission": about.model_copy(update={"name": name})}))
-        for name in (f"Method {number:02}" for number in range(count))
-    ]
+        replace(entry, row=entry.row.model_copy(update={
+            "submission": about.model_copy(update={"name": f"Method {number:02}"}),
+            "predictions_sha256": f"{number:064}",
+        }))
+        for number in range(count)
+    ]  # fmt: skip
     text = readme_block(rank([*named, read_entry(files[3])]))
     # All share one error, so names decide.
     assert [n for n in range(count) if f"Method {n:02}" in text] == list(range(5))
@@ -250,8 +386,12 @@ def test_unnamed_results_get_into_neither_page_nor_readme(readme, files, tmp_pat
     assert "Fast and rough" not in (tmp_path / "page" / "index.html").read_text()
 
 
-def test_shipped_rows_are_timed_and_have_intervals():
+def test_shipped_rows_and_the_list_fit_each_other():
+    """Each row is a row file that is listed or self-reported, each line of the list is one of theirs."""
     entries = read_entries(shipped_rows())
-    assert entries and {entry.provenance for entry in entries} <= set(rows.PROVENANCES)
-    for entry in entries:
-        assert entry.result.timing is not None and entry.interval("object_mae_mm") is not None
+    hashes = [sha256(entry.path.read_bytes()).hexdigest() for entry in entries]
+    assert entries and len(set(hashes)) == len(hashes) and set(rows.vouched()) <= set(hashes)
+    for entry, digest in zip(entries, hashes, strict=True):
+        assert entry.is_row_file and entry.path.stat().st_size <= LARGEST_ROW_BYTES
+        assert entry.provenance == rows.vouched().get(digest, "self-reported")
+        assert entry.row.timing is not None and entry.row.intervals.of("object_mae_mm") is not None

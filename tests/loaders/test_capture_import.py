@@ -328,7 +328,7 @@ BAD = {
     "unknown object": (splits("{test: [bolt, gear_wheel, nut]}"), "'nut' has no captures"),
     "unknown split": (splits("{tests: [bolt, gear_wheel]}"), "tests: is not a key"),
     "splits that are no list": (splits("{test: bolt}"), "test: .*list"),
-    "malformed splits": (splits("{test: ["), "can't be read as YAML"),
+    "malformed splits": (splits("{test: ["), "is no plain YAML"),
     "no splits file": (lambda f: ("--splits", f / "none.yaml"), "none.yaml: can't be read"),
     "dark": (of_frames(lambda image: image // 40), "refused as low modulation: probably the fringes are too faint"),
     "overexposed": (of_frames(lambda image: np.minimum(image.astype(int) * 5 + 170, 255)), "refused as .*: probably"),

@@ -123,7 +123,7 @@ def test_a_name_with_markup_is_shown_as_it_is(published, client):
     card = client.server.repos["datasets", "alice/fpp"].files["README.md"].decode()
     head, body = card.split("---\n", 2)[1:]
     assert ODD_OBJECT not in body
-    assert "&#60;b&#62;&#95;&#91;x&#93;(y)&#124;&#96;z&#96;" in body
+    assert "&#95;&#95;odd&#95;&#95;-name&#95;" in body
     assert {config["config_name"] for config in yaml.safe_load(head)["configs"]} == {
         "single_shot", "horizontal", "vertical", "sinusoidal", "all"
     }  # fmt: skip

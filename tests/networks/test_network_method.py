@@ -232,13 +232,13 @@ def test_a_given_mask_is_never_ranked_with_honest_rows(dataset, tmp_path, capsys
     page = unescape((tmp_path / "page" / "index.html").read_text())
     assert "oracle mask track" in page and "told the test sample's depth range and object mask" in page
     with pytest.raises(PublishError, match="no task for the oracle mask track"):
-        task_of(groups[1].rows[0].entry.result, "masked.json")
+        task_of(groups[1].rows[0].entry.row, "masked.json")
 
 
 def test_the_key_changes_no_file_without_it(dataset, tmp_path):
     folder = write_predictions(tmp_path / "p", dataset)
     result = evaluate(folder, dataset)
-    assert b"uses_ground_truth_mask" not in result_json(result) and result.schema_version == "2.4.0"
+    assert b"uses_ground_truth_mask" not in result_json(result) and result.schema_version == "3.0.0"
     # A result that hides the mask, and one that claims it, both differ from their predictions.
     masked = result.model_copy(
         update={"submission": Submission(**{**result.submission.model_dump(), "uses_ground_truth_mask": True})}

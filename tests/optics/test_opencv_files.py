@@ -210,8 +210,8 @@ def test_arguments_that_contradict_or_make_no_sense_are_refused(sound, tmp_path)
     ):
         with pytest.raises(RigError, match=message):
             read_opencv_calibration(path, **arguments)
-    for wrong in (tmp_path, tmp_path / "absent.xml"):
-        with pytest.raises(RigError, match="expected a file"):
+    for wrong, message in ((tmp_path, "not a regular file but a folder"), (tmp_path / "absent.xml", "No such file")):
+        with pytest.raises(RigError, match=message):
             read_opencv_calibration(wrong)
     calibration = read_opencv_calibration(path)
     for out, message in ((tmp_path / "a.txt", "ending in"), (tmp_path / "no" / "a.xml", "can't be written")):

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from matplotlib.transforms import Bbox
 from scored_dataset import make_dataset
 
+from fpp_ml_bench import leaderboard
 from fpp_ml_bench.baselines.tradeoff import Mark, Scatter, pareto_front
 from fpp_ml_bench.baselines.tradeoff.drawing import free_box
 from fpp_ml_bench.cli import main
@@ -64,6 +65,15 @@ def test_same_rows_same_bytes_whatever_their_order(files, tmp_path):
         for out in ("first", "second")
     )
     assert first == second and len(first) == 3 + len(files)
+
+
+def test_a_page_ranks_once(files, tmp_path, monkeypatch, capsys):
+    ranked = []
+    monkeypatch.setattr(leaderboard, "rank", lambda *given: ranked.append(given) or rank(*given))
+    assert main(["leaderboard", *map(str, files), "--page", str(tmp_path), "--csv", str(tmp_path / "t.csv")]) == 0
+    assert len(ranked) == 1
+    assert main(["leaderboard", *map(str, files), "--page", str(tmp_path), "--sort", "object_rmse_mm"]) == 2
+    assert "leave out --sort" in capsys.readouterr().err and len(ranked) == 1
 
 
 def test_pages_of_rows_that_left_are_removed_and_nothing_else_is(files, tmp_path):
@@ -187,7 +197,7 @@ def test_escaping_holds_without_the_checks_before_it():
 
 def test_a_slug_is_a_file_name_of_its_own(files):
     entry = read_entries(files[:1])[0]
-    earlier = replace(entry, result=entry.result.model_copy(update={"created": "2020-01-01T00:00:00+00:00"}))
+    earlier = replace(entry, row=entry.row.model_copy(update={"created": "2020-01-01T00:00:00+00:00"}))
     assert re.fullmatch(r"fast-and-rough-[0-9a-f]{12}", slug(entry)) and slug(entry) != slug(earlier)
 
 

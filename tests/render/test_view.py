@@ -16,9 +16,9 @@ from fpp_ml_bench.loaders.render.raycast import TracedObject
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.sensor import camera_noise
 from fpp_ml_bench.loaders.render.view import Studio, ground_truth_error
-from fpp_ml_bench.loaders.sample import Flag
+from fpp_ml_bench.loaders.sample import WEAK_GREY, Flag
 from fpp_ml_bench.machine import NUMBA_SWITCH as SWITCH
-from fpp_ml_bench.optics import Sequence
+from fpp_ml_bench.optics import Sequence, crossed_rig
 from fpp_ml_bench.skipping import skipping
 
 BALL = solid(trimesh.creation.icosphere(3, 0.12))
@@ -271,6 +271,26 @@ def test_saturation_is_flagged_where_white_is_at_the_end_of_the_range():
     assert (white[saturated] == 255).all() and (white[seen & ~saturated] <= 255).all()
     assert (white[seen & ~saturated] == 255).sum() < 0.05 * saturated.sum()  # 254.5 is rounded to 255
     assert not flagged(studio().photograph(BALL, "A0"), Flag.SATURATED).any()
+
+
+def test_weak_light_is_flagged_by_half_of_what_white_adds_to_black():
+    """Without noise: the rim of the ball, which is turned away, and most of it under a tenth of the light."""
+    dim = DIRECT.changed("camera", full_well_e=None, read_noise_e=0.0)
+    for light, least, most in ((dim, 0.001, 0.1), (dim.changed("camera", exposure=0.1), 0.2, 0.99)):
+        row = studio(light).photograph(BALL, "A0")
+        weak, unlit = flagged(row, Flag.WEAK), flagged(row, Flag.UNLIT)
+        seen = (row.depth_exact_mm > 0) & ~flagged(row, Flag.MIXED) & ~unlit
+        white, black = (row.frames[i].astype(float) for i in (RIG.sequence.white, RIG.sequence.black))
+        fringes = (white - black) / 2
+        assert least <= weak[seen].mean() <= most and not weak[row.depth_exact_mm == 0].any()
+        assert (fringes[weak & seen] <= WEAK_GREY + 0.5).all() and (fringes[seen & ~weak] >= WEAK_GREY - 0.5).all()
+
+
+def test_the_flags_are_the_same_whatever_is_projected():
+    crossed = RIG.with_crossed(crossed_rig().crossed)
+    rows = [studio(PAPER, rig=rig).photograph(GROOVE, "A60") for rig in (RIG, crossed)]
+    np.testing.assert_array_equal(rows[0].flags, rows[1].flags)
+    np.testing.assert_array_equal(rows[0].depth_exact_mm, rows[1].depth_exact_mm)
 
 
 def test_mixed_pixels_are_the_outline_of_a_ball():

@@ -18,13 +18,12 @@ from fpp_ml_bench.cli.evaluate import main as fpp_eval
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.report.figures import (
     CLIP_PERCENTILE,
-    TILE_PX,
     bins,
     nice_step,
     palette_png,
     sample_panels,
 )
-from fpp_ml_bench.evaluation.report.report_page import chosen_samples, write_report, write_sheet
+from fpp_ml_bench.evaluation.report.report_page import chosen_samples, write_report
 from fpp_ml_bench.evaluation.score import evaluate
 
 
@@ -167,7 +166,7 @@ def test_only_shown_samples_are_read(dataset, scored, tmp_path):
 def test_what_was_not_scored_is_not_reported(dataset, scored, tmp_path):
     folder, result = scored
     other_dataset = make_dataset(tmp_path / "other", size=(40, 40))
-    with pytest.raises(DatasetError, match="which was scored"):
+    with pytest.raises(DatasetError, match="is not what was scored"):
         write_report(result, other_dataset, folder, tmp_path / "out")
     copy = write_predictions(tmp_path / "changed", dataset, "all", offset_mm=3.0)
     with pytest.raises(PredictionError, match="is not the file that was scored"):
@@ -176,14 +175,6 @@ def test_what_was_not_scored_is_not_reported(dataset, scored, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(SubmissionError, match="can't be written"):
         write_report(result, dataset, folder, tmp_path / "file")
-
-
-def test_sheet_is_one_png_of_three_samples(dataset, scored, tmp_path):
-    write_sheet(scored[1], dataset, scored[0], tmp_path / "sheet.png")
-    image = decoded((tmp_path / "sheet.png").read_bytes())
-    assert image.shape == (3 * TILE_PX + 16, 5 * TILE_PX + 32, 4)
-    truth = image[:TILE_PX, TILE_PX + 8 : 2 * TILE_PX + 8]
-    assert 0.01 < (truth[..., 3] > 0).mean() < 0.5
 
 
 def test_command_and_browser(dataset, tmp_path):

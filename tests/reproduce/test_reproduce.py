@@ -22,7 +22,7 @@ from fpp_ml_bench.baselines.training import claim_folder, depth_training, load_r
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli.evaluate import main as fpp_eval
 from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError
-from fpp_ml_bench.evaluation.result import write_json
+from fpp_ml_bench.evaluation.result import read_result, write_json
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.leaderboard.rows import picture_of, read_entry
@@ -94,7 +94,7 @@ class Trainer:
         with torch.no_grad():
             network.head.weight.mul_(0.01)
             network.head.bias.fill_({"raw": 1500.0, "global": 1.5, "individual": 0.4}[recipe.normalisation])
-        save_weights(out / depth_training.WEIGHTS, network, model_config(recipe, network, opened.fingerprint, 3, {}))
+        save_weights(out / depth_training.WEIGHTS, network, model_config(recipe, network, opened, 3, {}))
         (out / depth_training.DONE).write_text(json.dumps({"epochs": 5, "best_epoch": 3, "seconds": 61.4}))
         return depth_training.finished_run(out)
 
@@ -124,15 +124,15 @@ def test_from_trainings_to_a_table(run, trainer, tmp_path, tiny, capsys):
     assert trainer.trained == [name.removeprefix("cpu-") for name in NAMES]
     assert sorted(path.stem for path in (below / "rows").glob("*.json")) == sorted((*NAMES, *TWINS))
     entries = {path.stem: read_entry(path) for path in (below / "rows").glob("*.json")}
-    assert {entry.provenance for entry in entries.values()} == {"measured here"}
-    tracks = {name: (entry.result.track, entry.result.mode, entry.result.target) for name, entry in entries.items()}
+    assert all(entry.is_row_file for entry in entries.values())
+    tracks = {name: (entry.row.track, entry.row.mode, entry.row.target) for name, entry in entries.items()}
     assert tracks[NAMES[2]] == ("oracle range", "paper", "depth")
     assert {tracks[name] for name in (*NAMES[:2], *TWINS)} == {("metric", "standard", "depth")}
     assert all(entry.name.endswith("(cpu preset)") for entry in entries.values())
     assert [len(group.rows) for group in rank(entries.values())] == [4, 1]
     for name, entry in entries.items():
         assert len(picture_of(entry)) < 100_000
-        assert entry.result.timing.parameters == sum(p.numel() for p in build("unet", width=1).parameters())
+        assert entry.row.timing.parameters == sum(p.numel() for p in build("unet", width=1).parameters())
         for folder in ("results", "rows"):
             files = str(below / folder / f"{name}.json"), str(below / "predictions" / name)
             assert fpp_eval(["verify", *files, "--dataset", str(tiny)]) == 0
@@ -140,9 +140,9 @@ def test_from_trainings_to_a_table(run, trainer, tmp_path, tiny, capsys):
     lines = {
         line.split(" | ")[0].strip("| "): line for line in text.split("## ")[0].splitlines() if line.startswith("| ")
     }
-    mae = entries[NAMES[2]].result.metrics.object_mae_mm
+    mae = entries[NAMES[2]].row.metrics.object_mae_mm
     assert f"| oracle range | {mae:.2f} / " in lines["individual"] and "| 16.20 / 21.19 |" in lines["individual"]
-    assert f" {entries[TWINS[0]].result.metrics.object_mae_mm:.2f} / " in lines["individual"]
+    assert f" {entries[TWINS[0]].row.metrics.object_mae_mm:.2f} / " in lines["individual"]
     assert "| 5 | 61 |" in lines["raw (mm)"]
     assert "3 among the rows measured here" in text and "of different tracks" in text
     assert "paper: reported by the paper" in capsys.readouterr().out
@@ -170,7 +170,7 @@ def test_only_missing_keeps_what_holds(run, trainer, tmp_path, capsys):
 def test_rows_of_other_weights_are_made_again_and_not_shown(run, trainer, tmp_path):
     assert run(TABLE) == 0
     below = tmp_path / "runs" / "cpu"
-    weights_before = read_entry(below / "rows" / f"{TWINS[0]}.json").result.submission.settings["weights_sha256"]
+    weights_before = read_entry(below / "rows" / f"{TWINS[0]}.json").row.submission.settings["weights_sha256"]
     training = below / "unet-individual-rmse"
     for path in training.iterdir():
         path.unlink()
@@ -180,7 +180,7 @@ def test_rows_of_other_weights_are_made_again_and_not_shown(run, trainer, tmp_pa
     assert "Not measured here: individual. To fill" in (below / f"{TABLE}.md").read_text()
     trainer.says.clear()
     assert run(TABLE, "--only-missing") == 0
-    weights_after = read_entry(below / "rows" / f"{TWINS[0]}.json").result.submission.settings["weights_sha256"]
+    weights_after = read_entry(below / "rows" / f"{TWINS[0]}.json").row.submission.settings["weights_sha256"]
     assert weights_before != weights_after and len(trainer.trained) == 4
 
 
@@ -195,7 +195,7 @@ def test_rows_of_another_machine_are_shown_if_of_the_same_recipe(run, trainer, t
     assert run(f"{TABLE}/raw") == 0 and len(trainer.trained) == 3
     assert len(made_here) == 3 and lines() == made_here
     row = below / "rows" / f"{NAMES[2]}.json"
-    digest = read_entry(row).result.submission.settings["recipe_digest"]
+    digest = read_entry(row).row.submission.settings["recipe_digest"]
     row.write_text(row.read_text().replace(digest, 64 * "0"))
     assert run(f"{TABLE}/raw") == 0
     assert "Not measured here: individual. To fill" in (below / f"{TABLE}.md").read_text()
@@ -262,11 +262,12 @@ def test_every_frame_is_scored_for_the_multi_frame_table(run, trainer, tmp_path,
     below = tmp_path / "runs" / "cpu"
     scores = read_all_frames(below / "all-frames" / "cpu-unet-individual-rmse-vertical-all-frames.json")
     assert scores.frames == list(range(18, 36)) and scores.pairs == 18 * len(opened.samples("test"))
-    row = read_entry(below / "rows" / "cpu-unet-individual-rmse-vertical.json").result
-    assert row.submission.frames_used == [18]
+    result = read_result(below / "results" / "cpu-unet-individual-rmse-vertical.json")
+    row = read_entry(below / "rows" / "cpu-unet-individual-rmse-vertical.json").row
+    assert result.submission.frames_used == row.submission.frames_used == [18]
     first = next(part.metrics for part in scores.per_frame if part.frame == 18)
     for key in ("object_mae_mm", "overall_rmse_mm", "background_mae_mm"):
-        assert getattr(first, key) == pytest.approx(getattr(row.metrics, key), rel=1e-9)
+        assert getattr(first, key) == pytest.approx(getattr(result.metrics, key), rel=1e-9)
         per_frame = [getattr(part.metrics, key) for part in scores.per_frame]
         assert getattr(scores.metrics, key) == pytest.approx(np.mean(per_frame), rel=1e-9)
     table = (below / "multi_frame.md").read_text().split("## ")[0]
@@ -343,11 +344,12 @@ def test_rows_of_another_dataset_are_not_overwritten(run, tmp_path, tiny, capsys
     rows = tmp_path / "runs" / "cpu" / "rows"
     path = rows / f"{NAMES[0]}.json"
     content = json.loads(path.read_text())
-    content["result"]["dataset"]["fingerprint"] = 64 * "b"
+    others = dict.fromkeys(content["dataset"]["content"], 32 * "b")
+    content["dataset"]["content"] = others
     path.write_text(json.dumps(content))
     assert run(TABLE) == 2
-    assert "is a row on dataset bbbbbbbb" in capsys.readouterr().err
-    assert json.loads(path.read_text())["result"]["dataset"]["fingerprint"] == 64 * "b"
+    assert "is a row on other data (no named benchmark" in capsys.readouterr().err
+    assert json.loads(path.read_text())["dataset"]["content"] == others
 
 
 def test_names_are_unique_in_every_group(run, trainer, tmp_path):
@@ -356,6 +358,6 @@ def test_names_are_unique_in_every_group(run, trainer, tmp_path):
     assert [path.stem for path in paths] == [
         f"cpu-unet-{kind}-rmse-bgremoved" for kind in ("global", "individual", "raw")
     ]
-    tracks = {entry.result.track for entry in read_entries(paths)}
+    tracks = {entry.row.track for entry in read_entries(paths)}
     assert tracks == {"oracle mask", "oracle range + mask"}
     assert "no twins there" in (tmp_path / "runs" / "cpu" / "background_removed.md").read_text()

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from statistics import fmean
 from types import SimpleNamespace
 
 import pytest
@@ -25,6 +26,7 @@ from fpp_ml_bench.leaderboard.reproduced import (
     table_lines,
     table_markdown,
 )
+from fpp_ml_bench.leaderboard.row_file import row_of
 from fpp_ml_bench.leaderboard.rows import Entry
 
 
@@ -126,11 +128,14 @@ def test_one_runs_folder_is_of_one_dataset(tmp_path, dataset):
 def line(label: str, paper_mae: float | None, errors: dict[str, float], entry: Entry | None = None) -> Line:
     """A line with these object errors, sample ``object_view`` to mm."""
     paper = None if paper_mae is None else {**paper_tables()["loss"].rows[0].errors_mm, "object_mae_mm": paper_mae}
-    samples = [
-        SimpleNamespace(sample=sample, object=sample.rpartition("_")[0], object_mae_mm=error)
-        for sample, error in errors.items()
+    of_objects: dict[str, list[float]] = {}
+    for sample, error in errors.items():
+        of_objects.setdefault(sample.rpartition("_")[0], []).append(error)
+    parts = [
+        SimpleNamespace(object=name, object_mae_mm=fmean(views), views={"object_mae_mm": len(views)}.__getitem__)
+        for name, views in of_objects.items()
     ]
-    return Line(label, label, load_recipe("loss/rmse"), SimpleNamespace(per_sample=samples), entry, paper)
+    return Line(label, label, load_recipe("loss/rmse"), SimpleNamespace(per_object=parts), entry, paper)
 
 
 def views(base: float, spread: float = 0.1) -> dict[str, float]:
@@ -185,17 +190,17 @@ def two_results(tmp_path, dataset):
 
 def test_the_difference_is_that_of_compare(tmp_path, dataset):
     results = two_results(tmp_path, dataset)
-    entries = [Entry(tmp_path / "x.json", result) for result in results]
+    entries = [Entry(tmp_path / "x.json", row_of(result, tmp_path)) for result in results]
     lines = [
-        replace(line(str(n), float(n), {"a_A0": 1.0}, entry), scores=entry.result) for n, entry in enumerate(entries, 1)
+        replace(line(str(n), float(n), {"a_A0": 1.0}, entry), scores=entry.row) for n, entry in enumerate(entries, 1)
     ]
     ordering, difference = orderings(lines)[0], compare(*results).differences["object_mae_mm"]
-    assert (ordering.gap_mm, list(ordering.interval_mm)) == (difference.mean_mm, difference.interval_mm)
+    expected = [difference.mean_mm, *difference.interval_mm]
+    assert [ordering.gap_mm, *ordering.interval_mm] == pytest.approx(expected, rel=1e-3)
     assert ordering.same_track
-    oracle = results[1].model_copy(
-        update={"submission": results[1].submission.model_copy(update={"uses_ground_truth_range": True})}
-    )
-    lines[1] = replace(lines[1], entry=Entry(tmp_path / "x.json", oracle))
+    oracle = entries[1].row.submission.model_copy(update={"uses_ground_truth_range": True})
+    row = entries[1].row.model_copy(update={"submission": oracle})
+    lines[1] = replace(lines[1], entry=Entry(tmp_path / "x.json", row))
     assert not orderings(lines)[0].same_track
     text = table_markdown("loss", lines, "cpu", "fpp-bench reproduce loss", {})
     assert "of different tracks" in text
@@ -204,8 +209,8 @@ def test_the_difference_is_that_of_compare(tmp_path, dataset):
 def test_a_table_that_the_paper_does_not_have_is_compared_with_its_first_line(tmp_path, dataset):
     results = two_results(tmp_path, dataset)
     lines = [
-        replace(line(name, None, {}, Entry(tmp_path / "x.json", result)), scores=result)
-        for name, result in zip(("the image alone", "guided"), results, strict=True)
+        replace(line(name, None, {}, Entry(tmp_path / "x.json", row)), scores=row)
+        for name, row in zip(("the image alone", "guided"), (row_of(r, tmp_path) for r in results), strict=True)
     ]
     difference = compare(*results).differences["object_mae_mm"]
     low, high = difference.interval_mm

@@ -1,17 +1,24 @@
 """The benchmark's name and version in results: written, read, refused where they contradict the data, compared."""
 
 import json
+import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from scored_dataset import make_dataset, write_predictions
+from conftest import tiny_settings
+from scored_dataset import make_dataset, name_benchmarks, write_predictions
 
 from fpp_ml_bench.cli.evaluate import main
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.result import read_result, result_json, write_result
-from fpp_ml_bench.evaluation.score import evaluate
-from fpp_ml_bench.loaders.storage import Benchmark
+from fpp_ml_bench.evaluation.result import model, read_result, result_from_rows, result_json, write_result
+from fpp_ml_bench.evaluation.score import ErrorStats, combine, evaluate
+from fpp_ml_bench.loaders.render import build
+from fpp_ml_bench.loaders.sample import column_hash, image_hash
+from fpp_ml_bench.loaders.storage import Benchmark, DatasetFolder
 from fpp_ml_bench.loaders.storage import benchmark as benchmarks
+
+OTHER = {"test/depth": "e" * 32, "test/flags": "e" * 32}
 
 
 @pytest.fixture(scope="module")
@@ -20,13 +27,11 @@ def dataset(tmp_path_factory):
 
 
 @pytest.fixture
-def named(dataset, monkeypatch):
-    """The dataset as ``tiny-bench`` version 4, beside a benchmark of other bytes."""
-    listed = (
-        Benchmark("tiny-bench", 4, "mini", 32, dataset.fingerprint),
-        Benchmark("other-bench", 1, "full", 64, "f" * 64),
-    )
-    monkeypatch.setattr(benchmarks, "BENCHMARKS", listed)
+def named(dataset, tmp_path, monkeypatch):
+    """The dataset as ``tiny-bench`` version 4, beside a benchmark of other content."""
+    other = make_dataset(tmp_path / "other", size=(40, 32))
+    known = (Benchmark("tiny-bench", 4, "mini", 32), dataset), (Benchmark("other-bench", 1, "full", 64), other)
+    name_benchmarks(monkeypatch, tmp_path / "facts", *known)
     return dataset
 
 
@@ -56,7 +61,8 @@ def test_a_result_on_a_benchmark_says_its_name_and_version(named, tmp_path, caps
     command = [str(tmp_path / "predictions"), "--dataset", str(named.path), "--report", str(tmp_path / "report")]
     assert main(command) == 0
     printed = capsys.readouterr()
-    assert f"(tiny-bench version 4, fingerprint {named.fingerprint[:8]})" in printed.out and printed.err == ""
+    truth = read_result(path).dataset.truth
+    assert f"(tiny-bench version 4, content {truth[:8]})" in printed.out and printed.err == ""
     assert "tiny-bench version 4" in (tmp_path / "report" / "index.html").read_text()
     assert main(["verify", str(path), str(tmp_path / "predictions"), "--dataset", str(named.path)]) == 0
 
@@ -66,11 +72,12 @@ def test_a_result_on_any_other_dataset_has_no_such_key(dataset, tmp_path, capsys
     assert "benchmark" not in json.loads(path.read_text())["dataset"]
     assert main([str(tmp_path / "predictions"), "--dataset", str(dataset.path)]) == 0
     printed = capsys.readouterr()
-    assert f"(no named benchmark, fingerprint {dataset.fingerprint[:8]})" in printed.out and printed.err == ""
+    truth = read_result(path).dataset.truth
+    assert f"(no named benchmark, content {truth[:8]})" in printed.out and printed.err == ""
 
 
 def test_settings_of_a_benchmark_with_other_bytes_are_warned_of(dataset, tmp_path, monkeypatch, capsys):
-    intended = Benchmark("tiny-bench", 4, "mini", 32, "f" * 64)
+    intended = Benchmark("tiny-bench", 4, "mini", 32)
     monkeypatch.setattr(benchmarks, "intended_benchmark", lambda manifest: intended)
     folder = write_predictions(tmp_path / "predictions", dataset)
     assert main([str(folder), "--dataset", str(dataset.path), "--json", str(tmp_path / "r.json")]) == 0
@@ -79,66 +86,114 @@ def test_settings_of_a_benchmark_with_other_bytes_are_warned_of(dataset, tmp_pat
     assert "warning" not in printed.out and read_result(tmp_path / "r.json").dataset.benchmark is None
 
 
-def test_a_file_of_schema_2_0_0_is_read_and_stays_as_it_is(named, tmp_path):
-    path = result_file(named, tmp_path)
-    change_dataset(path, benchmark=None)
-    old = path.read_bytes().replace(b'"schema_version": "2.4.0"', b'"schema_version": "2.0.0"')
-    assert old != path.read_bytes()
-    path.write_bytes(old)
-    result = read_result(path)
-    assert result.schema_version == "2.0.0" and result.dataset.benchmark is None
-    assert json.loads(result_json(result)) == json.loads(old)
-    assert result.dataset.identity.startswith("tiny-bench version 4")  # the fingerprint is enough
-    assert main(["verify", str(path), str(tmp_path / "predictions"), "--dataset", str(named.path)]) == 0
-    new = result_file(named, tmp_path / "new")
-    assert main(["compare", str(path), str(new)]) == 0
-
-
 @pytest.mark.parametrize(
     "changes, message",
     [
         ({"benchmark": {"name": "other-bench", "version": 1}},
-         "benchmark says other-bench version 1, but fingerprint .* is tiny-bench version 4; other-bench .* has fff"),
-        ({"benchmark": {"name": "tiny-bench", "version": 3}}, "but fingerprint .* is tiny-bench version 4"),
-        ({"fingerprint": "e" * 64}, "but fingerprint eeeeeeeeeeeeeeee is not that benchmark; tiny-bench version 4 has"),
+         "benchmark says other-bench version 1, but content is that of tiny-bench version 4"),
+        ({"benchmark": {"name": "tiny-bench", "version": 3}}, "but content is that of tiny-bench version 4"),
+        ({"content": OTHER}, "tiny-bench version 4, but content is not that benchmark's"),
+        ({"content": OTHER, "benchmark": {"name": "nobody-knows", "version": 1}}, "content is not that benchmark's"),
+        ({"content": {}}, "content: .*at least 1"),
+        ({"content": {"test/depth": "e" * 32}, "benchmark": None}, None),
+        ({"content": {**OTHER, "../x": "e" * 32}}, "content"),
+        ({"content": {**OTHER, "test/frame_00": "e" * 32}, "benchmark": None}, "expected hashes of test/depth"),
+        ({"content": {"train/depth": "e" * 32}, "benchmark": None}, "expected hashes of"),
         ({"benchmark": {"name": "tiny-bench", "version": "4"}}, "benchmark.version: .*integer"),
         ({"benchmark": {"name": "tiny-bench"}}, "benchmark.version: is missing"),
         ({"benchmark": {"name": "x\x1b[2J", "version": 4}}, r"U\+001B"),
         ({"benchmark": {"name": "tiny-bench", "version": 4, "size": 32}}, "size: is not a key"),
     ],
 )  # fmt: skip
-def test_a_claim_that_contradicts_the_fingerprint_is_refused(changes, message, named, tmp_path):
+def test_a_claim_that_contradicts_the_content_is_refused(changes, message, named, tmp_path):
     path = result_file(named, tmp_path)
     change_dataset(path, **changes)
+    if message is None:
+        assert read_result(path).dataset.benchmark is None
+        return
     with pytest.raises(SubmissionError, match=message):
         read_result(path)
 
 
-def test_a_benchmark_that_this_package_does_not_know_is_taken_as_it_is(named, tmp_path):
-    path = result_file(named, tmp_path)
-    change_dataset(path, fingerprint="e" * 64, benchmark={"name": "tiny-bench", "version": 5})
-    assert read_result(path).dataset.identity == "tiny-bench version 5, fingerprint eeeeeeee"
-
-
-def test_compare_and_verify_name_both_versions(named, tmp_path, capsys):
-    path, newer = result_file(named, tmp_path), result_file(named, tmp_path / "newer")
-    change_dataset(newer, fingerprint="e" * 64, benchmark={"name": "tiny-bench", "version": 5})
-    assert main(["compare", str(path), str(newer)]) == 2
-    expected = f"tiny-bench version 4, fingerprint {named.fingerprint[:8]}"
-    assert f"dataset: {expected} against tiny-bench version 5, fingerprint eeeeeeee" in capsys.readouterr().err
-    assert main(["verify", str(newer), str(tmp_path / "predictions"), "--dataset", str(named.path)]) == 1
+def test_compare_and_verify_name_both(named, dataset, tmp_path, capsys, monkeypatch):
+    path, other = result_file(named, tmp_path), result_file(named, tmp_path / "else")
+    change_dataset(other, content=OTHER, benchmark=None)
+    assert main(["compare", str(path), str(other)]) == 2
+    first, second = (read_result(file).dataset.identity for file in (path, other))
+    assert f"dataset: {first} against {second}" in capsys.readouterr().err and first.startswith("tiny-bench version 4")
+    assert main(["verify", str(other), str(tmp_path / "predictions"), "--dataset", str(named.path)]) == 1
     printed = capsys.readouterr().out
-    assert "tiny-bench version 5, fingerprint eeeeeeee in the result" in printed and f"{expected} is what" in printed
+    assert "dataset.content.test/depth: " + "e" * 32 in printed and named.content["test/depth"] in printed
 
 
-def test_two_versions_of_one_fingerprint_are_not_compared(named, tmp_path, capsys):
-    """Neither is known to this package, so each file is read; only one of them can be true."""
-    files = []
-    for version in (5, 6):
-        files.append(result_file(named, tmp_path / str(version)))
-        change_dataset(files[-1], fingerprint="e" * 64, benchmark={"name": "tiny-bench", "version": version})
-    assert main(["compare", *map(str, files)]) == 2
-    assert "tiny-bench version 5, fingerprint eeeeeeee against tiny-bench version 6" in capsys.readouterr().err
+def test_other_counts_of_a_named_benchmark_are_refused(named, tmp_path, monkeypatch):
+    """Pixels moved from the object to void, an object left out, one counted twice, an invented one: all averages are
+    made again, so the file agrees with itself."""
+    path = result_file(named, tmp_path)
+    scored = read_result(path)
+    rows = [row.model_dump() for row in scored.per_sample]
+    derived = {"per_sample", "metrics", "intervals", "median", "pooled", "per_object", "bootstrap", "seeds"}
+    kept = set(type(scored).model_fields) - derived - {"schema_version"} - {"samples_without_object"}
+    fields = {key: getattr(scored, key) for key in kept - {"samples_without_background"}}
+
+    def refused(changed, message):
+        with monkeypatch.context() as forging:
+            forging.setattr(model, "known_problem", lambda *claimed: None)
+            data = scored.dataset.model_copy(update={"samples": len(changed)})
+            write_result(result_from_rows(changed, **{**fields, "dataset": data}), path)
+        with pytest.raises(SubmissionError, match=message) as refusal:
+            read_result(path)
+        assert str(path) in str(refusal.value)
+
+    def with_void(row):
+        inside = ErrorStats(row["object_pixels"] - 9, row["object_mae_mm"], row["object_rmse_mm"])
+        behind = ErrorStats(row["background_pixels"], row["background_mae_mm"], row["background_rmse_mm"])
+        whole = combine(inside, behind)
+        changed = {"object_pixels": inside.pixels, "void_pixels": 9, "void_share": 9 / 1280}
+        return row | changed | {"overall_mae_mm": whole.mae_mm, "overall_rmse_mm": whole.rmse_mm}
+
+    refused(list(map(with_void, rows)), "object pixels of 'power_drill', this file says")
+    refused(rows[:2], "has the object 'wooden_boards'")
+    refused([row | {"object": "power_drill"} for row in rows], "has the object 'wooden_boards'")
+    refused([row | {"object": f"ball{number}"} for number, row in enumerate(rows)], "has no object 'ball0'")
+
+
+def test_a_dataset_that_was_changed_is_not_scored(named, tmp_path, capsys):
+    """Its depth overwritten by the predictions: an error of 0 under the benchmark's name, if it were believed."""
+    copy = shutil.copytree(named.path, tmp_path / "copy")
+    predictions = write_predictions(tmp_path / "p", named, offset_mm=100.0)
+    opened = DatasetFolder(copy)
+    shard = next(shard for shard in opened.manifest.shards if shard.split == "test")
+    bytes_before = (copy / shard.path).read_bytes()
+    sample = opened.samples("test")[0]
+    depth = opened.depth_mm(sample).tobytes()
+    changed = bytes_before.replace(depth, np.load(predictions / f"{sample}.npy").tobytes())
+    assert changed != bytes_before and len(changed) == len(bytes_before)
+    (copy / shard.path).write_bytes(changed)
+    command = [str(predictions), "--dataset", str(copy), "--json", str(tmp_path / "r.json")]
+    assert main(command) == 2
+    error = capsys.readouterr().err
+    assert str(copy) in error and "depth of split test is not what manifest.json says" in error
+    # A manifest that was made to fit: a dataset of its own, without the benchmark's name.
+    hashes = {name: image_hash(DatasetFolder(copy).depth_mm(name)) for name in opened.samples("test")}
+    content = {**opened.content, "test/depth": column_hash(hashes)}
+    replace(opened.manifest, content=content).write(copy)
+    assert main(command) == 0
+    assert read_result(tmp_path / "r.json").dataset.benchmark is None
+
+
+def test_a_build_that_lacks_columns_is_still_the_benchmark(tmp_path, monkeypatch):
+    settings = tiny_settings(objects=("power_drill",))
+    whole, part = tmp_path / "all", tmp_path / "part"
+    build(whole, replace(settings, stored="all"), workers=1)
+    build(part, replace(settings, stored="single_shot"), workers=1)
+    name_benchmarks(monkeypatch, tmp_path / "facts", (Benchmark("tiny-bench", 1, "test", 96), DatasetFolder(whole)))
+    results = []
+    for number, folder in enumerate((whole, part)):
+        opened = DatasetFolder(folder)
+        results.append(evaluate(write_predictions(tmp_path / str(number), opened, offset_mm=1.0), opened))
+    assert results[0].dataset.benchmark == results[1].dataset.benchmark and results[1].dataset.benchmark is not None
+    assert results[0].dataset.truth == results[1].dataset.truth and results[0].metrics == results[1].metrics
 
 
 def test_the_schema_describes_the_key(named, tmp_path, capsys):
@@ -146,11 +201,11 @@ def test_the_schema_describes_the_key(named, tmp_path, capsys):
 
     assert main(["schema"]) == 0
     schema = json.loads(capsys.readouterr().out)
-    assert "2.4.0" in schema["title"] and set(schema["$defs"]["BenchmarkInfo"]["required"]) == {"name", "version"}
+    assert "3.0.0" in schema["title"] and set(schema["$defs"]["BenchmarkInfo"]["required"]) == {"name", "version"}
     content = json.loads(result_file(named, tmp_path).read_text())
     jsonschema.validate(content, schema)
     del content["dataset"]["benchmark"]
-    jsonschema.validate({**content, "schema_version": "2.0.0"}, schema)
+    jsonschema.validate(content, schema)
     with pytest.raises(jsonschema.ValidationError):
         content["dataset"]["benchmark"] = "tiny-bench"
         jsonschema.validate(content, schema)
@@ -159,6 +214,6 @@ def test_the_schema_describes_the_key(named, tmp_path, capsys):
 def test_the_scores_do_not_depend_on_the_name(dataset, tmp_path, monkeypatch):
     folder = write_predictions(tmp_path / "predictions", dataset, noise_mm=2.0)
     unnamed = evaluate(folder, dataset)
-    monkeypatch.setattr(benchmarks, "BENCHMARKS", (Benchmark("tiny-bench", 4, "mini", 32, dataset.fingerprint),))
+    name_benchmarks(monkeypatch, tmp_path / "facts", (Benchmark("tiny-bench", 4, "mini", 32), dataset))
     assert evaluate(folder, dataset).metrics == unnamed.metrics
     assert np.isfinite(unnamed.metrics.object_mae_mm)

@@ -15,6 +15,7 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE, METRICS, RANGE_SHARE, SINCE_2
 from fpp_ml_bench.evaluation.result import read_result, write_result
 from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.loaders.sample import column_hash
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
 
@@ -53,8 +54,10 @@ def test_scores_equal_an_independent_computation(dataset, predictions, tmp_path)
 def test_result_says_what_was_scored_on_what(dataset, predictions, tmp_path):
     result = scored(predictions, dataset, tmp_path)
     assert result["dataset"] == {
-        "name": "tiny", "fingerprint": dataset.fingerprint, "split": "test", "size": [32, 40], "samples": 4,
+        "name": "tiny", "split": "test", "size": [32, 40], "samples": 4, "code": "phase shift",
+        "content": {name: dataset.content[name] for name in ("test/depth", "test/flags")},
     }  # fmt: skip
+    assert result["frames_class"] == "one frame"
     assert result["submission"] == {**DESCRIPTION, "timing": None, "png_mm_per_level": None, "seeds": {}}
     assert result["target"] == "depth"
     assert result["edge_band_px"] == 3 and result["edge_jump_mm"] == 240.0
@@ -112,6 +115,9 @@ class Emptied(DatasetFolder):
     def depth_mm(self, sample, column="depth"):
         return super().depth_mm(sample, column) * np.float32(sample != "power_drill_A60")
 
+    def content_hash(self, split, column, hashes):
+        return f"{split}/{column}", column_hash(hashes)  # the images are not those of its files
+
 
 def test_sample_without_object_has_no_object_score(dataset, tmp_path):
     data = Emptied(dataset.path)
@@ -163,7 +169,7 @@ def edit(path):
 
 
 EDITS = {
-    "other schema": (["schema_version"], "1.0.0", "expected .* 2.3.0 or 2.4.0, got schema_version 1.0.0"),
+    "other schema": (["schema_version"], "1.0.0", "expected .* 3.0.0, got schema_version 1.0.0"),
     "no schema": (["schema_version"], ..., "no schema_version"),
     "unknown key": (["rank"], 1, "rank: is not a key"),
     "missing key": (["target"], ..., "target: is missing"),

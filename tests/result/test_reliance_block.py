@@ -5,14 +5,13 @@ import re
 from pathlib import Path
 
 import pytest
-from board_rows import write_result_file
+from board_rows import reliance, write_result_file
 from scored_dataset import make_dataset
 
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result import (
     PART_TITLES,
-    RELIANCE_VERSION,
     Reliance,
     RelianceParts,
     json_schema,
@@ -30,12 +29,7 @@ SHA = "a" * 64
 
 
 def block(**changes):
-    parts = dict.fromkeys(RelianceParts.model_fields) | {"follows_phase": 0.75, "change_outline": 2.5}
-    return {
-        "version": RELIANCE_VERSION, "score": 0.625, "interval": [0.5, 0.75], "order_free_score": 0.875, "parts": parts,
-        "units": "mm", "direction": "horizontal", "samples": 4, "objects": 2, "dataset_fingerprint": "b" * 64,
-        "protocol_version": "1.1.0", "weights_sha256": SHA, **changes,
-    }  # fmt: skip
+    return {**reliance().model_dump(), "weights_sha256": SHA, **changes}
 
 
 @pytest.fixture(scope="module")
@@ -58,15 +52,17 @@ def test_a_result_without_it_stays_as_it_was(file):
 def test_it_is_written_read_back_and_replaced(row, file, tmp_path, capsys):
     if row:
         made = tmp_path / "made.json"
-        assert main(["leaderboard", str(file), "--row", str(made), "--provenance", "verified"]) == 0
+        assert main(["leaderboard", str(file), "--row", str(made)]) == 0
         file = made
     entry = read_entry(file)
     write_reliance(entry, Reliance(**block(score=0.1)))
     write_reliance(read_entry(file), Reliance(**block()))
     again = read_entry(file)
-    assert again.provenance == entry.provenance
-    assert again.result.reliance == Reliance(**block())
-    assert again.result.model_copy(update={"reliance": None}) == entry.result
+    assert again.is_row_file == row and again.row.reliance == Reliance(**block())
+    changed = {"reliance": None, "result_sha256": entry.row.result_sha256}
+    assert again.row.model_copy(update=changed) == entry.row
+    if not row:
+        assert read_result(file).reliance == Reliance(**block())
     before = file.read_bytes()
     write_reliance(again, Reliance(**block()))
     assert file.read_bytes() == before
@@ -117,7 +113,8 @@ def test_it_stands_on_the_leaderboard_beside_error_and_time(file, tmp_path, data
     details = [text.decode() for name, text in pages.items() if name.startswith("submissions/")]
     assert sum("What it reads" in text for text in details) == 1
     rows = json.loads(pages["data.json"])["groups"][0]["rows"]
-    assert [row["phase_reliance"] and row["phase_reliance"]["score"] for row in rows] == [0.625, None]
+    assert [row["phase_reliance"] for row in rows] == [0.625, None]
+    assert [part.get("reliance", {}).get("score") for row in rows for part in row["parts"]] == [0.625, None]
 
 
 class Method:
@@ -149,9 +146,9 @@ def test_the_command_measures_and_writes(tiny, tmp_path, capsys, dataset):
     row = write_result_file(tmp_path / "r.json", dataset, 1.0, method="classical", frames_used=used, settings=settings)
     options = ["--steps", "3", "--direction", "horizontal", "--views", "1"]
     assert main(["reliance", "classical", str(tiny), *options, "--into", str(row), "--json", str(tmp_path / "b")]) == 0
-    reliance = read_result(row).reliance
-    assert reliance is not None and reliance.score > 0.9 and reliance.interval == [None, None]  # one test object
-    assert Reliance(**json.loads((tmp_path / "b").read_text())) == reliance
+    written = read_result(row).reliance
+    assert written is not None and written.score > 0.9 and written.interval == [None, None]  # one test object
+    assert Reliance(**json.loads((tmp_path / "b").read_text())) == written
     assert "phase reliance, 0 to 1" in capsys.readouterr().out
     assert main(["reliance", "classical", str(tiny), "--steps", "6", "--into", str(row)]) == 2
     assert "very method that was scored" in capsys.readouterr().err

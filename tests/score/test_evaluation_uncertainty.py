@@ -172,9 +172,9 @@ def test_one_object_has_no_interval(dataset, tmp_path):
         (["per_sample", 0, "object_bias_mm"], -99.0, "bias or shift-free MAE is above the MAE"),
         (["per_sample", 0, "object_median_mm"], 99.0, "out of order"),
         (["per_sample", 0, "object_p95_mm"], None, "null all together"),
-        (["mode"], "paper", "void_pixels is extra by these rules"),
-        (["mode"], "paper-individual", "its track is oracle range"),
-        (["protocol_version"], "1.1.0", "void_pixels is extra by these rules"),
+        (["mode"], "paper", r"dataset\.content: expected hashes of test/depth, got"),
+        (["mode"], "paper-individual", "has no mode paper-individual"),
+        (["target"], "depth_exact", r"dataset\.content: expected hashes of test/depth_exact, test/flags"),
         (["environment", "code_sha256"], "x", "code_sha256"),
     ],
 )
@@ -259,7 +259,7 @@ def test_verify_on_other_data_and_other_protocol(make, dataset, tmp_path, capsys
     other_dataset = make_dataset(tmp_path / "other", size=(40, 32))
     file = make("p", noise_mm=2.0)
     assert main(["verify", str(file), str(tmp_path / "p"), "--dataset", str(other_dataset.path)]) == 1
-    assert "dataset.fingerprint" in capsys.readouterr().out
+    assert "dataset.content.test/depth" in capsys.readouterr().out
     file.write_text(file.read_text().replace('"protocol_version": "', '"protocol_version": "9'))
     assert main(["verify", str(file), str(tmp_path / "p"), "--dataset", str(dataset.path)]) == 2
     assert "scored by protocol 9" in capsys.readouterr().err

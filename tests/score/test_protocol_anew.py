@@ -15,10 +15,13 @@ SIZE = (48, 56)
 
 
 def flagged(depth):
-    """Every seventh row of the object unlit, every ninth column mixed, and flags that are not void."""
-    flags = np.full(depth.shape, 4 | 8, np.uint8)
+    """Every seventh row of the object unlit, every ninth column mixed, every 11th saturated, every 8th row weakly lit,
+    and a flag that is not void."""
+    flags = np.full(depth.shape, 8, np.uint8)
     flags[::7][depth[::7] > 0] |= 1
     flags[:, ::9] |= 2
+    flags[:, ::11] |= 4
+    flags[::8][depth[::8] > 0] |= 16
     return flags
 
 
@@ -28,12 +31,12 @@ def dataset(tmp_path_factory):
 
 
 def maps_of(dataset, sample, target):
-    """Target, void pixels and the depth of the unlit ones (0 elsewhere, or without an exact target)."""
+    """Target, void pixels and the depth of those lit too weakly (0 elsewhere, or without an exact target)."""
     depth, flags = dataset.depth_mm(sample), dataset.flags(sample)
     exact = dataset.depth_mm(sample, "depth_exact")
-    true = depth if target == "depth" else np.where(depth > 0, exact, 0)
-    unlit = np.where(((flags & 1) > 0) & (target == "depth_exact"), exact, 0)
-    return true, (flags & 3) > 0, unlit
+    if target == "depth":
+        return depth, (flags & 3) > 0, np.zeros_like(exact)
+    return exact, (flags & (1 | 2 | 4 | 16)) > 0, np.where((flags & (1 | 16)) > 0, exact, 0)
 
 
 def write(folder, dataset):
@@ -104,8 +107,8 @@ def test_the_perfect_prediction_scores_0(mode, target, dataset, tmp_path):
     folder = tmp_path / "p"
     folder.mkdir()
     for sample in dataset.samples("test"):
-        true, _, unlit = maps_of(dataset, sample, target)
-        np.save(folder / f"{sample}.npy", true + unlit)
+        true, _, _ = maps_of(dataset, sample, target)
+        np.save(folder / f"{sample}.npy", true)
         np.save(folder / f"{sample}.sigma.npy", np.ones(SIZE))
     write_description(folder)
     result = evaluate(folder, dataset, target=target, mode=mode)

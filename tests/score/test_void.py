@@ -1,20 +1,19 @@
-"""Void pixels count in no set, unlit ones are a set of their own, and results of protocol 1 are read as they are."""
+"""Void pixels count in no set, and unlit ones are a set of their own."""
 
 import numpy as np
 import pytest
 from scored_dataset import make_dataset, write_predictions
 
-from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import HEADLINE, RANGE_SHARE, SINCE_2
-from fpp_ml_bench.evaluation.report import compare, result_table, score_table
-from fpp_ml_bench.evaluation.result import parse_result, read_result, result_content, write_result
-from fpp_ml_bench.evaluation.score import DepthScores, differences, evaluate, score_sample
+from fpp_ml_bench.evaluation.report import result_table, score_table
+from fpp_ml_bench.evaluation.result import read_result, write_result
+from fpp_ml_bench.evaluation.score import DepthScores, evaluate, score_sample
 from fpp_ml_bench.loaders.sample import VOID, Flag, void_pixels
 
 
 def flagged(depth):
-    """Unlit: four rows through the disk. Mixed: its left border and the background beside it. The other flags: all."""
-    flags = np.full(depth.shape, Flag.SATURATED | Flag.INTERREFLECTION, np.uint8)
+    """Unlit: four rows through the disk. Mixed: its left border and the background beside it. Interreflection: all."""
+    flags = np.full(depth.shape, Flag.INTERREFLECTION, np.uint8)
     flags[14:18][depth[14:18] > 0] |= np.uint8(Flag.UNLIT)
     border = (depth > 0) != np.roll(depth > 0, 1, axis=1)
     flags[border] |= np.uint8(Flag.MIXED)
@@ -110,28 +109,3 @@ def test_the_torch_metric_leaves_them_out_too(dataset):
     expected = score_sample(prediction, target, void=void).metrics()
     for key, value in metric.compute().items():
         assert float(value) == pytest.approx(expected[key], rel=1e-12), key
-
-
-def test_results_of_protocol_1_are_read_and_keep_their_rules(dataset, tmp_path):
-    result = evaluate(write_predictions(tmp_path / "p", dataset, noise_mm=1.0), dataset, mode="paper")
-    content = {**result_content(result), "protocol_version": "1.1.0", "mode": "standard", "schema_version": "2.2.0"}
-    first = parse_result(content, tmp_path / "r.json")
-    assert first.protocol_version == "1.1.0" and first.metrics == result.metrics
-    assert result_content(first) == content
-    with pytest.raises(SubmissionError, match=r"protocol: 1\.1\.0 against 2\.0\.0"):
-        compare(first, evaluate(tmp_path / "p", dataset))
-    with pytest.raises(SubmissionError, match=r"protocol 1\.1\.0 has no mode paper"):
-        parse_result({**content, "mode": "paper"}, tmp_path / "r.json")
-    with pytest.raises(SubmissionError, match="void_pixels is missing"):
-        parse_result({**content, "protocol_version": "2.0.0"}, tmp_path / "r.json")
-
-
-def test_a_result_of_an_earlier_schema_is_verified(dataset, tmp_path):
-    """Before schema 2.4.0 there was no object MAE over depth range."""
-    result = evaluate(write_predictions(tmp_path / "p", dataset, noise_mm=1.0), dataset)
-    content = {**result_content(result), "schema_version": "2.3.0"}
-    for block in (content["metrics"], content["median"], *content["per_sample"]):
-        del block[RANGE_SHARE]
-    for row in content["per_object"]:
-        del row["metrics"][RANGE_SHARE], row["spread"][RANGE_SHARE]
-    assert differences(parse_result(content, tmp_path / "r.json"), tmp_path / "p", dataset) == []

@@ -2,31 +2,89 @@
 
 import json
 from dataclasses import replace
+from itertools import product
 
 import pytest
 from conftest import tiny_settings
 
 from fpp_ml_bench.cli import main
+from fpp_ml_bench.constants import VIEWS
 from fpp_ml_bench.loaders.render import assembly_of, build, named_light, preset_settings
 from fpp_ml_bench.loaders.storage import benchmark as module
 from fpp_ml_bench.loaders.storage.benchmark import (
     BENCHMARKS,
-    EARLIER,
+    FACTS,
+    benchmark_before,
     benchmark_of,
     benchmark_sentence,
     intended_benchmark,
+    known_problem,
 )
 
 
-def test_names_and_fingerprints_are_told_apart():
-    known = (*BENCHMARKS, *EARLIER)
-    assert len({(b.name, b.version) for b in known}) == len({b.fingerprint for b in known}) == len(known)
-    assert len({b.name for b in BENCHMARKS}) == len(BENCHMARKS)
-    for benchmark in known:
-        assert len(bytes.fromhex(benchmark.fingerprint)) == 32
-        assert benchmark_of(benchmark.fingerprint) is benchmark
-    assert benchmark_of("0" * 64) is None
-    assert BENCHMARKS[0].title == "fpp-bench-full version 1"
+def test_names_and_contents_are_told_apart():
+    assert len({b.title for b in BENCHMARKS}) == len({b.earlier for b in BENCHMARKS}) == len(BENCHMARKS)
+    assert BENCHMARKS[0].title == "fpp-bench-full version 2"
+    for benchmark in BENCHMARKS:
+        assert benchmark_before(f"{benchmark.earlier}{'0' * 32}") is benchmark
+        assert benchmark_of(benchmark.content).size == benchmark.size
+        assert all(len(bytes.fromhex(digest)) == 16 for digest in benchmark.content.values())
+        assert (FACTS / f"{benchmark.name}.json").stat().st_size < 50_000
+    assert benchmark_of({}) is None and benchmark_of({"test/depth": "0" * 32}) is None
+    assert benchmark_before("0" * 64) is None
+
+
+def test_the_facts_are_of_the_presets_objects():
+    for benchmark in BENCHMARKS:
+        settings = preset_settings(benchmark.preset, benchmark.size, benchmark.light, benchmark.rig)
+        splits = {name.partition("/")[0] for name in benchmark.content}
+        objects = [name for split in splits for name in benchmark.counts(split, "standard", "depth")]
+        assert sorted(objects) == sorted(settings.objects), benchmark.name
+        for split, mode, target in product(splits, ("standard", "paper"), ("depth", "depth_exact")):
+            for counts in benchmark.counts(split, mode, target).values():
+                assert counts.samples == len(VIEWS) and counts.object_px > 0
+                assert (counts.void_px > 0) == (mode == "standard")
+                assert counts.object_px + counts.void_px < len(VIEWS) * benchmark.size**2
+        assert benchmark.counts("all", "paper", "depth").keys() == set(objects)
+
+
+def test_scenes_are_the_same_whatever_is_projected():
+    """Exact depth and flags, and so void, follow from scene and light alone: one table for every code."""
+    named = {benchmark.name: benchmark for benchmark in BENCHMARKS}
+    for paper, crossed in (
+        ("full", "crossed"), ("unseen", "crossed-unseen"), ("test-workshop", "test-crossed-workshop"),
+        ("test-hard", "test-crossed-hard"),
+    ):  # fmt: skip
+        first, second = named[f"fpp-bench-{paper}"], named[f"fpp-bench-{crossed}"]
+        truth = {key: digest for key, digest in first.content.items() if key in ("test/depth_exact", "test/flags")}
+        assert len(truth) == 2 and truth.items() <= second.content.items()
+        assert benchmark_of(truth).size == first.size
+        assert first.counts("test", "standard", "depth_exact") == second.counts("test", "standard", "depth_exact")
+        assert first.content["test/depth"] != second.content["test/depth"], "decoded from other frames"
+
+
+def test_a_part_of_a_benchmark_is_that_benchmark():
+    full = BENCHMARKS[0].content
+    part = {name: digest for name, digest in full.items() if name in ("test/frame_00", "test/depth", "test/flags")}
+    assert benchmark_of(part) is BENCHMARKS[0]
+    assert benchmark_of({**part, "test/depth": "0" * 32}) is None
+
+
+def test_a_result_of_other_objects_or_pixels_is_known_to_be_none():
+    content = {name: digest for name, digest in BENCHMARKS[0].content.items() if name.startswith("test/depth")}
+    counts = BENCHMARKS[0].counts("test", "standard", "depth")
+    rules = content, "test", "depth", "standard"
+    assert known_problem(*rules, counts) is None
+    name, first = next(iter(counts.items()))
+    for changed, said in (
+        ({**counts, name: first._replace(samples=5)}, f"has 6 samples of '{name}', this file says 5"),
+        ({**counts, name: first._replace(void_px=first.void_px + 1)}, "void pixels"),
+        ({**counts, name: first._replace(object_px=1)}, "object pixels"),
+        ({**counts, "ball": first}, "has no object 'ball'"),
+        ({key: counts[key] for key in counts if key != name}, f"has the object '{name}'"),
+    ):
+        assert said in known_problem(*rules, changed)
+    assert known_problem({"test/depth": "0" * 32}, *rules[1:], {}) is None, "nothing is known of other data"
 
 
 @pytest.mark.parametrize("benchmark", BENCHMARKS, ids=lambda b: b.name)
@@ -36,8 +94,7 @@ def test_settings_of_a_benchmark_with_other_bytes_are_a_warning(benchmark):
     ).manifest  # no rows yet: other bytes
     assert intended_benchmark(manifest) is benchmark
     as_expected, sentence = benchmark_sentence(manifest)
-    assert not as_expected
-    assert benchmark.title in sentence and manifest.fingerprint[:8] in sentence
+    assert not as_expected and benchmark.title in sentence
 
 
 def test_settings_of_ones_own_are_no_benchmark():
@@ -45,7 +102,6 @@ def test_settings_of_ones_own_are_no_benchmark():
     for other in (
         replace(settings, seed=1),
         replace(settings, light=named_light("workshop")),  # a light of the full set alone
-        replace(settings, stored="single_shot"),
     ):
         manifest = assembly_of(other).manifest
         assert intended_benchmark(manifest) is None
@@ -58,15 +114,17 @@ def test_what_the_commands_say(tmp_path, capsys, monkeypatch):
     manifest = build(tmp_path / "data", settings, workers=1)
     assert main(["verify", str(tmp_path / "data")]) == 0
     assert "benchmark: a dataset of its own" in capsys.readouterr().out
-    known = replace(BENCHMARKS[0], name="fpp-bench-tiny", fingerprint=manifest.fingerprint)
+    known = replace(BENCHMARKS[0], name="fpp-bench-tiny")
     monkeypatch.setattr(module, "BENCHMARKS", (known,))
+    monkeypatch.setattr(module, "FACTS", tmp_path)
+    (tmp_path / "fpp-bench-tiny.json").write_text(json.dumps({"content": manifest.content, "counts": {}}))
     monkeypatch.setattr(module.render, "preset_settings", lambda preset, size, light, rig: settings)
     assert main(["verify", str(tmp_path / "data")]) == 0
-    assert "benchmark: this is fpp-bench-tiny version 1" in capsys.readouterr().out
+    assert "benchmark: this is fpp-bench-tiny version 2" in capsys.readouterr().out
     assert main(["info", str(tmp_path / "data"), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["benchmark"] == {"name": "fpp-bench-tiny", "version": 1}
-    monkeypatch.setattr(module, "BENCHMARKS", (replace(known, fingerprint="ab" * 32),))
+    assert json.loads(capsys.readouterr().out)["benchmark"] == {"name": "fpp-bench-tiny", "version": 2}
+    monkeypatch.setattr(module, "BENCHMARKS", (replace(known, name="fpp-bench-other"),))
     assert main(["verify", str(tmp_path / "data")]) == 0
     output = capsys.readouterr()
-    assert "warning: built with the settings of fpp-bench-tiny version 1, but not its bytes" in output.err
+    assert "warning: built with the settings of fpp-bench-other version 2, but not its content" in output.err
     assert "benchmark" not in output.out

@@ -298,6 +298,22 @@ def test_death_of_a_worker_is_an_error_that_says_so_and_the_rest_is_kept(tmp_pat
     assert file_bytes(folder) == uninterrupted
 
 
+def test_sigterm_to_a_build_in_processes_makes_no_noise(tmp_path, uninterrupted):
+    folder = tmp_path / "set"
+    process = start(folder, "--objects", "cork,mug", "--frames", "single_shot", workers=2)
+    assert wait_for(lambda: list(folder.glob(".build/*.tmp")), process)
+    os.killpg(process.pid, signal.SIGTERM)
+    errors = process.communicate(timeout=60)[1]
+    assert process.returncode == 143 and errors.endswith("fpp-bench build: stopped\n")
+    assert "Traceback" not in errors and "resource_tracker" not in errors
+    deadline = time.monotonic() + 30  # its helper process may outlive it by a moment
+    while group_members(process.pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not group_members(process.pid)
+    build(folder, half_settings(), workers=1)
+    assert file_bytes(folder) == uninterrupted
+
+
 # ---- full disks
 
 

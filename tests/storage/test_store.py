@@ -12,7 +12,7 @@ import pyarrow as pa
 import pytest
 
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.loaders.sample import DATA_GROUP
+from fpp_ml_bench.loaders.sample import DATA_GROUP, column_hash, image_hash
 from fpp_ml_bench.loaders.storage.manifest import read_manifest
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics import PAPER_SEQUENCE
@@ -86,14 +86,17 @@ def test_frames_in_the_order_of_the_indices(opened):
     assert len({opened.frame("bowl_A0", i).tobytes() for i in range(52)}) == 52
 
 
-def test_target_is_the_decoded_set_of_pixels(opened):
+def test_void_is_of_the_decoded_depth_or_of_scene_and_light_alone(opened):
     for sample in opened.samples("all"):
-        depth, exact = opened.depth_mm(sample), opened.depth_mm(sample, "depth_exact")
-        assert opened.target_mm(sample) is depth or np.shares_memory(opened.target_mm(sample), depth)
-        target = opened.target_mm(sample, "depth_exact")
-        np.testing.assert_array_equal(target > 0, depth > 0)
-        np.testing.assert_array_equal(target[target > 0], exact[target > 0])
-        assert target.dtype == np.float32
+        depth, exact, flags = opened.depth_mm(sample), opened.depth_mm(sample, "depth_exact"), opened.flags(sample)
+        for column, stored in (("depth", depth), ("depth_exact", exact)):
+            assert np.shares_memory(opened.target_mm(sample, column), stored) and stored.dtype == np.float32
+        unlit_or_mixed = (flags & 3) > 0
+        np.testing.assert_array_equal(opened.void(sample), unlit_or_mixed | ((exact > 0) & (depth == 0)))
+        np.testing.assert_array_equal(opened.void(sample, "depth_exact"), (flags & (1 | 2 | 4 | 16)) > 0)
+        # What is neither void nor unmeasurable, the full sequence decodes.
+        scored = (exact > 0) & ~opened.void(sample, "depth_exact")
+        assert (depth[scored] == 0).mean() < 2e-3
 
 
 def test_names_splits_and_what_was_measured(opened):
@@ -190,3 +193,23 @@ def test_reading_imports_neither_torch_nor_datasets_nor_pandas(tiny):
     )
     done = subprocess.run([sys.executable, "-c", code, str(tiny)], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_content_is_of_the_decoded_values_and_not_of_the_files(tmp_path, opened):
+    """The same images in other shards, in another order and with other paths have the same content; a changed bit has
+    another, a float that is written as another zero too."""
+    image = opened.depth_mm("bowl_A0")
+    assert image_hash(image) == image_hash(np.asfortranarray(image)) == image_hash(image.astype(">f4"))
+    assert image_hash(image) != image_hash(image.T) and image_hash(image) != image_hash(-image)
+    hashes = {sample: image_hash(opened.depth_mm(sample)) for sample in opened.samples("train")}
+    assert opened.content["train/depth"] == column_hash(hashes) == column_hash(dict(reversed(hashes.items())))
+    assert opened.content_hash("train", "depth", hashes) == ("train/depth", column_hash(hashes))
+    first, second = list(hashes)[:2]
+    swapped = {**hashes, first: hashes[second], second: hashes[first]}
+    with pytest.raises(DatasetError, match=r"depth of split train is not what manifest\.json says"):
+        opened.content_hash("train", "depth", swapped)
+    assert set(opened.content) == {
+        f"{split}/{column}"
+        for split in opened.splits
+        for column in (*(frame.column for frame in opened.sequence.frames), "depth", "depth_exact", "flags", "cover")
+    }

@@ -255,7 +255,7 @@ def test_every_kind_of_tampering_with_the_manifest_is_noticed(clean, capsys):
         ('"rows": 12', '"rows": 13'),
         ('"stored": "single_shot"', '"stored": "all"'),
         ('"exact": true', '"exact": false'),
-        ('"schema_version": "2', '"schema_version": "3'),
+        ('"schema_version": "3', '"schema_version": "4'),
         ('"origin": "generated"', '"origin": "imported"'),
         ('"xxh3_128": "', '"xxh3_128": "0'),  # the first is that of a shard
         ('"shards": [', '"shard": ['),

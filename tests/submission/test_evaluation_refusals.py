@@ -250,7 +250,8 @@ TEXTS = {
     "list as key": ("? [1]\n: 2\n", "expected text as key"),
     "too long": ("name: " + "x" * 70000, "at most 65536 bytes"),
     "nested": ("a: " + "[" * 20000, "is no plain YAML"),
-    "bad date": ("name: 2026-99-99\n", "is no plain YAML"),
+    "a date": ("name: !!timestamp 2026-99-99\n", "name: has the tag"),
+    "a number": ("seeds: {data: !!int x}\n", "data: has the tag"),
     "not UTF-8": (b"name: \xff\xfe", "expected UTF-8"),
 }
 

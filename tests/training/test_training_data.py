@@ -2,8 +2,10 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import pytest
+from scored_dataset import name_benchmarks
 from tiny_network import config_of, tiny_network
 
 from fpp_ml_bench.baselines.phase_network import PhaseNet, load_net, save_net
@@ -28,9 +30,10 @@ NET_OPTIONS = {"widths": [4, 6], "fine": 4, "squeezed": 6, "order_widths": [4, 6
 
 
 @pytest.fixture
-def benchmarks(monkeypatch, opened):
+def benchmarks(monkeypatch, opened, tmp_path):
     """The tiny dataset as version 1 of a benchmark ``tiny``, and a second benchmark."""
-    named = (Benchmark("tiny", 1, "mini", 176, opened.fingerprint), Benchmark("large", 0, "full", 960, "c" * 64))
+    name_benchmarks(monkeypatch, tmp_path / "facts", (Benchmark("tiny", 1, "mini", 176, earlier="b" * 32), opened))
+    named = (*benchmark.BENCHMARKS, Benchmark("large", 0, "full", 960, earlier="c" * 32))
     monkeypatch.setattr(benchmark, "BENCHMARKS", named)
     return named
 
@@ -45,13 +48,14 @@ def phase_net_config(**changes):
 def test_a_new_weights_file_names_its_benchmark(benchmarks, opened, tmp_path):
     recipe = load_recipe("loss/l1", "cpu")
     network = tiny_network()
-    for fingerprint, expected in ((opened.fingerprint, TrainingBenchmark("tiny", 1)), (OLD, None)):
-        config = replace(model_config(recipe, network, fingerprint, 1, {}), image_size=(32, 48))
+    other = SimpleNamespace(fingerprint=OLD, content={**opened.content, "test/depth": "0" * 32})
+    for data, expected in ((opened, TrainingBenchmark("tiny", 1)), (other, None)):
+        config = replace(model_config(recipe, network, data, 1, {}), image_size=(32, 48))
         assert config.benchmark == expected
         path = tmp_path / "net.safetensors"
         save_weights(path, network, config)
         assert open_weights(path).config.benchmark == expected
-        save_net(path, PhaseNet(**NET_OPTIONS), phase_net_config(benchmark=training_benchmark(fingerprint)))
+        save_net(path, PhaseNet(**NET_OPTIONS), phase_net_config(benchmark=training_benchmark(data.content)))
         assert load_net(path).config.benchmark == expected
 
 
@@ -83,6 +87,7 @@ def test_a_file_without_the_entry_is_read(tmp_path):
         (OLD, TrainingBenchmark("tiny", 0), "trained on tiny version 0; predicting on tiny version 1"),
         (OLD, TrainingBenchmark("large", 7), None),
         ("c" * 64, None, None),
+        ("b" * 64, TrainingBenchmark("tiny", 0), None),  # version 1 of the past, with the same images
     ],
 )
 def test_what_is_said_on_a_named_benchmark(benchmarks, opened, fingerprint, trained_on, words):
@@ -93,12 +98,12 @@ def test_what_is_said_on_a_named_benchmark(benchmarks, opened, fingerprint, trai
 
 def test_other_bytes_of_a_benchmarks_settings_are_said(benchmarks, opened, monkeypatch):
     """A dataset that was built with a benchmark's settings, and differs from it: on another processor, say."""
-    built = replace(benchmarks[0], fingerprint="d" * 64)
+    built = replace(benchmarks[0])
+    manifest = replace(opened.manifest, content={**opened.content, "test/depth": "0" * 32})
     monkeypatch.setattr(training_data, "intended_benchmark", lambda manifest: built)
-    monkeypatch.setattr(benchmark, "BENCHMARKS", (built,))
-    config = config_of(tiny_network(), dataset_fingerprint="d" * 64)
-    expected = f"trained on tiny version 1; predicting on dataset {opened.fingerprint[:8]}, which has the settings of "
-    assert training_data_warning(config, opened.manifest) == f"{expected}tiny version 1 but other bytes"
+    config = config_of(tiny_network(), dataset_fingerprint="d" * 64, benchmark=TrainingBenchmark("tiny", 1))
+    dataset = f"dataset {manifest.fingerprint[:8]}, which has the settings of tiny version 1 but other content"
+    assert training_data_warning(config, manifest) == f"trained on tiny version 1; predicting on {dataset}"
 
 
 def test_nothing_is_said_on_data_of_the_users_own(opened):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.calibration import Board
 from fpp_ml_bench.errors import CaptureError
-from fpp_ml_bench.files import exclusive, write_atomically
+from fpp_ml_bench.files import LOCK_FILE, exclusive, write_atomically
 from fpp_ml_bench.loaders.render.boards.poses import BoardPose, board_poses
 from fpp_ml_bench.loaders.render.boards.sheet import DARK, board_view, check_print
 from fpp_ml_bench.loaders.render.light import Light, named_light
@@ -65,9 +65,8 @@ def photograph_board(
     names = [f"pose_{index:02d}" for index in range(len(poses))]
     if place.exists() and not place.is_dir():
         raise CaptureError(f"{place}: is a file; give a folder")
-    lock = place / ".lock"
     try:
-        with exclusive(lock, place, "writing this folder"):
+        with exclusive(place / LOCK_FILE, place, "writing this folder"):
             _check_folder(place, described, rig)
             write_atomically(place / BOARD_FILE, described.encode())
             save_rig(rig, place / RIG_FILE)
@@ -75,7 +74,6 @@ def photograph_board(
                 if not (place / name).is_dir():
                     _write_pose(place, name, board_frames(studio, board, pose, name))
                 progress(len(rig.sequence))
-        lock.unlink(missing_ok=True)
     except OSError as error:
         raise CaptureError(
             f"{place}: writing failed ({error.strerror or error}); remove the cause, then run the same command again: "
@@ -96,7 +94,7 @@ def _description(board: Board, poses: Sequence[BoardPose], studio: Studio) -> di
 
 def _check_folder(place: Path, described: str, rig: Rig) -> None:
     """Raise `CaptureError` unless the folder is empty or an earlier run of the same captures left it."""
-    others = sorted(path.name for path in place.iterdir() if path.name != ".lock")
+    others = sorted(path.name for path in place.iterdir() if path.name != LOCK_FILE)
     board_file, rig_file = place / BOARD_FILE, place / RIG_FILE
     if not board_file.is_file():
         if others:

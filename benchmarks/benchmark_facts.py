@@ -1,0 +1,64 @@
+"""Write what the package knows of a named benchmark, ``loaders/storage/benchmarks/NAME.json``, from its build.
+
+    fpp-bench build data/full --preset full
+    python benchmarks/benchmark_facts.py fpp-bench-full data/full
+
+Content hashes of every column of every split, and by object how many samples it has and how many of its pixels are
+object and void, by both modes and against both depths. The images are read (`fpp-bench verify`) before they are named.
+"""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.evaluation.protocol import MODES, TARGETS
+from fpp_ml_bench.loaders.storage import BENCHMARKS, FACTS, DatasetFolder, intended_benchmark, verify
+
+
+def counts(dataset: DatasetFolder, split: str, mode: str, target: str) -> dict[str, list[int]]:
+    """Samples, object pixels and void pixels of each object of a split."""
+    found: dict[str, list[int]] = {}
+    for sample in dataset.samples(split):
+        inside, void = object_mask(dataset.target_mm(sample, target)), dataset.void(sample, target)
+        void &= mode == "standard"
+        numbers = found.setdefault(dataset.measured(sample)["object"], [0, 0, 0])
+        for place, number in enumerate((1, np.count_nonzero(inside & ~void), np.count_nonzero(void))):
+            numbers[place] += int(number)
+        dataset.release(sample)
+    return found
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0])
+    parser.add_argument("name", choices=[benchmark.name for benchmark in BENCHMARKS], metavar="NAME")
+    parser.add_argument("dataset", type=Path, help="its build")
+    parser.add_argument("--out", type=Path, default=FACTS, help="folder to write into")
+    args = parser.parse_args()
+    dataset = DatasetFolder(args.dataset)
+    intended = intended_benchmark(dataset.manifest)
+    if intended is None or intended.name != args.name:
+        parser.error(f"{args.dataset} was not built with the settings of {args.name}")
+    if findings := verify(args.dataset):
+        print("\n".join(findings), file=sys.stderr)
+        return 1
+    rules = [(mode, target) for mode in MODES for target in TARGETS]
+    facts = {
+        "content": dataset.content,
+        "counts": {
+            split: {f"{mode}/{target}": counts(dataset, split, mode, target) for mode, target in rules}
+            for split in dataset.splits
+        },
+    }
+    args.out.mkdir(exist_ok=True)
+    file = args.out / f"{args.name}.json"
+    file.write_text(json.dumps(facts, separators=(",", ":"), sort_keys=True).replace('},"', '},\n"') + "\n")
+    print(f"{file}: {file.stat().st_size} bytes")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,331 @@
+"""A row file: what the leaderboard needs of a result of ``fpp-eval``, in at most 12 KB, as a strict model that checks
+itself. Its means of objects are all that ranks need; the whole result is published elsewhere and found by its hash."""
+
+import json
+import math
+import re
+import unicodedata
+from collections.abc import Iterable, Iterator
+from hashlib import sha256
+from itertools import pairwise
+from pathlib import Path
+from statistics import fmean
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import Field, model_validator
+
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation import protocol
+from fpp_ml_bench.evaluation.protocol import HEADLINE, FramesClass, Mode, Target, Track
+from fpp_ml_bench.evaluation.result import (
+    DatasetInfo,
+    HardwareInfo,
+    Headline,
+    Interval,
+    Intervals,
+    Metrics,
+    ObjectResult,
+    Reliance,
+    Result,
+    Robustness,
+    Sha256,
+    Timing,
+    Uncertainty,
+    Whole,
+    check_data,
+    check_reliance,
+    result_json,
+    write_file,
+)
+from fpp_ml_bench.evaluation.score import object_interval
+from fpp_ml_bench.evaluation.submission import Submission
+from fpp_ml_bench.files import printable
+from fpp_ml_bench.loaders.storage import Counts
+from fpp_ml_bench.schema import Count, NonNegative, Share, SparseModel, StrictModel, Text, validate
+
+ROW_SCHEMA_VERSION = "2.0.0"
+LARGEST_ROW_BYTES = 12_000
+DIGITS = 5
+"""Significant digits of the means of a row."""
+_ROUNDED_TWICE = 1.001e-4
+"""Relative difference between a rounded mean of errors and a mean of rounded errors, at most."""
+_MARKS = ("Mn", "Me")
+"""Categories of the combining characters that are drawn on a letter."""
+# Default-ignorable code points that are no format characters, which no text of a submission may hold anyway.
+_IGNORABLE = re.compile(
+    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180d\u180f\u2065\u3164\ufe00-\ufe0f\uffa0\ufff0-\ufff8"
+    "\U000e0000-\U000e0fff]"
+)
+
+
+class ObjectMeans(Headline, SparseModel):
+    """An object: means over its ``samples`` views of the six errors, in mm, and over all views how many pixels count.
+    ``without_object`` and ``without_background``: views whose set is empty, which are in no mean of it."""
+
+    SPARSE: ClassVar[tuple[str, ...]] = ("without_object", "without_background")
+
+    object: Text
+    samples: Whole
+    object_pixels: Count
+    background_pixels: Count
+    void_pixels: Count
+    without_object: Count = 0
+    without_background: Count = 0
+
+    @property
+    def sample(self) -> str:
+        """In a comparison of rows, an object stands for its samples."""
+        return self.object
+
+    def views(self, key: str) -> int:
+        """How many views the mean ``key`` is over."""
+        empty = {"object": self.without_object, "background": self.without_background}
+        return self.samples - empty.get(key.partition("_")[0], 0)
+
+
+class RowUncertainty(StrictModel):
+    """Of a stated uncertainty: share of object pixels within the stated 95% interval, to which those that state none
+    do not belong, and AUSE in mm; the rules are in PROTOCOL.md."""
+
+    within_95_share: Share | None
+    ause_mae_mm: NonNegative | None
+
+
+class RowRobustness(StrictModel):
+    """`Robustness` in brief: ``clean_mae_mm`` is that of the undisturbed scene, ``axes`` are means over severities."""
+
+    version: Whole
+    mae_mm: NonNegative
+    interval: Interval
+    clean_mae_mm: NonNegative
+    axes: Annotated[dict[Text, NonNegative], Field(min_length=1)]
+    samples: Whole
+    objects: Whole
+    size_px: Whole
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "RowRobustness":
+        if not math.isclose(self.mae_mm, fmean(self.axes.values()), rel_tol=_ROUNDED_TWICE):
+            raise ValueError("mae_mm does not follow from axes")
+        return self
+
+
+class Row(SparseModel):
+    """What is ranked of a result. Means have `DIGITS` significant digits. ``submission`` has its run time only in
+    ``timing`` where that is there. ``predictions_sha256`` is over the sorted hashes of the prediction files;
+    ``result_sha256`` finds the full result, wherever it is published."""
+
+    SPARSE = ("uncertainty", "reliance", "robustness")
+
+    row_schema_version: Literal["2.0.0"]
+    submission: Submission
+    frames_class: FramesClass
+    dataset: DatasetInfo
+    target: Target
+    mode: Mode
+    edge_band_px: Annotated[int, Field(ge=0, le=1000)]
+    protocol_version: Annotated[str, Field(pattern=r"^[0-9]{1,4}\.[0-9]{1,4}\.[0-9]{1,4}$")]
+    created: Annotated[str, Field(pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9:.+Z-]{8,30}$")]
+    package: Text
+    git: Annotated[str, Field(pattern=r"^[0-9a-f]{40,64}$")] | None
+    code_sha256: Sha256
+    predictions_sha256: Sha256
+    result_sha256: Sha256
+    metrics: Metrics
+    intervals: Intervals
+    per_object: Annotated[list[ObjectMeans], Field(min_length=1, max_length=1000)]
+    uncertainty: RowUncertainty | None = None
+    reliance: Reliance | None = None
+    robustness: dict[Literal["test", "unseen"], RowRobustness] | None = None
+
+    @property
+    def per_sample(self) -> list[ObjectMeans]:
+        """What a comparison of rows takes for samples."""
+        return self.per_object
+
+    @property
+    def track(self) -> Track:
+        return self.submission.track
+
+    @property
+    def timing(self) -> Timing | None:
+        """What `fpp-bench time` measured, or what the submission reports; None where it reports nothing."""
+        return self.submission.timing
+
+    @property
+    def hardware(self) -> HardwareInfo | None:
+        """The machine that the time was taken on; None where there is no time."""
+        return self.submission.hardware if self.timing is None else self.timing.hardware
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Row":
+        if problem := name_problem(self.submission.name):
+            raise ValueError(f"submission.name: {problem}")
+        if (self.frames_class == protocol.FRAMES_CLASSES[0]) != (len(self.submission.frames_used) == 1):
+            raise ValueError(f"frames_class is {self.frames_class}, of {len(self.submission.frames_used)} frames_used")
+        if len({part.object for part in self.per_object}) != len(self.per_object):
+            raise ValueError("per_object names an object twice")
+        if (samples := sum(part.samples for part in self.per_object)) != self.dataset.samples:
+            raise ValueError(f"per_object holds {samples} samples, dataset.samples says {self.dataset.samples}")
+        for part in self.per_object:
+            _check_object(part, self.dataset.size[0] * self.dataset.size[1])
+        for key in HEADLINE:
+            _check_follows(f"metrics.{key}", getattr(self.metrics, key), mean_over(self.per_object, key))
+            ends = interval_over(self.per_object, key) or (None, None)
+            for stored, computed in zip(getattr(self.intervals, key), ends, strict=True):
+                _check_follows(f"intervals.{key}", stored, computed)
+        if self.protocol_version == protocol.PROTOCOL_VERSION:
+            found = {p.object: Counts(p.samples, p.object_pixels, p.void_pixels) for p in self.per_object}
+            check_data(self.dataset, self.target, self.mode, self.submission.units, found)
+        if self.reliance is not None:
+            check_reliance(self.reliance, self.submission)
+        return self
+
+
+def _check_follows(name: str, stored: float | None, computed: float | None) -> None:
+    """Refuse (ValueError) a value that is not the ``computed`` one but for rounding."""
+    missing = (stored is None) != (computed is None)
+    if missing or not math.isclose(stored or 0.0, computed or 0.0, rel_tol=_ROUNDED_TWICE):
+        raise ValueError(f"{name} does not follow from per_object: {stored}, not {computed}")
+
+
+def _check_object(part: ObjectMeans, pixels: int) -> None:
+    """Refuse (ValueError) an object whose sets do not make up ``pixels`` a view, or whose scores contradict them."""
+    name = printable(part.object)
+    if part.object_pixels + part.background_pixels + part.void_pixels != part.samples * pixels:
+        raise ValueError(f"{name}: object, background and void pixels do not add up to {part.samples} images")
+    for pixel_set in protocol.PIXEL_SETS:
+        mae, rmse = (getattr(part, f"{pixel_set}_{error}_mm") for error in ("mae", "rmse"))
+        count = getattr(part, f"{pixel_set}_pixels", part.object_pixels + part.background_pixels)
+        if not (count == 0) == (mae is None) == (rmse is None):
+            raise ValueError(f"{name}: {pixel_set} scores must be null exactly when the set is empty")
+        if mae is not None and (rmse < mae * (1 - _ROUNDED_TWICE) or part.views(pixel_set) < 1):
+            raise ValueError(f"{name}: {pixel_set} RMSE is below its MAE, or no view has the set")
+
+
+def mean_over(objects: Iterable[ObjectMeans], key: str) -> float | None:
+    """Mean of a headline score over the views of ``objects``; None where no view has it."""
+    means = list(view_means(objects, key))
+    return fmean(value for _, value in means) if means else None
+
+
+def interval_over(objects: Iterable[ObjectMeans], key: str) -> tuple[float, float] | None:
+    """The 95% interval of `mean_over`, from a bootstrap over objects."""
+    means = list(view_means(objects, key))
+    return object_interval([value for _, value in means], [name for name, _ in means])
+
+
+def view_means(objects: Iterable[ObjectMeans], key: str) -> Iterator[tuple[str, float]]:
+    """An object's name and mean for each of its views: the bootstrap needs no more of them than their sum."""
+    for part in objects:
+        if (mean := getattr(part, key)) is not None:
+            yield from [(part.object, mean)] * part.views(key)
+
+
+def name_key(name: str) -> str:
+    """What two names share that look the same: compatible forms, letter case and spaces aside."""
+    return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
+
+
+def name_problem(name: str) -> str | None:
+    """Why a method can't be called ``name``; None where it can."""
+    if ignorable := _IGNORABLE.search(name):
+        return f"expected visible characters, got U+{ord(ignorable[0]):04X}, which shows nothing"
+    # In this form a letter that a language writes with two marks has none.
+    for first, second in pairwise(unicodedata.normalize("NFC", name)):
+        of_first, of_second = map(unicodedata.category, (first, second))
+        if of_second in _MARKS and (of_first in _MARKS or unicodedata.decomposition(first)):
+            return f"expected at most one mark on a letter, got U+{ord(second):04X} on another mark"
+    return None
+
+
+def row_content(result: Result, digits: int | None = DIGITS) -> dict[str, Any]:
+    """The content of a `Row` of ``result``; with ``digits`` None nothing is rounded."""
+    described, about = result.submission.model_dump(mode="json"), result.environment
+    if result.timing is not None:  # it names the same time, machine and software
+        described |= dict.fromkeys(("seconds_per_sample", "seconds_source", "hardware"))
+        described["software"] = {} if result.timing.software else described["software"]
+    kept = {"dataset", "frames_class", "target", "mode", "edge_band_px", "protocol_version", "created"}
+    hashes = sorted(sample.prediction_sha256 for sample in result.per_sample)
+    content = {
+        "row_schema_version": ROW_SCHEMA_VERSION, "submission": described,
+        **result.model_dump(mode="json", include=kept), "package": about.packages["fpp_ml_bench"], "git": about.git,
+        "code_sha256": about.code_sha256, "predictions_sha256": sha256("\n".join(hashes).encode()).hexdigest(),
+        "result_sha256": sha256(result_json(result)).hexdigest(),
+        **rounded(result.model_dump(mode="json", include={"metrics", "intervals"}), digits),
+        "per_object": [rounded(_object_means(result, part), digits) for part in result.per_object],
+    }  # fmt: skip
+    if result.uncertainty is not None:
+        content["uncertainty"] = rounded(_uncertainty(result.uncertainty), digits)
+    if result.reliance is not None:
+        content["reliance"] = rounded(result.reliance.model_dump(mode="json"), 4)
+    if result.robustness is not None:
+        content["robustness"] = {name: robustness_in_brief(block) for name, block in result.robustness.items()}
+    return content
+
+
+def row_of(result: Result, path: Path) -> Row:
+    """The row of ``result``, which is in the file ``path``. SubmissionError for what can't be a row."""
+    return validate(Row, row_content(result), path, "result for the leaderboard")
+
+
+def _object_means(result: Result, part: ObjectResult) -> dict[str, Any]:
+    views = [sample for sample in result.per_sample if sample.object == part.object]
+    counts = {name: [getattr(v, f"{name}_pixels") or 0 for v in views] for name in ("object", "background", "void")}
+    return {
+        "object": part.object, "samples": part.samples,
+        **{f"{name}_pixels": sum(numbers) for name, numbers in counts.items()},
+        **{f"without_{name}": counts[name].count(0) for name in ("object", "background")},
+        **part.metrics.model_dump(include=set(HEADLINE)),
+    }  # fmt: skip
+
+
+def _uncertainty(block: Uncertainty) -> dict[str, float | None]:
+    samples = [scores for scores in block.per_sample.values() if scores.unstated_share is not None]
+    covered = [(scores.coverage_95 or 0.0) * (1 - (scores.unstated_share or 0.0)) for scores in samples]
+    return {"within_95_share": fmean(covered) if covered else None, "ause_mae_mm": block.metrics.ause_mae_mm}
+
+
+def robustness_in_brief(block: Robustness) -> dict[str, Any]:
+    """The content of a `RowRobustness`."""
+    axes = {name: fmean(scores.mae_mm for scores in axis) for name, axis in block.axes.items()}
+    kept = block.model_dump(mode="json", include=set(RowRobustness.model_fields))
+    return rounded({**kept, "clean_mae_mm": block.clean.mae_mm, "axes": axes}, DIGITS)  # type: ignore[no-any-return]
+
+
+def rounded(value: Any, digits: int | None) -> Any:
+    """``value`` with every fraction in it rounded to significant ``digits``."""
+    if isinstance(value, dict):
+        return {key: rounded(inner, digits) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [rounded(inner, digits) for inner in value]
+    return float(f"{value:.{digits}g}") if isinstance(value, float) and digits is not None else value
+
+
+def row_json(row: Row) -> bytes:
+    """The bytes of a row file: JSON with a line for each key."""
+    content = row.model_dump(mode="json").items()
+    lines = [f'"{key}": {json.dumps(value, ensure_ascii=False, allow_nan=False)}' for key, value in content]
+    return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
+
+
+def write_row(row: Row, path: Path) -> bytes:
+    """Write a row file; its bytes. SubmissionError for a row that is too large, or an unwritable path."""
+    data = row_json(row)
+    check_size(data, path)
+    write_file(data, path)
+    return data
+
+
+def check_size(data: bytes, path: Path) -> None:
+    """Refuse (SubmissionError) a row file of more than `LARGEST_ROW_BYTES`."""
+    if len(data) > LARGEST_ROW_BYTES:
+        raise SubmissionError(
+            f"{printable(str(path), 500)}: the row has {len(data):,} bytes, expected at most {LARGEST_ROW_BYTES:,}; "
+            "shorten settings, software or seeds in submission.yaml, and score again"
+        )
+
+
+def processor(hardware: HardwareInfo) -> str:
+    """A processor and how many of its cores there are, in words."""
+    return f"{hardware.cpu}, {'1 core' if hardware.cores == 1 else f'{hardware.cores} cores'}"

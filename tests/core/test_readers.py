@@ -1,0 +1,440 @@
+"""Every file from outside has one reader: what is mutated, hostile or no file at all ends in an error that names it."""
+
+import json
+import os
+import re
+import shutil
+import socket
+from dataclasses import replace
+
+import pytest
+from mutations import ODD, sealed_manifest, sources, tree_outcome
+from published_trees import make_tree
+from synthetic import assembly, make
+
+from fpp_ml_bench.baselines.training import DEPTH_NETWORKS
+from fpp_ml_bench.baselines.training import weights as weights_files
+from fpp_ml_bench.baselines.unfinished import UNFINISHED_FILE, Finished, UnfinishedRun
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.errors import DatasetError, FppBenchError, LayoutError, RemoteError, RigError, SubmissionError
+from fpp_ml_bench.evaluation.result import read_result
+from fpp_ml_bench.files import DEEPEST, MOST_NODES, MOST_VALUES, path_problem, read_json, strict_json, strict_yaml
+from fpp_ml_bench.loaders.captures.decoding import read_mask
+from fpp_ml_bench.loaders.published import plan_import
+from fpp_ml_bench.loaders.storage import DatasetFolder, assemble, verify
+from fpp_ml_bench.loaders.storage.assembly import planned_receipt
+from fpp_ml_bench.loaders.storage.manifest import read_manifest
+from fpp_ml_bench.optics import load_rig, read_opencv_calibration
+from fpp_ml_bench.remote import RemoteFolder
+
+YAML = ("rig", "projection", "mesh list", "light", "recipe", "splits", "submission")
+JSON = ("rig as JSON", "manifest", "result", "row")
+CODED = ("rig, phase shift", "rig, Gray code", "rig, crossed")
+MUTATIONS, TREES = 60, 12
+
+
+@pytest.fixture(scope="module")
+def valid(tmp_path_factory):
+    """The sources by name; a test that changes other files than theirs makes its own."""
+    return sources(tmp_path_factory.mktemp("valid"))
+
+
+def test_all_sources_are_tested_and_valid(valid):
+    assert set(valid) == {*YAML, *JSON, *CODED}
+    assert {name: source.outcome(source.text(source.content)) for name, source in valid.items()} == dict.fromkeys(
+        valid, "read"
+    )
+
+
+@pytest.mark.parametrize("name", YAML + JSON + CODED)
+def test_mutations_are_read_or_refused(name, valid):
+    """Some of each, or the mutations would test nothing."""
+    outcomes = [valid[name].outcome(mutation) for mutation in valid[name].mutations(MUTATIONS, seed=0)]
+    assert set(outcomes) == {"read", "refused"}
+
+
+def test_changed_published_trees_are_read_or_refused(tmp_path):
+    tree = make_tree(tmp_path / "tree", splits={"train": ("bowl",)})
+    for seed in range(TREES):
+        (work := tmp_path / str(seed)).mkdir()
+        assert tree_outcome(tree, work, seed) in ("read", "refused")
+
+
+# ---- texts
+
+BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
+    f"{name}: &{name} [{', '.join(9 * [f'*{before}'])}]\n" for before, name in zip("abcdefgh", "bcdefghi", strict=True)
+)
+TEXTS = {
+    "alias bomb": (BOMB, "uses an alias"),
+    "timestamp": ("name: !!timestamp x", "name: has the tag"),
+    "int": ("name: !!int x", "name: has the tag"),
+    "Python": ("name: !!python/object/apply:os.getcwd []", "name: has the tag"),
+    "plain tag": ("name: ! x", "has the tag"),
+    "own tag": ("%TAG ! tag:x,2000:\n--- !foo bar", "has the tag"),
+    "exponent": ("name: 1e999999", "name: Infinity is no number"),
+    "NaN": ("name: [1, .nan]", r"name\[1\]: NaN is no number"),
+    "digits": (f"name: {'9' * 10**5}", "name: a number of more than 1000 digits|at most 65536 bytes"),
+    "nested": ("[" * 10_000, "nested too deeply"),
+    "nested by lines": ("- " * 10_000, "nested too deeply"),
+    "large": ("#" * (1 << 20) + "\n", "expected at most"),
+    "no UTF-8": (b"name: \xff", "expected UTF-8"),
+    "key twice": ("name: a\nname: b", "'name' is given twice"),
+    "number as key": ("1: 2", "expected text as key"),
+    "half a character": (r'name: "\ud800"', "name: half of a surrogate pair"),
+    "no character": (r'name: "\Uffffffff"', "is no plain YAML"),
+    "two documents": ("a\n---\nb", "single document"),
+    "other version": ("%YAML 9.9\n--- a", "incompatible YAML"),
+}
+
+
+def refusal(source, content):
+    source.file.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(FppBenchError) as error:
+        source.read()
+    assert str(source.file) in str(error.value) and len(str(error.value)) < 2000
+    return str(error.value)
+
+
+@pytest.mark.parametrize("name", YAML)
+@pytest.mark.parametrize("attack", TEXTS)
+def test_hostile_yaml(name, attack, valid):
+    text, message = TEXTS[attack]
+    assert re.search(message, refusal(valid[name], text))
+
+
+def test_dates_stay_text_and_numbers_numbers():
+    assert strict_yaml("{a: 2001-99-99, b: 2026-01-31 10:00:00, c: 1e-3, d: -0.5}") == {
+        "a": "2001-99-99", "b": "2026-01-31 10:00:00", "c": 1e-3, "d": -0.5,
+    }  # fmt: skip
+    assert strict_yaml("[" * DEEPEST + "]" * DEEPEST)
+    with pytest.raises(ValueError, match=f"line 1: expected at most {MOST_NODES} keys and values"):
+        strict_yaml("[" + "1," * (MOST_NODES + 1))
+
+
+JSON_TEXTS = {
+    "key twice": ('{"a": 1, "a": 2}', "'a' is given twice"),
+    "NaN": ('{"a": {"b": [0, NaN]}}', r"a\.b\[1\]: NaN is no number"),
+    "Infinity": ('{"a": -Infinity}', "a: -Infinity is no number"),
+    "exponent": ('{"a": 1e999999}', "a: Infinity is no number"),
+    "digits": (f'{{"a": {"9" * 10**5}}}', "a number of more than 1000 digits"),
+    "no float": (f'{{"a": 1{"0" * 400}}}', r"a: 10+\.\.\. is no number"),
+    "nested": ("[" * 10_000, "nested too deeply"),
+    "many": (f"[{'[],' * (MOST_VALUES // 2)}[]]", f"at most {MOST_VALUES} values"),
+    "half a character": (r'{"a": ["\ud800"]}', r"a\[0\]: half of a surrogate pair"),
+    "half a character as key": (r'{"\udfff": 1}', "half of a surrogate pair"),
+    "no UTF-8": (b'{"a": "\xff"}', "expected UTF-8"),
+    "cut off": ('{"a": [1', "is no valid JSON"),
+    "more": ("{} {}", "is no valid JSON"),
+    "empty": (" \n", "is no valid JSON: it is empty"),
+}
+
+
+@pytest.mark.parametrize("name", JSON)
+@pytest.mark.parametrize("attack", JSON_TEXTS)
+def test_hostile_json(name, attack, valid):
+    text, message = JSON_TEXTS[attack]
+    assert re.search(message, refusal(valid[name], text))
+
+
+def test_json_is_read_as_it_is():
+    content = {"a": [1, 2.5, -1e-320, None, True, "é\U0001f600 \n"], "": {}}
+    assert strict_json(json.dumps(content)) == strict_json(json.dumps(content, ensure_ascii=False)) == content
+    assert strict_json("[" * DEEPEST + "]" * DEEPEST)
+    assert strict_json(f'["{"[{," * MOST_VALUES}"]') == ["[{," * MOST_VALUES]  # of a text nothing is counted
+
+
+def test_a_result_of_too_many_objects_is_refused_before_anything_is_computed(valid, monkeypatch):
+    """8,000 objects in 11 MB took 2 GB: the intervals are resampled over objects."""
+    monkeypatch.setattr("fpp_ml_bench.evaluation.result.model.intervals_over_objects", lambda *words: pytest.fail())
+    source = valid["result"]
+    row = source.content["per_sample"][0]
+    for samples, objects, message in ((1001, 1001, "got 1001 and 1001"), (10_001, 2, "got 2 and 10001")):
+        rows = [{**row, "sample": f"s{i}", "object": f"o{i % objects}"} for i in range(samples)]
+        content = {**source.content, "per_sample": rows}
+        assert f"at most 1000 objects and 10000 samples, {message}" in refusal(source, json.dumps(content))
+
+
+# ---- files
+
+
+def fifo(path):
+    os.mkfifo(path)
+
+
+def device(path):
+    path.symlink_to("/dev/zero")
+
+
+def endpoint(path):
+    with socket.socket(socket.AF_UNIX) as server:
+        os.chdir(path.parent)
+        server.bind(path.name)
+
+
+NO_FILES = {"pipe": fifo, "device": device, "folder": lambda path: path.mkdir(), "socket": endpoint}
+
+
+@pytest.mark.parametrize("kind", NO_FILES)
+@pytest.mark.parametrize("name", (*YAML, *JSON, "weights", "calibration", "mask"))
+def test_what_is_no_regular_file_is_refused_at_once(name, kind, valid, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    others = {
+        "weights": ("w.safetensors", lambda path: weights_files.read_file(path, DEPTH_NETWORKS)),
+        "calibration": ("c.xml", read_opencv_calibration), "mask": ("m.npy", lambda path: read_mask(path, (2, 2))),
+    }  # fmt: skip
+    if name in others:
+        file, read = tmp_path / others[name][0], others[name][1]
+    else:
+        file, read = valid[name].file, valid[name].read
+        file.unlink(missing_ok=True)
+    NO_FILES[kind](file)
+    try:
+        with pytest.raises(FppBenchError) as error:
+            read(file) if name in others else read()
+    finally:
+        file.rmdir() if kind == "folder" else file.unlink()
+    assert file.name in str(error.value) or str(file.parent) in str(error.value)
+
+
+def test_a_file_that_the_user_names_may_be_a_link_and_one_in_a_folder_of_predictions_not(valid, tmp_path):
+    source = valid["rig"]
+    source.file.write_bytes(source.text(source.content))
+    (tmp_path / "link.yaml").symlink_to(source.file)
+    assert load_rig(tmp_path / "link.yaml") == load_rig(source.file)
+    source = valid["submission"]
+    source.file.write_bytes(source.text(source.content))
+    source.file.rename(tmp_path / "submission.yaml")
+    source.file.symlink_to(tmp_path / "submission.yaml")
+    with pytest.raises(SubmissionError, match=r"submission\.yaml .* found a symbolic link"):
+        source.read()
+    source.file.unlink()
+
+
+def test_files_are_bounded_before_they_are_read(tmp_path):
+    """A sparse file: no disk is used, and reading it whole would take seconds."""
+    for name, size in (("rig.yaml", 1 << 40), ("rig.json", 1 << 40), ("c.xml", 1 << 40)):
+        with (tmp_path / name).open("wb") as file:
+            file.truncate(size)
+        read = read_opencv_calibration if name == "c.xml" else load_rig
+        with pytest.raises(RigError, match=f"{name}: has {size} bytes, expected at most"):
+            read(tmp_path / name)
+    with (tmp_path / "r.json").open("wb") as file:
+        file.truncate((1 << 26) + 1)
+    with pytest.raises(SubmissionError, match=r"r\.json: has 67108865 bytes, expected at most 67108864 bytes; write"):
+        read_result(tmp_path / "r.json")
+
+
+# ---- the manifest
+
+
+def changed_manifest(folder, change):
+    """Change the manifest's content, and make its fingerprint right again."""
+    path = folder / "manifest.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(sealed_manifest(content)))
+
+
+def first_row(**changes):
+    return lambda content: content["samples"]["train"][0].update(changes)
+
+
+def first_shard(**changes):
+    return lambda content: content["shards"][0].update(changes)
+
+
+MANIFESTS = {
+    "sample is a path": (first_row(sample="../../x"), "sample '../../x': expected a name of letters"),
+    "object is a path": (first_row(object="/etc/passwd"), "object '/etc/passwd': expected a name"),
+    "view is a path": (first_row(view="../x"), "view '../x': expected a name"),
+    "sample with markup": (first_row(sample="<b>_A0"), "sample '<b>_A0': expected a name"),
+    "sample of two lines": (first_row(sample="a_A0\n"), "expected a name"),
+    "sample too long": (first_row(sample=300 * "a" + "_A0"), "expected a name"),
+    "sample is a number": (first_row(sample=5), "sample '5': expected a name"),
+    "no object": (lambda content: content["samples"]["test"][0].pop("object"), "object 'None': expected a name"),
+    "pixels are text": (first_row(object_px="many"), "object_px: expected a number, got many"),
+    "no depth": (first_row(depth_min_mm=None), "depth_min_mm: expected a number"),
+    "error is a list": (first_row(gt_mae_mm=[]), "gt_mae_mm: expected a number"),
+    "shard outside": (first_shard(path="../../etc/passwd"), "without . and .."),
+    "shard absolute": (first_shard(path="/etc/passwd"), "'/etc/passwd': expected a relative path"),
+    "shard with backslash": (first_shard(path="train\\x"), "expected a relative path"),
+    "shard with empty part": (first_shard(path="train//x"), "expected a relative path"),
+    "shard by a dot": (first_shard(path="./x"), "expected a relative path"),
+    "shard of nothing": (first_shard(path=""), "expected a relative path"),
+    "shard is the folder": (first_shard(path="."), "expected a relative path"),
+    "shard with an escape": (first_shard(path="train/\x1b[31m"), r"U\+001B"),
+    "shard of a number": (first_shard(path=5), "shards path: expected str, got 5"),
+    "rows below 0": (first_shard(rows=-1), "expected counts of 0 and more"),
+    "rows of true": (first_shard(rows=True), "shards rows: expected int, got True"),
+    "no hash": (first_shard(xxh3_128="x"), "a hash of 32 hex digits"),
+    "another key": (first_shard(x=1), "shards: expected exactly the keys path, split"),
+    "shard of no split": (first_shard(split="holdout"), "unknown split 'holdout'"),
+    "shard of no group": (first_shard(group="x"), "unknown group 'x', expected data"),
+    "shard twice": (lambda content: content["shards"].append(content["shards"][0]), "is listed twice"),
+    "other file outside": (lambda content: content["others"][0].update(path="../x"), "without . and .."),
+    "no split": (
+        lambda content: content["samples"].update(holdout=content["samples"]["test"]),
+        "unknown split 'holdout'",
+    ),
+    "empty split": (lambda content: content["samples"].update(test=[]), "expected some in every split"),
+    "no samples": (lambda content: content.update(samples={}), "expected some in every split"),
+    "samples are a list": (lambda content: content.update(samples=[]), "samples: expected"),
+    "image of no size": (lambda content: content.update(size=[0, 16]), r"expected 1 to 16384 px a side"),
+    "image too large": (lambda content: content.update(size=[12, 16385]), r"expected 1 to 16384 px a side"),
+    "three sides": (lambda content: content.update(size=[12, 16, 3]), "size: expected tuple"),
+    "no rig": (lambda content: content.update(rig={}), "missing key camera"),
+    "another rig": (lambda content: content["rig"]["camera"].update(fx="wide"), "camera.fx: expected a number"),
+    "stored nothing": (lambda content: content.update(stored="crossed"), "'crossed' is no configuration"),
+    "exact is a number": (lambda content: content.update(exact=1), "exact: expected bool, got 1"),
+    "light is text": (lambda content: content["settings"].update(light="x"), "settings light: expected a mapping"),
+    "generator with an escape": (lambda content: content["generator"].update(name="\x1b[31m"), r"U\+001B"),
+    "another content": (lambda content: content["content"].update({"test/../x": "0" * 32}), "expected split/column"),
+    "content without hash": (lambda content: content["content"].update({"test/depth": "x"}), "a hash of 32 hex digits"),
+    "more": (lambda content: content.update(more=1), "expected exactly the keys origin"),
+}
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory):
+    return make(tmp_path_factory.mktemp("small") / "set", {"train": ("bowl",), "test": ("mug",)})
+
+
+@pytest.fixture
+def copied(small, tmp_path):
+    return shutil.copytree(small, tmp_path / "here" / "set")
+
+
+@pytest.mark.parametrize("attack", MANIFESTS)
+def test_a_manifest_that_no_dataset_has(attack, copied):
+    change, message = MANIFESTS[attack]
+    changed_manifest(copied, change)
+    with pytest.raises(DatasetError, match=r"manifest\.json: damaged \(.*" + message):
+        read_manifest(copied)
+
+
+def test_no_command_writes_or_reads_outside_by_a_manifests_names(copied, tmp_path, capsys):
+    changed_manifest(copied, first_row(sample="../../x"))
+    out = tmp_path / "here" / "out"
+    for command in (
+        ["predict", "phase", copied, "--split", "train", "--out", out], ["verify", copied], ["info", copied],
+        ["export", copied, out, "--mat"], ["export", copied, out, "--parquet"],
+        ["publish", "dataset", copied, "--repo", "a/b", "--dry-run"],
+    ):  # fmt: skip
+        assert main([str(word) for word in command]) == 2, command
+        assert "manifest.json: damaged (sample '../../x'" in capsys.readouterr().err, command
+    assert sorted(path.name for path in tmp_path.rglob("*x*")) == [] and not out.exists()
+
+
+def test_no_command_follows_a_link_out_of_the_dataset(copied, tmp_path, capsys):
+    shard = copied / read_manifest(copied).shards[0].path
+    shutil.move(shard, tmp_path / "elsewhere.arrow")
+    shard.symlink_to(tmp_path / "elsewhere.arrow")
+    out = tmp_path / "here" / "out"
+    for command in (
+        ["predict", "phase", copied, "--split", "train", "--out", out], ["verify", copied], ["info", copied],
+        ["export", copied, out, "--parquet"], ["publish", "dataset", copied, "--repo", "a/b", "--dry-run"],
+    ):  # fmt: skip
+        assert main([str(word) for word in command]) == 2, command
+        assert f"{shard}: is a link out of the dataset" in capsys.readouterr().err, command
+    assert not out.exists()
+    shard.unlink()
+    shutil.move(tmp_path / "elsewhere.arrow", copied / "train" / "kept.arrow")
+    shard.symlink_to("kept.arrow")
+    assert DatasetFolder(copied).samples("train")
+    shutil.move(copied, tmp_path / "moved")
+    copied.symlink_to(tmp_path / "moved")  # the folder itself is what the user names
+    assert DatasetFolder(copied).samples("train")
+
+
+@pytest.mark.parametrize("name", ["train", "README.md", "manifest.json"])
+def test_a_folder_and_any_other_file_may_not_lead_elsewhere_either(name, copied, tmp_path):
+    shutil.move(copied / name, tmp_path / name)
+    (copied / name).symlink_to(tmp_path / name)
+    with pytest.raises(DatasetError, match="is a link out of the dataset"):
+        verify(copied)
+
+
+def test_a_mesh_that_the_manifest_does_not_list_is_not_exported(copied, tmp_path, capsys):
+    (copied / "meshes").mkdir()
+    for name in ("bowl", "mug"):
+        (copied / "meshes" / f"{name}.ply").symlink_to("/etc/passwd")
+    assert main(["export", str(copied), str(tmp_path / "out"), "--meshes"]) == 2
+    assert "bowl.ply: the mesh is missing" in capsys.readouterr().err and not (tmp_path / "out").exists()
+
+
+def test_rows_without_end_are_a_finding_at_once(copied):
+    changed_manifest(copied, first_shard(rows=10**15))
+    assert any(f"the files hold {10**15} rows, expected each of 6 once" in finding for finding in verify(copied))
+
+
+# ---- receipts, names from elsewhere
+
+
+@pytest.mark.parametrize("value", ODD, ids=str)
+def test_a_receipt_that_no_shard_left_is_as_none(value, tmp_path):
+    planned = assembly({"train": ("bowl",)})
+    (plan,) = planned.plans
+    (tmp_path / "set").mkdir()
+    files, rows = planned.writer(tmp_path / "set", tmp_path).write(plan, planned.rows(plan, tmp_path))
+    good = {"files": [vars(file) for file in files], "rows": rows}
+    receipt = tmp_path / "receipt.json"
+    receipt.write_text(json.dumps(good))
+    assert planned_receipt(receipt, plan) == (files, rows)
+    assert planned_receipt(receipt, replace(plan, index=1)) is None  # a shard of another name
+    for key in ("path", "split", "group", "xxh3_128"):
+        receipt.write_text(json.dumps({**good, "files": [{**good["files"][0], key: value}]}))
+        assert planned_receipt(receipt, plan) is None
+    for key in ("sample", "object", "view", "hashes", "object_px"):
+        fits = {"hashes": isinstance(value, dict), "object_px": type(value) in (int, float)}
+        if not fits.get(key):
+            receipt.write_text(json.dumps({**good, "rows": [{**rows[0], key: value}, *rows[1:]]}))
+            assert planned_receipt(receipt, plan) is None, key
+    for content in (value, {"files": value, "rows": rows}, {"files": good["files"], "rows": value}):
+        receipt.write_text(json.dumps(content))
+        assert planned_receipt(receipt, plan) is None or (value == [] and content["files"] == value)
+
+
+@pytest.mark.parametrize("text", ["[]", "{", '"x"', '{"size": NaN}'])
+def test_damaged_settings_of_a_build_are_refused(text, tmp_path):
+    planned = assembly({"train": ("bowl",)})
+    (tmp_path / "set" / ".build").mkdir(parents=True)
+    (tmp_path / "set" / ".build" / "settings.json").write_text(text)
+    with pytest.raises(FppBenchError, match=r"settings\.json is no valid JSON|with other settings"):
+        assemble(tmp_path / "set", planned, workers=1)
+
+
+@pytest.mark.parametrize(
+    "path", ["", ".", "..", "/", "/x", "a/..", "a/../b", "./a", "a/", "a//b", "a\\b", "a\0", "a\nb"]
+)
+def test_paths_that_name_nothing_below_a_folder(path, tmp_path):
+    assert path_problem(path) and path_problem("a/b.arrow") is None
+    with pytest.raises(RemoteError, match="remove it there"):
+        RemoteFolder(f"file://{tmp_path}").get(path, tmp_path / "x")
+
+
+@pytest.mark.parametrize("stem", ["x" * 120, "a b", "<b>", "-a", "x\x1b[31m"])
+def test_published_files_have_names_that_a_dataset_may_have(stem, tmp_path):
+    make_tree(tmp_path, splits={"train": ("bowl",), "val": (stem,)})
+    with pytest.raises(LayoutError, match="expected a name like power_drill_A60"):
+        plan_import(tmp_path)
+
+
+def test_damaged_lines_of_a_stopped_run_do_not_count(tmp_path):
+    run = {"method": "x"}
+    good = {"sample": "a", "seconds": 0.5, "report": {}}
+    bad = (
+        '{"sample": "b"}',
+        '{"sample": "b", "seconds": [], "report": {}}',
+        "[" * 10_000,
+        '{"sample": "b", "seconds": NaN,',
+    )
+    (tmp_path / UNFINISHED_FILE).write_text("\n".join([json.dumps(run), *bad, json.dumps(good)]) + "\n")
+    assert UnfinishedRun(tmp_path, run).finished == {"a": Finished(0.5, {})}
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(SubmissionError, match=r"none\.json: can't be read: No such file or directory$"):
+        read_json(tmp_path / "none.json", SubmissionError)
+    with pytest.raises(SubmissionError, match=r"can't be read: embedded null byte"):
+        read_json(tmp_path / "a\0b", SubmissionError)

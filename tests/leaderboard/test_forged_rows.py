@@ -1,0 +1,248 @@
+"""Rows that are consistent with themselves and not with the world: refused by name, or beside the ranks."""
+
+import csv
+import io
+import json
+from hashlib import sha256
+
+import pytest
+from board_rows import entry_with_errors, named_benchmarks, reliance, robustness, timing, write_result_file
+from scored_dataset import make_dataset
+
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.protocol import HEADLINE
+from fpp_ml_bench.evaluation.result import Timing
+from fpp_ml_bench.leaderboard import columns, rows
+from fpp_ml_bench.leaderboard.data_files import table_csv
+from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
+from fpp_ml_bench.leaderboard.row_file import ObjectMeans, Row, interval_over, mean_over, row_json, write_row
+from fpp_ml_bench.leaderboard.rows import read_entry
+
+OBJECTS = [f"object {n}" for n in range(8)]
+HONEST = {"first": 1.0, "second": 2.0, "third": 3.0}
+MINI, OTHER, FULL, UNSEEN = ({"test/depth": digit * 32} for digit in "abcd")
+
+
+@pytest.fixture(scope="module")
+def base(tmp_path_factory):
+    work = tmp_path_factory.mktemp("base")
+    return read_entry(write_result_file(work / "base.json", make_dataset(work / "tiny"), 1.0))
+
+
+@pytest.fixture
+def board(base, tmp_path, monkeypatch):
+    """Three vouched rows of a named benchmark in the leaderboard's folder; gives a function that adds a row file of
+    these contents and reads and ranks all."""
+    folder = tmp_path / "rows"
+    folder.mkdir()
+    monkeypatch.setattr(rows, "SHIPPED_ROWS", folder)
+    monkeypatch.setattr(rows, "VOUCHED", tmp_path / "vouched.txt")
+    (tmp_path / "vouched.txt").write_text("")
+    honest = {name: row_with(base, name, error) for name, error in HONEST.items()}
+    counts = {p.object: [p.samples, p.object_pixels, p.void_pixels] for p in honest["first"].per_object}
+    named_benchmarks(monkeypatch, counts, mini=MINI, full=FULL, unseen=UNSEEN)
+    for name, row in honest.items():
+        vouch(row, write_row(row, folder / f"{name}.json"))
+
+    def add(*contents):
+        for number, content in enumerate(contents):
+            (folder / f"forged-{number}.json").write_text(json.dumps(content))
+        return rank(read_entries(shipped_rows()))
+
+    return add
+
+
+def row_with(base, name, error, content=MINI, objects=OBJECTS, **about):
+    """A row whose error on object n is ``error`` (1 + n / 10) mm."""
+    errors = {each: error * (1 + n / 10) for n, each in enumerate(objects)}
+    return entry_with_errors(base, errors, name, content, **about).row
+
+
+def vouch(row, data):
+    with rows.VOUCHED.open("a") as file:
+        file.write(rows.vouching_line(row, data, "measured", "a command") + "\n")
+
+
+def content_of(row):
+    return json.loads(row_json(row))
+
+
+def consistent(content):
+    """``content`` with means, intervals and samples that follow from its objects: a forger can compute, too."""
+    parts = [ObjectMeans(**part) for part in content["per_object"]]
+    for key in HEADLINE:
+        content["metrics"][key] = mean_over(parts, key)
+        content["intervals"][key] = list(interval_over(parts, key) or (None, None))
+    content["dataset"]["samples"] = sum(part.samples for part in parts)
+    Row.model_validate({**content, "dataset": {**content["dataset"], "content": OTHER}})  # sound but for the world
+    return content
+
+
+def invented_objects(content):
+    for part in content["per_object"]:
+        part["object"] = f"my {part['object']}"
+    return consistent(content)
+
+
+def one_easy_object(content):
+    del content["per_object"][1:]
+    return consistent(content)
+
+
+def void_over_the_object(content):
+    part = content["per_object"][0]
+    part |= {"void_pixels": 100, "object_pixels": part["object_pixels"] - 100}
+    return consistent(content)
+
+
+def fewer_object_pixels(content):
+    part = content["per_object"][0]
+    part |= {"background_pixels": part["background_pixels"] + 9, "object_pixels": part["object_pixels"] - 9}
+    return consistent(content)
+
+
+def more_views(content):
+    for key in ("samples", "object_pixels", "background_pixels"):
+        content["per_object"][0][key] *= 2
+    return consistent(content)
+
+
+def no_error(content):
+    for part in content["per_object"]:
+        part |= dict.fromkeys(HEADLINE, 0.0)
+    return consistent(content)
+
+
+def another_benchmark(content):
+    content["dataset"] |= {"content": OTHER, "benchmark": {"name": "fpp-bench-mini", "version": 2}}
+    return content
+
+
+def named(name):
+    def act(content):
+        content["submission"]["name"] = name
+        return content
+
+    return act
+
+
+@pytest.mark.parametrize(
+    ("forge", "message"),
+    [
+        (invented_objects, "has no object 'my object 0'"),
+        (one_easy_object, "has the object 'object 1'"),
+        (void_over_the_object, "object pixels of 'object 0', this file says"),
+        (fewer_object_pixels, "object pixels of 'object 0', this file says"),
+        (more_views, "has 2 samples of 'object 0', this file says 4"),
+        (no_error, "every error is exactly 0"),
+        (another_benchmark, "benchmark says fpp-bench-mini version 2, but content is not that benchmark's"),
+        (lambda content: content | {"provenance": "measured here"}, "provenance: is not a key of this file"),
+        (named("first"), "both hold 'first' on the same data"),
+        (named("\uff26irst  "), "or what looks like it"),  # full-width, and spaces
+        (named("fir\u017ft"), "or what looks like it"),  # a long s
+        (named("fir\u200bst"), "U+200B"),
+        (named("fir\u034fst"), "U+034F"),
+        (named("firs\u0301\u0301t"), "U+0301 on another mark"),
+    ],
+)
+def test_a_forged_row_is_refused_by_name(forge, message, base, board):
+    content = content_of(row_with(base, "forged", 0.5))
+    with pytest.raises(SubmissionError, match="forged-0") as raised:
+        board(forge(content))
+    assert message in str(raised.value)
+
+
+def ranks(groups):
+    (group,) = groups
+    return {row.entry.name: row.ranks for row in group.rows}
+
+
+def test_an_invented_but_consistent_row_stands_beside_the_ranks(base, board):
+    """Nothing in such a row tells: it has its error and its place, and ranks nobody."""
+    assert ranks(board()) == {"first": "1", "second": "2", "third": "3"}
+    (group,) = board(content_of(row_with(base, "forged", 0.001)), content_of(row_with(base, "also", 2.5)))
+    assert {row.entry.name: row.ranks for row in group.rows} == {
+        "first": "1", "second": "2", "third": "3", "forged": "(1)", "also": "(3)"
+    }  # fmt: skip
+    forged = next(row for row in group.rows if row.entry.name == "forged")
+    assert forged.provenance == "self-reported" and forged.interval("object_mae_mm") is not None
+
+
+def test_strangers_widen_nobodys_rank(base, board):
+    """Each row more would ask for smaller p values: of six objects one takes all verdicts, ten make 1-5 a 1-15."""
+    six = OBJECTS[:6]
+    vouched = [row_with(base, name, error, OTHER, six) for name, error in HONEST.items()][:2]
+    for row in vouched:
+        vouch(row, write_row(row, rows.SHIPPED_ROWS / f"{row.submission.name}-six.json"))
+    strangers = [content_of(row_with(base, f"copy {n}", 1.5 + n / 1e4, OTHER, six)) for n in range(10)]
+    for added in ([], strangers[:1], strangers):
+        shown = {row.entry.name: row.ranks for row in board(*added)[-1].rows}
+        assert (shown.pop("first"), shown.pop("second")) == ("1", "2") and set(shown.values()) <= {"(2)"}
+
+
+def test_local_results_are_ranked_where_nobody_vouches(base, board, tmp_path):
+    """Beside vouched rows they have a place; without any they are ranked, and strangers' rows are not."""
+    mine = [row_with(base, name, error) for name, error in (("mine", 1.5), ("mine, again", 2.5))]
+    files = [tmp_path / f"{row.submission.name}.json" for row in mine]
+    for row, path in zip(mine, files, strict=True):
+        write_row(row, path)
+    board()
+    assert ranks(rank(read_entries([*shipped_rows(), *files]))) == {
+        "first": "1", "second": "2", "third": "3", "mine": "(2)", "mine, again": "(3)"
+    }  # fmt: skip
+    rows.VOUCHED.write_text("")
+    assert ranks(rank(read_entries([*shipped_rows(), *files]))) == {
+        "mine": "1", "mine, again": "2", "first": "(1)", "second": "(2)", "third": "(3)"
+    }  # fmt: skip
+    (group,) = rank(read_entries(shipped_rows()))
+    assert group.notes == ("No ranks: nobody vouches for a row here.",) and {row.ranks for row in group.rows} == {"-"}
+
+
+def test_rows_with_the_same_predictions_are_one(base, board):
+    """The vouched one is shown, whatever its file is called, and the others are named in a note."""
+    copies = [content_of(row_with(base, name, 0.5)) for name in ("a copy", "another")]
+    predictions = content_of(read_entry(rows.SHIPPED_ROWS / "second.json").row)["predictions_sha256"]
+    (group,) = board(*(copy | {"predictions_sha256": predictions} for copy in copies))
+    assert ranks([group]) == {"first": "1", "second": "2", "third": "3"}
+    assert [note.partition(": ")[2] for note in group.notes] == [
+        "a copy (forged-0.json).", "another (forged-1.json)."
+    ]  # fmt: skip
+    assert all("same predictions as second (second.json)" in note for note in group.notes)
+
+
+def test_a_vouched_half_is_not_joined_with_a_strangers(base, board):
+    half = row_with(base, "joined", 0.5, FULL)
+    vouch(half, write_row(half, rows.SHIPPED_ROWS / "half.json"))
+    with pytest.raises(SubmissionError, match=r"half\.json and .*forged-0\.json both hold 'joined'.*vouch for one"):
+        board(content_of(row_with(base, "joined", 0.1, UNSEEN, [f"unseen {n}" for n in range(8)])))
+
+
+def test_blocks_that_predictions_dont_tell_are_marked(base, board):
+    row = row_with(base, "forged", 2.5, timing=Timing(**timing(0.01)))
+    blocks = {"reliance": reliance(score=1.0, interval=[0.9, 1.0]), "robustness": {"test": robustness()}}
+    (group,) = board(content_of(row.model_copy(update=blocks)))
+    shown = {row.short_name: row for row in group.rows}["forged"]
+    cells = [columns.reliance(shown.entry), columns.robustness(shown.entry), columns.milliseconds_text(shown)]
+    assert cells == ["1.00*", "31.0*", "0.01*"] and not shown.entry.time_measured
+
+
+@pytest.mark.parametrize("before", ["", " ", "\u00a0 ", "'", '"', "\u201c\u2019", "` '", "(", "\u3000"])
+@pytest.mark.parametrize("sign", ["=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20"])
+def test_no_spreadsheet_runs_a_cell(before, sign, base, board):
+    name = f"{before}{sign}HYPERLINK(1)"
+    content = content_of(row_with(base, name, 0.5, method=name))
+    content["dataset"]["code"] = name
+    lines = list(csv.DictReader(io.StringIO(table_csv(board(content)))))
+    cells = next(line for line in lines if line["source"] == "forged-0.json")
+    assert [cells[key] for key in ("name", "method", "code")] == [f"'{name}"] * 3
+    assert cells["short_name"].startswith("'") and next(line for line in lines if line["name"] == "first")
+
+
+def test_the_list_and_not_the_row_says_who_vouches(base, board):
+    """The same bytes are vouched for wherever they are; a changed row is not."""
+    file = rows.SHIPPED_ROWS / "first.json"
+    assert sha256(file.read_bytes()).hexdigest() in rows.vouched() and read_entry(file).vouched
+    file.write_bytes(file.read_bytes().replace(b'"first"', b'"First"'))
+    assert read_entry(file).provenance == "self-reported"
+    (group,) = board()
+    assert {row.entry.name: row.ranks for row in group.rows} == {"second": "1", "third": "2", "First": "(1)"}
