@@ -303,7 +303,7 @@ def rank(results: "Iterable[str | Path]", sort: str = "object_mae_mm") -> "list[
     Returns
     -------
     list of Group
-        Each with its ``rows`` in order of rank, the tests of all ``pairs``, and why rows have no rank or are left out (``notes``).
+        Each with its ``rows`` in order of rank, the tests of all ``pairs``, and ``notes`` on rows without a rank.
 
     Raises
     ------
