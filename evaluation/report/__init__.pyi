@@ -9,9 +9,8 @@ from .html import percent as percent
 from .html import render as render
 from .html import seconds as seconds
 from .html import signed as signed
-from .report_page import html_table as html_table
-from .report_page import sample_table as sample_table
 from .report_page import score_table as score_table
+from .report_page import score_text as score_text
 from .report_page import write_report as write_report
 from .terminal import comparison_table as comparison_table
 from .terminal import result_table as result_table

@@ -111,7 +111,7 @@ def _panels(result: Result, dataset: DatasetFolder, folder: Path) -> Iterator[tu
         yield place, row, sample_panels(fringe, target, prediction_mm, row.sample)
 
 
-def _text(key: str, value: float | None) -> str:
+def score_text(key: str, value: float | None) -> str:
     """A value of ``key`` as it is written: mm, or per cent for a share."""
     return percent(value) if key.endswith("_share") else signed(value) if "bias" in key else millimetres(value)
 
@@ -127,10 +127,10 @@ def score_table(result: Result) -> str:
     for key, title in _TITLES.items():
         if key in SINCE_2 and getattr(result.metrics, key) is None:
             continue
-        mean, median = (_text(key, getattr(scores, key)) for scores in (result.metrics, result.median))
+        mean, median = (score_text(key, getattr(scores, key)) for scores in (result.metrics, result.median))
         interval = interval_text(result.intervals.of(key)) if key in HEADLINE else ""
         pooled = getattr(result.pooled, key, None)
-        rows.append([title, mean, interval, median, "" if pooled is None else _text(key, pooled)])
+        rows.append([title, mean, interval, median, "" if pooled is None else score_text(key, pooled)])
     caption = "Scores in mm. Mean, its 95% interval over objects, and median over samples; pooled over all pixels"
     return html_table(caption, ("Score", "Mean", "95% interval", "Median", "Pooled"), rows)
 
@@ -165,6 +165,6 @@ def sample_table(result: Result) -> str:
     """Scores of every sample, the largest object MAE first, with the hash of the prediction it comes from."""
     keys = ("object_mae_mm", "object_rmse_mm", "overall_mae_mm", "background_mae_mm", "object_missing_share")
     ordered = sorted(result.per_sample, key=lambda row: (-(row.object_mae_mm or 0.0), row.sample))
-    rows = [[r.sample, *(_text(key, getattr(r, key)) for key in keys), r.prediction_sha256[:12]] for r in ordered]
+    rows = [[r.sample, *(score_text(key, getattr(r, key)) for key in keys), r.prediction_sha256[:12]] for r in ordered]
     titles = ["Sample", *(_TITLES[key] for key in keys), "Prediction SHA-256"]
     return html_table("Every sample, the largest object MAE first; mm", titles, rows)

@@ -13,7 +13,7 @@ from typing import Any
 from fpp_ml_bench.baselines.tradeoff import Ladder, Rung, Tradeoff
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, HEADLINE, METRICS
-from fpp_ml_bench.evaluation.report import interval_text, millimetres, page, percent, render
+from fpp_ml_bench.evaluation.report import interval_text, page, render, score_text
 from fpp_ml_bench.evaluation.result import PART_TITLES
 from fpp_ml_bench.evaluation.score import FEWEST_OBJECTS
 from fpp_ml_bench.files import printable, write_atomically
@@ -119,9 +119,8 @@ def _score_cells(row: Row) -> list[tuple[str, str, str]]:
     cells = []
     for key in (*HEADLINE, *(key for key in METRICS if key not in HEADLINE)):
         if (value := getattr(row.metrics, key)) is not None:
-            text = (percent if key.endswith("_share") else millimetres)(value)
             title = key.removesuffix("_mm").replace("_", " ")
-            cells.append((title, text, interval_text(row.intervals.of(key))))
+            cells.append((title, score_text(key, value), interval_text(row.intervals.of(key))))
     return cells
 
 
