@@ -16,7 +16,7 @@ from typing import Any
 
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
-from fpp_ml_bench.evaluation.result import Result, parse_result, read_json, read_result
+from fpp_ml_bench.evaluation.result import Result, parse_result, read_json
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.files import file_content, printable
 from fpp_ml_bench.leaderboard.row_file import (
@@ -138,9 +138,10 @@ def read_entry(path: Path) -> Entry:
 
 
 def read_scored(path: Path) -> Result | Row:
-    """The whole result in a result file, the row in a row file, read as `read_entry` does."""
-    entry = read_entry(path)
-    return entry.row if entry.is_row_file else read_result(path)
+    """The whole result in a result file, the row in a row file, read as strictly as `read_entry` does."""
+    content = read_json(path)
+    is_row_file = isinstance(content, dict) and "row_schema_version" in content
+    return read_entry(path).row if is_row_file else parse_result(content, path)
 
 
 def alike(first: Result | Row, second: Result | Row) -> tuple[Any, Any]:

@@ -59,8 +59,8 @@ VOID = Flag.UNLIT | Flag.MIXED
 UNMEASURABLE = Flag.SATURATED | Flag.WEAK
 WEAK_GREY = 6.0
 """Amplitude of a fringe in grey levels: the decoder's least modulation is 5, and noise moves what it measures. On the
-training objects the full sequence decodes all but 0.002% of the object pixels that are neither void nor unmeasurable
-(in the lights workshop and hard all but 0.02% and 0.5%)."""
+training objects the full sequence decodes all but 0.003% of the object pixels that are neither void nor unmeasurable
+(in the lights workshop and hard all but 0.02% and 0.8%; ``benchmarks/benchmark_facts.py``)."""
 
 
 def void_pixels(
@@ -70,6 +70,12 @@ def void_pixels(
     surface (``exact_mm`` above 0) that is lit too weakly for the full sequence to decode it (``depth_mm`` 0)."""
     void: NDArray[np.bool_] = (flags & np.uint8(VOID)) != 0
     return void if depth_mm is None or exact_mm is None else void | ((exact_mm > 0) & (depth_mm == 0))
+
+
+def exact_void(flags: NDArray[np.uint8]) -> NDArray[np.bool_]:
+    """Pixels that count in no score against the exact depth, bool of the shape of ``flags``: those flagged `VOID` or
+    `UNMEASURABLE`, which follow from scene and light alone."""
+    return (flags & np.uint8(VOID | UNMEASURABLE)) != 0  # type: ignore[no-any-return]
 
 
 @dataclass

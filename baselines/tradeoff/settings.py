@@ -22,7 +22,7 @@ from fpp_ml_bench.decoding import Directions, plain_plan
 from fpp_ml_bench.depth import RangeRule
 from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError
 from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
-from fpp_ml_bench.loaders.sample import UNMEASURABLE, VOID, Row, void_pixels
+from fpp_ml_bench.loaders.sample import Row, exact_void, void_pixels
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig
 
@@ -101,7 +101,7 @@ class PhotographedViews:
         return np.asarray(self._rows[name].depth_exact_mm)
 
     def void(self, name: str) -> NDArray[np.bool_]:
-        return (np.asarray(self._rows[name].flags) & np.uint8(VOID | UNMEASURABLE)) != 0  # type: ignore[no-any-return]
+        return exact_void(np.asarray(self._rows[name].flags))
 
     def left_out(self, name: str, rule: RangeRule) -> NDArray[np.bool_] | None:
         return void_pixels(np.asarray(self._rows[name].flags)) if rule == "valid" else None

@@ -126,13 +126,17 @@ def known_problem(
 
 
 def intended_benchmark(manifest: Manifest) -> Benchmark | None:
-    """The benchmark whose settings a dataset was built with, whatever its content is; None for settings of its own."""
+    """The benchmark whose settings, but for the frames that are stored, a dataset was built with, whatever its content
+    is; None for settings of its own."""
     if manifest.origin != GENERATED:
         return None
     light = manifest.settings.get("light", {}).get("name")
-    for benchmark in (benchmark for benchmark in BENCHMARKS if benchmark.light == light):
-        settings = render.preset_settings(benchmark.preset, benchmark.size, benchmark.light, benchmark.rig)
-        if (manifest.settings, manifest.rig) == (settings.describe(), settings.rig.to_dict()):
+    for benchmark in BENCHMARKS:
+        if benchmark.light != light:
+            continue
+        settings = render.preset_settings(benchmark.preset, benchmark.size, light, benchmark.rig)
+        stated = manifest.settings | {"frames": settings.stored}
+        if stated == settings.describe() and manifest.rig == settings.rig.to_dict():
             return benchmark
     return None
 

@@ -26,10 +26,9 @@ from fpp_ml_bench.loaders.sample import (
     DEPTH_EXACT,
     DEPTHS,
     FLAGS,
-    UNMEASURABLE,
-    VOID,
     Flag,
     config_columns,
+    exact_void,
     stored_groups,
     void_pixels,
 )
@@ -175,13 +174,12 @@ class DatasetFolder:
         return self._image(sample, DATA_GROUP, FLAGS)
 
     def void(self, sample: str, column: str = DEPTH) -> NDArray[np.bool_]:
-        """Pixels that count in no score against ``column``, bool (H, W). Of ``depth_exact``: those flagged `VOID` or
-        `UNMEASURABLE` (`loaders.sample`), a property of scene and light. Of ``depth``: those flagged `VOID`, and
-        surface without a decoded depth. None are in data without flags."""
+        """Pixels that count in no score against ``column``, bool (H, W): of ``depth_exact`` `exact_void`, of ``depth``
+        `void_pixels`, with surface that has no decoded depth. None are in data without flags."""
         if not self.has_exact:
             return np.zeros(self.size, dtype=bool)
         if column == DEPTH_EXACT:
-            return (self.flags(sample) & np.uint8(VOID | UNMEASURABLE)) != 0  # type: ignore[no-any-return]
+            return exact_void(self.flags(sample))
         return void_pixels(self.flags(sample), self.depth_mm(sample), self.depth_mm(sample, DEPTH_EXACT))
 
     def left_out(self, sample: str, rule: RangeRule, column: str = DEPTH) -> NDArray[np.bool_] | None:

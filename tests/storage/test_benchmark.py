@@ -93,6 +93,7 @@ def test_settings_of_a_benchmark_with_other_bytes_are_a_warning(benchmark):
         preset_settings(benchmark.preset, benchmark.size, benchmark.light, benchmark.rig)
     ).manifest  # no rows yet: other bytes
     assert intended_benchmark(manifest) is benchmark
+    assert intended_benchmark(replace(manifest, settings={**manifest.settings, "frames": "single_shot"})) is benchmark
     as_expected, sentence = benchmark_sentence(manifest)
     assert not as_expected and benchmark.title in sentence
 
