@@ -69,9 +69,15 @@ class ClassicalMethod(Method):
     def decode(self, frames: Frames, reasons: bool = True, details: bool = False) -> Decoded:
         """`decode_stack` of a captured sequence; frames that are not in `frames_used` may be None."""
         return decode_stack(
-            frames, self.rig, direction=self.direction, steps=self.steps, threads=self.threads, reasons=reasons,
-            fewest=self.fewest, details=details,
-        )  # fmt: skip
+            frames,
+            self.rig,
+            direction=self.direction,
+            steps=self.steps,
+            threads=self.threads,
+            reasons=reasons,
+            fewest=self.fewest,
+            details=details,
+        )
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         return self.decode(frames, reasons=False).depth_mm

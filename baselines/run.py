@@ -143,14 +143,19 @@ def _write_prediction(run: UnfinishedRun, path: Path, depth_mm: NDArray[np.float
 def _described(method: Method) -> dict[str, Any]:
     """What the submission says of ``method`` and the machine, beside the time."""
     return {
-        "name": method.title, "method": method.name, "units": method.units, "frames_used": list(method.frames_used),
+        "name": method.title,
+        "method": method.name,
+        "units": method.units,
+        "frames_used": list(method.frames_used),
         "uses_ground_truth_range": method.uses_ground_truth_range,
         **({"range_rule": method.range_rule} if method.range_rule != "object" else {}),
         **({"uses_ground_truth_mask": True} if method.uses_ground_truth_mask else {}),
         "learned_from": method.learned_from,
-        "hardware": describe_hardware().to_dict(), "software": method.software,
-        "settings": {**method.settings}, **({"seeds": dict(method.seeds)} if method.seeds else {}),
-    }  # fmt: skip
+        "hardware": describe_hardware().to_dict(),
+        "software": method.software,
+        "settings": {**method.settings},
+        **({"seeds": dict(method.seeds)} if method.seeds else {}),
+    }
 
 
 COUNTED_SAMPLES = 6
@@ -165,12 +170,17 @@ def explain_predict(opened: DatasetFolder, method: Method, split: str) -> Explan
     sample = samples[len(samples) // 2]
     seconds = seconds_of(lambda: [frame.copy() for frame in opened.frames(sample, unused)]) if unused else None
     opened.release(sample)
-    lines = [LeftOut(
-        "frames that the method does not use", "frames", len(method.frames_used) * len(samples),
-        len(unused) * len(samples), len(unused) * len(samples) * height * width,
-        None if seconds is None else seconds * len(samples),
-        f"processor seconds of reading them for one sample ({sample}) now, times the samples",
-    )]  # fmt: skip
+    lines = [
+        LeftOut(
+            "frames that the method does not use",
+            "frames",
+            len(method.frames_used) * len(samples),
+            len(unused) * len(samples),
+            len(unused) * len(samples) * height * width,
+            None if seconds is None else seconds * len(samples),
+            f"processor seconds of reading them for one sample ({sample}) now, times the samples",
+        )
+    ]
     count = min(COUNTED_SAMPLES, len(samples))
     stacks = (captured_frames(opened, method, samples[i * len(samples) // count]) for i in range(count))
     scale, how = len(samples) / count, f"{count} of {len(samples)} samples"
@@ -182,11 +192,17 @@ def explain_predict(opened: DatasetFolder, method: Method, split: str) -> Explan
             saved_s += saved_by(lambda: method.predict(frames), 1, 1) or 0.0  # noqa: B023  called at once
             done, left_out = done + second_px, left_out + height * width - second_px
         pixels = round(left_out * scale)
-        lines.append(LeftOut(
-            "second direction where the first shows no object", "pixels", round(done * scale), pixels,
-            pixels * (len(method.frames_used) // 2), saved_s * scale,
-            f"{how} predicted again now with skipping off and on, and scaled up",
-        ))  # fmt: skip
+        lines.append(
+            LeftOut(
+                "second direction where the first shows no object",
+                "pixels",
+                round(done * scale),
+                pixels,
+                pixels * (len(method.frames_used) // 2),
+                saved_s * scale,
+                f"{how} predicted again now with skipping off and on, and scaled up",
+            )
+        )
     else:
         for frames in stacks:
             if (crop := method.crop(frames)) is None:
@@ -195,8 +211,15 @@ def explain_predict(opened: DatasetFolder, method: Method, split: str) -> Explan
             done += (rows.stop - rows.start) * (columns.stop - columns.start)
         else:
             rule = "the crop is part of the method, so there is no run without it to measure against"
-            lines.append(LeftOut(
-                "local fits and orders far from the object", "pixels", round(done * scale),
-                round((count * height * width - done) * scale), None, None, f"pixels counted on {how}; {rule}",
-            ))  # fmt: skip
+            lines.append(
+                LeftOut(
+                    "local fits and orders far from the object",
+                    "pixels",
+                    round(done * scale),
+                    round((count * height * width - done) * scale),
+                    None,
+                    None,
+                    f"pixels counted on {how}; {rule}",
+                )
+            )
     return explained("predict", f"{method.title}; {len(samples)} samples of {width}x{height} px", lines)

@@ -28,9 +28,13 @@ _MIB = 2.0**20
 
 
 def time_method(
-    opened: DatasetFolder, method: Method, split: str = "test", batch: int = 4, repeats: int = 20,
+    opened: DatasetFolder,
+    method: Method,
+    split: str = "test",
+    batch: int = 4,
+    repeats: int = 20,
     progress: Callable[[int], None] = lambda runs: None,
-) -> Timing:  # fmt: skip
+) -> Timing:
     """Time ``method`` on images of ``split``: see `Timing` for what each figure means. Frames are in memory before the
     clock starts, at most ``batch`` sequences of them: no reading or writing counts. Raises `DatasetError` for an empty
     split, or when the dataset lacks a frame that the method needs."""
@@ -74,15 +78,24 @@ def time_method(
     # getrusage(2): kB on Linux, bytes on macOS
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (_MIB if sys.platform == "darwin" else 1024)
     return Timing(
-        provenance="measured", latency_median_ms=_digits(statistics.median(latencies_ms)),
-        latency_p5_ms=_digits(low), latency_p95_ms=_digits(high), repeats=repeats, batch=batch, batched=method.batched,
-        throughput_per_s=_digits(statistics.median(rates)), peak_memory_mib=round(peak_mib, 1),
+        provenance="measured",
+        latency_median_ms=_digits(statistics.median(latencies_ms)),
+        latency_p5_ms=_digits(low),
+        latency_p95_ms=_digits(high),
+        repeats=repeats,
+        batch=batch,
+        batched=method.batched,
+        throughput_per_s=_digits(statistics.median(rates)),
+        peak_memory_mib=round(peak_mib, 1),
         working_memory_mib=None if working_mib is None else round(working_mib, 1),
         gpu_memory_mib=None if cuda is None else round(cuda.max_memory_allocated(method.device) / _MIB, 1),
-        parameters=method.parameters, frames=len(method.frames_used), image_size=list(opened.size),
-        device=method.device, hardware=HardwareInfo.model_validate(describe_hardware().to_dict()),
+        parameters=method.parameters,
+        frames=len(method.frames_used),
+        image_size=list(opened.size),
+        device=method.device,
+        hardware=HardwareInfo.model_validate(describe_hardware().to_dict()),
         software=method.software,
-    )  # fmt: skip
+    )
 
 
 def _digits(value: float) -> float:
@@ -130,9 +143,11 @@ def write_timing(path: Path, timing: Timing) -> None:
     """Put ``timing`` into the file, with ``seconds_per_sample`` and ``hardware`` as measured. See `check_target`."""
     content = timing.model_dump(mode="json")
     measured = {
-        "seconds_per_sample": timing.latency_median_ms / 1000, "seconds_source": "measured",
-        "hardware": content["hardware"], "timing": content,
-    }  # fmt: skip
+        "seconds_per_sample": timing.latency_median_ms / 1000,
+        "seconds_source": "measured",
+        "hardware": content["hardware"],
+        "timing": content,
+    }
     result = read_result(path) if path.suffix == ".json" else None
     submission = _described(path) if result is None else result.submission
     submission = Submission.model_validate({**submission.model_dump(mode="json"), **measured})

@@ -36,9 +36,11 @@ class ConstantMethod(Method):
 
     def __init__(self, rig: Rig, at: str | float = STANDOFF) -> None:
         known = {
-            STANDOFF: rig.standoff_m * MM_PER_M, MIDDLE: sum(rig.working_range_mm) / 2, TRAINING_MEAN: TRAINING_MEAN_MM,
+            STANDOFF: rig.standoff_m * MM_PER_M,
+            MIDDLE: sum(rig.working_range_mm) / 2,
+            TRAINING_MEAN: TRAINING_MEAN_MM,
             **RANGE_SHARES,
-        }  # fmt: skip
+        }
         try:
             self.value = float(known.get(at, at) if isinstance(at, str) else at)
         except ValueError:

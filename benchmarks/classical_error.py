@@ -58,9 +58,14 @@ def measure(dataset: DatasetFolder, split: str, direction: str, steps: int) -> P
         target_mm = dataset.target_mm(sample, "depth_exact")
         scores = score_sample(depth_mm, target_mm, EDGE_BAND_PX, dataset.void(sample, "depth_exact"))
         rows.append(
-            (scores.interior_valid.mae_mm, scores.valid.mae_mm, scores.object.mae_mm,
-             scores.missing / scores.object.pixels, scores.background.mae_mm)
-        )  # fmt: skip
+            (
+                scores.interior_valid.mae_mm,
+                scores.valid.mae_mm,
+                scores.object.mae_mm,
+                scores.missing / scores.object.pixels,
+                scores.background.mae_mm,
+            )
+        )
     mean = np.mean(np.array(rows, dtype=np.float64), axis=0)
     return Point(direction, steps, len(method.frames_used), *map(float, mean), statistics.median(seconds))
 
@@ -81,8 +86,13 @@ def draw(points: list[Point], path: Path) -> None:
         by_frames.plot([p.frames for p in line], [p.measured_mae_mm for p in line], "s--", color=colour, alpha=0.45)
         by_time.plot([1000 * p.seconds for p in line], error, "o-", color=colour)
         for point in line:
-            by_time.annotate(f"N={point.steps}", (1000 * point.seconds, point.interior_mae_mm), fontsize=7,
-                             xytext=(4, 3), textcoords="offset points")  # fmt: skip
+            by_time.annotate(
+                f"N={point.steps}",
+                (1000 * point.seconds, point.interior_mae_mm),
+                fontsize=7,
+                xytext=(4, 3),
+                textcoords="offset points",
+            )
     by_steps.set_xlabel("phase steps N a direction")
     by_frames.set_xlabel("frames captured")
     by_time.set_xlabel("milliseconds a sample (1 thread)")
@@ -113,8 +123,17 @@ def main() -> int:
     height, width = dataset.size
     samples = f"{args.split}, {len(dataset.samples(args.split))} samples of {height}x{width} px"
     print(f"{args.dataset} {dataset.fingerprint[:8]}, {samples}\n")
-    columns = ("fringes", "N", "frames", "interior MAE mm", "x sqrt(N)", "with edge pixels", "not measured",
-               "background MAE mm", "ms")  # fmt: skip
+    columns = (
+        "fringes",
+        "N",
+        "frames",
+        "interior MAE mm",
+        "x sqrt(N)",
+        "with edge pixels",
+        "not measured",
+        "background MAE mm",
+        "ms",
+    )
     print(f"| {' | '.join(columns)} |")
     print("|---" * len(columns) + "|")
     for p in points:

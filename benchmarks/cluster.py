@@ -118,8 +118,10 @@ def main() -> int:
     with tempfile.TemporaryDirectory(dir=args.work) as temporary:
         work = Path(temporary)
         ways = {
-            "local": ["--workers", "2"], "cluster": ["--cluster", address], "url": ["--cluster", address],
-        }  # fmt: skip
+            "local": ["--workers", "2"],
+            "cluster": ["--cluster", address],
+            "url": ["--cluster", address],
+        }
         seconds: dict[str, list[float]] = {way: [] for way in ways}
         prints: dict[str, dict[str, str]] = {}
         for repeat in range(args.repeats):

@@ -64,8 +64,10 @@ def main() -> int:
             wrong = [100 * float(1 - good.mean()) for good in right]
             theory = float(code.sigma_px(0.6 * 127.5, sigma))
             errors_px = f"{rms[0]:6.4f} {rms[1]:7.4f} {theory:8.4f}"
-            print(f"{name:<27} {sigma:5.0f} | {errors_px} | {wrong[0]:6.3f}% {wrong[1]:7.3f}% | {ours_ms:4.0f} "
-                  f"{theirs_ms:7.0f}")  # fmt: skip
+            print(
+                f"{name:<27} {sigma:5.0f} | {errors_px} | {wrong[0]:6.3f}% {wrong[1]:7.3f}% | {ours_ms:4.0f} "
+                f"{theirs_ms:7.0f}"
+            )
     return 0
 
 

@@ -19,8 +19,14 @@ from fpp_ml_bench.loaders.sample import VOID
 from fpp_ml_bench.optics import paper_rig
 
 PAIRS = (
-    "18,18,0,90", "18,14,0,90", "18,18,144.6,54.6", "14,14,142.7,52.7", "16,18,25,105", "18,27,25,160", "10,12,30,75",
-)  # fmt: skip
+    "18,18,0,90",
+    "18,14,0,90",
+    "18,18,144.6,54.6",
+    "14,14,142.7,52.7",
+    "16,18,25,105",
+    "18,27,25,160",
+    "10,12,30,75",
+)
 WRONG_MM = 75.0  # an error that only another order explains
 
 
@@ -51,8 +57,11 @@ def main() -> int:
                 void = (studio.flags(scene)[0] & VOID) != 0
                 rows.append(scores(route.measure(frame).depth_mm, depth_mm, void))
         mae, median, right, wrong, missed, background = np.mean(rows, axis=0)
-        print(f"| {first:g} / {second:g} | {angle:g} / {other:g} | {mae:.2f} | {median:.2f} | {right:.2f} | "
-              f"{100 * wrong:.2f}% | {100 * missed:.3f}% | {background:.2f} |", flush=True)  # fmt: skip
+        print(
+            f"| {first:g} / {second:g} | {angle:g} / {other:g} | {mae:.2f} | {median:.2f} | {right:.2f} | "
+            f"{100 * wrong:.2f}% | {100 * missed:.3f}% | {background:.2f} |",
+            flush=True,
+        )
     return 0
 
 
@@ -63,9 +72,13 @@ def scores(found_mm: NDArray, depth_mm: NDArray, void: NDArray) -> tuple[float, 
     error, answered = np.abs(found_mm - depth_mm)[on_object], found_mm[on_object] > 0
     wrong = answered & (error > WRONG_MM)
     return (
-        float(error.mean()), float(np.median(error)), float(error[answered & ~wrong].mean()), float(wrong.mean()),
-        float((~answered).mean()), float(found_mm[background].mean()),
-    )  # fmt: skip
+        float(error.mean()),
+        float(np.median(error)),
+        float(error[answered & ~wrong].mean()),
+        float(wrong.mean()),
+        float((~answered).mean()),
+        float(found_mm[background].mean()),
+    )
 
 
 if __name__ == "__main__":

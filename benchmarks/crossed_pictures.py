@@ -70,13 +70,14 @@ def panels_of(dataset: DatasetFolder, sample: str, method: CrossedMethod, others
     names = ["crossed", *("three frames" if len(one.frames_used) > 1 else one.name for one in others)]
     return [
         ("crossed frame", seen.grey, {"cmap": "gray", "vmin": 0, "vmax": 255}),
-        ("first carrier, rad", first, cyclic), ("second carrier, rad", second, cyclic),
+        ("first carrier, rad", first, cyclic),
+        ("second carrier, rad", second, cyclic),
         ("mask: 1 object, 2 added, 3 missed", verdict, {"cmap": four("Set1"), "vmin": -0.5, "vmax": 3.5}),
         ("order", order_of(seen), {"cmap": four("Set2"), "vmin": -0.5, "vmax": 3.5}),
         ("depth, mm", np.where(found, depth_mm, np.nan), ranged),
         ("exact depth, mm", np.where(on_object, exact, np.nan), ranged),
         *((f"error of {name}, mm", error, signed) for name, error in zip(names, errors, strict=True)),
-    ]  # fmt: skip
+    ]
 
 
 def main() -> None:

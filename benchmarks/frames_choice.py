@@ -123,8 +123,19 @@ def calibrate(dataset: DatasetFolder, split: str, every: int) -> None:
 
 
 def table(views: list[View]) -> None:
-    columns = ("stated mm", "frames, mean", "median", "most", "object MAE mm", "over budget", "oracle: frames",
-               "MAE mm", "as many", "more", "fewer")  # fmt: skip
+    columns = (
+        "stated mm",
+        "frames, mean",
+        "median",
+        "most",
+        "object MAE mm",
+        "over budget",
+        "oracle: frames",
+        "MAE mm",
+        "as many",
+        "more",
+        "fewer",
+    )
     print(f"\n| {' | '.join(columns)} |\n{'|---' * len(columns)}|")
     for error in sorted({v.error_mm for v in views}):
         at_error = [v for v in views if v.error_mm == error]
@@ -136,8 +147,10 @@ def table(views: list[View]) -> None:
         print(f"| {error:g} | {ours} | {oracle.mean():.1f} | {best:.2f} | {' | '.join(map(str, counts))} |")
     for v in views:
         if v.mae_mm > v.error_mm:
-            print(f"over {v.error_mm:g} mm: {v.sample}, {v.frames} frames, {v.mae_mm:.2f} mm, expected "
-                  f"{v.expected_mm:.2f}; oracle {v.oracle_frames} frames, {v.oracle_mae_mm:.2f} mm")  # fmt: skip
+            print(
+                f"over {v.error_mm:g} mm: {v.sample}, {v.frames} frames, {v.mae_mm:.2f} mm, expected "
+                f"{v.expected_mm:.2f}; oracle {v.oracle_frames} frames, {v.oracle_mae_mm:.2f} mm"
+            )
 
 
 def draw(views: list[View], error_mm: float, path: Path) -> None:

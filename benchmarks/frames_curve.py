@@ -39,12 +39,18 @@ STEPS = (3, 4, 6, 9, 18)
 WRONG_MM = 60.0
 """A larger error comes from a wrong order, not from the phase: this is just under a quarter of the shortest period."""
 SETTINGS: dict[str, tuple[str, dict]] = {
-    **{f"phase {direction} {n}": ("phase", {"direction": direction, "frames": n})
-       for direction in ("horizontal", "vertical") for n in FRAME_COUNTS},
-    **{f"classical {direction} {n}": ("classical", {"direction": direction, "steps": n})
-       for direction in ("horizontal", "vertical", "both") for n in STEPS},
+    **{
+        f"phase {direction} {n}": ("phase", {"direction": direction, "frames": n})
+        for direction in ("horizontal", "vertical")
+        for n in FRAME_COUNTS
+    },
+    **{
+        f"classical {direction} {n}": ("classical", {"direction": direction, "steps": n})
+        for direction in ("horizontal", "vertical", "both")
+        for n in STEPS
+    },
     **{f"phase-net {direction} 1": ("phase-net", {"direction": direction}) for direction in ("horizontal", "vertical")},
-}  # fmt: skip
+}
 """Each setting's method and options; the setting's last word is the point on its line."""
 ERROR_TICKS = (0.1, 0.2, 0.5, 1, 2, 5, 10)
 FRAME_TICKS = (1, 2, 3, 4, 6, 9, 13, 18, 25, 32, 50)
@@ -102,9 +108,18 @@ def measure(dataset: DatasetFolder, split: str, setting: str, predictor: Method)
     scores_by_sample = np.array(rows, dtype=np.float64)
     whole, valid, interior, edge, far, missing, background = map(float, scores_by_sample.mean(axis=0))
     return Point(
-        setting, len(predictor.frames_used), whole, float(np.median(scores_by_sample[:, 0])), valid, interior, edge,
-        far, missing, background, float(np.median(seconds)),
-    )  # fmt: skip
+        setting,
+        len(predictor.frames_used),
+        whole,
+        float(np.median(scores_by_sample[:, 0])),
+        valid,
+        interior,
+        edge,
+        far,
+        missing,
+        background,
+        float(np.median(seconds)),
+    )
 
 
 def point(dataset: DatasetFolder, split: str, setting: str, work: Path) -> Point | None:
@@ -117,9 +132,11 @@ def point(dataset: DatasetFolder, split: str, setting: str, work: Path) -> Point
         print(f"{setting}: left out ({reason})")
         return None
     key = {
-        "dataset": dataset.fingerprint, "split": split,
-        "protocol": PROTOCOL_VERSION, "settings": {option: str(value) for option, value in predictor.settings.items()},
-    }  # fmt: skip
+        "dataset": dataset.fingerprint,
+        "split": split,
+        "protocol": PROTOCOL_VERSION,
+        "settings": {option: str(value) for option, value in predictor.settings.items()},
+    }
     if path.is_file():
         stored = json.loads(path.read_text())
         if stored["key"] == key:
@@ -169,8 +186,19 @@ def draw(points: list[Point], path: Path) -> None:
 
 def table(points: list[Point], path: Path) -> None:
     """Print the points as a Markdown table and write them as CSV."""
-    columns = ("setting", "frames", "object MAE mm", "median view mm", "measured pixels mm", "interior mm", "edge mm",
-               "far off %", "missing %", "background mm", "ms")  # fmt: skip
+    columns = (
+        "setting",
+        "frames",
+        "object MAE mm",
+        "median view mm",
+        "measured pixels mm",
+        "interior mm",
+        "edge mm",
+        "far off %",
+        "missing %",
+        "background mm",
+        "ms",
+    )
     print(f"\n| {' | '.join(columns)} |")
     print("|---" * len(columns) + "|")
     for p in points:

@@ -36,7 +36,7 @@ from fpp_ml_bench.loaders.render import (
     load_light,
     place,
     solid_mesh,
-)  # fmt: skip
+)
 from fpp_ml_bench.loaders.render.pixels import mixed_pixels
 from fpp_ml_bench.loaders.render.surfels import Surfels
 from fpp_ml_bench.machine import describe_hardware
@@ -94,11 +94,14 @@ def stages(settings: BuildSettings) -> list[tuple[str, float, float]]:
         ("form factors, once an object", (lambda: Surfels.of(mesh)) if surfels else None, len(VIEWS)),
         ("bounces", (lambda: studio.lighting.upon(mesh, traced, degrees, offset_m)) if surfels else None, 1),
         ("light of the central rays", lambda: upon.at(points_m, hits.normals, hits.triangle), 1),
-        ("light of the mixed pixels' rays",
-         (lambda: upon.at(mixed.points_m, mixed.normals, mixed.triangle)) if mixed else None, 1),
+        (
+            "light of the mixed pixels' rays",
+            (lambda: upon.at(mixed.points_m, mixed.normals, mixed.triangle)) if mixed else None,
+            1,
+        ),
         (f"{count} exposures", lambda: studio.expose(scene, tuple(range(count))), 1),
         ("ground truth (object only)", lambda: decode_stack(frames, rig, mask=seen), 1),
-    ]  # fmt: skip
+    ]
     times = [(name, median_ms(work), views) for name, work, views in every if work is not None]
     return [(name, ms, ms / count / views) for name, ms, views in times]
 

@@ -41,9 +41,15 @@ from fpp_ml_bench.loaders.storage import DatasetFolder
 
 ROWS = Path(__file__).resolve().parent.parent / "leaderboard" / "rows"
 CLASSICAL = (
-    (18, "both"), (18, "vertical"), (18, "horizontal"), (9, "both"), (9, "vertical"), (6, "vertical"), (4, "vertical"),
+    (18, "both"),
+    (18, "vertical"),
+    (18, "horizontal"),
+    (9, "both"),
+    (9, "vertical"),
+    (6, "vertical"),
+    (4, "vertical"),
     (3, "vertical"),
-)  # fmt: skip
+)
 """Steps and directions of the classical method; 18 is divisible by all but 4, so the 4 phases are not evenly spaced."""
 SEVERAL_FRAMES = ((2, "horizontal"), (3, "horizontal"), (3, "vertical"))
 """Frames and direction of the phase route with more than one frame."""

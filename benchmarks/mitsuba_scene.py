@@ -71,24 +71,50 @@ class PathTraced:
         mirror = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": surface.roughness**2}
         blend = {"type": "blendbsdf", "weight": surface.gloss, "matte": matte, "mirror": mirror}
         wall = {"type": "diffuse", "reflectance": {"type": "rgb", "value": (1 - surface.gloss) * surface.albedo}}
-        film = {"type": "hdrfilm", "width": camera.width, "height": camera.height, "pixel_format": "rgb",
-                "component_format": "float32", "rfilter": {"type": "box"}, "crop_offset_x": self.left,
-                "crop_offset_y": self.top, "crop_width": self.width, "crop_height": self.height}  # fmt: skip
+        film = {
+            "type": "hdrfilm",
+            "width": camera.width,
+            "height": camera.height,
+            "pixel_format": "rgb",
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+            "crop_offset_x": self.left,
+            "crop_offset_y": self.top,
+            "crop_width": self.width,
+            "crop_height": self.height,
+        }
         return {
             "type": "scene",
             "integrator": {"type": "path", "max_depth": length, "rr_depth": 1000},
-            "camera": {"type": "perspective", "fov_axis": "x", "fov": _field_degrees(camera), "near_clip": 0.1,
-                       "far_clip": 100.0, "to_world": self._looking(np.zeros(3)), "film": film,
-                       "sampler": {"type": "multijitter", "sample_count": samples}},
-            "projector": {"type": "projector", "fov": _field_degrees(projector), "scale": power,
-                          "to_world": self._looking(centre),
-                          "irradiance": {"type": "bitmap", "bitmap": self.mi.Bitmap(screen), "raw": True,
-                                         "wrap_mode": "clamp"}},
-            "object": {"type": "ply", "filename": str(self.file), "face_normals": True,
-                       "bsdf": {"type": "twosided", "surface": blend if surface.gloss else matte}},
-            "wall": {"type": "rectangle", "bsdf": {"type": "twosided", "surface": wall},
-                     "to_world": self.mi.ScalarTransform4f().translate([0, 0, rig.background_m]).scale([20, 20, 1])},
-        }  # fmt: skip
+            "camera": {
+                "type": "perspective",
+                "fov_axis": "x",
+                "fov": _field_degrees(camera),
+                "near_clip": 0.1,
+                "far_clip": 100.0,
+                "to_world": self._looking(np.zeros(3)),
+                "film": film,
+                "sampler": {"type": "multijitter", "sample_count": samples},
+            },
+            "projector": {
+                "type": "projector",
+                "fov": _field_degrees(projector),
+                "scale": power,
+                "to_world": self._looking(centre),
+                "irradiance": {"type": "bitmap", "bitmap": self.mi.Bitmap(screen), "raw": True, "wrap_mode": "clamp"},
+            },
+            "object": {
+                "type": "ply",
+                "filename": str(self.file),
+                "face_normals": True,
+                "bsdf": {"type": "twosided", "surface": blend if surface.gloss else matte},
+            },
+            "wall": {
+                "type": "rectangle",
+                "bsdf": {"type": "twosided", "surface": wall},
+                "to_world": self.mi.ScalarTransform4f().translate([0, 0, rig.background_m]).scale([20, 20, 1]),
+            },
+        }
 
     def _looking(self, origin: NDArray[np.float64]) -> Any:
         target = origin + np.array([0.0, 0.0, 1.0])

@@ -75,8 +75,9 @@ def mesh_of(name: str) -> SolidMesh:
     """A scene's object in object coordinates, metres: a tilted plate, a ball, or one of the benchmark's."""
     if name == "plane":
         y, z, tilt = 0.15, 0.15, np.radians(25)
-        corners = np.array([[s * y * np.sin(tilt), s * y * np.cos(tilt), t * z] for s, t in
-                            ((-1, -1), (1, -1), (1, 1), (-1, 1))])  # fmt: skip
+        corners = np.array(
+            [[s * y * np.sin(tilt), s * y * np.cos(tilt), t * z] for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
+        )
         return SolidMesh(name, corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
     if name == "sphere":
         ball = trimesh.creation.icosphere(subdivisions=8, radius=0.13)
@@ -178,14 +179,24 @@ def camera_rows() -> list[str]:
     lines = []
     for grey in (20.0, 60.0, 120.0, 180.0, 235.0):
         own = np.empty((1, pixels.size), dtype=np.uint8)
-        sense_kernel(own, np.full((1, pixels.size), grey, dtype=np.float32), pixels, normal_table(),
-                     stream_keys("fade", grey)[None], np.float32(sensor.noise.read_variance),
-                     np.float32(sensor.noise.shot_per_grey), np.float32(0), np.empty(0, dtype=np.uint8))  # fmt: skip
+        sense_kernel(
+            own,
+            np.full((1, pixels.size), grey, dtype=np.float32),
+            pixels,
+            normal_table(),
+            stream_keys("fade", grey)[None],
+            np.float32(sensor.noise.read_variance),
+            np.float32(sensor.noise.shot_per_grey),
+            np.float32(0),
+            np.empty(0, dtype=np.uint8),
+        )
         # `fade` cuts off decimals where ours rounds: half a grey level of dark current makes the two one.
         image = np.full((1, 1, pixels.size, 1), grey / 255)
         other = fade(image, K=gain, dark_noise=camera.read_noise_e, dark_current=0.5 / gain, rng=1)
-        lines.append(f"camera at grey {grey:g}: ours {own.mean():.3f} +- {own.std():.4f}, "
-                     f"fringes {other.mean():.3f} +- {other.std():.4f}")  # fmt: skip
+        lines.append(
+            f"camera at grey {grey:g}: ours {own.mean():.3f} +- {own.std():.4f}, "
+            f"fringes {other.mean():.3f} +- {other.std():.4f}"
+        )
     edge = np.where(np.arange(64) < 32, np.float32(40), np.float32(200)) + np.zeros((64, 1), dtype=np.float32)
     own_edge = edge.copy()
     blur_image(own_edge, gaussian_weights(1.2**2, 3.0).astype(np.float32), np.empty_like(edge))
@@ -225,8 +236,9 @@ def compare(mi: Any, name: str, args: argparse.Namespace, folder: Path) -> list[
     rows += phase_rows(name, (own, own_direct), *full, Images.mean(*direct), inside)
     if name in GLOSSY:
         light = light_of(False, GLOSS)
-        rows += image_rows(name, "glossy", ours(mesh, rig, light)[0], *path_traced(light, 2, DIRECT_SAMPLES), inside,
-                           DIRECT)  # fmt: skip
+        rows += image_rows(
+            name, "glossy", ours(mesh, rig, light)[0], *path_traced(light, 2, DIRECT_SAMPLES), inside, DIRECT
+        )
     if args.pictures:
         picture(name, own, Images.mean(*full), inside, args.pictures / f"path_traced_{name}.png")
     return rows
@@ -244,9 +256,10 @@ def picture(name: str, own: Images, other: Images, inside: NDArray, file: Path) 
     most = other.white[inside].max()
     figure, axes = plt.subplots(1, 3, figsize=(9, 3.2), layout="constrained")
     for axis, image, title in (
-        (axes[0], own.white, f"{name}: ours"), (axes[1], other.white, "Mitsuba 3"),
+        (axes[0], own.white, f"{name}: ours"),
+        (axes[1], other.white, "Mitsuba 3"),
         (axes[2], 10 * np.where(inside, own.white - other.white, 0.0), "difference x 10"),
-    ):  # fmt: skip
+    ):
         low, colours = (-most, "RdBu_r") if axis is axes[2] else (0, "gray")
         axis.imshow(image[box], vmin=low, vmax=most, cmap=colours)
         axis.set_title(title, fontsize=9)
@@ -260,8 +273,10 @@ def table(rows: list[Row]) -> str:
     lines = ["| scene | what | difference | seeds | asked | ours s | Mitsuba s |", "|---|---|---|---|---|---|---|"]
     for row in rows:
         asked = f"{row.asked:.1%}{'' if row.kept else ' **missed**'}"
-        lines.append(f"| {row.scene} | {row.what} | {row.difference:.2%} | {row.seeds:.2%} | {asked} | "
-                     f"{row.ours_s:.2f} | {row.mitsuba_s:.1f} |")  # fmt: skip
+        lines.append(
+            f"| {row.scene} | {row.what} | {row.difference:.2%} | {row.seeds:.2%} | {asked} | "
+            f"{row.ours_s:.2f} | {row.mitsuba_s:.1f} |"
+        )
     return "\n".join(lines)
 
 

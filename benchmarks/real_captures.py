@@ -96,8 +96,10 @@ def calibrate(
     sizes = (theirs.camera.width, theirs.camera.height), (theirs.projector.width, theirs.projector.height)
     print(f"six poses, {sum(len(pose.corners_px) for pose in poses)} corners, found in {found_in:.0f} s")
     if response is not None:
-        print(f"response: gamma {response.gamma:.3f} +- {response.sigma:.3f}, misfit {response.misfit_grey:.2f} grey "
-              f"levels, white on the board {response.white_grey:.0f} of 255")  # fmt: skip
+        print(
+            f"response: gamma {response.gamma:.3f} +- {response.sigma:.3f}, misfit {response.misfit_grey:.2f} grey "
+            f"levels, white on the board {response.white_grey:.0f} of 255"
+        )
     print("calibration, RMS in px                            camera  alone  projector  alone  stereo  left out")
     errors = theirs.camera_error_px, theirs.projector_error_px, theirs.stereo_error_px
     print(f"{'authors':<50}{errors[0]:6.3f}{'':9}{errors[1]:8.3f}{'':7}{errors[2]:8.3f}")
@@ -111,15 +113,19 @@ def calibrate(
     ):
         found = calibration.calibrate(poses, board, *sizes, lens, estimate_board=free)
         alone = found.alone_rms_px
-        print(f"{title:<50}{found.camera_rms_px:6.3f} {alone[0]:6.3f}  {found.projector_rms_px:8.3f} {alone[1]:6.3f}"
-              f"{found.stereo_rms_px:8.3f}{found.held_out_rms_px:10.3f}")  # fmt: skip
+        print(
+            f"{title:<50}{found.camera_rms_px:6.3f} {alone[0]:6.3f}  {found.projector_rms_px:8.3f} {alone[1]:6.3f}"
+            f"{found.stereo_rms_px:8.3f}{found.held_out_rms_px:10.3f}"
+        )
         results.append(found)
     best = min(results, key=lambda found: found.held_out_rms_px)
     rig = captures.calibrated_rig(best, stand_in)
     for name in ("camera", "projector"):
         for who, device in (("authors", getattr(theirs, name)), ("ours", getattr(rig, name))):
-            print(f"{name:<10} {who:<8} f {device.fx:8.1f} {device.fy:8.1f}  c {device.cx:7.1f} {device.cy:7.1f}  "
-                  f"k1 {device.distortion[0]:+.4f}")  # fmt: skip
+            print(
+                f"{name:<10} {who:<8} f {device.fx:8.1f} {device.fy:8.1f}  c {device.cx:7.1f} {device.cy:7.1f}  "
+                f"k1 {device.distortion[0]:+.4f}"
+            )
     for who, shift in (("authors", theirs.translation_m), ("ours", best.translation_m)):
         x, y, z = (1000 * length for length in shift)
         print(f"translation {who:<8} {x:8.2f} {y:8.2f} {z:8.2f} mm, baseline {np.linalg.norm([x, y, z]):.2f} mm")
@@ -159,9 +165,11 @@ def decode(
     within = float((np.abs(difference) < 2).mean())
     x, y = (axis[rows, columns][both] for axis in rig.camera.rays())
     apart, scale = after_motion(np.stack([x, y, np.ones_like(x)], axis=1) * depth_mm[both, None], theirs[both])
-    print(f"{title:<34} {both.sum():,} of {len(theirs):,} px: median {median:+.3f} mm, robust sigma {sigma:.3f} mm, "
-          f"{100 * within:.2f}% within 2 mm; noise {bend_noise_mm(answer.depth):.3f} mm; {seconds:.1f} s; after a "
-          f"rigid motion: median distance {apart:.3f} mm, their size / ours {scale:.5f}")  # fmt: skip
+    print(
+        f"{title:<34} {both.sum():,} of {len(theirs):,} px: median {median:+.3f} mm, robust sigma {sigma:.3f} mm, "
+        f"{100 * within:.2f}% within 2 mm; noise {bend_noise_mm(answer.depth):.3f} mm; {seconds:.1f} s; after a "
+        f"rigid motion: median distance {apart:.3f} mm, their size / ours {scale:.5f}"
+    )
 
 
 def after_motion(points: NDArray[np.float64], target: NDArray[np.float64]) -> tuple[float, float]:
@@ -216,9 +224,22 @@ def one_frame(folder: Path, rig: "optics.Rig", scratch: Path) -> None:
     for near, far in ((350.0, 450.0), (360.0, 430.0)):
         ranged = rig.with_range((near, far))
         in_range = on_object & (decoded.depth_mm >= near) & (decoded.depth_mm <= far)
-        half_mm = 0.5 / float(np.median(np.abs(decoding.coordinate_slope_px_per_mm(
-            rig, decoded.depth_mm[in_range], "vertical", tuple(axis[in_range] for axis in rig.camera.rays())
-        )))) * rig.pitch("vertical")  # fmt: skip
+        half_mm = (
+            0.5
+            / float(
+                np.median(
+                    np.abs(
+                        decoding.coordinate_slope_px_per_mm(
+                            rig,
+                            decoded.depth_mm[in_range],
+                            "vertical",
+                            tuple(axis[in_range] for axis in rig.camera.rays()),
+                        )
+                    )
+                )
+            )
+            * rig.pitch("vertical")
+        )
         file = scratch / "mask.png"
         Image.fromarray(in_range.astype(np.uint8) * 255).save(file)
         for mask, title in ((None, "own mask"), (file, "mask given")):
@@ -233,10 +254,12 @@ def one_frame(folder: Path, rig: "optics.Rig", scratch: Path) -> None:
             wrong = answered & (error > half_mm)
             confident = wrong & (sigma > 0) & (sigma < robustness.corruptions().confident_below * error)
             median = float(np.median(error[answered])) if answered.any() else float("nan")
-            print(f"one frame, {near:g} to {far:g} mm, {title:<10} answered {100 * answered.mean():.1f}% of "
-                  f"{in_range.sum():,} px, median error {median:.2f} mm, wrong orders (over {half_mm:.0f} mm) "
-                  f"{100 * wrong.mean():.2f}%, confident errors {100 * confident.mean():.3f}%; outside the object "
-                  f"{(given & ~on_object).sum():,} px; {seconds:.1f} s")  # fmt: skip
+            print(
+                f"one frame, {near:g} to {far:g} mm, {title:<10} answered {100 * answered.mean():.1f}% of "
+                f"{in_range.sum():,} px, median error {median:.2f} mm, wrong orders (over {half_mm:.0f} mm) "
+                f"{100 * wrong.mean():.2f}%, confident errors {100 * confident.mean():.3f}%; outside the object "
+                f"{(given & ~on_object).sum():,} px; {seconds:.1f} s"
+            )
 
 
 def crossed_frames(folder: Path, rig: "optics.Rig") -> None:
@@ -250,20 +273,25 @@ def crossed_frames(folder: Path, rig: "optics.Rig") -> None:
         near, far = np.percentile(decoded.depth_mm[on_board], (1, 99))
         ranged = rig.with_range((float(near) - BOARD_MARGIN_MM, float(far) + BOARD_MARGIN_MM))
         route = CrossedRoute(ranged)
-        vertical, horizontal = (np.ascontiguousarray(frames[rig.sequence.sinusoids(way)[0]])
-                                for way in ("vertical", "horizontal"))  # fmt: skip
+        vertical, horizontal = (
+            np.ascontiguousarray(frames[rig.sequence.sinusoids(way)[0]]) for way in ("vertical", "horizontal")
+        )
         measured = route.measure(coding.crossed_from_pair(horizontal, vertical), on_board)
         learned = CrossedNetMethod(ranged).answer(frames)
-        for title, depth_mm, sigma_mm in (("crossed", measured.depth_mm, measured.sigma_mm),
-                                          ("crossed-net", learned.depth, learned.sigma_mm)):  # fmt: skip
+        for title, depth_mm, sigma_mm in (
+            ("crossed", measured.depth_mm, measured.sigma_mm),
+            ("crossed-net", learned.depth, learned.sigma_mm),
+        ):
             both = on_board & (depth_mm > 0)
             error = np.abs(depth_mm - decoded.depth_mm)[both]
             wrong = error > WRONG_ORDER_MM
             confident = wrong & (sigma_mm[both] < robustness.corruptions().confident_below * error)
-            print(f"one crossed frame, pose {number}, {ranged.working_range_mm[0]:.0f} to "
-                  f"{ranged.working_range_mm[1]:.0f} mm, {title}: answered {100 * both.sum() / on_board.sum():.1f}% of "
-                  f"{on_board.sum():,} px, median error {np.median(error):.2f} mm, wrong orders "
-                  f"{100 * wrong.mean():.2f}%, confident errors {100 * confident.mean():.3f}%")  # fmt: skip
+            print(
+                f"one crossed frame, pose {number}, {ranged.working_range_mm[0]:.0f} to "
+                f"{ranged.working_range_mm[1]:.0f} mm, {title}: answered {100 * both.sum() / on_board.sum():.1f}% of "
+                f"{on_board.sum():,} px, median error {np.median(error):.2f} mm, wrong orders "
+                f"{100 * wrong.mean():.2f}%, confident errors {100 * confident.mean():.3f}%"
+            )
 
 
 if __name__ == "__main__":

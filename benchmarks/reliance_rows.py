@@ -135,8 +135,15 @@ class Materials:
 
 
 _NO_OPTIONS = {
-    "weights_sha256", "device", "mask_threshold", "order_lead", "order_by_range", "temperature", "offset", "doubted",
-}  # fmt: skip
+    "weights_sha256",
+    "device",
+    "mask_threshold",
+    "order_lead",
+    "order_by_range",
+    "temperature",
+    "offset",
+    "doubted",
+}
 """Settings that describe the weights and are no options of the method; of phase-net ``shading`` is one, too."""
 
 
@@ -175,15 +182,31 @@ def fill(materials: Materials, path: Path, again: bool) -> str:
 
 def table(entries: list[Entry]) -> str:
     """Every row that has a phase reliance as Markdown, the highest score first."""
-    titles = ("Row", "Reliance", "95% interval", "Periods aside", "Follows phase", "Follows brightness",
-              "Change by outline", "No fringe inside", "No fringe outside", "Object MAE, mm", "Track")  # fmt: skip
+    titles = (
+        "Row",
+        "Reliance",
+        "95% interval",
+        "Periods aside",
+        "Follows phase",
+        "Follows brightness",
+        "Change by outline",
+        "No fringe inside",
+        "No fringe outside",
+        "Object MAE, mm",
+        "Track",
+    )
     measured = [(entry, entry.row.reliance) for entry in entries if entry.row.reliance is not None]
     measured.sort(key=lambda pair: (-pair[1].score, pair[0].name))
     lines = []
     for entry, measured_reliance in measured:
         parts = measured_reliance.parts
-        values = (parts.follows_phase, parts.follows_light, parts.change_outline, parts.change_no_fringe_inside,
-                  parts.change_no_fringe_outside)  # fmt: skip
+        values = (
+            parts.follows_phase,
+            parts.follows_light,
+            parts.change_outline,
+            parts.change_no_fringe_inside,
+            parts.change_no_fringe_outside,
+        )
         cells = [
             entry.name,
             f"{measured_reliance.score:.3f}",

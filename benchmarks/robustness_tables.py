@@ -30,8 +30,17 @@ ALT = {
     "unseen": "Error against severity for each axis on the unseen set",
 }
 SCORES = ("wrong_share", "unanswered_share", "confident_share", "coverage")
-TITLES = ("method", "mean, mm", "95% interval", "clean, mm", "ratio", "wrong orders", "unanswered",
-          "confident errors", "coverage")  # fmt: skip
+TITLES = (
+    "method",
+    "mean, mm",
+    "95% interval",
+    "clean, mm",
+    "ratio",
+    "wrong orders",
+    "unanswered",
+    "confident errors",
+    "coverage",
+)
 Row = tuple[str, Robustness]
 
 
@@ -44,8 +53,10 @@ def rows_in(results: Iterable[Result]) -> dict[SetName, list[Row]]:
 def _of_set(name: SetName, results: Sequence[Result]) -> list[Row]:
     blocks = [(result, block) for result in results if (block := (result.robustness or {}).get(name))]
     names = short_names([result.submission for result, _ in blocks])
-    found = [(f"{short}, {block.size_px} px" if block.size_px != FULL_SIZE else short, block)
-             for short, (_, block) in zip(names, blocks, strict=True)]  # fmt: skip
+    found = [
+        (f"{short}, {block.size_px} px" if block.size_px != FULL_SIZE else short, block)
+        for short, (_, block) in zip(names, blocks, strict=True)
+    ]
     return sorted(found, key=lambda row: (row[1].mae_mm, row[0]))
 
 

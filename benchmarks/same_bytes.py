@@ -30,10 +30,14 @@ WAYS: dict[str, dict[str, str]] = {
     "C library without AVX and FMA": {"GLIBC_TUNABLES": GLIBC},
     "OpenBLAS for Nehalem": {"OPENBLAS_CORETYPE": "Nehalem"},
     "all of these": {
-        "NUMBA_CPU_NAME": "generic", "NUMBA_CPU_FEATURES": "", "NPY_DISABLE_CPU_FEATURES": NO_AVX,
-        "GLIBC_TUNABLES": GLIBC, "OPENBLAS_CORETYPE": "Nehalem", "WORKERS": "1",
+        "NUMBA_CPU_NAME": "generic",
+        "NUMBA_CPU_FEATURES": "",
+        "NPY_DISABLE_CPU_FEATURES": NO_AVX,
+        "GLIBC_TUNABLES": GLIBC,
+        "OPENBLAS_CORETYPE": "Nehalem",
+        "WORKERS": "1",
     },
-}  # fmt: skip
+}
 
 
 MESHES = """\

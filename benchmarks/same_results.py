@@ -59,24 +59,55 @@ RECIPES = {
 SHORT = {"width": 4, "max_epochs": 2, "pairs_per_epoch": 4, "validation_pairs": 2, "batch": 2}
 SCORED = ("normalization", "background_removed", "architecture")
 METHODS = (
-    "classical mini", "classical mini --steps 3", "classical mini --steps 4 --direction vertical",
-    "classical mini --steps 9 --direction horizontal", "classical mini --fewest", "classical mini --depth-noise 0.5",
-    "classical mini --direction vertical --no-skip", "classical three --split all", "classical shadows",
-    "classical varied --steps 6", "classical noisy --direction horizontal", "classical own-mesh --split all",
+    "classical mini",
+    "classical mini --steps 3",
+    "classical mini --steps 4 --direction vertical",
+    "classical mini --steps 9 --direction horizontal",
+    "classical mini --fewest",
+    "classical mini --depth-noise 0.5",
+    "classical mini --direction vertical --no-skip",
+    "classical three --split all",
+    "classical shadows",
+    "classical varied --steps 6",
+    "classical noisy --direction horizontal",
+    "classical own-mesh --split all",
     "classical deep --fewest",
-    "phase mini", "phase mini --fringe vertical", "phase mini --frames 2", "phase mini --frames 3",
-    "phase mini --frames 3 --fringe vertical", "phase mini --frames 6", "phase mini --error-mm 3",
-    "phase mini --prior standoff", "phase mini --no-shading", "phase mini --min-confidence 0.5",
-    "phase three --split all", "phase shadows", "phase varied", "phase noisy", "phase own-mesh --split all",
+    "phase mini",
+    "phase mini --fringe vertical",
+    "phase mini --frames 2",
+    "phase mini --frames 3",
+    "phase mini --frames 3 --fringe vertical",
+    "phase mini --frames 6",
+    "phase mini --error-mm 3",
+    "phase mini --prior standoff",
+    "phase mini --no-shading",
+    "phase mini --min-confidence 0.5",
+    "phase three --split all",
+    "phase shadows",
+    "phase varied",
+    "phase noisy",
+    "phase own-mesh --split all",
     "phase vertical --fringe vertical",
-    "phase-net mini", "phase-net mini --fringe vertical", "phase-net mini --albedo any",
-    "phase-net mini --weights phase-net-one-albedo", "phase-net mini --frames 2", "phase-net three", "phase-net noisy",
-    "phase-net deep --min-confidence 0.5", "unet-global-rmse small", "unet-global-rmse mini",
-    "unet-global-rmse small --range mean", "unet-individual-rmse small", "unet-individual-rmse small --range oracle",
-    "unet-individual-rmse small --range mean", "unet-individual-rmse three --split all --frame 20",
-    "unet-individual-hybrid_l1_0.7 small", "unet-individual-hybrid_l1_0.7 small --range oracle",
-    "unet-individual-hybrid_l1_0.7 varied", "no-such-method mini",
-)  # fmt: skip
+    "phase-net mini",
+    "phase-net mini --fringe vertical",
+    "phase-net mini --albedo any",
+    "phase-net mini --weights phase-net-one-albedo",
+    "phase-net mini --frames 2",
+    "phase-net three",
+    "phase-net noisy",
+    "phase-net deep --min-confidence 0.5",
+    "unet-global-rmse small",
+    "unet-global-rmse mini",
+    "unet-global-rmse small --range mean",
+    "unet-individual-rmse small",
+    "unet-individual-rmse small --range oracle",
+    "unet-individual-rmse small --range mean",
+    "unet-individual-rmse three --split all --frame 20",
+    "unet-individual-hybrid_l1_0.7 small",
+    "unet-individual-hybrid_l1_0.7 small --range oracle",
+    "unet-individual-hybrid_l1_0.7 varied",
+    "no-such-method mini",
+)
 
 
 def digest(value: bytes) -> dict[str, Any]:
@@ -270,8 +301,13 @@ def reports(recorder: Recorder) -> None:
     recorder.run("reports", "fpp-bench export mini published --mat --split test")
     recorder.run("reports", "fpp-bench import published imported --workers 1", "imported")
     recorder.run("reports", "fpp-bench show three mug_A0 --out mug.png", "mug.png")
-    methods = ("classical small --steps 4", "phase small", "phase small --fringe vertical --frames 3",
-               "phase-net noisy", "unet-individual-rmse small")  # fmt: skip
+    methods = (
+        "classical small --steps 4",
+        "phase small",
+        "phase small --fringe vertical --frames 3",
+        "phase-net noisy",
+        "unet-individual-rmse small",
+    )
     for number, method in enumerate(methods):
         command = f"fpp-bench reliance {method} --views 1 --threads 1 --json reliance-{number}.json"
         recorder.run("reports", command, f"reliance-{number}.json")

@@ -105,8 +105,11 @@ def measure(
                 build(Path(target) / "set", settings, workers=1)
                 return [file_hash(path) for path in sorted((Path(target) / "set").rglob("*")) if path.is_file()]
 
-        add(f"build, 6 views, {'52 frames' if stored == 'all' else 'frame 0'}", *switched(build_hashes),
-            rounds=max(1, repeats // 2))  # fmt: skip
+        add(
+            f"build, 6 views, {'52 frames' if stored == 'all' else 'frame 0'}",
+            *switched(build_hashes),
+            rounds=max(1, repeats // 2),
+        )
     build(folder / name / "all", BuildSettings(paper_rig(size), (user.name,), user_meshes=(user,)), workers=1)
     dataset = DatasetFolder(folder / name / "all")
     rig, samples = dataset.rig, dataset.samples("test")
@@ -118,8 +121,11 @@ def measure(
         return decode_stack(frames, rig, **options).depth_mm.tobytes()
 
     add("decode, depth alone", *switched(lambda: depth(reasons=False)))
-    add("decode in the mask, against whole and masked", lambda: depth(mask=mask, reasons=False),
-        lambda: np.where(mask, decode_stack(frames, rig).depth_mm, np.float32(0)).tobytes())  # fmt: skip
+    add(
+        "decode in the mask, against whole and masked",
+        lambda: depth(mask=mask, reasons=False),
+        lambda: np.where(mask, decode_stack(frames, rig).depth_mm, np.float32(0)).tobytes(),
+    )
     void = dataset.void(samples[0])
 
     def unmixed(**options: Any) -> bytes:
@@ -130,8 +136,12 @@ def measure(
     add("6 frames against 20", lambda: unmixed(steps=3, fewest=True), lambda: unmixed(steps=3))
     cropped, whole = PhaseRoute(rig), PhaseRoute(rig)
     whole._crop = lambda region: (slice(0, size), slice(0, size))  # type: ignore[method-assign]
-    add("phase route in its crop, against whole", lambda: cropped.measure(frames[0]).counts,
-        lambda: whole.measure(frames[0]).counts, compared=False)  # fmt: skip
+    add(
+        "phase route in its crop, against whole",
+        lambda: cropped.measure(frames[0]).counts,
+        lambda: whole.measure(frames[0]).counts,
+        compared=False,
+    )
     rng = np.random.default_rng(0)
     pairs = []
     for sample in samples:

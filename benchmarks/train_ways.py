@@ -123,10 +123,14 @@ def recipe_of(job: Job, compiled: bool) -> Recipe:
     """The paper's base recipe at the job's scale; bfloat16 on a GPU only."""
     return load_recipe("base", "paper").model_copy(
         update={
-            "network": job.network, "width": job.width, "size": job.size, "batch": job.batch, "compile": compiled,
+            "network": job.network,
+            "width": job.width,
+            "size": job.size,
+            "batch": job.batch,
+            "compile": compiled,
             "precision": "bf16" if torch.cuda.is_available() else "fp32",
         }
-    )  # fmt: skip
+    )
 
 
 _surroundings = contextlib.ExitStack()

@@ -13,9 +13,15 @@ RESULT_SCHEMA_VERSION: SchemaVersion = "3.0.0"
 
 Target = Literal["depth", "depth_exact"]
 Track = Literal[
-    "metric", "oracle mask", "oracle order", "oracle range", "oracle mask + order", "oracle range + mask",
-    "oracle range + order", "oracle range + mask + order",
-]  # fmt: skip
+    "metric",
+    "oracle mask",
+    "oracle order",
+    "oracle range",
+    "oracle mask + order",
+    "oracle range + mask",
+    "oracle range + order",
+    "oracle range + mask + order",
+]
 """What a method was given of the ground truth of the scored samples; see PROTOCOL.md."""
 Mode = Literal["standard", "paper", "paper-individual"]
 """By which rules; see PROTOCOL.md. ``paper-individual`` stands in results of protocol 1 only: ``paper`` for normalised
@@ -44,10 +50,16 @@ HEADLINE = tuple(f"{pixels}_{error}_mm" for pixels in PIXEL_SETS for error in ("
 """The paper's six numbers (Section 5.3.2): MAE and RMSE over the full grid, the object and the background, in mm."""
 
 BESIDE = (
-    "object_interior_mae_mm", "object_interior_rmse_mm", "object_edge_mae_mm", "object_edge_rmse_mm",
-    "object_valid_mae_mm", "object_interior_valid_mae_mm", "object_edge_share", "object_missing_share",
+    "object_interior_mae_mm",
+    "object_interior_rmse_mm",
+    "object_edge_mae_mm",
+    "object_edge_rmse_mm",
+    "object_valid_mae_mm",
+    "object_interior_valid_mae_mm",
+    "object_edge_share",
+    "object_missing_share",
     "object_interior_missing_share",
-)  # fmt: skip
+)
 """Reported beside the headline: the object away from and along depth edges, and the pixels that were not measured."""
 
 WITHIN_MM = (1, 2, 5, 10)
@@ -55,8 +67,13 @@ WITHIN = tuple(f"object_within_{limit}mm_share" for limit in WITHIN_MM)
 SIGNED = ("object_bias_mm", "object_valid_bias_mm")
 """The only scores that may be negative: the others are magnitudes or shares."""
 DISTRIBUTION = (
-    "object_median_mm", "object_p95_mm", "object_max_mm", *WITHIN, *SIGNED, "object_shift_free_mae_mm",
-)  # fmt: skip
+    "object_median_mm",
+    "object_p95_mm",
+    "object_max_mm",
+    *WITHIN,
+    *SIGNED,
+    "object_shift_free_mae_mm",
+)
 """How the error is distributed over the object: order statistics, tolerances, bias, and the error without an offset
 (the MAE once the median error has been subtracted)."""
 WIDE_BAND = ("object_wide_band_mae_mm", "object_wide_interior_mae_mm", "object_wide_band_share")
@@ -70,8 +87,12 @@ only, and `RANGE_SHARE`. Left out of a result where no sample has them."""
 METRICS = HEADLINE + BESIDE + DISTRIBUTION + WIDE_BAND + SINCE_2
 HIGHER_IS_BETTER = WITHIN
 HELPED_BY_MISSING = (
-    "object_valid_mae_mm", "object_interior_valid_mae_mm", "unlit_valid_mae_mm", *SIGNED, "object_shift_free_mae_mm",
-)  # fmt: skip
+    "object_valid_mae_mm",
+    "object_interior_valid_mae_mm",
+    "unlit_valid_mae_mm",
+    *SIGNED,
+    "object_shift_free_mae_mm",
+)
 """Scores that a method can improve by answering fewer pixels; nothing is ranked or sorted by them."""
 
 COVERED = (68, 95, 99)
@@ -83,9 +104,16 @@ SURE_LEFT_OUT = 0.05
 NLL_LEAST_SIGMA_MM, NLL_LARGEST_RATIO = 0.01, 10.0
 """The negative log-likelihood takes no sigma below the first, and no |error| / sigma above the second."""
 UNCERTAINTY = (
-    *(f"coverage_{percent}" for percent in COVERED), "sigma_mean_mm", "sigma_median_mm", "nll", "ause_mae_mm",
-    "ause_rmse_mm", "sure_mae_mm", "sure_rmse_mm", "unstated_share",
-)  # fmt: skip
+    *(f"coverage_{percent}" for percent in COVERED),
+    "sigma_mean_mm",
+    "sigma_median_mm",
+    "nll",
+    "ause_mae_mm",
+    "ause_rmse_mm",
+    "sure_mae_mm",
+    "sure_rmse_mm",
+    "unstated_share",
+)
 """Scores of a stated uncertainty (``{sample}.sigma.npy``), a block of their own in a result."""
 
 LARGEST_MM = 1e30

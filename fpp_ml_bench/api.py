@@ -183,22 +183,42 @@ def decode(
 
 @overload
 def evaluate(
-    predictions: str | Path, dataset: "str | Path | storage.DatasetFolder", split: str = "test", target: str = "depth",
-    *, mode: str = "standard", edge_band_px: int = EDGE_BAND_PX,
-) -> "result.Result": ...  # fmt: skip
+    predictions: str | Path,
+    dataset: "str | Path | storage.DatasetFolder",
+    split: str = "test",
+    target: str = "depth",
+    *,
+    mode: str = "standard",
+    edge_band_px: int = EDGE_BAND_PX,
+) -> "result.Result": ...
 
 
 @overload
 def evaluate(
-    predictions: "Maps", dataset: "Maps", *, flags: "Maps | None" = None, sigma: "Maps | None" = None,
-    objects: Sequence[str] | None = None, units: str | None = None, edge_band_px: int = EDGE_BAND_PX,
-) -> "result.ArrayScores": ...  # fmt: skip
+    predictions: "Maps",
+    dataset: "Maps",
+    *,
+    flags: "Maps | None" = None,
+    sigma: "Maps | None" = None,
+    objects: Sequence[str] | None = None,
+    units: str | None = None,
+    edge_band_px: int = EDGE_BAND_PX,
+) -> "result.ArrayScores": ...
 
 
 def evaluate(
-    predictions: Any, dataset: Any, split: str = "test", target: str = "depth", *, mode: str = "standard",
-    edge_band_px: int = EDGE_BAND_PX, flags: Any = None, sigma: Any = None, objects: Any = None, units: Any = None,
-) -> "result.Result | result.ArrayScores":  # fmt: skip
+    predictions: Any,
+    dataset: Any,
+    split: str = "test",
+    target: str = "depth",
+    *,
+    mode: str = "standard",
+    edge_band_px: int = EDGE_BAND_PX,
+    flags: Any = None,
+    sigma: Any = None,
+    objects: Any = None,
+    units: Any = None,
+) -> "result.Result | result.ArrayScores":
     """Score a folder of predictions, as ``fpp-eval`` does, or arrays in memory by the same rules.
 
     Parameters

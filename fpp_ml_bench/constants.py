@@ -28,25 +28,84 @@ CONFIGS = ("single_shot", "crossed", "horizontal", "vertical", "sinusoidal", "al
 sets with such frames)."""
 
 OBJECTS = (
-    "master_chef_can", "cracker_box", "sugar_box", "tomato_soup_can", "mustard_bottle", "tuna_fish_can", "pudding_box",
-    "gelatin_box", "potted_meat_can", "banana", "pitcher", "bleach_cleanser", "bowl", "mug", "power_drill",
-    "wood_block", "scissors", "marker", "large_clamp",
+    "master_chef_can",
+    "cracker_box",
+    "sugar_box",
+    "tomato_soup_can",
+    "mustard_bottle",
+    "tuna_fish_can",
+    "pudding_box",
+    "gelatin_box",
+    "potted_meat_can",
+    "banana",
+    "pitcher",
+    "bleach_cleanser",
+    "bowl",
+    "mug",
+    "power_drill",
+    "wood_block",
+    "scissors",
+    "marker",
+    "large_clamp",
     # YCB above, warehouse below
-    "eyeglasses", "open_book", "spray_bottle", "cleaning_bucket", "container_bottle", "container_tin", "vial",
-    "lighting_candles", "magazine_stack", "wooden_boards", "paint_container_bottle", "paint_container_jar",
-    "paint_container_spraycan", "paint_container_tube_small", "paint_container_tube", "paint_container_tube_large",
-    "paint_brush", "paint_brush_large", "pallet_knife", "pallet_knife_large", "spraygun", "paint_thinner", "battery",
-    "battery_case", "chalk_stick", "pen", "cork", "clamp", "boxcutter", "hammer", "duct_tape",
-)  # fmt: skip
+    "eyeglasses",
+    "open_book",
+    "spray_bottle",
+    "cleaning_bucket",
+    "container_bottle",
+    "container_tin",
+    "vial",
+    "lighting_candles",
+    "magazine_stack",
+    "wooden_boards",
+    "paint_container_bottle",
+    "paint_container_jar",
+    "paint_container_spraycan",
+    "paint_container_tube_small",
+    "paint_container_tube",
+    "paint_container_tube_large",
+    "paint_brush",
+    "paint_brush_large",
+    "pallet_knife",
+    "pallet_knife_large",
+    "spraygun",
+    "paint_thinner",
+    "battery",
+    "battery_case",
+    "chalk_stick",
+    "pen",
+    "cork",
+    "clamp",
+    "boxcutter",
+    "hammer",
+    "duct_tape",
+)
 
 VALIDATION_OBJECTS = ("mustard_bottle", "mug", "paint_brush_large", "paint_container_jar", "spraygun")
 TEST_OBJECTS = ("power_drill", "magazine_stack", "container_bottle", "wooden_boards", "large_clamp")
 
 UNSEEN = (
-    "blob", "concave_dish", "cone_stack", "gear", "hinged_leaves", "hollow_cube", "honeycomb", "perforated_plate",
-    "saddle", "sphere_pair", "spiral_shell", "stair_tower", "step_wedge", "tall_column", "thin_fin", "torus_knot",
-    "turbine_blade", "v_groove", "wave_plate", "wire_loop",
-)  # fmt: skip
+    "blob",
+    "concave_dish",
+    "cone_stack",
+    "gear",
+    "hinged_leaves",
+    "hollow_cube",
+    "honeycomb",
+    "perforated_plate",
+    "saddle",
+    "sphere_pair",
+    "spiral_shell",
+    "stair_tower",
+    "step_wedge",
+    "tall_column",
+    "thin_fin",
+    "torus_knot",
+    "turbine_blade",
+    "v_groove",
+    "wave_plate",
+    "wire_loop",
+)
 """Objects of a second test set, of kinds that are not among `OBJECTS`. It is for measuring, never for choosing."""
 
 # The mini preset: six objects from all splits, among them the extremes of the test figures (a concave union of parts
@@ -55,9 +114,11 @@ MINI_OBJECTS = ("bowl", "cracker_box", "banana", "mug", "power_drill", "wooden_b
 MINI_SIZE = 480
 FULL_SIZE = 960
 PRESETS: dict[str, tuple[tuple[str, ...], int]] = {
-    "mini": (MINI_OBJECTS, MINI_SIZE), "full": (OBJECTS, FULL_SIZE), "unseen": (UNSEEN, FULL_SIZE),
+    "mini": (MINI_OBJECTS, MINI_SIZE),
+    "full": (OBJECTS, FULL_SIZE),
+    "unseen": (UNSEEN, FULL_SIZE),
     "test": (tuple(name for name in OBJECTS if name in TEST_OBJECTS), FULL_SIZE),
-}  # fmt: skip
+}
 """Objects and image width of each."""
 
 

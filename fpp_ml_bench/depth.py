@@ -138,9 +138,12 @@ def _check(name: str) -> None:
 
 
 def normalise(
-    depth_mm: NDArray[np.floating], name: Normalisation, depth_min_mm: float, depth_max_mm: float,
+    depth_mm: NDArray[np.floating],
+    name: Normalisation,
+    depth_min_mm: float,
+    depth_max_mm: float,
     out: NDArray[np.floating] | None = None,
-) -> NDArray:  # fmt: skip
+) -> NDArray:
     """Depth map in mm, 0 = background, to the representation ``name``: in ``out`` if given, else float32, same shape.
     In single precision where depth and range are float32: the difference of two such depths within a factor of two is
     exact (Sterbenz), and the division rounds once. Else in float64, rounded at the end. Raises ``ValueError`` for an

@@ -65,11 +65,13 @@ class Explanation:
 
     def to_dict(self) -> dict[str, Any]:
         return {
-            "command": self.command, "subject": self.subject, "skipping": self.skipping,
+            "command": self.command,
+            "subject": self.subject,
+            "skipping": self.skipping,
             "left_out": [{**asdict(line), "share": round(line.share, 6)} for line in self.lines],
             "seconds_saved": sum(line.seconds_saved for line in self.lines if line.seconds_saved is not None),
             "bytes_saved": sum(line.bytes_saved or 0 for line in self.lines),
-        }  # fmt: skip
+        }
 
 
 def explained(command: str, subject: str, lines: list[LeftOut]) -> Explanation:

@@ -23,9 +23,14 @@ class Table(RichTable):
     lists what is left out and how to see it: in a wider terminal, or ``elsewhere``, such as ``--json FILE``."""
 
     def __init__(
-        self, *texts: str, numbers: Iterable[str] = (), names: int = 1, first_out: Sequence[str] = (),
-        elsewhere: str = "", **options: Any,
-    ) -> None:  # fmt: skip
+        self,
+        *texts: str,
+        numbers: Iterable[str] = (),
+        names: int = 1,
+        first_out: Sequence[str] = (),
+        elsewhere: str = "",
+        **options: Any,
+    ) -> None:
         super().__init__(*texts, title_justify="left", caption_justify="left", **options)
         for title in numbers:
             self.add_column(title, justify="right")

@@ -77,15 +77,21 @@ def columns(sort: str) -> list[Column]:
             errors += [replace(PARTS[0], from_width=MIDDLE), replace(PARTS[1], from_width=MIDDLE), RATIO]
             errors.append(replace(RANGE, from_width=MIDDLE))
     return [
-        RANK, METHOD, replace(CODE, from_width=MIDDLE), *errors, Column("s/sample", _seconds), FRAMES,
+        RANK,
+        METHOD,
+        replace(CODE, from_width=MIDDLE),
+        *errors,
+        Column("s/sample", _seconds),
+        FRAMES,
         replace(RELIANCE, from_width=WIDE),
-        replace(ROBUSTNESS, from_width=WIDEST), *(replace(column, from_width=WIDEST) for column in UNCERTAINTY),
+        replace(ROBUSTNESS, from_width=WIDEST),
+        *(replace(column, from_width=WIDEST) for column in UNCERTAINTY),
         replace(PROVENANCE, from_width=MIDDLE),
         replace(LEARNED, from_width=WIDEST),
         Column("Assumes", lambda row: assumption(row.entry.row) or "-", right=False, from_width=WIDEST),
         Column("Timed on", lambda row: device(row.entry), right=False, from_width=WIDEST),
         Column("Full name", lambda row: printable(row.entry.name, _LONGEST_NAME), False, ONLY_IN_FILES),
-    ]  # fmt: skip
+    ]
 
 
 def error(key: str, row: Ranked) -> str:

@@ -25,12 +25,14 @@ def table_json(groups: Sequence[Group], papers: Sequence[ReportedTable], sort: s
     table of more than `MOST_PAIRED` ranked rows has no list of pairs."""
     of_groups = [
         {
-            **asdict(group.key), "title": group.title, "rows": [_json_row(group, row) for row in group.rows],
+            **asdict(group.key),
+            "title": group.title,
+            "rows": [_json_row(group, row) for row in group.rows],
             "pairs": list(map(asdict, group.pairs)) if len(group.ranked) <= MOST_PAIRED else None,
             "notes": [*group.notes, *group.key.notes],
         }
         for group in groups
-    ]  # fmt: skip
+    ]
     content = {"sorted_by": sort, "groups": of_groups, "reported_by_others": list(map(asdict, papers))}
     return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
@@ -64,20 +66,44 @@ def _cells(group: Group, row: Ranked) -> dict[str, object]:
     timing, reliance, disturbed = about.timing, about.reliance, (about.robustness or {}).get("test")
     low, high = row.interval(_MAIN) or (None, None)
     covered, ause_mm = uncertainty(entry)
-    parts = {f"{_MAIN}_{name}": part and part.value(_MAIN) for name, part in zip(
-        ("test", "unseen"), map(row.on, (TEST, UNSEEN)), strict=True
-    )}  # fmt: skip
+    parts = {
+        f"{_MAIN}_{name}": part and part.value(_MAIN)
+        for name, part in zip(("test", "unseen"), map(row.on, (TEST, UNSEEN)), strict=True)
+    }
     return {
-        "data": key.data_title, "samples": group.parts, "class": key.frames, "code": about.dataset.code,
-        "track": key.track, "mode": key.mode, "target": key.target, "protocol": key.protocol_version,
-        "best_rank": row.best_rank, "worst_rank": row.worst_rank, "place": row.place, "short_name": row.short_name,
-        "name": entry.name, "method": about.submission.method, "objects": len(row.objects), _MAIN: row.value(_MAIN),
-        f"{_MAIN}_low": low, f"{_MAIN}_high": high, **parts, "ratio_to_trivial": row.ratio,
+        "data": key.data_title,
+        "samples": group.parts,
+        "class": key.frames,
+        "code": about.dataset.code,
+        "track": key.track,
+        "mode": key.mode,
+        "target": key.target,
+        "protocol": key.protocol_version,
+        "best_rank": row.best_rank,
+        "worst_rank": row.worst_rank,
+        "place": row.place,
+        "short_name": row.short_name,
+        "name": entry.name,
+        "method": about.submission.method,
+        "objects": len(row.objects),
+        _MAIN: row.value(_MAIN),
+        f"{_MAIN}_low": low,
+        f"{_MAIN}_high": high,
+        **parts,
+        "ratio_to_trivial": row.ratio,
         **{name: row.value(name) for name in (*HEADLINE, "object_missing_share") if name != _MAIN},
-        "latency_median_ms": entry.latency_ms, "latency_p5_ms": timing and timing.latency_p5_ms,
-        "latency_p95_ms": timing and timing.latency_p95_ms, "time_measured_here": entry.time_measured,
-        "timed_on": device(entry), "frames_used": entry.frames, "phase_reliance": reliance and reliance.score,
-        "disturbed_mae_mm": disturbed and disturbed.mae_mm, "within_stated_95": covered, "ause_mae_mm": ause_mm,
-        "learned_from": learned_from(about), "told": told(key.track), "provenance": row.provenance,
+        "latency_median_ms": entry.latency_ms,
+        "latency_p5_ms": timing and timing.latency_p5_ms,
+        "latency_p95_ms": timing and timing.latency_p95_ms,
+        "time_measured_here": entry.time_measured,
+        "timed_on": device(entry),
+        "frames_used": entry.frames,
+        "phase_reliance": reliance and reliance.score,
+        "disturbed_mae_mm": disturbed and disturbed.mae_mm,
+        "within_stated_95": covered,
+        "ause_mae_mm": ause_mm,
+        "learned_from": learned_from(about),
+        "told": told(key.track),
+        "provenance": row.provenance,
         "source": entry.path.name,
-    }  # fmt: skip
+    }

@@ -42,9 +42,16 @@ class GroupKey:
         info, benchmark = row.dataset, scenes_of(row)
         data = info.truth if benchmark is None else _title(TEST) if is_unseen(row) else benchmark.title
         return cls(
-            row.frames_class, row.track, row.mode, info.split, row.target, data, (info.size[0], info.size[1]),
-            row.edge_band_px, row.protocol_version,
-        )  # fmt: skip
+            row.frames_class,
+            row.track,
+            row.mode,
+            info.split,
+            row.target,
+            data,
+            (info.size[0], info.size[1]),
+            row.edge_band_px,
+            row.protocol_version,
+        )
 
     @property
     def benchmark(self) -> Benchmark | None:
@@ -77,9 +84,16 @@ class GroupKey:
         first, then the fewer frames, the metric track before the others."""
         place = len(BENCHMARKS) if self.benchmark is None else BENCHMARKS.index(self.benchmark)
         return (
-            len(self.notes), self.benchmark is None, -self.size[0] * self.size[1], place, self.data,
-            self.protocol_version, FRAMES_CLASSES.index(self.frames), self.track != "metric", self,
-        )  # fmt: skip
+            len(self.notes),
+            self.benchmark is None,
+            -self.size[0] * self.size[1],
+            place,
+            self.data,
+            self.protocol_version,
+            FRAMES_CLASSES.index(self.frames),
+            self.track != "metric",
+            self,
+        )
 
     @property
     def data_title(self) -> str:

@@ -49,11 +49,17 @@ def pairs(errors: Mapping[str, Mapping[str, float]]) -> list[Pair]:
     adjusted = holm([p for *_, p in compared])
     return [
         Pair(
-            first, second, len(differences), fmean(differences), object_interval(differences, range(len(differences))),
-            p, p_holm, p_holm <= SIGNIFICANT,
+            first,
+            second,
+            len(differences),
+            fmean(differences),
+            object_interval(differences, range(len(differences))),
+            p,
+            p_holm,
+            p_holm <= SIGNIFICANT,
         )
         for (first, second, differences, p), p_holm in zip(compared, adjusted, strict=True)
-    ]  # fmt: skip
+    ]
 
 
 def behind(errors: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -40,8 +40,21 @@ SCORE_TEXT = "score = 100 / (1 + object MAE / 10 mm), higher is better"
 _SCORE_DIGITS = 6
 CARD_FILE, EVAL_FILE, RESULT_FOLDER = "README.md", "eval.yaml", ".eval_results"
 _SUFFIXES = {
-    ".html", ".css", ".js", ".mjs", ".json", ".csv", ".txt", ".svg", ".png", ".jpg", ".webp", ".avif", ".ico", ".woff2",
-}  # fmt: skip
+    ".html",
+    ".css",
+    ".js",
+    ".mjs",
+    ".json",
+    ".csv",
+    ".txt",
+    ".svg",
+    ".png",
+    ".jpg",
+    ".webp",
+    ".avif",
+    ".ico",
+    ".woff2",
+}
 _LARGEST_BYTES = 1 << 30
 _BODY = """\
 # FPP-ML-Bench: single-shot fringe projection profilometry
@@ -123,8 +136,9 @@ def dataset_texts(dataset: DatasetFolder, repo: str, licence: str) -> dict[str, 
     widest = max(dataset.configs, key=CONFIGS.index)
     tasks = [
         {"id": task.id, "config": CONFIGS[0] if task.single_shot else widest, "split": SPLIT}
-        for task in TASKS if task.single_shot or widest != CONFIGS[0]
-    ]  # fmt: skip
+        for task in TASKS
+        if task.single_shot or widest != CONFIGS[0]
+    ]
     description = f"Depth from fringe images in structured light. {SCORE_TEXT[0].upper()}{SCORE_TEXT[1:]}."
     evaluation = {"name": NAME, "description": description, "evaluation_framework": FRAMEWORK, "tasks": tasks}
     splits = []
@@ -139,12 +153,21 @@ def dataset_texts(dataset: DatasetFolder, repo: str, licence: str) -> dict[str, 
         exact += "16 weak |"
         exact += "\n| `cover` | uint8 (H, W): share of the pixel, in 255ths, that the central ray's surface covers |"
     body = _BODY.format(
-        rows=sum(len(samples) for samples in dataset.splits.values()), height=dataset.size[0], width=dataset.size[1],
-        origin=dataset.manifest.origin, repo=repo, splits="\n".join(splits), config=dataset.configs[-1],
-        split=list(dataset.splits)[-1], exact=exact, preview=PREVIEW,
-        configs=", ".join(f"`{config}`" for config in dataset.configs), score=SCORE_TEXT,
-        fingerprint=dataset.fingerprint, package=__version__,
-    )  # fmt: skip
+        rows=sum(len(samples) for samples in dataset.splits.values()),
+        height=dataset.size[0],
+        width=dataset.size[1],
+        origin=dataset.manifest.origin,
+        repo=repo,
+        splits="\n".join(splits),
+        config=dataset.configs[-1],
+        split=list(dataset.splits)[-1],
+        exact=exact,
+        preview=PREVIEW,
+        configs=", ".join(f"`{config}`" for config in dataset.configs),
+        score=SCORE_TEXT,
+        fingerprint=dataset.fingerprint,
+        package=__version__,
+    )
     return {CARD_FILE: card_head(dataset, licence) + body, EVAL_FILE: yaml_text(evaluation)}
 
 
@@ -178,12 +201,18 @@ def stage_page(page: Path, repo: str, folder: Path, dataset_repo: str | None = N
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copyfile(path, target)
     head: dict[str, Any] = {
-        "title": "FPP-ML-Bench leaderboard", "emoji": "📐", "colorFrom": "blue", "colorTo": "gray", "sdk": "static",
-        "app_file": INDEX, "pinned": False, "license": "mit",
+        "title": "FPP-ML-Bench leaderboard",
+        "emoji": "📐",
+        "colorFrom": "blue",
+        "colorTo": "gray",
+        "sdk": "static",
+        "app_file": INDEX,
+        "pinned": False,
+        "license": "mit",
         "short_description": "Depth from one fringe image: error and run time",
         "tags": ["leaderboard", "depth-estimation", "structured-light", "fpp-ml-bench"],
         **({"datasets": [dataset_repo]} if dataset_repo is not None else {}),
-    }  # fmt: skip
+    }
     body = f"The page is `{INDEX}`, written by `fpp-bench leaderboard`, sent by `fpp-bench publish`.\n"
     (folder / CARD_FILE).write_bytes(f"---\n{yaml_text(head, allow_unicode=True)}---\n{body}".encode())
     (folder / MARK).write_bytes(mark_bytes("leaderboard"))
@@ -192,9 +221,14 @@ def stage_page(page: Path, repo: str, folder: Path, dataset_repo: str | None = N
 
 
 def stage_results(
-    paths: Sequence[Path], repo: str, folder: Path, scored_on: str, revision: str, content: object,
+    paths: Sequence[Path],
+    repo: str,
+    folder: Path,
+    scored_on: str,
+    revision: str,
+    content: object,
     source_url: str | None = None,
-) -> Publication:  # fmt: skip
+) -> Publication:
     """Write a file for each result into ``folder``; it replaces an earlier result of the same task. Only numbers and
     fixed words of a result are published, no text that its author wrote. A result scored on other data than ``content``
     (`DatasetFolder.content`, by the repository's mark) is refused, as is a result of another split or target, or
@@ -226,10 +260,15 @@ def stage_results(
                 f"{file}: has no object score (no sample shows an object), so there is nothing to rank by"
             )
         published = EvalResultEntry(
-            dataset_id=scored_on, task_id=task, value=score(error_mm), dataset_revision=revision,
-            date=row.created[:10], source_url=source_url,
-            source_name=f"{NAME} leaderboard" if source_url is not None else None, notes=_notes(entry),
-        )  # fmt: skip
+            dataset_id=scored_on,
+            task_id=task,
+            value=score(error_mm),
+            dataset_revision=revision,
+            date=row.created[:10],
+            source_url=source_url,
+            source_name=f"{NAME} leaderboard" if source_url is not None else None,
+            notes=_notes(entry),
+        )
         name = f"{task}--{scored_on.replace('/', '--')}.yaml"
         (folder / RESULT_FOLDER / name).write_bytes(yaml_text(eval_result_entries_to_yaml([published])).encode())
     return Publication("model", repo, folder, f"{NAME} results: {', '.join(named)}")

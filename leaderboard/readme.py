@@ -28,13 +28,23 @@ _ERRORS = (
     Column("Object MAE, mm", partial(error, "object_mae_mm")),
     Column("Object RMSE", partial(error, "object_rmse_mm")),
     Column("Overall MAE", partial(error, "overall_mae_mm")),
-)  # fmt: skip
+)
 _COLUMNS = (
-    columns.RANK, columns.METHOD, columns.CODE, _ERRORS[0],
-    Column("95% interval", partial(columns.interval, between=" - ")), *columns.PARTS, columns.RATIO, columns.RANGE,
-    *_ERRORS[1:], Column("Time, ms", columns.milliseconds_text), columns.FRAMES, columns.RELIANCE, columns.ROBUSTNESS,
+    columns.RANK,
+    columns.METHOD,
+    columns.CODE,
+    _ERRORS[0],
+    Column("95% interval", partial(columns.interval, between=" - ")),
+    *columns.PARTS,
+    columns.RATIO,
+    columns.RANGE,
+    *_ERRORS[1:],
+    Column("Time, ms", columns.milliseconds_text),
+    columns.FRAMES,
+    columns.RELIANCE,
+    columns.ROBUSTNESS,
     columns.PROVENANCE,
-)  # fmt: skip
+)
 
 
 def readme_block(groups: Sequence[Group]) -> str:
@@ -58,10 +68,14 @@ def readme_block(groups: Sequence[Group]) -> str:
     notes += dict.fromkeys(markdown_text(note) for group in groups for note in (*group.notes, *group.key.notes))
     keys, titles = ("object_mae_mm", "object_rmse_mm", "overall_mae_mm"), [column.title for column in _ERRORS]
     reported = [
-        [row.label, *(f"{row.errors_mm[key]:.2f}" if key in row.errors_mm else "-" for key in keys),
-         f"{table.source}, told {told(row.track)}"]
-        for table in (*chosen_tables("architecture"), *chosen_tables("oracle_order")) for row in table.rows
-    ]  # fmt: skip
+        [
+            row.label,
+            *(f"{row.errors_mm[key]:.2f}" if key in row.errors_mm else "-" for key in keys),
+            f"{table.source}, told {told(row.track)}",
+        ]
+        for table in (*chosen_tables("architecture"), *chosen_tables("oracle_order"))
+        for row in table.rows
+    ]
     rows = [list(map(markdown_text, cells)) for cells in reported]
     lines += [f"**{REPORTED_HEADING}, not ranked with the rows above**", ""]
     lines += [*markdown_rows(["Method", *titles, "Note"], (False, True, True, True, False), rows), ""]

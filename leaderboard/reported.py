@@ -78,11 +78,13 @@ def other_tables() -> dict[str, ReportedTable]:
     content = json.loads(Path(__file__).with_name("reported_rows.json").read_text(encoding="utf-8"))
     return {
         table["name"]: ReportedTable(
-            table["name"], table["title"], tuple(ReportedRow(**row) for row in table["rows"]),
+            table["name"],
+            table["title"],
+            tuple(ReportedRow(**row) for row in table["rows"]),
             f"{BY_ITS_AUTHORS} ({table['source']})",
         )
         for table in content["tables"]
-    }  # fmt: skip
+    }
 
 
 def chosen_tables(choice: str | None) -> list[ReportedTable]:

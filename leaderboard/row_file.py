@@ -248,13 +248,17 @@ def row_content(result: Result, digits: int | None = DIGITS) -> dict[str, Any]:
     kept = {"dataset", "frames_class", "target", "mode", "edge_band_px", "protocol_version", "created"}
     hashes = sorted(sample.prediction_sha256 for sample in result.per_sample)
     content = {
-        "row_schema_version": ROW_SCHEMA_VERSION, "submission": described,
-        **result.model_dump(mode="json", include=kept), "package": about.packages["fpp_ml_bench"], "git": about.git,
-        "code_sha256": about.code_sha256, "predictions_sha256": sha256("\n".join(hashes).encode()).hexdigest(),
+        "row_schema_version": ROW_SCHEMA_VERSION,
+        "submission": described,
+        **result.model_dump(mode="json", include=kept),
+        "package": about.packages["fpp_ml_bench"],
+        "git": about.git,
+        "code_sha256": about.code_sha256,
+        "predictions_sha256": sha256("\n".join(hashes).encode()).hexdigest(),
         "result_sha256": sha256(result_json(result)).hexdigest(),
         **rounded(result.model_dump(mode="json", include={"metrics", "intervals"}), digits),
         "per_object": [rounded(_object_means(result, part), digits) for part in result.per_object],
-    }  # fmt: skip
+    }
     if result.uncertainty is not None:
         content["uncertainty"] = rounded(_uncertainty(result.uncertainty), digits)
     if result.reliance is not None:
@@ -273,11 +277,12 @@ def _object_means(result: Result, part: ObjectResult) -> dict[str, Any]:
     views = [sample for sample in result.per_sample if sample.object == part.object]
     counts = {name: [getattr(v, f"{name}_pixels") or 0 for v in views] for name in ("object", "background", "void")}
     return {
-        "object": part.object, "samples": part.samples,
+        "object": part.object,
+        "samples": part.samples,
         **{f"{name}_pixels": sum(numbers) for name, numbers in counts.items()},
         **{f"without_{name}": counts[name].count(0) for name in ("object", "background")},
         **part.metrics.model_dump(include=set(HEADLINE)),
-    }  # fmt: skip
+    }
 
 
 def _uncertainty(block: Uncertainty) -> dict[str, float | None]:

@@ -58,8 +58,9 @@ _FIELDS = "SHA-256 of a row file, measured or verified, commit, machine, command
 _LINE = re.compile(r"([0-9a-f]{64}) \| (measured|verified) \| [0-9a-f]{40} \| [^|\s][^|]* \| \S.*")
 _NOT_COMPARED: Any = {
     **dict.fromkeys(("created", "package", "git", "code_sha256", "result_sha256", "reliance", "robustness"), True),
-    "submission": {"seconds_per_sample", "seconds_source", "hardware", "timing", "software"}, "dataset": {"name"},
-}  # fmt: skip
+    "submission": {"seconds_per_sample", "seconds_source", "hardware", "timing", "software"},
+    "dataset": {"name"},
+}
 
 
 @dataclass(frozen=True)
@@ -215,7 +216,8 @@ def not_checked(about: Row | Result) -> list[str]:
     submission = about.submission
     present = {
         "run time and its machine": (submission.timing or submission.seconds_per_sample) is not None,
-        "phase reliance": about.reliance is not None, "robustness": bool(about.robustness),
+        "phase reliance": about.reliance is not None,
+        "robustness": bool(about.robustness),
         "software, code and environment": True,
-    }  # fmt: skip
+    }
     return [words for words, there in present.items() if there]

@@ -22,9 +22,16 @@ No results here yet. Score predictions, and their row appears:
 Without arguments, result*.json and results/*.json of the current folder are read.
 """
 PAPER_TITLES = (
-    "Row", "Track", "Test samples", "Object MAE", "Object RMSE", "Overall MAE", "Overall RMSE", "Backgr. MAE",
+    "Row",
+    "Track",
+    "Test samples",
+    "Object MAE",
+    "Object RMSE",
+    "Overall MAE",
+    "Overall RMSE",
+    "Backgr. MAE",
     "Backgr. RMSE",
-)  # fmt: skip
+)
 PAPER_TEXT_COLUMNS = 2
 PAIR_TITLES = ("First", "Second", "Second - first", "95% interval", "p", "p, Holm", "Objects", "Verdict")
 PAIR_TEXT_COLUMNS = 2
@@ -45,9 +52,15 @@ def pair_cells(pair: Pair) -> list[str]:
     """Cells under `PAIR_TITLES`."""
     verdict = "second is behind" if pair.behind else "not told apart"
     return [
-        pair.first, pair.second, millimetres(pair.difference), interval_text(pair.interval, " to "), f"{pair.p:.2g}",
-        f"{pair.p_holm:.2g}", str(pair.objects), verdict,
-    ]  # fmt: skip
+        pair.first,
+        pair.second,
+        millimetres(pair.difference),
+        interval_text(pair.interval, " to "),
+        f"{pair.p:.2g}",
+        f"{pair.p_holm:.2g}",
+        str(pair.objects),
+        verdict,
+    ]
 
 
 def group_tables(groups: Sequence[Group], sort: str, with_pairs: bool = False) -> list[Table | Text]:

@@ -206,9 +206,13 @@ class Hub:
         return about if isinstance(about, dict) else {}
 
     def send(
-        self, publication: Publication, changes: list[Change], remote: Remote, private: bool,
+        self,
+        publication: Publication,
+        changes: list[Change],
+        remote: Remote,
+        private: bool,
         sent: Callable[[int], None] = lambda count: None,
-    ) -> str:  # fmt: skip
+    ) -> str:
         """Make the repository where there is none, send new and changed files, and commit; returns the commit's URL.
         All files become visible together; a run after an interrupted one sends only what is missing. ``sent`` is called
         with the bytes of each batch. Raises `PublishError`, also after a commit by someone else meanwhile."""
@@ -225,9 +229,12 @@ class Hub:
                 sent(sum(addition.upload_info.size for addition in batch))
             deletions = [CommitOperationDelete(c.path, is_folder=False) for c in changes if c.status == "deleted"]
             done = self._api.create_commit(
-                repo, [*additions, *deletions], commit_message=publication.message, repo_type=kind,
+                repo,
+                [*additions, *deletions],
+                commit_message=publication.message,
+                repo_type=kind,
                 parent_commit=remote.commit or None,
-            )  # fmt: skip
+            )
         return str(done.commit_url)
 
     @contextmanager

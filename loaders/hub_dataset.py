@@ -83,9 +83,13 @@ def card_head(dataset: DatasetFolder, licence: str) -> str:
 
 
 def stage_dataset(
-    dataset: DatasetFolder, repo: str, folder: Path, texts: Mapping[str, str], threads: int = 1,
+    dataset: DatasetFolder,
+    repo: str,
+    folder: Path,
+    texts: Mapping[str, str],
+    threads: int = 1,
     row_done: Callable[[int], None] = lambda rows: None,
-) -> Publication:  # fmt: skip
+) -> Publication:
     """Write all that is published of ``dataset``, and ``texts`` by file name, into ``folder``: same data, same bytes.
     Parquet files that are already there are kept (see `staging_folder`). Raises `DatasetError` for a damaged dataset,
     ``OSError`` when a file can't be written."""

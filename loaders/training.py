@@ -45,9 +45,14 @@ class FringeDepthDataset(Dataset[FringeDepth]):
     """
 
     def __init__(
-        self, folder: str | Path, split: str, config: str = "single_shot", normalisation: Normalisation = "individual",
-        background_removed: bool = False, range_rule: RangeRule = "valid",
-    ) -> None:  # fmt: skip
+        self,
+        folder: str | Path,
+        split: str,
+        config: str = "single_shot",
+        normalisation: Normalisation = "individual",
+        background_removed: bool = False,
+        range_rule: RangeRule = "valid",
+    ) -> None:
         self.source = DatasetFolder(folder)
         if config not in CONFIGS or config not in self.source.configs:
             raise DatasetError(f"{folder}: no configuration {config!r}; there are {', '.join(self.source.configs)}")
@@ -109,9 +114,12 @@ class FringeDepthDataset(Dataset[FringeDepth]):
         """Buffers for a batch of ``size`` items."""
         image = (size, 1, *self.source.size)
         return FringeDepth(
-            torch.empty(image), torch.empty(image), torch.empty(size, 2), torch.empty(size, dtype=torch.int64),
+            torch.empty(image),
+            torch.empty(image),
+            torch.empty(size, 2),
             torch.empty(size, dtype=torch.int64),
-        )  # fmt: skip
+            torch.empty(size, dtype=torch.int64),
+        )
 
     def batches(self, size: int, order: Sequence[int] | None = None) -> Iterator[FringeDepth]:
         """Batches of ``size`` items (the last may be smaller) in ``order``, default ascending. The tensors are views of

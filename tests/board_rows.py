@@ -28,11 +28,24 @@ HARDWARE = {"cpu": "Some CPU", "cores": 2, "memory_gib": 8.0, "gpu": None, "plat
 def timing(ms: float, frames: int = 1, **changes: Any) -> dict[str, Any]:
     """A ``timing`` block with a median of ``ms``, 10% either way to its percentiles."""
     return {
-        "provenance": "measured", "latency_median_ms": ms, "latency_p5_ms": 0.9 * ms, "latency_p95_ms": 1.1 * ms,
-        "repeats": 20, "batch": 4, "batched": True, "throughput_per_s": 2000 / ms, "peak_memory_mib": 300.0,
-        "working_memory_mib": 6.0, "gpu_memory_mib": None, "parameters": 0, "frames": frames, "image_size": [32, 40],
-        "device": "cpu", "hardware": HARDWARE, **changes,
-    }  # fmt: skip
+        "provenance": "measured",
+        "latency_median_ms": ms,
+        "latency_p5_ms": 0.9 * ms,
+        "latency_p95_ms": 1.1 * ms,
+        "repeats": 20,
+        "batch": 4,
+        "batched": True,
+        "throughput_per_s": 2000 / ms,
+        "peak_memory_mib": 300.0,
+        "working_memory_mib": 6.0,
+        "gpu_memory_mib": None,
+        "parameters": 0,
+        "frames": frames,
+        "image_size": [32, 40],
+        "device": "cpu",
+        "hardware": HARDWARE,
+        **changes,
+    }
 
 
 def write_result_file(path: Path, dataset: Any, offset_mm: float, noise_mm: float = 0.0, **changes: Any) -> Path:
@@ -52,24 +65,45 @@ def some_rows(folder: Path, dataset: Any) -> list[Path]:
             folder / "fast.json", dataset, 4.0, 1.0, name="Fast and rough", frames_used=[0, 1], timing=timing(2.0, 2)
         ),
         write_result_file(
-            folder / "fine.json", dataset, 0.5, 0.1, name="Slow and fine", frames_used=list(range(10)),
+            folder / "fine.json",
+            dataset,
+            0.5,
+            0.1,
+            name="Slow and fine",
+            frames_used=list(range(10)),
             timing=timing(50.0, 10),
         ),
         write_result_file(
-            folder / "beaten.json", dataset, 8.0, 2.0, name="Beaten", frames_used=[0, 1, 2], seconds_per_sample=0.08,
+            folder / "beaten.json",
+            dataset,
+            8.0,
+            2.0,
+            name="Beaten",
+            frames_used=[0, 1, 2],
+            seconds_per_sample=0.08,
             seconds_source="self-reported",
         ),
         write_result_file(
-            folder / "oracle.json", dataset, 0.1, 0.1, name="Was told", frames_used=[0, 1],
-            uses_ground_truth_range=True, timing=timing(10.0, 2),
+            folder / "oracle.json",
+            dataset,
+            0.1,
+            0.1,
+            name="Was told",
+            frames_used=[0, 1],
+            uses_ground_truth_range=True,
+            timing=timing(10.0, 2),
         ),
-    ]  # fmt: skip
+    ]
 
 
 def entry_with_errors(
-    base: Entry, errors: Mapping[str, float], name: str, content: Mapping[str, str] | None = None,
-    provenance: str | None = None, **about: Any,
-) -> Entry:  # fmt: skip
+    base: Entry,
+    errors: Mapping[str, float],
+    name: str,
+    content: Mapping[str, str] | None = None,
+    provenance: str | None = None,
+    **about: Any,
+) -> Entry:
     """A sound entry made of ``base``, scored on two views of each object of ``errors``, off by so many mm everywhere on
     the object and by nothing behind it. ``about`` goes into its description."""
     first = base.row.per_object[0]
@@ -77,11 +111,21 @@ def entry_with_errors(
     per_object = []
     for name_of_object, error in errors.items():
         whole = combine(ErrorStats(inside, error, error), ErrorStats(outside, 0.0, 0.0))
-        per_object.append(ObjectMeans(
-            object=name_of_object, samples=2, object_pixels=2 * inside, background_pixels=2 * outside, void_pixels=0,
-            object_mae_mm=error, object_rmse_mm=error, background_mae_mm=0.0, background_rmse_mm=0.0,
-            overall_mae_mm=whole.mae_mm, overall_rmse_mm=whole.rmse_mm,
-        ))  # fmt: skip
+        per_object.append(
+            ObjectMeans(
+                object=name_of_object,
+                samples=2,
+                object_pixels=2 * inside,
+                background_pixels=2 * outside,
+                void_pixels=0,
+                object_mae_mm=error,
+                object_rmse_mm=error,
+                background_mae_mm=0.0,
+                background_rmse_mm=0.0,
+                overall_mae_mm=whole.mae_mm,
+                overall_rmse_mm=whole.rmse_mm,
+            )
+        )
     means = {key: mean_over(per_object, key) for key in HEADLINE}
     keys = [key for key in Metrics.model_fields if key.startswith("object_") and key.endswith("_mm")]
     intervals = {key: list(interval_over(per_object, key) or (None, None)) for key in HEADLINE}
@@ -92,9 +136,10 @@ def entry_with_errors(
         "dataset": base.row.dataset.model_copy(update=data),
         "frames_class": FRAMES_CLASSES[(frames > 1) + (frames > 36)],
         "metrics": base.row.metrics.model_copy(update=dict.fromkeys(keys, means["object_mae_mm"]) | means),
-        "intervals": Intervals(**intervals), "per_object": per_object,
+        "intervals": Intervals(**intervals),
+        "per_object": per_object,
         "predictions_sha256": sha256(f"{name} {errors}".encode()).hexdigest(),
-    }  # fmt: skip
+    }
     row = Row.model_validate(base.row.model_copy(update=changes).model_dump())
     return Entry(base.path.with_name(f"{name}.json"), row, provenance or base.provenance)
 
@@ -103,19 +148,35 @@ def reliance(**changes: Any) -> Reliance:
     """A phase reliance of 0.625."""
     parts = dict.fromkeys(RelianceParts.model_fields) | {"follows_phase": 0.75, "change_outline": 2.5}
     content = {
-        "version": RELIANCE_VERSION, "score": 0.625, "interval": [0.5, 0.75], "order_free_score": 0.875, "parts": parts,
-        "units": "mm", "direction": "horizontal", "samples": 4, "objects": 2, "dataset_fingerprint": "b" * 64,
-        "protocol_version": "1.1.0", "weights_sha256": None, **changes,
-    }  # fmt: skip
+        "version": RELIANCE_VERSION,
+        "score": 0.625,
+        "interval": [0.5, 0.75],
+        "order_free_score": 0.875,
+        "parts": parts,
+        "units": "mm",
+        "direction": "horizontal",
+        "samples": 4,
+        "objects": 2,
+        "dataset_fingerprint": "b" * 64,
+        "protocol_version": "1.1.0",
+        "weights_sha256": None,
+        **changes,
+    }
     return Reliance(**content)
 
 
 def robustness() -> RowRobustness:
     """A robustness in brief, of 31 mm."""
     return RowRobustness(
-        version=1, mae_mm=31.0, interval=[20.0, 40.0], clean_mae_mm=5.0, axes={"motion": 30.0, "gloss": 32.0},
-        samples=4, objects=2, size_px=960,
-    )  # fmt: skip
+        version=1,
+        mae_mm=31.0,
+        interval=[20.0, 40.0],
+        clean_mae_mm=5.0,
+        axes={"motion": 30.0, "gloss": 32.0},
+        samples=4,
+        objects=2,
+        size_px=960,
+    )
 
 
 def named_benchmarks(monkeypatch: Any, counts: Mapping[str, Any] | None = None, **contents: Mapping[str, str]) -> None:

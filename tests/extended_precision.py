@@ -45,19 +45,27 @@ def sample_scores(prediction, target, band, void, unlit):
     core, near = inside & (distance >= band), inside & (distance < band)
     wide, deep = inside & (distance < 8), inside & (distance >= 8)
     scores = {
-        "overall_mae_mm": mae(~void), "overall_rmse_mm": rmse(~void),
-        "object_mae_mm": mae(inside), "object_rmse_mm": rmse(inside),
-        "background_mae_mm": mae(outside), "background_rmse_mm": rmse(outside),
-        "object_interior_mae_mm": mae(core), "object_interior_rmse_mm": rmse(core),
-        "object_edge_mae_mm": mae(near), "object_edge_rmse_mm": rmse(near),
-        "object_valid_mae_mm": mae(valid), "object_interior_valid_mae_mm": mae(valid & core),
-        "object_edge_share": share(near, inside), "object_missing_share": share(inside & ~valid, inside),
+        "overall_mae_mm": mae(~void),
+        "overall_rmse_mm": rmse(~void),
+        "object_mae_mm": mae(inside),
+        "object_rmse_mm": rmse(inside),
+        "background_mae_mm": mae(outside),
+        "background_rmse_mm": rmse(outside),
+        "object_interior_mae_mm": mae(core),
+        "object_interior_rmse_mm": rmse(core),
+        "object_edge_mae_mm": mae(near),
+        "object_edge_rmse_mm": rmse(near),
+        "object_valid_mae_mm": mae(valid),
+        "object_interior_valid_mae_mm": mae(valid & core),
+        "object_edge_share": share(near, inside),
+        "object_missing_share": share(inside & ~valid, inside),
         "object_interior_missing_share": share(core & ~valid, core),
-        "object_wide_band_mae_mm": mae(wide), "object_wide_interior_mae_mm": mae(deep),
+        "object_wide_band_mae_mm": mae(wide),
+        "object_wide_interior_mae_mm": mae(deep),
         "object_wide_band_share": share(wide, inside),
         "object_bias_mm": error[inside].mean() if inside.any() else None,
         "object_valid_bias_mm": error[valid].mean() if valid.any() else None,
-    }  # fmt: skip
+    }
     dark = unlit > 0
     far = np.abs(prediction.astype(LONG) - unlit.astype(LONG))
     lit = dark & (prediction > 0)

@@ -16,14 +16,18 @@ from fpp_ml_bench.loaders.render import (
     light_surface,
     named_light,
     solid_mesh,
-)  # fmt: skip
+)
 from fpp_ml_bench.optics import Rig, paper_rig
 
 RIG = paper_rig(480)
 OTHER_RIG = replace(
-    RIG, translation_m=(0.22, -0.16, 0.0), pitch_horizontal_px=24.0, pitch_vertical_px=27.0,
-    working_range_mm=(1400.0, 2200.0), background_m=2.9,
-)  # fmt: skip
+    RIG,
+    translation_m=(0.22, -0.16, 0.0),
+    pitch_horizontal_px=24.0,
+    pitch_vertical_px=27.0,
+    working_range_mm=(1400.0, 2200.0),
+    background_m=2.9,
+)
 FIRST = {"horizontal": 0, "vertical": 18}
 """The first fringe of each direction."""
 PAPER = named_light("paper")
@@ -48,9 +52,13 @@ def plane_depth_m(rig: Rig, distance_m: float, tilt: tuple[float, float] = (0.0,
 
 
 def plane_fringe(
-    rig: Rig, frame: int, depth_m: NDArray[np.float64], tilt: tuple[float, float] = (0.0, 0.0), noise: float = 1.0,
+    rig: Rig,
+    frame: int,
+    depth_m: NDArray[np.float64],
+    tilt: tuple[float, float] = (0.0, 0.0),
+    noise: float = 1.0,
     light: Light = PAPER,
-) -> NDArray[np.uint8]:  # fmt: skip
+) -> NDArray[np.uint8]:
     """Frame ``frame`` of a matte plane, uint8 (H, W)."""
     x, y = rig.camera.rays()
     points = np.stack([x, y, np.ones_like(x)], axis=-1) * depth_m[..., None]

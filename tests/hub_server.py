@@ -148,10 +148,14 @@ class _Handler(BaseHTTPRequestHandler):
             if name.startswith("raced/"):
                 repo.commits.append(hashlib.sha1(b"somebody else").hexdigest())
             files = [
-                {"path": f["path"], "uploadMode": "lfs" if f["path"].endswith(LARGE_SUFFIXES) else "regular",
-                 "shouldIgnore": False, "oid": None}
+                {
+                    "path": f["path"],
+                    "uploadMode": "lfs" if f["path"].endswith(LARGE_SUFFIXES) else "regular",
+                    "shouldIgnore": False,
+                    "oid": None,
+                }
                 for f in json.loads(body)["files"]
-            ]  # fmt: skip
+            ]
             return self._answer(200, {"files": files})
         if action == "commit":
             return self._commit(repo, kind, name, body)

@@ -24,11 +24,20 @@ class Oracle(nn.Module):
 def subject_with(network: nn.Module, size, layers=("out",)) -> Subject:
     """A subject around ``network``, whose ``layers`` are its children."""
     return Subject(
-        name="known", title="known", sha256="0" * 64, units="normalised", image_size=size, frames_used=(0,),
-        direction="horizontal", predict_frames=lambda frames: np.zeros(size, np.float32), normalisation="individual",
-        network=network, layer_names=layers, find_layers=lambda any_network: dict(any_network.named_children()),
+        name="known",
+        title="known",
+        sha256="0" * 64,
+        units="normalised",
+        image_size=size,
+        frames_used=(0,),
+        direction="horizontal",
+        predict_frames=lambda frames: np.zeros(size, np.float32),
+        normalisation="individual",
+        network=network,
+        layer_names=layers,
+        find_layers=lambda any_network: dict(any_network.named_children()),
         untrained=lambda seed: network,
-    )  # fmt: skip
+    )
 
 
 def oracle(opened, fields):

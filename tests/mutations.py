@@ -36,16 +36,71 @@ from fpp_ml_bench.loaders.storage import DatasetFolder, verify
 from fpp_ml_bench.optics import load_projection, load_rig, paper_rig
 
 ODD: tuple[Any, ...] = (
-    None, True, False, 0, 1, -1, 0.5, -0.0, 1e-320, 1e308, -1e308, math.nan, math.inf, 2**31, 2**63, -(2**63), 10**30,
-    10**400, "", " ", "0", "x" * 100_000, "../../x", "/etc/passwd", "a/b", "a\\b", "\0", "\x1b[31m", "\u202e", "\ud800",
-    "2001-99-99", "1e5", "~", "<b>", "é" * 300, [], {}, [[]], [{}], {"": None}, {"name": "x"}, [0] * 1000,
-    [1, "x", None], json.loads("[" * 60 + "]" * 60),
-)  # fmt: skip
+    None,
+    True,
+    False,
+    0,
+    1,
+    -1,
+    0.5,
+    -0.0,
+    1e-320,
+    1e308,
+    -1e308,
+    math.nan,
+    math.inf,
+    2**31,
+    2**63,
+    -(2**63),
+    10**30,
+    10**400,
+    "",
+    " ",
+    "0",
+    "x" * 100_000,
+    "../../x",
+    "/etc/passwd",
+    "a/b",
+    "a\\b",
+    "\0",
+    "\x1b[31m",
+    "\u202e",
+    "\ud800",
+    "2001-99-99",
+    "1e5",
+    "~",
+    "<b>",
+    "é" * 300,
+    [],
+    {},
+    [[]],
+    [{}],
+    {"": None},
+    {"name": "x"},
+    [0] * 1000,
+    [1, "x", None],
+    json.loads("[" * 60 + "]" * 60),
+)
 """Values that take the place of others."""
 ODD_BYTES = (
-    b"*a", b"&a ", b"!!int ", b"!!timestamp ", b"\xff", b"\0", b"[" * 99, b"9" * 99, b"- ", b": ", b"\n", b"\t",
-    b"<<: ", b"1e9999", b"\\ud800", b"%", b"---\n",
-)  # fmt: skip
+    b"*a",
+    b"&a ",
+    b"!!int ",
+    b"!!timestamp ",
+    b"\xff",
+    b"\0",
+    b"[" * 99,
+    b"9" * 99,
+    b"- ",
+    b": ",
+    b"\n",
+    b"\t",
+    b"<<: ",
+    b"1e9999",
+    b"\\ud800",
+    b"%",
+    b"---\n",
+)
 SEQUENCES: dict[str, dict[str, Any]] = {
     "phase shift": {
         "order": ["white", "vertical"],
@@ -54,16 +109,22 @@ SEQUENCES: dict[str, dict[str, Any]] = {
     "Gray code": {
         "vertical": {"scheme": "gray", "cell_px": 2, "inverse": "after each"},
         "horizontal": {
-            "scheme": "phase-shift", "pitch_px": 36, "shifts_deg": [0, 90, 180, 270], "gray": {"cell_px": 18, "bits": 6}
+            "scheme": "phase-shift",
+            "pitch_px": 36,
+            "shifts_deg": [0, 90, 180, 270],
+            "gray": {"cell_px": 18, "bits": 6},
         },
     },
     "crossed": {
         "order": ["crossed", "white"],
         "crossed": {
-            "pitches_px": [18, 14], "angles_deg": [0, 90], "weights": [0.5, 0.5], "shifts_deg": [[0, 0], [120, 0]]
+            "pitches_px": [18, 14],
+            "angles_deg": [0, 90],
+            "weights": [0.5, 0.5],
+            "shifts_deg": [[0, 0], [120, 0]],
         },
     },
-}  # fmt: skip
+}
 RECIPE = {"extends": "base", "network": "unet", "normalisation": "raw", "batch": 4, "loss": {"name": "rmse"}}
 
 

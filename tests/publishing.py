@@ -78,16 +78,25 @@ class Client:
     def environment(self, **changes: str | None) -> dict[str, str]:
         plain = {name: value for name, value in os.environ.items() if not name.startswith(("HF_", "HUGGING"))}
         own = {
-            "HF_ENDPOINT": self.server.endpoint, "HF_HUB_DISABLE_XET": "1", "HF_TOKEN": "hf_good",
-            "HF_HOME": str(self.home), "HF_HUB_DISABLE_TELEMETRY": "1", "PYTHONPATH": str(ROOT), **changes,
-        }  # fmt: skip
+            "HF_ENDPOINT": self.server.endpoint,
+            "HF_HUB_DISABLE_XET": "1",
+            "HF_TOKEN": "hf_good",
+            "HF_HOME": str(self.home),
+            "HF_HUB_DISABLE_TELEMETRY": "1",
+            "PYTHONPATH": str(ROOT),
+            **changes,
+        }
         return {**plain, **{name: value for name, value in own.items() if value is not None}}
 
     def _start(self, **environment: str | None) -> "subprocess.Popen[str]":
         return subprocess.Popen(
-            [sys.executable, "-c", _SERVE], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-            cwd=self.home.parent, env=self.environment(**environment),
-        )  # fmt: skip
+            [sys.executable, "-c", _SERVE],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=self.home.parent,
+            env=self.environment(**environment),
+        )
 
     def run(self, *calls: list[str], **environment: str | None) -> list[tuple[int, str, str]]:
         """Exit status, standard output and standard error of each call."""

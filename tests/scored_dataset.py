@@ -53,9 +53,13 @@ Scene = Callable[[int], tuple[NDArray[np.uint8], NDArray[np.float32]]]
 
 
 def make_dataset(
-    folder: Path, size: tuple[int, int] = (32, 40), exact: bool = True, views: Sequence[str] = VIEWS,
-    scene: Scene | None = None, flagged: Callable[[NDArray[np.float32]], NDArray[np.uint8]] | None = None,
-) -> DatasetFolder:  # fmt: skip
+    folder: Path,
+    size: tuple[int, int] = (32, 40),
+    exact: bool = True,
+    views: Sequence[str] = VIEWS,
+    scene: Scene | None = None,
+    flagged: Callable[[NDArray[np.float32]], NDArray[np.uint8]] | None = None,
+) -> DatasetFolder:
     """Write a `single_shot` dataset, by default of eight samples; ``depth_exact`` is 0.5 mm more than ``depth``.
 
     ``scene`` gives frame and depth of a number that no other sample has; by default a flat frame and a `disk_depth`.
@@ -106,10 +110,11 @@ def name_benchmarks(monkeypatch: Any, folder: Path, *named: tuple[Benchmark, Dat
         counts = {
             split: {
                 f"{mode}/{target}": pixel_counts(dataset, split, mode, target)
-                for mode in MODES for target in TARGETS[: 1 + dataset.has_exact]
+                for mode in MODES
+                for target in TARGETS[: 1 + dataset.has_exact]
             }
             for split in dataset.splits
-        }  # fmt: skip
+        }
         facts = {"content": dataset.content, "counts": counts}
         (folder / f"{known.name}.json").write_text(json.dumps(facts), encoding="utf-8")
     monkeypatch.setattr(benchmark, "FACTS", folder)

@@ -54,9 +54,16 @@ def assembly(splits=SPLITS, views=VIEWS, origin="generated", **changes):
     for split, names in splits.items():
         plans += plan_shards(split, {name: [(f"{name}_{v}", name, v) for v in views] for name in names})
     manifest = Manifest(
-        origin=origin, generator={"name": "test", "version": "0"}, settings={}, rig=paper_rig().to_dict(), size=SIZE,
-        stored="single_shot", exact=True, samples={}, shards=[],
-    )  # fmt: skip
+        origin=origin,
+        generator={"name": "test", "version": "0"},
+        settings={},
+        rig=paper_rig().to_dict(),
+        size=SIZE,
+        stored="single_shot",
+        exact=True,
+        samples={},
+        shards=[],
+    )
     return Assembly(plans, SyntheticRows(**changes), manifest)
 
 

@@ -59,9 +59,17 @@ def test_tables_are_those_of_the_rows(monkeypatch):
         mae_mm=3.0, protocol_mae_mm=3.0, wrong_share=0.1, unanswered_share=0.0, confident_share=None, coverage=None
     )
     block = Robustness(
-        version=1, set="test", mae_mm=3.0, interval=[2.0, 4.0], clean=scores, axes={"motion": [scores] * 5}, samples=2,
-        objects=2, size_px=960, weights_sha256=None,
-    )  # fmt: skip
+        version=1,
+        set="test",
+        mae_mm=3.0,
+        interval=[2.0, 4.0],
+        clean=scores,
+        axes={"motion": [scores] * 5},
+        samples=2,
+        objects=2,
+        size_px=960,
+        weights_sha256=None,
+    )
     about = SimpleNamespace(name="A | method", method="mine", settings={})
     made = rows_in([SimpleNamespace(submission=about, robustness={"test": block})])
     assert made["unseen"] == [] and "| A &#124; method | 3.0 | 2.0 to 4.0 | 3.0 | 1.0 |" in filled(text, made)

@@ -207,8 +207,11 @@ def test_constraints_pin_what_every_extra_brings():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     lines = [line.split("#")[0].strip() for line in (ROOT / "constraints.txt").read_text().splitlines()]
     pins = {canonicalize_name(name): version for name, version in (line.split("==") for line in lines if line)}
-    waiting = [Requirement(text) for texts in (project["dependencies"], *project["optional-dependencies"].values())
-               for text in texts]  # fmt: skip
+    waiting = [
+        Requirement(text)
+        for texts in (project["dependencies"], *project["optional-dependencies"].values())
+        for text in texts
+    ]
     seen, problems = set(), []
     while waiting:
         requirement = waiting.pop()

@@ -20,8 +20,12 @@ SMALL: dict[str, dict[str, int | float]] = {
     "pix2pix_unet": {"width": 4, "levels": 3},
 }
 RECIPE: dict[str, Any] = {
-    "preset": "cpu", "seed": 42, "max_epochs": 3, "loss": {"name": "hybrid_l1", "alpha": 0.7}, "batch": 4,
-}  # fmt: skip
+    "preset": "cpu",
+    "seed": 42,
+    "max_epochs": 3,
+    "loss": {"name": "hybrid_l1", "alpha": 0.7},
+    "batch": 4,
+}
 
 
 def tiny_network(name: str = "unet", width: int = 4, seed: int = 0, **options: Any) -> torch.nn.Module:

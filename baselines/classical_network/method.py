@@ -35,9 +35,13 @@ class ClassicalNetMethod(Method):
     packages = ("numpy", "numba", "torch")
 
     def __init__(
-        self, rig: Rig, direction: Directions | None = None, steps: int | None = None, weights: str | Path = DEFAULT,
+        self,
+        rig: Rig,
+        direction: Directions | None = None,
+        steps: int | None = None,
+        weights: str | Path = DEFAULT,
         threads: int = 1,
-    ) -> None:  # fmt: skip
+    ) -> None:
         path = weights_path(weights, SHIPPED)
         config, network, digest = read_net(path, DepthFilter, FILTER_NETWORKS)
         self.network = network.folded()
@@ -59,9 +63,11 @@ class ClassicalNetMethod(Method):
         more = "" if config.name == DEFAULT else f" ({config.name})"
         self.title = f"{self.classical.title}; noise and missed pixels learned{more}"
         self.settings = {
-            **self.classical.settings, "weights": config.name, "weights_sha256": digest,
+            **self.classical.settings,
+            "weights": config.name,
+            "weights_sha256": digest,
             "mask_threshold": config.threshold,
-        }  # fmt: skip
+        }
 
     @property
     def learned_from(self) -> dict[str, Any]:

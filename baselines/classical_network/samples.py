@@ -76,6 +76,12 @@ def draw(samples: list[Sample], size: int, near_edge: float, random: np.random.G
 
     scene = sample.scene.with_maps(cut)
     return Window(
-        channels(scene), scene.depth_mm, scene.sigma_mm, scene.found, cut(sample.exact_mm), cut(sample.target),
-        cut(~sample.void), np.asarray(scene.unit_mm, dtype=np.float32),
-    )  # fmt: skip
+        channels(scene),
+        scene.depth_mm,
+        scene.sigma_mm,
+        scene.found,
+        cut(sample.exact_mm),
+        cut(sample.target),
+        cut(~sample.void),
+        np.asarray(scene.unit_mm, dtype=np.float32),
+    )

@@ -11,9 +11,14 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.phase_route import Image, Mask
 
 CHANNELS = (
-    "found", "against the mean of near neighbours", "against the mean of far neighbours", "sigma", "modulation",
-    "slope", "spread",
-)  # fmt: skip
+    "found",
+    "against the mean of near neighbours",
+    "against the mean of far neighbours",
+    "sigma",
+    "modulation",
+    "slope",
+    "spread",
+)
 NEAR_PX, FAR_PX = 1.0, 3.0
 """Standard deviations of the Gaussians over which neighbours are averaged."""
 MARGIN_PX = 8  # of the crop around the found pixels
@@ -76,8 +81,13 @@ def channels(scene: DepthScene) -> NDArray[np.float32]:
     detail = [np.clip((depth - mean) / unit, -FURTHEST, FURTHEST) / 2 * found for mean in (near, far)]
     relative = np.log(np.maximum(scene.modulation, TINY) / np.float32(scene.bright))
     maps = (
-        found, *detail, np.log(unit / typical), np.clip(relative, -3, 3), np.log1p(slope), np.log1p(spread),
-    )  # fmt: skip
+        found,
+        *detail,
+        np.log(unit / typical),
+        np.clip(relative, -3, 3),
+        np.log1p(slope),
+        np.log1p(spread),
+    )
     return np.stack([np.asarray(one, dtype=np.float32) for one in maps])
 
 

@@ -92,9 +92,15 @@ class FilterRecipe(StepRecipe):
 
 
 def train_classical_net(
-    recipe: FilterRecipe, out: Path, *, rig: Rig | None = None, minutes: float | None = None, workers: int = 1,
-    show: bool = False, print_line: Callable[[str], None] = lambda line: None,
-) -> Trained:  # fmt: skip
+    recipe: FilterRecipe,
+    out: Path,
+    *,
+    rig: Rig | None = None,
+    minutes: float | None = None,
+    workers: int = 1,
+    show: bool = False,
+    print_line: Callable[[str], None] = lambda line: None,
+) -> Trained:
     """Train for ``rig`` (default: the paper's); the same call resumes a training that was stopped. ``show``: progress
     on stderr. Raises `TrainingError` for a folder of another recipe or rig."""
     started, rig = perf_counter(), rig or paper_rig()
@@ -130,11 +136,17 @@ def train_classical_net(
         threshold = chosen_threshold(answers, validation)
         means = mean_scores(score(one, sample, threshold) for one, sample in zip(answers, validation, strict=True))
         config = training.NetConfig(
-            name=recipe.name, title="Weights of neighbouring depths, and which missing pixels are object",
-            options=network.options, threshold=threshold, period_px={}, dataset_fingerprint=fingerprint,
-            benchmark=training.TrainingBenchmark("classical-net views", 1), steps=recipe.steps, recipe=described,
+            name=recipe.name,
+            title="Weights of neighbouring depths, and which missing pixels are object",
+            options=network.options,
+            threshold=threshold,
+            period_px={},
+            dataset_fingerprint=fingerprint,
+            benchmark=training.TrainingBenchmark("classical-net views", 1),
+            steps=recipe.steps,
+            recipe=described,
             validation=dict(means),
-        )  # fmt: skip
+        )
         save_net(weights, network, config, training.FILTER_NETWORKS)
         (out / training.CHECKPOINT).unlink(missing_ok=True)
         return Trained(weights, recipe.steps, threshold, means)
@@ -153,12 +165,13 @@ def score(answer: Filtered, sample: Sample, threshold: float) -> dict[str, float
     before = np.where(scene.found, np.abs(scene.depth_mm - sample.exact_mm), whole)[target]
     within = np.abs(answer.depth_mm - sample.exact_mm) < answer.sigma_mm
     return {
-        "object_mae_mm": float(error.mean(dtype=np.float64)), "input_mae_mm": float(before.mean(dtype=np.float64)),
+        "object_mae_mm": float(error.mean(dtype=np.float64)),
+        "input_mae_mm": float(before.mean(dtype=np.float64)),
         "missed_percent": 100 * float((~inside)[target].mean()),
         "input_missed_percent": 100 * float((~scene.found)[target].mean()),
         "invented_kpx": float((inside & ~scene.found & ~target & ~sample.void).sum()) / 1000,
         "within_percent": 100 * float(within[target & inside].mean()) if (target & inside).any() else None,
-    }  # fmt: skip
+    }
 
 
 def chosen_threshold(answers: Sequence[Filtered], samples: Sequence[Sample]) -> float:

@@ -15,12 +15,34 @@ from fpp_ml_bench.baselines.phase_network import LARGEST_RAD, SIDE_PERIODS, SIDE
 from fpp_ml_bench.baselines.phase_route import Crop, Image, Mask, phase_slopes, wrapped
 
 CHANNELS = (
-    "light", "plane misfit", "plane shown", "measured mask", "cos 1", "sin 1", "cos 2", "sin 2", "brightness",
-    "window share", "fit misfit", "slope down", "slope right", "window phase 1", "window phase 2", "modulation 1",
-    "modulation 2", "further: misfit", "base: misfit", "nearer: misfit", "further exists", "nearer exists", "relief",
-    "first guess", *(f"from {row:+.1f} {column:+.1f}: correction" for row, column in SIDES),
-    "own misfit around", *(f"from {row:+.1f} {column:+.1f}: misfit around" for row, column in SIDES),
-)  # fmt: skip
+    "light",
+    "plane misfit",
+    "plane shown",
+    "measured mask",
+    "cos 1",
+    "sin 1",
+    "cos 2",
+    "sin 2",
+    "brightness",
+    "window share",
+    "fit misfit",
+    "slope down",
+    "slope right",
+    "window phase 1",
+    "window phase 2",
+    "modulation 1",
+    "modulation 2",
+    "further: misfit",
+    "base: misfit",
+    "nearer: misfit",
+    "further exists",
+    "nearer exists",
+    "relief",
+    "first guess",
+    *(f"from {row:+.1f} {column:+.1f}: correction" for row, column in SIDES),
+    "own misfit around",
+    *(f"from {row:+.1f} {column:+.1f}: misfit around" for row, column in SIDES),
+)
 DOWN, RIGHT = CHANNELS.index("slope down"), CHANNELS.index("slope right")
 FIRST_SIDE = CHANNELS.index("first guess") + 1
 SLOPE_PERIODS = 0.13  # sigma over which slopes are averaged
@@ -72,14 +94,22 @@ class Scene:
         shown = background.shown
         plane = np.arcsinh(background.residual / np.float32(background.noise_grey)) / 4 * np.float32(shown)
         return cls(
-            crop=carriers.crop, light=(seen.grey - np.float32(background.ambient_grey)) / level,
-            plane_misfit=plane.astype(np.float32), shown=shown, inside=seen.inside, nearness=fit.nearness,
-            bright=bright, share=fit.weight,
+            crop=carriers.crop,
+            light=(seen.grey - np.float32(background.ambient_grey)) / level,
+            plane_misfit=plane.astype(np.float32),
+            shown=shown,
+            inside=seen.inside,
+            nearness=fit.nearness,
+            bright=bright,
+            share=fit.weight,
             window_rad=wrapped(seen.phase_rad - carriers.phases(fit.nearness)).astype(np.float32),
-            modulation=np.clip(np.stack(modulation), 0, 4).astype(np.float32), step_rad=steps.astype(np.float32),
-            misfit_rad=found.misfit_rad, exists=found.exists, contrast=seen.contrast,
+            modulation=np.clip(np.stack(modulation), 0, 4).astype(np.float32),
+            step_rad=steps.astype(np.float32),
+            misfit_rad=found.misfit_rad,
+            exists=found.exists,
+            contrast=seen.contrast,
             strength=float(level * np.mean(seen.contrast) / background.noise_grey),
-        )  # fmt: skip
+        )
 
     def window(self, rows: slice, columns: slice) -> "Scene":
         """A part of this scene; slices of its maps, with start and stop."""
@@ -133,11 +163,23 @@ def channels(scene: Scene, carriers: Carriers) -> tuple[Image, Mask]:
     exists = scene.exists.copy()
     exists[1] = True
     unit = np.float32(period_px / (2 * np.pi))
-    fitted = np.stack([
-        *waves, np.log(bright) / 2, scene.share, np.clip(misfit, -2, 2), unit * down, unit * right,
-        *np.clip(scene.window_rad, -2, 2), *(scene.modulation - 1), *np.minimum(scene.misfit_rad, 2) * exists,
-        exists[0], exists[2], np.clip((psi - middle) / RELIEF_RAD, -4, 4), np.clip(guess, -LARGEST_RAD, LARGEST_RAD),
-    ]).astype(np.float32)  # fmt: skip
+    fitted = np.stack(
+        [
+            *waves,
+            np.log(bright) / 2,
+            scene.share,
+            np.clip(misfit, -2, 2),
+            unit * down,
+            unit * right,
+            *np.clip(scene.window_rad, -2, 2),
+            *(scene.modulation - 1),
+            *np.minimum(scene.misfit_rad, 2) * exists,
+            exists[0],
+            exists[2],
+            np.clip((psi - middle) / RELIEF_RAD, -4, 4),
+            np.clip(guess, -LARGEST_RAD, LARGEST_RAD),
+        ]
+    ).astype(np.float32)
     fitted *= scene.share > LEAST_SHARE
     shown = np.full(psi.shape, scene.shown)
     own = np.stack([np.clip(scene.light, -1, 8), scene.plane_misfit, shown, scene.inside]).astype(np.float32)

@@ -33,8 +33,12 @@ class CrossedNetMethod(Method):
     packages = ("numpy", "numba", "torch")
 
     def __init__(
-        self, rig: Rig, weights: str | Path | NetFile = DEFAULT, min_confidence: float = 0.0, threads: int = 1,
-    ) -> None:  # fmt: skip
+        self,
+        rig: Rig,
+        weights: str | Path | NetFile = DEFAULT,
+        min_confidence: float = 0.0,
+        threads: int = 1,
+    ) -> None:
         self.file = weights if isinstance(weights, NetFile) else load_net(weights, shipped=SHIPPED)
         config = self.file.config
         if self.file.network.options["channels"] != len(CHANNELS) or "crossed" not in config.period_px:
@@ -54,9 +58,13 @@ class CrossedNetMethod(Method):
         more = "" if config.name == DEFAULT else f" ({config.name})"
         self.title = f"Crossed fringes, one frame{made}; order, mask and correction learned{more}"
         self.settings = {
-            "min_confidence": min_confidence, "weights": config.name, "weights_sha256": self.file.sha256,
-            "mask_threshold": config.threshold, "order_lead": config.lead, "threads": threads,
-        }  # fmt: skip
+            "min_confidence": min_confidence,
+            "weights": config.name,
+            "weights_sha256": self.file.sha256,
+            "mask_threshold": config.threshold,
+            "order_lead": config.lead,
+            "threads": threads,
+        }
 
     @property
     def learned_from(self) -> dict[str, Any]:

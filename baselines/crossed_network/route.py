@@ -65,9 +65,14 @@ class CrossedNetRoute:
     """One rig and network; ``threshold`` on the logit of the mask."""
 
     def __init__(
-        self, rig: Rig, network: PhaseNet, threshold: float, lead: float, settings: Settings | None = None,
+        self,
+        rig: Rig,
+        network: PhaseNet,
+        threshold: float,
+        lead: float,
+        settings: Settings | None = None,
         periods: Periods | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.route = CrossedRoute(rig, settings, periods=periods)
         self.network, self.threshold, self.lead = network, threshold, lead
 

@@ -58,9 +58,7 @@ class Variation:
     no_plane: float = 0.1
 
 
-def draw(
-    samples: list[Sample], carriers: Carriers, size: int, vary: Variation, random: np.random.Generator
-) -> Window:  # fmt: skip
+def draw(samples: list[Sample], carriers: Carriers, size: int, vary: Variation, random: np.random.Generator) -> Window:
     """A random window of ``size`` px of one of ``samples``, in one of 8 orientations."""
     sample = samples[random.integers(len(samples))]
     rows, columns = place_of(sample.edges, sample.target.shape, size, random.random() < vary.near_edge, random)
@@ -85,10 +83,14 @@ def draw(
     deep = ((0, 0), *pad)
     exists, order, correction, possible, target, valid = maps
     return Window(
-        np.pad(x, deep), np.pad(exists, deep, constant_values=True),
+        np.pad(x, deep),
+        np.pad(exists, deep, constant_values=True),
         np.pad(order, pad, constant_values=IGNORED).astype(np.int64),
-        np.pad(correction, pad).astype(np.float32), np.pad(possible, pad), np.pad(target, pad), np.pad(valid, pad),
-    )  # fmt: skip
+        np.pad(correction, pad).astype(np.float32),
+        np.pad(possible, pad),
+        np.pad(target, pad),
+        np.pad(valid, pad),
+    )
 
 
 def _wrong(scene: Scene, carriers: Carriers, vary: Variation, random: np.random.Generator) -> Scene:

@@ -58,9 +58,15 @@ class CrossedRecipe(WindowRecipe):
 
 
 def train_crossed_net(
-    recipe: CrossedRecipe, out: Path, *, rig: Rig | None = None, minutes: float | None = None, workers: int = 1,
-    show: bool = False, print_line: Callable[[str], None] = lambda line: None,
-) -> Trained:  # fmt: skip
+    recipe: CrossedRecipe,
+    out: Path,
+    *,
+    rig: Rig | None = None,
+    minutes: float | None = None,
+    workers: int = 1,
+    show: bool = False,
+    print_line: Callable[[str], None] = lambda line: None,
+) -> Trained:
     """Train for ``rig`` (default: `optics.crossed_rig`); the same call resumes a training that was stopped. ``show``:
     progress on stderr. Raises `TrainingError` for a folder of another recipe or rig."""
     started, rig = perf_counter(), rig or crossed_rig()
@@ -74,9 +80,16 @@ def train_crossed_net(
             return Trained.before(weights, load_net(weights).config)
         route, frame = CrossedRoute(rig), rig.sequence.crossed_frames[0]
         samples, validation = training.measured_views(
-            groups, rig, (frame,), out / VIEWS, lambda views: [sample_of(view, route) for view in views], recipe.unions,
-            recipe.seed, workers, show,
-        )  # fmt: skip
+            groups,
+            rig,
+            (frame,),
+            out / VIEWS,
+            lambda views: [sample_of(view, route) for view in views],
+            recipe.unions,
+            recipe.seed,
+            workers,
+            show,
+        )
         carriers = route.carriers
 
         def answers_of(network: PhaseNet, some: list[Sample]) -> list[Answers]:
@@ -111,11 +124,18 @@ def train_crossed_net(
             lead = chosen_lead(wrong_percent, LEADS)
             means = scores_of([one.with_lead(lead) for one in answers], validation, threshold)
         config = training.NetConfig(
-            name=recipe.name, title="Fringe order, mask and bounded phase correction of a crossed frame",
-            options=network.options, threshold=threshold, lead=lead, period_px={"crossed": carriers.period_px},
-            dataset_fingerprint=fingerprint, benchmark=training.TrainingBenchmark("crossed-net views", 1),
-            steps=recipe.steps, recipe=described, validation=dict(means),
-        )  # fmt: skip
+            name=recipe.name,
+            title="Fringe order, mask and bounded phase correction of a crossed frame",
+            options=network.options,
+            threshold=threshold,
+            lead=lead,
+            period_px={"crossed": carriers.period_px},
+            dataset_fingerprint=fingerprint,
+            benchmark=training.TrainingBenchmark("crossed-net views", 1),
+            steps=recipe.steps,
+            recipe=described,
+            validation=dict(means),
+        )
         save_net(weights, network, config)
         (out / training.CHECKPOINT).unlink(missing_ok=True)
         return Trained(weights, recipe.steps, threshold, means)

@@ -52,9 +52,15 @@ class Carriers:
         step = np.array([[np.diff(phase, axis=axis).mean() for axis in (1, 0)] for phase in standoff])
         everywhere = slice(None), slice(None)
         carriers = cls(
-            rig, family, everywhere, wrapped(infinity).astype(np.float32), gain.astype(np.float32),
-            forward.astype(np.float32), back_m, step,
-        )  # fmt: skip
+            rig,
+            family,
+            everywhere,
+            wrapped(infinity).astype(np.float32),
+            gain.astype(np.float32),
+            forward.astype(np.float32),
+            back_m,
+            step,
+        )
         span = float(np.median(carriers.joint_gain * np.abs(near_q - far_q)))
         if not span >= LEAST_RANGE_RAD:
             raise PredictionError(

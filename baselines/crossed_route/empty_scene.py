@@ -52,9 +52,15 @@ class EmptySceneFit:
         fall_off /= np.float32(np.median(fall_off))
         lamp = [fall_off * term for term in (np.ones_like(x), x, y, x * x, x * y, y * y)]
         first, second = (np.float32(w) * np.cos(phase) for w, phase in zip(carriers.weights, phases, strict=True))
-        self._terms = [term.astype(np.float32) for term in (
-            *(part * (1 + first + second) for part in lamp), fall_off * first, fall_off * second, np.ones(shape),
-        )]  # fmt: skip
+        self._terms = [
+            term.astype(np.float32)
+            for term in (
+                *(part * (1 + first + second) for part in lamp),
+                fall_off * first,
+                fall_off * second,
+                np.ones(shape),
+            )
+        ]
         self._margin = 2 * max(1, round(MARGIN_PERIODS * carriers.period_px / stride)) + 1
 
     def __call__(self, grey: Image, seen: Demodulated) -> Background:

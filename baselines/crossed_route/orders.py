@@ -60,9 +60,13 @@ def candidates(carriers: Carriers, phase_rad: Image, slack_mm: float, exact: int
 
 
 def chosen(
-    carriers: Carriers, found: Candidates, trust: Image, inside: Mask, links: tuple[Image, Image] | None = None,
+    carriers: Carriers,
+    found: Candidates,
+    trust: Image,
+    inside: Mask,
+    links: tuple[Image, Image] | None = None,
     more_cost: Image | None = None,
-) -> tuple[NDArray[np.int32], Image, Image]:  # fmt: skip
+) -> tuple[NDArray[np.int32], Image, Image]:
     """Index of the candidate of least energy, int32 (h', w'), the margin of the energy (0 for a tie), and the evidence:
     the cost of the best rival less its own, in half squared sigmas; ``trust`` (h', w'): weight of a point's evidence,
     0 to 1; ``links`` along x and y: weight of the smoothness between neighbours (default: 1 on the object);

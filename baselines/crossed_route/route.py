@@ -69,8 +69,12 @@ class CrossedRoute:
     `CrossedObservation` is of; images, masks and the `CrossedMeasurement` have the captured size."""
 
     def __init__(
-        self, rig: Rig, settings: Settings | None = None, family: Crossed | None = None, periods: Periods | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        rig: Rig,
+        settings: Settings | None = None,
+        family: Crossed | None = None,
+        periods: Periods | None = None,
+    ) -> None:
         self.settings = settings or Settings()
         self.family = family or rig.crossed or Crossed.of_pair(rig)
         rig.check_sampling()
@@ -142,12 +146,22 @@ class CrossedRoute:
         clipped = ((grey >= GREY_LEVELS) & inside).astype(np.float32)
         clipped_share = Window(WINDOW_PERIODS * period_px).moment(clipped) / np.maximum(fit.weight, 1e-3)
         return CrossedObservation(
-            carriers=carriers, shape=image.shape, grey=grey, background=background, inside=inside, fit=fit,
-            phase_rad=phase_rad, modulation=spread(modulation), contrast=contrast, margin=spread(margin),
-            evidence=spread(evidence), rival=spread(rival(found, index)),
+            carriers=carriers,
+            shape=image.shape,
+            grey=grey,
+            background=background,
+            inside=inside,
+            fit=fit,
+            phase_rad=phase_rad,
+            modulation=spread(modulation),
+            contrast=contrast,
+            margin=spread(margin),
+            evidence=spread(evidence),
+            rival=spread(rival(found, index)),
             candidates=Candidates(spread(beside.nearness), spread(beside.misfit_rad), spread(beside.exists)),
-            clipped_share=clipped_share.astype(np.float32), watch=watch,
-        )  # fmt: skip
+            clipped_share=clipped_share.astype(np.float32),
+            watch=watch,
+        )
 
     def conclude(self, seen: CrossedObservation, wrong_chance: Image | None = None) -> CrossedMeasurement:
         """The measurement that follows from an observation. ``wrong_chance`` (h, w): probability of a wrong order, by
@@ -177,11 +191,16 @@ class CrossedRoute:
         counts = np.bincount(reasons.ravel(), minlength=len(CrossedReason))
         watch.done("confidence")
         measured = CrossedMeasurement(
-            depth_mm=paste(kept), sigma_mm=paste(sigma_mm * (kept > 0)), confidence=paste(confidence),
-            wrong_chance=paste(wrong_chance), brightness_grey=paste(fit.brightness), reason=reasons,
+            depth_mm=paste(kept),
+            sigma_mm=paste(sigma_mm * (kept > 0)),
+            confidence=paste(confidence),
+            wrong_chance=paste(wrong_chance),
+            brightness_grey=paste(fit.brightness),
+            reason=reasons,
             counts={code.name.lower(): int(counts[code]) for code in CrossedReason},
-            background_share=seen.background.share, seconds=watch.seconds,
-        )  # fmt: skip
+            background_share=seen.background.share,
+            seconds=watch.seconds,
+        )
         return self._restored(measured) if self.resampling.needed else measured
 
     @cached_property
@@ -208,11 +227,15 @@ class CrossedRoute:
         reason = np.select([found, on_object], [nearest(measured.reason), CrossedReason.OUT_OF_RANGE], own)
         counts = np.bincount(reason.ravel(), minlength=len(CrossedReason))
         return replace(
-            measured, depth_mm=np.where(found, depth_mm, 0).astype(np.float32), reason=reason.astype(np.uint8),
+            measured,
+            depth_mm=np.where(found, depth_mm, 0).astype(np.float32),
+            reason=reason.astype(np.uint8),
             counts={code.name.lower(): int(counts[code]) for code in CrossedReason},
-            sigma_mm=restored(measured.sigma_mm), confidence=restored(measured.confidence),
-            wrong_chance=restored(measured.wrong_chance), brightness_grey=restored(measured.brightness_grey),
-        )  # fmt: skip
+            sigma_mm=restored(measured.sigma_mm),
+            confidence=restored(measured.confidence),
+            wrong_chance=restored(measured.wrong_chance),
+            brightness_grey=restored(measured.brightness_grey),
+        )
 
     def _reasons(
         self, seen: CrossedObservation, found: Mask, wrong_chance: Image, confidence: NDArray

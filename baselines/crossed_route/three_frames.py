@@ -156,16 +156,33 @@ class ThreeFrameRoute(CrossedRoute):
         watch.done("fit")
         clipped = np.any([grey[crop] >= GREY_LEVELS for grey in greys], axis=0) & inside
         return CrossedObservation(
-            carriers=carriers, shape=mean.shape, grey=mean[crop],
-            background=replace(background, residual=background.residual[crop]), inside=inside, fit=fit,
-            phase_rad=phases, modulation=modulations, contrast=contrast, margin=margin, evidence=evidence,
-            rival=rival(found, index), candidates=beside, clipped_share=clipped.astype(np.float32), watch=watch,
-        )  # fmt: skip
+            carriers=carriers,
+            shape=mean.shape,
+            grey=mean[crop],
+            background=replace(background, residual=background.residual[crop]),
+            inside=inside,
+            fit=fit,
+            phase_rad=phases,
+            modulation=modulations,
+            contrast=contrast,
+            margin=margin,
+            evidence=evidence,
+            rival=rival(found, index),
+            candidates=beside,
+            clipped_share=clipped.astype(np.float32),
+            watch=watch,
+        )
 
     def _light_cost(
-        self, carriers: Carriers, found: Candidates, light: Image, modulation: Image, contrast: tuple[float, float],
-        inside: Mask, background: Background,
-    ) -> Image:  # fmt: skip
+        self,
+        carriers: Carriers,
+        found: Candidates,
+        light: Image,
+        modulation: Image,
+        contrast: tuple[float, float],
+        inside: Mask,
+        background: Background,
+    ) -> Image:
         """Cost of every candidate (K, h, w) in half squared sigmas: how far the still carrier is at its depth from what
         ``light``, the mean of the frames less ambient light, shows over the brightness that the own ``modulation``
         tells. Light from other surfaces is what the candidates of least misfit leave, in the median around a pixel."""
@@ -181,9 +198,15 @@ class ThreeFrameRoute(CrossedRoute):
         return cost
 
     def _ordered(
-        self, carriers: Carriers, found: Candidates, phases: Image, modulations: Image, inside: Mask, noise_grey: float,
+        self,
+        carriers: Carriers,
+        found: Candidates,
+        phases: Image,
+        modulations: Image,
+        inside: Mask,
+        noise_grey: float,
         by_light: Image,
-    ) -> tuple[NDArray[np.int32], Image, Image]:  # fmt: skip
+    ) -> tuple[NDArray[np.int32], Image, Image]:
         """As `orders.chosen`, for every pixel, with the costs ``by_light``; neighbours between which the own phase or
         modulation jumps hardly count for each other."""
         own = modulations[self.moved]
@@ -195,9 +218,14 @@ class ThreeFrameRoute(CrossedRoute):
         return index, margin / np.float32(SMOOTHNESS), np.float32(EVIDENCE_WEIGHT) * evidence
 
     def _fit(
-        self, carriers: Carriers, light: Image, inside: Mask, nearness: Image, modulation: Image,
+        self,
+        carriers: Carriers,
+        light: Image,
+        inside: Mask,
+        nearness: Image,
+        modulation: Image,
         contrast: tuple[float, float],
-    ) -> Fit:  # fmt: skip
+    ) -> Fit:
         """What `refinement.refined` gives for one frame, from the ``modulation`` and ``nearness`` that every pixel
         measured itself; ``light``: the mean of the frames less ambient light."""
         gain = carriers.gain[self.moved]
@@ -269,8 +297,10 @@ def same_plane_mean(psi: Image, sigma: Image, inside: Mask) -> tuple[Image, Imag
     half = [(0, right) for right in range(1, reach + 1)]
     half += [(down, right) for down in range(1, reach + 1) for right in range(-reach, reach + 1)]
     for down, right in half:
-        both = [tuple(beside(maps, *place) for maps in (psis, variances, known))
-                for place in ((down, right), (-down, -right))]  # fmt: skip
+        both = [
+            tuple(beside(maps, *place) for maps in (psis, variances, known))
+            for place in ((down, right), (-down, -right))
+        ]
         (first, first_variance, first_known), (second, second_variance, second_known) = both
         alike = first_known & second_known
         alike &= (first - psi) ** 2 < limit * (first_variance + own)

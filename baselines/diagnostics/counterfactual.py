@@ -22,14 +22,20 @@ from fpp_ml_bench.loaders.storage import DatasetFolder
 MOST_VIEWS = 6
 _WIDE, _GAP = 11.5, 2  # width of the figure of scenes in inches, and gap between two scenes in px
 _FOLLOWS = {
-    "follows_phase": "phase alone", "follows_light": "brightness alone", "follows_both": "both, as in\na photograph",
-    "follows_constant": "phase, by\na constant", "order_free_follows_phase": "phase, whole\nperiods aside",
-}  # fmt: skip
+    "follows_phase": "phase alone",
+    "follows_light": "brightness alone",
+    "follows_both": "both, as in\na photograph",
+    "follows_constant": "phase, by\na constant",
+    "order_free_follows_phase": "phase, whole\nperiods aside",
+}
 _CHANGES = {
-    "change_outline": "other\noutline", "change_no_fringe_inside": "no fringe\ninside",
-    "change_no_fringe_outside": "no fringe\noutside", "change_other_direction": "other\ndirection",
-    "change_other_pitch": "other\npitch", "order_free_change_outline": "other outline,\nperiods aside",
-}  # fmt: skip
+    "change_outline": "other\noutline",
+    "change_no_fringe_inside": "no fringe\ninside",
+    "change_no_fringe_outside": "no fringe\noutside",
+    "change_other_direction": "other\ndirection",
+    "change_other_pitch": "other\npitch",
+    "order_free_change_outline": "other outline,\nperiods aside",
+}
 
 
 class Counterfactual(Probe):
@@ -107,10 +113,11 @@ def _draw_scenes(predictor: ScenePredictor, scenes: Counterfactuals, folder: Pat
     largest = max(float(np.abs(move[target]).max()) for move in moves)
     rows = (
         ("captured", "gray", 0.0, 255.0),
-        (f"truth,\n{unit}", "viridis", *depths), (f"prediction,\n{unit}", "viridis", *depths),
+        (f"truth,\n{unit}", "viridis", *depths),
+        (f"prediction,\n{unit}", "viridis", *depths),
         (f"expected change,\n{unit}", "coolwarm", -largest, largest),
         (f"actual change,\n{unit}", "coolwarm", -largest, largest),
-    )  # fmt: skip
+    )
     tiles: list[list[NDArray[np.float64]]] = []
     for _, scene, true_depth, mask in columns:
         answer, compared = predictor.predict(scene), mask & target

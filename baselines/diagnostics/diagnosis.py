@@ -46,9 +46,14 @@ class ProbeResult:
 
 
 def diagnose(
-    subject: Subject, dataset: DatasetFolder, probe_names: Sequence[str], settings: ProbeSettings, out: Path,
-    progress: Callable[[Probe], Progress], command: str = "",
-) -> list[ProbeResult]:  # fmt: skip
+    subject: Subject,
+    dataset: DatasetFolder,
+    probe_names: Sequence[str],
+    settings: ProbeSettings,
+    out: Path,
+    progress: Callable[[Probe], Progress],
+    command: str = "",
+) -> list[ProbeResult]:
     """Run the probes ``probe_names`` (all if empty) and write ``out/index.html`` and ``out/diagnose.json``; all results
     in the report's order. A finding in ``out`` is reused if subject, dataset, settings and the probe's version are the
     same; those of other probes join the report. ``progress`` is called with a probe before it runs. The report quotes
@@ -106,9 +111,13 @@ def make_probe(name: str) -> Probe:
 def finding_key(probe: Probe, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings) -> str:
     """Hash (64 hex digits) of everything that a finding depends on."""
     content = {
-        "probe": probe.name, "version": probe.version, "subject": subject.sha256, "layers": list(subject.layer_names),
-        "dataset": dataset.fingerprint, "settings": asdict(settings),
-    }  # fmt: skip
+        "probe": probe.name,
+        "version": probe.version,
+        "subject": subject.sha256,
+        "layers": list(subject.layer_names),
+        "dataset": dataset.fingerprint,
+        "settings": asdict(settings),
+    }
     return sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
@@ -153,14 +162,16 @@ def _context(subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, 
     return {
         "subject": {**{key: getattr(subject, key) for key in told}, "layers": subject.layer_names},
         "dataset": {
-            "name": dataset.path.resolve().name, "fingerprint": dataset.fingerprint, "size": list(dataset.size),
+            "name": dataset.path.resolve().name,
+            "fingerprint": dataset.fingerprint,
+            "size": list(dataset.size),
             "samples": {split: len(names) for split, names in dataset.splits.items()},
         },
         "settings": asdict(settings),
         "command": command,
         "software": {"fpp_ml_bench": __version__, **{name: version(name) for name in _PACKAGES}},
         "hardware": describe_hardware().to_dict(),
-    }  # fmt: skip
+    }
 
 
 def report_page(context: Mapping[str, Any], findings: Sequence[tuple[str, Finding]], folder: Path) -> str:

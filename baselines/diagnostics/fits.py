@@ -107,8 +107,14 @@ def truth(depth_mm: Image, rig: Rig, direction: Direction) -> dict[str, NDArray]
     phase = TAU * (periods - np.floor(periods))
     order = np.floor(periods) - np.where(inside, np.floor(_standoff_periods(rig, direction)), 0.0)
     sine, cosine = (np.where(inside, of(phase), 0.0) for of in (np.sin, np.cos))
-    maps = {"edges": edge_map(depth_mm), "depth": normalised_depth(depth_mm), "depth_mm": depth_mm, "sine": sine,
-            "cosine": cosine, "order": order}  # fmt: skip
+    maps = {
+        "edges": edge_map(depth_mm),
+        "depth": normalised_depth(depth_mm),
+        "depth_mm": depth_mm,
+        "sine": sine,
+        "cosine": cosine,
+        "order": order,
+    }
     return {"inside": inside, **{name: np.asarray(values, dtype=np.float32) for name, values in maps.items()}}
 
 
@@ -224,11 +230,14 @@ class ConvolutionProbe(nn.Module):
         super().__init__()
         self.mean, self.factor = (part[:, None, None] for part in moments.standard())
         self.body = nn.Sequential(
-            nn.Conv2d(len(self.mean), WIDTH, 1), nn.ReLU(),
-            nn.Conv2d(WIDTH, WIDTH, 3, padding=1), nn.ReLU(),
-            nn.Conv2d(WIDTH, WIDTH, 3, padding=1), nn.ReLU(),
+            nn.Conv2d(len(self.mean), WIDTH, 1),
+            nn.ReLU(),
+            nn.Conv2d(WIDTH, WIDTH, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(WIDTH, WIDTH, 3, padding=1),
+            nn.ReLU(),
             nn.Conv2d(WIDTH, 1, 1),
-        )  # fmt: skip
+        )
         last = self.body[-1]
         nn.init.zeros_(last.weight)  # type: ignore[arg-type]
         nn.init.constant_(last.bias, target_mean)  # type: ignore[arg-type]

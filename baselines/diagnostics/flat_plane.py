@@ -82,10 +82,18 @@ class PlanePrediction:
         values = self.prediction[self.mask].astype(np.float64)
         millimetres = scale.mm(values)
         error = millimetres - self.depth_mm[self.mask]
-        own = {"answer_mean": values.mean(), "answer_std": values.std(), "answer_min": values.min(),
-               "answer_max": values.max(), "collapsed_share": (values < scale.limit).mean(),
-               "mean_mm": millimetres.mean(), "std_mm": millimetres.std(), "bias_mm": error.mean(),
-               "mae_mm": np.abs(error).mean(), "true_std_mm": self.depth_mm[self.mask].std()}  # fmt: skip
+        own = {
+            "answer_mean": values.mean(),
+            "answer_std": values.std(),
+            "answer_min": values.min(),
+            "answer_max": values.max(),
+            "collapsed_share": (values < scale.limit).mean(),
+            "mean_mm": millimetres.mean(),
+            "std_mm": millimetres.std(),
+            "bias_mm": error.mean(),
+            "mae_mm": np.abs(error).mean(),
+            "true_std_mm": self.depth_mm[self.mask].std(),
+        }
         about = {"outline": self.outline, "distance_m": self.distance_m, "tilt_deg": list(self.tilt_deg)}
         return {**about, "pixels": int(self.mask.sum()), **{key: float(value) for key, value in own.items()}}
 
@@ -204,8 +212,10 @@ def control_of(
 def summary(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) -> str:
     """The share that collapsed in each outline and by size, the mean at the paper's distance, and for mm those at all
     distances."""
-    shares = {kind: float(np.mean([row["collapsed_share"] for row in rows if kind_of(row["outline"]) == kind]))
-              for kind in (RECTANGLE, FRAME, SILHOUETTE)}  # fmt: skip
+    shares = {
+        kind: float(np.mean([row["collapsed_share"] for row in rows if kind_of(row["outline"]) == kind]))
+        for kind in (RECTANGLE, FRAME, SILHOUETTE)
+    }
     facing = [row for row in rows if row["outline"] == RECTANGLE and row["tilt_deg"] == [0.0, 0.0]]
     paper = next(row for row in facing if row["distance_m"] == PAPER_DISTANCE_M)
     mean_text = (
@@ -248,8 +258,19 @@ def tables(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) 
         pose = f"{distance_m:g} m", f"{across:g}, {down:g}"
         lines.append((name, *pose, mean, std, f"{least:.4g} to {most:.4g}", *others))
     title = "Predictions for planes" + (", mm by the mean range of the test split" if normalised else "")
-    header = ("Outline", "Distance", "Tilt, degrees", f"Mean, {unit}", f"Spread, {unit}", f"Least to most, {unit}",
-              "Collapsed", "Mean, mm", "Spread, mm", "True spread, mm", "MAE, mm")  # fmt: skip
+    header = (
+        "Outline",
+        "Distance",
+        "Tilt, degrees",
+        f"Mean, {unit}",
+        f"Spread, {unit}",
+        f"Least to most, {unit}",
+        "Collapsed",
+        "Mean, mm",
+        "Spread, mm",
+        "True spread, mm",
+        "MAE, mm",
+    )
     keys = {"real objects, predicted": "collapsed_share", "real objects, in truth": "collapsed_share_true"}
     shares = [(pixels, control[key]) for pixels, key in keys.items()]
     return [Table(title, header, lines), Table("Share of background: the control", ("Pixels of", "Share"), shares)]

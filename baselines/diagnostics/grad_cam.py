@@ -60,9 +60,13 @@ class GradCam(probe.Probe):
         if correlations.average(EDGES).r is None:
             return self.skip(f"the heatmaps of every layer of {subject.name} ({', '.join(layers)}) are constant.")
         protocol = {
-            "split": "test", "samples": len(samples), "seeds": seeds, "layers": list(layers),
-            "score": "mean prediction", "heatmap": "ReLU, bilinear to the image",
-        }  # fmt: skip
+            "split": "test",
+            "samples": len(samples),
+            "seeds": seeds,
+            "layers": list(layers),
+            "score": "mean prediction",
+            "heatmap": "ReLU, bilinear to the image",
+        }
         values = {"protocol": protocol, **correlations.to_dict()}
         drawn = _draw_bars(correlations, folder), _draw_heatmaps(subject, dataset, samples, layers, folder)
         return self.finding(summary(correlations), values, tables(correlations), *drawn)
@@ -167,9 +171,10 @@ class Correlations:
 
     def _sample_means(self, layers: Sequence[str], reference: str, trained: bool) -> list[float | None]:
         columns = [
-            values for (weights, layer, target), values in self.values.items()
+            values
+            for (weights, layer, target), values in self.values.items()
             if layer in layers and target == reference and (weights == "trained") == trained
-        ]  # fmt: skip
+        ]
         return [mean_of([values[sample] for values in columns]) for sample in range(len(self.objects))]
 
     def _over_samples(self, values: Sequence[float | None]) -> Mean:
@@ -184,9 +189,11 @@ class Correlations:
             layers[layer] = {**_with_ratio(trained), "random": random}
         random = {target: self.average(target, trained=False)._asdict() for target in (EDGES, FRINGES, OWN)}
         return {
-            "layers": layers, "average": _with_ratio(average), "random_average": random,
+            "layers": layers,
+            "average": _with_ratio(average),
+            "random_average": random,
             "edges_with_fringes": self.references._asdict(),
-        }  # fmt: skip
+        }
 
 
 def _with_ratio(means: dict[str, Mean]) -> dict[str, Any]:
@@ -199,9 +206,13 @@ def ratio(edges: float | None, fringes: float | None) -> float | None:
 
 
 def measure(
-    subject: Subject, dataset: DatasetFolder, samples: Sequence[str], layers: Sequence[str], seeds: int,
+    subject: Subject,
+    dataset: DatasetFolder,
+    samples: Sequence[str],
+    layers: Sequence[str],
+    seeds: int,
     progress: Progress,
-) -> Correlations:  # fmt: skip
+) -> Correlations:
     """Correlations of every heatmap with both references, and of random weights' heatmaps with the trained ones."""
     network, untrained = subject.networks()
     correlations = Correlations(layers, [split_sample_name(name)[0] for name in samples])
@@ -258,11 +269,13 @@ def tables(correlations: Correlations) -> list[Table]:
         pairs[name] = place, [correlations.average(target, trained) for target in (EDGES, FRINGES)]
     rows: list[tuple[probe.Cell, ...]] = [
         (
-            name, *(text_of(*mean[:2]) for mean in pair), ratio(pair[0].r, pair[1].r),
+            name,
+            *(text_of(*mean[:2]) for mean in pair),
+            ratio(pair[0].r, pair[1].r),
             said_by_paper(PAPER, layer) if beside else None,
         )
         for name, (layer, pair) in pairs.items()
-    ]  # fmt: skip
+    ]
     rows.append(("Edges with fringes", text_of(*correlations.references[:2]), None, None, None))
     random = []
     for layer in correlations.layers:
@@ -279,9 +292,11 @@ def _draw_bars(correlations: Correlations, folder: Path) -> Figure:
     sheet = Sheet(1, 1, 9, 3.4)
     axis, layers, positions = sheet.axes[0, 0], correlations.layers, np.arange(len(correlations.layers))
     series = (
-        (EDGES, True, "edges", "edges"), (FRINGES, True, "phase", "fringes"),
-        (EDGES, False, "random", "edges, random weights"), (FRINGES, False, "raw", "fringes, random weights"),
-    )  # fmt: skip
+        (EDGES, True, "edges", "edges"),
+        (FRINGES, True, "phase", "fringes"),
+        (EDGES, False, "random", "edges, random weights"),
+        (FRINGES, False, "raw", "fringes, random weights"),
+    )
     for number, (target, trained, colour, label) in enumerate(series):
         bars = [correlations.mean(layer, target, trained)[:2] for layer in layers]
         sheet.bars(axis, positions + (number - 1.5) * _BAR, bars, width=_BAR, color=sheet.COLOURS[colour], label=label)

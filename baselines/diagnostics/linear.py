@@ -27,9 +27,13 @@ SAMPLES, QUICK_SAMPLES, QUICK_EPOCHS = 120, 24, 4
 SEEDS = 2
 PIXELS = 1024  # pixels drawn with replacement from each sample: so many over the image, and as many within the object
 TARGETS: dict[str, tuple[str, ...]] = {
-    "edges": ("edges",), "depth": ("depth",), OBJECT_DEPTH: ("depth",), "distance": ("depth_mm",),
-    "phase": ("sine", "cosine"), "order": ("order",),
-}  # fmt: skip
+    "edges": ("edges",),
+    "depth": ("depth",),
+    OBJECT_DEPTH: ("depth",),
+    "distance": ("depth_mm",),
+    "phase": ("sine", "cosine"),
+    "order": ("order",),
+}
 """Targets of the linear probe, by the names in `fits.truth`; the phase is an angle and so has two."""
 INSIDE = (OBJECT_DEPTH, "distance", "phase", "order")  # targets on object pixels only
 FRINGE = ("phase", "order")  # targets that need fringes of a single direction
@@ -71,10 +75,14 @@ class LinearProbing(Probe):
             return self.skip(f"every probed layer of {subject.name} ({layers}) is constant, so it holds nothing.")
         spatial = experiment.spatial_scores(seeds, epochs)
         protocol = {
-            "training_samples": len(train), "validation_samples": len(validation), "seeds": seeds,
-            "epochs": epochs, "batch": fits.BATCH, "probe_width": fits.WIDTH,
+            "training_samples": len(train),
+            "validation_samples": len(validation),
+            "seeds": seeds,
+            "epochs": epochs,
+            "batch": fits.BATCH,
+            "probe_width": fits.WIDTH,
             "image_px_a_grid_step": fits.grid_step(subject.image_size),
-        }  # fmt: skip
+        }
         summary, tables = linear_report.summary(linear, spatial), linear_report.tables(linear, spatial)
         values = {"protocol": protocol, **linear_report.values(linear, spatial)}
         drawn = linear_report.draw_four_convolutions(spatial, folder), linear_report.draw_one_by_one(linear, folder)
@@ -129,9 +137,13 @@ class Experiment:
     called with the number of samples just processed and the activity."""
 
     def __init__(
-        self, subject: Subject, dataset: DatasetFolder, train: Sequence[str], validation: Sequence[str],
+        self,
+        subject: Subject,
+        dataset: DatasetFolder,
+        train: Sequence[str],
+        validation: Sequence[str],
         tick: Callable[[int, str], None],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.subject, self.dataset, self.train, self.validation, self.tick = subject, dataset, train, validation, tick
         self.pixels = Pixels(subject, dataset)
         self.objects = [split_sample_name(name)[0] for name in validation]

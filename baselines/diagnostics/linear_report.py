@@ -13,9 +13,13 @@ from fpp_ml_bench.paper import AVERAGE, LAYERS, paper_layers, said_by_paper
 
 PAPER = "linear_probing"
 TITLES = {
-    "edges": "edges", "depth": "depth, whole image", OBJECT_DEPTH: "depth, object", "distance": "depth in mm, object",
-    "phase": "wrapped phase", "order": "fringe order",
-}  # fmt: skip
+    "edges": "edges",
+    "depth": "depth, whole image",
+    OBJECT_DEPTH: "depth, object",
+    "distance": "depth in mm, object",
+    "phase": "wrapped phase",
+    "order": "fringe order",
+}
 CONTROL_TITLES = {INPUT: "raw input", SILHOUETTE: "object's mask alone", POSITION: "pixel's position alone"}
 _LINES = dict(zip(CONTROL_TITLES, (":", "-.", "--"), strict=True))
 
@@ -42,18 +46,23 @@ def score(errors: Sequence[Sequence[float]], reference: Sequence[float], objects
     # have large errors in both terms, which cancels.
     deviation = object_interval(((sample_means - (1 - r2) * np.asarray(reference)) / mean_error).tolist(), objects)
     return {
-        "mse": mse, "mse_interval": object_interval(sample_means.tolist(), objects), "r2": r2,
+        "mse": mse,
+        "mse_interval": object_interval(sample_means.tolist(), objects),
+        "r2": r2,
         "r2_interval": None if deviation is None else (r2 - deviation[1], r2 - deviation[0]),
-        "seeds": (1 - table.mean(axis=1) / mean_error).tolist(), "mse_of_mean": mean_error,
-    }  # fmt: skip
+        "seeds": (1 - table.mean(axis=1) / mean_error).tolist(),
+        "mse_of_mean": mean_error,
+    }
 
 
 def values(linear: Scores, spatial: Scores) -> dict[str, Any]:
     """For ``diagnose.json``."""
     return {
-        "four_convolutions": spatial, "ratio": mean_ratio(spatial[TRAINED]),
-        "ratio_of_means": ratio_of_means(spatial[CONTROLS][INPUT]), "linear": linear,
-    }  # fmt: skip
+        "four_convolutions": spatial,
+        "ratio": mean_ratio(spatial[TRAINED]),
+        "ratio_of_means": ratio_of_means(spatial[CONTROLS][INPUT]),
+        "linear": linear,
+    }
 
 
 def mean_over(layers: Mapping[str, Mapping[str, Score]], target: str, key: str = "mse") -> float:
@@ -107,11 +116,12 @@ def tables(linear: Scores, spatial: Scores) -> list[Table]:
     errors: list[tuple[Cell, ...]] = [
         (
             f"{name} (paper's {LAYERS[name]})" if beside and LAYERS.get(name, name) != name else name,
-            *(mean_over(row, key) for key in MEASURED), mean_ratio(row),
+            *(mean_over(row, key) for key in MEASURED),
+            mean_ratio(row),
             said_by_paper(PAPER, name.lower()) if beside else None,
         )
         for name, row in rows.items()
-    ]  # fmt: skip
+    ]
     errors.append(("Predicting the mean", *(raw[key]["mse_of_mean"] for key in MEASURED), ratio_of_means(raw), None))
 
     paper = ("Layer", *(TITLES[key] for key in MEASURED), "Ratio depth / edges", "Paper: edges, depth, ratio")

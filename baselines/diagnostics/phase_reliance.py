@@ -215,11 +215,14 @@ def measure(
         parts=RelianceParts(
             **{key: mean_of(sample.parts.get(key) for sample in scored) for key in RelianceParts.model_fields}
         ),
-        units="mm" if predictor.in_mm else "normalised", direction=direction,
-        samples=len(scored), objects=len({sample.object for sample in scored}),
-        dataset_fingerprint=scene_set.dataset.fingerprint, protocol_version=PROTOCOL_VERSION,
+        units="mm" if predictor.in_mm else "normalised",
+        direction=direction,
+        samples=len(scored),
+        objects=len({sample.object for sample in scored}),
+        dataset_fingerprint=scene_set.dataset.fingerprint,
+        protocol_version=PROTOCOL_VERSION,
         weights_sha256=weights_sha256,
-    )  # fmt: skip
+    )
     return reliance, samples
 
 

@@ -49,10 +49,13 @@ def shares_within(heat: Heat, mask: NDArray[np.bool_]) -> dict[str, Any]:
 def attention_table(shares: Mapping[str, Any]) -> Table:
     """A row per layer."""
     rows: list[Sequence[Cell]] = [
-        (f"{layer} (paper's {LAYERS[layer]})" if LAYERS.get(layer, layer) != layer else layer, share,
-         shares[UNTRAINED][layer])
+        (
+            f"{layer} (paper's {LAYERS[layer]})" if LAYERS.get(layer, layer) != layer else layer,
+            share,
+            shares[UNTRAINED][layer],
+        )
         for layer, share in shares[TRAINED].items()
-    ]  # fmt: skip
+    ]
     title = f"Grad-CAM on the rectangle at 1.8 m, which covers {shares['area']:.0%} of the image: heat within it"
     return Table(title, ("Layer", "Share", "Random weights"), rows)
 

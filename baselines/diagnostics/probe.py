@@ -157,9 +157,15 @@ class Sheet:
     ``subplots``. ``axes``: an array of that shape."""
 
     COLOURS: ClassVar = {
-        "edges": "#2e8b57", "depth": "#c0392b", "object_depth": "#e08e79", "distance": "#c0392b", "phase": "#1b5bb8",
-        "order": "#8a4b00", "raw": "#59616b", "random": "#9aa3ad",
-    }  # fmt: skip
+        "edges": "#2e8b57",
+        "depth": "#c0392b",
+        "object_depth": "#e08e79",
+        "distance": "#c0392b",
+        "phase": "#1b5bb8",
+        "order": "#8a4b00",
+        "raw": "#59616b",
+        "random": "#9aa3ad",
+    }
     """Colours of the targets, edges and depth as in the paper's figure; of the raw input, and of random weights."""
     INK, GRID = "#191c20", "#dfe1e5"
 

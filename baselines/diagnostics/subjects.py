@@ -168,9 +168,13 @@ def checked_output(output: Tensor, batch: Tensor, name: str) -> Tensor:
 
 
 def subject(
-    name: str, dataset: DatasetFolder, layers: Sequence[str] | None = None, units: OutputUnits | None = None,
-    frame: int | None = None, threads: int = 1,
-) -> Subject:  # fmt: skip
+    name: str,
+    dataset: DatasetFolder,
+    layers: Sequence[str] | None = None,
+    units: OutputUnits | None = None,
+    frame: int | None = None,
+    threads: int = 1,
+) -> Subject:
     """The model called ``name``, ready to be diagnosed on ``dataset``. ``name``: a method of
     `fpp_ml_bench.baselines.method.METHODS`, shipped weights, a ``.safetensors`` file, or ``file.py:factory``, where
     ``factory()`` returns a torch module that maps fringes (B, 1, H, W) in [0, 1] to depth (B, 1, H, W) in ``units``
@@ -197,9 +201,11 @@ def subject_of_method(depth_method: Method, dataset: DatasetFolder, **network: A
     return Subject(
         **{key: getattr(depth_method, key) for key in same},
         sha256=hashlib.sha256(json.dumps([depth_method.name, settings], sort_keys=True).encode()).hexdigest(),
-        image_size=dataset.size, direction=_direction_of(dataset, depth_method.frames_used),
-        predict_frames=depth_method.predict, **network,
-    )  # fmt: skip
+        image_size=dataset.size,
+        direction=_direction_of(dataset, depth_method.frames_used),
+        predict_frames=depth_method.predict,
+        **network,
+    )
 
 
 def _subject_of_weights(
@@ -229,11 +235,15 @@ def _subject_of_weights(
         return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
     return subject_of_method(
-        NetworkMethod(model, frame=frame, threads=threads, sequence=dataset.sequence), dataset,
-        normalisation=config.normalisation, network=model.network, weights_sha256=model.sha256,
+        NetworkMethod(model, frame=frame, threads=threads, sequence=dataset.sequence),
+        dataset,
+        normalisation=config.normalisation,
+        network=model.network,
+        weights_sha256=model.sha256,
         layer_names=_select_layers(layers, model.network.probe_layers, config.name),
-        find_layers=lambda network: network.probe_layers, untrained=untrained,
-    )  # fmt: skip
+        find_layers=lambda network: network.probe_layers,
+        untrained=untrained,
+    )
 
 
 def _select_layers(requested: Sequence[str] | None, available: dict[str, nn.Module], name: str) -> tuple[str, ...]:
@@ -278,14 +288,20 @@ def _subject_of_factory(
         return values if units == "normalised" else denormalise(values, normalisation, 0.0, 0.0).astype(np.float32)
 
     user_subject = Subject(
-        name=path.stem, title=f"{path.name}:{name.rpartition(':')[2]}",
-        sha256=_digest(path, network, f"{units} {frame}"), units="normalised" if units == "normalised" else "mm",
-        image_size=dataset.size, frames_used=(frame,), direction=_direction_of(dataset, (frame,)),
-        predict_frames=predict, normalisation=normalisation, network=network,
+        name=path.stem,
+        title=f"{path.name}:{name.rpartition(':')[2]}",
+        sha256=_digest(path, network, f"{units} {frame}"),
+        units="normalised" if units == "normalised" else "mm",
+        image_size=dataset.size,
+        frames_used=(frame,),
+        direction=_direction_of(dataset, (frame,)),
+        predict_frames=predict,
+        normalisation=normalisation,
+        network=network,
         layer_names=_select_layers(layers, _layers(network, bool(layers)), name),
         find_layers=lambda model: _layers(model, bool(layers)),
         untrained=lambda seed: randomised(_build_network(name, factory), seed),
-    )  # fmt: skip
+    )
     first = next((sample for split in dataset.splits for sample in dataset.samples(split)), None)
     if first is None:
         raise DiagnosisError(f"{dataset.path}: holds no sample")

@@ -56,11 +56,16 @@ class Twins:
         distance_mm = np.abs(self.depths_mm[1] - self.depths_mm[0])[inside]
         pairs = {"": self.frames, "_noiseless": self.noiseless, "_other_direction": self.other_frames}
         return {
-            "sample": self.sample, "direction": self.direction, "frame": self.frame, "object_pixels": int(inside.sum()),
+            "sample": self.sample,
+            "direction": self.direction,
+            "frame": self.frame,
+            "object_pixels": int(inside.sum()),
             **{f"differing_pixels{which}": int(np.not_equal(*pair).sum()) for which, pair in pairs.items()},
-            "depth_apart_mean_mm": float(distance_mm.mean()), "depth_apart_least_mm": float(distance_mm.min()),
-            "paint_least": float(self.paint.min()), "paint_most": float(self.paint.max()),
-        }  # fmt: skip
+            "depth_apart_mean_mm": float(distance_mm.mean()),
+            "depth_apart_least_mm": float(distance_mm.min()),
+            "paint_least": float(self.paint.min()),
+            "paint_most": float(self.paint.max()),
+        }
 
 
 Curve = dict[str, Any]
@@ -86,8 +91,12 @@ class Theory(Probe):
         curves = error_curves(dataset.rig, twins.direction)
         keys = "name", "periods", "exponent", "fitted_m", "quadratic_m"
         shown = [{key: curve[key] for key in keys} for curve in curves]
-        values = {"twins": twins.to_dict(), "kappa_per_m": kappa_per_m(dataset.rig, twins.direction), "curves": shown,
-                  "choices": choices(twins.depths_mm)}  # fmt: skip
+        values = {
+            "twins": twins.to_dict(),
+            "kappa_per_m": kappa_per_m(dataset.rig, twins.direction),
+            "curves": shown,
+            "choices": choices(twins.depths_mm),
+        }
         figures = _draw_twins(twins, folder), _draw_curves(curves, folder)
         return self.finding(summary(values), values, tables(values, curves), *figures)
 
@@ -179,11 +188,14 @@ def _curve(name: str, periods: float, distances: NDArray[np.float64], error_mm: 
     fitted = quadratic if quadratic.sum() > 2 else finite
     spans = {"fitted_m": distances[fitted], "quadratic_m": distances[quadratic]}
     return {
-        "name": name, "periods": periods, "distances_m": distances, "error_mm": error_mm,
+        "name": name,
+        "periods": periods,
+        "distances_m": distances,
+        "error_mm": error_mm,
         "local": np.where(finite, local, np.nan),
         "exponent": float(np.polyfit(np.log(distances[fitted]), np.log(error_mm[fitted]), 1)[0]),
         **{key: [float(chosen.min()), float(chosen.max())] if chosen.size else None for key, chosen in spans.items()},
-    }  # fmt: skip
+    }
 
 
 def summary(values: Mapping[str, Any]) -> str:

@@ -212,9 +212,13 @@ class DoubleConvolution(nn.Sequential):
     def __init__(self, c_in: int, c_out: int, over_batch: bool = False) -> None:
         norm = nn.BatchNorm2d if over_batch else InstanceNorm
         super().__init__(
-            nn.Conv2d(c_in, c_out, 3, padding=1, bias=False), norm(c_out, affine=True), nn.ReLU(inplace=True),
-            nn.Conv2d(c_out, c_out, 3, padding=1, bias=False), norm(c_out, affine=True), nn.ReLU(inplace=True),
-        )  # fmt: skip
+            nn.Conv2d(c_in, c_out, 3, padding=1, bias=False),
+            norm(c_out, affine=True),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(c_out, c_out, 3, padding=1, bias=False),
+            norm(c_out, affine=True),
+            nn.ReLU(inplace=True),
+        )
 
 
 class ResidualBlock(nn.Module):
@@ -224,9 +228,12 @@ class ResidualBlock(nn.Module):
     def __init__(self, c_in: int, c_out: int, stride: int = 1) -> None:
         super().__init__()
         self.residual = nn.Sequential(
-            nn.Conv2d(c_in, c_out, 3, stride, 1, bias=False), nn.BatchNorm2d(c_out), nn.ReLU(inplace=True),
-            nn.Conv2d(c_out, c_out, 3, padding=1, bias=False), nn.BatchNorm2d(c_out),
-        )  # fmt: skip
+            nn.Conv2d(c_in, c_out, 3, stride, 1, bias=False),
+            nn.BatchNorm2d(c_out),
+            nn.ReLU(inplace=True),
+            nn.Conv2d(c_out, c_out, 3, padding=1, bias=False),
+            nn.BatchNorm2d(c_out),
+        )
         self.identity: nn.Module = nn.Identity()
         if stride != 1 or c_in != c_out:
             self.identity = nn.Sequential(nn.Conv2d(c_in, c_out, 1, stride, bias=False), nn.BatchNorm2d(c_out))

@@ -41,9 +41,11 @@ class Backbone(nn.Module):
         super().__init__()
         first = branches[0]
         self.stem = nn.Sequential(
-            _convolution(1, stem, 2), _convolution(stem, stem, 2), ResidualBlock(stem, first),
+            _convolution(1, stem, 2),
+            _convolution(stem, stem, 2),
+            ResidualBlock(stem, first),
             *(ResidualBlock(first, first) for _ in range(STEM_BLOCKS - 1)),
-        )  # fmt: skip
+        )
         self.stages = nn.ModuleList()
         for stage, blocks in enumerate(STAGE_BLOCKS, 1):
             lanes = nn.ModuleList()

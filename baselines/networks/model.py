@@ -193,9 +193,15 @@ def heads_from_tensors(tensors: Mapping[str, Tensor], name: str) -> RangeHeads |
     features = tensors["range_weight"].shape[0] if tensors["range_weight"].dim() == 2 else 0
     channels = tensors["mask_weight"].numel()
     shapes = {
-        "mean_range_mm": (2,), "range_weight": (features, 2), "range_bias": (2,), "mask_weight": (channels,),
-        "mask_bias": (), "mask_threshold": (2,), "limits_mm": (2,), "report": (len(HeadReport._fields),),
-    }  # fmt: skip
+        "mean_range_mm": (2,),
+        "range_weight": (features, 2),
+        "range_bias": (2,),
+        "mask_weight": (channels,),
+        "mask_bias": (),
+        "mask_threshold": (2,),
+        "limits_mm": (2,),
+        "report": (len(HeadReport._fields),),
+    }
     for key, shape in shapes.items():
         if tuple(tensors[key].shape) != shape or tensors[key].dtype != torch.float64:
             actual = f"{tensors[key].dtype} {tuple(tensors[key].shape)}"

@@ -32,9 +32,15 @@ class NetworkMethod(Method):
     batched = True
 
     def __init__(
-        self, model: Model, depth_range: DepthRange | None = None, frame: int | None = None, threads: int = 1,
-        sequence: AnySequence = PAPER_SEQUENCE, remark: str = "", about: Mapping[str, Setting] | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        model: Model,
+        depth_range: DepthRange | None = None,
+        frame: int | None = None,
+        threads: int = 1,
+        sequence: AnySequence = PAPER_SEQUENCE,
+        remark: str = "",
+        about: Mapping[str, Setting] | None = None,
+    ) -> None:
         config = self.weights_config = model.config
         self.model, self.threads = model, threads
         self.name, self.device, self.parameters = config.name, str(model.device), model.parameters
@@ -63,12 +69,21 @@ class NetworkMethod(Method):
         if isinstance(seed, int):
             self.seeds = {"training": seed}
         entries: dict[str, Setting] = {
-            "weights_sha256": model.sha256, "network": config.network, "width": config.options.get("width"),
-            "normalisation": config.normalisation, "loss": _loss(config.recipe.get("loss")),
-            "preset": config.recipe.get("preset"), "trained_frames": config.data_config,
-            "background_removed": config.background_removed, "seed": seed, "epochs": config.epoch, "frame": self.frame,
-            "depth_range": self.depth_range, "threads": threads, "device": self.device,
-        }  # fmt: skip
+            "weights_sha256": model.sha256,
+            "network": config.network,
+            "width": config.options.get("width"),
+            "normalisation": config.normalisation,
+            "loss": _loss(config.recipe.get("loss")),
+            "preset": config.recipe.get("preset"),
+            "trained_frames": config.data_config,
+            "background_removed": config.background_removed,
+            "seed": seed,
+            "epochs": config.epoch,
+            "frame": self.frame,
+            "depth_range": self.depth_range,
+            "threads": threads,
+            "device": self.device,
+        }
         self.settings = {key: value for key, value in entries.items() if value is not None} | dict(about or {})
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:

@@ -46,9 +46,15 @@ def export_onnx(model: Any, path: str | Path, size: int | tuple[int, int]) -> Pa
                 # The size rule is checked once, here, and is meant to be a constant of the file.
                 warnings.simplefilter("ignore")
                 torch.onnx.export(
-                    network, (example,), str(unfinished), dynamo=False, input_names=[INPUT], output_names=[OUTPUT],
-                    dynamic_axes={INPUT: {0: "batch"}, OUTPUT: {0: "batch"}}, opset_version=OPSET,
-                )  # fmt: skip
+                    network,
+                    (example,),
+                    str(unfinished),
+                    dynamo=False,
+                    input_names=[INPUT],
+                    output_names=[OUTPUT],
+                    dynamic_axes={INPUT: {0: "batch"}, OUTPUT: {0: "batch"}},
+                    opset_version=OPSET,
+                )
             unfinished.replace(target)
     except OSError as error:
         raise FppBenchError(f"can't write {target}: {error.strerror or error}") from error

@@ -29,9 +29,12 @@ class GeneratorBlock(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.residual = nn.Sequential(
-            _convolution(channels, channels, 3, reflect=True), InstanceNorm(channels), nn.ReLU(inplace=True),
-            _convolution(channels, channels, 3, reflect=True), InstanceNorm(channels),
-        )  # fmt: skip
+            _convolution(channels, channels, 3, reflect=True),
+            InstanceNorm(channels),
+            nn.ReLU(inplace=True),
+            _convolution(channels, channels, 3, reflect=True),
+            InstanceNorm(channels),
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         return x + self.residual(x)

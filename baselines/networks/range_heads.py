@@ -32,9 +32,11 @@ _PIXELS_AT_ONCE = 4 * 224 * 224
 
 
 def fit_heads(
-    network: FringeNetwork, config: ModelConfig, dataset_folder: str | Path,
+    network: FringeNetwork,
+    config: ModelConfig,
+    dataset_folder: str | Path,
     progress: Callable[[int], None] = lambda pairs: None,
-) -> dict[str, Tensor]:  # fmt: skip
+) -> dict[str, Tensor]:
     """Tensors of the `RangeHeads` of ``network``, which is not changed; ``save_weights(..., heads=...)`` stores them.
 
     Mean range, ridge regression and mask come from the training split; the ridge's strength and the masks' thresholds
@@ -68,9 +70,15 @@ class _Pairs:
     """The chosen pairs of one split; each `run` sends them through the network batch by batch."""
 
     def __init__(
-        self, network: FringeNetwork, probe: Probe, config: ModelConfig, folder: str | Path, split: str, cap: int,
+        self,
+        network: FringeNetwork,
+        probe: Probe,
+        config: ModelConfig,
+        folder: str | Path,
+        split: str,
+        cap: int,
         progress: Callable[[int], None],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.data = FringeDepthDataset(
             folder, split, config.data_config, "individual", config.background_removed, config.range_rule
         )
@@ -82,9 +90,10 @@ class _Pairs:
             )
         # A sample without an object has no depth range.
         usable = [
-            index for index in range(len(self.data))
+            index
+            for index in range(len(self.data))
             if source.measured(self.data.samples[self.data.pair(index)[0]])["depth_max_mm"] > 0
-        ]  # fmt: skip
+        ]
         if not usable:
             raise WeightsError(f"{folder}: split {split} holds no object, so there is no range to learn")
         places = np.linspace(0, len(usable) - 1, min(cap, len(usable))).round().astype(int)
@@ -135,11 +144,15 @@ def _fit(train: _Pairs, validation: _Pairs) -> RangeHeads:
     strength, weight, bias, error_mm = fitted
     mean = np.array([lows.mean(), highs.mean()])
     heads = RangeHeads(
-        mean_range_mm=torch.from_numpy(mean), range_weight=torch.from_numpy(weight), range_bias=torch.from_numpy(bias),
-        mask_weight=mask_weight, mask_bias=mask_bias, mask_threshold=torch.zeros(2, dtype=torch.float64),
+        mean_range_mm=torch.from_numpy(mean),
+        range_weight=torch.from_numpy(weight),
+        range_bias=torch.from_numpy(bias),
+        mask_weight=mask_weight,
+        mask_bias=mask_bias,
+        mask_threshold=torch.zeros(2, dtype=torch.float64),
         limits_mm=torch.tensor([lows.min() - margin, highs.max() + margin], dtype=torch.float64),
         report=torch.zeros(6, dtype=torch.float64),
-    )  # fmt: skip
+    )
     tallies = {twin: _Tally() for twin in TWINS}
     for values, depth_mm, _ in validation.run():
         logits = heads.logits(validation.probe, validation.size).cpu().numpy()[:, 0]

@@ -7,9 +7,13 @@ from fpp_ml_bench.baselines import networks
 from fpp_ml_bench.errors import NetworkError
 
 _CLASSES = {
-    "unet": "UNet", "transunet": "TransUNet", "resunet": "ResUNet", "hformer": "Hformer", "pix2pix": "Pix2Pix",
+    "unet": "UNet",
+    "transunet": "TransUNet",
+    "resunet": "ResUNet",
+    "hformer": "Hformer",
+    "pix2pix": "Pix2Pix",
     "pix2pix_unet": "Pix2PixUNet",
-}  # fmt: skip
+}
 NETWORKS = tuple(_CLASSES)
 
 

@@ -82,9 +82,14 @@ class UNet(UShape):
     name = "unet"
 
     def __init__(
-        self, *, width: int = 64, dropout: float = 0.0, standardised: int = 0, guided: int = 0,
+        self,
+        *,
+        width: int = 64,
+        dropout: float = 0.0,
+        standardised: int = 0,
+        guided: int = 0,
         batch_normalised: int = 0,
-    ) -> None:  # fmt: skip
+    ) -> None:
         width = base.whole(self.name, "width", width)
         dropout = base.rate(self.name, "dropout", dropout)
         flags = {"standardised": standardised, "guided": guided, "batch_normalised": batch_normalised}

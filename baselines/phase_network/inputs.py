@@ -25,12 +25,28 @@ LARGEST_RAD = 1.5708  # largest correction that is proposed
 AROUND_PX = 1.5
 """Gaussian over which the misfit of a proposal is averaged: the light of a single pixel fits many phases."""
 CHANNELS = (
-    "light", "plane light", "plane misfit", "classical mask", "cos", "sin", "brightness", "window share", "fit misfit",
-    "slope along", "slope across", "further: brightness misfit", "base: brightness misfit",
-    "nearer: brightness misfit", "further exists", "nearer exists", "relief", "first guess",
+    "light",
+    "plane light",
+    "plane misfit",
+    "classical mask",
+    "cos",
+    "sin",
+    "brightness",
+    "window share",
+    "fit misfit",
+    "slope along",
+    "slope across",
+    "further: brightness misfit",
+    "base: brightness misfit",
+    "nearer: brightness misfit",
+    "further exists",
+    "nearer exists",
+    "relief",
+    "first guess",
     *(f"from {row:+.1f} {column:+.1f}: correction" for row, column in SIDES),
-    "own misfit around", *(f"from {row:+.1f} {column:+.1f}: misfit around" for row, column in SIDES),
-)  # fmt: skip
+    "own misfit around",
+    *(f"from {row:+.1f} {column:+.1f}: misfit around" for row, column in SIDES),
+)
 FIRST_SIDE = CHANNELS.index("first guess") + 1
 FIRST_MISFIT = FIRST_SIDE + len(SIDES)
 """First of the misfit channels: of no correction, and of each proposed correction."""
@@ -84,9 +100,7 @@ class Geometry:
     rotation: Rotation
 
     @classmethod
-    def of(
-        cls, rig: Rig, settings: phase_route.Settings, periods: phase_route.Periods | None = None
-    ) -> "Geometry":  # fmt: skip
+    def of(cls, rig: Rig, settings: phase_route.Settings, periods: phase_route.Periods | None = None) -> "Geometry":
         """As `phase_route.PhaseRoute`: ``rig`` of the geometry is that of the images resampled to ``periods``."""
         route = phase_route.PhaseRoute(rig, settings, periods=periods)
         return cls(route.rig, route, Rotation.of(route.layer, settings.direction))
@@ -135,11 +149,18 @@ class Scene:
         residual = observation.layer.residual_phase(observation.phase_rad, order)
         on_object = observation.inside & np.isfinite(residual)
         return cls(
-            crop=observation.crop, light=light, plane_light=(light - background.residual * unit).astype(np.float32),
-            noise=float(background.noise_grey * unit), inside=observation.inside, phase_rad=observation.phase_rad,
-            order=order, bright=(fit.brightness * unit).astype(np.float32), weight=fit.weight,
-            slopes=observation.slopes, middle_rad=float(np.median(residual[on_object])) if on_object.any() else 0.0,
-        )  # fmt: skip
+            crop=observation.crop,
+            light=light,
+            plane_light=(light - background.residual * unit).astype(np.float32),
+            noise=float(background.noise_grey * unit),
+            inside=observation.inside,
+            phase_rad=observation.phase_rad,
+            order=order,
+            bright=(fit.brightness * unit).astype(np.float32),
+            weight=fit.weight,
+            slopes=observation.slopes,
+            middle_rad=float(np.median(residual[on_object])) if on_object.any() else 0.0,
+        )
 
     @property
     def strength(self) -> float:
@@ -195,11 +216,24 @@ def channels(scene: Scene, geometry: Geometry, shading: bool = True) -> tuple[Im
     guess = -misfit * rotation.sign * sine / (sine * sine + SINE_FLOOR)
     unit = geometry.route.period_px / TAU
     down, right = rotation.down_and_right(scene.slopes)
-    fitted = np.stack([
-        cosine, rotation.sign * sine, np.log(bright) / 2, scene.weight, np.clip(misfit, -2, 2),
-        unit * down, unit * right, ratio[0], ratio[1], ratio[2], exists[0], exists[2],
-        np.clip(relief, -4, 4), np.clip(guess, -1.5, 1.5),
-    ]).astype(np.float32)  # fmt: skip
+    fitted = np.stack(
+        [
+            cosine,
+            rotation.sign * sine,
+            np.log(bright) / 2,
+            scene.weight,
+            np.clip(misfit, -2, 2),
+            unit * down,
+            unit * right,
+            ratio[0],
+            ratio[1],
+            ratio[2],
+            exists[0],
+            exists[2],
+            np.clip(relief, -4, 4),
+            np.clip(guess, -1.5, 1.5),
+        ]
+    ).astype(np.float32)
     fitted *= scene.weight > LEAST_WEIGHT
     image_maps = np.stack([scene.light, scene.plane_light, plane_misfit, scene.inside]).astype(np.float32)
     turned_maps = rotation.turn(np.nan_to_num(np.concatenate([image_maps, fitted])))
@@ -218,9 +252,12 @@ def _misfit_around(light: Image, bright: Image, raised: NDArray, valid: Mask | b
 
 
 def from_the_sides(
-    light: Image, maps: NDArray[np.float32], reach_px: int, raised: Callable[[NDArray | float], NDArray],
+    light: Image,
+    maps: NDArray[np.float32],
+    reach_px: int,
+    raised: Callable[[NDArray | float], NDArray],
     difference: Callable[[NDArray], NDArray] = lambda rad: rad,
-) -> Image:  # fmt: skip
+) -> Image:
     """The phase extrapolated to a pixel from each of `SIDES`, minus its own phase, and the misfit of its light with it:
     (17, h, w) float32. ``maps`` (5, h, w): phase, its slopes down and right, brightness, object; ``raised``: light over
     brightness of the pixel's fringe with the phase moved by so many rad; ``difference``: of two phases, from their

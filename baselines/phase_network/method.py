@@ -102,10 +102,17 @@ class PhaseNetMethod(Method):
     packages = ("numpy", "numba", "torch")
 
     def __init__(
-        self, rig: Rig, direction: Direction = "horizontal", weights: str | Path | NetFile | None = None,
-        min_confidence: float = 0.0, albedo: str | None = None, levers: Levers | None = None, threads: int = 1,
-        white_grey: float | None = None, ambient_grey: float | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        rig: Rig,
+        direction: Direction = "horizontal",
+        weights: str | Path | NetFile | None = None,
+        min_confidence: float = 0.0,
+        albedo: str | None = None,
+        levers: Levers | None = None,
+        threads: int = 1,
+        white_grey: float | None = None,
+        ambient_grey: float | None = None,
+    ) -> None:
         self.file = weights if isinstance(weights, NetFile) else load_net(weights or _shipped(albedo or "one"))
         learned = self.file.config.recipe.get("albedo")
         if learned not in ("one", "any") or not self.file.network.uncertain:
@@ -116,9 +123,12 @@ class PhaseNetMethod(Method):
             raise PredictionError(f"{self.file.path}: learned {learned} albedo, not {albedo}; leave --albedo out")
         shading = learned == "one"
         self.options = Settings(
-            direction=direction, min_confidence=min_confidence, shading=shading, white_grey=white_grey,
+            direction=direction,
+            min_confidence=min_confidence,
+            shading=shading,
+            white_grey=white_grey,
             ambient_grey=ambient_grey,
-        )  # fmt: skip
+        )
         self.rig, self.threads = rig, threads
         trained_period_px = self.file.config.period_px.get(direction)
         if trained_period_px is None:
@@ -131,9 +141,15 @@ class PhaseNetMethod(Method):
         config = self.file.config
         odds = Odds(config.temperature, config.offset, config.doubted)
         self.route = NetworkRoute(
-            rig, self.options, self.file.network, config.threshold, replace(levers or Levers(), shading=shading),
-            config.lead, odds, periods,
-        )  # fmt: skip
+            rig,
+            self.options,
+            self.file.network,
+            config.threshold,
+            replace(levers or Levers(), shading=shading),
+            config.lead,
+            odds,
+            periods,
+        )
         self.weights_config = config
         self.parameters = sum(parameter.numel() for parameter in self.file.network.parameters())
         self.frames_used = (rig.sequence.sinusoids(direction)[0],)
@@ -143,12 +159,22 @@ class PhaseNetMethod(Method):
         told = "order by range; mask" if self.by_range else "order, mask"
         self.title = f"Phase route, one {direction} fringe, {learned} albedo; {told} and correction learned{more}"
         self.settings = {
-            "direction": direction, "albedo": learned, "shading": shading, "order_by_range": self.by_range,
-            "min_confidence": min_confidence, "weights": config.name, "weights_sha256": self.file.sha256,
-            "mask_threshold": config.threshold, "order_lead": config.lead, "temperature": config.temperature,
+            "direction": direction,
+            "albedo": learned,
+            "shading": shading,
+            "order_by_range": self.by_range,
+            "min_confidence": min_confidence,
+            "weights": config.name,
+            "weights_sha256": self.file.sha256,
+            "mask_threshold": config.threshold,
+            "order_lead": config.lead,
+            "temperature": config.temperature,
             "offset": config.offset,
-            "doubted": config.doubted, "threads": threads, "white_grey": white_grey, "ambient_grey": ambient_grey,
-        }  # fmt: skip
+            "doubted": config.doubted,
+            "threads": threads,
+            "white_grey": white_grey,
+            "ambient_grey": ambient_grey,
+        }
 
     @property
     def learned_from(self) -> dict[str, Any]:

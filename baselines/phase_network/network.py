@@ -64,10 +64,15 @@ class PhaseNet(nn.Module):
     the resolution. H and W must be multiples of ``stride``."""
 
     def __init__(
-        self, widths: tuple[int, ...] = (24, 32, 48, 64), fine: int = 14, squeezed: int = 20,
-        order_widths: tuple[int, ...] = (32, 48, 64), bound_rad: float = 1.5708, channels: int = len(CHANNELS),
+        self,
+        widths: tuple[int, ...] = (24, 32, 48, 64),
+        fine: int = 14,
+        squeezed: int = 20,
+        order_widths: tuple[int, ...] = (32, 48, 64),
+        bound_rad: float = 1.5708,
+        channels: int = len(CHANNELS),
         uncertain: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__()
         widths, order_widths = tuple(widths), tuple(order_widths)
         if min((*widths, *order_widths, fine, squeezed, channels - 2 * len(SIDES))) < 1 or not 0 < bound_rad < 3.1416:
@@ -76,9 +81,14 @@ class PhaseNet(nn.Module):
                 f"{order_widths}, fine {fine}, squeezed {squeezed}, bound_rad {bound_rad}"
             )
         self.options: dict[str, Any] = {
-            "widths": list(widths), "fine": fine, "squeezed": squeezed, "order_widths": list(order_widths),
-            "bound_rad": bound_rad, "channels": channels, "uncertain": uncertain,
-        }  # fmt: skip
+            "widths": list(widths),
+            "fine": fine,
+            "squeezed": squeezed,
+            "order_widths": list(order_widths),
+            "bound_rad": bound_rad,
+            "channels": channels,
+            "uncertain": uncertain,
+        }
         self.bound_rad, self.uncertain = bound_rad, uncertain
         self.stride = max(BLOCK * 2 ** (len(widths) - 1), COARSE * 2 ** (len(order_widths) - 1))
         self.squeeze = nn.Sequential(nn.Conv2d(channels, squeezed, 1), nn.ReLU(inplace=True))

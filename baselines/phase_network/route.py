@@ -80,9 +80,16 @@ class NetworkRoute:
     of order and mask rests on the brightness of a lit background."""
 
     def __init__(
-        self, rig: Rig, settings: Settings, network: PhaseNet, threshold: float = 0.0, levers: Levers | None = None,
-        lead: float = 0.0, odds: Odds | None = None, periods: phase_route.Periods | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        rig: Rig,
+        settings: Settings,
+        network: PhaseNet,
+        threshold: float = 0.0,
+        levers: Levers | None = None,
+        lead: float = 0.0,
+        odds: Odds | None = None,
+        periods: phase_route.Periods | None = None,
+    ) -> None:
         self.levers = levers or Levers()
         self.geometry = Geometry.of(rig, replace(settings, shading=self.levers.shading), periods)
         self.network, self.threshold, self.lead, self.odds = network, threshold, lead, odds or Odds()

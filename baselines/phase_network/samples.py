@@ -33,9 +33,14 @@ class Sample:
 
 
 def sample_of(
-    image: NDArray[np.uint8], depth_mm: Image, void: Mask, name: str, group: str, geometry: Geometry,
+    image: NDArray[np.uint8],
+    depth_mm: Image,
+    void: Mask,
+    name: str,
+    group: str,
+    geometry: Geometry,
     shading: bool = True,
-) -> Sample | None:  # fmt: skip
+) -> Sample | None:
     """Sample of an image uint8 (H, W), its true depth in mm, 0 = background, and its ``void`` pixels (H, W), which
     count nowhere; None where nothing calibrates its brightness, or no object is seen. ``shading``: as of
     `Scene.of`."""
@@ -57,9 +62,7 @@ def sample_of(
     return Sample(name, group, direction, scene, half, target, crop_void, places[sampled])
 
 
-def samples_of(
-    views: Iterable[View], geometries: Mapping[Direction, Geometry], shading: bool
-) -> list[Sample]:  # fmt: skip
+def samples_of(views: Iterable[View], geometries: Mapping[Direction, Geometry], shading: bool) -> list[Sample]:
     """Samples of ``views``, whose frames are the first fringes of the directions of ``geometries``, in their order; of
     a union for one direction alone, in turn. A view whose light the background does not calibrate is left out, since
     the network is not used on it."""

@@ -77,9 +77,7 @@ class Recipe(WindowRecipe):
         return f"{self.name}-{self.albedo}-albedo"
 
 
-def answers_of(
-    network: PhaseNet, samples: list[Sample], geometries: Geometries, shading: bool
-) -> Iterator[Answers]:  # fmt: skip
+def answers_of(network: PhaseNet, samples: list[Sample], geometries: Geometries, shading: bool) -> Iterator[Answers]:
     """The network's answers for each sample."""
     for sample in samples:
         yield network_answers(network, sample.scene.single(), geometries[sample.direction], shading)
@@ -153,9 +151,16 @@ class Trained:
 
 
 def train_phase_net(
-    recipe: Recipe, out: Path, *, rig: Rig | None = None, start: Path | None = None, minutes: float | None = None,
-    workers: int = 1, show: bool = False, print_line: Callable[[str], None] = lambda line: None,
-) -> Trained:  # fmt: skip
+    recipe: Recipe,
+    out: Path,
+    *,
+    rig: Rig | None = None,
+    start: Path | None = None,
+    minutes: float | None = None,
+    workers: int = 1,
+    show: bool = False,
+    print_line: Callable[[str], None] = lambda line: None,
+) -> Trained:
     """Train for ``rig`` (default: `optics.paper_rig`), starting from the weights in ``start`` or from random ones; the
     same call resumes a training that was stopped. ``show``: progress on stderr; ``print_line`` is given a line for
     every validation. Raises `TrainingError` for a folder of another recipe or rig."""
@@ -213,13 +218,21 @@ def train_phase_net(
         draw_reliability(out / RELIABILITY, seen, odds)
         means["confident_percent"] = 100 * max(confident_shares(seen, odds).values())
         config = training.NetConfig(
-            name=recipe.weights_name, title=f"Fringe order, mask and bounded phase correction, {recipe.albedo} albedo",
-            options=network.options, threshold=threshold, lead=lead, temperature=odds.temperature, offset=odds.offset,
+            name=recipe.weights_name,
+            title=f"Fringe order, mask and bounded phase correction, {recipe.albedo} albedo",
+            options=network.options,
+            threshold=threshold,
+            lead=lead,
+            temperature=odds.temperature,
+            offset=odds.offset,
             doubted=odds.doubted,
             period_px={direction: g.route.period_px for direction, g in geometries.items()},
-            dataset_fingerprint=fingerprint, benchmark=training.TrainingBenchmark("phase-net views", 1),
-            steps=recipe.steps, recipe=described, validation=dict(means),
-        )  # fmt: skip
+            dataset_fingerprint=fingerprint,
+            benchmark=training.TrainingBenchmark("phase-net views", 1),
+            steps=recipe.steps,
+            recipe=described,
+            validation=dict(means),
+        )
         save_net(weights, network, config)
         (out / training.CHECKPOINT).unlink(missing_ok=True)
         return Trained(weights, recipe.steps, threshold, means)

@@ -31,9 +31,11 @@ def mean_scores(rows: Iterable[Mapping[str, float | None]]) -> dict[str, float]:
 
 
 def chosen_threshold(
-    views: Iterable[tuple[Truth, Callable[[float], Mask]]], thresholds: Sequence[float], pixels: int,
+    views: Iterable[tuple[Truth, Callable[[float], Mask]]],
+    thresholds: Sequence[float],
+    pixels: int,
     tolerance_mm: float = 0.0,
-) -> float:  # fmt: skip
+) -> float:
     """The threshold, out of the rising ``thresholds`` on the mask's logit, with the least sum of object and background
     error: a missed object pixel and an invented background pixel are off by the same distance, each divided by the
     number of pixels of its kind. ``views``: each with the mask that it gets by a threshold; ``pixels``: of a whole

@@ -188,10 +188,14 @@ class WindowTraining(training.Training):
     largest_gradient = LARGEST_GRADIENT
 
     def __init__(
-        self, recipe: StepRecipe, draw: Callable[[np.random.Generator], Any],
-        validate: Callable[[Any], dict[str, float]], out: Path, start: PhaseNet | None = None,
+        self,
+        recipe: StepRecipe,
+        draw: Callable[[np.random.Generator], Any],
+        validate: Callable[[Any], dict[str, float]],
+        out: Path,
+        start: PhaseNet | None = None,
         print_line: Callable[[str], None] = lambda line: None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__(out, {"recipe": recipe.digest}, recipe.seed, cpu=True)
         self.recipe, self.draw, self.validate, self.print_line = recipe, draw, validate, print_line
         self.name = self.title = recipe.name

@@ -57,9 +57,13 @@ class Window:
 
 
 def draw(
-    samples: list[Sample], geometries: Mapping[Direction, Geometry], size: int, vary: Variation, shading: bool,
+    samples: list[Sample],
+    geometries: Mapping[Direction, Geometry],
+    size: int,
+    vary: Variation,
+    shading: bool,
     random: np.random.Generator,
-) -> Window:  # fmt: skip
+) -> Window:
     """A random window of ``size`` px of one of ``samples``; ``shading``: as of `inputs.channels`."""
     sample = samples[random.integers(len(samples))]
     geometry = geometries[sample.direction]
@@ -113,10 +117,13 @@ def _moved(
     phase = scene.phase_rad + delta
     carry = np.rint(phase / TAU)
     return replace(
-        scene, light=np.where(target, light, scene.light), bright=(scene.bright * ratio).astype(np.float32),
-        phase_rad=(phase - TAU * carry).astype(np.float32), order=scene.order + carry.astype(np.int32),
+        scene,
+        light=np.where(target, light, scene.light),
+        bright=(scene.bright * ratio).astype(np.float32),
+        phase_rad=(phase - TAU * carry).astype(np.float32),
+        order=scene.order + carry.astype(np.int32),
         middle_rad=scene.middle_rad + float(delta),
-    )  # fmt: skip
+    )
 
 
 def _wrong(
@@ -151,11 +158,14 @@ def _labelled(x: Image, exists: Mask, missing: Image, target: Mask, size: int, m
     pad = ((0, size - height), (0, size - width))
     deep = ((0, 0), *pad)
     return Window(
-        np.pad(x, deep), np.pad(exists, deep, constant_values=True),
+        np.pad(x, deep),
+        np.pad(exists, deep, constant_values=True),
         np.pad(np.where(possible, place, IGNORED), pad, constant_values=IGNORED),
-        np.pad(correction, pad), np.pad(possible, pad), np.pad(target, pad),
+        np.pad(correction, pad),
+        np.pad(possible, pad),
+        np.pad(target, pad),
         np.pad(mask_valid, pad),
-    )  # fmt: skip
+    )
 
 
 def _mirrored(window: Window) -> Window:

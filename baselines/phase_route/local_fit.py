@@ -107,9 +107,15 @@ def carrier_fit(grey: Image, inside: Mask, carrier_rad: NDArray, window: Window)
 
 
 def fringe_fit(
-    greys: Sequence[Image], inside: Mask, carrier_rad: Image, ambient: float, window: Window,
-    shifts_rad: Sequence[float], contrast: float = 1.0, terms: Sequence[tuple[int, int]] = PLANE,
-) -> FringeFit:  # fmt: skip
+    greys: Sequence[Image],
+    inside: Mask,
+    carrier_rad: Image,
+    ambient: float,
+    window: Window,
+    shifts_rad: Sequence[float],
+    contrast: float = 1.0,
+    terms: Sequence[tuple[int, int]] = PLANE,
+) -> FringeFit:
     """Fit of g (1 + c cos(carrier + shift + d)), g of the ``terms`` and c the ``contrast``, around each pixel of
     ``greys``, float32 (H, W) each: one image, or several whose fringes are shifted by ``shifts_rad``."""
     # The moments of more terms than a plane's are too much alike for the elimination in single precision.

@@ -113,10 +113,15 @@ class FrameChoice:
     def report(self) -> dict[str, Any]:
         """JSON of one sample: number of frames, their indices, and the expected error at each look."""
         looks = [
-            {"frames": look.frames, "gray_code": look.gray, "expected_error_mm": round(look.expected_mm, 4),
-             "by_phase_mm": round(look.phase_mm, 4), "by_order_mm": round(look.order_mm, 4)}
+            {
+                "frames": look.frames,
+                "gray_code": look.gray,
+                "expected_error_mm": round(look.expected_mm, 4),
+                "by_phase_mm": round(look.phase_mm, 4),
+                "by_order_mm": round(look.order_mm, 4),
+            }
             for look in self.looks
-        ]  # fmt: skip
+        ]
         last = {name: looks[-1][name] for name in ("frames", "expected_error_mm")}
         return last | {"frames_used": list(self.frames_used), "looks": looks}
 

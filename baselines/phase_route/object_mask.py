@@ -86,9 +86,13 @@ class EmptyScene:
     (`modulated_region`)."""
 
     def __init__(
-        self, rig: Rig, layer: CalibrationLayer, period_px: float, white_grey: float | None,
+        self,
+        rig: Rig,
+        layer: CalibrationLayer,
+        period_px: float,
+        white_grey: float | None,
         ambient_grey: float | None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.ambient_grey = ambient_grey
         self.strength = np.nan if white_grey is None else white_grey * (rig.working_range_mm[0] / MM_PER_M) ** 2
         self._rays = rig.camera.rays()

@@ -56,9 +56,14 @@ class Resampling:
         across, down = width / camera.width, height / camera.height
         # Pixel areas scale, not centres; rounding to whole pixels makes the two scales a little different.
         resized = replace(
-            camera, width=width, height=height, fx=camera.fx * across, fy=camera.fy * down,
-            cx=(camera.cx + 0.5) * across - 0.5, cy=(camera.cy + 0.5) * down - 0.5,
-        )  # fmt: skip
+            camera,
+            width=width,
+            height=height,
+            fx=camera.fx * across,
+            fy=camera.fy * down,
+            cx=(camera.cx + 0.5) * across - 0.5,
+            cy=(camera.cy + 0.5) * down - 0.5,
+        )
         return cls(rig, replace(rig, camera=resized))
 
     @property
@@ -120,9 +125,12 @@ class Resampling:
         return weight > 0.5, np.where(beside_jump, nearest(psi), total / np.maximum(weight, 1e-6)), nearest
 
     def restored(
-        self, measured: Measurement, layer: CalibrationLayer, captured_layer: CalibrationLayer,
+        self,
+        measured: Measurement,
+        layer: CalibrationLayer,
+        captured_layer: CalibrationLayer,
         range_mm: tuple[float, float],
-    ) -> Measurement:  # fmt: skip
+    ) -> Measurement:
         """The measurement in the size of the captured image. The residual phase, order included, is interpolated (it
         has no wraps), but not across jumps; depth, wrapped phase and order follow from it at every pixel of the
         captured image. The other maps are taken from the nearest pixel. ``range_mm``: the range of the candidates."""
@@ -153,10 +161,15 @@ class Resampling:
         reason = paste(reasons, np.uint8, Reason.BACKGROUND)
         counts = np.bincount(reason.ravel(), minlength=len(Reason))
         return replace(
-            measured, wrapped_phase_rad=paste(phase, np.float32, np.nan), order=paste(order, np.int32),
+            measured,
+            wrapped_phase_rad=paste(phase, np.float32, np.nan),
+            order=paste(order, np.int32),
             candidates=Candidates(paste(allowed.first, np.int32), paste(allowed.count, np.int32)),
-            depth_mm=paste(depth_mm, np.float32), reason=reason,
+            depth_mm=paste(depth_mm, np.float32),
+            reason=reason,
             counts={code.name.lower(): int(counts[code]) for code in Reason},
-            modulation_grey=pasted(measured.modulation_grey), confidence=pasted(measured.confidence),
-            expected_error_mm=pasted(measured.expected_error_mm), order_doubt_mm=pasted(measured.order_doubt_mm),
-        )  # fmt: skip
+            modulation_grey=pasted(measured.modulation_grey),
+            confidence=pasted(measured.confidence),
+            expected_error_mm=pasted(measured.expected_error_mm),
+            order_doubt_mm=pasted(measured.order_doubt_mm),
+        )

@@ -57,9 +57,12 @@ class PhaseRoute:
     resampled images, which an `Observation` is of; images, masks and the `Measurement` have the captured size."""
 
     def __init__(
-        self, rig: Rig, settings: Settings | None = None, chooser: orders.Chooser = orders.by_shading_and_smoothness,
+        self,
+        rig: Rig,
+        settings: Settings | None = None,
+        chooser: orders.Chooser = orders.by_shading_and_smoothness,
         periods: Periods | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         settings, self.chooser = settings or Settings(), chooser
         rig.check_sampling()
         self.resampling = Resampling.of(rig, settings.direction, periods or Periods())
@@ -121,9 +124,15 @@ class PhaseRoute:
         clipped = confidence.clipped_share(capture, fit, inside, self._windows[1])
         watch.done("confidence")
         return Observation(
-            **vars(capture), inside=inside, fit=fit, phase_rad=phase, slopes=slopes, uncertainty_rad=uncertainty,
-            clipped_share=clipped, candidates=candidates,
-        )  # fmt: skip
+            **vars(capture),
+            inside=inside,
+            fit=fit,
+            phase_rad=phase,
+            slopes=slopes,
+            uncertainty_rad=uncertainty,
+            clipped_share=clipped,
+            candidates=candidates,
+        )
 
     def choose(self, observation: Observation) -> tuple[NDArray[np.int32], Image]:
         """The chooser's order of every pixel of the observation's crop (h, w), and its margin."""
@@ -134,9 +143,12 @@ class PhaseRoute:
         return orders.spread_over_pixels(observation, chosen_rad, margin, question.inside)
 
     def conclude(
-        self, observation: Observation, order: NDArray[np.int32], margin: NDArray[np.floating],
+        self,
+        observation: Observation,
+        order: NDArray[np.int32],
+        margin: NDArray[np.floating],
         least_margin: float = -np.inf,
-    ) -> Measurement:  # fmt: skip
+    ) -> Measurement:
         """The measurement that follows from an ``order`` int32 for each pixel of the observation's crop (h, w);
         ``margin`` (h, w): how clearly that order won, 0 for a tie, 1 or more for a clear choice (see `orders.Chooser`).
         A pixel of less than ``least_margin`` has no depth, as always a tie in light that nothing calibrates. Raises
@@ -171,14 +183,18 @@ class PhaseRoute:
         counts = np.bincount(reasons.ravel(), minlength=len(Reason))
         measurement = Measurement(
             wrapped_phase_rad=paste(observation.phase_rad, np.float32, np.nan),
-            modulation_grey=paste(observation.fit.brightness, np.float32, 0), order=paste(order, np.int32, 0),
+            modulation_grey=paste(observation.fit.brightness, np.float32, 0),
+            order=paste(order, np.int32, 0),
             candidates=Candidates(paste(allowed.first, np.int32, 0), paste(allowed.count, np.int32, 0)),
-            confidence=paste(sureness, np.float32, 0), expected_error_mm=paste(error_mm, np.float32, 0),
+            confidence=paste(sureness, np.float32, 0),
+            expected_error_mm=paste(error_mm, np.float32, 0),
             order_doubt_mm=paste(doubt_mm, np.float32, 0),
             depth_mm=paste(depth_mm if least == 0 else depth_mm * (sureness >= least), np.float32, 0),
-            reason=reasons, counts={code.name.lower(): int(counts[code]) for code in Reason},
-            background_share=observation.background.share, seconds=watch.seconds,
-        )  # fmt: skip
+            reason=reasons,
+            counts={code.name.lower(): int(counts[code]) for code in Reason},
+            background_share=observation.background.share,
+            seconds=watch.seconds,
+        )
         if self.resampling.needed:
             (near, far), slack = self.rig.working_range_mm, self.settings.slack_mm
             layers = self.layer, self.captured_layer

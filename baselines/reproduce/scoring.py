@@ -88,9 +88,13 @@ class AllFrames(StrictModel):
 
 
 def score_all_frames(
-    opened: DatasetFolder, predict: Callable[[NDArray[np.uint8]], NDArray[np.float32]], frames: Sequence[int],
-    scoring: tuple[Units, Mode], about: Mapping[str, str], rule: RangeRule = "object",
-) -> AllFrames:  # fmt: skip
+    opened: DatasetFolder,
+    predict: Callable[[NDArray[np.uint8]], NDArray[np.float32]],
+    frames: Sequence[int],
+    scoring: tuple[Units, Mode],
+    about: Mapping[str, str],
+    rule: RangeRule = "object",
+) -> AllFrames:
     """Score ``predict`` (a frame (H, W) in, depth (H, W) in the units of ``scoring`` out, normalised by
     ``rule``) on every test sample and frame. ``about``: ``recipe`` and ``weights_sha256`` of the network. Raises
     PredictionError for a prediction that is not finite, and what `scored_pair` raises."""
@@ -112,8 +116,13 @@ def score_all_frames(
     objects = [split_sample_name(sample)[0] for sample in samples]
     ends = intervals_over_objects(rows, objects, HEADLINE)
     return AllFrames(
-        schema_version="1.0.0", protocol_version=PROTOCOL_VERSION, fingerprint=opened.fingerprint, mode=scoring[1],
-        frames=list(frames), pairs=len(scores), metrics=Headline(**_mean(rows)),
+        schema_version="1.0.0",
+        protocol_version=PROTOCOL_VERSION,
+        fingerprint=opened.fingerprint,
+        mode=scoring[1],
+        frames=list(frames),
+        pairs=len(scores),
+        metrics=Headline(**_mean(rows)),
         intervals=Intervals(**{key: list(interval or (None, None)) for key, interval in ends.items()}),
         per_frame=[FrameMean(frame=f, metrics=Headline(**row)) for f, row in zip(frames, of_frames, strict=True)],
         per_sample=[
@@ -121,7 +130,7 @@ def score_all_frames(
             for sample, name, row in zip(samples, objects, rows, strict=True)
         ],
         **about,
-    )  # fmt: skip
+    )
 
 
 def _mean(rows: Sequence[Scores]) -> Scores:

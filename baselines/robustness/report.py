@@ -82,12 +82,21 @@ def write_page(out: Path) -> Path:
     measured = read_measured(out)
     curves = draw_curves(measured)
     write_atomically(out / CURVES, curves)
-    worst = [(one.setup["title"], data_uri((one.folder / WORST).read_bytes())) for one in measured
-             if (one.folder / WORST).is_file()]  # fmt: skip
+    worst = [
+        (one.setup["title"], data_uri((one.folder / WORST).read_bytes()))
+        for one in measured
+        if (one.folder / WORST).is_file()
+    ]
     body = render(
-        "fpp_ml_bench.baselines.robustness", "robustness.html", methods=measured, axes=corruptions().axes,
-        rules=corruptions(), curves=data_uri(curves), worst=worst, clean=CLEAN,
-    )  # fmt: skip
+        "fpp_ml_bench.baselines.robustness",
+        "robustness.html",
+        methods=measured,
+        axes=corruptions().axes,
+        rules=corruptions(),
+        curves=data_uri(curves),
+        worst=worst,
+        clean=CLEAN,
+    )
     write_atomically(out / PAGE, page("Robustness: FPP-ML-Bench", body).encode("utf-8"))
     return out / PAGE
 
@@ -137,8 +146,11 @@ def write_worst(setup: Setup, rows: dict[str, list[View]], out: Path, cache: Pat
     import matplotlib.pyplot as plt
 
     last = {axis: [row for row in found if row["severity"] == max(setup.severities)] for axis, found in rows.items()}
-    worst = [max(found, key=lambda row: row["mae_mm"] or 0.0) | {"axis": axis}
-             for axis, found in last.items() if axis != CLEAN and found]  # fmt: skip
+    worst = [
+        max(found, key=lambda row: row["mae_mm"] or 0.0) | {"axis": axis}
+        for axis, found in last.items()
+        if axis != CLEAN and found
+    ]
     worst = sorted(worst, key=lambda row: -(row["mae_mm"] or 0.0))[:_SHOWN_WORST]
     if not worst:
         return
@@ -154,8 +166,11 @@ def write_worst(setup: Setup, rows: dict[str, list[View]], out: Path, cache: Pat
         error = np.where(truth.scored & (depth_mm > 0), np.abs(depth_mm - truth.depth_mm), np.nan)
         box = _box(truth.depth_mm)
         column[0].imshow(fringe[box], cmap="gray", vmin=0, vmax=255)
-        column[0].set_title(f"{row['axis']} {corruptions().axes[row['axis']].severities[row['severity'] - 1]:g}\n"
-                            f"{row['sample']}, {row['mae_mm']:.1f} mm", fontsize=8)  # fmt: skip
+        column[0].set_title(
+            f"{row['axis']} {corruptions().axes[row['axis']].severities[row['severity'] - 1]:g}\n"
+            f"{row['sample']}, {row['mae_mm']:.1f} mm",
+            fontsize=8,
+        )
         low, high = condition.settings.rig.working_range_mm
         column[1].imshow(np.where(depth_mm > 0, depth_mm, np.nan)[box], cmap="viridis", vmin=low, vmax=high)
         last_image = column[2].imshow(error[box], cmap="magma", vmin=0, vmax=corruptions().wrong_order_mm)

@@ -64,17 +64,28 @@ class Setup:
         """What must be equal for two measurements to be parts of one."""
         threads = ("threads", "device")
         return {
-            "fpp_ml_bench": __version__, "axes_version": corruptions().version, "set": self.set_name,
-            "size": self.size, "quick": self.quick, "method": self.method.name, "title": self.method.title,
+            "fpp_ml_bench": __version__,
+            "axes_version": corruptions().version,
+            "set": self.set_name,
+            "size": self.size,
+            "quick": self.quick,
+            "method": self.method.name,
+            "title": self.method.title,
             "frames_used": list(self.method.frames_used),
             "settings": {key: value for key, value in self.method.settings.items() if key not in threads},
-        }  # fmt: skip
+        }
 
 
 def measure(
-    setup: Setup, out: Path, axes: Sequence[str] = (), workers: int = 1, cache: Path | None = None,
-    progress: Progress = lambda axis, views: None, cluster: str | None = None, saved: Callable[[], None] = lambda: None,
-) -> dict[str, list[View]]:  # fmt: skip
+    setup: Setup,
+    out: Path,
+    axes: Sequence[str] = (),
+    workers: int = 1,
+    cache: Path | None = None,
+    progress: Progress = lambda axis, views: None,
+    cluster: str | None = None,
+    saved: Callable[[], None] = lambda: None,
+) -> dict[str, list[View]]:
     """The rows of every view by axis, and a file ``out/AXIS.json`` for each axis as soon as it is finished; files that
     an earlier run of the same setup left are read instead. Views are predicted and scored by so many processes, or by
     the Ray cluster at an address. ``progress`` is called with an axis and a number of views, ``saved`` after each file.
@@ -95,9 +106,16 @@ def measure(
 
 
 def _measure_missing(
-    setup: Setup, out: Path, axes: Sequence[str], workers: int, cache: FrameCache, rows: dict[str, list[View]],
-    progress: Progress, cluster: str | None, saved: Callable[[], None],
-) -> None:  # fmt: skip
+    setup: Setup,
+    out: Path,
+    axes: Sequence[str],
+    workers: int,
+    cache: FrameCache,
+    rows: dict[str, list[View]],
+    progress: Progress,
+    cluster: str | None,
+    saved: Callable[[], None],
+) -> None:
     work = setup.method, setup.conditions(CLEAN)[0], cache, setup.views
     with mapping(work, workers, cluster) as mapped:
         for axis in axes:

@@ -32,10 +32,16 @@ U64, U32, UB16 = 2.0**-53, 2.0**-24, 2.0**-8
 """Unit round-offs."""
 
 MODULES = {
-    "phase": "phase", "order": "order", "triangulation": "triangulation", "rig": "rig",
-    "normalisation": "scores", "metrics": "scores", "networks": "networks", "scenes": "scenes",
+    "phase": "phase",
+    "order": "order",
+    "triangulation": "triangulation",
+    "rig": "rig",
+    "normalisation": "scores",
+    "metrics": "scores",
+    "networks": "networks",
+    "scenes": "scenes",
     "crossed": "crossed_fringes",
-}  # fmt: skip
+}
 """Groups of cases, and the module whose constant of that name declares them; only ``networks`` imports torch."""
 
 # A crash of the code under test is a FAIL and does not end the run; numerical code raises these.
@@ -121,9 +127,17 @@ class Group:
     cases: list[Case] = field(default_factory=list)
 
     def family(
-        self, name: str, unit: str, /, *, about: str = "", expects: Expects | Callable[..., Expects] = "number",
-        refuses: Refusals = (), heavy: Callable[..., bool] = lambda **_: False, **grid: Iterable[Scalar],
-    ) -> Callable[[Run], Run]:  # fmt: skip
+        self,
+        name: str,
+        unit: str,
+        /,
+        *,
+        about: str = "",
+        expects: Expects | Callable[..., Expects] = "number",
+        refuses: Refusals = (),
+        heavy: Callable[..., bool] = lambda **_: False,
+        **grid: Iterable[Scalar],
+    ) -> Callable[[Run], Run]:
         """Declare a function as a family: a case for each combination of the grid's values, which the function,
         ``expects`` and ``heavy`` get by name. Its docstring (or ``about``) says in this form what it computes: "depth;
         against its reference; bound: how theory predicts it"."""
@@ -202,8 +216,14 @@ def judge(case: Case, outcome: Outcome) -> tuple[Verdict, str]:
     return Verdict.WITHIN, ""
 
 
-def worst(errors: ArrayLike, bounds: ArrayLike = 0.0, flagged: ArrayLike = False, may_flag: float | None = None,
-          condition: float | None = None, note: str = "") -> Outcome:  # fmt: skip
+def worst(
+    errors: ArrayLike,
+    bounds: ArrayLike = 0.0,
+    flagged: ArrayLike = False,
+    may_flag: float | None = None,
+    condition: float | None = None,
+    note: str = "",
+) -> Outcome:
     """The outcome of many elements: the worst of those that are not flagged. Their NaN errors stay NaN."""
     parts = np.broadcast_arrays(np.abs(np.asarray(errors, float)), np.asarray(bounds, float), np.asarray(flagged))
     error, bound, refused = (np.ravel(part) for part in parts)

@@ -58,8 +58,13 @@ def coded_rig(pitch_px: float = 18.0, steps: int = 18, size: int = 32, length: i
     return optics.Rig(rig.camera, device, rig.rotation, rig.translation_m, pitch_px, pitch_px, sequence)
 
 
-def direction_levels(rig: optics.Rig, coordinate_px: NDArray, direction: optics.Direction = "vertical",
-                     mean: float = MEAN, modulation: float = MODULATION) -> Floats:  # fmt: skip
+def direction_levels(
+    rig: optics.Rig,
+    coordinate_px: NDArray,
+    direction: optics.Direction = "vertical",
+    mean: float = MEAN,
+    modulation: float = MODULATION,
+) -> Floats:
     """Grey levels of one direction's sinusoids, then Gray bits, at projector coordinates (n,); float64 (N + bits, n).
     A pixel sees one projector pixel's Gray code, the one its coordinate rounds to."""
     pitch, bits = rig.pitch(direction), rig.sequence.bits(direction)
@@ -69,8 +74,9 @@ def direction_levels(rig: optics.Rig, coordinate_px: NDArray, direction: optics.
     return np.concatenate([waves, mean + modulation * (2.0 * bright - 1.0)])
 
 
-def plane_stack(rig: optics.Rig, depth_m: float = 1.8, mean: float = MEAN,
-                modulation: float = MODULATION) -> tuple[list[NDArray[np.uint8] | None], NDArray]:  # fmt: skip
+def plane_stack(
+    rig: optics.Rig, depth_m: float = 1.8, mean: float = MEAN, modulation: float = MODULATION
+) -> tuple[list[NDArray[np.uint8] | None], NDArray]:
     """All frames of a plane square to the axis, and the pixels more than 3 px inside the projector's image, (H, W)."""
     x, y = rig.camera.rays()
     exact = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * depth_m)
@@ -91,8 +97,9 @@ def coordinate_error(rig: optics.Rig, levels: NDArray, exact_px: NDArray) -> tup
     return decoded.coordinate_px - exact_px, decoded.reason != coding.Reason.DECODED
 
 
-def decoded_coordinate(rig: optics.Rig, levels: NDArray, exact_px: NDArray,
-                       further_px: float | NDArray = 0.0) -> Outcome:  # fmt: skip
+def decoded_coordinate(
+    rig: optics.Rig, levels: NDArray, exact_px: NDArray, further_px: float | NDArray = 0.0
+) -> Outcome:
     """The outcome of coordinates with the error of 8-bit frames and of ``further_px``."""
     error_px, flagged = coordinate_error(rig, levels, exact_px)
     return worst(error_px, rounding_px(rig) + further_px, flagged)

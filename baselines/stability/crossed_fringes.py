@@ -13,9 +13,10 @@ from fpp_ml_bench.errors import FppBenchError
 from fpp_ml_bench.optics import Rig, crossed_rig
 
 CROSSED = Group(
-    "crossed", "the plane's depth, closed form", "pi / 2 of the joint phase: a rival order is further off, and a pixel "
-    "that may be one must say so",
-)  # fmt: skip
+    "crossed",
+    "the plane's depth, closed form",
+    "pi / 2 of the joint phase: a rival order is further off, and a pixel that may be one must say so",
+)
 RIG = replace(crossed_rig(320), background_m=None)
 FAMILY: Crossed = RIG.crossed  # type: ignore[assignment]
 DEPTH_MM, WHITE, AMBIENT, NOISE = 1780.0, 160.0, 6.0, 0.7
@@ -24,9 +25,12 @@ MIDDLE = slice(120, 200), slice(120, 200)
 
 
 def seen(
-    family: Crossed, white: NDArray | float = WHITE, rig: Rig = RIG, measured_as: Crossed | None = None,
+    family: Crossed,
+    white: NDArray | float = WHITE,
+    rig: Rig = RIG,
+    measured_as: Crossed | None = None,
     bound_rad: float = math.pi / 2,
-) -> Outcome:  # fmt: skip
+) -> Outcome:
     """The worst pixel of a plane that ``family`` lights, flagged where the route gives a reason or no depth.
     ``measured_as``: the family that the route takes it for."""
     x, y = rig.camera.rays()
@@ -46,8 +50,12 @@ def seen(
     return worst(depth_mm - DEPTH_MM, bound_mm, flagged)
 
 
-@CROSSED.family("dim", "mm", expects=lambda white: "number" if white >= 40 else "either",
-                white=(220.0, 160.0, 80.0, 40.0, 20.0, 10.0, 5.0, 2.0, 0.0))  # fmt: skip
+@CROSSED.family(
+    "dim",
+    "mm",
+    expects=lambda white: "number" if white >= 40 else "either",
+    white=(220.0, 160.0, 80.0, 40.0, 20.0, 10.0, 5.0, 2.0, 0.0),
+)
 def dim(white: float) -> Outcome:
     """depth of a plane at this grey level of white, noise 0.7"""
     return seen(FAMILY, white)
@@ -59,8 +67,12 @@ def saturated(white: float) -> Outcome:
     return seen(FAMILY, white)
 
 
-@CROSSED.family("one direction lost", "mm", expects=lambda weight: "number" if weight >= 0.3 else "either",
-                weight=(0.5, 0.3, 0.1, 0.05, 0.02, 1e-9))  # fmt: skip
+@CROSSED.family(
+    "one direction lost",
+    "mm",
+    expects=lambda weight: "number" if weight >= 0.3 else "either",
+    weight=(0.5, 0.3, 0.1, 0.05, 0.02, 1e-9),
+)
 def lost(weight: float) -> Outcome:
     """depth of a plane whose second carrier has this weight, and not the 0.5 that the route knows of"""
     return seen(replace(FAMILY, weights=(0.5, weight)), measured_as=FAMILY)

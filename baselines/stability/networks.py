@@ -21,13 +21,20 @@ from fpp_ml_bench.errors import FppBenchError, PredictionError
 from fpp_ml_bench.evaluation.score import DepthScores
 from fpp_ml_bench.optics import DIRECTIONS, Direction, paper_rig
 
-NETWORKS = Group("networks", "Richardson's extrapolated differences", "difference of two extrapolations (the next "
-                 "order) + 64 u |f| sqrt(n) / h of rounding")  # fmt: skip
+NETWORKS = Group(
+    "networks",
+    "Richardson's extrapolated differences",
+    "difference of two extrapolations (the next order) + 64 u |f| sqrt(n) / h of rounding",
+)
 ALPHA = 0.7
 SMALL = {
-    "unet": {"width": 4}, "transunet": {"width": 16, "map_size": 4, "patch": 2}, "resunet": {"width": 4},
-    "hformer": {"width": 8}, "pix2pix": {"width": 4}, "pix2pix_unet": {"width": 4, "levels": 3},
-}  # fmt: skip
+    "unet": {"width": 4},
+    "transunet": {"width": 16, "map_size": 4, "patch": 2},
+    "resunet": {"width": 4},
+    "hformer": {"width": 8},
+    "pix2pix": {"width": 4},
+    "pix2pix_unet": {"width": 4, "levels": 3},
+}
 """Widths of the networks here: small, with the paper's layers. For images of 64 px one thread is faster."""
 _SHAPE = (2, 1, 24, 32)
 
@@ -115,8 +122,13 @@ def empty_mask(name: str) -> Outcome:
     return worst(loss - exact, gamma(32, U32) * exact)
 
 
-@NETWORKS.family("loss magnitude", "1", expects=lambda name, scale: "either" if scale > 1e19 else "number",
-                 name=("rmse", "hybrid_l1"), scale=(1e-30, 1e-6, 1.0, 2e3, 1e15, 1e25))  # fmt: skip
+@NETWORKS.family(
+    "loss magnitude",
+    "1",
+    expects=lambda name, scale: "either" if scale > 1e19 else "number",
+    name=("rmse", "hybrid_l1"),
+    scale=(1e-30, 1e-6, 1.0, 2e3, 1e15, 1e25),
+)
 def loss_size(name: str, scale: float, dtype: str = "float32") -> Outcome:
     """float32 loss of errors of this size; against exactly rounded sums in float64; bound: 2 (log2 n + 16) u32:
     pairwise sums; beyond 1e19 the square is infinite, and training stops"""
@@ -132,15 +144,20 @@ def loss_size(name: str, scale: float, dtype: str = "float32") -> Outcome:
 
 
 NETWORKS.family(
-    "half-precision loss", "1", about="loss of half-precision tensors in mm; against exactly rounded sums of the same "
+    "half-precision loss",
+    "1",
+    about="loss of half-precision tensors in mm; against exactly rounded sums of the same "
     "input; bound: 2 (log2 n + 16) u32: computed in float32; infinite input gives an infinite loss",
     expects=lambda name, dtype, scale: "either" if dtype == "float16" and scale > 3e4 else "number",
-    name=("rmse", "hybrid_l1"), dtype=("float16", "bfloat16"), scale=(1.0, 2e3, 3e4, 1e5),
-)(loss_size)  # fmt: skip
+    name=("rmse", "hybrid_l1"),
+    dtype=("float16", "bfloat16"),
+    scale=(1.0, 2e3, 3e4, 1e5),
+)(loss_size)
 
 
-@NETWORKS.family("constant input, instance norm", "1", dtype=("float32", "float64"),
-                 value=(0.0, 0.1, 1.0, 255.0, 1e4, 1e8, 1e-30))  # fmt: skip
+@NETWORKS.family(
+    "constant input, instance norm", "1", dtype=("float32", "float64"), value=(0.0, 0.1, 1.0, 255.0, 1e4, 1e8, 1e-30)
+)
 def constant_input(value: float, dtype: str) -> Outcome:
     """output and gradient of a map without variance; against the bias; bound: d / sqrt(d^2 + eps), d = (log2 n + 16) u
     |value|, or that factor twice: the mean, centred again"""
@@ -286,17 +303,26 @@ def network_half(name: str, dtype: str) -> Outcome:
     return worst((depth.double() - exact).numpy(), gamma(10, U32) * 1810.0, condition=UB16 / U32)
 
 
-@NETWORKS.family("phase route", "mm", expects="either", refuses=FppBenchError, name=("phase", "phase-net"),
-                 image=("black", "white", "constant", "noise", "checkerboard"))  # fmt: skip
+@NETWORKS.family(
+    "phase route",
+    "mm",
+    expects="either",
+    refuses=FppBenchError,
+    name=("phase", "phase-net"),
+    image=("black", "white", "constant", "noise", "checkerboard"),
+)
 @torch_threads(1)
 def phase_output(name: str, image: str) -> Outcome:
     """depth of an image without an object; against a depth in the working range, or none; bound: exact"""
     rig = paper_rig(480)
     shape = (rig.camera.width, rig.camera.width)
     levels = {
-        "black": 0, "white": 255, "constant": 128, "noise": np.random.default_rng(1).uniform(0, 256, shape),
+        "black": 0,
+        "white": 255,
+        "constant": 128,
+        "noise": np.random.default_rng(1).uniform(0, 256, shape),
         "checkerboard": 255 * (np.indices(shape).sum(axis=0) % 2),
-    }[image]  # fmt: skip
+    }[image]
     phase_method = load_method(name, rig)
     frames: list[NDArray[np.uint8] | None] = [None] * len(rig.sequence)
     frames[phase_method.frames_used[0]] = np.broadcast_to(np.asarray(levels), shape).astype(np.uint8)
@@ -321,8 +347,9 @@ def metric_scale(scale: float) -> Outcome:
     return worst(error, gamma(460) + 2 * 2.0**-1074 / max(exact_mm, 2.0**-1074))
 
 
-@NETWORKS.family("training metric, not a number", "mm", expects="refusal", refuses=PredictionError,
-                 value=(math.nan, math.inf, 1e200))  # fmt: skip
+@NETWORKS.family(
+    "training metric, not a number", "mm", expects="refusal", refuses=PredictionError, value=(math.nan, math.inf, 1e200)
+)
 def metric_refuses(value: float) -> None:
     """a score of a prediction with a pixel of this value; against there is none; bound: must be refused"""
     prediction = torch.tensor([[[1800.0, value]]], dtype=torch.float64)

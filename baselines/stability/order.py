@@ -24,8 +24,11 @@ from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.machine import numba_enabled
 
-ORDER = Group("order", "the coordinate that the frames were made from",
-              "P / 2 pi asin(g / 2B): 8-bit frames alone; a slip would be a whole period")  # fmt: skip
+ORDER = Group(
+    "order",
+    "the coordinate that the frames were made from",
+    "P / 2 pi asin(g / 2B): 8-bit frames alone; a slip would be a whole period",
+)
 
 
 @ORDER.family("on a Gray edge", "px", pitch_px=(4.0, 18.0, 37.3), blend=(0.0, 0.25, 0.5, 0.75, 1.0))
@@ -52,8 +55,11 @@ def wrap_at_pi(pitch_px: float, bit_noise: float) -> Outcome:
     return decoded_coordinate(rig, levels, positions_px)
 
 
-@ORDER.family("order of a phase at the wrap", "rad", phase_rad=(
-    -math.pi, math.pi, 3.1415926535897927, -3.1415926535897927, 0.0, -0.0, math.pi / 2))  # fmt: skip
+@ORDER.family(
+    "order of a phase at the wrap",
+    "rad",
+    phase_rad=(-math.pi, math.pi, 3.1415926535897927, -3.1415926535897927, 0.0, -0.0, math.pi / 2),
+)
 def order_of_pi(phase_rad: float) -> Outcome:
     """absolute phase in each of 102 cells; against the same rule in 50 digits; bound: 4 u |Phi|: one product and two
     sums"""
@@ -134,9 +140,14 @@ def flipped_bit_alone(bit: int) -> Outcome:
 
 
 ORDER.family(
-    "more periods than codes", "px", expects="refusal", refuses=RigError, bits=(1, 4, 5, 6), about="a rig of 51 "
+    "more periods than codes",
+    "px",
+    expects="refusal",
+    refuses=RigError,
+    bits=(1, 4, 5, 6),
+    about="a rig of 51 "
     "periods with this number of Gray bits; against 102 cells need 7 bits; bound: the code would repeat",
-)(lambda bits: replace(optics.paper_rig(32), sequence=optics.Sequence(18, 7, bits)))  # fmt: skip
+)(lambda bits: replace(optics.paper_rig(32), sequence=optics.Sequence(18, 7, bits)))
 
 
 @ORDER.family("cell off the pattern", "px", expects="refusal", cell=(102, 103, 111, 127))

@@ -35,8 +35,9 @@ NOISE = math.sqrt(2 / 18) * math.hypot(1.0, math.sqrt(1 / 12))
 """Standard deviation of the modulation by noise and rounding of one grey level, 18 steps."""
 
 
-def _decoded_phase(mean: float = MEAN, modulation: float = MODULATION, count: int = 2000,
-                   noise_grey: float = 0.0) -> tuple[Floats, NDArray]:  # fmt: skip
+def _decoded_phase(
+    mean: float = MEAN, modulation: float = MODULATION, count: int = 2000, noise_grey: float = 0.0
+) -> tuple[Floats, NDArray]:
     """Error of the absolute phase in rad, which includes slipped periods, across the pattern; the flagged pixels."""
     rig, positions_px = coded_rig(), np.linspace(2.0, 909.0, count)
     levels = direction_levels(rig, positions_px, mean=mean, modulation=modulation)
@@ -72,8 +73,9 @@ def _expects(modulation: float, spread: float) -> cases.Expects:
     return "number" if modulation > coding.MIN_MODULATION else "refusal"
 
 
-@PHASE.family("modulation, 8-bit frames", "rad", modulation=MODULATIONS,
-              expects=lambda modulation: _expects(modulation, ROUNDING))  # fmt: skip
+@PHASE.family(
+    "modulation, 8-bit frames", "rad", modulation=MODULATIONS, expects=lambda modulation: _expects(modulation, ROUNDING)
+)
 def modulation_8bit(modulation: float) -> Outcome:
     """absolute phase by the decoder, 8-bit frames; bound: asin(g / 2B), g = max (2/N) sum |sin|: half a grey level in
     every frame; under 5 levels refused"""
@@ -81,8 +83,12 @@ def modulation_8bit(modulation: float) -> Outcome:
     return worst(error, worst_angle(ROUNDING, modulation), flagged)
 
 
-@PHASE.family("modulation, noise of 1 grey level", "rad", modulation=MODULATIONS,  # up to six sigma off the limit:
-              expects=lambda modulation: _expects(modulation, 6 * NOISE))  # fmt: skip
+@PHASE.family(
+    "modulation, noise of 1 grey level",
+    "rad",
+    modulation=MODULATIONS,  # up to six sigma off the limit:
+    expects=lambda modulation: _expects(modulation, 6 * NOISE),
+)
 def noise(modulation: float) -> Outcome:
     """rms error of absolute phase, 20,000 pixels; bound: sqrt(2/N) sigma / B with sigma^2 = 1 + 1/12, second order 2
     sigma_phi^2, 4 standard errors"""
@@ -125,8 +131,12 @@ def saturation_phase(share: float, steps: int) -> Outcome:
     return worst(phase_error(frames), worst_angle(leak + rest, left) + 100 * U64)
 
 
-@PHASE.family("saturation, decoder", "rad", share=SHARES,  # clipped are floor(18 share) frames, or one more
-              expects=lambda share: ("number", "number", "either", "refusal")[min(int(18 * share), 3)])  # fmt: skip
+@PHASE.family(
+    "saturation, decoder",
+    "rad",
+    share=SHARES,  # clipped are floor(18 share) frames, or one more
+    expects=lambda share: ("number", "number", "either", "refusal")[min(int(18 * share), 3)],
+)
 def saturation_decoder(share: float) -> Outcome:
     """absolute phase by the decoder, 8-bit frames; bound: as above, plus half a grey level; more than 2 clipped frames
     of 18 must be refused"""
@@ -174,9 +184,13 @@ def uneven_steps(chosen: int) -> Outcome:
     return worst(phase_error(grey(sinusoids(phases(), deltas)), deltas), worst_angle(0.5 * float(shift) * (1 + 1e-6)))
 
 
-@PHASE.family("steps close together", "rad", refuses=DecodeError,
-              expects=lambda spread_rad: "number" if spread_rad > 5e-3 else "either",
-              spread_rad=(1.0, 0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 1e-4, 1e-8))  # fmt: skip
+@PHASE.family(
+    "steps close together",
+    "rad",
+    refuses=DecodeError,
+    expects=lambda spread_rad: "number" if spread_rad > 5e-3 else "either",
+    spread_rad=(1.0, 0.3, 0.1, 0.03, 0.01, 3e-3, 1e-3, 1e-4, 1e-8),
+)
 def close_steps(spread_rad: float) -> Outcome:
     """wrapped phase at shifts 0, s, 2 s; against least squares of the same frames in 50 digits; bound: 8 N u cond (A +
     B) / B (pinv M = I to u cond) + N u ||I|| / (sigma_min B); cond > 1e6 refused"""
@@ -191,9 +205,13 @@ def close_steps(spread_rad: float) -> Outcome:
 
 
 PHASE.family(
-    "equal shifts", "rad", expects="refusal", refuses=DecodeError, about="weights of the shifts 0, 1, 1 rad; against "
+    "equal shifts",
+    "rad",
+    expects="refusal",
+    refuses=DecodeError,
+    about="weights of the shifts 0, 1, 1 rad; against "
     "there is no such phase; bound: two different shifts do not determine the phase",
-)(lambda: coding.phase_weights([0.0, 1.0, 1.0]))  # fmt: skip
+)(lambda: coding.phase_weights([0.0, 1.0, 1.0]))
 
 
 @PHASE.family("dead frame", "mm", expects="refusal", refuses=DecodeError, steps=(18, 9, 6, 4), level=(0, 255))
@@ -211,10 +229,15 @@ def dead_frame(steps: int, level: int) -> Outcome:
 
 
 PHASE.family(
-    "dead frame of three", "mm", expects="either", refuses=DecodeError, steps=(3,), level=(0, 255),
+    "dead frame of three",
+    "mm",
+    expects="either",
+    refuses=DecodeError,
+    steps=(3,),
+    level=(0, 255),
     about="a plane's depth with one of three frames black or white; against the plane, 1800 mm; bound: no redundancy; "
     "the epipolar check allows 1.5 px across, hence 1.5 px / sin(alpha) of u",
-)(dead_frame)  # fmt: skip
+)(dead_frame)
 
 
 @PHASE.family("repeated frame", "rad", steps=(18, 9, 4))
@@ -226,8 +249,13 @@ def repeated_frame(steps: int) -> Outcome:
     return worst(phase_error(frames), worst_angle(2 / steps * 2 * math.sin(math.pi / steps), 1.0))
 
 
-@PHASE.family("pitch", "px", refuses=RigError, expects=lambda pitch_px: "number" if 4 <= pitch_px <= 912 else "refusal",
-              pitch_px=(2.5, 3.9, 4.0, 5.3, 9.0, 18.0, 36.7, 100.0, 456.0, 912.0, 1000.0))  # fmt: skip
+@PHASE.family(
+    "pitch",
+    "px",
+    refuses=RigError,
+    expects=lambda pitch_px: "number" if 4 <= pitch_px <= 912 else "refusal",
+    pitch_px=(2.5, 3.9, 4.0, 5.3, 9.0, 18.0, 36.7, 100.0, 456.0, 912.0, 1000.0),
+)
 def pitch(pitch_px: float) -> Outcome:
     """projector coordinate by the decoder, 8-bit frames; against the coordinate of the pixel; bound: P / 2 pi asin(g /
     2B) over the whole pattern; under 4 px or beyond the pattern refused"""

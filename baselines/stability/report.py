@@ -90,9 +90,12 @@ def row_content(row: Row) -> dict[str, Any]:
 def document(rows: Sequence[Row]) -> dict[str, Any]:
     """The whole run as JSON values."""
     return {
-        "schema_version": "1.0.0", "summary": summary(rows), "compiled_decoder": numba_enabled(),
-        "environment": environment().model_dump(mode="json"), "cases": [row_content(row) for row in rows],
-    }  # fmt: skip
+        "schema_version": "1.0.0",
+        "summary": summary(rows),
+        "compiled_decoder": numba_enabled(),
+        "environment": environment().model_dump(mode="json"),
+        "cases": [row_content(row) for row in rows],
+    }
 
 
 def square_of(row: Row) -> tuple[str, str]:
@@ -156,11 +159,19 @@ def write_report(rows: Sequence[Row], folder: Path) -> list[Path]:
     about = [hardware["cpu"], f"{hardware['cores']} cores", f"Python {machine['python']}"]
     about += [f"{name} {version}" for name, version in machine["packages"].items()]
     body = render(
-        __package__, "stability.html", total=content["summary"]["all"], machine=", ".join(about), squares=squares,
-        failed=[row for row in rows if row.verdict is Verdict.FAIL], picture=data_uri(picture), families=families(rows),
-        short=short, parameter_text=parameter_text, largest_ratio=largest_ratio,
+        __package__,
+        "stability.html",
+        total=content["summary"]["all"],
+        machine=", ".join(about),
+        squares=squares,
+        failed=[row for row in rows if row.verdict is Verdict.FAIL],
+        picture=data_uri(picture),
+        families=families(rows),
+        short=short,
+        parameter_text=parameter_text,
+        largest_ratio=largest_ratio,
         counts=lambda members: Counter(row.verdict.value for row in members),
-    )  # fmt: skip
+    )
     files = {
         folder / "index.html": page("Numerical stability", body, style=_STYLE).encode("utf-8"),
         folder / "stability.json": (json.dumps(content, indent=1, allow_nan=False) + "\n").encode("utf-8"),

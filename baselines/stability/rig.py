@@ -35,17 +35,34 @@ def intrinsics(focal_px: float, centre_px: float) -> Outcome:
 
 
 _BACK = "pixel to ray and back; against the pixel; bound: 3 u (|u - c| + |c|) + u |u|; refused from a condition number "
-RIG.family("intrinsic matrix", "px", about=f"{_BACK}of 2^26 on, half of the digits", refuses=RigError,
-           expects=lambda focal_px, centre_px: "number" if 1e-3 <= focal_px <= 1e8 else "either", centre_px=(479.5,),
-           focal_px=(2e3, 1.0, 1e-3, 1e-6, 1e-8, 1e-12, 1e-300, 5e-324, 1e8, 1e12, 1e300))(intrinsics)  # fmt: skip
-RIG.family("far principal point", "px", about=f"{_BACK}of 2^26 on", refuses=RigError, focal_px=(2e3,),
-           expects=lambda focal_px, centre_px: "number" if centre_px <= 1e6 else "either",
-           centre_px=(1e3, 1e6, 1e12, 1e16))(intrinsics)  # fmt: skip
+RIG.family(
+    "intrinsic matrix",
+    "px",
+    about=f"{_BACK}of 2^26 on, half of the digits",
+    refuses=RigError,
+    expects=lambda focal_px, centre_px: "number" if 1e-3 <= focal_px <= 1e8 else "either",
+    centre_px=(479.5,),
+    focal_px=(2e3, 1.0, 1e-3, 1e-6, 1e-8, 1e-12, 1e-300, 5e-324, 1e8, 1e12, 1e300),
+)(intrinsics)
+RIG.family(
+    "far principal point",
+    "px",
+    about=f"{_BACK}of 2^26 on",
+    refuses=RigError,
+    focal_px=(2e3,),
+    expects=lambda focal_px, centre_px: "number" if centre_px <= 1e6 else "either",
+    centre_px=(1e3, 1e6, 1e12, 1e16),
+)(intrinsics)
 
 
-@RIG.family("rotation off orthonormal", "relative", refuses=RigError, kind=("scaled", "sheared"),
-            off=(0.0, 1e-9, 1e-7, 9.9e-7, 1.1e-6, 1e-4, 1e-2),
-            expects=lambda kind, off: "number" if off < 1e-6 else "refusal")  # fmt: skip
+@RIG.family(
+    "rotation off orthonormal",
+    "relative",
+    refuses=RigError,
+    kind=("scaled", "sheared"),
+    off=(0.0, 1e-9, 1e-7, 9.9e-7, 1.1e-6, 1e-4, 1e-2),
+    expects=lambda kind, off: "number" if off < 1e-6 else "refusal",
+)
 def off_orthonormal(off: float, kind: str) -> Outcome:
     """depth through this matrix; against depth through the rotation, 1800 mm; bound: 2 |R R^T - I| kappa + round-off;
     over 1e-6 a rig is refused"""
@@ -60,8 +77,13 @@ def off_orthonormal(off: float, kind: str) -> Outcome:
     return worst(depth_mm / 1800.0 - 1, bound / (1 - bound), np.isnan(depth_mm), condition=float(condition.max()))
 
 
-@RIG.family("rotation vector", "1", angle_rad=(0.0, 1e-300, 1e-12, 1e-4, 1.0, math.pi, math.tau, 1e3, 1e8, 1e12, 1e15),
-            refuses=RigError, expects=lambda angle_rad: "number" if angle_rad <= 1e8 else "either")  # fmt: skip
+@RIG.family(
+    "rotation vector",
+    "1",
+    angle_rad=(0.0, 1e-300, 1e-12, 1e-4, 1.0, math.pi, math.tau, 1e3, 1e8, 1e12, 1e15),
+    refuses=RigError,
+    expects=lambda angle_rad: "number" if angle_rad <= 1e8 else "either",
+)
 def rotation_vector(angle_rad: float) -> Outcome:
     """rotation matrix by Rodrigues' formula; against the same formula in 50 digits; bound: 8 u (1 + angle): the angle
     carries its own rounding; refused where that is over 1e-6"""
@@ -180,9 +202,13 @@ def impossible_rig(change: str) -> None:
 def file_round_trip(suffix: str) -> Outcome:
     """a rig of awkward numbers, written and read; against the rig; bound: exact"""
     awkward = (0.1 + 0.2, 1e-17, math.nextafter(0.125, 1.0), 5e-324, -1 / 3)
-    rig = replace(PAPER, camera=replace(PAPER.camera, cx=math.pi * 1e2, cy=2 / 3 * 1e2, distortion=awkward),
-                  translation_m=(math.nextafter(0.125, 0.0), -0.1 - 1e-17, 1e-300), pitch_vertical_px=18 + 2**-48,
-                  rotation=optics.rotation_matrix((1e-9, 2e-9, -3e-9)).tolist())  # fmt: skip
+    rig = replace(
+        PAPER,
+        camera=replace(PAPER.camera, cx=math.pi * 1e2, cy=2 / 3 * 1e2, distortion=awkward),
+        translation_m=(math.nextafter(0.125, 0.0), -0.1 - 1e-17, 1e-300),
+        pitch_vertical_px=18 + 2**-48,
+        rotation=optics.rotation_matrix((1e-9, 2e-9, -3e-9)).tolist(),
+    )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"rig{suffix}"
         optics.save_rig(rig, path)

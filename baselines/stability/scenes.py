@@ -38,8 +38,12 @@ def image(hits: render.Hits) -> Floats:
     return depth
 
 
-@SCENES.family("wall edge-on", "m", expects=lambda off_deg: "number" if off_deg >= 1 else "either",
-               off_deg=(90.0, 30.0, 5.0, 1.0, 0.3, 0.1, 0.01, 1e-4, 0.0))  # fmt: skip
+@SCENES.family(
+    "wall edge-on",
+    "m",
+    expects=lambda off_deg: "number" if off_deg >= 1 else "either",
+    off_deg=(90.0, 30.0, 5.0, 1.0, 0.3, 0.1, 0.01, 1e-4, 0.0),
+)
 def edge_on(off_deg: float) -> Outcome:
     """depth of a wall at this angle to the line of sight; against ray and plane in 80-bit arithmetic; bound: 264 u
     kappa, kappa = sum |n d| over |n . d|; never beyond the wall's own extent"""
@@ -94,9 +98,19 @@ def _ball(subdivisions: int = 3, radius_m: float = 0.12) -> tuple[Floats, NDArra
     return np.asarray(mesh.vertices) + AHEAD_M, np.asarray(mesh.faces, np.int32)
 
 
-@SCENES.family("broken mesh", "m", kind=(
-    "degenerate triangles", "collinear triangles", "flipped triangles", "every triangle twice", "non-manifold fin",
-    "loose vertices", "open back"))  # fmt: skip
+@SCENES.family(
+    "broken mesh",
+    "m",
+    kind=(
+        "degenerate triangles",
+        "collinear triangles",
+        "flipped triangles",
+        "every triangle twice",
+        "non-manifold fin",
+        "loose vertices",
+        "open back",
+    ),
+)
 def broken(kind: str) -> Outcome:
     """outline, depth and normals of a ball with this defect; against the ball without it; bound: same outline; depth 64
     u x 1.8 m x condition of the most oblique facet"""
@@ -134,9 +148,12 @@ def broken(kind: str) -> Outcome:
 
 
 SCENES.family(
-    "no solid triangle", "m", expects="refusal", refuses=MeshError,
+    "no solid triangle",
+    "m",
+    expects="refusal",
+    refuses=MeshError,
     about="a mesh of triangles without area; against there is no surface; bound: must be refused",
-)(lambda: seen([[0, 0, 1.8], [0, 0.1, 1.8], [0, 0.2, 1.8]], [[0, 1, 2], [0, 0, 1]]))  # fmt: skip
+)(lambda: seen([[0, 0, 1.8], [0, 0.1, 1.8], [0, 0.2, 1.8]], [[0, 1, 2], [0, 0, 1]]))
 
 
 @SCENES.family("number of triangles", "m", heavy=lambda count: count > 1e6, count=(1.0, 1e2, 1e4, 1e6, 1e7))
@@ -175,8 +192,20 @@ def camera_inside(turn_deg: float) -> Outcome:
     corners = np.array(list(itertools.product((-1, 1), repeat=3)), float)
     cos, sin = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
     turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
-    faces = [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6],
-             [0, 6, 4], [1, 5, 7], [1, 7, 3]]  # fmt: skip
+    faces = [
+        [0, 1, 3],
+        [0, 3, 2],
+        [4, 6, 7],
+        [4, 7, 5],
+        [0, 4, 5],
+        [0, 5, 1],
+        [2, 3, 7],
+        [2, 7, 6],
+        [0, 2, 6],
+        [0, 6, 4],
+        [1, 5, 7],
+        [1, 7, 3],
+    ]
     hits = seen(corners @ turn.T, faces)
     x, y = (axis.ravel() for axis in RIG.camera.rays())
     if len(hits.pixels) != x.size:

@@ -14,8 +14,9 @@ from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation import score
 
 NORMALISATION = Group("normalisation")
-METRICS = Group("metrics", "exact sums", "6 sqrt(9600) u: a block of 9600 px in float64, random roundings; blocks are "
-                "added exactly")  # fmt: skip
+METRICS = Group(
+    "metrics", "exact sums", "6 sqrt(9600) u: a block of 9600 px in float64, random roundings; blocks are added exactly"
+)
 NAMES = ("raw", "global", "individual")
 STORED = ("float64", "float32")
 SPANS = (1e-6, 1e-3, 1.0, 200.0, 1e3, 1e6)
@@ -30,8 +31,15 @@ _STREAM_BLOCK, _STREAM_KINDS = 1_000_000, 20
 def depth_map(kind: str, low_mm: float, span_mm: float) -> Floats:
     """A depth map of 24 x 24 px in mm: the object's depths from ``low_mm`` to ``low_mm + span_mm``."""
     depth = np.zeros((24, 24))
-    part = depth[{"one pixel": np.s_[7:8, 11:12], "flat plane": np.s_[4:20, 4:20], "full frame": np.s_[:, :],
-                  "part": np.s_[3:21, 5:19], "empty": np.s_[:0, :0]}[kind]]  # fmt: skip
+    part = depth[
+        {
+            "one pixel": np.s_[7:8, 11:12],
+            "flat plane": np.s_[4:20, 4:20],
+            "full frame": np.s_[:, :],
+            "part": np.s_[3:21, 5:19],
+            "empty": np.s_[:0, :0],
+        }[kind]
+    ]
     sloped = kind in ("full frame", "part")
     part[...] = low_mm + (span_mm * np.linspace(0, 1, part.size).reshape(part.shape) if sloped else 0.0)
     return depth
@@ -60,12 +68,27 @@ def round_trip(name: Normalisation, kind: str, low_mm: float, span_mm: float, st
     return worst(denormalise(representation, name, low, high)[inside] - exact, bound)
 
 
-NORMALISATION.family("range", "mm", name=NAMES, kind=("part",), low_mm=(1700.0,), stored=STORED,
-                     span_mm=SPANS)(round_trip)  # fmt: skip
-NORMALISATION.family("depth_min = 0", "mm", name=NAMES, kind=("full frame",), low_mm=(0.0,), stored=STORED,
-                     span_mm=(1e-30, 1e-6, 1.0, 1e6))(round_trip)  # fmt: skip
-NORMALISATION.family("shape of the object", "mm", name=NAMES, low_mm=(1700.0,), span_mm=(200.0,), stored=("float32",),
-                     kind=("flat plane", "one pixel", "full frame", "empty"))(round_trip)  # fmt: skip
+NORMALISATION.family("range", "mm", name=NAMES, kind=("part",), low_mm=(1700.0,), stored=STORED, span_mm=SPANS)(
+    round_trip
+)
+NORMALISATION.family(
+    "depth_min = 0",
+    "mm",
+    name=NAMES,
+    kind=("full frame",),
+    low_mm=(0.0,),
+    stored=STORED,
+    span_mm=(1e-30, 1e-6, 1.0, 1e6),
+)(round_trip)
+NORMALISATION.family(
+    "shape of the object",
+    "mm",
+    name=NAMES,
+    low_mm=(1700.0,),
+    span_mm=(200.0,),
+    stored=("float32",),
+    kind=("flat plane", "one pixel", "full frame", "empty"),
+)(round_trip)
 
 
 @NORMALISATION.family("individual, forward", "1", kind=("part",), low_mm=(1700.0, 1700.1), stored=STORED, span_mm=SPANS)
@@ -82,21 +105,41 @@ def forward(low_mm: float, span_mm: float, kind: str = "part", stored: str = "")
 
 
 NORMALISATION.family(
-    "range from a file", "1", low_mm=(1700.1,), span_mm=(1e-2, 1.0, 200.0, 1e3), about="individual depth with a range "
+    "range from a file",
+    "1",
+    low_mm=(1700.1,),
+    span_mm=(1e-2, 1.0, 200.0, 1e3),
+    about="individual depth with a range "
     "that is not a float32 number; against the quotient in 80-bit arithmetic; bound: 4 u32 of the value",
-)(forward)  # fmt: skip
-NORMALISATION.family("subnormal range", "mm", name=("individual",), kind=("full frame",), low_mm=(0.0,),
-                     stored=("float64",), span_mm=(1e-40, 1e-60, 1e-300))(round_trip)  # fmt: skip
+)(forward)
 NORMALISATION.family(
-    "impossible range", "1", expects="refusal", refuses=ValueError,
+    "subnormal range",
+    "mm",
+    name=("individual",),
+    kind=("full frame",),
+    low_mm=(0.0,),
+    stored=("float64",),
+    span_mm=(1e-40, 1e-60, 1e-300),
+)(round_trip)
+NORMALISATION.family(
+    "impossible range",
+    "1",
+    expects="refusal",
+    refuses=ValueError,
     about="depth with an invalid range; against there is no such representation; bound: must be refused",
-    low_mm=(1600.0, math.nan, -math.inf), high_mm=(1500.0, math.inf, math.nan),
-)(lambda low_mm, high_mm: normalise(depth_map("part", 1500.0, 100.0), "individual", low_mm, high_mm))  # fmt: skip
+    low_mm=(1600.0, math.nan, -math.inf),
+    high_mm=(1500.0, math.inf, math.nan),
+)(lambda low_mm, high_mm: normalise(depth_map("part", 1500.0, 100.0), "individual", low_mm, high_mm))
 
 
-@NORMALISATION.family("scored", "mm", refuses=DatasetError, mode=("standard", "paper"),
-                      kind=("part", "full frame", "flat plane", "one pixel", "empty"),
-                      expects=lambda mode, kind: "number" if kind in ("part", "full frame") else "either")  # fmt: skip
+@NORMALISATION.family(
+    "scored",
+    "mm",
+    refuses=DatasetError,
+    mode=("standard", "paper"),
+    kind=("part", "full frame", "flat plane", "one pixel", "empty"),
+    expects=lambda mode, kind: "number" if kind in ("part", "full frame") else "either",
+)
 def scored(kind: str, mode: str) -> Outcome:
     """normalised predictions as the evaluator scores them; against the affine map, closed form; bound: 4 u D; no range
     to go back through is refused"""
@@ -153,9 +196,13 @@ def streamed(pixels: float, scale_mm: float) -> Outcome:
     return _compared(total, _exact(*zip(kinds, times, strict=True)), LIKELY * math.sqrt(score.BLOCK + 6 * blocks))
 
 
-@METRICS.family("magnitude", "relative", refuses=PredictionError,
-                expects=lambda scale_mm: "number" if scale_mm <= 1e140 else "either",
-                scale_mm=(1.0, 1e-30, 1e30, 1e-130, 1e140, 1e-160, 5e-324, 1e-310, 1e200, 1e306))  # fmt: skip
+@METRICS.family(
+    "magnitude",
+    "relative",
+    refuses=PredictionError,
+    expects=lambda scale_mm: "number" if scale_mm <= 1e140 else "either",
+    scale_mm=(1.0, 1e-30, 1e30, 1e-130, 1e140, 1e-160, 5e-324, 1e-310, 1e200, 1e306),
+)
 def magnitude(scale_mm: float) -> Outcome:
     """MAE and RMSE of 20,000 errors up to 999 x scale_mm; bound: 6 sqrt(9600) u: a block of 9600 px in float64, random
     roundings; blocks are added exactly; squares above 1e308 refused"""
@@ -178,8 +225,13 @@ def one_large(large_mm: float) -> Outcome:
     return _scored(errors, score.BLOCK)
 
 
-@METRICS.family("sample", "relative", refuses=PredictionError, stored=("float32", "float64"),
-                scale_mm=(1.0, 1e-30, 1e30, 1e-43, 1e-160, 1e-300))  # fmt: skip
+@METRICS.family(
+    "sample",
+    "relative",
+    refuses=PredictionError,
+    stored=("float32", "float64"),
+    scale_mm=(1.0, 1e-30, 1e30, 1e-43, 1e-160, 1e-300),
+)
 def sample(scale_mm: float, stored: str) -> Outcome:
     """object and background MAE and RMSE of 100 x 100 px"""
     errors = scale_mm * np.random.default_rng(5).integers(1, 1000, (100, 100))
@@ -247,9 +299,13 @@ def merged(order: str) -> Outcome:
 
 
 METRICS.family(
-    "not a number", "mm", expects="refusal", refuses=PredictionError, value=(math.nan, math.inf, -math.inf, 1e300),
+    "not a number",
+    "mm",
+    expects="refusal",
+    refuses=PredictionError,
+    value=(math.nan, math.inf, -math.inf, 1e300),
     about="a score of a prediction with a pixel of this value; against there is none; bound: must be refused",
-)(lambda value: score.score_sample(np.array([[1800.0, value]]), np.full((1, 2), 1800.0)))  # fmt: skip
+)(lambda value: score.score_sample(np.array([[1800.0, value]]), np.full((1, 2), 1800.0)))
 
 
 @METRICS.family("perfect and empty", "mm")

@@ -13,8 +13,11 @@ from fpp_ml_bench.baselines.stability.coded_frames import plane_stack
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.loaders.render import PatternLight, light_surface, named_light
 
-TRIANGULATION = Group("triangulation", "the closed form on the same float64 inputs in 50 digits", "u (8 kappa + 5 "
-    "kappa_top + 4), kappa = sum of magnitudes over |a - x_p a_2|: running error analysis")  # fmt: skip
+TRIANGULATION = Group(
+    "triangulation",
+    "the closed form on the same float64 inputs in 50 digits",
+    "u (8 kappa + 5 kappa_top + 4), kappa = sum of magnitudes over |a - x_p a_2|: running error analysis",
+)
 BASELINES = (160.0, 50.0, 10.0, 1.0, 0.1, 0.01)
 PAPER = optics.paper_rig(24)
 TURN = optics.rotation_matrix((0.05, -0.09, 0.12))
@@ -104,11 +107,17 @@ def one_coordinate(baseline_mm: float, range_m: float, direction: optics.Directi
 for _name, _of, _grid in (
     ("baseline", " at 1.8 m", {"direction": optics.AXES, "range_m": (1.8,), "baseline_mm": BASELINES}),
     ("range", "", {"direction": optics.AXES, "baseline_mm": (160.0,), "range_m": (0.3, 1.0, 1.8, 5.0, 20.0, 100.0)}),
-    ("short baseline and long range", "",
-     {"direction": ("vertical",), "baseline_mm": (1.0, 0.01), "range_m": (20.0, 100.0)}),
-    ("turned projector ahead of the camera", ", general pose",
-     {"direction": optics.AXES, "range_m": (0.3, 1.8, 100.0), "baseline_mm": (160.0, 0.01), "turned": (1,)}),
-):  # fmt: skip
+    (
+        "short baseline and long range",
+        "",
+        {"direction": ("vertical",), "baseline_mm": (1.0, 0.01), "range_m": (20.0, 100.0)},
+    ),
+    (
+        "turned projector ahead of the camera",
+        ", general pose",
+        {"direction": optics.AXES, "range_m": (0.3, 1.8, 100.0), "baseline_mm": (160.0, 0.01), "turned": (1,)},
+    ),
+):
     TRIANGULATION.family(_name, "relative", about=f"depth from one coordinate{_of}", **_grid)(one_coordinate)  # type: ignore[arg-type]
 
 
@@ -130,8 +139,14 @@ def _least_squares(measured_px: NDArray, rig: optics.Rig, rays: optics.Maps) -> 
     return 1000 / w, np.abs(bend / square).astype(float), np.abs((first - w) / w).astype(float)
 
 
-@TRIANGULATION.family("both directions", "relative", expects="either", noise_px=(0.0, 0.5), ahead=(0.0, 0.3, 1.0),
-                      baseline_mm=BASELINES[:4])  # fmt: skip
+@TRIANGULATION.family(
+    "both directions",
+    "relative",
+    expects="either",
+    noise_px=(0.0, 0.5),
+    ahead=(0.0, 0.3, 1.0),
+    baseline_mm=BASELINES[:4],
+)
 def both_coordinates(baseline_mm: float, ahead: float, noise_px: float) -> Outcome:
     """depth by weighted least squares of both coordinates; against the minimum, by Newton's method in 50 digits; bound:
     8 x the closed form's bound + start error x (Gauss-Newton contraction + 4 start error)^3"""
@@ -168,9 +183,14 @@ def noise_law(baseline_mm: float, direction: optics.Direction) -> Outcome:
     return Outcome(abs(float(np.isnan(depths_mm).mean()) - nowhere), bound, condition=1 / share)
 
 
-@TRIANGULATION.family("nearly parallel rays", "relative", expects="either",
+@TRIANGULATION.family(
+    "nearly parallel rays",
+    "relative",
+    expects="either",
     about=f"depth of a projector plane this many px from parallel; bound: {TRIANGULATION.predicts}; masked where it "
-    "lies behind", shift_px=(10.0, 1.0, 1e-3, 1e-6, 1e-9, 1e-11, 1e-12, 0.0, -1e-6, -1.0))  # fmt: skip
+    "lies behind",
+    shift_px=(10.0, 1.0, 1e-3, 1e-6, 1e-9, 1e-11, 1e-12, 0.0, -1e-6, -1.0),
+)
 def near_parallel(shift_px: float) -> Outcome:
     focal, centre = PAPER.projector.fx, PAPER.projector.cx
     coordinate = focal * RAYS[0] + centre + shift_px  # depth f b / shift, up to a point at infinity
@@ -217,8 +237,9 @@ def lit_from_behind() -> Outcome:
     return worst(lit.gain, 0.0, lit.gain == 0)
 
 
-@TRIANGULATION.family("float32 coordinate", "relative", expects="either", range_m=(0.3, 1.8, 100.0),
-                      baseline_mm=BASELINES)  # fmt: skip
+@TRIANGULATION.family(
+    "float32 coordinate", "relative", expects="either", range_m=(0.3, 1.8, 100.0), baseline_mm=BASELINES
+)
 def single_coordinate(baseline_mm: float, range_m: float) -> Outcome:
     """depth from a coordinate rounded to float32; against depth from the float64 coordinate, 50 digits; bound: 2^-24
     kappa, kappa = u_p / (u_p - u_infinity); not checked where that is over 1/2"""
@@ -230,8 +251,9 @@ def single_coordinate(baseline_mm: float, range_m: float) -> Outcome:
     return _rounded_input(error, slope * U32, slope, np.isnan(depth_mm), 1.001)
 
 
-def _rounded_input(error: Floats, rounding: Floats, condition: Floats, flagged: ArrayLike = False,
-                   slack: float = 1.0) -> Outcome:  # fmt: skip
+def _rounded_input(
+    error: Floats, rounding: Floats, condition: Floats, flagged: ArrayLike = False, slack: float = 1.0
+) -> Outcome:
     """The outcome of numbers with this relative error by rounding, which is not checked where that is over 1/2."""
     useless = rounding >= 0.5
     bound = slack * np.where(useless, 1.0, rounding / (1 - np.minimum(rounding, 0.5)))

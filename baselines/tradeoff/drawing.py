@@ -20,9 +20,15 @@ from matplotlib.transforms import Bbox
 from fpp_ml_bench.evaluation.report import escaped
 
 COLOURS = {
-    "ink": "#191c20", "soft": "#59616b", "line": "#dfe1e5", "panel": "#ffffff", "front": "#b84a00",
-    "measured": "#0b6b50", "verified": "#1b5bb8", "reported": "#8a4b00",
-}  # fmt: skip
+    "ink": "#191c20",
+    "soft": "#59616b",
+    "line": "#dfe1e5",
+    "panel": "#ffffff",
+    "front": "#b84a00",
+    "measured": "#0b6b50",
+    "verified": "#1b5bb8",
+    "reported": "#8a4b00",
+}
 """Colours of a page in light by the names of its style; in SVG they follow the page into its dark scheme."""
 _IN_PAGE = {colour: f"var(--{name})" for name, colour in COLOURS.items()}
 
@@ -90,11 +96,20 @@ class Scatter:
             lines += _boxes(axes, across) + _boxes(axes, up)
             pen_up = (math.nan, math.nan)
             axes.plot(
-                *zip((mark.x, mark.y), pen_up, *across, pen_up, *up, strict=True), mark.shape + "-", markevery=[0],
-                ms=2 * mark.radius, mew=1.5, lw=1.25, color=to_rgba(colour, 0.55), mec=colour,
+                *zip((mark.x, mark.y), pen_up, *across, pen_up, *up, strict=True),
+                mark.shape + "-",
+                markevery=[0],
+                ms=2 * mark.radius,
+                mew=1.5,
+                lw=1.25,
+                color=to_rgba(colour, 0.55),
+                mec=colour,
                 mfc=to_rgba(COLOURS["panel"], 0.8) if mark.hollow else to_rgba(colour, 0.55),
-                clip_on=False, gid=f"mark-{mark.number}", url=mark.url, zorder=2,
-            )  # fmt: skip
+                clip_on=False,
+                gid=f"mark-{mark.number}",
+                url=mark.url,
+                zorder=2,
+            )
         return self._label(axes, lines)
 
     def _label(self, axes: Axes, lines: Sequence[Bbox]) -> list[Mark]:
@@ -117,10 +132,17 @@ class Scatter:
                 offset = (box.get_points().mean(axis=0) - places[mark.number]) / px
                 line = {"arrowstyle": "-", "lw": 0.75, "color": COLOURS["soft"], "shrinkA": 0, "shrinkB": mark.radius}
                 axes.annotate(
-                    text, (mark.x, mark.y), tuple(offset), textcoords="offset points", ha="center", va="center",
-                    color=COLOURS["ink"], parse_math=False, gid=f"label-{mark.number}",
+                    text,
+                    (mark.x, mark.y),
+                    tuple(offset),
+                    textcoords="offset points",
+                    ha="center",
+                    va="center",
+                    color=COLOURS["ink"],
+                    parse_math=False,
+                    gid=f"label-{mark.number}",
                     arrowprops=line | {"gid": f"label-{mark.number}"} if gap >= _NUMBER_GAPS[1] else None,
-                )  # fmt: skip
+                )
                 taken.append(box)
                 numbered += [mark] if text != mark.name else []
                 break

@@ -60,9 +60,13 @@ def package_ladders(rig: Rig, quick: bool = False, more: Iterable[Ladder] = ()) 
     """The stages of this package, with those of ``more`` behind the stages over rows; networks last, because torch
     stays loaded. Each stage over pixels is run on a view rendered at each size."""
     over_pixels: dict[str, Callable[[Rig], Work]] = {
-        "render a view": _render, "decode": _decode, "decode: phase and order of one direction": _phase,
-        "decode: triangulate from both (NumPy)": _triangulate, "phase route": _phase_route, "score a view": _score,
-    }  # fmt: skip
+        "render a view": _render,
+        "decode": _decode,
+        "decode: phase and order of one direction": _phase,
+        "decode: triangulate from both (NumPy)": _triangulate,
+        "phase route": _phase_route,
+        "score a view": _score,
+    }
     sizes, steps, three = _QUICK_SIZES if quick else _SIZES, _QUICK_STEPS if quick else _STEPS, 3 if quick else None
     row_objects, pixel_sizes = (_QUICK_ROW_OBJECTS, (64, 128, 256)) if quick else (_ROW_OBJECTS, _SIZES)
     return [

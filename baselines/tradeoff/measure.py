@@ -122,16 +122,24 @@ def _figures(setting: Setting, rules: Rules) -> dict[str, Any]:
     low, middle, high = (float(f"{float(np.percentile(seconds, q)):.4g}") for q in (5, 50, 95))
     given = ["depth range"] * method.uses_ground_truth_range + ["object mask"] * method.uses_ground_truth_mask
     figures: dict[str, Any] = {
-        "frames": len(method.frames_used), "image_px": int(depth.shape[1]), "runs": len(seconds), "seconds": middle,
-        "seconds_p5": low, "seconds_p95": high, "parameters": method.parameters, "given": " and ".join(given) or None,
-    }  # fmt: skip
+        "frames": len(method.frames_used),
+        "image_px": int(depth.shape[1]),
+        "runs": len(seconds),
+        "seconds": middle,
+        "seconds_p5": low,
+        "seconds_p95": high,
+        "parameters": method.parameters,
+        "given": " and ".join(given) or None,
+    }
     if scores:
         object_mae, valid_mae, missing = zip(*scores, strict=True)
         interval = object_interval(list(object_mae), [split_sample_name(name)[0] for name in views.names])
         figures |= {
-            "object_mae_mm": _mean(object_mae), "interval_mm": None if interval is None else list(interval),
-            "measured_mae_mm": _mean(valid_mae), "missing_share": _mean(missing),
-        }  # fmt: skip
+            "object_mae_mm": _mean(object_mae),
+            "interval_mm": None if interval is None else list(interval),
+            "measured_mae_mm": _mean(valid_mae),
+            "missing_share": _mean(missing),
+        }
     return figures
 
 
@@ -187,9 +195,16 @@ def growth(stage: str, over: str, amounts: Sequence[float], seconds: Sequence[fl
     elif tail > LINEAR_LIMIT:
         flag = "steeper than linear at the largest amounts"
     return Growth(
-        stage=stage, over=over, amounts=[float(a) for a in amounts], seconds=[float(f"{s:.4g}") for s in seconds],
-        exponent=round(exponent, 3), low=round(low, 3), high=round(high, 3), tail=round(tail, 3), flag=flag,
-    )  # fmt: skip
+        stage=stage,
+        over=over,
+        amounts=[float(a) for a in amounts],
+        seconds=[float(f"{s:.4g}") for s in seconds],
+        exponent=round(exponent, 3),
+        low=round(low, 3),
+        high=round(high, 3),
+        tail=round(tail, 3),
+        flag=flag,
+    )
 
 
 def tradeoff(settings: TradeoffSettings, plan: Plan, progress: Callable[[str], object] = lambda key: None) -> Tradeoff:
@@ -201,9 +216,14 @@ def tradeoff(settings: TradeoffSettings, plan: Plan, progress: Callable[[str], o
     hardware, views = describe_hardware(), list(plan.views.names)
     # What two sittings of a run must share. Their groups may differ: a later sitting can add a group.
     about = {
-        "tradeoff": 2, "package": __version__, "dataset": plan.opened.fingerprint, "views": views,
-        "rules": asdict(rules), "cpu": hardware.cpu, "cores": hardware.cores,
-    }  # fmt: skip
+        "tradeoff": 2,
+        "package": __version__,
+        "dataset": plan.opened.fingerprint,
+        "views": views,
+        "rules": asdict(rules),
+        "cpu": hardware.cpu,
+        "cores": hardware.cores,
+    }
     cv2.setNumThreads(settings.threads)  # the phase route's filters take all threads by default; torch: see networks
     with exclusive(settings.out / LOCK_FILE, settings.out, "measuring into this folder"):
         path = settings.out / JOURNAL
@@ -225,12 +245,17 @@ def tradeoff(settings: TradeoffSettings, plan: Plan, progress: Callable[[str], o
         with suppress(PackageNotFoundError):
             versions[package] = version(package)
     return Tradeoff(
-        created=datetime.now(UTC).isoformat(timespec="seconds"), dataset=plan.opened.path.resolve().name,
-        fingerprint=plan.opened.fingerprint, image_size=list(plan.opened.size), target=plan.views.target, views=views,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        dataset=plan.opened.path.resolve().name,
+        fingerprint=plan.opened.fingerprint,
+        image_size=list(plan.opened.size),
+        target=plan.views.target,
+        views=views,
         settings={**asdict(rules), "quick": settings.quick, "views_an_object": per_object},
         hardware=HardwareInfo.model_validate(hardware.to_dict()),
-        software={"fpp_ml_bench": __version__, "python": python_version(), **versions}, sittings=journal.sittings,
+        software={"fpp_ml_bench": __version__, "python": python_version(), **versions},
+        sittings=journal.sittings,
         # Everything in this folder, so that a group measured on its own adds to the earlier ones.
         points=sorted(journal.points.values(), key=lambda point: GROUPS.index(point.group)),
         growth=[growth for growths in journal.growth.values() for growth in growths],
-    )  # fmt: skip
+    )

@@ -191,10 +191,16 @@ def _quantised(path: Path, examples: NDArray[np.float32]) -> Path:
         quant_pre_process(str(path), str(prepared))
         graph = onnx.load(str(prepared)).graph
         quantize_static(
-            str(prepared), str(quantised_path), Examples(), quant_format=QuantFormat.QDQ, per_channel=True,
-            activation_type=QuantType.QUInt8, weight_type=QuantType.QInt8, reduce_range=not _cpu_flags() & _VNNI_FLAGS,
+            str(prepared),
+            str(quantised_path),
+            Examples(),
+            quant_format=QuantFormat.QDQ,
+            per_channel=True,
+            activation_type=QuantType.QUInt8,
+            weight_type=QuantType.QInt8,
+            reduce_range=not _cpu_flags() & _VNNI_FLAGS,
             nodes_to_exclude=[node.name for node in graph.node if node.op_type == "Conv"][-1:],
-        )  # fmt: skip
+        )
     finally:
         logging.disable(disabled_level)
     return quantised_path

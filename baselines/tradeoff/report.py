@@ -193,19 +193,30 @@ def points_csv(tradeoff: Tradeoff) -> str:
     fronts = [tradeoff.front(cost) for cost in COST_KEYS]
     names = [name for name in Point.model_fields if name != "interval_mm"]
     head = [*names, "interval_low_mm", "interval_high_mm", "front_seconds", "front_frames", "slowed"]
-    return _csv(head, (
-        [*(getattr(point, name) for name in names), *(point.interval_mm or (None, None)),
-         *(point in front for front in fronts), tradeoff.slowed(point)]
-        for point in tradeoff.points
-    ))  # fmt: skip
+    return _csv(
+        head,
+        (
+            [
+                *(getattr(point, name) for name in names),
+                *(point.interval_mm or (None, None)),
+                *(point in front for front in fronts),
+                tradeoff.slowed(point),
+            ]
+            for point in tradeoff.points
+        ),
+    )
 
 
 def growth_csv(growths: Iterable[Growth]) -> str:
     """A line for each stage and amount, with the stage's fitted power."""
-    return _csv(["stage", "over", "amount", "seconds", "exponent", "low", "high", "tail", "flag"], (
-        [line.stage, line.over, amount, seconds, line.exponent, line.low, line.high, line.tail, line.flag]
-        for line in growths for amount, seconds in zip(line.amounts, line.seconds, strict=True)
-    ))  # fmt: skip
+    return _csv(
+        ["stage", "over", "amount", "seconds", "exponent", "low", "high", "tail", "flag"],
+        (
+            [line.stage, line.over, amount, seconds, line.exponent, line.low, line.high, line.tail, line.flag]
+            for line in growths
+            for amount, seconds in zip(line.amounts, line.seconds, strict=True)
+        ),
+    )
 
 
 def _csv(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
@@ -213,8 +224,10 @@ def _csv(head: Sequence[str], lines: Iterable[Sequence[object]]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(head)
     cells: dict[type, Callable[..., str | None]] = {
-        float: "{:.6g}".format, bool: lambda value: str(value).lower(), type(None): lambda value: None,
-    }  # fmt: skip
+        float: "{:.6g}".format,
+        bool: lambda value: str(value).lower(),
+        type(None): lambda value: None,
+    }
     writer.writerows([cells.get(type(value), str)(value) for value in line] for line in lines)
     return text.getvalue()
 

@@ -274,8 +274,12 @@ def planned(run: TradeoffSettings, more_ladders: Sequence[Ladder] = ()) -> Plan:
     opened = DatasetFolder(run.dataset)
     views = choose_views(opened, run.views or (QUICK_VIEWS if run.quick else VIEWS_AN_OBJECT))
     makers: dict[Group, Callable[[StoredViews, TradeoffSettings], Iterator[Setting]]] = {
-        "classical": _classical, "phase": _phase, "networks": _networks, "precision": _precision, "sizes": _sizes,
-    }  # fmt: skip
+        "classical": _classical,
+        "phase": _phase,
+        "networks": _networks,
+        "precision": _precision,
+        "sizes": _sizes,
+    }
     groups = [group for group in GROUPS if not run.only or group in run.only]
     settings = [setting for group in groups for setting in makers[group](views, run)]
     costs = not run.only or COSTS in run.only

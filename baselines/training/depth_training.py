@@ -42,8 +42,10 @@ from fpp_ml_bench.loaders.training import FringeDepth, FringeDepthDataset
 
 WEIGHTS, DONE = "weights.safetensors", "done.json"
 SCORING: dict[Normalisation, tuple[Units, Mode]] = {
-    "raw": ("mm", "standard"), "global": ("m", "standard"), "individual": ("normalised", "paper"),
-}  # fmt: skip
+    "raw": ("mm", "standard"),
+    "global": ("m", "standard"),
+    "individual": ("normalised", "paper"),
+}
 """How a network's output is scored: its unit, and the evaluator's mode."""
 LOGGED = ("object_mae_mm", "background_mae_mm", "overall_mae_mm")
 
@@ -215,9 +217,13 @@ class DepthTraining(Training):
             )
         training_loss = losses.pop("loss")
         return {
-            "epoch": self.epoch + 1, "learning_rate": self.schedule.rate, "training_loss": training_loss, **scores,
-            **losses, "seconds": round(perf_counter() - began, 3),
-        }  # fmt: skip
+            "epoch": self.epoch + 1,
+            "learning_rate": self.schedule.rate,
+            "training_loss": training_loss,
+            **scores,
+            **losses,
+            "seconds": round(perf_counter() - began, 3),
+        }
 
     def _validate(self) -> dict[str, float | None]:
         """``validation_loss`` and the scores in `LOGGED` of the network (not distributed, not compiled): means over the
@@ -283,9 +289,17 @@ class DepthTraining(Training):
 def model_config(recipe: Recipe, network: nn.Module, data: DatasetFolder, epoch: int, scores: Record) -> ModelConfig:
     """Configuration for the weights file of a network trained on ``data``."""
     return ModelConfig(
-        name=recipe.name, title=recipe.title, network=recipe.network,
+        name=recipe.name,
+        title=recipe.title,
+        network=recipe.network,
         options=dict(network.options),  # type: ignore[arg-type, call-overload]
-        normalisation=recipe.normalisation, image_size=(recipe.size, recipe.size), dataset_fingerprint=data.fingerprint,
-        benchmark=training_benchmark(data.content), data_config=recipe.frames,
-        background_removed=recipe.background_removed, recipe=recipe.to_dict(), epoch=epoch, validation=scores,
-    )  # fmt: skip
+        normalisation=recipe.normalisation,
+        image_size=(recipe.size, recipe.size),
+        dataset_fingerprint=data.fingerprint,
+        benchmark=training_benchmark(data.content),
+        data_config=recipe.frames,
+        background_removed=recipe.background_removed,
+        recipe=recipe.to_dict(),
+        epoch=epoch,
+        validation=scores,
+    )

@@ -148,9 +148,12 @@ class Regression:
     H, W) each; `RecipeError` as `loss_function`."""
 
     def __init__(
-        self, network: nn.Module, loss_name: str, alpha: float | None = None,
+        self,
+        network: nn.Module,
+        loss_name: str,
+        alpha: float | None = None,
         further: Callable[[Tensor, Tensor], Tensor] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.modules: dict[str, nn.Module] = {"network": network}
         self.loss_name, self.alpha, self.further = loss_name, alpha, further
         self.loss = loss_function(loss_name, alpha)

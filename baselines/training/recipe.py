@@ -22,8 +22,10 @@ from fpp_ml_bench.schema import Positive, StrictModel, Text, problems_of
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"
 _LONGEST_CHAIN = 8
 _OPTION_TITLES = {
-    "standardised": "input standardised", "guided": "guided by phase", "batch_normalised": "batch normalisation",
-}  # fmt: skip
+    "standardised": "input standardised",
+    "guided": "guided by phase",
+    "batch_normalised": "batch normalisation",
+}
 """What the UNet's options are called in a title; in a name they stand as they are."""
 
 

@@ -129,10 +129,15 @@ class Display:
 
     def __init__(self, name: str, steps: int, show: bool) -> None:
         self.progress = bar.Progress(
-            bar.TextColumn("{task.description}"), bar.BarColumn(bar_width=20), bar.TextColumn("{task.fields[state]}"),
-            bar.TimeElapsedColumn(), bar.TextColumn("left at most"), bar.TimeRemainingColumn(),
-            console=Console(stderr=True, quiet=not show), disable=not show,
-        )  # fmt: skip
+            bar.TextColumn("{task.description}"),
+            bar.BarColumn(bar_width=20),
+            bar.TextColumn("{task.fields[state]}"),
+            bar.TimeElapsedColumn(),
+            bar.TextColumn("left at most"),
+            bar.TimeRemainingColumn(),
+            console=Console(stderr=True, quiet=not show),
+            disable=not show,
+        )
         self.task = self.progress.add_task(name, total=steps, state="")
 
     def __enter__(self) -> "Display":

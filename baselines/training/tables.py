@@ -7,12 +7,20 @@ ROWS: dict[str, tuple[str, ...]] = {
     "background_removed": ("raw", "global", "individual"),
     "multi_frame": ("frame0", "horizontal", "vertical", "sinusoidal", "all"),
     "loss": (
-        "rmse", "l1", "masked_rmse", "masked_l1", "hybrid_rmse_0.5", "hybrid_rmse_0.7", "hybrid_rmse_0.9",
-        "hybrid_l1_0.5", "hybrid_l1_0.7", "hybrid_l1_0.9",
+        "rmse",
+        "l1",
+        "masked_rmse",
+        "masked_l1",
+        "hybrid_rmse_0.5",
+        "hybrid_rmse_0.7",
+        "hybrid_rmse_0.9",
+        "hybrid_l1_0.5",
+        "hybrid_l1_0.7",
+        "hybrid_l1_0.9",
     ),
     "architecture": ("unet", "transunet", "resunet", "pix2pix", "pix2pixhd", "hformer"),
     "further": ("plain", "guided", "physics"),
-}  # fmt: skip
+}
 """The paper's order; ``pix2pixhd`` is the authors' code, ``hformer`` the conference version's. ``further`` is no table
 of the paper: two of its further directions, and the network without them."""
 TABLES = tuple(ROWS)
@@ -20,9 +28,13 @@ PRESETS = ("cpu", "cpu-long", "paper")
 LOSSES = ("rmse", "l1", "masked_rmse", "masked_l1", "hybrid_rmse", "hybrid_l1")
 GAN = "gan"
 NETWORK_TITLES = {
-    "unet": "UNet", "transunet": "TransUNet", "resunet": "ResUNet", "hformer": "Hformer", "pix2pix": "pix2pixHD",
+    "unet": "UNet",
+    "transunet": "TransUNet",
+    "resunet": "ResUNet",
+    "hformer": "Hformer",
+    "pix2pix": "pix2pixHD",
     "pix2pix_unet": "Pix2Pix",
-}  # fmt: skip
+}
 GENERATORS = "pix2pix", "pix2pix_unet"
 """Networks that a GAN trains."""
 

@@ -75,20 +75,41 @@ def drawn_light(random: np.random.Generator) -> Light:
     full_well_e = by_ratio(4000, 32500)
     noise_grey = by_ratio(0.1, 6.0)
     textures = str(random.choice(("none", "by_kind", "checks"), p=(0.35, 0.5, 0.15)))
-    return named_light("paper").model_copy(update={"name": "drawn"}).changed(
-        "projector", response=now_and_then(0.4, even(1.0, 2.4), 1.0), pixel_blur_px=even(0, 0.6),
-        defocus_px=now_and_then(0.6, even(0, 4.5), 0.0), falloff=int(random.choice((0, 2))),
-    ).changed(
-        "surface", albedo=even(0.4, 0.92), gloss=now_and_then(0.5, even(0.05, 0.4), 0.0), roughness=even(0.18, 0.9),
-        textures=textures, contrast=0.0 if textures == "none" else even(0.1, 0.9),
-    ).changed("bounces", shadows=bool(random.random() < 0.5)).changed(
-        "camera", blur_px=now_and_then(0.6, even(0, 2.2), 0.0), falloff=int(random.choice((0, 4))),
-        exposure=by_ratio(0.17, 2.5), black_grey=even(0, 3), full_well_e=full_well_e,
-        read_noise_e=noise_grey * full_well_e / GREY_LEVELS, bits=int(random.choice((8, 10))),
-        response=now_and_then(0.3, even(0.75, 1.25), 1.0),
-    ).changed(
-        ambient_grey=by_ratio(1.5, 70), calibration_px=now_and_then(0.3, even(0.02, 0.3), 0.0),
-    )  # fmt: skip
+    return (
+        named_light("paper")
+        .model_copy(update={"name": "drawn"})
+        .changed(
+            "projector",
+            response=now_and_then(0.4, even(1.0, 2.4), 1.0),
+            pixel_blur_px=even(0, 0.6),
+            defocus_px=now_and_then(0.6, even(0, 4.5), 0.0),
+            falloff=int(random.choice((0, 2))),
+        )
+        .changed(
+            "surface",
+            albedo=even(0.4, 0.92),
+            gloss=now_and_then(0.5, even(0.05, 0.4), 0.0),
+            roughness=even(0.18, 0.9),
+            textures=textures,
+            contrast=0.0 if textures == "none" else even(0.1, 0.9),
+        )
+        .changed("bounces", shadows=bool(random.random() < 0.5))
+        .changed(
+            "camera",
+            blur_px=now_and_then(0.6, even(0, 2.2), 0.0),
+            falloff=int(random.choice((0, 4))),
+            exposure=by_ratio(0.17, 2.5),
+            black_grey=even(0, 3),
+            full_well_e=full_well_e,
+            read_noise_e=noise_grey * full_well_e / GREY_LEVELS,
+            bits=int(random.choice((8, 10))),
+            response=now_and_then(0.3, even(0.75, 1.25), 1.0),
+        )
+        .changed(
+            ambient_grey=by_ratio(1.5, 70),
+            calibration_px=now_and_then(0.3, even(0.02, 0.3), 0.0),
+        )
+    )
 
 
 def groups_of(
@@ -99,8 +120,11 @@ def groups_of(
     ``textured_every``-th drawn light has the albedo maps and the gloss that were drawn; the others show one matte
     material."""
     training, validation = ([name for name in OBJECTS if split_of(name) == split] for split in ("train", "validation"))
-    plain = tuple((name, VIEWS[(number + 2 * turn) % len(VIEWS)])
-                  for number, name in enumerate(training) for turn in range(len(VIEWS) // 2))  # fmt: skip
+    plain = tuple(
+        (name, VIEWS[(number + 2 * turn) % len(VIEWS)])
+        for number, name in enumerate(training)
+        for turn in range(len(VIEWS) // 2)
+    )
 
     def drawn(number: int, names: list[str], count: int, split: str) -> Group:
         random = np.random.default_rng([seed, number] if split == "train" else [seed, number, 1])
@@ -128,9 +152,13 @@ def fingerprint_of(recipe: dict[str, Any], groups: list[Group]) -> str:
 
 
 def render_views(
-    groups: list[Group], rig: Rig, frames: tuple[int, ...], folder: Path, workers: int,
+    groups: list[Group],
+    rig: Rig,
+    frames: tuple[int, ...],
+    folder: Path,
+    workers: int,
     progress: Callable[[int], None] = lambda views: None,
-) -> None:  # fmt: skip
+) -> None:
     """Render what ``folder`` does not hold yet of ``frames`` (indices in the rig's sequence), a file a view. Raises
     `TrainingError` for a folder that can't be written."""
     missing = [group for group in groups if not all(_file(folder, group, *view).exists() for view in group.views)]
@@ -185,9 +213,16 @@ def read_views(folder: Path, groups: list[Group], split: str) -> Iterator[View]:
 
 
 def measured_views(
-    groups: list[Group], rig: Rig, frames: tuple[int, ...], folder: Path,
-    measure: Callable[[Iterable[View]], list[Measured]], unions: int, seed: int, workers: int, show: bool,
-) -> tuple[list[Measured], list[Measured]]:  # fmt: skip
+    groups: list[Group],
+    rig: Rig,
+    frames: tuple[int, ...],
+    folder: Path,
+    measure: Callable[[Iterable[View]], list[Measured]],
+    unions: int,
+    seed: int,
+    workers: int,
+    show: bool,
+) -> tuple[list[Measured], list[Measured]]:
     """What ``measure`` makes of the training views, with ``unions`` for each, and of the validation views; those that
     ``folder`` lacks are rendered first. ``show``: progress on stderr. Raises `TrainingError` as `render_views` and
     `read_views`."""

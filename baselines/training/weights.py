@@ -119,17 +119,26 @@ class Family:
 
 
 DEPTH_NETWORKS = Family(
-    "fpp-ml-bench", TypeAdapter(ModelConfig), "a weights file", f"{SUFFIX} file",
+    "fpp-ml-bench",
+    TypeAdapter(ModelConfig),
+    "a weights file",
+    f"{SUFFIX} file",
     "a safetensors file of something else holds no configuration to rebuild the network from",
-)  # fmt: skip
+)
 FILTER_NETWORKS = Family(
-    "fpp-ml-bench classical-net", TypeAdapter(NetConfig), "classical-net weights", "classical-net weights",
+    "fpp-ml-bench classical-net",
+    TypeAdapter(NetConfig),
+    "classical-net weights",
+    "classical-net weights",
     "give a file that fpp-bench train classical-net wrote",
-)  # fmt: skip
+)
 PHASE_NETWORKS = Family(
-    "fpp-ml-bench phase-net", TypeAdapter(NetConfig), "phase-net weights", "phase-net weights",
+    "fpp-ml-bench phase-net",
+    TypeAdapter(NetConfig),
+    "phase-net weights",
+    "phase-net weights",
     "give a file that fpp-bench train phase-net wrote",
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -269,10 +278,11 @@ def _metadata(path: Path, data: bytes, family: Family) -> dict[str, Any]:
     """The header's ``__metadata__``; refuses what is no file of ``family`` before anything is unpacked."""
     if data[:4] == b"PK\x03\x04" or (data[:1] == b"\x80" and data[1:2] in b"\x02\x03\x04\x05"):
         raise _fault(
-            path, f": expected {SUFFIX}, got a PyTorch pickle (.pt, .pth), which is never opened, because a pickle can "
+            path,
+            f": expected {SUFFIX}, got a PyTorch pickle (.pt, .pth), which is never opened, because a pickle can "
             "run code; load it where you trust it and write it with "
             "fpp_ml_bench.baselines.training.weights.save_weights",
-        )  # fmt: skip
+        )
     try:
         length = int.from_bytes(data[:8], "little")
         if len(data) < 8 or length > min(len(data) - 8, _LONGEST_HEADER):

@@ -117,8 +117,14 @@ def write_scores(
     """Write `FUSION_FILE`: the scores of all objects, their means, and by which rules. Errors as `write_object`."""
     summary = {key: {"mean": mean, "interval": interval} for key, (mean, interval) in means(objects).items()}
     document = {
-        "method": name, "dataset": dataset.fingerprint, "split": split, "cell_mm": cell_mm, "within_mm": WITHIN_MM,
-        "tolerance_mm": TOLERANCE_MM, "mean_over_objects": summary, "objects": dict(objects),
-    }  # fmt: skip
+        "method": name,
+        "dataset": dataset.fingerprint,
+        "split": split,
+        "cell_mm": cell_mm,
+        "within_mm": WITHIN_MM,
+        "tolerance_mm": TOLERANCE_MM,
+        "mean_over_objects": summary,
+        "objects": dict(objects),
+    }
     content = (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
     return write_files(out, {FUSION_FILE: content}, PredictionError)

@@ -80,11 +80,15 @@ def flag_scores(views: Sequence[PlacedView], truths: Sequence[Truth], flags: Seq
     error, flag = np.concatenate(errors), np.concatenate(flagged)
     wrong = error > corruptions().wrong_order_mm
     return {
-        "scored_px": float(error.size), "wrong_px": float(wrong.sum()), "found_px": float((flag & wrong).sum()),
+        "scored_px": float(error.size),
+        "wrong_px": float(wrong.sum()),
+        "found_px": float((flag & wrong).sum()),
         "found_share": _share(flag, wrong),
-        "false_share": _share(flag, ~wrong), "dropped_share": _share(flag, np.ones_like(wrong)),
-        "mae_mm": _mean_error(error), "kept_mae_mm": _mean_error(error[~flag]),
-    }  # fmt: skip
+        "false_share": _share(flag, ~wrong),
+        "dropped_share": _share(flag, np.ones_like(wrong)),
+        "mae_mm": _mean_error(error),
+        "kept_mae_mm": _mean_error(error[~flag]),
+    }
 
 
 def _share(flag: Flags, among: Flags) -> float | None:

@@ -46,19 +46,27 @@ def _plot(
 
     drawn = [
         SimpleNamespace(
-            title=title, dashed=number == 0, kind="ideal" if number == 0 else "curve",
+            title=title,
+            dashed=number == 0,
+            kind="ideal" if number == 0 else "curve",
             points=" ".join(f"{across(x)},{up(y)}" for x, y in points),
         )
         for number, (title, points) in enumerate(lines.items())
-    ]  # fmt: skip
+    ]
     rising = all(points[-1][1] > points[0][1] for points in lines.values())
     ticks = [step / _TICKS for step in range(_TICKS + 1)]
     ends = "; ".join(f"{title}: {write(points[0][1])} to {write(points[-1][1])}" for title, points in lines.items())
     return SimpleNamespace(
-        width=_WIDTH, height=_HEIGHT, left=_LEFT, right=_WIDTH - _RIGHT, base=base, lines=drawn, label=label,
+        width=_WIDTH,
+        height=_HEIGHT,
+        left=_LEFT,
+        right=_WIDTH - _RIGHT,
+        base=base,
+        lines=drawn,
+        label=label,
         levels=[(up(highest * tick), write(highest * tick)) for tick in ticks],
         edges=[(across(tick), percent(tick)) for tick in ticks],
         legend=[(_TOP + _LABEL_PX * number, line) for number, line in enumerate(drawn)],
         legend_x=_LEFT + 12 if rising else _WIDTH - _RIGHT - 110,
         description=f"{label[0].upper()}{label[1:]}. {ends}",
-    )  # fmt: skip
+    )

@@ -60,12 +60,19 @@ def histogram(values: Sequence[float], mean: float, label: str) -> SimpleNamespa
             box = across(low) + 1, up(count), across(high) - across(low) - 2, base - up(count)
             bars.append((*(round(number, 1) for number in box), f"{low:.4g} to {high:.4g} mm: {count}"))
     return SimpleNamespace(
-        width=_WIDTH, height=_HEIGHT, left=_LEFT, right=_WIDTH - _RIGHT, top=_TOP, base=base, bars=bars,
+        width=_WIDTH,
+        height=_HEIGHT,
+        left=_LEFT,
+        right=_WIDTH - _RIGHT,
+        top=_TOP,
+        base=base,
+        bars=bars,
         levels=[(up(count), count) for count in range(0, tallest + 1, max(1, math.ceil(tallest / 4)))],
         edges=[(across(edge), f"{edge:.4g}") for edge in edges[:: max(1, math.ceil(len(edges) / 9))]],
-        mean=mean, mean_x=across(mean),
+        mean=mean,
+        mean_x=across(mean),
         description=f"Histogram of {label} over {len(values)} samples, from {min(values):.4g} to {max(values):.4g} mm",
-    )  # fmt: skip
+    )
 
 
 PANEL_PX = 320

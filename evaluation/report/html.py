@@ -81,13 +81,21 @@ def _environment(package: str) -> Any:  # a jinja2.Environment
 
     environment = jinja2.Environment(
         loader=jinja2.ChoiceLoader([jinja2.PackageLoader(p) for p in (package, __package__)]),
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True,
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
         keep_trailing_newline=True,
-    )  # fmt: skip
+    )
     environment.filters |= {
-        "printable": printable, "millimetres": millimetres, "percent": percent, "seconds": seconds, "signed": signed,
-        "interval_text": partial(interval_text, between=".."), "source": _source,
-    }  # fmt: skip
+        "printable": printable,
+        "millimetres": millimetres,
+        "percent": percent,
+        "seconds": seconds,
+        "signed": signed,
+        "interval_text": partial(interval_text, between=".."),
+        "source": _source,
+    }
     return environment
 
 

@@ -22,17 +22,27 @@ REPORT_FILE = "index.html"
 _PLACES = (("Best", 0.0), ("Worst", 1.0), ("Median", 0.5), ("Lower quartile", 0.25), ("Upper quartile", 0.75))
 """The samples that are shown and their place by error, in the order in which they are chosen where there are few."""
 _TITLES = {
-    "object_mae_mm": "Object MAE", "object_mae_range_share": "Object MAE, share of its depth range",
-    "object_rmse_mm": "Object RMSE", "overall_mae_mm": "Overall MAE",
-    "overall_rmse_mm": "Overall RMSE", "background_mae_mm": "Background MAE", "background_rmse_mm": "Background RMSE",
-    "object_median_mm": "Object, median error", "object_p95_mm": "Object, 95th percentile",
-    "object_max_mm": "Object, largest error", "object_within_1mm_share": "Object within 1 mm",
-    "object_within_2mm_share": "Object within 2 mm", "object_within_5mm_share": "Object within 5 mm",
-    "object_within_10mm_share": "Object within 10 mm", "object_bias_mm": "Object, signed bias",
+    "object_mae_mm": "Object MAE",
+    "object_mae_range_share": "Object MAE, share of its depth range",
+    "object_rmse_mm": "Object RMSE",
+    "overall_mae_mm": "Overall MAE",
+    "overall_rmse_mm": "Overall RMSE",
+    "background_mae_mm": "Background MAE",
+    "background_rmse_mm": "Background RMSE",
+    "object_median_mm": "Object, median error",
+    "object_p95_mm": "Object, 95th percentile",
+    "object_max_mm": "Object, largest error",
+    "object_within_1mm_share": "Object within 1 mm",
+    "object_within_2mm_share": "Object within 2 mm",
+    "object_within_5mm_share": "Object within 5 mm",
+    "object_within_10mm_share": "Object within 10 mm",
+    "object_bias_mm": "Object, signed bias",
     "object_valid_bias_mm": "Object where predicted, signed bias",
     "object_shift_free_mae_mm": "Object MAE without one offset",
-    "object_interior_mae_mm": "Object away from edges, MAE", "object_interior_rmse_mm": "Object away from edges, RMSE",
-    "object_edge_mae_mm": "Object along edges, MAE", "object_edge_rmse_mm": "Object along edges, RMSE",
+    "object_interior_mae_mm": "Object away from edges, MAE",
+    "object_interior_rmse_mm": "Object away from edges, RMSE",
+    "object_edge_mae_mm": "Object along edges, MAE",
+    "object_edge_rmse_mm": "Object along edges, RMSE",
     "object_valid_mae_mm": "Object where predicted, MAE",
     "object_interior_valid_mae_mm": "Object where predicted, away from edges, MAE",
     "object_missing_share": "Object not predicted",
@@ -41,9 +51,12 @@ _TITLES = {
     "object_wide_band_mae_mm": "Object within 8 px of edges, MAE",
     "object_wide_interior_mae_mm": "Object 8 px or more from edges, MAE",
     "object_wide_band_share": "Object within 8 px of edges, share of pixels",
-    "void_share": "Void, share of the image", "unlit_mae_mm": "Unlit, MAE", "unlit_rmse_mm": "Unlit, RMSE",
-    "unlit_valid_mae_mm": "Unlit where predicted, MAE", "unlit_missing_share": "Unlit, not predicted",
-}  # fmt: skip
+    "void_share": "Void, share of the image",
+    "unlit_mae_mm": "Unlit, MAE",
+    "unlit_rmse_mm": "Unlit, RMSE",
+    "unlit_valid_mae_mm": "Unlit where predicted, MAE",
+    "unlit_missing_share": "Unlit, not predicted",
+}
 """Every key of `METRICS` in the order of the page."""
 
 
@@ -138,10 +151,14 @@ def score_table(result: Result) -> str:
 _UNCERTAINTY_TITLES = {
     "unstated_share": "Object without a sigma",
     **{f"coverage_{level}": f"Pixels with a sigma in their {level}% interval" for level in COVERED},
-    "sigma_mean_mm": "Mean sigma", "sigma_median_mm": "Median sigma", "nll": "Negative log-likelihood, nats",
-    "ause_mae_mm": "AUSE, MAE", "ause_rmse_mm": "AUSE, RMSE", "sure_mae_mm": "MAE of the surest 95%",
+    "sigma_mean_mm": "Mean sigma",
+    "sigma_median_mm": "Median sigma",
+    "nll": "Negative log-likelihood, nats",
+    "ause_mae_mm": "AUSE, MAE",
+    "ause_rmse_mm": "AUSE, RMSE",
+    "sure_mae_mm": "MAE of the surest 95%",
     "sure_rmse_mm": "RMSE of the surest 95%",
-}  # fmt: skip
+}
 """Every key of `UNCERTAINTY` in the order of the page."""
 
 

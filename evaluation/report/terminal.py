@@ -108,11 +108,12 @@ def _uncertainty(result: Result) -> Table | None:
         return None
     titles = ["Not\nstated", *(f"In {level}%\ninterval" for level in COVERED), "Sigma\nmean", "Sigma\nmedian", "NLL"]
     table = _table(
-        "Stated uncertainty", numbers=[*titles, "AUSE\nMAE", "MAE of the\nsurest 95%"],
+        "Stated uncertainty",
+        numbers=[*titles, "AUSE\nMAE", "MAE of the\nsurest 95%"],
         first_out=["Sigma\nmedian", "NLL", "In 99%\ninterval", "MAE of the\nsurest 95%"],
         caption="mm; of the pixels that state a sigma, those within its Gaussian intervals, means over samples; AUSE: "
         "area between the sparsification curves by sigma and by error, over all object pixels",
-    )  # fmt: skip
+    )
     for name, scores in {"all": block.metrics, **block.per_object}.items():
         cells = [percent(scores.unstated_share), *(percent(getattr(scores, f"coverage_{lv}")) for lv in COVERED)]
         cells += map(millimetres, (scores.sigma_mean_mm, scores.sigma_median_mm))
@@ -147,9 +148,13 @@ def comparison_table(compared: report.Comparison) -> Group:
         counts = (row.lower, row.higher, row.samples, row.objects)
         p = "-" if row.sign_flip_p is None else f"{row.sign_flip_p:.3g}"
         table.add_row(
-            f"{pixels} {error.upper()}", signed(row.mean_mm), interval_text(row.interval, ".."), p, *map(str, counts),
+            f"{pixels} {error.upper()}",
+            signed(row.mean_mm),
+            interval_text(row.interval, ".."),
+            p,
+            *map(str, counts),
             style="bold" if row.told_apart and (row.sign_flip_p or 1.0) <= SIGNIFICANT else None,
-        )  # fmt: skip
+        )
     title = Text(
         f"\nfirst:  {printable(compared.first)}\nsecond: {printable(compared.second)}\n"
         f"{compared.split} split (content {compared.truth[:8]}), against {compared.target}, "

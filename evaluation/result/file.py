@@ -23,11 +23,12 @@ from fpp_ml_bench.machine import describe_hardware
 from fpp_ml_bench.schema import validate
 
 _OTHER_FILES = {
-    "shards": "the manifest of a dataset", "row_schema_version": "a row file of the leaderboard",
+    "shards": "the manifest of a dataset",
+    "row_schema_version": "a row file of the leaderboard",
     "groups": "a ranking, as fpp-bench leaderboard --json writes it",
     "differences": "a comparison, as fpp-eval compare --json writes it",
     "tradeoff_schema_version": "what fpp-bench tradeoff measured",
-}  # fmt: skip
+}
 """JSON files of this package that are no results, by a key that only they have."""
 
 
@@ -101,8 +102,10 @@ def json_schema(name: str) -> dict[str, Any]:
     """JSON Schema (draft 2020-12) of ``result``, ``submission`` or ``comparison``. It lists the keys and what each may
     hold. Whether averages follow from the samples is checked on reading."""
     models: dict[str, type[pydantic.BaseModel]] = {
-        "result": Result, "submission": submission.Submission, "comparison": report.Comparison,
-    }  # fmt: skip
+        "result": Result,
+        "submission": submission.Submission,
+        "comparison": report.Comparison,
+    }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": f"fpp-ml-bench {name}, schema version {RESULT_SCHEMA_VERSION}",

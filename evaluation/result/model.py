@@ -242,9 +242,7 @@ def _check_void(row: SampleResult, pixels: int, void: bool, unlit: bool) -> None
         raise ValueError(f"{row.sample}: unlit RMSE is below its MAE, which no error has")
 
 
-def check_data(
-    data: parts.DatasetInfo, target: str, mode: str, units: str, found: Mapping[str, Counts]
-) -> None:  # fmt: skip
+def check_data(data: parts.DatasetInfo, target: str, mode: str, units: str, found: Mapping[str, Counts]) -> None:
     """Refuse (ValueError) a content of other columns than the rules read, and a named benchmark whose samples, objects
     or pixels are others than those ``found`` in a file."""
     splits = {name.partition("/")[0] for name in data.content}

@@ -115,12 +115,16 @@ def uncertainty_of(samples: Mapping[str, SigmaSample], owners: Mapping[str, str]
     observed = [sample.observed for sample in samples.values() if sample.observed is not None]
     curves = [sample.curves for sample in samples.values() if sample.curves is not None]
     return Uncertainty(
-        metrics=_mean(per_sample.values()), per_object=_per_object(per_sample, owners), per_sample=per_sample,
+        metrics=_mean(per_sample.values()),
+        per_object=_per_object(per_sample, owners),
+        per_sample=per_sample,
         reliability=Reliability(nominal=list(NOMINAL), observed=_mean_curve(observed)) if observed else None,
         sparsification=Sparsification(
             left_out=list(LEFT_OUT), **{name: _mean_curve([of[name] for of in curves]) for name in curves[0]}
-        ) if curves else None,
-    )  # fmt: skip
+        )
+        if curves
+        else None,
+    )
 
 
 def _mean_curve(curves: list[list[float]]) -> list[float]:

@@ -19,9 +19,14 @@ Maps = NDArray[Any] | Sequence[NDArray[Any]]
 
 
 def evaluate_arrays(
-    predictions: Maps, targets: Maps, flags: Maps | None = None, sigma: Maps | None = None,
-    objects: Sequence[str] | None = None, edge_band_px: int = protocol.EDGE_BAND_PX, units: str | None = None,
-) -> "result.ArrayScores":  # fmt: skip
+    predictions: Maps,
+    targets: Maps,
+    flags: Maps | None = None,
+    sigma: Maps | None = None,
+    objects: Sequence[str] | None = None,
+    edge_band_px: int = protocol.EDGE_BAND_PX,
+    units: str | None = None,
+) -> "result.ArrayScores":
     """Score depth in mm, 0 = background or not measured, against depth in mm, 0 = background: floats (N, H, W), or N
     maps (H, W) that may differ in size. Pixels that a masked array of targets masks count in no set. ``flags``: whole
     numbers, bits of `loaders.sample.Flag`, whose void pixels count in no set. ``sigma``: the standard uncertainty in
@@ -103,9 +108,13 @@ def _void(targets: NDArray[Any], flags: NDArray[Any] | None) -> NDArray[np.bool_
 
 
 def _scored(
-    predictions: NDArray[Any], targets: NDArray[Any], edge_band_px: int, flags: NDArray[Any] | None = None,
-    sigma: NDArray[Any] | None = None, units: str | None = None,
-) -> tuple[dict[str, Any], SigmaSample | None]:  # fmt: skip
+    predictions: NDArray[Any],
+    targets: NDArray[Any],
+    edge_band_px: int,
+    flags: NDArray[Any] | None = None,
+    sigma: NDArray[Any] | None = None,
+    units: str | None = None,
+) -> tuple[dict[str, Any], SigmaSample | None]:
     for name, values in (("predictions", predictions), ("targets", targets), ("sigma", sigma)):
         if values is not None and values.dtype.kind != "f":
             raise PredictionError(f"{name}: expected real floats, got {values.dtype}")

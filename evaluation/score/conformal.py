@@ -160,13 +160,16 @@ def write_calibrated(calibration: Calibration, folder: Path, dataset: DatasetFol
         sigma_mm = submission.read_sigma(folder, sample, dataset.size).astype(np.float64) * calibration.factor
         np.save(out / f"{sample}{submission.SIGMA}", sigma_mm.astype(np.float32))
     settings = {
-        FACTOR_KEY: calibration.factor, "conformal_coverage": calibration.coverage,
-        "conformal_split": calibration.split, "conformal_objects": calibration.objects,
+        FACTOR_KEY: calibration.factor,
+        "conformal_coverage": calibration.coverage,
+        "conformal_split": calibration.split,
+        "conformal_objects": calibration.objects,
         "conformal_target": calibration.target,
-    }  # fmt: skip
+    }
     content = description.model_dump(exclude_unset=True) | {
-        "name": f"{description.name}, conformal sigma", "settings": {**description.settings, **settings},
-    }  # fmt: skip
+        "name": f"{description.name}, conformal sigma",
+        "settings": {**description.settings, **settings},
+    }
     text = submission.check_submission(out, content).to_yaml()
     write_atomically(out / submission.SUBMISSION_FILE, text.encode("utf-8"))
     return len(checked.samples)

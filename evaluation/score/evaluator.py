@@ -35,10 +35,14 @@ Outcome = tuple[list[str], list[dict[str, Any]]]
 
 
 def evaluate(
-    folder: str | Path, dataset: DatasetFolder, split: str = "test", target: str = "depth",
-    edge_band_px: int = protocol.EDGE_BAND_PX, mode: str = "standard",
+    folder: str | Path,
+    dataset: DatasetFolder,
+    split: str = "test",
+    target: str = "depth",
+    edge_band_px: int = protocol.EDGE_BAND_PX,
+    mode: str = "standard",
     while_scoring: Callable[[], object] = lambda: None,
-) -> result.Result:  # fmt: skip
+) -> result.Result:
     """Score ``folder`` (predictions in one of the accepted forms, and ``submission.yaml``) on a split of ``dataset``.
 
     ``target`` is ``depth`` (decoded, as in the paper) or ``depth_exact`` (from the ray cast); ``mode`` is ``standard``
@@ -159,9 +163,16 @@ def _samples(folder: Path, dataset: DatasetFolder, split: str, target: str, mode
 
 
 def _scored(
-    reader: submission.Reader, samples: list[str], dataset: DatasetFolder, target_name: str, units: Units,
-    rule: RangeRule, mode: Mode, edge_band_px: int, sigmas: Path | None,
-) -> Iterable[Outcome]:  # fmt: skip
+    reader: submission.Reader,
+    samples: list[str],
+    dataset: DatasetFolder,
+    target_name: str,
+    units: Units,
+    rule: RangeRule,
+    mode: Mode,
+    edge_band_px: int,
+    sigmas: Path | None,
+) -> Iterable[Outcome]:
     """Problems and row of each sample that has a prediction, in order; the files of its uncertainty in the folder
     ``sigmas`` are checked. Work begins with this call, in threads, before the first outcome is taken from the
     iterator."""
@@ -250,9 +261,10 @@ def _uncertainty_differences(stored: result.Uncertainty | None, recomputed: resu
         return [] if stored is recomputed else [f"uncertainty: {blocks[0]} in the result, {blocks[1]} recomputed"]
     lines = []
     for name in ("reliability", "sparsification"):
-        first, second = ([] if part is None else list(part.model_dump().values()) for part in (
-            getattr(stored, name), getattr(recomputed, name)
-        ))  # fmt: skip
+        first, second = (
+            [] if part is None else list(part.model_dump().values())
+            for part in (getattr(stored, name), getattr(recomputed, name))
+        )
         pairs = [pair for curves in zip(first, second, strict=False) for pair in zip(*curves, strict=True)]
         if len(first) != len(second) or not all(result.same(*pair, 1e-12) for pair in pairs):
             lines.append(f"uncertainty.{name}: the curve in the result is not the one recomputed")
@@ -300,15 +312,25 @@ def explain_eval(dataset: DatasetFolder, split: str, target: str, edge_band_px: 
     seconds = saved_by(lambda: object_near_edges(depth_mm, bands), depth_mm.size - boxes[median], skipped)
     lines = [
         LeftOut(
-            "columns that no score needs", "images", len(samples) * read, len(samples) * (frames + depths - read),
-            unread_bytes, None, "not read; seconds not measured, they depend on the disk",
+            "columns that no score needs",
+            "images",
+            len(samples) * read,
+            len(samples) * (frames + depths - read),
+            unread_bytes,
+            None,
+            "not read; seconds not measured, they depend on the disk",
         ),
         LeftOut(
-            "depth edges far from the object", "pixels", sum(boxes.values()), skipped, None, seconds,
+            "depth edges far from the object",
+            "pixels",
+            sum(boxes.values()),
+            skipped,
+            None,
+            seconds,
             f"processor seconds of one sample ({median}) without skipping minus with it, measured now, scaled to the "
             "pixels that all samples skipped",
         ),
-    ]  # fmt: skip
+    ]
     return explained("fpp-eval", f"{len(samples)} samples of {width}x{height} px", lines)
 
 

@@ -133,9 +133,14 @@ def _background(prediction: Map, target: Map, void: NDArray[np.bool_] | None) ->
 
 _EDGE, _WIDE, _MISSING = 1, 2, 4
 _SETS = (
-    *PIXEL_SETS, "object_interior", "object_edge", "object_valid", "object_interior_valid", "object_wide_band",
+    *PIXEL_SETS,
+    "object_interior",
+    "object_edge",
+    "object_valid",
+    "object_interior_valid",
+    "object_wide_band",
     "object_wide_interior",
-)  # fmt: skip
+)
 
 
 def _zones(bits: int, value: int) -> property:
@@ -190,10 +195,12 @@ class SampleScores:
         unlit, measured = self.unlit or (EMPTY, EMPTY)
         values |= {
             "void_share": None if self.void is None else void / (whole + self.background.pixels + void),
-            "unlit_mae_mm": unlit.mae_mm, "unlit_rmse_mm": unlit.rmse_mm, "unlit_valid_mae_mm": measured.mae_mm,
+            "unlit_mae_mm": unlit.mae_mm,
+            "unlit_rmse_mm": unlit.rmse_mm,
+            "unlit_valid_mae_mm": measured.mae_mm,
             "unlit_missing_share": _share(unlit.pixels - measured.pixels, unlit.pixels),
             protocol.RANGE_SHARE: _share(sets["object"].mae_mm or 0.0, self.range_mm),
-        }  # fmt: skip
+        }
         optional = {key for key in protocol.SINCE_2 if values[key] is None}
         return {key: values[key] for key in protocol.METRICS if key not in optional}
 
@@ -210,9 +217,12 @@ def _share(part: float, whole: float) -> float | None:
 
 @np.errstate(over="ignore")  # an overflow is no warning here: `_from_sums` refuses it
 def score_sample(
-    prediction_mm: Map, target_mm: Map, edge_band_px: int = EDGE_BAND_PX, void: NDArray[np.bool_] | None = None,
+    prediction_mm: Map,
+    target_mm: Map,
+    edge_band_px: int = EDGE_BAND_PX,
+    void: NDArray[np.bool_] | None = None,
     unlit_mm: Map | None = None,
-) -> SampleScores:  # fmt: skip
+) -> SampleScores:
     """Score one depth map against its target.
 
     ``prediction_mm`` (H, W) float16, float32 or float64 in mm; ``target_mm`` (H, W) float in mm, 0 = background. Pixel

@@ -58,9 +58,12 @@ class ReadingProcess:
         one_thread = dict.fromkeys(THREAD_COUNTS, "1")  # each thread's stack would count as memory
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", __name__, str(theirs.fileno()), *self._arguments],
-            pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            pass_fds=[theirs.fileno()],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
             env={**os.environ, **one_thread, "ARROW_DEFAULT_MEMORY_POOL": "system"},
-        )  # fmt: skip
+        )
         theirs.close()
         self._end = weakref.finalize(self, _end, self._process, self._connection)
         self._running = True

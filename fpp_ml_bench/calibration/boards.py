@@ -117,9 +117,11 @@ class Board:
             picture = stretched if dark else 255 - stretched
             for clustering in (0, cv2.CALIB_CB_CLUSTERING):
                 found, centres = cv2.findCirclesGrid(
-                    picture, (self.columns, self.rows), flags=flags + clustering,
+                    picture,
+                    (self.columns, self.rows),
+                    flags=flags + clustering,
                     blobDetector=cv2.SimpleBlobDetector_create(settings),  # type: ignore[attr-defined]
-                )  # fmt: skip
+                )
                 if found:
                     return centres
         return None

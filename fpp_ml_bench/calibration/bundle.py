@@ -140,10 +140,16 @@ class Bundle:
             raise CalibrationError(f"{len(poses)} poses give too few points for {unknowns} unknowns: capture more")
         try:
             found = least_squares(
-                lambda step: system(step)[0], np.zeros(unknowns), lambda step: system(step)[1], method="lm",
+                lambda step: system(step)[0],
+                np.zeros(unknowns),
+                lambda step: system(step)[1],
+                method="lm",
                 x_scale=1 / np.maximum(np.linalg.norm(system(np.zeros(unknowns))[1], axis=0), 1e-300),
-                ftol=TOLERANCE, xtol=TOLERANCE, gtol=TOLERANCE, max_nfev=300,
-            )  # fmt: skip
+                ftol=TOLERANCE,
+                xtol=TOLERANCE,
+                gtol=TOLERANCE,
+                max_nfev=300,
+            )
         except (ValueError, cv2.error) as error:  # coordinates that are not finite any more
             raise CalibrationError(f"the fit of the rig failed ({error}): look at the poses") from error
         return start + free @ found.x, system(found.x)[1], free

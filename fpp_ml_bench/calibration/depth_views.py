@@ -40,9 +40,13 @@ class DepthView:
 
 
 def view_from_maps(
-    name: str, camera: Pinhole, periods: Mapping[Direction, NDArray], depth_mm: NDArray,
-    modulation: Mapping[Direction, NDArray] | None = None, most_px: int = MOST_PX,
-) -> DepthView:  # fmt: skip
+    name: str,
+    camera: Pinhole,
+    periods: Mapping[Direction, NDArray],
+    depth_mm: NDArray,
+    modulation: Mapping[Direction, NDArray] | None = None,
+    most_px: int = MOST_PX,
+) -> DepthView:
     """A view from maps (H, W) of the camera's size: absolute phase / 2 pi of both directions, NaN = not decoded, and
     depth in mm, 0 = none. ``modulation`` in grey levels (default: the same at all pixels). At most ``most_px`` pixels
     are kept, spread evenly. Raises `CalibrationError` for an absent direction, maps of another size, or depth that is
@@ -75,9 +79,12 @@ def view_from_maps(
 
 
 def view_from_frames(
-    name: str, frames: Sequence[NDArray[np.uint8]] | NDArray[np.uint8], depth_mm: NDArray, rig: Rig,
+    name: str,
+    frames: Sequence[NDArray[np.uint8]] | NDArray[np.uint8],
+    depth_mm: NDArray,
+    rig: Rig,
     most_px: int = MOST_PX,
-) -> DepthView:  # fmt: skip
+) -> DepthView:
     """A view from all frames of ``rig.sequence``, uint8 (H, W) each, and depth in mm (H, W), 0 = none. Of ``rig``, only
     the camera and the sequence are used. Raises `DecodeError` as `decode_stack`, `CalibrationError` as
     `view_from_maps`."""
@@ -86,9 +93,11 @@ def view_from_frames(
     middle = (_CODED_PX - 1) / 2
     pitch_px = {direction: 2.0 * (_CODED_PX >> rig.sequence.bits(direction)) for direction in AXES}
     coded = replace(
-        rig, projector=Pinhole(_CODED_PX, _CODED_PX, _CODED_PX, _CODED_PX, middle, middle),
-        pitch_horizontal_px=pitch_px["horizontal"], pitch_vertical_px=pitch_px["vertical"],
-    )  # fmt: skip
+        rig,
+        projector=Pinhole(_CODED_PX, _CODED_PX, _CODED_PX, _CODED_PX, middle, middle),
+        pitch_horizontal_px=pitch_px["horizontal"],
+        pitch_vertical_px=pitch_px["vertical"],
+    )
     measured = decode_stack(frames, coded, details=True).details
     periods = {direction: measured[direction].coordinate_px / pitch_px[direction] for direction in AXES}
     modulation = {direction: measured[direction].modulation for direction in AXES}

@@ -70,9 +70,15 @@ class DepthFit:
 
 
 def fit_projector(
-    views: Iterable[DepthView], rig: Rig, size: tuple[int, int] | None = None, *, pitch_px: Pair | None = None,
-    focal_px: float | None = None, lens: bool = False, most_px: int = MOST_PX,
-) -> tuple[Rig, DepthFit]:  # fmt: skip
+    views: Iterable[DepthView],
+    rig: Rig,
+    size: tuple[int, int] | None = None,
+    *,
+    pitch_px: Pair | None = None,
+    focal_px: float | None = None,
+    lens: bool = False,
+    most_px: int = MOST_PX,
+) -> tuple[Rig, DepthFit]:
     """The rig whose projector gives the views' depth from their phases, by robust least squares over all of them.
 
     Of ``rig`` the camera, the sequence and the distances are kept; the working range is widened to hold the depths.
@@ -212,11 +218,15 @@ def _rig_of(found: Projector, rig: Rig, size: tuple[int, int], depths_mm: NDArra
     x, y, z = (float(found.values[name]) for name in ("t_x", "t_y", "t_z"))
     try:
         return replace(
-            rig, projector=Pinhole(*size, focal, focal * aspect, c_u, c_v, (found.values["k1"], 0.0, 0.0, 0.0, 0.0)),
-            rotation=tuple(map(tuple, found.rotation.tolist())), translation_m=(x, y, z),
-            pitch_vertical_px=found.values["pitch_u"], pitch_horizontal_px=found.values["pitch_v"],
-            working_range_mm=(near, far), background_m=max(rig.background_m, far / MM_PER_M + _BEHIND_M),
-        )  # fmt: skip
+            rig,
+            projector=Pinhole(*size, focal, focal * aspect, c_u, c_v, (found.values["k1"], 0.0, 0.0, 0.0, 0.0)),
+            rotation=tuple(map(tuple, found.rotation.tolist())),
+            translation_m=(x, y, z),
+            pitch_vertical_px=found.values["pitch_u"],
+            pitch_horizontal_px=found.values["pitch_v"],
+            working_range_mm=(near, far),
+            background_m=max(rig.background_m, far / MM_PER_M + _BEHIND_M),
+        )
     except RigError as error:
         raise CalibrationError(f"the projector found is not one of this sequence and size: {error}") from error
 

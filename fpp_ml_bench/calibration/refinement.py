@@ -102,9 +102,17 @@ def refined(measured: Measured, start: Projector, free: frozenset[str]) -> Proje
     begin = np.array([start.values[name] for name in names])
     knee_px = max(3 * _sigma(residuals_px(begin)), _SMALLEST_PX)
     solution = least_squares(
-        residuals_px, begin, jac="3-point", loss="soft_l1", f_scale=knee_px, x_scale="jac", max_nfev=_MOST_EVALUATIONS,
-        xtol=1e-12, ftol=1e-12, gtol=1e-12,
-    )  # fmt: skip
+        residuals_px,
+        begin,
+        jac="3-point",
+        loss="soft_l1",
+        f_scale=knee_px,
+        x_scale="jac",
+        max_nfev=_MOST_EVALUATIONS,
+        xtol=1e-12,
+        ftol=1e-12,
+        gtol=1e-12,
+    )
     jacobian = solution.jac
     lengths = np.linalg.norm(jacobian, axis=0)
     condition = np.inf if not (lengths > 0).all() else float(np.linalg.cond(np.linalg.qr(jacobian / lengths, mode="r")))

@@ -34,9 +34,13 @@ def draw_residuals(calibration: Calibration) -> bytes:
         scatter.axhline(0, color="0.6", lw=0.6)
         scatter.axvline(0, color="0.6", lw=0.6)
         cover.set(
-            title=f"{name}: points and residuals (enlarged)", xlabel="column, px", ylabel="row, px", aspect="equal",
-            xlim=(-0.5, device.width - 0.5), ylim=(device.height - 0.5, -0.5),
-        )  # fmt: skip
+            title=f"{name}: points and residuals (enlarged)",
+            xlabel="column, px",
+            ylabel="row, px",
+            aspect="equal",
+            xlim=(-0.5, device.width - 0.5),
+            ylim=(device.height - 0.5, -0.5),
+        )
     _bars(plots[0, 2], calibration)
     plots[1, 2].axis("off")
     handles, labels = plots[0, 0].get_legend_handles_labels()

@@ -105,9 +105,13 @@ def _start(
             matrix, distortion = np.array(matrix, dtype=np.float64), np.ravel(distortion).astype(np.float64)
             matrix[:2, 2] += np.array(size)
             error, matrix, distortion, turns, shifts = cv2.calibrateCamera(
-                objects, [image + margin for image in images], tuple(3 * length for length in size), matrix,
-                np.resize(distortion, 5), flags=lens.flags + cv2.CALIB_USE_INTRINSIC_GUESS,
-            )  # fmt: skip
+                objects,
+                [image + margin for image in images],
+                tuple(3 * length for length in size),
+                matrix,
+                np.resize(distortion, 5),
+                flags=lens.flags + cv2.CALIB_USE_INTRINSIC_GUESS,
+            )
             matrix = np.array(matrix, dtype=np.float64)
             matrix[:2, 2] -= np.array(size)
         except cv2.error as problem:
@@ -167,9 +171,16 @@ def rms_px(*residuals: NDArray[np.float64]) -> float:
 
 
 def _result(
-    bundle: Bundle, x: NDArray, root: NDArray, unknowns: int, alone: tuple[float, float], held_out: list[float],
-    board: Board, sizes: tuple, baseline_mm: float | None,
-) -> Calibration:  # fmt: skip
+    bundle: Bundle,
+    x: NDArray,
+    root: NDArray,
+    unknowns: int,
+    alone: tuple[float, float],
+    held_out: list[float],
+    board: Board,
+    sizes: tuple,
+    baseline_mm: float | None,
+) -> Calibration:
     sigma = np.linalg.norm(root, axis=1)
     devices = []
     for part, lens, (width, height) in zip((bundle.camera, bundle.projector), bundle.lenses, sizes, strict=True):
@@ -195,18 +206,38 @@ def _result(
         place = x[bundle.pose(index)]
         fitted.append(
             FittedPose(
-                pose.name, tuple(place[:3].tolist()), tuple((factor * place[3:]).tolist()), rms_px(residuals[0]),
-                rms_px(residuals[1]), rms_px(*residuals), held_out[index], *bundle.targets[index], *residuals,
+                pose.name,
+                tuple(place[:3].tolist()),
+                tuple((factor * place[3:]).tolist()),
+                rms_px(residuals[0]),
+                rms_px(residuals[1]),
+                rms_px(*residuals),
+                held_out[index],
+                *bundle.targets[index],
+                *residuals,
             )
-        )  # fmt: skip
+        )
     rotation = cv2.Rodrigues(turn)[0].tolist()
     return Calibration(
-        devices[0], devices[1], tuple(map(tuple, rotation)), tuple((factor * shift).tolist()),
-        tuple(sigma[bundle.stereo][:3].tolist()), tuple((factor * np.linalg.norm(of_shift, axis=1)).tolist()),
-        factor * baseline_sigma, board.spacing_mm * factor, scale, rms_px(*every[0]), rms_px(*every[1]),
-        rms_px(*every[0], *every[1]), alone, bundle.extra_px, _bic(bundle, x, unknowns), bundle.free_board,
-        factor * x[bundle.board].reshape(-1, 3), tuple(fitted),
-    )  # fmt: skip
+        devices[0],
+        devices[1],
+        tuple(map(tuple, rotation)),
+        tuple((factor * shift).tolist()),
+        tuple(sigma[bundle.stereo][:3].tolist()),
+        tuple((factor * np.linalg.norm(of_shift, axis=1)).tolist()),
+        factor * baseline_sigma,
+        board.spacing_mm * factor,
+        scale,
+        rms_px(*every[0]),
+        rms_px(*every[1]),
+        rms_px(*every[0], *every[1]),
+        alone,
+        bundle.extra_px,
+        _bic(bundle, x, unknowns),
+        bundle.free_board,
+        factor * x[bundle.board].reshape(-1, 3),
+        tuple(fitted),
+    )
 
 
 def _bic(bundle: Bundle, x: NDArray, unknowns: int) -> float:

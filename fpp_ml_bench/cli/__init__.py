@@ -90,9 +90,12 @@ def count(most: int = 100_000) -> Callable[[str], int]:
 def add_pool_options(parser: argparse.ArgumentParser) -> None:
     """``--workers`` and ``--cluster``, for `workers_of`."""
     parser.add_argument("--workers", type=int, metavar="N", help="processes (default: as many as there are processors)")
-    parser.add_argument("--cluster", metavar="ADDRESS",
-                        help="all CPUs of a Ray cluster instead: ray://HOST:10001, or HOST:6379 on one of its nodes; "
-                             "they must share the output folder, or write to a URL (docs/scale.md)")  # fmt: skip
+    parser.add_argument(
+        "--cluster",
+        metavar="ADDRESS",
+        help="all CPUs of a Ray cluster instead: ray://HOST:10001, or HOST:6379 on one of its nodes; "
+        "they must share the output folder, or write to a URL (docs/scale.md)",
+    )
 
 
 def workers_of(args: argparse.Namespace) -> int:

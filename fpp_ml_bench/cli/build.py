@@ -32,32 +32,59 @@ EXAMPLES = (
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("out", type=place, metavar="OUT",
-                        help="new folder, or one whose build was interrupted; or a URL: s3://bucket/set")  # fmt: skip
+    parser.add_argument(
+        "out",
+        type=place,
+        metavar="OUT",
+        help="new folder, or one whose build was interrupted; or a URL: s3://bucket/set",
+    )
     parser.add_argument("--preset", choices=tuple(PRESETS), default="mini", help="objects and size (default: mini)")
     parser.add_argument("--size", type=int, metavar="PX", help="image width and height (default: the preset's)")
     parser.add_argument("--objects", metavar="A,B", help="objects by name, comma separated (default: the preset's)")
-    parser.add_argument("--placement", choices=("fixed", "varied"), default="fixed",
-                        help="all objects at the standoff, or a distance drawn per view")  # fmt: skip
+    parser.add_argument(
+        "--placement",
+        choices=("fixed", "varied"),
+        default="fixed",
+        help="all objects at the standoff, or a distance drawn per view",
+    )
     parser.add_argument("--frames", choices=CONFIGS, help="frames to store (default: all; with --rig crossed: crossed)")
     parser.add_argument("--seed", type=int, default=42, help="seed of noise and placement (default: 42)")
     add_pool_options(parser)
-    parser.add_argument("--rig", default="paper", metavar="paper|crossed|FILE",
-                        help="the paper's, the same with crossed fringes, or a rig file (default: paper)")  # fmt: skip
-    parser.add_argument("--decode-with", type=Path, metavar="FILE",
-                        help="rig that a calibration found: it decodes the ground truth and is the dataset's; "
-                             "--rig photographs")  # fmt: skip
+    parser.add_argument(
+        "--rig",
+        default="paper",
+        metavar="paper|crossed|FILE",
+        help="the paper's, the same with crossed fringes, or a rig file (default: paper)",
+    )
+    parser.add_argument(
+        "--decode-with",
+        type=Path,
+        metavar="FILE",
+        help="rig that a calibration found: it decodes the ground truth and is the dataset's; --rig photographs",
+    )
     parser.add_argument("--pitch", type=float, metavar="PX", help="fringe period in projector px, both directions")
-    parser.add_argument("--light", default="paper", metavar="NAME|FILE",
-                        help="paper, workshop, hard, or a YAML file with other numbers (default: paper)")  # fmt: skip
-    parser.add_argument("--noise-sigma", type=float, metavar="GREY",
-                        help="sensor noise at mid-grey, grey levels of 255, half of its variance shot noise "
-                             "(default: the light's)")  # fmt: skip
+    parser.add_argument(
+        "--light",
+        default="paper",
+        metavar="NAME|FILE",
+        help="paper, workshop, hard, or a YAML file with other numbers (default: paper)",
+    )
+    parser.add_argument(
+        "--noise-sigma",
+        type=float,
+        metavar="GREY",
+        help="sensor noise at mid-grey, grey levels of 255, half of its variance shot noise (default: the light's)",
+    )
     parser.add_argument("--shadows", action="store_true", help="let objects cast shadows, whatever the light says")
-    parser.add_argument("--mesh", type=Path, action="append", default=[], metavar="FILE",
-                        help="a mesh of yours in metres (OBJ, PLY, STL, GLB); repeatable")  # fmt: skip
-    parser.add_argument("--meshes", type=Path, metavar="LIST.yaml",
-                        help="meshes of yours with scale, pose and split")  # fmt: skip
+    parser.add_argument(
+        "--mesh",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="a mesh of yours in metres (OBJ, PLY, STL, GLB); repeatable",
+    )
+    parser.add_argument("--meshes", type=Path, metavar="LIST.yaml", help="meshes of yours with scale, pose and split")
     add_explain_options(parser)
 
 

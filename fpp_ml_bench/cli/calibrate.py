@@ -71,16 +71,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("captures", nargs="?", type=Path, metavar="CAPTURES", help="folder with a folder of frames for each board pose")
     add("--from-depth", type=Path, metavar="TREE", help="instead: a published tree with raw scans and depth in mm")
-    add("--virtual", type=Path, metavar="DIR",
-        help="instead: photograph a board with a virtual rig into DIR, and calibrate from the images")  # fmt: skip
+    add(
+        "--virtual",
+        type=Path,
+        metavar="DIR",
+        help="instead: photograph a board with a virtual rig into DIR, and calibrate from the images",
+    )
     add("--out", type=Path, metavar="RIG", required=True, help="rig file to write, .yaml or .json")
     board = parser.add_argument_group("board")
     add = board.add_argument
     add("--board", metavar="KIND:CxR:MM", help="the board, such as checker:9x13:10")
     add("--sequence", type=Path, metavar="FILE", help="rig file with the projector's size and the sequence")
-    add("--lens", default=AUTO, metavar="MODEL",
+    add(
+        "--lens",
+        default=AUTO,
+        metavar="MODEL",
         help="none, radial-1, radial-2, radial-3+tangential, rational, or two of them, CAMERA,PROJECTOR; auto "
-             f"(default): of {', '.join(AUTO_MODELS)} the one that predicts poses left out best")  # fmt: skip
+        f"(default): of {', '.join(AUTO_MODELS)} the one that predicts poses left out best",
+    )
     add("--square-pixels", action="store_true", help="fx = fy, of both devices")
     add("--centred", action="store_true", help="the camera's principal point is the image's centre")
     add("--estimate-board", action="store_true", help="estimate the board's points too: no print is perfect")
@@ -97,16 +105,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--poses", type=count(100), metavar="N", help="poses of the board (default: 18)")
     depth = parser.add_argument_group("depth")
     add = depth.add_argument
-    add("--camera", type=Path, metavar="FILE",
-        help="rig file with the camera and the frames' sequence (default: the paper's)")  # fmt: skip
+    add(
+        "--camera",
+        type=Path,
+        metavar="FILE",
+        help="rig file with the camera and the frames' sequence (default: the paper's)",
+    )
     add("--projector", type=_size, metavar="WxH", help="projector's size in px (default: that of --camera, 912x1140)")
     known = depth.add_mutually_exclusive_group()
-    known.add_argument("--pitch", type=_pitches, metavar="PX",
-                       help="fringe pitch in projector px if known, or VERTICAL,HORIZONTAL")  # fmt: skip
+    known.add_argument(
+        "--pitch", type=_pitches, metavar="PX", help="fringe pitch in projector px if known, or VERTICAL,HORIZONTAL"
+    )
     known.add_argument("--focal", type=_focal, metavar="PX", help="projector's focal length in px if known")
     add("--lens-term", action="store_true", help="fit the projector's first radial lens term too")
-    add("--frame-order", default="auto", metavar="NAME",
-        help="order of the raw scans' files (default: auto, determined from the images)")  # fmt: skip
+    add(
+        "--frame-order",
+        default="auto",
+        metavar="NAME",
+        help="order of the raw scans' files (default: auto, determined from the images)",
+    )
     add("--workers", type=int, metavar="N", help="threads (default: one per processor)")
 
 
@@ -149,8 +166,10 @@ def _virtual(args: argparse.Namespace) -> int:
     range_mm = args.range or true_rig.working_range_mm
     found = _from_board(args, args.virtual, board, args.virtual / "rig.yaml", range_mm, true_rig)
     error = calibration.volume_error_mm(found, true_rig)
-    print(f"against truth   depth over the working range: {error.rms_mm:.3f} mm RMS, {error.worst_mm:.3f} mm at most, "
-          f"scale {error.scale:.5f}; baseline {MM_PER_M * true_rig.baseline_m:.2f} mm")  # fmt: skip
+    print(
+        f"against truth   depth over the working range: {error.rms_mm:.3f} mm RMS, {error.worst_mm:.3f} mm at most, "
+        f"scale {error.scale:.5f}; baseline {MM_PER_M * true_rig.baseline_m:.2f} mm"
+    )
     return 0
 
 
@@ -169,9 +188,13 @@ def _from_depth(args: argparse.Namespace, workers: int) -> int:
 
 
 def _from_board(
-    args: argparse.Namespace, folder: Path, board: "calibration.Board", sequence: Path,
-    range_mm: tuple[float, float] | None = None, like: "optics.Rig | None" = None,
-) -> "optics.Rig":  # fmt: skip
+    args: argparse.Namespace,
+    folder: Path,
+    board: "calibration.Board",
+    sequence: Path,
+    range_mm: tuple[float, float] | None = None,
+    like: "optics.Rig | None" = None,
+) -> "optics.Rig":
     """Calibrate, print and write; the rig, with standoff and background of ``like``."""
     lenses = _lenses(args)
     examined: dict[str, Examination] = {}
@@ -203,8 +226,10 @@ def _from_board(
     optics.check_lengths(rig, "the spacing of --board, in mm,")
     print_calibration(best)
     if response is not None:
-        print(f"response        gamma {response.gamma:.3f} +- {response.sigma:.4f} of projector and camera together; "
-              f"white on the board: {response.white_grey:.0f} of 255 grey levels")  # fmt: skip
+        print(
+            f"response        gamma {response.gamma:.3f} +- {response.sigma:.4f} of projector and camera together; "
+            f"white on the board: {response.white_grey:.0f} of 255 grey levels"
+        )
     optics.save_rig(rig, args.out)
     written = [args.out, args.out.with_suffix(".png")]
     write_atomically(written[-1], calibration.draw_residuals(best))
@@ -245,13 +270,18 @@ def print_calibration(found: "calibration.Calibration") -> None:
     )
     print(f"alone           {alone} px (each device by OpenCV's calibrateCamera, with a perfect board)")
     for name, device in (("camera", found.camera), ("projector", found.projector)):
-        values = [f"{label} {value:.2f} +- {sigma:.2f}" if sigma else f"{label} {value:.2f} (fixed)"
-                  for label, value, sigma in zip(("fx", "fy", "cx", "cy"), (device.fx, device.fy, device.cx, device.cy),
-                                                 device.sigma, strict=True)]  # fmt: skip
+        values = [
+            f"{label} {value:.2f} +- {sigma:.2f}" if sigma else f"{label} {value:.2f} (fixed)"
+            for label, value, sigma in zip(
+                ("fx", "fy", "cx", "cy"), (device.fx, device.fy, device.cx, device.cy), device.sigma, strict=True
+            )
+        ]
         terms = ", ".join(f"{term:.5f}" for term in device.distortion)
         print(f"{name:<15} {', '.join(values)} px; {device.lens}: {terms}")
-    x, y, z = (f"{length:.2f} +- {sigma:.2f}"
-               for length, sigma in zip(found.translation_mm, found.translation_sigma_mm, strict=True))  # fmt: skip
+    x, y, z = (
+        f"{length:.2f} +- {sigma:.2f}"
+        for length, sigma in zip(found.translation_mm, found.translation_sigma_mm, strict=True)
+    )
     print(f"translation     {x}, {y}, {z} mm; baseline {found.baseline_mm:.2f} mm; scale {found.scale}")
 
 
@@ -268,8 +298,10 @@ def print_fit(rig: "optics.Rig", fit: "calibration.DepthFit") -> None:
     show(table)
     print(f"pitch           {rig.pitch_vertical_px:g} px vertical, {rig.pitch_horizontal_px:g} px horizontal fringes")
     print(f"  taken from    {fit.pitch_from}; measured {measured}")
-    print(f"projector       {projector.width} x {projector.height} px, focal length {projector.fx:.2f} and "
-          f"{projector.fy:.2f} px, principal point {projector.cx:.2f}, {projector.cy:.2f}")  # fmt: skip
+    print(
+        f"projector       {projector.width} x {projector.height} px, focal length {projector.fx:.2f} and "
+        f"{projector.fy:.2f} px, principal point {projector.cx:.2f}, {projector.cy:.2f}"
+    )
     if projector.is_distorted:
         print(f"  lens          k1 {projector.distortion[0]:.5f}")
     print(f"translation     {x:.2f}, {y:.2f}, {z:.2f} mm; baseline {MM_PER_M * rig.baseline_m:.2f} mm")

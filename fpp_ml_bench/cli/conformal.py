@@ -24,13 +24,29 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("folder", type=Path, metavar="PREDICTIONS", help="predictions with {sample}.sigma.npy, whose sigma is scaled")
     add("--dataset", type=Path, required=True, metavar="DATASET", help="folder of the dataset")
     add("--split", choices=SPLITS, default="test", help="split of PREDICTIONS (default: test)")
-    add("--from", type=Path, required=True, dest="calibration", metavar="DIR",
-        help="the same method's predictions of the split that is calibrated on")  # fmt: skip
-    add("--calibrate", choices=("train", "validation"), default="validation", metavar="SPLIT",
-        help="split of --from (default: validation); not one that the method learned from")  # fmt: skip
-    add("--coverage", type=float, default=0.68, metavar="SHARE",
+    add(
+        "--from",
+        type=Path,
+        required=True,
+        dest="calibration",
+        metavar="DIR",
+        help="the same method's predictions of the split that is calibrated on",
+    )
+    add(
+        "--calibrate",
+        choices=("train", "validation"),
+        default="validation",
+        metavar="SPLIT",
+        help="split of --from (default: validation); not one that the method learned from",
+    )
+    add(
+        "--coverage",
+        type=float,
+        default=0.68,
+        metavar="SHARE",
         help="what the interval of +- sigma x its Gaussian quantile shall hold (default: 0.68); n calibration objects "
-        "support at most n / (n + 1)")  # fmt: skip
+        "support at most n / (n + 1)",
+    )
     add("--target", choices=TARGETS, default=TARGETS[0], help="depth that errors are taken against (default: depth)")
     add("--out", type=Path, required=True, metavar="OUT", help="new folder: a copy with the scaled sigma")
 

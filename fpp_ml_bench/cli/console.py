@@ -27,9 +27,13 @@ def progress_bar(title: str, total: int, unit: str, per_step: int = 1) -> Iterat
             return Text(f"{speed * per_step:,.0f} {unit}/s" if speed else "", style="cyan")
 
     columns = (
-        TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"), Rate(), TimeRemainingColumn(),
-    )  # fmt: skip
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
+        Rate(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task(title, total=total)
         yield lambda steps: progress.advance(task, steps)

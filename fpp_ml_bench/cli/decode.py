@@ -29,14 +29,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("rig", type=Path, metavar="RIG", help="rig file (.yaml, .json)")
     add("frames", metavar="FRAMES", help="folder of images, or a pattern in quotes")
     add("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
-    add("--direction", choices=("horizontal", "vertical", "both"), default="both",
-        help="which of the coded directions to use (default: all there are)")  # fmt: skip
+    add(
+        "--direction",
+        choices=("horizontal", "vertical", "both"),
+        default="both",
+        help="which of the coded directions to use (default: all there are)",
+    )
     add("--range", type=working_range, metavar="NEAR,FAR", help="working range in mm (default: the rig's)")
     add("--mask", type=Path, metavar="FILE", help="image or .npy: decode where it is not 0")
-    add("--min-modulation", type=float, metavar="GREY",
-        help="least modulation of a pixel in grey levels of 255 (default: 5)")  # fmt: skip
-    add("--noise", type=float, metavar="GREY",
-        help="noise of a frame in grey levels of 255 (default: measured with four steps and more, else 1)")  # fmt: skip
+    add(
+        "--min-modulation",
+        type=float,
+        metavar="GREY",
+        help="least modulation of a pixel in grey levels of 255 (default: 5)",
+    )
+    add(
+        "--noise",
+        type=float,
+        metavar="GREY",
+        help="noise of a frame in grey levels of 255 (default: measured with four steps and more, else 1)",
+    )
     add("--bits", type=int, metavar="N", help="bits of the camera, 8 to 16, where files of 16 bits hold fewer")
     add("--colour", metavar="NAME", help="of colour images: luminance, mean, red, green, blue")
     add("--forms", metavar="A,B", help="what to write of npy, mat, png, ply, mesh (default: all)")
@@ -65,9 +77,15 @@ def run(args: argparse.Namespace) -> int:
         least = {} if args.min_modulation is None else {"min_modulation": args.min_modulation}
         try:
             result = captures.decode_capture(
-                capture, rig, args.direction, mask=mask, noise_grey=args.noise, threads=args.threads,
-                anyway=args.anyway, **least
-            )  # fmt: skip
+                capture,
+                rig,
+                args.direction,
+                mask=mask,
+                noise_grey=args.noise,
+                threads=args.threads,
+                anyway=args.anyway,
+                **least,
+            )
         except RefusedCapture as refused:
             captures.write_refusal(args.out, capture, rig, refused.examination)
             raise

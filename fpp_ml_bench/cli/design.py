@@ -31,28 +31,81 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add, default = parser.add_argument, design.Assumptions()
     least, most = default.image_px
     add("rig", metavar="RIG", help="rig file (.yaml, .json), or paper or crossed")
-    add("--pitches", type=_numbers, metavar="A,B|A-B",
-        help="periods to search, projector px (default: all whole ones that fit the image)")  # fmt: skip
-    add("--angles", type=_numbers, metavar="A,B|A-B",
-        help="angles to search, 0: as horizontal fringes, 90: as vertical ones (default: 0, 15, ... 165)")  # fmt: skip
-    add("--pair", type=_family, action="append", default=[], metavar="P,Q[,A,B]",
-        help="also describe these periods and angles (0 and 90 degrees unless said); repeatable")  # fmt: skip
-    add("--image-px", type=_interval, default=default.image_px, metavar="LEAST,MOST",
-        help=f"limits of a period in the image, px; MOST of a beat too (default: {least:g},{most:g})")  # fmt: skip
-    add("--surfaces", type=working_range, metavar="NEAR,FAR",
-        help="where surfaces are expected, mm, for the share of wrong orders (default: the whole range)")  # fmt: skip
-    add("--phase-sigma", type=_positive, default=default.phase_sigma, metavar="RAD",
-        help=f"error of a phase at 20 image px a period, for orders (default: {default.phase_sigma:g})")  # fmt: skip
-    add("--blur", type=_positive, default=default.blur_px, metavar="PX",
-        help=f"sigma of the projector's blur, projector px (default: {default.blur_px:g})")  # fmt: skip
-    add("--wrong", type=_positive, default=100 * default.wrong_share, metavar="PERCENT",
-        help=f"wrong orders that may be left to the neighbours (default: {100 * default.wrong_share:g})")  # fmt: skip
-    add("--noise", type=_positive, default=default.noise_grey, metavar="GREY",
-        help=f"camera noise, grey levels of 255, for the depth noise (default: {default.noise_grey:g})")  # fmt: skip
-    add("--white", type=_positive, default=default.white_grey, metavar="GREY",
-        help=f"grey level of white at the near end (default: {default.white_grey:g})")  # fmt: skip
-    add("--window", type=_positive, default=default.window_px, metavar="PX",
-        help=f"Gaussian window, sigma in image px, for the depth noise (default: {default.window_px:g})")  # fmt: skip
+    add(
+        "--pitches",
+        type=_numbers,
+        metavar="A,B|A-B",
+        help="periods to search, projector px (default: all whole ones that fit the image)",
+    )
+    add(
+        "--angles",
+        type=_numbers,
+        metavar="A,B|A-B",
+        help="angles to search, 0: as horizontal fringes, 90: as vertical ones (default: 0, 15, ... 165)",
+    )
+    add(
+        "--pair",
+        type=_family,
+        action="append",
+        default=[],
+        metavar="P,Q[,A,B]",
+        help="also describe these periods and angles (0 and 90 degrees unless said); repeatable",
+    )
+    add(
+        "--image-px",
+        type=_interval,
+        default=default.image_px,
+        metavar="LEAST,MOST",
+        help=f"limits of a period in the image, px; MOST of a beat too (default: {least:g},{most:g})",
+    )
+    add(
+        "--surfaces",
+        type=working_range,
+        metavar="NEAR,FAR",
+        help="where surfaces are expected, mm, for the share of wrong orders (default: the whole range)",
+    )
+    add(
+        "--phase-sigma",
+        type=_positive,
+        default=default.phase_sigma,
+        metavar="RAD",
+        help=f"error of a phase at 20 image px a period, for orders (default: {default.phase_sigma:g})",
+    )
+    add(
+        "--blur",
+        type=_positive,
+        default=default.blur_px,
+        metavar="PX",
+        help=f"sigma of the projector's blur, projector px (default: {default.blur_px:g})",
+    )
+    add(
+        "--wrong",
+        type=_positive,
+        default=100 * default.wrong_share,
+        metavar="PERCENT",
+        help=f"wrong orders that may be left to the neighbours (default: {100 * default.wrong_share:g})",
+    )
+    add(
+        "--noise",
+        type=_positive,
+        default=default.noise_grey,
+        metavar="GREY",
+        help=f"camera noise, grey levels of 255, for the depth noise (default: {default.noise_grey:g})",
+    )
+    add(
+        "--white",
+        type=_positive,
+        default=default.white_grey,
+        metavar="GREY",
+        help=f"grey level of white at the near end (default: {default.white_grey:g})",
+    )
+    add(
+        "--window",
+        type=_positive,
+        default=default.window_px,
+        metavar="PX",
+        help=f"Gaussian window, sigma in image px, for the depth noise (default: {default.window_px:g})",
+    )
     add("--out", type=Path, metavar="FILE", help="write the rig with three frames of the proposed pair (.yaml, .json)")
     add("--picture", type=Path, metavar="FILE.png", help="draw the proposed pair beside the rig's own or 18/18")
 
@@ -83,18 +136,35 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print(
-    rig: "optics.Rig", assumed: "design.Assumptions", found: "design.Design",
+    rig: "optics.Rig",
+    assumed: "design.Assumptions",
+    found: "design.Design",
     others: "list[tuple[design.Candidate, str]]",
-) -> None:  # fmt: skip
+) -> None:
     (near_mm, far_mm), flat_deg = rig.working_range_mm, design.EpipolarLines.of(rig).flat_angle_deg
-    print(f"rig             range {near_mm:g} to {far_mm:g} mm; a carrier at {flat_deg:.0f} degrees runs along the "
-          "epipolar lines and tells no depth")  # fmt: skip
-    print(f"orders          by a phase error of {assumed.phase_sigma:g} rad at 20 image px a period, before neighbours "
-          "help")  # fmt: skip
-    print(f"depth noise     at {far_mm:g} mm, of {assumed.noise_grey:g} grey levels, white {assumed.white_grey:g} at "
-          f"{near_mm:g} mm, window {assumed.window_px:g} px, projector blur {assumed.blur_px:g} px")  # fmt: skip
-    names = ("projector px", "degrees", "image px", "rival, rad", "background", "error", "noise, mm", "wrong orders",
-             "periods in range")  # fmt: skip
+    print(
+        f"rig             range {near_mm:g} to {far_mm:g} mm; a carrier at {flat_deg:.0f} degrees runs along the "
+        "epipolar lines and tells no depth"
+    )
+    print(
+        f"orders          by a phase error of {assumed.phase_sigma:g} rad at 20 image px a period, before neighbours "
+        "help"
+    )
+    print(
+        f"depth noise     at {far_mm:g} mm, of {assumed.noise_grey:g} grey levels, white {assumed.white_grey:g} at "
+        f"{near_mm:g} mm, window {assumed.window_px:g} px, projector blur {assumed.blur_px:g} px"
+    )
+    names = (
+        "projector px",
+        "degrees",
+        "image px",
+        "rival, rad",
+        "background",
+        "error",
+        "noise, mm",
+        "wrong orders",
+        "periods in range",
+    )
     table = Table("", numbers=names, names=3)
     front = [candidate for candidate in found.front if candidate.wrong_share <= MOST_WRONG]
     every = max(-(-len(front) // ROWS), 1)
@@ -104,18 +174,27 @@ def _print(
         crossed = candidate.crossed
         background = "-" if candidate.background_rad is None else f"{candidate.background_rad:.2f}"
         table.add_row(
-            about, _two(crossed.pitches_px, "g"), _two(crossed.angles_deg, "g"), _two(candidate.image_px, ".1f"),
-            f"{candidate.rival_rad:.2f}", background, f"{candidate.sigma_rad:.2f}", f"{candidate.noise_mm:.3f}",
-            f"{100 * candidate.wrong_share:.3f}%", _two(candidate.turns, ".2f"),
-        )  # fmt: skip
+            about,
+            _two(crossed.pitches_px, "g"),
+            _two(crossed.angles_deg, "g"),
+            _two(candidate.image_px, ".1f"),
+            f"{candidate.rival_rad:.2f}",
+            background,
+            f"{candidate.sigma_rad:.2f}",
+            f"{candidate.noise_mm:.3f}",
+            f"{100 * candidate.wrong_share:.3f}%",
+            _two(candidate.turns, ".2f"),
+        )
     show(table)
     for candidate, about in others:
         for carrier in candidate.flat:
             pitch, angle = candidate.crossed.pitches_px[carrier], candidate.crossed.angles_deg[carrier]
             print(f"note: {about}: the carrier of {pitch:g} px at {angle:g} degrees tells no depth")
     crossed = found.proposed.crossed
-    print(f"proposed        {_two(crossed.pitches_px, 'g')} px at {_two(crossed.angles_deg, 'g')} degrees, out of "
-          f"{found.searched:,} pairs: {found.reason}")  # fmt: skip
+    print(
+        f"proposed        {_two(crossed.pitches_px, 'g')} px at {_two(crossed.angles_deg, 'g')} degrees, out of "
+        f"{found.searched:,} pairs: {found.reason}"
+    )
 
 
 def _two(pair: tuple[float, float], form: str) -> str:

@@ -31,16 +31,20 @@ UNITS = ("mm", "m", "normalised")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's arguments."""
     parser.add_argument(
-        "model", metavar="MODEL",
+        "model",
+        metavar="MODEL",
         help="weights that come with the package, a .safetensors file, a method (classical, phase, ...), or your own "
         "torch module as file.py:factory; that file is executed",
-    )  # fmt: skip
+    )
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder, of the model's image size")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="index.html and diagnose.json go here")
     parser.add_argument(
-        "--probe", action="append", default=[], metavar="NAME",
+        "--probe",
+        action="append",
+        default=[],
+        metavar="NAME",
         help=f"run only this probe; can be repeated: {', '.join(diagnostics.PROBES)} (default: all)",
-    )  # fmt: skip
+    )
     text = "most samples of a split, taken evenly (default: the probe's)"
     parser.add_argument("--samples", type=count(), metavar="N", help=text)
     text = "repeats of what depends on random numbers (default: 2)"
@@ -51,9 +55,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frame", type=int, metavar="N", help="number of a network's input frame (default: its first)")
     parser.add_argument("--threads", type=count(), metavar="N", help="threads (default: every core)")
     parser.add_argument(
-        "--units", choices=UNITS,
+        "--units",
+        choices=UNITS,
         help="output of your own module: depth in mm, in m, or normalised to the sample's range (default)",
-    )  # fmt: skip
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -65,9 +70,12 @@ def run(args: argparse.Namespace) -> int:
     model = diagnostics.subject(args.model, dataset, args.layers, args.units, args.frame, threads)
     settings = diagnostics.ProbeSettings(args.samples, args.seeds, args.quick)
     columns = (
-        bar.TextColumn("{task.description}"), bar.BarColumn(), bar.TaskProgressColumn(), bar.TimeElapsedColumn(),
+        bar.TextColumn("{task.description}"),
+        bar.BarColumn(),
+        bar.TaskProgressColumn(),
+        bar.TimeElapsedColumn(),
         bar.TimeRemainingColumn(),
-    )  # fmt: skip
+    )
     with bar.Progress(*columns, console=Console(stderr=True)) as bars:
 
         def progress(probe: "diagnostics.Probe") -> "diagnostics.Progress":

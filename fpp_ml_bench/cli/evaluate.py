@@ -31,20 +31,36 @@ EXAMPLES = (
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's arguments."""
     add = parser.add_argument
-    add("folder", type=Path, metavar="DIR",
+    add(
+        "folder",
+        type=Path,
+        metavar="DIR",
         help="folder of submission.yaml and one {sample}.npy, .npz, .mat or 16-bit .png per sample, or one "
         "predictions.parquet or .arrow: depth (H, W), 0 = background, in the units that submission.yaml declares; "
-        "every problem is listed by file, and then no JSON is written")  # fmt: skip
+        "every problem is listed by file, and then no JSON is written",
+    )
     add("--dataset", type=Path, required=True, metavar="DATASET", help="folder of the dataset")
     add("--split", choices=SPLITS, default="test", help="samples to score (default: test)")
-    add("--target", choices=TARGETS, default=TARGETS[0],
+    add(
+        "--target",
+        choices=TARGETS,
+        default=TARGETS[0],
         help="depth: decoded from the noisy frames, as in the paper (default); depth_exact: from the ray cast",
-    )  # fmt: skip
-    add("--edge-band", type=_band, default=EDGE_BAND_PX, metavar="PX",
-        help=f"object pixels nearer than this to a depth edge count as edge (default: {EDGE_BAND_PX})")  # fmt: skip
-    add("--mode", choices=MODES, default=MODES[0],
+    )
+    add(
+        "--edge-band",
+        type=_band,
+        default=EDGE_BAND_PX,
+        metavar="PX",
+        help=f"object pixels nearer than this to a depth edge count as edge (default: {EDGE_BAND_PX})",
+    )
+    add(
+        "--mode",
+        choices=MODES,
+        default=MODES[0],
         help="standard: void pixels (unlit or mixed) count in no set (default); paper: the paper's sets, without void, "
-        "and its rule for normalised depth; never ranked with the others")  # fmt: skip
+        "and its rule for normalised depth; never ranked with the others",
+    )
     add("--json", type=Path, metavar="FILE", help="write the result here, per-sample scores included")
     add("--report", type=Path, metavar="OUT", help="write an HTML page with figures into this folder")
     add_explain_options(parser)
@@ -63,9 +79,14 @@ def run(args: argparse.Namespace) -> int:
         _check_outputs(args.json, args.report, args.folder)
         dataset = storage.DatasetFolder(args.dataset)
         scored = score.evaluate(
-            args.folder, dataset, args.split, args.target, args.edge_band, args.mode,
+            args.folder,
+            dataset,
+            args.split,
+            args.target,
+            args.edge_band,
+            args.mode,
             while_scoring=lambda: report.result_table,
-        )  # fmt: skip
+        )
         if args.json is not None:
             result.write_result(scored, args.json)
         if args.report is not None:
@@ -103,8 +124,12 @@ def _check_outputs(file: Path | None, page: Path | None, folder: Path) -> None:
 def _compare_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("first", type=Path, metavar="A.json", help="a result of fpp-eval --json, or a row of the leaderboard")
-    add("second", type=Path, metavar="B.json",
-        help="a result of another method on the same data, split, target and track")  # fmt: skip
+    add(
+        "second",
+        type=Path,
+        metavar="B.json",
+        help="a result of another method on the same data, split, target and track",
+    )
     add("--json", type=Path, metavar="FILE", help="write the comparison here, each sample's included")
 
 
@@ -122,9 +147,12 @@ def _compare(args: argparse.Namespace) -> int:
 
 def _schema_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "file", nargs="?", choices=("result", "submission", "comparison"), default="result",
+        "file",
+        nargs="?",
+        choices=("result", "submission", "comparison"),
+        default="result",
         help="result: what fpp-eval writes (default); submission: submission.yaml; comparison: fpp-eval compare --json",
-    )  # fmt: skip
+    )
 
 
 def _schema(args: argparse.Namespace) -> int:
@@ -209,18 +237,22 @@ def _check(args: argparse.Namespace) -> int:
 SUBCOMMANDS = {
     "init": SimpleNamespace(
         SUMMARY="Write a submission.yaml to fill in; one that is there is not overwritten.",
-        EXAMPLES=("fpp-eval init predictions",), add_arguments=_init_arguments, run=_init,
+        EXAMPLES=("fpp-eval init predictions",),
+        add_arguments=_init_arguments,
+        run=_init,
     ),
     "check": SimpleNamespace(
         SUMMARY="Check a submission before it is scored, without ground truth: exit status 0 sound, 1 refused.",
         EXAMPLES=("fpp-eval check predictions", "fpp-eval check predictions --dataset data/mini --split test"),
-        add_arguments=_check_arguments, run=_check,
+        add_arguments=_check_arguments,
+        run=_check,
     ),
     "compare": SimpleNamespace(
         SUMMARY="Compare two results of the same samples: paired differences, their 95% intervals, and a plain "
         "sentence.",
         EXAMPLES=("fpp-eval compare a.json b.json", "fpp-eval compare a.json b.json --json difference.json"),
-        add_arguments=_compare_arguments, run=_compare,
+        add_arguments=_compare_arguments,
+        run=_compare,
     ),
     "verify": SimpleNamespace(
         SUMMARY="Score the predictions again and say whether the result or row is verified (exit status 0) or not (1).",
@@ -228,14 +260,16 @@ SUBCOMMANDS = {
             "fpp-eval verify result.json predictions --dataset data/mini",
             "fpp-eval verify leaderboard/rows/mine.json predictions --dataset data/full",
         ),
-        add_arguments=_verify_arguments, run=_verify,
+        add_arguments=_verify_arguments,
+        run=_verify,
     ),
     "schema": SimpleNamespace(
         SUMMARY="Print the JSON Schema (2020-12) of result.json or of submission.yaml.",
         EXAMPLES=("fpp-eval schema > result.schema.json", "fpp-eval schema submission"),
-        add_arguments=_schema_arguments, run=_schema,
+        add_arguments=_schema_arguments,
+        run=_schema,
     ),
-}  # fmt: skip
+}
 """First words that select a subcommand. A folder of such a name is given as ./compare."""
 
 

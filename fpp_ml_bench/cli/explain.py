@@ -42,18 +42,25 @@ def explain(args: argparse.Namespace, account: Callable[[], Explanation]) -> Non
     state = "left out" if explanation.skipping else "nothing left out (skipping is off); it would have been"
     rules = list(dict.fromkeys(line.rule for line in explanation.lines))
     table = Table(
-        "what", "unit", numbers=("done", "left out", "share", "bytes", "seconds"),
-        title=Text(f"{explanation.command}: {state} ({explanation.subject})"), elsewhere="--explain-json FILE",
+        "what",
+        "unit",
+        numbers=("done", "left out", "share", "bytes", "seconds"),
+        title=Text(f"{explanation.command}: {state} ({explanation.subject})"),
+        elsewhere="--explain-json FILE",
         caption=Text("\n".join(f"[{number}] {rule}" for number, rule in enumerate(rules, 1))),
-    )  # fmt: skip
+    )
     for line in explanation.lines:
         saved = line.seconds_saved
         seconds = "-" if saved is None else f"{saved:,.2g}" if abs(saved) < 10 else f"{saved:,.0f}"
         table.add_row(
-            Text(line.what), line.unit, f"{line.done:,}", f"{line.left_out:,}", f"{100 * line.share:.1f}%",
+            Text(line.what),
+            line.unit,
+            f"{line.done:,}",
+            f"{line.left_out:,}",
+            f"{100 * line.share:.1f}%",
             "-" if line.bytes_saved is None else gigabytes(line.bytes_saved),
             Text(f"{seconds} [{rules.index(line.rule) + 1}]"),
-        )  # fmt: skip
+        )
     show(table)
     if args.explain_json is not None:
         text = json.dumps(explanation.to_dict(), indent=1, allow_nan=False)

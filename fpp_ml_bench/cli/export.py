@@ -24,8 +24,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--mat", action="store_true", help="the published tree: PNG fringes, .mat depth, raw scans")
     parser.add_argument("--meshes", action="store_true", help="the objects' meshes as PLY (metres)")
     parser.add_argument("--patterns", action="store_true", help="the projected patterns as PNG")
-    parser.add_argument("--split", choices=("train", "validation", "test", "all"), default="all",
-                        help="samples to export (default: all)")  # fmt: skip
+    parser.add_argument(
+        "--split",
+        choices=("train", "validation", "test", "all"),
+        default="all",
+        help="samples to export (default: all)",
+    )
 
 
 def run(args: argparse.Namespace) -> int:

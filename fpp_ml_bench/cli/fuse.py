@@ -22,14 +22,22 @@ EXAMPLES = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("predictions", metavar="PREDICTIONS",
-        help="predictions of a split; or depth or depth_exact, the dataset's own (a folder: ./depth)")  # fmt: skip
+    add(
+        "predictions",
+        metavar="PREDICTIONS",
+        help="predictions of a split; or depth or depth_exact, the dataset's own (a folder: ./depth)",
+    )
     add("--dataset", type=Path, required=True, metavar="DATASET", help="folder of a generated dataset")
     add("--split", choices=SPLITS, default="test", help="split of PREDICTIONS (default: test)")
     add("--object", metavar="NAME", help="only this object (default: all of the split)")
     add("--cell-mm", type=float, metavar="MM", help="edge of the cells in which points are averaged (default: 2)")
-    add("--out", type=Path, required=True, metavar="DIR",
-        help="folder for {object}.ply (metres, object coordinates), {object}.png and fusion.json")  # fmt: skip
+    add(
+        "--out",
+        type=Path,
+        required=True,
+        metavar="DIR",
+        help="folder for {object}.ply (metres, object coordinates), {object}.png and fusion.json",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -70,10 +78,14 @@ def _print(name: str, scores: "dict[str, views.Row]") -> None:
         sum(int(row[key] or 0) for row in scores.values()) for key in ("wrong_px", "scored_px", "found_px")
     )
     print(f"wrong orders: {wrong:,} of {scored:,} object pixels; other views contradict {found:,} of them")
-    print(f"contradicted: {_percent(*means['found_share'])} of the wrong orders, {_percent(*means['false_share'])} of "
-          "the others")  # fmt: skip
-    print(f"object MAE: {_text(*means['mae_mm'])} mm, without contradicted pixels {_text(*means['kept_mae_mm'])} mm "
-          f"({_percent(*means['dropped_share'])} dropped)")  # fmt: skip
+    print(
+        f"contradicted: {_percent(*means['found_share'])} of the wrong orders, {_percent(*means['false_share'])} of "
+        "the others"
+    )
+    print(
+        f"object MAE: {_text(*means['mae_mm'])} mm, without contradicted pixels {_text(*means['kept_mae_mm'])} mm "
+        f"({_percent(*means['dropped_share'])} dropped)"
+    )
 
 
 def _percent(share: float | None, interval: "score.Interval | None") -> str:

@@ -42,26 +42,51 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("out", type=Path, metavar="OUT", help="new folder, or the folder of an interrupted import")
     parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one per processor)")
     rig = parser.add_mutually_exclusive_group()
-    rig.add_argument("--rig", type=Path, metavar="FILE",
-                     help="rig that took the images, YAML or JSON (default: the paper's, scaled)")  # fmt: skip
-    rig.add_argument("--fit-rig", action="store_true",
-                     help="find projector and pitch from raw scans and depth (fpp-bench calibrate)")  # fmt: skip
-    parser.add_argument("--frame-order", default="auto", metavar="NAME",
-                        help="order of the raw scans' files (default: auto, determined from the images)")  # fmt: skip
+    rig.add_argument(
+        "--rig", type=Path, metavar="FILE", help="rig that took the images, YAML or JSON (default: the paper's, scaled)"
+    )
+    rig.add_argument(
+        "--fit-rig", action="store_true", help="find projector and pitch from raw scans and depth (fpp-bench calibrate)"
+    )
+    parser.add_argument(
+        "--frame-order",
+        default="auto",
+        metavar="NAME",
+        help="order of the raw scans' files (default: auto, determined from the images)",
+    )
     add = parser.add_argument_group("captures without depth").add_argument
     add("--captures", action="store_true", help="TREE holds captures, which --rig decodes into the ground truth")
-    add("--splits", type=Path, metavar="FILE",
-        help="YAML lists of objects under train, validation and test (default: all in test)")  # fmt: skip
+    add(
+        "--splits",
+        type=Path,
+        metavar="FILE",
+        help="YAML lists of objects under train, validation and test (default: all in test)",
+    )
     add("--bits", type=int, metavar="N", help="bits of the camera, 8 to 16 (default: found in the images)")
-    add("--colour", metavar="NAME",
-        help="what to take of colour images: luminance, red, green, blue or mean (default: refuse them)")  # fmt: skip
-    add("--min-modulation", type=float, metavar="GREY",
-        help="least modulation of a pixel with depth, grey levels of 255 (default: 5)")  # fmt: skip
-    add("--max-clipped-steps", type=int, metavar="N",
-        help="phase steps that may be saturated at a pixel (default: a ninth of them)")  # fmt: skip
+    add(
+        "--colour",
+        metavar="NAME",
+        help="what to take of colour images: luminance, red, green, blue or mean (default: refuse them)",
+    )
+    add(
+        "--min-modulation",
+        type=float,
+        metavar="GREY",
+        help="least modulation of a pixel with depth, grey levels of 255 (default: 5)",
+    )
+    add(
+        "--max-clipped-steps",
+        type=int,
+        metavar="N",
+        help="phase steps that may be saturated at a pixel (default: a ninth of them)",
+    )
     add("--anyway", action="store_true", default=None, help="import captures that their examination refuses, too")
-    add("--max-disagreement", type=float, metavar="PX",
-        help="largest distance of both directions' coordinates from the epipolar line (default: 1.5)")  # fmt: skip
+    add(
+        "--max-disagreement",
+        type=float,
+        metavar="PX",
+        help="largest distance of both directions' coordinates from the epipolar line (default: 1.5)",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -79,8 +104,11 @@ def _run_captures(args: argparse.Namespace, workers: int) -> int:
         )
     if args.frame_order != "auto":
         raise BuildError("--frame-order belongs to published trees; captures have the order of their rig's sequence")
-    given = {"min_modulation": args.min_modulation, "max_clipped_steps": args.max_clipped_steps,
-             "max_disagreement_px": args.max_disagreement}  # fmt: skip
+    given = {
+        "min_modulation": args.min_modulation,
+        "max_clipped_steps": args.max_clipped_steps,
+        "max_disagreement_px": args.max_disagreement,
+    }
     limits = coding.Limits(**{name: value for name, value in given.items() if value is not None})
     splits = None if args.splits is None else captures.read_splits(args.splits)
     plan = captures.plan_captures(

@@ -28,36 +28,66 @@ _TABLES = ("normalization", "background_removed", "multi_frame", "loss", "archit
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("results", nargs="*", type=Path, metavar="RESULT.json",
+    add(
+        "results",
+        nargs="*",
+        type=Path,
+        metavar="RESULT.json",
         help="result files, or folders of them (default: the rows shipped with the package, ./result*.json and "
-             "./results/*.json)")  # fmt: skip
-    add("--sort", choices=(*METRICS, "seconds_per_sample", "frames_used"), default="object_mae_mm", metavar="KEY",
+        "./results/*.json)",
+    )
+    add(
+        "--sort",
+        choices=(*METRICS, "seconds_per_sample", "frames_used"),
+        default="object_mae_mm",
+        metavar="KEY",
         help=f"what to rank by (default: object_mae_mm): seconds_per_sample, frames_used, {', '.join(METRICS)}",
-    )  # fmt: skip
+    )
     one_file: dict[str, Any] = {"type": Path, "metavar": "FILE"}
     add("--markdown", **one_file, help="also write the tables as Markdown")
     add("--json", **one_file, help="also write the ranking as JSON, with the tests of all pairs")
     add("--csv", **one_file, help="also write a line for each row, with all digits")
-    add("--pairs", action="store_true",
-        help="also print every pair of ranked rows: difference, interval, p value, who is behind")  # fmt: skip
-    add("--paper", nargs="?", choices=_TABLES, const="all", metavar="TABLE",
+    add(
+        "--pairs",
+        action="store_true",
+        help="also print every pair of ranked rows: difference, interval, p value, who is behind",
+    )
+    add(
+        "--paper",
+        nargs="?",
+        choices=_TABLES,
+        const="all",
+        metavar="TABLE",
         help=f"tables of the paper and of others: {', '.join(_TABLES)} (default: architecture, normalization, "
-             "oracle_order, in the terminal only where no results are named; without TABLE: all)",
-    )  # fmt: skip
-    add("--page", type=Path, metavar="DIR",
+        "oracle_order, in the terminal only where no results are named; without TABLE: all)",
+    )
+    add(
+        "--page",
+        type=Path,
+        metavar="DIR",
         help="write the static page of the shipped rows, or of those given: index.html and a page for each submission",
-    )  # fmt: skip
-    add("--tradeoff", **one_file,
+    )
+    add(
+        "--tradeoff",
+        **one_file,
         help="with --page: the tradeoff.json to show on it (default, for the shipped rows: the file that ships)",
-    )  # fmt: skip
-    add("--readme", **one_file,
+    )
+    add(
+        "--readme",
+        **one_file,
         help="write the ranking between the leaderboard markers of this file, from the rows shipped with the package",
-    )  # fmt: skip
-    add("--check", action="store_true",
-        help="with --readme: write nothing; exit status 1 when the block is not up to date")  # fmt: skip
-    add("--row", **one_file,
+    )
+    add(
+        "--check",
+        action="store_true",
+        help="with --readme: write nothing; exit status 1 when the block is not up to date",
+    )
+    add(
+        "--row",
+        **one_file,
         help="make a row file for the leaderboard of the given result, and print what a maintainer adds to "
-             "leaderboard/vouched.txt to vouch for it")  # fmt: skip
+        "leaderboard/vouched.txt to vouch for it",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -109,6 +139,8 @@ def run(args: argparse.Namespace) -> int:
     tables = leaderboard.group_tables(groups, args.sort, args.pairs)
     show(*tables, *leaderboard.paper_rich_tables(papers[not_shown:]))
     if not_shown:
-        print(f"Not shown: {not_shown} tables that others reported on other data (--paper), and the leaderboard's own "
-              f"{len(leaderboard.shipped_rows())} rows (fpp-bench leaderboard without a file).")  # fmt: skip
+        print(
+            f"Not shown: {not_shown} tables that others reported on other data (--paper), and the leaderboard's own "
+            f"{len(leaderboard.shipped_rows())} rows (fpp-bench leaderboard without a file)."
+        )
     return 0

@@ -48,15 +48,29 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     """Add ``--threads`` and the options of each kind of method."""
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads a sample (default: 1)")
     add = parser.add_argument_group("classical and classical-net").add_argument
-    add("--steps", type=int, metavar="N",
-        help="phase steps a direction, 3 to 18, with Gray code (default: all; classical-net: 3)")  # fmt: skip
-    add("--direction", choices=("horizontal", "vertical", "both"),
-        help="fringes to use: one direction is enough for a depth (default: all that the rig codes)")  # fmt: skip
-    add("--fewest", action="store_const", const=True,
-        help="capture only the Gray frames that the rig's range needs: with both directions usually none")  # fmt: skip
-    add("--depth-noise", type=float, metavar="MM",
+    add(
+        "--steps",
+        type=int,
+        metavar="N",
+        help="phase steps a direction, 3 to 18, with Gray code (default: all; classical-net: 3)",
+    )
+    add(
+        "--direction",
+        choices=("horizontal", "vertical", "both"),
+        help="fringes to use: one direction is enough for a depth (default: all that the rig codes)",
+    )
+    add(
+        "--fewest",
+        action="store_const",
+        const=True,
+        help="capture only the Gray frames that the rig's range needs: with both directions usually none",
+    )
+    add(
+        "--depth-noise",
+        type=float,
+        metavar="MM",
         help="the fewest steps whose depth noise at the far end of the range is at most this (instead of --steps)",
-    )  # fmt: skip
+    )
     add = parser.add_argument_group("phase, phase-net, crossed and crossed-net").add_argument
     add("--fringe", choices=("horizontal", "vertical"), help="direction of the fringes (default: horizontal)")
     add(
@@ -65,30 +79,52 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="fringes of that direction, 1 to 18; no Gray code; of crossed 1 or 3 (default: 1)",
     )
-    add("--error-mm", type=float, metavar="MM",
+    add(
+        "--error-mm",
+        type=float,
+        metavar="MM",
         help="instead of --frames: for each scene the fewest frames whose expected error is at most this, starting "
-             "with a single fringe; may need the Gray code")  # fmt: skip
-    add("--prior", choices=("none", "standoff"),
+        "with a single fringe; may need the Gray code",
+    )
+    add(
+        "--prior",
+        choices=("none", "standoff"),
         help="standoff: assume that objects are near the rig's standoff, true of fixed placement (default: none)",
-    )  # fmt: skip
+    )
     add("--no-shading", action="store_const", const=True, help="phase: choose the fringe order without brightness")
-    add("--albedo", choices=("one", "any"),
+    add(
+        "--albedo",
+        choices=("one", "any"),
         help="phase-net: one, where all surfaces have the background's albedo, so that brightness tells the order, or "
-             "any, where the order is ambiguous unless range and shape tell it (default: one)")  # fmt: skip
-    add("--min-confidence", type=float, metavar="C",
-        help="mask pixels of less confidence, 0 to 1 (default: 0, dense)")  # fmt: skip
-    add("--white-grey", type=float, metavar="GREY",
+        "any, where the order is ambiguous unless range and shape tell it (default: one)",
+    )
+    add("--min-confidence", type=float, metavar="C", help="mask pixels of less confidence, 0 to 1 (default: 0, dense)")
+    add(
+        "--white-grey",
+        type=float,
+        metavar="GREY",
         help="for images without a lit background: grey level of a white pattern on a surface that faces the projector "
-             "at the near end of the working range")  # fmt: skip
-    add("--ambient-grey", type=float, metavar="GREY",
+        "at the near end of the working range",
+    )
+    add(
+        "--ambient-grey",
+        type=float,
+        metavar="GREY",
         help="for images without a lit background: grey level of a surface in ambient light alone (default: the "
-             "image's darkest)")  # fmt: skip
-    add("--mask", metavar="FILE",
+        "image's darkest)",
+    )
+    add(
+        "--mask",
+        metavar="FILE",
         help="object mask of phase or crossed: an image of the frames' size, above 0 on the object in every sample "
-             "(default: found in each image)")  # fmt: skip
-    add("--weights", metavar="FILE",
+        "(default: found in each image)",
+    )
+    add(
+        "--weights",
+        metavar="FILE",
         help="weights of classical-net, phase-net or crossed-net: a file, such as training writes (default: those that "
-             "come with the package)")  # fmt: skip
+        "come with the package)",
+    )
     add = parser.add_argument_group("constant").add_argument
     add(
         "--at",
@@ -99,10 +135,13 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument_group("nearest").add_argument
     add("--training", type=Path, metavar="FOLDER", help="dataset with the training split (default: DATASET itself)")
     add = parser.add_argument_group("trained networks").add_argument
-    add("--range", dest="depth_range", choices=("oracle", "predicted", "mean"),
+    add(
+        "--range",
+        dest="depth_range",
+        choices=("oracle", "predicted", "mean"),
         help="depth range of an individually normalised network: the test sample's own (oracle track), predicted from "
-             "the image, or the training set's mean (default: predicted where the weights can, else oracle)",
-    )  # fmt: skip
+        "the image, or the training set's mean (default: predicted where the weights can, else oracle)",
+    )
     add("--frame", type=int, metavar="N", help="frame to take (default: the first it was trained on)")
     add("--device", metavar="NAME", help="cpu, cuda, cuda:1 (default: cuda where there is one)")
 
@@ -252,6 +291,12 @@ def _nearest(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
 
 
 _MAKERS = {
-    "classical": _classical, "classical-net": _classical_net, "phase": _phase, "phase-net": _phase_net,
-    "crossed": _crossed, "crossed-net": _crossed_net, "constant": _constant, "nearest": _nearest,
-}  # fmt: skip
+    "classical": _classical,
+    "classical-net": _classical_net,
+    "phase": _phase,
+    "phase-net": _phase_net,
+    "crossed": _crossed,
+    "crossed-net": _crossed_net,
+    "constant": _constant,
+    "nearest": _nearest,
+}

@@ -31,8 +31,10 @@ def run(args: argparse.Namespace) -> int:
     if args.out.is_dir() and any(args.out.iterdir()):
         raise CaptureError(f"{args.out}: not empty; give a new folder, so that no old pattern is projected by mistake")
     paths = optics.export_patterns(rig, args.out)
-    frames = [{"file": path.name, "shows": frame.title.partition(": ")[2], **asdict(frame)}
-              for path, frame in zip(paths, rig.sequence, strict=True)]  # fmt: skip
+    frames = [
+        {"file": path.name, "shows": frame.title.partition(": ")[2], **asdict(frame)}
+        for path, frame in zip(paths, rig.sequence, strict=True)
+    ]
     content = {
         "projector_px": [rig.projector.width, rig.projector.height],
         "sequence": rig.to_dict()["sequence"],

@@ -27,8 +27,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("method", metavar="METHOD", help=METHOD_HELP)
     add("dataset", type=Path, metavar="DATASET", help="dataset folder")
     add("--split", default="test", choices=SPLITS, help="default: test")
-    add("--out", type=place, required=True, metavar="DIR",
-        help="new or empty folder, or a URL, written at the end; a run that was stopped continues")  # fmt: skip
+    add(
+        "--out",
+        type=place,
+        required=True,
+        metavar="DIR",
+        help="new or empty folder, or a URL, written at the end; a run that was stopped continues",
+    )
     add_method_options(parser)
     add_explain_options(parser)
 

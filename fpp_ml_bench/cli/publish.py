@@ -29,13 +29,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("dataset", type=Path, metavar="DATASET", help="folder of the dataset")
     add("--private", action="store_true", help="make the repository private if it is new")
     add("--license", metavar="ID", help="licence on the card (default: mit; imported data needs one)")
-    add("--staging", type=Path, metavar="DIR",
+    add(
+        "--staging",
+        type=Path,
+        metavar="DIR",
         help="put the files together in DIR and keep them, so that a later run continues (default: a temporary folder)",
-    )  # fmt: skip
+    )
 
     add = _part(kinds, "leaderboard", "the leaderboard's page as a static Space")
-    add("results", type=Path, nargs="*", metavar="RESULT.json",
-        help="result or row files, or folders of them (default: the rows shipped with the package)")  # fmt: skip
+    add(
+        "results",
+        type=Path,
+        nargs="*",
+        metavar="RESULT.json",
+        help="result or row files, or folders of them (default: the rows shipped with the package)",
+    )
     add("--page", type=Path, metavar="DIR", help="an existing page instead of results")
     add("--private", action="store_true", help="make the Space private if it is new")
     add("--dataset-repo", metavar="OWNER/NAME", help="dataset that the Space links to")

@@ -27,8 +27,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("method", metavar="METHOD", help=METHOD_HELP)
     add("dataset", type=Path, metavar="DATASET", help="dataset folder; scenes are made from its test objects")
     add("--views", type=int, default=2, metavar="N", help="samples of each test object, 1 to 6 (default: 2)")
-    add("--into", type=Path, metavar="FILE",
-        help="write the score into this result or leaderboard row of the same method (.json)")  # fmt: skip
+    add(
+        "--into",
+        type=Path,
+        metavar="FILE",
+        help="write the score into this result or leaderboard row of the same method (.json)",
+    )
     add("--json", type=Path, metavar="FILE", help="write the score and its parts to this file")
     add_method_options(parser)
 
@@ -60,8 +64,10 @@ def run(args: argparse.Namespace) -> int:
     if any(moved):
         show(_table(method.title, reliance))
     else:
-        print(f"{method.title}: gives the same answer whatever phase, light and outline of {reliance.samples} samples "
-              "are, so it reads nothing of them. Phase reliance 0.")  # fmt: skip
+        print(
+            f"{method.title}: gives the same answer whatever phase, light and outline of {reliance.samples} samples "
+            "are, so it reads nothing of them. Phase reliance 0."
+        )
     return 0
 
 

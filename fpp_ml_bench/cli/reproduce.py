@@ -31,21 +31,36 @@ EMPTY_BECAUSE = {
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("table", nargs="?", metavar="TABLE",
-        help=f"{', '.join(TABLES)} or {ALL}; or one row, like loss/l1")  # fmt: skip
-    add("--preset", choices=PRESETS, default="cpu",
+    add("table", nargs="?", metavar="TABLE", help=f"{', '.join(TABLES)} or {ALL}; or one row, like loss/l1")
+    add(
+        "--preset",
+        choices=PRESETS,
+        default="cpu",
         help="cpu: 224 px, narrow networks, 8 epochs (default); cpu-long: the same until the rate is at its minimum; "
-             "paper: 960 px and full width, needs a GPU")  # fmt: skip
+        "paper: 960 px and full width, needs a GPU",
+    )
     add("--data", type=Path, metavar="DIR", help="dataset, built when missing (default: data/cpu224 or data/full)")
-    add("--runs", type=Path, default=Path("runs"), metavar="DIR",
-        help="trainings, predictions and tables go below DIR/PRESET (default: runs)")  # fmt: skip
+    add(
+        "--runs",
+        type=Path,
+        default=Path("runs"),
+        metavar="DIR",
+        help="trainings, predictions and tables go below DIR/PRESET (default: runs)",
+    )
     add("--rows", type=Path, metavar="DIR", help="leaderboard rows (default: RUNS/PRESET/rows)")
-    add("--only-missing", action="store_true",
+    add(
+        "--only-missing",
+        action="store_true",
         help="keep rows that are up to date with the dataset and the weights; without it, all rows are made "
-             "again. Finished trainings are always kept")  # fmt: skip
-    add("--minutes", type=_minutes, metavar="M",
+        "again. Finished trainings are always kept",
+    )
+    add(
+        "--minutes",
+        type=_minutes,
+        metavar="M",
         help="stop before an epoch that would exceed M minutes, everything saved (exit status 1); the same command "
-             "continues")  # fmt: skip
+        "continues",
+    )
     add("--anyway", action="store_true", help="train preset paper even without a GPU")
     add("--list", action="store_true", help="show rows, recipes and their state, and stop")
 

@@ -37,17 +37,30 @@ CROSSED = "crossed", "crossed-net"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("method", metavar="METHOD", help=METHOD_HELP)
-    add("--out", type=place, required=True, metavar="DIR",
-        help="folder of measurements: each method has its own below it, and one page shows all; or a URL")  # fmt: skip
+    add(
+        "--out",
+        type=place,
+        required=True,
+        metavar="DIR",
+        help="folder of measurements: each method has its own below it, and one page shows all; or a URL",
+    )
     add("--axes", default="", metavar="A,B", help="only these axes (default: all that apply to the method)")
     add("--set", dest="objects", default="test", choices=("test", "unseen"), help="objects (default: test)")
     add("--size", type=int, default=FULL_SIZE, metavar="PX", help=f"image size (default: {FULL_SIZE})")
     add("--quick", action="store_true", help="one view of each object and three severities, for a look")
-    add("--into", type=Path, metavar="FILE",
-        help="write the block into this result or row of the same method (.json); needs all axes")  # fmt: skip
+    add(
+        "--into",
+        type=Path,
+        metavar="FILE",
+        help="write the block into this result or row of the same method (.json); needs all axes",
+    )
     add_pool_options(parser)
-    add("--cache", type=Path, metavar="DIR",
-        help="rendered frames, at most 10 GB (default: the user's cache folder; with --cluster none)")  # fmt: skip
+    add(
+        "--cache",
+        type=Path,
+        metavar="DIR",
+        help="rendered frames, at most 10 GB (default: the user's cache folder; with --cluster none)",
+    )
     add("--no-cache", action="store_true", help="render every frame anew, keep none")
     add_method_options(parser)
 

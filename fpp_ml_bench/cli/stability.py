@@ -24,8 +24,13 @@ _GROUPS = ("phase", "order", "triangulation", "rig", "normalisation", "metrics",
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--group", action="append", choices=_GROUPS, metavar="GROUP",
-        help=f"run only this group; can be repeated: {', '.join(_GROUPS)} (default: all)")  # fmt: skip
+    add(
+        "--group",
+        action="append",
+        choices=_GROUPS,
+        metavar="GROUP",
+        help=f"run only this group; can be repeated: {', '.join(_GROUPS)} (default: all)",
+    )
     add("--out", type=Path, metavar="DIR", help="write index.html, stability.json and stability.png here")
     add("--json", action="store_true", help="print the run as JSON instead of a table")
     add("--quick", action="store_true", help="leave out the case that needs gigabytes (10 million triangles)")

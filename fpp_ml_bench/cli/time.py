@@ -31,8 +31,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--batch", type=count(), default=4, metavar="N", help="images a batch (default: 4)")
     add("--repeats", type=count(), default=20, metavar="N", help="timed runs (default: 20)")
     add("--json", type=Path, metavar="FILE", help="write the timing here")
-    add("--into", type=Path, action="append", default=[], metavar="FILE",
-        help="put it into this submission.yaml or result file of the same method; may be given again")  # fmt: skip
+    add(
+        "--into",
+        type=Path,
+        action="append",
+        default=[],
+        metavar="FILE",
+        help="put it into this submission.yaml or result file of the same method; may be given again",
+    )
     add_method_options(parser)
 
 

@@ -22,19 +22,39 @@ _GROUPS = ("classical", "phase", "networks", "precision", "sizes", "costs")
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("dataset", type=Path, metavar="DATASET", help="dataset folder with all frames")
-    add("--out", type=Path, default=Path("tradeoff"), metavar="DIR",
-        help="folder for the results, or the folder of a stopped run to continue (default: tradeoff)")  # fmt: skip
-    add("--only", action="append", choices=_GROUPS, default=[], metavar="GROUP",
-        help=f"measure only this group; may be repeated: {', '.join(_GROUPS)} (default: all)")  # fmt: skip
+    add(
+        "--out",
+        type=Path,
+        default=Path("tradeoff"),
+        metavar="DIR",
+        help="folder for the results, or the folder of a stopped run to continue (default: tradeoff)",
+    )
+    add(
+        "--only",
+        action="append",
+        choices=_GROUPS,
+        default=[],
+        metavar="GROUP",
+        help=f"measure only this group; may be repeated: {', '.join(_GROUPS)} (default: all)",
+    )
     add("--quick", action="store_true", help="fewer settings, views, runs and sizes")
     add("--list", action="store_true", help="show what would be measured, and stop")
     add("--threads", type=count(1000), default=1, metavar="N", help="threads a method may use (default: 1)")
-    add("--clock", choices=("wall", "processor"), default="wall",
-        help="processor: processor time of this process, for a shared machine (default: wall)")  # fmt: skip
+    add(
+        "--clock",
+        choices=("wall", "processor"),
+        default="wall",
+        help="processor: processor time of this process, for a shared machine (default: wall)",
+    )
     add("--views", type=count(1000), metavar="N", help="views of each test object (default: 2, quick: 1)")
     add("--runs", type=Path, metavar="DIR", help="also measure the networks trained below DIR")
-    add("--widths", type=count(1000), nargs="*", metavar="W",
-        help="widths of untrained UNets to time (default: 4 8 16 32; on large images 4 8)")  # fmt: skip
+    add(
+        "--widths",
+        type=count(1000),
+        nargs="*",
+        metavar="W",
+        help="widths of untrained UNets to time (default: 4 8 16 32; on large images 4 8)",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -42,8 +62,17 @@ def run(args: argparse.Namespace) -> int:
     limit_threads(args.threads)  # before NumPy is loaded
     from fpp_ml_bench.cli.console import progress_bar, show
 
-    settings = tradeoff.TradeoffSettings(args.dataset, args.out, tuple(args.only), args.quick, args.threads, args.clock,
-                                         args.views, args.runs, args.widths)  # fmt: skip
+    settings = tradeoff.TradeoffSettings(
+        args.dataset,
+        args.out,
+        tuple(args.only),
+        args.quick,
+        args.threads,
+        args.clock,
+        args.views,
+        args.runs,
+        args.widths,
+    )
     plan = tradeoff.planned(settings, [page.board_ladder(args.quick)] if not args.only or "costs" in args.only else [])
     if args.list:
         show(tradeoff.plan_table(plan))

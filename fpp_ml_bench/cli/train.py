@@ -26,23 +26,40 @@ _OWN_VIEWS = "classical-net", "phase-net", "crossed-net"
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("recipe", metavar="RECIPE", help="a name like loss/l1 (fpp-bench reproduce --list), a .yaml, or "
-        f"{', '.join(_OWN_VIEWS)}")  # fmt: skip
-    add("dataset", type=Path, metavar="DATASET", nargs="?",
-        help="dataset folder, of the preset's image size (those three: none)")  # fmt: skip
+    add(
+        "recipe",
+        metavar="RECIPE",
+        help=f"a name like loss/l1 (fpp-bench reproduce --list), a .yaml, or {', '.join(_OWN_VIEWS)}",
+    )
+    add(
+        "dataset",
+        type=Path,
+        metavar="DATASET",
+        nargs="?",
+        help="dataset folder, of the preset's image size (those three: none)",
+    )
     add("--out", type=Path, required=True, metavar="DIR", help="new folder, or that of a training to resume")
     add("--preset", choices=training.PRESETS, default="cpu", help="what a shipped recipe is scaled to (default: cpu)")
-    add("--minutes", type=float, metavar="M",
-        help="stop before an epoch that would not finish in time, everything saved")  # fmt: skip
-    add("--steps", type=int, metavar="N",
-        help="those three: training steps (default: as the shipped weights)")  # fmt: skip
-    add("--unions", type=int, metavar="N",
+    add(
+        "--minutes",
+        type=float,
+        metavar="M",
+        help="stop before an epoch that would not finish in time, everything saved",
+    )
+    add("--steps", type=int, metavar="N", help="those three: training steps (default: as the shipped weights)")
+    add(
+        "--unions",
+        type=int,
+        metavar="N",
         help="the same: images that join several objects, made from each sample (default: as the shipped weights)",
-    )  # fmt: skip
+    )
     add("--lights", type=int, metavar="N", help="the same: lights that are drawn (default: as the shipped weights)")
     add("--rate", type=float, metavar="R", help="the same: largest learning rate (default: as the shipped weights)")
-    add("--albedo", choices=("one", "any"),
-        help="phase-net: one, with brightness as a cue for the order, or any, without (default: one)")  # fmt: skip
+    add(
+        "--albedo",
+        choices=("one", "any"),
+        help="phase-net: one, with brightness as a cue for the order, or any, without (default: one)",
+    )
     add("--start", type=Path, metavar="FILE", help="phase-net: weights to start from (default: none)")
 
 
@@ -85,24 +102,40 @@ def run(args: argparse.Namespace) -> int:
 def _phase_net(args: argparse.Namespace) -> int:
     recipe = phase_network.Recipe(**_given(args, "steps", "unions", "rate", "lights", "albedo", "start"))
     trained = phase_network.train_phase_net(
-        recipe, args.out, start=args.start, minutes=args.minutes, workers=usable_cores(), show=True, print_line=print,
-    )  # fmt: skip
+        recipe,
+        args.out,
+        start=args.start,
+        minutes=args.minutes,
+        workers=usable_cores(),
+        show=True,
+        print_line=print,
+    )
     return _window_training_said(args, recipe.steps, trained)
 
 
 def _classical_net(args: argparse.Namespace) -> int:
     recipe = classical_network.FilterRecipe(**_given(args, "steps", "unions", "rate", "lights"))
     trained = classical_network.train_classical_net(
-        recipe, args.out, minutes=args.minutes, workers=usable_cores(), show=True, print_line=print,
-    )  # fmt: skip
+        recipe,
+        args.out,
+        minutes=args.minutes,
+        workers=usable_cores(),
+        show=True,
+        print_line=print,
+    )
     return _window_training_said(args, recipe.steps, trained)
 
 
 def _crossed_net(args: argparse.Namespace) -> int:
     recipe = crossed_network.CrossedRecipe(**_given(args, "steps", "unions", "rate", "lights"))
     trained = crossed_network.train_crossed_net(
-        recipe, args.out, minutes=args.minutes, workers=usable_cores(), show=True, print_line=print,
-    )  # fmt: skip
+        recipe,
+        args.out,
+        minutes=args.minutes,
+        workers=usable_cores(),
+        show=True,
+        print_line=print,
+    )
     return _window_training_said(args, recipe.steps, trained)
 
 

@@ -63,9 +63,15 @@ class Coordinates:
 
     @classmethod
     def judged(
-        cls, coordinate_px: NDArray, modulation: NDArray, phase: NDArray, saturated: NDArray, inconsistent: NDArray,
-        length_px: float, limits: Limits,
-    ) -> "Coordinates":  # fmt: skip
+        cls,
+        coordinate_px: NDArray,
+        modulation: NDArray,
+        phase: NDArray,
+        saturated: NDArray,
+        inconsistent: NDArray,
+        length_px: float,
+        limits: Limits,
+    ) -> "Coordinates":
         """With the first reason that applies of `STAGE_REASONS`; ``saturated`` and ``inconsistent`` bool (n,)."""
         outside = (coordinate_px < -0.5) | (coordinate_px > length_px - 0.5)
         faults = modulation < limits.min_modulation, saturated, inconsistent, outside

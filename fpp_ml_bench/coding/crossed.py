@@ -87,9 +87,11 @@ class Crossed:
     def to_dict(self) -> dict[str, Any]:
         """The entries of a rig file; `from_entries` gives an equal family back."""
         return {
-            "pitches_px": list(self.pitches_px), "angles_deg": list(self.angles_deg), "weights": list(self.weights),
+            "pitches_px": list(self.pitches_px),
+            "angles_deg": list(self.angles_deg),
+            "weights": list(self.weights),
             "shifts_deg": [list(pair) for pair in self.shifts_deg],
-        }  # fmt: skip
+        }
 
     def __len__(self) -> int:
         return len(self.shifts_deg)
@@ -98,9 +100,8 @@ class Crossed:
     def title(self) -> str:
         """The family in a few words."""
         carriers = " and ".join(
-            f"{pitch:g} px at {angle:g} degrees"
-            for pitch, angle in zip(self.pitches_px, self.angles_deg, strict=True)
-        )  # fmt: skip
+            f"{pitch:g} px at {angle:g} degrees" for pitch, angle in zip(self.pitches_px, self.angles_deg, strict=True)
+        )
         return f"{len(self)} crossed frame(s) of {carriers}"
 
     @property

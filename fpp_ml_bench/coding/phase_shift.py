@@ -115,8 +115,9 @@ class PhaseShift(Code):
     def shown(self) -> tuple[Shown, ...]:
         frames = [
             Shown("sinusoid", step, number)
-            for number, fringe in enumerate(self.fringes) for step in range(len(fringe.shifts_deg))
-        ]  # fmt: skip
+            for number, fringe in enumerate(self.fringes)
+            for step in range(len(fringe.shifts_deg))
+        ]
         return (*frames, *(self.gray.shown if self.gray else ()))
 
     @cached_property
@@ -243,8 +244,9 @@ class PhaseShift(Code):
     def sigma_px(self, modulation: ArrayLike, noise_grey: ArrayLike) -> NDArray[np.float64]:
         precision = sum(
             len(fringe.shifts_deg) / 2 / fringe.pitch_px**2
-            for fringe in self.fringes if fringe.pitch_px <= FINE_RATIO * self.pitch_px
-        )  # fmt: skip
+            for fringe in self.fringes
+            if fringe.pitch_px <= FINE_RATIO * self.pitch_px
+        )
         with np.errstate(divide="ignore"):
             relative = np.asarray(noise_grey, dtype=np.float64) / np.asarray(modulation, dtype=np.float64)
         return relative / (TAU * math.sqrt(precision))

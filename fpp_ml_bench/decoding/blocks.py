@@ -88,11 +88,16 @@ def plan_direction(rig: Rig, direction: Direction, steps: int | None, limits: Li
     allowed = limits.max_clipped_steps
     sinusoids = tuple(available[i] for i in chosen)
     return DirectionPlan(
-        direction, code, length, (*sinusoids, *rig.sequence.gray(direction)), sinusoids=sinusoids,
+        direction,
+        code,
+        length,
+        (*sinusoids, *rig.sequence.gray(direction)),
+        sinusoids=sinusoids,
         weights=phase_weights(2 * np.pi * np.array(chosen) / len(available)),
-        centres_rad=coding.cell_centres_rad(length, code.pitch_px), pitch_px=code.pitch_px,
+        centres_rad=coding.cell_centres_rad(length, code.pitch_px),
+        pitch_px=code.pitch_px,
         max_clipped_steps=len(chosen) // CLIPPED_STEPS_DIVISOR if allowed is None else allowed,
-    )  # fmt: skip
+    )
 
 
 def plain_plan(rig: Rig, direction: Direction, steps: int | None, limits: Limits) -> DirectionPlan:

@@ -170,10 +170,17 @@ class _Image:
 
 
 def decode_stack(
-    frames: Sequence[NDArray | None] | NDArray, rig: Rig, direction: Directions = "both", steps: int | None = None,
-    mask: NDArray[np.bool_] | None = None, limits: Limits | None = None, details: bool = False, threads: int = 1,
-    reasons: bool = True, fewest: bool = False,
-) -> Decoded:  # fmt: skip
+    frames: Sequence[NDArray | None] | NDArray,
+    rig: Rig,
+    direction: Directions = "both",
+    steps: int | None = None,
+    mask: NDArray[np.bool_] | None = None,
+    limits: Limits | None = None,
+    details: bool = False,
+    threads: int = 1,
+    reasons: bool = True,
+    fewest: bool = False,
+) -> Decoded:
     """Depth in mm from a captured sequence.
 
     ``frames``: all frames of ``rig.sequence`` in order, uint8, or float32 of 0 to 255 for deeper images, (H, W) each: a

@@ -123,9 +123,14 @@ def depth_from_both(
 
 
 def depth_noise_mm(
-    rig: Rig, depth_mm: ArrayLike, direction: Direction | str, steps: int, modulation: ArrayLike,
-    noise: ArrayLike = 1.0, rays: Maps | None = None,
-) -> NDArray[np.float64]:  # fmt: skip
+    rig: Rig,
+    depth_mm: ArrayLike,
+    direction: Direction | str,
+    steps: int,
+    modulation: ArrayLike,
+    noise: ArrayLike = 1.0,
+    rays: Maps | None = None,
+) -> NDArray[np.float64]:
     """Standard deviation of the depth in mm that intensity noise causes, float64.
 
     ``modulation`` B and ``noise`` sigma in grey levels, ``rays`` the pixels' normalised (x, y), by default the optical

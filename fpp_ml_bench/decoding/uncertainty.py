@@ -30,9 +30,12 @@ with ``--split validation --target depth_exact``); larger errors are more freque
 
 
 def depth_sigma_mm(
-    decoded: Decoded, rig: Rig, noise_grey: NDArray | float, steps: int | None = None,
+    decoded: Decoded,
+    rig: Rig,
+    noise_grey: NDArray | float,
+    steps: int | None = None,
     systematic_rad: float | Mapping[str, float] = 0.0,
-) -> NDArray[np.float32]:  # fmt: skip
+) -> NDArray[np.float32]:
     """Standard uncertainty of every decoded pixel in mm, float32 (H, W), 0 = none, from noise of ``noise_grey`` grey
     levels a frame, one number or (H, W). Of ``decoded`` with details, and with so many ``steps`` of each direction
     (default: all). It is that of the noise, and of an error ``systematic_rad`` of every phase, one for all or by

@@ -58,13 +58,21 @@ def _draw_torus(axes: "Axes", lines: EpipolarLines, candidate: Candidate) -> Non
         axes.plot(*_wrapped(turns[pixel], np.array([place]))[0], marker, ms=9, color="C0", label=label)
     if lines.background is not None:
         axes.plot(
-            *_wrapped(turns[pixel], lines.background[pixel : pixel + 1])[0], "x", ms=11, mew=3, color="C3",
+            *_wrapped(turns[pixel], lines.background[pixel : pixel + 1])[0],
+            "x",
+            ms=11,
+            mew=3,
+            color="C3",
             label="background",
-        )  # fmt: skip
+        )
     axes.set(
-        title=f"{_title(candidate.crossed)}\nnearest rival {candidate.rival_rad:.2f} rad", xlim=(0, 1), ylim=(0, 1),
-        xlabel="phase of carrier 1, turns (near end: 0.5)", ylabel="phase of carrier 2, turns", aspect="equal",
-    )  # fmt: skip
+        title=f"{_title(candidate.crossed)}\nnearest rival {candidate.rival_rad:.2f} rad",
+        xlim=(0, 1),
+        ylim=(0, 1),
+        xlabel="phase of carrier 1, turns (near end: 0.5)",
+        ylabel="phase of carrier 2, turns",
+        aspect="equal",
+    )
     axes.legend(loc="best", fontsize=8)
 
 
@@ -90,6 +98,7 @@ def _draw_map(axes: "Axes", rig: Rig, lines: EpipolarLines, proposed: Candidate,
     first_deg, second_deg = proposed.crossed.angles_deg
     axes.set(
         title=f"nearest rival by periods, at {first_deg:g} / {second_deg:g} degrees",
-        xlabel="period of carrier 1, projector px", ylabel="period of carrier 2, projector px",
-    )  # fmt: skip
+        xlabel="period of carrier 1, projector px",
+        ylabel="period of carrier 2, projector px",
+    )
     axes.figure.colorbar(image, ax=axes, label="distance of the phases, rad")

@@ -84,18 +84,25 @@ def describe(rig: Rig, families: Sequence[Crossed], assumed: Assumptions) -> lis
     most = np.abs(turns).max(axis=1)
     return [
         Candidate(
-            family, float(rival[k]), None if background is None else float(background[k]), float(sigma[k].max()),
-            float(noise[k]), float(wrong[k]), (float(image_px[k, 0]), float(image_px[k, 1])),
+            family,
+            float(rival[k]),
+            None if background is None else float(background[k]),
+            float(sigma[k].max()),
+            float(noise[k]),
+            float(wrong[k]),
+            (float(image_px[k, 0]), float(image_px[k, 1])),
             (float(most[k, 0]), float(most[k, 1])),
         )
         for k, family in enumerate(families)
-    ]  # fmt: skip
+    ]
 
 
 def search(
-    rig: Rig, assumed: Assumptions, pitches_px: Iterable[float] | None = None,
+    rig: Rig,
+    assumed: Assumptions,
+    pitches_px: Iterable[float] | None = None,
     angles_deg: Iterable[float] = ANGLES_DEG,
-) -> Design:  # fmt: skip
+) -> Design:
     """The best pairs of carriers out of all ``pitches_px`` (by default all whole numbers that the image can hold) and
     ``angles_deg``. Proposed is the one with the least depth noise of those with few enough wrong orders. Raises
     `RigError` where the limits leave none."""
@@ -111,8 +118,9 @@ def search(
     pitches = np.array([pitch for pitch, _ in carriers])
     image_px = np.array([rig.image_px_of_carrier(tuple(carrier)) for carrier in cycles])
     sigmas = _sigmas(assumed, pitches, image_px)
-    turns, slopes = (np.stack([of_lines @ carrier for carrier in cycles])
-                     for of_lines in (lines.across_px, lines.far_px_per_mm))  # fmt: skip
+    turns, slopes = (
+        np.stack([of_lines @ carrier for carrier in cycles]) for of_lines in (lines.across_px, lines.far_px_per_mm)
+    )
     clearance, noise = np.empty((2, len(pairs)))
     for start in range(0, len(pairs), _CHUNK):
         part = slice(start, start + _CHUNK)
@@ -214,9 +222,12 @@ def _sigma_across(turns: NDArray[np.float64], sigmas: NDArray[np.float64]) -> ND
 
 
 def _depth_noise_mm(
-    slopes: NDArray[np.float64], pitches_px: NDArray[np.float64], weights: NDArray[np.float64] | float,
-    lines: EpipolarLines, assumed: Assumptions,
-) -> NDArray[np.float64]:  # fmt: skip
+    slopes: NDArray[np.float64],
+    pitches_px: NDArray[np.float64],
+    weights: NDArray[np.float64] | float,
+    lines: EpipolarLines,
+    assumed: Assumptions,
+) -> NDArray[np.float64]:
     """Depth noise at the far end, the most over the lines, of both carriers together (K,); ``slopes`` (K, n, 2) in
     turns per mm, ``pitches_px`` (K, 2). A phase in a Gaussian window of sigma W has the noise ``s / (B W sqrt(2 pi))``
     at noise s and modulation B."""

@@ -43,15 +43,24 @@ CONTRADICTING, DOUBTFUL = 0.6, 0.5
 MOVED_SHARE, NEIGHBOURS_PX = 0.05, 9
 """Share of the lit pixels at which mean images differ, averaged over so many neighbours, where the scene moved."""
 _FINEST, _SCORED_PX = 2.0, 4000
-_UNITS = {1000.0: "metres were read as mm", 10.0: "cm were read as mm", 0.01: "cm were read as metres",
-          0.001: "mm were read as metres"}  # fmt: skip
+_UNITS = {
+    1000.0: "metres were read as mm",
+    10.0: "cm were read as mm",
+    0.01: "cm were read as metres",
+    0.001: "mm were read as metres",
+}
 
 
 def examine(
-    frames: NDArray | Sequence[NDArray], rig: Rig, names: Sequence[str] | None = None, *,
-    directions: Sequence[Direction] | None = None, mask: NDArray[np.bool_] | None = None, limits: Limits | None = None,
+    frames: NDArray | Sequence[NDArray],
+    rig: Rig,
+    names: Sequence[str] | None = None,
+    *,
+    directions: Sequence[Direction] | None = None,
+    mask: NDArray[np.bool_] | None = None,
+    limits: Limits | None = None,
     calibrated: bool = True,
-) -> Examination:  # fmt: skip
+) -> Examination:
     """Examine the ``frames`` (F, H, W) of a rig's sequence, grey levels of 0 to 255; ``names`` are their files'.
 
     ``directions``: those that will be decoded (all). Pixels outside ``mask`` (H, W) don't count. ``calibrated`` False:
@@ -125,10 +134,12 @@ def _is_finest(one: FringeSet, rig: Rig) -> bool:
 def _equal(pairs: Sequence[tuple[int, int]], titles: Sequence[str]) -> Finding:
     listed = ", ".join(f"{titles[i]} and {titles[j]}" for i, j in pairs[:4]) + (" and others" if len(pairs) > 4 else "")
     return Finding(
-        "equal frames", "refuse", f"{listed} show the same image, and their patterns differ",
+        "equal frames",
+        "refuse",
+        f"{listed} show the same image, and their patterns differ",
         "the camera delivered a frame twice, or a pattern was not shown in time, or a file was copied",
         "capture again: trigger the camera by the projector, or wait longer after each pattern",
-    )  # fmt: skip
+    )
 
 
 def _exchanged_flat(lines: Lines, rig: Rig) -> list[Finding]:
@@ -138,10 +149,15 @@ def _exchanged_flat(lines: Lines, rig: Rig) -> list[Finding]:
     dark, bright = (lines.levels[index][lines.lit].astype(np.float64).mean() for index in (black, white))
     if bright >= dark:
         return []
-    return [Finding(
-        "white and black", "refuse", f"white has {bright:.0f} grey levels, and black {dark:.0f}",
-        "they changed places, or the frames are in another order", "rename the files, or correct the sequence's order",
-    )]  # fmt: skip
+    return [
+        Finding(
+            "white and black",
+            "refuse",
+            f"white has {bright:.0f} grey levels, and black {dark:.0f}",
+            "they changed places, or the frames are in another order",
+            "rename the files, or correct the sequence's order",
+        )
+    ]
 
 
 def _is_offset(found: Edges) -> bool:
@@ -155,14 +171,15 @@ def _offset(found: Edges, rig: Rig, direction: Direction) -> Finding:
     pitch, turns = rig.pitch(direction), found.offset_turns
     origin_px = (code.origin_px if isinstance(code, PhaseShift) else 0.0) - turns.value * pitch
     return Finding(
-        "phase and Gray code", "refuse",
+        "phase and Gray code",
+        "refuse",
         f"the {direction} phase at the edges of the Gray cells is {360 * turns.value:.1f} +- "
         f"{360 * turns.sigma:.1f} degrees off, {abs(turns.value) * pitch:.2f} projector px, "
         f"at {100 * found.agreeing:.0f}% of {found.edges} edges",
         "the sinusoids begin elsewhere than at the Gray code's first pixel (another origin, or sine for cosine)",
         f"if the Gray code begins at the pattern's first pixel: origin_px: {origin_px:.2f} ({direction}), or "
         f"{360 * turns.value:+.1f} degrees to every shift in shifts_deg",
-    )  # fmt: skip
+    )
 
 
 def _other_readings(
@@ -174,11 +191,15 @@ def _other_readings(
     listed = "; or ".join(f"{reading.what} ({100 * fits.fitting:.0f}%)" for reading, fits in found[:4])
     alike = " (these frames can't tell which)" if len(found) > 1 else ""
     changes = "; or ".join(dict.fromkeys(reading.change for reading, _ in found[:4]))
-    return [Finding(
-        "another reading fits", "refuse",
-        f"{100 * given.fitting:.0f}% of the lit pixels fit as the rig file says, and far more fit another reading",
-        f"{listed}{alike}", changes,
-    )]  # fmt: skip
+    return [
+        Finding(
+            "another reading fits",
+            "refuse",
+            f"{100 * given.fitting:.0f}% of the lit pixels fit as the rig file says, and far more fit another reading",
+            f"{listed}{alike}",
+            changes,
+        )
+    ]
 
 
 def _steps_and_response(
@@ -205,21 +226,28 @@ def _steps_and_response(
             evidence.append(f"the shift {which} is {abs(np.rad2deg(step[1].value)):.0f} degrees off")
         if twice is not None and wrong_wave:
             evidence.append(f"the phase has an error of {twice.value:.3f} rad that repeats twice a period")
-        findings.append(Finding(
-            "wrong step", "refuse", f"{name}: {', and '.join(evidence)}, which neither noise nor gamma explains",
-            "a frame that was exposed while the pattern changed, came late, or was shown at another brightness",
-            "capture again: trigger the camera by the projector, or wait longer after each pattern",
-        ))  # fmt: skip
+        findings.append(
+            Finding(
+                "wrong step",
+                "refuse",
+                f"{name}: {', and '.join(evidence)}, which neither noise nor gamma explains",
+                "a frame that was exposed while the pattern changed, came late, or was shown at another brightness",
+                "capture again: trigger the camera by the projector, or wait longer after each pattern",
+            )
+        )
     bent = waves.get(one.steps) if one.steps > 2 else None
     if bent is not None and bent.value > max(RESPONSE_RAD, SIGMAS * bent.sigma) and not findings:
         error_rad = bent.value / math.sqrt(2)
         systematic[one.direction] = max(systematic.get(one.direction, 0.0), error_rad)
-        findings.append(Finding(
-            "response", "note",
-            f"{name}: the phase has an error of {bent.value:.3f} rad that repeats {one.steps} times a period",
-            "the response of projector and camera is not straight (gamma)",
-            "the stated uncertainty holds it; set projector and camera to gamma 1, or use more steps",
-        ))  # fmt: skip
+        findings.append(
+            Finding(
+                "response",
+                "note",
+                f"{name}: the phase has an error of {bent.value:.3f} rad that repeats {one.steps} times a period",
+                "the response of projector and camera is not straight (gamma)",
+                "the stated uncertainty holds it; set projector and camera to gamma 1, or use more steps",
+            )
+        )
     return findings
 
 
@@ -234,23 +262,28 @@ def _moved(sets: Sequence[FringeSet]) -> list[Finding]:
         difference = uniform_filter1d(other.mean - gain * one.mean, NEIGHBOURS_PX)[both]
         apart = np.abs(difference) > 0.25 * one.modulation[both] + 6.0
         if apart.mean() > MOVED_SHARE:
-            return [Finding(
-                "scene moved", "refuse",
-                f"the mean images of the {one.direction} fringes of {one.pitch_px:g} px and the {other.direction} ones "
-                f"of {other.pitch_px:g} px differ at {100 * apart.mean():.0f}% of the lit pixels",
-                "object or camera moved between them, the frames are of two captures, or a frame failed",
-                "put the frames of one capture, of a scene at rest, into the folder",
-            )]  # fmt: skip
+            return [
+                Finding(
+                    "scene moved",
+                    "refuse",
+                    f"the mean images of the {one.direction} fringes of {one.pitch_px:g} px and the "
+                    f"{other.direction} ones "
+                    f"of {other.pitch_px:g} px differ at {100 * apart.mean():.0f}% of the lit pixels",
+                    "object or camera moved between them, the frames are of two captures, or a frame failed",
+                    "put the frames of one capture, of a scene at rest, into the folder",
+                )
+            ]
     return []
 
 
 def _contradictions(given: Fit) -> Finding:
     return Finding(
-        "contradictions", "refuse" if given.contradicting > CONTRADICTING else "warn",
+        "contradictions",
+        "refuse" if given.contradicting > CONTRADICTING else "warn",
         f"{100 * given.contradicting:.0f}% of the lit pixels contradict the code, and no other reading tried fits",
         "the rig file's sequence, projector size or pose is not what captured this, or the scene moved",
         "compare the first and last image with the sequence's first and last pattern (fpp-bench patterns)",
-    )  # fmt: skip
+    )
 
 
 def _out_of_range(depth_mm: NDArray[np.float64], rig: Rig) -> Finding:
@@ -267,7 +300,9 @@ def _out_of_range(depth_mm: NDArray[np.float64], rig: Rig) -> Finding:
     )
     baseline = MM_PER_M * rig.baseline_m
     return Finding(
-        "nothing in the range", "refuse",
+        "nothing in the range",
+        "refuse",
         f"depths of {low:.4g} to {high:.4g} mm, a baseline of {baseline:.4g} mm, and a range of {near:g} to {far:g} mm",
-        cause, change,
-    )  # fmt: skip
+        cause,
+        change,
+    )

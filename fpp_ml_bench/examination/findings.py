@@ -42,9 +42,11 @@ class Examination:
 
     def to_dict(self) -> dict[str, Any]:
         return {
-            "findings": [asdict(finding) for finding in self.findings], "not_checked": list(self.not_checked),
-            "measured": dict(self.measured), "systematic_rad": dict(self.systematic_rad),
-        }  # fmt: skip
+            "findings": [asdict(finding) for finding in self.findings],
+            "not_checked": list(self.not_checked),
+            "measured": dict(self.measured),
+            "systematic_rad": dict(self.systematic_rad),
+        }
 
 
 class RefusedCapture(CaptureError):

@@ -181,9 +181,10 @@ def _single(rig: Rig, solid: bool) -> Iterator[Reading]:
     everything = list(range(len(frames)))
     if solid:
         for flips, name in (
-            ((True, False), "mirrored left to right"), ((False, True), "mirrored top to bottom"),
+            ((True, False), "mirrored left to right"),
+            ((False, True), "mirrored top to bottom"),
             ((True, True), "turned by 180 degrees"),
-        ):  # fmt: skip
+        ):
             change = f"write the images as the calibrated camera sees them: they are {name}"
             yield Reading(f"images that are {name}", change, flips=flips)
         turned: Any = tuple(tuple(column) for column in rig.R.T.tolist())

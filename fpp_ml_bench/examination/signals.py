@@ -74,8 +74,11 @@ def fringe_sets(lines: Lines, rig: Rig, directions: Sequence[Direction]) -> list
             modulation = np.sqrt(cosine * cosine + sine * sine)
             good = lines.lit & (modulation >= MIN_MODULATION) & (levels < GREY_LEVELS).all(axis=0)
             phase = minus_atan2(sine, cosine)
-            sets.append(FringeSet(direction, number, fringe.pitch_px, frames, shifts, mean, cosine, sine, phase,
-                                  modulation, good))  # fmt: skip
+            sets.append(
+                FringeSet(
+                    direction, number, fringe.pitch_px, frames, shifts, mean, cosine, sine, phase, modulation, good
+                )
+            )
     return sets
 
 

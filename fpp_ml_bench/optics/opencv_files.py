@@ -69,9 +69,11 @@ class OpenCvCalibration:
 
 
 def read_opencv_calibration(
-    *paths: str | Path, camera_size: tuple[int, int] | None = None, projector_size: tuple[int, int] | None = None,
+    *paths: str | Path,
+    camera_size: tuple[int, int] | None = None,
+    projector_size: tuple[int, int] | None = None,
     unit: str = "mm",
-) -> OpenCvCalibration:  # fmt: skip
+) -> OpenCvCalibration:
     """The calibration in a file, or in several that hold parts of it (OpenCV's sample writes intrinsics and extrinsics
     apart). ``camera_size`` and ``projector_size``: (width, height) in px, needed where the files do not store them;
     ``unit``: mm or m, of the files' translation. A rotation rounded to float32 becomes the nearest exact one. Raises

@@ -226,12 +226,16 @@ class Rig:
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers, lists and mappings, as stored with a dataset; `rig_from_dict` gives an equal rig back."""
         content: dict[str, Any] = {
-            "camera": self.camera.to_dict(), "projector": self.projector.to_dict(),
-            "rotation": [list(row) for row in self.rotation], "translation_m": list(self.translation_m),
+            "camera": self.camera.to_dict(),
+            "projector": self.projector.to_dict(),
+            "rotation": [list(row) for row in self.rotation],
+            "translation_m": list(self.translation_m),
             "pitch_px": {direction: self._pitch(direction) for direction in DIRECTIONS},
-            "sequence": self.sequence.to_dict(), "working_range_mm": list(self.working_range_mm),
-            "standoff_m": self.standoff_m, "background_m": self.background_m,
-        }  # fmt: skip
+            "sequence": self.sequence.to_dict(),
+            "working_range_mm": list(self.working_range_mm),
+            "standoff_m": self.standoff_m,
+            "background_m": self.background_m,
+        }
         if isinstance(self.sequence, CodedSequence):
             del content["pitch_px"]
         return content

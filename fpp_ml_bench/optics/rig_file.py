@@ -92,8 +92,9 @@ def rig_from_dict(data: object) -> Rig:
     if isinstance(turn, list | tuple) and len(turn) == 3 and not any(isinstance(v, list | tuple) for v in turn):
         entries["rotation"] = rotation_matrix(numbers(turn, 3, "rotation")).tolist()
     lengths: dict[Direction, int] = {
-        "horizontal": entries["projector"].height, "vertical": entries["projector"].width,
-    }  # fmt: skip
+        "horizontal": entries["projector"].height,
+        "vertical": entries["projector"].width,
+    }
     entries["sequence"] = sequence_from_dict(entries["sequence"], lengths)
     entries.setdefault("background_m", None)
     if "standoff_m" not in entries:
@@ -182,8 +183,15 @@ def load_projection(path: str | Path, camera_size: tuple[int, int] | None = None
         sizes["projector"] = device["width"], device["height"]
         devices = {}
         for name, (width, height) in sizes.items():
-            devices[name] = {"width": width, "height": height, "fx": 1e3, "fy": 1e3, "cx": 0.0, "cy": 0.0,
-                             "distortion": [0.0] * 5}  # fmt: skip
+            devices[name] = {
+                "width": width,
+                "height": height,
+                "fx": 1e3,
+                "fy": 1e3,
+                "cx": 0.0,
+                "cy": 0.0,
+                "distortion": [0.0] * 5,
+            }
         kept = {key: entries[key] for key in ("sequence", "pitch_px") if key in entries}
         pose = {"rotation": np.eye(3).tolist(), "translation_m": [0.1, 0.0, 0.0], "working_range_mm": [1.0, 1e9]}
         return rig_from_dict({**devices, **kept, **pose})
@@ -212,9 +220,12 @@ def _with_calibration(data: object, folder: Path) -> object:
             sizes[key] = int(width), int(height)
     found = read_opencv_calibration(folder / str(file), unit=str(given.get("unit", "mm")), **sizes)  # type: ignore[arg-type]
     return {
-        **entries, "camera": found.camera.to_dict(), "projector": found.projector.to_dict(),
-        "rotation": [list(row) for row in found.rotation], "translation_m": list(found.translation_m),
-    }  # fmt: skip
+        **entries,
+        "camera": found.camera.to_dict(),
+        "projector": found.projector.to_dict(),
+        "rotation": [list(row) for row in found.rotation],
+        "translation_m": list(found.translation_m),
+    }
 
 
 def _loaded(file: Path, build: Callable[[object], Rig]) -> Rig:

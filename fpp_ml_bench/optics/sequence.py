@@ -49,9 +49,11 @@ class Frame:
     def title(self) -> str:
         period = f" of period {self.fringe}" if self.fringe else ""
         inverse = ", inverse" if self.inverse else ""
-        part = {"sinusoid": f"{self.direction} sinusoid, step {self.step}{period}",
-                "gray": f"{self.direction} Gray bit {self.step}{inverse}",
-                "crossed": f"crossed fringes, step {self.step}"}.get(self.kind, self.kind)  # fmt: skip
+        part = {
+            "sinusoid": f"{self.direction} sinusoid, step {self.step}{period}",
+            "gray": f"{self.direction} Gray bit {self.step}{inverse}",
+            "crossed": f"crossed fringes, step {self.step}",
+        }.get(self.kind, self.kind)
         return f"{self.index}: {part}"
 
 
@@ -100,9 +102,10 @@ class AnySequence(ABC):
     def period(self, direction: Direction, fringe: int) -> tuple[int, ...]:
         """Frame indices of a direction's sinusoids of the ``fringe``-th period, in the order of their steps."""
         return tuple(
-            frame.index for frame in self.frames
+            frame.index
+            for frame in self.frames
             if frame.kind == "sinusoid" and frame.direction == direction and frame.fringe == fringe
-        )  # fmt: skip
+        )
 
     def gray(self, direction: Direction) -> tuple[int, ...] | range:
         """Frame indices of a direction's Gray code, in the order of its frames; none where it has none."""
@@ -274,8 +277,10 @@ class CodedSequence(AnySequence):
                 frames += [Frame(len(frames) + n, "crossed", step=n) for n in range(len(self.crossed or ()))]
                 continue
             direction: Direction = "horizontal" if name == "horizontal" else "vertical"
-            frames += [Frame(len(frames) + i, shown.kind, direction, shown.step, shown.fringe, shown.inverse)
-                       for i, shown in enumerate(self.code(direction).shown)]  # fmt: skip
+            frames += [
+                Frame(len(frames) + i, shown.kind, direction, shown.step, shown.fringe, shown.inverse)
+                for i, shown in enumerate(self.code(direction).shown)
+            ]
         return tuple(frames)
 
     def _finest(self, direction: Direction) -> int:
@@ -301,8 +306,9 @@ def sequence_from_dict(entries: object, lengths_px: Mapping[Direction, int]) -> 
             raise RigError(f"sequence: unknown key {unknown[0]}; expected {', '.join(CODED_KEYS)}")
         codes = {
             direction: code_from_dict(entries[direction], lengths_px[direction], f"sequence.{direction}")
-            for direction in DIRECTIONS if direction in entries
-        }  # fmt: skip
+            for direction in DIRECTIONS
+            if direction in entries
+        }
         crossed = None
         if "crossed" in entries:
             if not isinstance(entries["crossed"], Mapping):

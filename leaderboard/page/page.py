@@ -73,14 +73,24 @@ def page_files(
     }
     present = {row.provenance for _, row in rows}
     body = render(
-        _PACKAGE, "index.html", **shared, tables=tables, columns=columns, told=told, assumption=assumption,
-        search=_search, slug=lambda entry: slugs[id(entry)], blocks=blocks(groups, slugs),
+        _PACKAGE,
+        "index.html",
+        **shared,
+        tables=tables,
+        columns=columns,
+        told=told,
+        assumption=assumption,
+        search=_search,
+        slug=lambda entry: slugs[id(entry)],
+        blocks=blocks(groups, slugs),
         tradeoff=tradeoff_section(run),
-        provenances=[name for name in MEANING if name in present], colours=CLASS_COLOURS, not_said=NOT_SAID,
+        provenances=[name for name in MEANING if name in present],
+        colours=CLASS_COLOURS,
+        not_said=NOT_SAID,
         fewest=FEWEST_OBJECTS,
         filters={name: (title, values) for name, (title, values) in filters.items() if len(values) > 1},
         papers=[(f"{p.title}, mm", list(map(tables.paper_cells, p.rows)), p.note) for p in papers],
-    )  # fmt: skip
+    )
     about = "Ranking of single-shot fringe projection profilometry: depth error with intervals, run time and captures."
     index = page("FPP-ML-Bench leaderboard", body, style, script, about)
     files = {INDEX: index, **data}
@@ -100,13 +110,16 @@ def _submission(group: Group, row: Ranked) -> dict[str, Any]:
     changes = about.reliance.parts if about.reliance else None
     changed = [(words, getattr(changes, key)) for key, words in PART_TITLES.items()] if changes else []
     return {
-        "row": row, "group": group, "rows": len(group.ranked),
+        "row": row,
+        "group": group,
+        "rows": len(group.ranked),
         "assumption_sentences": assumption_sentences,
         "columns": columns,
         "scored": [(_data_words(part), _score_cells(part)) for part in parts],
-        "bars": sorted(bars, key=lambda bar: (-bar[0], bar[1])), "longest_mm": max(bars, default=(0.0, ""))[0],
+        "bars": sorted(bars, key=lambda bar: (-bar[0], bar[1])),
+        "longest_mm": max(bars, default=(0.0, ""))[0],
         "parts": [(words, f"{value:.2f}") for words, value in changed if value is not None],
-    }  # fmt: skip
+    }
 
 
 def _data_words(row: Row) -> str:
@@ -160,9 +173,10 @@ def _board_rung(rows: int, folder: Path) -> Rung:
             changed = timing.model_copy(update={key: getattr(timing, key) * factor for key in keys})
             about = about.model_copy(update={"timing": changed})
         changes = {
-            "submission": about, "metrics": row.metrics.model_copy(update={DEFAULT_SORT: factor}),
+            "submission": about,
+            "metrics": row.metrics.model_copy(update={DEFAULT_SORT: factor}),
             "predictions_sha256": f"{number:064x}",
-        }  # fmt: skip
+        }
         entries.append(replace(first, row=row.model_copy(update=changes)))
 
     def run() -> None:  # a dictionary that a run returns would be taken for the seconds of its parts

@@ -47,14 +47,20 @@ def _mark(number: int, group: Group, row: Ranked, cost: str, page: str) -> Mark 
     span = None if timing is None else (timing.latency_p5_ms / 1000, timing.latency_p95_ms / 1000)
     hollow = cost == "seconds" and not entry.time_measured
     return Mark(
-        x, error, number, printable(row.short_name),
+        x,
+        error,
+        number,
+        printable(row.short_name),
         _TRIVIAL_COLOUR if is_trivial(row) else CLASS_COLOURS[group.key.frames],
-        shape="o" if group.key.track == "metric" else "s", hollow=hollow, x_span=span if cost == "seconds" else None,
+        shape="o" if group.key.track == "metric" else "s",
+        hollow=hollow,
+        x_span=span if cost == "seconds" else None,
         y_span=row.interval(DEFAULT_SORT),
         title=f"{entry.name}: {error:.3g} mm, {time}, {frames}, {group.key.track} track, {row.provenance}",
         css=f"p-{row.provenance.replace(' ', '-')}{' hollow' if hollow else ''}",
-        row=page, url=f"submissions/{page}.html",
-    )  # fmt: skip
+        row=page,
+        url=f"submissions/{page}.html",
+    )
 
 
 def drawn(picture: Scatter, css: str, width: int, height: int, about: str) -> dict[str, Any]:

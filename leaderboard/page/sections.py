@@ -29,15 +29,19 @@ def blocks(groups: Sequence[Group], slugs: Mapping[int, str]) -> list[dict[str, 
         key, rows = of_data[0].key, [row for group in of_data for row in group.rows]
         name = key.benchmark.name if key.benchmark is not None else data.split(", ")[0]
         numbered = [(n, row.short_name, slugs[id(row.entry)]) for n, row in enumerate(rows, start=1)]
-        datasets.append({
-            "numbered": numbered if len(rows) <= MOST_LABELLED else [],
-            "id": f"data-{hashlib.sha256(data.encode()).hexdigest()[:8]}",
-            "title": data, "short": f"earlier, {name}" if key.notes else key.aside or name,
-            "main": not datasets or not (key.notes or key.aside), "notes": key.notes,
-            "figures": overview_figures(of_data, slugs),
-            "targets": sorted({group.key.against for group in of_data}),
-            "sections": [_section(group, _link(group, of_data)) for group in of_data],
-        })  # fmt: skip
+        datasets.append(
+            {
+                "numbered": numbered if len(rows) <= MOST_LABELLED else [],
+                "id": f"data-{hashlib.sha256(data.encode()).hexdigest()[:8]}",
+                "title": data,
+                "short": f"earlier, {name}" if key.notes else key.aside or name,
+                "main": not datasets or not (key.notes or key.aside),
+                "notes": key.notes,
+                "figures": overview_figures(of_data, slugs),
+                "targets": sorted({group.key.against for group in of_data}),
+                "sections": [_section(group, _link(group, of_data)) for group in of_data],
+            }
+        )
     return datasets
 
 
@@ -68,13 +72,19 @@ def _section(group: Group, link: str) -> dict[str, Any]:
     ends = [(row.value(DEFAULT_SORT), *(row.interval(DEFAULT_SORT) or ())) for row in group.rows]
     cells = [[(errors.get(name), _shade(errors.get(name), low, high)) for name in objects] for errors in per_object]
     return {
-        "group": group, "id": anchor(group), "link": link, "machines": machines, "objects": objects,
+        "group": group,
+        "id": anchor(group),
+        "link": link,
+        "machines": machines,
+        "objects": objects,
         "object_cells": cells,
         "title": f"{key.frames[0].upper()}{key.frames[1:]}, {key.track} track, against {key.against}{mode}",
-        "ranked": len(group.ranked), "most_paired": MOST_PAIRED, "matrix": _matrix(group) if group.pairs else [],
+        "ranked": len(group.ranked),
+        "most_paired": MOST_PAIRED,
+        "matrix": _matrix(group) if group.pairs else [],
         "with": [column.title for column in _SPARSE if column.shown_for(group.rows)],
         "highest": max((end or 0.0 for row_ends in ends for end in row_ends), default=0.0),
-    }  # fmt: skip
+    }
 
 
 def _matrix(group: Group) -> list[tuple[str, list[tuple[str, str, str] | None]]]:
@@ -85,8 +95,9 @@ def _matrix(group: Group) -> list[tuple[str, list[tuple[str, str, str] | None]]]
         low, high = pair.interval or (pair.difference, pair.difference)
         p = f"p {pair.p_holm:.2g}"
         for first, second, sign, ends in (
-            (pair.second, pair.first, 1, (low, high)), (pair.first, pair.second, -1, (-high, -low))
-        ):  # fmt: skip
+            (pair.second, pair.first, 1, (low, high)),
+            (pair.first, pair.second, -1, (-high, -low)),
+        ):
             verdict = "" if not pair.behind else "behind" if sign > 0 else "ahead"
             difference = signed(sign * pair.difference)
             cells[first, second] = difference, f"{interval_text(ends)}; {p}", verdict
@@ -108,15 +119,26 @@ def tradeoff_section(run: Tradeoff | None) -> dict[str, Any] | None:
         fronts = " and ".join(name for name, front in (("time", by_time), ("frames", by_frames)) if point in front)
         ms, low, high = point.ms
         missing = "-" if point.missing_share is None else f"{100 * point.missing_share:.2g}%"
-        rows.append((
-            point.title, fronts, millimetres(point.object_mae_mm), millimetres(point.measured_mae_mm), missing,
-            f"{ms:.3g}", f"{low:.3g} to {high:.3g}", str(point.frames),
-        ))  # fmt: skip
+        rows.append(
+            (
+                point.title,
+                fronts,
+                millimetres(point.object_mae_mm),
+                millimetres(point.measured_mae_mm),
+                missing,
+                f"{ms:.3g}",
+                f"{low:.3g} to {high:.3g}",
+                str(point.frames),
+            )
+        )
     return {
-        "run": run, "benchmark": benchmark_before(run.fingerprint), "pictures": pictures, "rows": rows,
+        "run": run,
+        "benchmark": benchmark_before(run.fingerprint),
+        "pictures": pictures,
+        "rows": rows,
         "steepest": max(run.growth, key=lambda growth: growth.exponent, default=None),
         "flagged": [f"{growth.stage} over {growth.over}" for growth in run.growth if growth.flag],
-    }  # fmt: skip
+    }
 
 
 def _shade(error: float | None, low: float, high: float) -> int | None:

@@ -18,9 +18,12 @@ from fpp_ml_bench.leaderboard.rows import Entry, read_entry
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
 _NOT_IN_THE_PAPER = {
-    "pix2pixhd": "pix2pixHD", "hformer": "Hformer", "plain": "the image alone", "guided": "guided by phase",
+    "pix2pixhd": "pix2pixHD",
+    "hformer": "Hformer",
+    "plain": "the image alone",
+    "guided": "guided by phase",
     "physics": "re-projection of depth to phase as a loss",
-}  # fmt: skip
+}
 
 
 def write_measured(result: Result, path: Path) -> None:

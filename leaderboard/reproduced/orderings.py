@@ -63,8 +63,10 @@ def _difference(line: Line, other: Line) -> tuple[float, tuple[float, float] | N
     first, second = _errors(line), _errors(other)
     gaps = [
         (name, statistics.fmean(views) - statistics.fmean(second[name]))
-        for name, views in first.items() if name in second for _ in views
-    ]  # fmt: skip
+        for name, views in first.items()
+        if name in second
+        for _ in views
+    ]
     if not gaps:
         return None
     objects, differences = [name for name, _ in gaps], [gap for _, gap in gaps]

@@ -34,14 +34,22 @@ def _titles(preset: str) -> list[tuple[str, str | None]]:
     measured, paper = f"{MEASURED_HERE}, {preset} preset", BY_THE_PAPER
     twin = f"object MAE / of its measured pixels / missing pixels, {MEASURED_HERE}"
     return [
-        ("Row", "Row"), ("Track", None), (f"Object MAE / RMSE, {measured}", "Object, here"),
+        ("Row", "Row"),
+        ("Track", None),
+        (f"Object MAE / RMSE, {measured}", "Object, here"),
         (f"95% interval of the object MAE, {MEASURED_HERE}", "95% of MAE"),
-        (f"Object MAE / RMSE, {paper}", "Object, paper"), (f"Overall MAE / RMSE, {measured}", "Overall, here"),
-        (f"Overall MAE / RMSE, {paper}", "Overall, paper"), (f"Background MAE / RMSE, {measured}", None),
-        (f"Background MAE / RMSE, {paper}", None), (f"Range predicted: {twin}", "Range predicted"),
-        (f"Range of the training mean: {twin}", None), ("Parameters", None), ("Epochs", "Epochs"),
-        ("Training, s", "s"), ("Latency, ms", "ms"),
-    ]  # fmt: skip
+        (f"Object MAE / RMSE, {paper}", "Object, paper"),
+        (f"Overall MAE / RMSE, {measured}", "Overall, here"),
+        (f"Overall MAE / RMSE, {paper}", "Overall, paper"),
+        (f"Background MAE / RMSE, {measured}", None),
+        (f"Background MAE / RMSE, {paper}", None),
+        (f"Range predicted: {twin}", "Range predicted"),
+        (f"Range of the training mean: {twin}", None),
+        ("Parameters", None),
+        ("Epochs", "Epochs"),
+        ("Training, s", "s"),
+        ("Latency, ms", "ms"),
+    ]
 
 
 def _cells(line: Line) -> list[str]:
@@ -52,14 +60,21 @@ def _cells(line: Line) -> list[str]:
     counts = [settings.get("epochs_trained"), settings.get("training_seconds")]
     timing, latency = (entry.row.timing, entry.latency_ms) if entry else (None, None)
     return [
-        line.label, entry.row.track if entry else "-", _pair(here, "object"),
+        line.label,
+        entry.row.track if entry else "-",
+        _pair(here, "object"),
         " - ".join(map(_mm, interval)) if interval else "-",
-        _pair(paper, "object"), _pair(here, "overall"), _pair(paper, "overall"), _pair(here, "background"),
-        _pair(paper, "background"), _twin(line, "predicted"), _twin(line, "mean"),
+        _pair(paper, "object"),
+        _pair(here, "overall"),
+        _pair(paper, "overall"),
+        _pair(here, "background"),
+        _pair(paper, "background"),
+        _twin(line, "predicted"),
+        _twin(line, "mean"),
         f"{timing.parameters:,}" if timing else "-",
         *(f"{count:,.0f}" if isinstance(count, int | float) else "-" for count in counts),
         "-" if latency is None else f"{latency:.3g}",
-    ]  # fmt: skip
+    ]
 
 
 def _mm(value: float | None) -> str:
@@ -107,12 +122,17 @@ def table_markdown(table: str, lines: Sequence[Line], preset: str, command: str,
     titles, (columns, cells) = _titles(preset), _shown(table, lines)
     rows = [[markdown_text(row[number]) for number in columns] for row in cells]
     parts = [
-        f"# {markdown_text(_title(table))}", "",
-        f"Made by `{command}`. Errors in mm, mean over samples.", *_about(lines, table in paper_tables()), "",
-        *markdown_rows([titles[number][0] for number in columns], [number > 1 for number in columns], rows), "",
-        *_missing(lines, command, failed), *_twins_explained(lines),
+        f"# {markdown_text(_title(table))}",
+        "",
+        f"Made by `{command}`. Errors in mm, mean over samples.",
+        *_about(lines, table in paper_tables()),
+        "",
+        *markdown_rows([titles[number][0] for number in columns], [number > 1 for number in columns], rows),
+        "",
+        *_missing(lines, command, failed),
+        *_twins_explained(lines),
         *(_orderings(orderings(lines)) if table in paper_tables() else [conclusion(table, lines)]),
-    ]  # fmt: skip
+    ]
     return "\n".join(parts).rstrip("\n") + "\n"
 
 
@@ -193,9 +213,13 @@ def _orderings(judged: Sequence[Ordering]) -> list[str]:
         interval = "-" if ordering.interval_mm is None else between(ordering.interval_mm)
         rows.append([markdown_text(ordering.better), worse, *gaps, interval, ordering.verdict])
     titles = (
-        "Better in the paper", "Worse in the paper", f"Worse minus better, mm, {BY_THE_PAPER}",
-        f"Worse minus better, mm, {MEASURED_HERE}", "95% interval", "Here",
-    )  # fmt: skip
+        "Better in the paper",
+        "Worse in the paper",
+        f"Worse minus better, mm, {BY_THE_PAPER}",
+        f"Worse minus better, mm, {MEASURED_HERE}",
+        "95% interval",
+        "Here",
+    )
     parts += [*markdown_rows(titles, (False, False, True, True, True, False), rows), ""]
     parts += ["Differences sample by sample; intervals by bootstrap over objects."]
     if not all(ordering.same_track for ordering in judged):

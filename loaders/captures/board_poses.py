@@ -32,10 +32,15 @@ def pose_folders(captures: Path) -> list[Path]:
 
 
 def board_poses(
-    captures: Path, board: Board, sequence: Path, bits: int | None = None, colour: str | None = None,
-    progress: Callable[[int], None] = lambda poses: None, anyway: bool = False,
+    captures: Path,
+    board: Board,
+    sequence: Path,
+    bits: int | None = None,
+    colour: str | None = None,
+    progress: Callable[[int], None] = lambda poses: None,
+    anyway: bool = False,
     examined: Callable[[str, Examination], None] = lambda name, examination: None,
-) -> tuple[list[Pose], Rig, Response | None]:  # fmt: skip
+) -> tuple[list[Pose], Rig, Response | None]:
     """The board's points in every pose folder of ``captures``, in camera and projector px, a rig with the sequence of
     the rig file ``sequence`` that stands in for the one sought (`optics.load_projection`), and the response of
     projector and camera where the captures tell it. ``bits`` and ``colour`` as in `read_frames`. The
@@ -100,6 +105,9 @@ def calibrated_rig(found: Calibration, stand_in: Rig, range_mm: tuple[float, flo
         depths.append(found.board_mm @ turn[2] + pose.translation_mm[2])
     near, far = range_mm or (float(np.min(depths)) * (1 - RANGE_MARGIN), float(np.max(depths)) * (1 + RANGE_MARGIN))
     return replace(
-        stand_in, camera=found.camera.pinhole(), projector=found.projector.pinhole(), rotation=found.rotation,
+        stand_in,
+        camera=found.camera.pinhole(),
+        projector=found.projector.pinhole(),
+        rotation=found.rotation,
         translation_m=found.translation_m,
-    ).with_range((near, far))  # fmt: skip
+    ).with_range((near, far))

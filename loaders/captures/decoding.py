@@ -61,9 +61,16 @@ class DecodedCapture:
 
 
 def decode_capture(
-    capture: CapturedFrames, rig: Rig, direction: Directions = "both", *, mask: NDArray[np.bool_] | None = None,
-    min_modulation: float = MIN_MODULATION, noise_grey: float | None = None, threads: int = 1, anyway: bool = False,
-) -> DecodedCapture:  # fmt: skip
+    capture: CapturedFrames,
+    rig: Rig,
+    direction: Directions = "both",
+    *,
+    mask: NDArray[np.bool_] | None = None,
+    min_modulation: float = MIN_MODULATION,
+    noise_grey: float | None = None,
+    threads: int = 1,
+    anyway: bool = False,
+) -> DecodedCapture:
     """Depth of a capture and what goes with it; arguments as in `decode_stack`. ``noise_grey``: of a frame, by default
     measured where there are four steps and more, else `ASSUMED_NOISE_GREY`. The frames are examined first: raises
     `RefusedCapture` where a finding makes the depth untrustworthy, unless ``anyway``; `CaptureError` for images of
@@ -93,9 +100,13 @@ def decode_capture(
 
 
 def examine_capture(
-    capture: CapturedFrames, rig: Rig, direction: Directions = "both", *, mask: NDArray[np.bool_] | None = None,
+    capture: CapturedFrames,
+    rig: Rig,
+    direction: Directions = "both",
+    *,
+    mask: NDArray[np.bool_] | None = None,
     min_modulation: float = MIN_MODULATION,
-) -> Examination:  # fmt: skip
+) -> Examination:
     """What the frames of a capture say about themselves (`fpp_ml_bench.examination`), before they are decoded. Raises
     `CaptureError` for images of another size than the rig's, `RigError` for a direction that it does not code."""
     height, width = capture.frames.shape[1:]
@@ -164,10 +175,13 @@ def write_capture(
     findings = [str(finding) for finding in result.examination.findings]
     write_atomically(folder / "picture.png", capture_picture(title, *maps, findings))
     content = {
-        "pixels": decoded.counts, "noise_grey": result.noise_grey, "noise_measured": result.noise_measured,
-        "median_sigma_mm": float(np.median(result.sigma_mm[found])), "notes": list(result.notes),
+        "pixels": decoded.counts,
+        "noise_grey": result.noise_grey,
+        "noise_measured": result.noise_measured,
+        "median_sigma_mm": float(np.median(result.sigma_mm[found])),
+        "notes": list(result.notes),
         "reasons": {reason.name.lower(): int(reason) for reason in Reason},
-    }  # fmt: skip
+    }
     _write_report(folder, capture, rig, result.examination, content)
 
 
@@ -181,6 +195,11 @@ def write_refusal(folder: Path, capture: CapturedFrames, rig: Rig, examination: 
 def _write_report(
     folder: Path, capture: CapturedFrames, rig: Rig, examination: Examination, content: Mapping[str, object]
 ) -> None:
-    report = {"rig": rig.to_dict(), "frames": [file.name for file in capture.files], "full_scale": capture.full_scale,
-              "examination": examination.to_dict(), **content}  # fmt: skip
+    report = {
+        "rig": rig.to_dict(),
+        "frames": [file.name for file in capture.files],
+        "full_scale": capture.full_scale,
+        "examination": examination.to_dict(),
+        **content,
+    }
     write_atomically(folder / REPORT, (json.dumps(report, indent=1) + "\n").encode())

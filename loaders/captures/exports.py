@@ -40,9 +40,13 @@ _FIRST, _RIGHT, _BELOW, _ACROSS = (_BEFORE, _BEFORE), (_BEFORE, _AFTER), (_AFTER
 
 
 def export_capture(
-    folder: str | Path, depth_mm: ArrayLike, camera: Pinhole, grey: ArrayLike | None = None,
-    forms: Sequence[str] = FORMS, step_mm: float | None = None,
-) -> list[Path]:  # fmt: skip
+    folder: str | Path,
+    depth_mm: ArrayLike,
+    camera: Pinhole,
+    grey: ArrayLike | None = None,
+    forms: Sequence[str] = FORMS,
+    step_mm: float | None = None,
+) -> list[Path]:
     """Write a depth map (H, W) in mm, 0 = none, into ``folder``; returns the files written, in the order of ``forms``::
 
         npy    depth.npy: float32 mm
@@ -188,9 +192,12 @@ def _png(depth: NDArray[np.float32], unit: float) -> bytes:
 
 
 def _ply(
-    depth: NDArray[np.float32], camera: Pinhole, normals: NDArray[np.float64], grey: NDArray[np.float64] | None,
+    depth: NDArray[np.float32],
+    camera: Pinhole,
+    normals: NDArray[np.float64],
+    grey: NDArray[np.float64] | None,
     faces: NDArray[np.int64],
-) -> bytes:  # fmt: skip
+) -> bytes:
     """The points with depth and the triangles between them."""
     import trimesh
 

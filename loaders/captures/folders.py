@@ -57,8 +57,9 @@ def split_captures(captures: Iterable[Capture], splits: Splits | None) -> dict[s
             places.setdefault(name, []).append(split)
     problems = [
         f"object {name!r} is listed under {' and '.join(found)}; keep it in one split"
-        for name, found in places.items() if len(found) > 1
-    ]  # fmt: skip
+        for name, found in places.items()
+        if len(found) > 1
+    ]
     problems += [f"object {name!r} has no captures; remove it" for name in places if name not in objects]
     problems += [f"object {name!r} is in no split; add it" for name in objects if name not in places]
     if problems:

@@ -24,9 +24,12 @@ from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.published import png_chunks
 
 COLOURS = {
-    "luminance": (0.299, 0.587, 0.114), "red": (1.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0), "blue": (0.0, 0.0, 1.0),
+    "luminance": (0.299, 0.587, 0.114),
+    "red": (1.0, 0.0, 0.0),
+    "green": (0.0, 1.0, 0.0),
+    "blue": (0.0, 0.0, 1.0),
     "mean": (1 / 3, 1 / 3, 1 / 3),
-}  # fmt: skip
+}
 """Weights of red, green and blue; luminance as in Rec. 601 and OpenCV's conversion to grey."""
 SUFFIXES = (".png", ".bmp", ".tif", ".tiff")
 _OTHER_IMAGES = (".jpg", ".jpeg", ".jpe", ".jp2", ".webp", ".gif", ".pgm", ".ppm", ".exr", ".hdr", ".raw", ".dng")
@@ -38,9 +41,14 @@ _BITS_PER_SAMPLE, _PHOTOMETRIC = 258, 262
 _THREADS = 4
 _ORIENTATION = 274
 _UPRIGHT: dict[int, Callable[[NDArray[Any]], NDArray[Any]]] = {
-    2: np.fliplr, 3: lambda levels: np.rot90(levels, 2), 4: np.flipud, 5: lambda levels: np.swapaxes(levels, 0, 1),
-    6: lambda levels: np.rot90(levels, -1), 7: lambda levels: np.swapaxes(np.rot90(levels, 2), 0, 1), 8: np.rot90,
-}  # fmt: skip
+    2: np.fliplr,
+    3: lambda levels: np.rot90(levels, 2),
+    4: np.flipud,
+    5: lambda levels: np.swapaxes(levels, 0, 1),
+    6: lambda levels: np.rot90(levels, -1),
+    7: lambda levels: np.swapaxes(np.rot90(levels, 2), 0, 1),
+    8: np.rot90,
+}
 """What makes an image upright, by its EXIF orientation."""
 
 
@@ -66,9 +74,12 @@ class _Image(NamedTuple):
 
 
 def read_frames(
-    source: str | Path | Sequence[str | Path], *, count: int | None = None, bits: int | None = None,
+    source: str | Path | Sequence[str | Path],
+    *,
+    count: int | None = None,
+    bits: int | None = None,
     colour: str | None = None,
-) -> CapturedFrames:  # fmt: skip
+) -> CapturedFrames:
     """The frames in ``source``, which is as in `frame_files`.
 
     ``count``: how many there must be. ``bits``: 8 to 16, of the camera, where the files have 16; they may be the low or

@@ -94,8 +94,10 @@ def _measured(decoded: Decoded, captured: CapturedFrames) -> dict[str, Any]:
         "decoded_share": float(good.mean()),
         "median_modulation": float(np.median(weakest[good])) if good.any() else 0.0,
         "refused_share": {name: count / good.size for name, count in counts.items()},
-        "full_scale": captured.full_scale, "rounded": captured.frames.dtype != np.uint8, "note": captured.note,
-    }  # fmt: skip
+        "full_scale": captured.full_scale,
+        "rounded": captured.frames.dtype != np.uint8,
+        "note": captured.note,
+    }
 
 
 def _views(captures: list[Capture]) -> dict[str, list[str]]:
@@ -114,9 +116,14 @@ class CapturePlan(NamedTuple):
 
 
 def plan_captures(
-    root: Path, rig: Rig, splits: Splits | None = None, limits: Limits | None = None, bits: int | None = None,
-    colour: str | None = None, anyway: bool = False,
-) -> CapturePlan:  # fmt: skip
+    root: Path,
+    rig: Rig,
+    splits: Splits | None = None,
+    limits: Limits | None = None,
+    bits: int | None = None,
+    colour: str | None = None,
+    anyway: bool = False,
+) -> CapturePlan:
     """Find the captures ``root/{object}/{view}/`` or ``root/{object}/``, each a folder of all frames of
     ``rig.sequence``. ``splits``: which objects are in which; None puts all into ``test``. ``limits``: of the decoder;
     ``bits`` and ``colour``: see `read_frames`; ``anyway``: captures that the examination refuses too.
@@ -131,10 +138,13 @@ def plan_captures(
     for split, chosen in by_split.items():
         plans += storage.plan_rows(split, [(c.sample, c.object, c.view) for c in chosen], size[0] * size[1])
     settings = {
-        "layout": "captures", "splits": "all in test" if splits is None else "given",
-        **asdict(limits), "bits": bits, "colour": colour,
+        "layout": "captures",
+        "splits": "all in test" if splits is None else "given",
+        **asdict(limits),
+        "bits": bits,
+        "colour": colour,
         "objects": {split: _views(chosen) for split, chosen in by_split.items()},
-    }  # fmt: skip
+    }
     generator = {"name": "fpp-ml-bench", "version": __version__}
     manifest = Manifest(CAPTURED, generator, settings, rig.to_dict(), size, "all", exact=False)
     reader = CaptureReader({capture.sample: capture for capture in captures}, rig, limits, bits, colour, anyway)

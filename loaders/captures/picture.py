@@ -10,19 +10,29 @@ from numpy.typing import NDArray
 from fpp_ml_bench.coding import Reason
 
 _REASONS = {
-    Reason.DECODED: "decoded", Reason.NO_RAY: "no ray", Reason.LOW_MODULATION: "low modulation",
-    Reason.SATURATED: "saturated", Reason.INCONSISTENT_ORDER: "order not clear",
-    Reason.OUTSIDE_PATTERN: "outside the pattern", Reason.DIRECTIONS_DISAGREE: "directions disagree",
-    Reason.OUTSIDE_RANGE: "outside the range", Reason.NOT_ASKED: "not asked",
-}  # fmt: skip
+    Reason.DECODED: "decoded",
+    Reason.NO_RAY: "no ray",
+    Reason.LOW_MODULATION: "low modulation",
+    Reason.SATURATED: "saturated",
+    Reason.INCONSISTENT_ORDER: "order not clear",
+    Reason.OUTSIDE_PATTERN: "outside the pattern",
+    Reason.DIRECTIONS_DISAGREE: "directions disagree",
+    Reason.OUTSIDE_RANGE: "outside the range",
+    Reason.NOT_ASKED: "not asked",
+}
 _COLUMNS = 250
 _COLOURS = ("#3ca951", "#9498a0", "#22252b", "#ff725c", "#efb118", "#a463f2", "#ff8ab7", "#4269d0", "#ffffff")
 
 
 def capture_picture(
-    title: str, grey: NDArray, depth_mm: NDArray[np.float32], sigma_mm: NDArray[np.float32], modulation: NDArray,
-    reason: NDArray[np.uint8], findings: Sequence[str] = (),
-) -> bytes:  # fmt: skip
+    title: str,
+    grey: NDArray,
+    depth_mm: NDArray[np.float32],
+    sigma_mm: NDArray[np.float32],
+    modulation: NDArray,
+    reason: NDArray[np.uint8],
+    findings: Sequence[str] = (),
+) -> bytes:
     """PNG of maps (H, W): a frame in grey levels, depth and standard uncertainty in mm (0 = none), modulation in grey
     levels, and `Reason` codes; the ``findings`` stand below it."""
     from matplotlib.colors import ListedColormap
@@ -51,8 +61,11 @@ def capture_picture(
     axes[4].imshow(reason, cmap=ListedColormap(_COLOURS), vmin=0, vmax=len(_COLOURS) - 1, interpolation="nearest")
     axes[4].set_title("pixels", fontsize=9)
     shares = np.bincount(reason.ravel(), minlength=len(_COLOURS)) / reason.size
-    handles = [Patch(facecolor=_COLOURS[code], edgecolor="0.6", label=f"{name} {100 * shares[code]:.1f}%")
-               for code, name in _REASONS.items() if shares[code] > 0]  # fmt: skip
+    handles = [
+        Patch(facecolor=_COLOURS[code], edgecolor="0.6", label=f"{name} {100 * shares[code]:.1f}%")
+        for code, name in _REASONS.items()
+        if shares[code] > 0
+    ]
     axes[4].legend(handles=handles, fontsize=7, loc="upper left", bbox_to_anchor=(0.0, -0.02), ncols=2, frameon=False)
     for plot in axes:
         plot.set_xticks([])

@@ -129,9 +129,13 @@ def chosen_splits(dataset: DatasetFolder, split: str) -> list[str]:
 
 
 def export(
-    dataset: DatasetFolder, out: Path, forms: list[str], splits: list[str], threads: int = 1,
+    dataset: DatasetFolder,
+    out: Path,
+    forms: list[str],
+    splits: list[str],
+    threads: int = 1,
     progress: Callable[[int], None] = lambda rows: None,
-) -> None:  # fmt: skip
+) -> None:
     """Write a dataset in ``forms`` (of `FORMS`): a single form into ``out``, several forms into folders of their names.
     ``out`` must be new or empty and is written completely or not at all; ``progress`` is called with numbers of samples
     written. Raises `BuildError` for an unusable ``out`` or disk, `DatasetError` for data that the dataset lacks."""

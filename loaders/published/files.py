@@ -108,9 +108,23 @@ _HEADER_PARTS = (6,), (5, 6), (1, 16)
 _HDF5_AT, _HDF5_SIGNATURE = 512, b"\x89HDF\r\n\x1a\n"
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _CLASSES = (
-    "unknown", "cell", "struct", "object", "char", "sparse", "double", "single", "int8", "uint8", "int16", "uint16",
-    "int32", "uint32", "int64", "uint64",
-)  # fmt: skip
+    "unknown",
+    "cell",
+    "struct",
+    "object",
+    "char",
+    "sparse",
+    "double",
+    "single",
+    "int8",
+    "uint8",
+    "int16",
+    "uint16",
+    "int32",
+    "uint32",
+    "int64",
+    "uint64",
+)
 _FIRST_NUMERIC = 6
 _COMPLEX = 0x0800
 _LARGEST_BYTES = 1 << 30

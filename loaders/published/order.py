@@ -22,8 +22,11 @@ _Run = tuple[str, Direction]
 _Lit = list[NDArray[np.bool_]]
 """Which pixels of `_Lines.parts` the projector reaches: (lines, W) and (lines, H)."""
 _RUNS: tuple[_Run, _Run, _Run, _Run] = (
-    ("sinusoid", "horizontal"), ("sinusoid", "vertical"), ("gray", "horizontal"), ("gray", "vertical"),
-)  # fmt: skip
+    ("sinusoid", "horizontal"),
+    ("sinusoid", "vertical"),
+    ("gray", "horizontal"),
+    ("gray", "vertical"),
+)
 _SH, _SV, _GH, _GV = _RUNS
 LAYOUTS: dict[str, tuple[_Run, ...]] = {
     "paper": (_SH, _SV, _GH, _GV),

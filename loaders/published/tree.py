@@ -30,8 +30,10 @@ BACKGROUND_REMOVED_FOLDERS: dict[Normalisation, str] = {
     for name, folder in VARIANT_FOLDERS.items()
 }
 VARIABLES: dict[Normalisation, str] = {
-    "raw": "depthMap", "global": "depthMapMeters", "individual": "depthMapNormalized",
-}  # fmt: skip
+    "raw": "depthMap",
+    "global": "depthMapMeters",
+    "individual": "depthMapNormalized",
+}
 WRAPPED_PHASE, UNWRAPPED_PHASE, HEIGHTS = "wrapped_phase.mat", "unwrapped_phase.mat", "z.csv"
 WRAPPED_PHASE_VARIABLE, UNWRAPPED_PHASE_VARIABLE = "wph", "uph"
 NOT_STORED = (WRAPPED_PHASE, UNWRAPPED_PHASE, HEIGHTS)
@@ -306,6 +308,7 @@ class _Scan:
         common = Counter(sizes.values()).most_common(1)[0][0]
         self.problems += [
             f"{path}: expected {common[1]} x {common[0]} px as most images here, got {size[1]} x {size[0]}"
-            for path, size in sizes.items() if size != common
-        ]  # fmt: skip
+            for path, size in sizes.items()
+            if size != common
+        ]
         return common

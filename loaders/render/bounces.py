@@ -71,10 +71,15 @@ class PlaneLight:
         """Irradiance of an object's surfels from the plane, float64 (K, F), the object turned and then moved."""
         arriving = np.zeros((len(surfels.grid.area_m2), self.table.shape[2]))
         from_plane(
-            surfels.open_starts, np.ascontiguousarray(turned(surfels.open_directions, degrees)),
-            np.ascontiguousarray(turned(surfels.grid.position_m, degrees) + offset_m), self.distance_m, self.corner_m,
-            self.cell_m, self.table, arriving,
-        )  # fmt: skip
+            surfels.open_starts,
+            np.ascontiguousarray(turned(surfels.open_directions, degrees)),
+            np.ascontiguousarray(turned(surfels.grid.position_m, degrees) + offset_m),
+            self.distance_m,
+            self.corner_m,
+            self.cell_m,
+            self.table,
+            arriving,
+        )
         return arriving
 
 
@@ -143,9 +148,17 @@ def at_points(
     """
     out = np.empty((values.shape[1], len(position_m)), dtype=np.float32)
     interpolate(
-        grid.corner_m, grid.cell_m, grid.table, grid.position_m, grid.normal, grid.area_m2, values, position_m, normal,
+        grid.corner_m,
+        grid.cell_m,
+        grid.table,
+        grid.position_m,
+        grid.normal,
+        grid.area_m2,
+        values,
+        position_m,
+        normal,
         out,
-    )  # fmt: skip
+    )
     return out
 
 

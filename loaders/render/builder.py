@@ -66,9 +66,12 @@ def assembly_of(settings: BuildSettings) -> Assembly:
 
 
 def build(
-    folder: Path | RemoteFolder, settings: BuildSettings, workers: int, progress: Progress = lambda rows: None,
+    folder: Path | RemoteFolder,
+    settings: BuildSettings,
+    workers: int,
+    progress: Progress = lambda rows: None,
     cluster: str | None = None,
-) -> Manifest:  # fmt: skip
+) -> Manifest:
     """Build a dataset into ``folder``, or go on with one that was interrupted, by so many processes or by the Ray
     cluster at an address. Same settings, same bytes. Raises `BuildError` (folder in use, other settings, disk full),
     `MeshError` (an object does not fit), and `PoolError` and `RemoteError` for a cluster or URL that fails."""
@@ -123,26 +126,48 @@ def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
     lines = [
         background,
         account(
-            f"exposures ({unstored} unstored frames off the object, {frames - stored - unstored} everywhere)", "pixels",
-            object_px * unstored + all_px * stored, all_px * frames, lambda: studio.expose(scene, made),
+            f"exposures ({unstored} unstored frames off the object, {frames - stored - unstored} everywhere)",
+            "pixels",
+            object_px * unstored + all_px * stored,
+            all_px * frames,
+            lambda: studio.expose(scene, made),
             view_px * (frames - stored) - view_object_px * unstored,
         ),
         account(
-            "ground truth off the object", "grey levels", object_px * decoded, all_px * decoded,
-            lambda: studio.ground_truth_mm(seen), (view_px - view_object_px) * decoded,
+            "ground truth off the object",
+            "grey levels",
+            object_px * decoded,
+            all_px * decoded,
+            lambda: studio.ground_truth_mm(seen),
+            (view_px - view_object_px) * decoded,
         ),
         LeftOut(
-            "rays across pixels that see one surface", "rays", mixed_rays, all_px * settings.light.camera.rays_across**2
-            - mixed_rays, None, None, "not lit and not exposed; seconds not measured",
+            "rays across pixels that see one surface",
+            "rays",
+            mixed_rays,
+            all_px * settings.light.camera.rays_across**2 - mixed_rays,
+            None,
+            None,
+            "not lit and not exposed; seconds not measured",
         ),
         LeftOut(
-            "stages that are off", "stages", len(stages) - len(off), len(off), None, None,
+            "stages that are off",
+            "stages",
+            len(stages) - len(off),
+            len(off),
+            None,
+            None,
             f"none of their code runs: {', '.join(off) or 'none is off'}",
         ),
         LeftOut(
-            "frames not asked for", "frames", stored * views, (frames - stored) * views,
-            (frames - stored) * all_px, None, "not written; seconds not measured, they depend on the disk",
+            "frames not asked for",
+            "frames",
+            stored * views,
+            (frames - stored) * views,
+            (frames - stored) * all_px,
+            None,
+            "not written; seconds not measured, they depend on the disk",
         ),
-    ]  # fmt: skip
+    ]
     about = f"{views} views of {camera.width}x{camera.height} px, cover {100 * object_px / all_px:.1f}%"
     return explained("build", about, lines)

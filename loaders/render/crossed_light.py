@@ -31,9 +31,10 @@ def carrier_waves(crossed: Crossed, frame: int) -> NDArray[np.float64]:
 
 
 def phase_table(
-    crossed: Crossed, light_of_level: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    crossed: Crossed,
+    light_of_level: Callable[[NDArray[np.float64]], NDArray[np.float64]],
     variance_px2: NDArray[np.float64],
-) -> NDArray[np.float32]:  # fmt: skip
+) -> NDArray[np.float32]:
     """Light in [0, 1] over the carriers' turns, float32 (S, SIDE + 1, SIDE + 1), the first entry repeated at the end.
     ``light_of_level`` maps pattern levels in [0, 1] to linear light; ``variance_px2`` (S, 2): of the blur along u and
     v."""

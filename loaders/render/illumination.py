@@ -71,9 +71,13 @@ def projector_centre_m(rig: Rig) -> NDArray[np.float64]:
 
 @np.errstate(divide="ignore", invalid="ignore")  # of points in a lens, which get no light
 def shine(
-    points_m: NDArray[np.float64], normals: NDArray[np.float64], rig: Rig, light: Light, pattern: PatternLight,
+    points_m: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    rig: Rig,
+    light: Light,
+    pattern: PatternLight,
     occluder: TracedObject | None = None,
-) -> Shine:  # fmt: skip
+) -> Shine:
     """The projector's light at surface points (n, 3) with unit ``normals`` (n, 3), in camera coordinates; none at NaN
     points. ``occluder`` casts shadows where the light has them."""
     centre_m = projector_centre_m(rig)
@@ -105,9 +109,14 @@ def shine(
 
 @np.errstate(divide="ignore", invalid="ignore")
 def light_surface(
-    points_m: NDArray[np.float64], normals: NDArray[np.float64], rig: Rig, light: Light, pattern: PatternLight,
-    material: Material | None = None, occluder: TracedObject | None = None,
-) -> LitPixels:  # fmt: skip
+    points_m: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    rig: Rig,
+    light: Light,
+    pattern: PatternLight,
+    material: Material | None = None,
+    occluder: TracedObject | None = None,
+) -> LitPixels:
     """Direct and ambient light of surface points (n, 3) with unit ``normals`` (n, 3) that face the camera."""
     surface = light.surface
     material = material or Material((1.0 - surface.gloss) * surface.albedo, 0.0)  # a matte wall
@@ -120,9 +129,13 @@ def light_surface(
     half_x, half_y, half_z = to_x + view_x, to_y + view_y, to_z + view_z
     along = (nx * half_x + ny * half_y + nz * half_z) / np.sqrt(half_x * half_x + half_y * half_y + half_z * half_z)
     returned = reflectance(
-        nx * to_x + ny * to_y + nz * to_z, nx * view_x + ny * view_y + nz * view_z, along, material.albedo,
-        material.gloss, surface.roughness,
-    )  # fmt: skip
+        nx * to_x + ny * to_y + nz * to_z,
+        nx * view_x + ny * view_y + nz * view_z,
+        along,
+        material.albedo,
+        material.gloss,
+        surface.roughness,
+    )
     gain = np.where(arriving.irradiance > 0, arriving.irradiance * returned * grey_of_white(light), 0.0)
     ambient = np.where(np.isfinite(x + y + z), light.ambient_grey / surface.albedo * material.albedo, 0.0)
     return LitPixels(arriving.place, gain.astype(np.float32), ambient.astype(np.float32), None, arriving.shadow_rays)

@@ -117,15 +117,24 @@ class Light(StrictModel):
         """Which of the stages that can be off are on."""
         projector, bounces, camera = self.projector, self.bounces, self.camera
         return {
-            "projector response": projector.response != 1.0, "projector blur": projector.pixel_blur_px > 0,
-            "defocus": projector.defocus_px > 0, "projector falloff": projector.falloff != 0,
-            "flicker": projector.flicker > 0, "textures": self.surface.textures != "none",
-            "gloss": self.surface.gloss > 0, "interreflection": bounces.interreflection,
-            "ambient occlusion": bounces.ambient_occlusion, "shadows": bounces.shadows,
-            "pixel area": camera.rays_across > 1, "lens blur": camera.blur_px > 0, "vignetting": camera.falloff > 0,
-            "noise": camera.full_well_e is not None, "camera response": camera.response != 1.0,
-            "motion": self.motion_mm > 0, "calibration error": self.calibration_px > 0,
-        }  # fmt: skip
+            "projector response": projector.response != 1.0,
+            "projector blur": projector.pixel_blur_px > 0,
+            "defocus": projector.defocus_px > 0,
+            "projector falloff": projector.falloff != 0,
+            "flicker": projector.flicker > 0,
+            "textures": self.surface.textures != "none",
+            "gloss": self.surface.gloss > 0,
+            "interreflection": bounces.interreflection,
+            "ambient occlusion": bounces.ambient_occlusion,
+            "shadows": bounces.shadows,
+            "pixel area": camera.rays_across > 1,
+            "lens blur": camera.blur_px > 0,
+            "vignetting": camera.falloff > 0,
+            "noise": camera.full_well_e is not None,
+            "camera response": camera.response != 1.0,
+            "motion": self.motion_mm > 0,
+            "calibration error": self.calibration_px > 0,
+        }
 
     def changed(self, stage: str = "", **values: Any) -> "Light":
         """A copy with other values, of ``stage`` or, with none, of the light itself; checked like a file."""

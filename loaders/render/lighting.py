@@ -14,7 +14,7 @@ from fpp_ml_bench.loaders.render.illumination import (
     light_surface,
     projector_centre_m,
     shine,
-)  # fmt: skip
+)
 from fpp_ml_bench.loaders.render.light import Light
 from fpp_ml_bench.loaders.render.projector import PatternLight
 from fpp_ml_bench.loaders.render.raycast import TracedObject

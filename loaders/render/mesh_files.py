@@ -23,9 +23,19 @@ MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
 # What trimesh's readers let through on damaged files (found by fuzzing them; ImportError: a text that is not UTF-8
 # sends it looking for a package that guesses encodings).
 _READER_ERRORS = (
-    ArithmeticError, AssertionError, AttributeError, EOFError, ImportError, LookupError, NameError, OSError,
-    RuntimeError, TypeError, ValueError, struct.error,
-)  # fmt: skip
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    EOFError,
+    ImportError,
+    LookupError,
+    NameError,
+    OSError,
+    RuntimeError,
+    TypeError,
+    ValueError,
+    struct.error,
+)
 _IMAGE_ERRORS = (*_READER_ERRORS, SyntaxError, Image.DecompressionBombError, zlib.error)
 
 

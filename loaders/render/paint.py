@@ -69,8 +69,9 @@ def bilinear(image: NDArray[np.float32], u: NDArray[np.float64], v: NDArray[np.f
     x, y = (u - np.floor(u)) * width - 0.5, (np.ceil(v) - v) * height - 0.5
     left, top = np.floor(x), np.floor(y)
     across, down = x - left, y - top
-    columns, rows = ([(first.astype(np.int64) + step) % size for step in (0, 1)]
-                     for first, size in ((left, width), (top, height)))  # fmt: skip
+    columns, rows = (
+        [(first.astype(np.int64) + step) % size for step in (0, 1)] for first, size in ((left, width), (top, height))
+    )
     upper = image[rows[0], columns[0]] * (1.0 - across) + image[rows[0], columns[1]] * across
     lower = image[rows[1], columns[0]] * (1.0 - across) + image[rows[1], columns[1]] * across
     return upper * (1.0 - down) + lower * down

@@ -130,9 +130,13 @@ class PatternLight:
         return replace(self, table=table, crossed=crossed)
 
     def place(
-        self, u_px: NDArray[np.float64], v_px: NDArray[np.float64], distance_m: NDArray[np.float64], rig: Rig,
+        self,
+        u_px: NDArray[np.float64],
+        v_px: NDArray[np.float64],
+        distance_m: NDArray[np.float64],
+        rig: Rig,
         light: ProjectorLight,
-    ) -> PatternPlace:  # fmt: skip
+    ) -> PatternPlace:
         """The place of projector pixels (n,) at a distance (n,) along the projector's axis; beyond the outer pixel
         centres the outer pixel is read."""
         level, level_weight = np.empty(0, dtype=np.uint8), np.empty(0, dtype=np.float32)
@@ -150,9 +154,20 @@ class PatternLight:
         float64 (F, n)."""
         p = place
         read_kernel(
-            out, irradiance, self.table, self.along, self.crossed, self.waves, self.per_px, p.u_index, p.u_weight,
-            p.v_index, p.v_weight, p.level, p.level_weight,
-        )  # fmt: skip
+            out,
+            irradiance,
+            self.table,
+            self.along,
+            self.crossed,
+            self.waves,
+            self.per_px,
+            p.u_index,
+            p.u_weight,
+            p.v_index,
+            p.v_weight,
+            p.level,
+            p.level_weight,
+        )
 
     def _sample(self, coordinate_px: NDArray[np.float64], length: int) -> tuple[NDArray, NDArray]:
         last = (length - 1.0) * self.per_px
@@ -261,8 +276,19 @@ def read_kernel(  # type: ignore[no-untyped-def]
 ):
     for frame in range(table.shape[0]):
         fill_frame(
-            out[frame], frame, table, along, crossed, waves, per_px, u_index, u_weight, v_index, v_weight, level,
+            out[frame],
+            frame,
+            table,
+            along,
+            crossed,
+            waves,
+            per_px,
+            u_index,
+            u_weight,
+            v_index,
+            v_weight,
+            level,
             level_weight,
-        )  # fmt: skip
+        )
         for k in range(irradiance.size):
             out[frame, k] *= irradiance[k]

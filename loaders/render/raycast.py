@@ -83,9 +83,19 @@ class TracedObject:
         depth_m, triangle = np.full(shape, np.inf), np.full(shape, -1, dtype=np.int32)
         if triangle.size:
             rasterise(
-                self._corners, self._normals, self._offsets, rays.x, rays.y, rays.columns, rays.rows, left, top,
-                np.ones(rays.x.shape, dtype=bool) if wanted is None else wanted, depth_m, triangle,
-            )  # fmt: skip
+                self._corners,
+                self._normals,
+                self._offsets,
+                rays.x,
+                rays.y,
+                rays.columns,
+                rays.rows,
+                left,
+                top,
+                np.ones(rays.x.shape, dtype=bool) if wanted is None else wanted,
+                depth_m,
+                triangle,
+            )
         row, column = np.nonzero(triangle >= 0)
         seen = triangle[row, column]
         row, column = row + top, column + left

@@ -111,14 +111,20 @@ class BuildSettings:
     def describe(self) -> dict[str, Any]:
         """The settings as plain data for the manifest and for comparing an interrupted build with this one."""
         described = {
-            "objects": list(self.objects), "placement": self.placement, "frames": self.stored, "seed": self.seed,
+            "objects": list(self.objects),
+            "placement": self.placement,
+            "frames": self.stored,
+            "seed": self.seed,
             "light": self.light.model_dump(mode="json"),
             "user_meshes": [
-                {key: list(value) if isinstance(value, tuple) else value for key, value in asdict(mesh).items()
-                 if key != "path"}
+                {
+                    key: list(value) if isinstance(value, tuple) else value
+                    for key, value in asdict(mesh).items()
+                    if key != "path"
+                }
                 for mesh in self.user_meshes
             ],
-        }  # fmt: skip
+        }
         return described if self.decode_with is None else {**described, PHOTOGRAPHED_BY: self.rig.to_dict()}
 
 

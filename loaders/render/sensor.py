@@ -128,9 +128,13 @@ class Exposure:
         return cls(pattern, Sensor.of(light.camera), light.projector.flicker)
 
     def expose(
-        self, frames: Sequence[int], lit: LitPixels, pixels: NDArray[np.uint32], stream: tuple[object, ...],
+        self,
+        frames: Sequence[int],
+        lit: LitPixels,
+        pixels: NDArray[np.uint32],
+        stream: tuple[object, ...],
         out: NDArray[np.uint8] | None = None,
-    ) -> NDArray[np.uint8]:  # fmt: skip
+    ) -> NDArray[np.uint8]:
         """Frames at flat image positions ``pixels`` uint32 (n,), which ``lit`` describes in that order; where it has m
         times as many points, a pixel is the mean of m in turn.
 
@@ -150,9 +154,13 @@ class Exposure:
         return out
 
     def sense(
-        self, frames: Sequence[int], radiance: NDArray[np.float32], pixels: NDArray[np.uint32],
-        stream: tuple[object, ...], out: NDArray[np.uint8],
-    ) -> NDArray[np.uint8]:  # fmt: skip
+        self,
+        frames: Sequence[int],
+        radiance: NDArray[np.float32],
+        pixels: NDArray[np.uint32],
+        stream: tuple[object, ...],
+        out: NDArray[np.uint8],
+    ) -> NDArray[np.uint8]:
         """The sensor's answer to ``radiance`` (k, n): fills ``out`` uint8 (k, n)."""
         sense_kernel(out, radiance, pixels, *self._sensor(frames, stream))
         return out
@@ -165,33 +173,78 @@ class Exposure:
             lamp += np.float32(self.flicker) * np.array([standard_normal(np.zeros(1, np.uint32), k)[0] for k in keys])
         bounced = np.empty((0, 0), dtype=np.float32) if lit.bounced is None else lit.bounced
         return (
-            np.array(frames, dtype=np.int64), pattern.table, pattern.along, pattern.crossed, pattern.waves,
-            pattern.per_px, p.u_index, p.u_weight, p.v_index, p.v_weight, p.level, p.level_weight, lit.gain,
-            lit.ambient, bounced, lamp,
-        )  # fmt: skip
+            np.array(frames, dtype=np.int64),
+            pattern.table,
+            pattern.along,
+            pattern.crossed,
+            pattern.waves,
+            pattern.per_px,
+            p.u_index,
+            p.u_weight,
+            p.v_index,
+            p.v_weight,
+            p.level,
+            p.level_weight,
+            lit.gain,
+            lit.ambient,
+            bounced,
+            lamp,
+        )
 
     def _sensor(self, frames: Sequence[int], stream: tuple[object, ...]) -> tuple:
         keys = np.array([stream_keys(*stream, index) for index in frames], dtype=np.uint32).reshape(-1, 2)
         noise, sensor = self.sensor.noise, self.sensor
         plain = np.array_equal(sensor.grey_of_code, np.arange(GREY_LEVELS + 1))
         return (
-            normal_table(), keys, _FLOAT(noise.read_variance), _FLOAT(noise.shot_per_grey), _FLOAT(sensor.black_grey),
+            normal_table(),
+            keys,
+            _FLOAT(noise.read_variance),
+            _FLOAT(noise.shot_per_grey),
+            _FLOAT(sensor.black_grey),
             np.empty(0, dtype=np.uint8) if plain else sensor.grey_of_code,
-        )  # fmt: skip
+        )
 
 
 @njit
 def fill_signal(  # type: ignore[no-untyped-def]
-    signal, row, frame, table, along, crossed, waves, per_px, u_index, u_weight, v_index, v_weight, level, level_weight,
-    gain, ambient, bounced, lamp, start,
-):  # fmt: skip
+    signal,
+    row,
+    frame,
+    table,
+    along,
+    crossed,
+    waves,
+    per_px,
+    u_index,
+    u_weight,
+    v_index,
+    v_weight,
+    level,
+    level_weight,
+    gain,
+    ambient,
+    bounced,
+    lamp,
+    start,
+):
     """Light of the points from ``start`` on in one frame: fills ``signal`` float32 (n,)."""
     stop = start + signal.size
     # Slices, not offsets: only then does the compiler see plain loops over plain arrays (1.75 times faster).
     fill_frame(
-        signal, frame, table, along, crossed, waves, per_px, u_index[start:stop], u_weight[start:stop],
-        v_index[start:stop], v_weight[start:stop], level[start:stop], level_weight[start:stop],
-    )  # fmt: skip
+        signal,
+        frame,
+        table,
+        along,
+        crossed,
+        waves,
+        per_px,
+        u_index[start:stop],
+        u_weight[start:stop],
+        v_index[start:stop],
+        v_weight[start:stop],
+        level[start:stop],
+        level_weight[start:stop],
+    )
     factor, offset, flash = gain[start:stop], ambient[start:stop], lamp[row]
     for k in range(signal.size):
         signal[k] = offset[k] + flash * factor[k] * signal[k]
@@ -247,9 +300,31 @@ def fill_bytes(  # type: ignore[no-untyped-def]
 
 @njit
 def expose_kernel(  # type: ignore[no-untyped-def]
-    out, frames, light, along, crossed, waves, per_px, u_index, u_weight, v_index, v_weight, level, level_weight, gain,
-    ambient, bounced, lamp, pixels, table, keys, read_variance, shot_per_grey, black, grey_of_code,
-):  # fmt: skip
+    out,
+    frames,
+    light,
+    along,
+    crossed,
+    waves,
+    per_px,
+    u_index,
+    u_weight,
+    v_index,
+    v_weight,
+    level,
+    level_weight,
+    gain,
+    ambient,
+    bounced,
+    lamp,
+    pixels,
+    table,
+    keys,
+    read_variance,
+    shot_per_grey,
+    black,
+    grey_of_code,
+):
     """Expose ``frames`` (k,) at n pixels: row i of ``out`` uint8 (k, n) is frame ``frames[i]``.
 
     ``light`` (F, S, L + 1), ``along``, ``crossed``, ``waves`` and ``per_px`` as in `PatternLight`, then the places and
@@ -271,21 +346,63 @@ def expose_kernel(  # type: ignore[no-untyped-def]
             numbers[k] = np.uint32(number[k] * np.uint32(0x9E3779B1))
         for row in range(frames.size):
             fill_signal(
-                signal[: n * samples], row, frames[row], light, along, crossed, waves, per_px, u_index, u_weight,
-                v_index, v_weight, level, level_weight, gain, ambient, bounced, lamp, start * samples,
-            )  # fmt: skip
+                signal[: n * samples],
+                row,
+                frames[row],
+                light,
+                along,
+                crossed,
+                waves,
+                per_px,
+                u_index,
+                u_weight,
+                v_index,
+                v_weight,
+                level,
+                level_weight,
+                gain,
+                ambient,
+                bounced,
+                lamp,
+                start * samples,
+            )
             average(signal, n, samples)
             fill_bytes(
-                out[row, start : start + n], signal[:n], numbers, hashes, normal, keys[row, 0], keys[row, 1], table,
-                read_variance, shot_per_grey, black, grey_of_code,
-            )  # fmt: skip
+                out[row, start : start + n],
+                signal[:n],
+                numbers,
+                hashes,
+                normal,
+                keys[row, 0],
+                keys[row, 1],
+                table,
+                read_variance,
+                shot_per_grey,
+                black,
+                grey_of_code,
+            )
 
 
 @njit
 def radiance_kernel(  # type: ignore[no-untyped-def]
-    out, frames, light, along, crossed, waves, per_px, u_index, u_weight, v_index, v_weight, level, level_weight, gain,
-    ambient, bounced, lamp,
-):  # fmt: skip
+    out,
+    frames,
+    light,
+    along,
+    crossed,
+    waves,
+    per_px,
+    u_index,
+    u_weight,
+    v_index,
+    v_weight,
+    level,
+    level_weight,
+    gain,
+    ambient,
+    bounced,
+    lamp,
+):
     """The light of ``frames`` (k,) at n pixels: fills ``out`` float32 (k, n)."""
     count = out.shape[1]
     samples = gain.size // max(count, 1)
@@ -294,9 +411,26 @@ def radiance_kernel(  # type: ignore[no-untyped-def]
         n = min(start + _CHUNK, count) - start
         for row in range(frames.size):
             fill_signal(
-                signal[: n * samples], row, frames[row], light, along, crossed, waves, per_px, u_index, u_weight,
-                v_index, v_weight, level, level_weight, gain, ambient, bounced, lamp, start * samples,
-            )  # fmt: skip
+                signal[: n * samples],
+                row,
+                frames[row],
+                light,
+                along,
+                crossed,
+                waves,
+                per_px,
+                u_index,
+                u_weight,
+                v_index,
+                v_weight,
+                level,
+                level_weight,
+                gain,
+                ambient,
+                bounced,
+                lamp,
+                start * samples,
+            )
             average(signal, n, samples)
             out[row, start : start + n] = signal[:n]
 
@@ -311,6 +445,16 @@ def sense_kernel(out, radiance, pixels, table, keys, read_variance, shot_per_gre
             numbers[k] = np.uint32(pixels[start + k] * np.uint32(0x9E3779B1))
         for row in range(out.shape[0]):
             fill_bytes(
-                out[row, start : start + n], radiance[row, start : start + n], numbers, hashes, normal, keys[row, 0],
-                keys[row, 1], table, read_variance, shot_per_grey, black, grey_of_code,
-            )  # fmt: skip
+                out[row, start : start + n],
+                radiance[row, start : start + n],
+                numbers,
+                hashes,
+                normal,
+                keys[row, 0],
+                keys[row, 1],
+                table,
+                read_variance,
+                shot_per_grey,
+                black,
+                grey_of_code,
+            )

@@ -14,9 +14,13 @@ Values = NDArray[np.float64]
 
 
 def reflectance(
-    cos_light: Values, cos_view: Values, cos_half: Values, albedo: Values | float, gloss: Values | float,
+    cos_light: Values,
+    cos_view: Values,
+    cos_half: Values,
+    albedo: Values | float,
+    gloss: Values | float,
     roughness: float,
-) -> Values:  # fmt: skip
+) -> Values:
     """pi f for unit cosines (n,) between the normal and light, view and the direction half-way; float64 (n,).
 
     Times the irradiance it is what a matte surface of that albedo would send: 1 for a white one.

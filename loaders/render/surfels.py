@@ -94,13 +94,32 @@ class Surfels:
         radius = np.sqrt(height)
         local = np.column_stack([radius * cosine_of_turns(disk), radius * sine_of_turns(disk), np.sqrt(1.0 - height)])
         origin_m, direction = np.empty((count * RAYS, 3)), np.empty((count * RAYS, 3))
-        aim_rays(points.position_m, points.normal, points.starts, local, cosine_of_turns(turn), sine_of_turns(turn),
-                 origin_m, direction)  # fmt: skip
+        aim_rays(
+            points.position_m,
+            points.normal,
+            points.starts,
+            local,
+            cosine_of_turns(turn),
+            sine_of_turns(turn),
+            origin_m,
+            direction,
+        )
         reach_m = float(np.sqrt((np.ptp(mesh.vertices_m, axis=0) ** 2).sum())) + 1.0
         along, triangle = traced.met(origin_m, origin_m + reach_m * direction)
         target: NDArray[np.int32] = np.empty(len(along), dtype=np.int32)
-        assign_hits(origin_m, reach_m * direction, along, triangle, traced.tree_corners, grid.corner_m, grid.cell_m,
-                    grid.table, grid.position_m, grid.normal, target)  # fmt: skip
+        assign_hits(
+            origin_m,
+            reach_m * direction,
+            along,
+            triangle,
+            traced.tree_corners,
+            grid.corner_m,
+            grid.cell_m,
+            grid.table,
+            grid.position_m,
+            grid.normal,
+            target,
+        )
         target = target.reshape(count, RAYS)
         left = target < 0
         open_starts = np.concatenate([[0], np.cumsum(left.sum(axis=1))])

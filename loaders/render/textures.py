@@ -18,37 +18,83 @@ from fpp_ml_bench.loaders.render.scene import SolidMesh, uniform
 Values = NDArray[np.float64]
 KINDS: dict[str, tuple[str, ...]] = {
     "label": (
-        "master_chef_can", "tomato_soup_can", "mustard_bottle", "tuna_fish_can", "potted_meat_can", "bleach_cleanser",
-        "spray_bottle", "container_bottle", "container_tin", "paint_container_bottle", "paint_container_jar",
-        "paint_container_spraycan", "paint_container_tube_small", "paint_container_tube", "paint_container_tube_large",
-        "paint_thinner", "battery", "battery_case", "tall_column", "sphere_pair",
+        "master_chef_can",
+        "tomato_soup_can",
+        "mustard_bottle",
+        "tuna_fish_can",
+        "potted_meat_can",
+        "bleach_cleanser",
+        "spray_bottle",
+        "container_bottle",
+        "container_tin",
+        "paint_container_bottle",
+        "paint_container_jar",
+        "paint_container_spraycan",
+        "paint_container_tube_small",
+        "paint_container_tube",
+        "paint_container_tube_large",
+        "paint_thinner",
+        "battery",
+        "battery_case",
+        "tall_column",
+        "sphere_pair",
     ),
     "text": (
-        "cracker_box", "sugar_box", "pudding_box", "gelatin_box", "open_book", "magazine_stack", "vial",
+        "cracker_box",
+        "sugar_box",
+        "pudding_box",
+        "gelatin_box",
+        "open_book",
+        "magazine_stack",
+        "vial",
         "hinged_leaves",
     ),
     "wood": (
-        "wood_block", "wooden_boards", "hammer", "paint_brush", "paint_brush_large", "cork", "pallet_knife",
-        "stair_tower", "cone_stack",
+        "wood_block",
+        "wooden_boards",
+        "hammer",
+        "paint_brush",
+        "paint_brush_large",
+        "cork",
+        "pallet_knife",
+        "stair_tower",
+        "cone_stack",
     ),
     "checks": ("duct_tape", "mug", "marker", "pen", "boxcutter", "saddle", "step_wedge"),
-}  # fmt: skip
+}
 """Objects by what is on them; all others, and users' meshes without colours, have stains."""
 _KIND_OF = {name: kind for kind, names in KINDS.items() for name in names}
 CHECK_MM, LETTER_MM, STAIN_MM, RING_MM = 24.0, 14.0, 45.0, 9.0
 DARKEST = 0.02
 """Least luminance of a mesh's own colours: black paint returns some light."""
 _GLYPHS = (
-    0x7C12117E00, 0x7F49493600, 0x3E41412200, 0x7F41413E00, 0x7F49494100, 0x7F09090100, 0x3E41497A00, 0x7F08087F00,
-    0x00417F4100, 0x7F08147300, 0x7F40404000, 0x7F06187F00, 0x3E41413E00, 0x7F09090600, 0x7F09197600, 0x2649493200,
-)  # fmt: skip
+    0x7C12117E00,
+    0x7F49493600,
+    0x3E41412200,
+    0x7F41413E00,
+    0x7F49494100,
+    0x7F09090100,
+    0x3E41497A00,
+    0x7F08087F00,
+    0x00417F4100,
+    0x7F08147300,
+    0x7F40404000,
+    0x7F06187F00,
+    0x3E41413E00,
+    0x7F09090600,
+    0x7F09197600,
+    0x2649493200,
+)
 """Letters as five columns of seven points, a byte each, the lowest bit on top."""
 
 
 def material_of(
-    mesh: SolidMesh, position_m: Values, normal: Values, surface: SurfaceLight,
+    mesh: SolidMesh,
+    position_m: Values,
+    normal: Values,
+    surface: SurfaceLight,
     triangle: NDArray[np.integer] | None = None,
-) -> Material:  # fmt: skip
+) -> Material:
     """Albedo and gloss of a mesh at surface points (n, 3) with unit normals (n, 3), object coordinates, on triangles
     ``triangle`` (n,) of it. Where a light has textures, a mesh with colours of its own has those and no map."""
     if surface.textures == "none":
@@ -109,8 +155,12 @@ def stains(position_mm: Values, normal: Values, name: str) -> Values:
 
 
 MAPS: dict[str, Callable[[Values, Values, str], Values]] = {
-    "checks": checks, "text": text, "label": label, "wood": wood, "stains": stains,
-}  # fmt: skip
+    "checks": checks,
+    "text": text,
+    "label": label,
+    "wood": wood,
+    "stains": stains,
+}
 """How dark each map is, from 0 to 1, at places in mm (n, 3) with unit normals (n, 3), by the object's name; (n,)."""
 
 

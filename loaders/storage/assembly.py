@@ -24,7 +24,7 @@ from fpp_ml_bench.loaders.storage.manifest import (
     check_row,
     describe_file,
     strictly,
-)  # fmt: skip
+)
 from fpp_ml_bench.loaders.storage.shard_processes import write_in_processes
 from fpp_ml_bench.loaders.storage.shards import Receipt, ShardPlan, ShardWriter
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -205,8 +205,9 @@ def compare(folder: Path | RemoteFolder, stored: dict[str, Any], requested: dict
             there, now = {key: there}, {key: now}
         differing += [
             f"{name} (there {_short(there.get(name))}, now {_short(now.get(name))})"
-            for name in sorted({*there, *now}) if there.get(name) != now.get(name)
-        ]  # fmt: skip
+            for name in sorted({*there, *now})
+            if there.get(name) != now.get(name)
+        ]
     if differing:
         raise BuildError(
             f"{folder}: holds a dataset with other settings: {'; '.join(differing)}. Give another folder, or delete it"

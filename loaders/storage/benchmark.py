@@ -82,13 +82,18 @@ BENCHMARKS = (
     Benchmark("fpp-bench-test-workshop", 2, "test", FULL_SIZE, "workshop", earlier="7d2b42bb8e89330dd8e62190fb33b962"),
     Benchmark("fpp-bench-test-hard", 2, "test", FULL_SIZE, "hard", earlier="ae15c33431eb62c8f938e4ac22b0b8bf"),
     Benchmark(
-        "fpp-bench-test-crossed-workshop", 2, "test", FULL_SIZE, "workshop", "crossed",
+        "fpp-bench-test-crossed-workshop",
+        2,
+        "test",
+        FULL_SIZE,
+        "workshop",
+        "crossed",
         "ec64e96ac523335ec5bf7be0a2c13265",
     ),
     Benchmark(
         "fpp-bench-test-crossed-hard", 2, "test", FULL_SIZE, "hard", "crossed", "1b681c74c7f3b56f606b279d1e05fce4"
     ),
-)  # fmt: skip
+)
 """The current version of each. ``fpp-bench-full-224`` is what `fpp-bench reproduce --preset cpu` trains on."""
 
 

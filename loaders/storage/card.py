@@ -74,23 +74,37 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
         files = [shard.path for shard in manifest.shards if (shard.group, shard.split) == (DATA_GROUP, split)]
         contents[f"{split}/state.json"] = {
             "_data_files": [{"filename": path.split("/")[-1]} for path in files],
-            "_fingerprint": manifest.fingerprint[:16], "_format_columns": None, "_format_kwargs": {},
-            "_format_type": None, "_output_all_columns": False, "_split": split,
-        }  # fmt: skip
+            "_fingerprint": manifest.fingerprint[:16],
+            "_format_columns": None,
+            "_format_kwargs": {},
+            "_format_type": None,
+            "_output_all_columns": False,
+            "_split": split,
+        }
         contents[f"{split}/dataset_info.json"] = {
-            "citation": "", "description": "", "features": features(columns, manifest.size), "homepage": "",
+            "citation": "",
+            "description": "",
+            "features": features(columns, manifest.size),
+            "homepage": "",
             "license": "" if manifest.origin == CAPTURED else "mit",
-        }  # fmt: skip
+        }
     for name, content in contents.items():
         write_atomically(folder / name, json.dumps(content, indent=1).encode() + b"\n")
     save_rig(rig, folder / RIG_FILE)
     paths = (f"  - split: {split}\n    path: {split}/{DATA_GROUP}-*.arrow" for split in manifest.samples)
     text = card_head(manifest) + _CARD.format(
-        version=data_version(manifest.fingerprint), data_files="\n".join(paths), origin=manifest.origin,
-        rows=sum(len(rows) for rows in manifest.samples.values()), height=manifest.size[0], width=manifest.size[1],
-        stored=manifest.stored, split=next(iter(manifest.samples)),
-        config=available_configs(sequence, manifest.stored)[-1], package=__version__, first=frames[0],
-    )  # fmt: skip
+        version=data_version(manifest.fingerprint),
+        data_files="\n".join(paths),
+        origin=manifest.origin,
+        rows=sum(len(rows) for rows in manifest.samples.values()),
+        height=manifest.size[0],
+        width=manifest.size[1],
+        stored=manifest.stored,
+        split=next(iter(manifest.samples)),
+        config=available_configs(sequence, manifest.stored)[-1],
+        package=__version__,
+        first=frames[0],
+    )
     write_atomically(folder / "README.md", text.encode())
     return ["README.md", RIG_FILE, *contents]
 
@@ -121,13 +135,19 @@ def _split(split: str, rows: list[dict[str, Any]], manifest: Manifest) -> dict[s
     exact_px = sum(row.get("exact_px") or 0 for row in rows)
     means = ("gt_mae_mm", "gt_rmse_mm", "gt_interior_mae_mm", "gt_interior_rmse_mm")
     return {
-        "split": split, "samples": len(rows), "objects": len({row["object"] for row in rows}),
-        "cover_mean": float(cover.mean()), "cover_min": float(cover.min()), "cover_max": float(cover.max()),
-        "depth_range_median_mm": float(np.median(ranges)), "depth_range_max_mm": float(ranges.max()),
-        **{name: average(name) for name in means}, "gt_max_mm": max(largest) if largest else None,
+        "split": split,
+        "samples": len(rows),
+        "objects": len({row["object"] for row in rows}),
+        "cover_mean": float(cover.mean()),
+        "cover_min": float(cover.min()),
+        "cover_max": float(cover.max()),
+        "depth_range_median_mm": float(np.median(ranges)),
+        "depth_range_max_mm": float(ranges.max()),
+        **{name: average(name) for name in means},
+        "gt_max_mm": max(largest) if largest else None,
         "undecoded_share": sum(row.get("undecoded_px") or 0 for row in rows) / exact_px if exact_px else None,
         "void_share": sum(row.get("void_px") or 0 for row in rows) / exact_px if exact_px else None,
-    }  # fmt: skip
+    }
 
 
 def ground_truth_summary(manifest: Manifest) -> list[str]:

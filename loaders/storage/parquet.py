@@ -92,9 +92,12 @@ def data_shards(dataset: DatasetFolder) -> dict[str, ShardFile]:
 
 
 def write_parquet(
-    dataset: DatasetFolder, folder: Path, splits: list[str], threads: int = 1,
+    dataset: DatasetFolder,
+    folder: Path,
+    splits: list[str],
+    threads: int = 1,
     rows_done: Callable[[int], None] = lambda rows: None,
-) -> None:  # fmt: skip
+) -> None:
     """Write ``splits`` of a dataset into ``folder``: Parquet under ``data/`` and the card that opens it. Raises
     ``OSError`` when the disk can't be written. Each thread writes a shard and holds one of its row groups in memory."""
     (folder / "data").mkdir(parents=True, exist_ok=True)
@@ -249,8 +252,13 @@ def _card(dataset: DatasetFolder, splits: list[str]) -> str:
     identity = sha256(" ".join([manifest.fingerprint, *splits]).encode()).hexdigest()
     configs = card_configs(dataset, identity, {split: f"data/{split}-*.parquet" for split in splits}, preview=False)
     return card_head(manifest) + _CARD.format(
-        configs=yaml.safe_dump(configs, sort_keys=False, width=120).rstrip(), origin=manifest.origin,
-        rows=sum(len(dataset.samples(split)) for split in splits), height=dataset.size[0], width=dataset.size[1],
-        fingerprint=manifest.fingerprint, config=dataset.configs[0], split=splits[0],
+        configs=yaml.safe_dump(configs, sort_keys=False, width=120).rstrip(),
+        origin=manifest.origin,
+        rows=sum(len(dataset.samples(split)) for split in splits),
+        height=dataset.size[0],
+        width=dataset.size[1],
+        fingerprint=manifest.fingerprint,
+        config=dataset.configs[0],
+        split=splits[0],
         names=", ".join(f"`{config}`" for config in dataset.configs),
-    )  # fmt: skip
+    )

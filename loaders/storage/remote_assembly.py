@@ -22,7 +22,7 @@ from fpp_ml_bench.loaders.storage.assembly import (
     compare,
     planned_receipt,
     without_files,
-)  # fmt: skip
+)
 from fpp_ml_bench.loaders.storage.card import write_card
 from fpp_ml_bench.loaders.storage.manifest import (
     MANIFEST,
@@ -33,7 +33,7 @@ from fpp_ml_bench.loaders.storage.manifest import (
     describe_file,
     read_manifest,
     strictly,
-)  # fmt: skip
+)
 from fpp_ml_bench.loaders.storage.shards import Receipt, ShardPlan
 from fpp_ml_bench.pool import mapping
 from fpp_ml_bench.remote import TEMPORARY, RemoteFolder
@@ -43,9 +43,12 @@ Written = tuple[Receipt, list[OtherFile]]
 
 
 def assemble_remote(
-    remote: RemoteFolder, assembly: Assembly, workers: int = 1, cluster: str | None = None,
+    remote: RemoteFolder,
+    assembly: Assembly,
+    workers: int = 1,
+    cluster: str | None = None,
     progress: Progress = lambda rows: None,
-) -> Manifest:  # fmt: skip
+) -> Manifest:
     """Write or finish the dataset at a URL by the processes that `mapping` takes, and return its manifest. ``progress``
     is called as by `assemble`. Nothing keeps a second run from the same URL; it would write the same files.
 

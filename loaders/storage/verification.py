@@ -26,7 +26,7 @@ from fpp_ml_bench.loaders.sample import (
     group_columns,
     image_hash,
     stored_groups,
-)  # fmt: skip
+)
 from fpp_ml_bench.loaders.storage.manifest import CAPTURED, GENERATED, MANIFEST, WORK_FOLDER, Manifest, ShardFile
 from fpp_ml_bench.loaders.storage.shards import arrow_schema
 from fpp_ml_bench.loaders.storage.store import DatasetFolder

@@ -172,8 +172,14 @@ def test_without_a_mask_background_is_not_in_range(opened):
     np.testing.assert_array_equal(depth[both], decoded[both])  # all steps, both directions: the same process
 
 
-@pytest.mark.parametrize(("name", "options"), [("classical", {"steps": 3, "direction": "vertical"}),
-    ("classical", {"steps": 3, "fewest": True}), ("classical-net", {})])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("classical", {"steps": 3, "direction": "vertical"}),
+        ("classical", {"steps": 3, "fewest": True}),
+        ("classical-net", {}),
+    ],
+)
 def test_beyond_the_end_of_the_range_there_is_no_depth(name, options):
     method, exact_m = load_method(name, RIG, **options), plane_depth_m(RIG, 2.1, (0.025, 0.0))
     frames = [
@@ -204,12 +210,14 @@ PLAIN = {"scheme": "phase-shift", "pitch_px": 18, "steps": 9, "gray": {}}
         ({"vertical": UNIT_CUE}, "vertical", "Classical, vertical phase-shift 57 + 912 px", 6),
         ({"vertical": GRAY}, "vertical", "Classical, vertical Gray code, cells of 2 px", 11),
         (
-            {"horizontal": UNIT_CUE, "vertical": PLAIN}, "both",
-            "Classical, horizontal phase-shift 57 + 912 px, vertical phase-shift 18 px + Gray code", 22,
+            {"horizontal": UNIT_CUE, "vertical": PLAIN},
+            "both",
+            "Classical, horizontal phase-shift 57 + 912 px, vertical phase-shift 18 px + Gray code",
+            22,
         ),
         ({"vertical": PLAIN}, "vertical", "Classical 9-step + Gray code, vertical fringes", 16),
     ],
-)  # fmt: skip
+)
 def test_any_rig(sequence, direction, title, frames):
     """All that the rig codes; with the paper's kind of code the paper's title and settings."""
     data = paper_rig(TINY_SIZE).to_dict()
@@ -258,8 +266,15 @@ def test_the_phase_route_takes_the_only_direction_that_a_rig_has():
 
 def test_methods_by_name(opened):
     assert tuple(METHODS) == (
-        "classical", "classical-net", "phase", "phase-net", "crossed", "crossed-net", "constant", "nearest",
-    )  # fmt: skip
+        "classical",
+        "classical-net",
+        "phase",
+        "phase-net",
+        "crossed",
+        "crossed-net",
+        "constant",
+        "nearest",
+    )
     assert load_method("classical", opened.rig, steps=4).title == "Classical 4-step + Gray code, both directions"
     network = load_method("unet-individual-rmse", opened.rig, device="cpu", depth_range="oracle")
     assert (network.frames_used, network.units, network.mode) == ((0,), "normalised", "paper")

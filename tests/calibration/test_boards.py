@@ -83,8 +83,11 @@ def test_labels_are_never_mirrored():
 
 def test_points():
     assert Board("checker", 3, 4, 2.5).points_mm()[[0, 1, 3, -1]].tolist() == [
-        [0, 0, 0], [2.5, 0, 0], [0, 2.5, 0], [5, 7.5, 0],
-    ]  # fmt: skip
+        [0, 0, 0],
+        [2.5, 0, 0],
+        [0, 2.5, 0],
+        [5, 7.5, 0],
+    ]
     assert Board("circles-asymmetric", 3, 4, 2.0).points_mm()[[0, 1, 3]].tolist() == [[0, 0, 0], [4, 0, 0], [2, 2, 0]]
 
 

@@ -107,8 +107,14 @@ def test_bad_input_is_a_sentence_and_no_rig_is_written(virtual, tmp_path, monkey
         "SIZES": lambda file, pose: write(file, boards, lambda image: image[:200] if pose == 2 else image),
         "MIRRORED": lambda file, pose: write(file, boards, lambda image: np.ascontiguousarray(image[:, ::-1])),
     }
-    places = {"BOARDS": boards, "TRUE": virtual / "true.yaml", "BOARD": "circles:5x9:50:15", "NOWHERE": "nowhere",
-              "ONE": "one.yaml", "OTHER": "other.yaml"}  # fmt: skip
+    places = {
+        "BOARDS": boards,
+        "TRUE": virtual / "true.yaml",
+        "BOARD": "circles:5x9:50:15",
+        "NOWHERE": "nowhere",
+        "ONE": "one.yaml",
+        "OTHER": "other.yaml",
+    }
     for name, change in changed.items():
         if name in words:
             places[name] = tmp_path / name

@@ -13,8 +13,10 @@ from fpp_ml_bench.optics import paper_rig, rig_from_dict
 def test_gamma_is_that_of_the_light(tmp_path, gamma):
     data = paper_rig(480).to_dict()
     del data["pitch_px"]
-    codes = {"vertical": {"scheme": "phase-shift", "pitches_px": [24, 912], "steps": [4, 8]},
-             "horizontal": {"scheme": "phase-shift", "pitches_px": [24, 1140], "steps": [4, 8]}}  # fmt: skip
+    codes = {
+        "vertical": {"scheme": "phase-shift", "pitches_px": [24, 912], "steps": [4, 8]},
+        "horizontal": {"scheme": "phase-shift", "pitches_px": [24, 1140], "steps": [4, 8]},
+    }
     rig = rig_from_dict({**data, "sequence": {"order": ["vertical", "horizontal", "white"], **codes}})
     board = fitting_board(rig)
     light = named_light("paper").changed("projector", response=gamma)

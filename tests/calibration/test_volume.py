@@ -69,8 +69,13 @@ def test_a_photographed_board_gives_the_rig_back_and_a_wrong_spacing_shows(captu
     sizes = ((device.width, device.height) for device in (true.camera, true.projector))
     found = calibrate(poses, given, *sizes, "none", hold_out=False)
     assert found.camera_rms_px < 0.05 and found.projector_rms_px < 0.1  # an image px is 2.6 projector px
-    rig = replace(true, camera=found.camera.pinhole(), projector=found.projector.pinhole(), rotation=found.rotation,
-                  translation_m=found.translation_m)  # fmt: skip
+    rig = replace(
+        true,
+        camera=found.camera.pinhole(),
+        projector=found.projector.pinhole(),
+        rotation=found.rotation,
+        translation_m=found.translation_m,
+    )
     error = volume_error_mm(rig, true)
     assert error.scale == pytest.approx(spacing_given, abs=0.002)
     if spacing_given == 1:

@@ -92,9 +92,13 @@ def test_what_the_network_sees_has_no_distance_unit_or_direction(samples: list[S
     seen = channels(scene)
     assert seen.shape == (len(CHANNELS), *scene.found.shape) and np.isfinite(seen).all()
     twice = replace(
-        scene, depth_mm=2 * scene.depth_mm, sigma_mm=2 * scene.sigma_mm, modulation=scene.modulation / 4,
-        unit_mm=2 * scene.unit_mm, bright=scene.bright / 4,
-    )  # fmt: skip
+        scene,
+        depth_mm=2 * scene.depth_mm,
+        sigma_mm=2 * scene.sigma_mm,
+        modulation=scene.modulation / 4,
+        unit_mm=2 * scene.unit_mm,
+        bright=scene.bright / 4,
+    )
     np.testing.assert_allclose(channels(twice), seen, atol=2e-3)
     np.testing.assert_allclose(channels(scene.with_maps(np.rot90)), np.rot90(seen, axes=(-2, -1)), atol=2e-3)
 
@@ -159,8 +163,12 @@ def test_the_shipped_weights_take_noise_away_on_every_view(views: Views) -> None
 
 def test_scores_count_a_missed_pixel_with_its_whole_depth(samples: list[Sample]) -> None:
     sample = samples[0]
-    exact = Filtered(sample.exact_mm, np.ones_like(sample.exact_mm), np.full(sample.exact_mm.shape, -9.0, np.float32),
-                     np.ones_like(sample.target))  # fmt: skip
+    exact = Filtered(
+        sample.exact_mm,
+        np.ones_like(sample.exact_mm),
+        np.full(sample.exact_mm.shape, -9.0, np.float32),
+        np.ones_like(sample.target),
+    )
     found = replace(sample.scene, found=sample.scene.found & (np.arange(sample.target.shape[1]) % 2 == 0))
     scores = score(exact, replace(sample, scene=found), 0.0)
     missed = sample.target & ~found.found

@@ -162,9 +162,12 @@ def test_a_full_or_unusable_cache_folder_is_gone_without(tmp_path):
 def _python(code, folder, **environment):
     path = os.pathsep.join((str(folder), str(ROOT)))
     return subprocess.run(
-        [sys.executable, "-c", code], cwd=folder, capture_output=True, text=True,
+        [sys.executable, "-c", code],
+        cwd=folder,
+        capture_output=True,
+        text=True,
         env={**os.environ, "PYTHONPATH": path, **environment},
-    )  # fmt: skip
+    )
 
 
 # ---- full disks
@@ -293,9 +296,12 @@ def test_without_shared_memory_there_is_a_message(tmp_path, monkeypatch, capsys)
 def _shell(redirection, words, **environment):
     kept = {key: value for key, value in os.environ.items() if key != "PYTHONUNBUFFERED"}
     return subprocess.run(
-        ["bash", "-c", f'set -o pipefail; "$@" {redirection}', "bash", *COMMAND, *words], cwd=ROOT, text=True,
-        capture_output=True, env={**kept, **environment},
-    )  # fmt: skip
+        ["bash", "-c", f'set -o pipefail; "$@" {redirection}', "bash", *COMMAND, *words],
+        cwd=ROOT,
+        text=True,
+        capture_output=True,
+        env={**kept, **environment},
+    )
 
 
 @pytest.mark.parametrize("environment", [{}, {"PYTHONUNBUFFERED": "1"}])

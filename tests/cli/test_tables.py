@@ -109,8 +109,12 @@ def test_tables_of_others_keep_their_rows(width):
 
 @pytest.mark.parametrize("sort", ["object_edge_mae_mm", "background_mae_mm", "object_p95_mm", "seconds_per_sample"])
 def test_what_rows_are_sorted_by_is_never_left_out(groups, sort):
-    titles = {"object_edge_mae_mm": "Edge MAE", "background_mae_mm": "Backgr. MAE", "object_p95_mm": "object p95",
-              "seconds_per_sample": "s/sample"}  # fmt: skip
+    titles = {
+        "object_edge_mae_mm": "Edge MAE",
+        "background_mae_mm": "Backgr. MAE",
+        "object_p95_mm": "object p95",
+        "seconds_per_sample": "s/sample",
+    }
     entries = [row.entry for row in groups[0].rows]
     text = printed(leaderboard.group_tables(leaderboard.rank(entries, sort), sort), 80)
     assert titles[sort] in tables_in(text, 1 if " Rank " in text.split("┡")[0] else 0)[0][0]

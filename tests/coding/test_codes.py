@@ -52,9 +52,15 @@ def seen(code, position_px, mean=120.0, amplitude=100.0, noise=0.0, seed=0):
 @pytest.mark.parametrize("name", CODES)
 def test_a_code_gives_its_own_pixels_back(name):
     code, pixels = code_of(name), np.arange(LENGTH, dtype=float)
-    found = code.decode(code.profiles(LENGTH) if not code.needs_flat else np.concatenate(
-        [code.profiles(LENGTH), np.zeros((1, LENGTH), np.uint8), np.full((1, LENGTH), 255, np.uint8)]
-    ), LENGTH, Limits(max_clipped_steps=20))  # fmt: skip
+    found = code.decode(
+        code.profiles(LENGTH)
+        if not code.needs_flat
+        else np.concatenate(
+            [code.profiles(LENGTH), np.zeros((1, LENGTH), np.uint8), np.full((1, LENGTH), 255, np.uint8)]
+        ),
+        LENGTH,
+        Limits(max_clipped_steps=20),
+    )
     assert (found.reason == Reason.DECODED).mean() > (0.9 if name == "whole-period cells" else 0.99)
     good = found.reason == 0
     # 8-bit patterns are rounded to half a grey level of 127.5; a cell knows its pixels to half its width.
@@ -115,8 +121,12 @@ def test_cells_begin_at_their_origin_and_either_bit_comes_first():
 def test_a_rig_dictionary_names_only_what_is_unusual():
     assert GrayCells(2, 9).to_dict() == {"cell_px": 2, "bits": 9, "inverse": "none"}
     assert GrayCells(2, 9, "none", -3.0, True).to_dict() == {
-        "cell_px": 2, "bits": 9, "inverse": "none", "origin_px": -3.0, "least_first": True,
-    }  # fmt: skip
+        "cell_px": 2,
+        "bits": 9,
+        "inverse": "none",
+        "origin_px": -3.0,
+        "least_first": True,
+    }
     plain = code_of("the paper's")
     for change in ({"origin_px": -9.0}, {"least_first": True}):
         assert not replace(plain, gray=replace(plain.gray, **change)).is_plain

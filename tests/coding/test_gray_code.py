@@ -32,9 +32,18 @@ def test_code_round_trips(values):
     assert gray_to_binary(binary_to_gray(values)).tolist() == values
 
 
-@pytest.mark.parametrize("length, pitch, cells, bits", [(912, 18, 102, 7), (1140, 18, 127, 7), (1140, 17, 135, 8),
-                                                         (1152, 18, 128, 7), (1153, 18, 129, 8), (8, 8, 2, 1),
-                                                         (64, 12.8, 10, 4)])  # fmt: skip
+@pytest.mark.parametrize(
+    "length, pitch, cells, bits",
+    [
+        (912, 18, 102, 7),
+        (1140, 18, 127, 7),
+        (1140, 17, 135, 8),
+        (1152, 18, 128, 7),
+        (1153, 18, 129, 8),
+        (8, 8, 2, 1),
+        (64, 12.8, 10, 4),
+    ],
+)
 def test_cells_and_bits(length, pitch, cells, bits):
     assert cell_count(length, pitch) == cells and bits_needed(length, pitch) == bits
     assert len(np.unique(cell_of(np.arange(length), pitch))) == cells

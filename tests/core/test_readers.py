@@ -105,8 +105,11 @@ def test_hostile_yaml(name, attack, valid):
 
 def test_dates_stay_text_and_numbers_numbers():
     assert strict_yaml("{a: 2001-99-99, b: 2026-01-31 10:00:00, c: 1e-3, d: -0.5}") == {
-        "a": "2001-99-99", "b": "2026-01-31 10:00:00", "c": 1e-3, "d": -0.5,
-    }  # fmt: skip
+        "a": "2001-99-99",
+        "b": "2026-01-31 10:00:00",
+        "c": 1e-3,
+        "d": -0.5,
+    }
     assert strict_yaml("[" * DEEPEST + "]" * DEEPEST)
     with pytest.raises(ValueError, match=f"line 1: expected at most {MOST_NODES} keys and values"):
         strict_yaml("[" + "1," * (MOST_NODES + 1))
@@ -181,8 +184,9 @@ def test_what_is_no_regular_file_is_refused_at_once(name, kind, valid, tmp_path,
     monkeypatch.chdir(tmp_path)
     others = {
         "weights": ("w.safetensors", lambda path: weights_files.read_file(path, DEPTH_NETWORKS)),
-        "calibration": ("c.xml", read_opencv_calibration), "mask": ("m.npy", lambda path: read_mask(path, (2, 2))),
-    }  # fmt: skip
+        "calibration": ("c.xml", read_opencv_calibration),
+        "mask": ("m.npy", lambda path: read_mask(path, (2, 2))),
+    }
     if name in others:
         file, read = tmp_path / others[name][0], others[name][1]
     else:
@@ -317,10 +321,13 @@ def test_no_command_writes_or_reads_outside_by_a_manifests_names(copied, tmp_pat
     changed_manifest(copied, first_row(sample="../../x"))
     out = tmp_path / "here" / "out"
     for command in (
-        ["predict", "phase", copied, "--split", "train", "--out", out], ["verify", copied], ["info", copied],
-        ["export", copied, out, "--mat"], ["export", copied, out, "--parquet"],
+        ["predict", "phase", copied, "--split", "train", "--out", out],
+        ["verify", copied],
+        ["info", copied],
+        ["export", copied, out, "--mat"],
+        ["export", copied, out, "--parquet"],
         ["publish", "dataset", copied, "--repo", "a/b", "--dry-run"],
-    ):  # fmt: skip
+    ):
         assert main([str(word) for word in command]) == 2, command
         assert "manifest.json: damaged (sample '../../x'" in capsys.readouterr().err, command
     assert sorted(path.name for path in tmp_path.rglob("*x*")) == [] and not out.exists()
@@ -332,9 +339,12 @@ def test_no_command_follows_a_link_out_of_the_dataset(copied, tmp_path, capsys):
     shard.symlink_to(tmp_path / "elsewhere.arrow")
     out = tmp_path / "here" / "out"
     for command in (
-        ["predict", "phase", copied, "--split", "train", "--out", out], ["verify", copied], ["info", copied],
-        ["export", copied, out, "--parquet"], ["publish", "dataset", copied, "--repo", "a/b", "--dry-run"],
-    ):  # fmt: skip
+        ["predict", "phase", copied, "--split", "train", "--out", out],
+        ["verify", copied],
+        ["info", copied],
+        ["export", copied, out, "--parquet"],
+        ["publish", "dataset", copied, "--repo", "a/b", "--dry-run"],
+    ):
         assert main([str(word) for word in command]) == 2, command
         assert f"{shard}: is a link out of the dataset" in capsys.readouterr().err, command
     assert not out.exists()

@@ -23,7 +23,7 @@ from fpp_ml_bench.loaders.render import (
     build,
     named_light,
     place,
-)  # fmt: skip
+)
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import NUMBA_SWITCH as COMPILED
 from fpp_ml_bench.optics import paper_rig

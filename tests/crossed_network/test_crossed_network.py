@@ -164,9 +164,13 @@ def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert main(["train", "loss/l1", "--out", str(tmp_path / "x")]) == 2
     assert "expected a dataset folder" in capsys.readouterr().err
     view = training.View(
-        "x", "x", "x", np.zeros((1, SIZE, SIZE), np.uint8), np.zeros((SIZE, SIZE), np.float32),
+        "x",
+        "x",
+        "x",
+        np.zeros((1, SIZE, SIZE), np.uint8),
+        np.zeros((SIZE, SIZE), np.float32),
         np.zeros((SIZE, SIZE), bool),
-    )  # fmt: skip
+    )
     assert not sample_of(view, route()).target.any()
     with pytest.raises(TrainingError, match=r"delete it"):
         next(training.read_views(tmp_path, GROUPS, "train"))

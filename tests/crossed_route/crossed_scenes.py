@@ -22,9 +22,15 @@ def route(rig: Rig = RIG, family: Crossed = FAMILY) -> CrossedRoute:
 
 
 def frame(
-    depth_mm: NDArray, rig: Rig = RIG, family: Crossed = FAMILY, white_grey: NDArray | float = 160.0,
-    ambient_grey: float = 6.0, noise_grey: float = 0.7, background_grey: float = 50.0, number: int = 0,
-) -> NDArray[np.uint8]:  # fmt: skip
+    depth_mm: NDArray,
+    rig: Rig = RIG,
+    family: Crossed = FAMILY,
+    white_grey: NDArray | float = 160.0,
+    ambient_grey: float = 6.0,
+    noise_grey: float = 0.7,
+    background_grey: float = 50.0,
+    number: int = 0,
+) -> NDArray[np.uint8]:
     """Crossed frame ``number`` uint8 (H, W) of a surface at ``depth_mm`` (H, W), 0 where the background is."""
     x, y = rig.camera.rays()
     z = np.where(depth_mm > 0, depth_mm / 1000, rig.background_m or 3.2)

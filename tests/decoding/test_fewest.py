@@ -78,9 +78,15 @@ def fewer(rig, frames, direction):
 @pytest.mark.parametrize("compiled", ["1", "0"])
 @pytest.mark.parametrize(
     ("rig", "direction", "gray"),
-    [(PAPER, "both", 0), (PAPER, "vertical", 7), (COARSE, "both", 0), (COARSE, "horizontal", 6), (TURNED, "both", None),
-     (LENSES, "both", None)],
-)  # fmt: skip
+    [
+        (PAPER, "both", 0),
+        (PAPER, "vertical", 7),
+        (COARSE, "both", 0),
+        (COARSE, "horizontal", 6),
+        (TURNED, "both", None),
+        (LENSES, "both", None),
+    ],
+)
 def test_depth_with_the_fewest_frames_is_the_same_bytes(rig, direction, gray, compiled, monkeypatch):
     monkeypatch.setenv(COMPILED, compiled)
     surface = tilted(rig)
@@ -154,8 +160,9 @@ def test_predicting_with_the_fewest_frames(tiny, tmp_path, capsys):
     method = ClassicalMethod(dataset.rig, "both", 3, fewest=True)
     assert len(method.frames_used) == 6 and method.title == "Classical 3-step, both directions, no Gray code"
     assert ClassicalMethod(paper_rig(TINY_SIZE), "vertical", fewest=True).frames_used == (
-        *range(18, 36), *dataset.sequence.gray("vertical")
-    )  # fmt: skip
+        *range(18, 36),
+        *dataset.sequence.gray("vertical"),
+    )
     for name, options in (("all", []), ("six", ["--fewest"])):
         assert main(["predict", "classical", str(tiny), "--out", str(tmp_path / name), "--steps", "3", *options]) == 0
     for sample in dataset.samples("test"):

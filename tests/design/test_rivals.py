@@ -21,9 +21,10 @@ from fpp_ml_bench.optics import CROSSED, paper_rig
 
 PAPER = paper_rig()
 TURNED = replace(
-    PAPER, rotation=((0.98, 0.0, 0.198997487421324), (0.0, 1.0, 0.0), (-0.198997487421324, 0.0, 0.98)),
+    PAPER,
+    rotation=((0.98, 0.0, 0.198997487421324), (0.0, 1.0, 0.0), (-0.198997487421324, 0.0, 0.98)),
     translation_m=(-0.25, -0.12, 0.06),
-)  # fmt: skip
+)
 """Looks to the side, with the projector in front of the camera: lines of all directions and lengths."""
 SIDEWAYS = replace(PAPER, translation_m=(0.16, 0.0, 0.0))
 

@@ -42,9 +42,11 @@ def scenes(opened, renderer):
 
 
 WORN = (
-    named_light("hard").changed("surface", gloss=0.0, textures="none").changed(calibration_px=0.0)
+    named_light("hard")
+    .changed("surface", gloss=0.0, textures="none")
+    .changed(calibration_px=0.0)
     .changed("camera", blur_px=0.0, falloff=0, exposure=0.8)
-)  # fmt: skip
+)
 """A defocused, flickering projector and a sensor with a response: stages that scenes share with their dataset."""
 
 
@@ -72,8 +74,16 @@ def test_direct_light_keeps_projector_sensor_and_brightness():
     hard = named_light("hard")
     direct = direct_light(hard)
     assert direct.projector == hard.projector and direct.ambient_grey == hard.ambient_grey
-    off = {"gloss", "textures", "interreflection", "shadows", "ambient occlusion", "lens blur", "vignetting",
-           "calibration error"}  # fmt: skip
+    off = {
+        "gloss",
+        "textures",
+        "interreflection",
+        "shadows",
+        "ambient occlusion",
+        "lens blur",
+        "vignetting",
+        "calibration error",
+    }
     assert {name for name, on in hard.stages().items() if on and not direct.stages()[name]} <= off
     assert not any(direct.stages()[name] for name in off)
     low, high = hard.camera.exposure
@@ -142,11 +152,15 @@ def test_crossed_fringes_are_mirrored_and_widened():
     renderer = SceneRenderer(crossed_rig(320))
     surface = plane(renderer.rig, 1.8)
     scene = Scene(surface.pixels.astype(np.uint32), renderer.light(surface), np.ones(renderer.shape, bool), (0,))
-    light = {name: renderer.frames(replace(scene, projected=name), [0])[0]
-             for name in ("sequence", "other direction", "other pitch")}  # fmt: skip
+    light = {
+        name: renderer.frames(replace(scene, projected=name), [0])[0]
+        for name in ("sequence", "other direction", "other pitch")
+    }
     spectra = {name: np.abs(np.fft.fft2(grey - grey.mean())) for name, grey in light.items()}
-    peaks = {name: np.abs(np.fft.fftfreq(320)[list(np.unravel_index(power.argmax(), power.shape))])
-             for name, power in spectra.items()}  # fmt: skip
+    peaks = {
+        name: np.abs(np.fft.fftfreq(320)[list(np.unravel_index(power.argmax(), power.shape))])
+        for name, power in spectra.items()
+    }
     assert np.hypot(*peaks["other pitch"]) == pytest.approx(np.hypot(*peaks["sequence"]) / PITCH_FACTOR, rel=0.05)
     mirrored = spectra["other direction"][:, 1:], spectra["sequence"][:, :0:-1]
     assert np.corrcoef(mirrored[0].ravel(), mirrored[1].ravel())[0, 1] > 0.9
@@ -212,8 +226,13 @@ def test_fringes_are_removed_swapped_and_widened_where_it_says(opened, renderer,
 def test_samples_are_spread_over_objects_and_views(opened):
     chosen = chosen_samples(opened, "train", 3)
     assert [sample for sample, _ in chosen] == [
-        "bowl_A0", "bowl_A120", "bowl_A240", "cork_A120", "cork_A240", "cork_A60",
-    ]  # fmt: skip
+        "bowl_A0",
+        "bowl_A120",
+        "bowl_A240",
+        "cork_A120",
+        "cork_A240",
+        "cork_A60",
+    ]
     assert all(outlines and outlines[0].split("_")[0] != sample.split("_")[0] for sample, outlines in chosen)
     with pytest.raises(DiagnosisError, match="no sample with an object"):
         chosen_samples_of_nothing(opened)

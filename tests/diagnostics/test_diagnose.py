@@ -247,9 +247,13 @@ def test_a_finding_is_kept_until_something_it_depends_on_changes(opened, tmp_pat
 
 def test_findings_come_back_as_they_were_and_only_whole(tmp_path):
     finding = Finding(
-        "linear", "Title", "Said.", {"a": [1, None], "b": {"c": 0.5}},
-        (Table("T", ("x", "y"), (("a", 1.5), ("b", None))),), (Figure("F", "f.png", "alt"),),
-    )  # fmt: skip
+        "linear",
+        "Title",
+        "Said.",
+        {"a": [1, None], "b": {"c": 0.5}},
+        (Table("T", ("x", "y"), (("a", 1.5), ("b", None))),),
+        (Figure("F", "f.png", "alt"),),
+    )
     (tmp_path / "f.png").write_bytes(b"png")
     save_finding(tmp_path, "key", finding, 1.25)
     stored, seconds = load_finding(tmp_path, "linear", "key")
@@ -270,8 +274,11 @@ def test_text_of_a_finding_can_only_be_text(tmp_path):
     context = {
         "subject": {"name": "<b>x</b>", "title": "t", "frames_used": [0], "direction": "both", "layers": []},
         "dataset": {"name": "d", "fingerprint": "0" * 64, "size": [4, 4], "samples": {"test": 1}},
-        "settings": {"samples": None}, "software": {}, "command": "fpp-bench <i>", "hardware": {"cpu": "c", "cores": 1},
-    }  # fmt: skip
+        "settings": {"samples": None},
+        "software": {},
+        "command": "fpp-bench <i>",
+        "hardware": {"cpu": "c", "cores": 1},
+    }
     table = Table("<u>", ("<u>",), (("<script>",), (0.123456,), (None,)))
     page = diagnosis.report_page(context, [("<q>?", Finding("linear", "<t>", "<s>", tables=(table,)))], tmp_path)
     for tag in ("<b>x", "<script>", "<s>", "<t>", "<u>", "<q>", "fpp-bench <i>"):

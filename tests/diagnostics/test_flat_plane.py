@@ -28,9 +28,17 @@ def answering(dataset, answer, units="mm"):
         return answer(frames).astype(np.float32)
 
     return SimpleNamespace(
-        name="known", units=units, answers_normalised=units == "normalised", answer=predict, predict=predict,
-        uses_ground_truth_mask=False, frames_used=(51,), image_size=dataset.size, weights_sha256=None, network=None,
-    )  # fmt: skip
+        name="known",
+        units=units,
+        answers_normalised=units == "normalised",
+        answer=predict,
+        predict=predict,
+        uses_ground_truth_mask=False,
+        frames_used=(51,),
+        image_size=dataset.size,
+        weights_sha256=None,
+        network=None,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -115,10 +123,12 @@ def test_heat_on_the_plane_is_where_a_linear_network_looks(tmp_path):
     away = copy.deepcopy(network)
     away[1].weight.data.fill_(-2.0)
     subject = SimpleNamespace(
-        frames_used=(3,), layer_names=("first",), networks=lambda: (network, lambda seed: away),
+        frames_used=(3,),
+        layer_names=("first",),
+        networks=lambda: (network, lambda seed: away),
         layers_of=lambda one: {"first": one[0]},
         input_batch=lambda stacks: torch.from_numpy(stacks[0][3][None, None].astype(np.float32) / 255),
-    )  # fmt: skip
+    )
     frame = np.random.default_rng(0).integers(0, 256, (24, 32), dtype=np.uint8)
     mask = np.zeros((24, 32), bool)
     mask[5:20, 8:30] = True

@@ -169,7 +169,7 @@ def test_the_exact_decoder_is_a_pure_phase_reader(units, scene_set, exact):
         Reader(lambda frames: np.zeros(frames[0].shape)),
     ],
     ids=["edges of the fringe", "edges in mm", "edges of the mask", "template", "constant", "brightness", "no answer"],
-)  # fmt: skip
+)
 def test_readers_of_shape_have_no_phase_reliance(reader, scene_set):
     reliance, _ = measure(reader, scene_set)
     assert 0 <= reliance.score <= 0.02

@@ -78,18 +78,22 @@ def test_what_a_loss_chooses_of_two_depths():
     for loss, alpha in (("l1", None), ("masked_l1", None), ("hybrid_l1", 0.7)):
         for batch in (1, 4):  # a median, in batches of any size
             assert [choice_of(pair, loss, chance, batch, alpha) for chance in (0.25, 0.5, 0.75)] == [
-                (0.0, 0.0), (0.0, 1.0), (1.0, 1.0)
-            ]  # fmt: skip
+                (0.0, 0.0),
+                (0.0, 1.0),
+                (1.0, 1.0),
+            ]
     # The root of one image's mean square is its distance, so a batch of one image is a median too.
     assert choice_of(pair, "rmse", 0.25, 1) == (0.0, 0.0)
     # In batches of n: least sum over k of C(n, k) q^k (1 - q)^(n - k) sqrt(k (1 - c)^2 + (n - k) c^2).
     for batch, chance in ((4, 0.25), (4, 0.75), (9, 0.3)):
         places = np.linspace(0, 1, 100_001)
         expected = sum(
-            comb(batch, k) * chance**k * (1 - chance) ** (batch - k)
+            comb(batch, k)
+            * chance**k
+            * (1 - chance) ** (batch - k)
             * np.sqrt(k * (1 - places) ** 2 + (batch - k) * places**2)
             for k in range(batch + 1)
-        )  # fmt: skip
+        )
         low, high = choice_of(pair, "rmse", chance, batch)
         assert low - 0.01 <= places[expected.argmin()] <= high + 0.01 and high - low < 0.05
     low, high = choice_of(pair, "rmse", 0.3, 40)  # large batches: the mean

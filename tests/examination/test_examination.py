@@ -14,8 +14,11 @@ SIZE = 200
 FOUR = {"scheme": "phase-shift", "pitch_px": 57, "steps": 4, "gray": {}}
 UNIT = {"scheme": "phase-shift", "pitches_px": [912, 57], "steps": 4}
 PAPER = {"steps": 5, "bits_horizontal": 7, "bits_vertical": 7}
-TWO = {"order": ["vertical", "horizontal", "white", "black"], "vertical": UNIT,
-       "horizontal": UNIT | {"pitches_px": [1140, 57]}}  # fmt: skip
+TWO = {
+    "order": ["vertical", "horizontal", "white", "black"],
+    "vertical": UNIT,
+    "horizontal": UNIT | {"pitches_px": [1140, 57]},
+}
 
 
 def rig_of(sequence, size=SIZE, **changes):
@@ -47,12 +50,19 @@ def photographed(rig, light, name="mug", view="A60", **changes):
 
 
 @pytest.mark.parametrize("light", ["paper", "workshop", "hard"])
-@pytest.mark.parametrize("sequence", [
-    PAPER, PAPER | {"steps": 3}, PAPER | {"steps": 18}, TWO, {"order": ["vertical"], "vertical": FOUR},
-    {"order": ["vertical", "white", "black"], "vertical": {"scheme": "gray", "cell_px": 4}},
-    {"order": ["vertical"], "vertical": {"scheme": "gray", "cell_px": 4, "inverse": "after each"}},
-    {"order": ["vertical"], "vertical": UNIT | {"steps": 3}},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "sequence",
+    [
+        PAPER,
+        PAPER | {"steps": 3},
+        PAPER | {"steps": 18},
+        TWO,
+        {"order": ["vertical"], "vertical": FOUR},
+        {"order": ["vertical", "white", "black"], "vertical": {"scheme": "gray", "cell_px": 4}},
+        {"order": ["vertical"], "vertical": {"scheme": "gray", "cell_px": 4, "inverse": "after each"}},
+        {"order": ["vertical"], "vertical": UNIT | {"steps": 3}},
+    ],
+)
 def test_what_decodes_right_is_not_refused_nor_warned_of(sequence, light):
     rig = rig_of(sequence)
     assert said(photographed(rig, light), rig) == []
@@ -136,7 +146,7 @@ READINGS = {
     "periods exchanged": (UNIT, moved([4, 5, 6, 7, 0, 1, 2, 3]), "of period 1, vertical sinusoids of period 0"),
     "other sign of both": (UNIT, moved([0, 3, 2, 1, 4, 7, 6, 5]), "shifts of the other sign"),
     "sine for cosine": (UNIT, moved([1, 2, 3, 0, 5, 6, 7, 4]), "sine for cosine"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", READINGS)

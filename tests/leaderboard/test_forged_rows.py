@@ -162,8 +162,12 @@ def test_an_invented_but_consistent_row_stands_beside_the_ranks(base, board):
     assert ranks(board()) == {"first": "1", "second": "2", "third": "3"}
     (group,) = board(content_of(row_with(base, "forged", 0.001)), content_of(row_with(base, "also", 2.5)))
     assert {row.entry.name: row.ranks for row in group.rows} == {
-        "first": "1", "second": "2", "third": "3", "forged": "(1)", "also": "(3)"
-    }  # fmt: skip
+        "first": "1",
+        "second": "2",
+        "third": "3",
+        "forged": "(1)",
+        "also": "(3)",
+    }
     forged = next(row for row in group.rows if row.entry.name == "forged")
     assert forged.provenance == "self-reported" and forged.interval("object_mae_mm") is not None
 
@@ -188,12 +192,20 @@ def test_local_results_are_ranked_where_nobody_vouches(base, board, tmp_path):
         write_row(row, path)
     board()
     assert ranks(rank(read_entries([*shipped_rows(), *files]))) == {
-        "first": "1", "second": "2", "third": "3", "mine": "(2)", "mine, again": "(3)"
-    }  # fmt: skip
+        "first": "1",
+        "second": "2",
+        "third": "3",
+        "mine": "(2)",
+        "mine, again": "(3)",
+    }
     rows.VOUCHED.write_text("")
     assert ranks(rank(read_entries([*shipped_rows(), *files]))) == {
-        "mine": "1", "mine, again": "2", "first": "(1)", "second": "(2)", "third": "(3)"
-    }  # fmt: skip
+        "mine": "1",
+        "mine, again": "2",
+        "first": "(1)",
+        "second": "(2)",
+        "third": "(3)",
+    }
     (group,) = rank(read_entries(shipped_rows()))
     assert group.notes == ("No ranks: nobody vouches for a row here.",) and {row.ranks for row in group.rows} == {"-"}
 
@@ -204,9 +216,7 @@ def test_rows_with_the_same_predictions_are_one(base, board):
     predictions = content_of(read_entry(rows.SHIPPED_ROWS / "second.json").row)["predictions_sha256"]
     (group,) = board(*(copy | {"predictions_sha256": predictions} for copy in copies))
     assert ranks([group]) == {"first": "1", "second": "2", "third": "3"}
-    assert [note.partition(": ")[2] for note in group.notes] == [
-        "a copy (forged-0.json).", "another (forged-1.json)."
-    ]  # fmt: skip
+    assert [note.partition(": ")[2] for note in group.notes] == ["a copy (forged-0.json).", "another (forged-1.json)."]
     assert all("same predictions as second (second.json)" in note for note in group.notes)
 
 

@@ -104,9 +104,11 @@ def test_what_differs_in_data_or_rules_is_never_ranked_together(make, capsys, tm
     out = board(capsys, *files)
     out = " ".join(out.split())
     for words in (
-        "metric track, test split, against exact depth", "oracle range track, test split, against decoded depth",
-        "metric track, train split", "40 x 40 px, data",
-    ):  # fmt: skip
+        "metric track, test split, against exact depth",
+        "oracle range track, test split, against decoded depth",
+        "metric track, train split",
+        "40 x 40 px, data",
+    ):
         assert words in out
 
 
@@ -139,8 +141,12 @@ def test_paper_rows_are_the_papers():
     """Spot values retyped from the paper's tables, and what its text derives from them."""
     tables = paper_tables()
     assert {name: len(table.rows) for name, table in tables.items()} == {
-        "normalization": 3, "background_removed": 3, "multi_frame": 5, "loss": 10, "architecture": 4,
-    }  # fmt: skip
+        "normalization": 3,
+        "background_removed": 3,
+        "multi_frame": 5,
+        "loss": 10,
+        "architecture": 4,
+    }
     rows = {(table.name, row.row): row for table in tables.values() for row in table.rows}
     for table_and_row, errors in PAPER.items():
         assert tuple(rows[table_and_row].errors_mm.values()) == errors
@@ -163,8 +169,9 @@ def test_paper_rows_are_the_papers():
 def test_probes_and_figures_of_the_paper():
     """Averages and ratios of Tables 7 and 8 follow from their layers, up to the printed digits."""
     for probe, above, below, digit in (
-        ("linear_probing", "depth_mse", "edges_mse", 1e-6), ("grad_cam", "r_edges", "r_fringes", 1e-3),
-    ):  # fmt: skip
+        ("linear_probing", "depth_mse", "edges_mse", 1e-6),
+        ("grad_cam", "r_edges", "r_fringes", 1e-3),
+    ):
         layers = paper_layers(probe)
         average = layers.pop(AVERAGE)
         for key in (above, below):

@@ -91,8 +91,11 @@ def test_what_stands_aside(shipped):
     groups = [group for group in rank(shipped) if not group.key.notes]
     aside = {group.key.benchmark.name: group.key.aside for group in groups}
     assert aside == {
-        "fpp-bench-full": "", "fpp-bench-full-224": "224 px", "fpp-bench-workshop": "workshop", "fpp-bench-hard": "hard"
-    }  # fmt: skip
+        "fpp-bench-full": "",
+        "fpp-bench-full-224": "224 px",
+        "fpp-bench-workshop": "workshop",
+        "fpp-bench-hard": "hard",
+    }
     block = readme_block(rank(shipped))
     assert "fpp-bench-full version 2" in block and "fpp-bench-workshop" not in block
     assert "Rows of other data (workshop; hard; 224 px) are on the page." in block
@@ -102,8 +105,9 @@ def test_one_frame_of_either_code_stands_in_one_table(shipped):
     """The best methods of one frame are ranked together, on the test objects and the unseen ones."""
     group = next(group for group in rank(shipped) if group.key.takes_unseen and group.key.target == "depth_exact")
     assert group.key.frames == "one frame" and {row.entry.row.dataset.code for row in group.ranked} == {
-        "phase shift", "crossed"
-    }  # fmt: skip
+        "phase shift",
+        "crossed",
+    }
     assert {len(row.objects) for row in group.ranked} == {25}
 
 
@@ -134,15 +138,23 @@ def test_short_names_of_shipped_rows(shipped):
 
 def submission(name, method="mine", **settings):
     return Submission(
-        name=name, method=method, units="mm", frames_used=[0], uses_ground_truth_range=False, seconds_per_sample=None,
+        name=name,
+        method=method,
+        units="mm",
+        frames_used=[0],
+        uses_ground_truth_range=False,
+        seconds_per_sample=None,
         settings=settings,
-    )  # fmt: skip
+    )
 
 
 UNET = {
-    "network": "unet", "normalisation": "global", "loss": "rmse", "trained_frames": "single_shot",
+    "network": "unet",
+    "normalisation": "global",
+    "loss": "rmse",
+    "trained_frames": "single_shot",
     "background_removed": False,
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(

@@ -89,8 +89,11 @@ def test_equal_rows_share_ranks_and_the_perfect_one_is_first(base):
     for order in (errors, dict(reversed(errors.items()))):
         (group,) = rank(entries_of(base, order, TEN))
         assert [(row.ranks, row.entry.name) for row in group.rows] == [
-            ("1", "zero"), ("2-3", "a"), ("2-3", "b"), ("4", "worst")
-        ]  # fmt: skip
+            ("1", "zero"),
+            ("2-3", "a"),
+            ("2-3", "b"),
+            ("4", "worst"),
+        ]
     twins = next(pair for pair in group.pairs if {pair.first, pair.second} == {"a", "b"})
     assert twins.p == twins.p_holm == 1.0 and not twins.behind
 
@@ -134,8 +137,9 @@ def test_test_and_unseen_objects_make_one_ranked_row(base, benchmarks):
     (group,) = rank([*second, *first])
     assert group.title.endswith("one frame, metric track, test split + unseen, against decoded depth")
     assert [(row.ranks, row.entry.name, len(row.objects)) for row in group.rows] == [
-        ("1", "first", 25), ("2", "second", 25)
-    ]  # fmt: skip
+        ("1", "first", 25),
+        ("2", "second", 25),
+    ]
     row = group.rows[1]
     assert (row.on("fpp-bench-full").name, row.on("fpp-bench-unseen").name) == ("second", "second")
     assert row.on("fpp-bench-full").value("object_mae_mm") == pytest.approx(2.0 * 3)
@@ -175,9 +179,11 @@ def test_classes_and_what_was_told_are_tables_of_their_own(base):
     entries.append(entry_with_errors(base, errors, "told", uses_ground_truth_order=True))
     groups = rank(entries)
     assert [(group.key.frames, group.key.track) for group in groups] == [
-        (FRAMES_CLASSES[0], "metric"), (FRAMES_CLASSES[0], "oracle order"), (FRAMES_CLASSES[1], "metric"),
+        (FRAMES_CLASSES[0], "metric"),
+        (FRAMES_CLASSES[0], "oracle order"),
+        (FRAMES_CLASSES[1], "metric"),
         (FRAMES_CLASSES[2], "metric"),
-    ]  # fmt: skip
+    ]
 
 
 def test_every_class_is_compared_with_the_best_trivial_row(base):
@@ -272,16 +278,17 @@ def test_what_a_result_says_beyond_its_scores(base, monkeypatch):
     assert not {"In 95%", "AUSE", "Learned from", "Rank", "x trivial", "On unseen"} & set(shown)
     scores = SimpleNamespace(coverage_95=0.9, ause_mae_mm=1.5, unstated_share=0.0)
     samples = {
-        "all pixels state a sigma": scores, "half of them": SimpleNamespace(coverage_95=1.0, unstated_share=0.5),
+        "all pixels state a sigma": scores,
+        "half of them": SimpleNamespace(coverage_95=1.0, unstated_share=0.5),
         "none": SimpleNamespace(coverage_95=None, unstated_share=1.0),
         "no object": SimpleNamespace(coverage_95=None, unstated_share=None),
-    }  # fmt: skip
+    }
     in_brief = _uncertainty(SimpleNamespace(metrics=scores, per_sample=samples))
     assert in_brief == {"within_95_share": pytest.approx((0.9 + 0.5 + 0.0) / 3), "ause_mae_mm": 1.5}
     changes = {
         "uncertainty": RowUncertainty(**in_brief),
         "submission": base.row.submission.model_copy(update={"learned_from": LearnedFrom(data="generated")}),
-    }  # fmt: skip
+    }
     (row,) = rank([replace(base, row=base.row.model_copy(update=changes))])[0].rows
     assert learned_from(row.entry.row) == "generated"
     shown = [column.title for column in columns("object_mae_mm") if column.shown_for([row])]
@@ -298,9 +305,15 @@ def test_a_submission_may_say_that_it_was_given_the_order(base):
         }
         tracks[given] = Submission.model_validate({**about, **flags}).track
     assert tracks == {
-        0: "metric", 1: "oracle range", 2: "oracle mask", 3: "oracle range + mask", 4: "oracle order",
-        5: "oracle range + order", 6: "oracle mask + order", 7: "oracle range + mask + order",
-    }  # fmt: skip
+        0: "metric",
+        1: "oracle range",
+        2: "oracle mask",
+        3: "oracle range + mask",
+        4: "oracle order",
+        5: "oracle range + order",
+        6: "oracle mask + order",
+        7: "oracle range + mask + order",
+    }
     assert set(tracks.values()) == set(get_args(Track))
     assert told(tracks[7]) == "the test sample's depth range, object mask and fringe order" and told("metric") == ""
 

@@ -119,11 +119,17 @@ def test_means_weigh_objects_by_the_views_that_have_them(tmp_path):
 
 @pytest.mark.parametrize(
     "line",
-    ["measured", "{sha} measured {commit} here by me", "{sha} | measured | {commit} | a machine | ",
-     "{sha} | trusted | {commit} | a machine | a command", "{sha} | measured | HEAD | a machine | a command",
-     "{short} | measured | {commit} | a machine | a command", "{sha} | measured | {commit} | a machine | a command\r",
-     " {sha} | measured | {commit} | a machine | a command"],
-)  # fmt: skip
+    [
+        "measured",
+        "{sha} measured {commit} here by me",
+        "{sha} | measured | {commit} | a machine | ",
+        "{sha} | trusted | {commit} | a machine | a command",
+        "{sha} | measured | HEAD | a machine | a command",
+        "{short} | measured | {commit} | a machine | a command",
+        "{sha} | measured | {commit} | a machine | a command\r",
+        " {sha} | measured | {commit} | a machine | a command",
+    ],
+)
 def test_a_bad_line_of_the_list_is_named(line, listed, files):
     listed("")
     listed(line.format(sha="a" * 64, short="a" * 63, commit="b" * 40))
@@ -168,8 +174,10 @@ def test_fpp_eval_verifies_a_row_from_its_predictions(files, dataset, tmp_path, 
     verdict, *lines, last = capsys.readouterr().out.splitlines()
     assert "robustness" in last and "differs from what the predictions give in 3 places" in verdict
     assert [line.split(":")[0].strip() for line in lines] == [
-        "submission.settings.steps", "predictions_sha256", "metrics.object_median_mm"
-    ]  # fmt: skip
+        "submission.settings.steps",
+        "predictions_sha256",
+        "metrics.object_median_mm",
+    ]
     content["protocol_version"] = "2.0.0"
     row.write_text(json.dumps(content))
     assert fpp_eval(words) == 2 and "was scored by protocol 2.0.0" in capsys.readouterr().err
@@ -177,10 +185,20 @@ def test_fpp_eval_verifies_a_row_from_its_predictions(files, dataset, tmp_path, 
 
 @pytest.mark.parametrize(
     ("stored", "computed", "agree"),
-    [(12.346, 12.3456, True), (12.346, 12.3455000001, True), (12.346, 12.3454999, False), (12.345, 12.3456, False),
-     (10.0, 9.99996, True), (0.0, 0.0, True), (1e-7, 0.0, False), (-0.5, -0.500004, True), (0.5, -0.5, False),
-     (None, 0.0, False), (3, 3, True)],
-)  # fmt: skip
+    [
+        (12.346, 12.3456, True),
+        (12.346, 12.3455000001, True),
+        (12.346, 12.3454999, False),
+        (12.345, 12.3456, False),
+        (10.0, 9.99996, True),
+        (0.0, 0.0, True),
+        (1e-7, 0.0, False),
+        (-0.5, -0.500004, True),
+        (0.5, -0.5, False),
+        (None, 0.0, False),
+        (3, 3, True),
+    ],
+)
 def test_a_mean_may_differ_by_what_five_digits_leave_open(stored, computed, agree):
     assert rows._agree(stored, computed, 1.0) is agree
 
@@ -335,12 +353,17 @@ def test_readme_shows_the_best_of_a_group(extra, files):
     entry = read_entry(files[0])
     about = entry.row.submission
     named = [
-        replace(entry, row=entry.row.model_copy(update={
-            "submission": about.model_copy(update={"name": f"Method {number:02}"}),
-            "predictions_sha256": f"{number:064}",
-        }))
+        replace(
+            entry,
+            row=entry.row.model_copy(
+                update={
+                    "submission": about.model_copy(update={"name": f"Method {number:02}"}),
+                    "predictions_sha256": f"{number:064}",
+                }
+            ),
+        )
         for number in range(count)
-    ]  # fmt: skip
+    ]
     text = readme_block(rank([*named, read_entry(files[3])]))
     # All share one error, so names decide.
     assert [n for n in range(count) if f"Method {n:02}" in text] == list(range(5))

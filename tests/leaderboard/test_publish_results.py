@@ -66,10 +66,14 @@ def test_results_parse_back(client, scored):
     dry = client.good([*call, "--dry-run", "--source-url", "https://example.org/page"])
     assert client.server.writes() == []
     output = client.good([*call, "--source-url", "https://example.org/page"])
-    assert listed(output) == listed(dry) == {
-        ".eval_results/multi_frame_depth_oracle_range--alice--scored.yaml": "new",
-        ".eval_results/single_shot_depth--alice--scored.yaml": "new",
-    }  # fmt: skip
+    assert (
+        listed(output)
+        == listed(dry)
+        == {
+            ".eval_results/multi_frame_depth_oracle_range--alice--scored.yaml": "new",
+            ".eval_results/single_shot_depth--alice--scored.yaml": "new",
+        }
+    )
     repo = client.server.repos["models", "alice/unet"]
     assert repo.files["README.md"] == b"card" and repo.files[".eval_results/hle.yaml"] == b"[]"
     single = entry(client, "alice/unet", "single_shot_depth")
@@ -89,9 +93,7 @@ def test_results_parse_back(client, scored):
 def test_a_second_run_sends_nothing_and_a_better_result_replaces(client, scored):
     client.server.repos["models", "alice/mlp"] = Repo()
     call = ["--repo", "alice/mlp", "--dataset-repo", "alice/scored"]
-    first, second, better = client.run(
-        *(["results", str(scored[name]), *call] for name in ("good", "good", "better"))
-    )  # fmt: skip
+    first, second, better = client.run(*(["results", str(scored[name]), *call] for name in ("good", "good", "better")))
     assert first[0] == second[0] == better[0] == 0
     assert "Nothing to send" in second[1]
     assert list(listed(better[1]).values()) == ["changed"]
@@ -151,9 +153,14 @@ def test_the_page_becomes_a_static_space(client, tmp_path):
     assert (head["sdk"], head["app_file"], head["datasets"]) == ("static", "index.html", ["alice/scored"])
     assert len(head["short_description"]) <= 60  # the Hub refuses more
     assert set(space.files) == {
-        ".gitattributes", "README.md", "fpp-bench.json", "index.html", "data.json", "submissions/a.html",
+        ".gitattributes",
+        "README.md",
+        "fpp-bench.json",
+        "index.html",
+        "data.json",
+        "submissions/a.html",
         "submissions/a.png",
-    }  # fmt: skip
+    }
 
 
 def test_the_page_of_results(client, scored, tmp_path):
@@ -217,9 +224,12 @@ def test_changes_compare_with_the_hashes_the_hub_keeps(tmp_path):
     ]
     remote = Remote("c" * 40, files={file.path: file for file in stored})
     assert changes(Publication("dataset", "a/b", tmp_path, "m", owned=("d/",)), remote) == [
-        Change("deleted", "d/gone.txt", 7), Change("new", "d/new.txt", 0), Change("changed", "other.txt", 1),
-        Change("unchanged", "same.bin", 1), Change("unchanged", "same.txt", 1),
-    ]  # fmt: skip
+        Change("deleted", "d/gone.txt", 7),
+        Change("new", "d/new.txt", 0),
+        Change("changed", "other.txt", 1),
+        Change("unchanged", "same.bin", 1),
+        Change("unchanged", "same.txt", 1),
+    ]
     assert not any(c.status == "deleted" for c in changes(Publication("model", "a/b", tmp_path, "m"), remote))
     (tmp_path / "link").symlink_to("/etc/passwd")
     with pytest.raises(PublishError, match="symbolic link"):

@@ -202,13 +202,16 @@ def test_bad_words_are_a_sentence_and_nothing_is_written(capture, tmp_path, caps
     assert said in error and "Traceback" not in error and not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("change, said", [
-    (lambda frames: frames[:-1], "expected 14 frames, found 13"),
-    (lambda frames: [frame[:, :100] for frame in frames], "camera of 120 x 120"),
-    (lambda frames: [frames[0][:50], *frames[1:]], "120 x 50"),
-    (lambda frames: [], "expected a folder with images"),
-    (lambda frames: [np.zeros_like(frame) for frame in frames], "too faint"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        (lambda frames: frames[:-1], "expected 14 frames, found 13"),
+        (lambda frames: [frame[:, :100] for frame in frames], "camera of 120 x 120"),
+        (lambda frames: [frames[0][:50], *frames[1:]], "120 x 50"),
+        (lambda frames: [], "expected a folder with images"),
+        (lambda frames: [np.zeros_like(frame) for frame in frames], "too faint"),
+    ],
+)
 def test_a_bad_capture_is_a_sentence(capture, tmp_path, capsys, change, said):
     folder, row = capture
     scan = written(folder, change(list(row.frames.values())), tmp_path)
@@ -232,13 +235,19 @@ def test_patterns_come_with_a_manifest(tmp_path, capsys):
     assert "not empty" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("text, said", [
-    ("", "empty"),
-    ("sequence: {}", "projector: expected a mapping"),
-    ("projector: {width: 20}", "projector.height: missing"),
-    ("projector: {width: 20, height: 20}", "missing key pitch_px"),
-    ("projector: {width: 20, height: 20}\nsequence: {vertical: {scheme: gray, bits: 1}, order: [vertical]}", "need"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "text, said",
+    [
+        ("", "empty"),
+        ("sequence: {}", "projector: expected a mapping"),
+        ("projector: {width: 20}", "projector.height: missing"),
+        ("projector: {width: 20, height: 20}", "missing key pitch_px"),
+        (
+            "projector: {width: 20, height: 20}\nsequence: {vertical: {scheme: gray, bits: 1}, order: [vertical]}",
+            "need",
+        ),
+    ],
+)
 def test_a_projector_that_is_not_described_is_a_sentence(tmp_path, capsys, text, said):
     (tmp_path / "projector.yaml").write_text(text)
     assert main(["patterns", str(tmp_path / "projector.yaml"), str(tmp_path / "images")]) == 2

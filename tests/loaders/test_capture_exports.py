@@ -142,9 +142,14 @@ def test_the_grey_image_is_stored_unrounded(written):
 
 @pytest.mark.parametrize(
     ("largest_mm", "name"),
-    [(60.0, "depth_0.001mm.png"), (600.0, "depth_0.01mm.png"), (2100.0, "depth_0.1mm.png"), (65534.0, "depth_1mm.png"),
-     (65535.0, "depth_10mm.png")],
-)  # fmt: skip
+    [
+        (60.0, "depth_0.001mm.png"),
+        (600.0, "depth_0.01mm.png"),
+        (2100.0, "depth_0.1mm.png"),
+        (65534.0, "depth_1mm.png"),
+        (65535.0, "depth_10mm.png"),
+    ],
+)
 def test_the_png_takes_the_finest_unit_that_fits(tmp_path, largest_mm, name):
     depth = np.full((48, 64), largest_mm / 7)
     depth[0, 0], depth[0, 1] = largest_mm, 0

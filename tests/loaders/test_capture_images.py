@@ -92,8 +92,14 @@ def _turned(image, suffix, orientation):
     tags = [content[place : place + 12] for place in range(start + 2, start + 2 + 12 * count, 12)]
     tags = sorted([tag, *(t for t in tags if t[:2] != tag[:2])], key=lambda t: struct.unpack_from("<H", t))
     padded = content + bytes(len(content) % 2)
-    return (padded[:4] + struct.pack("<I", len(padded)) + padded[8:]
-            + struct.pack("<H", len(tags)) + b"".join(tags) + bytes(4))  # fmt: skip
+    return (
+        padded[:4]
+        + struct.pack("<I", len(padded))
+        + padded[8:]
+        + struct.pack("<H", len(tags))
+        + b"".join(tags)
+        + bytes(4)
+    )
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))

@@ -339,7 +339,7 @@ BAD = {
     "impossible limit": (lambda f: ("--min-modulation", -1), "min_modulation: expected a positive"),
     "frame order": (lambda f: ("--frame-order", "paper"), "belongs to published trees"),
     "no workers": (lambda f: ("--workers", 0), "expected 1 or more"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", BAD)

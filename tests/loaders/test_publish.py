@@ -90,9 +90,12 @@ np.save(f"{out}/streamed.npy", np.asarray(first["frame_00"]))
 
 def test_load_dataset_reads_the_same_rows_of_every_configuration(published, client, dataset, tmp_path):
     done = subprocess.run(
-        [sys.executable, "-c", READ_BACK, str(tmp_path)], env=client.environment(), capture_output=True, text=True,
+        [sys.executable, "-c", READ_BACK, str(tmp_path)],
+        env=client.environment(),
+        capture_output=True,
+        text=True,
         timeout=120,
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stderr
     same_bits(np.load(tmp_path / "streamed.npy"), dataset.frame(dataset.splits["test"][0], 0))
     assert dataset.configs == ("single_shot", "horizontal", "vertical", "sinusoidal", "all")
@@ -125,8 +128,12 @@ def test_a_name_with_markup_is_shown_as_it_is(published, client):
     assert ODD_OBJECT not in body
     assert "&#95;&#95;odd&#95;&#95;-name&#95;" in body
     assert {config["config_name"] for config in yaml.safe_load(head)["configs"]} == {
-        "single_shot", "horizontal", "vertical", "sinusoidal", "all"
-    }  # fmt: skip
+        "single_shot",
+        "horizontal",
+        "vertical",
+        "sinusoidal",
+        "all",
+    }
 
 
 def test_the_benchmark_is_registered(published, client):

@@ -106,9 +106,12 @@ def test_flat_sample_is_zero_throughout(tiny, monkeypatch):
     flat = np.zeros(dataset.source.size, np.float32)
     flat[50:90, 60:80] = 1800
     source = SimpleNamespace(
-        size=dataset.source.size, frame=dataset.source.frame, depth_mm=lambda sample: flat,
-        measured=lambda sample: {"depth_min_mm": 1800.0, "depth_max_mm": 1800.0}, void=lambda sample: flat < 0,
-    )  # fmt: skip
+        size=dataset.source.size,
+        frame=dataset.source.frame,
+        depth_mm=lambda sample: flat,
+        measured=lambda sample: {"depth_min_mm": 1800.0, "depth_max_mm": 1800.0},
+        void=lambda sample: flat < 0,
+    )
     dataset.source = source
     item = dataset[0]
     assert (item.depth == 0).all() and torch.isfinite(item.depth).all()

@@ -57,9 +57,14 @@ def weights(tmp_path_factory, dataset):
         ("global-removed", "global", False, True),
     ):
         config = config_of(
-            network, name=f"unet-{name}", title=f"UNet {name}", normalisation=normalisation, background_removed=removed,
-            image_size=SIZE, dataset_fingerprint=dataset.fingerprint,
-        )  # fmt: skip
+            network,
+            name=f"unet-{name}",
+            title=f"UNet {name}",
+            normalisation=normalisation,
+            background_removed=removed,
+            image_size=SIZE,
+            dataset_fingerprint=dataset.fingerprint,
+        )
         range_heads = fit_heads(network, config, dataset.path) if heads else None
         save_weights(folder / f"{name}.safetensors", network, config, range_heads)
     return folder
@@ -102,9 +107,10 @@ def test_what_a_submission_says(dataset, weights, tmp_path, name, depth_range, u
     sample = dataset.samples("test")[0]
     fringe = captured_frames(dataset, network_method, sample)[0]
     expected = (
-        network_method.model.predict_representation([fringe])[0] if units == "normalised"
+        network_method.model.predict_representation([fringe])[0]
+        if units == "normalised"
         else network_method.model.predict(fringe, depth_range or "predicted")
-    )  # fmt: skip
+    )
     np.testing.assert_array_equal(np.load(tmp_path / "p" / f"{sample}.npy"), expected)
 
 
@@ -217,9 +223,13 @@ def test_a_given_mask_is_never_ranked_with_honest_rows(dataset, tmp_path, capsys
         for given_mask in (False, True):
             name = f"{given_range}-{given_mask}"
             folder = write_predictions(
-                tmp_path / name, dataset, offset_mm=1.0, name=name, uses_ground_truth_range=given_range,
+                tmp_path / name,
+                dataset,
+                offset_mm=1.0,
+                name=name,
+                uses_ground_truth_range=given_range,
                 **({"uses_ground_truth_mask": True} if given_mask else {}),
-            )  # fmt: skip
+            )
             result = evaluate(folder, dataset)
             assert not differences(result, folder, dataset)
             write_result(result, tmp_path / f"{name}.json")

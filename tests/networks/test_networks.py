@@ -64,9 +64,12 @@ def test_full_width_runs_at_960_px_on_the_meta_device(name):
         network = build(name)
         shapes = _probed(network, torch.empty(1, 1, 960, 960))
     paper = {
-        "unet": (1024, 60), "transunet": (1024, 60), "resunet": (960, 120), "hformer": (256, 30),
+        "unet": (1024, 60),
+        "transunet": (1024, 60),
+        "resunet": (960, 120),
+        "hformer": (256, 30),
         "pix2pix_unet": (512, 15),
-    }  # fmt: skip
+    }
     channels, side = paper.get(name, (1024, 60))
     assert shapes["bottleneck"] == (1, channels, side, side)
     assert shapes[network.last_layer][2:] == (960, 960)

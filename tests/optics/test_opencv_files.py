@@ -184,13 +184,16 @@ def test_files_that_are_no_calibration_are_refused(tmp_path, content, message):
 @pytest.mark.parametrize(
     ("name", "content", "keys"),
     [
-        ("ros.yaml", "image_width: 640\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [8, 0, 3, 0, 8, 2, 0, 0, 1]\n",
-         "image_width, camera_matrix"),
+        (
+            "ros.yaml",
+            "image_width: 640\ncamera_matrix:\n  rows: 3\n  cols: 3\n  data: [8, 0, 3, 0, 8, 2, 0, 0, 1]\n",
+            "image_width, camera_matrix",
+        ),
         ("flow.yml", "camera: {K: [800, 0, 320, 0, 800, 240, 0, 0, 1], D: [0, 0, 0, 0, 0]}\n", "camera"),
         ("block.yml", "camera:\n  K:\n  - [800, 0, 320]\nlens model: none\n", "camera, lens model"),
         ("alone.json", '{\n\t"camera": {"K": [[800, 0], [0]], "D": null}}', "camera"),
     ],
-)  # fmt: skip
+)
 def test_a_sound_file_of_another_layout_is_not_called_damaged(tmp_path, name, content, keys):
     (tmp_path / name).write_text(content)
     with pytest.raises(RigError) as caught:

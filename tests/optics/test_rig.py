@@ -232,14 +232,16 @@ def test_missing_file_and_unwritable_folder_are_rig_errors(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"translation_m": [200, 0, 0]},
-         "translation_m gives a baseline of 200 m, which no rig has; as mm it would be 200 mm: divide by 1000"),
+        (
+            {"translation_m": [200, 0, 0]},
+            "translation_m gives a baseline of 200 m, which no rig has; as mm it would be 200 mm: divide by 1000",
+        ),
         ({"translation_m": [0.0002, 0, 0]}, "translation_m gives a baseline of 0.2 mm, .*; check its numbers"),
         ({"translation_m": [1e6, 0, 0]}, "translation_m gives a baseline of 1e.06 m, .*; check its numbers"),
         ({"working_range_mm": [0.5, 1.5]}, r"working_range_mm: 0.5 to 1.5 mm, .*like metres: write \[500, 1500\]"),
         ({"working_range_mm": [2e6, 3e6]}, r"working_range_mm: 2e\+06 to 3e\+06 mm, .*; check its unit, mm"),
     ],
-)  # fmt: skip
+)
 def test_lengths_in_a_unit_that_no_rig_has_are_refused(tmp_path, changes, message):
     data = {**paper_rig().to_dict(), "background_m": None, **changes}
     near, far = data["working_range_mm"]
@@ -253,12 +255,20 @@ def test_lengths_in_a_unit_that_no_rig_has_are_refused(tmp_path, changes, messag
 @pytest.mark.parametrize(
     ("stored", "unit", "message"),
     [
-        ("m", "", "gives a baseline of 0.2 mm, which no rig has; as metres it would be 200 mm: "
-         "write calibration: {file: ..., unit: m}"),
-        ("mm", ", unit: m", "gives a baseline of 200 m, which no rig has; as mm it would be 200 mm: "
-         "write calibration: {file: ..., unit: mm}"),
+        (
+            "m",
+            "",
+            "gives a baseline of 0.2 mm, which no rig has; as metres it would be 200 mm: "
+            "write calibration: {file: ..., unit: m}",
+        ),
+        (
+            "mm",
+            ", unit: m",
+            "gives a baseline of 200 m, which no rig has; as mm it would be 200 mm: "
+            "write calibration: {file: ..., unit: mm}",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_calibration_read_in_the_wrong_unit_is_refused(tmp_path, stored, unit, message):
     rig = paper_rig()
     calibration = OpenCvCalibration(rig.camera, rig.projector, np.eye(3).tolist(), (0.2, 0.0, 0.0))

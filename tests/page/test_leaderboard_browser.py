@@ -295,9 +295,10 @@ def test_ranks_parts_and_pairs_are_on_the_page(browser, ranked_page):
     cells = "[...document.querySelectorAll('.ranking tbody tr')].map(row => [...row.cells].map(c => c.innerText))"
     shown = browser.run(cells)
     assert [(row[0], row[3], row[5], row[6], row[7]) for row in shown] == [
-        ("1", "9.000", "3.000", "10.500", "0.33"), ("2", "18.000", "6.000", "21.000", "0.67"),
+        ("1", "9.000", "3.000", "10.500", "0.33"),
+        ("2", "18.000", "6.000", "21.000", "0.67"),
         ("3", "27.000", "9.000", "31.500", "1"),
-    ]  # fmt: skip
+    ]
     browser.run("document.querySelectorAll('details').forEach(part => part.open = true)")
     matrix = browser.run("[...document.querySelectorAll('.matrix tbody td')].map(cell => cell.className)")
     assert matrix == ["", "ahead", "ahead", "behind", "", "ahead", "behind", "behind", ""]

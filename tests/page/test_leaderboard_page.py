@@ -153,9 +153,14 @@ def test_a_name_is_only_a_name(name, dataset, tmp_path, files):
     def pages_with(text):
         hardware = {"cpu": text, "cores": 1, "memory_gib": 1.0, "gpu": text, "platform": text}
         path = write_result_file(
-            tmp_path / "x.json", dataset, 1.0, name=text, method=text, settings={text[:50]: text},
+            tmp_path / "x.json",
+            dataset,
+            1.0,
+            name=text,
+            method=text,
+            settings={text[:50]: text},
             timing=timing(3.0, hardware=hardware),
-        )  # fmt: skip
+        )
         return pages([path, files[0]])
 
     written, expected = pages_with(name), pages_with("p" * len(name))
@@ -172,9 +177,14 @@ def test_a_name_is_only_a_name(name, dataset, tmp_path, files):
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("\x1b[2Jgone", "control character U+001B"), ("x" * 10_000_000, "at most 200 characters"), ("a\nb", "U+000A"),
-     ("\u202egnp.exe", "U+202E"), ("  ", "expected some text")],
-)  # fmt: skip
+    [
+        ("\x1b[2Jgone", "control character U+001B"),
+        ("x" * 10_000_000, "at most 200 characters"),
+        ("a\nb", "U+000A"),
+        ("\u202egnp.exe", "U+202E"),
+        ("  ", "expected some text"),
+    ],
+)
 def test_dangerous_text_is_refused_by_every_output(name, message, files, tmp_path, capsys):
     import json
 

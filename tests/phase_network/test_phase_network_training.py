@@ -29,13 +29,26 @@ RIG = paper_rig(240)
 AS_CAPTURED = Variation(near_edge=0, shift=0, wrong_window=0, wrong_patch=0, mirror=0, brightness=0)
 OPTIONS = {"widths": [4, 6], "fine": 4, "squeezed": 6, "order_widths": [4, 6], "bound_rad": 1.0, "uncertain": True}
 SMALL = Recipe(
-    steps=4, batch=2, window=48, warm_up=1, widths=(4, 6), fine=4, squeezed=6, order_widths=(4, 6), bound_rad=1.0,
-    validate_every=2, directions=("horizontal",),
-)  # fmt: skip
+    steps=4,
+    batch=2,
+    window=48,
+    warm_up=1,
+    widths=(4, 6),
+    fine=4,
+    squeezed=6,
+    order_widths=(4, 6),
+    bound_rad=1.0,
+    validate_every=2,
+    directions=("horizontal",),
+)
 CONFIG = NetConfig(
-    name="small", title="Small", options=OPTIONS, threshold=-1.0,
-    period_px={"horizontal": 5.6}, dataset_fingerprint="0" * 64,
-)  # fmt: skip
+    name="small",
+    title="Small",
+    options=OPTIONS,
+    threshold=-1.0,
+    period_px={"horizontal": 5.6},
+    dataset_fingerprint="0" * 64,
+)
 
 
 def geometry(direction: str = "horizontal") -> Geometry:
@@ -131,9 +144,15 @@ def test_stopping_and_going_on_gives_the_same_weights(tmp_path: Path) -> None:
 
 def test_recipes_that_train_nothing_are_refused() -> None:
     for wrong in (
-        {"steps": 0}, {"unions": -1}, {"rate": 0.0}, {"directions": ("both",)}, {"averaged": 1.0},
-        {"albedo": "two"}, {"textured_every": 0}, {"lights": -1},
-    ):  # fmt: skip
+        {"steps": 0},
+        {"unions": -1},
+        {"rate": 0.0},
+        {"directions": ("both",)},
+        {"averaged": 1.0},
+        {"albedo": "two"},
+        {"textured_every": 0},
+        {"lights": -1},
+    ):
         with pytest.raises(RecipeError):
             replace(SMALL, **wrong)  # type: ignore[arg-type]
     assert SMALL.digest != replace(SMALL, rate=1e-3).digest
@@ -169,9 +188,12 @@ def test_weights_that_are_none_are_refused(tmp_path: Path) -> None:
     save_net(wider, PhaseNet(**OPTIONS), replace(CONFIG, options=OPTIONS | {"widths": [4, 8]}))
     unet = next(SHIPPED.glob("*.safetensors"))
     for file, message in (
-        (tmp_path / "none.safetensors", "found nothing"), (cut, "damaged"), (junk, "cut off|damaged"),
-        (unet, "expected weights of fpp-ml-bench phase-net"), (wider, "not those of its network"),
-    ):  # fmt: skip
+        (tmp_path / "none.safetensors", "found nothing"),
+        (cut, "damaged"),
+        (junk, "cut off|damaged"),
+        (unet, "expected weights of fpp-ml-bench phase-net"),
+        (wider, "not those of its network"),
+    ):
         with pytest.raises(WeightsError, match=message):
             load_net(file)
     with pytest.raises(WeightsError, match="phase-nut"):

@@ -73,8 +73,12 @@ def exact_mm(left_m: float, right_m: float) -> np.ndarray:
 
 def test_steps_are_spread_and_complete_each_other() -> None:
     assert [steps_of(18, n) for n in (1, 2, 3, 4, 6)] == [
-        (0,), (0, 6), (0, 6, 12), (0, 5, 9, 14), (0, 3, 6, 9, 12, 15),
-    ]  # fmt: skip
+        (0,),
+        (0, 6),
+        (0, 6, 12),
+        (0, 5, 9, 14),
+        (0, 3, 6, 9, 12, 15),
+    ]
     assert steps_of(18, 18) == tuple(range(18))
     for steps, expected in ((18, (1, 2, 3, 6, 18)), (12, (1, 2, 3, 6, 12)), (9, (1, 2, 3, 6, 9)), (4, (1, 4))):
         levels = levels_of(steps)
@@ -151,8 +155,14 @@ def test_a_depth_edge_blurs_one_frame_and_no_more() -> None:
 def test_frames_are_added_until_the_stated_error_is_expected() -> None:
     frames, truth = scene(1.8, 1.72), exact_mm(1.8, 1.72)
     looks = FewestFrames(RIG, 1e-3).choose(frames).looks
-    assert [(look.frames, look.gray) for look in looks] == [(1, False), (2, False), (3, False), (6, False), (18, False),
-                                                         (25, True)]  # fmt: skip
+    assert [(look.frames, look.gray) for look in looks] == [
+        (1, False),
+        (2, False),
+        (3, False),
+        (6, False),
+        (18, False),
+        (25, True),
+    ]
     # Two frames still average over a small window, which a plane rewards; from three on noise falls as the root.
     assert looks[0].expected_mm > 2 * looks[1].expected_mm
     assert looks[2].expected_mm == pytest.approx(looks[4].expected_mm * 6**0.5, rel=0.2)

@@ -284,9 +284,17 @@ def test_refusals_name_what_came() -> None:
     with pytest.raises(DecodeError, match=r"\(100, 480\)"):
         route("horizontal").measure(np.zeros((100, SIZE), np.uint8))
     for wrong in (
-        {"direction": "both"}, {"prior": "shape"}, {"min_confidence": 1.0}, {"jump_rad": 0.0}, {"pitch": 3},
-        {"white_grey": 0.0}, {"white_grey": float("nan")}, {"white_grey": float("inf")}, {"ambient_grey": -1.0},
-        {"ambient_grey": float("nan")}, {"ambient_grey": 300.0},
-    ):  # fmt: skip
+        {"direction": "both"},
+        {"prior": "shape"},
+        {"min_confidence": 1.0},
+        {"jump_rad": 0.0},
+        {"pitch": 3},
+        {"white_grey": 0.0},
+        {"white_grey": float("nan")},
+        {"white_grey": float("inf")},
+        {"ambient_grey": -1.0},
+        {"ambient_grey": float("nan")},
+        {"ambient_grey": 300.0},
+    ):
         with pytest.raises(PredictionError, match=next(iter(wrong))):
             PhaseMethod(RIG, **wrong)

@@ -16,10 +16,13 @@ from fpp_ml_bench.optics import Pinhole, load_rig, paper_rig, rotation_matrix, s
 
 SIZE = 128
 HIDDEN = replace(
-    paper_rig(SIZE), projector=Pinhole(912, 1140, 1650.0, 1650.0, 455.5, 569.5), translation_m=(0.19, -0.08, 0.03),
+    paper_rig(SIZE),
+    projector=Pinhole(912, 1140, 1650.0, 1650.0, 455.5, 569.5),
+    translation_m=(0.19, -0.08, 0.03),
     rotation=tuple(map(tuple, rotation_matrix((0.04, -0.07, 0.015)).tolist())),
-    pitch_vertical_px=30.0, pitch_horizontal_px=26.0,
-)  # fmt: skip
+    pitch_vertical_px=30.0,
+    pitch_horizontal_px=26.0,
+)
 
 
 @pytest.fixture(scope="module")

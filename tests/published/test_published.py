@@ -22,7 +22,7 @@ from published_trees import (
     v73_bytes,
     write_mat,
     write_png,
-)  # fmt: skip
+)
 
 from fpp_ml_bench.errors import BuildError, LayoutError, RigError
 from fpp_ml_bench.loaders.published.importing import plan_import

@@ -183,10 +183,12 @@ def test_groove_of_two_squares():
 SHAPES = {
     "torus": solid(trimesh.creation.torus(0.08, 0.03, 48, 24)),
     "box": solid(trimesh.creation.box((0.1, 0.2, 0.15))),
-    "two boxes": solid(trimesh.util.concatenate(
-        [trimesh.creation.box((0.1, 0.1, 0.1)).apply_translation([x, 0, z]) for x, z in ((0, 0), (0.14, 0.03))]
-    )),
-}  # fmt: skip
+    "two boxes": solid(
+        trimesh.util.concatenate(
+            [trimesh.creation.box((0.1, 0.1, 0.1)).apply_translation([x, 0, z]) for x, z in ((0, 0), (0.14, 0.03))]
+        )
+    ),
+}
 
 
 @pytest.mark.parametrize("name", ["shell", "torus", "box", "two boxes"])
@@ -210,8 +212,14 @@ def test_rows_and_reciprocity(name):
     assert max(crossing) == 0 if name == "box" else max(crossing) > 20
 
 
-@pytest.mark.parametrize("mesh", [SHAPES["box"], solid(trimesh.creation.icosphere(4, 0.08)),
-                                  solid(trimesh.creation.cylinder(0.05, 0.2, sections=64))])  # fmt: skip
+@pytest.mark.parametrize(
+    "mesh",
+    [
+        SHAPES["box"],
+        solid(trimesh.creation.icosphere(4, 0.08)),
+        solid(trimesh.creation.cylinder(0.05, 0.2, sections=64)),
+    ],
+)
 def test_a_convex_object_gets_nothing_from_itself(mesh):
     surfels = Surfels.of(mesh)
     assert surfels.open_share.min() == 1 and surfels.share.size == 0

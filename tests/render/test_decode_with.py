@@ -17,9 +17,10 @@ from fpp_ml_bench.optics import Sequence, paper_rig, save_rig
 
 TRUE = paper_rig(TINY_SIZE)
 FOUND = replace(
-    TRUE, camera=replace(TRUE.camera, fx=TRUE.camera.fx * 1.001, cx=TRUE.camera.cx + 0.02),
+    TRUE,
+    camera=replace(TRUE.camera, fx=TRUE.camera.fx * 1.001, cx=TRUE.camera.cx + 0.02),
     translation_m=(0.1252, -0.1001, 0.0003),
-)  # fmt: skip
+)
 
 
 @pytest.fixture(scope="module")

@@ -57,8 +57,16 @@ def test_every_wrong_key_is_named(tmp_path):
         load_light(path)
     message = str(error.value)
     assert str(path) in message
-    for key in ("projector.gamma", "projector.falloff", "surface.albedo", "surface.textures", "bounces.shadows",
-                "camera.bits", "ambient_grey", "lamp"):  # fmt: skip
+    for key in (
+        "projector.gamma",
+        "projector.falloff",
+        "surface.albedo",
+        "surface.textures",
+        "bounces.shadows",
+        "camera.bits",
+        "ambient_grey",
+        "lamp",
+    ):
         assert f"\n  {key}" in message, key
 
 

@@ -137,13 +137,18 @@ def write_list(folder, content):
 
 def test_list_reads_every_key(part):
     entry = {
-        "name": "my_part", "path": part.name, "scale": 0.001, "rotation_deg": [90, 0, 0.5], "offset_m": [0, 0, 0.1],
-        "centre": False, "split": "train",
-    }  # fmt: skip
+        "name": "my_part",
+        "path": part.name,
+        "scale": 0.001,
+        "rotation_deg": [90, 0, 0.5],
+        "offset_m": [0, 0, 0.1],
+        "centre": False,
+        "split": "train",
+    }
     (mesh,) = read_mesh_list(write_list(part.parent, [entry]))
     assert mesh == UserMesh(
         "my_part", str(part), 0.001, (90.0, 0.0, 0.5), (0.0, 0.0, 0.1), False, "train", mesh.content
-    )  # fmt: skip
+    )
     assert len(mesh.content) == 32
     part.write_bytes(part.read_bytes()[:-1] + b"x")
     (changed,) = read_mesh_list(write_list(part.parent, [entry]))

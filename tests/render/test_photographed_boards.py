@@ -161,9 +161,12 @@ def test_folders_that_are_refused(tmp_path):
     poses = board_poses(RIG, BOARD, 1)
     photograph_board(tmp_path / "out", RIG, BOARD, poses)
     others = (
-        {"seed": 7}, {"light": named_light("workshop")}, {"poses": board_poses(RIG, BOARD, 2)},
-        {"board": Board("circles", 5, 9, 40.0, 12.0)}, {"rig": replace(RIG, background_m=3.0)},
-    )  # fmt: skip
+        {"seed": 7},
+        {"light": named_light("workshop")},
+        {"poses": board_poses(RIG, BOARD, 2)},
+        {"board": Board("circles", 5, 9, 40.0, 12.0)},
+        {"rig": replace(RIG, background_m=3.0)},
+    )
     for change in others:
         asked = {"rig": RIG, "board": BOARD, "poses": poses, **change}
         with pytest.raises(CaptureError, match="another board, rig, light, seed or poses"):

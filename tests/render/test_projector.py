@@ -79,9 +79,14 @@ def test_every_pattern_level_shines_by_the_response(response):
 @pytest.mark.parametrize("frame", [0, 4])  # horizontal, vertical
 @pytest.mark.parametrize(
     "light",
-    [projector(pixel_blur_px=0.5), projector(pixel_blur_px=2.0), projector(pixel_blur_px=0.5, defocus_px=1.5),
-     projector(defocus_px=4.0), projector(defocus_px=3.0, focus_m=1.3)],
-)  # fmt: skip
+    [
+        projector(pixel_blur_px=0.5),
+        projector(pixel_blur_px=2.0),
+        projector(pixel_blur_px=0.5, defocus_px=1.5),
+        projector(defocus_px=4.0),
+        projector(defocus_px=3.0, focus_m=1.3),
+    ],
+)
 def test_blur_takes_the_modulation_that_a_gaussian_takes(light, frame):
     """Against exp(-2 pi^2 sigma^2 / P^2) of what there is without blur, at nine distances."""
     sharp = modulation(projector(), frame, 1.8)
@@ -178,8 +183,14 @@ def test_distances_beyond_the_blur_table_read_its_last_level():
 def test_two_levels_are_mixed_by_hand():
     profiles = np.array([[0.0, 0.2, 1.0, 1.0], [0.4, 0.5, 0.6, 0.6]], dtype=np.float32)
     out = np.empty(3)
-    fill_pattern(out, profiles, np.array([0, 1, 2], np.uint16), np.array([0.5, 0.25, 0.0], np.float32),
-                 np.zeros(3, np.uint8), np.array([0.0, 0.5, 1.0], np.float32))  # fmt: skip
+    fill_pattern(
+        out,
+        profiles,
+        np.array([0, 1, 2], np.uint16),
+        np.array([0.5, 0.25, 0.0], np.float32),
+        np.zeros(3, np.uint8),
+        np.array([0.0, 0.5, 1.0], np.float32),
+    )
     np.testing.assert_allclose(out, [0.1, 0.4625, 0.6], atol=1e-7)
 
 

@@ -54,14 +54,14 @@ def brute_force(mesh_vertices, faces, rays=RAYS):
 SHAPES = {
     "icosphere": trimesh.creation.icosphere(2, 0.15),
     "torus": trimesh.creation.torus(0.1, 0.04, 16, 10),
-    "box turned": trimesh.creation.box(
-        (0.2, 0.1, 0.25), trimesh.transformations.euler_matrix(0.4, 0.3, 0.2)
-    ),
+    "box turned": trimesh.creation.box((0.2, 0.1, 0.25), trimesh.transformations.euler_matrix(0.4, 0.3, 0.2)),
     "two bodies": trimesh.util.concatenate(
-        [trimesh.creation.box((0.1, 0.1, 0.1)),
-         trimesh.creation.icosphere(1, 0.06).apply_translation([0.05, 0.03, -0.1])]
+        [
+            trimesh.creation.box((0.1, 0.1, 0.1)),
+            trimesh.creation.icosphere(1, 0.06).apply_translation([0.05, 0.03, -0.1]),
+        ]
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", SHAPES)

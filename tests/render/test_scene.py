@@ -101,10 +101,13 @@ def test_placement_depends_on_seed_object_and_view_alone():
     draw = {
         key: place(mesh, view, RIG, "varied", seed)[1]
         for key, (mesh, view, seed) in {
-            "a": (mesh, "A0", 1), "again": (mesh, "A0", 1), "seed": (mesh, "A0", 2), "view": (mesh, "A60", 1),
+            "a": (mesh, "A0", 1),
+            "again": (mesh, "A0", 1),
+            "seed": (mesh, "A0", 2),
+            "view": (mesh, "A60", 1),
             "name": (other, "A0", 1),
         }.items()
-    }  # fmt: skip
+    }
     assert draw["a"] == draw["again"]
     assert len({draw["a"], draw["seed"], draw["view"], draw["name"]}) == 4
 

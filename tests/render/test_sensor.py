@@ -334,8 +334,10 @@ def randomly_lit(exposure, light, n=211 * 173):
 
 def subset(lit, indices):
     p = lit.place
-    part = [array[indices] if array.size else array for array in
-            (p.u_index, p.u_weight, p.v_index, p.v_weight, p.level, p.level_weight)]  # fmt: skip
+    part = [
+        array[indices] if array.size else array
+        for array in (p.u_index, p.u_weight, p.v_index, p.v_weight, p.level, p.level_weight)
+    ]
     bounced = None if lit.bounced is None else lit.bounced[:, indices]
     return LitPixels(PatternPlace(*part), lit.gain[indices], lit.ambient[indices], bounced)
 
@@ -439,9 +441,12 @@ def test_pattern_lookup_is_opencv_remap_of_the_pattern_image(index):
     image = np.ascontiguousarray(pattern_image(RIG, index)).astype(np.float32)
     size = (211, 173)
     light = cv2.remap(
-        image, u.reshape(size).astype(np.float32), v.reshape(size).astype(np.float32), cv2.INTER_LINEAR,
+        image,
+        u.reshape(size).astype(np.float32),
+        v.reshape(size).astype(np.float32),
+        cv2.INTER_LINEAR,
         borderMode=cv2.BORDER_REPLICATE,
-    ).ravel()  # fmt: skip
+    ).ravel()
     expected = np.clip(lit.ambient + lit.gain * (light / 255), 0, 255)
     steepest = np.abs(np.diff(image, axis=0)).max() + np.abs(np.diff(image, axis=1)).max()
     # Half a grey level of rounding, a weight wrong by up to 1/64 px on the steepest flank, and 0.01 grey levels for

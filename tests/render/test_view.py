@@ -32,10 +32,14 @@ def noisy(sigma_grey, light=DIRECT):
 
 
 def test_shadows_off_traces_no_shadow_ray_and_on_darkens_what_is_hidden():
-    mesh = solid(trimesh.util.concatenate(
-        [trimesh.creation.box((0.02, 0.3, 0.3)).apply_translation([0.1, 0, 0]),
-         trimesh.creation.box((0.02, 0.06, 0.06)).apply_translation([-0.1, 0.0, 0])]
-    ))  # fmt: skip
+    mesh = solid(
+        trimesh.util.concatenate(
+            [
+                trimesh.creation.box((0.02, 0.3, 0.3)).apply_translation([0.1, 0, 0]),
+                trimesh.creation.box((0.02, 0.06, 0.06)).apply_translation([-0.1, 0.0, 0]),
+            ]
+        )
+    )
     without, shaded = studio(), studio(SHADOWS)
     plain = without.photograph(mesh, "A0")
     white, depth = plain.frames[51].copy(), plain.depth_exact_mm.copy()
@@ -124,9 +128,11 @@ def test_without_noise_ground_truth_is_nearly_exact():
 def test_depth_never_guesses():
     """What the camera can't see of the pattern has no decoded depth: such pixels are 0 and counted."""
     mesh = trimesh.util.concatenate(
-        [trimesh.creation.box((0.02, 0.1, 0.1)),
-         trimesh.creation.box((0.3, 0.002, 0.3)).apply_translation([0, 0.11, 0])]  # a fin turned away from the light
-    )  # fmt: skip
+        [
+            trimesh.creation.box((0.02, 0.1, 0.1)),
+            trimesh.creation.box((0.3, 0.002, 0.3)).apply_translation([0, 0.11, 0]),
+        ]  # a fin turned away from the light
+    )
     at = studio(noisy(1.0))
     row = at.photograph(solid(mesh), "A0")
     exact, depth = object_mask(row.depth_exact_mm), object_mask(row.depth_mm)
@@ -358,9 +364,13 @@ def test_stages_that_are_off_are_not_asked(monkeypatch):
         monkeypatch.setattr(view, name, never)
     ball = replace(BALL)  # nothing is kept of this one
     studio(rig=SMALL).photograph(ball, "A0")
-    for light in (DIRECT.changed("bounces", interreflection=True), DIRECT.changed("bounces", ambient_occlusion=True),
-                  DIRECT.changed("camera", rays_across=2), DIRECT.changed("camera", blur_px=1.0),
-                  DIRECT.changed("camera", falloff=2)):  # fmt: skip
+    for light in (
+        DIRECT.changed("bounces", interreflection=True),
+        DIRECT.changed("bounces", ambient_occlusion=True),
+        DIRECT.changed("camera", rays_across=2),
+        DIRECT.changed("camera", blur_px=1.0),
+        DIRECT.changed("camera", falloff=2),
+    ):
         with pytest.raises(AssertionError, match="a stage that is off"):
             studio(light, rig=SMALL).photograph(ball, "A0")
 

@@ -157,8 +157,10 @@ def test_orderings_are_judged_by_number():
     ]
     judged = orderings(lines[::-1])
     assert [(ordering.better, ordering.worse, ordering.verdict) for ordering in judged] == [
-        ("best", "worse", "holds"), ("best", "odd", "not decided"), ("worse", "odd", "not decided"),
-    ]  # fmt: skip
+        ("best", "worse", "holds"),
+        ("best", "odd", "not decided"),
+        ("worse", "odd", "not decided"),
+    ]
     assert [ordering.paper_gap_mm for ordering in judged] == [1.0, 2.0, 1.0]
     assert judged[0].gap_mm == pytest.approx(2.0)
     turned = orderings([line("best", 1.0, views(12.0)), line("worse", 2.0, noise)])
@@ -170,9 +172,14 @@ def test_orderings_are_judged_by_number():
 
 @pytest.mark.parametrize(
     ("ends", "verdict"),
-    [((0.1, 2.0), "holds"), ((0.0, 2.0), "not decided"), ((-1.0, 0.0), "not decided"), ((-2.0, -0.1), "reversed"),
-     (None, "not decided")],
-)  # fmt: skip
+    [
+        ((0.1, 2.0), "holds"),
+        ((0.0, 2.0), "not decided"),
+        ((-1.0, 0.0), "not decided"),
+        ((-2.0, -0.1), "reversed"),
+        (None, "not decided"),
+    ],
+)
 def test_an_interval_that_touches_zero_decides_nothing(ends, verdict):
     assert Ordering("a", "b", 1.0, 1.0, ends, True, 5).verdict == verdict
 

@@ -89,8 +89,10 @@ def test_settings_of_a_benchmark_with_other_bytes_are_warned_of(dataset, tmp_pat
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"benchmark": {"name": "other-bench", "version": 1}},
-         "benchmark says other-bench version 1, but content is that of tiny-bench version 4"),
+        (
+            {"benchmark": {"name": "other-bench", "version": 1}},
+            "benchmark says other-bench version 1, but content is that of tiny-bench version 4",
+        ),
         ({"benchmark": {"name": "tiny-bench", "version": 3}}, "but content is that of tiny-bench version 4"),
         ({"content": OTHER}, "tiny-bench version 4, but content is not that benchmark's"),
         ({"content": OTHER, "benchmark": {"name": "nobody-knows", "version": 1}}, "content is not that benchmark's"),
@@ -104,7 +106,7 @@ def test_settings_of_a_benchmark_with_other_bytes_are_warned_of(dataset, tmp_pat
         ({"benchmark": {"name": "x\x1b[2J", "version": 4}}, r"U\+001B"),
         ({"benchmark": {"name": "tiny-bench", "version": 4, "size": 32}}, "size: is not a key"),
     ],
-)  # fmt: skip
+)
 def test_a_claim_that_contradicts_the_content_is_refused(changes, message, named, tmp_path):
     path = result_file(named, tmp_path)
     change_dataset(path, **changes)

@@ -54,9 +54,13 @@ def test_scores_equal_an_independent_computation(dataset, predictions, tmp_path)
 def test_result_says_what_was_scored_on_what(dataset, predictions, tmp_path):
     result = scored(predictions, dataset, tmp_path)
     assert result["dataset"] == {
-        "name": "tiny", "split": "test", "size": [32, 40], "samples": 4, "code": "phase shift",
+        "name": "tiny",
+        "split": "test",
+        "size": [32, 40],
+        "samples": 4,
+        "code": "phase shift",
         "content": {name: dataset.content[name] for name in ("test/depth", "test/flags")},
-    }  # fmt: skip
+    }
     assert result["frames_class"] == "one frame"
     assert result["submission"] == {**DESCRIPTION, "timing": None, "png_mm_per_level": None, "seeds": {}}
     assert result["target"] == "depth"
@@ -196,7 +200,7 @@ EDITS = {
     "time": (["created"], "yesterday", "created"),
     "name": (["submission", "name"], "x\x1b[2J", "U\\+001B"),
     "long name": (["submission", "name"], "x" * 10_000_000, "at most 200 characters"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", EDITS)

@@ -196,9 +196,12 @@ def test_processes_and_a_cluster_give_the_same_rows_as_one(tmp_path, fake_ray):
     one, two = (measure(setup, tmp_path / str(n), ["ambient-light"], workers=n) for n in (1, 2))
     saved = []
     three = measure(
-        setup, tmp_path / "3", ["ambient-light"], cluster=fake_ray.address,
+        setup,
+        tmp_path / "3",
+        ["ambient-light"],
+        cluster=fake_ray.address,
         saved=lambda: saved.append(sorted(file.name for file in (tmp_path / "3").glob("*.json"))),
-    )  # fmt: skip
+    )
     assert saved == [["clean.json"], ["ambient-light.json", "clean.json"]]
     for rows in (*one.values(), *two.values(), *three.values()):
         for row in rows:
@@ -233,18 +236,33 @@ def rows_of(axes_maes: dict[str, list[list[float]]]):
     found = {}
     for axis, severities in axes_maes.items():
         found[axis] = [
-            {"sample": f"s{k}", "object": f"o{k // 2}", "severity": severity, "mae_mm": mae, "protocol_mae_mm": mae,
-             "wrong_share": 0.0, "unanswered_share": 0.0, "confident_share": None, "coverage": None}
-            for severity, maes in enumerate(severities, 0 if axis == CLEAN else 1) for k, mae in enumerate(maes)
-        ]  # fmt: skip
+            {
+                "sample": f"s{k}",
+                "object": f"o{k // 2}",
+                "severity": severity,
+                "mae_mm": mae,
+                "protocol_mae_mm": mae,
+                "wrong_share": 0.0,
+                "unanswered_share": 0.0,
+                "confident_share": None,
+                "coverage": None,
+            }
+            for severity, maes in enumerate(severities, 0 if axis == CLEAN else 1)
+            for k, mae in enumerate(maes)
+        ]
     return found
 
 
 def test_the_headline_is_the_mean_over_axes_and_severities_also_of_axes_of_few_objects(monkeypatch):
     setup = Setup(Noisy(), "test", SIZE)
     monkeypatch.setattr(Setup, "axes", lambda self, names: [CLEAN, "gloss", "interreflection"])
-    rows = rows_of({CLEAN: [[1, 1, 2, 2]], "gloss": [[s, s, 2 * s, 2 * s] for s in range(1, 6)],
-                    "interreflection": [[10.0, 30.0]] * 5})  # fmt: skip
+    rows = rows_of(
+        {
+            CLEAN: [[1, 1, 2, 2]],
+            "gloss": [[s, s, 2 * s, 2 * s] for s in range(1, 6)],
+            "interreflection": [[10.0, 30.0]] * 5,
+        }
+    )
     block = robustness(setup, rows)
     assert block.mae_mm == pytest.approx(((1 + 2 + 3 + 4 + 5) * 1.5 + 5 * 20) / 10)
     assert block.ratio == pytest.approx(block.mae_mm / 1.5)
@@ -272,8 +290,23 @@ def test_a_normalised_answer_and_an_unknown_axis_are_refused():
 
 def test_the_command_measures_draws_and_says_where(tmp_path, capsys):
     out, cache = tmp_path / "out", tmp_path / "cache"
-    words = ["robustness", "constant", "--at", "training-mean", "--quick", "--size", str(SIZE), "--axes", "read-noise",
-             "--workers", "1", "--out", str(out), "--cache", str(cache)]  # fmt: skip
+    words = [
+        "robustness",
+        "constant",
+        "--at",
+        "training-mean",
+        "--quick",
+        "--size",
+        str(SIZE),
+        "--axes",
+        "read-noise",
+        "--workers",
+        "1",
+        "--out",
+        str(out),
+        "--cache",
+        str(cache),
+    ]
     assert main(words) == 0
     assert "Constant depth: training-mean" in capsys.readouterr().out
     assert main([*words[:2], "--at", "1700", *words[4:]]) == 0

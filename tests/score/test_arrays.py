@@ -114,7 +114,7 @@ REFUSED = {
     "objects as text": ((TRUE, TRUE), {"objects": "ab"}, "objects: expected .* got str"),
     "a dataset": ((TRUE, "data"), {}, "need the targets as arrays"),
     "a folder": (("folder", "data"), {"sigma": TRUE}, "sigma: belongs to arrays"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", REFUSED)

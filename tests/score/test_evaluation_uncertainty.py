@@ -48,9 +48,13 @@ def test_interval_is_the_expanded_percentile_of_resampled_objects():
     widened = stats.norm.cdf(-np.sqrt(12 / 11) * stats.t.ppf(0.975, 11))
     per_object = values.reshape(12, 6).mean(axis=1)
     expected = stats.bootstrap(
-        (per_object,), np.mean, n_resamples=10_000, method="percentile", confidence_level=1 - 2 * widened,
+        (per_object,),
+        np.mean,
+        n_resamples=10_000,
+        method="percentile",
+        confidence_level=1 - 2 * widened,
         rng=np.random.default_rng(0),
-    ).confidence_interval  # fmt: skip
+    ).confidence_interval
     assert (low, high) == pytest.approx((expected.low, expected.high), abs=0.03)
     assert low < values.mean() < high
     assert object_interval(values.tolist(), objects.tolist()) == (low, high)
@@ -92,9 +96,12 @@ def test_too_few_objects_for_95_percent_are_said():
 def scipy_p(differences):
     """All flips, by SciPy."""
     answer = stats.permutation_test(
-        (differences, np.zeros(len(differences))), lambda a, b, axis: np.mean(a - b, axis=axis), vectorized=True,
-        permutation_type="samples", n_resamples=np.inf,
-    )  # fmt: skip
+        (differences, np.zeros(len(differences))),
+        lambda a, b, axis: np.mean(a - b, axis=axis),
+        vectorized=True,
+        permutation_type="samples",
+        n_resamples=np.inf,
+    )
     return answer.pvalue
 
 

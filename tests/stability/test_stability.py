@@ -42,9 +42,16 @@ def test_no_case_fails(group):
 
 def test_no_case_of_losses_and_layers_fails():
     rows = run_cases(
-        cases_of("networks", "zero residual", "empty mask", "half-precision loss", "constant input, instance norm",
-                 "loss gradient", "training metric")
-    )  # fmt: skip
+        cases_of(
+            "networks",
+            "zero residual",
+            "empty mask",
+            "half-precision loss",
+            "constant input, instance norm",
+            "loss gradient",
+            "training metric",
+        )
+    )
     assert not failing(rows)
 
 
@@ -167,10 +174,16 @@ def break_lens(monkeypatch):
 @pytest.mark.parametrize(
     "broken",
     [
-        break_metrics, break_arctangent, break_interval, break_triangulation, break_normalisation,
-        break_instance_norm, break_guard, break_lens,
+        break_metrics,
+        break_arctangent,
+        break_interval,
+        break_triangulation,
+        break_normalisation,
+        break_instance_norm,
+        break_guard,
+        break_lens,
     ],
-)  # fmt: skip
+)
 def test_code_that_is_broken_on_purpose_fails(broken, monkeypatch):
     assert failing(run_cases(broken(monkeypatch)))
 

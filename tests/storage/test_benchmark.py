@@ -52,9 +52,11 @@ def test_scenes_are_the_same_whatever_is_projected():
     """Exact depth and flags, and so void, follow from scene and light alone: one table for every code."""
     named = {benchmark.name: benchmark for benchmark in BENCHMARKS}
     for paper, crossed in (
-        ("full", "crossed"), ("unseen", "crossed-unseen"), ("test-workshop", "test-crossed-workshop"),
+        ("full", "crossed"),
+        ("unseen", "crossed-unseen"),
+        ("test-workshop", "test-crossed-workshop"),
         ("test-hard", "test-crossed-hard"),
-    ):  # fmt: skip
+    ):
         first, second = named[f"fpp-bench-{paper}"], named[f"fpp-bench-{crossed}"]
         truth = {key: digest for key, digest in first.content.items() if key in ("test/depth_exact", "test/flags")}
         assert len(truth) == 2 and truth.items() <= second.content.items()

@@ -38,9 +38,18 @@ def test_every_configuration_has_its_columns_in_order_and_their_values(tiny, ope
     dataset = load_dataset(tiny, config, split="validation")
     frames = [f"frame_{i:02d}" for i in PAPER_SEQUENCE.config(config)]
     assert dataset.column_names == [
-        "sample", "object", "view", "split", *frames, "depth", "depth_exact", "flags", "cover",
-        "depth_min", "depth_max",
-    ]  # fmt: skip
+        "sample",
+        "object",
+        "view",
+        "split",
+        *frames,
+        "depth",
+        "depth_exact",
+        "flags",
+        "cover",
+        "depth_min",
+        "depth_max",
+    ]
     assert len(dataset) == 6 and dataset.split == "validation"
     assert dataset["sample"][:] == opened.splits["validation"]
     row = dataset.with_format("numpy")[3]
@@ -119,9 +128,10 @@ def test_memory_is_the_files_own_map(tiny):
         storage = dataset.data.column(column).chunk(0).storage
         buffer = storage.values.values.buffers()[1]
         holder = [
-            line for line in maps
+            line
+            for line in maps
             if int(line.split("-")[0], 16) <= buffer.address < int(line.split()[0].split("-")[1], 16)
-        ]  # fmt: skip
+        ]
         assert len(holder) == 1 and str(tiny) in holder[0]
 
 

@@ -30,17 +30,28 @@ SMALL = {"objects": ("cork",), "stored": "single_shot"}
 
 def build_arguments(folder, *more, workers=1):
     return [
-        "build", str(folder), "--size", str(TINY_SIZE), "--objects", ",".join(TINY_OBJECTS), "--workers", str(workers),
+        "build",
+        str(folder),
+        "--size",
+        str(TINY_SIZE),
+        "--objects",
+        ",".join(TINY_OBJECTS),
+        "--workers",
+        str(workers),
         *more,
-    ]  # fmt: skip
+    ]
 
 
 def start(folder, *more, **options):
     """A build in a separate process and process group."""
     return subprocess.Popen(
-        [*COMMAND, *build_arguments(folder, *more, **options)], cwd=ROOT, start_new_session=True,
-        stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+        [*COMMAND, *build_arguments(folder, *more, **options)],
+        cwd=ROOT,
+        start_new_session=True,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
 
 
 def wait_for(reached, process, seconds=300):
@@ -355,9 +366,18 @@ def test_files_that_can_not_grow(tmp_path, uninterrupted):
     """The same through a limit on file sizes (EFBIG), which needs no privileges, and the real command."""
     folder = tmp_path / "set"
     arguments = [
-        *COMMAND, "build", str(folder), "--size", str(TINY_SIZE), "--objects", "cork,mug", "--frames", "single_shot",
-        "--workers", "1",
-    ]  # fmt: skip
+        *COMMAND,
+        "build",
+        str(folder),
+        "--size",
+        str(TINY_SIZE),
+        "--objects",
+        "cork,mug",
+        "--frames",
+        "single_shot",
+        "--workers",
+        "1",
+    ]
     limit = 1_000_000  # bytes; a shard has 1.7 million
 
     def no_large_files():

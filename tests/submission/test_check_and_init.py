@@ -70,7 +70,7 @@ FAULTS = {
     "no description": (lambda f: (f / "submission.yaml").unlink(), "found none"),
     "bad description": (lambda f: write_description(f, units="inch"), "units: Input should be"),
     "a scale without PNG": (lambda f: write_description(f, png_mm_per_level=0.1), "remove the key"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", FAULTS)

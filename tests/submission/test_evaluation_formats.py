@@ -144,7 +144,7 @@ FORMS = {
     "arrow stream": lambda f, m: write_table(
         f, "predictions.arrow", arrow_bytes(table(m, pa.list_(pa.float64(), 1280)), pa.ipc.new_stream)
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -231,8 +231,13 @@ PER_SAMPLE = {
     "npz of text": (".npz", zip_bytes({"readme.txt": b"x"}), "expected one .npy array"),
     "npz of bz2": (".npz", zip_bytes({"d.npy": npy_bytes(DEPTH)}, zipfile.ZIP_BZIP2), "unusual way"),
     "npz cut off": (".npz", npz_bytes(a=DEPTH)[:-30], "is no .npz archive, or damaged"),
-    "npz damaged": (".npz", npz_bytes(a=np.random.default_rng(0).random(SIZE))[:300] + b"xxxx"
-                    + npz_bytes(a=np.random.default_rng(0).random(SIZE))[304:], "damaged"),
+    "npz damaged": (
+        ".npz",
+        npz_bytes(a=np.random.default_rng(0).random(SIZE))[:300]
+        + b"xxxx"
+        + npz_bytes(a=np.random.default_rng(0).random(SIZE))[304:],
+        "damaged",
+    ),
     "npz of objects": (".npz", zip_bytes({"d.npy": npy_bytes(np.array([[{}]], object))}), "pickled Python objects"),
     "npz complex": (".npz", npz_bytes(a=DEPTH.astype(complex)), r"got complex128 \(complex\)"),
     "npz integers": (".npz", npz_bytes(a=DEPTH.astype(np.uint8)), "got uint8: whole numbers .*wrap around"),
@@ -262,7 +267,7 @@ PER_SAMPLE = {
     "png grown": (".png", bad_png(lambda c: c + b"more"), "foreign bytes"),
     "png noise": (".png", b"no picture", "is no PNG file"),
     "too large": (".npz", b"PK" + b"\0" * 200_000, "has 200002 bytes, expected at most"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", PER_SAMPLE)
@@ -313,8 +318,10 @@ TABLES = {
     "missing": (without_first, "lacks the sample power_drill_A0"),
     "twice": (twice, "holds the sample power_drill_A0 twice"),
     "unknown": (lambda m: table({**m, "mug_A0": DEPTH}), "holds mug_A0, which is no sample of this split"),
-    "integers": (lambda m: table({k: v.astype(int) for k, v in m.items()}, pa.list_(pa.list_(pa.int32()))),
-                 "expected lists of float16, float32 or float64, got list<.*int32"),
+    "integers": (
+        lambda m: table({k: v.astype(int) for k, v in m.items()}, pa.list_(pa.list_(pa.int32()))),
+        "expected lists of float16, float32 or float64, got list<.*int32",
+    ),
     "text": (lambda m: pa.table({"sample": list(m), "depth": ["x"] * len(m)}), "got string"),
     "one number": (lambda m: pa.table({"sample": list(m), "depth": pa.array([1.0] * len(m))}), "got double"),
     "sample numbers": (lambda m: pa.table({"sample": [1, 2, 3, 4], "depth": table(m)["depth"]}), "expected text"),
@@ -322,7 +329,7 @@ TABLES = {
     "ragged": (ragged, "power_drill_A60: expected rows of one length"),
     "shape": (lambda m: table({k: v[:, :-1] for k, v in m.items()}), r"got \(32, 39\)"),
     "NaN": (lambda m: table({**m, SAMPLE: np.full(SIZE, np.nan)}), "power_drill_A60: holds 1280 NaN"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", TABLES)
@@ -422,7 +429,7 @@ UNITS = {
     "scale in metres": ("m", lambda d: d / 1000, {"png_mm_per_level": 0.1}, "units must be mm"),
     "negative scale": ("mm", lambda d: d, {"png_mm_per_level": -0.1}, "png_mm_per_level: .*greater than 0"),
     "huge in metres": ("m", lambda d: np.where(d == d.max(), 1e29, d / 1000), {}, "the limit is 1e\\+27"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", UNITS)

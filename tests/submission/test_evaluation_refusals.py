@@ -134,7 +134,7 @@ FILES = {
     "broken link": (lambda f: (f / FILE).unlink() or (f / FILE).symlink_to("nowhere"), "is a symbolic link"),
     "folder": (replace_by_folder, "is not a regular file"),
     "pipe": (replace_by_pipe, "is not a regular file"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", FILES)
@@ -227,7 +227,7 @@ DESCRIPTIONS = {
     "train split of what": ({"learned_from": {"data": "train-split"}}, "data: train-split needs versions"),
     "versions of nothing": ({"learned_from": {"data": "none", "versions": ["x"]}}, "from no data has no versions"),
     "nested settings": ({"settings": {"a": {"b": 1}}}, r"settings\.a"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", DESCRIPTIONS)

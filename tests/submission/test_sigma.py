@@ -56,6 +56,7 @@ def test_a_bad_sigma_is_refused_and_named(dataset, predictions, change, said):
     change(predictions / FIRST)
     with pytest.raises(PredictionError) as caught:
         evaluate(predictions, dataset)
-    text = "\n".join([str(caught.value), *caught.value.__notes__] if hasattr(caught.value, "__notes__") else
-                     [str(caught.value)])  # fmt: skip
+    text = "\n".join(
+        [str(caught.value), *caught.value.__notes__] if hasattr(caught.value, "__notes__") else [str(caught.value)]
+    )
     assert FIRST in text and said in text

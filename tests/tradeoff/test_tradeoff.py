@@ -114,19 +114,39 @@ def test_views_are_spread_and_differ_between_objects(small):
 
 def point(key, seconds, frames, error, group="classical", **changes):
     return Point(
-        key=key, group=group, title=f"Setting {key}", frames=frames, image_px=40, runs=3, seconds=seconds,
-        seconds_p5=seconds, seconds_p95=seconds, object_mae_mm=error, measured_mae_mm=error, missing_share=0.0,
-        pace_ms=5.0, load=0.5, **changes,
-    )  # fmt: skip
+        key=key,
+        group=group,
+        title=f"Setting {key}",
+        frames=frames,
+        image_px=40,
+        runs=3,
+        seconds=seconds,
+        seconds_p5=seconds,
+        seconds_p95=seconds,
+        object_mae_mm=error,
+        measured_mae_mm=error,
+        missing_share=0.0,
+        pace_ms=5.0,
+        load=0.5,
+        **changes,
+    )
 
 
 def tradeoff_of(dataset, points, growth=()):
     return Tradeoff(
-        created="2026-01-01T00:00:00+00:00", dataset="small", fingerprint=dataset.fingerprint, image_size=[32, 40],
-        target="depth_exact", views=["power_drill_A0"], settings={"threads": 1, "clock": "wall"},
+        created="2026-01-01T00:00:00+00:00",
+        dataset="small",
+        fingerprint=dataset.fingerprint,
+        image_size=[32, 40],
+        target="depth_exact",
+        views=["power_drill_A0"],
+        settings={"threads": 1, "clock": "wall"},
         hardware={"cpu": "Some CPU", "cores": 2, "memory_gib": 8.0, "gpu": None, "platform": "Linux"},
-        software={"numpy": "2"}, sittings=1, points=list(points), growth=list(growth),
-    )  # fmt: skip
+        software={"numpy": "2"},
+        sittings=1,
+        points=list(points),
+        growth=list(growth),
+    )
 
 
 numbers = st.tuples(st.integers(1, 6), st.integers(1, 6), st.integers(1, 6))
@@ -201,8 +221,19 @@ def test_runs_of_other_rules_do_not_mix(small, tmp_path):
 
 
 def test_files_hold_what_was_measured(small, tmp_path):
-    growth = [{"stage": "s", "over": "rows", "amounts": [1, 2, 4], "seconds": [1, 4, 16], "exponent": 2.0, "low": 2.0,
-               "high": 2.0, "tail": 2.0, "flag": "steeper than linear"}]  # fmt: skip
+    growth = [
+        {
+            "stage": "s",
+            "over": "rows",
+            "amounts": [1, 2, 4],
+            "seconds": [1, 4, 16],
+            "exponent": 2.0,
+            "low": 2.0,
+            "high": 2.0,
+            "tail": 2.0,
+            "flag": "steeper than linear",
+        }
+    ]
     points = [
         point("classical-both-03", 0.02, 10, 0.5),
         point("phase-x", 0.2, 1, 9.0),

@@ -187,8 +187,11 @@ def test_two_processes_agree(tiny, tmp_path):
     command = ["-m", "fpp_ml_bench", "train", tmp_path / "mine.yaml", tiny, "--out", tmp_path / "run"]
     done = subprocess.run(
         [sys.executable, "-c", code, *options, "--main_process_port", "0", *map(str, command)],
-        cwd=Path(__file__).resolve().parent.parent, capture_output=True, text=True, timeout=240,
-    )  # fmt: skip
+        cwd=Path(__file__).resolve().parent.parent,
+        capture_output=True,
+        text=True,
+        timeout=240,
+    )
     assert done.returncode == 0, done.stderr[-2000:]
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert names == {WEIGHTS, CHECKPOINT, DONE, CURVE_FILE, "recipe.json", "log.jsonl", "model.safetensors"}

@@ -41,8 +41,13 @@ def test_further_directions_differ_from_the_plain_unet_in_one_thing():
 
 def test_every_row_of_the_paper_has_a_recipe():
     assert {table: len(table_rows(table)) for table in TABLES} == {
-        "normalization": 3, "background_removed": 3, "multi_frame": 5, "loss": 10, "architecture": 6, "further": 3,
-    }  # fmt: skip
+        "normalization": 3,
+        "background_removed": 3,
+        "multi_frame": 5,
+        "loss": 10,
+        "architecture": 6,
+        "further": 3,
+    }
     assert set(TABLES) - set(paper_tables()) == {"further"}
     for name, table in paper_tables().items():
         assert [row.row for row in table.rows] == [
@@ -66,10 +71,13 @@ def test_the_papers_recipe():
 @pytest.mark.parametrize("table", TABLES)
 def test_rows_of_a_table_differ_in_what_the_table_is_about(table, preset):
     about = {
-        "normalization": {"normalisation"}, "background_removed": {"normalisation"}, "multi_frame": {"frames"},
-        "loss": {"loss"}, "architecture": {"network", "width", "options", "loss", "schedule"},
+        "normalization": {"normalisation"},
+        "background_removed": {"normalisation"},
+        "multi_frame": {"frames"},
+        "loss": {"loss"},
+        "architecture": {"network", "width", "options", "loss", "schedule"},
         "further": {"options", "loss"},
-    }[table]  # fmt: skip
+    }[table]
     if table in ("normalization", "background_removed"):  # raw targets need a higher rate in the small presets
         about |= {"cpu": {"optimizer"}, "cpu-long": {"optimizer", "schedule"}, "paper": set()}[preset]
     rows = [load_recipe(f"{table}/{row}", preset).to_dict() for row in table_rows(table)]

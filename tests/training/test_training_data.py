@@ -39,9 +39,15 @@ def benchmarks(monkeypatch, opened, tmp_path):
 
 
 def phase_net_config(**changes):
-    content = {"name": "phase-net", "title": "Small", "options": NET_OPTIONS, "threshold": -1.0,
-               "period_px": {"horizontal": 5.6}, "dataset_fingerprint": "0" * 64,
-               "recipe": {"albedo": "one"}}  # fmt: skip
+    content = {
+        "name": "phase-net",
+        "title": "Small",
+        "options": NET_OPTIONS,
+        "threshold": -1.0,
+        "period_px": {"horizontal": 5.6},
+        "dataset_fingerprint": "0" * 64,
+        "recipe": {"albedo": "one"},
+    }
     return NetConfig(**{**content, **changes})
 
 

@@ -173,9 +173,16 @@ class SphereRows:
 def make_spheres(folder, views=VIEWS):
     plans = plan_shards("test", {"power_drill": [(f"power_drill_{view}", "power_drill", view) for view in views]})
     manifest = Manifest(
-        origin="generated", generator={}, settings={}, rig=RIG.to_dict(), size=(SIZE, SIZE), stored="single_shot",
-        exact=True, samples={}, shards=[],
-    )  # fmt: skip
+        origin="generated",
+        generator={},
+        settings={},
+        rig=RIG.to_dict(),
+        size=(SIZE, SIZE),
+        stored="single_shot",
+        exact=True,
+        samples={},
+        shards=[],
+    )
     assemble(folder, Assembly(plans, SphereRows(), manifest), workers=1)
     write_ply(SolidMesh("power_drill", SPHERE.vertices + CENTRE_M, SPHERE.faces), folder / "meshes/power_drill.ply")
     return folder

@@ -44,9 +44,14 @@ def board_frames(studio: Studio, board: Board, pose: BoardPose, name: str) -> li
 
 
 def photograph_board(
-    folder: str | Path, rig: Rig, board: Board, poses: Sequence[BoardPose] | None = None, light: Light | None = None,
-    seed: int = 42, progress: Callable[[int], None] = lambda images: None,
-) -> list[Path]:  # fmt: skip
+    folder: str | Path,
+    rig: Rig,
+    board: Board,
+    poses: Sequence[BoardPose] | None = None,
+    light: Light | None = None,
+    seed: int = 42,
+    progress: Callable[[int], None] = lambda images: None,
+) -> list[Path]:
     """Photograph ``board`` with ``rig`` in ``poses`` (by default `board_poses`) under ``light`` (by default `paper`),
     and return the poses' folders::
 
@@ -85,11 +90,15 @@ def photograph_board(
 def _description(board: Board, poses: Sequence[BoardPose], studio: Studio) -> dict:
     detail = f":{board.detail_mm!r}" if board.detail_mm else ""
     return {
-        "board": f"{board.kind}:{board.columns}x{board.rows}:{board.spacing_mm!r}{detail}", "dark_over_white": DARK,
-        "light": studio.light.model_dump(mode="json"), "seed": studio.settings.seed,
-        "poses": [{"rotation": [list(row) for row in pose.rotation], "translation_m": list(pose.translation_m)}
-                  for pose in poses],
-    }  # fmt: skip
+        "board": f"{board.kind}:{board.columns}x{board.rows}:{board.spacing_mm!r}{detail}",
+        "dark_over_white": DARK,
+        "light": studio.light.model_dump(mode="json"),
+        "seed": studio.settings.seed,
+        "poses": [
+            {"rotation": [list(row) for row in pose.rotation], "translation_m": list(pose.translation_m)}
+            for pose in poses
+        ],
+    }
 
 
 def _check_folder(place: Path, described: str, rig: Rig) -> None:

@@ -135,9 +135,15 @@ def board_view(studio: Studio, board: Board, pose: BoardPose, stream: tuple[obje
     covered = upon.reshape(-1, count).mean(axis=1)
     mixed = MixedPixels(edges, points_m, normals, np.where(upon, 0, -1).astype(np.int32), covered < 1, covered)
     return TracedView(
-        traced, pose.translation_m[2], hits, board_light, mixed, lit(points_m, normals, print_share),
-        studio.brightness(stream), stream,
-    )  # fmt: skip
+        traced,
+        pose.translation_m[2],
+        hits,
+        board_light,
+        mixed,
+        lit(points_m, normals, print_share),
+        studio.brightness(stream),
+        stream,
+    )
 
 
 def _outline(board: Board, pose: BoardPose) -> TracedObject:

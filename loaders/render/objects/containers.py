@@ -3,9 +3,34 @@
 import numpy as np
 
 from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
-    SEGMENTS, Point2, Solid, around, ball, block, curve, cut, disc, embossed, facing, lathe, lettered, loft, place,
-    plate, polygon, rectangle, ring, rod, softened, stroke, text_plate, text_section, tube, union, wrapped,
-)  # fmt: skip
+    SEGMENTS,
+    Point2,
+    Solid,
+    around,
+    ball,
+    block,
+    curve,
+    cut,
+    disc,
+    embossed,
+    facing,
+    lathe,
+    lettered,
+    loft,
+    place,
+    plate,
+    polygon,
+    rectangle,
+    ring,
+    rod,
+    softened,
+    stroke,
+    text_plate,
+    text_section,
+    tube,
+    union,
+    wrapped,
+)
 
 
 def ribbed_cap(radius: float, height: float, ribs: int = 36) -> Solid:
@@ -18,9 +43,19 @@ def ribbed_cap(radius: float, height: float, ribs: int = 36) -> Solid:
 def mustard_bottle() -> Solid:
     """Oval squeeze bottle, 96 x 58 x 190 mm, with a pointed nozzle."""
     body = loft(
-        [(0, 84, 46, 2.6), (3, 92, 55, 2.6), (10, 95, 58, 2.6), (60, 95, 58, 2.6), (112, 94, 57, 2.5),
-         (132, 84, 53, 2.4), (146, 62, 46, 2.2), (153, 46, 42, 2.0), (155, 42, 41, 2.0)], smooth=8,
-    )  # fmt: skip
+        [
+            (0, 84, 46, 2.6),
+            (3, 92, 55, 2.6),
+            (10, 95, 58, 2.6),
+            (60, 95, 58, 2.6),
+            (112, 94, 57, 2.5),
+            (132, 84, 53, 2.4),
+            (146, 62, 46, 2.2),
+            (153, 46, 42, 2.0),
+            (155, 42, 41, 2.0),
+        ],
+        smooth=8,
+    )
     closure = lathe([(23, 152), (23, 163), *curve([(21, 165), (14, 169), (8, 176), (5.5, 184), (4.2, 192)])])
     grips = [ring(23, 0.8, z) for z in (155, 158, 161)]
     panel = embossed(body, rectangle(72, 84, 14, (0, 66)), 0.8)
@@ -31,9 +66,21 @@ def mustard_bottle() -> Solid:
 def bleach_cleanser() -> Solid:
     """Cleanser bottle, 98 x 66 x 250 mm: square shoulders, a waist to hold it by and a ribbed cap."""
     body = loft(
-        [(0, 88, 54, 4), (3, 96, 64, 4), (10, 98, 66, 4), (90, 98, 66, 4), (112, 93, 60, 3.6), (135, 86, 54, 3.2),
-         (158, 86, 54, 3.0), (178, 84, 52, 2.8), (194, 70, 46, 2.4), (206, 46, 38, 2.0), (212, 36, 35, 2)], smooth=8,
-    )  # fmt: skip
+        [
+            (0, 88, 54, 4),
+            (3, 96, 64, 4),
+            (10, 98, 66, 4),
+            (90, 98, 66, 4),
+            (112, 93, 60, 3.6),
+            (135, 86, 54, 3.2),
+            (158, 86, 54, 3.0),
+            (178, 84, 52, 2.8),
+            (194, 70, 46, 2.4),
+            (206, 46, 38, 2.0),
+            (212, 36, 35, 2),
+        ],
+        smooth=8,
+    )
     neck = rod((0, 0, 205), (0, 0, 222), 16)
     cap = union(ribbed_cap(20, 22).translate((0, 0, 216)), rod((0, 0, 236), (0, 0, 250), 11, 8))
     words = text_section("BLEACH", 74).translate((0, 70))
@@ -45,9 +92,20 @@ def bleach_cleanser() -> Solid:
 def container_bottle() -> Solid:
     """Canister with a handle through its shoulder, 170 x 105 x 280 mm, and a wide screw cap."""
     body = loft(
-        [(0, 152, 90, 3.4), (4, 164, 101, 3.4), (12, 168, 105, 3.4), (120, 168, 105, 3.4), (165, 166, 102, 3.2),
-         (205, 152, 92, 2.8), (232, 118, 78, 2.4), (248, 76, 62, 2.1), (254, 58, 56, 2), (262, 56, 56, 2)], smooth=8,
-    )  # fmt: skip
+        [
+            (0, 152, 90, 3.4),
+            (4, 164, 101, 3.4),
+            (12, 168, 105, 3.4),
+            (120, 168, 105, 3.4),
+            (165, 166, 102, 3.2),
+            (205, 152, 92, 2.8),
+            (232, 118, 78, 2.4),
+            (248, 76, 62, 2.1),
+            (254, 58, 56, 2),
+            (262, 56, 56, 2),
+        ],
+        smooth=8,
+    )
     hole = place(tube(curve([(-90, 46, 205), (0, 46, 205), (90, 46, 205)], 2), 15.0, 2.1), (0, 0, -18))
     thinner = [place(block(40, 60, 120, 18), (s * 56, -0.0 + 62, 190), (0, s * -6, 0)) for s in (-1, 1)]
     cap = union(ribbed_cap(31, 26, 44).translate((0, 0, 258)), ring(31, 2.2, 259))
@@ -65,10 +123,25 @@ def spray_bottle() -> Solid:
     side = [(39, 5), (39, 60), (38, 100), (34, 125), (30, 140), (28.5, 155), (25, 172), (18, 186), (14.5, 192)]
     body = lathe([(31, 0), (37, 1), *curve(side), (14.5, 205)])
     collar = ribbed_cap(19, 20, 30).translate((0, 0, 196))
-    head = polygon([(-18, 214), (18, 214), (20, 226), (34, 236), (36, 262), (20, 275), (-34, 275), (-62, 266),
-        (-64, 248), (-20, 244)], 3)  # fmt: skip
-    front, back = (curve([(-42, 250), (-38, 232), (-42, 210), (-52, 190)]),
-                   curve([(-60, 192), (-52, 214), (-49, 232), (-54, 250)]))  # fmt: skip
+    head = polygon(
+        [
+            (-18, 214),
+            (18, 214),
+            (20, 226),
+            (34, 236),
+            (36, 262),
+            (20, 275),
+            (-34, 275),
+            (-62, 266),
+            (-64, 248),
+            (-20, 244),
+        ],
+        3,
+    )
+    front, back = (
+        curve([(-42, 250), (-38, 232), (-42, 210), (-52, 190)]),
+        curve([(-60, 192), (-52, 214), (-49, 232), (-54, 250)]),
+    )
     trigger = plate(polygon([*front, *back]), 13)
     tip = rod((-76, 257, 0), (-80, 257, 0), 5)
     nozzle = facing(union(rod((-60, 257, 0), (-72, 257, 0), 11), block(8, 24, 24, 1, (-74, 257, 0)), tip))
@@ -218,11 +291,12 @@ def _tube(length: float, width: float, cap_radius: float, cap_height: float, cri
     shoulder = cap_height + 10
     end = shoulder + length
     levels = [
-        (shoulder, 0.80 * width, 0.80 * width, 2.0), (shoulder + 0.18 * length, 0.82 * width, 0.77 * width, 2.0),
+        (shoulder, 0.80 * width, 0.80 * width, 2.0),
+        (shoulder + 0.18 * length, 0.82 * width, 0.77 * width, 2.0),
         (shoulder + 0.45 * length, 0.87 * width, 0.62 * width, 2.1),
         (shoulder + 0.75 * length, 0.94 * width, 0.34 * width, 2.2),
         (end - crimp, width, 0.09 * width + 1.2, 2.6),
-    ]  # fmt: skip
+    ]
     body = loft(levels, smooth=8)
     fold = block(0.08 * width + 2.6, width + 1.5, crimp, 0.8, (0, 0, end - crimp / 2))
     folds = (end - crimp + 1.5 + 2.4 * k for k in range(int(crimp / 2.6)))
@@ -267,10 +341,11 @@ def paint_thinner() -> Solid:
     bow = [(16, 196), (12, 224), (-14, 238), (-48, 234), (-64, 214), (-66, 196)]
     strap = tube(curve([(0, y, z) for y, z in bow]), 9, flatten=0.28, up=(0, 0.3, 1))
     words = union(
-        text_plate("PAINT", 112, 1.6).translate((0, 46, 0)), text_plate("THINNER", 140, 1.6).translate((0, 14, 0)),
+        text_plate("PAINT", 112, 1.6).translate((0, 46, 0)),
+        text_plate("THINNER", 140, 1.6).translate((0, 14, 0)),
         plate(stroke([(-58, -34), (-20, -34), (-20, -58), (-58, -58), (-58, -34)], 4), 3),
         plate(polygon([(-39, -36), (-33, -45), (-35, -55), (-43, -55), (-45, -45)], 1.5), 3),
         *(plate(rectangle(74, 4, 0, (28, y)), 3) for y in (-36, -46, -56)),
-    )  # fmt: skip
+    )
     seam = block(3, 8, 190, 1, (49, -30, 100))
     return place(union(cut(body, top), spout, strap, facing(words).translate((-49.2, 0, 96)), seam), turn=(0, -1, 3))

@@ -3,9 +3,33 @@
 import numpy as np
 
 from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
-    SMALL_SEGMENTS, Solid, angles, ball, block, curve, cut, disc, facing, lathe, lettered, place, plate, polygon,
-    rectangle, ring, rod, skin, stroke, superellipse, text_plate, text_section, tube, union, vessel, wrapped,
-)  # fmt: skip
+    SMALL_SEGMENTS,
+    Solid,
+    angles,
+    ball,
+    block,
+    curve,
+    cut,
+    disc,
+    facing,
+    lathe,
+    lettered,
+    place,
+    plate,
+    polygon,
+    rectangle,
+    ring,
+    rod,
+    skin,
+    stroke,
+    superellipse,
+    text_plate,
+    text_section,
+    tube,
+    union,
+    vessel,
+    wrapped,
+)
 
 
 def bowl() -> Solid:
@@ -43,8 +67,14 @@ def pitcher() -> Solid:
 def _spout(inset: float) -> Solid:
     """Beak of the pitcher towards +y; drawn ``inset`` mm smaller on every side it is its channel."""
     rim = 238.0 + (12 if inset else 0)
-    outline = [(0, 90 - 2 * inset, rim), (-30 + inset, 44, rim), (30 - inset, 44, rim),
-        (0, 55 - inset, 176 + 2 * inset), (-18, 30, rim), (18, 30, rim)]  # fmt: skip
+    outline = [
+        (0, 90 - 2 * inset, rim),
+        (-30 + inset, 44, rim),
+        (30 - inset, 44, rim),
+        (0, 55 - inset, 176 + 2 * inset),
+        (-18, 30, rim),
+        (18, 30, rim),
+    ]
     return Solid.batch_hull([ball(2.5, point) for point in outline]).trim_by_plane((0, 0, -1), -rim)
 
 
@@ -105,8 +135,20 @@ def banana() -> Solid:
     radius = 112.0
     path = np.stack([np.zeros_like(bend), radius * np.sin(bend), -radius * np.cos(bend)], axis=1)
     along = np.linspace(0, 1, len(bend))
-    knots = curve([(0, 4.2), (0.03, 6.0), (0.09, 11.5), (0.22, 16.4), (0.45, 18.4), (0.66, 16.6), (0.8, 11.5),
-        (0.88, 6.2), (0.95, 4.4), (1.0, 5.4)])  # fmt: skip
+    knots = curve(
+        [
+            (0, 4.2),
+            (0.03, 6.0),
+            (0.09, 11.5),
+            (0.22, 16.4),
+            (0.45, 18.4),
+            (0.66, 16.6),
+            (0.8, 11.5),
+            (0.88, 6.2),
+            (0.95, 4.4),
+            (1.0, 5.4),
+        ]
+    )
     girth = np.interp(along, knots[:, 0], knots[:, 1])
     tangent = np.gradient(path, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
@@ -135,8 +177,23 @@ def pen() -> Solid:
     """Retractable ballpoint, 12 x 145 mm: push button, clip, ribbed rubber grip and a fine point."""
     rib = ((0, 0), (0.5, 1), (1.3, 1), (1.8, 0))
     ribs = [(5.2 + 0.6 * proud, 21 + 2.6 * k + at) for k in range(11) for at, proud in rib]
-    barrel = lathe([(0.7, 0), (1.0, 3), (1.9, 4), (4.6, 17), (5.2, 20), *ribs, (5.2, 50), (5.8, 51), (5.8, 54),
-        (5.3, 55), (5.3, 126), (4.4, 130)], segments=64)  # fmt: skip
+    barrel = lathe(
+        [
+            (0.7, 0),
+            (1.0, 3),
+            (1.9, 4),
+            (4.6, 17),
+            (5.2, 20),
+            *ribs,
+            (5.2, 50),
+            (5.8, 51),
+            (5.8, 54),
+            (5.3, 55),
+            (5.3, 126),
+            (4.4, 130),
+        ],
+        segments=64,
+    )
     button = lathe([(3, 128), (3, 140), (2.3, 142)], 0.4, SMALL_SEGMENTS)
     foot = block(5, 4.2, 5, 0.8, (-6.4, 0, 127.5))
     clip = union(block(2.2, 4.2, 52, 0.8, (-8.4, 0, 104)), foot, ball(2.2, (-7.6, 0, 79)))
@@ -176,8 +233,20 @@ def eyeglasses() -> Solid:
 
 def battery() -> Solid:
     """Round cell, 26 x 50 mm, tipped to show its positive nub: crimped collar, sleeve with lettering."""
-    body = lathe([(11.5, 0), (12.6, 0.6), (12.6, 1.4), (13, 1.8), (13, 45.4), (12.4, 46.2), (12.4, 47), (10.4, 47.6),
-        (10.2, 47)], 0.2)  # fmt: skip
+    body = lathe(
+        [
+            (11.5, 0),
+            (12.6, 0.6),
+            (12.6, 1.4),
+            (13, 1.8),
+            (13, 45.4),
+            (12.4, 46.2),
+            (12.4, 47),
+            (10.4, 47.6),
+            (10.2, 47),
+        ],
+        0.2,
+    )
     nub = lathe([(4.4, 46), (4.4, 49.6), (3.8, 50.4)], 0.2, SMALL_SEGMENTS)
     collar = union(ring(12.9, 0.45, 36), ring(12.9, 0.45, 34.8), ring(8, 0.5, 47.3))
     lines = [wrapped(rectangle(30, 1.2), 13, z, 0.45) for z in (15, 29)]

@@ -265,11 +265,33 @@ def tube(
 
 
 _GLYPHS = {
-    "A": "EHHVHHH", "B": "UHHUHHU", "C": "FGGGGGF", "D": "UHHHHHU", "E": "VGGUGGV", "F": "VGGUGGG", "G": "FGGJHHF",
-    "H": "HHHVHHH", "I": "E44444E", "J": "72222IC", "K": "HIKOKIH", "L": "GGGGGGV", "M": "HRLLHHH", "N": "HPLLJHH",
-    "O": "EHHHHHE", "P": "UHHUGGG", "R": "UHHUKIH", "S": "FGGE11U", "T": "V444444", "U": "HHHHHHE", "V": "HHHHAA4",
-    "Y": "HHA4444", "Z": "V1248GV", "+": "044V440", "-": "000V000", " ": "0000000",
-}  # fmt: skip
+    "A": "EHHVHHH",
+    "B": "UHHUHHU",
+    "C": "FGGGGGF",
+    "D": "UHHHHHU",
+    "E": "VGGUGGV",
+    "F": "VGGUGGG",
+    "G": "FGGJHHF",
+    "H": "HHHVHHH",
+    "I": "E44444E",
+    "J": "72222IC",
+    "K": "HIKOKIH",
+    "L": "GGGGGGV",
+    "M": "HRLLHHH",
+    "N": "HPLLJHH",
+    "O": "EHHHHHE",
+    "P": "UHHUGGG",
+    "R": "UHHUKIH",
+    "S": "FGGE11U",
+    "T": "V444444",
+    "U": "HHHHHHE",
+    "V": "HHHHAA4",
+    "Y": "HHA4444",
+    "Z": "V1248GV",
+    "+": "044V440",
+    "-": "000V000",
+    " ": "0000000",
+}
 """Letters of 5 x 7 cells: a base-32 digit is a row, its bits are the cells, the left one first."""
 _ROWS, _ADVANCE = 7, 6
 

@@ -3,18 +3,53 @@
 import numpy as np
 
 from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
-    Point2, Solid, around, ball, block, curve, cut, disc, facing, laid, lathe, loft, place, plate, polygon,
-    rectangle, ring, rod, skin, softened, stroke, superellipse, tube, union,
-)  # fmt: skip
+    Point2,
+    Solid,
+    around,
+    ball,
+    block,
+    curve,
+    cut,
+    disc,
+    facing,
+    laid,
+    lathe,
+    loft,
+    place,
+    plate,
+    polygon,
+    rectangle,
+    ring,
+    rod,
+    skin,
+    softened,
+    stroke,
+    superellipse,
+    tube,
+    union,
+)
 
 
 def hammer() -> Solid:
     """Claw hammer, 330 mm long: turned face, cheek, forked claw, waisted grip with a bulged end."""
-    handle = laid(loft(
-        [(0, 26, 34, 2.4), (4, 30, 39, 2.4), (18, 29, 37, 2.4), (60, 25, 30, 2.3), (100, 26, 33, 2.3),
-         (140, 23, 28, 2.2), (200, 18, 23, 2.0), (250, 18, 23, 2.0), (292, 20, 26, 2.4), (312, 20, 26, 2.4)],
-        smooth=6, sides=64,
-    ))  # fmt: skip
+    handle = laid(
+        loft(
+            [
+                (0, 26, 34, 2.4),
+                (4, 30, 39, 2.4),
+                (18, 29, 37, 2.4),
+                (60, 25, 30, 2.3),
+                (100, 26, 33, 2.3),
+                (140, 23, 28, 2.2),
+                (200, 18, 23, 2.0),
+                (250, 18, 23, 2.0),
+                (292, 20, 26, 2.4),
+                (312, 20, 26, 2.4),
+            ],
+            smooth=6,
+            sides=64,
+        )
+    )
     face = place(lathe([(14, 0), (17, 3), (17, 15), (13, 21), (12, 40)], 0.5), (64, 292, 0), (0, -90, 0))
     cheek = block(46, 34, 30, 5, (4, 292, 0))
     spine = curve([(-10, 296), (-36, 300), (-62, 291), (-84, 268)])
@@ -198,7 +233,7 @@ def spraygun() -> Solid:
         place(ring(18, 2.4).scale((1, 1, 2.6)), (-66, 60, 0), _TO_LEFT),
         place(lathe([(18, 0), (18, 8), (8, 13), (5, 18)]), (-60, 60, 0), _TO_LEFT),
         *(place(block(16, 9, 11, 2), (-76, 60 + s * 15, 0), (0, 0, s * 24)) for s in (-1, 1)),
-    )  # fmt: skip
+    )
     front = curve([(4, 56), (6, 30), (16, -6), (24, -40), (28, -66)])
     back = curve([(58, -66), (54, -36), (46, -4), (42, 30), (56, 52), (60, 66), (48, 74)])
     grip_outline = polygon([*front, *back], 3)

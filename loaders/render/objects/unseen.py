@@ -9,9 +9,25 @@ import numpy as np
 from manifold3d import CrossSection, Manifold, OpType
 
 from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
-    Solid, angles, around, block, curve, cut, disc, facing, lathe, on_grid, place, plate, polygon,
-    rectangle, rod, skin, tube, union,
-)  # fmt: skip
+    Solid,
+    angles,
+    around,
+    block,
+    curve,
+    cut,
+    disc,
+    facing,
+    lathe,
+    on_grid,
+    place,
+    plate,
+    polygon,
+    rectangle,
+    rod,
+    skin,
+    tube,
+    union,
+)
 
 _ADD = OpType.Add
 _TO_CAMERA = (0, -90, 0)  # turns a lathe so that its top points to the camera of the first view
@@ -46,8 +62,10 @@ def concave_dish() -> Solid:
 
 def hinged_leaves() -> Solid:
     """Two boards at 70 degrees, like a book that stands open, and the rod that they turn about."""
-    leaves = [place(block(12, width, 330, 2, (0, side * width / 2, 0)), turn=(0, 0, side * 55))
-              for side, width in ((1, 250), (-1, 210))]  # fmt: skip
+    leaves = [
+        place(block(12, width, 330, 2, (0, side * width / 2, 0)), turn=(0, 0, side * 55))
+        for side, width in ((1, 250), (-1, 210))
+    ]
     return place(union(*leaves, rod((0, 0, -165), (0, 0, 165), 11)), turn=(3, 4, 0))
 
 
@@ -121,9 +139,15 @@ def turbine_blade() -> Solid:
 def blob() -> Solid:
     """A smooth body like a bust: the level set of a sum of eight fading bumps."""
     bumps = (
-        (0, 0, 150, 150), (-55, 0, 130, 95), (-70, 0, 175, 60), (0, 0, 40, 110), (0, 110, -80, 150),
-        (0, -110, -80, 150), (-40, 30, -100, 150), (30, 0, -110, 170),
-    )  # fmt: skip
+        (0, 0, 150, 150),
+        (-55, 0, 130, 95),
+        (-70, 0, 175, 60),
+        (0, 0, 40, 110),
+        (0, 110, -80, 150),
+        (0, -110, -80, 150),
+        (-40, 30, -100, 150),
+        (30, 0, -110, 170),
+    )
 
     def height(x: float, y: float, z: float) -> float:
         total = -0.35
@@ -170,8 +194,10 @@ def cone_stack() -> Solid:
 def hollow_cube() -> Solid:
     """The frame of a cube of 280 mm, and the sphere that its beams hold."""
     windows = [block(400, 200, 200), block(200, 400, 200), block(200, 200, 400)]
-    beams = [rod(tuple(-100.0 * np.array(way)), tuple(100.0 * np.array(way)), 16)
-             for way in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))]  # fmt: skip
+    beams = [
+        rod(tuple(-100.0 * np.array(way)), tuple(100.0 * np.array(way)), 16)
+        for way in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
+    ]
     body = union(cut(block(280, 280, 280, 6), *windows), *beams, Manifold.sphere(70, 64))
     return place(body, turn=(28, 22, 15))
 
