@@ -5,10 +5,15 @@ With all steps and both directions it is the process that made the ``depth`` col
 shows its error.
 """
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from operator import index
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.method import Answer, Frames, Method
+from fpp_ml_bench.baselines.method import Answer, Frames, Method, Photographed
 from fpp_ml_bench.coding import Limits, PhaseShift
 from fpp_ml_bench.decoding import (
     ASSUMED_NOISE_GREY,
@@ -19,24 +24,61 @@ from fpp_ml_bench.decoding import (
     decode_stack,
     depth_sigma_mm,
     fewest_plans,
+    fewest_steps,
     noise_by_light,
     plan_direction,
 )
-from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.errors import DecodeError, PredictionError
+from fpp_ml_bench.loaders import render
 from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics import Sequence as FrameSequence
+from fpp_ml_bench.options import option
+from fpp_ml_bench.schema import validate
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.evaluation.submission import Submission
+
+DIRECTIONS = ("horizontal", "vertical", "both")
+
+
+@dataclass(frozen=True)
+class ClassicalOptions:
+    """Options of `ClassicalMethod`; ``threads`` a sample."""
+
+    steps: int | None = option(None, "phase steps a direction, 3 to 18, with Gray code (default: all)", "N")
+    direction: Directions = option(
+        "both",
+        "fringes to use: one direction is enough for a depth (default: all that the rig codes)",
+        choices=DIRECTIONS,
+    )
+    fewest: bool = option(
+        False, "capture only the Gray frames that the rig's range needs: with both directions usually none"
+    )
+    depth_noise: float | None = option(
+        None,
+        "the fewest steps whose depth noise at the far end of the range is at most this (instead of --steps)",
+        "MM",
+    )
+    threads: int = 1
 
 
 class ClassicalMethod(Method):
     """All that a rig codes in one direction or "both", decoded. With the paper's kind of code, ``steps`` of the N
     sinusoids (default: all) and the Gray code, or with ``fewest`` only those of its frames that the rig's working range
     needs (`fpp_ml_bench.decoding.fewest`). Metric, nothing learned. Raises `RigError` for a direction that the rig does
-    not code, `DecodeError` for steps that were not captured, and for ``steps`` or ``fewest`` with another kind."""
+    not code, `DecodeError` for steps that were not captured, and for ``steps`` or ``fewest`` with another kind, and
+    `PredictionError` for ``depth_noise``, which needs a dataset."""
 
     name = "classical"
+    purpose = "N-step phase, Gray-code order, triangulation"
+    Options = ClassicalOptions
 
-    def __init__(
-        self, rig: Rig, direction: Directions = "both", steps: int | None = None, threads: int = 1, fewest: bool = False
-    ) -> None:
+    def __init__(self, rig: Rig, **options: Any) -> None:
+        self.options = self.checked_options(options)
+        direction, steps, fewest = self.options.direction, self.options.steps, self.options.fewest
+        threads = self.options.threads
+        if self.options.depth_noise is not None:
+            raise PredictionError(f"{self.name}: depth_noise needs a dataset, which says how noisy its frames are")
         directions = rig.directions if direction == "both" else (direction,)
         plans = [plan_direction(rig, way, steps, Limits()) for way in directions]
         if fewest:
@@ -65,6 +107,31 @@ class ClassicalMethod(Method):
             gray = f"{count} Gray frames" if count else "no Gray code"
             self.title = f"Classical {self.steps}-step, {fringes}, {gray}"
             self.settings = {**self.settings, "fewest": True}
+
+    @classmethod
+    def for_dataset(cls, dataset: Photographed, **options: Any) -> Method:
+        """With the steps that ``depth_noise`` mm takes, by the light and the camera that the dataset was built with."""
+        if (depth_noise_mm := options.pop("depth_noise", None)) is not None:
+            options["steps"] = _steps_for(dataset, depth_noise_mm, options)
+        return cls.for_rig(dataset.rig, **options)
+
+    @classmethod
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+        if not isinstance(rig.sequence, FrameSequence):
+            return [{}] if rig.directions else []
+        both = [{"steps": steps} for steps in (3, 4, 6, 9, rig.sequence.steps)]
+        return [*both, {"steps": 3, "direction": "horizontal"}, {"steps": 3, "fewest": True}]
+
+    @classmethod
+    def short_name(cls, submission: "Submission") -> str | None:
+        if not submission.name.startswith("Classical "):
+            return None
+        settings = submission.settings
+        steps, direction = index(settings["steps"]), DIRECTIONS[DIRECTIONS.index(settings["direction"])]  # type: ignore[arg-type]
+        if not settings.get("fewest"):
+            return f"Classical {steps}+Gray, {direction}"
+        gray = len(submission.frames_used) - steps * (2 if direction == "both" else 1)
+        return f"Classical {steps}, {direction}, {f'{gray} Gray' if gray else 'no Gray'}"
 
     def decode(self, frames: Frames, reasons: bool = True, details: bool = False) -> Decoded:
         """`decode_stack` of a captured sequence; frames that are not in `frames_used` may be None."""
@@ -97,3 +164,24 @@ class ClassicalMethod(Method):
         noise_grey = np.sqrt(dark + per_grey * modulation.astype(np.float64))
         sigma_mm = depth_sigma_mm(decoded, self.rig, noise_grey, self.steps, SYSTEMATIC_RAD)
         return Answer(decoded.depth_mm, sigma_mm), modulation
+
+
+def _steps_for(dataset: Photographed, depth_noise_mm: float, options: Mapping[str, Any]) -> int:
+    """The fewest steps whose depth noise at the far end of the working range is at most ``depth_noise_mm``."""
+    described = dataset.manifest.settings.get("light")
+    if options.get("steps") is not None or not 0 < depth_noise_mm < float("inf"):
+        raise PredictionError(f"--depth-noise {depth_noise_mm:g}: expected mm above 0, and not together with --steps")
+    if not isinstance(described, dict):
+        raise PredictionError("--depth-noise: this dataset does not say how noisy its frames are; give --steps")
+    light = validate(render.Light, described, dataset.path / "manifest.json", "light", PredictionError)
+    far_mm = dataset.rig.working_range_mm[1]
+    modulation = render.modulation_at(dataset.rig, far_mm, light)
+    noise_grey = render.fringe_noise_at(dataset.rig, far_mm, light)
+    direction = options.get("direction", "both")
+    steps = fewest_steps(dataset.rig, direction, depth_noise_mm, modulation, noise_grey)
+    if steps is None:
+        raise PredictionError(
+            f"--depth-noise {depth_noise_mm:g}: more noise remains even with all {dataset.sequence.steps} steps that "
+            "were captured; allow more noise, or use both directions"
+        )
+    return steps

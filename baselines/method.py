@@ -1,35 +1,60 @@
-"""What a method is, the methods that ``fpp-bench predict`` knows by name, and loading any of them."""
+"""What a method is: a class that says its name, options, assumptions and training itself. No other file knows a method
+by its name; `registry` finds the classes.
+
+A whole method, in a file ``mine.py`` of its own, for ``fpp-bench predict mine.py:Mine data/mini``:
+
+    import numpy as np
+    from fpp_ml_bench import Method
+
+    class Mine(Method):
+        name, title, frames_used = "mine", "Everything lit is 1.5 m away", (0,)
+
+        def predict(self, frames):
+            return np.where(frames[0] > 60, np.float32(1500), np.float32(0))
+"""
 
 import platform
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench import __version__, baselines
-from fpp_ml_bench.baselines import (
-    classical_network,
-    crossed_network,
-    crossed_route,
-    networks,
-    phase_network,
-    phase_route,
-    training,
-)
-from fpp_ml_bench.coding import PhaseShift
+from fpp_ml_bench import __version__
 from fpp_ml_bench.depth import RangeRule
-from fpp_ml_bench.errors import PredictionError, WeightsError
+from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.protocol import Mode, Target, Units
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics import AnySequence, Rig
+from fpp_ml_bench.options import did_you_mean, option
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.baselines.training import ModelConfig, NetConfig
+    from fpp_ml_bench.evaluation.submission import Submission
+    from fpp_ml_bench.loaders.storage import Manifest
 
 Frames = Sequence[NDArray[np.uint8] | None]
 """A captured sequence by frame number, with None for frames that are not needed."""
 Setting = str | int | float | bool | None
+
+
+class Photographed(Protocol):
+    """What a method can be made for: a dataset, or scenes of a rig that are rendered and not stored."""
+
+    @property
+    def path(self) -> Path: ...
+    @property
+    def rig(self) -> Rig: ...
+    @property
+    def size(self) -> tuple[int, int]: ...
+    @property
+    def sequence(self) -> AnySequence: ...
+    @property
+    def manifest(self) -> "Manifest": ...
 
 
 class Answer(NamedTuple):
@@ -41,10 +66,38 @@ class Answer(NamedTuple):
     report: Mapping[str, Any] = MappingProxyType({})
 
 
-class Method(ABC):
-    """A frame stack in, a depth map out.
+class Assumption(NamedTuple):
+    """What a method assumes of every scene: in a few ``words`` for a table, and as a ``sentence``."""
 
-    name: what it is called on the command line. title: name of the submission, with the settings that matter.
+    words: str
+    sentence: str
+
+
+@dataclass(frozen=True)
+class NoOptions:
+    """Options of a method that has none."""
+
+
+@dataclass(frozen=True)
+class OwnViews:
+    """Options of a training that renders what it learns from; None: as the shipped weights were trained."""
+
+    steps: int | None = option(None, "training steps (default: as the shipped weights)", "N")
+    unions: int | None = option(
+        None, "images that join several objects, made from each sample (default: as the shipped weights)", "N"
+    )
+    lights: int | None = option(None, "lights that are drawn (default: as the shipped weights)", "N")
+    rate: float | None = option(None, "largest learning rate (default: as the shipped weights)", "R")
+
+
+class Method(ABC):
+    """A frame stack in, a depth map out. A subclass needs ``name``, ``title``, ``frames_used`` and `predict`.
+
+    name: what it is called on the command line and in submissions. purpose: what it does, one line of ``--help``.
+    Options: a frozen dataclass, whose fields made with `fpp_ml_bench.options.option` are options of every command that
+    takes a method. Training: the same for ``fpp-bench train``, None where there is nothing to train. trivial: whether
+    it looks at nothing, or only for the nearest training image, so that it says what other errors are worth.
+    title: name of the submission, with the settings that matter.
     frames_used: frames that must be captured, ascending. settings: everything needed to run it again.
     uses_ground_truth_range: whether it is given depth_min and depth_max of the sample it predicts.
     range_rule: by which range normalised depth is.
@@ -56,9 +109,14 @@ class Method(ABC):
     """
 
     name: str
+    purpose: ClassVar[str] = ""
+    Options: ClassVar[type] = NoOptions
+    Training: ClassVar[type | None] = None
+    trivial: ClassVar[bool] = False
+
     title: str
     frames_used: tuple[int, ...]
-    settings: Mapping[str, Setting]
+    settings: Mapping[str, Setting] = MappingProxyType({})
 
     uses_ground_truth_range: bool = False
     uses_ground_truth_mask: bool = False
@@ -70,9 +128,58 @@ class Method(ABC):
     seeds: Mapping[str, int] = MappingProxyType({})
     device: str = "cpu"
     parameters: int = 0
-    weights_config: "training.ModelConfig | training.NetConfig | None" = None
+    weights_config: "ModelConfig | NetConfig | None" = None
     batched: bool = False
     reports: bool = False
+
+    def __init__(self, rig: Rig, **options: Any) -> None:
+        """For images of ``rig``; ``options`` are the fields of `Options`, and become the settings of its submission.
+        `PredictionError` for an option that it does not have."""
+        self.rig, self.options = rig, self.checked_options(options)
+        self.settings = {**self.settings, **plain_settings(self.options)}
+
+    @classmethod
+    def checked_options(cls, given: Mapping[str, Any]) -> Any:
+        """`Options` with the values ``given``, by name. `PredictionError` for a name that it does not have."""
+        known = [entry.name for entry in fields(cls.Options)]
+        for name in given:
+            if name not in known:
+                hint = did_you_mean(name, known) if known else "it has none"
+                raise PredictionError(f"{cls.name}: has no option {name}; {hint}")
+        return cls.Options(**given)
+
+    @classmethod
+    def for_rig(cls, rig: Rig, **options: Any) -> "Method":
+        """The method for images of ``rig``. A class that makes another one for some options overrides this."""
+        return cls(rig, **options)
+
+    @classmethod
+    def for_dataset(cls, dataset: "Photographed", **options: Any) -> "Method":
+        """The method for a dataset. A class that needs more of it than the rig (its training split, the light it was
+        built with) overrides this."""
+        return cls.for_rig(dataset.rig, **options)
+
+    @classmethod
+    def train(cls, training: Any, out: Path, minutes: float | None = None) -> bool:
+        """Learn by ``training``, an instance of `Training`, into the folder ``out``; within ``minutes``, everything
+        saved, and continued by the next call. Prints what came of it. Whether the training has finished."""
+        raise PredictionError(f"{cls.name}: there is nothing to train")
+
+    @classmethod
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+        """The options with which ``fpp-bench tradeoff`` measures it on ``rig``; none for a rig that it can't be for."""
+        return [{}]
+
+    @classmethod
+    def short_name(cls, submission: "Submission") -> str | None:
+        """A short name for tables, made of the settings of a submission of this method; None for one that it did not
+        write. May raise KeyError, TypeError or ValueError for such settings."""
+        return None
+
+    @classmethod
+    def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
+        """What it assumes of every scene with these settings; None where it assumes nothing."""
+        return None
 
     @abstractmethod
     def predict(self, frames: Frames) -> NDArray[np.float32]:
@@ -99,7 +206,9 @@ class Method(ABC):
         """What data the method learned from, as `evaluation.submission.LearnedFrom` has it."""
         if (config := self.weights_config) is None:
             return {"data": "none"}
-        benchmark = training.trained_on(config)
+        from fpp_ml_bench.baselines.training import trained_on
+
+        benchmark = trained_on(config)
         title = f"dataset {config.dataset_fingerprint[:8]}" if benchmark is None else benchmark.title
         return {"data": "train-split", "versions": [title]}
 
@@ -110,73 +219,6 @@ class Method(ABC):
         return {"fpp_ml_bench": __version__, "python": platform.python_version(), **versions}
 
 
-METHODS: Mapping[str, Callable[..., Method]] = {
-    "classical": lambda rig, **options: baselines.ClassicalMethod(rig, **options),
-    "classical-net": lambda rig, **options: classical_network.ClassicalNetMethod(rig, **options),
-    "phase": lambda rig, **options: (phase_route.FewestFrames if "error_mm" in options else phase_route.PhaseMethod)(
-        rig, **_fringe_options("phase", rig, options)
-    ),
-    "phase-net": lambda rig, **options: phase_network.PhaseNetMethod(rig, **_fringe_options("phase-net", rig, options)),
-    "crossed": lambda rig, **options: crossed_route.CrossedMethod(rig, **options),
-    "crossed-net": lambda rig, **options: crossed_network.CrossedNetMethod(rig, **options),
-    "constant": lambda rig, **options: baselines.ConstantMethod(rig, **options),
-    "nearest": lambda rig, **options: baselines.NearestMethod(rig, **options),
-}
-"""The methods by name, each made from a rig and its options; with the weights of a network from image to depth it is a
-`NetworkMethod`."""
-
-
-def _fringe_options(name: str, rig: Rig, options: dict[str, Any]) -> dict[str, Any]:
-    """``options`` of a method that computes with the fringes of one direction, which is the rig's only one by default.
-    Raises `PredictionError` for fringes that it would take for others."""
-    ways = rig.fringe_directions
-    if len(ways) == 1:
-        options = {"direction": ways[0], **options}
-    direction = options.get("direction", "horizontal")
-    if direction not in ways or not isinstance(code := rig.code(direction), PhaseShift):
-        return options  # refused by the method
-    shifts = code.fringes[code.finest].shifts_deg
-    if code.origin_px != 0 or shifts[0] != 0:
-        raise PredictionError(
-            f"{name}: needs fringes with a crest on pixel 0 of the projector, and in this rig the first {direction} "
-            f"frame is shifted (origin_px {code.origin_px:g}, {shifts[0]:g} degrees); use classical"
-        )
-    if "error_mm" in options and not code.is_plain:
-        raise PredictionError(
-            f"{name}: error_mm needs fringes of one period with Gray code in half periods, and this rig has "
-            f"{code.title}; say how many frames instead"
-        )
-    return options
-
-
-def load_method(name_or_path: str | Path, rig: Rig, **options: Any) -> Method:
-    """A method for images of ``rig``: one of `METHODS`, or the trained network of weights that come with the package
-    or of a ``.safetensors`` file.
-
-    ``options`` are those of the method's class; a network also takes ``device`` (``cpu``, ``cuda``, ...).
-    >>> from fpp_ml_bench.baselines import load_method
-    >>> depth_mm = load_method("phase", dataset.rig).predict(frames)    # doctest: +SKIP
-
-    Raises `PredictionError` for an unknown name, and what the method refuses: unusable weights, invalid options.
-    """
-    try:
-        if name_or_path in METHODS:
-            return METHODS[str(name_or_path)](rig, **options)
-        model = networks.load(known_weights(name_or_path), options.pop("device", None))
-        return networks.NetworkMethod(model, sequence=rig.sequence, **options)
-    except TypeError as error:
-        if "unexpected keyword argument" not in str(error):
-            raise
-        option = str(error).rsplit(" ", 1)[-1]
-        raise PredictionError(f"{name_or_path}: has no option {option}; fpp-bench predict --help lists them") from None
-
-
-def known_weights(name_or_path: str | Path) -> Path:
-    """Path of the weights file that ``name_or_path`` means. `PredictionError` for an unknown name lists the known."""
-    try:
-        return training.weights_path(name_or_path)
-    except WeightsError:
-        raise PredictionError(
-            f"unknown method {str(name_or_path)!r}; there are {', '.join((*METHODS, *training.shipped_names()))}, and "
-            "every .safetensors file of trained weights"
-        ) from None
+def plain_settings(options: Any) -> dict[str, Setting]:
+    """The values of an instance of `Method.Options` as a submission states them: a path as text."""
+    return {key: str(value) if isinstance(value, Path) else value for key, value in asdict(options).items()}

@@ -1,20 +1,21 @@
 """Predictors that look at nothing, or only for the nearest training image: what a method's error is worth is how far it
 is from theirs."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.method import Frames, Method
+from fpp_ml_bench.baselines.method import Frames, Method, Photographed
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.options import option
 
-TRIVIAL = "constant", "nearest"
-"""The methods of this module by name."""
 STANDOFF, MIDDLE, TRAINING_MEAN = "standoff", "middle", "training-mean"
 TRAINING_MEAN_MM, TRAINING_MEAN_DATA = 1743.75, "fpp-bench-full version 1"
 """Mean exact depth over the object pixels of the training split of that benchmark."""
@@ -26,15 +27,31 @@ BLOCKS = 60
 """Blocks along an image's shorter side, by whose means `NearestMethod` compares images."""
 
 
+@dataclass(frozen=True)
+class ConstantOptions:
+    """Options of `ConstantMethod`."""
+
+    at: str | float = option(
+        STANDOFF,
+        "standoff, middle (of the working range), training-mean, or mm; range-middle or range-training: a share of the "
+        "sample's depth range, which it is given",
+        "DEPTH",
+    )
+
+
 class ConstantMethod(Method):
     """One depth at every pixel: ``at`` the rig's standoff, the middle of its working range, the mean of the benchmark's
     training split, or so many mm. Or one of `RANGE_SHARES` of the sample's depth range, which it is then given, as a
     network of the oracle range track is: normalised depth. Raises PredictionError for anything else."""
 
     name = "constant"
+    purpose = "looks at nothing"
+    Options = ConstantOptions
+    trivial = True
     packages = ("numpy",)
 
-    def __init__(self, rig: Rig, at: str | float = STANDOFF) -> None:
+    def __init__(self, rig: Rig, **options: Any) -> None:
+        at = self.checked_options(options).at
         known = {
             STANDOFF: rig.standoff_m * MM_PER_M,
             MIDDLE: sum(rig.working_range_mm) / 2,
@@ -54,6 +71,10 @@ class ConstantMethod(Method):
             self.uses_ground_truth_range, self.units, self.mode, self.target = True, "normalised", "paper", "depth"
         self.settings = {"at": at, "share" if at in RANGE_SHARES else "depth_mm": self.value}
 
+    @classmethod
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+        return [{}, {"at": TRAINING_MEAN}]
+
     @property
     def learned_from(self) -> dict[str, Any]:
         data = {TRAINING_MEAN: TRAINING_MEAN_DATA, "range-training": RANGE_DATA}.get(str(self.settings["at"]))
@@ -61,6 +82,15 @@ class ConstantMethod(Method):
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         return np.full(self.shape, self.value, dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class NearestOptions:
+    """Options of `NearestMethod`; ``training``: also an opened dataset."""
+
+    training: "DatasetFolder | str | Path | None" = option(
+        None, "dataset with the training split (default: DATASET itself)", "FOLDER"
+    )
 
 
 class NearestMethod(Method):
@@ -71,14 +101,24 @@ class NearestMethod(Method):
     Raises PredictionError for a dataset without a training split, or of another image size or sequence than ``rig``."""
 
     name = "nearest"
+    purpose = "depth of the training sample with the nearest image"
+    Options = NearestOptions
+    trivial = True
     title = "Nearest training image"
     target = "depth"
     packages = ("numpy",)
 
-    def __init__(self, rig: Rig, training: "DatasetFolder | str | Path | None" = None) -> None:
+    @classmethod
+    def for_dataset(cls, dataset: Photographed, **options: Any) -> Method:
+        """With the dataset's own training split, unless another dataset's is given."""
+        own = {"training": dataset} if isinstance(dataset, DatasetFolder) else {}
+        return cls.for_rig(dataset.rig, **{**own, **options})
+
+    def __init__(self, rig: Rig, **options: Any) -> None:
+        training = self.checked_options(options).training
         if training is None:
             raise PredictionError(
-                "nearest needs the training split: give the dataset that holds it (--training FOLDER)"
+                f"{self.name} needs the training split: give the dataset that holds it (--training FOLDER)"
             )
         self.training = training if isinstance(training, DatasetFolder) else DatasetFolder(Path(training))
         size = rig.camera.height, rig.camera.width
@@ -106,7 +146,7 @@ class NearestMethod(Method):
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         frame = frames[self.frames_used[0]]
         if frame is None:
-            raise PredictionError(f"nearest needs frame {self.frames_used[0]}, and it is missing")
+            raise PredictionError(f"{self.name} needs frame {self.frames_used[0]}, and it is missing")
         distances = ((self._sums - self._block_sums(frame)) ** 2).sum(axis=(1, 2))
         sample = self.samples[int(np.argmin(distances))]
         depth_mm = self.training.depth_mm(sample).astype(np.float32)

@@ -67,7 +67,7 @@ def level_errors(chooser: FewestFrames, frames: list, target_mm: np.ndarray, voi
     for count, method in chooser.methods.items():
         errors_mm[count] = object_mae_mm(method.measure(frames).depth_mm, target_mm, void)
         if count >= PIXELWISE:
-            classical = ClassicalMethod(chooser.rig, chooser.options.direction, count)
+            classical = ClassicalMethod(chooser.rig, direction=chooser.options.direction, steps=count)
             errors_mm[count + len(chooser.gray)] = object_mae_mm(classical.predict(frames), target_mm, void)
     return dict(sorted(errors_mm.items()))
 

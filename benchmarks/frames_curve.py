@@ -25,7 +25,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import cv2
 import numpy as np
 
-from fpp_ml_bench.baselines.method import Method, load_method
+from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.cli.console import progress_bar
 from fpp_ml_bench.depth import object_mask

@@ -150,7 +150,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     dataset = DatasetFolder(args.dataset)
-    method = PhaseNetMethod(dataset.rig, args.fringe, args.weights)
+    method = PhaseNetMethod(dataset.rig, direction=args.fringe, weights=args.weights)
     blind = PhaseNetMethod(dataset.rig, args.fringe, albedo="any") if args.blind else None
     predict_depth = unet(dataset.size) if args.hybrid else None
     variants = {title: VARIANTS[title] for title in ((NOTHING_LEARNED, FULL) if args.brief else VARIANTS)}

@@ -24,9 +24,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines import TRIVIAL
 from fpp_ml_bench.baselines.diagnostics import VIEWS_PER_OBJECT, SceneSet, measure
-from fpp_ml_bench.baselines.method import METHODS, Method, load_method
+from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.networks import (
     TWINS,
     Model,
@@ -37,6 +36,7 @@ from fpp_ml_bench.baselines.networks import (
     represent,
     torch_threads,
 )
+from fpp_ml_bench.baselines.registry import load_method, methods
 from fpp_ml_bench.baselines.training import shipped_names, weights_path
 from fpp_ml_bench.depth import denormalise
 from fpp_ml_bench.errors import FppBenchError
@@ -119,9 +119,9 @@ class Materials:
     def method_and_scenes(self, entry: Entry) -> tuple[Method, SceneSet]:
         """The row's method, built again, and the scenes to measure it on. FppBenchError where it can't be built."""
         about = entry.row.submission
-        if about.method in TRIVIAL:
+        if about.method in methods() and methods()[about.method].trivial:
             raise FppBenchError("a trivial method: it looks at no fringe")
-        if about.method in METHODS:
+        if about.method in methods():
             scenes = self.scenes_of(entry, anywhere=True)
             return built(entry, scenes.dataset.rig), scenes
         weights_sha256 = about.settings.get("weights_sha256")

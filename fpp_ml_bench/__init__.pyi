@@ -5,5 +5,6 @@ from .api import load_dataset as load_dataset
 from .api import load_method as load_method
 from .api import open_dataset as open_dataset
 from .api import rank as rank
+from .baselines.method import Method as Method
 
 __version__: str

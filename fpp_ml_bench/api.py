@@ -105,13 +105,13 @@ def load_method(name: str | Path, dataset: "storage.DatasetFolder", **options: A
     Parameters
     ----------
     name : str or Path
-        ``classical``, ``phase``, ``crossed`` and the other methods of ``fpp-bench predict``, shipped weights, or a
-        ``.safetensors`` file.
+        ``classical``, ``phase``, ``crossed`` and the other methods of ``fpp-bench predict``, a class of yours as
+        ``mine.py:Mine``, shipped weights, or a ``.safetensors`` file.
     dataset : DatasetFolder
         What it is to run on; see `open_dataset`.
     **options
-        The method's settings: ``steps=4`` (classical), ``frames=3`` (phase), ``direction="vertical"`` (both; the
-        command calls it ``--fringe`` for phase), ``depth_range="predicted"`` (networks).
+        The method's settings: ``steps=4`` (classical), ``frames=3`` (phase), ``direction="vertical"`` (both),
+        ``depth_range="predicted"`` (networks).
 
     Returns
     -------
@@ -132,9 +132,9 @@ def load_method(name: str | Path, dataset: "storage.DatasetFolder", **options: A
     >>> len(method.frames_used) < 52
     True
     """
-    from fpp_ml_bench.baselines import method
+    from fpp_ml_bench.baselines import registry
 
-    return method.load_method(name, dataset.rig, **options)
+    return registry.load_method(name, dataset, **options)
 
 
 def decode(

@@ -4,10 +4,11 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from fpp_ml_bench.baselines.phase_route.method import ONE_ALBEDO
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.leaderboard import columns
-from fpp_ml_bench.leaderboard.assumptions import ASSUMED, assumption, told
+from fpp_ml_bench.leaderboard.assumptions import assumption, told
 from fpp_ml_bench.leaderboard.columns import NOT_CHECKED, Column, device, error
 from fpp_ml_bench.leaderboard.groups import Group
 from fpp_ml_bench.leaderboard.reported import PAPER_DEPTHS, REPORTED_HEADING, chosen_tables
@@ -63,7 +64,7 @@ def readme_block(groups: Sequence[Group]) -> str:
         lines += [f"… and {more} more on the page", ""] if more > 0 else []
     shown = [row.entry.row for group in groups for row in group.rows]
     assuming = sorted({row.submission.method for row in shown if assumption(row)})
-    notes = [_NOTE] + ([f"{' and '.join(assuming)} assume {ASSUMED}."] if assuming else [])
+    notes = [_NOTE] + ([f"{' and '.join(assuming)} assume {ONE_ALBEDO.words}."] if assuming else [])
     notes += [f"Rows of other data ({'; '.join(others)}) are on the page."] if others else []
     notes += dict.fromkeys(markdown_text(note) for group in groups for note in (*group.notes, *group.key.notes))
     keys, titles = ("object_mae_mm", "object_rmse_mm", "overall_mae_mm"), [column.title for column in _ERRORS]

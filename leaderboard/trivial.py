@@ -4,15 +4,17 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from statistics import fmean
 
-from fpp_ml_bench.baselines import TRIVIAL
+from fpp_ml_bench.baselines.registry import methods
 from fpp_ml_bench.leaderboard.groups import Group, GroupKey, Ranked
 
 _KEY = "object_mae_mm"
 
 
 def is_trivial(row: Ranked) -> bool:
-    """Whether it is a row of `TRIVIAL` that was measured here; what others call their methods does not count."""
-    return row.entry.row.submission.method in TRIVIAL and row.entry.all_checked
+    """Whether it is a row of a trivial method (`Method.trivial`) that was measured here; what others call their methods
+    does not count."""
+    method = methods().get(row.entry.row.submission.method)
+    return method is not None and method.trivial and row.entry.all_checked
 
 
 def more_than_trivial(groups: Sequence[Group]) -> list[Group]:

@@ -1,28 +1,43 @@
 """classical-net as a method of ``fpp-bench predict``: classical frames, averaged and filled by a small network."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.classical_network.network import DepthFilter
-from fpp_ml_bench.baselines.classical_network.route import decided, filtered, written
-from fpp_ml_bench.baselines.classical_network.scene import DepthScene
-from fpp_ml_bench.baselines.method import Answer, Frames, Method
-from fpp_ml_bench.baselines.networks import torch_threads
-from fpp_ml_bench.baselines.phase_network import read_net, rendered_data
-from fpp_ml_bench.baselines.training import FILTER_NETWORKS, weights_path
+from fpp_ml_bench.baselines.classical import DIRECTIONS, ClassicalMethod
+from fpp_ml_bench.baselines.method import Answer, Frames, Method, OwnViews
+from fpp_ml_bench.baselines.phase_network.method import WEIGHTS, recipe_values, rendered_data, say_trained
 from fpp_ml_bench.coding import PhaseShift
 from fpp_ml_bench.decoding import Directions
 from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.files import printable
+from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.options import option
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.evaluation.submission import Submission
 
 SHIPPED = Path(__file__).resolve().parent / "weights"  # folder of the weights that come with the package
 DEFAULT = "classical-net"
 STEPS = 3
 """Phase steps where a rig's code leaves the choice and no others are asked for: noise is what it takes away."""
+
+
+@dataclass(frozen=True)
+class ClassicalNetOptions:
+    """Options of `ClassicalNetMethod`."""
+
+    direction: Directions | None = option(
+        None, "fringes to use (default: those that the weights learned)", choices=DIRECTIONS
+    )
+    steps: int | None = option(None, "phase steps a direction, 3 to 18, with Gray code (default: 3)", "N")
+    weights: str | Path = option(DEFAULT, WEIGHTS, "FILE")
+    threads: int = 1
 
 
 class ClassicalNetMethod(Method):
@@ -32,16 +47,37 @@ class ClassicalNetMethod(Method):
     `PredictionError` for a code whose uncertainty is not known."""
 
     name = "classical-net"
+    purpose = "classical frames; noise and missed pixels learned"
+    Options = ClassicalNetOptions
+    Training = OwnViews
     packages = ("numpy", "numba", "torch")
 
-    def __init__(
-        self,
-        rig: Rig,
-        direction: Directions | None = None,
-        steps: int | None = None,
-        weights: str | Path = DEFAULT,
-        threads: int = 1,
-    ) -> None:
+    @classmethod
+    def train(cls, training: OwnViews, out: Path, minutes: float | None = None) -> bool:
+        from fpp_ml_bench.baselines.classical_network.training import FilterRecipe, train_classical_net
+
+        recipe = FilterRecipe(**recipe_values(training))
+        trained = train_classical_net(recipe, out, minutes=minutes, workers=usable_cores(), show=True, print_line=print)
+        return say_trained(cls.name, out, recipe.steps, trained)
+
+    @classmethod
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+        return [{}] if all(isinstance(rig.code(way), PhaseShift) for way in rig.directions[:1]) else []
+
+    @classmethod
+    def short_name(cls, submission: "Submission") -> str | None:
+        classical = ClassicalMethod.short_name(submission)
+        if classical is None:
+            return None
+        return printable(submission.settings["weights"]) + classical.removeprefix("Classical")
+
+    def __init__(self, rig: Rig, **options: Any) -> None:
+        from fpp_ml_bench.baselines.classical_network.network import DepthFilter
+        from fpp_ml_bench.baselines.phase_network.net_file import read_net
+        from fpp_ml_bench.baselines.training import FILTER_NETWORKS, weights_path
+
+        given = self.checked_options(options)
+        direction, steps, weights, threads = given.direction, given.steps, given.weights, given.threads
         path = weights_path(weights, SHIPPED)
         config, network, digest = read_net(path, DepthFilter, FILTER_NETWORKS)
         self.network = network.folded()
@@ -51,12 +87,12 @@ class ClassicalNetMethod(Method):
         fringes = [code for code in codes if isinstance(code, PhaseShift)]
         if len(fringes) < len(codes):
             raise PredictionError(
-                f"classical-net: needs the uncertainty of every pixel, which {codes[0].title} does not give; use "
-                "classical"
+                f"{self.name}: needs the uncertainty of every pixel, which {codes[0].title} does not give; use "
+                f"{ClassicalMethod.name}"
             )
         if steps is None and all(code.is_plain for code in fringes):
             steps = STEPS
-        self.classical = ClassicalMethod(rig, way, steps, threads)
+        self.classical = ClassicalMethod(rig, direction=way, steps=steps, threads=threads)
         self.rig, self.threads, self.frames_used = rig, threads, self.classical.frames_used
         self.config = self.weights_config = config
         self.parameters = sum(parameter.numel() for parameter in network.parameters())
@@ -79,6 +115,10 @@ class ClassicalNetMethod(Method):
 
     def answer(self, frames: Frames) -> Answer:
         """Depth, and the standard uncertainty that the network expects."""
+        from fpp_ml_bench.baselines.classical_network.route import decided, filtered, written
+        from fpp_ml_bench.baselines.classical_network.scene import DepthScene
+        from fpp_ml_bench.baselines.networks import torch_threads
+
         decoded, modulation = self.classical.measure(frames)
         scene = None if decoded.sigma_mm is None else DepthScene.of(decoded.depth, decoded.sigma_mm, modulation)
         if scene is None:

@@ -104,7 +104,7 @@ def train_classical_net(
     """Train for ``rig`` (default: the paper's); the same call resumes a training that was stopped. ``show``: progress
     on stderr. Raises `TrainingError` for a folder of another recipe or rig."""
     started, rig = perf_counter(), rig or paper_rig()
-    method = ClassicalMethod(rig, recipe.direction, recipe.phase_steps)
+    method = ClassicalMethod(rig, direction=recipe.direction, steps=recipe.phase_steps)
     groups = training.groups_of(recipe.lights, recipe.views_a_light, recipe.seed)
     described = recipe.to_dict() | {"rig": rig.to_dict()}
     fingerprint = training.fingerprint_of(described, groups)

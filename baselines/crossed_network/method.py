@@ -1,21 +1,27 @@
 """crossed-net as a method of ``fpp-bench predict``: one crossed frame, metric depth, nothing told."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.crossed_network.inputs import CHANNELS
-from fpp_ml_bench.baselines.crossed_network.route import CrossedNetRoute
 from fpp_ml_bench.baselines.crossed_route import CrossedMeasurement, Settings, crossed_image, frames_of
-from fpp_ml_bench.baselines.method import Answer, Frames, Method
-from fpp_ml_bench.baselines.networks import torch_threads
-from fpp_ml_bench.baselines.phase_network import NetFile, load_net, rendered_data
+from fpp_ml_bench.baselines.crossed_route.method import crossed_name, has_crossed_fringes
+from fpp_ml_bench.baselines.method import Answer, Frames, Method, OwnViews
+from fpp_ml_bench.baselines.phase_network.method import WEIGHTS, recipe_values, rendered_data, say_trained
 from fpp_ml_bench.baselines.phase_route import Periods
-from fpp_ml_bench.baselines.training import NetConfig
+from fpp_ml_bench.baselines.phase_route.method import MIN_CONFIDENCE
 from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.options import option
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.baselines.phase_network.net_file import NetFile
+    from fpp_ml_bench.evaluation.submission import Submission
 
 SHIPPED = Path(__file__).resolve().parent / "weights"  # folder of the weights that come with the package
 DEFAULT = "crossed-net"
@@ -24,27 +30,55 @@ PERIOD_TOLERANCE = 2.2
 resampled to theirs."""
 
 
+@dataclass(frozen=True)
+class CrossedNetOptions:
+    """Options of `CrossedNetMethod`; ``weights``: also a file that was read."""
+
+    weights: "str | Path | NetFile" = option(DEFAULT, WEIGHTS, "FILE")
+    min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
+    threads: int = 1
+
+
 class CrossedNetMethod(Method):
     """Depth from one crossed frame by the weights ``weights`` (a shipped name or a file), or from the mean of the first
     fringe of both directions where the rig has no crossed frame. ``min_confidence``: pixels below it are masked. Raises
     `WeightsError` for weights that can't be used, and `PredictionError` for a rig whose fringes they did not learn."""
 
     name = "crossed-net"
+    purpose = "one crossed frame, with order, mask and correction learned"
+    Options = CrossedNetOptions
+    Training = OwnViews
     packages = ("numpy", "numba", "torch")
 
-    def __init__(
-        self,
-        rig: Rig,
-        weights: str | Path | NetFile = DEFAULT,
-        min_confidence: float = 0.0,
-        threads: int = 1,
-    ) -> None:
+    @classmethod
+    def train(cls, training: OwnViews, out: Path, minutes: float | None = None) -> bool:
+        from fpp_ml_bench.baselines.crossed_network.training import CrossedRecipe, train_crossed_net
+
+        recipe = CrossedRecipe(**recipe_values(training))
+        trained = train_crossed_net(recipe, out, minutes=minutes, workers=usable_cores(), show=True, print_line=print)
+        return say_trained(cls.name, out, recipe.steps, trained)
+
+    @classmethod
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+        return [{}] if has_crossed_fringes(rig) else []
+
+    @classmethod
+    def short_name(cls, submission: "Submission") -> str | None:
+        return crossed_name(submission, "Crossed fringes, ")
+
+    def __init__(self, rig: Rig, **options: Any) -> None:
+        from fpp_ml_bench.baselines.crossed_network.inputs import CHANNELS
+        from fpp_ml_bench.baselines.crossed_network.route import CrossedNetRoute
+        from fpp_ml_bench.baselines.phase_network.net_file import NetFile, load_net
+
+        given = self.checked_options(options)
+        weights, min_confidence, threads = given.weights, given.min_confidence, given.threads
         self.file = weights if isinstance(weights, NetFile) else load_net(weights, shipped=SHIPPED)
         config = self.file.config
         if self.file.network.options["channels"] != len(CHANNELS) or "crossed" not in config.period_px:
             raise PredictionError(
                 f"{self.file.path}: learned from {', '.join(config.period_px)} fringes, not from crossed ones; use "
-                "weights that fpp-bench train crossed-net wrote"
+                f"weights that fpp-bench train {self.name} wrote"
             )
         self.rig, self.threads, self.frames_used = rig, threads, frames_of(rig, self.name)
         learned_px = config.period_px["crossed"]
@@ -52,7 +86,7 @@ class CrossedNetMethod(Method):
         self.route = CrossedNetRoute(
             rig, self.file.network, config.threshold, config.lead, Settings(min_confidence), periods
         )
-        self.weights_config: NetConfig = config
+        self.weights_config = config
         self.parameters = sum(parameter.numel() for parameter in self.file.network.parameters())
         made = "" if len(self.frames_used) == 1 else ", the mean of two"
         more = "" if config.name == DEFAULT else f" ({config.name})"
@@ -73,6 +107,8 @@ class CrossedNetMethod(Method):
 
     def measure(self, frames: Frames) -> CrossedMeasurement:
         """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
+        from fpp_ml_bench.baselines.networks import torch_threads
+
         with torch_threads(self.threads):
             return self.route.measure(crossed_image(frames, self.frames_used))
 

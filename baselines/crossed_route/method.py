@@ -1,6 +1,9 @@
 """The crossed route as a method of ``fpp-bench predict``: one frame or three, nothing learned, nothing told."""
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,11 +12,17 @@ from fpp_ml_bench.baselines.crossed_route.observation import CrossedMeasurement,
 from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute
 from fpp_ml_bench.baselines.crossed_route.three_frames import FRAMES, ThreeFrameRoute, shifted_carrier
 from fpp_ml_bench.baselines.method import Answer, Frames, Method
+from fpp_ml_bench.baselines.phase_route.method import MASK, MIN_CONFIDENCE
 from fpp_ml_bench.coding import crossed_from_pair
 from fpp_ml_bench.decoding import grey_levels
 from fpp_ml_bench.errors import DecodeError, PredictionError
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.captures import read_mask
 from fpp_ml_bench.optics import DIRECTIONS, Rig
+from fpp_ml_bench.options import option
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.evaluation.submission import Submission
 
 
 def frames_of(rig: Rig, name: str) -> tuple[int, ...]:
@@ -46,6 +55,20 @@ def crossed_image(frames: Frames, used: tuple[int, ...]) -> NDArray[np.uint8]:
     return images[0] if len(images) == 1 else crossed_from_pair(images[0], images[1])
 
 
+def has_crossed_fringes(rig: Rig) -> bool:
+    """Whether `frames_of` finds a crossed frame."""
+    return bool(rig.sequence.crossed_frames) or rig.fringe_directions == DIRECTIONS
+
+
+@dataclass(frozen=True)
+class CrossedOptions:
+    """Options of `CrossedMethod`."""
+
+    frames: int = option(1, "crossed frames, 1 or 3 (default: 1)", "N")
+    min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
+    mask: str | Path | None = option(None, MASK, "FILE")
+
+
 class CrossedMethod(Method):
     """Depth from one crossed frame; where the rig has none, from the mean of the first fringe of both directions, which
     is one. With ``frames`` 3: from three that shift one carrier (`ThreeFrameRoute`). ``mask``: a file
@@ -53,8 +76,12 @@ class CrossedMethod(Method):
     such frames and for an invalid option, `CaptureError` for a mask that can't be used."""
 
     name = "crossed"
+    purpose = "one frame with two fringe directions, or three, nothing learned"
+    Options = CrossedOptions
 
-    def __init__(self, rig: Rig, min_confidence: float = 0.0, mask: str | Path | None = None, frames: int = 1) -> None:
+    def __init__(self, rig: Rig, **options: Any) -> None:
+        given = self.checked_options(options)
+        min_confidence, mask, frames = given.min_confidence, given.mask, given.frames
         self.rig, settings = rig, Settings(min_confidence)
         self.route: CrossedRoute
         if frames == FRAMES:
@@ -72,6 +99,16 @@ class CrossedMethod(Method):
         self.mask = None if mask is None else read_mask(Path(mask), (rig.camera.height, rig.camera.width))
         self.settings = {"min_confidence": min_confidence} | ({} if mask is None else {"mask": Path(mask).name})
         self.settings |= {} if frames == 1 else {"frames": frames}
+
+    @classmethod
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+        if not has_crossed_fringes(rig):
+            return []
+        return [{}, {"frames": FRAMES}] if len(rig.sequence.crossed_frames) >= FRAMES else [{}]
+
+    @classmethod
+    def short_name(cls, submission: "Submission") -> str | None:
+        return crossed_name(submission, "Crossed fringes ")
 
     def observe(self, frames: Frames) -> CrossedObservation:
         """What is measured before depth; frames that are not in `frames_used` may be None."""
@@ -93,3 +130,11 @@ class CrossedMethod(Method):
     def answer(self, frames: Frames) -> Answer:
         measurement = self.measure(frames)
         return Answer(measurement.depth_mm, measurement.sigma_mm)
+
+
+def crossed_name(submission: "Submission", begins: str) -> str | None:
+    """A short name for a submission of crossed fringes whose name ``begins`` so; None for another."""
+    if not submission.name.startswith(begins):
+        return None
+    frames = {1: "1 frame", 2: "mean of 2"}.get(len(submission.frames_used), f"{len(submission.frames_used)} frames")
+    return f"{printable(submission.settings.get('weights', 'Crossed'))}, {frames}"

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from fpp_ml_bench.baselines.diagnostics.probe import spread
-from fpp_ml_bench.baselines.method import METHODS, Frames, Method, load_method
+from fpp_ml_bench.baselines.method import Frames, Method
 from fpp_ml_bench.baselines.networks import NetworkMethod, build, fringe_batch, load
+from fpp_ml_bench.baselines.registry import load_method, methods
 from fpp_ml_bench.baselines.training import shipped_names, weights_path
 from fpp_ml_bench.depth import Normalisation, denormalise, object_mask
 from fpp_ml_bench.errors import DiagnosisError, FppBenchError, WeightsError
@@ -176,7 +177,7 @@ def subject(
     threads: int = 1,
 ) -> Subject:
     """The model called ``name``, ready to be diagnosed on ``dataset``. ``name``: a method of
-    `fpp_ml_bench.baselines.method.METHODS`, shipped weights, a ``.safetensors`` file, or ``file.py:factory``, where
+    `fpp_ml_bench.baselines.registry.methods`, shipped weights, a ``.safetensors`` file, or ``file.py:factory``, where
     ``factory()`` returns a torch module that maps fringes (B, 1, H, W) in [0, 1] to depth (B, 1, H, W) in ``units``
     (default: normalised). ``layers``: names of the layers to probe, by default the network's ``probe_layers``, or every
     child of a module without them. ``frame``: number of the network's input frame, by default the first that it was
@@ -186,11 +187,11 @@ def subject(
         return _subject_of_factory(name, dataset, layers, units or "normalised", frame or 0, threads)
     if units is not None:
         raise DiagnosisError(f"{name}: its units are known; set units only for your own module, file.py:factory")
-    if name not in METHODS:
+    if name not in methods():
         return _subject_of_weights(name, dataset, layers, frame, threads)
     if given := [option for option, value in (("layers", layers), ("frame", frame)) if value is not None]:
         raise DiagnosisError(f"{name} is a method without a network, so it has no {given[0]}; leave it out")
-    return subject_of_method(load_method(name, dataset.rig), dataset)
+    return subject_of_method(load_method(name, dataset), dataset)
 
 
 def subject_of_method(depth_method: Method, dataset: DatasetFolder, **network: Any) -> Subject:
@@ -215,8 +216,8 @@ def _subject_of_weights(
         path = weights_path(name)
     except WeightsError:
         raise DiagnosisError(
-            f"unknown model {name!r}; there are {', '.join((*METHODS, *shipped_names()))}, every .safetensors file of "
-            "trained weights, and your own module as file.py:factory"
+            f"unknown model {name!r}; there are {', '.join((*methods(), *shipped_names()))}, every .safetensors file "
+            "of trained weights, and your own module as file.py:factory"
         ) from None
     torch.set_num_threads(threads)
     model = load(path, "cpu")

@@ -1,20 +1,54 @@
 """A trained network as a method of the benchmark: of the metric track, or told the sample's depth range (oracle)."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal, get_args
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.method import Frames, Method, Setting
-from fpp_ml_bench.baselines.networks.base import torch_threads
-from fpp_ml_bench.baselines.networks.model import Model
-from fpp_ml_bench.baselines.training import Loss
-from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.optics import PAPER_SEQUENCE, AnySequence
+from fpp_ml_bench.baselines.method import Frames, Method, Photographed, Setting
+from fpp_ml_bench.baselines.training import NETWORK_TITLES, PRESETS, Loss, load_recipe
+from fpp_ml_bench.constants import CONFIGS
+from fpp_ml_bench.errors import PredictionError, RecipeError, WeightsError
+from fpp_ml_bench.optics import PAPER_SEQUENCE, AnySequence, Rig
+from fpp_ml_bench.options import option
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.baselines.networks.model import Model
+    from fpp_ml_bench.evaluation.submission import Submission
 
 DepthRange = Literal["oracle", "predicted", "mean"]
 DEPTH_RANGES: tuple[DepthRange, ...] = get_args(DepthRange)
+_SHORT_RANGES = {"oracle": "", "mean": "mean range", "predicted": "pred. range", None: ""}
+"""By the setting ``depth_range``. That the range was told is the group's track."""
+_SHORT_OPTIONS = {
+    "input standardised": "standardised",
+    "guided by phase": "guided",
+    "batch normalisation": "batch norm",
+}
+"""A recipe's title and the short name of each option of a network."""
+_SHORT_LOSSES = {"rmse": "RMSE", "l1": "L1", "gan": "GAN"}
+
+
+@dataclass(frozen=True)
+class NetworkOptions:
+    """Options of `NetworkMethod`; the name of the method gives ``weights``, a file, or the ``recipe`` that trained
+    them."""
+
+    depth_range: str | None = option(
+        None,
+        "depth range of an individually normalised network: the test sample's own (oracle track), predicted from the "
+        "image, or the training set's mean (default: predicted where the weights can, else oracle)",
+        choices=DEPTH_RANGES,
+        flag="--range",
+    )
+    frame: int | None = option(None, "frame to take (default: the first it was trained on)", "N")
+    device: str | None = option(None, "cpu, cuda, cuda:1 (default: cuda where there is one)", "NAME")
+    threads: int = 1
+    weights: Path | None = None
+    recipe: str | None = None
 
 
 class NetworkMethod(Method):
@@ -27,13 +61,59 @@ class NetworkMethod(Method):
     ``threads`` are torch's while it predicts. ``remark`` is added to the title, ``about`` to the settings. Raises
     `PredictionError` for an unknown range or frame."""
 
+    name = "network"  # a trained one has the name of its weights
+    purpose = "trained network from image to depth"
+    Options = NetworkOptions
     target = "depth"
     packages = ("numpy", "torch", "safetensors")
     batched = True
 
+    @classmethod
+    def for_rig(cls, rig: Rig, **options: Any) -> "NetworkMethod":
+        """The network of a weights file, for frames in the order of ``rig``."""
+        from fpp_ml_bench.baselines.networks.model import load
+
+        given = cls.checked_options(options)
+        path = given.weights if given.recipe is None else weights_of_recipe(given.recipe, rig.camera.width)
+        return cls(load(path, given.device), given.depth_range, given.frame, given.threads, rig.sequence)
+
+    @classmethod
+    def for_dataset(cls, dataset: Photographed, **options: Any) -> Method:
+        """`for_rig`. Raises `WeightsError` for a network that was trained at another image size."""
+        if recipe := options.pop("recipe", None):
+            options["weights"] = weights_of_recipe(recipe, dataset.size[1])
+        method = cls.for_rig(dataset.rig, **options)
+        if method.model.config.image_size != dataset.size:
+            trained_at, here = (f"{height}x{width}" for height, width in (method.model.config.image_size, dataset.size))
+            raise WeightsError(
+                f"{options['weights']}: was trained at {trained_at} px (H x W), {dataset.path} has images of {here} "
+                "px: the fringe period in px depends on the size, so a network works at one size only; use weights "
+                "trained at that size, or a dataset built at the weights' size"
+            )
+        return method
+
+    @classmethod
+    def short_name(cls, submission: "Submission") -> str | None:
+        settings = submission.settings
+        network = NETWORK_TITLES[str(settings["network"])]
+        if not submission.name.startswith(f"{network}, "):
+            return None
+        normalisation = {"individual": "", "raw": " raw", "global": " global"}[str(settings["normalisation"])]
+        trained_frames = str(settings["trained_frames"])
+        if trained_frames not in CONFIGS:
+            return None
+        frames = {"single_shot": "", "all": " all frames"}.get(trained_frames, f" {trained_frames}")
+        loss, _, weight = str(settings["loss"]).partition("_physics_")
+        physics = f" + physics {float(weight):g}" if weight else ""
+        parts = [f"{network}{normalisation} {_short_loss(loss)}{physics}{frames}"]
+        parts += [word for words, word in _SHORT_OPTIONS.items() if f", {words}" in submission.name]
+        parts.append("no background" if settings["background_removed"] else "")
+        parts.append(_SHORT_RANGES[settings.get("depth_range")])  # type: ignore[index]
+        return ", ".join(filter(None, parts))
+
     def __init__(
         self,
-        model: Model,
+        model: "Model",
         depth_range: DepthRange | None = None,
         frame: int | None = None,
         threads: int = 1,
@@ -97,13 +177,15 @@ class NetworkMethod(Method):
             raise PredictionError(
                 f"{self.name} needs frame {self.frame}, which was not captured; build with --frames all"
             )
+        from fpp_ml_bench.baselines.networks.base import torch_threads
+
         with torch_threads(self.threads):
             if self.depth_range == "oracle":
                 return self.model.predict_representation(fringes)
             return self.model.predict_batch(fringes, self.depth_range or "predicted")
 
 
-def _checked_range(model: Model, depth_range: str | None) -> Any:
+def _checked_range(model: "Model", depth_range: str | None) -> Any:
     """The depth range in force, one of `DEPTH_RANGES` or None."""
     name = model.config.name
     if model.config.normalisation != "individual":
@@ -128,3 +210,33 @@ def _checked_range(model: Model, depth_range: str | None) -> Any:
 def _loss(loss: Any) -> str | None:
     """The recipe's loss as in the names of runs: ``hybrid_l1_0.7``."""
     return Loss.model_validate(loss).label if isinstance(loss, dict) else loss
+
+
+def _short_loss(label: str) -> str:
+    """``hybrid_l1_0.7`` as ``hybrid L1 0.7``; the weight is checked to be a number."""
+    kind, _, rest = label.partition("_")
+    if kind == "gan" and rest:
+        return f"{_SHORT_LOSSES[kind]} {float(rest):g}"
+    if kind == "hybrid":
+        loss, _, weight = rest.partition("_")
+        return f"hybrid {_SHORT_LOSSES[loss]} {float(weight):g}"
+    return f"masked {_SHORT_LOSSES[rest]}" if kind == "masked" else _SHORT_LOSSES[label]
+
+
+def weights_of_recipe(recipe: str, size: int) -> Path:
+    """The weights that ``fpp-bench reproduce`` left of ``recipe`` below ``runs/``, by the preset of images ``size`` px
+    wide. Raises FppBenchError where there are none."""
+    from fpp_ml_bench.baselines.reproduce import RUNS, Folders, current_weights
+
+    resolved = [load_recipe(recipe, preset) for preset in PRESETS]
+    searched = []
+    for candidate in resolved:
+        below = RUNS / candidate.preset
+        weights = current_weights(candidate, Folders(candidate.preset, below, below / "rows"))
+        if weights is not None and candidate.size == size:
+            return weights
+        searched.append(f"{below / candidate.name} ({candidate.size} px)")
+    raise RecipeError(
+        f"{recipe}: no finished training of it for images of {size} px, looked for {' and '.join(searched)}; train it "
+        "with fpp-bench reproduce (or fpp-bench train, and give the .safetensors file that it names)"
+    )

@@ -1,94 +1,88 @@
 """The learned route as a method of ``fpp-bench predict``: one captured fringe, metric depth, no range given."""
 
-from collections.abc import Callable
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import nn
 
-from fpp_ml_bench.baselines.method import Answer, Frames, Method
-from fpp_ml_bench.baselines.networks import torch_threads
-from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.phase_network.odds import Odds
-from fpp_ml_bench.baselines.phase_network.route import Levers, NetworkRoute
+from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method, OwnViews
 from fpp_ml_bench.baselines.phase_route import Measurement, Periods, Settings
-from fpp_ml_bench.baselines.training import PHASE_NETWORKS, Family, NetConfig, read_file, weights_path, write_file
-from fpp_ml_bench.errors import DecodeError, NetworkError, PredictionError, WeightsError
+from fpp_ml_bench.baselines.phase_route.method import (
+    AMBIENT_GREY,
+    DIRECTION,
+    LIT_BACKGROUND,
+    MIN_CONFIDENCE,
+    ONE_ALBEDO,
+    WHITE_GREY,
+    direction_of,
+    fringe_options,
+)
+from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.optics import Direction, Rig
+from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig
+from fpp_ml_bench.options import option
 
-SHIPPED = Path(__file__).resolve().parent / "weights"  # folder of the weights that come with the package
-DEFAULT = "phase-net-one-albedo"
+if TYPE_CHECKING:
+    from fpp_ml_bench.baselines.phase_network.net_file import NetFile
+    from fpp_ml_bench.baselines.phase_network.route import Levers
+    from fpp_ml_bench.baselines.phase_network.training import Trained
+    from fpp_ml_bench.baselines.training import NetConfig
+    from fpp_ml_bench.evaluation.submission import Submission
+
 PERIOD_TOLERANCE = 1.4
 """Factor by which an image's fringe period in px may differ from that of the training images; beyond, the image is
 resampled to theirs."""
 
 
-@dataclass(frozen=True)
-class NetFile:
-    """A checked file and the network in it, ready to run."""
-
-    path: Path
-    config: NetConfig
-    network: PhaseNet
-    sha256: str
+WEIGHTS = "weights: a file, such as training writes (default: those that come with the package)"
+"""Help of an option that all learned methods have."""
+ALBEDOS = ("one", "any")
 
 
-def rendered_data(config: NetConfig) -> dict[str, Any]:
+def rendered_data(config: "NetConfig") -> dict[str, Any]:
     """`Method.learned_from` of weights whose training renders its own views."""
     recipe = config.recipe
     lights = f"training objects in the light paper and {recipe.get('lights')} drawn ones, seed {recipe.get('seed')}"
     return {"data": "generated", "versions": [lights]}
 
 
-def save_net(path: Path, network: nn.Module, config: NetConfig, family: Family = PHASE_NETWORKS) -> str:
-    """Write ``network`` to ``path`` in half precision, complete or not at all; the file's SHA-256. `WeightsError` for
-    tensors that are not finite in half precision, and for a path that can't be written."""
-    tensors = {}
-    for name, tensor in network.state_dict().items():
-        tensors[name] = tensor.detach().cpu().half() if tensor.is_floating_point() else tensor
-        if not bool(tensors[name].isfinite().all()):
-            raise WeightsError(f"{path}: {name} is not finite in half precision; the training diverged")
-    return write_file(path, family, config, tensors)
-
-
-Network = TypeVar("Network", bound=nn.Module)
-
-
-def read_net(
-    path: Path, build: Callable[..., Network], family: Family = PHASE_NETWORKS
-) -> tuple[NetConfig, Network, str]:
-    """Configuration, network, float32, and SHA-256 of a file of ``family`` whose options ``build`` takes.
-    `WeightsError` for a file that is absent, damaged, of another kind or version, or whose tensors do not fit its
-    configuration."""
-    shown = printable(str(path), 500)
-    config, tensors, digest = read_file(path, family)
-    try:
-        network = build(**config.options)
-        network.load_state_dict({name: t.float() if t.is_floating_point() else t for name, t in tensors.items()})
-    except (NetworkError, TypeError, ValueError, RuntimeError) as error:
-        raise WeightsError(f"{shown}: its tensors are not those of its network: {printable(str(error), 300)}") from None
-    if not all(bool(torch.isfinite(t).all()) for t in network.state_dict().values()):
-        raise WeightsError(f"{shown}: holds values that are not finite; copy or train it again")
-    return config, network, digest
-
-
-def load_net(name_or_path: str | Path = DEFAULT, folded: bool = True, shipped: Path = SHIPPED) -> NetFile:
-    """Weights in the folder ``shipped`` or of a file, float32; ``folded``: for inference alone (`PhaseNet.folded`),
-    False to train on. Raises what `read_net` raises."""
-    path = weights_path(name_or_path, shipped)
-    config, network, digest = read_net(path, PhaseNet)
-    return NetFile(path, config, network.folded() if folded else network, digest)
-
-
 def _shipped(albedo: str) -> str:
-    if albedo not in ("one", "any"):
+    if albedo not in ALBEDOS:
         raise PredictionError(f"albedo {albedo!r}: expected one or any")
     return f"phase-net-{albedo}-albedo"
+
+
+@dataclass(frozen=True)
+class PhaseNetOptions:
+    """Options of `PhaseNetMethod`; ``weights``: also a file that was read, ``levers``: of `NetworkRoute`."""
+
+    direction: Direction = option("horizontal", DIRECTION, choices=DIRECTIONS)
+    weights: "str | Path | NetFile | None" = option(None, WEIGHTS, "FILE")
+    min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
+    albedo: str | None = option(
+        None,
+        "one, where all surfaces have the background's albedo, so that brightness tells the order, or any, where the "
+        "order is ambiguous unless range and shape tell it (default: one)",
+        choices=ALBEDOS,
+    )
+    levers: "Levers | None" = None
+    threads: int = 1
+    white_grey: float | None = option(None, WHITE_GREY, "GREY")
+    ambient_grey: float | None = option(None, AMBIENT_GREY, "GREY")
+
+
+@dataclass(frozen=True)
+class PhaseNetTraining(OwnViews):
+    """Training of phase-net; ``start``: weights to start from."""
+
+    albedo: str | None = option(
+        None, "one, with brightness as a cue for the order, or any, without (default: one)", choices=ALBEDOS
+    )
+    start: Path | None = option(None, "weights to start from (default: none)", "FILE")
 
 
 class PhaseNetMethod(Method):
@@ -99,20 +93,53 @@ class PhaseNetMethod(Method):
     for weights that can't be used, and `PredictionError` for an invalid option."""
 
     name = "phase-net"
+    purpose = "one fringe; order, mask and correction learned"
+    Options = PhaseNetOptions
+    Training = PhaseNetTraining
     packages = ("numpy", "numba", "torch")
 
-    def __init__(
-        self,
-        rig: Rig,
-        direction: Direction = "horizontal",
-        weights: str | Path | NetFile | None = None,
-        min_confidence: float = 0.0,
-        albedo: str | None = None,
-        levers: Levers | None = None,
-        threads: int = 1,
-        white_grey: float | None = None,
-        ambient_grey: float | None = None,
-    ) -> None:
+    @classmethod
+    def for_rig(cls, rig: Rig, **options: Any) -> Method:
+        return cls(rig, **fringe_options(cls.name, rig, options))
+
+    @classmethod
+    def train(cls, training: PhaseNetTraining, out: Path, minutes: float | None = None) -> bool:
+        from fpp_ml_bench.baselines.phase_network.training import Recipe, train_phase_net
+
+        given = recipe_values(training)
+        start = given.pop("start", None)
+        recipe = Recipe(**given)
+        trained = train_phase_net(
+            recipe, out, start=start, minutes=minutes, workers=usable_cores(), show=True, print_line=print
+        )
+        return say_trained(cls.name, out, recipe.steps, trained)
+
+    @classmethod
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+        return [{"albedo": albedo} for albedo in ALBEDOS] if rig.fringe_directions else []
+
+    @classmethod
+    def short_name(cls, submission: "Submission") -> str | None:
+        if not submission.name.startswith("Phase route, "):
+            return None
+        settings = submission.settings
+        weights, albedo = str(settings["weights"]), settings.get("albedo", "one")
+        name = printable(weights.removesuffix(f"-{albedo}-albedo"))
+        return f"{name}, 1 {direction_of(submission)}" + ("" if settings["shading"] else f", {albedo} albedo")
+
+    @classmethod
+    def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
+        shading = settings.get("shading")
+        return ONE_ALBEDO if shading is True else LIT_BACKGROUND if shading is False else None
+
+    def __init__(self, rig: Rig, **options: Any) -> None:
+        from fpp_ml_bench.baselines.phase_network.net_file import NetFile, load_net
+        from fpp_ml_bench.baselines.phase_network.odds import Odds
+        from fpp_ml_bench.baselines.phase_network.route import Levers, NetworkRoute
+
+        given = self.checked_options(options)
+        direction, weights, albedo, threads = given.direction, given.weights, given.albedo, given.threads
+        min_confidence, white_grey, ambient_grey = given.min_confidence, given.white_grey, given.ambient_grey
         self.file = weights if isinstance(weights, NetFile) else load_net(weights or _shipped(albedo or "one"))
         learned = self.file.config.recipe.get("albedo")
         if learned not in ("one", "any") or not self.file.network.uncertain:
@@ -145,7 +172,7 @@ class PhaseNetMethod(Method):
             self.options,
             self.file.network,
             config.threshold,
-            replace(levers or Levers(), shading=shading),
+            replace(given.levers or Levers(), shading=shading),
             config.lead,
             odds,
             periods,
@@ -183,6 +210,8 @@ class PhaseNetMethod(Method):
 
     def measure(self, frames: Frames) -> Measurement:
         """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
+        from fpp_ml_bench.baselines.networks import torch_threads
+
         with torch_threads(self.threads):
             return self.route.measure(self._image(frames))
 
@@ -204,3 +233,19 @@ class PhaseNetMethod(Method):
     def answer(self, frames: Frames) -> Answer:
         measurement = self.measure(frames)
         return Answer(measurement.depth_mm, measurement.sigma_mm)
+
+
+def recipe_values(training: OwnViews) -> dict[str, Any]:
+    """The values that were given; what is None is as the recipe has it."""
+    return {key: value for key, value in vars(training).items() if value is not None}
+
+
+def say_trained(name: str, out: Path, steps: int, trained: "Trained") -> bool:
+    """Print how a training of a method called ``name``, of ``steps``, ended; whether it has finished."""
+    if trained.weights is None:
+        print(f"{out}: stopped after {trained.steps} of {steps} steps, all saved; run the same command to resume")
+        return False
+    scores = ", ".join(f"{key} {value:.3g}" for key, value in trained.validation.items())
+    print(f"{trained.weights}: {trained.steps} steps, mask threshold {trained.threshold:g}; validation: {scores}")
+    print(f"next: fpp-bench predict {name} DATASET --weights {trained.weights} --out predictions")
+    return True

@@ -16,7 +16,7 @@ import numpy as np
 from fpp_ml_bench.baselines import training
 from fpp_ml_bench.baselines.phase_network.answers import Answers
 from fpp_ml_bench.baselines.phase_network.inputs import STEPS, Geometry
-from fpp_ml_bench.baselines.phase_network.method import load_net, save_net
+from fpp_ml_bench.baselines.phase_network.net_file import load_net, save_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.odds import Judged, chosen_odds, confident_shares, draw_reliability
 from fpp_ml_bench.baselines.phase_network.route import decided_mask, decided_order, network_answers

@@ -5,27 +5,79 @@ expected error, from its phase and from its order. While that error is too large
 (more fringes for the phase, the Gray code for the order) and measure again. No captured frame is wasted.
 """
 
+import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.method import Answer, Frames, Method
-from fpp_ml_bench.baselines.phase_route.observation import PIXELWISE, Measurement, Reason, Settings
+from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method
+from fpp_ml_bench.baselines.phase_route.observation import PIXELWISE, Measurement, Prior, Reason, Settings
 from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
 from fpp_ml_bench.baselines.phase_route.several_frames import steps_of
+from fpp_ml_bench.coding import PhaseShift
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.loaders.captures import read_mask
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics import DIRECTIONS, PAPER_SEQUENCE, Direction, Rig
+from fpp_ml_bench.options import option
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.evaluation.submission import Submission
 
 ORDER_SHARE = (0.16, 0.10, 0.05)
 """Actual error from wrong orders as a share of the expected one, with 1, 2, and 3 or more frames, over training views
 (``benchmarks/frames_choice.py --calibrate`` measures it again). The margin of an order overestimates the probability
 that it is wrong; these factors correct that."""
+
+
+MIN_CONFIDENCE = "mask pixels of less confidence, 0 to 1 (default: 0, dense)"
+DIRECTION = "direction of the fringes (default: horizontal)"
+WHITE_GREY = (
+    "for images without a lit background: grey level of a white pattern on a surface that faces the projector at the "
+    "near end of the working range"
+)
+AMBIENT_GREY = (
+    "for images without a lit background: grey level of a surface in ambient light alone (default: the image's darkest)"
+)
+MASK = "object mask: an image of the frames' size, above 0 on the object in every sample (default: found in each image)"
+"""Help of options that several routes have."""
+LIT_BACKGROUND = Assumption(
+    "a lit background", "Assumes a lit background; not one albedo, so that little tells the fringe order."
+)
+ONE_ALBEDO = Assumption(
+    "one albedo, a lit background",
+    "Assumes one albedo for all surfaces and a lit background, which shows how strong the lamp is: the brightness of "
+    "the fringe image decides the fringe order.",
+)
+
+
+@dataclass(frozen=True)
+class PhaseOptions(Settings):
+    """Options of `PhaseMethod`: those of `Settings`, an object ``mask`` (a file of `captures.read_mask`), and
+    ``error_mm``, which makes it `FewestFrames`."""
+
+    direction: Direction = option("horizontal", DIRECTION, choices=DIRECTIONS)
+    frames: int = option(1, "fringes of that direction, 1 to 18; no Gray code (default: 1)", "N")
+    error_mm: float | None = option(
+        None,
+        "instead of --frames: for each scene the fewest frames whose expected error is at most this, starting with a "
+        "single fringe; may need the Gray code",
+        "MM",
+    )
+    prior: Prior = option(
+        "none",
+        "standoff: assume that objects are near the rig's standoff, true of fixed placement (default: none)",
+        choices=get_args(Prior),
+    )
+    shading: bool = option(True, "choose the fringe order without brightness", flag="--no-shading")
+    min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
+    white_grey: float | None = option(None, WHITE_GREY, "GREY")
+    ambient_grey: float | None = option(None, AMBIENT_GREY, "GREY")
+    mask: str | Path | None = option(None, MASK, "FILE")
 
 
 class PhaseMethod(Method):
@@ -34,12 +86,19 @@ class PhaseMethod(Method):
     `PredictionError` for an unknown option or an invalid value, `CaptureError` for a mask that can't be used."""
 
     name = "phase"
+    purpose = "one fringe or a few, nothing learned"
+    Options = PhaseOptions
 
-    def __init__(self, rig: Rig, mask: str | Path | None = None, **options: Any) -> None:
-        try:
-            settings = Settings(**options)
-        except TypeError as error:
-            raise PredictionError(f"phase: {error}; there are {', '.join(Settings.__dataclass_fields__)}") from None
+    @classmethod
+    def for_rig(cls, rig: Rig, **options: Any) -> Method:
+        """`FewestFrames` where ``error_mm`` is given."""
+        options = fringe_options(cls.name, rig, options)
+        return cls(rig, **options) if options.get("error_mm") is None else FewestFrames(rig, **options)
+
+    def __init__(self, rig: Rig, **options: Any) -> None:
+        given = self.checked_options(options)
+        settings = Settings(**{entry.name: getattr(given, entry.name) for entry in fields(Settings)})
+        mask = given.mask
         self.rig, self.options, self.route = rig, settings, PhaseRoute(rig, settings)
         sinusoids = rig.sequence.sinusoids(settings.direction)
         self.frames_used = tuple(sinusoids[step] for step in self.route.steps)
@@ -50,6 +109,32 @@ class PhaseMethod(Method):
         shape = rig.camera.height, rig.camera.width
         self.mask = None if mask is None else read_mask(Path(mask), shape)
         self.settings = asdict(settings) | ({} if mask is None else {"mask": Path(mask).name})
+
+    @classmethod
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+        if not rig.fringe_directions:
+            return []
+        few = [{"frames": 1}, {"frames": 3}] if rig.sequence.steps >= PIXELWISE else [{"frames": 1}]
+        return [*few, {"error_mm": 3.0}] if rig.sequence == PAPER_SEQUENCE else few
+
+    @classmethod
+    def short_name(cls, submission: "Submission") -> str | None:
+        if not submission.name.startswith("Phase route, "):
+            return None
+        settings = submission.settings
+        direction = direction_of(submission)
+        if "error_mm" in settings:
+            name = f"Phase, fewest {direction}, {float(settings['error_mm'] or 0):g} mm"
+        else:
+            name = f"Phase, {operator.index(settings['frames'])} {direction}"  # type: ignore[arg-type]
+        standoff = settings.get("prior") == "standoff"
+        if not settings["shading"]:
+            return f"{name}, standoff alone" if standoff else f"{name}, no shading"
+        return f"{name}, standoff" if standoff else name
+
+    @classmethod
+    def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
+        return ONE_ALBEDO if settings.get("shading") is True else None
 
     def measure(self, frames: Frames) -> Measurement:
         """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
@@ -126,6 +211,34 @@ class FrameChoice:
         return last | {"frames_used": list(self.frames_used), "looks": looks}
 
 
+def fringe_options(name: str, rig: Rig, options: dict[str, Any]) -> dict[str, Any]:
+    """``options`` of a method called ``name`` that computes with the fringes of one direction, by default the rig's
+    only one. Raises `PredictionError` for fringes that it would take for others."""
+    ways = rig.fringe_directions
+    if len(ways) == 1:
+        options = {"direction": ways[0], **options}
+    direction = options.get("direction", "horizontal")
+    if direction not in ways or not isinstance(code := rig.code(direction), PhaseShift):
+        return options  # refused by the method
+    shifts = code.fringes[code.finest].shifts_deg
+    if code.origin_px != 0 or shifts[0] != 0:
+        raise PredictionError(
+            f"{name}: needs fringes with a crest on pixel 0 of the projector, and in this rig the first {direction} "
+            f"frame is shifted (origin_px {code.origin_px:g}, {shifts[0]:g} degrees); decode all frames instead"
+        )
+    if options.get("error_mm") is not None and not code.is_plain:
+        raise PredictionError(
+            f"{name}: error_mm needs fringes of one period with Gray code in half periods, and this rig has "
+            f"{code.title}; say how many frames instead"
+        )
+    return options
+
+
+def direction_of(submission: "Submission") -> str:
+    """The setting ``direction`` of a submission. Raises ValueError or KeyError for settings of no fringe route."""
+    return DIRECTIONS[DIRECTIONS.index(submission.settings["direction"])]  # type: ignore[arg-type]
+
+
 def levels_of(steps: int) -> tuple[int, ...]:
     """Numbers of fringes to capture in turn, each containing the fringes before: 1, 2, 3 and more where ``steps`` is a
     multiple of three, else 1 and then all."""
@@ -141,13 +254,13 @@ def levels_of(steps: int) -> tuple[int, ...]:
 class FewestFrames(Method):
     """The phase route with as many frames of one direction as ``error_mm`` takes, scene by scene: 1, 2 and 3 fringes a
     third of a period apart, then 6, then 18; the Gray code may be added from 3 on. Frames that were not captured are
-    never read. Further options are those of `Settings`, ``frames`` aside. Raises `PredictionError` for an error that is
-    no positive number of mm, and as `PhaseMethod`."""
+    never read. Further options are those of `PhaseMethod`, ``frames`` aside. Raises `PredictionError` for an error that
+    is no positive number of mm, and as `PhaseMethod`."""
 
-    name = "phase"
     reports = True
 
     def __init__(self, rig: Rig, error_mm: float, **options: Any) -> None:
+        self.name = PhaseMethod.name
         if isinstance(error_mm, bool) or not isinstance(error_mm, int | float) or not 0 < error_mm < np.inf:
             raise PredictionError(f"error_mm {error_mm!r}: expected the largest error to accept, in mm, above 0")
         if "frames" in options:

@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.baselines.networks import NETWORKS as NAMES
 from fpp_ml_bench.baselines.networks import RECENTRED_FROM, InstanceNorm, build, in_full_precision, torch_threads
 from fpp_ml_bench.baselines.phase_route import CalibrationLayer, Reason
+from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.stability.cases import U32, U64, UB16, Group, Outcome, gamma, worst, wrong
 from fpp_ml_bench.baselines.training import EPSILON, LOSSES, loss_function, sample_losses
 from fpp_ml_bench.errors import FppBenchError, PredictionError

@@ -24,8 +24,9 @@ import torch
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines import networks
-from fpp_ml_bench.baselines.method import Frames, Method, load_method
+from fpp_ml_bench.baselines.method import Frames, Method
 from fpp_ml_bench.baselines.networks import DepthRange, FringeNetwork, NetworkMethod, fringe_batch
+from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.tradeoff.settings import Setting, StoredViews, TradeoffSettings
 from fpp_ml_bench.baselines.training import SHIPPED, SUFFIX, WeightsFile, open_weights
 from fpp_ml_bench.errors import FppBenchError, NetworkError, PredictionError, WeightsError

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.method import Frames, Method, load_method
+from fpp_ml_bench.baselines.method import Frames, Method
+from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.baselines.tradeoff.ladders import Ladder, package_ladders
 from fpp_ml_bench.baselines.tradeoff.points import COSTS, GROUPS, Group
@@ -151,7 +152,7 @@ def _classical(views: StoredViews, run: TradeoffSettings) -> Iterator[Setting]:
     most = views.rig.sequence.steps
     for direction in CLASSICAL_DIRECTIONS:
         for steps in sorted({3, min(6, most), most}) if run.quick else range(3, most + 1):
-            make = partial(ClassicalMethod, views.rig, direction, steps, run.threads)
+            make = partial(ClassicalMethod, views.rig, direction=direction, steps=steps, threads=run.threads)
             title = f"classical N={steps}, {direction}"
             yield Setting(f"classical-{direction}-{steps:02d}", "classical", title, make, views)
 
@@ -205,7 +206,7 @@ def _sizes(views: StoredViews, run: TradeoffSettings) -> Iterator[Setting]:
             continue  # coarser than the fringes allow: no dataset of this rig has such a size
         photographed = PhotographedViews(scaled)
         for direction, steps in choices:
-            make = partial(ClassicalMethod, scaled, direction, steps, run.threads)
+            make = partial(ClassicalMethod, scaled, direction=direction, steps=steps, threads=run.threads)
             title = f"classical N={steps}, {direction}"
             yield Setting(f"size-{size:04d}-{direction}-{steps}", "sizes", title, make, photographed)
         phase = partial(load_method, "phase", scaled, direction="horizontal")

@@ -3,12 +3,14 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
-from fpp_ml_bench import baselines, decoding, optics
-from fpp_ml_bench.baselines import networks, training
-from fpp_ml_bench.errors import PredictionError, RecipeError, WeightsError
-from fpp_ml_bench.loaders import render, storage
+from fpp_ml_bench import baselines
+from fpp_ml_bench.baselines import training
+from fpp_ml_bench.errors import PredictionError
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.baselines.method import Photographed
 
 METHOD_HELP = (
     "classical (N-step phase, Gray-code order, triangulation), classical-net (the same; noise and missed pixels "
@@ -40,8 +42,6 @@ _OPTIONS: dict[str, tuple[str, ...]] = {
     "trained networks": ("depth_range", "frame", "device"),
 }
 """Options that belong to one kind of method only, by their name in the parsed arguments."""
-_SHARED = "min_confidence", "white_grey", "ambient_grey"
-"""Options that phase and phase-net have as they are."""
 
 
 def add_method_options(parser: argparse.ArgumentParser) -> None:
@@ -146,157 +146,37 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     add("--device", metavar="NAME", help="cpu, cuda, cuda:1 (default: cuda where there is one)")
 
 
-class Photographed(Protocol):
-    """What a method is chosen for: a dataset, or images of a rig that are not stored."""
-
-    @property
-    def path(self) -> Path: ...
-    @property
-    def rig(self) -> "optics.Rig": ...
-    @property
-    def size(self) -> tuple[int, int]: ...
-    @property
-    def sequence(self) -> "optics.AnySequence": ...
-    @property
-    def manifest(self) -> "storage.Manifest": ...
-
-
-def chosen_method(args: argparse.Namespace, opened: Photographed, warn: bool = True) -> "baselines.Method":
+def chosen_method(args: argparse.Namespace, opened: "Photographed", warn: bool = True) -> "baselines.Method":
     """The method that ``args`` name, for the rig of ``opened``. Unless told not to, warns on standard error about
     weights that were trained on another version of the dataset's benchmark. Raises FppBenchError for an unknown method,
     and for an option that belongs to another one."""
     if args.threads < 1:
         raise PredictionError(f"--threads {args.threads}: expected 1 or more")
-    maker = _MAKERS.get(args.method)
-    weights = None if maker else _weights(args.method, opened.size[1])
-    own = _OPTIONS[args.method if maker else "trained networks"]
-    for owner, options in _OPTIONS.items():
-        foreign = [option for option in options if getattr(args, option) is not None and option not in own]
-        if foreign:
-            flag = "range" if foreign[0] == "depth_range" else foreign[0].replace("_", "-")
-            raise PredictionError(f"--{flag} is an option of {owner}, not of {args.method}; leave it out")
-    if weights is not None:
-        method = _network(weights, args, opened)
-    else:
-        method = baselines.load_method(args.method, opened.rig, **_MAKERS[args.method](args, opened))
+    from dataclasses import fields
+
+    from fpp_ml_bench.baselines import registry
+    from fpp_ml_bench.options import described
+
+    found = registry.find(args.method)
+    own = described(found.method.Options)
+    given: dict[str, Any] = {}
+    for owner, names in _OPTIONS.items():
+        for option in names:
+            value = getattr(args, option)
+            name = {"fringe": "direction", "no_shading": "shading"}.get(option, option)
+            if value is None:
+                continue
+            if name not in own:
+                flag = "range" if option == "depth_range" else option.replace("_", "-")
+                raise PredictionError(f"--{flag} is an option of {owner}, not of {args.method}; leave it out")
+            given[name] = False if option == "no_shading" else value
+    if "frames" in given and "error_mm" in given:
+        raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
+    if "threads" in {entry.name for entry in fields(found.method.Options)}:
+        given["threads"] = args.threads
+    method = baselines.load_method(args.method, opened, **given)
     config = method.weights_config
     warning = None if config is None else training.training_data_warning(config, opened.manifest)
     if warn and config is not None and warning is not None:
         print(f"warning: {config.name} was {warning}", file=sys.stderr)
     return method
-
-
-def weights_of_recipe(recipe: str, size: int) -> Path:
-    """The weights that ``fpp-bench reproduce`` left of ``recipe`` below ``runs/``, by the preset of images ``size`` px
-    wide. Raises FppBenchError where there are none."""
-    from fpp_ml_bench.baselines.reproduce import RUNS, Folders, current_weights
-
-    resolved = [training.load_recipe(recipe, preset) for preset in training.PRESETS]
-    searched = []
-    for candidate in resolved:
-        below = RUNS / candidate.preset
-        weights = current_weights(candidate, Folders(candidate.preset, below, below / "rows"))
-        if weights is not None and candidate.size == size:
-            return weights
-        searched.append(f"{below / candidate.name} ({candidate.size} px)")
-    raise RecipeError(
-        f"{recipe}: no finished training of it for images of {size} px, looked for {' and '.join(searched)}; train it "
-        "with fpp-bench reproduce (or fpp-bench train, and give the .safetensors file that it names)"
-    )
-
-
-def _weights(name: str, size: int) -> Path:
-    """The weights file that METHOD means, where it is no method of its own."""
-    row_of_a_table = name.split("/")[0] in training.TABLES and not name.endswith(training.SUFFIX)
-    if name.endswith((".yaml", ".yml")) or row_of_a_table:
-        return weights_of_recipe(name, size)
-    return baselines.known_weights(name)
-
-
-def _network(path: Path, args: argparse.Namespace, opened: Photographed) -> "baselines.Method":
-    model = networks.load(path, args.device)
-    if model.config.image_size != opened.size:
-        trained_at, here = (f"{height}x{width}" for height, width in (model.config.image_size, opened.size))
-        raise WeightsError(
-            f"{path}: was trained at {trained_at} px (H x W), {opened.path} has images of {here} px: "
-            "the fringe period in px depends on the size, so a network works at one size only; use weights trained "
-            "at that size, or a dataset built at the weights' size"
-        )
-    return networks.NetworkMethod(model, args.depth_range, args.frame, args.threads, opened.sequence)
-
-
-def _classical(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
-    steps = args.steps if args.depth_noise is None else _steps_for(args, opened)
-    return _given(direction=args.direction or "both", steps=steps, threads=args.threads, fewest=args.fewest)
-
-
-def _steps_for(args: argparse.Namespace, opened: Photographed) -> int:
-    """Steps for ``--depth-noise``, by the light and the camera that the dataset was built with."""
-    from fpp_ml_bench.schema import validate
-
-    depth_noise_mm = args.depth_noise
-    described = opened.manifest.settings.get("light")
-    if args.steps is not None or not (depth_noise_mm > 0 and depth_noise_mm < float("inf")):
-        raise PredictionError(f"--depth-noise {depth_noise_mm:g}: expected mm above 0, and not together with --steps")
-    if not isinstance(described, dict):
-        raise PredictionError("--depth-noise: this dataset does not say how noisy its frames are; give --steps")
-    light = validate(render.Light, described, opened.path / "manifest.json", "light", PredictionError)
-    far_mm = opened.rig.working_range_mm[1]
-    modulation = render.modulation_at(opened.rig, far_mm, light)
-    noise_grey = render.fringe_noise_at(opened.rig, far_mm, light)
-    steps = decoding.fewest_steps(opened.rig, args.direction or "both", depth_noise_mm, modulation, noise_grey)
-    if steps is None:
-        raise PredictionError(
-            f"--depth-noise {depth_noise_mm:g}: more noise remains even with all {opened.sequence.steps} steps that "
-            "were captured; allow more noise, or use both directions"
-        )
-    return steps
-
-
-def _classical_net(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
-    return _given(direction=args.direction, steps=args.steps, weights=args.weights, threads=args.threads)
-
-
-def _phase(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
-    if args.frames is not None and args.error_mm is not None:
-        raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
-    options = {name: getattr(args, name) for name in ("prior", "frames", "error_mm", "mask", *_SHARED)}
-    return _given(direction=args.fringe, shading=None if args.no_shading is None else False, **options)
-
-
-def _phase_net(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
-    options = {name: getattr(args, name) for name in ("threads", "weights", "albedo", *_SHARED)}
-    return _given(direction=args.fringe, **options)
-
-
-def _crossed(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
-    return _given(frames=args.frames, min_confidence=args.min_confidence, mask=args.mask)
-
-
-def _crossed_net(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
-    return _given(min_confidence=args.min_confidence, weights=args.weights, threads=args.threads)
-
-
-def _given(**options: Any) -> dict[str, Any]:
-    return {name: value for name, value in options.items() if value is not None}
-
-
-def _constant(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
-    return _given(at=args.at)
-
-
-def _nearest(args: argparse.Namespace, opened: Photographed) -> dict[str, Any]:
-    own = opened if isinstance(opened, storage.DatasetFolder) else None
-    return {"training": args.training or own}
-
-
-_MAKERS = {
-    "classical": _classical,
-    "classical-net": _classical_net,
-    "phase": _phase,
-    "phase-net": _phase_net,
-    "crossed": _crossed,
-    "crossed-net": _crossed_net,
-    "constant": _constant,
-    "nearest": _nearest,
-}

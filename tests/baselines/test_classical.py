@@ -9,7 +9,8 @@ from conftest import TINY_SIZE
 from flat_planes import DIRECT, RIG, plane_depth_m, plane_fringe
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.method import METHODS, Method, load_method
+from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.registry import load_method, methods
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.decoding import noise_by_light
@@ -35,7 +36,7 @@ def noisy(tmp_path_factory):
 
 def interior_rmse_mm(opened, direction, steps):
     """RMSE against exact depth over all object pixels 3 px or more from an edge that are decoded."""
-    classical = ClassicalMethod(opened.rig, direction, steps)
+    classical = ClassicalMethod(opened.rig, direction=direction, steps=steps)
     squares, count = 0.0, 0
     for sample in opened.samples("all"):
         exact = opened.depth_mm(sample, "depth_exact")
@@ -69,7 +70,7 @@ def test_both_directions_are_better_than_either(noisy):
 @pytest.mark.parametrize(("direction", "steps"), [("both", 18), ("vertical", 6), ("horizontal", 4)])
 def test_the_stated_uncertainty_covers_what_it_says(noisy, direction, steps):
     """Where noise is all there is; of grazing pixels of almost no modulation only the luckier ones are decoded."""
-    classical = ClassicalMethod(noisy.rig, direction, steps)
+    classical = ClassicalMethod(noisy.rig, direction=direction, steps=steps)
     deviations = []
     for sample in noisy.samples("all"):
         exact = noisy.depth_mm(sample, "depth_exact")
@@ -138,7 +139,7 @@ def test_accuracy_in_the_papers_light(opened):
 @pytest.mark.parametrize("direction", ["vertical", "horizontal", "both"])
 @pytest.mark.parametrize("steps", [3, 4, 7, 18])
 def test_only_the_frames_it_names_are_used(opened, direction, steps):
-    classical = ClassicalMethod(opened.rig, direction, steps)
+    classical = ClassicalMethod(opened.rig, direction=direction, steps=steps)
     used = classical.frames_used
     assert list(used) == sorted(set(used))
     directions = 2 if direction == "both" else 1
@@ -265,7 +266,7 @@ def test_the_phase_route_takes_the_only_direction_that_a_rig_has():
 
 
 def test_methods_by_name(opened):
-    assert tuple(METHODS) == (
+    assert tuple(methods()) == (
         "classical",
         "classical-net",
         "phase",
@@ -290,7 +291,7 @@ def test_methods_by_name(opened):
 
 def test_prediction_folder(opened, tmp_path):
     out, samples_done = tmp_path / "out", []
-    classical = ClassicalMethod(opened.rig, "vertical", 4)
+    classical = ClassicalMethod(opened.rig, direction="vertical", steps=4)
     run = predict_split(opened, classical, "validation", out, samples_done.append)
     assert run.samples == 6 and run.seconds_per_sample > 0 and samples_done == [1] * 6
     assert sorted(p.name for p in out.iterdir()) == sorted(
@@ -318,7 +319,7 @@ def test_predictions_at_a_url(tiny, tmp_path, capsys):
 
 def test_method_sees_copies_and_no_other_frame(opened, tmp_path):
     class Spy(Method):
-        name, title, frames_used, settings = "spy", "Spy", (0, 20), {}
+        name, title, frames_used = "spy", "Spy", (0, 20)
 
         def predict(self, frames):
             assert [i for i, f in enumerate(frames) if f is not None] == [0, 20] and len(frames) == 52
@@ -326,7 +327,7 @@ def test_method_sees_copies_and_no_other_frame(opened, tmp_path):
             return np.ones(opened.size, np.float32)
 
     before = opened.frame("mug_A0", 0).copy()
-    predict_split(opened, Spy(), "validation", tmp_path / "out")
+    predict_split(opened, Spy(opened.rig), "validation", tmp_path / "out")
     np.testing.assert_array_equal(opened.frame("mug_A0", 0), before)
 
 
@@ -341,18 +342,18 @@ def test_method_sees_copies_and_no_other_frame(opened, tmp_path):
 )
 def test_faulty_methods_are_caught(opened, tmp_path, depth, says):
     class Faulty(Method):
-        name, title, frames_used, settings = "x", "X", (0,), {}
+        name, title, frames_used = "x", "X", (0,)
 
         def predict(self, frames):
             return depth
 
     with pytest.raises(PredictionError, match=says):
-        predict_split(opened, Faulty(), "validation", tmp_path / "out")
+        predict_split(opened, Faulty(opened.rig), "validation", tmp_path / "out")
     assert not list((tmp_path / "out").glob("*"))
 
 
 def test_foreign_folders_are_not_taken_over(opened, tmp_path):
-    classical = ClassicalMethod(opened.rig, "vertical", 3)
+    classical = ClassicalMethod(opened.rig, direction="vertical", steps=3)
     out = tmp_path / "out"
     predict_split(opened, classical, "validation", out)
     with pytest.raises(PredictionError, match=r"already holds submission.yaml"):
@@ -374,5 +375,5 @@ def test_dataset_without_the_frames(tmp_path):
     build(tmp_path / "set", settings, workers=1)
     opened = DatasetFolder(tmp_path / "set")
     with pytest.raises(DatasetError, match=r"frame 43 is not stored.*--frames all"):
-        predict_split(opened, ClassicalMethod(opened.rig, "vertical"), "train", tmp_path / "out")
+        predict_split(opened, ClassicalMethod(opened.rig, direction="vertical"), "train", tmp_path / "out")
     shutil.rmtree(tmp_path / "out")

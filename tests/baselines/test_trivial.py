@@ -7,7 +7,7 @@ import pytest
 from scored_dataset import disk_depth, make_dataset
 
 from fpp_ml_bench.baselines import ConstantMethod, NearestMethod, predict_split
-from fpp_ml_bench.baselines.method import load_method
+from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.score import evaluate
@@ -34,7 +34,7 @@ def stack(frame):
 
 
 def test_the_nearest_of_the_training_images_by_another_computation(dataset):
-    method = NearestMethod(paper_rig(96), dataset)
+    method = NearestMethod(paper_rig(96), training=dataset)
     training = {sample: dataset.frame(sample, 0).astype(float) for sample in dataset.samples("train")}
     chosen = set()
     for sample in dataset.samples("test"):
@@ -48,7 +48,7 @@ def test_the_nearest_of_the_training_images_by_another_computation(dataset):
 
 
 def test_blocks_are_means_over_their_pixels(dataset):
-    method = NearestMethod(paper_rig(96), dataset)
+    method = NearestMethod(paper_rig(96), training=dataset)
     method.block_px = 7  # 96 = 13 * 7 + 5
     frame = dataset.frame(dataset.samples("test")[0], 0)
     sums = method._block_sums(frame)
@@ -59,7 +59,9 @@ def test_it_runs_over_a_split_and_says_what_it_used(dataset, tmp_path):
     assert main(["predict", "nearest", str(dataset.path), "--out", str(tmp_path / "p")]) == 0
     text = (tmp_path / "p" / "submission.yaml").read_text()
     assert "method: nearest" in text and f"training_fingerprint: {dataset.fingerprint}" in text
-    assert predict_split(dataset, NearestMethod(dataset.rig, dataset.path), "test", tmp_path / "q").samples == 8
+    assert (
+        predict_split(dataset, NearestMethod(dataset.rig, training=dataset.path), "test", tmp_path / "q").samples == 8
+    )
 
 
 def test_what_can_not_be_searched_is_refused(dataset, tmp_path, capsys):
@@ -70,20 +72,20 @@ def test_what_can_not_be_searched_is_refused(dataset, tmp_path, capsys):
     assert main(["predict", "classical", str(dataset.path), "--training", "x", "--out", str(tmp_path / "p")]) == 2
     assert "--training is an option of nearest" in capsys.readouterr().err
     with pytest.raises(PredictionError, match="nearest needs frame 0"):
-        NearestMethod(paper_rig(96), dataset).predict([None])
+        NearestMethod(paper_rig(96), training=dataset).predict([None])
 
 
 @pytest.mark.parametrize(
     ("at", "depth_mm"), [("standoff", 1800.0), ("middle", 1800.0), ("training-mean", 1743.75), (5.0, 5.0)]
 )
 def test_a_constant_is_one_depth(at, depth_mm):
-    depth = ConstantMethod(paper_rig(16), at).predict([])
+    depth = ConstantMethod(paper_rig(16), at=at).predict([])
     assert depth.shape == (16, 16) and depth.dtype == np.float32 and np.unique(depth).tolist() == [depth_mm]
 
 
 @pytest.mark.parametrize(("at", "share"), [("range-middle", 0.5), ("range-training", 0.287)])
 def test_a_constant_that_is_told_the_range_is_a_share_of_it(at, share, dataset, tmp_path):
-    method = ConstantMethod(dataset.rig, at)
+    method = ConstantMethod(dataset.rig, at=at)
     assert np.unique(method.predict([])).tolist() == [np.float32(share)] and method.units == "normalised"
     assert method.learned_from["data"] == ("none" if at == "range-middle" else "train-split")
     predict_split(dataset, method, "test", tmp_path / "p")

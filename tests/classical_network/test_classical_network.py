@@ -38,7 +38,7 @@ Views = list[training.View]
 
 @cache
 def method() -> ClassicalMethod:
-    return ClassicalMethod(paper_rig(SIZE), "vertical", 3)
+    return ClassicalMethod(paper_rig(SIZE), direction="vertical", steps=3)
 
 
 @pytest.fixture(scope="module")

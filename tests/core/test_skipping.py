@@ -234,7 +234,7 @@ def test_memory_of_a_split_that_is_gone_through_does_not_grow_with_its_samples(t
 
 def test_frames_that_a_method_does_not_use_are_not_read(tiny):
     opened = DatasetFolder(tiny)
-    method = ClassicalMethod(opened.rig, "vertical", 3)
+    method = ClassicalMethod(opened.rig, direction="vertical", steps=3)
     sample = opened.samples("test")[0]
     frames = captured_frames(opened, method, sample)
     assert [i for i, frame in enumerate(frames) if frame is not None] == list(method.frames_used)

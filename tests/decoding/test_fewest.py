@@ -150,16 +150,18 @@ def test_an_object_in_direct_light_has_the_same_depth_with_six_frames(view):
         solid_mesh("power_drill"), view
     )
     frames = [row.frames[index] for index in range(52)]
-    six, twenty = (ClassicalMethod(rig, "both", 3, fewest=fewest).predict(frames) for fewest in (True, False))
+    six, twenty = (
+        ClassicalMethod(rig, direction="both", steps=3, fewest=fewest).predict(frames) for fewest in (True, False)
+    )
     assert (twenty > 0).sum() > 1500
     np.testing.assert_array_equal(six, twenty)
 
 
 def test_predicting_with_the_fewest_frames(tiny, tmp_path, capsys):
     dataset = DatasetFolder(tiny)
-    method = ClassicalMethod(dataset.rig, "both", 3, fewest=True)
+    method = ClassicalMethod(dataset.rig, direction="both", steps=3, fewest=True)
     assert len(method.frames_used) == 6 and method.title == "Classical 3-step, both directions, no Gray code"
-    assert ClassicalMethod(paper_rig(TINY_SIZE), "vertical", fewest=True).frames_used == (
+    assert ClassicalMethod(paper_rig(TINY_SIZE), direction="vertical", fewest=True).frames_used == (
         *range(18, 36),
         *dataset.sequence.gray("vertical"),
     )

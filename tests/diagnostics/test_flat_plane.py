@@ -19,7 +19,7 @@ from fpp_ml_bench.baselines.diagnostics.plane_attention import (
 )
 from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, silent
 from fpp_ml_bench.baselines.diagnostics.subjects import subject_of_method
-from fpp_ml_bench.baselines.method import load_method
+from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.stability import U32
 
 

@@ -18,7 +18,7 @@ from fpp_ml_bench.baselines.diagnostics.phase_reliance import (
     rms_expected,
     sample_score,
 )
-from fpp_ml_bench.baselines.method import load_method
+from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.score import object_interval
 

@@ -7,12 +7,13 @@ import pytest
 import torch
 from flat_planes import FIRST, OTHER_RIG, RIG, USERS_WORD, photograph, plane_depth_m, plane_fringe
 
-from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS
-from fpp_ml_bench.baselines.phase_network.method import PhaseNetMethod, load_net
+from fpp_ml_bench.baselines.phase_network.method import PhaseNetMethod
+from fpp_ml_bench.baselines.phase_network.net_file import load_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.route import Levers, NetworkRoute
 from fpp_ml_bench.baselines.phase_route import TAU, PhaseRoute, Reason, Settings
+from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.errors import DecodeError, NetworkError, PredictionError
 from fpp_ml_bench.optics import Rig, paper_rig
 
@@ -84,9 +85,9 @@ def test_a_range_under_one_period_settles_the_order(direction: str) -> None:
     order = np.rint((absolute - answered.observation.phase_rad) / TAU)
     assert one.sum() > 300 and (order == candidates.first)[one].all()
     assert measurement.order_doubt_mm[crop][one].max() < 0.01
-    assert "order by range" in PhaseNetMethod(short, direction).title  # type: ignore[arg-type]
-    assert PhaseNetMethod(short, direction).settings["order_by_range"] is True  # type: ignore[arg-type]
-    assert PhaseNetMethod(RIG, direction).settings["order_by_range"] is False  # type: ignore[arg-type]
+    assert "order by range" in PhaseNetMethod(short, direction=direction).title  # type: ignore[arg-type]
+    assert PhaseNetMethod(short, direction=direction).settings["order_by_range"] is True  # type: ignore[arg-type]
+    assert PhaseNetMethod(RIG, direction=direction).settings["order_by_range"] is False  # type: ignore[arg-type]
 
 
 def test_any_albedo_says_what_it_cannot_tell() -> None:
@@ -148,7 +149,7 @@ def test_beyond_the_end_of_the_range_there_is_no_depth(translation_m: tuple[floa
 def test_a_plane_in_unknown_light_is_ambiguous(direction: str) -> None:
     """The same without background in view and without the user's word: no order can be told from brightness."""
     rig = part_of(paper_rig(960), 240)
-    measurement = PhaseNetMethod(rig, direction).route.measure(  # type: ignore[arg-type]
+    measurement = PhaseNetMethod(rig, direction=direction).route.measure(  # type: ignore[arg-type]
         plane_fringe(rig, FIRST[direction], plane_depth_m(rig, 1.8))
     )
     several = (measurement.candidates.count > 1) & (measurement.modulation_grey > 5)
@@ -163,7 +164,7 @@ def test_short_periods_are_resampled_to_those_of_training(direction: str) -> Non
     for size, resampled in ((480, True), (720, False), (960, False), (1920, True)):
         assert PhaseNetMethod(paper_rig(size)).route.geometry.route.resampling.needed is resampled
     row = photograph("cracker_box", "A60", rig)
-    measurement = PhaseNetMethod(rig, direction).route.measure(row.frames[FIRST[direction]])  # type: ignore[arg-type]
+    measurement = PhaseNetMethod(rig, direction=direction).route.measure(row.frames[FIRST[direction]])  # type: ignore[arg-type]
     target = row.depth_mm > 0
     error = np.abs(measurement.depth_mm - row.depth_mm)[target]
     assert np.median(error) < 2 and (error > 100).mean() < 0.02
@@ -199,7 +200,7 @@ def test_refusals_name_what_came() -> None:
     with pytest.raises(DecodeError, match="frame 0 is missing"):
         PhaseNetMethod(RIG).predict([None] * 52)
     with pytest.raises(PredictionError, match="both"):
-        PhaseNetMethod(RIG, "both")  # type: ignore[arg-type]
+        PhaseNetMethod(RIG, direction="both")  # type: ignore[arg-type]
     with pytest.raises(PredictionError, match="expected one or any"):
         PhaseNetMethod(RIG, albedo="both")
     with pytest.raises(PredictionError, match="learned one albedo"):

@@ -13,7 +13,7 @@ from flat_planes import DIRECT, USERS_WORD, plane_depth_m, plane_fringe
 
 from fpp_ml_bench.baselines import load_method, training
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, Geometry, Rotation
-from fpp_ml_bench.baselines.phase_network.method import load_net, save_net
+from fpp_ml_bench.baselines.phase_network.net_file import load_net, save_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.samples import Sample, sample_of, samples_of
 from fpp_ml_bench.baselines.phase_network.training import Recipe, answers_of, scores_of, train_phase_net

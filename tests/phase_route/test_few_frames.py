@@ -11,10 +11,11 @@ import pytest
 from flat_planes import PAPER, USERS_WORD
 from synthetic import make
 
-from fpp_ml_bench.baselines.method import Answer, Method, load_method
+from fpp_ml_bench.baselines.method import Answer, Method
 from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window, fringe_fit
 from fpp_ml_bench.baselines.phase_route.method import FewestFrames, PhaseMethod, levels_of
 from fpp_ml_bench.baselines.phase_route.several_frames import steps_of
+from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.decoding import depth_noise_mm
 from fpp_ml_bench.errors import DecodeError, PredictionError
@@ -241,7 +242,7 @@ def test_reports_lie_beside_the_predictions(tmp_path: Path) -> None:
     dataset = make(tmp_path / "data", views=("A0", "A60"))
     opened = DatasetFolder(dataset)
     out = tmp_path / "out"
-    predict_split(opened, Reporting(), "test", out)
+    predict_split(opened, Reporting(opened.rig), "test", out)
     reports = json.loads((out / REPORTS_FILE).read_text())
     assert list(reports) == opened.samples("test")
     mean = np.mean([report["frames"] for report in reports.values()])

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from flat_planes import DIRECT, FIRST, OTHER_RIG, PAPER, RIG, USERS_WORD, photograph, plane_depth_m, plane_fringe
 
-from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
 from fpp_ml_bench.baselines.phase_route.object_mask import image_noise_grey
 from fpp_ml_bench.baselines.phase_route.observation import Reason, Settings
 from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
+from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.decoding import depth_noise_mm
 from fpp_ml_bench.errors import DecodeError, PredictionError

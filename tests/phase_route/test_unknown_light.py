@@ -10,8 +10,8 @@ import pytest
 from flat_planes import RIG, photograph, plane_depth_m, plane_fringe
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.method import load_method
 from fpp_ml_bench.baselines.phase_route import Periods, PhaseMethod, PhaseRoute, Reason, Settings
+from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import CaptureError
 from fpp_ml_bench.loaders.render import BuildSettings, build

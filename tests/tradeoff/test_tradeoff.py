@@ -271,7 +271,7 @@ def test_types_of_the_decoder(opened):
     sample = opened.samples("test")[0]
     frames = opened.frames(sample, range(len(opened.sequence)))
     for direction in ("vertical", "horizontal"):
-        packaged = ClassicalMethod(opened.rig, direction, 18).predict(frames)
+        packaged = ClassicalMethod(opened.rig, direction=direction, steps=18).predict(frames)
         double = DecodeInType(opened.rig, direction, 18, dtype="float64").predict(frames)
         single = DecodeInType(opened.rig, direction, 18, dtype="float32").predict(frames)
         both = (packaged > 0) & (double > 0) & (single > 0)

@@ -1,0 +1,191 @@
+"""Finding a method: those of this package and of installed packages by name, one of a file as ``mine.py:Mine``, and
+trained networks by the name or path of their weights.
+
+An installed package offers methods by the entry point group `GROUP`:
+
+    [project.entry-points."fpp_ml_bench.methods"]
+    mine = "my_package.methods:Mine"
+"""
+
+import inspect
+import sys
+import traceback
+from functools import cache
+from importlib import import_module, metadata
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from fpp_ml_bench.baselines.method import Method, Photographed
+from fpp_ml_bench.errors import FppBenchError, PredictionError, WeightsError
+from fpp_ml_bench.files import printable
+from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.options import did_you_mean
+
+GROUP = "fpp_ml_bench.methods"
+FILE_MARK = ".py:"
+"""What tells ``mine.py:Mine`` from a name."""
+BUILT_IN = (
+    "classical:ClassicalMethod",
+    "classical_network.method:ClassicalNetMethod",
+    "phase_route.method:PhaseMethod",
+    "phase_network.method:PhaseNetMethod",
+    "crossed_route.method:CrossedMethod",
+    "crossed_network.method:CrossedNetMethod",
+    "trivial:ConstantMethod",
+    "trivial:NearestMethod",
+)
+"""The classes of this package, below `fpp_ml_bench.baselines`. Their names are their own."""
+NETWORKS = "networks.network_method:NetworkMethod"
+"""The class that trained networks from image to depth are made with, by their weights."""
+
+
+class Found(NamedTuple):
+    """A method's class, and the options that its name already says."""
+
+    method: type[Method]
+    options: dict[str, Any]
+
+
+def methods() -> dict[str, type[Method]]:
+    """The methods by name: those of this package, then those of installed ones. What an installed package offers and
+    can't be used is left out here; `find` says why when it is asked for."""
+    return {**{method.name: method for method in map(_built_in, BUILT_IN)}, **_installed()[0]}
+
+
+def network_method() -> type[Method]:
+    """The class of trained networks from image to depth."""
+    return _built_in(NETWORKS)
+
+
+def find(name: str | Path) -> Found:
+    """The class that ``name`` means: a method's name, ``file.py:Class`` (the file is executed), or weights that come
+    with the package or in a ``.safetensors`` file, or a recipe that ``fpp-bench reproduce`` has trained. Raises
+    `PredictionError`, for an unknown name with what it might have meant."""
+    text = str(name)
+    if FILE_MARK in text:
+        return Found(_checked(load_from_file(text), text), {})
+    known = methods()
+    if text in known:
+        return Found(known[text], {})
+    if text in (unusable := _installed()[1]):
+        raise PredictionError(unusable[text])
+    from fpp_ml_bench.baselines.training import TABLES, shipped_names, weights_path
+
+    try:
+        if text.endswith((".yaml", ".yml")) or (text.split("/")[0] in TABLES and not text.endswith(".safetensors")):
+            return Found(network_method(), {"recipe": text})
+        return Found(network_method(), {"weights": weights_path(name)})
+    except WeightsError:
+        hint = did_you_mean(text, [*known, *shipped_names()])
+        raise PredictionError(
+            f"unknown method {printable(text, 200)!r}; {hint}. A method is a name, file.py:Class, or a .safetensors "
+            "file of trained weights"
+        ) from None
+
+
+def load_method(name: str | Path, source: Photographed | Rig, **options: Any) -> Method:
+    """The method that ``name`` means (see `find`), for a dataset, or for images of a rig.
+
+    ``options`` are the fields of its class's ``Options``; a network also takes ``device`` (``cpu``, ``cuda``, ...).
+    >>> from fpp_ml_bench.baselines.registry import load_method
+    >>> depth_mm = load_method("phase", dataset).predict(frames)    # doctest: +SKIP
+
+    Raises `PredictionError` for an unknown name, and what the method refuses: unusable weights, invalid options.
+    """
+    method, preset = find(name)
+    make = method.for_rig if isinstance(source, Rig) else method.for_dataset
+    try:
+        return make(source, **preset, **options)  # type: ignore[arg-type]
+    except TypeError as error:
+        if inspect.isabstract(method):
+            missing = ", ".join(sorted(method.__abstractmethods__))
+            raise PredictionError(f"{name}: does not define {missing}, which a method needs") from error
+        raise
+
+
+def load_from_file(text: str) -> Any:
+    """The object that ``file.py:name`` means; the file is executed once. `PredictionError` where that fails."""
+    path_text, _, name = text.rpartition(":")
+    module = _module_of(Path(path_text).resolve())
+    try:
+        return getattr(module, name)
+    except AttributeError:
+        public = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
+        raise PredictionError(f"{path_text}: has no {printable(name)!r}; {did_you_mean(name, public)}") from None
+
+
+def failure_in_file(error: BaseException) -> str | None:
+    """Where and why code of a file given as ``file.py:Class`` failed, for a message; None for any other error."""
+    own = [frame for frame in traceback.extract_tb(error.__traceback__) if Path(frame.filename) in _FILES]
+    return f"{own[-1].filename}, line {own[-1].lineno}, in {own[-1].name}: {_cause(error)}" if own else None
+
+
+_FILES: set[Path] = set()
+"""The files that were executed."""
+
+
+@cache
+def _module_of(path: Path) -> Any:
+    if not path.is_file():
+        raise PredictionError(f"{path}: no such file; expected FILE.py:NAME")
+    name = f"fpp_ml_bench_user_{path.stem}"
+    spec = spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise PredictionError(f"{path}: is no Python file; expected FILE.py:NAME")
+    module = module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    _FILES.add(path)
+    sys.path.insert(0, str(path.parent))  # for what it imports from beside it
+    try:
+        spec.loader.exec_module(module)
+    except FppBenchError:
+        raise
+    except Exception as error:
+        raise PredictionError(f"can't be executed: {failure_in_file(error) or f'{path}: {_cause(error)}'}") from error
+    finally:
+        sys.path.remove(str(path.parent))
+    return module
+
+
+@cache
+def _built_in(place: str) -> type[Method]:
+    module, _, name = place.partition(":")
+    method: type[Method] = getattr(import_module(f"fpp_ml_bench.baselines.{module}"), name)
+    return method
+
+
+@cache
+def _installed() -> tuple[dict[str, type[Method]], dict[str, str]]:
+    """Methods of installed packages by name, and what is wrong with those that can't be used, by the name offered."""
+    taken = {method.name for method in map(_built_in, BUILT_IN)}
+    usable: dict[str, type[Method]] = {}
+    unusable: dict[str, str] = {}
+    for entry in metadata.entry_points(group=GROUP):
+        where = f"{entry.value} of the installed package {entry.dist.name if entry.dist else '?'}"
+        try:
+            method = _checked(entry.load(), where)
+        except PredictionError as error:
+            unusable[entry.name] = str(error)
+        except Exception as error:  # whatever a stranger's package does when it is imported
+            unusable[entry.name] = f"{where} can't be imported: {_cause(error)}; repair or uninstall it"
+        else:
+            if method.name in taken or method.name in usable:
+                unusable[entry.name] = f"{where}: the name {method.name!r} is taken; uninstall one of the two"
+            else:
+                usable[method.name] = method
+    return usable, unusable
+
+
+def _checked(method: Any, where: str) -> type[Method]:
+    """``method`` if it is a class of methods that says what it must."""
+    if not (isinstance(method, type) and issubclass(method, Method)):
+        raise PredictionError(f"{where}: expected a subclass of fpp_ml_bench.Method, got {type(method).__name__}")
+    name = getattr(method, "name", None)
+    if not isinstance(name, str) or not name or printable(name) != name or any(c in name for c in " /:\\"):
+        raise PredictionError(f"{where}: its name is {name!r}; expected text without spaces, slashes and colons")
+    return method
+
+
+def _cause(error: BaseException) -> str:
+    return f"{type(error).__name__}: {printable(str(error), 300)}"

@@ -1,0 +1,63 @@
+"""Options that describe themselves: fields of a dataclass which carry their help, for the command line and the docs.
+
+>>> from dataclasses import dataclass
+>>> @dataclass(frozen=True)
+... class Options:
+...     steps: int = option(4, "phase steps", metavar="N")
+>>> Options().steps, described(Options)["steps"].help
+(4, 'phase steps')
+"""
+
+from collections.abc import Collection, Mapping
+from dataclasses import MISSING, dataclass, field, fields
+from difflib import get_close_matches
+from typing import Any
+
+from fpp_ml_bench.files import printable
+
+_KEY = "fpp_ml_bench.option"
+
+
+@dataclass(frozen=True)
+class Description:
+    """What the command line says of an option: ``help``, ``metavar`` of its value, the ``choices`` that there are, and
+    ``flag``, its spelling where that is not made of the field's name."""
+
+    help: str
+    metavar: str | None = None
+    choices: tuple[str, ...] = ()
+    flag: str | None = None
+
+
+def option(
+    default: Any, help: str, metavar: str | None = None, choices: Collection[str] = (), flag: str | None = None
+) -> Any:
+    """A dataclass field that is an option of the command line: its ``default``, and the rest as of `Description`."""
+    return field(default=default, metadata={_KEY: Description(help, metavar, tuple(choices), flag)})
+
+
+def described(options: type) -> dict[str, Description]:
+    """The fields of a dataclass that are options of the command line, in order; its other fields are for code alone."""
+    return {entry.name: entry.metadata[_KEY] for entry in fields(options) if _KEY in entry.metadata}
+
+
+def defaults(options: type) -> dict[str, Any]:
+    """The default of each field of a dataclass that has one."""
+    return {entry.name: entry.default for entry in fields(options) if entry.default is not MISSING}
+
+
+def flag_of(name: str, description: Description) -> str:
+    """``--its-name`` of a field called ``name``."""
+    return description.flag or f"--{name.replace('_', '-')}"
+
+
+def did_you_mean(name: str, known: Collection[str] | Mapping[str, Any]) -> str:
+    """How a message about an unknown ``name`` ends: the nearest known one, or all of them.
+
+    >>> did_you_mean("clasical", ["classical", "phase"])
+    "did you mean 'classical'?"
+    >>> did_you_mean("x", ["classical", "phase"])
+    'there are classical, phase'
+    """
+    nearest = get_close_matches(name, known, n=1)
+    return f"did you mean {printable(nearest[0])!r}?" if nearest else f"there are {', '.join(known) or 'none'}"
