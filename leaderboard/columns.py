@@ -3,9 +3,10 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from operator import attrgetter
 
-from fpp_ml_bench.evaluation.protocol import HEADLINE, RANGE_SHARE
-from fpp_ml_bench.evaluation.report import millimetres, percent, seconds
+from fpp_ml_bench.evaluation.metrics import METRICS, RANGE_KEY, RANK_KEY, WIDE, WIDEST, listed
+from fpp_ml_bench.evaluation.report import millimetres, percent, score_text, seconds
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.assumptions import assumption, learned_from
 from fpp_ml_bench.leaderboard.groups import TEST, UNSEEN, Ranked
@@ -31,20 +32,10 @@ NOTE = (
     f"Errors in mm, mean over samples; 95% interval from a bootstrap over objects. {RANK_NOTE} {TRUST_NOTE} "
     f"{RATIO_NOTE}"
 )
-MIDDLE, WIDE, WIDEST = 100, 140, 170
+MIDDLE = 100
 """Where a terminal is too narrow, columns of a larger number are left out first."""
 ONLY_IN_FILES = 1_000_000
 _DEVICE_WIDTH, _LONGEST_NAME = 40, 90
-_ERRORS = {
-    "object_mae_mm": ("Object MAE", 0),
-    "object_rmse_mm": ("Object RMSE", 0),
-    "overall_mae_mm": ("Overall MAE", 0),
-    "background_mae_mm": ("Backgr. MAE", WIDE),
-    "object_missing_share": ("Missing", WIDE),
-    "object_interior_mae_mm": ("Interior MAE", WIDEST),
-    "object_edge_mae_mm": ("Edge MAE", WIDEST),
-}
-"""Title of each error's column, and its ``from_width``."""
 
 
 @dataclass(frozen=True)
@@ -65,15 +56,18 @@ class Column:
 
 def columns(sort: str) -> list[Column]:
     """Columns of a ranking by ``sort``; a key without a column gets its own, and that of the errors its interval."""
-    named = {*_ERRORS, "seconds_per_sample", "frames_used"}
-    own = {} if sort in named else {sort: (sort.removesuffix("_mm").replace("_", " "), 0)}
+    ordered = sorted(listed(METRICS.values()), key=attrgetter("column_from"))
+    shown = {metric.key: metric.column for metric in ordered if metric.column}
+    if sort in METRICS:
+        own = sort.removesuffix("_mm").replace("_", " ")
+        shown = shown if sort in shown else {sort: own, **shown}
     errors = []
-    for key, (title, from_width) in {**own, **_ERRORS}.items():
-        errors.append(Column(title, partial(error, key), from_width=0 if key == sort else from_width))
-        if key == sort in HEADLINE:
+    for key, title in shown.items():
+        errors.append(Column(title, partial(error, key), from_width=0 if key == sort else METRICS[key].column_from))
+        if key == sort and METRICS[key].headline:
             ends = partial(interval, between="-", key=sort)
             errors.append(Column("95% interval", ends, from_width=MIDDLE))
-        if key == "object_mae_mm":
+        if key == RANK_KEY:
             errors += [replace(PARTS[0], from_width=MIDDLE), replace(PARTS[1], from_width=MIDDLE), RATIO]
             errors.append(replace(RANGE, from_width=MIDDLE))
     return [
@@ -95,16 +89,16 @@ def columns(sort: str) -> list[Column]:
 
 
 def error(key: str, row: Ranked) -> str:
-    return (percent if key.endswith("_share") else millimetres)(row.value(key))
+    return score_text(key, row.value(key))
 
 
 def error_on(benchmark: str, row: Ranked) -> str:
     """Object MAE on the part of the row that is of ``benchmark``, `TEST` or `UNSEEN`; a dash without any."""
     part = row.on(benchmark)
-    return "-" if part is None else millimetres(part.value("object_mae_mm"))
+    return "-" if part is None else millimetres(part.value(RANK_KEY))
 
 
-def interval(row: Ranked, between: str, key: str = "object_mae_mm") -> str:
+def interval(row: Ranked, between: str, key: str = RANK_KEY) -> str:
     return between.join(map(millimetres, row.interval(key) or ())) or "-"
 
 
@@ -175,7 +169,7 @@ PARTS = tuple(
     for title, part in (("On test", TEST), ("On unseen", UNSEEN))
 )
 """Both errors of a row that joins the two sets."""
-RANGE = Column("Of depth range", partial(error, RANGE_SHARE), present=lambda row: row.value(RANGE_SHARE) is not None)
+RANGE = Column("Of depth range", partial(error, RANGE_KEY), present=lambda row: row.value(RANGE_KEY) is not None)
 RATIO = Column("x trivial", ratio, present=lambda row: row.ratio is not None)
 RELIANCE = Column("Phase reliance", lambda row: reliance(row.entry))
 ROBUSTNESS = Column("Disturbed, mm", lambda row: robustness(row.entry))

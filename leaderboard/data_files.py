@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from fpp_ml_bench.evaluation.protocol import HEADLINE
+from fpp_ml_bench.evaluation.metrics import HEADLINE
 from fpp_ml_bench.leaderboard.assumptions import learned_from, told
 from fpp_ml_bench.leaderboard.columns import device, uncertainty
 from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, TEST, UNSEEN, Group, Ranked

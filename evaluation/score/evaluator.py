@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from operator import attrgetter
@@ -17,6 +17,7 @@ from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.depth import RangeRule, edge_jump_mm, extremes, object_box, object_mask, object_near_edges
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import protocol, result, submission
+from fpp_ml_bench.evaluation.metrics import METRICS, UNCERTAINTY, Metric
 from fpp_ml_bench.evaluation.protocol import Mode, Units
 from fpp_ml_bench.evaluation.score.check import checked_description
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
@@ -269,25 +270,34 @@ def _uncertainty_differences(stored: result.Uncertainty | None, recomputed: resu
         if len(first) != len(second) or not all(result.same(*pair, 1e-12) for pair in pairs):
             lines.append(f"uncertainty.{name}: the curve in the result is not the one recomputed")
     for sample, scores in recomputed.per_sample.items():
-        for key in protocol.UNCERTAINTY:
-            first, second = getattr(stored.per_sample[sample], key), getattr(scores, key)
-            # The area between two curves is a small difference of large numbers, and a likelihood may be near 0.
-            if not result.same(first, second, 1e-9 * (scores.sure_rmse_mm or 0.0) if "ause" in key else 1e-12):
-                texts = f"{_value_text(first)} in the result, {_value_text(second)} recomputed"
-                lines.append(f"{sample}: uncertainty.{key}: {texts}")
+        keys = _different(stored.per_sample[sample], scores, UNCERTAINTY, scores.sure_rmse_mm, 1e-12)  # near 0: nll
+        lines += _difference_lines(sample, stored.per_sample[sample], scores, keys, "uncertainty.")
     return lines
 
 
 def _sample_differences(stored: result.SampleResult, recomputed: result.SampleResult) -> list[str]:
     exact = ("object", "prediction_sha256", *(f"{name}_pixels" for name in ("object", "background", "void", "unlit")))
     keys = [key for key in exact if getattr(stored, key) != getattr(recomputed, key)]
-    for key in protocol.METRICS:
-        # Signed means and the error without an offset are small differences of large numbers.
-        rounding_mm = 1e-9 * (recomputed.object_mae_mm or 0.0) if "bias" in key or "shift_free" in key else 0.0
-        if not result.same(getattr(stored, key), getattr(recomputed, key), rounding_mm):
-            keys.append(key)
+    keys += _different(stored, recomputed, METRICS, recomputed.object_mae_mm)
+    return _difference_lines(recomputed.sample, stored, recomputed, keys)
+
+
+def _different(
+    stored: object, recomputed: object, metrics: Mapping[str, Metric], error_mm: float | None, rounding: float = 0.0
+) -> list[str]:
+    """Keys of the scores that differ; ``error_mm``: the error of which those that cancel are a small difference."""
+    return [
+        key
+        for key, metric in metrics.items()
+        if not result.same(
+            getattr(stored, key), getattr(recomputed, key), 1e-9 * (error_mm or 0.0) if metric.cancels else rounding
+        )
+    ]
+
+
+def _difference_lines(sample: str, stored: object, recomputed: object, keys: list[str], part: str = "") -> list[str]:
     texts = {key: [_value_text(getattr(row, key)) for row in (stored, recomputed)] for key in keys}
-    return [f"{recomputed.sample}: {key}: {a} in the result, {b} recomputed" for key, (a, b) in texts.items()]
+    return [f"{sample}: {part}{key}: {a} in the result, {b} recomputed" for key, (a, b) in texts.items()]
 
 
 def _value_text(value: object) -> str:

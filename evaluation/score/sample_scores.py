@@ -11,16 +11,17 @@ RMSE is never 0 by underflow.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.depth import edge_jump_mm, object_box, object_mask, object_near_edges
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation import protocol
-from fpp_ml_bench.evaluation.protocol import DISTRIBUTION, EDGE_BAND_PX, PIXEL_SETS, WIDE_BAND_PX, WITHIN_MM
+from fpp_ml_bench.evaluation.metrics import METRICS
+from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, WIDE_BAND_PX, WITHIN_MM
 
 BLOCK = 9600
 """Pixels per block. OpenBLAS spreads dot products over its threads from 10,000 elements on, and the rounding of the sum
@@ -132,87 +133,79 @@ def _background(prediction: Map, target: Map, void: NDArray[np.bool_] | None) ->
 
 
 _EDGE, _WIDE, _MISSING = 1, 2, 4
-_SETS = (
-    *PIXEL_SETS,
-    "object_interior",
-    "object_edge",
-    "object_valid",
-    "object_interior_valid",
-    "object_wide_band",
-    "object_wide_interior",
-)
 
 
-def _zones(bits: int, value: int) -> property:
+def _zones(bits: int, value: int) -> cached_property[ErrorStats]:
     """The statistics of the union of all zones whose ``bits`` have this ``value``."""
-    return property(lambda self: combine(*(stats for zone, stats in self.zones.items() if zone & bits == value)))
+    return cached_property(lambda self: combine(*(stats for zone, stats in self.zones.items() if zone & bits == value)))
 
 
-@dataclass(frozen=True, slots=True)
+class Spread(NamedTuple):
+    """How the object's errors are distributed, in mm; ``within``: the share of them of at most each of
+    `protocol.WITHIN_MM`; all None where there is no object."""
+
+    median_mm: Any = None
+    p95_mm: Any = None
+    largest_mm: Any = None
+    within: tuple[Any, ...] = (None,) * len(WITHIN_MM)
+    bias_mm: Any = None
+    valid_bias_mm: Any = None
+    shift_free_mm: Any = None
+
+
+_NO_SPREAD = Spread()
+
+
+@dataclass(frozen=True)
 class SampleScores:
-    """Scores of one sample: statistics of the background and of the object's zones, and the object's ``distribution``.
-    A zone's number is a sum of 1 (nearer to a depth edge than the edge band), 2 (nearer than the wide band) and 4 (not
-    measured: predicted 0 mm or less); every MAE and RMSE of the object is that of a union of zones. ``void``: pixels in
-    no set, None by rules without void. ``unlit``: statistics of the unlit pixels and of those that were measured; None
-    where they are not scored. ``range_mm``: largest minus smallest depth of the object."""
+    """What the metrics of a sample are made of. ``prediction_mm`` and ``target_mm`` (H, W) as they were scored, the
+    pixels ``inside`` the object, which are in no other set, and ``errors``: prediction minus target in mm there, float64
+    (n,) in the order of the pixels.
 
+    Statistics of the background and of the object's zones, and the object's ``spread``. A zone's number is a sum of 1
+    (nearer to a depth edge than the edge band), 2 (nearer than the wide band) and 4 (not measured: predicted 0 mm or
+    less); every MAE and RMSE of the object is that of a union of zones. ``void``: how many pixels are in no set, None
+    by rules without void. ``unlit``: statistics of the unlit pixels, ``unlit_valid`` of those that were measured;
+    ``scores_unlit``: whether the rules know them. ``range_mm``: largest minus smallest depth of the object."""
+
+    prediction_mm: Map
+    target_mm: Map
+    inside: NDArray[np.bool_]
     background: ErrorStats
-    zones: dict[int, ErrorStats]
-    distribution: dict[str, float | None]
-    void: int | None = None
-    unlit: tuple[ErrorStats, ErrorStats] | None = None
+    void: int | None
+    unlit: ErrorStats
+    unlit_valid: ErrorStats
+    scores_unlit: bool
+    errors: Errors = field(default_factory=lambda: np.empty(0))
+    zones: dict[int, ErrorStats] = field(default_factory=dict)
+    spread: Spread = _NO_SPREAD
     range_mm: float = 0.0
 
     object = _zones(0, 0)
     interior, edge = _zones(_EDGE, 0), _zones(_EDGE, _EDGE)
     wide_interior, wide_band = _zones(_WIDE, 0), _zones(_WIDE, _WIDE)
     valid = _zones(_MISSING, 0)
-    interior_valid, edge_valid = _zones(_EDGE | _MISSING, 0), _zones(_EDGE | _MISSING, _EDGE)
+    interior_valid = _zones(_EDGE | _MISSING, 0)
 
     @property
     def missing(self) -> int:
         """Object pixels that were not measured."""
         return int(self.object.pixels - self.valid.pixels)
 
-    @property
+    @cached_property
     def overall(self) -> ErrorStats:
         return combine(self.object, self.background)
 
     def metrics(self) -> dict[str, float | None]:
-        """The keys of ``protocol.METRICS``; where the pixel set is empty None, those of `SINCE_2` left out."""
-        sets: dict[str, ErrorStats] = {name: getattr(self, name.removeprefix("object_")) for name in _SETS}
-        whole, interior = sets["object"].pixels, sets["object_interior"].pixels
-        values: dict[str, float | None] = {
-            "object_edge_share": _share(sets["object_edge"].pixels, whole),
-            "object_missing_share": _share(self.missing, whole),
-            "object_interior_missing_share": _share(interior - sets["object_interior_valid"].pixels, interior),
-            "object_wide_band_share": _share(sets["object_wide_band"].pixels, whole),
-        }
-        for name, stats in sets.items():
-            values |= {f"{name}_mae_mm": stats.mae_mm, f"{name}_rmse_mm": stats.rmse_mm}
-        values |= self.distribution
-        void = self.void or 0
-        unlit, measured = self.unlit or (EMPTY, EMPTY)
-        values |= {
-            "void_share": None if self.void is None else void / (whole + self.background.pixels + void),
-            "unlit_mae_mm": unlit.mae_mm,
-            "unlit_rmse_mm": unlit.rmse_mm,
-            "unlit_valid_mae_mm": measured.mae_mm,
-            "unlit_missing_share": _share(unlit.pixels - measured.pixels, unlit.pixels),
-            protocol.RANGE_SHARE: _share(sets["object"].mae_mm or 0.0, self.range_mm),
-        }
-        optional = {key for key in protocol.SINCE_2 if values[key] is None}
-        return {key: values[key] for key in protocol.METRICS if key not in optional}
+        """Every metric by its key: None where the pixel set is empty, and those that a file may leave out left out."""
+        values = {key: metric.of(self) for key, metric in METRICS.items()}
+        return {key: value for key, value in values.items() if value is not None or not METRICS[key].optional}
 
     def pixels(self) -> dict[str, int | None]:
         """How many pixels each set of a result's row has; None for a set that the rules do not know."""
-        unlit = None if self.unlit is None else self.unlit[0].pixels
+        unlit = self.unlit.pixels if self.scores_unlit else None
         counts = {"object": self.object.pixels, "background": self.background.pixels, "void": self.void, "unlit": unlit}
         return {f"{name}_pixels": count for name, count in counts.items()}
-
-
-def _share(part: float, whole: float) -> float | None:
-    return part / whole if whole else None
 
 
 @np.errstate(over="ignore")  # an overflow is no warning here: `_from_sums` refuses it
@@ -249,13 +242,15 @@ def score_sample(
     flat_void = None if void is None else void.ravel()
     background, flat_inside = _background(prediction, target_mm.ravel(), flat_void)
     void_px = None if void is None else int(np.count_nonzero(void))
-    unlit = None if unlit_mm is None else _unlit_stats(prediction, unlit_mm.ravel())
-    nothing = SampleScores(background, {}, dict.fromkeys(DISTRIBUTION), void_px, unlit)
+    unlit, measured = (EMPTY, EMPTY) if unlit_mm is None else _unlit_stats(prediction, unlit_mm.ravel())
     inside = flat_inside.reshape(target_mm.shape)
-    if (box := object_box(inside)) is None:
-        return nothing
-    index = np.flatnonzero(inside[box] if void is None else inside[box] & ~void[box])
-    if not index.size:
+    box = object_box(inside)
+    if void is not None:
+        inside &= ~void
+    nothing = SampleScores(
+        prediction_mm, target_mm, inside, background, void_px, unlit, measured, scores_unlit=unlit_mm is not None
+    )
+    if box is None or not (index := np.flatnonzero(inside[box])).size:
         return nothing
     depths = prediction_mm[box].ravel().take(index)
     errors = depths.astype(np.float64)
@@ -272,7 +267,7 @@ def score_sample(
     zones = {code: stats_of(errors[pixels]) for code, pixels in within.items() if pixels.any()}
     range_mm = float(true_mm.max()) - float(true_mm.min())
     range_mm = range_mm if range_mm > 1e-150 else 0.0  # else an error may exceed it by more than a float64 can hold
-    return SampleScores(background, zones, _distribution(errors, missing), void_px, unlit, range_mm)
+    return replace(nothing, errors=errors, zones=zones, spread=_spread(errors, missing), range_mm=range_mm)
 
 
 def _unlit_stats(prediction: Map, unlit_mm: Map) -> tuple[ErrorStats, ErrorStats]:
@@ -285,10 +280,9 @@ def _unlit_stats(prediction: Map, unlit_mm: Map) -> tuple[ErrorStats, ErrorStats
     return stats_of(errors), stats_of(errors[depths > 0])
 
 
-def _distribution(errors: Errors, missing: NDArray[np.bool_]) -> dict[str, float | None]:
-    """The keys of `DISTRIBUTION`, in its order."""
+def _spread(errors: Errors, missing: NDArray[np.bool_]) -> Spread:
     magnitude = np.abs(errors)
-    within = [np.count_nonzero(magnitude <= limit) / errors.size for limit in WITHIN_MM]
+    within = tuple(np.count_nonzero(magnitude <= limit) / errors.size for limit in WITHIN_MM)
     largest = float(magnitude.max())
     median, p95 = _quantiles(magnitude, 0.5, 0.95)
     signed = errors.copy()
@@ -297,8 +291,7 @@ def _distribution(errors: Errors, missing: NDArray[np.bool_]) -> dict[str, float
     np.abs(signed, out=signed)
     bias = mean_of(errors)
     valid_bias = mean_of(errors[~missing]) if missing.any() else bias
-    values = (median, p95, largest, *within, bias, valid_bias, mean_of(signed))
-    return dict(zip(DISTRIBUTION, values, strict=True))
+    return Spread(median, p95, largest, within, bias, valid_bias, mean_of(signed))
 
 
 def _quantiles(values: Errors, *levels: float) -> list[float]:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation import protocol
+from fpp_ml_bench.evaluation.metrics import UNCERTAINTY
 from fpp_ml_bench.evaluation.score.sample_scores import mean_of, stats_of
 
 Map = NDArray[np.floating[Any]]
@@ -25,13 +26,37 @@ _HALF_LOG_2_PI = 0.9189385332046727
 
 @dataclass(frozen=True, slots=True)
 class SigmaSample:
-    """Of one sample: ``scores`` has the keys of `protocol.UNCERTAINTY`; ``observed`` the share of stated pixels within
-    the interval of each of `protocol.NOMINAL`; ``curves`` the errors in mm after each of `protocol.LEFT_OUT` has been
-    left out, ``mae_mm`` and ``rmse_mm`` by sigma, ``best_*`` by the error itself. None where there is no such pixel."""
+    """Of one sample, what its scores are made of: the share of object pixels that state no sigma; of the others mean
+    and median sigma in mm, and the mean negative log-likelihood; ``observed``: the share of stated pixels within the
+    interval of each of `protocol.NOMINAL`; ``curves``: the errors in mm after each of `protocol.LEFT_OUT` has been left
+    out, ``mae_mm`` and ``rmse_mm`` by sigma, ``best_*`` by the error itself. None where there is no such pixel."""
 
-    scores: dict[str, float | None]
-    observed: list[float] | None
-    curves: dict[str, list[float]] | None
+    curves: dict[str, list[float]] | None = None
+    unstated_share: float | None = None
+    observed: list[float] | None = None
+    sigma_mean_mm: float | None = None
+    sigma_median_mm: float | None = None
+    nll: float | None = None
+
+    @property
+    def scores(self) -> dict[str, float | None]:
+        """Every metric of a stated uncertainty by its key."""
+        return {key: metric.of(self) for key, metric in UNCERTAINTY.items()}
+
+    def within(self, percent: int) -> float | None:
+        """Share of the stated pixels within the interval of one of `protocol.COVERED`."""
+        return self.observed and self.observed[protocol.NOMINAL.index(percent / 100)]
+
+    def sure_mm(self, error: str) -> float | None:
+        """``mae_mm`` or ``rmse_mm`` of the object without its least sure pixels."""
+        return self.curves and self.curves[error][protocol.LEFT_OUT.index(protocol.SURE_LEFT_OUT)]
+
+    def area_mm(self, error: str) -> float | None:
+        """Mean distance of the two curves of ``mae_mm`` or ``rmse_mm``. Never below 0 but by rounding: no order leaves
+        smaller errors than that of the errors themselves."""
+        return self.curves and mean_of(
+            np.maximum(np.array(self.curves[error]) - np.array(self.curves[f"best_{error}"]), 0.0)
+        )
 
 
 @cache
@@ -55,28 +80,17 @@ def score_sigma(
     inside = object_mask(target_mm) if void is None else object_mask(target_mm) & ~void
     depth, sigma = (np.asarray(values[inside], np.float64) for values in (prediction_mm, sigma_mm))
     magnitude = np.abs(depth - target_mm[inside])
-    scores: dict[str, float | None] = dict.fromkeys(protocol.UNCERTAINTY)
     if not magnitude.size:
-        return SigmaSample(scores, None, None)
+        return SigmaSample()
     stated = states_sigma(depth, sigma)
     curves = _curves(magnitude, np.where(stated, sigma, np.inf))
-    sure = protocol.LEFT_OUT.index(protocol.SURE_LEFT_OUT)
-    for error in ("mae_mm", "rmse_mm"):
-        by_sigma, best = curves[error], curves[f"best_{error}"]
-        # Never below 0 but by rounding: no order leaves smaller errors than that of the errors themselves.
-        gaps = np.array([max(0.0, first - second) for first, second in zip(by_sigma, best, strict=True)])
-        scores[f"ause_{error}"] = mean_of(gaps)
-        scores[f"sure_{error}"] = by_sigma[sure]
-    scores["unstated_share"] = 1 - np.count_nonzero(stated) / stated.size
+    unstated = 1 - np.count_nonzero(stated) / stated.size
     if not stated.any():
-        return SigmaSample(scores, None, curves)
+        return SigmaSample(curves, unstated)
     magnitude, sigma = magnitude[stated], sigma[stated]
     observed = [float(np.mean(magnitude <= gaussian_quantile(level) * sigma)) for level in protocol.NOMINAL]
-    for percent in protocol.COVERED:
-        scores[f"coverage_{percent}"] = observed[protocol.NOMINAL.index(percent / 100)]
-    scores |= {"sigma_mean_mm": mean_of(sigma), "sigma_median_mm": float(np.median(sigma))}
-    scores["nll"] = mean_of(_negative_log_likelihood(magnitude, sigma))
-    return SigmaSample(scores, observed, curves)
+    likelihood = mean_of(_negative_log_likelihood(magnitude, sigma))
+    return SigmaSample(curves, unstated, observed, mean_of(sigma), float(np.median(sigma)), likelihood)
 
 
 def _negative_log_likelihood(magnitude: Values, sigma: Values) -> Values:

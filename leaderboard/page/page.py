@@ -12,7 +12,8 @@ from typing import Any
 
 from fpp_ml_bench.baselines.tradeoff import Ladder, Rung, Tradeoff
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, HEADLINE, METRICS
+from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS, RANGE_KEY
+from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
 from fpp_ml_bench.evaluation.report import interval_text, page, render, score_text
 from fpp_ml_bench.evaluation.result import PART_TITLES
 from fpp_ml_bench.evaluation.score import FEWEST_OBJECTS
@@ -78,6 +79,7 @@ def page_files(
         **shared,
         tables=tables,
         columns=columns,
+        range_key=RANGE_KEY,
         told=told,
         assumption=assumption,
         search=_search,
