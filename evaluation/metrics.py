@@ -33,7 +33,8 @@ class Metric:
     small difference of large numbers, which two machines compute to 1e-9 of the error.
 
     Roles: ``headline``: one of the paper's six numbers, which have intervals and ranks; ``role``: ``rank``, the
-    leaderboard's order, and ``range``, which stands beside it; ``helped_by_missing``: a method improves it by answering fewer pixels, so nothing is sorted by it;
+    leaderboard's order, and ``range``, which stands beside it; ``helped_by_missing``: a method improves it by answering
+    fewer pixels, so nothing is sorted by it;
     ``training``: `DepthScores` has it, and ``of`` reads only what is there, too; ``over``: it is null exactly where
     this pixel set is empty; ``column``: title of its column in the leaderboard's tables, in terminals of
     ``column_from`` characters and more; ``terminal``: title of its column in the tables of ``fpp-eval``."""

@@ -159,8 +159,8 @@ _NO_SPREAD = Spread()
 @dataclass(frozen=True)
 class SampleScores:
     """What the metrics of a sample are made of. ``prediction_mm`` and ``target_mm`` (H, W) as they were scored, the
-    pixels ``inside`` the object, which are in no other set, and ``errors``: prediction minus target in mm there, float64
-    (n,) in the order of the pixels.
+    pixels ``inside`` the object that are not void, and ``errors``: prediction minus target in mm there, float64 (n,) in
+    the order of the pixels.
 
     Statistics of the background and of the object's zones, and the object's ``spread``. A zone's number is a sum of 1
     (nearer to a depth edge than the edge band), 2 (nearer than the wide band) and 4 (not measured: predicted 0 mm or
@@ -185,7 +185,7 @@ class SampleScores:
     interior, edge = _zones(_EDGE, 0), _zones(_EDGE, _EDGE)
     wide_interior, wide_band = _zones(_WIDE, 0), _zones(_WIDE, _WIDE)
     valid = _zones(_MISSING, 0)
-    interior_valid = _zones(_EDGE | _MISSING, 0)
+    interior_valid, edge_valid = _zones(_EDGE | _MISSING, 0), _zones(_EDGE | _MISSING, _EDGE)
 
     @property
     def missing(self) -> int:
