@@ -25,8 +25,9 @@ _rows = count()
 
 @dataclass(frozen=True)
 class Metric:
-    """``of`` computes it for a sample, None where the sample has no pixel for it; ``title`` and ``rule`` say what it is
-    in reports and in PROTOCOL.md; entries are listed there as they are written, by ``row``.
+    """``of`` computes it for a sample, None where the sample has no pixel for it, or names a statistic that a sample
+    has; ``title`` and ``rule`` say what it is in reports and in PROTOCOL.md, which list the entries by ``row``, in the
+    order in which they are written.
 
     ``place``: that of its key in a file. In the first `ALWAYS` places a score that no sample has is null, in the others
     its key is left out. A new metric has no place: it comes last, and files from before stay readable. ``cancels``: a
@@ -34,15 +35,15 @@ class Metric:
 
     Roles: ``headline``: one of the paper's six numbers, which have intervals and ranks; ``role``: ``rank``, the
     leaderboard's order, and ``range``, which stands beside it; ``helped_by_missing``: a method improves it by answering
-    fewer pixels, so nothing is sorted by it;
-    ``training``: `DepthScores` has it, and ``of`` reads only what is there, too; ``over``: it is null exactly where
-    this pixel set is empty; ``column``: title of its column in the leaderboard's tables, in terminals of
-    ``column_from`` characters and more; ``terminal``: title of its column in the tables of ``fpp-eval``."""
+    fewer pixels, so nothing is sorted by it; ``training``: `DepthScores` has it, and ``of`` reads only what is there,
+    too; ``over``: it is null exactly where this pixel set is empty; ``column``: title of its column in the
+    leaderboard's tables, in terminals of ``column_from`` characters and more; ``terminal``: title of its column in the
+    tables of ``fpp-eval``."""
 
     key: str
     title: str
     unit: Unit
-    of: Callable[[Any], Any]
+    of: Callable[[Any], Any] | str
     rule: str
     place: int = 1000
     cancels: bool = False
@@ -56,6 +57,10 @@ class Metric:
     column_from: int = 0
     terminal: str = ""
     row: int = field(default_factory=lambda: next(_rows), compare=False)
+
+    def value(self, sample: Any) -> Any:
+        """The metric of a sample."""
+        return attrgetter(self.of)(sample) if isinstance(self.of, str) else self.of(sample)
 
     @property
     def optional(self) -> bool:
@@ -72,15 +77,16 @@ def _within(number: int, sample: Any) -> Any:
     return sample.spread.within[number]
 
 
-_headline = partial(Metric, unit="mm", headline=True, training=True)
+_headline = partial(Metric, headline=True, training=True)
 _object = partial(Metric, over="object", training=True)
 _ENTRIES = (
     _headline(
         "object_mae_mm",
         "Object MAE",
-        of=attrgetter("object.mae_mm"),
-        rule="mean of |e| over the object",
-        place=2,
+        "mm",
+        "object.mae_mm",
+        "mean of |e| over the object",
+        2,
         role="rank",
         over="object",
         column="Object MAE",
@@ -93,16 +99,17 @@ _ENTRIES = (
         lambda s: share(s.object.mae_mm, s.range_mm),
         "object MAE over (D_max - D_min), the range of the sample's object pixels that are scored; may exceed 1; none "
         "for a flat object. The paper's 18% is such a share",
-        place=33,
+        33,
         training=True,
         role="range",
     ),
     _headline(
         "object_rmse_mm",
         "Object RMSE",
-        of=attrgetter("object.rmse_mm"),
-        rule="root mean square of e over the object",
-        place=3,
+        "mm",
+        "object.rmse_mm",
+        "root mean square of e over the object",
+        3,
         over="object",
         column="Object RMSE",
         terminal="Object\nRMSE",
@@ -110,24 +117,27 @@ _ENTRIES = (
     _headline(
         "overall_mae_mm",
         "Overall MAE",
-        of=attrgetter("overall.mae_mm"),
-        rule="mean of |e| over object and background",
-        place=0,
+        "mm",
+        "overall.mae_mm",
+        "mean of |e| over object and background",
+        0,
         column="Overall MAE",
     ),
     _headline(
         "overall_rmse_mm",
         "Overall RMSE",
-        of=attrgetter("overall.rmse_mm"),
-        rule="root mean square of e over object and background",
-        place=1,
+        "mm",
+        "overall.rmse_mm",
+        "root mean square of e over object and background",
+        1,
     ),
     _headline(
         "background_mae_mm",
         "Background MAE",
-        of=attrgetter("background.mae_mm"),
-        rule="mean of |e| over the background",
-        place=4,
+        "mm",
+        "background.mae_mm",
+        "mean of |e| over the background",
+        4,
         over="background",
         column="Backgr. MAE",
         column_from=WIDE,
@@ -136,28 +146,29 @@ _ENTRIES = (
     _headline(
         "background_rmse_mm",
         "Background RMSE",
-        of=attrgetter("background.rmse_mm"),
-        rule="root mean square of e over the background",
-        place=5,
+        "mm",
+        "background.rmse_mm",
+        "root mean square of e over the background",
+        5,
         over="background",
     ),
     _object(
         "object_median_mm",
         "Object, median error",
         "mm",
-        attrgetter("spread.median_mm"),
+        "spread.median_mm",
         "median of |e|, with linear interpolation",
-        place=15,
+        15,
     ),
     _object(
         "object_p95_mm",
         "Object, 95th percentile",
         "mm",
-        attrgetter("spread.p95_mm"),
+        "spread.p95_mm",
         "95th percentile of |e|, with linear interpolation",
-        place=16,
+        16,
     ),
-    _object("object_max_mm", "Object, largest error", "mm", attrgetter("spread.largest_mm"), "largest |e|", place=17),
+    _object("object_max_mm", "Object, largest error", "mm", "spread.largest_mm", "largest |e|", 17),
     *(
         _object(
             f"object_within_{limit}mm_share",
@@ -165,7 +176,7 @@ _ENTRIES = (
             "share",
             partial(_within, number),
             f"share of pixels with |e| of at most {limit} mm",
-            place=18 + number,
+            18 + number,
             better="higher",
         )
         for number, limit in enumerate(WITHIN_MM)
@@ -174,9 +185,9 @@ _ENTRIES = (
         "object_bias_mm",
         "Object, signed bias",
         "signed mm",
-        attrgetter("spread.bias_mm"),
+        "spread.bias_mm",
         "mean of e",
-        place=22,
+        22,
         cancels=True,
         better="nearer 0",
         helped_by_missing=True,
@@ -185,9 +196,9 @@ _ENTRIES = (
         "object_valid_bias_mm",
         "Object where predicted, signed bias",
         "signed mm",
-        attrgetter("spread.valid_bias_mm"),
+        "spread.valid_bias_mm",
         "mean of e over the measured pixels",
-        place=23,
+        23,
         cancels=True,
         better="nearer 0",
         helped_by_missing=True,
@@ -197,10 +208,10 @@ _ENTRIES = (
         "object_shift_free_mae_mm",
         "Object MAE without one offset",
         "mm",
-        attrgetter("spread.shift_free_mm"),
+        "spread.shift_free_mm",
         "MAE after the median of e has been subtracted: the error without a constant offset. Not the mean, which a few "
         "missing pixels move by metres",
-        place=24,
+        24,
         cancels=True,
         helped_by_missing=True,
     ),
@@ -208,9 +219,9 @@ _ENTRIES = (
         "object_interior_mae_mm",
         "Object away from edges, MAE",
         "mm",
-        attrgetter("interior.mae_mm"),
+        "interior.mae_mm",
         "MAE over the object interior",
-        place=6,
+        6,
         column="Interior MAE",
         column_from=WIDEST,
     ),
@@ -218,17 +229,17 @@ _ENTRIES = (
         "object_interior_rmse_mm",
         "Object away from edges, RMSE",
         "mm",
-        attrgetter("interior.rmse_mm"),
+        "interior.rmse_mm",
         "RMSE over the object interior",
-        place=7,
+        7,
     ),
     Metric(
         "object_edge_mae_mm",
         "Object along edges, MAE",
         "mm",
-        attrgetter("edge.mae_mm"),
+        "edge.mae_mm",
         "MAE over the object edge",
-        place=8,
+        8,
         column="Edge MAE",
         column_from=WIDEST,
     ),
@@ -236,17 +247,17 @@ _ENTRIES = (
         "object_edge_rmse_mm",
         "Object along edges, RMSE",
         "mm",
-        attrgetter("edge.rmse_mm"),
+        "edge.rmse_mm",
         "RMSE over the object edge",
-        place=9,
+        9,
     ),
     Metric(
         "object_valid_mae_mm",
         "Object where predicted, MAE",
         "mm",
-        attrgetter("valid.mae_mm"),
+        "valid.mae_mm",
         "MAE over the measured pixels; read it beside their share",
-        place=10,
+        10,
         helped_by_missing=True,
         training=True,
     ),
@@ -254,9 +265,9 @@ _ENTRIES = (
         "object_interior_valid_mae_mm",
         "Object where predicted, away from edges, MAE",
         "mm",
-        attrgetter("interior_valid.mae_mm"),
+        "interior_valid.mae_mm",
         "MAE over the measured pixels of the interior",
-        place=11,
+        11,
         helped_by_missing=True,
     ),
     _object(
@@ -265,7 +276,7 @@ _ENTRIES = (
         "share",
         lambda s: share(s.object.pixels - s.valid.pixels, s.object.pixels),
         "share of pixels predicted 0 or less; all other scores of the object count them with their full error",
-        place=13,
+        13,
         column="Missing",
         column_from=WIDE,
         terminal="Not\nmeasured",
@@ -276,7 +287,7 @@ _ENTRIES = (
         "share",
         lambda s: share(s.interior.pixels - s.interior_valid.pixels, s.interior.pixels),
         "the same share of the interior",
-        place=14,
+        14,
     ),
     Metric(
         "object_edge_share",
@@ -284,7 +295,7 @@ _ENTRIES = (
         "share",
         lambda s: share(s.edge.pixels, s.object.pixels),
         "share of the object that is object edge",
-        place=12,
+        12,
         better="neither",
         over="object",
         terminal="Near\nedges",
@@ -293,17 +304,17 @@ _ENTRIES = (
         "object_wide_band_mae_mm",
         f"Object within {WIDE_BAND_PX} px of edges, MAE",
         "mm",
-        attrgetter("wide_band.mae_mm"),
+        "wide_band.mae_mm",
         "MAE over the object wide band",
-        place=25,
+        25,
     ),
     Metric(
         "object_wide_interior_mae_mm",
         f"Object {WIDE_BAND_PX} px or more from edges, MAE",
         "mm",
-        attrgetter("wide_interior.mae_mm"),
+        "wide_interior.mae_mm",
         "MAE over the object wide interior",
-        place=26,
+        26,
     ),
     Metric(
         "object_wide_band_share",
@@ -311,7 +322,7 @@ _ENTRIES = (
         "share",
         lambda s: share(s.wide_band.pixels, s.object.pixels),
         "share of the object that is wide band",
-        place=27,
+        27,
         better="neither",
         over="object",
     ),
@@ -321,35 +332,35 @@ _ENTRIES = (
         "share",
         lambda s: None if s.void is None else s.void / (s.object.pixels + s.background.pixels + s.void),
         "void pixels over all pixels of the image",
-        place=28,
+        28,
         better="neither",
     ),
     Metric(
         "unlit_mae_mm",
         "Unlit, MAE",
         "mm",
-        attrgetter("unlit.mae_mm"),
+        "unlit.mae_mm",
         "MAE over the unlit set, missing pixels included. There is no phase to read: what is right here is inferred "
         "from the rest",
-        place=29,
+        29,
         over="unlit",
     ),
     Metric(
         "unlit_rmse_mm",
         "Unlit, RMSE",
         "mm",
-        attrgetter("unlit.rmse_mm"),
+        "unlit.rmse_mm",
         "RMSE over the unlit set, missing pixels included",
-        place=30,
+        30,
         over="unlit",
     ),
     Metric(
         "unlit_valid_mae_mm",
         "Unlit where predicted, MAE",
         "mm",
-        attrgetter("unlit_valid.mae_mm"),
+        "unlit_valid.mae_mm",
         "MAE over the measured pixels of the unlit set",
-        place=31,
+        31,
         helped_by_missing=True,
     ),
     Metric(
@@ -358,7 +369,7 @@ _ENTRIES = (
         "share",
         lambda s: share(s.unlit.pixels - s.unlit_valid.pixels, s.unlit.pixels),
         "share of the unlit set predicted 0 or less",
-        place=32,
+        32,
         over="unlit",
     ),
 )
@@ -404,9 +415,9 @@ _STATED = (
         "unstated_share",
         "Object without a sigma",
         "share",
-        attrgetter("unstated_share"),
+        "unstated_share",
         "share of object pixels that state none",
-        place=1,
+        1,
         terminal="Not\nstated",
     ),
     *(
@@ -426,7 +437,7 @@ _STATED = (
         "sigma_mean_mm",
         "Mean sigma",
         "mm",
-        attrgetter("sigma_mean_mm"),
+        "sigma_mean_mm",
         "sharpness: mean of s over these pixels",
         terminal="Sigma\nmean",
     ),
@@ -434,7 +445,7 @@ _STATED = (
         "sigma_median_mm",
         "Median sigma",
         "mm",
-        attrgetter("sigma_median_mm"),
+        "sigma_median_mm",
         "sharpness: median of s over these pixels",
         terminal="Sigma\nmedian",
     ),
@@ -442,7 +453,7 @@ _STATED = (
         "nll",
         "Negative log-likelihood, nats",
         "nats",
-        attrgetter("nll"),
+        "nll",
         "mean over these pixels of ln s' + ln(2 pi) / 2 + min(|e| / s', 10)^2 / 2 in nats, with s' = max(s, 0.01 mm): "
         "the Gaussian negative log-likelihood, robust against a single wrong order and against s near 0",
         terminal="NLL",

@@ -198,7 +198,7 @@ class SampleScores:
 
     def metrics(self) -> dict[str, float | None]:
         """Every metric by its key: None where the pixel set is empty, and those that a file may leave out left out."""
-        values = {key: metric.of(self) for key, metric in METRICS.items()}
+        values = {key: metric.value(self) for key, metric in METRICS.items()}
         return {key: value for key, value in values.items() if value is not None or not METRICS[key].optional}
 
     def pixels(self) -> dict[str, int | None]:

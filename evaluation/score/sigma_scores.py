@@ -41,7 +41,7 @@ class SigmaSample:
     @property
     def scores(self) -> dict[str, float | None]:
         """Every metric of a stated uncertainty by its key."""
-        return {key: metric.of(self) for key, metric in UNCERTAINTY.items()}
+        return {key: metric.value(self) for key, metric in UNCERTAINTY.items()}
 
     def within(self, percent: int) -> float | None:
         """Share of the stated pixels within the interval of one of `protocol.COVERED`."""

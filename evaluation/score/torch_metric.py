@@ -61,7 +61,7 @@ class DepthScores(Metric):
             counted = predicted[pixels], truth[pixels]  # what a void pixel holds, as NaN, does not matter
             mm_per_unit = _mm_per_unit(*counted, self.units)
             sample = _sample(*(depths * mm_per_unit for depths in counted))
-            scores = [METRICS[key].of(sample) for key in KEYS]
+            scores = [METRICS[key].value(sample) for key in KEYS]
             values = [predicted.new_zeros(()) if score is None else score for score in scores]
             self.sums += torch.stack(values).to(self.sums.device)
             self.counts += torch.tensor([score is not None for score in scores], device=self.counts.device)
