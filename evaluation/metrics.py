@@ -409,7 +409,7 @@ NOTES = (
 """What the terminal says below its table; a line whose first score may be left out of a file is left out with it."""
 
 
-_sigma = partial(Metric, helped_by_missing=True, place=0)
+_sigma = partial(Metric, helped_by_missing=True)
 _STATED = (
     _sigma(
         "unstated_share",
@@ -428,6 +428,7 @@ _STATED = (
             methodcaller("within", percent),
             "of the object pixels that state one, the share with |e| <= z s, z the quantile of a central Gaussian "
             f"interval that holds {percent}%",
+            0,
             better="neither",
             terminal=f"In {percent}%\ninterval",
         )
@@ -439,6 +440,7 @@ _STATED = (
         "mm",
         "sigma_mean_mm",
         "sharpness: mean of s over these pixels",
+        0,
         terminal="Sigma\nmean",
     ),
     _sigma(
@@ -447,6 +449,7 @@ _STATED = (
         "mm",
         "sigma_median_mm",
         "sharpness: median of s over these pixels",
+        0,
         terminal="Sigma\nmedian",
     ),
     _sigma(
@@ -456,6 +459,7 @@ _STATED = (
         "nll",
         "mean over these pixels of ln s' + ln(2 pi) / 2 + min(|e| / s', 10)^2 / 2 in nats, with s' = max(s, 0.01 mm): "
         "the Gaussian negative log-likelihood, robust against a single wrong order and against s near 0",
+        0,
         terminal="NLL",
     ),
     *(
@@ -467,6 +471,7 @@ _STATED = (
             f"sparsification (Ilg et al., ECCV 2018), over all object pixels: the {error.upper()} of the rest after "
             "the share 0, 0.05, ... 0.95 of least sure pixels has been left out, minus that after the same share of "
             "largest errors; mean of the 20 differences, in mm, not divided by the error",
+            0,
             cancels=True,
             terminal="AUSE\nMAE" if error == "mae" else "",
         )
@@ -479,6 +484,7 @@ _STATED = (
             "mm",
             methodcaller("sure_mm", f"{error}_mm"),
             f"{error.upper()} of the object without its 5% least sure pixels",
+            0,
             terminal="MAE of the\nsurest 95%" if error == "mae" else "",
         )
         for error in ("mae", "rmse")
