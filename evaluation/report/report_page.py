@@ -8,8 +8,7 @@ from markupsafe import Markup
 
 from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation.metrics import METRICS, UNCERTAINTY, WIDEST, listed
-from fpp_ml_bench.evaluation.report.curves import uncertainty_plots
-from fpp_ml_bench.evaluation.report.figures import Panel, histogram, sample_panels
+from fpp_ml_bench.evaluation.report.figures import Panel, histogram, sample_panels, uncertainty_plots
 from fpp_ml_bench.evaluation.report.html import interval_text, page, render, score_text
 from fpp_ml_bench.evaluation.result import Result, SampleResult, Uncertainty, write_file
 from fpp_ml_bench.evaluation.score import scored_pair

@@ -18,8 +18,8 @@ from torchmetrics import Metric
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.metrics import METRICS
 from fpp_ml_bench.evaluation.protocol import WITHIN_MM
+from fpp_ml_bench.evaluation.score.check import MM_PER_UNIT, declared_units, not_in_mm
 from fpp_ml_bench.evaluation.score.sample_scores import EMPTY, NOT_FINITE, ErrorStats, Spread
-from fpp_ml_bench.evaluation.score.units import MM_PER_UNIT, declared_units, not_in_mm
 
 KEYS = tuple(key for key, metric in METRICS.items() if metric.training)
 SQUARES_VANISH = 1e-140
