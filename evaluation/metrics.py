@@ -500,6 +500,13 @@ def listed(metrics: Iterable[Metric]) -> list[Metric]:
     return sorted(metrics, key=attrgetter("row"))
 
 
+def with_column(width: int) -> list[Metric]:
+    """Those with a column in the leaderboard's tables where the terminal has ``width`` characters, the most important
+    first."""
+    shown = (metric for metric in listed(METRICS.values()) if metric.column and metric.column_from <= width)
+    return sorted(shown, key=attrgetter("column_from"))
+
+
 def sort_keys() -> tuple[str, ...]:
     """What the leaderboard can be sorted by."""
     keys = (key for key, metric in METRICS.items() if not metric.helped_by_missing)

@@ -3,9 +3,8 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from operator import attrgetter
 
-from fpp_ml_bench.evaluation.metrics import METRICS, RANGE_KEY, RANK_KEY, WIDE, WIDEST, listed
+from fpp_ml_bench.evaluation.metrics import METRICS, RANGE_KEY, RANK_KEY, WIDE, WIDEST, with_column
 from fpp_ml_bench.evaluation.report import millimetres, percent, score_text, seconds
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.assumptions import assumption, learned_from
@@ -56,8 +55,7 @@ class Column:
 
 def columns(sort: str) -> list[Column]:
     """Columns of a ranking by ``sort``; a key without a column gets its own, and that of the errors its interval."""
-    ordered = sorted(listed(METRICS.values()), key=attrgetter("column_from"))
-    shown = {metric.key: metric.column for metric in ordered if metric.column}
+    shown = {metric.key: metric.column for metric in with_column(WIDEST)}
     if sort in METRICS:
         own = sort.removesuffix("_mm").replace("_", " ")
         shown = shown if sort in shown else {sort: own, **shown}

@@ -7,7 +7,7 @@ from pathlib import Path
 from markupsafe import Markup
 
 from fpp_ml_bench.errors import DatasetError, PredictionError
-from fpp_ml_bench.evaluation.metrics import METRICS, UNCERTAINTY, WIDEST, listed
+from fpp_ml_bench.evaluation.metrics import METRICS, UNCERTAINTY, WIDE, listed, with_column
 from fpp_ml_bench.evaluation.report.figures import Panel, histogram, sample_panels, uncertainty_plots
 from fpp_ml_bench.evaluation.report.html import interval_text, page, render, score_text
 from fpp_ml_bench.evaluation.result import Result, SampleResult, Uncertainty, write_file
@@ -117,7 +117,7 @@ def uncertainty_table(block: Uncertainty) -> str:
 
 def sample_table(result: Result) -> str:
     """Scores of every sample, the largest object MAE first, with the hash of the prediction it comes from."""
-    shown = [metric for metric in listed(METRICS.values()) if metric.column and metric.column_from < WIDEST]
+    shown = with_column(WIDE)
     ordered = sorted(result.per_sample, key=lambda row: (-(row.object_mae_mm or 0.0), row.sample))
     rows = [
         [r.sample, *(score_text(m.key, getattr(r, m.key)) for m in shown), r.prediction_sha256[:12]] for r in ordered

@@ -3,6 +3,7 @@ text from a submission is shown as plain text, never as markup."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import partial
 from string import Formatter
 
@@ -10,7 +11,7 @@ from rich.console import Group
 from rich.text import Text
 
 from fpp_ml_bench.evaluation import report
-from fpp_ml_bench.evaluation.metrics import METRICS, NOTES, UNCERTAINTY, listed
+from fpp_ml_bench.evaluation.metrics import METRICS, NOTES, UNCERTAINTY, Metric, listed
 from fpp_ml_bench.evaluation.protocol import PIXEL_SETS
 from fpp_ml_bench.evaluation.report.html import interval_text, millimetres, score_text, seconds, signed
 from fpp_ml_bench.evaluation.result import Result
@@ -99,9 +100,12 @@ def _uncertainty(result: Result) -> Table | None:
         "area between the sparsification curves by sigma and by error, over all object pixels",
     )
     for name, scores in {"all": block.metrics, **block.per_object}.items():
-        cells = (score_text(metric.key, getattr(scores, metric.key)) for metric in shown)
-        table.add_row(Text(printable(name)), *cells, style="bold" if name == "all" else None)
+        table.add_row(Text(printable(name)), *_cells(scores, shown), style="bold" if name == "all" else None)
     return table
+
+
+def _cells(scores: object, shown: Iterable[Metric]) -> list[str]:
+    return [score_text(metric.key, getattr(scores, metric.key)) for metric in shown]
 
 
 def _worst(result: Result) -> Table | None:
@@ -115,7 +119,7 @@ def _worst(result: Result) -> Table | None:
         title=f"Largest object MAE, {min(WORST, len(rows))} of {len(rows)} samples",
     )
     for row in sorted(rows, key=lambda row: (-(row.object_mae_mm or 0.0), row.sample))[:WORST]:
-        table.add_row(Text(printable(row.sample)), *(score_text(m.key, getattr(row, m.key)) for m in shown))
+        table.add_row(Text(printable(row.sample)), *_cells(row, shown))
     return table
 
 
