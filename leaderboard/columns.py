@@ -1,7 +1,7 @@
 """The columns of the leaderboard's tables: what a cell says of a row, and where a column is shown."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 from fpp_ml_bench.evaluation.metrics import METRICS, RANGE_KEY, RANK_KEY, WIDE, WIDEST, with_column
@@ -66,22 +66,21 @@ def columns(sort: str) -> list[Column]:
             ends = partial(interval, between="-", key=sort)
             errors.append(Column("95% interval", ends, from_width=MIDDLE))
         if key == RANK_KEY:
-            errors += [replace(PARTS[0], from_width=MIDDLE), replace(PARTS[1], from_width=MIDDLE), RATIO]
-            errors.append(replace(RANGE, from_width=MIDDLE))
+            errors += [*PARTS, RATIO, RANGE]
     return [
         RANK,
         METHOD,
-        replace(CODE, from_width=MIDDLE),
+        CODE,
         *errors,
         Column("s/sample", _seconds),
         FRAMES,
-        replace(RELIANCE, from_width=WIDE),
-        replace(ROBUSTNESS, from_width=WIDEST),
-        *(replace(column, from_width=WIDEST) for column in UNCERTAINTY),
-        replace(PROVENANCE, from_width=MIDDLE),
-        replace(LEARNED, from_width=WIDEST),
-        Column("Assumes", lambda row: assumption(row.entry.row) or "-", right=False, from_width=WIDEST),
-        Column("Timed on", lambda row: device(row.entry), right=False, from_width=WIDEST),
+        RELIANCE,
+        ROBUSTNESS,
+        *UNCERTAINTY,
+        PROVENANCE,
+        LEARNED,
+        Column("Assumes", lambda row: assumption(row.entry.row) or "-", False, WIDEST),
+        Column("Timed on", lambda row: device(row.entry), False, WIDEST),
         Column("Full name", lambda row: printable(row.entry.name, _LONGEST_NAME), False, ONLY_IN_FILES),
     ]
 
@@ -154,26 +153,28 @@ def _states_uncertainty(row: Ranked) -> bool:
     return uncertainty(row.entry) != (None, None)
 
 
-def _says_learned(row: Ranked) -> bool:
-    return bool(learned_from(row.entry.row))
-
-
 RANK = Column("Rank", lambda row: row.ranks, present=lambda row: row.best_rank is not None)
-CODE = Column("Code", lambda row: printable(row.entry.row.dataset.code, _DEVICE_WIDTH), right=False)
-METHOD = Column("Method", lambda row: printable(row.short_name), right=False)
+CODE = Column("Code", lambda row: printable(row.entry.row.dataset.code, _DEVICE_WIDTH), False, MIDDLE)
+METHOD = Column("Method", lambda row: printable(row.short_name), False)
 FRAMES = Column("Frames", lambda row: str(row.entry.frames))
 PARTS = tuple(
-    Column(title, partial(error_on, part), present=lambda row: row.on(UNSEEN) is not None)
+    Column(title, partial(error_on, part), True, MIDDLE, lambda row: row.on(UNSEEN) is not None)
     for title, part in (("On test", TEST), ("On unseen", UNSEEN))
 )
 """Both errors of a row that joins the two sets."""
-RANGE = Column("Of depth range", partial(error, RANGE_KEY), present=lambda row: row.value(RANGE_KEY) is not None)
+RANGE = Column("Of depth range", partial(error, RANGE_KEY), True, MIDDLE, lambda row: row.value(RANGE_KEY) is not None)
 RATIO = Column("x trivial", ratio, present=lambda row: row.ratio is not None)
-RELIANCE = Column("Phase reliance", lambda row: reliance(row.entry))
-ROBUSTNESS = Column("Disturbed, mm", lambda row: robustness(row.entry))
+RELIANCE = Column("Phase reliance", lambda row: reliance(row.entry), True, WIDE)
+ROBUSTNESS = Column("Disturbed, mm", lambda row: robustness(row.entry), True, WIDEST)
 UNCERTAINTY = (
-    Column("In 95%", lambda row: percent(uncertainty(row.entry)[0]), present=_states_uncertainty),
-    Column("AUSE", lambda row: millimetres(uncertainty(row.entry)[1]), present=_states_uncertainty),
+    Column("In 95%", lambda row: percent(uncertainty(row.entry)[0]), True, WIDEST, _states_uncertainty),
+    Column("AUSE", lambda row: millimetres(uncertainty(row.entry)[1]), True, WIDEST, _states_uncertainty),
 )
-LEARNED = Column("Learned from", lambda row: learned_from(row.entry.row) or "-", False, present=_says_learned)
-PROVENANCE = Column("Provenance", lambda row: row.provenance, right=False)
+LEARNED = Column(
+    "Learned from",
+    lambda row: learned_from(row.entry.row) or "-",
+    False,
+    WIDEST,
+    lambda row: bool(learned_from(row.entry.row)),
+)
+PROVENANCE = Column("Provenance", lambda row: row.provenance, False, MIDDLE)
