@@ -166,21 +166,21 @@ _NO_SPREAD = Spread()
 
 @dataclass(frozen=True)
 class SampleScores:
-    """What the metrics of a sample are made of. ``prediction_mm`` and ``target_mm`` (H, W) as they were scored, the
-    pixels ``inside`` the object that are not void, and ``errors``: prediction minus target in mm there, float64 (n,) in
-    the order of the pixels.
+    """What the metrics of a sample are made of. ``prediction_mm`` and ``target_mm`` (H, W) as they were scored,
+    ``surface``: where the target has a depth, ``void_mask``: which pixels are in no set, None by rules without void;
+    and ``errors``: prediction minus target in mm on the object's pixels, float64 (n,).
 
     Statistics of the background and of the object's zones, and the object's ``spread``. A zone's number is a sum of 1
     (nearer to a depth edge than the edge band), 2 (nearer than the wide band) and 4 (not measured: predicted 0 mm or
-    less); every MAE and RMSE of the object is that of a union of zones. ``void``: how many pixels are in no set, None
-    by rules without void. ``unlit``: statistics of the unlit pixels, ``unlit_valid`` of those that were measured;
-    ``scores_unlit``: whether the rules know them. ``range_mm``: largest minus smallest depth of the object."""
+    less); every MAE and RMSE of the object is that of a union of zones. ``unlit``: statistics of the unlit pixels,
+    ``unlit_valid`` of those that were measured; ``scores_unlit``: whether the rules know them. ``range_mm``: largest
+    minus smallest depth of the object."""
 
     prediction_mm: Map
     target_mm: Map
-    inside: NDArray[np.bool_]
+    surface: NDArray[np.bool_]
+    void_mask: NDArray[np.bool_] | None
     background: ErrorStats
-    void: int | None
     unlit: ErrorStats
     unlit_valid: ErrorStats
     scores_unlit: bool
@@ -194,6 +194,16 @@ class SampleScores:
     wide_interior, wide_band = _zones(_WIDE, 0), _zones(_WIDE, _WIDE)
     valid = _zones(_MISSING, 0)
     interior_valid, edge_valid = _zones(_EDGE | _MISSING, 0), _zones(_EDGE | _MISSING, _EDGE)
+
+    @cached_property
+    def inside(self) -> NDArray[np.bool_]:
+        """The object's pixels, (H, W)."""
+        return self.surface if self.void_mask is None else self.surface & ~self.void_mask
+
+    @cached_property
+    def void(self) -> int | None:
+        """How many pixels are in no set."""
+        return None if self.void_mask is None else int(np.count_nonzero(self.void_mask))
 
     @property
     def missing(self) -> int:
@@ -249,16 +259,15 @@ def score_sample(
     prediction = prediction_mm.ravel()
     flat_void = None if void is None else void.ravel()
     background, flat_inside = _background(prediction, target_mm.ravel(), flat_void)
-    void_px = None if void is None else int(np.count_nonzero(void))
     unlit, measured = (EMPTY, EMPTY) if unlit_mm is None else _unlit_stats(prediction, unlit_mm.ravel())
     inside = flat_inside.reshape(target_mm.shape)
-    box = object_box(inside)
-    if void is not None:
-        inside &= ~void
     nothing = SampleScores(
-        prediction_mm, target_mm, inside, background, void_px, unlit, measured, scores_unlit=unlit_mm is not None
+        prediction_mm, target_mm, inside, void, background, unlit, measured, scores_unlit=unlit_mm is not None
     )
-    if box is None or not (index := np.flatnonzero(inside[box])).size:
+    if (box := object_box(inside)) is None:
+        return nothing
+    index = np.flatnonzero(inside[box] if void is None else inside[box] & ~void[box])
+    if not index.size:
         return nothing
     depths = prediction_mm[box].ravel().take(index)
     errors = depths.astype(np.float64)
