@@ -32,6 +32,7 @@ from fpp_ml_bench.evaluation.result.parts import (
     Reliance,
     Robustness,
     SampleResult,
+    SigmaScores,
     Sparsification,
     Uncertainty,
 )
@@ -316,7 +317,7 @@ def uncertainty_of(samples: Mapping[str, SigmaSample], owners: Mapping[str, str]
     means = {"left_out": list(LEFT_OUT), **{name: _mean_curve([of[name] for of in curves]) for name in names}}
     return Uncertainty(
         **_uncertainty_means(per_sample, owners),
-        per_sample=per_sample,
+        per_sample={name: SigmaScores(**scores) for name, scores in per_sample.items()},
         reliability=Reliability(nominal=list(NOMINAL), observed=_mean_curve(observed)) if observed else None,
         sparsification=Sparsification(**means) if curves else None,
     )

@@ -347,18 +347,18 @@ class SigmaSample:
 
     def within(self, percent: int) -> float | None:
         """Share of the stated pixels within the interval of one of `protocol.COVERED`."""
-        return self.observed and self.observed[protocol.NOMINAL.index(percent / 100)]
+        return None if self.observed is None else self.observed[protocol.NOMINAL.index(percent / 100)]
 
     def sure_mm(self, error: str) -> float | None:
         """``mae_mm`` or ``rmse_mm`` of the object without its least sure pixels."""
-        return self.curves and self.curves[error][protocol.LEFT_OUT.index(protocol.SURE_LEFT_OUT)]
+        return None if self.curves is None else self.curves[error][protocol.LEFT_OUT.index(protocol.SURE_LEFT_OUT)]
 
     def area_mm(self, error: str) -> float | None:
         """Mean distance of the two curves of ``mae_mm`` or ``rmse_mm``. Never below 0 but by rounding: no order leaves
         smaller errors than that of the errors themselves."""
-        return self.curves and mean_of(
-            np.maximum(np.array(self.curves[error]) - np.array(self.curves[f"best_{error}"]), 0.0)
-        )
+        if self.curves is None:
+            return None
+        return mean_of(np.maximum(np.array(self.curves[error]) - np.array(self.curves[f"best_{error}"]), 0.0))
 
 
 @cache

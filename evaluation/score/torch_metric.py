@@ -9,7 +9,8 @@ give each process its own samples instead.
 Included are the metrics whose entry says ``training``; those of edge bands need the depth edges of every target.
 """
 
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -116,31 +117,23 @@ def _mm_per_unit(prediction: Tensor, target: Tensor, units: str | None) -> float
     return scale
 
 
-class _Sample(NamedTuple):
-    """The parts of a `fpp_ml_bench.evaluation.score.SampleScores` that the metrics of the training read, as tensors."""
-
-    overall: ErrorStats
-    object: ErrorStats
-    background: ErrorStats
-    valid: ErrorStats
-    spread: Spread = Spread()
-    range_mm: Any = 0.0
-
-
-def _sample(prediction: Tensor, target: Tensor) -> _Sample:
-    """The parts of one sample, float64 (n,) in mm each."""
+def _sample(prediction: Tensor, target: Tensor) -> SimpleNamespace:
+    """The parts of a `fpp_ml_bench.evaluation.score.SampleScores` that the metrics of the training read, as tensors, of
+    one sample, float64 (n,) in mm."""
     error = prediction - target
     if error.numel() and not bool(torch.isfinite(error.square().sum())):
         raise PredictionError(NOT_FINITE)
     inside = target > 0
     errors, measured = error[inside], prediction[inside] > 0
     valid = errors[measured]
-    sets = (_stats(pixels) for pixels in (error, errors, error[~inside], valid))
+    sets = {"overall": error, "object": errors, "background": error[~inside], "valid": valid}
+    sample = SimpleNamespace(**{name: _stats(pixels) for name, pixels in sets.items()}, spread=Spread(), range_mm=0.0)
     if not errors.numel():
-        return _Sample(*sets)
+        return sample
     ascending = errors.abs().sort().values
     offset = _quantile(errors.sort().values, 0.5)
-    spread = Spread(
+    sample.range_mm = target[inside].max() - target[inside].min()
+    sample.spread = Spread(
         _quantile(ascending, 0.5),
         _quantile(ascending, 0.95),
         ascending[-1],
@@ -149,14 +142,15 @@ def _sample(prediction: Tensor, target: Tensor) -> _Sample:
         valid.mean() if valid.numel() else None,
         (errors - offset).abs().mean(),
     )
-    return _Sample(*sets, spread, target[inside].max() - target[inside].min())
+    return sample
 
 
-def _stats(errors: Tensor) -> Any:
-    """`ErrorStats` of tensors."""
+def _stats(errors: Tensor) -> ErrorStats | SimpleNamespace:
+    """`ErrorStats`, of tensors where there are errors."""
     if not errors.numel():
         return EMPTY
-    return ErrorStats(errors.new_tensor(errors.numel()), errors.abs().mean(), _root_mean_square(errors))
+    pixels = errors.new_tensor(errors.numel())
+    return SimpleNamespace(pixels=pixels, mae_mm=errors.abs().mean(), rmse_mm=_root_mean_square(errors))
 
 
 def _root_mean_square(errors: Tensor) -> Tensor:
