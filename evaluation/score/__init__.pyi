@@ -1,4 +1,3 @@
-from .check import Checked as Checked
 from .check import check_folder as check_folder
 from .check import scored_pair as scored_pair
 from .conformal import Calibration as Calibration

@@ -370,8 +370,10 @@ def differences(scored: result.Result, folder: Path, dataset: DatasetFolder) -> 
     stored_rows = {row.sample: row for row in scored.per_sample}
     if set(stored_rows) != {row.sample for row in again.per_sample}:
         return [*problems, "per_sample: other samples than the split has"]
+    exact = ("object", "prediction_sha256", *(f"{name}_pixels" for name in ("object", "background", "void", "unlit")))
     for row in again.per_sample:
-        problems += _sample_differences(stored_rows[row.sample], row)
+        pair = stored_rows[row.sample], row
+        problems += _different(f"{row.sample}: ", *pair, METRICS, row.object_mae_mm, exact=exact)
     return problems + _uncertainty_differences(scored.uncertainty, again.uncertainty)
 
 
@@ -389,34 +391,29 @@ def _uncertainty_differences(stored: result.Uncertainty | None, recomputed: resu
         if len(first) != len(second) or not all(result.same(*pair, 1e-12) for pair in pairs):
             lines.append(f"uncertainty.{name}: the curve in the result is not the one recomputed")
     for sample, scores in recomputed.per_sample.items():
-        keys = _different(stored.per_sample[sample], scores, UNCERTAINTY, scores.sure_rmse_mm, 1e-12)  # near 0: nll
-        lines += _difference_lines(sample, stored.per_sample[sample], scores, keys, "uncertainty.")
+        pair = stored.per_sample[sample], scores
+        lines += _different(f"{sample}: uncertainty.", *pair, UNCERTAINTY, scores.sure_rmse_mm, 1e-12)  # nll is near 0
     return lines
 
 
-def _sample_differences(stored: result.SampleResult, recomputed: result.SampleResult) -> list[str]:
-    exact = ("object", "prediction_sha256", *(f"{name}_pixels" for name in ("object", "background", "void", "unlit")))
-    keys = [key for key in exact if getattr(stored, key) != getattr(recomputed, key)]
-    keys += _different(stored, recomputed, METRICS, recomputed.object_mae_mm)
-    return _difference_lines(recomputed.sample, stored, recomputed, keys)
-
-
 def _different(
-    stored: object, recomputed: object, metrics: Mapping[str, Metric], error_mm: float | None, rounding: float = 0.0
+    name: str,
+    stored: object,
+    recomputed: object,
+    metrics: Mapping[str, Metric],
+    error_mm: float | None,
+    rounding: float = 0.0,
+    exact: Iterable[str] = (),
 ) -> list[str]:
-    """Keys of the scores that differ; ``error_mm``: the error of which those that cancel are a small difference."""
-    return [
-        key
-        for key, metric in metrics.items()
-        if not result.same(
-            getattr(stored, key), getattr(recomputed, key), 1e-9 * (error_mm or 0.0) if metric.cancels else rounding
-        )
-    ]
-
-
-def _difference_lines(sample: str, stored: object, recomputed: object, keys: list[str], part: str = "") -> list[str]:
-    texts = {key: [_value_text(getattr(row, key)) for row in (stored, recomputed)] for key in keys}
-    return [f"{sample}: {part}{key}: {a} in the result, {b} recomputed" for key, (a, b) in texts.items()]
+    """A line for each key of ``exact`` and each score that differs; ``error_mm``: the error of which the scores that
+    cancel are a small difference."""
+    limits = {key: 1e-9 * (error_mm or 0.0) if metric.cancels else rounding for key, metric in metrics.items()}
+    lines = []
+    for key in (*exact, *metrics):
+        first, second = getattr(stored, key), getattr(recomputed, key)
+        if not (result.same(first, second, limits[key]) if key in limits else first == second):
+            lines.append(f"{name}{key}: {_value_text(first)} in the result, {_value_text(second)} recomputed")
+    return lines
 
 
 def _value_text(value: object) -> str:

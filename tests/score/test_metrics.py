@@ -46,6 +46,9 @@ assert result.result_json(result.read_result(old)) == old.read_bytes()  # of bef
 assert "toy_mm" in result.json_schema("result")["$defs"]["Metrics"]["properties"]
 print("BOARD")
 assert bench(["leaderboard", str(out), str(old), "--sort", "toy_mm", "--markdown", str(out.parent / "table.md")]) == 0
+assert bench(["leaderboard", str(out), "--page", str(out.parent / "page"), "--csv", str(out.parent / "rows.csv")]) == 0
+assert "Toy, mm" in (out.parent / "page" / "index.html").read_text()
+assert "toy_mm" in (out.parent / "rows.csv").read_text().splitlines()[0].split(",")
 """
 
 
