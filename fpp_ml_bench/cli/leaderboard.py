@@ -9,7 +9,7 @@ from fpp_ml_bench import leaderboard
 from fpp_ml_bench.baselines import tradeoff
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation import result
-from fpp_ml_bench.evaluation.protocol import METRICS
+from fpp_ml_bench.evaluation.metrics import METRICS
 from fpp_ml_bench.leaderboard import page
 
 SUMMARY = "Rank result files: error and run time side by side, as a table, a static page and a block for README."
