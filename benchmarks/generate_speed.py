@@ -19,7 +19,6 @@ in rows shows the same figure three times, to a few MiB of noise.
 """
 
 import argparse
-import os
 import shutil
 import statistics
 import subprocess
@@ -54,6 +53,13 @@ from fpp_ml_bench.optics import Rig, paper_rig, pattern_image
 FULL_IMAGES = 15_600
 VIEW = "A60"
 MEMORY_PX = 240
+LAUNCHER = """\
+import resource, subprocess, sys
+status = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode
+print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+sys.exit(status)
+"""
+"""Runs a command from a small process: the largest resident set of a child begins at that of its parent."""
 
 
 def timed_build(folder: Path, settings: BuildSettings, workers: int) -> tuple[float, int, int]:
@@ -154,14 +160,11 @@ def peer_images_per_second(settings: BuildSettings, folder: Path, images: int = 
 
 def peak_mib(program: str, *arguments: str) -> float:
     """Largest resident set of a command, MiB. Raises `SystemExit` where it fails."""
-    command = [str(Path(sys.executable).with_name(program)), *arguments]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    error = process.stderr.read() if process.stderr else b""
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        raise SystemExit(f"{program} {' '.join(arguments)}: {error.decode()[-2000:]}")
-    return usage.ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+    command = [sys.executable, "-c", LAUNCHER, str(Path(sys.executable).with_name(program)), *arguments]
+    ended = subprocess.run(command, capture_output=True, text=True)
+    if ended.returncode:
+        raise SystemExit(f"{program} {' '.join(arguments)}: {ended.stderr[-2000:]}")
+    return int(ended.stdout) / (2**20 if sys.platform == "darwin" else 2**10)
 
 
 def peaks_mib(folder: Path, rows: int, size: int) -> dict[str, float]:
