@@ -30,7 +30,6 @@ import pyarrow.parquet as pq
 import yaml
 from safetensors import safe_open
 
-README = Path(__file__).resolve().parents[1] / "README.md"
 SECTIONS = ("build", "train", "predict", "leaderboard", "reports")
 LEFT_OUT = re.compile(
     r"created|.*seconds.*|hardware|software|environment|generator|pace_ms|load|.*_s|sittings|runs|peak_.*"
@@ -288,10 +287,6 @@ def leaderboard(recorder: Recorder) -> None:
     options = "--paper all --markdown ranking.md --json ranking.json"
     recorder.run("leaderboard", f"fpp-bench leaderboard {options}", *files, output=True)
     recorder.run("leaderboard", "fpp-bench leaderboard --sort overall_rmse_mm --paper none", output=True)
-    shutil.copy(README, recorder.work / "README.md")
-    recorder.run("leaderboard", "fpp-bench leaderboard --readme README.md --check", output=True)
-    recorder.work.joinpath("README.md").write_text("<!-- leaderboard:begin -->\n\n<!-- leaderboard:end -->\n")
-    recorder.run("leaderboard", "fpp-bench leaderboard --readme README.md", "README.md")
 
 
 def reports(recorder: Recorder) -> None:

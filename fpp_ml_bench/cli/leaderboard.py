@@ -1,7 +1,6 @@
 """``fpp-bench leaderboard``: rank result files, and show the paper's rows apart."""
 
 import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ from fpp_ml_bench.evaluation import result
 from fpp_ml_bench.evaluation.metrics import METRICS
 from fpp_ml_bench.leaderboard import page
 
-SUMMARY = "Rank result files: error and run time side by side, as a table, a static page and a block for README."
+SUMMARY = "Rank result files: error and run time side by side, as a table and a static page."
 EXAMPLES = (
     "fpp-bench leaderboard result.json second.json",
     "fpp-bench leaderboard results/ --sort object_rmse_mm --markdown table.md",
@@ -20,7 +19,6 @@ EXAMPLES = (
     "fpp-bench leaderboard --csv leaderboard.csv",
     "fpp-bench leaderboard --paper loss",
     "fpp-bench leaderboard --page page",
-    "fpp-bench leaderboard --readme README.md --check",
     "fpp-bench leaderboard result.json --row leaderboard/rows/mine.json",
 )
 _TABLES = ("normalization", "background_removed", "multi_frame", "loss", "architecture", "oracle_order", "all", "none")
@@ -73,16 +71,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="with --page: the tradeoff.json to show on it (default, for the shipped rows: the file that ships)",
     )
     add(
-        "--readme",
-        **one_file,
-        help="write the ranking between the leaderboard markers of this file, from the rows shipped with the package",
-    )
-    add(
-        "--check",
-        action="store_true",
-        help="with --readme: write nothing; exit status 1 when the block is not up to date",
-    )
-    add(
         "--row",
         **one_file,
         help="make a row file for the leaderboard of the given result, and print what a maintainer adds to "
@@ -94,13 +82,11 @@ def run(args: argparse.Namespace) -> int:
     """Rank, write the requested files, print the tables. Raises SubmissionError naming a file that is not valid."""
     from fpp_ml_bench.cli.console import show
 
-    if args.check and args.readme is None:
-        raise SubmissionError("--check checks a README; give it with --readme FILE")
     if args.tradeoff is not None and args.page is None:
         raise SubmissionError("--tradeoff adds settings to a page; give it with --page DIR")
     if args.page is not None and args.sort != "object_mae_mm":
         raise SubmissionError("--page is by object_mae_mm, and a click sorts it otherwise; leave out --sort")
-    if args.row is not None and args.readme is None:
+    if args.row is not None:
         if len(args.results) != 1:
             raise SubmissionError(f"--row makes a row of one result, {len(args.results)} were given")
         row = leaderboard.read_entry(args.results[0]).row
@@ -108,21 +94,9 @@ def run(args: argparse.Namespace) -> int:
         print(f"{args.row}: {len(data):,} bytes, self-reported until a maintainer adds to leaderboard/vouched.txt:")
         print(leaderboard.vouching_line(row, data, "measured", "THE COMMAND THAT MAKES IT AGAIN"))
         return 0
-    # Page and README hold the shipped rows or the named files, never results that happen to be in the current folder.
-    published = args.page is not None or args.readme is not None
-    unnamed = leaderboard.shipped_rows() if published else leaderboard.discover(Path.cwd())
+    # A page holds the shipped rows or the named files, never results that happen to be in the current folder.
+    unnamed = leaderboard.discover(Path.cwd()) if args.page is None else leaderboard.shipped_rows()
     entries = leaderboard.read_entries(leaderboard.expand(args.results) if args.results else unnamed)
-    if args.readme is not None:
-        same = leaderboard.update_readme(args.readme, leaderboard.rank(entries), args.check)
-        if args.check and not same:
-            print(
-                f"{args.readme}: the ranking is not up to date with the rows; don't edit it by hand, run: "
-                f"fpp-bench leaderboard --readme {args.readme}",
-                file=sys.stderr,
-            )
-            return 1
-        print(f"{args.readme}: {'the ranking is up to date with the rows' if same else 'written'}")
-        return 0
     groups, papers = leaderboard.rank(entries, args.sort), leaderboard.chosen_tables(args.paper)
     for path, text in ((args.markdown, leaderboard.markdown), (args.json, leaderboard.table_json)):
         if path is not None:

@@ -40,8 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, write, print. A file that can't take the score raises FppBenchError before measuring."""
     limit_threads(args.threads)  # before NumPy is loaded
-    from fpp_ml_bench.leaderboard.measured import check_same_method, write_reliance
-    from fpp_ml_bench.leaderboard.rows import read_entry
+    from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_reliance
 
     if not 1 <= args.views <= 6:
         raise PredictionError(f"--views {args.views}: expected 1 to 6, an object has six views")

@@ -68,8 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Measure, write the page, print. A file that can't take the block raises FppBenchError before measuring."""
     limit_threads(args.threads)
-    from fpp_ml_bench.leaderboard.measured import check_same_method, write_robustness
-    from fpp_ml_bench.leaderboard.rows import read_entry
+    from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_robustness
 
     workers = workers_of(args)
     names = [name.strip() for name in args.axes.split(",") if name.strip()]

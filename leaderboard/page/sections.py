@@ -21,8 +21,8 @@ _SHADES = 6
 
 
 def blocks(groups: Sequence[Group], slugs: Mapping[int, str]) -> list[dict[str, Any]]:
-    """What the template needs of each dataset: its title and a ``short`` one, whether it is ``main`` (the first, or of
-    today and not `GroupKey.aside`), notes on earlier data or rules, the pictures of all its rows, and its tables."""
+    """What the template needs of each dataset: its title and a ``short`` one, whether it is ``main`` (the first, or
+    not `GroupKey.aside`), the pictures of all its rows, and its tables."""
     datasets: list[dict[str, Any]] = []
     for data, members in groupby(groups, key=lambda group: group.key.data_title):
         of_data = list(members)
@@ -34,9 +34,8 @@ def blocks(groups: Sequence[Group], slugs: Mapping[int, str]) -> list[dict[str, 
                 "numbered": numbered if len(rows) <= MOST_LABELLED else [],
                 "id": f"data-{hashlib.sha256(data.encode()).hexdigest()[:8]}",
                 "title": data,
-                "short": f"earlier, {name}" if key.notes else key.aside or name,
-                "main": not datasets or not (key.notes or key.aside),
-                "notes": key.notes,
+                "short": key.aside or name,
+                "main": not datasets or not key.aside,
                 "figures": overview_figures(of_data, slugs),
                 "targets": sorted({group.key.against for group in of_data}),
                 "sections": [_section(group, _link(group, of_data)) for group in of_data],
