@@ -1,7 +1,8 @@
 """Importing a published tree into the dataset format, through the same crash-safe assembly as a build. `SampleReader`
-reads a sample, fringe, depth in mm and raw frames, with every check on their contents."""
+reads a sample, fringe, depth in mm and raw frames, with every check on their contents. And what a tree's raw scans and
+depths say about the rig, whose pitch and projector are not published."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -12,11 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench import __version__
+from fpp_ml_bench.calibration import MOST_PX, DepthView, view_from_frames
+from fpp_ml_bench.containers import from_file, parse_image, parse_matrix
+from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mask
-from fpp_ml_bench.errors import LayoutError, RigError
+from fpp_ml_bench.errors import DecodeError, LayoutError, PredictionError, RigError
 from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.loaders.published import tree as published_tree
-from fpp_ml_bench.loaders.published.files import read_grey_png, read_matrix, read_scalar
 from fpp_ml_bench.loaders.published.order import AUTO, FrameOrder, check_order, find_order, parse_order
 from fpp_ml_bench.loaders.published.tree import VARIABLES, VARIANT_FOLDERS, PublishedSample, PublishedTree
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME, Row
@@ -26,12 +29,49 @@ from fpp_ml_bench.optics import Rig, paper_rig, rig_from_dict
 IMPORTED = "imported"
 _CHECK_THREADS = 4
 _MOST_SCANS_TRIED = 6
+AGREEING_MM = 1.0
+"""Largest median difference between a tree's depth and what its own rig decodes from its frames: twice the error of
+the benchmark's ground truth."""
+_LEAST_PX_A_VIEW = 2000
 AGREEMENT_MM = 0.01
 """Accepted difference between variants of a depth map: float32 in m is exact to 0.0001 mm, and a wrong unit or file
 differs by mm."""
 _UNIT_SLACK = 10.0
 _ROUNDING = 1e-6
 _SHOWN_MISFITS = 3
+
+
+def read_grey_png(path: Path) -> NDArray[np.uint8]:
+    """Grey levels of an 8-bit PNG, uint8 (H, W); RGB is accepted where its three channels are equal. Raises
+    `LayoutError` naming the file when it is not a PNG, is cut off or damaged, has another bit depth or colour type, or
+    its channels differ."""
+    return from_file(_grey_levels, path, LayoutError)
+
+
+def _grey_levels(content: bytes) -> NDArray[np.uint8]:
+    published_tree.png_size(content)
+    image = parse_image(content)
+    if image.transparent:
+        raise PredictionError("has transparent colours; expected plain grey levels")
+    if image.levels.ndim == 2:
+        return image.levels
+    if (image.levels != image.levels[..., :1]).any():
+        raise PredictionError("an RGB image whose channels differ; expected grey levels")
+    return np.ascontiguousarray(image.levels[..., 0])
+
+
+def read_matrix(path: Path, variable: str) -> NDArray:
+    """Variable ``variable`` of a MATLAB file as `containers.parse_matrix`; `LayoutError` naming the file."""
+    return from_file(parse_matrix, path, LayoutError, variable)
+
+
+def read_scalar(path: Path, variable: str) -> float:
+    """A scalar that MATLAB stores as a 1 x 1 matrix. Raises `LayoutError` as `read_matrix`, or for another shape."""
+    matrix = read_matrix(path, variable)
+    if matrix.shape != (1, 1) or not np.isfinite(matrix).all():
+        shape = " x ".join(map(str, matrix.shape))
+        raise LayoutError(f"{path}: {variable}: expected a finite number stored as 1 x 1, got {shape} {matrix.dtype}")
+    return float(matrix[0, 0])
 
 
 @contextmanager
@@ -297,3 +337,47 @@ def _order_of(tree: PublishedTree, rig: Rig) -> FrameOrder:
         "give a rough rig, from which fpp-bench calibrate --from-depth TREE --camera ROUGH finds the exact one"
     )
     raise published_tree.layout_error(tree.root, [*refusals, hint])
+
+
+def tree_views(
+    reader: SampleReader, threads: int = 1, progress: Callable[[int], None] = lambda views: None
+) -> list[DepthView]:
+    """Phase and depth of all samples of a tree, some pixels of each. ``reader``: that of `plan_import`; of its rig,
+    camera, sequence and frame order are used. ``progress`` is called with numbers of views read. Raises `LayoutError`
+    for a tree without raw scans or a file that is wrong, `DecodeError` for frames that can't be decoded."""
+    if reader.order is None:
+        raise LayoutError(
+            f"{reader.tree.root}: has no raw scans; the rig is found from all frames of a view, in "
+            f"{published_tree.RAW_SCANS}/"
+        )
+    samples = list(reader.tree.by_name.values())
+    most_px = max(_LEAST_PX_A_VIEW, MOST_PX // len(samples))
+
+    def view(sample: PublishedSample) -> DepthView:
+        row = reader.read(sample)
+        measured = view_from_frames(sample.sample, _frames(row, reader.rig), row.depth_mm, reader.rig, most_px)
+        progress(1)
+        return measured
+
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(view, samples))
+
+
+def depth_difference_mm(reader: SampleReader) -> float | None:
+    """Median difference (absolute, mm) between the first sample's depth and what ``reader.rig`` decodes from its
+    frames; inf where it decodes less than half of the pixels or none, None for a tree without raw scans."""
+    if reader.order is None:
+        return None
+    row = reader.read(next(iter(reader.tree.by_name.values())))
+    try:
+        decoded_mm = decode_stack(_frames(row, reader.rig), reader.rig, mask=object_mask(row.depth_mm)).depth_mm
+    except DecodeError:
+        return float("inf")
+    both = object_mask(decoded_mm) & object_mask(row.depth_mm)
+    if 2 * np.count_nonzero(both) < np.count_nonzero(object_mask(row.depth_mm)):
+        return float("inf")
+    return float(np.median(np.abs(decoded_mm[both].astype(np.float64) - row.depth_mm[both])))
+
+
+def _frames(row: Row, rig: Rig) -> list[np.ndarray]:
+    return [row.frames[index] for index in range(len(rig.sequence))]

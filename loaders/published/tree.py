@@ -9,9 +9,10 @@ from functools import cached_property
 from pathlib import Path
 
 from fpp_ml_bench.constants import OBJECT_NAME, OBJECTS, PUBLISHED_SPLIT_FOLDERS, VIEWS, sample_name, split_sample_name
+from fpp_ml_bench.containers import PNG_GREY, PNG_HEADER_BYTES, PNG_RGB, png_header
 from fpp_ml_bench.depth import Normalisation
-from fpp_ml_bench.errors import LayoutError
-from fpp_ml_bench.loaders.published.files import read_png_size
+from fpp_ml_bench.errors import LayoutError, PredictionError
+from fpp_ml_bench.files import opened
 
 TRAINING = "training_datasets"
 RAW_SCANS = "fpp_synthetic_dataset"
@@ -43,6 +44,22 @@ LISTED_PROBLEMS = 50
 _KINDS = {FRINGE: ".png", DEPTH: ".mat"}
 FilesBySplit = dict[str, dict[str, Path]]
 """The files of each split by stem (sample name); keys are this package's split names."""
+
+
+_COLOURS = {PNG_GREY: "grey", PNG_RGB: "RGB", 3: "palette", 4: "grey + alpha", 6: "RGB + alpha"}
+
+
+def png_size(start: bytes) -> tuple[int, int]:
+    """Size (H, W) of an 8-bit grey or RGB PNG, by the first bytes of its file; PredictionError for any other."""
+    header = png_header(start)
+    if header is None:
+        raise PredictionError("expected a PNG file, got other content")
+    if header.bits != 8:
+        raise PredictionError(f"expected an 8-bit PNG, got {header.bits} bits per channel; convert it to 8 bits")
+    if header.colour not in (PNG_GREY, PNG_RGB):
+        colour = _COLOURS.get(header.colour, header.colour)
+        raise PredictionError(f"expected a grey PNG, or RGB with equal channels, got {colour}")
+    return header.size
 
 
 def frame_file(index: int) -> str:
@@ -300,9 +317,10 @@ class _Scan:
         sizes: dict[Path, tuple[int, int]] = {}
         for path in (path for sample in samples for path in (*sample.fringes, *sample.frames)):
             try:
-                sizes[path] = read_png_size(path)
-            except LayoutError as error:
-                self.problems.append(str(error))
+                with opened(path, links=True) as (stream, _):
+                    sizes[path] = png_size(stream.read(PNG_HEADER_BYTES))
+            except PredictionError as error:
+                self.problems.append(f"{path}: {error}")
         if not sizes:
             return 0, 0
         common = Counter(sizes.values()).most_common(1)[0][0]

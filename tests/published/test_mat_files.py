@@ -8,8 +8,9 @@ import pytest
 import scipy.io
 from published_trees import v73_bytes
 
+from fpp_ml_bench.containers import matrix_bytes
 from fpp_ml_bench.errors import LayoutError
-from fpp_ml_bench.loaders.published.files import matrix_bytes, read_matrix, read_scalar
+from fpp_ml_bench.loaders.published.importing import read_matrix, read_scalar
 
 WRITTEN_BY_MATLAB = Path(scipy.io.matlab.__file__).parent / "tests" / "data"
 DEPTH = np.where(np.add.outer(np.arange(11), np.arange(7)) > 6, 1800 + np.arange(77.0).reshape(11, 7) / 3, 0)
