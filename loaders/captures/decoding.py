@@ -5,16 +5,14 @@ What the rig can't decode is background there.
 """
 
 import io
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench import __version__
 from fpp_ml_bench.coding import MIN_MODULATION, Limits, Reason
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.decoding import (
@@ -39,15 +37,15 @@ from fpp_ml_bench.loaders.captures.images import (
     read_frames,
     split_captures,
 )
+from fpp_ml_bench.loaders.published.importing import ImportPlan, RowReader, import_plan, run_import
 from fpp_ml_bench.loaders.sample import Row
-from fpp_ml_bench.loaders.storage import CAPTURED, Assembly, Manifest, Progress, ShardPlan
+from fpp_ml_bench.loaders.storage import CAPTURED, Manifest, Progress, ShardPlan
 from fpp_ml_bench.optics import Direction, Rig
 
 CLIPPED_SHARE = 0.02
 """A frame in which more of the lit pixels than this are at full scale is named."""
 LEAST_DECODED_SHARE = 0.005
 """Of a capture's pixels. Below it nothing was measured but noise that passed by chance."""
-_CHECK_THREADS = 2
 CAUSES = {
     Reason.NO_RAY: "the rig's lens model or pose is not this scanner's",
     Reason.LOW_MODULATION: "the fringes are too faint (too dark, overexposed, --min-modulation), or the frames are not "
@@ -94,9 +92,7 @@ def decode_capture(
     `RefusedCapture` where a finding makes the depth untrustworthy, unless ``anyway``; `CaptureError` for images of
     another size than the rig's, `DecodeError` where nothing can be decoded."""
     frames, names = capture.frames, [file.name for file in capture.files]
-    examination = examine_capture(capture, rig, direction, mask=mask, min_modulation=min_modulation)
-    if examination.refused and not anyway:
-        raise RefusedCapture(str(capture.files[0].parent), examination)
+    examination = examine_capture(capture, rig, direction, mask=mask, min_modulation=min_modulation, anyway=anyway)
     limits = Limits(min_modulation=min_modulation)
     decoded = decode_stack(frames, rig, direction, mask=mask, limits=limits, details=True, threads=threads)
     modulation = np.nanmax([measured.modulation for measured in decoded.details.values()], axis=0)
@@ -124,9 +120,11 @@ def examine_capture(
     *,
     mask: NDArray[np.bool_] | None = None,
     min_modulation: float = MIN_MODULATION,
+    anyway: bool = True,
 ) -> Examination:
     """What the frames of a capture say about themselves (`fpp_ml_bench.examination`), before they are decoded. Raises
-    `CaptureError` for images of another size than the rig's, `RigError` for a direction that it does not code."""
+    `CaptureError` for images of another size than the rig's, `RigError` for a direction that it does not code, and
+    unless ``anyway`` `RefusedCapture` where a finding makes the depth untrustworthy."""
     height, width = capture.frames.shape[1:]
     if (height, width) != (rig.camera.height, rig.camera.width):
         raise CaptureError(
@@ -137,7 +135,10 @@ def examine_capture(
     limits = Limits(min_modulation=min_modulation)
     check_limits(limits)
     names = [file.name for file in capture.files]
-    return examine(capture.frames, rig, names, directions=directions, mask=mask, limits=limits)
+    examination = examine(capture.frames, rig, names, directions=directions, mask=mask, limits=limits)
+    if examination.refused and not anyway:
+        raise RefusedCapture(str(capture.files[0].parent), examination)
+    return examination
 
 
 def main_reason(decoded: Decoded) -> Reason:
@@ -177,39 +178,27 @@ def read_mask(file: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True)
-class CaptureReader:
-    """Picklable source of a dataset's rows: reads and decodes one of ``captures``, by sample, after the other."""
+class CaptureReader(RowReader):
+    """Reads and decodes captures."""
 
-    captures: dict[str, Capture]
+    captures: Mapping[str, Capture]
     rig: Rig
     limits: Limits
     bits: int | None
     colour: str | None
     anyway: bool = False
 
-    def __call__(self, plan: ShardPlan, folder: Path) -> Iterator[Row]:
-        for sample, _, _ in plan.samples:
-            yield self.read(self.captures[sample])
-
-    def files(self, sample: str) -> tuple[Path, ...]:
-        return self.captures[sample].files
-
-    def problem(self, capture: Capture) -> str | None:
-        """What is wrong with a capture; None where it can be read."""
-        try:
-            self.read(capture)
-        except CaptureError as error:
-            return str(error)
-        return None
+    @property
+    def samples(self) -> Mapping[str, Capture]:
+        return self.captures
 
     def read(self, capture: Capture) -> Row:
         """The capture's row: frames of 8 bits, and depth from the frames as they were captured. Raises `CaptureError`
         for frames that can't be read, that are of another size than the rig's camera, that the examination refuses
         (unless ``anyway``), and that give almost no depth."""
         captured = read_frames(capture.files, bits=self.bits, colour=self.colour)
-        examination = examine_capture(captured, self.rig, min_modulation=self.limits.min_modulation)
-        if examination.refused and not self.anyway:
-            raise RefusedCapture(str(capture.folder), examination)
+        least = self.limits.min_modulation
+        examination = examine_capture(captured, self.rig, min_modulation=least, anyway=self.anyway)
         try:
             decoded = decode_stack(captured.frames, self.rig, limits=self.limits, details=True)
         except DecodeError as error:
@@ -256,13 +245,6 @@ def _views(captures: list[Capture]) -> dict[str, list[str]]:
     return views
 
 
-class CapturePlan(NamedTuple):
-    """An import that is ready to start: the reader of the captures found, and the dataset to assemble."""
-
-    reader: CaptureReader
-    assembly: Assembly
-
-
 def plan_captures(
     root: Path,
     rig: Rig,
@@ -271,7 +253,7 @@ def plan_captures(
     bits: int | None = None,
     colour: str | None = None,
     anyway: bool = False,
-) -> CapturePlan:
+) -> ImportPlan[CaptureReader]:
     """Find the captures ``root/{object}/{view}/`` or ``root/{object}/``, each a folder of all frames of
     ``rig.sequence``. ``splits``: which objects are in which; None puts all into ``test``. ``limits``: of the decoder;
     ``bits`` and ``colour``: see `read_frames`; ``anyway``: captures that the examination refuses too.
@@ -281,10 +263,10 @@ def plan_captures(
     check_limits(limits := limits or Limits())
     captures = find_captures(root, len(rig.sequence))
     by_split = split_captures(captures, splits)
-    size = rig.camera.height, rig.camera.width
+    pixels = rig.camera.height * rig.camera.width
     plans: list[ShardPlan] = []
     for split, chosen in by_split.items():
-        plans += storage.plan_rows(split, [(c.sample, c.object, c.view) for c in chosen], size[0] * size[1])
+        plans += storage.plan_rows(split, [(c.sample, c.object, c.view) for c in chosen], pixels)
     settings = {
         "layout": "captures",
         "splits": "all in test" if splits is None else "given",
@@ -293,24 +275,15 @@ def plan_captures(
         "colour": colour,
         "objects": {split: _views(chosen) for split, chosen in by_split.items()},
     }
-    generator = {"name": "fpp-ml-bench", "version": __version__}
-    manifest = Manifest(CAPTURED, generator, settings, rig.to_dict(), size, "all", exact=False)
     reader = CaptureReader({capture.sample: capture for capture in captures}, rig, limits, bits, colour, anyway)
-    return CapturePlan(reader, Assembly(plans, reader, manifest))
+    return import_plan(reader, plans, CAPTURED, settings, "all")
 
 
-def import_captures(folder: Path, plan: CapturePlan, workers: int, progress: Progress = lambda rows: None) -> Manifest:
-    """Write the planned dataset into ``folder``, or go on with one that was interrupted. When a capture can't be used,
-    all others are tried too, so that the `CaptureError` lists every one. Raises `BuildError` as a build does, and when
-    a capture changed after ``folder`` was finished."""
-    reader = plan.reader
-    storage.forget_outdated(folder, plan.assembly.plans, reader.files)
-    try:
-        return storage.assemble(folder, plan.assembly, workers, progress)
-    except CaptureError as error:
-        with ThreadPoolExecutor(_CHECK_THREADS) as pool:
-            problems = [line for line in pool.map(reader.problem, reader.captures.values()) if line]
-        raise CaptureError("\n  ".join(problems) if problems else str(error)) from error
+def import_captures(
+    folder: Path, plan: ImportPlan[CaptureReader], workers: int, progress: Progress = lambda rows: None
+) -> Manifest:
+    """Write the planned dataset into ``folder`` as `run_import`; the `CaptureError` lists every wrong capture."""
+    return run_import(folder, plan, workers, progress, lambda problems: CaptureError("\n  ".join(problems)))
 
 
 def capture_notes(manifest: Manifest) -> list[str]:

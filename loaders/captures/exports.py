@@ -74,29 +74,28 @@ def export_capture(
         raise CaptureError("depth_mm: no pixel has a depth, so there is nothing to write; check the capture's light")
     shade = None if grey is None else _checked(grey, camera, "grey", GREY_LEVELS)
     normals = pixel_normals(depth, camera, step_mm) if {"ply", "mesh"} & set(forms) else np.zeros((0, 0, 3))
-    contents: dict[str, bytes] = {}
-    for form in forms:
-        if form == "npy":
-            buffer = io.BytesIO()
-            np.save(buffer, depth)
-            contents["depth.npy"] = buffer.getvalue()
-        elif form == "mat":
-            contents["depth.mat"] = matrix_bytes({"depthMap": depth})
-        elif form == "png":
-            unit = _unit(float(depth.max()))
-            contents[f"depth_{unit:g}mm.png"] = _png(depth, unit)
-        elif form == "ply":
-            contents["points.ply"] = _ply(depth, camera, normals, shade, np.zeros((0, 3), np.int64))
-        else:
-            contents["mesh.ply"] = _ply(depth, camera, normals, shade, triangles(depth, camera, step_mm))
-    return write_files(Path(folder), contents, CaptureError)
+    no_faces = np.zeros((0, 3), np.int64)
+    written = {
+        "npy": lambda: ("depth.npy", _npy(depth)),
+        "mat": lambda: ("depth.mat", matrix_bytes({"depthMap": depth})),
+        "png": lambda: _png(depth),
+        "ply": lambda: ("points.ply", _ply(depth, camera, normals, shade, no_faces)),
+        "mesh": lambda: ("mesh.ply", _ply(depth, camera, normals, shade, triangles(depth, camera, step_mm))),
+    }
+    return write_files(Path(folder), dict(written[form]() for form in forms), CaptureError)
+
+
+def _npy(values: NDArray) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, values)
+    return buffer.getvalue()
 
 
 def pixel_normals(depth_mm: ArrayLike, camera: Pinhole, step_mm: float | None = None) -> NDArray[np.float64]:
     """Unit normals float64 (H, W, 3) of a depth map (H, W) in mm, towards the camera; 0 where there is no depth. From
     the differences to the neighbours that belong to the same surface (``step_mm`` as in `export_capture`), and along
     the ray where there are too few. Raises `CaptureError` as `export_capture`."""
-    rays, depth = _rays_and_depth(_checked(depth_mm, camera, "depth_mm"), camera)
+    rays, depth = _rays_and_depth(depth_mm, camera)
     points = rays * depth[..., None]
     tangents = []
     for one, other in (((_BEFORE, _ALL), (_AFTER, _ALL)), ((_ALL, _BEFORE), (_ALL, _AFTER))):
@@ -118,7 +117,7 @@ def triangles(depth_mm: ArrayLike, camera: Pinhole, step_mm: float | None = None
     pixels, row * W + column, in the order that makes their normals point at the camera. A square of four pixels is
     divided along the diagonal that gives more triangles, or has the smaller step. Raises `CaptureError` as
     `export_capture`."""
-    rays, depth = _rays_and_depth(_checked(depth_mm, camera, "depth_mm"), camera)
+    rays, depth = _rays_and_depth(depth_mm, camera)
     index = np.arange(depth.size).reshape(depth.shape)
     sides = (_FIRST, _RIGHT), (_FIRST, _BELOW), (_RIGHT, _ACROSS), (_BELOW, _ACROSS)
     top, left, right, bottom = (_joined(rays, depth, one, other, step_mm) for one, other in sides)
@@ -156,12 +155,12 @@ def _checked(values: ArrayLike, camera: Pinhole, name: str, most: float = np.inf
     return array
 
 
-def _rays_and_depth(depth_mm: NDArray[np.float64], camera: Pinhole) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rays (H, W, 3) with z = 1 and depth in mm; both 0 where the lens has no ray."""
+def _rays_and_depth(depth_mm: ArrayLike, camera: Pinhole) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rays (H, W, 3) with z = 1 and the checked depth in mm; both 0 where the lens has no ray."""
     x, y = camera.rays()
     seen = np.isfinite(x) & np.isfinite(y)
     rays = np.where(seen[..., None], np.stack([x, y, np.ones_like(x)], axis=-1), 0.0)
-    return rays, np.where(seen, depth_mm, 0.0)
+    return rays, np.where(seen, _checked(depth_mm, camera, "depth_mm"), 0.0)
 
 
 def _joined(
@@ -175,27 +174,25 @@ def _joined(
     return (near > 0) & (far > 0) & (np.abs(near - far) <= (STEEPEST * apart if step_mm is None else step_mm))
 
 
-def _unit(largest_mm: float) -> float:
-    """mm per level."""
+def _png(depth: NDArray[np.float32]) -> tuple[str, bytes]:
+    """Name and content, in the finest unit that fits."""
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    largest_mm = float(depth.max())
     fitting = [unit for unit in MM_PER_LEVEL if largest_mm <= LARGEST_LEVEL * unit]
     if not fitting:
         limit = LARGEST_LEVEL * MM_PER_LEVEL[-1]
         raise CaptureError(
             f"depth_mm: {largest_mm:g} mm do not fit in a 16-bit PNG, whose limit is {limit:g} mm; use npy"
         )
-    return fitting[0]
-
-
-def _png(depth: NDArray[np.float32], unit: float) -> bytes:
-    from PIL import Image
-    from PIL.PngImagePlugin import PngInfo
-
+    unit = fitting[0]
     levels = np.rint(depth.astype(np.float64) / unit)
     levels = np.where(depth > 0, np.clip(levels, 1, LARGEST_LEVEL), 0).astype(np.uint16)
     text, buffer = PngInfo(), io.BytesIO()
     text.add_text("mm_per_level", f"{unit:g}")
     Image.fromarray(levels).save(buffer, format="PNG", pnginfo=text)
-    return buffer.getvalue()
+    return f"depth_{unit:g}mm.png", buffer.getvalue()
 
 
 def _ply(
@@ -208,7 +205,7 @@ def _ply(
     """The points with depth and the triangles between them."""
     import trimesh
 
-    rays, z = _rays_and_depth(depth.astype(np.float64), camera)
+    rays, z = _rays_and_depth(depth, camera)
     there = z > 0
     if not there.any():
         raise CaptureError("depth_mm: the camera's lens has no ray where there is depth; check its calibration")
@@ -257,9 +254,7 @@ def write_capture(
     decoded, found = result.decoded, result.decoded.depth_mm > 0
     export_capture(folder, decoded.depth_mm, rig.camera, result.grey, forms)
     for name, values in (("sigma_mm", result.sigma_mm), ("modulation", result.modulation), ("reason", decoded.reason)):
-        buffer = io.BytesIO()
-        np.save(buffer, values)
-        write_atomically(folder / f"{name}.npy", buffer.getvalue())
+        write_atomically(folder / f"{name}.npy", _npy(values))
     title = f"{capture.files[0].parent.name}: {100 * found.mean():.1f}% of the pixels with depth"
     maps = result.grey, decoded.depth_mm, result.sigma_mm, result.modulation, decoded.reason
     findings = [str(finding) for finding in result.examination.findings]

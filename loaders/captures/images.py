@@ -2,7 +2,7 @@
 captures in folders, ``{object}/{view}/`` or ``{object}/``, with the split that each object belongs to."""
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -34,16 +34,8 @@ _WHOLE_BITS = (8, 10, 12, 14, 16)
 CAPTURE_AGAIN = "capture or copy it again"
 _THREADS = 2
 """Each has a process that reads (`fpp_ml_bench.containers`)."""
-_UPRIGHT: dict[int, Callable[[NDArray[Any]], NDArray[Any]]] = {
-    2: np.fliplr,
-    3: lambda levels: np.rot90(levels, 2),
-    4: np.flipud,
-    5: lambda levels: np.swapaxes(levels, 0, 1),
-    6: lambda levels: np.rot90(levels, -1),
-    7: lambda levels: np.swapaxes(np.rot90(levels, 2), 0, 1),
-    8: np.rot90,
-}
-"""What makes an image upright, by its EXIF orientation."""
+_QUARTER_TURNS, _MIRRORED = {3: 2, 4: 2, 5: -1, 6: -1, 7: 1, 8: 1}, (2, 4, 5, 7)
+"""What makes an image upright, by its EXIF orientation: a turn to the left, then left and right exchanged."""
 
 
 @dataclass(frozen=True)
@@ -203,7 +195,9 @@ def _read(file: Path, colour: str | None) -> _Image:
         raise CaptureError(f"{file}: {error}; {CAPTURE_AGAIN}") from None
     if problem := _problem(image):
         raise CaptureError(f"{file}: {problem}")
-    levels = _UPRIGHT.get(image.orientation, lambda levels: levels)(image.levels)
+    levels = np.rot90(image.levels, _QUARTER_TURNS.get(image.orientation, 0))
+    if image.orientation in _MIRRORED:
+        levels = np.fliplr(levels)
     if levels.ndim == 3 and levels.shape[2] in (2, 4):
         levels = levels[..., 0] if levels.shape[2] == 2 else levels[..., :3]
     return _Image(_grey(levels, colour, file), image.bits, int(np.bitwise_or.reduce(levels, axis=None)))

@@ -2,12 +2,12 @@
 reads a sample, fringe, depth in mm and raw frames, with every check on their contents. And what a tree's raw scans and
 depths say about the rig, whose pitch and projector are not published."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,7 @@ from fpp_ml_bench.calibration import MOST_PX, DepthView, view_from_frames
 from fpp_ml_bench.containers import from_file, parse_image, parse_matrix
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mask
-from fpp_ml_bench.errors import DecodeError, LayoutError, PredictionError, RigError
+from fpp_ml_bench.errors import CaptureError, DecodeError, LayoutError, PredictionError, RigError
 from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.loaders.published import tree as published_tree
 from fpp_ml_bench.loaders.published.order import AUTO, FrameOrder, check_order, find_order, parse_order
@@ -27,7 +27,7 @@ from fpp_ml_bench.loaders.storage import Assembly, Manifest, Progress, ShardPlan
 from fpp_ml_bench.optics import Rig, paper_rig, rig_from_dict
 
 IMPORTED = "imported"
-_CHECK_THREADS = 4
+_CHECK_THREADS = 2
 _MOST_SCANS_TRIED = 6
 AGREEING_MM = 1.0
 """Largest median difference between a tree's depth and what its own rig decodes from its frames: twice the error of
@@ -83,25 +83,80 @@ def _listed(problems: list[str]) -> Iterator[None]:
         problems.append(str(error))
 
 
+class RowReader:
+    """Picklable source of an import's rows: reads and checks one sample after the other."""
+
+    rig: Rig
+
+    @property
+    def samples(self) -> Mapping[str, Any]:
+        """What `read` takes, by sample; each has its ``files``."""
+        raise NotImplementedError
+
+    def read(self, sample: Any) -> Row:
+        """The row of one of ``samples``. Raises `LayoutError` or `CaptureError` for a wrong file."""
+        raise NotImplementedError
+
+    def __call__(self, plan: ShardPlan, folder: Path) -> Iterator[Row]:
+        for name, _, _ in plan.samples:
+            yield self.read(self.samples[name])
+
+    def problem(self, sample: Any) -> str | None:
+        """What is wrong with a sample; None where it can be read."""
+        try:
+            self.read(sample)
+        except (LayoutError, CaptureError) as error:
+            return str(error)
+        return None
+
+
+Reader = TypeVar("Reader", bound=RowReader)
+
+
+class ImportPlan(NamedTuple, Generic[Reader]):
+    """An import that is ready to start: the reader of the samples found, and the dataset to assemble."""
+
+    reader: Reader
+    assembly: Assembly
+
+
+def import_plan(
+    reader: Reader, plans: list[ShardPlan], origin: str, settings: dict[str, Any], stored: str
+) -> ImportPlan[Reader]:
+    """The plan of a dataset of ``reader``'s rows, with ``stored`` frames of its rig."""
+    camera, generator = reader.rig.camera, {"name": "fpp-ml-bench", "version": __version__}
+    size = camera.height, camera.width
+    manifest = Manifest(origin, generator, settings, reader.rig.to_dict(), size, stored, exact=False)
+    return ImportPlan(reader, Assembly(plans, reader, manifest))
+
+
+def run_import(
+    folder: Path, plan: ImportPlan, workers: int, progress: Progress, refusal: Callable[[list[str]], Exception]
+) -> Manifest:
+    """Write the planned dataset into ``folder``, or go on with one that was interrupted. When a sample can't be read,
+    all others are tried too, and ``refusal`` of all problems is raised. Raises `BuildError` as a build does, and when a
+    file changed after ``folder`` was finished."""
+    reader = plan.reader
+    storage.forget_outdated(folder, plan.assembly.plans, lambda name: reader.samples[name].files)
+    try:
+        return storage.assemble(folder, plan.assembly, workers, progress)
+    except (LayoutError, CaptureError) as error:
+        with ThreadPoolExecutor(_CHECK_THREADS) as pool:
+            problems = [problem for problem in pool.map(reader.problem, reader.samples.values()) if problem]
+        raise refusal(problems or [str(error)]) from error
+
+
 @dataclass(frozen=True)
-class SampleReader:
-    """Picklable source of an import's rows: reads and checks the files of one sample of ``tree`` after the other.
-    ``order`` None: raw frames are only checked, not read as frames of a sequence."""
+class SampleReader(RowReader):
+    """Reads the samples of ``tree``. ``order`` None: raw frames are only checked, not read as frames of a sequence."""
 
     tree: PublishedTree
     rig: Rig
     order: FrameOrder | None
 
-    def __call__(self, plan: ShardPlan, folder: Path) -> Iterator[Row]:
-        for stem, _, _ in plan.samples:
-            yield self.read(self.tree.by_name[stem])
-
-    def problems(self, sample: PublishedSample) -> list[str]:
-        """Problems of the sample's files, a line each; empty when the sample can be read."""
-        problems: list[str] = []
-        with _listed(problems):
-            self.read(sample)
-        return "\n".join(problems).splitlines()
+    @property
+    def samples(self) -> Mapping[str, PublishedSample]:
+        return self.tree.by_name
 
     def read(self, sample: PublishedSample) -> Row:
         """The sample's row, depth float32 mm, 0 = background. Raises `LayoutError` with a line for each wrong file."""
@@ -221,14 +276,7 @@ def _disagreement_mm(variant_mm: NDArray[np.float64], depth_mm: NDArray[np.float
     return float(np.abs(variant_mm - expected).max())
 
 
-class ImportPlan(NamedTuple):
-    """An import that is ready to start: the reader of the scanned tree, and the dataset to assemble."""
-
-    reader: SampleReader
-    assembly: Assembly
-
-
-def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> ImportPlan:
+def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> ImportPlan[SampleReader]:
     """Scan the tree at ``root`` and determine how it is read. ``rig``: the rig that took the images; None assumes the
     paper's rig, scaled to the image size. ``frame_order``: see `FrameOrder`; ``auto`` determines it from the first
     sample's images, and checks all others against it. Raises `LayoutError` listing all files that break the layout,
@@ -256,24 +304,19 @@ def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> 
         "ignored": list(tree.ignored),
         "objects": {split: list(dict.fromkeys(s.object for s in samples)) for split, samples in tree.samples.items()},
     }
-    generator = {"name": "fpp-ml-bench", "version": __version__}
-    manifest = Manifest(IMPORTED, generator, settings, rig_used.to_dict(), tree.size, stored, exact=False)
     reader = SampleReader(tree, rig_used, order)
-    return ImportPlan(reader, Assembly(plans, reader, manifest))
+    return import_plan(reader, plans, IMPORTED, settings, stored)
 
 
-def import_tree(folder: Path, plan: ImportPlan, workers: int, progress: Progress = lambda rows: None) -> Manifest:
-    """Write the planned import into ``folder``, or resume an interrupted import. Contents are checked as they are read.
-    When a file is wrong, all others are checked too, so that the `LayoutError` lists every wrong file. Raises
-    `BuildError` as a build does, and when the tree changed after ``folder`` was finished."""
-    samples = plan.reader.tree.by_name
-    storage.forget_outdated(folder, plan.assembly.plans, lambda sample: samples[sample].files)
-    try:
-        return storage.assemble(folder, plan.assembly, workers, progress)
-    except LayoutError as error:
-        with ThreadPoolExecutor(_CHECK_THREADS) as pool:
-            problems = [line for lines in pool.map(plan.reader.problems, samples.values()) for line in lines]
-        raise published_tree.layout_error(plan.reader.tree.root, problems or str(error).splitlines()) from error
+def import_tree(
+    folder: Path, plan: ImportPlan[SampleReader], workers: int, progress: Progress = lambda rows: None
+) -> Manifest:
+    """Write the planned import into ``folder`` as `run_import`; the `LayoutError` lists every wrong file."""
+
+    def refusal(problems: list[str]) -> LayoutError:
+        return published_tree.layout_error(plan.reader.tree.root, "\n".join(problems).splitlines())
+
+    return run_import(folder, plan, workers, progress, refusal)
 
 
 def import_notes(manifest: Manifest) -> list[str]:
@@ -350,7 +393,7 @@ def tree_views(
             f"{reader.tree.root}: has no raw scans; the rig is found from all frames of a view, in "
             f"{published_tree.RAW_SCANS}/"
         )
-    samples = list(reader.tree.by_name.values())
+    samples = list(reader.samples.values())
     most_px = max(_LEAST_PX_A_VIEW, MOST_PX // len(samples))
 
     def view(sample: PublishedSample) -> DepthView:
@@ -368,7 +411,7 @@ def depth_difference_mm(reader: SampleReader) -> float | None:
     frames; inf where it decodes less than half of the pixels or none, None for a tree without raw scans."""
     if reader.order is None:
         return None
-    row = reader.read(next(iter(reader.tree.by_name.values())))
+    row = reader.read(next(iter(reader.samples.values())))
     try:
         decoded_mm = decode_stack(_frames(row, reader.rig), reader.rig, mask=object_mask(row.depth_mm)).depth_mm
     except DecodeError:
