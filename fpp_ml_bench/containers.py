@@ -22,7 +22,7 @@ from collections.abc import Callable, Mapping
 from importlib import import_module
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
-from typing import Any, NamedTuple, ParamSpec, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ from fpp_ml_bench.errors import FppBenchError, LayoutError, PredictionError
 from fpp_ml_bench.files import file_content, printable
 from fpp_ml_bench.machine import THREAD_COUNTS
 
-P, T = ParamSpec("P"), TypeVar("T")
+T = TypeVar("T")
 Answer = tuple[dict[str, Any], Any]
 """What a reader says of a file, as JSON values, and the bytes read."""
 
@@ -324,7 +324,7 @@ def _read_image(content: bytes, largest: int, unpacked: int | None) -> Answer:
             "orientation": 1,
             "white_is_0": image.format == "TIFF" and image.tag_v2.get(_PHOTOMETRIC) == 0,
         }
-        levels = np.zeros((0, 0), np.uint8)
+        levels: NDArray[Any] = np.zeros((0, 0), np.uint8)
         if not lossy and facts["images"] == 1:
             _check_complete(content, image.format, unpacked)
             if image.format != "TIFF":  # which Pillow and OpenCV turn themselves
@@ -370,7 +370,9 @@ def _check_complete(content: bytes, form: str, unpacked: int | None) -> None:
         return
     from PIL.PngImagePlugin import ChunkStream
 
-    file, kinds, pixels = io.BytesIO(content), [], []
+    file = io.BytesIO(content)
+    kinds: list[bytes] = []
+    pixels: list[bytes] = []
     file.seek(len(_PNG_SIGNATURE))
     chunks = ChunkStream(file)
     try:

@@ -16,7 +16,7 @@ from pydantic import Field
 from fpp_ml_bench.constants import GREY_LEVELS, OBJECT_NAME, SPLITS, VIEW_NAME, sample_name
 from fpp_ml_bench.containers import LARGEST_BYTES, StoredImage, parse_image
 from fpp_ml_bench.errors import BuildError, CaptureError, PredictionError
-from fpp_ml_bench.files import file_content, read_yaml
+from fpp_ml_bench.files import file_content, read_yaml, visible
 from fpp_ml_bench.schema import StrictModel, Text, validate
 
 COLOURS = {
@@ -121,8 +121,7 @@ def frame_files(source: str | Path | Sequence[str | Path]) -> list[Path]:
         return files
     path, forms = Path(source), ", ".join(SUFFIXES)
     if path.is_dir():
-        files = [file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")]
-        files = [file for file in files if file.suffix.lower() in (*SUFFIXES, *_OTHER_IMAGES)]
+        files = _images(path, (*SUFFIXES, *_OTHER_IMAGES))
         if not files:
             raise CaptureError(f"{path}: expected a folder with images ({forms}), found none; give the frames' folder")
     elif path.is_file():
@@ -342,9 +341,9 @@ def _of_object(folder: Path, frames: int, problems: list[str]) -> Iterable[Captu
 
 
 def _folders(folder: Path) -> list[Path]:
-    found = [path for path in folder.iterdir() if path.is_dir() and not path.name.startswith(".")]
-    return sorted(found, key=lambda path: (natural_key(path.name), path.name))
+    found = [path for path in visible(folder, CaptureError) if path.is_dir()]
+    return sorted(found, key=lambda path: natural_key(path.name))
 
 
-def _images(folder: Path) -> list[Path]:
-    return [path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in SUFFIXES]
+def _images(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> list[Path]:
+    return [path for path in visible(folder, CaptureError) if path.is_file() and path.suffix.lower() in suffixes]

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -312,11 +313,7 @@ def import_tree(
     folder: Path, plan: ImportPlan[SampleReader], workers: int, progress: Progress = lambda rows: None
 ) -> Manifest:
     """Write the planned import into ``folder`` as `run_import`; the `LayoutError` lists every wrong file."""
-
-    def refusal(problems: list[str]) -> LayoutError:
-        return published_tree.layout_error(plan.reader.tree.root, "\n".join(problems).splitlines())
-
-    return run_import(folder, plan, workers, progress, refusal)
+    return run_import(folder, plan, workers, progress, partial(published_tree.layout_error, plan.reader.tree.root))
 
 
 def import_notes(manifest: Manifest) -> list[str]:

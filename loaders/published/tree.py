@@ -12,7 +12,7 @@ from fpp_ml_bench.constants import OBJECT_NAME, OBJECTS, PUBLISHED_SPLIT_FOLDERS
 from fpp_ml_bench.containers import PNG_GREY, PNG_HEADER_BYTES, PNG_RGB, png_header
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import LayoutError, PredictionError
-from fpp_ml_bench.files import opened
+from fpp_ml_bench.files import opened, visible
 
 TRAINING = "training_datasets"
 RAW_SCANS = "fpp_synthetic_dataset"
@@ -68,7 +68,8 @@ def frame_file(index: int) -> str:
 
 
 def layout_error(root: object, problems: list[str]) -> LayoutError:
-    """The error that lists the problems of a tree, at most `LISTED_PROBLEMS` of them."""
+    """The error that lists the problems of a tree, a line each, at most `LISTED_PROBLEMS` of them."""
+    problems = "\n".join(problems).splitlines()
     shown = problems[:LISTED_PROBLEMS]
     if len(problems) > len(shown):
         shown.append(f"... and {len(problems) - len(shown)} more")
@@ -133,13 +134,6 @@ def _locate(root: Path) -> tuple[Path, Path | None]:
     )
 
 
-def _entries(folder: Path) -> list[Path]:
-    try:
-        return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
-    except OSError as error:
-        raise LayoutError(f"{folder}: can't be read ({error.strerror or error})") from error
-
-
 def scan_tree(root: Path, frames: int) -> PublishedTree:
     """Scan the tree at ``root``, whose raw scans have ``frames`` files. Raises `LayoutError` listing all problems.
     ``root`` holds ``training_datasets/`` and maybe ``fpp_synthetic_dataset/``, or is ``training_datasets`` itself."""
@@ -179,7 +173,7 @@ class _Scan:
     def _folders(self, folder: Path, names: Collection[str], listed: str) -> list[Path]:
         """Folders called ``names`` in a folder; reports everything else in it."""
         folders = []
-        for entry in _entries(folder):
+        for entry in visible(folder, LayoutError):
             if entry.name in names and entry.is_dir():
                 folders.append(entry)
             else:
@@ -191,7 +185,7 @@ class _Scan:
             self.problems.append(f"{folder}: the folder is missing")
             return {}
         files = {}
-        for entry in _entries(folder):
+        for entry in visible(folder, LayoutError):
             name, _, view = entry.stem.rpartition("_")
             if entry.suffix != suffix or not entry.is_file():
                 self._foreign(entry, f"files ending in {suffix}")
@@ -256,7 +250,7 @@ class _Scan:
         stems_with_depth = {stem for split in fringes.values() for stem in split}
         names = [frame_file(index) for index in range(frames)]
         scans: dict[str, tuple[Path, ...]] = {}
-        for folder in _entries(root):
+        for folder in visible(root, LayoutError):
             if not folder.is_dir():
                 self._foreign(folder, "one folder per object")
                 continue
@@ -265,7 +259,7 @@ class _Scan:
                 if stem not in stems_with_depth:
                     self.problems.append(f"{view}: a raw scan without depth; {TRAINING} has no sample {stem}")
                     continue
-                present = {entry.name: entry for entry in _entries(view)}
+                present = {entry.name: entry for entry in visible(view, LayoutError)}
                 self.problems += [f"{view / name}: is missing" for name in names if name not in present]
                 for name in sorted(set(present) - set(names) - set(NOT_STORED)):
                     self._foreign(present[name], f"{names[0]} to {names[-1]}, {', '.join(NOT_STORED)}")
