@@ -191,13 +191,20 @@ def _read_matrix(content: bytes, largest: int, variable: str) -> Answer:
 
 
 class _WholeFile(io.BytesIO):
-    """Has no short reads: SciPy takes a compressed variable without its last bytes, which are its checksum."""
+    """Refuses to read or go beyond its end: SciPy takes a compressed variable without its last bytes, which are its
+    checksum, and a matrix that ends behind the file."""
 
     def read(self, size: int | None = -1) -> bytes:
         content = super().read(size)
         if content and size is not None and len(content) < size:
             raise EOFError(f"expected {size} bytes, got {len(content)}")
         return content
+
+    def seek(self, position: int, whence: int = io.SEEK_SET) -> int:
+        length = self.getbuffer().nbytes
+        if whence == io.SEEK_SET and position > length:
+            raise EOFError(f"expected {position} bytes, got {length}")
+        return super().seek(position, whence)
 
 
 def _matrix_v5(content: bytes, variable: str, largest: int) -> NDArray[Any]:
