@@ -87,7 +87,7 @@ def time_method(
         batched=method.batched,
         throughput_per_s=four_digits(statistics.median(rates)),
         peak_memory_mib=round(peak_mib, 1),
-        working_memory_mib=None if working_mib is None else round(working_mib, 1),
+        working_memory_mib=working_mib,
         gpu_memory_mib=None if cuda is None else round(cuda.max_memory_allocated(method.device) / _MIB, 1),
         parameters=method.parameters,
         frames=len(method.frames_used),
@@ -104,7 +104,7 @@ def four_digits(value: float) -> float:
 
 
 def added_mib(run: Callable[[], Any]) -> float | None:
-    """By how much ``run`` raises the resident set at its highest, in MiB; None where the kernel does not tell."""
+    """By how much ``run`` raises the resident set at its highest, in MiB to a tenth; None where the kernel does not tell."""
     try:
         # What earlier runs freed goes back to the system (malloc_trim(3)), so that the next run's use shows.
         gc.collect()
@@ -112,7 +112,7 @@ def added_mib(run: Callable[[], Any]) -> float | None:
         Path("/proc/self/clear_refs").write_text("5")  # resets the peak of the resident set, VmHWM (proc(5))
         before = _status_mib("VmRSS")
         run()
-        return max(0.0, _status_mib("VmHWM") - before)
+        return round(max(0.0, _status_mib("VmHWM") - before), 1)
     except (OSError, KeyError):
         run()
         return None

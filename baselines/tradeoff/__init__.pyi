@@ -7,8 +7,6 @@ from .measure import planned as planned
 from .measure import read_tradeoff as read_tradeoff
 from .measure import shipped_tradeoff as shipped_tradeoff
 from .measure import tradeoff as tradeoff
-from .report import POINTS as POINTS
-from .report import point_rows as point_rows
 from .report import remarks as remarks
 from .report import rich_tables as rich_tables
 from .report import scatter as scatter

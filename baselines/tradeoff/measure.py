@@ -11,9 +11,8 @@ from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
 from statistics import fmean, median
-from textwrap import shorten
 from time import perf_counter, process_time
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
@@ -35,18 +34,19 @@ from fpp_ml_bench.machine import describe_hardware
 from fpp_ml_bench.optics import Rig
 from fpp_ml_bench.schema import Count, NonNegative, Positive, Scalar, Share, StrictModel, Text, validate
 
-Result = TypeVar("Result")
 Cost = Literal["seconds", "frames", "working_memory_mib"]
 COST_KEYS: tuple[Cost, ...] = get_args(Cost)
 TRADEOFF_FILE = "tradeoff.json"
 BATCH = 4
 """Views at most that are predicted in one batch, to see what a view costs among others."""
-SMALLER, LARGER = (0.25, 0.5, 1.0), (1.0, 2.0, 4.0)
-"""Shares of the image's pixels at which a method is timed on a scene; the larger ones where a quarter of the pixels is
-too coarse for the fringes."""
-OBJECT, VIEW, SCENE_RUNS = "power_drill", "A60", 3
-"""That scene, and how often a method is timed on it."""
-_REASON_LENGTH = 400
+SHARES = (0.25, 0.5, 1.0)
+"""Shares of the image's pixels at which a method is timed on a scene; four times as many where a quarter of the pixels
+is too coarse for the fringes."""
+OBJECT, VIEW = "power_drill", "A60"
+"""That scene."""
+RUNS, LIMIT_S = 5, 1.0
+"""Timed runs of each view, fewer once these seconds are used up: a short run is timed badly."""
+REASON_LENGTH = 400
 _PACKAGE = f"{Path(__file__).resolve().parents[2]}/"
 """The package's folder, which is removed from messages that go into a result."""
 
@@ -168,15 +168,12 @@ class Plan:
     @cached_property
     def rigs(self) -> list[Rig]:
         """The dataset's rig at each size that methods are timed at."""
-        rig = self.opened.rig
-        smaller, larger = (
-            [rig.scaled(round(rig.camera.width * math.sqrt(share))) for share in shares] for shares in (SMALLER, LARGER)
-        )
+        rig, times = self.opened.rig, 1
         try:
-            smaller[0].check_sampling()
+            rig.scaled(rig.camera.width // 2).check_sampling()
         except RigError:
-            return larger
-        return smaller
+            times = 4
+        return [rig.scaled(round(rig.camera.width * math.sqrt(times * share))) for share in SHARES]
 
     @cached_property
     def scenes(self) -> list[Frames]:
@@ -190,12 +187,16 @@ class Plan:
         has_threads = "threads" in {field.name for field in fields(find(point.method).method.Options)}
         return load_method(point.method, source, **point.options, **({"threads": self.threads} if has_threads else {}))
 
-    def timed(self, call: Callable[..., Result], *given: Any) -> tuple[float, Result]:
-        """Seconds of a call, and what it returned."""
+    def timed(self, call: Callable[..., Any], *given: Any) -> tuple[float, Any]:
+        """Median seconds of a call, of `RUNS` or of fewer once `LIMIT_S` is used up, after one that is not counted and
+        whose result is the second value."""
         clock = perf_counter if self.clock == "wall" else process_time
-        started = clock()
-        result = call(*given)
-        return clock() - started, result
+        result, runs = call(*given), list[float]()
+        while len(runs) < RUNS and sum(runs) < LIMIT_S:
+            started = clock()
+            call(*given)
+            runs.append(clock() - started)
+        return median(runs), result
 
 
 def planned(
@@ -295,47 +296,41 @@ def measured(plan: Plan, point: Point) -> Point:
         figures |= _figures(plan, method)
         pixel_seconds = []
         for rig, frames in zip(plan.rigs, plan.scenes, strict=True):
-            predict = plan.load(point, rig).predict
-            predict(frames)
-            pixel_seconds.append(four_digits(median(plan.timed(predict, frames)[0] for _ in range(SCENE_RUNS))))
+            pixel_seconds.append(four_digits(plan.timed(plan.load(point, rig).predict, frames)[0]))
         figures["pixel_seconds"] = pixel_seconds
     except FppBenchError as error:
-        message = printable(" ".join(str(error).split()).replace(_PACKAGE, ""), 1000)
-        figures["failed"] = shorten(message, _REASON_LENGTH, placeholder=" ...")
+        figures["failed"] = printable(" ".join(str(error).split()).replace(_PACKAGE, ""), REASON_LENGTH)
     return Point(**figures)
 
 
 def _figures(plan: Plan, method: Method) -> dict[str, Any]:
     """Errors, seconds and memory of ``method`` on the plan's views, as fields of a `Point`. Frames are in memory before
-    the clock starts, and a run before is not counted."""
+    the clock starts."""
     opened, target = plan.opened, plan.target
     seconds, errors_mm, missing = [], [], []
     memory_mib = None
     for name in plan.views:
         frames = captured_frames(opened, method, name)
-        if not seconds:
-            method.predict(frames)
-            memory_mib = added_mib(partial(method.predict, frames))
         run_s, depth = plan.timed(method.predict, frames)
+        if not seconds:
+            memory_mib = added_mib(partial(method.predict, frames))
+        seconds.append(run_s)
         if depth.shape != opened.size or not np.isfinite(depth).all():
             raise PredictionError(f"{name}: expected finite depth (H, W) {opened.size}, the method gave another")
         left_out = opened.left_out(name, method.range_rule, target)
         pair = scored_pair(depth, opened.target_mm(name, target), method.units, method.mode, name, left_out)
         sample = score_sample(*pair, void=opened.void(name, target) if method.mode == "standard" else None)
-        seconds.append(run_s)
         if sample.object.mae_mm is not None:
             errors_mm.append(sample.object.mae_mm)
             missing.append(sample.missing / sample.object.pixels)
     batch = [captured_frames(opened, method, name) for name in plan.views[:BATCH]]
-    if method.batched:
-        method.predict_batch(batch)
     return {
         "title": method.title,
         "software": method.software,
         "frames": len(method.frames_used),
         "seconds": four_digits(median(seconds)),
         "batch_seconds": four_digits(plan.timed(method.predict_batch, batch)[0] / len(batch)),
-        "working_memory_mib": None if memory_mib is None else round(memory_mib, 1),
+        "working_memory_mib": memory_mib,
         "object_mae_mm": fmean(errors_mm) if errors_mm else None,
         "missing_share": fmean(missing) if missing else None,
     }

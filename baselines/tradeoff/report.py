@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from rich.text import Text
 
 from fpp_ml_bench.baselines.tradeoff.drawing import Mark, Scatter
-from fpp_ml_bench.baselines.tradeoff.measure import BATCH, COST_KEYS, TRADEOFF_FILE, Cost, Tradeoff
+from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, TRADEOFF_FILE, Cost, Tradeoff
 from fpp_ml_bench.evaluation.report import millimetres, percent
 from fpp_ml_bench.evaluation.result import write_file
 from fpp_ml_bench.files import printable
@@ -21,7 +21,7 @@ COSTS: dict[Cost, tuple[str, float, str]] = {
 }
 """Each cost in a word, the factor to what is shown, and the title of its axis."""
 POINTS = ("Method", "Front of", "Object MAE, mm", "Not measured", "ms per view", "Frames", "Memory, MiB")
-GROWTH = ("Method", "ms at each size", "Power of pixels", "Power of frames", f"ms per view, {BATCH} at once")
+GROWTH = ("Method", "ms at each size", "Power of pixels", "Power of frames", "ms per view in a batch")
 TEXT_COLUMNS = 2
 
 
@@ -58,7 +58,7 @@ def growth_rows(run: Tradeoff) -> list[list[str]]:
 
 
 def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"
+    return "-" if value is None else f"{value:,.0f}" if value >= 1000 else f"{value:.3g}"
 
 
 def _ms(seconds: float | None) -> str:
@@ -105,7 +105,6 @@ def scatter(run: Tradeoff, cost: Cost) -> Scatter | None:
     marks = []
     for point in [*front, *(point for point in run.points if point not in front)]:
         if (x := getattr(point, cost)) and point.object_mae_mm:
-            told = f"{point.object_mae_mm:.3g} mm, {_ms(point.seconds)} ms, {point.frames} frames"
             marks.append(
                 Mark(
                     COSTS[cost][1] * x,
@@ -114,7 +113,7 @@ def scatter(run: Tradeoff, cost: Cost) -> Scatter | None:
                     printable(point.label),
                     f"C{methods.index(point.method) % 10}",
                     hollow=bool(point.aside),
-                    title=f"{point.title}: {told}",
+                    title=f"{point.title}: {point.object_mae_mm:.3g} mm, {_ms(point.seconds)} ms",
                 )
             )
     return Scatter(marks, marks[: len(front)], COSTS[cost][2], marks, numbers=False) if marks else None
