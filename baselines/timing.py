@@ -104,7 +104,8 @@ def four_digits(value: float) -> float:
 
 
 def added_mib(run: Callable[[], Any]) -> float | None:
-    """By how much ``run`` raises the resident set at its highest, in MiB to a tenth; None where the kernel does not tell."""
+    """By how much ``run`` raises the resident set at its highest, in MiB to a tenth; None where the kernel does not
+    tell."""
     try:
         # What earlier runs freed goes back to the system (malloc_trim(3)), so that the next run's use shows.
         gc.collect()

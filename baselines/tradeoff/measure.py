@@ -5,17 +5,18 @@ where it stopped. A point that can't be measured says why, and the others are me
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
-from statistics import fmean, median
+from statistics import fmean, linear_regression, median
 from time import perf_counter, process_time
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal, get_args
 
 import cv2
 import numpy as np
+from pydantic import Field
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.baselines import training
@@ -93,7 +94,7 @@ class Tradeoff(StrictModel):
     tradeoff_schema_version: Literal["2.0.0"] = "2.0.0"
     dataset: Text
     fingerprint: Text
-    image_size: list[Count]
+    image_size: Annotated[list[Count], Field(min_length=2, max_length=2)]
     target: Text
     views: list[Text]
     settings: dict[Text, Scalar]
@@ -107,15 +108,6 @@ class Tradeoff(StrictModel):
         points = [point for point in self.points if not point.aside and point.object_mae_mm and getattr(point, cost)]
         return [points[i] for i in pareto_front([(getattr(p, cost), p.object_mae_mm or 0) for p in points])]
 
-    def pixel_power(self, point: Point) -> float | None:
-        """The power p of seconds = c pixels^p; None for a point that was not timed at several sizes."""
-        return power(self.pixels, point.pixel_seconds) if point.pixel_seconds else None
-
-    def frame_power(self, method: str) -> float | None:
-        """The power p of seconds = c frames^p over the points of a method; None where all take equally many."""
-        costs = [(p.frames, p.seconds) for p in self.points if p.method == method and p.seconds]
-        return power(*zip(*costs, strict=True)) if costs else None
-
 
 def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     """Indices of the ``points`` (cost, error) that no other beats (as good in both, better in one), by cost. Smaller is
@@ -127,12 +119,12 @@ def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
     return front
 
 
-def power(amounts: Sequence[float], seconds: Sequence[float]) -> float | None:
-    """The power p of seconds = c amount^p by least squares of the logarithms; None where all amounts are equal."""
-    if len(set(amounts)) < 2:
-        return None
-    x = np.log(amounts) - np.log(amounts).mean()
-    return float(x @ np.log(seconds) / (x @ x))
+def power(costs: Iterable[tuple[float, float]]) -> float | None:
+    """The power p of seconds = c amount^p by least squares of the logarithms of ``costs``, (amount, seconds); those
+    with a 0 are left out. None where all amounts are equal."""
+    known = [cost for cost in costs if all(cost)]
+    logarithms = zip(*([math.log(value) for value in cost] for cost in known), strict=True)
+    return linear_regression(*logarithms).slope if len({amount for amount, _ in known}) > 1 else None
 
 
 def read_tradeoff(path: Path) -> Tradeoff:
@@ -307,7 +299,7 @@ def _figures(plan: Plan, method: Method) -> dict[str, Any]:
     """Errors, seconds and memory of ``method`` on the plan's views, as fields of a `Point`. Frames are in memory before
     the clock starts."""
     opened, target = plan.opened, plan.target
-    seconds, errors_mm, missing = [], [], []
+    seconds, errors_mm, missing = list[float](), list[float](), list[float]()
     memory_mib = None
     for name in plan.views:
         frames = captured_frames(opened, method, name)

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from rich.text import Text
 
 from fpp_ml_bench.baselines.tradeoff.drawing import Mark, Scatter
-from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, TRADEOFF_FILE, Cost, Tradeoff
+from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, TRADEOFF_FILE, Cost, Tradeoff, power
 from fpp_ml_bench.evaluation.report import millimetres, percent
 from fpp_ml_bench.evaluation.result import write_file
 from fpp_ml_bench.files import printable
@@ -43,13 +43,13 @@ def point_rows(run: Tradeoff) -> list[list[str]]:
 
 
 def growth_rows(run: Tradeoff) -> list[list[str]]:
-    """Cells of every point that was measured under `GROWTH`; the power of frames is that of all points of a method."""
+    """Cells of every point that was measured under `GROWTH`. The power of frames is over all points of its method."""
     return [
         [
             printable(point.label),
-            ", ".join(map(_ms, point.pixel_seconds or [None])),
-            _number(run.pixel_power(point)),
-            _number(run.frame_power(point.method)),
+            ", ".join(map(_ms, point.pixel_seconds or ())) or "-",
+            _number(power(zip(run.pixels, point.pixel_seconds or (), strict=False))),
+            _number(power((other.frames, other.seconds or 0) for other in run.points if other.method == point.method)),
             _ms(point.batch_seconds),
         ]
         for point in run.points
@@ -102,7 +102,7 @@ def scatter(run: Tradeoff, cost: Cost) -> Scatter | None:
     """Object MAE against ``cost`` of every point that has both, a colour for each method, hollow where it is on no
     front by rule. Named as far as there is room, the front first. None where no point has both."""
     front, methods = run.front(cost), list(dict.fromkeys(point.method for point in run.points))
-    marks = []
+    marks: list[Mark] = []
     for point in [*front, *(point for point in run.points if point not in front)]:
         if (x := getattr(point, cost)) and point.object_mae_mm:
             marks.append(

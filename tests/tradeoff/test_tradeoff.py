@@ -218,14 +218,16 @@ def test_the_front_is_what_no_point_beats(triples, cost):
 @pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 2.0])
 def test_a_pure_power_is_found_exactly(exponent):
     amounts = [10, 20, 40, 80]
-    assert power(amounts, [3e-4 * n**exponent for n in amounts]) == pytest.approx(exponent, abs=1e-12)
-    assert power([5, 5], [1.0, 2.0]) is None and power([], []) is None
+    assert power([(n, 3e-4 * n**exponent) for n in amounts]) == pytest.approx(exponent, abs=1e-12)
+    assert power([(5, 1.0), (5, 2.0)]) is None and power([]) is None and power([(0, 1.0), (5, 2.0)]) is None
 
 
 def test_a_power_is_that_of_least_squares():
     amounts = [10, 20, 40, 80, 160]
     seconds = 2e-3 * np.array(amounts) ** 1.4 * np.exp(0.1 * np.random.default_rng(1).standard_normal(5))
-    assert power(amounts, list(seconds)) == pytest.approx(stats.linregress(np.log(amounts), np.log(seconds)).slope)
+    assert power(zip(amounts, seconds, strict=True)) == pytest.approx(
+        stats.linregress(np.log(amounts), np.log(seconds)).slope
+    )
 
 
 def test_growth_over_pixels_and_frames(small):
@@ -313,6 +315,9 @@ def test_files_hold_what_was_measured(small, tmp_path):
     (tmp_path / "broken.json").write_text(json.dumps(broken))
     with pytest.raises(SubmissionError, match=r"points\.0\.frames"):
         read_tradeoff(tmp_path / "broken.json")
+    (tmp_path / "broken.json").write_text(json.dumps(run.model_dump(mode="json") | {"image_size": [32]}))
+    with pytest.raises(SubmissionError, match="image_size"):
+        read_tradeoff(tmp_path / "broken.json")
 
 
 def test_the_page_shows_methods_as_text(small):
@@ -323,6 +328,8 @@ def test_the_page_shows_methods_as_text(small):
     assert "<script" not in section and "&lt;script&gt;" in section and section.count("<svg") == len(COST_KEYS)
     assert 'href="#tradeoff"' in index and "time, frames" in section and "Power of pixels" in section
     assert "tradeoff" not in page_files([], [])["index.html"].decode()
+    longer = points[1].model_copy(update={"frames": 0, "pixel_seconds": [1.0] * 9})
+    assert b"<svg" in page_files([], [], tradeoff_of(small, [points[0], longer]))["index.html"]
     nothing = tradeoff_of(small, [Point(method="lost", options={}, failed="frame 7 is not stored")])
     assert page_files([], [], nothing) == page_files([], [])
 
