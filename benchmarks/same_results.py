@@ -32,7 +32,7 @@ from safetensors import safe_open
 
 SECTIONS = ("build", "train", "predict", "leaderboard", "reports")
 LEFT_OUT = re.compile(
-    r"created|.*seconds.*|hardware|software|environment|generator|pace_ms|load|.*_s|sittings|runs|peak_.*"
+    r"created|.*seconds.*|hardware|software|environment|generator|working_memory_mib|load|.*_s|runs|peak_.*"
 )
 """Keys of JSON and YAML files that hold times, dates, the machine or versions."""
 THREE = "mug,mustard_bottle,power_drill"
@@ -311,8 +311,7 @@ def reports(recorder: Recorder) -> None:
         command = f"fpp-bench diagnose {method} --quick --threads 1 --out diagnosis-{number}"
         recorder.run("reports", command, f"diagnosis-{number}/diagnose.json")
     recorder.run("reports", "fpp-bench tradeoff small --list", output=True)
-    groups = "--only classical --only phase --only networks --only precision"
-    command = f"fpp-bench tradeoff small --quick {groups} --out tradeoff"
+    command = "fpp-bench tradeoff small --quick --out tradeoff"
     recorder.run("reports", command, "tradeoff/tradeoff.json")
     commands = (
         "build import info verify show export train predict time tradeoff reproduce reliance diagnose leaderboard"
