@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corruptions
-from fpp_ml_bench.baselines.robustness.scores import Truth
+from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, Truth, corruptions
 from fpp_ml_bench.constants import MM_PER_M, sample_name
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.loaders.render import BuildSettings, SolidMesh, Studio, solid_mesh
