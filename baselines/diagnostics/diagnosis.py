@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from functools import cache
 from hashlib import sha256
@@ -150,12 +150,10 @@ def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | N
         content = read_json(folder / f"{name}.json", DiagnosisError)
         if content["key"] != key:
             return None
-        finding = Finding(**content["finding"])
-        tables = [Table(**table) for table in content["finding"]["tables"]]
-        figures = [
-            Figure(**fields, png=(folder / fields["file"]).read_bytes()) for fields in content["finding"]["figures"]
-        ]
-        return replace(finding, tables=tables, figures=figures), float(content["seconds"])
+        fields = content["finding"]
+        tables = tuple(Table(**table) for table in fields["tables"])
+        figures = tuple(Figure(**figure, png=(folder / figure["file"]).read_bytes()) for figure in fields["figures"])
+        return Finding(**{**fields, "tables": tables, "figures": figures}), float(content["seconds"])
     except (OSError, ValueError, TypeError, KeyError):
         return None  # absent, half written, or of another version: it is made again
 
