@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import original
+from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import Original, original
 from fpp_ml_bench.baselines.diagnostics.probe import (
     COLOURS,
     Figure,
@@ -35,7 +35,7 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     chart,
     gallery,
 )
-from fpp_ml_bench.baselines.diagnostics.scene_renderer import SceneRenderer, constant, moved
+from fpp_ml_bench.baselines.diagnostics.scene_renderer import SceneRenderer, Surface, constant, moved
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.baselines.training import LOSSES, loss_function
@@ -136,15 +136,14 @@ def twins_of(dataset: DatasetFolder, renderer: SceneRenderer, direction: Directi
             shifts_rad = (TAU * turns for turns in (start, start + 1))
             pair = [moved(first.surface, renderer.rig, direction, constant, shift) for shift in shifts_rad]
             if all(near_m <= surface.depth_m.min() and surface.depth_m.max() <= far_m for surface in pair):
-                break
-        else:
-            continue
-        break
-    else:
-        raise DiagnosisError(
-            f"{dataset.path}: no test object fits twice, a period of {direction} fringes apart, within "
-            f"{near_m:g} to {far_m:g} m; use a rig with a finer pitch or a wider range"
-        )
+                return _photographed(renderer, first, pair, direction)
+    raise DiagnosisError(
+        f"{dataset.path}: no test object fits twice, a period of {direction} fringes apart, within "
+        f"{near_m:g} to {far_m:g} m; use a rig with a finer pitch or a wider range"
+    )
+
+
+def _photographed(renderer: SceneRenderer, first: Original, pair: Sequence[Surface], direction: Direction) -> Twins:
     renderer = SceneRenderer(renderer.rig, renderer.lamp.changed("projector", defocus_px=0.0))
     lights = [renderer.light(surface) for surface in pair]
     gains = [light.gain.astype(np.float64) for light in lights]
@@ -161,7 +160,7 @@ def twins_of(dataset: DatasetFolder, renderer: SceneRenderer, direction: Directi
     frame, across = sinusoids(direction)[0], sinusoids("vertical" if direction == "horizontal" else "horizontal")[0]
     noiseless = frames(frame, quiet)
     depths_mm = [surface.depth_mm(renderer.shape) for surface in pair]
-    return Twins(sample, direction, frame, across, depths_mm, frames(frame), noiseless, frames(across), paint)
+    return Twins(first.sample, direction, frame, across, depths_mm, frames(frame), noiseless, frames(across), paint)
 
 
 def choice_of(
@@ -286,27 +285,27 @@ def tables(values: Mapping[str, Any], curves: Sequence[Curve]) -> list[Table]:
         "pixels that differ in the other direction's frame": "differing_pixels_other_direction",
         "least albedo factor on the brighter surface": "paint_least",
     }
-    chosen = []
+    chosen = {}
     for row in values["choices"]:
-        cells = (f"{low:.2f}" if low == high else f"{low:.2f} to {high:.2f}" for low, high in row["chosen"].values())
         alpha = "" if row["alpha"] is None else f", alpha {row['alpha']:g}"
-        chosen.append((f"{row['loss']}{alpha}", str(row["batch"]), *cells))
-    exponents = [(one["name"], one["exponent"], _span(one["fitted_m"]), _span(one["quadratic_m"])) for one in curves]
+        chosen[f"{row['loss']}{alpha}, batches of {row['batch']}"] = row["chosen"]
     errors = []
     for curve in curves:
         shown = np.interp(np.log(_SHOWN_M), np.log(curve["distances_m"]), curve["error_mm"])
         errors.append((curve["name"], *("no depth" if not np.isfinite(value) else f"{value:.4g}" for value in shown)))
     return [
         Table("Two scenes, one frame", ("What", "Value"), [(what, values["twins"][key]) for what, key in same.items()]),
-        Table(
+        Table.of(
             "Which depth a loss chooses for one image of two scenes: 0 the first, 1 the second, between them neither",
-            ("Loss", "Images a batch", *(f"second scene in {chance:.0%}" for chance in CHANCES)),
+            "Loss",
             chosen,
+            {str(chance): f"second scene in {chance:.0%}" for chance in CHANCES},
         ),
-        Table(
+        Table.of(
             "Exponent of distance in the depth error",
-            ("Phase error", "Fitted exponent", "Fitted over", "Within 1% of 2"),
-            exponents,
+            "Phase error",
+            {curve["name"]: curve for curve in values["curves"]},
+            {"exponent": "Fitted exponent", "fitted_m": "Fitted over, m", "quadratic_m": "Within 1% of 2, m"},
         ),
         Table("Depth error, mm", ("Phase error", *(f"{z:g} m" for z in _SHOWN_M)), errors),
     ]

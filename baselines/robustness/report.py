@@ -39,23 +39,11 @@ class Measured:
     setup: dict[str, Any]
     means: dict[str, dict[int, dict[str, float | None]]]
 
-    @property
-    def mae_mm(self) -> float | None:
-        return self.mean("mae_mm")
-
-    def axis_mae_mm(self, axis: str) -> float | None:
-        """Mean over the severities of an axis that were measured."""
-        return _mean([scores["mae_mm"] for scores in self.means.get(axis, {}).values()])
-
-    def mean(self, key: str) -> float | None:
-        """Mean of a score over all axes and severities that were measured."""
-        found = [s[key] for axis, by in self.means.items() if axis != CLEAN for s in by.values()]
-        return _mean(found)
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known and len(known) == len(values) else None
+    def mean(self, key: str = "mae_mm", axis: str | None = None) -> float | None:
+        """Mean of a score over the severities of an axis, or of all, that were measured; None where one is unknown."""
+        axes = self.means.keys() - {CLEAN} if axis is None else {axis}
+        values = [scores[key] for name, by in self.means.items() if name in axes for scores in by.values()]
+        return float(np.mean(values)) if values and None not in values else None
 
 
 def read_measured(out: Path) -> list[Measured]:
@@ -67,7 +55,7 @@ def read_measured(out: Path) -> list[Measured]:
         if contents:
             means = {content["axis"]: severity_means(content["views"]) for content in contents}
             found.append(Measured(folder, contents[0]["setup"], means))
-    return sorted(found, key=lambda one: (one.mae_mm is None, one.mae_mm or 0.0))
+    return sorted(found, key=lambda one: (one.mean() is None, one.mean() or 0.0))
 
 
 def write_page(out: Path) -> Path:

@@ -11,7 +11,7 @@ from typing import Any
 from fpp_ml_bench import __version__
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corruptions, score, severity_means
-from fpp_ml_bench.baselines.robustness.scenes import Condition, FrameCache, conditions_of
+from fpp_ml_bench.baselines.robustness.scenes import Condition, FrameCache
 from fpp_ml_bench.constants import sample_name
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.result import Robustness, SeverityScores
@@ -60,7 +60,12 @@ class Setup:
         return [CLEAN, *(name for name, axis in chosen.items() if axis.applies(SETS[self.set_name], frames))]
 
     def conditions(self, axis: str) -> list[Condition]:
-        return conditions_of(axis, self.severities, self.set_name, self.size, self.rig)
+        """Those of an axis of `corruptions`, or of `CLEAN`, on the objects of the set that it disturbs."""
+        objects = tuple(SETS[self.set_name])
+        if axis == CLEAN:
+            return [Condition(CLEAN, 0, objects, self.size, self.rig)]
+        disturbed = corruptions().axes[axis].seen_on(objects)
+        return [Condition(axis, severity, disturbed, self.size, self.rig) for severity in self.severities]
 
     def key(self) -> dict[str, Any]:
         """What must be equal for two measurements to be parts of one."""
@@ -93,46 +98,28 @@ def measure(
     the Ray cluster at an address. ``progress`` is called with an axis and a number of views, ``saved`` after each file.
     Raises PredictionError for files of another setup, `BuildError` where another process is at it, `PoolError`."""
     with exclusive(out / LOCK_FILE, out, "measuring there"):
-        rows: dict[str, list[View]] = {}
-        missing = []
-        for axis in setup.axes(axes):
-            kept = _rows(out / f"{axis}.json", setup.key())
-            if kept is None:
-                missing.append(axis)
-            else:
-                rows[axis] = kept
-                progress(axis, len(kept))
-        if missing:
-            _measure_missing(setup, out, missing, workers, FrameCache(cache), rows, progress, cluster, saved)
-        return {axis: rows[axis] for axis in setup.axes(axes)}
-
-
-def _measure_missing(
-    setup: Setup,
-    out: Path,
-    axes: Sequence[str],
-    workers: int,
-    cache: FrameCache,
-    rows: dict[str, list[View]],
-    progress: Progress,
-    cluster: str | None,
-    saved: Callable[[], None],
-) -> None:
-    work = setup.method, setup.conditions(CLEAN)[0], cache, setup.views
-    with mapping(work, workers, cluster) as mapped:
-        for axis in axes:
-            conditions = setup.conditions(axis)
-            frame_bytes = len(setup.method.frames_used) * setup.size**2
-            cache.make_room(sum(len(c.objects) for c in conditions) * len(setup.views) * frame_bytes)
-            tasks = [(condition, name) for condition in conditions for name in condition.objects]
-            found: list[View] = []
-            for views in mapped(_measure_object, *zip(*tasks, strict=True)):
-                found += views
-                progress(axis, len(views))
-            content = {"setup": setup.key(), "axis": axis, "views": found}
-            write_atomically(out / f"{axis}.json", (json.dumps(content, indent=1) + "\n").encode())
-            saved()
-            rows[axis] = found
+        files = {axis: out / f"{axis}.json" for axis in setup.axes(axes)}
+        kept = {axis: _rows(file, setup.key()) for axis, file in files.items()}
+        rows = {axis: found for axis, found in kept.items() if found is not None}
+        for axis, found in rows.items():
+            progress(axis, len(found))
+        missing = [axis for axis in files if axis not in rows]
+        frames = FrameCache(cache)
+        work = setup.method, setup.conditions(CLEAN)[0], frames, setup.views
+        if not missing:
+            return rows
+        with mapping(work, workers, cluster) as mapped:
+            for axis in missing:
+                tasks = [(condition, name) for condition in setup.conditions(axis) for name in condition.objects]
+                frames.make_room(len(tasks) * len(setup.views) * len(setup.method.frames_used) * setup.size**2)
+                rows[axis] = []
+                for views in mapped(_measure_object, *zip(*tasks, strict=True)):
+                    rows[axis] += views
+                    progress(axis, len(views))
+                content = {"setup": setup.key(), "axis": axis, "views": rows[axis]}
+                write_atomically(files[axis], (json.dumps(content, indent=1) + "\n").encode())
+                saved()
+        return {axis: rows[axis] for axis in files}
 
 
 def _measure_object(work: Work, condition: Condition, name: str) -> list[View]:
@@ -198,8 +185,7 @@ def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
     clean = list(rows[CLEAN])
     axes = {axis: list(by_severity(found).values()) for axis, found in rows.items() if axis != CLEAN}
     sha256 = setup.method.settings.get("weights_sha256")
-    sums, objects = _shares_of_the_mean(setup, rows)
-    found = object_interval(sums, objects)
+    found = object_interval(*_shares_of_the_mean(rows))
     every = [scores.mae_mm for severities in axes.values() for scores in severities]
     return Robustness(
         version=corruptions().version,
@@ -215,15 +201,15 @@ def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
     )
 
 
-def _shares_of_the_mean(setup: Setup, rows: Mapping[str, Sequence[View]]) -> tuple[list[float], list[str]]:
+def _shares_of_the_mean(rows: Mapping[str, Sequence[View]]) -> tuple[list[float], list[str]]:
     """For each sample what it adds to the mean over axes and severities, times the number of samples, and its object:
     the mean of these numbers is that mean, also where an axis disturbs a few objects only."""
     objects = {row["sample"]: row["object"] for row in rows[CLEAN]}
     sums = dict.fromkeys(objects, 0.0)
     conditions = 0
-    for axis in (axis for axis in rows if axis != CLEAN):
-        for severity in sorted({row["severity"] for row in rows[axis]}):
-            found = [row for row in rows[axis] if row["severity"] == severity]
+    for views in (views for axis, views in rows.items() if axis != CLEAN):
+        for severity in sorted({row["severity"] for row in views}):
+            found = [row for row in views if row["severity"] == severity]
             conditions += 1
             for row in found:
                 sums[row["sample"]] += (row["mae_mm"] or 0.0) * len(objects) / len(found)
