@@ -27,6 +27,7 @@ from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
+from fpp_ml_bench.loaders.render import LitPixels
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
 LARGEST_SHIFT_RAD = 0.4 * TAU
@@ -63,6 +64,9 @@ def original(dataset: DatasetFolder, renderer: SceneRenderer, sample: str) -> Or
     return Original(sample, record["object"], surface, replace(scene, mask=target), target, depth_mm)
 
 
+Kind = Literal["phase", "constant", "light", "both", "outline", "projected"]
+
+
 @dataclass(frozen=True)
 class Variant:
     """A scene that differs from its `Original` in one property, and its true depth (H, W). ``kind``:
@@ -75,7 +79,7 @@ class Variant:
       and after
     - ``projected``: another pattern, ``name`` of `REPROJECTED`"""
 
-    kind: Literal["phase", "constant", "light", "both", "outline", "projected"]
+    kind: Kind
     name: str
     scene: Scene
     depth_mm: NDArray[np.float64]
@@ -129,7 +133,9 @@ def _moves(sample: Original, renderer: SceneRenderer, direction: MovedPhase) -> 
                 continue
             moved_surface = rendering.moved(surface, renderer.rig, direction, field, amplitude)
             lit = renderer.light(moved_surface)
-            lights = {"constant" if name == "constant" else "phase": (lit, before)}
+            lights: dict[Kind, tuple[LitPixels, LitPixels]] = {
+                "constant" if name == "constant" else "phase": (lit, before)
+            }
             if name != "constant" and sign > 0:
                 lights |= {"light": (before, lit), "both": (lit, lit)}
             for kind, (place, brightness) in lights.items():

@@ -29,6 +29,7 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     Table,
     layer_title,
     mean_of,
+    said_of_layers,
 )
 from fpp_ml_bench.baselines.diagnostics.probe import with_interval as text_of
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
@@ -160,7 +161,7 @@ def measure(
     edges_with_fringes: list[float | None] = []
     done = 0
     for names, fringe in subject.batches(dataset, samples):
-        compared = [references(subject, dataset, name) for name in names]
+        compared: list[dict[str, Any]] = [{**references(subject, dataset, name)} for name in names]
         edges_with_fringes += [correlation(*maps.values()) for maps in compared]
         for weights, one_network in networks.items():
             heat = heat_by_layer(subject, one_network, fringe, layers)
@@ -251,10 +252,9 @@ def ratio_text(average: Mapping[str, Any]) -> str:
 def tables(means: Mapping[str, Any], samples: int) -> list[Table]:
     """The paper's table with random weights beside it, and the sanity check."""
     layers = means["layers"]
-    said = {layer: {"paper": said_by_paper(PAPER, layer)} for layer in (*layers, AVERAGE)}
-    beside = said if {*layers, AVERAGE} == set(paper_layers(PAPER)) else {layer: {} for layer in said}
-    rows = {layer_title(layer) if beside[layer] else layer: row | beside[layer] for layer, row in layers.items()}
-    rows["Average"] = means["average"] | beside[AVERAGE]
+    said = said_of_layers(PAPER, layers)
+    rows = {layer_title(layer) if said else layer: row | {"paper": said.get(layer)} for layer, row in layers.items()}
+    rows["Average"] = means["average"] | {"paper": said.get(AVERAGE)}
     rows["Average, random weights"] = _with_ratio(means["random_average"])
     rows["Edges with fringes"] = {EDGES: means["edges_with_fringes"]}
     columns = {EDGES: "r(CAM, edges)", FRINGES: "r(CAM, fringes)"}

@@ -24,6 +24,7 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     Table,
     chart,
     layer_title,
+    said_of_layers,
 )
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.constants import split_sample_name
@@ -31,7 +32,7 @@ from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.score import object_interval
 from fpp_ml_bench.loaders.storage import DatasetFolder
-from fpp_ml_bench.paper import AVERAGE, paper_layers, said_by_paper
+from fpp_ml_bench.paper import AVERAGE, paper_layers
 
 PAPER = "linear_probing"
 SAMPLES, QUICK_SAMPLES, QUICK_EPOCHS = 120, 24, 4
@@ -138,18 +139,15 @@ def _samples_with_object(dataset: DatasetFolder, split: str) -> list[str]:
 
 
 class Pixels:
-    """Pixels drawn from each sample, the same for every network, and cached. ``columns``: for each target its set (over
-    the image or within the object) and its columns in that set's targets."""
+    """Pixels drawn from each sample, the same for every network, and cached. ``targets``: those of each set, over the
+    image or within the object, whose columns stand side by side."""
 
     def __init__(self, subject: Subject, dataset: DatasetFolder) -> None:
         self.dataset, self.direction = dataset, subject.direction
-        self.fields: dict[bool, list[str]] = {False: [], True: []}
-        self.columns: dict[str, tuple[bool, slice]] = {}
-        for target, names in TARGETS.items():
-            if self.direction != "both" or target not in FRINGE:
-                fields = self.fields[target in INSIDE]
-                self.columns[target] = target in INSIDE, slice(len(fields), len(fields) + len(names))
-                fields += names
+        usable = [target for target in TARGETS if self.direction != "both" or target not in FRINGE]
+        self.targets = {
+            inside: [target for target in usable if (target in INSIDE) == inside] for inside in (False, True)
+        }
         self._drawn: dict[str, Drawn] = {}
 
     def of(self, sample: str) -> Drawn:
@@ -161,18 +159,17 @@ class Pixels:
             inside, size = np.flatnonzero(truth["inside"]), truth["inside"].size
             pixels = {False: rng.integers(size, size=PIXELS), True: inside[rng.integers(inside.size, size=PIXELS)]}
             self._drawn[sample] = {}
-            for key, fields in self.fields.items():
-                values = np.stack([truth[name].ravel()[pixels[key]] for name in fields], axis=1)
+            for key, targets in self.targets.items():
+                maps = [truth[name].ravel() for target in targets for name in TARGETS[target]]
+                values = np.stack([one[pixels[key]] for one in maps], axis=1)
                 self._drawn[sample][key] = torch.from_numpy(pixels[key]), torch.from_numpy(values)
         return self._drawn[sample]
 
     def errors_of(self, inside: bool, errors: Tensor) -> dict[str, float]:
         """Mean square of one sample's ``errors`` (P, T) for every target of a set."""
-        return {
-            target: float(errors[:, columns].square().mean())
-            for target, (within_object, columns) in self.columns.items()
-            if within_object == inside
-        }
+        widths = [len(TARGETS[target]) for target in self.targets[inside]]
+        columns = zip(self.targets[inside], errors.split(widths, dim=1), strict=True)
+        return {target: float(of_target.square().mean()) for target, of_target in columns}
 
 
 class Experiment:
@@ -378,15 +375,14 @@ def summary(linear: Scores, spatial: Scores) -> str:
 def tables(linear: Scores, spatial: Scores) -> list[Table]:
     """The paper's table first, then the same probes as shares of variance, then the linear probes; with controls."""
     trained, raw = spatial[TRAINED], spatial[CONTROLS][INPUT]
-    beside = {*trained, AVERAGE} == set(paper_layers(PAPER))
+    said = said_of_layers(PAPER, trained)
     groups = {layer: {layer: targets} for layer, targets in trained.items()}
     groups |= {"Average": trained, "Average, random weights": spatial[UNTRAINED]}
     groups |= {CONTROL_TITLES[name]: {name: targets} for name, targets in spatial[CONTROLS].items()}
     errors = {}
     for name, layers in groups.items():
         row = {key: mean_over(layers, key) for key in MEASURED} | {"ratio": mean_ratio(layers)}
-        paper = said_by_paper(PAPER, name.lower()) if beside else None
-        errors[layer_title(name) if beside else name] = {**row, "paper": paper}
+        errors[layer_title(name) if said else name] = row | {"paper": said.get(name.lower())}
     means = {key: raw[key]["mse_of_mean"] for key in MEASURED}
     errors["Predicting the mean"] = {**means, "ratio": ratio_of_means(raw)}
     columns = {key: TITLES[key] for key in MEASURED}
@@ -412,7 +408,7 @@ def _shares(title: str, scores: Scores, intervals: bool) -> Table:
         layer: cells(targets) | cells(scores[UNTRAINED][layer], "random ") for layer, targets in scores[TRAINED].items()
     }
     rows |= {CONTROL_TITLES[name]: cells(targets) for name, targets in scores[CONTROLS].items()}
-    columns = {}
+    columns: dict[str, str] = {}
     for key in scores[CONTROLS][INPUT]:
         columns |= {key: TITLES[key], f"random {key}": "random weights"}
     return Table.of(title, "Layer", rows, columns)
@@ -450,5 +446,5 @@ def _panel(title: str, scores: Scores, targets: Sequence[str], key: str) -> Pane
             level = [of_target[target][key]] * len(layers)
             label = CONTROL_TITLES[control] + name
             lines.append(Line(label, layers, level, colour if name else COLOURS["ink"], _STYLES[control]))
-    limits = {} if name else {"ylim": (min(-0.1, max(-0.5, min(lines[0].y) - 0.05)), 1.02)}
+    limits = {} if name else {"ylim": (min(-0.1, max(-0.5, min(one[key] for one in trained.values()) - 0.05)), 1.02)}
     return Panel(title, lines, "", "MSE" if key == "mse" else "R2", limits)

@@ -14,7 +14,7 @@ from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.paper import LAYERS
+from fpp_ml_bench.paper import AVERAGE, LAYERS, paper_layers, said_by_paper
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -73,6 +73,12 @@ def layer_title(layer: str) -> str:
     """Our name of a layer, and the paper's where it has another."""
     theirs = LAYERS.get(layer, layer)
     return layer if theirs == layer else f"{layer} (paper's {theirs})"
+
+
+def said_of_layers(probe: str, layers: Iterable[str]) -> dict[str, str | None]:
+    """What the paper's table of a probe says of each layer and of their average; nothing for other layers than its."""
+    names = set(paper_layers(probe))
+    return {name: said_by_paper(probe, name) for name in names} if {*layers, AVERAGE} == names else {}
 
 
 def with_interval(value: float | None, interval: Sequence[float] | None = None) -> str:
@@ -192,15 +198,15 @@ class Line:
     ``style``: marker and line as for matplotlib's ``plot``."""
 
     label: str
-    x: Sequence[Any]
-    y: Sequence[float | None]
+    x: Sequence[Any] | NDArray
+    y: Sequence[float | None] | NDArray
     colour: str
     style: str = "o-"
     ends: Sequence[Sequence[float] | None] = ()
 
     @classmethod
     def of(
-        cls, label: str, rows: Mapping[str, Mapping[str, Any]], key: str, colour: str, style: str = "o-", ends: str = ""
+        cls, label: str, rows: Mapping[Any, Mapping[str, Any]], key: str, colour: str, style: str = "o-", ends: str = ""
     ) -> Line:
         """The values ``key`` of the named ``rows``, whose intervals are called ``ends``."""
         return cls(
@@ -249,7 +255,7 @@ def chart(panels: Sequence[Panel], columns: int, panel_size: tuple[float, float]
     """``panels`` in rows of ``columns``, of so many inches each, and one legend of all their lines; PNG."""
     rows = max(-(-len(panels) // columns), 1)
     figure, axes_of = _figure(rows, columns, panel_size[0] * columns, panel_size[1] * rows)
-    handles = {}
+    handles: dict[str, Any] = {}
     for panel, axes in zip(panels, axes_of.flat, strict=False):
         for line in panel.lines:
             values = [float("nan") if value is None else value for value in line.y]
@@ -273,10 +279,8 @@ def chart(panels: Sequence[Panel], columns: int, panel_size: tuple[float, float]
     for axes in axes_of.flat[len(panels) :]:
         axes.axis("off")
     # As many columns as the longest label leaves room for, at 12 letters an inch.
-    across = int(12 * panel_size[0] * columns / (8 + max(map(len, handles), default=0)))
-    figure.legend(
-        handles.values(), handles, fontsize=8, frameon=False, ncols=max(across, 1), loc="outside lower center"
-    )
+    across = max(1, int(12 * panel_size[0] * columns / (8 + max(map(len, handles), default=0))))
+    figure.legend(handles.values(), handles, fontsize=8, frameon=False, ncols=across, loc="outside lower center")
     return _png(figure)
 
 

@@ -247,7 +247,8 @@ class SceneRenderer:
         """Frames ``indices`` of ``scene``, uint8 (H, W), by number, else None; ``masked``: 0 outside ``scene.mask``."""
         turned = scene.projected == "other direction"
         other = scene.projected == "other pitch" or (turned and self.rig.crossed is not None)
-        inside = outside = scene.projected if other else "sequence"
+        usual: str = scene.projected if other else "sequence"
+        inside = outside = usual
         if scene.projected == "no fringe inside":
             inside = "uniform"
         elif scene.projected == "no fringe outside":

@@ -43,7 +43,8 @@ class Measured:
         """Mean of a score over the severities of an axis, or of all, that were measured; None where one is unknown."""
         axes = self.means.keys() - {CLEAN} if axis is None else {axis}
         values = [scores[key] for name, by in self.means.items() if name in axes for scores in by.values()]
-        return float(np.mean(values)) if values and None not in values else None
+        known = [value for value in values if value is not None]
+        return float(np.mean(known)) if known and len(known) == len(values) else None
 
 
 def read_measured(out: Path) -> list[Measured]:
@@ -129,9 +130,13 @@ def write_worst(setup: Setup, rows: dict[str, list[View]], out: Path, cache: Pat
         box = tuple(slice(max(places.min() - 20, 0), places.max() + 20) for places in seen)
         severity = corruptions().axes[row["axis"]].severities[row["severity"] - 1]
         titles.append(f"{row['axis']} {severity:g}\n{row['sample']}, {row['mae_mm']:.1f} mm")
-        shown = (fringe, "gray", 0, 255), (depth_mm, "viridis", low, high), (error, "magma", 0, most)
-        for column, (image, *scale) in zip(pictures.values(), shown, strict=True):
-            column.append(Picture(image[box], *scale))
+        shown = (
+            Picture(fringe[box]),
+            Picture(depth_mm[box], "viridis", low, high),
+            Picture(error[box], "magma", 0, most),
+        )
+        for column, picture in zip(pictures.values(), shown, strict=True):
+            column.append(picture)
     if titles:
         write_atomically(out / WORST, gallery(pictures, titles, 2.4))
 
