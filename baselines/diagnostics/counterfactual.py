@@ -380,9 +380,9 @@ def _box(mask: NDArray[np.bool_], margin: int = 6) -> tuple[slice, ...]:
 def _draw_parts(reliance: Reliance, samples: Sequence[SampleReliance]) -> Figure:
     """The means of the parts, with a point for each sample."""
     panels = []
-    for names, title, colour in (
-        (_FOLLOWS, "Follows, share of the expected change", "phase"),
-        (_CHANGES, "Changes, relative to a moved phase", "depth"),
+    for names, title, colour, top in (
+        (_FOLLOWS, "Follows, share of the expected change", "phase", 1.05),
+        (_CHANGES, "Changes, relative to a moved phase", "depth", None),
     ):
         measured = {key: name for key, name in names.items() if getattr(reliance.parts, key) is not None}
         means = [getattr(reliance.parts, key) for key in measured]
@@ -390,7 +390,7 @@ def _draw_parts(reliance: Reliance, samples: Sequence[SampleReliance]) -> Figure
         for sample in samples:
             points = [sample.parts.get(key) for key in measured]
             lines.append(Line("sample", list(measured.values()), points, COLOURS["ink"], "."))
-        panels.append(Panel(title, lines, axes={"ylim": (0, None)}))
+        panels.append(Panel(title, lines, axes={"ylim": (0, top)}))
     title = f"What the score is made of: phase reliance {reliance.score:.2f}"
     alt = "How far the answer follows and what changes it"
     return Figure(title, "counterfactual_parts.png", alt, chart(panels, 2))

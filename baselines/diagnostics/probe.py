@@ -278,8 +278,8 @@ def chart(panels: Sequence[Panel], columns: int, panel_size: tuple[float, float]
         axes.spines[["top", "right"]].set_visible(False)
     for axes in axes_of.flat[len(panels) :]:
         axes.axis("off")
-    # As many columns as the longest label leaves room for, at 12 letters an inch.
-    across = max(1, int(12 * panel_size[0] * columns / (8 + max(map(len, handles), default=0))))
+    # As many columns as the longest label leaves room for, at 16 letters an inch.
+    across = max(1, int(16 * panel_size[0] * columns / (8 + max(map(len, handles), default=0))))
     figure.legend(handles.values(), handles, fontsize=8, frameon=False, ncols=across, loc="outside lower center")
     return _png(figure)
 
