@@ -82,7 +82,7 @@ def coded_rig(pitch_px: float = 18.0, steps: int = 18, size: int = 32, length: i
     return optics.Rig(rig.camera, device, rig.rotation, rig.translation_m, pitch_px, pitch_px, sequence)
 
 
-def gray_levels(cells: NDArray, bits: int, mean: float = MEAN, modulation: float = MODULATION) -> Floats:
+def gray_levels(cells: NDArray, bits: int, mean: float = MEAN, modulation: float = MODULATION) -> NDArray:
     """Grey levels of the Gray bits of cells (n,), float64 (bits, n)."""
     bright = (coding.binary_to_gray(cells) >> np.arange(bits - 1, -1, -1)[:, None]) & 1
     return mean + modulation * (2.0 * bright - 1.0)

@@ -133,7 +133,6 @@ def closed_form(coordinate: NDArray, rig: optics.Rig, axis: int = 0, indistinct:
 @TRIANGULATION.family(
     "short baseline and long range",
     "relative",
-    about="depth from one coordinate",
     direction=("vertical",),
     baseline_mm=(1.0, 0.01),
     range_m=(20.0, 100.0),
@@ -141,7 +140,6 @@ def closed_form(coordinate: NDArray, rig: optics.Rig, axis: int = 0, indistinct:
 @TRIANGULATION.family(
     "range",
     "relative",
-    about="depth from one coordinate",
     direction=optics.AXES,
     baseline_mm=(160.0,),
     range_m=(0.3, 1.0, 1.8, 5.0, 20.0, 100.0),
@@ -155,6 +153,7 @@ def closed_form(coordinate: NDArray, rig: optics.Rig, axis: int = 0, indistinct:
     baseline_mm=BASELINES,
 )
 def one_coordinate(baseline_mm: float, range_m: float, direction: optics.Direction, turned: int = 0) -> Outcome:
+    """depth from one coordinate"""
     rig, axis = scaled_baseline(baseline_mm, 0.3 * turned, turned > 0), optics.AXES.index(direction)
     return closed_form(exact_coordinates(range_m, rig)[axis], rig, axis)
 

@@ -194,9 +194,9 @@ def _start(
         intrinsics.append(np.concatenate([matrix[[0, 1, 0, 1], [0, 1, 2, 2]], distortion]))
         rms.append(float(error))
         views.append((turns, shifts))
-    turns = [Rotation.from_rotvec(np.reshape(vectors, (-1, 3))) for vectors, _ in views]
+    first, second = (Rotation.from_rotvec(np.reshape(vectors, (-1, 3))) for vectors, _ in views)
     shifts = [np.reshape(vectors, (-1, 3)) for _, vectors in views]
-    between = turns[1] * turns[0].inv()
+    between = second * first.inv()
     stereo = [between.mean().as_rotvec(), np.median(shifts[1] - between.apply(shifts[0]), axis=0)]
     boards = np.hstack([np.reshape(views[0][0], (-1, 3)), shifts[0]]).ravel()
     return np.concatenate([*intrinsics, *stereo, boards, board.points_mm().ravel()]), (rms[0], rms[1])
