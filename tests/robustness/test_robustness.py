@@ -112,7 +112,7 @@ def test_a_moving_object_rests_halfway_through_its_frames():
 
 
 def test_motion_is_nothing_to_one_frame_and_interreflection_to_convex_objects():
-    setup = Setup(Noisy(), "test", SIZE)
+    setup = Setup(Noisy(paper_rig(SIZE)), "test", SIZE)
     assert "motion" not in setup.axes(()) and "interreflection" in setup.axes(())
     assert not RULES.axes["interreflection"].applies(("power_drill",), 1)
 
@@ -165,7 +165,7 @@ def test_no_number_is_refused(bad):
 
 def test_random_silent_and_lying_methods_land_where_they_should(tmp_path):
     chosen = ["ambient-light"]
-    random, silent, liar = Noisy(), Noisy(), Noisy()
+    random, silent, liar = Noisy(paper_rig(SIZE)), Noisy(paper_rig(SIZE)), Noisy(paper_rig(SIZE))
     random.noise_mm, silent.silent, liar.sigma_mm = 400.0, True, 1.0
     liar.noise_mm = 400.0
     means = {}
@@ -180,12 +180,12 @@ def test_random_silent_and_lying_methods_land_where_they_should(tmp_path):
 
 
 def test_measuring_resumes_axis_by_axis_and_refuses_another_methods_folder(tmp_path, monkeypatch):
-    setup = Setup(Noisy(), "test", SIZE, quick=True)
+    setup = Setup(Noisy(paper_rig(SIZE)), "test", SIZE, quick=True)
     first = measure(setup, tmp_path, ["ambient-light"])
     monkeypatch.setattr(run, "_measure_object", None)  # nothing is left to do
     assert measure(setup, tmp_path, ["ambient-light"]) == first
     with pytest.raises(PredictionError, match="other quick"):
-        measure(Setup(Noisy(), "test", SIZE), tmp_path, ["ambient-light"])
+        measure(Setup(Noisy(paper_rig(SIZE)), "test", SIZE), tmp_path, ["ambient-light"])
     (tmp_path / "clean.json").write_text('{"views": 3}')
     with pytest.raises(PredictionError, match=r"clean\.json: damaged"):
         measure(setup, tmp_path, ["ambient-light"])
@@ -254,7 +254,7 @@ def rows_of(axes_maes: dict[str, list[list[float]]]):
 
 
 def test_the_headline_is_the_mean_over_axes_and_severities_also_of_axes_of_few_objects(monkeypatch):
-    setup = Setup(Noisy(), "test", SIZE)
+    setup = Setup(Noisy(paper_rig(SIZE)), "test", SIZE)
     monkeypatch.setattr(Setup, "axes", lambda self, names: [CLEAN, "gloss", "interreflection"])
     rows = rows_of(
         {
@@ -279,7 +279,7 @@ def test_the_headline_is_the_mean_over_axes_and_severities_also_of_axes_of_few_o
 
 
 def test_a_normalised_answer_and_an_unknown_axis_are_refused():
-    method = Noisy()
+    method = Noisy(paper_rig(SIZE))
     method.units = "normalised"
     with pytest.raises(PredictionError, match="--range predicted"):
         Setup(method, "test", SIZE)
