@@ -8,7 +8,7 @@
 (4, 'phase steps')
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from difflib import get_close_matches
 from typing import Any
@@ -16,24 +16,46 @@ from typing import Any
 from fpp_ml_bench.files import printable
 
 _KEY = "fpp_ml_bench.option"
+REQUIRED: Any = MISSING
+"""In place of a default: the command line must give it."""
 
 
 @dataclass(frozen=True)
 class Description:
     """What the command line says of an option: ``help``, ``metavar`` of its value, the ``choices`` that there are, and
-    ``flag``, its spelling where that is not made of the field's name."""
+    ``flag``, its spelling where that is not made of the field's name. ``parse`` makes a value of its text where the
+    field's type does not say how; it raises ValueError with what it expected. ``many``: may be given again, the field
+    is a tuple. ``positional``: an argument without a flag."""
 
     help: str
     metavar: str | None = None
     choices: tuple[str, ...] = ()
     flag: str | None = None
+    parse: Callable[[str], Any] | None = None
+    many: bool = False
+    positional: bool = False
 
 
 def option(
-    default: Any, help: str, metavar: str | None = None, choices: Collection[str] = (), flag: str | None = None
+    default: Any,
+    help: str,
+    metavar: str | None = None,
+    choices: Collection[str] = (),
+    flag: str | None = None,
+    parse: Callable[[str], Any] | None = None,
+    many: bool = False,
 ) -> Any:
     """A dataclass field that is an option of the command line: its ``default``, and the rest as of `Description`."""
-    return field(default=default, metadata={_KEY: Description(help, metavar, tuple(choices), flag)})
+    description = Description(help, metavar, tuple(choices), flag, parse, many)
+    return field(default=default, metadata={_KEY: description})
+
+
+def argument(
+    help: str, metavar: str, default: Any = REQUIRED, choices: Collection[str] = (), many: bool = False
+) -> Any:
+    """A dataclass field that is an argument of the command line, told by its place; else as `option`."""
+    description = Description(help, metavar, tuple(choices), many=many, positional=True)
+    return field(default=default, metadata={_KEY: description})
 
 
 def described(options: type) -> dict[str, Description]:
@@ -51,6 +73,11 @@ def flag_of(name: str, description: Description) -> str:
     return description.flag or f"--{name.replace('_', '-')}"
 
 
+def nearest(name: str, known: Collection[str] | Mapping[str, Any], count: int = 1) -> list[str]:
+    """The known names, at most ``count``, that an unknown ``name`` is probably meant as; none that is far from it."""
+    return get_close_matches(name, known, n=count)
+
+
 def did_you_mean(name: str, known: Collection[str] | Mapping[str, Any]) -> str:
     """How a message about an unknown ``name`` ends: the nearest known one, or all of them.
 
@@ -59,5 +86,5 @@ def did_you_mean(name: str, known: Collection[str] | Mapping[str, Any]) -> str:
     >>> did_you_mean("x", ["classical", "phase"])
     'there are classical, phase'
     """
-    nearest = get_close_matches(name, known, n=1)
-    return f"did you mean {printable(nearest[0])!r}?" if nearest else f"there are {', '.join(known) or 'none'}"
+    meant = nearest(name, known)
+    return f"did you mean {printable(meant[0])!r}?" if meant else f"there are {', '.join(known) or 'none'}"

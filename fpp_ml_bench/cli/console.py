@@ -1,15 +1,23 @@
-"""Console output: a progress bar on standard error, and numbers with units for tables."""
+"""Console output: a progress bar on standard error, numbers with units for tables, and accounts of skipped work."""
 
-import argparse
+import json
 import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 
 from rich.console import Console, RenderableType
+from rich.text import Text
 
+from fpp_ml_bench.errors import FppBenchError
 from fpp_ml_bench.examination import Examination
+from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.options import option
+from fpp_ml_bench.skipping import Explanation
+from fpp_ml_bench.tables import Table
 
 WIDTH_IN_PIPES = 140
 
@@ -19,7 +27,6 @@ def progress_bar(title: str, total: int, unit: str, per_step: int = 1) -> Iterat
     """A rich progress bar over ``total`` steps; yields the function that advances it. Shows the time left and the rate
     of ``unit``, of which a step counts ``per_step`` (52 images a sample)."""
     from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
-    from rich.text import Text
 
     class Rate(ProgressColumn):
         def render(self, task: object) -> Text:
@@ -37,17 +44,6 @@ def progress_bar(title: str, total: int, unit: str, per_step: int = 1) -> Iterat
     with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task(title, total=total)
         yield lambda steps: progress.advance(task, steps)
-
-
-def working_range(text: str) -> tuple[float, float]:
-    """Type of an option: NEAR,FAR in mm."""
-    try:
-        near, far = (float(part) for part in text.split(","))
-    except ValueError:
-        near, far = 1.0, 0.0
-    if not 0 < near < far < 1e9:
-        raise argparse.ArgumentTypeError(f"expected NEAR,FAR in mm such as 350,450, got {text!r}")
-    return near, far
 
 
 def gigabytes(count: float) -> str:
@@ -93,3 +89,56 @@ def show(*parts: RenderableType) -> None:
     console = Console(width=output_width(), highlight=False, markup=False, emoji=False)
     for part in parts:
         console.print(part)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explain:
+    """Settings of a command that tells which work it left out."""
+
+    HEADING = "skipped work"
+    explain: bool = option(False, "print which work was left out and what that saved (takes a moment)")
+    explain_json: Path | None = option(None, "write the same as JSON into FILE; implies --explain", "FILE")
+
+    def check_explain_file(self) -> None:
+        """Raises `FppBenchError`, before any work, for a JSON file that can't be written."""
+        path = self.explain_json
+        if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
+            raise FppBenchError(
+                f"--explain-json {path}: expected a file in an existing folder; create the folder first"
+            )
+
+    def say_explanation(self, account: Callable[[], Explanation]) -> None:
+        """Print the account as a table with the rules for the seconds below, and write it as JSON, if asked for."""
+        if self.explain or self.explain_json:
+            explanation = account()
+            show(_explanation_table(explanation))
+        if self.explain_json is not None:
+            text = json.dumps(explanation.to_dict(), indent=1, allow_nan=False)
+            write_atomically(self.explain_json, (text + "\n").encode("utf-8"))
+            print(f"Written: {self.explain_json}")
+
+
+def _explanation_table(explanation: Explanation) -> Table:
+    state = "left out" if explanation.skipping else "nothing left out (skipping is off); it would have been"
+    rules = list(dict.fromkeys(line.rule for line in explanation.lines))
+    table = Table(
+        "what",
+        "unit",
+        numbers=("done", "left out", "share", "bytes", "seconds"),
+        title=Text(f"{explanation.command}: {state} ({explanation.subject})"),
+        elsewhere="--explain-json FILE",
+        caption=Text("\n".join(f"[{number}] {rule}" for number, rule in enumerate(rules, 1))),
+    )
+    for line in explanation.lines:
+        saved = line.seconds_saved
+        seconds = "-" if saved is None else f"{saved:,.2g}" if abs(saved) < 10 else f"{saved:,.0f}"
+        table.add_row(
+            Text(line.what),
+            line.unit,
+            f"{line.done:,}",
+            f"{line.left_out:,}",
+            f"{100 * line.share:.1f}%",
+            "-" if line.bytes_saved is None else gigabytes(line.bytes_saved),
+            Text(f"{seconds} [{rules.index(line.rule) + 1}]"),
+        )
+    return table

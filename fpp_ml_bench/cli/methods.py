@@ -1,0 +1,153 @@
+"""Commands that take a METHOD: its options on the command line are the fields of its class, whoever wrote it."""
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from fpp_ml_bench.baselines import registry, training
+from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.cli.options import (
+    AT_LEAST_ONE,
+    Command,
+    Option,
+    flags_of,
+    parameter,
+    parse_value,
+    parser_of,
+    row_of,
+)
+from fpp_ml_bench.errors import FppBenchError, PredictionError
+from fpp_ml_bench.options import argument, described, flag_of, option
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.baselines.method import Photographed
+
+METHOD_HELP = (
+    "one of those below with their options, the name of weights that come with the package, a .safetensors file, a "
+    "recipe that fpp-bench reproduce has trained (loss/l1), or file.py:Class, a method of yours; that file is executed"
+)
+_METHODS = "methods"
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodSettings:
+    """Settings of a command that runs a method. ``of_method``: the text of the method's own options by their flags."""
+
+    method: str = argument(METHOD_HELP, "METHOD")
+    threads: int = option(1, "threads a sample (default: 1)", "N", parse=AT_LEAST_ONE)
+    of_method: Mapping[str, Any] = field(default_factory=dict)
+
+
+class MethodCommand(Command):
+    """A command whose options are also those of all methods, and of a ``file.py:Class`` among its words."""
+
+    part = "Options"
+
+    def methods(self, words: Sequence[str]) -> list[type[Method]]:
+        """The methods, the user's own first: where two share a flag, the first says whether a value stands behind
+        it."""
+        own = [registry.find(word).method for word in words if registry.FILE_MARK in word and word[0] != "-"]
+        return [*own, *_known_methods()]
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        taken = flags_of(ctx)
+        by_method = {method: _parameters(method, self.part) for method in self.methods(args)}
+        for method, params in by_method.items():
+            if clash := [flag for flag in params if flag in taken]:
+                raise PredictionError(
+                    f"{method.name}: its option {clash[0]} is one of {ctx.command_path}; give it another flag"
+                )
+        ctx.meta[_METHODS] = by_method
+        return super().parse_args(ctx, args)
+
+    def of_methods(self, ctx: click.Context) -> dict[str, Option]:
+        """The options of methods by their flag."""
+        found: dict[str, Option] = {}
+        for params in ctx.meta.get(_METHODS, {}).values():
+            found = {**params, **found}
+        return found
+
+    def get_params(self, ctx: click.Context) -> list[click.Parameter]:
+        return [*super().get_params(ctx), *self.of_methods(ctx).values()]
+
+    def values(self, ctx: click.Context) -> dict[str, Any]:
+        values = super().values(ctx)
+        of_methods = self.of_methods(ctx).items()
+        return {**values, "of_method": {flag: values.pop(p.name) for flag, p in of_methods if p.name in values}}
+
+    def sections(self, ctx: click.Context) -> dict[str, list[tuple[str, str]]]:
+        listed = {
+            f"{label_of(method)} ({method.purpose})": [row_of(param, ctx) for param in params.values()]
+            for method, params in ctx.meta[_METHODS].items()
+        }
+        return {**super().sections(ctx), **listed}
+
+    def invoke(self, ctx: click.Context) -> int:
+        try:
+            return super().invoke(ctx)
+        except FppBenchError:
+            raise
+        except Exception as error:
+            if (failure := registry.failure_in_file(error)) is None:
+                raise
+            raise PredictionError(f"a method of yours failed: {failure}") from error
+
+
+def _known_methods() -> list[type[Method]]:
+    return [*registry.methods().values(), registry.network_method()]
+
+
+def _parameters(method: type[Method], part: str) -> dict[str, Option]:
+    """The options of a method by their flag, which leave their text as it is. They are listed below the method, so
+    hidden where a command lists its own."""
+    options = getattr(method, part)
+    made: dict[str, Option] = {}
+    for name, about in described(options).items() if options else ():
+        entry = next(entry for entry in fields(options) if entry.name == name)
+        flag = flag_of(name, about)
+        param = made[flag] = parameter(entry, replace(about, parse=str), name=f"of_method{flag.replace('-', '_')}")
+        param.hidden = True
+    return made
+
+
+def label_of(method: type[Method]) -> str:
+    """What a method is called in help and messages."""
+    return "trained networks" if method is registry.network_method() else method.name
+
+
+def options_given(method: type[Method], part: str, texts: Mapping[str, Any], name: str) -> dict[str, Any]:
+    """The fields of a method's ``part`` that the ``texts`` give, by flag; ``name``: what the user calls the method.
+    Raises `PredictionError` for options of others, and for text that is no value of its option."""
+    options = getattr(method, part, None)
+    own = {flag_of(field, about): field for field, about in described(options).items()} if options else {}
+    given: dict[str, Any] = {}
+    for flag, text in texts.items():
+        if flag not in own:
+            owners = [label_of(known) for known in _known_methods() if flag in _parameters(known, part)]
+            raise PredictionError(f"{flag} is an option of {', '.join(owners)}, not of {name}; leave it out")
+        entry = next(entry for entry in fields(options) if entry.name == own[flag])
+        try:
+            read = parser_of(entry, described(options)[entry.name])
+            given[entry.name] = text if isinstance(text, bool) else parse_value(flag, text, read)
+        except ValueError as error:
+            raise PredictionError(str(error)) from None
+    return given
+
+
+def chosen_method(settings: MethodSettings, dataset: "Photographed", warn: bool = True) -> Method:
+    """The method that the settings name, for the rig of ``dataset``. Unless told not to, warns on standard error about
+    weights that were trained on another version of the dataset's benchmark. Raises FppBenchError for an unknown method,
+    and for an option that belongs to another one."""
+    kind = registry.find(settings.method).method
+    given = options_given(kind, "Options", settings.of_method, settings.method)
+    if "threads" in {entry.name for entry in fields(kind.Options)}:
+        given["threads"] = settings.threads
+    method = registry.load_method(settings.method, dataset, **given)
+    config = method.weights_config
+    warning = None if config is None else training.training_data_warning(config, dataset.manifest)
+    if warn and config is not None and warning is not None:
+        print(f"warning: {config.name} was {warning}", file=sys.stderr)
+    return method
