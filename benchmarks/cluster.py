@@ -128,7 +128,7 @@ def main() -> int:
             for way, options in ways.items():
                 folder = work / (way if repeat == args.repeats - 1 else f"{way}-{repeat}")
                 out = folder.as_uri() if way == "url" else str(folder)
-                seconds[way].append(timed("build", out, *settings, *options))
+                seconds[way].append(timed("build", "--out", out, *settings, *options))
                 print(f"{way}: {seconds[way][-1]:.1f} s", flush=True)
                 prints[way] = hashes(folder)
                 same &= prints[way] == prints["local"]
@@ -152,7 +152,7 @@ def main() -> int:
         )
 
         killed = work / "killed"
-        words = ["build", str(killed), *settings, "--cluster", address]
+        words = ["build", "--out", str(killed), *settings, "--cluster", address]
         killed_s, finished, lost = killed_build(words, killed, cluster, node)
         equal = hashes(killed) == prints["local"]
         same &= equal

@@ -134,7 +134,7 @@ def main() -> None:
         )
         prepare(Path(data), Path(predictions), Path(targets), args.size, args.samples)
         commands = {
-            "fpp-eval": [str(COMMAND), predictions, "--dataset", data, "--json", result],
+            "fpp-eval": [str(COMMAND), predictions, data, "--json", result],
             "load": [sys.executable, "-c", LOAD, predictions, targets],
             "plain": [sys.executable, "-c", PLAIN, predictions, targets],
         }

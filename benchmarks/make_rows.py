@@ -59,12 +59,13 @@ METHODS: dict[str, tuple[object, ...]] = {
         for n, direction in CLASSICAL
     },
     "classical-net-03-vertical": ("classical-net",),
-    **{f"phase-{direction}": ("phase", "--fringe", direction) for direction in ("horizontal", "vertical")},
+    **{f"phase-{direction}": ("phase", "--direction", direction) for direction in ("horizontal", "vertical")},
     **{
-        f"phase-{n:02d}-{direction}": ("phase", "--frames", n, "--fringe", direction) for n, direction in SEVERAL_FRAMES
+        f"phase-{n:02d}-{direction}": ("phase", "--frames", n, "--direction", direction)
+        for n, direction in SEVERAL_FRAMES
     },
     **{
-        f"phase-net{suffix}-{direction}": ("phase-net", "--fringe", direction, *words)
+        f"phase-net{suffix}-{direction}": ("phase-net", "--direction", direction, *words)
         for suffix, words in {"": (), "-any": ("--albedo", "any")}.items()
         for direction in ("horizontal", "vertical")
     },
@@ -106,7 +107,7 @@ def make_row(dataset: Path, work: Path, row: Path, name: str, repeats: int, trai
     run("fpp-bench", "time", *settings, "--repeats", repeats, "--into", predictions / "submission.yaml")
     target = "depth_exact" if DatasetFolder(dataset).size[0] == FULL_SIZE else "depth"
     mode = "paper" if name.startswith("constant-range") else "standard"
-    run("fpp-eval", predictions, "--dataset", dataset, "--target", target, "--mode", mode, "--json", result)
+    run("fpp-eval", predictions, dataset, "--target", target, "--mode", mode, "--json", result)
     before = read_entry(row) if row.exists() else None
     run("fpp-bench", "leaderboard", result, "--row", row)
     keep_measured(before, row)

@@ -47,13 +47,13 @@ def measure(folder: Path, rows: int, size: int) -> dict[str, float]:
     scratch = Path(tempfile.mkdtemp(prefix="fpp-memory-", dir=folder))
     data = str(scratch / "set")
     try:
-        build = command("build", data, "--size", str(size), "--objects", ",".join(names), "--workers", "1")
+        build = command("build", "--out", data, "--size", str(size), "--objects", ",".join(names), "--workers", "1")
         peaks = {"build": peak_mib(build)}
         for method, options in (("classical", ()), ("classical --fewest", ("--steps", "3")), ("phase", ())):
             out = str(scratch / f"predictions-{len(peaks)}")
             arguments = (*method.split(), data, "--split", "train", "--out", out, *options)
             peaks[f"predict {method}"] = peak_mib(command("predict", *arguments))
-        peaks["fpp-eval"] = peak_mib(command("fpp-eval", out, "--dataset", data, "--split", "train"))
+        peaks["fpp-eval"] = peak_mib(command("fpp-eval", out, data, "--split", "train"))
         peaks["verify"] = peak_mib(command("verify", data))
         peaks["info"] = peak_mib(command("info", data))
         return peaks

@@ -130,9 +130,9 @@ def _without_extras(folder, *words):
 
 def test_the_main_job_needs_no_extra(tiny, tmp_path):
     for words in (
-        ("build", "built", "--objects", "cork", "--size", "176"),
+        ("build", "--out", "built", "--objects", "cork", "--size", "176"),
         ("predict", "classical", tiny, "--out", "predictions"),
-        ("fpp-eval", "predictions", "--dataset", tiny, "--json", "result.json", "--report", "report"),
+        ("fpp-eval", "predictions", tiny, "--json", "result.json", "--report", "report"),
         ("leaderboard", "result.json"),
         ("leaderboard", "result.json", "--page", "page"),
     ):
@@ -147,7 +147,11 @@ def test_the_main_job_needs_no_extra(tiny, tmp_path):
         (("predict", "phase-net", "DATA", "--out", "predictions"), "torch", "train"),
         (("tradeoff", "DATA", "--quick", "--out", "tradeoff"), "torch", "train"),
         (("diagnose", "unet-individual-rmse", "DATA", "--quick", "--out", "report"), "torch", "train"),
-        (("build", "more", "--objects", "cork", "--size", "176", "--cluster", "127.0.0.1:1"), "ray", "cluster"),
+        (
+            ("build", "--out", "more", "--objects", "cork", "--size", "176", "--cluster", "127.0.0.1:1"),
+            "ray",
+            "cluster",
+        ),
         (("stability", "--quick", "--out", "out"), "(mpmath|torch)", "(diagnose|train)"),
     ],
 )

@@ -23,6 +23,10 @@ uses_ground_truth_range: false   # was the method given depth_min and depth_max 
 # learned_from:              # what data it learned from
 #   data: train-split        # train-split | generated (by this package's renderer) | other | none
 #   versions: [fpp-bench-full version 1]
+# predicted:                 # what was predicted, for fpp-eval without DATASET; fpp-bench predict writes it
+#   dataset: data/mini
+#   split: test
+#   content: {}              # hashes of its columns, from its manifest.json: test/depth and others
 
 seconds_per_sample: null     # median time for one sample; a number needs the next two keys
 # seconds_source: self-reported

@@ -18,7 +18,7 @@ from pathlib import Path
 from textwrap import indent
 from time import monotonic
 from types import FrameType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import click
 
@@ -56,11 +56,10 @@ class Program(NamedTuple):
         """The place of each command by its name."""
         return {name: place for group in self.groups.values() for name, (place, _) in group.items()}
 
-    def command(self, name: str) -> click.Command:
-        """The command of that name, whose module is imported."""
+    def command(self, name: str) -> Any:
+        """The `Command` of that name, or a `Program` of several, whose module is imported."""
         module, _, function = self.commands[name].partition(":")
-        command: click.Command = getattr(import_module(f"fpp_ml_bench.cli.{module}"), function)
-        return command
+        return getattr(import_module(f"fpp_ml_bench.cli.{module}"), function)
 
 
 BENCH = Program(
@@ -277,15 +276,18 @@ def main(argv: Sequence[str] | None = None) -> int:
 def run_program(program: Program, argv: Sequence[str] | None = None) -> int:
     """Run the command that the first word of ``argv`` (default: the process's) names, or the default one."""
     words = list(sys.argv[1:] if argv is None else argv)
-    if words and words[0] in program.commands:
-        if words[0] in (*ONE_THREAD, "diagnose"):  # before the command's module loads NumPy
+    first = words[0] if words else "--help"
+    if first in program.commands:
+        if first in (*ONE_THREAD, "diagnose"):  # before the command's module loads NumPy
             told = re.search(r"--threads[ =](\d+)", " ".join(words))
-            limit_threads(int(told[1]) if told else 1 if words[0] in ONE_THREAD else usable_cores())
-        return run_command(program.command(words[0]), f"{program.name} {words[0]}", words[1:])
-    asks = not words or words[0] in ("--help", "-h", "--version")
+            limit_threads(int(told[1]) if told else 1 if first in ONE_THREAD else usable_cores())
+        command = program.command(first)
+        if isinstance(command, Program):
+            return run_program(command, words[1:])
+        return run_command(command, f"{program.name} {first}", words[1:])
     # A folder of predictions has any name; one that is not there and almost that of a command is a slip.
-    slip = not asks and words[0][0:1] != "-" and nearest(words[0], program.commands) and not Path(words[0]).exists()
-    if program.default and not asks and not slip:
+    slip = nearest(first, program.commands) and not Path(first).exists()
+    if program.default and first not in ("--help", "-h", "--version") and not slip:
         return run_command(program.command(program.default), program.name, words)
     return _guarded(program.name, partial(_without_command, program, words))
 

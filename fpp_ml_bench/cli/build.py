@@ -6,8 +6,8 @@ from time import perf_counter
 from typing import Literal
 
 from fpp_ml_bench import coding, optics
-from fpp_ml_bench.cli.console import Explain, gigabytes, progress_bar, say_benchmark
-from fpp_ml_bench.cli.options import Pool, command, names, value, whole
+from fpp_ml_bench.cli.console import gigabytes, progress_bar, say_benchmark
+from fpp_ml_bench.cli.options import Explain, Pool, command, names, value, whole
 from fpp_ml_bench.constants import CONFIGS, LARGEST_SIDE_PX, PRESETS
 from fpp_ml_bench.loaders import render, storage
 from fpp_ml_bench.options import REQUIRED, option

@@ -1,21 +1,15 @@
 """Console output: a progress bar on standard error, numbers with units for tables, and accounts of skipped work."""
 
-import json
 import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
 
 from rich.console import Console, RenderableType
 from rich.text import Text
 
-from fpp_ml_bench.errors import FppBenchError
 from fpp_ml_bench.examination import Examination
-from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders import storage
-from fpp_ml_bench.options import option
 from fpp_ml_bench.skipping import Explanation
 from fpp_ml_bench.tables import Table
 
@@ -91,34 +85,8 @@ def show(*parts: RenderableType) -> None:
         console.print(part)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Explain:
-    """Settings of a command that tells which work it left out."""
-
-    HEADING = "skipped work"
-    explain: bool = option(False, "print which work was left out and what that saved (takes a moment)")
-    explain_json: Path | None = option(None, "write the same as JSON into FILE; implies --explain", "FILE")
-
-    def check_explain_file(self) -> None:
-        """Raises `FppBenchError`, before any work, for a JSON file that can't be written."""
-        path = self.explain_json
-        if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
-            raise FppBenchError(
-                f"--explain-json {path}: expected a file in an existing folder; create the folder first"
-            )
-
-    def say_explanation(self, account: Callable[[], Explanation]) -> None:
-        """Print the account as a table with the rules for the seconds below, and write it as JSON, if asked for."""
-        if self.explain or self.explain_json:
-            explanation = account()
-            show(_explanation_table(explanation))
-        if self.explain_json is not None:
-            text = json.dumps(explanation.to_dict(), indent=1, allow_nan=False)
-            write_atomically(self.explain_json, (text + "\n").encode("utf-8"))
-            print(f"Written: {self.explain_json}")
-
-
-def _explanation_table(explanation: Explanation) -> Table:
+def explanation_table(explanation: Explanation) -> Table:
+    """What was left out, with the rules for the seconds below."""
     state = "left out" if explanation.skipping else "nothing left out (skipping is off); it would have been"
     rules = list(dict.fromkeys(line.rule for line in explanation.lines))
     table = Table(

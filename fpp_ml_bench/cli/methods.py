@@ -30,6 +30,7 @@ METHOD_HELP = (
     "recipe that fpp-bench reproduce has trained (loss/l1), or file.py:Class, a method of yours; that file is executed"
 )
 _METHODS = "methods"
+NO_OPTIONS = [("no options", "")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,16 +51,18 @@ class MethodCommand(Command):
         """The methods, the user's own first: where two share a flag, the first says whether a value stands behind
         it."""
         own = [registry.find(word).method for word in words if registry.FILE_MARK in word and word[0] != "-"]
-        return [*own, *_known_methods()]
+        return [method for method in (*own, *_known_methods()) if getattr(method, self.part) is not None]
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
-        taken = flags_of(ctx)
-        by_method = {method: _parameters(method, self.part) for method in self.methods(args)}
-        for method, params in by_method.items():
-            if clash := [flag for flag in params if flag in taken]:
+        taken, by_method = flags_of(ctx), {}
+        for method in self.methods(args):
+            params = _parameters(method, self.part)
+            clash = [flag for flag in params if flag in taken]
+            if clash and any(method.name == word or registry.FILE_MARK in word for word in args):
                 raise PredictionError(
                     f"{method.name}: its option {clash[0]} is one of {ctx.command_path}; give it another flag"
                 )
+            by_method[method] = {flag: param for flag, param in params.items() if flag not in clash}
         ctx.meta[_METHODS] = by_method
         return super().parse_args(ctx, args)
 
@@ -75,12 +78,12 @@ class MethodCommand(Command):
 
     def values(self, ctx: click.Context) -> dict[str, Any]:
         values = super().values(ctx)
-        of_methods = self.of_methods(ctx).items()
-        return {**values, "of_method": {flag: values.pop(p.name) for flag, p in of_methods if p.name in values}}
+        texts = {flag: values.pop(p.name) for flag, p in self.of_methods(ctx).items() if p.name in values}
+        return {**values, "of_method": texts}
 
     def sections(self, ctx: click.Context) -> dict[str, list[tuple[str, str]]]:
         listed = {
-            f"{label_of(method)} ({method.purpose})": [row_of(param, ctx) for param in params.values()]
+            f"{label_of(method)} ({method.purpose})": [row_of(param, ctx) for param in params.values()] or NO_OPTIONS
             for method, params in ctx.meta[_METHODS].items()
         }
         return {**super().sections(ctx), **listed}

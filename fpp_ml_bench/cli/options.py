@@ -1,23 +1,30 @@
 """Commands made of dataclasses: the fields of a command's settings are its arguments and options, and its function gets
 an instance."""
 
+import json
+import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import redirect_stdout, suppress
 from dataclasses import MISSING, Field, dataclass, fields, replace
 from io import StringIO
+from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from textwrap import indent
-from typing import Any, TypeVar, get_args
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import click
 from click.core import ParameterSource
 
-from fpp_ml_bench.errors import PoolError
-from fpp_ml_bench.files import printable
+from fpp_ml_bench.errors import FppBenchError, PoolError
+from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.options import Description, described, did_you_mean, flag_of, option
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.skipping import Explanation
 
 SPLITS = ("train", "validation", "test", "all")
 HELP_WIDTH, LEFT_COLUMN = 110, 28
@@ -143,11 +150,57 @@ class Pool:
         return self.workers or usable_cores()
 
 
+@dataclass(frozen=True, kw_only=True)
+class Explain:
+    """Settings of a command that tells which work it left out."""
+
+    HEADING = "skipped work"
+    explain: bool = option(False, "print which work was left out and what that saved (takes a moment)")
+    explain_json: Path | None = option(None, "write the same as JSON into FILE; implies --explain", "FILE")
+
+    def check_explain_file(self) -> None:
+        """Raises `FppBenchError`, before any work, for a JSON file that can't be written."""
+        path = self.explain_json
+        if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
+            raise FppBenchError(
+                f"--explain-json {path}: expected a file in an existing folder; create the folder first"
+            )
+
+    def say_explanation(self, account: Callable[[], "Explanation"]) -> None:
+        """Print the account as a table with the rules for the seconds below, and write it as JSON, if asked for."""
+        if self.explain or self.explain_json:
+            from fpp_ml_bench.cli.console import explanation_table, show  # imports rich, which --help must not
+
+            explanation = account()
+            show(explanation_table(explanation))
+        if self.explain_json is not None:
+            text = json.dumps(explanation.to_dict(), indent=1, allow_nan=False)
+            write_atomically(self.explain_json, (text + "\n").encode("utf-8"))
+            print(f"Written: {self.explain_json}")
+
+
 def given(settings: Any, part: type) -> list[str]:
     """Flags of the options of the base class ``part`` that don't have their default."""
     options = described(part)
     known = {entry.name: entry.default for entry in fields(part)}
     return [flag_of(name, about) for name, about in options.items() if getattr(settings, name) != known[name]]
+
+
+def command_line(name: str, settings: Any, of_method: Mapping[str, Any] = MappingProxyType({})) -> str:
+    """The command that runs with these settings, and a method's own options by their flag."""
+    words, options = ["fpp-bench", name], []
+    for entry in fields(settings):
+        about, value = described(type(settings)).get(entry.name), getattr(settings, entry.name)
+        if about is None or value == entry.default:
+            continue
+        values = value if about.many else [",".join(value) if isinstance(value, tuple) else value]
+        if about.positional:
+            words += map(str, values)
+        else:
+            options += [(flag_of(entry.name, about), one) for one in values]
+    for flag, one in (*options, *of_method.items()):
+        words += [flag] if isinstance(one, bool) else [flag, f"{one:g}" if isinstance(one, float) else str(one)]
+    return shlex.join(words)
 
 
 # ---- commands
@@ -173,21 +226,21 @@ def parameter(entry: "Field[Any]", about: Description, name: str = "", heading: 
 
 
 def _parameters(settings: type) -> list[click.Parameter]:
-    made: list[click.Parameter] = []
-    options = described(settings)
-    for entry in fields(settings):
-        if (about := options.get(entry.name)) is None:
-            continue
+    """Arguments in the order of the fields, then options, those of the settings' own class before those it shares."""
+    arguments: list[click.Parameter] = []
+    options: dict[type, list[click.Parameter]] = {base: [] for base in settings.__mro__}
+    for name, about in described(settings).items():
+        entry = next(entry for entry in fields(settings) if entry.name == name)
         if about.positional:
             kind, count = _Value(parser_of(entry, about)), -1 if about.many else 1
             required = entry.default is MISSING
-            made.append(
-                click.Argument([entry.name], required, about.help, type=kind, nargs=count, metavar=about.metavar)
+            arguments.append(
+                click.Argument([name], required, about.help, type=kind, nargs=count, metavar=about.metavar)
             )
         else:
-            owner = next(base for base in settings.__mro__ if entry.name in vars(base).get("__annotations__", {}))
-            made.append(parameter(entry, about, heading=vars(owner).get("HEADING", OPTIONS)))
-    return made
+            owner = next(base for base in settings.__mro__ if name in vars(base).get("__annotations__", {}))
+            options[owner].append(parameter(entry, about, heading=vars(owner).get("HEADING", OPTIONS)))
+    return [*arguments, *chain.from_iterable(options.values())]
 
 
 class Command(click.Command):
@@ -234,10 +287,10 @@ class Command(click.Command):
 
     def sections(self, ctx: click.Context) -> dict[str, list[tuple[str, str]]]:
         """What the help lists: terms and what they mean, by heading."""
-        found: dict[str, list[tuple[str, str]]] = {}
+        found: dict[str, list[tuple[str, str]]] = {"arguments": [], OPTIONS: []}
         for param in self.get_params(ctx):
             if isinstance(param, click.Argument):
-                found.setdefault("arguments", []).append((param.make_metavar(ctx), param.help or ""))
+                found["arguments"].append((param.make_metavar(ctx), param.help or ""))
             elif isinstance(param, click.Option) and not param.hidden:
                 found.setdefault(getattr(param, "heading", OPTIONS), []).append(row_of(param, ctx))
         return found
@@ -266,6 +319,8 @@ def row_of(param: click.Option, ctx: click.Context) -> tuple[str, str]:
 def write_sections(sections: dict[str, list[tuple[str, str]]], formatter: click.HelpFormatter) -> None:
     """Headings with lists of terms and what they mean."""
     for heading, rows in sections.items():
+        if not rows:
+            continue
         with formatter.section(heading):
             formatter.write_dl(rows, LEFT_COLUMN)
 

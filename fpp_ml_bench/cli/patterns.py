@@ -145,7 +145,7 @@ since patterns come before the calibration. Project them without scaling; captur
 fpp-bench patterns paper --design
 fpp-bench patterns rig.yaml --design --out crossed.yaml --picture design.png     the rig with the proposed pair
 fpp-bench patterns rig.yaml --design --pitches 12-30 --angles 0,45,90            these periods and angles only
-fpp-bench patterns paper --design --pair 18,18 --pair 18,14 --pair 24,13,0,45    beside pairs of yours (px, px, deg, deg)
+fpp-bench patterns paper --design --pair 18,18 --pair 18,14 --pair 24,13,0,45    beside pairs of yours (px, deg)
 
 Rival: another depth in the working range at which both phases nearly are what they are at the true one; its
 distance is what errors of the phases must cross half of. Finer fringes have less depth noise and more rivals.
@@ -205,7 +205,7 @@ def _design(settings: PatternSettings) -> None:
     if rig.crossed is not None:
         families.setdefault(rig.crossed, "its crossed")
     others = design.describe(rig, list(families), assumed)
-    _print(rig, assumed, found, list(zip(others, families.values(), strict=True)))
+    _print_design(rig, assumed, found, list(zip(others, families.values(), strict=True)))
     if settings.picture is not None:
         beside = others[0] if others else design.describe(rig, [coding.Crossed((18.0, 18.0))], assumed)[0]
         write_atomically(settings.picture, design.draw_design(rig, found.proposed, beside, assumed))

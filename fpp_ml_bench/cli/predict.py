@@ -9,9 +9,9 @@ from rich.text import Text
 
 from fpp_ml_bench import baselines
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.cli.console import Explain, progress_bar, show
+from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings, chosen_method
-from fpp_ml_bench.cli.options import COUNT, SPLITS, command
+from fpp_ml_bench.cli.options import COUNT, SPLITS, Explain, command
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation import result
 from fpp_ml_bench.files import write_atomically

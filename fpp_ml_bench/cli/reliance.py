@@ -1,74 +1,74 @@
 """``fpp-bench reliance``: how far a method's predictions follow the fringe's phase, as a score from 0 to 1."""
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
 
 from rich.text import Text
 
 from fpp_ml_bench.baselines import diagnostics
 from fpp_ml_bench.cli.console import progress_bar, show
-from fpp_ml_bench.cli.method_options import METHOD_HELP, add_method_options, chosen_method
-from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings, chosen_method
+from fpp_ml_bench.cli.options import command, value
 from fpp_ml_bench.evaluation import result
+from fpp_ml_bench.leaderboard.measured import check_same_method, write_reliance
+from fpp_ml_bench.leaderboard.rows import read_entry
 from fpp_ml_bench.loaders import storage
-from fpp_ml_bench.machine import limit_threads
+from fpp_ml_bench.options import argument, option
 from fpp_ml_bench.tables import Table
 
-SUMMARY = "Measure phase reliance: does the predicted depth follow the fringe's phase, or the object's outline?"
-EXAMPLES = (
-    "fpp-bench reliance classical data/cpu224",
-    "fpp-bench reliance phase data/cpu224 --fringe vertical",
-    "fpp-bench reliance unet-individual-rmse data/cpu224 --range oracle --into result.json",
-)
 
+@dataclass(frozen=True, kw_only=True)
+class RelianceSettings(MethodSettings):
+    """Settings of `reliance`."""
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("method", metavar="METHOD", help=METHOD_HELP)
-    add("dataset", type=Path, metavar="DATASET", help="dataset folder; scenes are made from its test objects")
-    add("--views", type=int, default=2, metavar="N", help="samples of each test object, 1 to 6 (default: 2)")
-    add(
-        "--into",
-        type=Path,
-        metavar="FILE",
-        help="write the score into this result or leaderboard row of the same method (.json)",
+    dataset: Path = argument("dataset folder; scenes are made from its test objects", "DATASET")
+    views: int = option(
+        2,
+        "samples of each test object, 1 to 6 (default: 2)",
+        "N",
+        parse=value("1 to 6, an object has six views", int, lambda views: 1 <= views <= 6),
     )
-    add("--json", type=Path, metavar="FILE", help="write the score and its parts to this file")
-    add_method_options(parser)
+    into: Path | None = option(
+        None, "write the score into this result or leaderboard row of the same method (.json)", "FILE"
+    )
+    json: Path | None = option(None, "write the score and its parts to this file; - is standard output", "FILE")
 
 
-def run(args: argparse.Namespace) -> int:
-    """Measure, write, print. A file that can't take the score raises FppBenchError before measuring."""
-    limit_threads(args.threads)  # before NumPy is loaded
-    from fpp_ml_bench.leaderboard.measured import check_same_method, write_reliance
-    from fpp_ml_bench.leaderboard.rows import read_entry
+@command(
+    """\
+fpp-bench reliance classical data/cpu224
+fpp-bench reliance phase data/cpu224 --direction vertical
+fpp-bench reliance unet-individual-rmse data/cpu224 --range oracle --into result.json
+""",
+    MethodCommand,
+)
+def reliance(settings: RelianceSettings) -> None:
+    """Measure phase reliance: does the predicted depth follow the fringe's phase, or the object's outline?
 
-    if not 1 <= args.views <= 6:
-        raise PredictionError(f"--views {args.views}: expected 1 to 6, an object has six views")
-    dataset = storage.DatasetFolder(args.dataset)
-    method = chosen_method(args, dataset)
-    entry = None if args.into is None else read_entry(args.into)
+    A file that can't take the score raises FppBenchError before measuring."""
+    dataset = storage.DatasetFolder(settings.dataset)
+    method = chosen_method(settings, dataset)
+    entry = None if settings.into is None else read_entry(settings.into)
     if entry is not None:
         check_same_method(entry, method)
-    scene_set = diagnostics.SceneSet(dataset, args.views)
+    scene_set = diagnostics.SceneSet(dataset, settings.views)
     found = method.settings.get("weights_sha256")
     sha256 = found if isinstance(found, str) else None
-    with progress_bar(f"reliance of {args.method}", len(scene_set.samples), "samples") as advance:
+    with progress_bar(f"reliance of {settings.method}", len(scene_set.samples), "samples") as advance:
         # Called before each sample, so the first call is for none.
-        reliance, _ = diagnostics.measure(method, scene_set, sha256, lambda done, total, sample: advance(min(done, 1)))
-    if args.json is not None:
-        result.write_json(reliance.model_dump(mode="json"), args.json)
+        measured, _ = diagnostics.measure(method, scene_set, sha256, lambda done, total, sample: advance(min(done, 1)))
+    if settings.json is not None:
+        result.write_json(measured.model_dump(mode="json"), settings.json)
     if entry is not None:
-        write_reliance(entry, reliance)
-    moved = [value for key, value in reliance.parts if not key.startswith("answered")]
+        write_reliance(entry, measured)
+    moved = [value for key, value in measured.parts if not key.startswith("answered")]
     if any(moved):
-        show(_table(method.title, reliance))
+        show(_table(method.title, measured))
     else:
         print(
-            f"{method.title}: gives the same answer whatever phase, light and outline of {reliance.samples} samples "
+            f"{method.title}: gives the same answer whatever phase, light and outline of {measured.samples} samples "
             "are, so it reads nothing of them. Phase reliance 0."
         )
-    return 0
 
 
 def _table(title: str, reliance: "result.Reliance") -> Table:

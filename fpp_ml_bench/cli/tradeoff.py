@@ -1,86 +1,91 @@
 """``fpp-bench tradeoff``: error against run time and captured frames, and what each stage costs as its input grows."""
 
-import argparse
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from fpp_ml_bench.baselines import tradeoff
-from fpp_ml_bench.cli import count
+from fpp_ml_bench.cli.console import progress_bar, show
+from fpp_ml_bench.cli.options import command, names, value, whole
 from fpp_ml_bench.leaderboard import page
-from fpp_ml_bench.machine import limit_threads
+from fpp_ml_bench.options import argument, option
 
-SUMMARY = "Error against run time and frames for every method and setting on this machine, and how each cost grows."
-EXAMPLES = (
-    "fpp-bench tradeoff data/full",
-    "fpp-bench tradeoff data/cpu224 --runs runs --out tradeoff-224",
-    "fpp-bench tradeoff data/mini --quick --only classical --only phase",
-    "fpp-bench tradeoff data/full --list",
-    "fpp-bench leaderboard --page page --tradeoff tradeoff/tradeoff.json",
-)
 _GROUPS = ("classical", "phase", "networks", "precision", "sizes", "costs")
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("dataset", type=Path, metavar="DATASET", help="dataset folder with all frames")
-    add(
-        "--out",
-        type=Path,
-        default=Path("tradeoff"),
-        metavar="DIR",
-        help="folder for the results, or the folder of a stopped run to continue (default: tradeoff)",
+@dataclass(frozen=True, kw_only=True)
+class TradeoffCommandSettings:
+    """Settings of `measure`."""
+
+    dataset: Path = argument("dataset folder with all frames", "DATASET")
+    out: Path = option(
+        Path("tradeoff"),
+        "folder for the results, or the folder of a stopped run to continue (default: tradeoff)",
+        "DIR",
     )
-    add(
-        "--only",
-        action="append",
+    only: tuple[str, ...] = option(
+        (),
+        f"measure only this group; may be repeated: {', '.join(_GROUPS)} (default: all)",
+        "GROUP",
         choices=_GROUPS,
-        default=[],
-        metavar="GROUP",
-        help=f"measure only this group; may be repeated: {', '.join(_GROUPS)} (default: all)",
+        many=True,
     )
-    add("--quick", action="store_true", help="fewer settings, views, runs and sizes")
-    add("--list", action="store_true", help="show what would be measured, and stop")
-    add("--threads", type=count(1000), default=1, metavar="N", help="threads a method may use (default: 1)")
-    add(
-        "--clock",
+    quick: bool = option(False, "fewer settings, views, runs and sizes")
+    list: bool = option(False, "show what would be measured, and stop")
+    threads: int = option(1, "threads a method may use (default: 1)", "N", parse=whole(1, 1000))
+    clock: Literal["wall", "processor"] = option(
+        "wall",
+        "processor: processor time of this process, for a shared machine (default: wall)",
         choices=("wall", "processor"),
-        default="wall",
-        help="processor: processor time of this process, for a shared machine (default: wall)",
     )
-    add("--views", type=count(1000), metavar="N", help="views of each test object (default: 2, quick: 1)")
-    add("--runs", type=Path, metavar="DIR", help="also measure the networks trained below DIR")
-    add(
-        "--widths",
-        type=count(1000),
-        nargs="*",
-        metavar="W",
-        help="widths of untrained UNets to time (default: 4 8 16 32; on large images 4 8)",
+    views: int | None = option(None, "views of each test object (default: 2, quick: 1)", "N", parse=whole(1, 1000))
+    runs: Path | None = option(None, "also measure the networks trained below DIR", "DIR")
+    widths: tuple[int, ...] | None = option(
+        None,
+        "widths of untrained UNets to time, or none (default: 4,8,16,32; on large images 4,8)",
+        "A,B",
+        parse=value(
+            "widths such as 4,8 or none",
+            lambda text: tuple(int(width) for width in names(text) if text != "none"),
+            lambda widths: all(1 <= width <= 1000 for width in widths),
+        ),
     )
 
 
-def run(args: argparse.Namespace) -> int:
-    """Measure what is missing, write all files, print fronts, growths and remarks."""
-    limit_threads(args.threads)  # before NumPy is loaded
-    from fpp_ml_bench.cli.console import progress_bar, show
+@command(
+    """\
+fpp-bench tradeoff data/full
+fpp-bench tradeoff data/cpu224 --runs runs --out tradeoff-224
+fpp-bench tradeoff data/mini --quick --only classical --only phase
+fpp-bench tradeoff data/full --list
+fpp-bench leaderboard --page page --tradeoff tradeoff/tradeoff.json
+"""
+)
+def measure(settings: TradeoffCommandSettings) -> None:
+    """Error against run time and frames for every method and setting on this machine, and how each cost grows.
 
-    settings = tradeoff.TradeoffSettings(
-        args.dataset,
-        args.out,
-        tuple(args.only),
-        args.quick,
-        args.threads,
-        args.clock,
-        args.views,
-        args.runs,
-        args.widths,
+    Measures what is missing, writes all files, prints fronts, growths and remarks."""
+    asked = tradeoff.TradeoffSettings(
+        settings.dataset,
+        settings.out,
+        settings.only,
+        settings.quick,
+        settings.threads,
+        settings.clock,
+        settings.views,
+        settings.runs,
+        settings.widths,
     )
-    plan = tradeoff.planned(settings, [page.board_ladder(args.quick)] if not args.only or "costs" in args.only else [])
-    if args.list:
+    plan = tradeoff.planned(
+        asked, [page.board_ladder(settings.quick)] if not settings.only or "costs" in settings.only else []
+    )
+    if settings.list:
         show(tradeoff.plan_table(plan))
         print(f"{len(plan.settings)} settings and {len(plan.ladders)} ladders of costs.")
-        return 0
+        return
     with progress_bar("measuring", len(plan.settings) + len(plan.ladders), "settings") as advance:
-        measurements = tradeoff.tradeoff(settings, plan, lambda key: advance(1))
-    written = tradeoff.write_report(measurements, args.out)
+        measurements = tradeoff.tradeoff(asked, plan, lambda key: advance(1))
+    written = tradeoff.write_report(measurements, settings.out)
     if measurements.points:
         show(tradeoff.front_table(measurements))
     if measurements.growth:
@@ -89,4 +94,3 @@ def run(args: argparse.Namespace) -> int:
         print(line)
     for path in written:
         print(f"Written: {path}")
-    return 0

@@ -99,37 +99,37 @@ def test_examples_in_the_help_are_accepted_by_their_parsers():
         (["xyz"], "unknown command 'xyz'"),
         (["--bogus"], "unknown option '--bogus'"),
         (["--bogus", "build"], "unknown option '--bogus'"),
-        (["build"], "OUT"),
-        (["build", "OUT", "--sise", "9"], "--sise"),
-        (["build", "OUT", "--size", "big"], "--size"),
-        (["build", "OUT", "--size", "0"], "1 to 8192"),
-        (["build", "OUT", "--size", "-5"], "1 to 8192"),
-        (["build", "OUT", "--size", "9000"], "1 to 8192"),
-        (["build", "OUT", "--size", "120"], "pitch of at least"),
-        (["build", "OUT", "--preset", "huge"], "--preset"),
-        (["build", "OUT", "--frames", "some"], "--frames"),
-        (["build", "OUT", "--placement", "random"], "--placement"),
-        (["build", "OUT", "--objects", "mugg"], "did you mean mug"),
-        (["build", "OUT", "--objects", ","], "name at least one"),
-        (["build", "OUT", "--objects", "mug,mug"], "named twice"),
-        (["build", "OUT", "--seed", "-1"], "seed -1"),
-        (["build", "OUT", "--seed", "1.5"], "--seed"),
-        (["build", "OUT", "--seed", "9" * 20], "seed 9999"),
-        (["build", "OUT", "--workers", "0"], "--workers 0"),
-        (["build", "OUT", "--workers", "two"], "--workers"),
-        (["build", "OUT", "--noise-sigma", "nan"], "--noise-sigma nan: expected 0 to 50"),
-        (["build", "OUT", "--noise-sigma", "-1"], "--noise-sigma -1: expected 0 to 50"),
-        (["build", "OUT", "--pitch", "nan"], "pitch"),
-        (["build", "OUT", "--pitch", "inf"], "pitch"),
-        (["build", "OUT", "--pitch", "0"], "pitch"),
-        (["build", "OUT", "--pitch", "3"], "pitch"),
-        (["build", "OUT", "--pitch", "5000"], "pitch"),
-        (["build", "OUT", "--rig", "none.yaml"], "none.yaml"),
-        (["build", "OUT", "--rig", "FILE.txt"], "FILE.txt"),
-        (["build", "OUT", "--mesh", "none.stl"], "none.stl"),
-        (["build", "OUT", "--meshes", "none.yaml"], "none.yaml"),
-        (["build", "FILE", "--objects", "mug"], "is a file"),
-        (["build", "FILE/inside", "--objects", "mug"], "FILE"),
+        (["build"], "--out DIR is missing"),
+        (["build", "--out", "OUT", "--sise", "9"], "--sise"),
+        (["build", "--out", "OUT", "--size", "big"], "--size"),
+        (["build", "--out", "OUT", "--size", "0"], "1 to 8192"),
+        (["build", "--out", "OUT", "--size", "-5"], "1 to 8192"),
+        (["build", "--out", "OUT", "--size", "9000"], "1 to 8192"),
+        (["build", "--out", "OUT", "--size", "120"], "pitch of at least"),
+        (["build", "--out", "OUT", "--preset", "huge"], "--preset"),
+        (["build", "--out", "OUT", "--config", "some"], "--config some: there are single_shot"),
+        (["build", "--out", "OUT", "--placement", "random"], "--placement"),
+        (["build", "--out", "OUT", "--objects", "mugg"], "did you mean mug"),
+        (["build", "--out", "OUT", "--objects", ","], "name at least one"),
+        (["build", "--out", "OUT", "--objects", "mug,mug"], "named twice"),
+        (["build", "--out", "OUT", "--seed", "-1"], "seed -1"),
+        (["build", "--out", "OUT", "--seed", "1.5"], "--seed"),
+        (["build", "--out", "OUT", "--seed", "9" * 20], "seed 9999"),
+        (["build", "--out", "OUT", "--workers", "0"], "--workers 0"),
+        (["build", "--out", "OUT", "--workers", "two"], "--workers"),
+        (["build", "--out", "OUT", "--noise-sigma", "nan"], "--noise-sigma nan: expected 0 to 50"),
+        (["build", "--out", "OUT", "--noise-sigma", "-1"], "--noise-sigma -1: expected 0 to 50"),
+        (["build", "--out", "OUT", "--pitch", "nan"], "pitch"),
+        (["build", "--out", "OUT", "--pitch", "inf"], "pitch"),
+        (["build", "--out", "OUT", "--pitch", "0"], "pitch"),
+        (["build", "--out", "OUT", "--pitch", "3"], "pitch"),
+        (["build", "--out", "OUT", "--pitch", "5000"], "pitch"),
+        (["build", "--out", "OUT", "--rig", "none.yaml"], "none.yaml"),
+        (["build", "--out", "OUT", "--rig", "FILE.txt"], "FILE.txt"),
+        (["build", "--out", "OUT", "--mesh", "none.stl"], "none.stl"),
+        (["build", "--out", "OUT", "--meshes", "none.yaml"], "none.yaml"),
+        (["build", "--out", "FILE", "--objects", "mug"], "is a file"),
+        (["build", "--out", "FILE/inside", "--objects", "mug"], "FILE"),
         (["info"], "DATASET"),
         (["info", "OUT"], "no such folder"),
         (["info", "."], "no manifest.json"),
@@ -211,7 +211,7 @@ def test_output_cut_off_by_its_reader_is_no_traceback(tiny):
 
 
 def test_info_json_says_what_is_there(tiny, opened, capsys):
-    assert call("info", tiny, "--json") == 0
+    assert call("info", tiny, "--json", "-") == 0
     content = json.loads(capsys.readouterr().out)
     assert content["fingerprint"] == opened.fingerprint and content["size"] == [TINY_SIZE, TINY_SIZE]
     assert content["samples"] == opened.splits
@@ -283,7 +283,20 @@ def test_show_by_default_writes_into_the_current_folder(tiny, tmp_path, monkeypa
 def test_show_works_with_one_frame_without_meshes_and_with_few_gray_bits(tmp_path):
     out, folder = tmp_path / "x.png", tmp_path / "set"
     assert (
-        call("build", folder, "--size", TINY_SIZE, "--objects", "cork", "--frames", "single_shot", "--workers", 1) == 0
+        call(
+            "build",
+            "--out",
+            folder,
+            "--size",
+            TINY_SIZE,
+            "--objects",
+            "cork",
+            "--config",
+            "single_shot",
+            "--workers",
+            1,
+        )
+        == 0
     )
     shutil.rmtree(folder / "meshes")
     assert call("show", folder, "cork_A0", "--out", out) == 0
@@ -294,7 +307,10 @@ def test_show_works_with_one_frame_without_meshes_and_with_few_gray_bits(tmp_pat
 
     coarse = replace(paper_rig(TINY_SIZE), pitch_horizontal_px=1140, pitch_vertical_px=912, sequence=Sequence(3, 1, 1))
     save_rig(coarse, tmp_path / "rig.yaml")
-    assert call("build", tmp_path / "few", "--rig", tmp_path / "rig.yaml", "--objects", "bowl", "--workers", 1) == 0
+    assert (
+        call("build", "--out", tmp_path / "few", "--rig", tmp_path / "rig.yaml", "--objects", "bowl", "--workers", 1)
+        == 0
+    )
     assert call("show", tmp_path / "few", "bowl_A0", "--out", tmp_path / "y.png") == 0
 
 
@@ -318,13 +334,13 @@ def test_contact_sheet_shows_every_object_and_view(tiny, opened, tmp_path):
 def test_build_predict_and_evaluate_with_a_users_mesh(tmp_path, capsys):
     trimesh.creation.icosphere(3, 0.08).export(tmp_path / "ball.ply")
     data, out = tmp_path / "data", tmp_path / "predictions"
-    assert call("build", data, "--mesh", tmp_path / "ball.ply", "--size", TINY_SIZE, "--workers", 1) == 0
+    assert call("build", "--out", data, "--mesh", tmp_path / "ball.ply", "--size", TINY_SIZE, "--workers", 1) == 0
     assert "6 samples, 312 images" in capsys.readouterr().out
     assert call("verify", data) == 0
     assert call("predict", "classical", data, "--out", out, "--steps", 6, "--direction", "vertical") == 0
     assert "next: fpp-eval" in capsys.readouterr().out
     result = tmp_path / "result.json"
-    options = ("--dataset", data, "--split", "test", "--target", "depth_exact", "--json", result)
+    options = (data, "--split", "test", "--target", "depth_exact", "--json", result)
     assert call(out, *options, command=evaluate.main) == 0
     metrics = json.loads(result.read_text())["metrics"]
     assert 0 < metrics["object_mae_mm"] < 5

@@ -8,7 +8,7 @@ from fpp_ml_bench.optics import load_rig, paper_rig, rig_from_dict, save_rig
 
 def call(*arguments):
     try:
-        return main(["design", *map(str, arguments)])
+        return main(["patterns", *map(str, arguments), "--design"])
     except SystemExit as stop:  # argparse
         return stop.code
 

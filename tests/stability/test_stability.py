@@ -215,7 +215,7 @@ def failing_case() -> Case:
 
 
 def test_the_command(tmp_path, capsys, monkeypatch):
-    assert main(["stability", "--group", "normalisation", "--json"]) == 0
+    assert main(["stability", "--group", "normalisation", "--json", "-"]) == 0
     content = json.loads(capsys.readouterr().out)
     assert content["summary"]["normalisation"]["FAIL"] == 0
     assert main(["stability", "--group", "rig", "--list"]) == 0
