@@ -4,12 +4,13 @@
 >>> @dataclass(frozen=True)
 ... class Options:
 ...     steps: int = option(4, "phase steps", metavar="N")
->>> Options().steps, described(Options)["steps"].help
-(4, 'phase steps')
+>>> (steps,) = options_of(Options)
+>>> Options().steps, flag_of(steps), described(steps).help
+(4, '--steps', 'phase steps')
 """
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields
 from difflib import get_close_matches
 from typing import Any
 
@@ -58,19 +59,20 @@ def argument(
     return field(default=default, metadata={_KEY: description})
 
 
-def described(options: type) -> dict[str, Description]:
+def options_of(settings: type | None) -> "list[Field[Any]]":
     """The fields of a dataclass that are options of the command line, in order; its other fields are for code alone."""
-    return {entry.name: entry.metadata[_KEY] for entry in fields(options) if _KEY in entry.metadata}
+    return [entry for entry in (fields(settings) if settings else ()) if _KEY in entry.metadata]
 
 
-def defaults(options: type) -> dict[str, Any]:
-    """The default of each field of a dataclass that has one."""
-    return {entry.name: entry.default for entry in fields(options) if entry.default is not MISSING}
+def described(entry: "Field[Any]") -> Description:
+    """What the command line says of a field that is an option."""
+    description: Description = entry.metadata[_KEY]
+    return description
 
 
-def flag_of(name: str, description: Description) -> str:
-    """``--its-name`` of a field called ``name``."""
-    return description.flag or f"--{name.replace('_', '-')}"
+def flag_of(entry: "Field[Any]") -> str:
+    """Its spelling on the command line: ``--its-name``, or what it says itself."""
+    return described(entry).flag or f"--{entry.name.replace('_', '-')}"
 
 
 def nearest(name: str, known: Collection[str] | Mapping[str, Any], count: int = 1) -> list[str]:

@@ -110,7 +110,7 @@ fpp-bench build --out data/pen --objects pen --explain             what was left
 )
 def build(settings: BuildCommandSettings) -> None:
     """Generate the benchmark: virtual rig, objects, six views each, decoded and exact ground truth."""
-    settings.check_explain_file()
+    settings.check()
     asked, workers = settings_of(settings), settings.processes
     assembly = render.assembly_of(asked)
     rows = sum(len(plan.samples) for plan in assembly.plans)
@@ -136,4 +136,4 @@ def build(settings: BuildCommandSettings) -> None:
     say_benchmark(manifest)
     if isinstance(out, Path):
         print(f"next: fpp-bench info {out}")
-    settings.say_explanation(lambda: render.explain_build(manifest, asked))
+    settings.say(lambda: render.explain_build(manifest, asked))

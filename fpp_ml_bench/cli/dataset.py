@@ -1,7 +1,6 @@
 """Commands that open a dataset: ``fpp-bench info``, ``show``, ``verify`` and ``export``."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,24 +17,20 @@ from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.tables import Table
 
 
-@dataclass(frozen=True, kw_only=True)
-class InfoSettings:
-    """Settings of `info`."""
-
-    dataset: Path = argument("dataset folder", "DATASET")
-    json: Path | None = option(None, "write all of it as JSON; - is standard output, without the table", "FILE")
-
-
 @command("""\
 fpp-bench info data/mini
 fpp-bench info data/mini --json - | jq .splits
 """)
-def info(settings: InfoSettings) -> None:
+def info(
+    *,
+    dataset: Path = argument("dataset folder", "DATASET"),
+    json: Path | None = option(None, "write all of it as JSON; - is standard output, without the table", "FILE"),
+) -> None:
     """What a dataset holds: sizes, configurations, splits, rig, and how exact its ground truth is."""
-    opened = storage.DatasetFolder(settings.dataset)
+    opened = storage.DatasetFolder(dataset)
     benchmark = storage.benchmark_of(opened.content)
     statistics = storage.split_statistics(opened.manifest)
-    if settings.json is not None:
+    if json is not None:
         content = {
             "path": str(opened.path),
             "fingerprint": opened.fingerprint,
@@ -51,7 +46,7 @@ def info(settings: InfoSettings) -> None:
             "all": storage.whole_statistics(opened.manifest),
             "samples": opened.splits,
         }
-        result.write_json(content, settings.json)
+        result.write_json(content, json)
     manifest, rig = opened.manifest, opened.rig
     groups: dict[str, int] = {}
     for shard in manifest.shards:
@@ -127,83 +122,60 @@ _ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class ShowSettings:
-    """Settings of `show_sample`."""
-
-    dataset: Path = argument("dataset folder", "DATASET")
-    sample: str | None = argument("sample such as power_drill_A60", "SAMPLE", None)
-    sheet: bool = option(False, "all objects and views on one sheet instead")
-    split: str = option("all", "split that --sheet shows (default: all)", "SPLIT")
-    out: Path | None = option(None, "picture to write (default: SAMPLE.png or sheet.png)", "FILE.png")
-
-
 @command("""\
 fpp-bench show data/mini power_drill_A60                 writes power_drill_A60.png
 fpp-bench show data/mini mug_A0 --out pictures/mug.png
 fpp-bench show data/full --sheet --out sheet.png         all 50 objects x 6 views
 """)
-def show_sample(settings: ShowSettings) -> None:
+def show_sample(
+    *,
+    dataset: Path = argument("dataset folder", "DATASET"),
+    sample: str | None = argument("sample such as power_drill_A60", "SAMPLE", None),
+    sheet: bool = option(False, "all objects and views on one sheet instead"),
+    split: str = option("all", "split that --sheet shows (default: all)", "SPLIT"),
+    out: Path | None = option(None, "picture to write (default: SAMPLE.png or sheet.png)", "FILE.png"),
+) -> None:
     """One sample as a picture (frames, depth, error, mask, mesh), or a contact sheet of every object and view."""
-    if settings.sheet == (settings.sample is not None):
+    if sheet == (sample is not None):
         raise DatasetError("expected either a SAMPLE or --sheet; `fpp-bench info DATASET --json -` lists the samples")
-    out = settings.out or Path("sheet.png" if settings.sheet else f"{settings.sample}.png")
-    if out.suffix.lower() != ".png":
+    picture = out or Path("sheet.png" if sheet else f"{sample}.png")
+    if picture.suffix.lower() != ".png":
         raise DatasetError(f"--out {out}: expected a file ending in .png")
-    dataset = storage.DatasetFolder(settings.dataset)
+    opened = storage.DatasetFolder(dataset)
     from fpp_ml_bench.loaders.pictures import contact_sheet, sample_picture
 
-    if settings.sample is None:
-        contact_sheet(dataset, settings.split, out)
+    if sample is None:
+        contact_sheet(opened, split, picture)
     else:
-        dataset.split_of_sample(settings.sample)
-        sample_picture(dataset, settings.sample, out)
-    print(out)
-
-
-@dataclass(frozen=True, kw_only=True)
-class VerifySettings:
-    """Settings of `verify`."""
-
-    dataset: Path = argument("dataset folder", "DATASET")
+        opened.split_of_sample(sample)
+        sample_picture(opened, sample, picture)
+    print(picture)
 
 
 @command("""\
 fpp-bench verify data/mini
 fpp-bench verify data/mini && echo safe to train on
 """)
-def verify(settings: VerifySettings) -> int | None:
+def verify(
+    *,
+    dataset: Path = argument("dataset folder", "DATASET"),
+) -> int | None:
     """Prove a dataset intact: checksums, files, labels, split leaks, duplicated images; and name its benchmark."""
-    manifest = storage.read_manifest(settings.dataset)
+    manifest = storage.read_manifest(dataset)
     files = manifest.files
     with progress_bar("verifying", len(files), "files") as advance:
-        findings = storage.verify(settings.dataset, advance)
+        findings = storage.verify(dataset, advance)
     for finding in findings:
         print(finding)
     size = gigabytes(sum(file.bytes for file in files))
     samples = sum(len(rows) for rows in manifest.samples.values())
     if findings:
-        print(f"{settings.dataset}: {len(findings)} finding(s) in {len(files)} files, {size}")
+        print(f"{dataset}: {len(findings)} finding(s) in {len(files)} files, {size}")
         return CHECK_FAILED
-    print(
-        f"{settings.dataset}: intact; {len(files)} files, {size}, {samples} samples, no object or image in two splits"
-    )
+    print(f"{dataset}: intact; {len(files)} files, {size}, {samples} samples, no object or image in two splits")
     print(f"fingerprint {manifest.fingerprint}")
     say_benchmark(manifest)
     return None
-
-
-@dataclass(frozen=True, kw_only=True)
-class ExportSettings:
-    """Settings of `export`."""
-
-    dataset: Path = argument("folder of the dataset", "DATASET")
-    out: Path = option(REQUIRED, "new or empty folder; written completely or not at all", "DIR")
-    parquet: bool = option(False, "Parquet and a card, ready for the Hugging Face Hub")
-    mat: bool = option(False, "the published tree: PNG fringes, .mat depth, raw scans")
-    meshes: bool = option(False, "the objects' meshes as PLY (metres)")
-    patterns: bool = option(False, "the projected patterns as PNG")
-    split: str = option("all", "samples to export (default: all)", choices=SPLITS)
 
 
 @command("""\
@@ -212,23 +184,33 @@ fpp-bench export data/mini --out tree --mat                 the published layout
 fpp-bench export data/mini --out out --meshes --patterns    several forms: out/meshes and out/patterns
 fpp-bench export data/mini --out test --parquet --split test
 """)
-def export(settings: ExportSettings) -> None:
+def export(
+    *,
+    dataset: Path = argument("folder of the dataset", "DATASET"),
+    out: Path = option(REQUIRED, "new or empty folder; written completely or not at all", "DIR"),
+    parquet: bool = option(False, "Parquet and a card, ready for the Hugging Face Hub"),
+    mat: bool = option(False, "the published tree: PNG fringes, .mat depth, raw scans"),
+    meshes: bool = option(False, "the objects' meshes as PLY (metres)"),
+    patterns: bool = option(False, "the projected patterns as PNG"),
+    split: str = option("all", "samples to export (default: all)", choices=SPLITS),
+) -> None:
     """Write a dataset as Parquet, as the published .mat tree, or its meshes and patterns.
 
     Raises FppBenchError for an unusable dataset, form or folder."""
-    forms = [form for form in published.FORMS if getattr(settings, form)]
+    asked = {"parquet": parquet, "mat": mat, "meshes": meshes, "patterns": patterns}
+    forms = [form for form in published.FORMS if asked[form]]
     if not forms:
         raise BuildError("nothing to export: give at least one of --parquet, --mat, --meshes, --patterns")
-    dataset, out = storage.DatasetFolder(settings.dataset), settings.out
-    splits = published.chosen_splits(dataset, settings.split)
-    samples = sum(len(dataset.samples(split)) for split in splits)
+    opened = storage.DatasetFolder(dataset)
+    splits = published.chosen_splits(opened, split)
+    samples = sum(len(opened.samples(part)) for part in splits)
     steps = samples * sum(form in published.SAMPLE_FORMS for form in forms)
     with progress_bar("exporting", steps, "samples") as advance:
-        published.export(dataset, out, forms, splits, usable_cores(), advance)
+        published.export(opened, out, forms, splits, usable_cores(), advance)
     files = [path for path in out.rglob("*") if path.is_file()]
     size = gigabytes(sum(path.stat().st_size for path in files))
     print(f"{out}: {', '.join(forms)} of {samples} samples, {len(files):,} files, {size}")
     if "mat" in forms:
-        scans = "with raw scans" if "all" in dataset.configs else "without raw scans: not all frames are stored"
-        exact = "; depth_exact has no place in the published layout" if dataset.has_exact else ""
+        scans = "with raw scans" if "all" in opened.configs else "without raw scans: not all frames are stored"
+        exact = "; depth_exact has no place in the published layout" if opened.has_exact else ""
         print(f"  published layout {scans}{exact}")

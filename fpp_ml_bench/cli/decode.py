@@ -1,7 +1,6 @@
 """``fpp-bench decode``: captured frames to depth."""
 
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
 
@@ -17,42 +16,6 @@ from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.tables import Table
 
 
-@dataclass(frozen=True, kw_only=True)
-class DecodeSettings:
-    """Settings of `decode`."""
-
-    rig: Path = argument("rig file (.yaml, .json)", "RIG")
-    frames: str = argument("folder of images, or a pattern in quotes", "FRAMES")
-    out: Path = option(REQUIRED, "folder for the results", "DIR")
-    direction: Directions = option(
-        "both", "which of the coded directions to use (default: all there are)", choices=DIRECTIONS
-    )
-    working_range: tuple[float, float] | None = option(
-        None, "working range in mm (default: the rig's)", "NEAR,FAR", parse=WORKING_RANGE
-    )
-    mask: Path | None = option(None, "image or .npy: decode where it is not 0", "FILE")
-    min_modulation: float | None = option(
-        None, "least modulation of a pixel in grey levels of 255 (default: 5)", "GREY"
-    )
-    noise: float | None = option(
-        None,
-        "noise of a frame in grey levels of 255 (default: measured with four steps and more, else 1)",
-        "GREY",
-    )
-    bits: int | None = option(None, "bits of the camera, 8 to 16, where files of 16 bits hold fewer", "N")
-    colour: str | None = option(None, "of colour images: luminance, mean, red, green, blue", "NAME")
-    forms: tuple[str, ...] = option(
-        captures.FORMS,
-        "what to write of npy, mat, png, ply, mesh (default: all)",
-        "A,B",
-        parse=value(
-            f"some of {', '.join(captures.FORMS)}", names, lambda some: some != () and set(some) <= {*captures.FORMS}
-        ),
-    )
-    anyway: bool = option(False, "decode a capture that its examination refuses")
-    threads: int = option(usable_cores(), "threads (default: one for each core)", "N", parse=AT_LEAST_ONE)
-
-
 @command(
     """\
 fpp-bench decode rig.yaml scan --out scan-decoded               scan/: one image a frame, in the order of names
@@ -63,46 +26,76 @@ RIG says what was projected in which order, how the devices see, and the range i
 (fpp_ml_bench.optics.rig_file, docs/own_rig.md). Images: PNG, BMP or TIFF of 8 to 16 bits.
 """
 )
-def decode(settings: DecodeSettings) -> None:
+def decode(
+    *,
+    file: Path = argument("rig file (.yaml, .json)", "RIG"),
+    frames: str = argument("folder of images, or a pattern in quotes", "FRAMES"),
+    out: Path = option(REQUIRED, "folder for the results", "DIR"),
+    direction: Directions = option(
+        "both", "which of the coded directions to use (default: all there are)", choices=DIRECTIONS
+    ),
+    working_range: tuple[float, float] | None = option(
+        None, "working range in mm (default: the rig's)", "NEAR,FAR", parse=WORKING_RANGE
+    ),
+    mask: Path | None = option(None, "image or .npy: decode where it is not 0", "FILE"),
+    min_modulation: float | None = option(
+        None, "least modulation of a pixel in grey levels of 255 (default: 5)", "GREY"
+    ),
+    noise: float | None = option(
+        None,
+        "noise of a frame in grey levels of 255 (default: measured with four steps and more, else 1)",
+        "GREY",
+    ),
+    bits: int | None = option(None, "bits of the camera, 8 to 16, where files of 16 bits hold fewer", "N"),
+    colour: str | None = option(None, "of colour images: luminance, mean, red, green, blue", "NAME"),
+    forms: tuple[str, ...] = option(
+        captures.FORMS,
+        "what to write of npy, mat, png, ply, mesh (default: all)",
+        "A,B",
+        parse=value(
+            f"some of {', '.join(captures.FORMS)}", names, lambda some: some != () and set(some) <= {*captures.FORMS}
+        ),
+    ),
+    anyway: bool = option(False, "decode a capture that its examination refuses"),
+    threads: int = option(usable_cores(), "threads (default: one for each core)", "N", parse=AT_LEAST_ONE),
+) -> None:
     """Decode captured frames: depth, point cloud, uncertainty, and the reason for every pixel without depth.
 
     Raises FppBenchError for an unusable rig, capture or folder."""
-    captures.check_outputs(settings.out)
-    rig = optics.load_rig(settings.rig)
-    if settings.working_range is not None:
-        rig = rig.with_range(settings.working_range)
-        optics.check_lengths(rig, settings.rig.name)
+    captures.check_outputs(out)
+    rig = optics.load_rig(file)
+    if working_range is not None:
+        rig = rig.with_range(working_range)
+        optics.check_lengths(rig, file.name)
     started = perf_counter()
     with progress_bar("decoding", 4, "steps") as advance:
-        capture = captures.read_frames(
-            settings.frames, count=len(rig.sequence), bits=settings.bits, colour=settings.colour
-        )
+        capture = captures.read_frames(frames, count=len(rig.sequence), bits=bits, colour=colour)
         advance(1)
-        mask = None if settings.mask is None else captures.read_mask(settings.mask, capture.frames.shape[1:])
-        least = {} if settings.min_modulation is None else {"min_modulation": settings.min_modulation}
+        asked = None if mask is None else captures.read_mask(mask, capture.frames.shape[1:])
+        least = {} if min_modulation is None else {"min_modulation": min_modulation}
         try:
             result = captures.decode_capture(
                 capture,
                 rig,
-                settings.direction,
-                mask=mask,
-                noise_grey=settings.noise,
-                threads=settings.threads,
-                anyway=settings.anyway,
+                direction,
+                mask=asked,
+                noise_grey=noise,
+                threads=threads,
+                anyway=anyway,
                 **least,
             )
         except RefusedCapture as refused:
-            captures.write_refusal(settings.out, capture, rig, refused.examination)
+            captures.write_refusal(out, capture, rig, refused.examination)
             raise
         advance(2)
-        captures.write_capture(settings.out, capture, rig, result, settings.forms)
+        captures.write_capture(out, capture, rig, result, forms)
         advance(1)
     say_findings(result.examination)
     for note in result.notes:
         print(f"note: {note}", file=sys.stderr)
     _print(result)
-    listed = ", ".join(sorted(path.name for path in settings.out.iterdir()))
-    print(f"{settings.out}: {listed}; {perf_counter() - started:.1f} s")
+    listed = ", ".join(sorted(path.name for path in out.iterdir()))
+    print(f"{out}: {listed}; {perf_counter() - started:.1f} s")
 
 
 def _print(result: "captures.DecodedCapture") -> None:

@@ -1,9 +1,8 @@
 """``fpp-bench diagnose``: does a model read fringes or shapes? An HTML report."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from rich import progress as bar
 from rich.console import Console
@@ -12,42 +11,12 @@ from rich.text import Text
 from fpp_ml_bench.baselines import diagnostics, registry
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.cli.console import show
-from fpp_ml_bench.cli.methods import MethodCommand, options_given
+from fpp_ml_bench.cli.methods import MethodCommand, OfMethods
 from fpp_ml_bench.cli.options import COUNT, command, command_line, names
 from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.tables import Table
-
-
-@dataclass(frozen=True, kw_only=True)
-class DiagnoseSettings:
-    """Settings of `diagnose`. ``of_method``: the text of a method's options by their flags."""
-
-    model: str = argument(
-        "weights that come with the package, a .safetensors file, a method (classical, phase, ...), or your own torch "
-        "module as file.py:factory; that file is executed",
-        "MODEL",
-    )
-    dataset: Path = argument("dataset folder, of the model's image size", "DATASET")
-    out: Path = option(REQUIRED, "index.html and diagnose.json go here", "DIR")
-    probe: tuple[str, ...] = option(
-        (), f"run only this probe; can be repeated: {', '.join(diagnostics.PROBES)} (default: all)", "NAME", many=True
-    )
-    samples: int | None = option(None, "most samples of a split, taken evenly (default: the probe's)", "N", parse=COUNT)
-    seeds: int | None = option(None, "repeats of what depends on random numbers (default: 2)", "N", parse=COUNT)
-    frame: int | None = option(None, "number of a network's input frame (default: its first)", "N")
-    units: Literal["mm", "m", "normalised"] | None = option(
-        None,
-        "output of your own module: depth in mm, in m, or normalised to the sample's range (default)",
-        choices=("mm", "m", "normalised"),
-    )
-    quick: bool = option(False, "a short run for a first look; its numbers are not reliable")
-    layers: tuple[str, ...] | None = option(
-        None, "layers to probe, comma separated (default: the model's own)", "A,B", parse=names
-    )
-    threads: int | None = option(None, "threads (default: every core)", "N", parse=COUNT)
-    of_method: Mapping[str, Any] = field(default_factory=dict)
 
 
 class DiagnoseCommand(MethodCommand):
@@ -67,18 +36,45 @@ fpp-bench diagnose my_net.py:make data/cpu224 --units mm --layers encoder,decode
 """,
     DiagnoseCommand,
 )
-def diagnose(settings: DiagnoseSettings) -> None:
+def diagnose(
+    *,
+    model: str = argument(
+        "weights that come with the package, a .safetensors file, a method (classical, phase, ...), or your own torch "
+        "module as file.py:factory; that file is executed",
+        "MODEL",
+    ),
+    dataset: Path = argument("dataset folder, of the model's image size", "DATASET"),
+    out: Path = option(REQUIRED, "index.html and diagnose.json go here", "DIR"),
+    probe: tuple[str, ...] = option(
+        (), f"run only this probe; can be repeated: {', '.join(diagnostics.PROBES)} (default: all)", "NAME", many=True
+    ),
+    samples: int | None = option(
+        None, "most samples of a split, taken evenly (default: the probe's)", "N", parse=COUNT
+    ),
+    seeds: int | None = option(None, "repeats of what depends on random numbers (default: 2)", "N", parse=COUNT),
+    frame: int | None = option(None, "number of a network's input frame (default: its first)", "N"),
+    units: Literal["mm", "m", "normalised"] | None = option(
+        None,
+        "output of your own module: depth in mm, in m, or normalised to the sample's range (default)",
+        choices=("mm", "m", "normalised"),
+    ),
+    quick: bool = option(False, "a short run for a first look; its numbers are not reliable"),
+    layers: tuple[str, ...] | None = option(
+        None, "layers to probe, comma separated (default: the model's own)", "A,B", parse=names
+    ),
+    threads: int | None = option(None, "threads (default: every core)", "N", parse=COUNT),
+    options: OfMethods,
+) -> None:
     """Diagnose a network or method with the paper's probes and further ones; writes an HTML report and a JSON file.
 
     Raises FppBenchError for what can't be diagnosed."""
-    threads = settings.threads or usable_cores()
-    probe_names = diagnostics.checked_names(settings.probe)
-    dataset = storage.DatasetFolder(settings.dataset)
-    model = diagnostics.subject(
-        settings.model, dataset, settings.layers, settings.units, settings.frame, threads, _options(settings)
-    )
-    probing = diagnostics.ProbeSettings(settings.samples, settings.seeds, settings.quick)
-    again = command_line("diagnose", replace(settings, threads=None), settings.of_method)
+    probe_names = diagnostics.checked_names(probe)
+    opened = storage.DatasetFolder(dataset)
+    method = registry.methods().get(model, registry.network_method())
+    of_method = options.of(method, model)
+    subject = diagnostics.subject(model, opened, layers, units, frame, threads or usable_cores(), of_method)
+    probing = diagnostics.ProbeSettings(samples, seeds, quick)
+    again = command_line(without=("threads",))
     columns = (
         bar.TextColumn("{task.description}"),
         bar.BarColumn(),
@@ -94,17 +90,10 @@ def diagnose(settings: DiagnoseSettings) -> None:
                 task, completed=done, total=total, description=f"{probe.title}: {activity}"
             )
 
-        results = diagnostics.diagnose(model, dataset, probe_names, probing, settings.out, progress, again)
-    table = Table("Probe", "Summary", numbers=("Seconds",), title=Text(model.title))
+        results = diagnostics.diagnose(subject, opened, probe_names, probing, out, progress, again)
+    table = Table("Probe", "Summary", numbers=("Seconds",), title=Text(subject.title))
     for result in results:
         text = f"not run: {result.finding.skipped}" if result.finding.skipped else result.finding.summary
         table.add_row(result.probe.name, Text(text), "reused" if result.reused else f"{result.seconds:.1f}")
     show(table)
-    print(f"Written: {settings.out / diagnostics.REPORT_FILE}\nWritten: {settings.out / diagnostics.JSON_FILE}")
-
-
-def _options(settings: DiagnoseSettings) -> dict[str, Any]:
-    """The options of the method that is diagnosed; those of others are refused."""
-    methods = registry.methods()
-    method = methods.get(settings.model, registry.network_method())
-    return options_given(method, "Options", settings.of_method, settings.model)
+    print(f"Written: {out / diagnostics.REPORT_FILE}\nWritten: {out / diagnostics.JSON_FILE}")

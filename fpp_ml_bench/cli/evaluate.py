@@ -1,9 +1,8 @@
 """``fpp-eval``: score a folder of predictions against one split of a dataset, and work on results."""
 
-import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from json import dumps
 from pathlib import Path
 
 from fpp_ml_bench.cli import CHECK_FAILED, EVAL, OK, run_program
@@ -25,84 +24,80 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run_program(EVAL, argv)
 
 
-@dataclass(frozen=True, kw_only=True)
-class ScoreSettings(Explain):
-    """Settings of `score_folder`."""
-
-    predictions: Path = argument(
-        "folder of submission.yaml and one {sample}.npy, .npz, .mat or 16-bit .png per sample, or one "
-        "predictions.parquet or .arrow: depth (H, W), 0 = background, in the units that submission.yaml declares; "
-        "every problem is listed by file, and then no JSON is written",
-        "PREDICTIONS",
-    )
-    dataset: Path | None = argument(
-        "folder of the dataset (default: the one that fpp-bench predict read, by submission.yaml)", "DATASET", None
-    )
-    split: str | None = option(
-        None, "samples to score (default: those that were predicted by submission.yaml, else test)", choices=SPLITS
-    )
-    target: str = option(
-        TARGETS[0],
-        "depth: decoded from the noisy frames, as in the paper (default); depth_exact: from the ray cast",
-        choices=TARGETS,
-    )
-    edge_band: int = option(
-        EDGE_BAND_PX,
-        f"object pixels nearer than this to a depth edge count as edge (default: {EDGE_BAND_PX})",
-        "PX",
-        parse=whole(0, 1000, "px"),
-    )
-    mode: str = option(
-        MODES[0],
-        "standard: void pixels (unlit or mixed) count in no set (default); paper: the paper's sets, without void, and "
-        "its rule for normalised depth; never ranked with the others",
-        choices=MODES,
-    )
-    json: Path | None = option(None, "write the result here, per-sample scores included; - is standard output", "FILE")
-    report: Path | None = option(None, "write an HTML page with figures into this folder", "DIR")
-
-
 @command(
     """\
 fpp-eval predictions --json result.json
 fpp-eval predictions data/mini --split test --target depth_exact --report report
 """
 )
-def score_folder(settings: ScoreSettings) -> None:
+def score_folder(
+    *,
+    predictions: Path = argument(
+        "folder of submission.yaml and one {sample}.npy, .npz, .mat or 16-bit .png per sample, or one "
+        "predictions.parquet or .arrow: depth (H, W), 0 = background, in the units that submission.yaml declares; "
+        "every problem is listed by file, and then no JSON is written",
+        "PREDICTIONS",
+    ),
+    dataset: Path | None = argument(
+        "folder of the dataset (default: the one that fpp-bench predict read, by submission.yaml)", "DATASET", None
+    ),
+    split: str | None = option(
+        None, "samples to score (default: those that were predicted by submission.yaml, else test)", choices=SPLITS
+    ),
+    target: str = option(
+        TARGETS[0],
+        "depth: decoded from the noisy frames, as in the paper (default); depth_exact: from the ray cast",
+        choices=TARGETS,
+    ),
+    edge_band: int = option(
+        EDGE_BAND_PX,
+        f"object pixels nearer than this to a depth edge count as edge (default: {EDGE_BAND_PX})",
+        "PX",
+        parse=whole(0, 1000, "px"),
+    ),
+    mode: str = option(
+        MODES[0],
+        "standard: void pixels (unlit or mixed) count in no set (default); paper: the paper's sets, without void, and "
+        "its rule for normalised depth; never ranked with the others",
+        choices=MODES,
+    ),
+    json: Path | None = option(None, "write the result here, per-sample scores included; - is standard output", "FILE"),
+    page: Path | None = option(None, "write an HTML page with figures into this folder", "DIR", flag="--report"),
+    account: Explain,
+) -> None:
     """Score a folder of predictions: MAE and RMSE in mm over the full grid, the object and the background.
 
     Raises FppBenchError for anything that can't be scored."""
     prepare_process()
-    settings.check_explain_file()
-    folder = settings.predictions
-    _check_outputs(settings.json, settings.report, folder)
-    dataset, split = scored_data(folder, settings.dataset, settings.split)
+    account.check()
+    _check_outputs(json, page, predictions)
+    opened, split = scored_data(predictions, dataset, split)
     scored = score.evaluate(
-        folder,
-        dataset,
+        predictions,
+        opened,
         split,
-        settings.target,
-        settings.edge_band,
-        settings.mode,
+        target,
+        edge_band,
+        mode,
         while_scoring=lambda: report.result_table,
     )
-    if settings.json is not None:
-        result.write_result(scored, settings.json)
-    if settings.report is not None:
-        report.write_report(scored, dataset, folder, settings.report)
+    if json is not None:
+        result.write_result(scored, json)
+    if page is not None:
+        report.write_report(scored, opened, predictions, page)
     from fpp_ml_bench.cli.console import show  # imports rich, which --help must not
 
     show(report.result_table(scored))  # when all is written: printing ends where nobody reads any more
-    for written in (settings.json, settings.report):
+    for written in (json, page):
         if written is not None:
             print(f"Written: {written}")
-    has_expected_bytes, sentence = storage.benchmark_sentence(dataset.manifest)
+    has_expected_bytes, sentence = storage.benchmark_sentence(opened.manifest)
     if not has_expected_bytes:
-        print(f"fpp-eval: warning: {dataset.path}: {sentence}", file=sys.stderr)
-    settings.say_explanation(lambda: score.explain_eval(dataset, split, settings.target, settings.edge_band))
+        print(f"fpp-eval: warning: {opened.path}: {sentence}", file=sys.stderr)
+    account.say(lambda: score.explain_eval(opened, split, target, edge_band))
 
 
-def scored_data(folder: Path, place: Path | None, split: str | None) -> tuple[storage.DatasetFolder, str]:
+def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[storage.DatasetFolder, str]":
     """The dataset in ``place`` and the ``split`` to score; where they are not given, those that ``folder`` was
     predicted from, by its submission.yaml. Raises `SubmissionError` where that does not say, and `DatasetError` where
     the dataset is gone or another one now."""
@@ -153,32 +148,18 @@ def _check_outputs(file: Path | None, page: Path | None, folder: Path) -> None:
             raise SubmissionError(f"--report {page}: {inside}")
 
 
-@dataclass(frozen=True, kw_only=True)
-class InitSettings:
-    """Settings of `init`."""
-
-    predictions: Path = argument("folder of the predictions, made if absent", "PREDICTIONS")
-
-
 @command(
     """\
 fpp-eval init predictions
 """
 )
-def init(settings: InitSettings) -> None:
+def init(
+    *,
+    predictions: Path = argument("folder of the predictions, made if absent", "PREDICTIONS"),
+) -> None:
     """Write a submission.yaml to fill in; one that is there is not overwritten."""
-    folder = settings.predictions
-    print(f"Written: {submission.write_template(folder)}")
-    print(f"next: fill it in, write one {{sample}}.npy for each sample beside it, then: fpp-eval check {folder}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class CheckSettings:
-    """Settings of `check`."""
-
-    predictions: Path = argument("folder of predictions and submission.yaml", "PREDICTIONS")
-    dataset: Path | None = argument("check names, sizes and frames against this dataset, too", "DATASET", None)
-    split: str = option("test", "samples expected with DATASET (default: test)", choices=SPLITS)
+    print(f"Written: {submission.write_template(predictions)}")
+    print(f"next: fill it in, write one {{sample}}.npy for each sample beside it, then: fpp-eval check {predictions}")
 
 
 @command(
@@ -187,13 +168,18 @@ fpp-eval check predictions
 fpp-eval check predictions data/mini --split test
 """
 )
-def check(settings: CheckSettings) -> int:
+def check(
+    *,
+    predictions: Path = argument("folder of predictions and submission.yaml", "PREDICTIONS"),
+    dataset: Path | None = argument("check names, sizes and frames against this dataset, too", "DATASET", None),
+    split: str = option("test", "samples expected with DATASET (default: test)", choices=SPLITS),
+) -> int:
     """Check a submission before it is scored, without ground truth: exit status 0 sound, 1 refused.
 
     Raises FppBenchError for no folder."""
-    dataset = None if settings.dataset is None else storage.DatasetFolder(settings.dataset)
-    checked = score.check_folder(settings.predictions, dataset, settings.split)
-    folder = printable(str(settings.predictions), 500)
+    opened = None if dataset is None else storage.DatasetFolder(dataset)
+    checked = score.check_folder(predictions, opened, split)
+    folder = printable(str(predictions), 500)
     for note in checked.notes:
         print(f"fpp-eval: note: {note}", file=sys.stderr)
     if checked.problems:
@@ -203,21 +189,12 @@ def check(settings: CheckSettings) -> int:
         return CHECK_FAILED
     height, width = checked.size
     sigma = ", with an uncertainty" if checked.sigmas else ""
-    against = "" if dataset is None else f" of split {settings.split}"
+    against = "" if dataset is None else f" of split {split}"
     print(f"{folder}: {len(checked.samples)} samples{against}, {checked.form}, {width}x{height} px{sigma}; sound")
     if checked.description is not None:
         frames, track = len(checked.description.frames_used), checked.description.track
         print(f"submission.yaml: {track} track, {frames} {'frame' if frames == 1 else 'frames'}; sound")
     return OK
-
-
-@dataclass(frozen=True, kw_only=True)
-class CompareSettings:
-    """Settings of `compare`."""
-
-    first: Path = argument("a result of fpp-eval --json, or a row of the leaderboard", "A.json")
-    second: Path = argument("a result of another method on the same data, split, target and track", "B.json")
-    json: Path | None = option(None, "write the comparison here, each sample's included; - is standard output", "FILE")
 
 
 @command(
@@ -226,26 +203,22 @@ fpp-eval compare a.json b.json
 fpp-eval compare a.json b.json --json difference.json
 """
 )
-def compare(settings: CompareSettings) -> None:
+def compare(
+    *,
+    first: Path = argument("a result of fpp-eval --json, or a row of the leaderboard", "A.json"),
+    second: Path = argument("a result of another method on the same data, split, target and track", "B.json"),
+    json: Path | None = option(None, "write the comparison here, each sample's included; - is standard output", "FILE"),
+) -> None:
     """Compare two results of the same samples: paired differences, their 95% intervals, and a plain sentence.
 
     Raises SubmissionError for results that can't be compared."""
     from fpp_ml_bench.cli.console import show
     from fpp_ml_bench.leaderboard.rows import alike, read_scored
 
-    comparison = report.compare(*alike(read_scored(settings.first), read_scored(settings.second)))
-    if settings.json is not None:
-        result.write_json(comparison.model_dump(mode="json"), settings.json)
+    comparison = report.compare(*alike(read_scored(first), read_scored(second)))
+    if json is not None:
+        result.write_json(comparison.model_dump(mode="json"), json)
     show(report.comparison_table(comparison))
-
-
-@dataclass(frozen=True, kw_only=True)
-class VerifySettings:
-    """Settings of `verify`."""
-
-    result: Path = argument("a result of fpp-eval --json, or a row of the leaderboard", "RESULT.json")
-    predictions: Path = argument("the predictions it was made from", "PREDICTIONS")
-    dataset: Path = argument("folder of the dataset", "DATASET")
 
 
 @command(
@@ -254,53 +227,31 @@ fpp-eval verify result.json predictions data/mini
 fpp-eval verify leaderboard/rows/mine.json predictions data/full
 """
 )
-def verify(settings: VerifySettings) -> int:
+def verify(
+    *,
+    file: Path = argument("a result of fpp-eval --json, or a row of the leaderboard", "RESULT.json"),
+    predictions: Path = argument("the predictions it was made from", "PREDICTIONS"),
+    dataset: Path = argument("folder of the dataset", "DATASET"),
+) -> int:
     """Score the predictions again and say whether the result or row is verified (exit status 0) or not (1).
 
     Raises FppBenchError where nothing can be recomputed at all."""
     from fpp_ml_bench.leaderboard import rows
 
-    scored = rows.read_scored(settings.result)
-    dataset = storage.DatasetFolder(settings.dataset)
-    if isinstance(scored, result.Result):
-        problems = score.differences(scored, settings.predictions, dataset)
-    else:
-        problems = rows.differences(scored, settings.predictions, dataset)
-    file = printable(str(settings.result), 500)
+    scored, opened = rows.read_scored(file), storage.DatasetFolder(dataset)
+    differences = score.differences if isinstance(scored, result.Result) else rows.differences
+    problems, shown = differences(scored, predictions, opened), printable(str(file), 500)  # type: ignore[arg-type]
     unchecked = f"not checked: {', '.join(rows.not_checked(scored))}: predictions don't tell them"
     if not problems:
-        print(f"verified: {file} is what {scored.dataset.samples} predictions give\n{unchecked}")
+        print(f"verified: {shown} is what {scored.dataset.samples} predictions give\n{unchecked}")
         return OK
-    print(f"not verified: {file} differs from what the predictions give in {len(problems)} places")
+    print(f"not verified: {shown} differs from what the predictions give in {len(problems)} places")
     for line in problems[:LISTED]:
         print(f"  {line}")
     if len(problems) > LISTED:
         print(f"  ... and {len(problems) - LISTED} more")
     print(unchecked)
     return CHECK_FAILED
-
-
-@dataclass(frozen=True, kw_only=True)
-class ConformalSettings:
-    """Settings of `conformal`."""
-
-    predictions: Path = argument("predictions with {sample}.sigma.npy, whose sigma is scaled", "PREDICTIONS")
-    dataset: Path = argument("folder of the dataset", "DATASET")
-    split: str = option("test", "split of PREDICTIONS (default: test)", choices=SPLITS)
-    calibration: Path = option(REQUIRED, "the same method's predictions of the split that is calibrated on", "DIR")
-    calibrate: str = option(
-        "validation",
-        "split of --from (default: validation); not one that the method learned from",
-        choices=("train", "validation"),
-    )
-    coverage: float = option(
-        0.68,
-        "what the interval of +- sigma x its Gaussian quantile shall hold (default: 0.68); n calibration objects "
-        "support at most n / (n + 1)",
-        "SHARE",
-    )
-    target: str = option(TARGETS[0], "depth that errors are taken against (default: depth)", choices=TARGETS)
-    out: Path = option(REQUIRED, "new folder: a copy with the scaled sigma", "DIR")
 
 
 @command(
@@ -311,33 +262,42 @@ fpp-eval conformal predictions data/full --from predictions-validation --out pre
 fpp-eval predictions-conformal
 """
 )
-def conformal(settings: ConformalSettings) -> None:
+def conformal(
+    *,
+    predictions: Path = argument("predictions with {sample}.sigma.npy, whose sigma is scaled", "PREDICTIONS"),
+    dataset: Path = argument("folder of the dataset", "DATASET"),
+    split: str = option("test", "split of PREDICTIONS (default: test)", choices=SPLITS),
+    calibration: Path = option(
+        REQUIRED, "the same method's predictions of the split that is calibrated on", "DIR", flag="--from"
+    ),
+    calibrate: str = option(
+        "validation",
+        "split of --from (default: validation); not one that the method learned from",
+        choices=("train", "validation"),
+    ),
+    coverage: float = option(
+        0.68,
+        "what the interval of +- sigma x its Gaussian quantile shall hold (default: 0.68); n calibration objects "
+        "support at most n / (n + 1)",
+        "SHARE",
+    ),
+    target: str = option(TARGETS[0], "depth that errors are taken against (default: depth)", choices=TARGETS),
+    out: Path = option(REQUIRED, "new folder: a copy with the scaled sigma", "DIR"),
+) -> None:
     """Scale a method's stated sigma by split-conformal calibration over objects, from its predictions of another
     split."""
-    dataset = storage.DatasetFolder(settings.dataset)
-    found = score.calibrate(settings.calibration, dataset, settings.calibrate, settings.coverage, settings.target)
-    samples = score.write_calibrated(found, settings.predictions, dataset, settings.split, settings.out)
+    opened = storage.DatasetFolder(dataset)
+    found = score.calibrate(calibration, opened, calibrate, coverage, target)
+    samples = score.write_calibrated(found, predictions, opened, split, out)
     share, most = f"{100 * found.coverage:g}%", 100 * score.largest_coverage(found.objects)
-    print(f"{settings.calibration}: {found.samples} samples")
+    print(f"{calibration}: {found.samples} samples")
     print(f"  {score.counted(found.objects)} can support at most {most:.1f}%")
     print(f"  {100 * found.before:.1f}% of the pixels are in their {share} interval as it was stated")
     print(
         f"  factor {found.factor:.4g}: the {share} interval of a new object's pixel holds in {share} of cases or more,"
     )
     print("  over objects that are like these and pixels that state a sigma")
-    print(f"{settings.out}: {samples} predictions with the scaled sigma")
-
-
-@dataclass(frozen=True, kw_only=True)
-class SchemaSettings:
-    """Settings of `schema`."""
-
-    file: str = argument(
-        "result: what fpp-eval writes (default); submission: submission.yaml; comparison: fpp-eval compare --json",
-        "result|submission|comparison",
-        "result",
-        choices=("result", "submission", "comparison"),
-    )
+    print(f"{out}: {samples} predictions with the scaled sigma")
 
 
 @command(
@@ -346,6 +306,14 @@ fpp-eval schema > result.schema.json
 fpp-eval schema submission
 """
 )
-def schema(settings: SchemaSettings) -> None:
+def schema(
+    *,
+    file: str = argument(
+        "result: what fpp-eval writes (default); submission: submission.yaml; comparison: fpp-eval compare --json",
+        "result|submission|comparison",
+        "result",
+        choices=("result", "submission", "comparison"),
+    ),
+) -> None:
     """Print the JSON Schema (2020-12) of result.json or of submission.yaml."""
-    print(json.dumps(result.json_schema(settings.file), indent=1))
+    print(dumps(result.json_schema(file), indent=1))

@@ -1,6 +1,5 @@
 """``fpp-bench fuse``: an object's views in one point cloud, and the pixels that other views contradict."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from fpp_ml_bench.baselines import views
@@ -13,22 +12,6 @@ from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.tables import Table
 
 
-@dataclass(frozen=True, kw_only=True)
-class FuseSettings:
-    """Settings of `fuse`."""
-
-    predictions: str = argument(
-        "predictions of a split; or depth or depth_exact, the dataset's own (a folder: ./depth)", "PREDICTIONS"
-    )
-    dataset: Path = argument("folder of a generated dataset", "DATASET")
-    split: str = option("test", "split of PREDICTIONS (default: test)", choices=SPLITS)
-    object: str | None = option(None, "only this object (default: all of the split)", "NAME")
-    cell_mm: float | None = option(None, "edge of the cells in which points are averaged (default: 2)", "MM")
-    out: Path = option(
-        REQUIRED, "folder for {object}.ply (metres, object coordinates), {object}.png and fusion.json", "DIR"
-    )
-
-
 @command(
     """\
 fpp-bench predict phase data/full --out predictions
@@ -37,24 +20,33 @@ fpp-bench fuse predictions data/full --object power_drill --out fused
 fpp-bench fuse depth_exact data/full --out fused-exact          what the views can cover at best
 """
 )
-def fuse(settings: FuseSettings) -> None:
+def fuse(
+    *,
+    predictions: str = argument(
+        "predictions of a split; or depth or depth_exact, the dataset's own (a folder: ./depth)", "PREDICTIONS"
+    ),
+    dataset: Path = argument("folder of a generated dataset", "DATASET"),
+    split: str = option("test", "split of PREDICTIONS (default: test)", choices=SPLITS),
+    only: str | None = option(None, "only this object (default: all of the split)", "NAME", flag="--object"),
+    cell_mm: float = option(views.CELL_MM, "edge of the cells in which points are averaged (default: 2)", "MM"),
+    out: Path = option(
+        REQUIRED, "folder for {object}.ply (metres, object coordinates), {object}.png and fusion.json", "DIR"
+    ),
+) -> None:
     """Put the views of each object into one point cloud by their known placement, and compare them with each other.
 
     Prints means over objects. Raises FppBenchError for unusable predictions or data."""
-    dataset = storage.DatasetFolder(settings.dataset)
-    cell_mm = views.CELL_MM if settings.cell_mm is None else settings.cell_mm
-    name, objects = views.fuse_split(settings.predictions, dataset, settings.split, settings.object, cell_mm)
+    opened = storage.DatasetFolder(dataset)
+    name, objects = views.fuse_split(predictions, opened, split, only, cell_mm)
     scores = {}
-    with progress_bar(
-        "fusing", len(views.views_by_object(dataset, settings.split, settings.object)), "objects"
-    ) as advance:
+    with progress_bar("fusing", len(views.views_by_object(opened, split, only)), "objects") as advance:
         for fused in objects:
-            views.write_object(settings.out, fused)
+            views.write_object(out, fused)
             scores[fused.name] = fused.scores
             advance(1)
-    views.write_scores(settings.out, name, dataset, settings.split, cell_mm, scores)
+    views.write_scores(out, name, opened, split, cell_mm, scores)
     _print(name, scores)
-    print(f"{settings.out}: {{object}}.ply, {{object}}.png, {views.FUSION_FILE}")
+    print(f"{out}: {{object}}.ply, {{object}}.png, {views.FUSION_FILE}")
 
 
 def _print(name: str, scores: "dict[str, views.Row]") -> None:

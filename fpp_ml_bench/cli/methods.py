@@ -12,38 +12,77 @@ from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.cli.options import (
     AT_LEAST_ONE,
     Command,
-    Option,
     flags_of,
-    parameter,
+    given_in,
+    parameter_of,
     parse_value,
     parser_of,
     row_of,
 )
 from fpp_ml_bench.errors import FppBenchError, PredictionError
-from fpp_ml_bench.options import argument, described, flag_of, option
+from fpp_ml_bench.options import argument, flag_of, option, options_of
 
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.method import Photographed
 
-METHOD_HELP = (
-    "one of those below with their options, the name of weights that come with the package, a .safetensors file, a "
-    "recipe that fpp-bench reproduce has trained (loss/l1), or file.py:Class, a method of yours; that file is executed"
-)
 _METHODS = "methods"
 NO_OPTIONS = [("no options", "")]
 
 
 @dataclass(frozen=True, kw_only=True)
-class MethodSettings:
-    """Settings of a command that runs a method. ``of_method``: the text of the method's own options by their flags."""
+class OfMethods:
+    """``texts`` of the options that the command line gives of methods, by their flag."""
 
-    method: str = argument(METHOD_HELP, "METHOD")
+    texts: Mapping[str, Any] = field(default_factory=dict)
+
+    def of(self, method: type[Method], name: str, part: str = "Options") -> dict[str, Any]:
+        """Fields of a method's ``part`` (``Options`` or ``Training``) that are given; ``name``: what the user calls the
+        method. Raises `PredictionError` for options of others, and for text that is no value of its option."""
+        own = {flag_of(entry): entry for entry in options_of(getattr(method, part))}
+        given: dict[str, Any] = {}
+        for flag, text in self.texts.items():
+            if flag not in own:
+                owners = [label_of(other) for other in _known_methods() if flag in _flags(other, part)]
+                raise PredictionError(f"{flag} is an option of {', '.join(owners)}, not of {name}; leave it out")
+            try:
+                value = text if isinstance(text, bool) else parse_value(flag, text, parser_of(own[flag]))
+            except ValueError as error:
+                raise PredictionError(str(error)) from None
+            given[own[flag].name] = value
+        return given
+
+
+@dataclass(frozen=True, kw_only=True)
+class MethodSettings(OfMethods):
+    """Which method a command runs, and how."""
+
+    name: str = argument(
+        "one of those below with their options, the name of weights that come with the package, a .safetensors file, a "
+        "recipe that fpp-bench reproduce has trained (loss/l1), or file.py:Class, a method of yours; that file is "
+        "executed",
+        "METHOD",
+    )
     threads: int = option(1, "threads a sample (default: 1)", "N", parse=AT_LEAST_ONE)
-    of_method: Mapping[str, Any] = field(default_factory=dict)
+
+    def load(self, dataset: "Photographed", warn: bool = True) -> Method:
+        """The method for the rig of ``dataset``. Unless told not to, warns on standard error about weights that were
+        trained on another version of the dataset's benchmark. Raises FppBenchError for an unknown method, and for an
+        option that belongs to another one."""
+        kind = registry.find(self.name).method
+        given = self.of(kind, self.name)
+        if "threads" in {entry.name for entry in fields(kind.Options)}:
+            given["threads"] = self.threads
+        method = registry.load_method(self.name, dataset, **given)
+        config = method.weights_config
+        warning = None if config is None else training.training_data_warning(config, dataset.manifest)
+        if warn and config is not None and warning is not None:
+            print(f"warning: {config.name} was {warning}", file=sys.stderr)
+        return method
 
 
 class MethodCommand(Command):
-    """A command whose options are also those of all methods, and of a ``file.py:Class`` among its words."""
+    """A command whose options are also those of all methods, and of a ``file.py:Class`` among its words. It gives
+    them to the `OfMethods` among its parameters."""
 
     part = "Options"
 
@@ -56,7 +95,7 @@ class MethodCommand(Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         taken, by_method = flags_of(ctx), {}
         for method in self.methods(args):
-            params = _parameters(method, self.part)
+            params = _flags(method, self.part)
             clash = [flag for flag in params if flag in taken]
             if clash and any(method.name == word or registry.FILE_MARK in word for word in args):
                 raise PredictionError(
@@ -66,9 +105,9 @@ class MethodCommand(Command):
         ctx.meta[_METHODS] = by_method
         return super().parse_args(ctx, args)
 
-    def of_methods(self, ctx: click.Context) -> dict[str, Option]:
+    def of_methods(self, ctx: click.Context) -> dict[str, click.Option]:
         """The options of methods by their flag."""
-        found: dict[str, Option] = {}
+        found: dict[str, click.Option] = {}
         for params in ctx.meta.get(_METHODS, {}).values():
             found = {**params, **found}
         return found
@@ -77,9 +116,12 @@ class MethodCommand(Command):
         return [*super().get_params(ctx), *self.of_methods(ctx).values()]
 
     def values(self, ctx: click.Context) -> dict[str, Any]:
-        values = super().values(ctx)
-        texts = {flag: values.pop(p.name) for flag, p in self.of_methods(ctx).items() if p.name in values}
-        return {**values, "of_method": texts}
+        values, of_methods = super().values(ctx), self.of_methods(ctx)
+        texts = {flag: ctx.params[str(p.name)] for flag, p in of_methods.items() if given_in(ctx, p.name)}
+        return {
+            name: replace(value, texts=texts) if isinstance(value, OfMethods) else value
+            for name, value in values.items()
+        }
 
     def sections(self, ctx: click.Context) -> dict[str, list[tuple[str, str]]]:
         listed = {
@@ -103,15 +145,13 @@ def _known_methods() -> list[type[Method]]:
     return [*registry.methods().values(), registry.network_method()]
 
 
-def _parameters(method: type[Method], part: str) -> dict[str, Option]:
+def _flags(method: type[Method], part: str) -> dict[str, click.Option]:
     """The options of a method by their flag, which leave their text as it is. They are listed below the method, so
     hidden where a command lists its own."""
-    options = getattr(method, part)
-    made: dict[str, Option] = {}
-    for name, about in described(options).items() if options else ():
-        entry = next(entry for entry in fields(options) if entry.name == name)
-        flag = flag_of(name, about)
-        param = made[flag] = parameter(entry, replace(about, parse=str), name=f"of_method{flag.replace('-', '_')}")
+    made: dict[str, click.Option] = {}
+    for entry in options_of(getattr(method, part)):
+        flag = flag_of(entry)
+        param = made[flag] = parameter_of(entry, name=f"of_method{flag.replace('-', '_')}", parse=str)
         param.hidden = True
     return made
 
@@ -119,38 +159,3 @@ def _parameters(method: type[Method], part: str) -> dict[str, Option]:
 def label_of(method: type[Method]) -> str:
     """What a method is called in help and messages."""
     return "trained networks" if method is registry.network_method() else method.name
-
-
-def options_given(method: type[Method], part: str, texts: Mapping[str, Any], name: str) -> dict[str, Any]:
-    """The fields of a method's ``part`` that the ``texts`` give, by flag; ``name``: what the user calls the method.
-    Raises `PredictionError` for options of others, and for text that is no value of its option."""
-    options = getattr(method, part, None)
-    own = {flag_of(field, about): field for field, about in described(options).items()} if options else {}
-    given: dict[str, Any] = {}
-    for flag, text in texts.items():
-        if flag not in own:
-            owners = [label_of(known) for known in _known_methods() if flag in _parameters(known, part)]
-            raise PredictionError(f"{flag} is an option of {', '.join(owners)}, not of {name}; leave it out")
-        entry = next(entry for entry in fields(options) if entry.name == own[flag])
-        try:
-            read = parser_of(entry, described(options)[entry.name])
-            given[entry.name] = text if isinstance(text, bool) else parse_value(flag, text, read)
-        except ValueError as error:
-            raise PredictionError(str(error)) from None
-    return given
-
-
-def chosen_method(settings: MethodSettings, dataset: "Photographed", warn: bool = True) -> Method:
-    """The method that the settings name, for the rig of ``dataset``. Unless told not to, warns on standard error about
-    weights that were trained on another version of the dataset's benchmark. Raises FppBenchError for an unknown method,
-    and for an option that belongs to another one."""
-    kind = registry.find(settings.method).method
-    given = options_given(kind, "Options", settings.of_method, settings.method)
-    if "threads" in {entry.name for entry in fields(kind.Options)}:
-        given["threads"] = settings.threads
-    method = registry.load_method(settings.method, dataset, **given)
-    config = method.weights_config
-    warning = None if config is None else training.training_data_warning(config, dataset.manifest)
-    if warn and config is not None and warning is not None:
-        print(f"warning: {config.name} was {warning}", file=sys.stderr)
-    return method

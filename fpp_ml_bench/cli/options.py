@@ -4,15 +4,15 @@ an instance."""
 import json
 import shlex
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import redirect_stdout, suppress
-from dataclasses import MISSING, Field, dataclass, fields, replace
+from dataclasses import MISSING, Field, dataclass
+from functools import partial
+from inspect import signature
 from io import StringIO
-from itertools import chain
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from textwrap import indent
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import click
@@ -21,7 +21,7 @@ from click.core import ParameterSource
 from fpp_ml_bench.errors import FppBenchError, PoolError
 from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.machine import usable_cores
-from fpp_ml_bench.options import Description, described, did_you_mean, flag_of, option
+from fpp_ml_bench.options import described, did_you_mean, flag_of, option, options_of
 
 if TYPE_CHECKING:
     from fpp_ml_bench.skipping import Explanation
@@ -33,7 +33,6 @@ OPTIONS = "options"
 """Heading of the options of a settings class that has no ``HEADING`` of its own."""
 
 T = TypeVar("T")
-Settings = TypeVar("Settings")
 
 
 # ---- how the text of an option becomes its value
@@ -76,21 +75,22 @@ MINUTES = value("minutes above 0", float, lambda minutes: 0 < minutes < 1e6)
 WORKING_RANGE = value("NEAR,FAR in mm such as 350,450", number_pair, lambda ends: 0 < ends[0] < ends[1] < 1e9)
 
 
-def parser_of(entry: "Field[Any]", about: Description) -> Callable[[str], Any]:
+def parser_of(entry: "Field[Any]") -> Callable[[str], Any]:
     """What makes the value of a field of its text: its own ``parse``, else by its choices or its type."""
+    about = described(entry)
     if about.parse is not None:
         return about.parse
     if about.choices:
-
-        def chosen(text: str) -> str:
-            if text not in about.choices:
-                raise ValueError(did_you_mean(text, about.choices))
-            return text
-
-        return chosen
+        return partial(_choice, about.choices)
     kinds = _kinds(entry)
     plain = {"float": value("a number", float), "int": value("a whole number", int), "Path": Path}
     return str if "str" in kinds else next((plain[kind] for kind in plain if kind in kinds), str)
+
+
+def _choice(choices: tuple[str, ...], text: str) -> str:
+    if text not in choices:
+        raise ValueError(did_you_mean(text, choices))
+    return text
 
 
 def _kinds(entry: "Field[Any]") -> set[str]:
@@ -134,6 +134,7 @@ class _Value(click.ParamType[Any]):
 class Pool:
     """Settings of a command whose work may go to several processes or machines."""
 
+    HEADING = "where it runs"
     workers: int | None = option(None, "processes (default: as many as there are processors)", "N", parse=AT_LEAST_ONE)
     cluster: str | None = option(
         None,
@@ -158,7 +159,7 @@ class Explain:
     explain: bool = option(False, "print which work was left out and what that saved (takes a moment)")
     explain_json: Path | None = option(None, "write the same as JSON into FILE; implies --explain", "FILE")
 
-    def check_explain_file(self) -> None:
+    def check(self) -> None:
         """Raises `FppBenchError`, before any work, for a JSON file that can't be written."""
         path = self.explain_json
         if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
@@ -166,7 +167,7 @@ class Explain:
                 f"--explain-json {path}: expected a file in an existing folder; create the folder first"
             )
 
-    def say_explanation(self, account: Callable[[], "Explanation"]) -> None:
+    def say(self, account: Callable[[], "Explanation"]) -> None:
         """Print the account as a table with the rules for the seconds below, and write it as JSON, if asked for."""
         if self.explain or self.explain_json:
             from fpp_ml_bench.cli.console import explanation_table, show  # imports rich, which --help must not
@@ -181,89 +182,90 @@ class Explain:
 
 def given(settings: Any, part: type) -> list[str]:
     """Flags of the options of the base class ``part`` that don't have their default."""
-    options = described(part)
-    known = {entry.name: entry.default for entry in fields(part)}
-    return [flag_of(name, about) for name, about in options.items() if getattr(settings, name) != known[name]]
+    return [flag_of(entry) for entry in options_of(part) if getattr(settings, entry.name) != entry.default]
 
 
-def command_line(name: str, settings: Any, of_method: Mapping[str, Any] = MappingProxyType({})) -> str:
-    """The command that runs with these settings, and a method's own options by their flag."""
-    words, options = ["fpp-bench", name], []
-    for entry in fields(settings):
-        about, value = described(type(settings)).get(entry.name), getattr(settings, entry.name)
-        if about is None or value == entry.default:
+def command_line(*, without: tuple[str, ...] = (), more: tuple[str, ...] = ()) -> str:
+    """The command that runs, with all it was given but the parameters ``without``, and ``more`` words."""
+    ctx = click.get_current_context()
+    words = ctx.command_path.split()
+    for param in ctx.command.get_params(ctx):
+        if param.name in without or not given_in(ctx, str(param.name)):
             continue
-        values = value if about.many else [",".join(value) if isinstance(value, tuple) else value]
-        if about.positional:
-            words += map(str, values)
-        else:
-            options += [(flag_of(entry.name, about), one) for one in values]
-    for flag, one in (*options, *of_method.items()):
-        words += [flag] if isinstance(one, bool) else [flag, f"{one:g}" if isinstance(one, float) else str(one)]
-    return shlex.join(words)
+        value = ctx.params[str(param.name)]
+        many = getattr(param, "multiple", False) or param.nargs != 1
+        for one in value if many else [",".join(value) if isinstance(value, tuple) else value]:
+            text = [] if isinstance(one, bool) else [f"{one:g}" if isinstance(one, float) else str(one)]
+            words += text if isinstance(param, click.Argument) else [param.opts[0], *text]
+    return shlex.join([*words, *more])
 
 
 # ---- commands
 
 
 class Option(click.Option):
-    """An option, and the ``heading`` above it in the help; empty for one that the command lists itself."""
+    """An option, and the ``heading`` above it in the help."""
 
     heading = OPTIONS
 
 
-def parameter(entry: "Field[Any]", about: Description, name: str = "", heading: str = OPTIONS) -> Option:
-    """The option of click that a field is. Its default stays with the dataclass."""
-    words = [flag_of(entry.name, about), name or entry.name]
+def parameter_of(
+    entry: "Field[Any]", name: str = "", heading: str = OPTIONS, parse: Callable[[str], Any] | None = None
+) -> Any:
+    """The `Option` or click.Argument that a field is, of the field's name if it has no other, and with the field's way
+    to ``parse`` its text if there is no other. Its default stays with the field."""
+    about, required = described(entry), entry.default is MISSING
+    kind = _Value(parse or parser_of(entry))
+    if about.positional:
+        count = -1 if about.many else 1
+        return click.Argument([entry.name], required, about.help, type=kind, nargs=count, metavar=about.metavar)
+    words = [flag_of(entry), name or entry.name]
     if _kinds(entry) == {"bool"}:
         made = Option(words, is_flag=True, flag_value=not entry.default, help=about.help)
     else:
-        shown, required = about.metavar or "|".join(about.choices), entry.default is MISSING
-        kind = _Value(parser_of(entry, about))
+        shown = about.metavar or "|".join(about.choices)
         made = Option(words, type=kind, multiple=about.many, required=required, metavar=shown, help=about.help)
     made.heading = heading
     return made
 
 
-def _parameters(settings: type) -> list[click.Parameter]:
-    """Arguments in the order of the fields, then options, those of the settings' own class before those it shares."""
-    arguments: list[click.Parameter] = []
-    options: dict[type, list[click.Parameter]] = {base: [] for base in settings.__mro__}
-    for name, about in described(settings).items():
-        entry = next(entry for entry in fields(settings) if entry.name == name)
-        if about.positional:
-            kind, count = _Value(parser_of(entry, about)), -1 if about.many else 1
-            required = entry.default is MISSING
-            arguments.append(
-                click.Argument([name], required, about.help, type=kind, nargs=count, metavar=about.metavar)
-            )
-        else:
-            owner = next(base for base in settings.__mro__ if name in vars(base).get("__annotations__", {}))
-            options[owner].append(parameter(entry, about, heading=vars(owner).get("HEADING", OPTIONS)))
-    return [*arguments, *chain.from_iterable(options.values())]
-
-
 class Command(click.Command):
-    """A command that runs ``function`` with an instance of ``settings``; with ``--json -`` standard output gets
-    the JSON alone."""
+    """A command that runs ``function``. Its keyword parameters are arguments and options by their defaults, made with
+    `argument` and `option`, or dataclasses of such fields, of which it gets an instance. With ``--json -`` standard
+    output gets the JSON alone."""
 
-    def __init__(self, name: str, function: Callable[[Any], int | None], settings: type, examples: str) -> None:
+    def __init__(self, function: Callable[..., int | None], examples: str) -> None:
+        self.function, self.examples = function, examples
+        self.defaults: dict[str, Any] = {}
+        self.groups: dict[str, type] = {}
+        params = []
+        for name, parameter in signature(function).parameters.items():
+            if isinstance(entry := parameter.default, Field):
+                entry.name, entry.type = name, parameter.annotation
+                self.defaults[name] = entry.default
+                params.append(parameter_of(entry))
+            else:
+                group = self.groups[name] = parameter.annotation
+                params += [parameter_of(entry, heading=heading_of(group, entry.name)) for entry in options_of(group)]
         look = {"terminal_width": HELP_WIDTH, "help_option_names": ["-h", "--help"]}
-        super().__init__(name, look, params=_parameters(settings), help=function.__doc__)  # type: ignore[arg-type]
-        self.function, self.settings, self.examples = function, settings, examples
+        super().__init__(function.__name__, look, params=params, help=function.__doc__)
 
     def values(self, ctx: click.Context) -> dict[str, Any]:
-        """The fields that the command line gives."""
-        return {key: ctx.params[key] for key in ctx.params if given_in(ctx, key)}
+        """The function's arguments by what the command line gives."""
+        given = {name: value for name, value in ctx.params.items() if given_in(ctx, name)}
+        values = {name: given.get(name, default) for name, default in self.defaults.items()}
+        for name, group in self.groups.items():
+            values[name] = group(**{key: given[key] for key in group.__dataclass_fields__ if key in given})
+        return values
 
     def invoke(self, ctx: click.Context) -> int:
-        settings = self.settings(**self.values(ctx))
-        if str(getattr(settings, "json", None)) != STANDARD_OUTPUT:
-            return self.function(settings) or 0
+        values = self.values(ctx)
+        if str(values.get("json")) != STANDARD_OUTPUT:
+            return self.function(**values) or 0
         with TemporaryDirectory(prefix="fpp-bench-") as folder:
             file = Path(folder) / "standard-output.json"
             with redirect_stdout(StringIO()):
-                status = self.function(replace(settings, json=file)) or 0
+                status = self.function(**{**values, "json": file}) or 0
             if file.exists():
                 sys.stdout.write(file.read_text(encoding="utf-8"))
         return status
@@ -305,9 +307,15 @@ class Command(click.Command):
         formatter.write(f"\nexamples:\n{indent(self.examples, '  ')}")
 
 
-def given_in(ctx: click.Context, name: str) -> bool:
+def heading_of(group: type, name: str) -> str:
+    """What stands above an option in the help: ``HEADING`` of the class whose field it is."""
+    owner = next(base for base in group.__mro__ if name in vars(base).get("__annotations__", {}))
+    return str(vars(owner).get("HEADING", OPTIONS))
+
+
+def given_in(ctx: click.Context, name: str | None) -> bool:
     """Whether the command line gives a parameter."""
-    return ctx.get_parameter_source(name) is ParameterSource.COMMANDLINE
+    return ctx.get_parameter_source(str(name)) is ParameterSource.COMMANDLINE
 
 
 def row_of(param: click.Option, ctx: click.Context) -> tuple[str, str]:
@@ -325,16 +333,10 @@ def write_sections(sections: dict[str, list[tuple[str, str]]], formatter: click.
             formatter.write_dl(rows, LEFT_COLUMN)
 
 
-def command(examples: str, kind: type[Command] = Command) -> Callable[[Callable[[Any], int | None]], Command]:
-    """Make a command of a function of its settings, a dataclass of `option` and `argument` fields. Its help begins with
-    the first paragraph of the function's docstring and ends with ``examples``. It returns its exit status, None for
-    0."""
-
-    def made(function: Callable[[Any], int | None]) -> Command:
-        settings = function.__annotations__["settings"]
-        return kind(function.__name__, function, settings, examples)
-
-    return made
+def command(examples: str, kind: type[Command] = Command) -> Callable[[Callable[..., int | None]], Command]:
+    """Make a `Command` of a function. Its help begins with the first paragraph of the function's docstring and ends
+    with ``examples``. The function returns its exit status, None for 0."""
+    return lambda function: kind(function, examples)
 
 
 def flags_of(ctx: click.Context) -> list[str]:

@@ -1,7 +1,5 @@
 """``fpp-bench predict`` and ``fpp-bench time``: run a method over a split, and measure what it costs."""
 
-import json
-from dataclasses import dataclass
 from pathlib import Path
 
 from rich.table import Table
@@ -10,28 +8,13 @@ from rich.text import Text
 from fpp_ml_bench import baselines
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.cli.console import progress_bar, show
-from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings, chosen_method
+from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
 from fpp_ml_bench.cli.options import COUNT, SPLITS, Explain, command
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation import result
-from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.remote import RemoteFolder, place, working_copy
-
-
-@dataclass(frozen=True, kw_only=True)
-class PredictSettings(Explain, MethodSettings):
-    """Settings of `predict`."""
-
-    dataset: Path = argument("dataset folder", "DATASET")
-    split: str = option("test", "default: test", choices=SPLITS)
-    out: Path | RemoteFolder = option(
-        REQUIRED,
-        "new or empty folder, or a URL, written at the end; a run that was stopped continues",
-        "DIR",
-        parse=place,
-    )
 
 
 @command(
@@ -46,25 +29,37 @@ fpp-eval predictions --target depth_exact --json result.json
 """,
     MethodCommand,
 )
-def predict(settings: PredictSettings) -> None:
+def predict(
+    *,
+    chosen: MethodSettings,
+    dataset: Path = argument("dataset folder", "DATASET"),
+    split: str = option("test", "default: test", choices=SPLITS),
+    out: Path | RemoteFolder = option(
+        REQUIRED,
+        "new or empty folder, or a URL, written at the end; a run that was stopped continues",
+        "DIR",
+        parse=place,
+    ),
+    account: Explain,
+) -> None:
     """Run a method over a split and write predictions that fpp-eval scores."""
-    settings.check_explain_file()
-    opened = storage.DatasetFolder(settings.dataset)
-    method = chosen_method(settings, opened)
-    samples = len(opened.samples(settings.split))
-    bar = progress_bar(f"{settings.method}, {settings.split}", samples, "samples")
-    with working_copy(settings.out) as (out, _), bar as advance:
-        finished = baselines.predict_split(opened, method, settings.split, out, advance)
+    account.check()
+    opened = storage.DatasetFolder(dataset)
+    method = chosen.load(opened)
+    samples = len(opened.samples(split))
+    bar = progress_bar(f"{chosen.name}, {split}", samples, "samples")
+    with working_copy(out) as (folder, _), bar as advance:
+        finished = baselines.predict_split(opened, method, split, folder, advance)
     print(
-        f"{settings.out}: {finished.samples} predictions by {method.title}; {len(method.frames_used)} frames and "
+        f"{out}: {finished.samples} predictions by {method.title}; {len(method.frames_used)} frames and "
         f"{finished.seconds_per_sample:.3f} s a sample (median)"
     )
     how = f"{_scoring(method, opened)} --json result.json"
-    if isinstance(settings.out, Path):
-        print(f"next: fpp-eval {settings.out}{how}")
+    if isinstance(out, Path):
+        print(f"next: fpp-eval {out}{how}")
     else:
-        print(f"next: copy {settings.out} to a disk, then: fpp-eval COPY {settings.dataset}{how}")
-    settings.say_explanation(lambda: baselines.explain_predict(opened, method, settings.split))
+        print(f"next: copy {out} to a disk, then: fpp-eval COPY {dataset}{how}")
+    account.say(lambda: baselines.explain_predict(opened, method, split))
 
 
 def _scoring(method: Method, opened: "storage.DatasetFolder") -> str:
@@ -73,24 +68,6 @@ def _scoring(method: Method, opened: "storage.DatasetFolder") -> str:
     target = method.target if opened.has_exact else "depth"
     mode = "" if method.mode == "standard" else f" --mode {method.mode}"
     return mode + ("" if target == "depth" else f" --target {target}")
-
-
-@dataclass(frozen=True, kw_only=True)
-class TimeSettings(MethodSettings):
-    """Settings of `time`."""
-
-    dataset: Path = argument("dataset folder", "DATASET")
-    split: str = option("test", "default: test", choices=SPLITS)
-    batch: int = option(4, "images a batch (default: 4)", "N", parse=COUNT)
-    repeats: int = option(20, "timed runs (default: 20)", "N", parse=COUNT)
-    json: Path | None = option(None, "write the timing here; - is standard output", "FILE")
-    into: tuple[Path, ...] = option(
-        (),
-        "put it into this submission.yaml or result file of the same method; may be given again",
-        "FILE",
-        parse=Path,
-        many=True,
-    )
 
 
 @command(
@@ -102,24 +79,38 @@ fpp-bench time classical data/mini --into predictions/submission.yaml --into res
 """,
     MethodCommand,
 )
-def time(settings: TimeSettings) -> None:
+def time(
+    *,
+    chosen: MethodSettings,
+    dataset: Path = argument("dataset folder", "DATASET"),
+    split: str = option("test", "default: test", choices=SPLITS),
+    batch: int = option(4, "images a batch (default: 4)", "N", parse=COUNT),
+    repeats: int = option(20, "timed runs (default: 20)", "N", parse=COUNT),
+    json: Path | None = option(None, "write the timing here; - is standard output", "FILE"),
+    into: tuple[Path, ...] = option(
+        (),
+        "put it into this submission.yaml or result file of the same method; may be given again",
+        "FILE",
+        parse=Path,
+        many=True,
+    ),
+) -> None:
     """Measure a method's latency at batch 1, throughput, memory, parameters and frames, on a named machine."""
-    opened = storage.DatasetFolder(settings.dataset)
-    method, file = chosen_method(settings, opened), settings.json
-    for path in settings.into:
+    opened = storage.DatasetFolder(dataset)
+    method = chosen.load(opened)
+    for path in into:
         baselines.check_target(path, method)
-    if file is not None and not file.absolute().parent.is_dir():
-        raise SubmissionError(f"--json {file}: the folder {file.parent} does not exist; make it first")
-    with progress_bar(f"timing {settings.method}", settings.repeats, "images") as advance:
-        timing = baselines.time_method(opened, method, settings.split, settings.batch, settings.repeats, advance)
-    if file is not None:
+    if json is not None and not json.absolute().parent.is_dir():
+        raise SubmissionError(f"--json {json}: the folder {json.parent} does not exist; make it first")
+    with progress_bar(f"timing {chosen.name}", repeats, "images") as advance:
+        timing = baselines.time_method(opened, method, split, batch, repeats, advance)
+    if json is not None:
         content = {"name": method.title, "method": method.name, "settings": dict(method.settings)}
-        text = json.dumps({**content, "timing": timing.model_dump(mode="json")}, indent=1, allow_nan=False)
-        write_atomically(file, (text + "\n").encode("utf-8"))
-    for path in settings.into:
+        result.write_json({**content, "timing": timing.model_dump(mode="json")}, json)
+    for path in into:
         baselines.write_timing(path, timing)
     show(_timing_table(method.title, timing))
-    for path in (*([file] if file else []), *settings.into):
+    for path in (*([json] if json else []), *into):
         print(f"Written: {path}")
 
 

@@ -1,13 +1,12 @@
 """``fpp-bench reliance``: how far a method's predictions follow the fringe's phase, as a score from 0 to 1."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from rich.text import Text
 
 from fpp_ml_bench.baselines import diagnostics
 from fpp_ml_bench.cli.console import progress_bar, show
-from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings, chosen_method
+from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
 from fpp_ml_bench.cli.options import command, value
 from fpp_ml_bench.evaluation import result
 from fpp_ml_bench.leaderboard.measured import check_same_method, write_reliance
@@ -15,23 +14,6 @@ from fpp_ml_bench.leaderboard.rows import read_entry
 from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.options import argument, option
 from fpp_ml_bench.tables import Table
-
-
-@dataclass(frozen=True, kw_only=True)
-class RelianceSettings(MethodSettings):
-    """Settings of `reliance`."""
-
-    dataset: Path = argument("dataset folder; scenes are made from its test objects", "DATASET")
-    views: int = option(
-        2,
-        "samples of each test object, 1 to 6 (default: 2)",
-        "N",
-        parse=value("1 to 6, an object has six views", int, lambda views: 1 <= views <= 6),
-    )
-    into: Path | None = option(
-        None, "write the score into this result or leaderboard row of the same method (.json)", "FILE"
-    )
-    json: Path | None = option(None, "write the score and its parts to this file; - is standard output", "FILE")
 
 
 @command(
@@ -42,23 +24,37 @@ fpp-bench reliance unet-individual-rmse data/cpu224 --range oracle --into result
 """,
     MethodCommand,
 )
-def reliance(settings: RelianceSettings) -> None:
+def reliance(
+    *,
+    chosen: MethodSettings,
+    dataset: Path = argument("dataset folder; scenes are made from its test objects", "DATASET"),
+    views: int = option(
+        2,
+        "samples of each test object, 1 to 6 (default: 2)",
+        "N",
+        parse=value("1 to 6, an object has six views", int, lambda views: 1 <= views <= 6),
+    ),
+    into: Path | None = option(
+        None, "write the score into this result or leaderboard row of the same method (.json)", "FILE"
+    ),
+    json: Path | None = option(None, "write the score and its parts to this file; - is standard output", "FILE"),
+) -> None:
     """Measure phase reliance: does the predicted depth follow the fringe's phase, or the object's outline?
 
     A file that can't take the score raises FppBenchError before measuring."""
-    dataset = storage.DatasetFolder(settings.dataset)
-    method = chosen_method(settings, dataset)
-    entry = None if settings.into is None else read_entry(settings.into)
+    opened = storage.DatasetFolder(dataset)
+    method = chosen.load(opened)
+    entry = None if into is None else read_entry(into)
     if entry is not None:
         check_same_method(entry, method)
-    scene_set = diagnostics.SceneSet(dataset, settings.views)
-    found = method.settings.get("weights_sha256")
+    scene_set = diagnostics.SceneSet(opened, views)
+    found = method.get("weights_sha256")
     sha256 = found if isinstance(found, str) else None
-    with progress_bar(f"reliance of {settings.method}", len(scene_set.samples), "samples") as advance:
+    with progress_bar(f"reliance of {chosen.name}", len(scene_set.samples), "samples") as advance:
         # Called before each sample, so the first call is for none.
         measured, _ = diagnostics.measure(method, scene_set, sha256, lambda done, total, sample: advance(min(done, 1)))
-    if settings.json is not None:
-        result.write_json(measured.model_dump(mode="json"), settings.json)
+    if json is not None:
+        result.write_json(measured.model_dump(mode="json"), json)
     if entry is not None:
         write_reliance(entry, measured)
     moved = [value for key, value in measured.parts if not key.startswith("answered")]

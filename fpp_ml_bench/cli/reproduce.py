@@ -1,7 +1,6 @@
 """``fpp-bench reproduce``: the paper's tables and its further directions, trained and scored here."""
 
 import sys
-from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
@@ -25,36 +24,6 @@ EMPTY_BECAUSE = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class ReproduceCommandSettings:
-    """Settings of `reproduce_tables`."""
-
-    table: str | None = argument(f"{', '.join(TABLES)} or {ALL}; or one row, like loss/l1", "TABLE", None)
-    dataset: Path | None = argument("dataset, built when missing (default: data/cpu224 or data/full)", "DATASET", None)
-    preset: str = option(
-        "cpu",
-        "cpu: 224 px, narrow networks, 8 epochs (default); cpu-long: the same until the rate is at its minimum; paper: "
-        "960 px and full width, needs a GPU",
-        choices=PRESETS,
-    )
-    out: Path = option(Path("runs"), "trainings, predictions and tables go below DIR/PRESET (default: runs)", "DIR")
-    rows: Path | None = option(None, "leaderboard rows (default: OUT/PRESET/rows)", "DIR")
-    only_missing: bool = option(
-        False,
-        "keep rows that are up to date with the dataset and the weights; without it, all rows are made again. Finished "
-        "trainings are always kept",
-    )
-    minutes: float | None = option(
-        None,
-        "stop before an epoch that would exceed M minutes, everything saved (exit status 1); the same command "
-        "continues",
-        "M",
-        parse=MINUTES,
-    )
-    anyway: bool = option(False, "train preset paper even without a GPU")
-    list: bool = option(False, "show rows, recipes and their state, and stop")
-
-
 @command(
     """\
 fpp-bench reproduce --list
@@ -64,38 +33,64 @@ fpp-bench reproduce all --only-missing                 every table; up-to-date r
 fpp-bench reproduce loss --preset paper --minutes 10   the paper's own settings, on a GPU, in pieces
 """
 )
-def reproduce_tables(settings: ReproduceCommandSettings) -> int:
+def reproduce_tables(
+    *,
+    table: str | None = argument(f"{', '.join(TABLES)} or {ALL}; or one row, like loss/l1", "TABLE", None),
+    dataset: Path | None = argument("dataset, built when missing (default: data/cpu224 or data/full)", "DATASET", None),
+    preset: str = option(
+        "cpu",
+        "cpu: 224 px, narrow networks, 8 epochs (default); cpu-long: the same until the rate is at its minimum; paper: "
+        "960 px and full width, needs a GPU",
+        choices=PRESETS,
+    ),
+    out: Path = option(Path("runs"), "trainings, predictions and tables go below DIR/PRESET (default: runs)", "DIR"),
+    rows: Path | None = option(None, "leaderboard rows (default: OUT/PRESET/rows)", "DIR"),
+    only_missing: bool = option(
+        False,
+        "keep rows that are up to date with the dataset and the weights; without it, all rows are made again. Finished "
+        "trainings are always kept",
+    ),
+    minutes: float | None = option(
+        None,
+        "stop before an epoch that would exceed M minutes, everything saved (exit status 1); the same command "
+        "continues",
+        "M",
+        parse=MINUTES,
+    ),
+    anyway: bool = option(False, "train preset paper even without a GPU"),
+    listed: bool = option(False, "show rows, recipes and their state, and stop", flag="--list"),
+) -> int:
     """Train, predict, time and score the rows of the paper's tables, and show them beside its numbers.
 
     Does what is missing. Raises FppBenchError where a step can't be done or a training failed."""
-    below = settings.out / settings.preset
-    folders = reproduce.Folders(settings.preset, below, below / "rows" if settings.rows is None else settings.rows)
-    table, slash, row = (settings.table or ALL).partition("/")
-    tables = TABLES if table == ALL else (table,)
-    if slash and row not in table_rows(table):
-        raise RecipeError(f"{table} has no row {printable(row)!r}; {did_you_mean(row, table_rows(table))}")
-    if settings.list:
+    below = out / preset
+    folders = reproduce.Folders(preset, below, below / "rows" if rows is None else rows)
+    name, slash, row = (table or ALL).partition("/")
+    tables = TABLES if name == ALL else (name,)
+    if slash and row not in table_rows(name):
+        raise RecipeError(f"{name} has no row {printable(row)!r}; {did_you_mean(row, table_rows(name))}")
+    if listed:
         _list(tables, folders)
         return OK
-    if settings.table is None:
+    if table is None:
         raise RecipeError(f"expected a table: {', '.join(TABLES)} or {ALL}; --list shows their rows")
 
     def report(line: str) -> None:  # with the time, where the engine's progress is too
         print(f"{datetime.now():%H:%M:%S} {line}", file=sys.stderr, flush=True)
 
-    again = command_line("reproduce", replace(settings, only_missing=True))
-    options = (settings.dataset, settings.only_missing, settings.minutes, settings.anyway)
+    again = command_line(without=("only_missing",), more=("--only-missing",))
+    options = (dataset, only_missing, minutes, anyway)
     asked = reproduce.ReproduceSettings(tables, folders, again, reproduced, *options, report, row=row)
     outcome = reproduce.reproduce(asked)
-    for table, path in zip(tables, outcome.tables, strict=True):
-        lines = reproduced.table_lines(table, outcome.jobs, folders, outcome.opened)
-        show(reproduced.table_rich(table, lines, settings.preset), reproduced.conclusion(table, lines))
+    for name, path in zip(tables, outcome.tables, strict=True):
+        lines = reproduced.table_lines(name, outcome.jobs, folders, outcome.opened)
+        show(reproduced.table_rich(name, lines, preset), reproduced.conclusion(name, lines))
         print(f"Written: {path}")
     if outcome.failed:
         each = "\n".join(f"  {name}: {why}" for name, why in outcome.failed.items())
         raise TrainingError(f"{len(outcome.failed)} of {len(outcome.jobs)} rows could not be made:\n{each}")
     if outcome.stopped is not None:
-        print(f"Stopped at {outcome.stopped} after {settings.minutes:g} minutes. Continue with: {again}")
+        print(f"Stopped at {outcome.stopped} after {minutes:g} minutes. Continue with: {again}")
         return CHECK_FAILED
     return OK
 

@@ -8,7 +8,7 @@ from typing import Literal
 from fpp_ml_bench import optics
 from fpp_ml_bench.baselines import robustness
 from fpp_ml_bench.cli.console import progress_bar, show
-from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings, chosen_method
+from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
 from fpp_ml_bench.cli.options import Pool, command, names
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import PredictionError
@@ -24,31 +24,6 @@ CROSSED = "crossed", "crossed-net"
 """Methods whose scenes are photographed by the rig that projects crossed fringes."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class RobustnessSettings(Pool, MethodSettings):
-    """Settings of `robust`."""
-
-    out: Path | RemoteFolder = option(
-        REQUIRED,
-        "folder of measurements: each method has its own below it, and one page shows all; or a URL",
-        "DIR",
-        parse=place,
-    )
-    axes: tuple[str, ...] = option((), "only these axes (default: all that apply to the method)", "A,B", parse=names)
-    objects: Literal["test", "unseen"] = option(
-        "test", "objects (default: test)", choices=("test", "unseen"), flag="--set"
-    )
-    size: int = option(FULL_SIZE, f"image size (default: {FULL_SIZE})", "PX")
-    quick: bool = option(False, "one view of each object and three severities, for a look")
-    into: Path | None = option(
-        None, "write the block into this result or row of the same method (.json); needs all axes", "FILE"
-    )
-    cache: Path | None = option(
-        None, "rendered frames, at most 10 GB (default: the user's cache folder; with --cluster none)", "DIR"
-    )
-    no_cache: bool = option(False, "render every frame anew, keep none")
-
-
 @command(
     """\
 fpp-bench robustness phase --quick --out robustness                    a look, some minutes
@@ -60,30 +35,53 @@ fpp-bench robustness phase --out s3://bucket/robustness --cluster ray://head:100
 """,
     MethodCommand,
 )
-def robust(settings: RobustnessSettings) -> None:
+def robust(
+    *,
+    chosen: MethodSettings,
+    pool: Pool,
+    out: Path | RemoteFolder = option(
+        REQUIRED,
+        "folder of measurements: each method has its own below it, and one page shows all; or a URL",
+        "DIR",
+        parse=place,
+    ),
+    axes: tuple[str, ...] = option((), "only these axes (default: all that apply to the method)", "A,B", parse=names),
+    objects: Literal["test", "unseen"] = option(
+        "test", "objects (default: test)", choices=("test", "unseen"), flag="--set"
+    ),
+    size: int = option(FULL_SIZE, f"image size (default: {FULL_SIZE})", "PX"),
+    quick: bool = option(False, "one view of each object and three severities, for a look"),
+    into: Path | None = option(
+        None, "write the block into this result or row of the same method (.json); needs all axes", "FILE"
+    ),
+    cache: Path | None = option(
+        None, "rendered frames, at most 10 GB (default: the user's cache folder; with --cluster none)", "DIR"
+    ),
+    no_cache: bool = option(False, "render every frame anew, keep none"),
+) -> None:
     """Measure what breaks a method: scenes disturbed axis by axis, at five severities each, in the image formation.
 
     A file that can't take the block raises FppBenchError before measuring."""
-    workers = settings.processes
-    if settings.into is not None and (settings.axes or settings.quick):
+    workers = pool.processes
+    if into is not None and (axes or quick):
         raise PredictionError("--into: needs all axes and severities; leave out --axes and --quick")
-    rig = "crossed" if settings.method in CROSSED else "paper"
-    method = chosen_method(settings, Scenes.of(settings.objects, settings.size, rig), warn=False)
-    entry = None if settings.into is None else read_entry(settings.into)
+    rig = "crossed" if chosen.name in CROSSED else "paper"
+    method = chosen.load(Scenes.of(objects, size, rig), warn=False)
+    entry = None if into is None else read_entry(into)
     if entry is not None:
         check_same_method(entry, method)
-    setup = robustness.Setup(method, settings.objects, settings.size, settings.quick, rig)
+    setup = robustness.Setup(method, objects, size, quick, rig)
     # The nodes of a cluster have folders of their own, which nobody would keep small.
-    cache = None if settings.no_cache else settings.cache or (None if settings.cluster else robustness.CACHE)
-    views = sum(len(c.objects) * len(setup.views) for axis in setup.axes(settings.axes) for c in setup.conditions(axis))
-    with working_copy(settings.out) as (out, save):
-        folder = out / slug(setup)
-        with progress_bar(f"{settings.method}, {settings.objects}", views, "views") as advance:
+    cache = None if no_cache else cache or (None if pool.cluster else robustness.CACHE)
+    views = sum(len(c.objects) * len(setup.views) for axis in setup.axes(axes) for c in setup.conditions(axis))
+    with working_copy(out) as (below, save):
+        folder = below / slug(setup)
+        with progress_bar(f"{chosen.name}, {objects}", views, "views") as advance:
             rows = robustness.measure(
-                setup, folder, settings.axes, workers, cache, lambda axis, count: advance(count), settings.cluster, save
+                setup, folder, axes, workers, cache, lambda axis, count: advance(count), pool.cluster, save
             )
         robustness.write_worst(setup, rows, folder, cache)
-        page = f"{settings.out}/{robustness.write_page(out).name}"
+        page = f"{out}/{robustness.write_page(below).name}"
     if entry is not None:
         write_robustness(entry, robustness.robustness(setup, rows))
     show(_table(setup, rows))

@@ -1,7 +1,6 @@
 """``fpp-bench stability``: ill-conditioned and extreme cases against higher precision and theoretical bounds."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
@@ -19,23 +18,6 @@ from fpp_ml_bench.tables import Table
 _GROUPS = ("phase", "order", "triangulation", "rig", "normalisation", "metrics", "networks", "scenes", "crossed")
 
 
-@dataclass(frozen=True, kw_only=True)
-class StabilitySettings:
-    """Settings of `check`."""
-
-    group: tuple[str, ...] = option(
-        _GROUPS,
-        f"run only this group; can be repeated: {', '.join(_GROUPS)} (default: all)",
-        "GROUP",
-        choices=_GROUPS,
-        many=True,
-    )
-    out: Path | None = option(None, "write index.html, stability.json and stability.png here", "DIR")
-    json: Path | None = option(None, "write the run as JSON; - is standard output, without the table", "FILE")
-    quick: bool = option(False, "leave out the case that needs gigabytes (10 million triangles)")
-    list: bool = option(False, "list the cases and their bounds, and run none")
-
-
 @command(
     """\
 fpp-bench stability
@@ -44,22 +26,35 @@ fpp-bench stability --group phase --group metrics --json -
 fpp-bench stability --list
 """
 )
-def check(settings: StabilitySettings) -> int:
+def check(
+    *,
+    group: tuple[str, ...] = option(
+        _GROUPS,
+        f"run only this group; can be repeated: {', '.join(_GROUPS)} (default: all)",
+        "GROUP",
+        choices=_GROUPS,
+        many=True,
+    ),
+    out: Path | None = option(None, "write index.html, stability.json and stability.png here", "DIR"),
+    json: Path | None = option(None, "write the run as JSON; - is standard output, without the table", "FILE"),
+    quick: bool = option(False, "leave out the case that needs gigabytes (10 million triangles)"),
+    listed: bool = option(False, "list the cases and their bounds, and run none", flag="--list"),
+) -> int:
     """Check ill-conditioned and extreme cases against references of higher precision and theoretical bounds.
 
     The status is 1 if any FAILs."""
-    out, groups = settings.out, [group for group in _GROUPS if group in settings.group]
+    groups = [name for name in _GROUPS if name in group]
     if out is not None and out.exists() and not out.is_dir():
         raise StabilityError(f"--out {out}: expected a folder or a new path, got a file")
-    cases = stability.all_cases(groups, quick=settings.quick)
-    if settings.list:
+    cases = stability.all_cases(groups, quick=quick)
+    if listed:
         _list(cases)
         return OK
     with progress_bar("stability", len(cases), "cases") as advance:
         rows = stability.run_cases(cases, lambda _: advance(1))
     written = [] if out is None else stability.write_report(rows, out)
-    if settings.json is not None:
-        result.write_json(stability.document(rows), settings.json)
+    if json is not None:
+        result.write_json(stability.document(rows), json)
     _show(rows)
     for path in written:
         show(f"Written: {path}")

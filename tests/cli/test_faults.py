@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -192,14 +191,14 @@ def test_full_disks_are_answered_with_file_and_cure(tiny, tmp_path, capsys):
     score = [str(predictions), str(tiny), "--json", str(tmp_path / "result.json")]
     board = ["calibrate", "--virtual", str(tmp_path / "v"), "--size", "256", "--poses", "4", "--out", str(rig)]
     words = ["predict", "constant", str(tiny), "--out", str(again)]
-    for command, arguments, count, name in (
+    for run, arguments, count, name in (
         (main, words, 100, "again/unfinished.jsonl"),
         (main, words, 10_000, "again/power_drill_A0.npy"),
         (evaluate.main, score, 100, "result.json"),
         (main, board, 100, "/v: "),
     ):
         with files_of_at_most(count):
-            assert command(arguments) == 2
+            assert run(arguments) == 2
         message = capsys.readouterr().err.splitlines()[-1]
         assert name in message and FREE_SPACE in message and "Errno" not in message, message
     assert evaluate.main(score) == 0 and predict(tiny, again) == 0  # nothing is in the way
@@ -345,14 +344,9 @@ def test_everything_is_written_before_a_table_that_nobody_reads(tiny, tmp_path, 
 # ---- SIGTERM
 
 
-@dataclass
-class _Settings:
-    """None."""
-
-
 def test_sigterm_ends_a_command_as_ctrl_c_does(capsys, tmp_path):
     @command("")
-    def run(settings: _Settings) -> None:
+    def run() -> None:
         """Stop."""
         try:
             os.kill(os.getpid(), signal.SIGTERM)
@@ -371,10 +365,9 @@ def test_sigterm_during_an_import_is_not_swallowed(tmp_path):
     swallows = "import os, signal\ntry:\n    os.kill(os.getpid(), signal.SIGTERM)\nexcept BaseException:\n    pass\n"
     (tmp_path / "swallows.py").write_text(swallows)
     code = (
-        "from dataclasses import dataclass\nfrom fpp_ml_bench.cli import run_command\n"
+        "from fpp_ml_bench.cli import run_command\n"
         "from fpp_ml_bench.cli.options import command\n"
-        "@dataclass\nclass Settings:\n    pass\n"
-        "@command('')\ndef stopped(settings: Settings):\n    import swallows\n"
+        "@command('')\ndef stopped():\n    import swallows\n"
         "run_command(stopped, 'x', [])"
     )
     done = _python(code, tmp_path)
