@@ -2,7 +2,7 @@
 
     python benchmarks/eval_speed.py [--size 960] [--samples 30] [--repeats 7]
 
-- ``fpp-eval PREDICTIONS --dataset DATASET --json FILE``: imports, reading, hashing, checking, all scores, intervals,
+- ``fpp-eval PREDICTIONS DATASET --json FILE``: imports, reading, hashing, checking, all scores, intervals,
   table and result file.
 - `LOAD`: imports NumPy and loads the predictions and targets, nothing else.
 - `PLAIN`: what a careful user writes: loads the same files, checks shapes and values, and computes the six headline

@@ -13,8 +13,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from fpp_ml_bench.cli import COMMANDS, EXTRAS
-from fpp_ml_bench.cli.evaluate import SUBCOMMANDS
+from fpp_ml_bench.cli import COMMANDS, EVAL, EXTRAS
 
 ROOT = Path(__file__).resolve().parent.parent
 SUBPACKAGES = ("loaders", "evaluation", "baselines", "leaderboard")
@@ -193,7 +192,7 @@ def test_ci_runs_every_command_without_extras():
     script = (ROOT / ".ci/without_extras").read_text()
     for name in set(COMMANDS) - {"publish"}:  # which needs the network
         assert re.search(rf"^ *(needs \w+ )?fpp-bench {name} ", script, flags=re.MULTILINE), name
-    for name in SUBCOMMANDS:
+    for name in EVAL.commands:
         assert f"fpp-eval {name} " in script
     assert ".ci/without_extras" in (ROOT / ".ci/run").read_text()
 

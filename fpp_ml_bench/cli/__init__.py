@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import click
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.cli.options import HELP_WIDTH, Command, problem_of, write_sections
+from fpp_ml_bench.cli.options import HELP_WIDTH, problem_of, write_sections
 from fpp_ml_bench.errors import FppBenchError
 from fpp_ml_bench.files import DISK_FULL, cause_of
 from fpp_ml_bench.machine import limit_threads, usable_cores
@@ -160,8 +160,8 @@ ONE_THREAD = "predict", "time", "reliance", "robustness", "tradeoff"
 
 _STREAMS = "stdout", "stderr"
 _MEANINGS = """\
-{name} COMMAND --help shows its options. Exit status: 0 done, 1 a check failed, 2 bad input or failed, 130 stopped
-(143 by SIGTERM), 141 nobody reads the output.
+{name} COMMAND --help shows its options.
+Exit status: 0 done, 1 a check failed, 2 bad input or failed, 130 stopped (143 by SIGTERM), 141 nobody reads the output.
 """
 
 
@@ -310,17 +310,15 @@ def help_of(program: Program) -> str:
     """The help of a program: its commands by group, and the options of its default command."""
     formatter = click.HelpFormatter(width=HELP_WIDTH)
     formatter.write_usage(program.name, "[--help] [--version] COMMAND ...", "usage: ")
-    default = program.command(program.default) if program.default else None
-    if isinstance(default, Command):
-        with click.Context(default, info_name=program.name) as ctx:
-            default.format_usage(ctx, formatter)
-            sections = default.sections(ctx)
-    else:
-        sections = {}
-    formatter.write(f"\n{program.purpose}\n")
-    groups = {
+    sections = {
         group: [(name, line) for name, (_, line) in commands.items()] for group, commands in program.groups.items()
     }
-    write_sections({**groups, **sections}, formatter)
+    if program.default:
+        command = program.command(program.default)
+        ctx = click.Context(command, info_name=program.name)
+        formatter.write_usage(program.name, command.usage(ctx), "usage: ")
+        sections |= command.sections(ctx)
+    formatter.write(f"\n{program.purpose}\n")
+    write_sections(sections, formatter)
     formatter.write(f"\nexamples:\n{indent(program.examples, '  ')}\n{_MEANINGS.format(name=program.name)}")
     return formatter.getvalue()

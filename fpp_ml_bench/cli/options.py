@@ -88,9 +88,9 @@ def parser_of(entry: "Field[Any]") -> Callable[[str], Any]:
 
 
 def _choice(choices: tuple[str, ...], text: str) -> str:
-    if text not in choices:
-        raise ValueError(did_you_mean(text, choices))
-    return text
+    if text in choices:
+        return text
+    raise ValueError(did_you_mean(text, choices))
 
 
 def _kinds(entry: "Field[Any]") -> set[str]:
@@ -270,41 +270,30 @@ class Command(click.Command):
                 sys.stdout.write(file.read_text(encoding="utf-8"))
         return status
 
-    def collect_usage_pieces(self, ctx: click.Context) -> list[str]:
+    def usage(self, ctx: click.Context) -> str:
+        """The words behind the command's name: arguments, and the options that it must be given."""
         pieces = ["[options]"]
         for param in self.get_params(ctx):
-            if isinstance(param, click.Argument):
-                shown = f"{param.make_metavar(ctx)}{' ...' if param.nargs != 1 else ''}"
+            shown = row_of(param, ctx)[0] + " ..." * (param.nargs != 1)
+            if isinstance(param, click.Argument) or param.required:
                 pieces.append(shown if param.required else f"[{shown}]")
-            elif param.required and isinstance(param, click.Option):
-                pieces.append(f"{param.opts[0]} {param.make_metavar(ctx)}")
-        return pieces
+        return " ".join(pieces)
 
-    def format_usage(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        formatter.write_usage(ctx.command_path, " ".join(self.collect_usage_pieces(ctx)), "usage: ")
-
-    def format_help_text(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+    def format_help(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        formatter.write_usage(ctx.command_path, self.usage(ctx), "usage: ")
         formatter.write_paragraph()
         formatter.write_text((self.help or "").split("\n\n")[0])
+        write_sections(self.sections(ctx), formatter)
+        formatter.write(f"\nexamples:\n{indent(self.examples, '  ')}")
 
     def sections(self, ctx: click.Context) -> dict[str, list[tuple[str, str]]]:
         """What the help lists: terms and what they mean, by heading."""
         found: dict[str, list[tuple[str, str]]] = {"arguments": [], OPTIONS: []}
         for param in self.get_params(ctx):
-            if isinstance(param, click.Argument):
-                found["arguments"].append((param.make_metavar(ctx), param.help or ""))
-            elif isinstance(param, click.Option) and not param.hidden:
-                found.setdefault(getattr(param, "heading", OPTIONS), []).append(row_of(param, ctx))
+            if not getattr(param, "hidden", False):
+                heading = "arguments" if isinstance(param, click.Argument) else getattr(param, "heading", OPTIONS)
+                found.setdefault(heading, []).append(row_of(param, ctx))
         return found
-
-    def format_arguments(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        """Nothing: they are among the sections."""
-
-    def format_options(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        write_sections(self.sections(ctx), formatter)
-
-    def format_epilog(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        formatter.write(f"\nexamples:\n{indent(self.examples, '  ')}")
 
 
 def heading_of(group: type, name: str) -> str:
@@ -318,10 +307,11 @@ def given_in(ctx: click.Context, name: str | None) -> bool:
     return ctx.get_parameter_source(str(name)) is ParameterSource.COMMANDLINE
 
 
-def row_of(param: click.Option, ctx: click.Context) -> tuple[str, str]:
-    """Flags of an option with its value, and its help."""
-    flags = ", ".join(param.opts)
-    return (flags if param.is_flag else f"{flags} {param.make_metavar(ctx)}"), param.help or ""
+def row_of(param: click.Parameter, ctx: click.Context) -> tuple[str, str]:
+    """What a parameter is called in help and messages, with the metavar of its value, and what it is."""
+    flags = ", ".join(param.opts) if isinstance(param, click.Option) else ""
+    shown = flags if getattr(param, "is_flag", False) else f"{flags} {param.make_metavar(ctx)}".strip()
+    return shown, getattr(param, "help", None) or ""
 
 
 def write_sections(sections: dict[str, list[tuple[str, str]]], formatter: click.HelpFormatter) -> None:
@@ -350,6 +340,5 @@ def problem_of(error: click.ClickException) -> str:
     if isinstance(error, click.NoSuchOption) and ctx is not None:
         return f"unknown option {printable(error.option_name)!r}; {did_you_mean(error.option_name, flags_of(ctx))}"
     if isinstance(error, click.MissingParameter) and ctx is not None and error.param is not None:
-        shown = row_of(error.param, ctx)[0] if isinstance(error.param, click.Option) else error.param.make_metavar(ctx)
-        return f"{shown} is missing: {getattr(error.param, 'help', '')}"
+        return " is missing: ".join(row_of(error.param, ctx))
     return error.format_message()

@@ -92,7 +92,7 @@ class BuildSettings:
         if not self.rig.directions:
             raise BuildError(
                 "this rig projects crossed fringes alone, from which no ground truth can be decoded; add the "
-                "horizontal or vertical code to its sequence (it need not be stored: --frames crossed)"
+                "horizontal or vertical code to its sequence (it need not be stored: --config crossed)"
             )
         if not self.rig.sequence.config(self.stored):
             raise BuildError(f"frames {self.stored!r}: this rig's sequence has none of them")
@@ -155,7 +155,7 @@ def preset_settings(preset: str, size: int | None = None, light: str = "paper", 
 
 
 def default_frames(rig: str) -> str:
-    """The configuration that ``fpp-bench build --rig RIG`` stores unless ``--frames`` says otherwise: of the crossed
+    """The configuration that ``fpp-bench build --rig RIG`` stores unless ``--config`` says otherwise: of the crossed
     rig its crossed frames, of any other all frames."""
     return "crossed" if rig == "crossed" else "all"
 

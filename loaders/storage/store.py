@@ -202,7 +202,7 @@ class DatasetFolder:
                 return self._image(sample, group, self.sequence.frames[index].column)
         raise DatasetError(
             f"{self.path}: frame {index} is not stored here (configurations: {', '.join(self.configs)}); build with "
-            "--frames all"
+            "--config all"
         )
 
     def frames(self, sample: str, indices: Iterable[int]) -> list[NDArray[np.uint8]]:
@@ -308,7 +308,7 @@ def load_dataset(folder: str | Path, config: str = "single_shot", split: str | N
     if config not in dataset.configs:
         raise DatasetError(
             f"{folder}: configuration {config!r} is not stored; this dataset has {', '.join(dataset.configs)}. Build "
-            f"it with --frames {config} or --frames all"
+            f"it with --config {config} or --config all"
         )
     if split is not None:
         dataset.samples(split)

@@ -118,7 +118,7 @@ def test_one_runs_folder_is_of_one_dataset(tmp_path, dataset):
     record = run_folders.runs / "dataset.json"
     recorded = json.loads(record.read_text())
     record.write_text(json.dumps({**recorded, "fingerprint": 64 * "a"}))
-    with pytest.raises(DatasetError, match=r"are of aaaaaaaa .*give that dataset as --data, or another --runs"):
+    with pytest.raises(DatasetError, match=r"are of aaaaaaaa .*give that dataset as DATASET, or another --out"):
         open_dataset(dataset.path, jobs, run_folders, print)
     record.write_text("{")
     with pytest.raises(DatasetError, match="damaged"):
