@@ -30,7 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import TEST_OBJECTS, VIEWS
-from fpp_ml_bench.evaluation.protocol import HEADLINE
+from fpp_ml_bench.evaluation.metrics import HEADLINE
 from fpp_ml_bench.loaders.sample import Row
 from fpp_ml_bench.loaders.storage import Assembly, Manifest, ShardWriter, plan_shards
 from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig

@@ -1,4 +1,4 @@
-"""Constants of the scoring protocol: version, metric names, limits. PROTOCOL.md explains them. A change that can move
+"""Constants of the scoring protocol: version, names, limits. PROTOCOL.md explains them. A change that can move
 any number in a result raises `PROTOCOL_VERSION`; a change of the file format raises `RESULT_SCHEMA_VERSION`. Results of
 different protocol versions are never ranked together."""
 
@@ -46,54 +46,7 @@ WIDE_BAND_PX = 8
 """The same split at a fixed width, reported in every result whatever ``--edge-band`` is: results stay comparable."""
 
 PIXEL_SETS = ("overall", "object", "background")
-HEADLINE = tuple(f"{pixels}_{error}_mm" for pixels in PIXEL_SETS for error in ("mae", "rmse"))
-"""The paper's six numbers (Section 5.3.2): MAE and RMSE over the full grid, the object and the background, in mm."""
-
-BESIDE = (
-    "object_interior_mae_mm",
-    "object_interior_rmse_mm",
-    "object_edge_mae_mm",
-    "object_edge_rmse_mm",
-    "object_valid_mae_mm",
-    "object_interior_valid_mae_mm",
-    "object_edge_share",
-    "object_missing_share",
-    "object_interior_missing_share",
-)
-"""Reported beside the headline: the object away from and along depth edges, and the pixels that were not measured."""
-
 WITHIN_MM = (1, 2, 5, 10)
-WITHIN = tuple(f"object_within_{limit}mm_share" for limit in WITHIN_MM)
-SIGNED = ("object_bias_mm", "object_valid_bias_mm")
-"""The only scores that may be negative: the others are magnitudes or shares."""
-DISTRIBUTION = (
-    "object_median_mm",
-    "object_p95_mm",
-    "object_max_mm",
-    *WITHIN,
-    *SIGNED,
-    "object_shift_free_mae_mm",
-)
-"""How the error is distributed over the object: order statistics, tolerances, bias, and the error without an offset
-(the MAE once the median error has been subtracted)."""
-WIDE_BAND = ("object_wide_band_mae_mm", "object_wide_interior_mae_mm", "object_wide_band_share")
-
-RANGE_SHARE = "object_mae_range_share"
-"""Object MAE over the depth range of the sample's scored object pixels, the only share that may exceed 1."""
-SINCE_2 = ("void_share", "unlit_mae_mm", "unlit_rmse_mm", "unlit_valid_mae_mm", "unlit_missing_share", RANGE_SHARE)
-"""The share of the image that counts in no set, scores of its unlit pixels, against ``depth_exact``
-only, and `RANGE_SHARE`. Left out of a result where no sample has them."""
-
-METRICS = HEADLINE + BESIDE + DISTRIBUTION + WIDE_BAND + SINCE_2
-HIGHER_IS_BETTER = WITHIN
-HELPED_BY_MISSING = (
-    "object_valid_mae_mm",
-    "object_interior_valid_mae_mm",
-    "unlit_valid_mae_mm",
-    *SIGNED,
-    "object_shift_free_mae_mm",
-)
-"""Scores that a method can improve by answering fewer pixels; nothing is ranked or sorted by them."""
 
 COVERED = (68, 95, 99)
 NOMINAL = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.68, 0.7, 0.8, 0.9, 0.95, 0.99)
@@ -103,19 +56,6 @@ LEFT_OUT = tuple(step / 20 for step in range(20))
 SURE_LEFT_OUT = 0.05
 NLL_LEAST_SIGMA_MM, NLL_LARGEST_RATIO = 0.01, 10.0
 """The negative log-likelihood takes no sigma below the first, and no |error| / sigma above the second."""
-UNCERTAINTY = (
-    *(f"coverage_{percent}" for percent in COVERED),
-    "sigma_mean_mm",
-    "sigma_median_mm",
-    "nll",
-    "ause_mae_mm",
-    "ause_rmse_mm",
-    "sure_mae_mm",
-    "sure_rmse_mm",
-    "unstated_share",
-)
-"""Scores of a stated uncertainty (``{sample}.sigma.npy``), a block of their own in a result."""
-
 LARGEST_MM = 1e30
 """Magnitudes above this are refused: the numerical contract of the scores ends there (see PROTOCOL.md)."""
 

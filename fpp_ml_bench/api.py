@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fpp_ml_bench.baselines.method import Method
-    from fpp_ml_bench.evaluation.score.arrays import Maps
+    from fpp_ml_bench.evaluation.score.evaluator import Maps
     from fpp_ml_bench.leaderboard.groups import Group
     from fpp_ml_bench.optics import Rig
 

@@ -1,11 +1,11 @@
 """The columns of the leaderboard's tables: what a cell says of a row, and where a column is shown."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
-from fpp_ml_bench.evaluation.protocol import HEADLINE, RANGE_SHARE
-from fpp_ml_bench.evaluation.report import millimetres, percent, seconds
+from fpp_ml_bench.evaluation.metrics import METRICS, RANGE_KEY, RANK_KEY, WIDE, WIDEST, with_column
+from fpp_ml_bench.evaluation.report import millimetres, percent, score_text, seconds
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.assumptions import assumption, learned_from
 from fpp_ml_bench.leaderboard.groups import TEST, UNSEEN, Ranked
@@ -31,20 +31,10 @@ NOTE = (
     f"Errors in mm, mean over samples; 95% interval from a bootstrap over objects. {RANK_NOTE} {TRUST_NOTE} "
     f"{RATIO_NOTE}"
 )
-MIDDLE, WIDE, WIDEST = 100, 140, 170
+MIDDLE = 100
 """Where a terminal is too narrow, columns of a larger number are left out first."""
 ONLY_IN_FILES = 1_000_000
 _DEVICE_WIDTH, _LONGEST_NAME = 40, 90
-_ERRORS = {
-    "object_mae_mm": ("Object MAE", 0),
-    "object_rmse_mm": ("Object RMSE", 0),
-    "overall_mae_mm": ("Overall MAE", 0),
-    "background_mae_mm": ("Backgr. MAE", WIDE),
-    "object_missing_share": ("Missing", WIDE),
-    "object_interior_mae_mm": ("Interior MAE", WIDEST),
-    "object_edge_mae_mm": ("Edge MAE", WIDEST),
-}
-"""Title of each error's column, and its ``from_width``."""
 
 
 @dataclass(frozen=True)
@@ -65,46 +55,47 @@ class Column:
 
 def columns(sort: str) -> list[Column]:
     """Columns of a ranking by ``sort``; a key without a column gets its own, and that of the errors its interval."""
-    named = {*_ERRORS, "seconds_per_sample", "frames_used"}
-    own = {} if sort in named else {sort: (sort.removesuffix("_mm").replace("_", " "), 0)}
+    shown = {metric.key: metric.column for metric in with_column(WIDEST)}
+    if sort in METRICS:
+        own = sort.removesuffix("_mm").replace("_", " ")
+        shown = shown if sort in shown else {sort: own, **shown}
     errors = []
-    for key, (title, from_width) in {**own, **_ERRORS}.items():
-        errors.append(Column(title, partial(error, key), from_width=0 if key == sort else from_width))
-        if key == sort in HEADLINE:
+    for key, title in shown.items():
+        errors.append(Column(title, partial(error, key), from_width=0 if key == sort else METRICS[key].column_from))
+        if key == sort and METRICS[key].headline:
             ends = partial(interval, between="-", key=sort)
             errors.append(Column("95% interval", ends, from_width=MIDDLE))
-        if key == "object_mae_mm":
-            errors += [replace(PARTS[0], from_width=MIDDLE), replace(PARTS[1], from_width=MIDDLE), RATIO]
-            errors.append(replace(RANGE, from_width=MIDDLE))
+        if key == RANK_KEY:
+            errors += [*PARTS, RATIO, RANGE]
     return [
         RANK,
         METHOD,
-        replace(CODE, from_width=MIDDLE),
+        CODE,
         *errors,
         Column("s/sample", _seconds),
         FRAMES,
-        replace(RELIANCE, from_width=WIDE),
-        replace(ROBUSTNESS, from_width=WIDEST),
-        *(replace(column, from_width=WIDEST) for column in UNCERTAINTY),
-        replace(PROVENANCE, from_width=MIDDLE),
-        replace(LEARNED, from_width=WIDEST),
-        Column("Assumes", lambda row: assumption(row.entry.row) or "-", right=False, from_width=WIDEST),
-        Column("Timed on", lambda row: device(row.entry), right=False, from_width=WIDEST),
+        RELIANCE,
+        ROBUSTNESS,
+        *UNCERTAINTY,
+        PROVENANCE,
+        LEARNED,
+        Column("Assumes", lambda row: assumption(row.entry.row) or "-", False, WIDEST),
+        Column("Timed on", lambda row: device(row.entry), False, WIDEST),
         Column("Full name", lambda row: printable(row.entry.name, _LONGEST_NAME), False, ONLY_IN_FILES),
     ]
 
 
 def error(key: str, row: Ranked) -> str:
-    return (percent if key.endswith("_share") else millimetres)(row.value(key))
+    return score_text(key, row.value(key))
 
 
 def error_on(benchmark: str, row: Ranked) -> str:
     """Object MAE on the part of the row that is of ``benchmark``, `TEST` or `UNSEEN`; a dash without any."""
     part = row.on(benchmark)
-    return "-" if part is None else millimetres(part.value("object_mae_mm"))
+    return "-" if part is None else millimetres(part.value(RANK_KEY))
 
 
-def interval(row: Ranked, between: str, key: str = "object_mae_mm") -> str:
+def interval(row: Ranked, between: str, key: str = RANK_KEY) -> str:
     return between.join(map(millimetres, row.interval(key) or ())) or "-"
 
 
@@ -162,26 +153,28 @@ def _states_uncertainty(row: Ranked) -> bool:
     return uncertainty(row.entry) != (None, None)
 
 
-def _says_learned(row: Ranked) -> bool:
-    return bool(learned_from(row.entry.row))
-
-
 RANK = Column("Rank", lambda row: row.ranks, present=lambda row: row.best_rank is not None)
-CODE = Column("Code", lambda row: printable(row.entry.row.dataset.code, _DEVICE_WIDTH), right=False)
-METHOD = Column("Method", lambda row: printable(row.short_name), right=False)
+CODE = Column("Code", lambda row: printable(row.entry.row.dataset.code, _DEVICE_WIDTH), False, MIDDLE)
+METHOD = Column("Method", lambda row: printable(row.short_name), False)
 FRAMES = Column("Frames", lambda row: str(row.entry.frames))
 PARTS = tuple(
-    Column(title, partial(error_on, part), present=lambda row: row.on(UNSEEN) is not None)
+    Column(title, partial(error_on, part), True, MIDDLE, lambda row: row.on(UNSEEN) is not None)
     for title, part in (("On test", TEST), ("On unseen", UNSEEN))
 )
 """Both errors of a row that joins the two sets."""
-RANGE = Column("Of depth range", partial(error, RANGE_SHARE), present=lambda row: row.value(RANGE_SHARE) is not None)
+RANGE = Column("Of depth range", partial(error, RANGE_KEY), True, MIDDLE, lambda row: row.value(RANGE_KEY) is not None)
 RATIO = Column("x trivial", ratio, present=lambda row: row.ratio is not None)
-RELIANCE = Column("Phase reliance", lambda row: reliance(row.entry))
-ROBUSTNESS = Column("Disturbed, mm", lambda row: robustness(row.entry))
+RELIANCE = Column("Phase reliance", lambda row: reliance(row.entry), True, WIDE)
+ROBUSTNESS = Column("Disturbed, mm", lambda row: robustness(row.entry), True, WIDEST)
 UNCERTAINTY = (
-    Column("In 95%", lambda row: percent(uncertainty(row.entry)[0]), present=_states_uncertainty),
-    Column("AUSE", lambda row: millimetres(uncertainty(row.entry)[1]), present=_states_uncertainty),
+    Column("In 95%", lambda row: percent(uncertainty(row.entry)[0]), True, WIDEST, _states_uncertainty),
+    Column("AUSE", lambda row: millimetres(uncertainty(row.entry)[1]), True, WIDEST, _states_uncertainty),
 )
-LEARNED = Column("Learned from", lambda row: learned_from(row.entry.row) or "-", False, present=_says_learned)
-PROVENANCE = Column("Provenance", lambda row: row.provenance, right=False)
+LEARNED = Column(
+    "Learned from",
+    lambda row: learned_from(row.entry.row) or "-",
+    False,
+    WIDEST,
+    lambda row: bool(learned_from(row.entry.row)),
+)
+PROVENANCE = Column("Provenance", lambda row: row.provenance, False, MIDDLE)

@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
-from fpp_ml_bench.evaluation.protocol import HEADLINE
+from fpp_ml_bench.evaluation.metrics import HEADLINE, WIDE, with_column
+from fpp_ml_bench.evaluation.metrics import RANK_KEY as _MAIN
 from fpp_ml_bench.leaderboard.assumptions import learned_from, told
 from fpp_ml_bench.leaderboard.columns import device, uncertainty
 from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, TEST, UNSEEN, Group, Ranked
 from fpp_ml_bench.leaderboard.reported import ReportedTable
 
-_MAIN = "object_mae_mm"
 _FORMULA = re.compile(r"[^\w=+@-]*[=+@-]")
 """A sign that begins a formula, before any letter or digit: behind spaces, quotes, a byte order mark."""
 
@@ -70,6 +70,7 @@ def _cells(group: Group, row: Ranked) -> dict[str, object]:
         f"{_MAIN}_{name}": part and part.value(_MAIN)
         for name, part in zip(("test", "unseen"), map(row.on, (TEST, UNSEEN)), strict=True)
     }
+    errors = dict.fromkeys((*HEADLINE, *(metric.key for metric in with_column(WIDE))))
     return {
         "data": key.data_title,
         "samples": group.parts,
@@ -91,7 +92,7 @@ def _cells(group: Group, row: Ranked) -> dict[str, object]:
         f"{_MAIN}_high": high,
         **parts,
         "ratio_to_trivial": row.ratio,
-        **{name: row.value(name) for name in (*HEADLINE, "object_missing_share") if name != _MAIN},
+        **{name: row.value(name) for name in errors if name != _MAIN},
         "latency_median_ms": entry.latency_ms,
         "latency_p5_ms": timing and timing.latency_p5_ms,
         "latency_p95_ms": timing and timing.latency_p95_ms,

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 from fpp_ml_bench.constants import FULL_SIZE
-from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, HEADLINE, PROTOCOL_VERSION, FramesClass, Track
+from fpp_ml_bench.evaluation.metrics import HEADLINE
+from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, PROTOCOL_VERSION, FramesClass, Track
 from fpp_ml_bench.evaluation.score import Interval
 from fpp_ml_bench.leaderboard.pairs import Pair, pairs
 from fpp_ml_bench.leaderboard.row_file import ObjectMeans, Row, interval_over, mean_over

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import HEADLINE, HELPED_BY_MISSING, HIGHER_IS_BETTER, METRICS
+from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS, RANK_KEY, sort_keys
 from fpp_ml_bench.evaluation.score import FEWEST_OBJECTS
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import rows
@@ -21,8 +21,7 @@ from fpp_ml_bench.leaderboard.row_file import name_key
 from fpp_ml_bench.leaderboard.rows import LOCAL, MEANING, SELF_REPORTED, Entry, read_entry
 from fpp_ml_bench.leaderboard.trivial import with_ratios
 
-DEFAULT_SORT = "object_mae_mm"
-SORT_KEYS = (*(key for key in METRICS if key not in HELPED_BY_MISSING), "seconds_per_sample", "frames_used")
+DEFAULT_SORT = RANK_KEY
 
 
 def discover(here: Path) -> list[Path]:
@@ -63,10 +62,10 @@ def rank(entries: Iterable[Entry], sort: str = DEFAULT_SORT) -> list[Group]:
     values last. Equal values are ordered by name, so the order of the files changes nothing. Raises SubmissionError
     where rows of a group contradict each other: a name twice, other objects of the same data, a vouched part of a row
     with one that nobody vouches for."""
-    if sort in HELPED_BY_MISSING:
+    if sort in METRICS and METRICS[sort].helped_by_missing:
         raise SubmissionError(f"{sort}: a method could lead by answering few pixels; sort by {DEFAULT_SORT}")
-    if sort not in SORT_KEYS:
-        raise SubmissionError(f"expected a sort key out of {', '.join(SORT_KEYS)}, got {printable(sort)!r}")
+    if sort not in sort_keys():
+        raise SubmissionError(f"expected a sort key out of {', '.join(sort_keys())}, got {printable(sort)!r}")
     members: dict[GroupKey, list[Entry]] = {}
     for entry in entries:
         members.setdefault(GroupKey.of(entry.row), []).append(entry)
@@ -82,7 +81,7 @@ def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
     names = short_names([first.row.submission for first, _ in methods], claims)
     shown = [Ranked(first, name, unseen) for (first, unseen), name in zip(methods, names, strict=True)]
     # Smaller is better: a tolerance share with its sign turned.
-    turned = operator.neg if sort in HIGHER_IS_BETTER else operator.pos
+    turned = operator.neg if sort in METRICS and METRICS[sort].better == "higher" else operator.pos
 
     def by_rank(row: Ranked) -> tuple[object, ...]:
         value = row.value(sort)

@@ -16,7 +16,8 @@ from pydantic import Field, model_validator
 
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation import protocol
-from fpp_ml_bench.evaluation.protocol import HEADLINE, FramesClass, Mode, Target, Track
+from fpp_ml_bench.evaluation.metrics import HEADLINE
+from fpp_ml_bench.evaluation.protocol import FramesClass, Mode, Target, Track
 from fpp_ml_bench.evaluation.result import (
     DatasetInfo,
     HardwareInfo,

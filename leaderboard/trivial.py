@@ -5,9 +5,8 @@ from dataclasses import replace
 from statistics import fmean
 
 from fpp_ml_bench.baselines.registry import methods
+from fpp_ml_bench.evaluation.metrics import RANK_KEY
 from fpp_ml_bench.leaderboard.groups import Group, GroupKey, Ranked
-
-_KEY = "object_mae_mm"
 
 
 def is_trivial(row: Ranked) -> bool:
@@ -29,7 +28,7 @@ def with_ratios(groups: Sequence[Group]) -> list[Group]:
     trivial: dict[tuple[object, ...], list[tuple[set[str], dict[str, float]]]] = {}
     for group in groups:
         for row in filter(is_trivial, group.rows):
-            trivial.setdefault(_data(group.key), []).append((_given(group.key), row.object_means(_KEY)))
+            trivial.setdefault(_data(group.key), []).append((_given(group.key), row.object_means(RANK_KEY)))
     with_ratio = []
     for group in groups:
         means = [own for given, own in trivial.get(_data(group.key), []) if given <= _given(group.key)]
@@ -47,6 +46,6 @@ def _data(key: GroupKey) -> tuple[object, ...]:
 
 
 def _ratio(row: Ranked, trivial: Sequence[Mapping[str, float]]) -> float | None:
-    errors = row.object_means(_KEY)
+    errors = row.object_means(RANK_KEY)
     means = [fmean(means[name] for name in errors) for means in trivial if errors and means.keys() >= errors.keys()]
     return fmean(errors.values()) / min(means) if means and min(means) > 0 else None

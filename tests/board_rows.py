@@ -7,7 +7,8 @@ from typing import Any
 
 from scored_dataset import write_predictions
 
-from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, HEADLINE
+from fpp_ml_bench.evaluation.metrics import HEADLINE
+from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
 from fpp_ml_bench.evaluation.result import (
     RELIANCE_VERSION,
     Intervals,

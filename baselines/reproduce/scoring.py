@@ -23,7 +23,8 @@ from fpp_ml_bench.baselines.timing import time_method, write_timing
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.depth import RangeRule
 from fpp_ml_bench.errors import PredictionError, SubmissionError
-from fpp_ml_bench.evaluation.protocol import HEADLINE, PROTOCOL_VERSION, Mode, Units
+from fpp_ml_bench.evaluation.metrics import HEADLINE
+from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION, Mode, Units
 from fpp_ml_bench.evaluation.result import Headline, Intervals, Result, Sha256, read_json, write_result
 from fpp_ml_bench.evaluation.score import evaluate, intervals_over_objects, score_sample, scored_pair
 from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE

@@ -255,7 +255,7 @@ def distribution(scale_mm: float) -> Outcome:
     errors = scale_mm * np.random.default_rng(6).integers(-500, 1000, (100, 100)).astype(np.float64)
     target = np.full((100, 100), 4096.0 * scale_mm)
     prediction = target + errors
-    measured = score.score_sample(prediction, target).distribution
+    measured = score.score_sample(prediction, target).metrics()
     exact = np.sort((prediction - target).ravel())
     size, last = np.sort(np.abs(exact)), exact.size - 1
     parts = (exact, 0.5), (size, 0.5), (size, 0.95)

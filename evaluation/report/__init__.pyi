@@ -7,10 +7,10 @@ from .html import millimetres as millimetres
 from .html import page as page
 from .html import percent as percent
 from .html import render as render
+from .html import score_text as score_text
 from .html import seconds as seconds
 from .html import signed as signed
 from .report_page import score_table as score_table
-from .report_page import score_text as score_text
 from .report_page import write_report as write_report
 from .terminal import comparison_table as comparison_table
 from .terminal import result_table as result_table

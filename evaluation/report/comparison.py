@@ -9,14 +9,12 @@ from typing import Annotated
 from pydantic import Field
 
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import HEADLINE
+from fpp_ml_bench.evaluation.metrics import HEADLINE, RANK_KEY
 from fpp_ml_bench.evaluation.report.html import interval_text, millimetres
 from fpp_ml_bench.evaluation.result import Interval, Result, ends
 from fpp_ml_bench.evaluation.score import FEWEST_OBJECTS, SIGNIFICANT, caution, object_interval, sign_flip_p
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.schema import Count, Share, StrictModel, Text
-
-MAIN_KEY = "object_mae_mm"
 
 
 class PairedSample(StrictModel):
@@ -87,7 +85,7 @@ def compare(first: Result, second: Result) -> Comparison:
         split=first.dataset.split,
         **{key: getattr(first, key) for key in ("target", "track", "mode")},
         differences=summaries,
-        sentence=sentence(*names, summaries[MAIN_KEY]),
+        sentence=sentence(*names, summaries[RANK_KEY]),
         per_sample=paired,
     )
 

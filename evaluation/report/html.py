@@ -5,10 +5,12 @@ given hashes: the page sends no request, and an injected script can't run."""
 import hashlib
 import html
 from base64 import b64encode
+from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
+from fpp_ml_bench.evaluation.metrics import METRICS, UNCERTAINTY
 from fpp_ml_bench.files import NAME_LIMIT, printable
 
 
@@ -36,6 +38,20 @@ def signed(value: float | None, plus: str = "+") -> str:
     if value is None:
         return "-"
     return ("-" if value < 0 else plus if value > 0 else "") + millimetres(abs(value))
+
+
+_WRITERS: dict[str, Callable[[float | None], str]] = {
+    "mm": millimetres,
+    "signed mm": signed,
+    "share": percent,
+    "ratio": percent,
+    "nats": partial(signed, plus=""),
+}
+
+
+def score_text(key: str, value: float | None) -> str:
+    """A value of the metric ``key`` as its unit is written: mm, or per cent for a share."""
+    return _WRITERS[(METRICS.get(key) or UNCERTAINTY[key]).unit](value)
 
 
 def interval_text(ends: tuple[float, float] | None, between: str = " to ") -> str:

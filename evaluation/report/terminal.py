@@ -3,14 +3,17 @@ text from a submission is shown as plain text, never as markup."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import partial
+from string import Formatter
 
 from rich.console import Group
 from rich.text import Text
 
 from fpp_ml_bench.evaluation import report
-from fpp_ml_bench.evaluation.protocol import COVERED, PIXEL_SETS, WIDE_BAND_PX, WITHIN_MM
-from fpp_ml_bench.evaluation.report.html import interval_text, millimetres, percent, seconds, signed
+from fpp_ml_bench.evaluation.metrics import METRICS, NOTES, UNCERTAINTY, Metric, listed
+from fpp_ml_bench.evaluation.protocol import PIXEL_SETS
+from fpp_ml_bench.evaluation.report.html import interval_text, millimetres, score_text, seconds, signed
 from fpp_ml_bench.evaluation.result import Result
 from fpp_ml_bench.evaluation.score import SIGNIFICANT, caution
 from fpp_ml_bench.files import printable
@@ -61,30 +64,12 @@ def _scores(result: Result) -> Table:
 
 def _notes(result: Result) -> Text:
     scores, submission = result.metrics, result.submission
-    shares = ((limit, getattr(scores, f"object_within_{limit}mm_share")) for limit in WITHIN_MM)
-    within = ", ".join(f"{limit} mm {percent(share)}" for limit, share in shares)
-    lines = [
-        f"Object: |error| median {millimetres(scores.object_median_mm)}, 95th percentile "
-        f"{millimetres(scores.object_p95_mm)}, maximum {millimetres(scores.object_max_mm)} mm; pixels within {within}. "
-        f"MAE {percent(scores.object_mae_range_share)} of each sample's depth range.",
-        f"Bias {signed(scores.object_bias_mm)} mm ({signed(scores.object_valid_bias_mm)} mm where measured); MAE "
-        f"{millimetres(scores.object_shift_free_mae_mm)} mm once each sample's best single offset is removed.",
-        f"MAE {millimetres(scores.object_wide_band_mae_mm)} mm within {WIDE_BAND_PX} px of depth edges, "
-        f"{millimetres(scores.object_wide_interior_mae_mm)} mm inside.",
-        f"Object pixels near a depth edge: {percent(scores.object_edge_share)}.",
-        f"Object pixels not measured: {percent(scores.object_missing_share)} "
-        f"({percent(scores.object_interior_missing_share)} of those away from edges), scored with their whole depth. "
-        f"MAE where measured: {millimetres(scores.object_valid_mae_mm)} mm, away from edges "
-        f"{millimetres(scores.object_interior_valid_mae_mm)} mm.",
-    ]
-    if scores.void_share is not None:
-        lines.append(f"Void pixels, in no set: {percent(scores.void_share)} of the image (unlit, or of mixed depths).")
-    if scores.unlit_mae_mm is not None:
-        lines.append(
-            f"Unlit pixels: MAE {millimetres(scores.unlit_mae_mm)}, RMSE {millimetres(scores.unlit_rmse_mm)} mm; "
-            f"{percent(scores.unlit_missing_share)} not measured, MAE of the others "
-            f"{millimetres(scores.unlit_valid_mae_mm)} mm."
-        )
+    texts = {key: score_text(key, getattr(scores, key)) for key in METRICS}
+    lines = []
+    for note in NOTES:
+        first = next(name for _, name, _, _ in Formatter().parse(note) if name)
+        if not (METRICS[first].optional and getattr(scores, first) is None):
+            lines.append(note.format_map(texts))
     if result.samples_without_object:
         lines.append(f"{result.samples_without_object} samples without an object: left out of the object scores.")
     if result.samples_without_background:
@@ -106,35 +91,35 @@ def _notes(result: Result) -> Text:
 def _uncertainty(result: Result) -> Table | None:
     if (block := result.uncertainty) is None:
         return None
-    titles = ["Not\nstated", *(f"In {level}%\ninterval" for level in COVERED), "Sigma\nmean", "Sigma\nmedian", "NLL"]
+    shown = [metric for metric in listed(UNCERTAINTY.values()) if metric.terminal]
     table = _table(
         "Stated uncertainty",
-        numbers=[*titles, "AUSE\nMAE", "MAE of the\nsurest 95%"],
+        numbers=[metric.terminal for metric in shown],
         first_out=["Sigma\nmedian", "NLL", "In 99%\ninterval", "MAE of the\nsurest 95%"],
         caption="mm; of the pixels that state a sigma, those within its Gaussian intervals, means over samples; AUSE: "
         "area between the sparsification curves by sigma and by error, over all object pixels",
     )
     for name, scores in {"all": block.metrics, **block.per_object}.items():
-        cells = [percent(scores.unstated_share), *(percent(getattr(scores, f"coverage_{lv}")) for lv in COVERED)]
-        cells += map(millimetres, (scores.sigma_mean_mm, scores.sigma_median_mm))
-        cells += [signed(scores.nll, plus=""), millimetres(scores.ause_mae_mm), millimetres(scores.sure_mae_mm)]
-        style = "bold" if name == "all" else None
-        table.add_row(Text(printable(name)), *cells, style=style)
+        table.add_row(Text(printable(name)), *_cells(scores, shown), style="bold" if name == "all" else None)
     return table
+
+
+def _cells(scores: object, shown: Iterable[Metric]) -> list[str]:
+    return [score_text(metric.key, getattr(scores, metric.key)) for metric in shown]
 
 
 def _worst(result: Result) -> Table | None:
     rows = [row for row in result.per_sample if row.object_mae_mm is not None]
     if not rows:
         return None
-    titles = ["Object\nMAE", "Object\nRMSE", "Background\nMAE", "Near\nedges", "Not\nmeasured"]
+    shown = [metric for metric in METRICS.values() if metric.terminal]
     table = _table(
-        "Sample", numbers=titles, title=f"Largest object MAE, {min(WORST, len(rows))} of {len(rows)} samples"
+        "Sample",
+        numbers=[metric.terminal for metric in shown],
+        title=f"Largest object MAE, {min(WORST, len(rows))} of {len(rows)} samples",
     )
     for row in sorted(rows, key=lambda row: (-(row.object_mae_mm or 0.0), row.sample))[:WORST]:
-        errors = (row.object_mae_mm, row.object_rmse_mm, row.background_mae_mm)
-        shares = (row.object_edge_share, row.object_missing_share)
-        table.add_row(Text(printable(row.sample)), *map(millimetres, errors), *map(percent, shares))
+        table.add_row(Text(printable(row.sample)), *_cells(row, shown))
     return table
 
 

@@ -16,6 +16,7 @@ from .model import check_reliance as check_reliance
 from .model import over_samples as over_samples
 from .model import result_from_rows as result_from_rows
 from .model import same as same
+from .model import uncertainty_of as uncertainty_of
 from .parts import PART_TITLES as PART_TITLES
 from .parts import RELIANCE_VERSION as RELIANCE_VERSION
 from .parts import DatasetInfo as DatasetInfo
@@ -32,8 +33,6 @@ from .parts import SampleResult as SampleResult
 from .parts import SeverityScores as SeverityScores
 from .parts import Sha256 as Sha256
 from .parts import Timing as Timing
+from .parts import Uncertainty as Uncertainty
 from .parts import Whole as Whole
 from .parts import ends as ends
-from .uncertainty import SigmaScores as SigmaScores
-from .uncertainty import Uncertainty as Uncertainty
-from .uncertainty import uncertainty_of as uncertainty_of

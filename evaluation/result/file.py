@@ -160,6 +160,11 @@ def checkout_commit(folder: Path) -> str | None:
 @cache
 def _scoring_code() -> str:
     """SHA-256 over the source files that compute scores, 64 hex digits."""
-    files = (_EVALUATION / "protocol.py", *sorted((_EVALUATION / "score").glob("*.py")), Path(depth.__file__))
+    files = (
+        _EVALUATION / "metrics.py",
+        _EVALUATION / "protocol.py",
+        *sorted((_EVALUATION / "score").glob("*.py")),
+        Path(depth.__file__),
+    )
     content = (path.name.encode() + b"\0" + path.read_bytes() + b"\0" for path in files)
     return hashlib.sha256(b"".join(content)).hexdigest()

@@ -4,17 +4,38 @@ file is read, and overall is checked against object and background in every samp
 
 import math
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime
+from functools import partial
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
 from fpp_ml_bench.evaluation import protocol
-from fpp_ml_bench.evaluation.protocol import METRICS, FramesClass, Mode, SchemaVersion, Target, Track, scored_columns
+from fpp_ml_bench.evaluation.metrics import BOUNDS, HEADLINE, METRICS, UNCERTAINTY, Metric
+from fpp_ml_bench.evaluation.protocol import (
+    COVERED,
+    LEFT_OUT,
+    NOMINAL,
+    SURE_LEFT_OUT,
+    FramesClass,
+    Mode,
+    SchemaVersion,
+    Target,
+    Track,
+    scored_columns,
+)
 from fpp_ml_bench.evaluation.result import parts
-from fpp_ml_bench.evaluation.result.parts import Metrics, Reliance, Robustness, SampleResult
-from fpp_ml_bench.evaluation.result.uncertainty import Uncertainty, uncertainty_of
+from fpp_ml_bench.evaluation.result.parts import (
+    Metrics,
+    Reliability,
+    Reliance,
+    Robustness,
+    SampleResult,
+    SigmaScores,
+    Sparsification,
+    Uncertainty,
+)
 from fpp_ml_bench.evaluation.score import ErrorStats, SigmaSample, combine, intervals_over_objects
 from fpp_ml_bench.evaluation.submission import Submission
 from fpp_ml_bench.loaders.storage import Counts, known_problem
@@ -83,7 +104,7 @@ class Result(SparseModel):
         if self.reliance is not None:
             check_reliance(self.reliance, self.submission)
         if self.uncertainty is not None:
-            self.uncertainty.check({row.sample: row for row in self.per_sample}, self.metrics)
+            _check_uncertainty(self.uncertainty, {row.sample: row for row in self.per_sample}, self.metrics)
         for name, block in (self.robustness or {}).items():
             _check_weights("robustness", block.weights_sha256, self.submission)
             if name != block.set:
@@ -100,8 +121,7 @@ class Result(SparseModel):
         check_data(self.dataset, self.target, self.mode, self.submission.units, found)
         void = self.mode == "standard"
         for row in self.per_sample:
-            _check_sample(row, height * width)
-            _check_void(row, height * width, void, void and self.target == "depth_exact")
+            _check_sample(row, height * width, {"void": void, "unlit": void and self.target == "depth_exact"})
         stored = self.model_dump(include=set(derived := _derived(self.per_sample)))
         for key, computed in derived.items():
             _check_same(key, stored[key], computed)
@@ -143,7 +163,7 @@ def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
     objects = [row.object for row in per_sample]
     inside = combine(*(row.stats("object") for row in per_sample))
     outside = combine(*(row.stats("background") for row in per_sample))
-    intervals = intervals_over_objects(rows, objects, protocol.HEADLINE)
+    intervals = intervals_over_objects(rows, objects, HEADLINE)
     return {
         "metrics": over_samples(rows),
         "intervals": {key: [None, None] if ends is None else list(ends) for key, ends in intervals.items()},
@@ -170,11 +190,16 @@ def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
     }
 
 
-def over_samples(rows: Sequence[Scores], statistic: Callable[[list[float]], float | None] = statistics.fmean) -> Scores:
+def over_samples(
+    rows: Iterable[Scores],
+    statistic: Callable[[list[float]], float | None] = statistics.fmean,
+    metrics: Mapping[str, Metric] = METRICS,
+) -> Scores:
     """A statistic (plain mean, paper Section 5.3.2) of each metric over the samples that have it. Where none has it, it
-    is None, or left out if it is one of `SINCE_2`."""
-    columns = {key: [value for row in rows if (value := row.get(key)) is not None] for key in METRICS}
-    columns = {key: values for key, values in columns.items() if values or key not in protocol.SINCE_2}
+    is None, or left out if a file may leave it out."""
+    rows = list(rows)
+    columns = {key: [value for row in rows if (value := row.get(key)) is not None] for key in metrics}
+    columns = {key: values for key, values in columns.items() if values or not metrics[key].optional}
     return {key: statistic(values) if values else None for key, values in columns.items()}
 
 
@@ -197,49 +222,34 @@ def pooled(inside: ErrorStats, outside: ErrorStats) -> Scores:
     return {f"{name}_{key}": getattr(stats, key) for name, stats in sets.items() for key in ("mae_mm", "rmse_mm")}
 
 
-def _check_sample(row: SampleResult, pixels: int) -> None:
-    """Refuse (ValueError) a sample whose sets do not make up its ``pixels`` or whose scores contradict each other."""
-    if row.object_pixels + row.background_pixels + (row.void_pixels or 0) != pixels:
+def _check_sample(row: SampleResult, pixels: int, known: Mapping[str, bool]) -> None:
+    """Refuse (ValueError) a sample whose sets do not make up its ``pixels`` or whose scores contradict each other or
+    its sets; ``known``: whether the rules know void and unlit pixels."""
+    counts = {name: getattr(row, f"{name}_pixels") for name in ("object", "background", *known)}
+    sets = {name: count or 0 for name, count in counts.items()}
+    if sets["object"] + sets["background"] + sets["void"] != pixels:
         raise ValueError(f"{row.sample}: object, background and void pixels do not add up to the image's {pixels}")
-    sets = {name: row.stats(name) for name in ("object", "background")}
-    for name, stats in sets.items():
-        mae, rmse = stats.mae_mm, stats.rmse_mm
-        if not (stats.pixels == 0) == (mae is None) == (rmse is None):
-            raise ValueError(f"{row.sample}: {name} scores must be null exactly when the set is empty")
-        if mae is not None and rmse is not None and rmse < mae * (1 - AGREES):
+    for name, by_rules in known.items():
+        if (counts[name] is not None) != by_rules:
+            raise ValueError(f"{row.sample}: {name}_pixels {'is missing' if by_rules else 'is extra by these rules'}")
+    if not same(row.void_share, None if counts["void"] is None else sets["void"] / pixels):
+        raise ValueError(f"{row.sample}: void_share does not follow from void_pixels")
+    if sets["unlit"] > sets["void"]:
+        raise ValueError(f"{row.sample}: unlit_pixels is above void_pixels")
+    for key, metric in METRICS.items():
+        if metric.over and (getattr(row, key) is None) != (sets[metric.over] == 0):
+            together = "must be null exactly when the set is empty, and then null all together"
+            raise ValueError(f"{row.sample}: {metric.over} scores {together}")
+    for name in ("object", "background", "unlit"):
+        mae, rmse = (getattr(row, f"{name}_{error}_mm") for error in ("mae", "rmse"))
+        if mae is not None and rmse < mae * (1 - AGREES):
             raise ValueError(f"{row.sample}: {name} RMSE is below its MAE, which no error has")
-    overall = combine(*sets.values())
+    overall = combine(row.stats("object"), row.stats("background"))
     if not (same(row.overall_mae_mm, overall.mae_mm) and same(row.overall_rmse_mm, overall.rmse_mm)):
         raise ValueError(f"{row.sample}: overall scores do not follow from object and background")
-    names = ("mae", "median", "p95", "max", "bias", "shift_free_mae", "rmse")
-    values = [getattr(row, f"object_{name}_mm") for name in names]
-    if any(value is None for value in values):
-        if any(value is not None for value in values):
-            raise ValueError(f"{row.sample}: the object's scores must be null all together, when the set is empty")
-        return
-    mae, median, p95, largest, bias, shift_free, rmse = values
-    loose = 1 + AGREES
-    if not (median <= p95 * loose and p95 <= largest * loose and rmse <= largest * loose):
-        raise ValueError(f"{row.sample}: object median, 95th percentile, RMSE and maximum are out of order")
-    if abs(bias) > mae * loose or shift_free > mae * loose:
-        raise ValueError(f"{row.sample}: object bias or shift-free MAE is above the MAE, which no error has")
-
-
-def _check_void(row: SampleResult, pixels: int, void: bool, unlit: bool) -> None:
-    """Refuse (ValueError) a sample whose void or unlit pixels are missing, extra, or contradict their scores; ``void``,
-    ``unlit``: whether the rules know them."""
-    for name, known in (("void", void), ("unlit", unlit)):
-        if (getattr(row, f"{name}_pixels") is not None) != known:
-            raise ValueError(f"{row.sample}: {name}_pixels {'is missing' if known else 'is extra by these rules'}")
-    if not same(row.void_share, None if row.void_pixels is None else row.void_pixels / pixels):
-        raise ValueError(f"{row.sample}: void_share does not follow from void_pixels")
-    if (row.unlit_pixels or 0) > (row.void_pixels or 0):
-        raise ValueError(f"{row.sample}: unlit_pixels is above void_pixels")
-    mae, rmse, share = row.unlit_mae_mm, row.unlit_rmse_mm, row.unlit_missing_share
-    if not (mae is None) == (rmse is None) == (share is None) == (not row.unlit_pixels):
-        raise ValueError(f"{row.sample}: unlit scores must be null exactly when there is no unlit pixel")
-    if mae is not None and rmse is not None and rmse < mae * (1 - AGREES):
-        raise ValueError(f"{row.sample}: unlit RMSE is below its MAE, which no error has")
+    for key, bound, problem in BOUNDS:
+        if (value := getattr(row, key)) is not None and abs(value) > getattr(row, bound) * (1 + AGREES):
+            raise ValueError(f"{row.sample}: {problem}")
 
 
 def check_data(data: parts.DatasetInfo, target: str, mode: str, units: str, found: Mapping[str, Counts]) -> None:
@@ -276,26 +286,97 @@ def _check_weights(part: str, measured: str | None, submission: Submission) -> N
         raise ValueError(f"{part} was measured on {pair}; measure it again")
 
 
-def _check_same(name: str, stored: Any, computed: Any) -> None:
+def _check_same(name: str, stored: Any, computed: Any, rounding: float = 0.0) -> None:
     """Refuse (ValueError) a stored value, mapping or list that is not what the per-sample scores give."""
     if isinstance(computed, Mapping):
         if set(stored) != set(computed):
             raise ValueError(f"{name} does not hold the keys {', '.join(map(str, computed))}")
         for key in computed:
-            _check_same(f"{name}.{key}", stored[key], computed[key])
+            # A mean of signed values may cancel to rounding errors, which depend on the machine.
+            cancels = key in METRICS and METRICS[key].unit == "signed mm"
+            _check_same(f"{name}.{key}", stored[key], computed[key], 1e-9 if cancels else rounding)
     elif isinstance(computed, list):
         if len(stored) != len(computed):
             raise ValueError(f"{name} holds {len(stored)} entries, per_sample makes {len(computed)}")
         for index, (stored_item, computed_item) in enumerate(zip(stored, computed, strict=True)):
-            _check_same(f"{name}.{index}", stored_item, computed_item)
-    elif isinstance(computed, float) or computed is None:
-        # A mean of signed values may cancel to rounding errors, which depend on the machine.
-        if not same(stored, computed, rounding=1e-9 if name.endswith("bias_mm") else 0.0):
-            raise ValueError(f"{name} does not follow from per_sample: {stored}, not {computed}")
-    elif stored != computed and name.startswith("samples_without_"):
+            _check_same(f"{name}.{index}", stored_item, computed_item, rounding)
+    elif same(stored, computed, rounding) if isinstance(computed, float) or computed is None else stored == computed:
+        return
+    elif name.startswith("samples_without_"):
         raise ValueError(f"{name} is not the number of such samples, {computed}")
-    elif stored != computed:
+    else:
         raise ValueError(f"{name} does not follow from per_sample: {stored}, not {computed}")
+
+
+def uncertainty_of(samples: Mapping[str, SigmaSample], owners: Mapping[str, str]) -> Uncertainty:
+    """The block of the scored ``samples`` by name; ``owners``: the object of each."""
+    per_sample = {name: sample.scores for name, sample in samples.items()}
+    observed = [sample.observed for sample in samples.values() if sample.observed is not None]
+    curves = [sample.curves for sample in samples.values() if sample.curves is not None]
+    names = curves[0] if curves else ()
+    means = {"left_out": list(LEFT_OUT), **{name: _mean_curve([of[name] for of in curves]) for name in names}}
+    return Uncertainty(
+        **_uncertainty_means(per_sample, owners),
+        per_sample={name: SigmaScores(**scores) for name, scores in per_sample.items()},
+        reliability=Reliability(nominal=list(NOMINAL), observed=_mean_curve(observed)) if observed else None,
+        sparsification=Sparsification(**means) if curves else None,
+    )
+
+
+def _mean_curve(curves: list[list[float]]) -> list[float]:
+    return [statistics.fmean(values) for values in zip(*curves, strict=True)]
+
+
+def _uncertainty_means(per_sample: Mapping[str, Scores], owners: Mapping[str, str]) -> dict[str, Any]:
+    """The keys of `Uncertainty` that are means over samples, and over the views of each object."""
+    views: dict[str, list[Scores]] = {}
+    for sample, scores in per_sample.items():
+        views.setdefault(owners[sample], []).append(scores)
+    mean = partial(over_samples, metrics=UNCERTAINTY)
+    return {"metrics": mean(per_sample.values()), "per_object": {name: mean(rows) for name, rows in views.items()}}
+
+
+def _check_uncertainty(block: Uncertainty, rows: Mapping[str, SampleResult], metrics: Metrics) -> None:
+    """Refuse (ValueError) a block of other samples than ``rows``, or that contradicts itself or ``metrics``."""
+    if set(block.per_sample) != set(rows):
+        raise ValueError("uncertainty.per_sample: other samples than per_sample has")
+    for sample, scores in block.per_sample.items():
+        if (scores.unstated_share is None) != (rows[sample].object_pixels == 0):
+            raise ValueError(f"uncertainty.per_sample.{sample} must have scores exactly where there is an object")
+        covered = [getattr(scores, f"coverage_{percent}") for percent in COVERED]
+        if None not in covered and covered != sorted(covered):
+            raise ValueError(f"uncertainty.per_sample.{sample}: a wider interval holds less than a narrower one")
+    stored = block.model_dump(include={"metrics", "per_object", "per_sample"})
+    derived = _uncertainty_means(stored["per_sample"], {sample: row.object for sample, row in rows.items()})
+    if set(block.per_object) != set(derived["per_object"]):
+        raise ValueError("uncertainty.per_object: other objects than per_sample has")
+    agree = partial(_check_same, rounding=1e-12)  # a likelihood may be near 0
+    for name, means in derived.items():
+        agree(f"uncertainty.{name}", stored[name], means)
+    if (block.reliability is None) != (block.metrics.coverage_68 is None):
+        raise ValueError("uncertainty.reliability must be there exactly where some pixel states an uncertainty")
+    if (block.sparsification is None) != (block.metrics.ause_mae_mm is None):
+        raise ValueError("uncertainty.sparsification must be there exactly where there is an object")
+    if (reliability := block.reliability) is not None:
+        if reliability.nominal != list(NOMINAL):
+            raise ValueError(f"uncertainty.reliability.nominal: expected {', '.join(map(str, NOMINAL))}")
+        for percent in COVERED:
+            observed = reliability.observed[NOMINAL.index(percent / 100)]
+            stated = getattr(block.metrics, f"coverage_{percent}")
+            agree(f"uncertainty.reliability at {percent}%", observed, stated)
+    if (curves := block.sparsification) is None:
+        return
+    if curves.left_out != list(LEFT_OUT):
+        raise ValueError("uncertainty.sparsification.left_out: expected 0 to 0.95 in steps of 0.05")
+    for error in ("mae_mm", "rmse_mm"):
+        by_sigma, best = getattr(curves, error), getattr(curves, f"best_{error}")
+        whole = getattr(metrics, f"object_{error}")
+        sure, area = (getattr(block.metrics, f"{name}_{error}") for name in ("sure", "ause"))
+        agree(f"uncertainty.sparsification.{error}.0", by_sigma[0], whole)
+        agree(f"uncertainty.sparsification.best_{error}.0", best[0], whole)
+        agree(f"uncertainty.sparsification.{error}", by_sigma[LEFT_OUT.index(SURE_LEFT_OUT)], sure)
+        gap = math.fsum(first - second for first, second in zip(by_sigma, best, strict=True)) / len(LEFT_OUT)
+        agree(f"uncertainty.metrics.ause_{error}", area, max(gap, 0.0), rounding=max(AGREES * (whole or 0.0), 1e-12))
 
 
 def same(first: float | None, second: float | None, rounding: float = 0.0) -> bool:

@@ -1,15 +1,16 @@
 """The parts of ``result.json`` as strict models: scores, data, what was scored with what, run time, phase reliance,
-robustness."""
+robustness, a stated uncertainty."""
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from hashlib import sha256
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from fpp_ml_bench.evaluation.protocol import SINCE_2
+from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS, UNCERTAINTY, Metric
+from fpp_ml_bench.evaluation.protocol import LEFT_OUT, NOMINAL
 from fpp_ml_bench.evaluation.score import ErrorStats
 from fpp_ml_bench.loaders.storage import benchmark as benchmarks
 from fpp_ml_bench.schema import Count, NonNegative, Positive, Share, SparseModel, StrictModel, Text
@@ -17,6 +18,8 @@ from fpp_ml_bench.schema import Count, NonNegative, Positive, Share, SparseModel
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Whole = Annotated[int, Field(gt=0)]
 Interval = Annotated[list[float | None], Field(min_length=2, max_length=2)]
+OPTIONAL = tuple(key for key, metric in METRICS.items() if metric.optional)
+"""Scores whose keys are not written where no sample has them."""
 
 
 def ends(interval: Sequence[float | None]) -> tuple[float, float] | None:
@@ -25,58 +28,49 @@ def ends(interval: Sequence[float | None]) -> tuple[float, float] | None:
     return None if low is None or high is None else (low, high)
 
 
-class Headline(StrictModel):
+_TYPES: dict[str, Any] = {
+    "mm": NonNegative | None,
+    "signed mm": float | None,
+    "share": Share | None,
+    "ratio": NonNegative | None,
+    "nats": float | None,
+}
+"""What a score of each unit may be."""
+
+
+def _fields(metrics: Iterable[Metric]) -> dict[str, Any]:
+    """A field for each metric, as the annotations of a model."""
+    types = {metric.key: (metric.optional, _TYPES[metric.unit]) for metric in metrics}
+    return {key: Annotated[kind, Field(default=None)] if optional else kind for key, (optional, kind) in types.items()}
+
+
+class Scores(StrictModel):
+    """A model with a field for each metric of a kind."""
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, key: str) -> Any: ...
+
+
+class Headline(Scores):
     """The paper's six errors in mm; null for a pixel set that is empty."""
 
-    overall_mae_mm: NonNegative | None
-    overall_rmse_mm: NonNegative | None
-    object_mae_mm: NonNegative | None
-    object_rmse_mm: NonNegative | None
-    background_mae_mm: NonNegative | None
-    background_rmse_mm: NonNegative | None
+    __annotations__ = _fields(METRICS[key] for key in HEADLINE)
 
 
 class Metrics(Headline, SparseModel):
-    """All scores: errors in mm, shares of pixels. PROTOCOL.md defines each. Those of `SINCE_2` are not written where
-    there are none: no unlit pixels are scored, or the rules know no void."""
+    """All scores: errors in mm, shares of pixels. PROTOCOL.md defines each. Those that may be null by default are not
+    written where there are none: no unlit pixels are scored, or the rules know no void."""
 
-    SPARSE: ClassVar[tuple[str, ...]] = SINCE_2
-
-    object_interior_mae_mm: NonNegative | None
-    object_interior_rmse_mm: NonNegative | None
-    object_edge_mae_mm: NonNegative | None
-    object_edge_rmse_mm: NonNegative | None
-    object_valid_mae_mm: NonNegative | None
-    object_interior_valid_mae_mm: NonNegative | None
-    object_edge_share: Share | None
-    object_missing_share: Share | None
-    object_interior_missing_share: Share | None
-    object_median_mm: NonNegative | None
-    object_p95_mm: NonNegative | None
-    object_max_mm: NonNegative | None
-    object_within_1mm_share: Share | None
-    object_within_2mm_share: Share | None
-    object_within_5mm_share: Share | None
-    object_within_10mm_share: Share | None
-    object_bias_mm: float | None
-    object_valid_bias_mm: float | None
-    object_shift_free_mae_mm: NonNegative | None
-    object_wide_band_mae_mm: NonNegative | None
-    object_wide_interior_mae_mm: NonNegative | None
-    object_wide_band_share: Share | None
-    void_share: Share | None = None
-    unlit_mae_mm: NonNegative | None = None
-    unlit_rmse_mm: NonNegative | None = None
-    unlit_valid_mae_mm: NonNegative | None = None
-    unlit_missing_share: Share | None = None
-    object_mae_range_share: NonNegative | None = None
+    SPARSE = OPTIONAL
+    __annotations__ = _fields(METRICS[key] for key in METRICS if key not in HEADLINE)
 
 
 class SampleResult(Metrics):
     """Scores of one sample, how many pixels each set has, and the hash of the prediction file they come from.
     ``void_pixels`` is absent by rules without void, ``unlit_pixels`` where the unlit ones are not scored."""
 
-    SPARSE = (*SINCE_2, "void_pixels", "unlit_pixels")
+    SPARSE = (*OPTIONAL, "void_pixels", "unlit_pixels")
 
     sample: Text
     object: Text
@@ -101,15 +95,10 @@ class ObjectResult(StrictModel):
     spread: dict[Text, NonNegative | None]
 
 
-class Intervals(StrictModel):
+class Intervals(Scores):
     """Ends of the 95% interval of each headline mean in mm, from a bootstrap over objects; nulls below two objects."""
 
-    overall_mae_mm: Interval
-    overall_rmse_mm: Interval
-    object_mae_mm: Interval
-    object_rmse_mm: Interval
-    background_mae_mm: Interval
-    background_rmse_mm: Interval
+    __annotations__ = dict.fromkeys(HEADLINE, Interval)
 
     def of(self, key: str) -> tuple[float, float] | None:
         """The interval of ``key``; None where there is none (not a headline key, or too few objects)."""
@@ -294,12 +283,7 @@ class Reliance(StrictModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> "Reliance":
-        if self.interval.count(None) == 1:
-            raise ValueError("interval: expected two numbers or two nulls")
-        if (interval := ends(self.interval)) and not 0 <= interval[0] <= interval[1] <= 1:
-            raise ValueError("interval: expected 0 <= low <= high <= 1")
-        if self.objects > self.samples:
-            raise ValueError("objects is above samples")
+        _check_measured(self, 1.0, "0 <= low <= high <= 1")
         return self
 
 
@@ -346,10 +330,53 @@ class Robustness(StrictModel):
     def _consistent(self) -> "Robustness":
         if not math.isclose(self.mae_mm, self.mean("mae_mm") or 0.0, rel_tol=1e-9, abs_tol=1e-12):
             raise ValueError("mae_mm does not follow from axes")
-        if self.interval.count(None) == 1:
-            raise ValueError("interval: expected two numbers or two nulls")
-        if (interval := ends(self.interval)) and not 0 <= interval[0] <= interval[1]:
-            raise ValueError("interval: expected 0 <= low <= high")
-        if self.objects > self.samples:
-            raise ValueError("objects is above samples")
+        _check_measured(self, math.inf, "0 <= low <= high")
         return self
+
+
+def _check_measured(block: Reliance | Robustness, most: float, expected: str) -> None:
+    """Refuse (ValueError) an interval that is none, and more objects than samples."""
+    if block.interval.count(None) == 1:
+        raise ValueError("interval: expected two numbers or two nulls")
+    if (interval := ends(block.interval)) and not 0 <= interval[0] <= interval[1] <= most:
+        raise ValueError(f"interval: expected {expected}")
+    if block.objects > block.samples:
+        raise ValueError("objects is above samples")
+
+
+class SigmaScores(Scores):
+    """Scores of a stated uncertainty; null where no object pixel states one, or where there is no object. The rules are
+    in PROTOCOL.md."""
+
+    __annotations__ = _fields(UNCERTAINTY.values())
+
+
+class Reliability(StrictModel):
+    """``observed``: mean over samples of the share of pixels within the interval that should hold ``nominal``."""
+
+    nominal: list[Share]
+    observed: Annotated[list[Share], Field(min_length=len(NOMINAL), max_length=len(NOMINAL))]
+
+
+_Curve = Annotated[list[NonNegative], Field(min_length=len(LEFT_OUT), max_length=len(LEFT_OUT))]
+
+
+class Sparsification(StrictModel):
+    """Means over samples of the errors in mm of the object pixels that remain after the share ``left_out``: the least
+    sure by sigma, and for ``best_*`` the worst by their error."""
+
+    left_out: list[Share]
+    mae_mm: _Curve
+    best_mae_mm: _Curve
+    rmse_mm: _Curve
+    best_rmse_mm: _Curve
+
+
+class Uncertainty(StrictModel):
+    """``metrics`` is the mean over the samples that have a score, ``per_object`` over the views of each object."""
+
+    metrics: SigmaScores
+    per_object: dict[Text, SigmaScores] = Field(max_length=100_000)
+    per_sample: dict[Text, SigmaScores] = Field(max_length=100_000)
+    reliability: Reliability | None
+    sparsification: Sparsification | None

@@ -1,6 +1,5 @@
-from .arrays import evaluate_arrays as evaluate_arrays
-from .check import Checked as Checked
 from .check import check_folder as check_folder
+from .check import scored_pair as scored_pair
 from .conformal import Calibration as Calibration
 from .conformal import calibrate as calibrate
 from .conformal import counted as counted
@@ -8,19 +7,20 @@ from .conformal import largest_coverage as largest_coverage
 from .conformal import write_calibrated as write_calibrated
 from .evaluator import differences as differences
 from .evaluator import evaluate as evaluate
+from .evaluator import evaluate_arrays as evaluate_arrays
 from .evaluator import explain_eval as explain_eval
 from .sample_scores import BLOCK as BLOCK
 from .sample_scores import EMPTY as EMPTY
 from .sample_scores import ErrorStats as ErrorStats
 from .sample_scores import SampleScores as SampleScores
+from .sample_scores import SigmaSample as SigmaSample
 from .sample_scores import combine as combine
+from .sample_scores import gaussian_quantile as gaussian_quantile
 from .sample_scores import mean_of as mean_of
 from .sample_scores import score_sample as score_sample
+from .sample_scores import score_sigma as score_sigma
+from .sample_scores import states_sigma as states_sigma
 from .sample_scores import stats_of as stats_of
-from .sigma_scores import SigmaSample as SigmaSample
-from .sigma_scores import gaussian_quantile as gaussian_quantile
-from .sigma_scores import score_sigma as score_sigma
-from .sigma_scores import states_sigma as states_sigma
 from .torch_metric import DepthScores as DepthScores
 from .uncertainty import FEWEST_OBJECTS as FEWEST_OBJECTS
 from .uncertainty import SIGNIFICANT as SIGNIFICANT
@@ -31,4 +31,3 @@ from .uncertainty import intervals_over_objects as intervals_over_objects
 from .uncertainty import object_interval as object_interval
 from .uncertainty import sign_flip_bounds as sign_flip_bounds
 from .uncertainty import sign_flip_p as sign_flip_p
-from .units import scored_pair as scored_pair

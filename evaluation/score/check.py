@@ -1,4 +1,5 @@
-"""What can be checked of a submission without ground truth: its description, its files, their size and values."""
+"""Checks of what a submission declares: its units, from which depth becomes the mm that are scored, and all that can be
+checked without ground truth: its description, its files, their size and values."""
 
 from __future__ import annotations
 
@@ -8,13 +9,139 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fpp_ml_bench.constants import LARGEST_SIDE_PX
-from fpp_ml_bench.errors import PredictionError, SubmissionError
-from fpp_ml_bench.evaluation import submission
-from fpp_ml_bench.evaluation.score.units import unit_note, value_problems
+from fpp_ml_bench.constants import LARGEST_SIDE_PX, MM_PER_M
+from fpp_ml_bench.depth import depth_range_mm, extremes, object_mask
+from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
+from fpp_ml_bench.evaluation import protocol, submission
+from fpp_ml_bench.evaluation.protocol import Mode, Units
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.storage import DatasetFolder
+
+Depth = NDArray[np.floating[Any]]
+MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "normalised": 1000.0}
+"""Upper bound in mm of one declared unit; for normalised depth, that no working range is above 1 m."""
+
+
+def declared_units(target_max: float, units: str | None) -> Units:
+    """The units of arrays, which know no rig: ``mm``, unless ``units`` says ``m``. Raises PredictionError for other
+    units, and where they are not said and the largest depth of a target, ``target_max``, could as well be metres."""
+    if units not in (None, "mm", "m"):
+        raise PredictionError(f"units: expected mm or m, got {printable(str(units))}")
+    if units is None and 0 < target_max < protocol.METRES_BELOW:
+        raise PredictionError(
+            f"targets: the largest depth is {target_max:.4g}, which could be metres; say units='m', or units='mm' "
+            f"where depths below {protocol.METRES_BELOW:g} mm are meant"
+        )
+    return "m" if units == "m" else "mm"
+
+
+def in_mm(values: Any, units: Units) -> Any:
+    """Depths in mm or m (an array) in mm; those in mm are not copied."""
+    return values.astype(np.float64) * MM_PER_M if units == "m" else values
+
+
+def not_in_mm(largest: float, reach_mm: float) -> bool:
+    """Whether depths up to ``largest`` can't be mm where there are depths up to ``reach_mm``, but metres or shares."""
+    return 0 < largest < min(protocol.METRES_BELOW, reach_mm / protocol.UNITS_APART)
+
+
+def value_problems(prediction: Depth, target_mm: Depth, reach_mm: float, units: Units) -> list[str]:
+    """What is wrong with the values of a prediction (H, W) in ``units``; usually an empty list. ``reach_mm``: up to
+    which depth there is something to measure, the far end of the rig's working range, or the largest target; 0 where
+    that is not known."""
+    low, high = extremes(prediction)
+    problems = []
+    if not np.isfinite([low, high]).all():  # min and max carry NaN through
+        nans, infinities = int(np.isnan(prediction).sum()), int(np.isinf(prediction).sum())
+        counts = [f"{n} {word}" for n, word in ((nans, "NaN"), (infinities, "infinite")) if n]
+        problems.append(f"holds {' and '.join(counts)} of {prediction.size} values; write 0 where nothing was measured")
+        if nans + infinities == prediction.size:
+            return problems
+        prediction = np.where(np.isfinite(prediction), prediction, prediction.dtype.type(0))
+        low, high = float(prediction.min()), float(prediction.max())
+    largest = protocol.LARGEST_MM / MM_PER_UNIT[units]
+    if max(high, -low) > largest:
+        values = f"values up to {max(high, -low):.3g} {units} in magnitude"
+        problems.append(f"holds {values}; the limit is {largest:g}; write 0 where nothing was measured")
+    wrong_unit = _unit_problem(prediction, target_mm, units, high, reach_mm)
+    return [*problems, wrong_unit] if wrong_unit else problems
+
+
+def _unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, reach_mm: float) -> str | None:
+    """Why ``values`` (H, W), finite and at most ``high``, can't be in ``units``; None where they can. Where mm are
+    declared, the largest value shows whether the values are metres or shares of the range. Where m or normalised depth
+    is declared, a single stray pixel must not decide, so the median over the object is compared."""
+    reach = f"its largest value is {high:.4g}, and there are depths up to {reach_mm / MM_PER_M:.4g} m"
+    if units == "mm":
+        if not_in_mm(high, reach_mm):
+            return (
+                f"looks like metres or normalised depth: {reach}; convert it to mm, or declare units: m or normalised"
+            )
+        return None
+    depths = values[object_mask(target_mm) & (values > 0)]
+    if not depths.size:
+        return None
+    typical = float(np.median(depths))
+    median = f"its median over the object is {typical:.4g}"
+    if units == "m" and typical * MM_PER_M > reach_mm * protocol.UNITS_APART:
+        return f"does not look like metres: {median}; if it is in mm, declare units: mm"
+    if units == "m" and high < min(1.0, reach_mm / MM_PER_M / 2):
+        return f"does not look like metres: {reach}; if it is normalised, declare units: normalised"
+    if units == "normalised" and typical > protocol.NORMALISED_AT_MOST:
+        advice = "if it is in m or mm, declare that in submission.yaml"
+        return f"does not look like normalised depth: {median}, the target's is at most 1; {advice}"
+    return None
+
+
+def unit_note(largest: float, units: Units) -> str | None:
+    """What looks wrong with ``units`` where no target is known and ``largest`` is the largest value of all samples."""
+    suspicious = {
+        "mm": (0 < largest < protocol.METRES_BELOW, "are these metres or normalised depth?"),
+        "m": (largest > protocol.METRES_AT_MOST, "are these mm?"),
+        "normalised": (largest > protocol.METRES_BELOW, "are these m or mm?"),
+    }
+    wrong, question = suspicious[units]
+    return f"units: {units}, but the largest value of all samples is {largest:.4g}; {question}" if wrong else None
+
+
+def scored_pair(
+    values: Depth, target_mm: Depth, units: Units, mode: Mode, sample: str, left_out: NDArray[np.bool_] | None = None
+) -> tuple[Depth, Depth]:
+    """Prediction and target (H, W) in mm, such that scoring them is scoring ``values`` by the rules of ``mode``. Pixels
+    ``left_out`` (bool (H, W)) do not count in the range of normalised values (`fpp_ml_bench.depth.RangeRule`).
+
+    ``standard``: depth in mm, 0 = background. Normalised values go back through the sample's own range,
+    D = v (D_max - D_min) + D_min, except for an exact 0, which stays 0: background, or not measured.
+
+    ``paper`` differs for normalised values (paper Section 5.3.2, individual normalisation): the target is normalised
+    first, its mask is D_norm > 0, and prediction and target go through the same affine map everywhere. D_min cancels in
+    every difference, so v (D_max - D_min) is scored against D - D_min: the same numbers, without the rounding of adding
+    and subtracting 1.7 m.
+
+    Raises DatasetError where the target has no range to normalise by."""
+    if units == "mm":
+        return values, target_mm
+    if units == "m":
+        return values.astype(np.float64) * MM_PER_M, target_mm
+    inside = object_mask(target_mm)
+    if not inside.any():
+        if mode == "standard" and not values.any():
+            return values, target_mm
+        no_range = "the target holds no object, so normalised depth has no range to go back through"
+        raise DatasetError(f"{sample}: {no_range}; submit mm")
+    low, high = depth_range_mm(target_mm, left_out)
+    if mode == "standard":
+        depth = values.astype(np.float64) * (high - low) + low
+        depth[values == 0] = 0.0
+        return depth, target_mm
+    if high == low:
+        flat = "the target is one flat plane, and individual normalisation divides by its range, 0"
+        raise DatasetError(f"{sample}: {flat}; score it with --mode standard")
+    if left_out is not None:  # pixels that are left out may be nearer than D_min, and stay object
+        return values.astype(np.float64) * (high - low) + np.where(inside, low, 0.0), target_mm
+    return values.astype(np.float64) * (high - low), np.where(inside, target_mm.astype(np.float64) - low, 0.0)
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,9 @@ from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation import submission
-from fpp_ml_bench.evaluation.score.check import check_folder
+from fpp_ml_bench.evaluation.score.check import check_folder, scored_pair
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
-from fpp_ml_bench.evaluation.score.sigma_scores import gaussian_quantile, states_sigma
-from fpp_ml_bench.evaluation.score.units import scored_pair
+from fpp_ml_bench.evaluation.score.sample_scores import gaussian_quantile, states_sigma
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.storage import DatasetFolder
 

@@ -1,8 +1,10 @@
-"""Scoring a folder of predictions against one split of a dataset: everything is checked, every problem is named."""
+"""Scoring a folder of predictions against one split of a dataset, and arrays in memory by the same rules: everything is
+checked, every problem is named."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import hashlib
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from operator import attrgetter
@@ -17,18 +19,18 @@ from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.depth import RangeRule, edge_jump_mm, extremes, object_box, object_mask, object_near_edges
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import protocol, result, submission
+from fpp_ml_bench.evaluation.metrics import METRICS, UNCERTAINTY, Metric
 from fpp_ml_bench.evaluation.protocol import Mode, Units
-from fpp_ml_bench.evaluation.score.check import checked_description
-from fpp_ml_bench.evaluation.score.sample_scores import score_sample
-from fpp_ml_bench.evaluation.score.sigma_scores import score_sigma
-from fpp_ml_bench.evaluation.score.units import scored_pair, value_problems
+from fpp_ml_bench.evaluation.score.check import checked_description, declared_units, in_mm, scored_pair, value_problems
+from fpp_ml_bench.evaluation.score.sample_scores import SigmaSample, score_sample, score_sigma
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.sample import image_hash, stored_frames
+from fpp_ml_bench.loaders.sample import Flag, image_hash, stored_frames, void_pixels
 from fpp_ml_bench.loaders.storage import DatasetFolder, benchmark_of
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics import DIRECTIONS, AnySequence
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by
 
+Maps = NDArray[Any] | Sequence[NDArray[Any]]
 WORKERS = 4
 Outcome = tuple[list[str], list[dict[str, Any]]]
 """Problems and rows of a sample: a line for each problem and no row, or no problem and a row."""
@@ -217,6 +219,124 @@ def _scored(
     return ThreadPoolExecutor(min(WORKERS, usable_cores())).map(work, samples)
 
 
+def evaluate_arrays(
+    predictions: Maps,
+    targets: Maps,
+    flags: Maps | None = None,
+    sigma: Maps | None = None,
+    objects: Sequence[str] | None = None,
+    edge_band_px: int = protocol.EDGE_BAND_PX,
+    units: str | None = None,
+) -> result.ArrayScores:
+    """Score depth in mm, 0 = background or not measured, against depth in mm, 0 = background: floats (N, H, W), or N
+    maps (H, W) that may differ in size. Pixels that a masked array of targets masks count in no set. ``flags``: whole
+    numbers, bits of `loaders.sample.Flag`, whose void pixels count in no set. ``sigma``: the standard uncertainty in
+    mm, 0 where none is stated. ``objects``: what each sample shows; samples of the same object are not independent, and
+    the intervals are over objects (by default, each sample is its own). ``units``: ``mm`` or ``m``, of all depths and
+    sigma; must be said where a target reaches less than 10.
+
+    Raises PredictionError, naming the sample by its number, for numbers or shapes that differ, for what is no real
+    float or not finite, for a negative sigma or target, for masked predictions, for flags that are no such bits, and
+    for depths that look like another unit."""
+    count = len(_sequence("targets", targets))
+    columns = {"predictions": predictions, "targets": targets, "flags": flags, "sigma": sigma, "objects": objects}
+    for name, values in columns.items():
+        if values is not None and len(_sequence(name, values)) != count:
+            raise PredictionError(f"{name}: expected {count}, one for each target, got {len(values)}")  # type: ignore[arg-type]
+    if count == 0:
+        raise PredictionError("targets: expected one depth map or more, got none")
+    names = [printable(str(name)) for name in objects] if objects is not None else [f"sample {n}" for n in range(count)]
+    rows: list[dict[str, Any]] = []
+    stated: dict[str, SigmaSample] = {}
+    for number in range(count):
+        try:
+            maps = {
+                name: _array(name, values[number])  # type: ignore[index]
+                for name, values in columns.items()
+                if name != "objects" and values is not None
+            }
+            row, uncertainty = _scored_arrays(edge_band_px=edge_band_px, units=units, **maps)
+        except PredictionError as error:
+            raise PredictionError(f"sample {number}: {error}") from None
+        rows.append({"sample": f"sample {number}", "object": names[number], **row})
+        if uncertainty is not None:
+            stated[f"sample {number}"] = uncertainty
+    return result.array_scores(rows, stated)
+
+
+def _sequence(name: str, values: Any) -> Any:
+    """``values``, if they are a sequence of maps or names."""
+    shape = getattr(values, "shape", None)
+    if isinstance(values, (str, bytes)) or not hasattr(values, "__len__") or (shape is not None and len(shape) == 2):
+        got = type(values).__name__ if shape is None else f"one map {tuple(shape)}"
+        raise PredictionError(f"{name}: expected an array (N, H, W) or a list of maps (H, W), got {got}")
+    return values
+
+
+def _array(name: str, values: Any) -> NDArray[Any]:
+    """A map as an array; a mask stays where its meaning is clear, with the targets."""
+    try:
+        array = np.asanyarray(values)
+    except (TypeError, ValueError, RuntimeError) as error:  # ragged lists; tensors with a gradient, or of a GPU
+        raise PredictionError(f"{name}: expected an array (H, W), got {type(values).__name__}: {error}") from None
+    if not np.ma.is_masked(array):
+        return np.asarray(array)
+    if name != "targets":
+        advice = (
+            f"write 0 where nothing is known ({name}.filled(0)); to leave pixels out of every score, mask the targets"
+        )
+        raise PredictionError(f"{name}: a masked array, and what a masked pixel means is not known; {advice}")
+    return array
+
+
+def _void(targets: NDArray[Any], flags: NDArray[Any] | None) -> NDArray[np.bool_]:
+    """Pixels that count in no set: those masked in the targets, and those flagged."""
+    void = np.ma.getmaskarray(targets)
+    if flags is None:
+        return void
+    if flags.shape != targets.shape or flags.dtype.kind not in "iu":
+        advice = "; to leave pixels out of every score, mask the targets" if flags.dtype.kind == "b" else ""
+        raise PredictionError(
+            f"flags: expected whole numbers {targets.shape}, got {flags.dtype} {flags.shape}; they are the column "
+            f"flags of a dataset, bits that mark void pixels, not a mask{advice}"
+        )
+    most = sum(Flag)
+    if not 0 <= flags.min() <= flags.max() <= most:
+        bits = ", ".join(f"{flag.value} {(flag.name or '').lower()}" for flag in Flag)
+        value = flags.max() if flags.max() > most else flags.min()
+        raise PredictionError(f"flags: expected sums of {bits}, got {value}; a mask of valid pixels is no flags")
+    return void | void_pixels(flags.astype(np.uint8))
+
+
+def _scored_arrays(
+    predictions: NDArray[Any],
+    targets: NDArray[Any],
+    edge_band_px: int,
+    flags: NDArray[Any] | None = None,
+    sigma: NDArray[Any] | None = None,
+    units: str | None = None,
+) -> tuple[dict[str, Any], SigmaSample | None]:
+    for name, values in (("predictions", predictions), ("targets", targets), ("sigma", sigma)):
+        if values is not None and values.dtype.kind != "f":
+            raise PredictionError(f"{name}: expected real floats, got {values.dtype}")
+        if values is not None and (values.ndim != 2 or values.shape != targets.shape or values.size == 0):
+            raise PredictionError(f"{name}: expected a map (H, W) of the target's size, got {values.shape}")
+    void = _void(targets, flags)
+    targets = np.ma.filled(targets, 0)
+    for name, values in (("targets", targets), ("sigma", sigma)):
+        if values is not None and not (values.min() >= 0 and np.isfinite(values.max())):
+            raise PredictionError(f"{name}: expected finite mm of 0 and more")
+    declared = declared_units(float(targets.max()), units)
+    digest = hashlib.sha256(np.ascontiguousarray(predictions).data).hexdigest()
+    targets, largest_mm = in_mm(targets, declared), in_mm(targets.max(), declared)
+    if problems := value_problems(predictions, targets, float(largest_mm), declared):
+        raise PredictionError(f"the prediction {problems[0]}")
+    predictions = in_mm(predictions, declared)
+    scores = score_sample(predictions, targets, edge_band_px, void)
+    uncertainty = None if sigma is None else score_sigma(predictions, targets, in_mm(sigma, declared), void)
+    return {"prediction_sha256": digest, **scores.pixels(), **scores.metrics()}, uncertainty
+
+
 _TIME_KEYS = ("seconds_per_sample", "seconds_source", "hardware", "timing")
 """`fpp-bench time` may write these into a result later; run times can't be recomputed from predictions."""
 
@@ -250,8 +370,10 @@ def differences(scored: result.Result, folder: Path, dataset: DatasetFolder) -> 
     stored_rows = {row.sample: row for row in scored.per_sample}
     if set(stored_rows) != {row.sample for row in again.per_sample}:
         return [*problems, "per_sample: other samples than the split has"]
+    exact = ("object", "prediction_sha256", *(f"{name}_pixels" for name in ("object", "background", "void", "unlit")))
     for row in again.per_sample:
-        problems += _sample_differences(stored_rows[row.sample], row)
+        pair = stored_rows[row.sample], row
+        problems += _different(f"{row.sample}: ", *pair, METRICS, row.object_mae_mm, exact=exact)
     return problems + _uncertainty_differences(scored.uncertainty, again.uncertainty)
 
 
@@ -269,25 +391,29 @@ def _uncertainty_differences(stored: result.Uncertainty | None, recomputed: resu
         if len(first) != len(second) or not all(result.same(*pair, 1e-12) for pair in pairs):
             lines.append(f"uncertainty.{name}: the curve in the result is not the one recomputed")
     for sample, scores in recomputed.per_sample.items():
-        for key in protocol.UNCERTAINTY:
-            first, second = getattr(stored.per_sample[sample], key), getattr(scores, key)
-            # The area between two curves is a small difference of large numbers, and a likelihood may be near 0.
-            if not result.same(first, second, 1e-9 * (scores.sure_rmse_mm or 0.0) if "ause" in key else 1e-12):
-                texts = f"{_value_text(first)} in the result, {_value_text(second)} recomputed"
-                lines.append(f"{sample}: uncertainty.{key}: {texts}")
+        pair = stored.per_sample[sample], scores
+        lines += _different(f"{sample}: uncertainty.", *pair, UNCERTAINTY, scores.sure_rmse_mm, 1e-12)  # nll is near 0
     return lines
 
 
-def _sample_differences(stored: result.SampleResult, recomputed: result.SampleResult) -> list[str]:
-    exact = ("object", "prediction_sha256", *(f"{name}_pixels" for name in ("object", "background", "void", "unlit")))
-    keys = [key for key in exact if getattr(stored, key) != getattr(recomputed, key)]
-    for key in protocol.METRICS:
-        # Signed means and the error without an offset are small differences of large numbers.
-        rounding_mm = 1e-9 * (recomputed.object_mae_mm or 0.0) if "bias" in key or "shift_free" in key else 0.0
-        if not result.same(getattr(stored, key), getattr(recomputed, key), rounding_mm):
-            keys.append(key)
-    texts = {key: [_value_text(getattr(row, key)) for row in (stored, recomputed)] for key in keys}
-    return [f"{recomputed.sample}: {key}: {a} in the result, {b} recomputed" for key, (a, b) in texts.items()]
+def _different(
+    name: str,
+    stored: object,
+    recomputed: object,
+    metrics: Mapping[str, Metric],
+    error_mm: float | None,
+    rounding: float = 0.0,
+    exact: Iterable[str] = (),
+) -> list[str]:
+    """A line for each key of ``exact`` and each score that differs; ``error_mm``: the error of which the scores that
+    cancel are a small difference."""
+    limits = {key: 1e-9 * (error_mm or 0.0) if metric.cancels else rounding for key, metric in metrics.items()}
+    lines = []
+    for key in (*exact, *metrics):
+        first, second = getattr(stored, key), getattr(recomputed, key)
+        if not (result.same(first, second, limits[key]) if key in limits else first == second):
+            lines.append(f"{name}{key}: {_value_text(first)} in the result, {_value_text(second)} recomputed")
+    return lines
 
 
 def _value_text(value: object) -> str:

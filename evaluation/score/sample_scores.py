@@ -1,4 +1,5 @@
-"""Scores of one sample: MAE and RMSE over the pixel sets, and how the object's error is distributed.
+"""Scores of one sample: MAE and RMSE over the pixel sets, how the object's error is distributed, and what a stated
+uncertainty is worth.
 
 The overall score is composed of object and background, so that overall MAE = f object + (1 - f) background, with f the
 object's share of the pixels, holds by construction.
@@ -7,12 +8,18 @@ Numerical contract: differences are formed in float64 whatever the input; every 
 `BLOCK` pixels that fit into the cache, and the block sums are added exactly (`math.fsum`). Errors above 1e140 are
 refused. Errors so small that their squares underflow are divided by the largest before they are squared, so that an
 RMSE is never 0 by underflow.
+
+Of a stated uncertainty: how often its intervals hold, how narrow they are, and whether the pixels that a method is
+least sure of are those that are most wrong (sparsification: Ilg et al., ECCV 2018). Intervals are central ones of a
+Gaussian: error within quantile x sigma. The area between two curves is accurate to 1e-12 of the error that it compares.
 """
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
+from statistics import NormalDist
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +27,15 @@ from numpy.typing import NDArray
 from fpp_ml_bench.depth import edge_jump_mm, object_box, object_mask, object_near_edges
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation import protocol
-from fpp_ml_bench.evaluation.protocol import DISTRIBUTION, EDGE_BAND_PX, PIXEL_SETS, WIDE_BAND_PX, WITHIN_MM
+from fpp_ml_bench.evaluation.metrics import METRICS, UNCERTAINTY
+from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, WIDE_BAND_PX, WITHIN_MM
 
 BLOCK = 9600
 """Pixels per block. OpenBLAS spreads dot products over its threads from 10,000 elements on, and the rounding of the sum
 would then depend on the number of cores. Below that a score depends on the type of processor only."""
 
 _BLOCKS_AT_ONCE = 8
+_HALF_LOG_2_PI = 0.9189385332046727
 _SQUARES_LOST = 1e-280
 """Mean square below which squares may have lost digits: the smallest normal number is 2e-308, and an image has about a
 million pixels."""
@@ -132,35 +141,52 @@ def _background(prediction: Map, target: Map, void: NDArray[np.bool_] | None) ->
 
 
 _EDGE, _WIDE, _MISSING = 1, 2, 4
-_SETS = (
-    *PIXEL_SETS,
-    "object_interior",
-    "object_edge",
-    "object_valid",
-    "object_interior_valid",
-    "object_wide_band",
-    "object_wide_interior",
-)
 
 
-def _zones(bits: int, value: int) -> property:
+def _zones(bits: int, value: int) -> cached_property[ErrorStats]:
     """The statistics of the union of all zones whose ``bits`` have this ``value``."""
-    return property(lambda self: combine(*(stats for zone, stats in self.zones.items() if zone & bits == value)))
+    return cached_property(lambda self: combine(*(stats for zone, stats in self.zones.items() if zone & bits == value)))
 
 
-@dataclass(frozen=True, slots=True)
+class Spread(NamedTuple):
+    """How the object's errors are distributed, in mm; ``within``: the share of them of at most each of
+    `protocol.WITHIN_MM`; all None where there is no object."""
+
+    median_mm: Any = None
+    p95_mm: Any = None
+    largest_mm: Any = None
+    within: tuple[Any, ...] = (None,) * len(WITHIN_MM)
+    bias_mm: Any = None
+    valid_bias_mm: Any = None
+    shift_free_mm: Any = None
+
+
+_NO_SPREAD = Spread()
+
+
+@dataclass(frozen=True)
 class SampleScores:
-    """Scores of one sample: statistics of the background and of the object's zones, and the object's ``distribution``.
-    A zone's number is a sum of 1 (nearer to a depth edge than the edge band), 2 (nearer than the wide band) and 4 (not
-    measured: predicted 0 mm or less); every MAE and RMSE of the object is that of a union of zones. ``void``: pixels in
-    no set, None by rules without void. ``unlit``: statistics of the unlit pixels and of those that were measured; None
-    where they are not scored. ``range_mm``: largest minus smallest depth of the object."""
+    """What the metrics of a sample are made of. ``prediction_mm`` and ``target_mm`` (H, W) as they were scored,
+    ``surface``: where the target has a depth, ``void_mask``: which pixels are in no set, None by rules without void;
+    and ``errors``: prediction minus target in mm on the object's pixels, float64 (n,).
 
+    Statistics of the background and of the object's zones, and the object's ``spread``. A zone's number is a sum of 1
+    (nearer to a depth edge than the edge band), 2 (nearer than the wide band) and 4 (not measured: predicted 0 mm or
+    less); every MAE and RMSE of the object is that of a union of zones. ``unlit``: statistics of the unlit pixels,
+    ``unlit_valid`` of those that were measured; ``scores_unlit``: whether the rules know them. ``range_mm``: largest
+    minus smallest depth of the object."""
+
+    prediction_mm: Map
+    target_mm: Map
+    surface: NDArray[np.bool_]
+    void_mask: NDArray[np.bool_] | None
     background: ErrorStats
-    zones: dict[int, ErrorStats]
-    distribution: dict[str, float | None]
-    void: int | None = None
-    unlit: tuple[ErrorStats, ErrorStats] | None = None
+    unlit: ErrorStats
+    unlit_valid: ErrorStats
+    scores_unlit: bool
+    errors: Errors = field(default_factory=lambda: np.empty(0))
+    zones: dict[int, ErrorStats] = field(default_factory=dict)
+    spread: Spread = _NO_SPREAD
     range_mm: float = 0.0
 
     object = _zones(0, 0)
@@ -169,50 +195,35 @@ class SampleScores:
     valid = _zones(_MISSING, 0)
     interior_valid, edge_valid = _zones(_EDGE | _MISSING, 0), _zones(_EDGE | _MISSING, _EDGE)
 
+    @cached_property
+    def inside(self) -> NDArray[np.bool_]:
+        """The object's pixels, (H, W)."""
+        return self.surface if self.void_mask is None else self.surface & ~self.void_mask
+
+    @cached_property
+    def void(self) -> int | None:
+        """How many pixels are in no set."""
+        return None if self.void_mask is None else int(np.count_nonzero(self.void_mask))
+
     @property
     def missing(self) -> int:
         """Object pixels that were not measured."""
         return int(self.object.pixels - self.valid.pixels)
 
-    @property
+    @cached_property
     def overall(self) -> ErrorStats:
         return combine(self.object, self.background)
 
     def metrics(self) -> dict[str, float | None]:
-        """The keys of ``protocol.METRICS``; where the pixel set is empty None, those of `SINCE_2` left out."""
-        sets: dict[str, ErrorStats] = {name: getattr(self, name.removeprefix("object_")) for name in _SETS}
-        whole, interior = sets["object"].pixels, sets["object_interior"].pixels
-        values: dict[str, float | None] = {
-            "object_edge_share": _share(sets["object_edge"].pixels, whole),
-            "object_missing_share": _share(self.missing, whole),
-            "object_interior_missing_share": _share(interior - sets["object_interior_valid"].pixels, interior),
-            "object_wide_band_share": _share(sets["object_wide_band"].pixels, whole),
-        }
-        for name, stats in sets.items():
-            values |= {f"{name}_mae_mm": stats.mae_mm, f"{name}_rmse_mm": stats.rmse_mm}
-        values |= self.distribution
-        void = self.void or 0
-        unlit, measured = self.unlit or (EMPTY, EMPTY)
-        values |= {
-            "void_share": None if self.void is None else void / (whole + self.background.pixels + void),
-            "unlit_mae_mm": unlit.mae_mm,
-            "unlit_rmse_mm": unlit.rmse_mm,
-            "unlit_valid_mae_mm": measured.mae_mm,
-            "unlit_missing_share": _share(unlit.pixels - measured.pixels, unlit.pixels),
-            protocol.RANGE_SHARE: _share(sets["object"].mae_mm or 0.0, self.range_mm),
-        }
-        optional = {key for key in protocol.SINCE_2 if values[key] is None}
-        return {key: values[key] for key in protocol.METRICS if key not in optional}
+        """Every metric by its key: None where the pixel set is empty, and those that a file may leave out left out."""
+        values = {key: metric.value(self) for key, metric in METRICS.items()}
+        return {key: value for key, value in values.items() if value is not None or not METRICS[key].optional}
 
     def pixels(self) -> dict[str, int | None]:
         """How many pixels each set of a result's row has; None for a set that the rules do not know."""
-        unlit = None if self.unlit is None else self.unlit[0].pixels
+        unlit = self.unlit.pixels if self.scores_unlit else None
         counts = {"object": self.object.pixels, "background": self.background.pixels, "void": self.void, "unlit": unlit}
         return {f"{name}_pixels": count for name, count in counts.items()}
-
-
-def _share(part: float, whole: float) -> float | None:
-    return part / whole if whole else None
 
 
 @np.errstate(over="ignore")  # an overflow is no warning here: `_from_sums` refuses it
@@ -248,10 +259,11 @@ def score_sample(
     prediction = prediction_mm.ravel()
     flat_void = None if void is None else void.ravel()
     background, flat_inside = _background(prediction, target_mm.ravel(), flat_void)
-    void_px = None if void is None else int(np.count_nonzero(void))
-    unlit = None if unlit_mm is None else _unlit_stats(prediction, unlit_mm.ravel())
-    nothing = SampleScores(background, {}, dict.fromkeys(DISTRIBUTION), void_px, unlit)
+    unlit, measured = (EMPTY, EMPTY) if unlit_mm is None else _unlit_stats(prediction, unlit_mm.ravel())
     inside = flat_inside.reshape(target_mm.shape)
+    nothing = SampleScores(
+        prediction_mm, target_mm, inside, void, background, unlit, measured, scores_unlit=unlit_mm is not None
+    )
     if (box := object_box(inside)) is None:
         return nothing
     index = np.flatnonzero(inside[box] if void is None else inside[box] & ~void[box])
@@ -272,7 +284,7 @@ def score_sample(
     zones = {code: stats_of(errors[pixels]) for code, pixels in within.items() if pixels.any()}
     range_mm = float(true_mm.max()) - float(true_mm.min())
     range_mm = range_mm if range_mm > 1e-150 else 0.0  # else an error may exceed it by more than a float64 can hold
-    return SampleScores(background, zones, _distribution(errors, missing), void_px, unlit, range_mm)
+    return replace(nothing, errors=errors, zones=zones, spread=_spread(errors, missing), range_mm=range_mm)
 
 
 def _unlit_stats(prediction: Map, unlit_mm: Map) -> tuple[ErrorStats, ErrorStats]:
@@ -285,10 +297,9 @@ def _unlit_stats(prediction: Map, unlit_mm: Map) -> tuple[ErrorStats, ErrorStats
     return stats_of(errors), stats_of(errors[depths > 0])
 
 
-def _distribution(errors: Errors, missing: NDArray[np.bool_]) -> dict[str, float | None]:
-    """The keys of `DISTRIBUTION`, in its order."""
+def _spread(errors: Errors, missing: NDArray[np.bool_]) -> Spread:
     magnitude = np.abs(errors)
-    within = [np.count_nonzero(magnitude <= limit) / errors.size for limit in WITHIN_MM]
+    within = tuple(np.count_nonzero(magnitude <= limit) / errors.size for limit in WITHIN_MM)
     largest = float(magnitude.max())
     median, p95 = _quantiles(magnitude, 0.5, 0.95)
     signed = errors.copy()
@@ -297,8 +308,7 @@ def _distribution(errors: Errors, missing: NDArray[np.bool_]) -> dict[str, float
     np.abs(signed, out=signed)
     bias = mean_of(errors)
     valid_bias = mean_of(errors[~missing]) if missing.any() else bias
-    values = (median, p95, largest, *within, bias, valid_bias, mean_of(signed))
-    return dict(zip(DISTRIBUTION, values, strict=True))
+    return Spread(median, p95, largest, within, bias, valid_bias, mean_of(signed))
 
 
 def _quantiles(values: Errors, *levels: float) -> list[float]:
@@ -314,3 +324,99 @@ def _quantiles(values: Errors, *levels: float) -> list[float]:
         quantiles.append(below + (above - below) * (position - low))
         first = low
     return quantiles
+
+
+@dataclass(frozen=True, slots=True)
+class SigmaSample:
+    """Of one sample, what its scores are made of: the share of object pixels that state no sigma; of the others mean
+    and median sigma in mm, and the mean negative log-likelihood; ``observed``: the share of stated pixels within the
+    interval of each of `protocol.NOMINAL`; ``curves``: the errors in mm after each of `protocol.LEFT_OUT` has been left
+    out, ``mae_mm`` and ``rmse_mm`` by sigma, ``best_*`` by the error itself. None where there is no such pixel."""
+
+    curves: dict[str, list[float]] | None = None
+    unstated_share: float | None = None
+    observed: list[float] | None = None
+    sigma_mean_mm: float | None = None
+    sigma_median_mm: float | None = None
+    nll: float | None = None
+
+    @property
+    def scores(self) -> dict[str, float | None]:
+        """Every metric of a stated uncertainty by its key."""
+        return {key: metric.value(self) for key, metric in UNCERTAINTY.items()}
+
+    def within(self, percent: int) -> float | None:
+        """Share of the stated pixels within the interval of one of `protocol.COVERED`."""
+        return None if self.observed is None else self.observed[protocol.NOMINAL.index(percent / 100)]
+
+    def sure_mm(self, error: str) -> float | None:
+        """``mae_mm`` or ``rmse_mm`` of the object without its least sure pixels."""
+        return None if self.curves is None else self.curves[error][protocol.LEFT_OUT.index(protocol.SURE_LEFT_OUT)]
+
+    def area_mm(self, error: str) -> float | None:
+        """Mean distance of the two curves of ``mae_mm`` or ``rmse_mm``. Never below 0 but by rounding: no order leaves
+        smaller errors than that of the errors themselves."""
+        if self.curves is None:
+            return None
+        return mean_of(np.maximum(np.array(self.curves[error]) - np.array(self.curves[f"best_{error}"]), 0.0))
+
+
+@cache
+def gaussian_quantile(coverage: float) -> float:
+    """Half the width, in sigmas, of the central interval of a Gaussian that holds ``coverage`` of it."""
+    return NormalDist().inv_cdf((1 + coverage) / 2)
+
+
+def states_sigma(depth_mm: Map, sigma_mm: Map) -> NDArray[np.bool_]:
+    """Pixels that state an uncertainty: they have an answer, and a sigma above 0 (both of any same shape, in mm)."""
+    return (depth_mm > 0) & (sigma_mm > 0)
+
+
+def score_sigma(
+    prediction_mm: Map, target_mm: Map, sigma_mm: Map, void: NDArray[np.bool_] | None = None
+) -> SigmaSample:
+    """Score the stated standard uncertainty ``sigma_mm`` of ``prediction_mm`` over the object pixels of ``target_mm``
+    that are not ``void``; all (H, W), in mm, sigma of 0 and more. Raises PredictionError for another shape."""
+    if not prediction_mm.shape == target_mm.shape == sigma_mm.shape:
+        raise PredictionError(f"sigma: expected a map of {target_mm.shape}, got {sigma_mm.shape}")
+    inside = object_mask(target_mm) if void is None else object_mask(target_mm) & ~void
+    depth, sigma = (np.asarray(values[inside], np.float64) for values in (prediction_mm, sigma_mm))
+    magnitude = np.abs(depth - target_mm[inside])
+    if not magnitude.size:
+        return SigmaSample()
+    stated = states_sigma(depth, sigma)
+    curves = _curves(magnitude, np.where(stated, sigma, np.inf))
+    unstated = 1 - np.count_nonzero(stated) / stated.size
+    if not stated.any():
+        return SigmaSample(curves, unstated)
+    magnitude, sigma = magnitude[stated], sigma[stated]
+    observed = [float(np.mean(magnitude <= gaussian_quantile(level) * sigma)) for level in protocol.NOMINAL]
+    likelihood = mean_of(_negative_log_likelihood(magnitude, sigma))
+    return SigmaSample(curves, unstated, observed, mean_of(sigma), float(np.median(sigma)), likelihood)
+
+
+def _negative_log_likelihood(magnitude: Errors, sigma: Errors) -> Errors:
+    """Of each error under a Gaussian, in nats with sigma in mm. Sigma is at least `NLL_LEAST_SIGMA_MM`, and the error
+    at most `NLL_LARGEST_RATIO` sigmas, so that neither an error of 0 nor a wrong order decides the mean."""
+    floored = np.maximum(sigma, protocol.NLL_LEAST_SIGMA_MM)
+    ratio = np.minimum(magnitude / floored, protocol.NLL_LARGEST_RATIO)
+    return np.log(floored) + _HALF_LOG_2_PI + 0.5 * ratio * ratio
+
+
+def _curves(magnitude: Errors, sigma: Errors) -> dict[str, list[float]]:
+    """The curves of `SigmaSample`. Of pixels of the same sigma an equal part of each is left out, so that the order of
+    the pixels does not matter; a pixel at the cut counts in part."""
+    kept = magnitude.size * (1 - np.array(protocol.LEFT_OUT))
+    curves = {}
+    for prefix, key in (("", sigma), ("best_", magnitude)):
+        order = np.argsort(key, kind="stable")
+        ascending = key[order]
+        last = np.flatnonzero(np.append(ascending[1:] != ascending[:-1], True))  # of each run of equal keys
+        for name, values in (("mae_mm", magnitude[order]), ("rmse_mm", magnitude[order] ** 2)):
+            sums = np.concatenate([[0.0], np.cumsum(values)[last]])
+            means = np.interp(kept, np.concatenate([[0], last + 1]), sums) / kept
+            curves[prefix + name] = (np.sqrt(means) if name == "rmse_mm" else means).tolist()
+    whole = stats_of(magnitude)
+    for prefix in ("", "best_"):  # nothing left out: the object's MAE and RMSE, to the last digit
+        curves[f"{prefix}mae_mm"][0], curves[f"{prefix}rmse_mm"][0] = whole.mae_mm or 0.0, whole.rmse_mm or 0.0
+    return curves

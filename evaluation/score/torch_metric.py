@@ -6,10 +6,10 @@ or number of processes therefore give the same numbers, up to the rounding of ad
 sampler that repeats samples to fill the last batch (``DistributedSampler`` without ``drop_last``) changes the mean;
 give each process its own samples instead.
 
-Not included: the scores of edge bands, which need the depth edges of every target.
+Included are the metrics whose entry says ``training``; those of edge bands need the depth edges of every target.
 """
 
-from collections.abc import Mapping
+from types import SimpleNamespace
 from typing import Any
 
 import torch
@@ -17,11 +17,12 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.protocol import DISTRIBUTION, HEADLINE, RANGE_SHARE, WITHIN, WITHIN_MM
-from fpp_ml_bench.evaluation.score.sample_scores import NOT_FINITE
-from fpp_ml_bench.evaluation.score.units import MM_PER_UNIT, declared_units, not_in_mm
+from fpp_ml_bench.evaluation.metrics import METRICS
+from fpp_ml_bench.evaluation.protocol import WITHIN_MM
+from fpp_ml_bench.evaluation.score.check import MM_PER_UNIT, declared_units, not_in_mm
+from fpp_ml_bench.evaluation.score.sample_scores import EMPTY, NOT_FINITE, ErrorStats, Spread
 
-KEYS = (*HEADLINE, "object_valid_mae_mm", "object_missing_share", *DISTRIBUTION, RANGE_SHARE)
+KEYS = tuple(key for key, metric in METRICS.items() if metric.training)
 SQUARES_VANISH = 1e-140
 """Errors below this have squares below the smallest normal float64."""
 
@@ -60,10 +61,11 @@ class DepthScores(Metric):
         for predicted, truth, pixels in zip(prediction, target, scored.to(target.device), strict=True):
             counted = predicted[pixels], truth[pixels]  # what a void pixel holds, as NaN, does not matter
             mm_per_unit = _mm_per_unit(*counted, self.units)
-            scores = _sample_scores(*(depths * mm_per_unit for depths in counted))
-            values = [predicted.new_zeros(()) if (score := scores[key]) is None else score for key in KEYS]
+            sample = _sample(*(depths * mm_per_unit for depths in counted))
+            scores = [METRICS[key].value(sample) for key in KEYS]
+            values = [predicted.new_zeros(()) if score is None else score for score in scores]
             self.sums += torch.stack(values).to(self.sums.device)
-            self.counts += torch.tensor([scores[key] is not None for key in KEYS], device=self.counts.device)
+            self.counts += torch.tensor([score is not None for score in scores], device=self.counts.device)
 
     def compute(self) -> dict[str, Tensor]:
         """Mean over the samples so far, of all processes, of every key."""
@@ -115,37 +117,40 @@ def _mm_per_unit(prediction: Tensor, target: Tensor, units: str | None) -> float
     return scale
 
 
-def _sample_scores(prediction: Tensor, target: Tensor) -> Mapping[str, Tensor | None]:
-    """Scores of one sample, float64 (n,) in mm each: the keys of `KEYS`, None for an empty pixel set."""
+def _sample(prediction: Tensor, target: Tensor) -> SimpleNamespace:
+    """The parts of a `fpp_ml_bench.evaluation.score.SampleScores` that the metrics of the training read, as tensors, of
+    one sample, float64 (n,) in mm."""
     error = prediction - target
-    if not error.numel():
-        return dict.fromkeys(KEYS)
-    if not bool(torch.isfinite(error.square().sum())):
+    if error.numel() and not bool(torch.isfinite(error.square().sum())):
         raise PredictionError(NOT_FINITE)
     inside = target > 0
-    scores: dict[str, Tensor | None] = dict.fromkeys(KEYS)
-    for name, part in (("overall", error.flatten()), ("object", error[inside]), ("background", error[~inside])):
-        if part.numel():
-            scores[f"{name}_mae_mm"] = part.abs().mean()
-            scores[f"{name}_rmse_mm"] = _root_mean_square(part)
-    if not bool(inside.any()):
-        return scores
     errors, measured = error[inside], prediction[inside] > 0
     valid = errors[measured]
+    sets = {"overall": error, "object": errors, "background": error[~inside], "valid": valid}
+    sample = SimpleNamespace(**{name: _stats(pixels) for name, pixels in sets.items()}, spread=Spread(), range_mm=0.0)
+    if not errors.numel():
+        return sample
     ascending = errors.abs().sort().values
     offset = _quantile(errors.sort().values, 0.5)
-    scores["object_missing_share"] = 1.0 - measured.to(torch.float64).mean()
-    if valid.numel():
-        scores["object_valid_mae_mm"], scores["object_valid_bias_mm"] = valid.abs().mean(), valid.mean()
-    scores["object_median_mm"], scores["object_p95_mm"] = _quantile(ascending, 0.5), _quantile(ascending, 0.95)
-    scores["object_max_mm"] = ascending[-1]
-    for key, limit in zip(WITHIN, WITHIN_MM, strict=True):
-        scores[key] = (ascending <= limit).to(torch.float64).mean()
-    scores["object_bias_mm"] = errors.mean()
-    scores["object_shift_free_mae_mm"] = (errors - offset).abs().mean()
-    if (range_mm := target[inside].max() - target[inside].min()) > 0:
-        scores[RANGE_SHARE] = errors.abs().mean() / range_mm
-    return scores
+    sample.range_mm = target[inside].max() - target[inside].min()
+    sample.spread = Spread(
+        _quantile(ascending, 0.5),
+        _quantile(ascending, 0.95),
+        ascending[-1],
+        tuple((ascending <= limit).to(torch.float64).mean() for limit in WITHIN_MM),
+        errors.mean(),
+        valid.mean() if valid.numel() else None,
+        (errors - offset).abs().mean(),
+    )
+    return sample
+
+
+def _stats(errors: Tensor) -> ErrorStats | SimpleNamespace:
+    """`ErrorStats`, of tensors where there are errors."""
+    if not errors.numel():
+        return EMPTY
+    pixels = errors.new_tensor(errors.numel())
+    return SimpleNamespace(pixels=pixels, mae_mm=errors.abs().mean(), rmse_mm=_root_mean_square(errors))
 
 
 def _root_mean_square(errors: Tensor) -> Tensor:

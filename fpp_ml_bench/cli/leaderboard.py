@@ -10,7 +10,7 @@ from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation import result
-from fpp_ml_bench.evaluation.protocol import METRICS
+from fpp_ml_bench.evaluation.metrics import RANK_KEY, sort_keys
 from fpp_ml_bench.leaderboard import page
 from fpp_ml_bench.options import argument, option
 
@@ -39,10 +39,7 @@ def rank(
         many=True,
     ),
     sort: str = option(
-        "object_mae_mm",
-        f"what to rank by (default: object_mae_mm): seconds_per_sample, frames_used, {', '.join(METRICS)}",
-        "KEY",
-        choices=(*METRICS, "seconds_per_sample", "frames_used"),
+        RANK_KEY, f"what to rank by (default: {RANK_KEY}): {', '.join(sort_keys())}", "KEY", choices=sort_keys()
     ),
     markdown: Path | None = option(None, "also write the tables as Markdown", "FILE"),
     json: Path | None = option(
@@ -90,8 +87,8 @@ def rank(
         raise SubmissionError("--check checks a README; give it with --readme FILE")
     if measured is not None and out is None:
         raise SubmissionError("--tradeoff adds settings to a page; give it with --page DIR")
-    if out is not None and sort != "object_mae_mm":
-        raise SubmissionError("--page is by object_mae_mm, and a click sorts it otherwise; leave out --sort")
+    if out is not None and sort != RANK_KEY:
+        raise SubmissionError(f"--page is by {RANK_KEY}, and a click sorts it otherwise; leave out --sort")
     if row_file is not None and readme is None:
         if len(results) != 1:
             raise SubmissionError(f"--row makes a row of one result, {len(results)} were given")

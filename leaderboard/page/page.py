@@ -12,7 +12,8 @@ from typing import Any
 
 from fpp_ml_bench.baselines.tradeoff import Ladder, Rung, Tradeoff
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, HEADLINE, METRICS
+from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS, RANGE_KEY, with_column
+from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
 from fpp_ml_bench.evaluation.report import interval_text, page, render, score_text
 from fpp_ml_bench.evaluation.result import PART_TITLES
 from fpp_ml_bench.evaluation.score import FEWEST_OBJECTS
@@ -78,6 +79,8 @@ def page_files(
         **shared,
         tables=tables,
         columns=columns,
+        range_key=RANGE_KEY,
+        errors=[(m.key, f"{m.column}, mm" if m.unit == "mm" else m.column) for m in with_column(0) if not m.role],
         told=told,
         assumption=assumption,
         search=_search,

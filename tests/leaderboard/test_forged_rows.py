@@ -10,7 +10,7 @@ from board_rows import entry_with_errors, named_benchmarks, reliance, robustness
 from scored_dataset import make_dataset
 
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import HEADLINE
+from fpp_ml_bench.evaluation.metrics import HEADLINE
 from fpp_ml_bench.evaluation.result import Timing
 from fpp_ml_bench.leaderboard import columns, rows
 from fpp_ml_bench.leaderboard.data_files import table_csv

@@ -14,7 +14,7 @@ from scored_dataset import disk_depth, make_dataset
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli.evaluate import main as fpp_eval
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.protocol import HEADLINE, HELPED_BY_MISSING
+from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
 from fpp_ml_bench.evaluation.result import read_result
 from fpp_ml_bench.leaderboard import columns, rows
 from fpp_ml_bench.leaderboard.page import page_files
@@ -316,7 +316,7 @@ def test_more_within_a_tolerance_is_better(dataset, tmp_path):
     assert [row.entry.name for row in ranked][-1] == "off by 20.0"
 
 
-@pytest.mark.parametrize("key", HELPED_BY_MISSING)
+@pytest.mark.parametrize("key", [key for key, metric in METRICS.items() if metric.helped_by_missing])
 def test_no_rank_by_what_missing_pixels_improve(key, dataset, tmp_path, capsys):
     path = write_result_file(tmp_path / "a.json", dataset, 1.0)
     assert main(["leaderboard", str(path), "--sort", key]) == 2

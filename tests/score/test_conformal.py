@@ -8,7 +8,7 @@ from fpp_ml_bench.cli.evaluate import main
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.evaluation.score.conformal import calibrate, conformal_quantile, write_calibrated
-from fpp_ml_bench.evaluation.score.sigma_scores import gaussian_quantile
+from fpp_ml_bench.evaluation.score.sample_scores import gaussian_quantile
 from fpp_ml_bench.evaluation.submission import read_submission
 
 

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from scored_dataset import disk_depth
 
-from fpp_ml_bench.evaluation.protocol import HELPED_BY_MISSING, METRICS, SIGNED, SINCE_2, WITHIN
+from fpp_ml_bench.evaluation.metrics import METRICS
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 
 
@@ -40,14 +40,16 @@ def cases(draw):
 def test_every_score_agrees_with_float128_to_1e_minus_10(case):
     scores = score_sample(*case).metrics()
     expected = sample_scores(*case)
-    assert set(scores) == set(expected) and {*METRICS} - {*SINCE_2} <= set(scores) <= set(METRICS)
+    assert set(scores) == set(expected) and {key for key, m in METRICS.items() if not m.optional} <= set(scores) <= set(
+        METRICS
+    )
     scale = float(expected["object_mae_mm"] or 0)
     for key, value in expected.items():
         if value is None:
             assert scores[key] is None, key
             continue
         # Signed means and the error without an offset are small differences: accurate relative to the object's MAE.
-        rounding = 1e-12 * scale if key in SIGNED or key == "object_shift_free_mae_mm" else 0.0
+        rounding = 1e-12 * scale if METRICS[key].cancels else 0.0
         assert scores[key] == pytest.approx(float(value), rel=1e-10, abs=rounding), key
 
 
@@ -107,7 +109,9 @@ def test_only_the_scores_that_say_so_are_improved_by_missing_pixels():
         best = np.unravel_index(np.where(pixels, np.abs(answer - target - unlit), np.inf).argmin(), target.shape)
         single[best] = answer[best]
     whole, few = (score_sample(values, target, void=unlit > 0, unlit_mm=unlit).metrics() for values in (answer, single))
-    better = {key for key in METRICS if (few[key] > whole[key] if key in WITHIN else abs(few[key]) < abs(whole[key]))}
-    assert better <= set(HELPED_BY_MISSING) and "object_valid_mae_mm" in better and "unlit_valid_mae_mm" in better
+    higher = {key for key, metric in METRICS.items() if metric.better == "higher"}
+    better = {key for key in METRICS if (few[key] > whole[key] if key in higher else abs(few[key]) < abs(whole[key]))}
+    helped = {key for key, metric in METRICS.items() if metric.helped_by_missing}
+    assert better <= helped and "object_valid_mae_mm" in better and "unlit_valid_mae_mm" in better
     assert {"object_shift_free_mae_mm", "object_valid_bias_mm"} <= better
     assert few["object_mae_range_share"] == pytest.approx(few["object_mae_mm"] / np.ptp(target[target > 0]), rel=1e-12)

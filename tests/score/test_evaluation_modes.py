@@ -10,8 +10,8 @@ from fpp_ml_bench.cli.evaluate import main
 from fpp_ml_bench.depth import denormalise, normalise
 from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation.result import read_result, write_result
+from fpp_ml_bench.evaluation.score.check import scored_pair
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
-from fpp_ml_bench.evaluation.score.units import scored_pair
 from fpp_ml_bench.loaders.sample import Flag
 
 ORACLE = {"units": "normalised", "uses_ground_truth_range": True}

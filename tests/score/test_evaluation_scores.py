@@ -11,10 +11,12 @@ from scored_dataset import disk_depth
 
 from fpp_ml_bench.depth import depth_edges, edge_distance_px, object_near_edge
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.protocol import WITHIN
+from fpp_ml_bench.evaluation.metrics import METRICS
 from fpp_ml_bench.evaluation.result.model import over_samples, pooled
 from fpp_ml_bench.evaluation.score import sample_scores
 from fpp_ml_bench.evaluation.score.sample_scores import EMPTY, ErrorStats, combine, score_sample
+
+WITHIN = [key for key in METRICS if "_within_" in key]
 
 
 def reference(prediction, target):

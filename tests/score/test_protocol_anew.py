@@ -8,7 +8,7 @@ import pytest
 from extended_precision import sample_scores, sigma_scores
 from scored_dataset import make_dataset, write_description
 
-from fpp_ml_bench.evaluation.protocol import METRICS, UNCERTAINTY
+from fpp_ml_bench.evaluation.metrics import METRICS, UNCERTAINTY
 from fpp_ml_bench.evaluation.score import evaluate
 
 SIZE = (48, 56)

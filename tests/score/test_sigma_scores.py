@@ -9,7 +9,8 @@ from scored_dataset import make_dataset, write_description
 
 from fpp_ml_bench.cli.evaluate import main
 from fpp_ml_bench.errors import PredictionError, SubmissionError
-from fpp_ml_bench.evaluation.protocol import COVERED, NOMINAL, UNCERTAINTY
+from fpp_ml_bench.evaluation.metrics import UNCERTAINTY
+from fpp_ml_bench.evaluation.protocol import COVERED, NOMINAL
 from fpp_ml_bench.evaluation.report import write_report
 from fpp_ml_bench.evaluation.result import parse_result, read_result, result_content, write_result
 from fpp_ml_bench.evaluation.score import evaluate, score_sigma

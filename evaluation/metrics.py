@@ -1,0 +1,519 @@
+"""The metrics: an entry says everything about one. From the entries come the result model and its JSON Schema, the
+table of PROTOCOL.md, the reports, the columns and the sort keys of the leaderboard, and the metric of the training.
+
+To add one, write an entry here and give PROTOCOL.md the table of `protocol_table`; no other file changes. Its function
+gets a `fpp_ml_bench.evaluation.score.SampleScores`: prediction, target and masks of a sample, its errors on the object,
+and the statistics that the built-in metrics share.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import count
+from operator import attrgetter, methodcaller
+from typing import Any, Literal
+
+from fpp_ml_bench.evaluation.protocol import COVERED, WIDE_BAND_PX, WITHIN_MM
+
+Unit = Literal["mm", "signed mm", "share", "ratio", "nats"]
+"""A ``share`` is from 0 to 1, a ``ratio`` may exceed 1; both are shown as per cent."""
+ALWAYS = 28
+"""So many places among the keys of a file are always there."""
+WIDE, WIDEST = 140, 170
+_rows = count()
+
+
+@dataclass(frozen=True)
+class Metric:
+    """``of`` computes it for a sample, None where the sample has no pixel for it, or names a statistic that a sample
+    has; ``title`` and ``rule`` say what it is in reports and in PROTOCOL.md, which list the entries by ``row``, in the
+    order in which they are written.
+
+    ``place``: that of its key in a file. In the first `ALWAYS` places a score that no sample has is null, in the others
+    its key is left out. A new metric has no place: it comes last, and files from before stay readable. ``cancels``: a
+    small difference of large numbers, which two machines compute to 1e-9 of the error.
+
+    Roles: ``headline``: one of the paper's six numbers, which have intervals and ranks; ``role``: ``rank``, the
+    leaderboard's order, and ``range``, which stands beside it; ``helped_by_missing``: a method improves it by answering
+    fewer pixels, so nothing is sorted by it; ``training``: `DepthScores` has it, and ``of`` reads only what is there,
+    too; ``over``: it is null exactly where this pixel set is empty; ``column``: title of its column in the
+    leaderboard's tables, in terminals of ``column_from`` characters and more; ``terminal``: title of its column in the
+    tables of ``fpp-eval``."""
+
+    key: str
+    title: str
+    unit: Unit
+    of: Callable[[Any], Any] | str
+    rule: str
+    place: int = 1000
+    cancels: bool = False
+    better: Literal["lower", "higher", "nearer 0", "neither"] = "lower"
+    headline: bool = False
+    role: Literal["", "rank", "range"] = ""
+    helped_by_missing: bool = False
+    training: bool = False
+    over: str = ""
+    column: str = ""
+    column_from: int = 0
+    terminal: str = ""
+    row: int = field(default_factory=lambda: next(_rows), compare=False)
+
+    def value(self, sample: Any) -> Any:
+        """The metric of a sample."""
+        return attrgetter(self.of)(sample) if isinstance(self.of, str) else self.of(sample)
+
+    @property
+    def optional(self) -> bool:
+        """Whether a file leaves it out where no sample has it."""
+        return self.place >= ALWAYS
+
+
+def share(part: Any, whole: Any) -> Any:
+    """``part / whole``; None where there is no whole."""
+    return part / whole if whole else None
+
+
+def _within(number: int, sample: Any) -> Any:
+    return sample.spread.within[number]
+
+
+_headline = partial(Metric, headline=True, training=True)
+_object = partial(Metric, over="object", training=True)
+_ENTRIES = (
+    _headline(
+        "object_mae_mm",
+        "Object MAE",
+        "mm",
+        "object.mae_mm",
+        "mean of |e| over the object",
+        2,
+        role="rank",
+        over="object",
+        column="Object MAE",
+        terminal="Object\nMAE",
+    ),
+    Metric(
+        "object_mae_range_share",
+        "Object MAE, share of its depth range",
+        "ratio",
+        lambda s: share(s.object.mae_mm, s.range_mm),
+        "object MAE over (D_max - D_min), the range of the sample's object pixels that are scored; may exceed 1; none "
+        "for a flat object. The paper's 18% is such a share",
+        33,
+        training=True,
+        role="range",
+    ),
+    _headline(
+        "object_rmse_mm",
+        "Object RMSE",
+        "mm",
+        "object.rmse_mm",
+        "root mean square of e over the object",
+        3,
+        over="object",
+        column="Object RMSE",
+        terminal="Object\nRMSE",
+    ),
+    _headline(
+        "overall_mae_mm",
+        "Overall MAE",
+        "mm",
+        "overall.mae_mm",
+        "mean of |e| over object and background",
+        0,
+        column="Overall MAE",
+    ),
+    _headline(
+        "overall_rmse_mm",
+        "Overall RMSE",
+        "mm",
+        "overall.rmse_mm",
+        "root mean square of e over object and background",
+        1,
+    ),
+    _headline(
+        "background_mae_mm",
+        "Background MAE",
+        "mm",
+        "background.mae_mm",
+        "mean of |e| over the background",
+        4,
+        over="background",
+        column="Backgr. MAE",
+        column_from=WIDE,
+        terminal="Background\nMAE",
+    ),
+    _headline(
+        "background_rmse_mm",
+        "Background RMSE",
+        "mm",
+        "background.rmse_mm",
+        "root mean square of e over the background",
+        5,
+        over="background",
+    ),
+    _object(
+        "object_median_mm",
+        "Object, median error",
+        "mm",
+        "spread.median_mm",
+        "median of |e|, with linear interpolation",
+        15,
+    ),
+    _object(
+        "object_p95_mm",
+        "Object, 95th percentile",
+        "mm",
+        "spread.p95_mm",
+        "95th percentile of |e|, with linear interpolation",
+        16,
+    ),
+    _object("object_max_mm", "Object, largest error", "mm", "spread.largest_mm", "largest |e|", 17),
+    *(
+        _object(
+            f"object_within_{limit}mm_share",
+            f"Object within {limit} mm",
+            "share",
+            partial(_within, number),
+            f"share of pixels with |e| of at most {limit} mm",
+            18 + number,
+            better="higher",
+        )
+        for number, limit in enumerate(WITHIN_MM)
+    ),
+    _object(
+        "object_bias_mm",
+        "Object, signed bias",
+        "signed mm",
+        "spread.bias_mm",
+        "mean of e",
+        22,
+        cancels=True,
+        better="nearer 0",
+        helped_by_missing=True,
+    ),
+    Metric(
+        "object_valid_bias_mm",
+        "Object where predicted, signed bias",
+        "signed mm",
+        "spread.valid_bias_mm",
+        "mean of e over the measured pixels",
+        23,
+        cancels=True,
+        better="nearer 0",
+        helped_by_missing=True,
+        training=True,
+    ),
+    _object(
+        "object_shift_free_mae_mm",
+        "Object MAE without one offset",
+        "mm",
+        "spread.shift_free_mm",
+        "MAE after the median of e has been subtracted: the error without a constant offset. Not the mean, which a few "
+        "missing pixels move by metres",
+        24,
+        cancels=True,
+        helped_by_missing=True,
+    ),
+    Metric(
+        "object_interior_mae_mm",
+        "Object away from edges, MAE",
+        "mm",
+        "interior.mae_mm",
+        "MAE over the object interior",
+        6,
+        column="Interior MAE",
+        column_from=WIDEST,
+    ),
+    Metric(
+        "object_interior_rmse_mm",
+        "Object away from edges, RMSE",
+        "mm",
+        "interior.rmse_mm",
+        "RMSE over the object interior",
+        7,
+    ),
+    Metric(
+        "object_edge_mae_mm",
+        "Object along edges, MAE",
+        "mm",
+        "edge.mae_mm",
+        "MAE over the object edge",
+        8,
+        column="Edge MAE",
+        column_from=WIDEST,
+    ),
+    Metric(
+        "object_edge_rmse_mm",
+        "Object along edges, RMSE",
+        "mm",
+        "edge.rmse_mm",
+        "RMSE over the object edge",
+        9,
+    ),
+    Metric(
+        "object_valid_mae_mm",
+        "Object where predicted, MAE",
+        "mm",
+        "valid.mae_mm",
+        "MAE over the measured pixels; read it beside their share",
+        10,
+        helped_by_missing=True,
+        training=True,
+    ),
+    Metric(
+        "object_interior_valid_mae_mm",
+        "Object where predicted, away from edges, MAE",
+        "mm",
+        "interior_valid.mae_mm",
+        "MAE over the measured pixels of the interior",
+        11,
+        helped_by_missing=True,
+    ),
+    _object(
+        "object_missing_share",
+        "Object not predicted",
+        "share",
+        lambda s: share(s.object.pixels - s.valid.pixels, s.object.pixels),
+        "share of pixels predicted 0 or less; all other scores of the object count them with their full error",
+        13,
+        column="Missing",
+        column_from=WIDE,
+        terminal="Not\nmeasured",
+    ),
+    Metric(
+        "object_interior_missing_share",
+        "Object away from edges, not predicted",
+        "share",
+        lambda s: share(s.interior.pixels - s.interior_valid.pixels, s.interior.pixels),
+        "the same share of the interior",
+        14,
+    ),
+    Metric(
+        "object_edge_share",
+        "Object along edges, share of pixels",
+        "share",
+        lambda s: share(s.edge.pixels, s.object.pixels),
+        "share of the object that is object edge",
+        12,
+        better="neither",
+        over="object",
+        terminal="Near\nedges",
+    ),
+    Metric(
+        "object_wide_band_mae_mm",
+        f"Object within {WIDE_BAND_PX} px of edges, MAE",
+        "mm",
+        "wide_band.mae_mm",
+        "MAE over the object wide band",
+        25,
+    ),
+    Metric(
+        "object_wide_interior_mae_mm",
+        f"Object {WIDE_BAND_PX} px or more from edges, MAE",
+        "mm",
+        "wide_interior.mae_mm",
+        "MAE over the object wide interior",
+        26,
+    ),
+    Metric(
+        "object_wide_band_share",
+        f"Object within {WIDE_BAND_PX} px of edges, share of pixels",
+        "share",
+        lambda s: share(s.wide_band.pixels, s.object.pixels),
+        "share of the object that is wide band",
+        27,
+        better="neither",
+        over="object",
+    ),
+    Metric(
+        "void_share",
+        "Void, share of the image",
+        "share",
+        lambda s: None if s.void is None else s.void / (s.object.pixels + s.background.pixels + s.void),
+        "void pixels over all pixels of the image",
+        28,
+        better="neither",
+    ),
+    Metric(
+        "unlit_mae_mm",
+        "Unlit, MAE",
+        "mm",
+        "unlit.mae_mm",
+        "MAE over the unlit set, missing pixels included. There is no phase to read: what is right here is inferred "
+        "from the rest",
+        29,
+        over="unlit",
+    ),
+    Metric(
+        "unlit_rmse_mm",
+        "Unlit, RMSE",
+        "mm",
+        "unlit.rmse_mm",
+        "RMSE over the unlit set, missing pixels included",
+        30,
+        over="unlit",
+    ),
+    Metric(
+        "unlit_valid_mae_mm",
+        "Unlit where predicted, MAE",
+        "mm",
+        "unlit_valid.mae_mm",
+        "MAE over the measured pixels of the unlit set",
+        31,
+        helped_by_missing=True,
+    ),
+    Metric(
+        "unlit_missing_share",
+        "Unlit, not predicted",
+        "share",
+        lambda s: share(s.unlit.pixels - s.unlit_valid.pixels, s.unlit.pixels),
+        "share of the unlit set predicted 0 or less",
+        32,
+        over="unlit",
+    ),
+)
+METRICS = {metric.key: metric for metric in sorted(_ENTRIES, key=attrgetter("place"))}
+"""Every metric by its key, in the order of a file."""
+HEADLINE = tuple(key for key, metric in METRICS.items() if metric.headline)
+"""The paper's six numbers (Section 5.3.2): MAE and RMSE over the full grid, the object and the background, in mm."""
+RANK_KEY, RANGE_KEY = (next(m.key for m in _ENTRIES if m.role == role) for role in ("rank", "range"))
+
+_ORDER = "object median, 95th percentile, RMSE and maximum are out of order"
+_BIAS = "object bias or shift-free MAE is above the MAE, which no error has"
+BOUNDS = (
+    ("object_median_mm", "object_p95_mm", _ORDER),
+    ("object_p95_mm", "object_max_mm", _ORDER),
+    ("object_rmse_mm", "object_max_mm", _ORDER),
+    ("object_bias_mm", "object_mae_mm", _BIAS),
+    ("object_shift_free_mae_mm", "object_mae_mm", _BIAS),
+)
+"""Of any errors, the magnitude of the first score is at most the second; what is said where it is not."""
+
+NOTES = (
+    "Object: |error| median {object_median_mm}, 95th percentile {object_p95_mm}, maximum {object_max_mm} mm; pixels "
+    f"within {', '.join(f'{limit} mm {{object_within_{limit}mm_share}}' for limit in WITHIN_MM)}. "
+    "MAE {object_mae_range_share} of each sample's depth range.",
+    "Bias {object_bias_mm} mm ({object_valid_bias_mm} mm where measured); MAE {object_shift_free_mae_mm} mm once each "
+    "sample's best single offset is removed.",
+    f"MAE {{object_wide_band_mae_mm}} mm within {WIDE_BAND_PX} px of depth edges, {{object_wide_interior_mae_mm}} mm "
+    "inside.",
+    "Object pixels near a depth edge: {object_edge_share}.",
+    "Object pixels not measured: {object_missing_share} ({object_interior_missing_share} of those away from edges), "
+    "scored with their whole depth. MAE where measured: {object_valid_mae_mm} mm, away from edges "
+    "{object_interior_valid_mae_mm} mm.",
+    "Void pixels, in no set: {void_share} of the image (unlit, or of mixed depths).",
+    "Unlit pixels: MAE {unlit_mae_mm}, RMSE {unlit_rmse_mm} mm; {unlit_missing_share} not measured, MAE of the others "
+    "{unlit_valid_mae_mm} mm.",
+)
+"""What the terminal says below its table; a line whose first score may be left out of a file is left out with it."""
+
+
+_sigma = partial(Metric, helped_by_missing=True)
+_STATED = (
+    _sigma(
+        "unstated_share",
+        "Object without a sigma",
+        "share",
+        "unstated_share",
+        "share of object pixels that state none",
+        1,
+        terminal="Not\nstated",
+    ),
+    *(
+        _sigma(
+            f"coverage_{percent}",
+            f"Pixels with a sigma in their {percent}% interval",
+            "share",
+            methodcaller("within", percent),
+            "of the object pixels that state one, the share with |e| <= z s, z the quantile of a central Gaussian "
+            f"interval that holds {percent}%",
+            0,
+            better="neither",
+            terminal=f"In {percent}%\ninterval",
+        )
+        for percent in COVERED
+    ),
+    _sigma(
+        "sigma_mean_mm",
+        "Mean sigma",
+        "mm",
+        "sigma_mean_mm",
+        "sharpness: mean of s over these pixels",
+        0,
+        terminal="Sigma\nmean",
+    ),
+    _sigma(
+        "sigma_median_mm",
+        "Median sigma",
+        "mm",
+        "sigma_median_mm",
+        "sharpness: median of s over these pixels",
+        0,
+        terminal="Sigma\nmedian",
+    ),
+    _sigma(
+        "nll",
+        "Negative log-likelihood, nats",
+        "nats",
+        "nll",
+        "mean over these pixels of ln s' + ln(2 pi) / 2 + min(|e| / s', 10)^2 / 2 in nats, with s' = max(s, 0.01 mm): "
+        "the Gaussian negative log-likelihood, robust against a single wrong order and against s near 0",
+        0,
+        terminal="NLL",
+    ),
+    *(
+        _sigma(
+            f"ause_{error}_mm",
+            f"AUSE, {error.upper()}",
+            "mm",
+            methodcaller("area_mm", f"{error}_mm"),
+            f"sparsification (Ilg et al., ECCV 2018), over all object pixels: the {error.upper()} of the rest after "
+            "the share 0, 0.05, ... 0.95 of least sure pixels has been left out, minus that after the same share of "
+            "largest errors; mean of the 20 differences, in mm, not divided by the error",
+            0,
+            cancels=True,
+            terminal="AUSE\nMAE" if error == "mae" else "",
+        )
+        for error in ("mae", "rmse")
+    ),
+    *(
+        _sigma(
+            f"sure_{error}_mm",
+            f"{error.upper()} of the surest 95%",
+            "mm",
+            methodcaller("sure_mm", f"{error}_mm"),
+            f"{error.upper()} of the object without its 5% least sure pixels",
+            0,
+            terminal="MAE of the\nsurest 95%" if error == "mae" else "",
+        )
+        for error in ("mae", "rmse")
+    ),
+)
+UNCERTAINTY = {metric.key: metric for metric in sorted(_STATED, key=attrgetter("place"))}
+"""Scores of a stated uncertainty (``{sample}.sigma.npy``), a block of their own in a result; ``of`` gets a
+`SigmaSample`."""
+
+
+def listed(metrics: Iterable[Metric]) -> list[Metric]:
+    """The entries in the order in which they are written, which is that of tables for people."""
+    return sorted(metrics, key=attrgetter("row"))
+
+
+def with_column(width: int) -> list[Metric]:
+    """Those with a column in the leaderboard's tables where the terminal has ``width`` characters, the most important
+    first."""
+    shown = (metric for metric in listed(METRICS.values()) if metric.column and metric.column_from <= width)
+    return sorted(shown, key=attrgetter("column_from"))
+
+
+def sort_keys() -> tuple[str, ...]:
+    """What the leaderboard can be sorted by."""
+    keys = (key for key, metric in METRICS.items() if not metric.helped_by_missing)
+    return (*keys, "seconds_per_sample", "frames_used")
+
+
+def protocol_table(metrics: Iterable[Metric]) -> list[str]:
+    """Lines of the table in PROTOCOL.md."""
+    rows = [(f"`{m.key}`", m.unit, m.better, m.rule.replace("|", "\\|")) for m in listed(metrics)]
+    return ["| key | unit | better | rule |", "|---|---|---|---|", *(f"| {' | '.join(row)} |" for row in rows)]

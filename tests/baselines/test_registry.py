@@ -1,0 +1,142 @@
+"""Finding methods: of this package, of an installed package, of a file, and by weights; and what is refused."""
+
+from importlib import metadata
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fpp_ml_bench.baselines import registry
+from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.options import described
+
+RIG = paper_rig(224)
+MINE = """
+from dataclasses import dataclass
+
+import numpy as np
+from fpp_ml_bench import Method
+from fpp_ml_bench.options import option
+
+
+@dataclass(frozen=True)
+class Options:
+    depth: float = option(1500.0, "depth of what is lit", "MM")
+
+
+class Mine(Method):
+    name, title, frames_used, Options = "mine", "Everything lit is near", (0,), Options
+
+    def predict(self, frames):
+        return np.where(frames[0] > 60, np.float32(self.options.depth), np.float32(0))
+
+
+class Half(Method):
+    name, title, frames_used = "half", "No prediction", (0,)
+
+
+here = 3
+"""
+
+
+@pytest.fixture
+def mine(tmp_path: Path) -> str:
+    (tmp_path / "mine.py").write_text(MINE)
+    return str(tmp_path / "mine.py")
+
+
+def test_a_method_of_a_file_with_its_options(mine):
+    method = registry.load_method(f"{mine}:Mine", RIG, depth=900.0)
+    assert (method.name, method.settings, method.learned_from) == ("mine", {"depth": 900.0}, {"data": "none"})
+    frame = np.full((224, 224), 61, np.uint8)
+    assert (method.predict([frame]) == 900).all()
+    found = registry.find(f"{mine}:Mine")
+    assert found is not registry.find(f"{mine}:Mine") and found.method is registry.find(f"{mine}:Mine").method
+    assert described(found.method.Options)["depth"].metavar == "MM"
+    with pytest.raises(PredictionError, match=r"mine: has no option dept; did you mean 'depth'\?"):
+        registry.load_method(f"{mine}:Mine", RIG, dept=1.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "says"),
+    [
+        ("mine.py:Min", r"mine.py: has no 'Min'; did you mean 'Mine'\?"),
+        ("mine.py:Half", "does not define predict"),
+        ("mine.py:here", "expected a subclass of fpp_ml_bench.Method, got int"),
+        ("none.py:Mine", "none.py: no such file"),
+        ("broken.py:Mine", r"broken.py, line 1, in <module>: ZeroDivisionError"),
+        ("spaces.py:Mine", "its name is 'a b'; expected text without spaces"),
+    ],
+)
+def test_files_that_hold_no_method(mine, name, says):
+    folder = Path(mine).parent
+    (folder / "broken.py").write_text("1 / 0\n")
+    (folder / "spaces.py").write_text(MINE.replace('"mine"', '"a b"'))
+    with pytest.raises(PredictionError, match=says):
+        registry.load_method(str(folder / name), RIG)
+
+
+def test_where_code_of_a_file_failed(mine):
+    method = registry.load_method(f"{mine}:Mine", RIG)
+    with pytest.raises(IndexError) as caught:
+        method.predict([])
+    assert f"{mine}, line 18, in predict: IndexError" in str(registry.failure_in_file(caught.value))
+    with pytest.raises(KeyError) as elsewhere:
+        {}["a"]
+    assert registry.failure_in_file(elsewhere.value) is None
+
+
+class Installed(Method):
+    name, title, frames_used = "installed", "Of a package", (0,)
+
+    def predict(self, frames):
+        return np.zeros(frames[0].shape, np.float32)
+
+
+class Taken(Installed):
+    name = "phase"
+
+
+def test_methods_of_installed_packages(monkeypatch):
+    """By the entry point group; one that can't be used does no harm until it is asked for."""
+    dist = SimpleNamespace(name="strangers")
+
+    def entry(name, load):
+        return SimpleNamespace(name=name, value=f"strangers:{name}", dist=dist, load=load)
+
+    def offered(group: str) -> list[SimpleNamespace]:
+        assert group == "fpp_ml_bench.methods"
+        broken = entry("broken", lambda: 1 / 0)
+        return [entry("one", lambda: Installed), entry("taken", lambda: Taken), broken, entry("no", lambda: 3)]
+
+    monkeypatch.setattr(metadata, "entry_points", offered)
+    registry._installed.cache_clear()
+    try:
+        assert [*registry.methods()][-2:] == ["nearest", "installed"]
+        assert registry.load_method("installed", RIG).title == "Of a package"
+        assert registry.load_method("phase", RIG).title.startswith("Phase route")
+        for name, says in (("broken", "ZeroDivisionError"), ("taken", "name 'phase' is taken"), ("no", "got int")):
+            with pytest.raises(PredictionError, match=says):
+                registry.find(name)
+    finally:
+        registry._installed.cache_clear()
+
+
+def test_a_name_that_is_almost_right():
+    with pytest.raises(PredictionError, match=r"unknown method 'phase-nte'; did you mean 'phase-net'\?"):
+        registry.find("phase-nte")
+    with pytest.raises(PredictionError, match="there are classical, classical-net, phase"):
+        registry.find("something else")
+
+
+@pytest.mark.parametrize("method", registry.methods().values(), ids=str)
+def test_a_method_says_what_it_needs_to(method):
+    """One line for ``--help``, and help for each option; no option that its class does not take."""
+    assert method.purpose and method.name
+    for options in filter(None, (method.Options, method.Training)):
+        for name, description in described(options).items():
+            assert description.help and name in options.__dataclass_fields__
+    assert all(set(options) <= set(method.Options.__dataclass_fields__) for options in method.variants(RIG))
