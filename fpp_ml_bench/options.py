@@ -17,6 +17,7 @@ from typing import Any
 from fpp_ml_bench.files import printable
 
 _KEY = "fpp_ml_bench.option"
+MOST_LISTED = 80
 REQUIRED: Any = MISSING
 """In place of a default: the command line must give it."""
 
@@ -81,7 +82,7 @@ def nearest(name: str, known: Collection[str] | Mapping[str, Any], count: int = 
 
 
 def did_you_mean(name: str, known: Collection[str] | Mapping[str, Any]) -> str:
-    """How a message about an unknown ``name`` ends: the nearest known one, or all of them.
+    """How a message about an unknown ``name`` ends: the nearest known one, or all of them, up to `MOST_LISTED`.
 
     >>> did_you_mean("clasical", ["classical", "phase"])
     "did you mean 'classical'?"
@@ -89,4 +90,7 @@ def did_you_mean(name: str, known: Collection[str] | Mapping[str, Any]) -> str:
     'there are classical, phase'
     """
     meant = nearest(name, known)
-    return f"did you mean {printable(meant[0])!r}?" if meant else f"there are {', '.join(known) or 'none'}"
+    if meant:
+        return f"did you mean {printable(meant[0])!r}?"
+    listed = [*known][:MOST_LISTED] + ["..."] * (len(known) > MOST_LISTED)
+    return f"there are {', '.join(listed) or 'none'}"

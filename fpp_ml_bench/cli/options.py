@@ -194,10 +194,16 @@ def command_line(*, without: tuple[str, ...] = (), more: tuple[str, ...] = ()) -
             continue
         value = ctx.params[str(param.name)]
         many = getattr(param, "multiple", False) or param.nargs != 1
-        for one in value if many else [",".join(value) if isinstance(value, tuple) else value]:
-            text = [] if isinstance(one, bool) else [f"{one:g}" if isinstance(one, float) else str(one)]
-            words += text if isinstance(param, click.Argument) else [param.opts[0], *text]
+        for one in value if many else [value]:
+            flag = [] if isinstance(param, click.Argument) else param.opts[:1]
+            words += flag if isinstance(one, bool) else [*flag, _text_of(one)]
     return shlex.join([*words, *more])
+
+
+def _text_of(value: Any) -> str:
+    if isinstance(value, tuple):
+        return ",".join(map(_text_of, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 # ---- commands

@@ -195,7 +195,7 @@ def test_groups_hold_every_frame_once(stored, count, configs):
     ("change", "message"),
     [
         ({"objects": ()}, "no object"),
-        ({"objects": ("mugg",)}, "did you mean mug"),
+        ({"objects": ("mugg",)}, "did you mean 'mug'"),
         ({"objects": ("mug", "bowl", "mug")}, "'mug' is named twice"),
         ({"placement": "random"}, "fixed or varied"),
         ({"stored": "both"}, "single_shot"),
