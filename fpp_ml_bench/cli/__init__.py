@@ -83,7 +83,7 @@ BENCH = Program(
         "understand": {
             "diagnose": ("diagnose:diagnose", "probe a model: does it read fringes or shapes; an HTML report"),
             "reliance": (
-                "reliance:reliance",
+                "diagnose:reliance",
                 "measure phase reliance: does a prediction follow the fringes or the outline",
             ),
             "robustness": (
@@ -96,7 +96,7 @@ BENCH = Program(
         "learn": {
             "train": ("train:train", "train a recipe, shipped or yours, into a weights file"),
             "reproduce": (
-                "reproduce:reproduce_tables",
+                "train:reproduce_tables",
                 "train and score the rows of the paper's tables, beside its numbers",
             ),
         },

@@ -1,4 +1,5 @@
-"""``fpp-bench diagnose``: does a model read fringes or shapes? An HTML report."""
+"""What a model reads: ``fpp-bench diagnose`` probes it, ``fpp-bench reliance`` measures how far it follows the fringe's
+phase."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,9 +11,12 @@ from rich.text import Text
 
 from fpp_ml_bench.baselines import diagnostics, registry
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.cli.console import show
-from fpp_ml_bench.cli.methods import MethodCommand, OfMethods
-from fpp_ml_bench.cli.options import COUNT, command, command_line, names
+from fpp_ml_bench.cli.console import progress_bar, show
+from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings, OfMethods
+from fpp_ml_bench.cli.options import COUNT, command, command_line, names, value
+from fpp_ml_bench.evaluation import result
+from fpp_ml_bench.leaderboard.measured import check_same_method, write_reliance
+from fpp_ml_bench.leaderboard.rows import read_entry
 from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.options import REQUIRED, argument, option
@@ -92,8 +96,74 @@ def diagnose(
 
         results = diagnostics.diagnose(subject, opened, probe_names, probing, out, progress, again)
     table = Table("Probe", "Summary", numbers=("Seconds",), title=Text(subject.title))
-    for result in results:
-        text = f"not run: {result.finding.skipped}" if result.finding.skipped else result.finding.summary
-        table.add_row(result.probe.name, Text(text), "reused" if result.reused else f"{result.seconds:.1f}")
+    for probed in results:
+        text = f"not run: {probed.finding.skipped}" if probed.finding.skipped else probed.finding.summary
+        table.add_row(probed.probe.name, Text(text), "reused" if probed.reused else f"{probed.seconds:.1f}")
     show(table)
     print(f"Written: {out / diagnostics.REPORT_FILE}\nWritten: {out / diagnostics.JSON_FILE}")
+
+
+@command(
+    """\
+fpp-bench reliance classical data/cpu224
+fpp-bench reliance phase data/cpu224 --direction vertical
+fpp-bench reliance unet-individual-rmse data/cpu224 --range oracle --into result.json
+""",
+    MethodCommand,
+)
+def reliance(
+    *,
+    chosen: MethodSettings,
+    dataset: Path = argument("dataset folder; scenes are made from its test objects", "DATASET"),
+    views: int = option(
+        2,
+        "samples of each test object, 1 to 6 (default: 2)",
+        "N",
+        parse=value("1 to 6, an object has six views", int, lambda views: 1 <= views <= 6),
+    ),
+    into: Path | None = option(
+        None, "write the score into this result or leaderboard row of the same method (.json)", "FILE"
+    ),
+    json: Path | None = option(None, "write the score and its parts to this file; - is standard output", "FILE"),
+) -> None:
+    """Measure phase reliance: does the predicted depth follow the fringe's phase, or the object's outline?
+
+    A file that can't take the score raises FppBenchError before measuring."""
+    opened = storage.DatasetFolder(dataset)
+    method = chosen.load(opened)
+    entry = None if into is None else read_entry(into)
+    if entry is not None:
+        check_same_method(entry, method)
+    scene_set = diagnostics.SceneSet(opened, views)
+    found = method.get("weights_sha256")
+    sha256 = found if isinstance(found, str) else None
+    with progress_bar(f"reliance of {chosen.name}", len(scene_set.samples), "samples") as advance:
+        # Called before each sample, so the first call is for none.
+        measured, _ = diagnostics.measure(method, scene_set, sha256, lambda done, total, sample: advance(min(done, 1)))
+    if json is not None:
+        result.write_json(measured.model_dump(mode="json"), json)
+    if entry is not None:
+        write_reliance(entry, measured)
+    moved = [value for key, value in measured.parts if not key.startswith("answered")]
+    if any(moved):
+        show(_reliance_table(method.title, measured))
+    else:
+        print(
+            f"{method.title}: gives the same answer whatever phase, light and outline of {measured.samples} samples "
+            "are, so it reads nothing of them. Phase reliance 0."
+        )
+
+
+def _reliance_table(title: str, reliance: "result.Reliance") -> Table:
+    heading = Text(f"{title}: {reliance.samples} samples of {reliance.objects} objects")
+    table = Table("", numbers=("value",), title=heading)
+    low, high = reliance.interval
+    interval = "" if low is None or high is None else f" ({low:.2f} to {high:.2f})"
+    table.add_row("phase reliance, 0 to 1", f"{reliance.score:.3f}{interval}")
+    if reliance.order_free_score is not None:
+        table.add_row("  whole periods aside", f"{reliance.order_free_score:.3f}")
+    for key, words in result.PART_TITLES.items():
+        value = getattr(reliance.parts, key)
+        if value is not None:
+            table.add_row(words, f"{value:.3f}")
+    return table

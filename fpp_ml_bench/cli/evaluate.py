@@ -6,7 +6,7 @@ from json import dumps
 from pathlib import Path
 
 from fpp_ml_bench.cli import CHECK_FAILED, EVAL, OK, run_program
-from fpp_ml_bench.cli.options import SPLITS, Explain, command, whole
+from fpp_ml_bench.cli.options import SPLITS, Explain, command, value
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import report, result, score, submission
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, MODES, TARGETS
@@ -53,7 +53,7 @@ def score_folder(
         EDGE_BAND_PX,
         f"object pixels nearer than this to a depth edge count as edge (default: {EDGE_BAND_PX})",
         "PX",
-        parse=whole(0, 1000, "px"),
+        parse=value("whole pixels from 0 to 1000", int, lambda band: 0 <= band <= 1000),
     ),
     mode: str = option(
         MODES[0],

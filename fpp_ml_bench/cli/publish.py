@@ -6,7 +6,6 @@ from tempfile import TemporaryDirectory
 
 from fpp_ml_bench import leaderboard, loaders
 from fpp_ml_bench.cli import Program
-from fpp_ml_bench.cli.console import gigabytes, progress_bar
 from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.files import printable
@@ -81,6 +80,8 @@ def publish_dataset(settings: DatasetSettings) -> None:
 
     Raises FppBenchError for files that can't be published and for errors of the Hub or the network."""
     hub = loaders.hub.Hub()
+    from fpp_ml_bench.cli.console import progress_bar  # imports rich, which --help must not
+
     dataset = loaders.DatasetFolder(settings.dataset)
     licence = loaders.hub_dataset.dataset_licence(dataset, settings.license)
     remote = _remote(settings, hub, "dataset")
@@ -176,6 +177,8 @@ def _carry_out(
     settings: RepositorySettings, hub: loaders.hub.Hub, publication: loaders.hub.Publication, remote: loaders.hub.Remote
 ) -> None:
     """Print what changes and send it, unless nothing changes or this is a dry run."""
+    from fpp_ml_bench.cli.console import gigabytes, progress_bar
+
     private = getattr(settings, "private", False)
     loaders.hub.check_replaceable(publication, remote, getattr(settings, "adopt", False))
     planned = loaders.hub.changes(publication, remote)

@@ -12,7 +12,7 @@ from scored_dataset import make_dataset, write_predictions
 from fpp_ml_bench.baselines.reproduce import Folders, plan, planned, variants
 from fpp_ml_bench.baselines.reproduce.plan import default_folder, open_dataset
 from fpp_ml_bench.baselines.training import PRESETS, TABLES, load_recipe
-from fpp_ml_bench.cli import reproduce as command
+from fpp_ml_bench.cli import train as command
 from fpp_ml_bench.errors import DatasetError, RecipeError
 from fpp_ml_bench.evaluation.report import compare
 from fpp_ml_bench.evaluation.score import evaluate

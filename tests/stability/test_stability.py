@@ -222,9 +222,7 @@ def test_the_command(tmp_path, capsys, monkeypatch):
     assert "rig: intrinsic matrix (11)" in capsys.readouterr().out
     (tmp_path / "file").write_text("x")
     assert main(["stability", "--group", "rig", "--out", str(tmp_path / "file")]) == 2
-    with pytest.raises(SystemExit) as stopped:
-        main(["stability", "--group", "chance"])
-    assert stopped.value.code == 2
+    assert main(["stability", "--group", "chance"]) == 2
     broken = break_interval(monkeypatch)
     monkeypatch.setattr("fpp_ml_bench.baselines.stability.all_cases", lambda *_, **__: broken)
     assert main(["stability", "--group", "order"]) == 1
