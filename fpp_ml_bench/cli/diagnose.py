@@ -135,7 +135,7 @@ def reliance(
     if entry is not None:
         check_same_method(entry, method)
     scene_set = diagnostics.SceneSet(opened, views)
-    found = method.get("weights_sha256")
+    found = method.settings.get("weights_sha256")
     sha256 = found if isinstance(found, str) else None
     with progress_bar(f"reliance of {chosen.name}", len(scene_set.samples), "samples") as advance:
         # Called before each sample, so the first call is for none.

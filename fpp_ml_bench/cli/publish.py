@@ -158,7 +158,7 @@ def publish_results(settings: ResultSettings) -> None:
         _carry_out(settings, hub, publication, remote)
 
 
-def _remote(settings: RepositorySettings, hub: loaders.hub.Hub, kind: loaders.hub.Kind) -> loaders.hub.Remote:
+def _remote(settings: RepositorySettings, hub: "loaders.hub.Hub", kind: "loaders.hub.Kind") -> "loaders.hub.Remote":
     """The current state of the repository, after checking that token, owner and visibility allow the run."""
     names = set() if settings.dry_run else hub.check_token()
     remote = hub.state(kind, settings.repo)
@@ -174,7 +174,10 @@ def _remote(settings: RepositorySettings, hub: loaders.hub.Hub, kind: loaders.hu
 
 
 def _carry_out(
-    settings: RepositorySettings, hub: loaders.hub.Hub, publication: loaders.hub.Publication, remote: loaders.hub.Remote
+    settings: RepositorySettings,
+    hub: "loaders.hub.Hub",
+    publication: "loaders.hub.Publication",
+    remote: "loaders.hub.Remote",
 ) -> None:
     """Print what changes and send it, unless nothing changes or this is a dry run."""
     from fpp_ml_bench.cli.console import gigabytes, progress_bar

@@ -31,6 +31,7 @@ SMALL = {"objects": ("cork",), "stored": "single_shot"}
 def build_arguments(folder, *more, workers=1):
     return [
         "build",
+        "--out",
         str(folder),
         "--size",
         str(TINY_SIZE),
