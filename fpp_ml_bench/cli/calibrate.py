@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from fpp_ml_bench import calibration, optics
 from fpp_ml_bench.cli.console import progress_bar, say_findings, show
@@ -207,7 +208,7 @@ def _from_board(
         say_findings(examination, f"{name}: ", notes=False)  # the response is measured over all poses
     lenses = lenses if len(poses) > 3 else lenses[:1]  # models are compared by poses left out
     sizes = (poses[0].size, (rig.projector.width, rig.projector.height))
-    options = {"estimate_board": settings.estimate_board, "baseline_mm": settings.baseline}
+    options: dict[str, Any] = {"estimate_board": settings.estimate_board, "baseline_mm": settings.baseline}
     with progress_bar("fitting", len(lenses), "lens models") as advance:
         found = []
         for lens in lenses:

@@ -128,7 +128,7 @@ def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[s
             f"{dataset.path}: is not what {shown} was predicted from, {printable(changed)} is another now; {give}, or "
             "predict again"
         )
-    return dataset, split
+    return dataset, split or "test"
 
 
 def _check_outputs(file: Path | None, page: Path | None, folder: Path) -> None:

@@ -4,6 +4,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 from fpp_ml_bench import calibration, coding, optics
 from fpp_ml_bench.cli.calibrate import print_fit
@@ -95,7 +96,7 @@ def _import_captures(settings: ImportSettings) -> None:
         )
     if settings.frame_order != "auto":
         raise BuildError("--frame-order belongs to published trees; captures have the order of their rig's sequence")
-    options = {
+    options: dict[str, Any] = {
         "min_modulation": settings.min_modulation,
         "max_clipped_steps": settings.max_clipped_steps,
         "max_disagreement_px": settings.max_disagreement,

@@ -243,7 +243,7 @@ class Command(click.Command):
     def __init__(self, function: Callable[..., int | None], examples: str) -> None:
         self.function, self.examples = function, examples
         self.defaults: dict[str, Any] = {}
-        self.groups: dict[str, type] = {}
+        self.groups: dict[str, Any] = {}
         params = []
         for name, parameter in signature(function).parameters.items():
             if isinstance(entry := parameter.default, Field):
