@@ -61,7 +61,7 @@ def time_method(
 
     for number in range(WARM_UP):
         latency_s(number)
-    working_mib = _added_by(lambda: latency_s(0))
+    working_mib = added_mib(lambda: latency_s(0))
     if cuda is not None:
         cuda.reset_peak_memory_stats(method.device)
     latencies_ms = []
@@ -79,15 +79,15 @@ def time_method(
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (_MIB if sys.platform == "darwin" else 1024)
     return Timing(
         provenance="measured",
-        latency_median_ms=_digits(statistics.median(latencies_ms)),
-        latency_p5_ms=_digits(low),
-        latency_p95_ms=_digits(high),
+        latency_median_ms=four_digits(statistics.median(latencies_ms)),
+        latency_p5_ms=four_digits(low),
+        latency_p95_ms=four_digits(high),
         repeats=repeats,
         batch=batch,
         batched=method.batched,
-        throughput_per_s=_digits(statistics.median(rates)),
+        throughput_per_s=four_digits(statistics.median(rates)),
         peak_memory_mib=round(peak_mib, 1),
-        working_memory_mib=None if working_mib is None else round(working_mib, 1),
+        working_memory_mib=working_mib,
         gpu_memory_mib=None if cuda is None else round(cuda.max_memory_allocated(method.device) / _MIB, 1),
         parameters=method.parameters,
         frames=len(method.frames_used),
@@ -98,13 +98,14 @@ def time_method(
     )
 
 
-def _digits(value: float) -> float:
+def four_digits(value: float) -> float:
     """Four significant digits: more would be noise."""
     return float(f"{value:.4g}")
 
 
-def _added_by(run: Callable[[], Any]) -> float | None:
-    """By how much ``run`` raises the resident set at its highest, in MiB; None where the kernel does not tell."""
+def added_mib(run: Callable[[], Any]) -> float | None:
+    """By how much ``run`` raises the resident set at its highest, in MiB to a tenth; None where the kernel does not
+    tell."""
     try:
         # What earlier runs freed goes back to the system (malloc_trim(3)), so that the next run's use shows.
         gc.collect()
@@ -112,7 +113,7 @@ def _added_by(run: Callable[[], Any]) -> float | None:
         Path("/proc/self/clear_refs").write_text("5")  # resets the peak of the resident set, VmHWM (proc(5))
         before = _status_mib("VmRSS")
         run()
-        return max(0.0, _status_mib("VmHWM") - before)
+        return round(max(0.0, _status_mib("VmHWM") - before), 1)
     except (OSError, KeyError):
         run()
         return None

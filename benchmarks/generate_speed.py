@@ -9,11 +9,19 @@ memory (``/dev/shm``): the difference is the disk's share. A first build that is
 The peer is what a careful script does with OpenCV and NumPy on one core, with the same scene and noise model and direct
 light alone: a `cv2.remap` lookup of the projector image, NumPy's SFC64 normal noise, rounding, `cv2.imwrite` to PNG; no
 ground truth. Its images a second are multiplied by the number of workers, as if it scaled perfectly.
+
+    python benchmarks/generate_speed.py --memory [--rows 24,48,96] [--sizes 240,480,960] [--folder DIR]
+
+The peak memory of each command against rows and image size instead. Every command runs as a process of its own
+(``fpp-bench ... --workers 1``), and the figure is its ``ru_maxrss`` (getrusage(2)), imports and shared libraries
+included. First the rows grow at 240 px, then the size at the first number of rows. A command whose memory is constant
+in rows shows the same figure three times, to a few MiB of noise.
 """
 
 import argparse
 import shutil
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
@@ -44,6 +52,14 @@ from fpp_ml_bench.optics import Rig, paper_rig, pattern_image
 
 FULL_IMAGES = 15_600
 VIEW = "A60"
+MEMORY_PX = 240
+LAUNCHER = """\
+import resource, subprocess, sys
+status = subprocess.run(sys.argv[1:], stdout=subprocess.DEVNULL).returncode
+print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)
+sys.exit(status)
+"""
+"""Runs a command from a small process: the largest resident set of a child begins at that of its parent."""
 
 
 def timed_build(folder: Path, settings: BuildSettings, workers: int) -> tuple[float, int, int]:
@@ -142,6 +158,47 @@ def peer_images_per_second(settings: BuildSettings, folder: Path, images: int = 
     return images / (time.perf_counter() - started)
 
 
+def peak_mib(program: str, *arguments: str) -> float:
+    """Largest resident set of a command, MiB. Raises `SystemExit` where it fails."""
+    command = [sys.executable, "-c", LAUNCHER, str(Path(sys.executable).with_name(program)), *arguments]
+    ended = subprocess.run(command, capture_output=True, text=True)
+    if ended.returncode:
+        raise SystemExit(f"{program} {' '.join(arguments)}: {ended.stderr[-2000:]}")
+    return int(ended.stdout) / (2**20 if sys.platform == "darwin" else 2**10)
+
+
+def peaks_mib(folder: Path, rows: int, size: int) -> dict[str, float]:
+    """MiB by command, on a dataset of its own that is removed again."""
+    names = [name for name in OBJECTS if split_of(name) == "train"][: rows // len(VIEWS)]
+    with tempfile.TemporaryDirectory(prefix="fpp-memory-", dir=folder) as scratch:
+        data, out, split = f"{scratch}/set", f"{scratch}/predictions", ("--split", "train")
+        commands = {
+            "build": ("build", data, "--size", str(size), "--objects", ",".join(names), "--workers", "1"),
+            "predict classical": ("predict", "classical", data, *split, "--out", f"{scratch}/classical"),
+            "predict classical --fewest": (
+                *("predict", "classical", data, "--fewest", "--steps", "3"),
+                *(*split, "--out", f"{scratch}/fewest"),
+            ),
+            "predict phase": ("predict", "phase", data, *split, "--out", out),
+        }
+        peaks = {name: peak_mib("fpp-bench", *words) for name, words in commands.items()}
+        peaks["fpp-eval"] = peak_mib("fpp-eval", out, data, *split)
+        return peaks | {name: peak_mib("fpp-bench", name, data) for name in ("verify", "info")}
+
+
+def print_memory(rows: list[int], sizes: list[int], folder: Path) -> None:
+    """Both tables: over rows at `MEMORY_PX`, and over the image size at the first number of rows."""
+    by_rows = [peaks_mib(folder, count, MEMORY_PX) for count in rows]
+    by_size = [by_rows[0] if size == MEMORY_PX else peaks_mib(folder, rows[0], size) for size in sizes]
+    for title, columns, results in (
+        (f"rows at {MEMORY_PX} px", [f"{count} rows" for count in rows], by_rows),
+        (f"image size at {rows[0]} rows", [f"{size} px" for size in sizes], by_size),
+    ):
+        print(f"\n{title}\n{'command':<28}" + "".join(f"{column:>12}" for column in columns))
+        for name in results[0]:
+            print(f"{name:<28}" + "".join(f"{result[name]:>8.0f} MiB" for result in results))
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=960)
@@ -149,7 +206,14 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=describe_hardware().cores)
     parser.add_argument("--folder", type=Path, default=Path.cwd(), help="a folder on the disk to measure")
     parser.add_argument("--light", default="paper", help="a named light, or a YAML file (default: paper)")
+    parser.add_argument("--memory", action="store_true", help="the peak memory of each command instead")
+    parser.add_argument("--rows", default="24,48,96", help="rows at 240 px, each a multiple of 6 up to 240")
+    parser.add_argument("--sizes", default="240,480,960", help="image sizes at the first number of rows")
     args = parser.parse_args()
+    if args.memory:
+        rows, sizes = ([int(number) for number in numbers.split(",")] for numbers in (args.rows, args.sizes))
+        print_memory(rows, sizes, args.folder)
+        return 0
     # Of one split, so that the shards are of equal size and no worker waits for another at the end.
     objects = tuple(name for name in OBJECTS if split_of(name) == "train")[: args.objects]
     settings = BuildSettings(rig=paper_rig(args.size), objects=objects, light=load_light(args.light))

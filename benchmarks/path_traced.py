@@ -1,6 +1,6 @@
 """Is the light right? Our images against a path tracer's, Mitsuba 3, of the same scenes; our camera against `fringes`.
 
-    python benchmarks/path_traced.py [--scenes plane,bowl] [--size 240] [--pictures DIR] [--keep DIR] [--json FILE]
+    python benchmarks/path_traced.py [--scenes plane,bowl] [--size 240] [--pictures DIR]
 
 Each scene stands before the background plane in the paper's rig, lit by the projector with shadows, no other lamp and
 no noise. Both renderers give the light of white and of the 18 horizontal fringes, direct (path length 2) and with every
@@ -20,27 +20,34 @@ Seconds are of one core. Exit status 1 if an agreement is missed. Needs ``pip in
 """
 
 import argparse
-import json
 import sys
 import tempfile
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import trimesh
-from mitsuba_scene import Images, PathTraced, first_harmonic
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion, gaussian_filter
 
-from fpp_ml_bench.loaders.render import BuildSettings, Light, SolidMesh, Studio, named_light
+from fpp_ml_bench.loaders.render import (
+    BuildSettings,
+    Light,
+    SolidMesh,
+    Studio,
+    named_light,
+    place,
+    projector_centre_m,
+)
 from fpp_ml_bench.loaders.render import solid_mesh as benchmark_mesh
+from fpp_ml_bench.loaders.render.illumination import grey_of_white
 from fpp_ml_bench.loaders.render.pixels import blur_image
 from fpp_ml_bench.loaders.render.sensor import Sensor, normal_table, sense_kernel, stream_keys
 from fpp_ml_bench.loaders.render.surfels import Surfels
 from fpp_ml_bench.loaders.sample import Flag
-from fpp_ml_bench.optics import Rig, paper_rig
+from fpp_ml_bench.optics import Rig, paper_rig, pattern_profiles
 from fpp_ml_bench.portable import gaussian_weights
 
 SCENES = ("plane", "sphere", "open_book", "bowl", "cleaning_bucket", "magazine_stack")
@@ -52,6 +59,117 @@ BOUNCES = 12
 DIRECT_SAMPLES = 256
 SAMPLES = {"bowl": 1296}
 """Paths a pixel with all bounces where 1024 are too few for the seeds to agree."""
+
+
+@dataclass(frozen=True)
+class Images:
+    """Light in grey levels: ``white`` float64 (H, W), and ``harmonic`` complex (H, W), the first of the 18 frames."""
+
+    white: NDArray[np.float64]
+    harmonic: NDArray[np.complex128]
+    seconds: float
+
+    @classmethod
+    def mean(cls, a: "Images", b: "Images") -> "Images":
+        return cls((a.white + b.white) / 2, (a.harmonic + b.harmonic) / 2, (a.seconds + b.seconds) / 2)
+
+
+def first_harmonic(frames: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """2/N sum I_k exp(-2 pi i k / N) of N frames along the first axis; its angle is the N-step phase."""
+    steps = len(frames)
+    weights = 2 / steps * np.exp(-2j * np.pi * np.arange(steps) / steps)
+    return np.tensordot(weights, frames, axes=1)
+
+
+class PathTraced:
+    """A scene in the path tracer: the same mesh in the same place, before the same plane, lit by the same projector."""
+
+    def __init__(self, mi: Any, mesh: SolidMesh, rig: Rig, light: Light, folder: Path) -> None:
+        self.mi, self.rig, self.light = mi, rig, light
+        vertices_m, _ = place(mesh, "A0", rig, "fixed", 42)
+        self.file = folder / f"{mesh.name}.ply"
+        trimesh.Trimesh(vertices_m, mesh.faces, process=False).export(self.file)
+        u = rig.camera.fx * vertices_m[:, 0] / vertices_m[:, 2] + rig.camera.cx
+        v = rig.camera.fy * vertices_m[:, 1] / vertices_m[:, 2] + rig.camera.cy
+        self.left, self.top = int(u.min()) - 2, int(v.min()) - 2
+        self.width, self.height = int(u.max()) + 3 - self.left, int(v.max()) + 3 - self.top
+
+    def render(self, length: int, samples: int, seed: int) -> Images:
+        """Light by paths of up to ``length`` pieces from the camera, ``samples`` a pixel; 0 beside the object's box."""
+        start = time.process_time()
+        pixels = np.array(self.mi.render(self.mi.load_dict(self._scene(length, samples)), seed=seed), dtype=np.float64)
+        seconds = time.process_time() - start
+        whole = np.zeros((self.rig.camera.height, self.rig.camera.width, 3))
+        whole[self.top : self.top + self.height, self.left : self.left + self.width] = pixels
+        white = whole[..., 0]
+        return Images(white, 2 * whole[..., 1] - white + 1j * (2 * whole[..., 2] - white), seconds)
+
+    def _scene(self, length: int, samples: int) -> dict[str, Any]:
+        rig, surface, camera = self.rig, self.light.surface, self.rig.camera
+        projector = rig.projector
+        row = first_harmonic(np.array(pattern_profiles(rig))[list(rig.sequence.sinusoids("horizontal"))] / 255.0)
+        row = row[: projector.height]
+        channels = np.stack([np.ones_like(row.real), (1 + row.real) / 2, (1 + row.imag) / 2], axis=1)
+        screen = np.repeat(channels[:, None], projector.width, axis=1).astype(np.float32)
+        centre = projector_centre_m(rig)
+        # Mitsuba multiplies by pi, so a white surface that faces the lamp at 1 m has radiance `scale`.
+        power = grey_of_white(self.light) * (rig.working_range_mm[0] / 1000) ** 2
+        matte: dict[str, Any] = {"type": "diffuse", "reflectance": {"type": "rgb", "value": surface.albedo}}
+        mirror = {"type": "roughconductor", "material": "none", "distribution": "ggx", "alpha": surface.roughness**2}
+        blend = {"type": "blendbsdf", "weight": surface.gloss, "matte": matte, "mirror": mirror}
+        wall = {"type": "diffuse", "reflectance": {"type": "rgb", "value": (1 - surface.gloss) * surface.albedo}}
+        film = {
+            "type": "hdrfilm",
+            "width": camera.width,
+            "height": camera.height,
+            "pixel_format": "rgb",
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+            "crop_offset_x": self.left,
+            "crop_offset_y": self.top,
+            "crop_width": self.width,
+            "crop_height": self.height,
+        }
+        return {
+            "type": "scene",
+            "integrator": {"type": "path", "max_depth": length, "rr_depth": 1000},
+            "camera": {
+                "type": "perspective",
+                "fov_axis": "x",
+                "fov": _field_degrees(camera),
+                "near_clip": 0.1,
+                "far_clip": 100.0,
+                "to_world": self._looking(np.zeros(3)),
+                "film": film,
+                "sampler": {"type": "multijitter", "sample_count": samples},
+            },
+            "projector": {
+                "type": "projector",
+                "fov": _field_degrees(projector),
+                "scale": power,
+                "to_world": self._looking(centre),
+                "irradiance": {"type": "bitmap", "bitmap": self.mi.Bitmap(screen), "raw": True, "wrap_mode": "clamp"},
+            },
+            "object": {
+                "type": "ply",
+                "filename": str(self.file),
+                "face_normals": True,
+                "bsdf": {"type": "twosided", "surface": blend if surface.gloss else matte},
+            },
+            "wall": {
+                "type": "rectangle",
+                "bsdf": {"type": "twosided", "surface": wall},
+                "to_world": self.mi.ScalarTransform4f().translate([0, 0, rig.background_m]).scale([20, 20, 1]),
+            },
+        }
+
+    def _looking(self, origin: NDArray[np.float64]) -> Any:
+        target = origin + np.array([0.0, 0.0, 1.0])
+        return self.mi.ScalarTransform4f().look_at(origin=origin.tolist(), target=target.tolist(), up=[0, -1, 0])
+
+
+def _field_degrees(pinhole: Any) -> float:
+    return float(np.degrees(2 * np.arctan(pinhole.width / 2 / pinhole.fx)))
 
 
 @dataclass(frozen=True)
@@ -210,16 +328,7 @@ def compare(mi: Any, name: str, args: argparse.Namespace, folder: Path) -> list[
 
     def path_traced(light: Light, length: int, samples: int) -> tuple[Images, Images]:
         scene = PathTraced(mi, mesh, rig, light, folder)
-        images = []
-        for seed in (1, 2):
-            kept = args.keep and args.keep / f"{name}_{args.size}_{light.surface.gloss}_{length}_{samples}_{seed}.npz"
-            if kept and kept.exists():
-                images.append(Images(**{key: value[()] for key, value in np.load(kept).items()}))
-                continue
-            images.append(scene.render(length, samples, seed))
-            if kept:
-                np.savez(kept, **asdict(images[-1]))
-        return images[0], images[1]
+        return scene.render(length, samples, seed=1), scene.render(length, samples, seed=2)
 
     start = time.process_time()
     surfels = Surfels.of(mesh)
@@ -286,16 +395,12 @@ def main() -> int:
     parser.add_argument("--size", type=int, default=240, metavar="PX", help="image size (default: 240)")
     parser.add_argument("--samples", type=int, help="Mitsuba's paths a pixel with all bounces (default: by scene)")
     parser.add_argument("--pictures", type=Path, metavar="DIR", help="write side-by-side pictures")
-    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep Mitsuba's images here, and use those kept")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write the table as JSON")
     args = parser.parse_args()
     try:
         import mitsuba as mi
     except ImportError:
         sys.exit("Mitsuba is not installed: pip install 'fpp-ml-bench[pathtrace]'")
     mi.set_variant("scalar_rgb")
-    if args.keep:
-        args.keep.mkdir(parents=True, exist_ok=True)
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
         for name in args.scenes.split(","):
@@ -309,8 +414,6 @@ def main() -> int:
     ratio = np.median([19 / 3 * row.mitsuba_s / row.ours_s for row in bounced])
     print(f"a frame with all bounces: ours is {np.log10(ratio):.1f} orders of magnitude faster (median of scenes)")
     print("\n".join(camera_rows()))
-    if args.json:
-        args.json.write_text(json.dumps([asdict(row) for row in rows], indent=1, default=float) + "\n")
     return 0 if all(row.kept for row in rows) and not noisy else 1
 
 

@@ -32,10 +32,9 @@ import pyarrow.parquet as pq
 import yaml
 from safetensors import safe_open
 
-README = Path(__file__).resolve().parents[1] / "README.md"
 SECTIONS = ("build", "train", "predict", "leaderboard", "reports")
 LEFT_OUT = re.compile(
-    r"created|.*seconds.*|hardware|software|environment|generator|pace_ms|load|.*_s|sittings|runs|peak_.*"
+    r"created|.*seconds.*|hardware|software|environment|generator|working_memory_mib|load|.*_s|runs|peak_.*"
 )
 """Keys of JSON and YAML files that hold times, dates, the machine or versions."""
 THREE = "mug,mustard_bottle,power_drill"
@@ -312,10 +311,6 @@ def leaderboard(recorder: Recorder) -> None:
     options = "--paper all --markdown ranking.md --json ranking.json"
     recorder.run("leaderboard", f"fpp-bench leaderboard {options}", *files, output=True)
     recorder.run("leaderboard", "fpp-bench leaderboard --sort overall_rmse_mm --paper none", output=True)
-    shutil.copy(README, recorder.work / "README.md")
-    recorder.run("leaderboard", "fpp-bench leaderboard --readme README.md --check", output=True)
-    recorder.work.joinpath("README.md").write_text("<!-- leaderboard:begin -->\n\n<!-- leaderboard:end -->\n")
-    recorder.run("leaderboard", "fpp-bench leaderboard --readme README.md", "README.md")
 
 
 def reports(recorder: Recorder) -> None:
@@ -340,8 +335,7 @@ def reports(recorder: Recorder) -> None:
         command = f"fpp-bench diagnose {method} --quick --threads 1 --out diagnosis-{number}"
         recorder.run("reports", command, f"diagnosis-{number}/diagnose.json")
     recorder.run("reports", "fpp-bench tradeoff small --list", output=True)
-    groups = "--only classical --only phase --only networks --only precision"
-    command = f"fpp-bench tradeoff small --quick {groups} --out tradeoff"
+    command = "fpp-bench tradeoff small --quick --out tradeoff"
     recorder.run("reports", command, "tradeoff/tradeoff.json")
     commands = (
         "build import info verify show export train predict time tradeoff reproduce reliance diagnose leaderboard"

@@ -1,4 +1,4 @@
-"""A training step of our engine against the plain loop a lab would write, and what a step costs, in the same run.
+"""A training step of our engine against the plain loop a lab would write, in the same run.
 
     python benchmarks/train_speed.py [--size PX] [--width N] [--network unet] [--batch 4] [--objects 8] [--epochs 5]
     python benchmarks/train_speed.py --quick
@@ -18,36 +18,206 @@ itself (``fpp-bench build``, ``fpp-bench export --mat``), each in its own proces
 "compute" come from further epochs, in which the GPU is synchronised after each part. Medians over epochs without the
 first, which compiles and fills caches. "loss" is that of the last epoch and shows that both learn alike. "GiB" is the
 GPU's peak of allocated memory, or the process's peak on a CPU.
-
-The table is the engine's step alone, on random images already in place and without torch.compile.
 """
 
 import argparse
 import contextlib
-import itertools
+import resource
 import statistics
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from time import perf_counter
+from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 
 import torch
-from train_ways import Contiguous, Epoch, Job, Ours, Plain, PngAndMat, run_epoch, start, step_seconds, surround
+from torch.utils.data import DataLoader, Dataset
 
-from fpp_ml_bench.constants import OBJECTS, VALIDATION_OBJECTS, split_of
-from fpp_ml_bench.loaders.training import FringeDepthDataset
+from fpp_ml_bench.baselines import networks
+from fpp_ml_bench.baselines.training import DepthTraining, Recipe, load_recipe, open_data, reproducible
+from fpp_ml_bench.constants import OBJECTS, PUBLISHED_SPLIT_FOLDERS, VALIDATION_OBJECTS, split_of
+from fpp_ml_bench.loaders.published import DEPTH, FRINGE, TRAINING, VARIABLES, VARIANT_FOLDERS
+from fpp_ml_bench.loaders.training import FringeDepth, FringeDepthDataset
 from fpp_ml_bench.machine import describe_hardware
 
-TABLE = {"width": (8, 16, 32), "size": (160, 224, 320), "batch": (1, 2, 4, 8)}
-QUICK_TABLE = {"width": (8, 16), "size": (160, 224), "batch": (1, 4)}
 GPU, CPU = {"size": 960, "width": 64}, {"size": 224, "width": 8}
 QUICK = {"size": 224, "width": 8, "objects": 2, "epochs": 2}
+
+
+class Job(NamedTuple):
+    """Settings of a process: ``data`` is the dataset for our engine, the exported tree for the plain loop."""
+
+    data: Path
+    scratch: Path
+    network: str
+    size: int
+    width: int
+    batch: int
+    threads: int | None
+    loader_workers: int = 0
+
+
+class Epoch(NamedTuple):
+    """Seconds a step, the epoch's mean loss, GiB. ``data`` and ``compute`` are 0 where they were not timed apart."""
+
+    step: float
+    data: float
+    compute: float
+    loss: float
+    memory_gib: float
+
+
+class Ours:
+    """The engine: its loader and its step."""
+
+    def __init__(self, job: Job) -> None:
+        recipe = recipe_of(job, compiled=torch.cuda.is_available())
+        surround(job)
+        self.engine = DepthTraining(recipe, *open_data(recipe, job.data), job.scratch / "ours")
+        for module in self.engine.objective.modules.values():
+            module.train()
+
+    def batches(self) -> Iterable[Any]:
+        self.engine.sampler.epoch += 1
+        return self.engine.loader
+
+    def step(self, batch: FringeDepth) -> torch.Tensor:
+        return self.engine.step(batch)["loss"]
+
+
+class Contiguous(Ours):
+    """The engine with its networks in torch's default layout."""
+
+    def __init__(self, job: Job) -> None:
+        super().__init__(job._replace(scratch=job.scratch / "contiguous"))
+        for module in self.engine.bare.values():
+            module.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+
+
+class Plain:
+    """A plain PyTorch loop: RMSprop, default settings, the loss read after every step."""
+
+    def __init__(self, job: Job) -> None:
+        torch.manual_seed(42)
+        self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+        self.network = networks.build(job.network, width=job.width).to(self.device)
+        self.optimizer = torch.optim.RMSprop(self.network.parameters(), lr=1e-4, alpha=0.99, weight_decay=1e-5)
+        self.loader: DataLoader = DataLoader(
+            PngAndMat(job.data), batch_size=job.batch, shuffle=True, num_workers=job.loader_workers
+        )
+
+    def batches(self) -> Iterable[Any]:
+        return ((fringe.to(self.device), depth.to(self.device)) for fringe, depth in self.loader)
+
+    def step(self, batch: Any) -> float:
+        fringe, depth = batch
+        self.optimizer.zero_grad()
+        loss = torch.sqrt(torch.mean((self.network(fringe) - depth) ** 2) + 1e-8)
+        loss.backward()
+        self.optimizer.step()
+        return loss.item()
+
+
+class PngAndMat(Dataset[tuple[torch.Tensor, torch.Tensor]]):
+    """The published tree's training pairs, one file each: fringe / 255 and individually normalised depth."""
+
+    def __init__(self, tree: Path) -> None:
+        split = tree / TRAINING / VARIANT_FOLDERS["individual"] / PUBLISHED_SPLIT_FOLDERS["train"]
+        self.fringes = sorted((split / FRINGE).glob("*.png"))
+        self.depths = [split / DEPTH / f"{path.stem}.mat" for path in self.fringes]
+
+    def __len__(self) -> int:
+        return len(self.fringes)
+
+    def __getitem__(self, index: int) -> tuple[Any, Any]:
+        import cv2
+        import scipy.io
+
+        image = cv2.imread(str(self.fringes[index]), cv2.IMREAD_GRAYSCALE)
+        if image is None:
+            raise OSError(f"{self.fringes[index]}: no readable PNG")
+        fringe = image.astype("float32") / 255
+        depth = scipy.io.loadmat(self.depths[index])[VARIABLES["individual"]].astype("float32")
+        return torch.from_numpy(fringe)[None], torch.from_numpy(depth)[None]
+
+
+def recipe_of(job: Job, compiled: bool) -> Recipe:
+    """The paper's base recipe at the job's scale; bfloat16 on a GPU only."""
+    return load_recipe("base", "paper").model_copy(
+        update={
+            "network": job.network,
+            "width": job.width,
+            "size": job.size,
+            "batch": job.batch,
+            "compile": compiled,
+            "precision": "bf16" if torch.cuda.is_available() else "fp32",
+        }
+    )
+
+
+_surroundings = contextlib.ExitStack()
+"""Never closed: the engine's settings stay in force until the process ends."""
+
+
+def surround(job: Job) -> None:
+    """Apply to this process the settings that the engine applies around a training."""
+    _set_threads(job)
+    _surroundings.enter_context(reproducible(recipe_of(job, compiled=False).precision))
+
+
+def _set_threads(job: Job) -> None:
+    if job.threads is not None:
+        torch.set_num_threads(job.threads)
+
+
+_loop: Ours | Plain
+
+
+def start(kind: type[Ours] | type[Plain], job: Job) -> None:
+    """Start a training in this process."""
+    global _loop
+    _set_threads(job)
+    _loop = kind(job)
+
+
+def run_epoch(apart: bool) -> Epoch:
+    """One pass over the data; ``apart`` waits for the GPU between data and compute."""
+
+    def wait() -> None:
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+
+    data, compute, losses = 0.0, 0.0, []
+    wait()
+    started = perf_counter()
+    batches = iter(_loop.batches())
+    while True:
+        before = perf_counter()
+        batch = next(batches, None)
+        if apart:
+            wait()
+        middle = perf_counter()
+        data += middle - before
+        if batch is None:
+            break
+        losses.append(_loop.step(batch))
+        if apart:
+            wait()
+        compute += perf_counter() - middle
+    wait()
+    seconds = perf_counter() - started
+    if torch.cuda.is_available():
+        peak = torch.cuda.max_memory_allocated()
+    else:
+        peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    steps, loss = len(losses), statistics.mean(map(float, losses))
+    return Epoch(seconds / steps, apart * data / steps, apart * compute / steps, loss, peak / 2**30)
 
 
 def make_data(scratch: Path, size: int, count: int) -> tuple[Path, Path]:
@@ -110,20 +280,6 @@ def compare(args: argparse.Namespace, scratch: Path) -> None:
         )
 
 
-def tabulate(args: argparse.Namespace, scratch: Path) -> None:
-    axes = QUICK_TABLE if args.quick else TABLE
-    job = Job(scratch, scratch, args.network, 0, 0, 0, args.threads)
-    print(f"\nThe engine's step, {args.network}: ms, and ms an image\n")
-    print(f"{'width':>5s} {'size':>5s}" + "".join(f"{f'batch {batch}':>20s}" for batch in axes["batch"]))
-    with process(surround, job) as pool:
-        for width, size in itertools.product(axes["width"], axes["size"]):
-            cells = []
-            for batch in axes["batch"]:
-                seconds = pool.submit(step_seconds, job._replace(width=width, size=size, batch=batch)).result()
-                cells.append("no memory" if seconds is None else f"{1e3 * seconds:.1f} ({1e3 * seconds / batch:.1f})")
-            print(f"{width:5d} {size:5d}" + "".join(f"{cell:>20s}" for cell in cells), flush=True)
-
-
 def process(initializer: Callable[..., None], *arguments: Any) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(1, get_context("spawn"), initializer, arguments)
 
@@ -142,8 +298,7 @@ def main() -> int:
     parser.add_argument("--epochs", type=int, default=5, help="epochs measured of each kind (default: 5)")
     parser.add_argument("--threads", type=int, help="of torch on the processor (default: torch's own)")
     parser.add_argument("--loader-workers", type=int, default=0, help="also a plain loop with N reading processes")
-    parser.add_argument("--no-table", action="store_true", help="leave out the table of step costs")
-    parser.add_argument("--quick", action="store_true", help=f"rough, in a minute or two: {QUICK}, a small table")
+    parser.add_argument("--quick", action="store_true", help=f"rough, in a minute: {QUICK}")
     args = parser.parse_args()
     scale = GPU if torch.cuda.is_available() else CPU
     options = {name: value for name, value in vars(args).items() if value is not None}
@@ -155,8 +310,6 @@ def main() -> int:
     print(f"{args.network} of width {args.width}, {args.size} px, batches of {args.batch}")
     with tempfile.TemporaryDirectory(dir=Path.cwd()) as scratch:
         compare(args, Path(scratch))
-        if not args.no_table:
-            tabulate(args, Path(scratch))
     return 0
 
 

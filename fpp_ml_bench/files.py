@@ -83,6 +83,15 @@ def opened(path: Path, links: bool = False) -> Iterator[tuple[IO[bytes], int]]:
         yield stream, info.st_size
 
 
+def visible(folder: Path, raised: type[FppBenchError]) -> list[Path]:
+    """The entries of a folder by name, but those whose name begins with a dot. Raises ``raised`` for a folder that
+    can't be read."""
+    try:
+        return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
+    except OSError as error:
+        raise raised(f"{folder}: can't be read ({cause_of(error)})") from error
+
+
 def is_file(path: Path) -> bool:
     """Whether there is a file; False for a name that no file can have, for which ``Path.is_file`` raises an error."""
     try:

@@ -6,7 +6,6 @@ from .ranking import expand as expand
 from .ranking import rank as rank
 from .ranking import read_entries as read_entries
 from .ranking import shipped_rows as shipped_rows
-from .readme import update_readme as update_readme
 from .reported import chosen_tables as chosen_tables
 from .row_file import write_row as write_row
 from .rows import read_entry as read_entry

@@ -29,7 +29,7 @@ def table_json(groups: Sequence[Group], papers: Sequence[ReportedTable], sort: s
             "title": group.title,
             "rows": [_json_row(group, row) for row in group.rows],
             "pairs": list(map(asdict, group.pairs)) if len(group.ranked) <= MOST_PAIRED else None,
-            "notes": [*group.notes, *group.key.notes],
+            "notes": group.notes,
         }
         for group in groups
     ]

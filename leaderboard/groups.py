@@ -1,25 +1,40 @@
-"""The leaderboard's tables: what rows must share to stand in one, and how a table and its data are called. The
-row of a method on the test objects and that on the unseen ones are shown as one."""
+"""The leaderboard's tables: what rows must share to stand in one, how a table and its data are called, and which row is
+behind which. The row of a method on the test objects and that on the unseen ones are shown as one.
 
+Two rows are compared by their paired differences over the objects: a sign-flip test of each pair, Holm's correction
+over all pairs of the table, and the ranks that follow.
+"""
+
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import combinations
+from statistics import fmean
+
+import numpy as np
+from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.evaluation.metrics import HEADLINE
-from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, PROTOCOL_VERSION, FramesClass, Track
-from fpp_ml_bench.evaluation.score import Interval
-from fpp_ml_bench.leaderboard.pairs import Pair, pairs
+from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, FramesClass, Track
+from fpp_ml_bench.evaluation.score import (
+    SIGNIFICANT,
+    Interval,
+    holm,
+    object_interval,
+    sign_flip_bounds,
+    sign_flip_p,
+)
 from fpp_ml_bench.leaderboard.row_file import ObjectMeans, Row, interval_over, mean_over
 from fpp_ml_bench.leaderboard.rows import MEANING, Entry
 from fpp_ml_bench.loaders.storage import BENCHMARKS, Benchmark, benchmark_of
 
-EARLIER_PROTOCOL_NOTE = (
-    "Scored by an earlier protocol, with other rules than today's results: these rows compare only within their group."
-)
 TEST, UNSEEN = "fpp-bench-full", "fpp-bench-unseen"
 """The benchmark whose test split, and the set of unseen objects that, make one row."""
 MOST_PAIRED = 40
 """Ranked rows up to which a table lists its pairs, 780 of them."""
+_AT_ONCE = 50_000
+"""Pairs whose differences are held at once."""
 
 
 @dataclass(frozen=True, order=True)
@@ -75,22 +90,15 @@ class GroupKey:
         return ", ".join(word for word, usual in zip(words, ("paper", f"{FULL_SIZE} px"), strict=True) if word != usual)
 
     @property
-    def notes(self) -> list[str]:
-        """Why the rows are not comparable with today's results; empty where they are."""
-        return [EARLIER_PROTOCOL_NOTE] * (self.protocol_version != PROTOCOL_VERSION)
-
-    @property
     def order(self) -> tuple[object, ...]:
-        """Sort key of the groups: named benchmarks as they are listed, other data, earlier protocols; the larger images
-        first, then the fewer frames, the metric track before the others."""
+        """Sort key of the groups: named benchmarks as they are listed, then other data; the larger images first, then
+        the fewer frames, the metric track before the others."""
         place = len(BENCHMARKS) if self.benchmark is None else BENCHMARKS.index(self.benchmark)
         return (
-            len(self.notes),
             self.benchmark is None,
             -self.size[0] * self.size[1],
             place,
             self.data,
-            self.protocol_version,
             FRAMES_CLASSES.index(self.frames),
             self.track != "metric",
             self,
@@ -100,8 +108,7 @@ class GroupKey:
     def data_title(self) -> str:
         """``fpp-bench-full version 2, 960 x 960 px``; other data by size and the first 8 digits of their hash."""
         pixels = f"{self.size[1]} x {self.size[0]} px"
-        data = f"{pixels}, data {self.data[:8]}" if self.benchmark is None else f"{self.data}, {pixels}"
-        return data + (f", protocol {self.protocol_version}" if self.notes else "")
+        return f"{pixels}, data {self.data[:8]}" if self.benchmark is None else f"{self.data}, {pixels}"
 
     @property
     def against(self) -> str:
@@ -186,6 +193,78 @@ def is_unseen(row: Row) -> bool:
 
 def _title(name: str) -> str:
     return next(benchmark.title for benchmark in BENCHMARKS if benchmark.name == name)
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two rows by their short names, the smaller error first: the mean of second minus first over the ``objects`` (at
+    least 0), its 95% interval, the sign-flip test's p value, and that value after Holm's correction over all pairs of
+    the table. ``behind``: whether the second is behind the first, the corrected value being at most 5%."""
+
+    first: str
+    second: str
+    objects: int
+    difference: float
+    interval: Interval | None
+    p: float
+    p_holm: float
+    behind: bool
+
+
+def pairs(errors: Mapping[str, Mapping[str, float]]) -> list[Pair]:
+    """Every pair of the rows by name, whose errors by object are ``errors``; smaller is better."""
+    compared = []
+    for first, second in combinations(errors, 2):
+        differences = [errors[second][name] - errors[first][name] for name in errors[first]]
+        if fmean(differences) < 0:
+            first, second, differences = second, first, [-value for value in differences]
+        compared.append((first, second, differences, sign_flip_p(differences)))
+    adjusted = holm([p for *_, p in compared])
+    return [
+        Pair(
+            first,
+            second,
+            len(differences),
+            fmean(differences),
+            object_interval(differences, range(len(differences))),
+            p,
+            p_holm,
+            p_holm <= SIGNIFICANT,
+        )
+        for (first, second, differences, p), p_holm in zip(compared, adjusted, strict=True)
+    ]
+
+
+def behind(errors: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Who is behind whom, as `pairs` says: ``errors`` (rows, objects), smaller is better, gives (rows, rows), [i, j]
+    True where row j is behind row i. A pair is tested by itself only where the bounds of its p value don't decide."""
+    first, second = np.triu_indices(len(errors), 1)
+    low, high = np.empty(len(first)), np.empty(len(first))
+    for start in range(0, len(first), _AT_ONCE):
+        part = slice(start, start + _AT_ONCE)
+        low[part], high[part] = sign_flip_bounds(errors[second[part]] - errors[first[part]])
+    apart, left = np.zeros(len(first), bool), len(first)
+    while left:  # Holm's procedure: with each pair that is told apart, fewer are left, and the next may have a larger p
+        for pair in np.flatnonzero((left * low <= SIGNIFICANT) & (left * high > SIGNIFICANT)):
+            low[pair] = high[pair] = sign_flip_p(errors[second[pair]] - errors[first[pair]])
+        apart = left * high <= SIGNIFICANT
+        if (now_left := len(first) - int(np.count_nonzero(apart))) == left:
+            break
+        left = now_left
+    means = errors.mean(axis=1)
+    is_behind = np.zeros((len(errors), len(errors)), bool)
+    second_ahead = means[second] < means[first]
+    better, worse = np.where(second_ahead, second, first), np.where(second_ahead, first, second)
+    is_behind[better[apart], worse[apart]] = True
+    return is_behind
+
+
+def rank_ranges(errors: NDArray[np.float64]) -> list[tuple[int, int]]:
+    """Best and worst rank that the tests allow each row of ``errors``, as `behind` takes them. Best: 1 and the number
+    of rows that it is behind. Worst: the number of all rows without those behind it."""
+    is_behind = behind(errors)
+    best, worst = 1 + is_behind.sum(axis=0), len(errors) - is_behind.sum(axis=1)
+    return list(zip(best.tolist(), worst.tolist(), strict=True))
 
 
 @dataclass(frozen=True)

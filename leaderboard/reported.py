@@ -7,7 +7,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from fpp_ml_bench.baselines.training import TABLES
 from fpp_ml_bench.leaderboard.assumptions import told
 from fpp_ml_bench.leaderboard.rows import BY_ITS_AUTHORS, BY_THE_PAPER
 from fpp_ml_bench.paper import paper_rows
@@ -59,36 +58,29 @@ class ReportedTable:
 
 
 @cache
-def paper_tables() -> dict[str, ReportedTable]:
-    """Every table of the paper by name, in the order of `TABLES`."""
-    content = paper_rows()
+def reported_tables() -> dict[str, ReportedTable]:
+    """Every table by name: the paper's in its order, then those of other publications."""
+    others = json.loads(Path(__file__).with_name("reported_rows.json").read_text(encoding="utf-8"))
     tables = {}
-    for table in content["tables"]:
-        rows = tuple(
-            ReportedRow(**row | {"errors_mm": dict(zip(content["columns"], row["errors_mm"], strict=True))})
-            for row in table["rows"]
-        )
-        tables[table["name"]] = ReportedTable(table["name"], table["title"], rows, figure=table.get("figure"))
-    return {name: tables[name] for name in TABLES if name in tables}
+    for content in (paper_rows(), others):
+        for table in content["tables"]:
+            rows = []
+            for row in table["rows"]:
+                errors_mm = dict(zip(content["columns"], row["errors_mm"], strict=True))
+                rows.append(ReportedRow(**row | {"errors_mm": errors_mm}))
+            source = f"{BY_ITS_AUTHORS} ({table['source']})" if "source" in table else BY_THE_PAPER
+            name, title = table["name"], table["title"]
+            tables[name] = ReportedTable(name, title, tuple(rows), source, table.get("figure"))
+    return tables
 
 
-@cache
-def other_tables() -> dict[str, ReportedTable]:
-    """The tables of other publications by name."""
-    content = json.loads(Path(__file__).with_name("reported_rows.json").read_text(encoding="utf-8"))
-    return {
-        table["name"]: ReportedTable(
-            table["name"],
-            table["title"],
-            tuple(ReportedRow(**row) for row in table["rows"]),
-            f"{BY_ITS_AUTHORS} ({table['source']})",
-        )
-        for table in content["tables"]
-    }
+def paper_tables() -> dict[str, ReportedTable]:
+    """The tables of the paper by name."""
+    return {name: table for name, table in reported_tables().items() if table.source == BY_THE_PAPER}
 
 
 def chosen_tables(choice: str | None) -> list[ReportedTable]:
     """Tables for ``--paper``: None for those shown by default, ``all``, ``none``, or one table's name."""
-    tables = {**paper_tables(), **other_tables()}
+    tables = reported_tables()
     several = {None: SHOWN_BY_DEFAULT, "all": tuple(tables), "none": ()}
     return [tables[name] for name in several.get(choice, (str(choice),))]

@@ -1,4 +1,5 @@
-"""The leaderboard's rows as they are read: who vouches for each, and what recomputing its scores tells.
+"""The leaderboard's rows as they are read: who vouches for each, what recomputing its scores tells, and what is
+measured of a method later (phase reliance, robustness) written into its file.
 
 A result file of ``fpp-eval`` becomes a `Row` when it is read, so that everything here is made of rows. The maintainers
 keep ``vouched.txt``: a line for each row file that they measured themselves, or verified from its author's predictions.
@@ -14,9 +15,10 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
-from fpp_ml_bench.evaluation.result import Result, parse_result, read_json
+from fpp_ml_bench.evaluation.result import Reliance, Result, Robustness, parse_result, read_json, write_result
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.files import file_content, printable
 from fpp_ml_bench.leaderboard.row_file import (
@@ -25,8 +27,11 @@ from fpp_ml_bench.leaderboard.row_file import (
     Row,
     check_size,
     processor,
+    robustness_in_brief,
+    rounded,
     row_content,
     row_of,
+    write_row,
 )
 from fpp_ml_bench.loaders.storage import DatasetFolder, benchmark_of
 from fpp_ml_bench.schema import validate
@@ -61,6 +66,8 @@ _NOT_COMPARED: Any = {
     "submission": {"seconds_per_sample", "seconds_source", "hardware", "timing", "software"},
     "dataset": {"name"},
 }
+_OF_THE_MACHINE = ("threads", "device")
+"""Settings that two runs of the same method may differ in."""
 
 
 @dataclass(frozen=True)
@@ -115,7 +122,8 @@ class Entry:
 
 
 def read_entry(path: Path) -> Entry:
-    """Read a row file or a result file strictly. SubmissionError names the file and what is wrong with it."""
+    """Read a row file or a result file strictly. SubmissionError names the file and what is wrong with it, also for one
+    of another protocol: its errors follow other rules."""
     content, file = read_json(path), printable(str(path), 500)
     data = file_content(path, _LARGEST_FILE_BYTES, SubmissionError)
     is_row_file = isinstance(content, dict) and "row_schema_version" in content
@@ -128,6 +136,11 @@ def read_entry(path: Path) -> Entry:
     else:
         row = validate(Row, content, path, "leaderboard row")
         check_size(data, path)
+    if row.protocol_version != PROTOCOL_VERSION:
+        raise SubmissionError(
+            f"{file}: was scored by protocol {row.protocol_version}, this is {PROTOCOL_VERSION}; score the predictions "
+            "again"
+        )
     benchmark = benchmark_of(row.dataset.content)
     if benchmark is not None and row.metrics.object_mae_mm == 0:
         raise SubmissionError(
@@ -180,10 +193,7 @@ def vouching_line(row: Row, data: bytes, word: str, command: str) -> str:
 def differences(row: Row, folder: Path, dataset: DatasetFolder) -> list[str]:
     """What of ``row`` does not follow from the predictions in ``folder`` on ``dataset``, a line for each difference.
     Everything is scored again; means may differ by what their digits leave open, and by 1e-9. Raises what `evaluate`
-    raises, and SubmissionError for a row of another protocol version."""
-    if row.protocol_version != PROTOCOL_VERSION:
-        scored_by = f"the row was scored by protocol {row.protocol_version}, this is {PROTOCOL_VERSION}"
-        raise SubmissionError(f"{scored_by}; score the predictions again")
+    raises."""
     scored = evaluate(folder, dataset, row.dataset.split, row.target, row.edge_band_px, row.mode)
     rows = row, Row.model_validate(row_content(scored, digits=None))
     stored, computed = (dict(_leaves("", each.model_dump(mode="json", exclude=_NOT_COMPARED))) for each in rows)
@@ -221,3 +231,45 @@ def not_checked(about: Row | Result) -> list[str]:
         "software, code and environment": True,
     }
     return [words for words, there in present.items() if there]
+
+
+def check_same_method(entry: Entry, method: Method) -> None:
+    """Refuse (SubmissionError) a row of another method: name, frames, units, or a setting that both have."""
+    about = entry.row.submission
+    pairs: dict[str, tuple[object, object]] = {
+        "method": (about.method, method.name),
+        "frames_used": (sorted(about.frames_used), sorted(method.frames_used)),
+        "units": (about.units, method.units),
+    }
+    for key, value in method.settings.items():
+        if key in about.settings and key not in _OF_THE_MACHINE:
+            pairs[f"settings.{key}"] = about.settings[key], value
+    for key, (of_row, of_method) in pairs.items():
+        if of_row != of_method:
+            raise SubmissionError(
+                f"{printable(str(entry.path), 500)}: {key} is {printable(str(of_row))}, but "
+                f"{printable(str(of_method))} for the method to measure; what is measured belongs to the very method "
+                "that was scored: give the same options"
+            )
+
+
+def write_reliance(entry: Entry, reliance: Reliance) -> None:
+    """Put ``reliance`` into the file of ``entry``, replacing an earlier value; of a row, in four digits. Raises
+    SubmissionError for a block that contradicts the result (other weights, other units)."""
+    block = reliance.model_dump(mode="json")
+    _write(entry, "reliance", rounded(block, 4) if entry.is_row_file else block)
+
+
+def write_robustness(entry: Entry, robustness: Robustness) -> None:
+    """`write_reliance` of ``robustness``, beside that on another set; of a row, in brief."""
+    block = robustness_in_brief(robustness) if entry.is_row_file else robustness.model_dump(mode="json")
+    sets = read_json(entry.path).get("robustness", {})
+    _write(entry, "robustness", {**sets, robustness.set: block})
+
+
+def _write(entry: Entry, key: str, block: dict[str, Any]) -> None:
+    content = {**read_json(entry.path), key: block}
+    if entry.is_row_file:
+        write_row(validate(Row, content, entry.path, "leaderboard row"), entry.path)
+    else:
+        write_result(validate(Result, content, entry.path, "result of fpp-eval"), entry.path)

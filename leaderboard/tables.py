@@ -9,8 +9,7 @@ from rich.text import Text
 from fpp_ml_bench.evaluation.report import interval_text, millimetres
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.columns import METHOD, NOTE, ONLY_IN_FILES, Column, columns
-from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, Group, Ranked
-from fpp_ml_bench.leaderboard.pairs import Pair
+from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, Group, Pair, Ranked
 from fpp_ml_bench.leaderboard.reported import REPORTED_HEADING, ReportedRow, ReportedTable
 from fpp_ml_bench.tables import Table
 
@@ -76,7 +75,7 @@ def group_tables(groups: Sequence[Group], sort: str, with_pairs: bool = False) -
         table.names = 1 + shown.index(METHOD)
         shown.reverse()  # of equal importance, the rightmost is left out first
         table.first_out = [_two_lines(column.title) for column in sorted(shown, key=partial(_importance, sort))]
-        parts += [table, Text("".join(f"{note}\n" for note in (*group.notes, *group.key.notes)))]
+        parts += [table, Text("".join(f"{note}\n" for note in group.notes))]
         if with_pairs and len(group.ranked) > MOST_PAIRED:
             parts.append(Text(f"The pairs of more than {MOST_PAIRED} ranked rows are not listed.\n"))
         elif with_pairs and group.pairs:
@@ -143,7 +142,7 @@ def markdown(groups: Sequence[Group], papers: Sequence[ReportedTable], sort: str
     lines: list[str] = []
     for group in groups:
         lines += [f"### {markdown_text(group.title)}", "", *markdown_columns(columns(sort), group.rows), ""]
-        for note in (*group.notes, *group.key.notes):
+        for note in group.notes:
             lines += [markdown_text(note), ""]
     lines += [NOTE.replace("*", "\\*"), ""] if groups else []
     lines += [f"### {REPORTED_HEADING}", ""] if papers else []

@@ -4,7 +4,6 @@ import re
 import shlex
 from importlib import import_module
 from pathlib import Path
-from types import SimpleNamespace
 
 import click
 import pytest
@@ -12,7 +11,6 @@ from conftest import tiny_settings
 
 from fpp_ml_bench.cli import BENCH, COMMANDS, EVAL, Program
 from fpp_ml_bench.cli.options import flags_of
-from fpp_ml_bench.evaluation.result import Robustness, SeverityScores
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted(
@@ -41,40 +39,6 @@ def test_named_files_and_modules_are_there(page):
             for part in parts[count:]:
                 found = getattr(found, part)
             break
-
-
-def test_tables_are_those_of_the_rows(monkeypatch):
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    from reliance_rows import table
-    from robustness_tables import PAGE, filled, rows_in
-
-    from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, read_entry
-
-    entries = [read_entry(path) for path in sorted(SHIPPED_ROWS.glob("*.json"))]
-    assert (ROOT / "docs/tables/reliance.md").read_text(encoding="utf-8") == table(entries)
-
-    text = PAGE.read_text(encoding="utf-8")
-    assert all(f"<!-- {name}:{end} -->" in text for name in ("test", "unseen") for end in ("begin", "end"))
-    with pytest.raises(ValueError, match="markers <!-- test:begin -->"):
-        filled("a page without them", {"test": []})
-    scores = SeverityScores(
-        mae_mm=3.0, protocol_mae_mm=3.0, wrong_share=0.1, unanswered_share=0.0, confident_share=None, coverage=None
-    )
-    block = Robustness(
-        version=1,
-        set="test",
-        mae_mm=3.0,
-        interval=[2.0, 4.0],
-        clean=scores,
-        axes={"motion": [scores] * 5},
-        samples=2,
-        objects=2,
-        size_px=960,
-        weights_sha256=None,
-    )
-    about = SimpleNamespace(name="A | method", method="mine", settings={})
-    made = rows_in([SimpleNamespace(submission=about, robustness={"test": block})])
-    assert made["unseen"] == [] and "| A &#124; method | 3.0 | 2.0 to 4.0 | 3.0 | 1.0 |" in filled(text, made)
 
 
 FENCED = re.compile(r"^ *```(\w*)\n(.*?)^ *```$", flags=re.DOTALL | re.MULTILINE)

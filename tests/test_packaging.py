@@ -144,7 +144,7 @@ def test_the_main_job_needs_no_extra(tiny, tmp_path):
     [
         (("train", "loss/l1", "DATA", "--out", "run"), "(torch|accelerate)", "train"),
         (("predict", "phase-net", "DATA", "--out", "predictions"), "torch", "train"),
-        (("tradeoff", "DATA", "--quick", "--out", "tradeoff"), "torch", "train"),
+        (("tradeoff", "DATA", "--quick", "--out", "tradeoff"), "safetensors", "train"),
         (("diagnose", "unet-individual-rmse", "DATA", "--quick", "--out", "report"), "torch", "train"),
         (
             ("build", "--out", "more", "--objects", "cork", "--size", "176", "--cluster", "127.0.0.1:1"),

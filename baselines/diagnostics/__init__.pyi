@@ -1,3 +1,4 @@
+from .counterfactual import measure as measure
 from .counterfactual_scenes import VIEWS_PER_OBJECT as VIEWS_PER_OBJECT
 from .counterfactual_scenes import SceneSet as SceneSet
 from .diagnosis import JSON_FILE as JSON_FILE
@@ -5,7 +6,6 @@ from .diagnosis import REPORT_FILE as REPORT_FILE
 from .diagnosis import ProbeResult as ProbeResult
 from .diagnosis import checked_names as checked_names
 from .diagnosis import diagnose as diagnose
-from .phase_reliance import measure as measure
 from .probe import PROBES as PROBES
 from .probe import Probe as Probe
 from .probe import ProbeSettings as ProbeSettings

@@ -1,29 +1,55 @@
-"""Counterfactual scenes (own probe): does the predicted depth follow the fringe's phase, or the object's outline?
+"""Phase reliance (own probe): does the predicted depth follow the fringe's phase, or the object's outline? From 0 to 1.
 
-Each test object is rendered again with a single property changed, so that the correct change of depth is known. A score
-compares it with the change of the prediction (`fpp_ml_bench.baselines.diagnostics.phase_reliance`).
+Each test object is rendered again with a single property changed, so that the correct change of depth is known, and is
+compared with the change of the prediction. A sample's score is the product of `follows`, over moves of the phase within
+the object, and of 1 - `relative_change` under other outlines over the same phase, at least 0. The method's score is the
+mean over samples, with a bootstrap over objects. docs/reliance.md defines and explains it: units, missing predictions,
+and *order-free* values, which allow errors of whole periods.
 """
 
+from collections import defaultdict
 from collections.abc import Sequence
-from pathlib import Path
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import VIEWS_PER_OBJECT, Counterfactuals, SceneSet
-from fpp_ml_bench.baselines.diagnostics.phase_reliance import SampleReliance, ScenePredictor, measure
-from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
-from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene
-from fpp_ml_bench.baselines.diagnostics.subjects import Subject
-from fpp_ml_bench.evaluation.result import PART_TITLES, Reliance
-from fpp_ml_bench.evaluation.score import caution
+from fpp_ml_bench.baselines.diagnostics import probe
+from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import (
+    REPROJECTED,
+    VIEWS_PER_OBJECT,
+    Counterfactuals,
+    SceneSet,
+)
+from fpp_ml_bench.baselines.diagnostics.probe import (
+    COLOURS,
+    Figure,
+    Line,
+    Panel,
+    Picture,
+    Progress,
+    Table,
+    chart,
+    gallery,
+    mean_of,
+    silent,
+)
+from fpp_ml_bench.baselines.diagnostics.scene_renderer import MovedPhase, Scene, SceneRenderer
+from fpp_ml_bench.errors import DiagnosisError
+from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
+from fpp_ml_bench.evaluation.result import PART_TITLES, RELIANCE_VERSION, Reliance, RelianceParts
+from fpp_ml_bench.evaluation.score import caution, object_interval
 from fpp_ml_bench.loaders.storage import DatasetFolder
 
+if TYPE_CHECKING:
+    from fpp_ml_bench.baselines.diagnostics.subjects import Subject
+    from fpp_ml_bench.baselines.method import Method
+
 MOST_VIEWS = 6
-_WIDE, _GAP = 11.5, 2  # width of the figure of scenes in inches, and gap between two scenes in px
 _FOLLOWS = {
     "follows_phase": "phase alone",
-    "follows_light": "brightness alone",
+    "follows_light": "brightness\nalone",
     "follows_both": "both, as in\na photograph",
     "follows_constant": "phase, by\na constant",
     "order_free_follows_phase": "phase, whole\nperiods aside",
@@ -37,8 +63,205 @@ _CHANGES = {
     "order_free_change_outline": "other outline,\nperiods aside",
 }
 
+Map = NDArray[np.floating]
 
-class Counterfactual(Probe):
+
+@dataclass(frozen=True)
+class Change:
+    """Change of the prediction in a counterfactual scene, at the pixels that are compared. ``expected`` and ``actual``
+    change (n,) in the prediction's units; ``answered`` bool (n,): a prediction exists before and after."""
+
+    expected: NDArray[np.float64]
+    actual: NDArray[np.float64]
+    answered: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, before: Map, after: Map, expected: Map, where: NDArray[np.bool_], zero_is_none: bool) -> "Change":
+        """From two predictions and the expected change, maps (H, W), at the pixels ``where`` (H, W). With
+        ``zero_is_none`` a 0 means that there is no prediction, and the actual change there is 0."""
+        first, second = before[where].astype(np.float64), after[where].astype(np.float64)
+        answered = (first != 0) & (second != 0) if zero_is_none else np.ones(first.shape, dtype=bool)
+        return cls(np.asarray(expected[where], dtype=np.float64), np.where(answered, second - first, 0.0), answered)
+
+
+def follows(changes: Sequence[Change]) -> float | None:
+    """Purity <d, t> / sqrt(<d, d> <t, t>) times min(gain, 1 / gain), gain = <d, t> / <t, t>, over all pixels of
+    ``changes``, with d the actual and t the expected change; 0 where <d, t> is not positive, None where t is 0."""
+    product, actual, expected = (
+        sum(float(getattr(change, a) @ getattr(change, b)) for change in changes)
+        for a, b in (("actual", "expected"), ("actual", "actual"), ("expected", "expected"))
+    )
+    if expected <= 0:
+        return None
+    if product <= 0:
+        return 0.0
+    gain, purity = product / expected, product / np.sqrt(actual * expected)
+    return float(min(purity, 1.0) * min(gain, 1 / gain))
+
+
+def rms_expected(changes: Sequence[Change]) -> float:
+    """Root mean square of the expected change over all pixels of ``changes``; 0 without pixels."""
+    values = np.concatenate([change.expected for change in changes]) if changes else np.zeros(0)
+    return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
+
+
+def relative_change(changes: Sequence[Change], unit: float) -> float | None:
+    """Root mean square of actual minus expected change, or of the actual change if that is less, divided by ``unit``,
+    as which a pixel that lost its prediction counts. None without pixels or with ``unit`` 0."""
+    size, total = sum(change.actual.size for change in changes), 0.0
+    if unit <= 0 or not size:
+        return None
+    for change in changes:
+        differences = [np.where(change.answered, change.actual - expected, unit) for expected in (change.expected, 0.0)]
+        total += min(float(np.dot(values, values)) for values in differences)
+    return float(np.sqrt(total / size) / unit)
+
+
+def order_free_follows(changes: Sequence[Change]) -> float | None:
+    """`follows` for changes of phase in rad, modulo whole periods: 1 - (1 - <cos(d - t)>) / (1 - <cos t>), at least 0.
+    A random prediction gets no credit: its <cos(d - t)> is 0, below that of a constant prediction."""
+    actual, expected = (np.concatenate([getattr(change, key) for change in changes]) for key in ("actual", "expected"))
+    standing_still = 1 - float(np.mean(np.cos(expected))) if expected.size else 0.0
+    if standing_still <= 0:
+        return None
+    return max(0.0, 1 - (1 - float(np.mean(np.cos(actual - expected)))) / standing_still)
+
+
+def order_free(changes: Sequence[Change]) -> list[Change]:
+    """Changes of phase in rad as chords, for `relative_change`: a whole period is no change."""
+    return [Change(2 * np.sin(one.expected / 2), 2 * np.sin(one.actual / 2), one.answered) for one in changes]
+
+
+def sample_score(follow: float | None, change: float | None) -> float | None:
+    """The score of a sample; an outline that could not be changed counts as ignored."""
+    return None if follow is None else follow * (1.0 if change is None else max(0.0, 1.0 - change))
+
+
+@dataclass(frozen=True)
+class SampleReliance:
+    """A sample's score, order-free score, and ``parts`` by the names of `RelianceParts`."""
+
+    sample: str
+    object: str
+    score: float | None
+    order_free_score: float | None
+    parts: dict[str, float | None]
+
+
+class ScenePredictor:
+    """Runs ``method`` on scenes and gives the true depth in the units of its predictions."""
+
+    def __init__(self, method: "Method | Subject", renderer: SceneRenderer) -> None:
+        self.method, self.renderer, self.in_mm = method, renderer, method.units == "mm"
+        if method.units not in ("mm", "normalised"):
+            raise DiagnosisError(f"units {method.units!r}: reliance is measured for predictions in mm, or normalised")
+
+    def predict(self, scene: Scene) -> NDArray[np.float32]:
+        """Predicted depth (H, W) in the units of the method."""
+        frames = self.renderer.frames(scene, self.method.frames_used, self.method.uses_ground_truth_mask)
+        return self.method.predict(frames)
+
+    def true_depth(self, depth_mm: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """``depth_mm`` (H, W) in the units of the method: mm, or normalised to its range over ``mask``."""
+        if self.in_mm or not mask.any():
+            return depth_mm
+        inside = depth_mm[mask]
+        low, span = float(inside.min()), float(np.ptp(inside))
+        return (depth_mm - low) / span if span > 0 else np.zeros_like(depth_mm)
+
+
+def measure_sample(predictor: ScenePredictor, scenes: Counterfactuals) -> SampleReliance:
+    """Runs the method on every scene of a sample and compares."""
+    original = scenes.original
+    target = original.target & (original.depth_mm > 0)
+    before, truth = predictor.predict(original.scene), predictor.true_depth(original.depth_mm, target)
+    changes: dict[str, list[Change]] = defaultdict(list)
+    turns: dict[str, list[Change]] = defaultdict(list)
+    for variant in scenes.variants:
+        if variant.kind == "constant" and not predictor.in_mm:
+            continue
+        after, where = predictor.predict(variant.scene), variant.scene.mask & target
+        key = variant.name.replace(" ", "_") if variant.kind == "projected" else variant.kind
+        true_depth = predictor.true_depth(variant.depth_mm, variant.scene.mask & (variant.depth_mm > 0))
+        changes[key].append(Change.of(before, after, true_depth - truth, where, predictor.in_mm))
+        if predictor.in_mm and key in ("phase", "outline"):
+            turns[key].append(_phase_change(scenes, before, after, variant.depth_mm, where))
+    unit = rms_expected(changes["phase"])
+    parts: dict[str, float | None] = {
+        "follows_phase": follows(changes["phase"]),
+        "change_outline": relative_change(changes["outline"], unit),
+        **{f"follows_{kind}": follows(changes[kind]) for kind in ("light", "both", "constant")},
+    }
+    for name in REPROJECTED:
+        key = name.replace(" ", "_")
+        (other,) = changes[key]
+        kept = other.answered
+        parts[f"change_{key}"] = relative_change([Change(other.expected[kept], other.actual[kept], kept[kept])], unit)
+        if name.startswith("no fringe"):
+            parts[f"answered_{key}"] = float(kept.mean())
+    order_free_score = None
+    if predictor.in_mm:
+        parts["order_free_follows_phase"] = order_free_follows(turns["phase"])
+        chords = rms_expected(order_free(turns["phase"]))
+        parts["order_free_change_outline"] = relative_change(order_free(turns["outline"]), chords)
+        order_free_score = sample_score(parts["order_free_follows_phase"], parts["order_free_change_outline"])
+    score = sample_score(parts["follows_phase"], parts["change_outline"])
+    return SampleReliance(original.sample, original.object, score, order_free_score, parts)
+
+
+def _phase_change(scenes: Counterfactuals, before: Map, after: Map, depth_mm: Map, where: NDArray[np.bool_]) -> Change:
+    """Change in rad of the phase of predictions in mm, and of the true phase."""
+    layer = scenes.layer.at(where)
+    expected = layer.absolute_phase(depth_mm[where]) - layer.absolute_phase(scenes.original.depth_mm[where])
+    answered = (before[where] > 0) & (after[where] > 0)
+    first, second = (layer.absolute_phase(np.where(answered, answer[where], 1000.0)) for answer in (before, after))
+    return Change(expected, np.where(answered, second - first, 0.0), answered)
+
+
+def measure(
+    method: "Method | Subject", scene_set: SceneSet, weights_sha256: str | None = None, progress: Progress = silent
+) -> tuple[Reliance, list[SampleReliance]]:
+    """The reliance block of a method, and the values of every sample. Raises `DiagnosisError` for a method of other
+    units, and where no sample has a score."""
+    predictor = ScenePredictor(method, scene_set.renderer)
+    direction = direction_read(method.frames_used, scene_set.dataset)
+    samples: list[SampleReliance] = []
+    for scenes in scene_set.scenes(direction):
+        progress(len(samples), len(scene_set.samples), scenes.original.sample)
+        samples.append(measure_sample(predictor, scenes))
+    scored = [sample for sample in samples if sample.score is not None]
+    if not scored:
+        raise DiagnosisError("no sample's phase can be moved within the working range, so there is no score")
+    interval = object_interval([sample.score for sample in scored], [sample.object for sample in scored])
+    reliance = Reliance(
+        version=RELIANCE_VERSION,
+        score=mean_of(sample.score for sample in scored) or 0.0,
+        interval=[None, None] if interval is None else [min(max(end, 0.0), 1.0) for end in interval],
+        order_free_score=mean_of(sample.order_free_score for sample in scored),
+        parts=RelianceParts(
+            **{key: mean_of(sample.parts.get(key) for sample in scored) for key in RelianceParts.model_fields}
+        ),
+        units="mm" if predictor.in_mm else "normalised",
+        direction=direction,
+        samples=len(scored),
+        objects=len({sample.object for sample in scored}),
+        dataset_fingerprint=scene_set.dataset.fingerprint,
+        protocol_version=PROTOCOL_VERSION,
+        weights_sha256=weights_sha256,
+    )
+    return reliance, samples
+
+
+def direction_read(frames: Sequence[int], dataset: DatasetFolder) -> MovedPhase:
+    """The direction whose phase is moved for a method of these frames: their own. For both directions it is the
+    vertical, whose period is the shorter in depth."""
+    if all(dataset.sequence.frames[index].kind == "crossed" for index in frames):
+        return "crossed"
+    directions = {dataset.sequence.frames[index].direction for index in frames}
+    return "vertical" if "vertical" in directions else "horizontal"
+
+
+class Counterfactual(probe.Probe):
     """The phase-reliance score over the counterfactual scenes of all test objects, with its parts and pictures."""
 
     name = "counterfactual"
@@ -47,8 +270,8 @@ class Counterfactual(Probe):
     question = "Does the predicted depth follow the fringe's phase, or the object's outline?"
 
     def run(
-        self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, folder: Path, progress: Progress
-    ) -> Finding:
+        self, subject: "Subject", dataset: DatasetFolder, settings: probe.ProbeSettings, progress: Progress
+    ) -> probe.Finding:
         views = 1 if settings.quick else VIEWS_PER_OBJECT
         if settings.samples is not None:
             objects = len({dataset.measured(sample)["object"] for sample in dataset.samples("test")})
@@ -63,9 +286,10 @@ class Counterfactual(Probe):
         middle = samples[len(samples) // 2].sample
         scenes = next(scenes for scenes in scene_set.scenes(reliance.direction) if scenes.original.sample == middle)
         values = {"reliance": reliance.model_dump(mode="json"), "per_sample": per_sample}
-        drawn = _draw_scenes(ScenePredictor(subject, scene_set.renderer), scenes, folder)
-        bars = _draw_parts(reliance, samples, folder)
-        return self.finding(summary(reliance), values, tables(reliance, samples), drawn, bars)
+        drawn = _draw_scenes(ScenePredictor(subject, scene_set.renderer), scenes)
+        return self.finding(
+            summary(reliance), values, tables(reliance, per_sample), drawn, _draw_parts(reliance, samples)
+        )
 
 
 def summary(reliance: Reliance) -> str:
@@ -88,83 +312,63 @@ def summary(reliance: Reliance) -> str:
     return f"{text} {warning}" if (warning := caution(reliance.objects)) else text
 
 
-def tables(reliance: Reliance, samples: Sequence[SampleReliance]) -> list[Table]:
+def tables(reliance: Reliance, per_sample: dict[str, dict[str, float | None]]) -> list[Table]:
     """The parts of the score, and the score of every sample."""
-    shown = ("follows_phase", "follows_light", "change_outline")
     parts = [(words, getattr(reliance.parts, key)) for key, words in PART_TITLES.items()]
-    header = ("Sample", "Score", "Whole periods aside", "Follows phase", "Follows brightness", "Change by outline")
-    rows = [(s.sample, s.score, s.order_free_score, *(s.parts.get(part) for part in shown)) for s in samples]
+    columns = {
+        "score": "Score",
+        "order_free_score": "Whole periods aside",
+        "follows_phase": "Follows phase",
+        "follows_light": "Follows brightness",
+        "change_outline": "Change by outline",
+    }
     means = Table("Parts of the score, and further measurements", ("Part", "Mean over samples"), parts)
-    return [means, Table("Sample by sample", header, rows)]
+    return [means, Table.of("Sample by sample", "Sample", per_sample, columns)]
 
 
-def _draw_scenes(predictor: ScenePredictor, scenes: Counterfactuals, folder: Path) -> Figure:
+def _draw_scenes(predictor: ScenePredictor, scenes: Counterfactuals) -> Figure:
     """One column per scene: captured frame, true depth, prediction, expected change and actual change."""
     original = scenes.original
     target = original.target & (original.depth_mm > 0)
     truth, before = predictor.true_depth(original.depth_mm, target), predictor.predict(original.scene)
-    columns = _figure_columns(predictor, scenes, truth, target)
-    box = _box(np.logical_or.reduce([mask for *_, mask in columns]))
+    first = {move.name: move for move in reversed(scenes.of_kind("phase"))}
+    shown = [(f"phase moved:\n{name}", first[name]) for name in ("ramp across", "ramp down", "bump") if name in first]
+    shown += [(f"outline:\n{change.name}", change) for change in scenes.of_kind("outline")]
+    shown += [(change.name.replace(" ", "\n", 1), change) for change in scenes.of_kind("projected")]
+    columns = [("as it is", original.scene, original.depth_mm)]
+    columns += [(title, variant.scene, variant.depth_mm) for title, variant in shown]
     index, masked = predictor.method.frames_used[0], predictor.method.uses_ground_truth_mask
-    unit = "mm" if predictor.in_mm else "share of range"
     margin = 0.5 * (float(np.ptp(truth[target])) or 1.0)
-    depths = float(truth[target].min()) - margin, float(truth[target].max()) + margin
-    moves = [predictor.true_depth(move.depth_mm, target) - truth for move in scenes.moves_within()]
+    low, high = float(truth[target].min()) - margin, float(truth[target].max()) + margin
+    moves = [predictor.true_depth(move.depth_mm, target) - truth for move in scenes.of_kind("phase")]
     largest = max(float(np.abs(move[target]).max()) for move in moves)
-    rows = (
-        ("captured", "gray", 0.0, 255.0),
-        (f"truth,\n{unit}", "viridis", *depths),
-        (f"prediction,\n{unit}", "viridis", *depths),
-        (f"expected change,\n{unit}", "coolwarm", -largest, largest),
-        (f"actual change,\n{unit}", "coolwarm", -largest, largest),
-    )
-    tiles: list[list[NDArray[np.float64]]] = []
-    for _, scene, true_depth, mask in columns:
-        answer, compared = predictor.predict(scene), mask & target
+    unit, digits = ("mm", 0) if predictor.in_mm else ("of range", 2)
+    scales: dict[str, tuple[str, float, float]] = {
+        "captured": ("gray", 0.0, 255.0),
+        f"truth,\n{low:.{digits}f} to\n{high:.{digits}f} {unit}": ("viridis", low, high),
+        "prediction": ("viridis", low, high),
+        f"expected change,\n-+{largest:.{digits}f} {unit}": ("coolwarm", -largest, largest),
+        "actual change": ("coolwarm", -largest, largest),
+    }
+    rows: dict[str, list[Picture]] = {name: [] for name in scales}
+    box = _box(np.logical_or.reduce([scene.mask for _, scene, _ in columns]))
+    for _, scene, depth_mm in columns:
+        mask, answer = scene.mask & (depth_mm > 0), predictor.predict(scene)
+        true_depth, compared = predictor.true_depth(depth_mm, mask), mask & target
         missing = predictor.in_mm & (answer == 0)
-        column = (
+        images = (
             predictor.renderer.frames(scene, [index], masked)[index],
             np.where(mask, true_depth, np.nan),
             np.where(mask & ~missing, answer, np.nan),
             np.where(compared, true_depth - truth, np.nan),
             np.where(compared & ~missing & ~(predictor.in_mm & (before == 0)), answer - before, np.nan),
         )
-        images = (np.asarray(image, dtype=np.float64)[box] for image in column)
-        tiles.append([np.pad(image, _GAP, constant_values=np.nan) for image in images])
-    height, width = tiles[0][0].shape
-    sheet = Sheet(5, 1, _WIDE, 5 * 0.9 * _WIDE / len(tiles) * height / width + 0.9)
-    for row, (axis, (title, colours, low, high)) in enumerate(zip(sheet.axes[:, 0], rows, strict=True)):
-        # One image per row: fifty small axes take ten times as long to lay out.
-        drawn = sheet.picture(axis, np.hstack([column[row] for column in tiles]), "", colours, low, high)
-        axis.set_facecolor("#e8e8e8" if row else "white")
-        axis.set_ylabel(title, fontsize=8)
-        sheet.scale(drawn, axis, 6, fraction=0.012, pad=0.008)
-    top = sheet.axes[0, 0]
-    top.xaxis.tick_top()
-    top.set_xticks([width * (number + 0.5) for number in range(len(columns))], [name for name, *_ in columns])
-    top.tick_params(axis="x", length=0, labelsize=7)
+        for name, image in zip(scales, images, strict=True):
+            rows[name].append(Picture(np.asarray(image)[box], *scales[name]))
     title = f"{original.sample}: one thing changed at a time; {scenes.direction} phase; grey: no prediction"
-    sheet.figure.suptitle(title, fontsize=10)
     alt = f"Scenes of {original.sample} with changed phase, outline or fringes; truth, prediction and its change"
-    return sheet.save(folder, "counterfactual_scenes.png", "One thing changed at a time", alt)
-
-
-def _figure_columns(
-    predictor: ScenePredictor, scenes: Counterfactuals, truth: NDArray[np.float64], target: NDArray[np.bool_]
-) -> list[tuple[str, Scene, NDArray[np.float64], NDArray[np.bool_]]]:
-    """Scenes of the figure: title, scene, its true depth in the prediction's units, and the mask of that depth."""
-    columns = [("as it is", scenes.original.scene, truth, target)]
-    first = {move.name: move for move in reversed(scenes.moves_within())}
-    for name in ("ramp across", "ramp down", "bump"):
-        if move := first.get(name):
-            columns.append((f"phase moved:\n{name}", move.phase, predictor.true_depth(move.depth_mm, target), target))
-    for change in scenes.outline_changes:
-        mask = change.scene.mask & (change.depth_mm > 0)
-        name = change.name.replace("another object's outline", "another\nobject's")
-        columns.append((f"outline: {name}", change.scene, predictor.true_depth(change.depth_mm, mask), mask))
-    for name, scene in scenes.reprojected.items():
-        columns.append((name.replace("fringe ", "fringe\n").replace("other ", "other\n"), scene, truth, target))
-    return columns
+    png = gallery(rows, [column for column, *_ in columns])
+    return Figure(title, "counterfactual_scenes.png", alt, png)
 
 
 def _box(mask: NDArray[np.bool_], margin: int = 6) -> tuple[slice, ...]:
@@ -173,24 +377,20 @@ def _box(mask: NDArray[np.bool_], margin: int = 6) -> tuple[slice, ...]:
     return tuple(slice(max(places[0] - margin, 0), places[-1] + margin + 1) for places in seen)
 
 
-def _draw_parts(reliance: Reliance, samples: Sequence[SampleReliance], folder: Path) -> Figure:
-    """Bars of the parts, with a point for each sample."""
-    sheet = Sheet(1, 2, 9.2, 3.2)
-    sides = (
+def _draw_parts(reliance: Reliance, samples: Sequence[SampleReliance]) -> Figure:
+    """The means of the parts, with a point for each sample."""
+    panels = []
+    for names, title, colour, top in (
         (_FOLLOWS, "Follows, share of the expected change", "phase", 1.05),
         (_CHANGES, "Changes, relative to a moved phase", "depth", None),
-    )
-    for axis, (names, title, colour, top) in zip(sheet.axes[0], sides, strict=True):
+    ):
         measured = {key: name for key, name in names.items() if getattr(reliance.parts, key) is not None}
-        values = [getattr(reliance.parts, key) for key in measured]
-        axis.bar(range(len(measured)), values, 0.6, color=sheet.COLOURS[colour], alpha=0.75)
-        for number, key in enumerate(measured):
-            points = [value for sample in samples if (value := sample.parts.get(key)) is not None]
-            axis.plot([number] * len(points), points, ".", color=sheet.INK, markersize=4, alpha=0.6)
-        axis.set_xticks(range(len(measured)), list(measured.values()))
-        sheet.tidy(axis, title)
-        axis.tick_params(axis="x", labelsize=7)
-        axis.set_ylim(0, top)
-    sheet.figure.suptitle(f"Phase reliance {reliance.score:.2f}; a point is a sample", fontsize=10)
-    alt = "Bars of how far the answer follows and what changes it"
-    return sheet.save(folder, "counterfactual_parts.png", "What the score is made of", alt)
+        means = [getattr(reliance.parts, key) for key in measured]
+        lines = [Line("mean", list(measured.values()), means, COLOURS[colour], "D")]
+        for sample in samples:
+            points = [sample.parts.get(key) for key in measured]
+            lines.append(Line("sample", list(measured.values()), points, COLOURS["ink"], "."))
+        panels.append(Panel(title, lines, axes={"ylim": (0, top)}))
+    title = f"What the score is made of: phase reliance {reliance.score:.2f}"
+    alt = "How far the answer follows and what changes it"
+    return Figure(title, "counterfactual_parts.png", alt, chart(panels, 2))

@@ -7,6 +7,7 @@ shift can't be confused with the opposite one.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -63,27 +64,26 @@ def original(dataset: DatasetFolder, renderer: SceneRenderer, sample: str) -> Or
     return Original(sample, record["object"], surface, replace(scene, mask=target), target, depth_mm)
 
 
-@dataclass(frozen=True)
-class Move:
-    """The surface moved to ``depth_mm``, so that its phase changes by ``amplitude_rad`` times the field ``name``.
-    ``phase``: the phase of the moved surface with the brightness of the original. ``light``: the brightness of the
-    moved surface with the phase of the original. ``both``: the moved surface as it would be photographed."""
-
-    name: str
-    amplitude_rad: float
-    phase: Scene
-    light: Scene
-    both: Scene
-    depth_mm: NDArray[np.float64]
+Kind = Literal["phase", "constant", "light", "both", "outline", "projected"]
 
 
 @dataclass(frozen=True)
-class OutlineChange:
-    """The same phase under another outline; target pixels within the scene's mask show the object before and after."""
+class Variant:
+    """A scene that differs from its `Original` in one property, and its true depth (H, W). ``kind``:
 
+    - ``phase`` and ``constant``: the surface moved so that its phase changes by ``amplitude_rad`` times the field
+      ``name``, with the brightness of the original; for ``constant`` by the same everywhere
+    - ``light``: the brightness of the moved surface with the phase of the original
+    - ``both``: the moved surface as it would be photographed
+    - ``outline``: the same phase under another outline; target pixels within the scene's mask show the object before
+      and after
+    - ``projected``: another pattern, ``name`` of `REPROJECTED`"""
+
+    kind: Kind
     name: str
     scene: Scene
     depth_mm: NDArray[np.float64]
+    amplitude_rad: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -93,25 +93,23 @@ class Counterfactuals:
     original: Original
     direction: MovedPhase
     layer: CalibrationLayer
-    moves: tuple[Move, ...]
-    outline_changes: tuple[OutlineChange, ...]
-    reprojected: dict[str, Scene]
+    variants: tuple[Variant, ...]
 
-    def moves_within(self) -> list[Move]:
-        """Moves that vary over the object, so all but the constant."""
-        return [move for move in self.moves if move.name != "constant"]
+    def of_kind(self, *kinds: str) -> list[Variant]:
+        """Those of some kinds."""
+        return [variant for variant in self.variants if variant.kind in kinds]
 
 
 def counterfactuals(
     dataset: DatasetFolder, renderer: SceneRenderer, sample: str, direction: MovedPhase, outline_samples: Sequence[str]
 ) -> Counterfactuals:
     """Every scene of ``sample``, which shows an object and may be cut to the outlines of ``outline_samples``."""
-    sample_scene = original(dataset, renderer, sample)
+    unchanged = original(dataset, renderer, sample)
     outlines = [object_mask(dataset.depth_mm(outline_sample)) for outline_sample in outline_samples]
-    moves, changes = _moves(sample_scene, renderer, direction), outline_changes(sample_scene, renderer, outlines)
-    reprojected: dict[str, Scene] = {name: replace(sample_scene.scene, projected=name) for name in REPROJECTED}
-    layer = layer_of(renderer.rig, direction)
-    return Counterfactuals(sample_scene, direction, layer, tuple(moves), tuple(changes), reprojected)
+    variants = [*_moves(unchanged, renderer, direction), *_outline_changes(unchanged, renderer, outlines)]
+    for name in REPROJECTED:
+        variants.append(Variant("projected", name, replace(unchanged.scene, projected=name), unchanged.depth_mm))
+    return Counterfactuals(unchanged, direction, layer_of(renderer.rig, direction), tuple(variants))
 
 
 def fields(surface: Surface) -> dict[str, Field]:
@@ -126,20 +124,23 @@ def fields(surface: Surface) -> dict[str, Field]:
     }
 
 
-def _moves(sample: Original, renderer: SceneRenderer, direction: MovedPhase) -> Iterator[Move]:
-    surface = sample.surface
+def _moves(sample: Original, renderer: SceneRenderer, direction: MovedPhase) -> Iterator[Variant]:
+    surface, before = sample.surface, sample.scene.lit
     for name, field in fields(surface).items():
         for sign in (1.0, -1.0):
             amplitude = sign * _largest_shift_rad(surface, renderer, direction, field, sign)
             if abs(amplitude) < SMALLEST_SHIFT_RAD:
                 continue
             moved_surface = rendering.moved(surface, renderer.rig, direction, field, amplitude)
-            lit, before = renderer.light(moved_surface), sample.scene.lit
-            phase, light, both = (
-                replace(sample.scene, lit=replace(one, gain=brightness.gain, ambient=brightness.ambient))
-                for one, brightness in ((lit, before), (before, lit), (lit, lit))
-            )
-            yield Move(name, amplitude, phase, light, both, moved_surface.depth_mm(renderer.shape))
+            lit = renderer.light(moved_surface)
+            lights: dict[Kind, tuple[LitPixels, LitPixels]] = {
+                "constant" if name == "constant" else "phase": (lit, before)
+            }
+            if name != "constant" and sign > 0:
+                lights |= {"light": (before, lit), "both": (lit, lit)}
+            for kind, (place, brightness) in lights.items():
+                scene = replace(sample.scene, lit=replace(place, gain=brightness.gain, ambient=brightness.ambient))
+                yield Variant(kind, name, scene, moved_surface.depth_mm(renderer.shape), amplitude)
 
 
 def _largest_shift_rad(
@@ -156,9 +157,9 @@ def _largest_shift_rad(
     return float(np.clip(limits.min(), 0.0, LARGEST_SHIFT_RAD))
 
 
-def outline_changes(
+def _outline_changes(
     sample: Original, renderer: SceneRenderer, outlines: Sequence[NDArray[np.bool_]]
-) -> Iterator[OutlineChange]:
+) -> Iterator[Variant]:
     """The sample under three other outlines, two without ``outlines`` (masks (H, W) of other objects)."""
     inside = np.zeros(renderer.shape, dtype=bool)
     inside.ravel()[sample.surface.pixels] = True
@@ -170,13 +171,15 @@ def outline_changes(
         cuts["another object's outline"] = moved[int(np.argmin(np.abs(np.array(shares) - KEPT_SHARE)))]
     for name, cut in cuts.items():
         inside_cut = cut.ravel()[sample.surface.pixels]
-        lit, pixels = _part(sample.scene.lit, inside_cut), sample.scene.pixels[inside_cut]
-        scene = replace(sample.scene, pixels=pixels, lit=lit, mask=sample.target & cut)
-        yield OutlineChange(name, scene, sample.depth_mm * (inside & cut))
+        lit, place = sample.scene.lit, sample.scene.lit.place
+        place = replace(place, **{name: values[inside_cut] for name, values in vars(place).items() if values.size})
+        lit = replace(lit, place=place, gain=lit.gain[inside_cut], ambient=lit.ambient[inside_cut])
+        scene = replace(sample.scene, pixels=sample.scene.pixels[inside_cut], lit=lit, mask=sample.target & cut)
+        yield Variant("outline", name, scene, sample.depth_mm * (inside & cut))
     yield _grown(sample, renderer, inside)
 
 
-def _grown(sample: Original, renderer: SceneRenderer, inside: NDArray[np.bool_]) -> OutlineChange:
+def _grown(sample: Original, renderer: SceneRenderer, inside: NDArray[np.bool_]) -> Variant:
     """The surface extended beyond its outline with depth and brightness of the nearest target pixel."""
     surface = sample.surface
     distance_px, nearest = distance_transform_edt(~sample.target, return_indices=True)
@@ -189,13 +192,7 @@ def _grown(sample: Original, renderer: SceneRenderer, inside: NDArray[np.bool_])
     gain = np.concatenate([sample.scene.lit.gain, sample.scene.lit.gain[source]])
     lit = replace(renderer.light(both), gain=gain)
     scene = replace(sample.scene, pixels=both.pixels.astype(np.uint32), lit=lit, mask=sample.target | ring)
-    return OutlineChange("grown", scene, both.depth_mm(renderer.shape))
-
-
-def _part(lit: LitPixels, selection: NDArray[np.bool_]) -> LitPixels:
-    every = vars(lit.place).items()
-    place = replace(lit.place, **{name: values[selection] for name, values in every if values.size})
-    return replace(lit, place=place, gain=lit.gain[selection], ambient=lit.ambient[selection])
+    return Variant("outline", "grown", scene, both.depth_mm(renderer.shape))
 
 
 def _laid_over(outline: NDArray[np.bool_], target: NDArray[np.bool_]) -> NDArray[np.bool_]:

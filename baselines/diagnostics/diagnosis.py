@@ -6,14 +6,24 @@ from dataclasses import asdict, dataclass
 from difflib import get_close_matches
 from functools import cache
 from hashlib import sha256
-from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 from time import perf_counter
 from typing import Any
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.diagnostics.probe import PROBES, Figure, Finding, Probe, ProbeSettings, Progress, Table
+from fpp_ml_bench.baselines.diagnostics.probe import (
+    PROBES,
+    Cell,
+    Figure,
+    Finding,
+    Probe,
+    ProbeSettings,
+    Progress,
+    Table,
+    make_probe,
+    with_interval,
+)
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.report import data_uri, page, render
@@ -76,18 +86,24 @@ def diagnose(
                 if reason := probe.applies_to(subject) or (nothing() if probe.asks_subject else None):
                     finding = probe.skip(reason)
                 else:
-                    finding = probe.run(subject, dataset, settings, out, progress(probe))
+                    finding = probe.run(subject, dataset, settings, progress(probe))
                 seconds = round(perf_counter() - started, 2)
                 save_finding(out, key, finding, seconds)
                 results.append(ProbeResult(probe, finding, seconds, reused=False))
         context = _context(subject, dataset, settings, command)
-        findings = {}
-        for one in results:
-            told = {key: getattr(one.finding, key) for key in ("title", "summary", "skipped")}
-            findings[one.finding.probe] = {**told, "seconds": one.seconds, "values": one.finding.values}
+        findings = {
+            one.probe.name: {
+                "title": one.finding.title,
+                "summary": one.finding.summary,
+                "skipped": one.finding.skipped,
+                "seconds": one.seconds,
+                "values": one.finding.values,
+            }
+            for one in results
+        }
         content = {"format": "fpp-ml-bench diagnosis", "version": FORMAT_VERSION, **context, "findings": findings}
         _write_json(out / JSON_FILE, content)
-        html = report_page(context, [(one.probe.question, one.finding) for one in results], out)
+        html = report_page(context, [(one.probe.question, one.finding) for one in results])
         write_atomically(out / REPORT_FILE, html.encode("utf-8"))
         return results
 
@@ -99,13 +115,6 @@ def checked_names(names: Sequence[str]) -> tuple[str, ...]:
             hint = "".join(f"did you mean {near!r}? " for near in get_close_matches(name, PROBES, n=1))
             raise DiagnosisError(f"unknown probe {name!r}; {hint}there are {', '.join(PROBES)}")
     return tuple(name for name in PROBES if not names or name in names)
-
-
-def make_probe(name: str) -> Probe:
-    """The probe ``name`` of `PROBES`."""
-    module, cls = PROBES[name]
-    probe: Probe = getattr(import_module(f"fpp_ml_bench.baselines.diagnostics.{module}"), cls)()
-    return probe
 
 
 def finding_key(probe: Probe, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings) -> str:
@@ -122,8 +131,13 @@ def finding_key(probe: Probe, subject: Subject, dataset: DatasetFolder, settings
 
 
 def save_finding(folder: Path, key: str, finding: Finding, seconds: float) -> None:
-    """Write ``PROBE.json`` into ``folder``, which holds its pictures. Raises ``ValueError`` for NaN and infinity."""
-    _write_json(folder / f"{finding.probe}.json", {"key": key, "seconds": seconds, "finding": asdict(finding)})
+    """Write ``PROBE.json`` and the pictures into ``folder``. Raises ``ValueError`` for NaN and infinity."""
+    for figure in finding.figures:
+        write_atomically(folder / figure.file, figure.png)
+    content = asdict(finding)
+    for figure in content["figures"]:
+        del figure["png"]
+    _write_json(folder / f"{finding.probe}.json", {"key": key, "seconds": seconds, "finding": content})
 
 
 def _write_json(path: Path, content: Mapping[str, Any]) -> None:
@@ -136,13 +150,12 @@ def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | N
         content = read_json(folder / f"{name}.json", DiagnosisError)
         if content["key"] != key:
             return None
-        fields = dict(content["finding"])
-        fields["tables"] = tuple(Table(**table) for table in fields["tables"])
-        fields["figures"] = tuple(Figure(**figure) for figure in fields["figures"])
-        finding, seconds = Finding(**fields), float(content["seconds"])
-    except (ValueError, TypeError, KeyError):
+        fields = content["finding"]
+        tables = tuple(Table(**table) for table in fields["tables"])
+        figures = tuple(Figure(**figure, png=(folder / figure["file"]).read_bytes()) for figure in fields["figures"])
+        return Finding(**{**fields, "tables": tables, "figures": figures}), float(content["seconds"])
+    except (OSError, ValueError, TypeError, KeyError):
         return None  # absent, half written, or of another version: it is made again
-    return (finding, seconds) if all((folder / figure.file).is_file() for figure in finding.figures) else None
 
 
 def _prepare(out: Path) -> None:
@@ -174,21 +187,28 @@ def _context(subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, 
     }
 
 
-def report_page(context: Mapping[str, Any], findings: Sequence[tuple[str, Finding]], folder: Path) -> str:
-    """The report: a section for each finding with its question and its pictures from ``folder``; ``context`` is what
-    ``diagnose.json`` says about subject, dataset, settings and machine."""
-    sections = []
-    for question, finding in findings:
-        figures = [(figure, data_uri((folder / figure.file).read_bytes())) for figure in finding.figures]
-        tables = [(one.title, one.header, [list(map(cell_text, row)) for row in one.rows]) for one in finding.tables]
-        sections.append((question, finding, figures, tables))
-    body = render("fpp_ml_bench.baselines.diagnostics", "diagnosis.html", sections=sections, **context)
+def report_page(context: Mapping[str, Any], findings: Sequence[tuple[str, Finding]]) -> str:
+    """The report: a section for each finding with its question; ``context`` is what ``diagnose.json`` says about
+    subject, dataset, settings and machine."""
+    body = render(
+        "fpp_ml_bench.baselines.diagnostics",
+        "diagnosis.html",
+        sections=findings,
+        data_uri=data_uri,
+        cells=lambda table: [[cell_text(cell) for cell in row] for row in table.rows],
+        **context,
+    )
     name = context["subject"]["name"]
     return page(f"{name}: diagnosis", body, _STYLE, description=f"What {name} read")
 
 
-def cell_text(cell: str | float | None) -> str:
+def cell_text(cell: Cell) -> str:
     """A cell as text: floats with four significant digits, a dash for None."""
     if cell is None:
         return "-"
+    if isinstance(cell, Mapping):
+        return with_interval(cell["r"], cell["interval"])
+    if isinstance(cell, (list, tuple)):
+        low, high = map(cell_text, cell)
+        return low if low == high else f"{low} to {high}"
     return f"{cell:.4g}" if isinstance(cell, float) else printable(cell, 500)

@@ -5,26 +5,35 @@ each filling the frame (no edge at all), as a rectangle in front of the backgrou
 silhouettes of test objects. The paper does not give the size of its rectangle, so a facing one grows until it fills the
 frame. For an individually normalised network the prediction is its own output, without range heads, converted to mm by
 the mean D_min and D_max of the test split: a facing plane has no depth range of its own.
+
+Grad-CAM on the rectangle (the paper's figure beside Section 7.3) tells whether a layer attends to the plane's fringes.
+A heatmap that is the same everywhere has the plane's share of the area within it. Random weights stand beside: their
+heatmaps may follow the brighter fringes of a near plane without having learnt anything.
 """
 
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.baselines.diagnostics import probe
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import original
-from fpp_ml_bench.baselines.diagnostics.plane_attention import (
-    attention_table,
-    draw_attention,
-    plane_heat,
-    shares_within,
+from fpp_ml_bench.baselines.diagnostics.grad_cam import cam_layers, heat_by_layer
+from fpp_ml_bench.baselines.diagnostics.probe import (
+    COLOURS,
+    TRAINED,
+    UNTRAINED,
+    Figure,
+    Line,
+    Panel,
+    Picture,
+    Table,
+    layer_title,
 )
-from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene, SceneRenderer, plane
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject, background_below
 from fpp_ml_bench.constants import MM_PER_M
@@ -66,39 +75,15 @@ class Scale:
 
 @dataclass(frozen=True)
 class PlanePrediction:
-    """A plane and its prediction: name of the ``outline``, and maps (H, W) with the plane's ``mask`` and true depth."""
+    """A plane's numbers, its mask, image and prediction (H, W)."""
 
-    outline: str
-    distance_m: float
-    tilt_deg: tuple[float, float]
+    row: Row
     mask: NDArray[np.bool_]
-    depth_mm: NDArray[np.float64]
     frame: NDArray[np.uint8]
     prediction: NDArray[np.float32]
 
-    def statistics(self, scale: Scale) -> dict[str, Any]:
-        """Mean, standard deviation, least and largest prediction over ``mask``, in its own units and in mm, its error,
-        and the share that collapsed to background; in float64."""
-        values = self.prediction[self.mask].astype(np.float64)
-        millimetres = scale.mm(values)
-        error = millimetres - self.depth_mm[self.mask]
-        own = {
-            "answer_mean": values.mean(),
-            "answer_std": values.std(),
-            "answer_min": values.min(),
-            "answer_max": values.max(),
-            "collapsed_share": (values < scale.limit).mean(),
-            "mean_mm": millimetres.mean(),
-            "std_mm": millimetres.std(),
-            "bias_mm": error.mean(),
-            "mae_mm": np.abs(error).mean(),
-            "true_std_mm": self.depth_mm[self.mask].std(),
-        }
-        about = {"outline": self.outline, "distance_m": self.distance_m, "tilt_deg": list(self.tilt_deg)}
-        return {**about, "pixels": int(self.mask.sum()), **{key: float(value) for key, value in own.items()}}
 
-
-class FlatPlane(Probe):
+class FlatPlane(probe.Probe):
     """Predictions for planes in three outlines, and for the test objects as the control."""
 
     name = "flat-plane"
@@ -111,30 +96,34 @@ class FlatPlane(Probe):
         return reason if subject.uses_ground_truth_mask else None
 
     def run(
-        self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, folder: Path, progress: Progress
-    ) -> Finding:
+        self, subject: Subject, dataset: DatasetFolder, settings: probe.ProbeSettings, progress: probe.Progress
+    ) -> probe.Finding:
         renderer = SceneRenderer.of(dataset)
         records = [dataset.measured(sample) for sample in dataset.samples("test")]
         ranges = [(record["depth_min_mm"], record["depth_max_mm"]) for record in records if record.get("depth_max_mm")]
         low, high = (float(np.mean(ends)) for ends in zip(*ranges, strict=True))
         normalised = subject.answers_normalised
         scale = Scale(normalised, (low, high), renderer.rig.working_range_mm[0])
-        outlines = outlines_of(dataset, settings)
-        total = sum(len(poses_of(outline, settings.quick)) for outline in (*SIDES, *outlines))
-        planes: list[PlanePrediction] = []
-        for one in predict_planes(subject, renderer, outlines, settings.quick):
-            planes.append(one)
-            progress(len(planes), total, f"{one.outline}, {one.distance_m:g} m")
-        control = control_of(subject, dataset, renderer, list(outlines), scale)
-        rows, range_mm = [one.statistics(scale) for one in planes], [low, high] if normalised else None
+        silhouettes = outlines_of(dataset, settings)
+        masks = {outline: rectangle(renderer.shape, side) for outline, side in SIDES.items()} | silhouettes
+        poses = [
+            (outline, mask, *pose) for outline, mask in masks.items() for pose in poses_of(outline, settings.quick)
+        ]
+        planes = []
+        for outline, mask, tilt_deg, distance_m in poses:
+            planes.append(predict_plane(subject, renderer, scale, outline, mask, tilt_deg, distance_m))
+            progress(len(planes), len(poses), f"{outline}, {distance_m:g} m")
+        control = control_of(subject, dataset, renderer, list(silhouettes), scale)
+        rows, range_mm = [one.row for one in planes], [low, high] if normalised else None
         values = {"planes": rows, "objects": control, "range_mm": range_mm, "collapse_below": scale.limit}
-        found, figures = tables(rows, control, normalised), [draw(planes, rows, normalised, folder)]
+        shown = {kind_of(one.row["outline"]): one for one in reversed(planes) if is_facing(one.row, PAPER_DISTANCE_M)}
+        found, figures = tables(rows, control, normalised), draw(shown, rows, normalised)
         if subject.network is not None:
-            shown = next(p for p in planes if (p.outline, p.distance_m) == (RECTANGLE, PAPER_DISTANCE_M))
-            heat = plane_heat(subject, shown.frame)
-            values["grad_cam"] = shares = shares_within(heat, shown.mask)
+            frame, mask = shown[RECTANGLE].frame, shown[RECTANGLE].mask
+            heat = plane_heat(subject, frame)
+            values["grad_cam"] = shares = shares_within(heat, mask)
             found.append(attention_table(shares))
-            figures.append(draw_attention(shown.frame, heat, folder))
+            figures.append(draw_attention(frame, heat))
         return self.finding(summary(rows, control, normalised), values, found, *figures)
 
 
@@ -143,16 +132,12 @@ def kind_of(outline: str) -> str:
     return outline if outline in SIDES else SILHOUETTE
 
 
-def shown_to(
-    subject: Subject, renderer: SceneRenderer, scene: Scene
-) -> tuple[NDArray[np.uint8] | None, NDArray[np.float32]]:
-    """The first frame of ``scene`` that the subject uses, and its prediction (H, W) in mm, or normalised
-    (`Subject.answer`)."""
-    frames = renderer.frames(scene, subject.frames_used, subject.uses_ground_truth_mask)
-    return frames[subject.frames_used[0]], subject.answer(frames)
+def is_facing(row: Row, distance_m: float) -> bool:
+    """Whether a plane faces the camera at a distance."""
+    return row["tilt_deg"] == [0.0, 0.0] and row["distance_m"] == distance_m
 
 
-def outlines_of(dataset: DatasetFolder, settings: ProbeSettings) -> dict[str, NDArray[np.bool_]]:
+def outlines_of(dataset: DatasetFolder, settings: probe.ProbeSettings) -> dict[str, NDArray[np.bool_]]:
     """Silhouettes (H, W) of a test sample of each object, by sample."""
     first: dict[str, str] = {}
     for sample in dataset.samples("test"):
@@ -177,20 +162,46 @@ def rectangle(shape: tuple[int, int], side: float) -> NDArray[np.bool_]:
     return mask
 
 
-def predict_planes(
-    subject: Subject, renderer: SceneRenderer, outlines: dict[str, NDArray[np.bool_]], quick: bool = False
-) -> Iterator[PlanePrediction]:
-    """Every plane, rendered and predicted."""
-    masks = {outline: rectangle(renderer.shape, side) for outline, side in SIDES.items()} | outlines
-    for outline, mask in masks.items():
-        for tilt, distance_m in poses_of(outline, quick):
-            surface = plane(renderer.rig, distance_m, tilt, mask)
-            lit, seen = renderer.light(surface), mask.copy()
-            seen.ravel()[surface.pixels] &= lit.gain > 0  # no fringe beyond the projector's field
-            scene = Scene(surface.pixels.astype(np.uint32), lit, seen, STREAM)
-            frame, answer = shown_to(subject, renderer, scene)
-            depth_mm = surface.depth_mm(renderer.shape)
-            yield PlanePrediction(outline, distance_m, tilt, seen, depth_mm, np.asarray(frame), answer)
+def predict_plane(
+    subject: Subject,
+    renderer: SceneRenderer,
+    scale: Scale,
+    outline: str,
+    mask: NDArray[np.bool_],
+    tilt_deg: tuple[float, float],
+    distance_m: float,
+) -> PlanePrediction:
+    """A plane cut to ``mask`` (H, W), rendered and predicted (`Subject.answer`). Of its row: mean, standard deviation,
+    least and largest prediction, in its own units and in mm, its error, and the share that collapsed to background; in
+    float64."""
+    surface = plane(renderer.rig, distance_m, tilt_deg, mask)
+    lit, seen = renderer.light(surface), mask.copy()
+    seen.ravel()[surface.pixels] &= lit.gain > 0  # no fringe beyond the projector's field
+    frames = renderer.frames(Scene(surface.pixels.astype(np.uint32), lit, seen, STREAM), subject.frames_used)
+    prediction, true_mm = subject.answer(frames), surface.depth_mm(renderer.shape)[seen]
+    values = prediction[seen].astype(np.float64)
+    millimetres = scale.mm(values)
+    error = millimetres - true_mm
+    own = {
+        "answer_mean": values.mean(),
+        "answer_std": values.std(),
+        "answer_min": values.min(),
+        "answer_max": values.max(),
+        "collapsed_share": (values < scale.limit).mean(),
+        "mean_mm": millimetres.mean(),
+        "std_mm": millimetres.std(),
+        "bias_mm": error.mean(),
+        "mae_mm": np.abs(error).mean(),
+        "true_std_mm": true_mm.std(),
+    }
+    row = {
+        "outline": outline,
+        "distance_m": distance_m,
+        "tilt_deg": list(tilt_deg),
+        "pixels": int(seen.sum()),
+        **{key: float(value) for key, value in own.items()},
+    }
+    return PlanePrediction(row, seen, np.asarray(frames[subject.frames_used[0]]), prediction)
 
 
 def control_of(
@@ -200,43 +211,85 @@ def control_of(
     shares = []
     for sample in samples:
         unchanged = original(dataset, renderer, sample)
-        predicted = shown_to(subject, renderer, unchanged.scene)[1][unchanged.target].astype(np.float64)
+        answer = subject.answer(renderer.frames(unchanged.scene, subject.frames_used))
         true = unchanged.depth_mm[unchanged.target]
         if scale.normalised:
             true = (true - true.min()) / (float(np.ptp(true)) or MM_PER_M)
+        predicted = answer[unchanged.target].astype(np.float64)
         shares.append([(values < scale.limit).mean() for values in (predicted, true)])
     means = (float(np.mean(column)) for column in zip(*shares, strict=True))
     return dict(zip(("collapsed_share", "collapsed_share_true"), means, strict=True))
 
 
+def plane_heat(subject: Subject, frame: NDArray[np.uint8]) -> dict[str, dict[str, NDArray[np.float32]]]:
+    """Heatmaps float32 (H, W) of an image by `TRAINED` or `UNTRAINED` weights and by layer, after the ReLU. Raises
+    `DiagnosisError` as `grad_cam.heatmaps`."""
+    network, untrained = subject.networks()
+    stack: list[NDArray[np.uint8] | None] = [None] * subject.frames_used[0] + [frame]
+    fringe, layers = subject.input_batch([stack]), cam_layers(subject)
+    return {
+        weights: {name: heat[0] for name, heat in heat_by_layer(subject, one, fringe, layers).items()}
+        for weights, one in ((TRAINED, network), (UNTRAINED, untrained(0)))
+    }
+
+
+def shares_within(heat: Mapping[str, Mapping[str, NDArray[np.float32]]], mask: NDArray[np.bool_]) -> dict[str, Any]:
+    """``area``: the share of ``mask`` (H, W) in the image; for each layer the share of its heat within the mask, None
+    where it has no heat at all."""
+
+    def share(values: NDArray[np.float32]) -> float | None:
+        total = float(values.sum(dtype=np.float64))
+        return float(values[mask].sum(dtype=np.float64)) / total if total > 0 else None
+
+    of_layers = {weights: {name: share(values) for name, values in layers.items()} for weights, layers in heat.items()}
+    return {"area": float(mask.mean()), **of_layers}
+
+
+def attention_table(shares: Mapping[str, Any]) -> Table:
+    """A row per layer."""
+    rows = [(layer_title(layer), share, shares[UNTRAINED][layer]) for layer, share in shares[TRAINED].items()]
+    title = f"Grad-CAM on the rectangle at 1.8 m, which covers {shares['area']:.0%} of the image: heat within it"
+    return Table(title, ("Layer", "Share", "Random weights"), rows)
+
+
+def draw_attention(frame: NDArray[np.uint8], heat: Mapping[str, Mapping[str, NDArray[np.float32]]]) -> Figure:
+    """The paper's figure, and the same with random weights."""
+    rows = {
+        weights: [Picture(frame), *(Picture(one, "inferno", high=float(one.max())) for one in layers.values())]
+        for weights, layers in heat.items()
+    }
+    alt = "Grad-CAM by layer on a plane with an outline, with trained and with random weights"
+    png = probe.gallery(rows, ("input", *heat[TRAINED]))
+    return Figure("Grad-CAM on the plane, each to its own largest value", "flat_plane_attention.png", alt, png)
+
+
 def summary(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) -> str:
     """The share that collapsed in each outline and by size, the mean at the paper's distance, and for mm those at all
     distances."""
-    shares = {
-        kind: float(np.mean([row["collapsed_share"] for row in rows if kind_of(row["outline"]) == kind]))
-        for kind in (RECTANGLE, FRAME, SILHOUETTE)
-    }
-    facing = [row for row in rows if row["outline"] == RECTANGLE and row["tilt_deg"] == [0.0, 0.0]]
-    paper = next(row for row in facing if row["distance_m"] == PAPER_DISTANCE_M)
-    mean_text = (
-        f"{paper['answer_mean']:.3f} of the range (paper: {PAPER['answer_mean']})"
-        if normalised
-        else f"{paper['mean_mm']:.0f} mm"
+    frame, rectangles, silhouettes = (
+        float(np.mean([row["collapsed_share"] for row in rows if kind_of(row["outline"]) == kind]))
+        for kind in (FRAME, RECTANGLE, SILHOUETTE)
+    )
+    rectangles_at = {z: row for z in DISTANCES_M for row in rows if row["outline"] == RECTANGLE and is_facing(row, z)}
+    paper = rectangles_at[PAPER_DISTANCE_M]
+    mean_text, range_text = f"{paper['mean_mm']:.0f} mm", ""
+    if normalised:
+        mean_text = f"{paper['answer_mean']:.3f} of the range (paper: {PAPER['answer_mean']})"
+        range_text = " (paper: {:g} to {:g})".format(*PAPER["answer_range"])
+    sizes = ", ".join(
+        f"{row['collapsed_share']:.0%} at {GROWING[row['outline']]:g}" for row in rows if row["outline"] in GROWING
     )
     text = (
-        f"Predicted as background: {shares[RECTANGLE]:.0%} of a rectangular plane, {shares[FRAME]:.0%} of a plane that "
-        f"fills the frame, {shares[SILHOUETTE]:.0%} of a plane in an object's outline; "
+        f"Predicted as background: {rectangles:.0%} of a rectangular plane, {frame:.0%} of a plane that "
+        f"fills the frame, {silhouettes:.0%} of a plane in an object's outline; "
         f"{control['collapsed_share']:.0%} of real objects ({control['collapsed_share_true']:.0%} in truth). The "
         f"prediction for the rectangle at 1.8 m has a mean of {mean_text} and a spread of {paper['answer_std']:.3g}, "
-        f"from {paper['answer_min']:.4g} to {paper['answer_max']:.4g}"
-        f"{' (paper: {:g} to {:g})'.format(*PAPER['answer_range']) if normalised else ''}."
+        f"from {paper['answer_min']:.4g} to {paper['answer_max']:.4g}{range_text}. "
+        f"Share of a facing rectangle there predicted as background, by its side relative to the image's: {sizes}."
     )
-    collapsed = {GROWING[row["outline"]]: row["collapsed_share"] for row in rows if row["outline"] in GROWING}
-    sizes = ", ".join(f"{share:.0%} at {side:g}" for side, share in collapsed.items())
-    text += f" Share of a facing rectangle there predicted as background, by its side relative to the image's: {sizes}."
     if not normalised:
-        means = ", ".join(f"{row['mean_mm']:.0f}" for row in facing)
-        distances = ", ".join(f"{1000 * row['distance_m']:.0f}" for row in facing)
+        means = ", ".join(f"{row['mean_mm']:.0f}" for row in rectangles_at.values())
+        distances = ", ".join(f"{1000 * distance_m:.0f}" for distance_m in rectangles_at)
         text += f" Facing planes at {distances} mm are predicted with means of {means} mm."
     return text
 
@@ -244,81 +297,68 @@ def summary(rows: Sequence[Row], control: Mapping[str, float], normalised: bool)
 def tables(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) -> list[Table]:
     """A row per plane; silhouettes as means over objects."""
     unit = "of range" if normalised else "mm"
+    columns = {
+        "answer_mean": f"Mean, {unit}",
+        "answer_std": f"Spread, {unit}",
+        "span": f"Least to most, {unit}",
+        "collapsed_share": "Collapsed",
+        "mean_mm": "Mean, mm",
+        "std_mm": "Spread, mm",
+        "true_std_mm": "True spread, mm",
+        "mae_mm": "MAE, mm",
+    }
     poses = defaultdict(list)
     for row in rows:  # in the order of `SIDES`, then silhouettes
-        poses[kind_of(row["outline"]), row["distance_m"], *row["tilt_deg"]].append(row)
-    lines = []
-    for (kind, distance_m, across, down), same_pose in poses.items():
-        name = f"{kind}, {len(same_pose)} objects" if kind == SILHOUETTE else kind
-        least, most = min(row["answer_min"] for row in same_pose), max(row["answer_max"] for row in same_pose)
-        mean, std, *others = (
-            float(np.mean([row[key] for row in same_pose]))
-            for key in ("answer_mean", "answer_std", "collapsed_share", "mean_mm", "std_mm", "true_std_mm", "mae_mm")
-        )
-        pose = f"{distance_m:g} m", f"{across:g}, {down:g}"
-        lines.append((name, *pose, mean, std, f"{least:.4g} to {most:.4g}", *others))
+        across, down = row["tilt_deg"]
+        pose = f"{kind_of(row['outline'])}, {row['distance_m']:g} m, tilt {across:g}, {down:g}"
+        poses[pose].append(row)
+    lines = {}
+    for pose, same_pose in poses.items():
+        span = min(row["answer_min"] for row in same_pose), max(row["answer_max"] for row in same_pose)
+        means = {key: float(np.mean([row[key] for row in same_pose])) for key in columns if key != "span"}
+        lines[pose] = {**means, "span": span}
     title = "Predictions for planes" + (", mm by the mean range of the test split" if normalised else "")
-    header = (
-        "Outline",
-        "Distance",
-        "Tilt, degrees",
-        f"Mean, {unit}",
-        f"Spread, {unit}",
-        f"Least to most, {unit}",
-        "Collapsed",
-        "Mean, mm",
-        "Spread, mm",
-        "True spread, mm",
-        "MAE, mm",
-    )
     keys = {"real objects, predicted": "collapsed_share", "real objects, in truth": "collapsed_share_true"}
     shares = [(pixels, control[key]) for pixels, key in keys.items()]
-    return [Table(title, header, lines), Table("Share of background: the control", ("Pixels of", "Share"), shares)]
+    return [
+        Table.of(title, "Outline, distance, tilt in degrees", lines, columns),
+        Table("Share of background: the control", ("Pixels of", "Share"), shares),
+    ]
 
 
-def draw(planes: Sequence[PlanePrediction], rows: Sequence[Row], normalised: bool, folder: Path) -> Figure:
-    """The paper's figure, input and prediction, for each outline at 1.8 m, and the distribution of the predictions,
-    and what changes with distance and size."""
-    facing = [shown for shown in planes if shown.distance_m == PAPER_DISTANCE_M and shown.tilt_deg == (0.0, 0.0)]
-    examples = [next(shown for shown in facing if shown.outline == kind) for kind in (FRAME, RECTANGLE)]
-    examples += [shown for shown in facing if kind_of(shown.outline) == SILHOUETTE][:1]
-    sheet = Sheet(2, len(examples) + 2, 13.5, 5.2, width_ratios=[1] * len(examples) + [1.5, 1.5])
-    low, high = (-0.2, 1.2) if normalised else (0.0, 2400.0)
-    unit, digits = ("share of range", 2) if normalised else ("mm", 0)
-    for (above, below), shown in zip(sheet.axes.T, examples, strict=False):
-        values = shown.prediction[shown.mask]
-        sheet.picture(above, shown.frame, f"{shown.outline}\n{shown.distance_m:g} m", "gray", 0, 255)
-        least, most, mean = (f"{value:.{digits}f}" for value in (values.min(), values.max(), values.mean()))
-        title = f"prediction over the plane:\n{least} to {most}, mean {mean}"
-        image = sheet.picture(below, shown.prediction, title, "viridis", low, high)
-    sheet.scale(image, sheet.axes[1, : len(examples)], fraction=0.05, pad=0.02, label=unit)
-    _against_distance(sheet, planes, normalised)
-    axis, bins = sheet.axes[1, -2], np.linspace(low, high, 57)
-    for shown in examples:
-        values = np.clip(shown.prediction[shown.mask], low, high)
-        axis.hist(values, bins, histtype="step", weights=np.full(values.size, 1 / values.size), label=shown.outline)
-    sheet.tidy(axis, "Predictions at 1.8 m (end bins: beyond)", unit, "share of pixels")
-    axis.legend(fontsize=7, frameon=False)
-    sizes = [row for row in rows if row["outline"] in GROWING]
-    lines = ("answer_mean", "Mean prediction", unit), ("collapsed_share", "Predicted as background", "share of pixels")
-    for axis, (key, title, label) in zip(sheet.axes[:, -1], lines, strict=True):
-        axis.plot(list(GROWING.values()), [row[key] for row in sizes], "s-", markersize=5)
-        sheet.tidy(axis, f"{title}, 1.8 m", "side of the rectangle, share of the image's", label)
-    alt = "Fringes on planes in three outlines, the predictions, and their means against distance and size"
-    return sheet.save(folder, "flat_plane.png", "Flat planes", alt)
-
-
-def _against_distance(sheet: Sheet, planes: Sequence[PlanePrediction], normalised: bool) -> None:
-    axis, scale = sheet.axes[0, -2], 1.0 if normalised else 1000.0
-    for kind, mark in ((FRAME, "o"), (RECTANGLE, "s"), (SILHOUETTE, "^")):
-        points = defaultdict(list)
-        for shown in planes:
-            if kind_of(shown.outline) == kind and shown.tilt_deg == (0.0, 0.0):
-                points[shown.distance_m].append(float(shown.prediction[shown.mask].mean(dtype=np.float64)))
-        means = [np.mean(values) / scale for values in points.values()]
-        axis.plot(list(points), means, mark + "-", markersize=5, label=kind)
+def draw(shown: Mapping[str, PlanePrediction], rows: Sequence[Row], normalised: bool) -> list[Figure]:
+    """The paper's figure, input and prediction, for each outline at 1.8 m; and what changes with distance and size,
+    with the distribution of the predictions."""
+    low, high, unit = (-0.2, 1.2, "share of range") if normalised else (0.0, 2400.0, "mm")
+    bins = np.linspace(low, high, 57)
+    columns, frames, predictions, histograms, distances = [], [], [], [], []
+    for kind, colour in ((FRAME, "edges"), (RECTANGLE, "depth"), (SILHOUETTE, "phase")):
+        one = shown[kind]
+        values = one.prediction[one.mask]
+        columns.append(f"{one.row['outline']}\n{values.min():.4g} to {values.max():.4g}, mean {values.mean():.4g}")
+        frames.append(Picture(one.frame))
+        predictions.append(Picture(one.prediction, "viridis", low, high))
+        shares = np.histogram(np.clip(values, low, high), bins)[0] / values.size
+        histograms.append(Line(kind, ((bins[1:] + bins[:-1]) / 2).tolist(), shares, COLOURS[colour], "-"))
+        of_kind = [row for row in rows if kind_of(row["outline"]) == kind]
+        means = [np.mean([row["answer_mean"] for row in of_kind if is_facing(row, z)]) for z in DISTANCES_M]
+        distances.append(Line(kind, DISTANCES_M, means, COLOURS[colour]))
     if not normalised:
-        ends = min(DISTANCES_M), max(DISTANCES_M)
-        axis.plot(ends, ends, color=sheet.INK, linewidth=0.8, label="true")
-    sheet.tidy(axis, "Mean prediction of a facing plane", "distance, m", "share of range" if normalised else "m")
-    axis.legend(fontsize=7, frameon=False)
+        distances.append(Line("true", DISTANCES_M, [MM_PER_M * z for z in DISTANCES_M], COLOURS["ink"], ":"))
+    sizes = {side: row for outline, side in GROWING.items() for row in rows if row["outline"] == outline}
+    mean, collapsed = ([Line.of(RECTANGLE, sizes, key, COLOURS["depth"])] for key in ("answer_mean", "collapsed_share"))
+    side = "side of the rectangle, share of the image's"
+    panels = [
+        Panel("Mean prediction of a facing plane", distances, "distance, m", unit),
+        Panel("Predictions at 1.8 m (ends: beyond)", histograms, unit, "share of pixels"),
+        Panel("Mean prediction, 1.8 m", mean, side, unit),
+        Panel("Predicted as background, 1.8 m", collapsed, side, "share of pixels"),
+    ]
+    png = probe.gallery({"fringes": frames, f"prediction,\n{low:g} to {high:g}\n{unit}": predictions}, columns, 2.4)
+    curves = probe.chart(panels, 2)
+    return [
+        Figure(
+            "Flat planes at 1.8 m", "flat_plane.png", "Fringes on planes in three outlines, and the predictions", png
+        ),
+        Figure("Predictions by distance and size", "flat_plane_curves.png", "Means against distance and size", curves),
+    ]

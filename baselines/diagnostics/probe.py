@@ -1,28 +1,30 @@
-"""What all probes share: their base class, settings and results, their names, and the style of figures.
+"""What all probes share: their base class, settings and results, their names, and how figures are drawn.
 
+A probe gives rows for tables, and lines or pictures for figures; `chart` and `gallery` draw them in one style.
 Importing this module imports neither numpy nor matplotlib, so that the command line can name the probes.
 """
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import import_module
 from io import BytesIO
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 from fpp_ml_bench.errors import DiagnosisError
+from fpp_ml_bench.paper import AVERAGE, LAYERS, paper_layers, said_by_paper
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from numpy.typing import NDArray
 
     from fpp_ml_bench.baselines.diagnostics.subjects import Subject
     from fpp_ml_bench.loaders.storage import DatasetFolder
 
-Cell = str | int | float | None
+TRAINED, UNTRAINED = "trained", "untrained"
+Cell = str | int | float | Sequence[float] | Mapping[str, Any] | None
+"""Of a table. A pair is a range, and a mapping a value ``r`` with its ``interval``."""
 Progress = Callable[[int, int, str], None]
 """Called by a running probe with the steps done, their total, and the activity."""
 
@@ -67,7 +69,19 @@ def mean_of(values: Iterable[float | None]) -> float | None:
     return float(np.mean(defined)) if defined else None
 
 
-def with_interval(value: float | None, interval: Sequence[float] | None) -> str:
+def layer_title(layer: str) -> str:
+    """Our name of a layer, and the paper's where it has another."""
+    theirs = LAYERS.get(layer, layer)
+    return layer if theirs == layer else f"{layer} (paper's {theirs})"
+
+
+def said_of_layers(probe: str, layers: Iterable[str]) -> dict[str, str | None]:
+    """What the paper's table of a probe says of each layer and of their average; nothing for other layers than its."""
+    names = set(paper_layers(probe))
+    return {name: said_by_paper(probe, name) for name in names} if {*layers, AVERAGE} == names else {}
+
+
+def with_interval(value: float | None, interval: Sequence[float] | None = None) -> str:
     """A mean with its interval as a table's cell; a dash for None."""
     span = "" if interval is None else f" ({interval[0]:.3f} to {interval[1]:.3f})"
     return "-" if value is None else f"{value:.3f}{span}"
@@ -86,14 +100,21 @@ class Table:
         if uneven is not None:
             raise ValueError(f"table {self.title!r}: a row has {len(uneven)} cells, its header has {len(self.header)}")
 
+    @classmethod
+    def of(cls, title: str, first: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> Table:
+        """The named ``rows``; ``columns``: titles by the keys of what a row shows, and a dash where it lacks a key."""
+        cells = [(name, *(row.get(key) for key in columns)) for name, row in rows.items()]
+        return cls(title, (first, *columns.values()), cells)
+
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture ``file`` (PNG, in the probe's folder), with its title and a description ``alt``."""
+    """A picture with its title and a description ``alt``; ``file``: its name in the folder of the report."""
 
     title: str
     file: str
     alt: str
+    png: bytes = field(repr=False)
 
 
 @dataclass(frozen=True)
@@ -120,6 +141,11 @@ class Probe(ABC):
     version = 1
     without_network: str | None = None
     asks_subject = True
+    known: dict[str, type[Probe]] = {}  # noqa: RUF012
+    """Every subclass by its name, once its module is imported."""
+
+    def __init_subclass__(cls) -> None:
+        Probe.known[cls.name] = cls
 
     def applies_to(self, subject: Subject) -> str | None:
         """None where the probe can run, else the reason why it can't, for the report."""
@@ -128,10 +154,8 @@ class Probe(ABC):
         return f"{subject.name} is a method without a network: {self.without_network}."
 
     @abstractmethod
-    def run(
-        self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, folder: Path, progress: Progress
-    ) -> Finding:
-        """Measure ``subject``; pictures are written into ``folder``, which exists."""
+    def run(self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, progress: Progress) -> Finding:
+        """Measure ``subject``."""
 
     def skip(self, reason: str) -> Finding:
         """Why this probe has no result."""
@@ -142,80 +166,162 @@ class Probe(ABC):
         return Finding(self.name, self.title, summary, values, tables, figures)
 
 
-PROBES = {
-    "linear": ("linear", "LinearProbing"),
-    "grad-cam": ("grad_cam", "GradCam"),
-    "flat-plane": ("flat_plane", "FlatPlane"),
-    "counterfactual": ("counterfactual", "Counterfactual"),
-    "theory": ("theory", "Theory"),
+PROBES = ("linear", "grad-cam", "flat-plane", "counterfactual", "theory")
+"""The probes in the order of the report; each is in the module of its name, which is imported when it runs."""
+
+
+def make_probe(name: str) -> Probe:
+    """The probe ``name`` of `PROBES`."""
+    import_module(f"{__package__}.{name.replace('-', '_')}")
+    return Probe.known[name]()
+
+
+COLOURS = {
+    "edges": "#2e8b57",
+    "depth": "#c0392b",
+    "object_depth": "#e08e79",
+    "distance": "#c0392b",
+    "phase": "#1b5bb8",
+    "order": "#8a4b00",
+    "raw": "#59616b",
+    "random": "#9aa3ad",
+    "ink": "#191c20",
 }
-"""The probes by name, in the order of the report: module of this package, imported on first use, and class in it."""
+"""Colours of the targets, edges and depth as in the paper's figure; of the raw input, of random weights, of text."""
+_GRID, _SHADE, _NOTHING = "#dfe1e5", "#f0e6d2", 0.91
+_GAP = 4  # px between two pictures
 
 
-class Sheet:
-    """A figure of ``rows x columns`` axes in the report's style, black on white; sizes in inches, ``options`` as of
-    ``subplots``. ``axes``: an array of that shape."""
+@dataclass(frozen=True)
+class Line:
+    """Values ``y`` (n,) at ``x`` (n,), numbers or names; None is left out. ``ends``: the interval of each value.
+    ``style``: marker and line as for matplotlib's ``plot``."""
 
-    COLOURS: ClassVar = {
-        "edges": "#2e8b57",
-        "depth": "#c0392b",
-        "object_depth": "#e08e79",
-        "distance": "#c0392b",
-        "phase": "#1b5bb8",
-        "order": "#8a4b00",
-        "raw": "#59616b",
-        "random": "#9aa3ad",
-    }
-    """Colours of the targets, edges and depth as in the paper's figure; of the raw input, and of random weights."""
-    INK, GRID = "#191c20", "#dfe1e5"
+    label: str
+    x: Sequence[Any] | NDArray
+    y: Sequence[float | None] | NDArray
+    colour: str
+    style: str = "o-"
+    ends: Sequence[Sequence[float] | None] = ()
 
-    def __init__(self, rows: int, columns: int, width: float, height: float, **options: Any) -> None:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
+    @classmethod
+    def of(
+        cls, label: str, rows: Mapping[Any, Mapping[str, Any]], key: str, colour: str, style: str = "o-", ends: str = ""
+    ) -> Line:
+        """The values ``key`` of the named ``rows``, whose intervals are called ``ends``."""
+        return cls(
+            label,
+            list(rows),
+            [row[key] for row in rows.values()],
+            colour,
+            style,
+            [row.get(ends) for row in rows.values()],
+        )
 
-        self.figure = Figure(figsize=(width, height), layout="constrained")
-        FigureCanvasAgg(self.figure)
-        self.axes: Any = self.figure.subplots(rows, columns, squeeze=False, **options)
 
-    def tidy(self, axes: Axes, title: str = "", x: str = "", y: str = "") -> None:
-        """Set titles and a light grid, and remove the box."""
-        axes.set_title(title, fontsize=10, loc="left")
-        axes.set_xlabel(x, fontsize=9)
-        axes.set_ylabel(y, fontsize=9)
+@dataclass(frozen=True)
+class Panel:
+    """Lines over one pair of axes. ``axes``: further properties of matplotlib's ``Axes``, such as ``ylim``;
+    ``shaded``: a range of x."""
+
+    title: str
+    lines: Sequence[Line]
+    x: str = ""
+    y: str = ""
+    axes: Mapping[str, Any] = field(default_factory=dict)
+    shaded: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A map (H, W) from ``low`` to ``high`` in matplotlib's ``colours``; NaN is grey."""
+
+    image: NDArray
+    colours: str = "gray"
+    low: float = 0.0
+    high: float = 255.0
+
+    def rgb(self) -> NDArray:
+        """Float (H, W, 3) in [0, 1]."""
+        import numpy as np
+        from matplotlib import colormaps
+
+        values = np.asarray(self.image, dtype=float)
+        share = np.clip((np.nan_to_num(values) - self.low) / ((self.high - self.low) or 1.0), 0, 1)
+        return np.where(np.isnan(values)[..., None], _NOTHING, colormaps[self.colours](share)[..., :3])
+
+
+def chart(panels: Sequence[Panel], columns: int, panel_size: tuple[float, float] = (5.0, 3.4)) -> bytes:
+    """``panels`` in rows of ``columns``, of so many inches each, and one legend of all their lines; PNG."""
+    rows = max(-(-len(panels) // columns), 1)
+    figure, axes_of = _figure(rows, columns, panel_size[0] * columns, panel_size[1] * rows)
+    handles: dict[str, Any] = {}
+    for panel, axes in zip(panels, axes_of.flat, strict=False):
+        for line in panel.lines:
+            values = [float("nan") if value is None else value for value in line.y]
+            (handle,) = axes.plot(line.x, values, line.style, color=line.colour, markersize=4, linewidth=1.2)
+            handles.setdefault(line.label, handle)
+            for x, ends in zip(line.x, line.ends, strict=False):
+                if ends is not None:
+                    axes.plot([x] * len(ends), ends, color=line.colour, linewidth=0.8)
+        if panel.shaded:
+            axes.axvspan(*panel.shaded, color=_SHADE, zorder=0)
+        axes.set(**panel.axes)
+        axes.set_title(panel.title, fontsize=10, loc="left")
+        axes.set_xlabel(panel.x, fontsize=9)
+        axes.set_ylabel(panel.y, fontsize=9)
         axes.tick_params(labelsize=8)
-        axes.grid(axis="y", color=self.GRID, linewidth=0.8)
+        if isinstance(panel.lines[0].x[0], str):
+            axes.tick_params(axis="x", rotation=40 if len(panel.lines[0].x) > 6 else 0)
+        axes.grid(axis="y", color=_GRID, linewidth=0.8)
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
+    for axes in axes_of.flat[len(panels) :]:
+        axes.axis("off")
+    # As many columns as the longest label leaves room for, at 16 letters an inch.
+    across = max(1, int(16 * panel_size[0] * columns / (8 + max(map(len, handles), default=0))))
+    figure.legend(handles.values(), handles, fontsize=8, frameon=False, ncols=across, loc="outside lower center")
+    return _png(figure)
 
-    def picture(self, axes: Axes, image: NDArray, title: str = "", colours: str = "gray", *limits: float) -> Any:
-        """An image (H, W) without ticks; ``limits``, low and high, default to its own range."""
-        axes.set_title(title, fontsize=9)
-        axes.set(xticks=[], yticks=[])
-        low, high = limits or (None, None)
-        return axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation="nearest")
 
-    def scale(self, image: Any, axes: Any, size: int = 7, **options: Any) -> None:
-        """The colour scale of a `picture` beside ``axes``."""
-        self.figure.colorbar(image, ax=axes, **options).ax.tick_params(labelsize=size)
+def gallery(rows: Mapping[str, Sequence[Picture]], columns: Sequence[str], picture_inches: float = 1.1) -> bytes:
+    """Pictures in named rows and columns, so many inches wide each; PNG."""
+    import numpy as np
 
-    def bars(self, axes: Axes, positions: NDArray, bars: Sequence[tuple[Any, Any]], **style: Any) -> None:
-        """Bars of (value, interval), each of which may be None; ``style`` as of ``bar``."""
-        axes.bar(positions, [math.nan if value is None else value for value, _ in bars], **style)
-        for x, (value, interval) in zip(positions, bars, strict=True):
-            if value is not None and interval is not None:
-                axes.plot([x, x], interval, color=self.INK, linewidth=1)
+    shapes = [picture.image.shape for row in rows.values() for picture in row]
+    height, width = (max(lengths) + _GAP for lengths in zip(*shapes, strict=True))
+    # One image: fifty small axes take ten times as long to lay out.
+    sheet = np.ones((height * len(rows), width * len(columns), 3))
+    for down, row in enumerate(rows.values()):
+        for across, picture in enumerate(row):
+            part = picture.rgb()
+            sheet[down * height :, across * width :][: part.shape[0], : part.shape[1]] = part
+    size = picture_inches * len(columns), picture_inches * len(rows) * height / width
+    figure, ((axes,),) = _figure(1, 1, size[0] + 1.2, size[1] + 0.6)
+    axes.imshow(sheet, interpolation="nearest")
+    axes.xaxis.tick_top()
+    axes.set_xticks(width * (np.arange(len(columns)) + 0.5), columns)
+    axes.set_yticks(height * (np.arange(len(rows)) + 0.5), list(rows))
+    axes.tick_params(length=0, labelsize=7)
+    axes.spines[:].set_visible(False)
+    return _png(figure)
 
-    def legend(self, axes: Axes, columns: int) -> None:
-        """The legend of ``axes`` below the figure."""
-        handles, labels = axes.get_legend_handles_labels()
-        self.figure.legend(handles, labels, fontsize=8, frameon=False, ncols=columns, loc="outside lower center")
 
-    def save(self, folder: Path, file: str, title: str, alt: str) -> Figure:
-        """Write ``file`` with 256 colours, a third of the size; the bytes are reproducible."""
-        from PIL import Image
+def _figure(rows: int, columns: int, width: float, height: float) -> tuple[Any, Any]:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
 
-        buffer = BytesIO()
-        self.figure.savefig(buffer, format="png", dpi=130, facecolor="white", metadata={"Software": None})
-        reduced = Image.open(buffer).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-        reduced.save(folder / file, optimize=True)
-        return Figure(title, file, alt)
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.subplots(rows, columns, squeeze=False)
+
+
+def _png(figure: Any) -> bytes:
+    """With 256 colours, a third of the size; the bytes are reproducible."""
+    from PIL import Image
+
+    drawn, reduced = BytesIO(), BytesIO()
+    figure.savefig(drawn, format="png", dpi=130, facecolor="white", metadata={"Software": None})
+    image = Image.open(drawn).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    image.save(reduced, format="png", optimize=True)
+    return reduced.getvalue()

@@ -7,11 +7,10 @@ dataset in direct light, noise included, except for a few pixels in 50,000 that 
 view, frame and pixel, so it is the same in a changed scene.
 """
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from typing import Literal, cast
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -199,13 +198,14 @@ def direct_light(light: render.Light) -> render.Light:
 
 
 class SceneRenderer:
-    """Renders scenes with the direct light, sensor and empty background of a rig; caches the last background."""
+    """Renders scenes with the direct light, sensor and empty background of a rig; keeps the last background."""
 
     def __init__(self, rig: Rig, light: render.Light | None = None) -> None:
         self.rig, self.lamp = rig, direct_light(light or render.named_light("paper"))
         self.shape = (rig.camera.height, rig.camera.width)
+        self._exposures: dict[str, render.Exposure] = {}
         self._background_stream: tuple[object, ...] = ()
-        self._backgrounds: dict[tuple[int, int], NDArray[np.uint8]] = {}
+        self._backgrounds: dict[tuple[str, int], NDArray[np.uint8]] = {}
 
     @classmethod
     def of(cls, dataset: DatasetFolder) -> "SceneRenderer":
@@ -213,30 +213,21 @@ class SceneRenderer:
         light = dataset.manifest.settings.get("light")
         return cls(dataset.rig, None if light is None else render.Light.model_validate(light))
 
-    @cached_property
-    def exposure(self) -> render.Exposure:
-        return render.Exposure.of(self.rig, self.lamp)
-
-    @cached_property
-    def _uniform(self) -> render.Exposure:
-        return replace(self.exposure, pattern=self.exposure.pattern.uniform(self.rig))
-
-    @cached_property
-    def _other_pitch(self) -> render.Exposure:
-        names = ("pitch_horizontal_px", "pitch_vertical_px")
-        wider = replace(self.rig, **{name: PITCH_FACTOR * getattr(self.rig, name) for name in names})
-        if (pair := self.rig.crossed) is not None:
-            pitches_px = cast(tuple[float, float], tuple(PITCH_FACTOR * pitch for pitch in pair.pitches_px))
-            wider = wider.with_crossed(replace(pair, pitches_px=pitches_px))
-        return render.Exposure.of(wider, self.lamp)
-
-    @cached_property
-    def _mirrored(self) -> render.Exposure:
-        """With both carriers of crossed frames mirrored."""
-        if (pair := self.rig.crossed) is None:
-            return self.exposure
-        angles_deg = cast(tuple[float, float], tuple(-angle for angle in pair.angles_deg))
-        return render.Exposure.of(self.rig.with_crossed(replace(pair, angles_deg=angles_deg)), self.lamp)
+    def _exposure(self, pattern: str) -> render.Exposure:
+        """With the pattern ``sequence``, its mean light (``uniform``), ``other pitch`` or ``other direction``; kept."""
+        if pattern not in self._exposures:
+            rig, pair = self.rig, self.rig.crossed
+            if pattern == "other pitch":
+                names = ("pitch_horizontal_px", "pitch_vertical_px")
+                rig = replace(rig, **{name: PITCH_FACTOR * getattr(rig, name) for name in names})
+            if pair is not None and pattern.startswith("other"):
+                key, factor = ("pitches_px", PITCH_FACTOR) if pattern == "other pitch" else ("angles_deg", -1)
+                first, second = getattr(pair, key)
+                rig = rig.with_crossed(replace(pair, **{key: (factor * first, factor * second)}))
+            exposure = render.Exposure.of(rig, self.lamp)
+            uniform = pattern == "uniform"
+            self._exposures[pattern] = replace(exposure, pattern=exposure.pattern.uniform(rig)) if uniform else exposure
+        return self._exposures[pattern]
 
     @cached_property
     def _empty(self) -> render.LitPixels:
@@ -249,20 +240,21 @@ class SceneRenderer:
         return self._lit(surface.points_m(), surface.normals)
 
     def _lit(self, points_m: NDArray[np.float64], normals: NDArray[np.float64]) -> render.LitPixels:
-        lit = render.light_surface(points_m, normals, self.rig, self.lamp, self.exposure.pattern)
-        exposure = self.lamp.camera.exposure  # of a range that views draw from, the middle of its logarithms
-        factor = math.sqrt(math.prod(exposure)) if isinstance(exposure, tuple) else exposure
-        return lit if factor == 1 else lit.brighter(np.float32(factor))
+        lit = render.light_surface(points_m, normals, self.rig, self.lamp, self._exposure("sequence").pattern)
+        return lit.brighter(np.float32(self.lamp.camera.exposure))  # type: ignore[arg-type]  # direct light has one
 
     def frames(self, scene: Scene, indices: Sequence[int], masked: bool = False) -> list[NDArray[np.uint8] | None]:
         """Frames ``indices`` of ``scene``, uint8 (H, W), by number, else None; ``masked``: 0 outside ``scene.mask``."""
-        other = {"other pitch": lambda: self._other_pitch, "other direction": lambda: self._mirrored}
-        usual = other.get(scene.projected, lambda: self.exposure)()
-        inside = self._uniform if scene.projected == "no fringe inside" else usual
-        outside = self._uniform if scene.projected == "no fringe outside" else usual
-        swapped = scene.projected == "other direction"
-        projected_indices = [self._partner(index) if swapped else index for index in indices]
-        object_values = inside.expose(projected_indices, scene.lit, scene.pixels, scene.stream)
+        turned = scene.projected == "other direction"
+        other = scene.projected == "other pitch" or (turned and self.rig.crossed is not None)
+        usual: str = scene.projected if other else "sequence"
+        inside = outside = usual
+        if scene.projected == "no fringe inside":
+            inside = "uniform"
+        elif scene.projected == "no fringe outside":
+            outside = "uniform"
+        projected_indices = [self._partner(index) if turned else index for index in indices]
+        object_values = self._exposure(inside).expose(projected_indices, scene.lit, scene.pixels, scene.stream)
         frames: list[NDArray[np.uint8] | None] = [None] * len(self.rig.sequence)
         for index, projected_index, values in zip(indices, projected_indices, object_values, strict=True):
             image = self._background(scene.stream, projected_index, outside).copy()
@@ -272,23 +264,21 @@ class SceneRenderer:
 
     def decoded_mm(self, scene: Scene) -> NDArray[np.float32]:
         """Depth (H, W) in mm decoded from the whole sequence on the scene's pixels, as a dataset's is; 0 beyond."""
-        frames = np.zeros((len(self.rig.sequence), *self.shape), dtype=np.uint8)
-        every = range(len(frames))
-        frames.reshape(len(frames), -1)[:, scene.pixels] = self.exposure.expose(
-            every, scene.lit, scene.pixels, scene.stream
-        )
-        seen = np.zeros(self.shape, dtype=bool)
+        count = len(self.rig.sequence)
+        frames, seen = np.zeros((count, *self.shape), dtype=np.uint8), np.zeros(self.shape, dtype=bool)
+        exposed = self._exposure("sequence").expose(range(count), scene.lit, scene.pixels, scene.stream)
+        frames.reshape(count, -1)[:, scene.pixels] = exposed
         seen.ravel()[scene.pixels] = True
         return decode_stack(frames, self.rig, direction="both", mask=seen, reasons=False).depth_mm
 
-    def _background(self, stream: tuple[object, ...], index: int, exposure: render.Exposure) -> NDArray[np.uint8]:
+    def _background(self, stream: tuple[object, ...], index: int, pattern: str) -> NDArray[np.uint8]:
         if self._background_stream != stream:
             self._background_stream, self._backgrounds = stream, {}
-        key = id(exposure), index  # the three exposures live as long as the renderer
-        if key not in self._backgrounds:
+        if (pattern, index) not in self._backgrounds:
             pixels = np.arange(self.shape[0] * self.shape[1], dtype=np.uint32)
-            self._backgrounds[key] = exposure.expose([index], self._empty, pixels, stream)[0].reshape(self.shape)
-        return self._backgrounds[key]
+            image = self._exposure(pattern).expose([index], self._empty, pixels, stream)[0]
+            self._backgrounds[pattern, index] = image.reshape(self.shape)
+        return self._backgrounds[pattern, index]
 
     def _partner(self, index: int) -> int:
         """The frame of the other direction with the same step or bit; black and white frames map to themselves."""

@@ -3,24 +3,42 @@
 *A single fringe does not determine depth*: surfaces a whole period apart on every ray give the same frame of that
 direction, noise included, if at each pixel the brighter one gets a lower albedo (in direct light from a projector in
 focus at both: its blur would be a hint). *An error of one period costs Z^2*,
-and along the camera's axis Z^2 kappa / (1 -+ Z kappa), one sign for each side, with kappa = P / (f_p b). And which of
-two depths a loss chooses where both share an image (`loss_choice`).
+and along the camera's axis Z^2 kappa / (1 -+ Z kappa), one sign for each side, with kappa = P / (f_p b).
+
+And which of two depths a training loss chooses where both share an image: the paper says that under l1 or l2 losses a
+network may learn an average. A network gives one answer for it: first + c (second - first) on every pixel of the
+object, c from 0 to 1. Each image of a batch is the second scene with a given chance, and the expected loss is evaluated
+by the training's own functions. Where the answer is right beside the object, the other pixels only scale the loss.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from math import comb
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import Original, original
-from fpp_ml_bench.baselines.diagnostics.loss_choice import choices, choices_table
-from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, Sheet, Table
+from fpp_ml_bench.baselines.diagnostics.probe import (
+    COLOURS,
+    Figure,
+    Finding,
+    Line,
+    Panel,
+    Picture,
+    Probe,
+    ProbeSettings,
+    Progress,
+    Table,
+    chart,
+    gallery,
+)
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import SceneRenderer, Surface, constant, moved
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.training import LOSSES, loss_function
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders.render import camera_noise
@@ -35,6 +53,17 @@ STARTS_PERIODS = (0.0, -1.0, -0.5)
 """Position of the first of two scenes that are a period apart, in periods from the object's own position."""
 SET_BACK_M = 0.1  # distance of the projector behind the camera in the rig that shows the limit of the thin baseline
 _SHOWN_M = (0.3, 1.0, 1.8, 3.0, 5.0, 10.0)
+AWAY, BOTH = "one period, away", "one period, mean of both"
+
+CHANCES = (0.25, 0.5, 0.75)  # of the second scene
+BATCHES = (1, 4)  # images; 4 is the paper's
+ALPHA = 0.7
+STEPS, PIXELS = 100, 64
+_SAME = 1e-6
+"""Relative difference of two expected losses that count as equal: no training tells them apart."""
+
+Maps = list[NDArray[np.float64]]
+Frames = list[NDArray[np.uint8]]
 
 
 @dataclass(frozen=True)
@@ -45,10 +74,10 @@ class Twins:
     direction: Direction
     frame: int
     other_frame: int
-    depths_mm: list[NDArray[np.float64]]
-    frames: list[NDArray[np.uint8]]
-    noiseless: list[NDArray[np.uint8]]
-    other_frames: list[NDArray[np.uint8]]
+    depths_mm: Maps
+    frames: Frames
+    noiseless: Frames
+    other_frames: Frames
     paint: NDArray[np.float64]
 
     def to_dict(self) -> dict[str, Any]:
@@ -82,23 +111,19 @@ class Theory(Probe):
     asks_subject = False
     question = "Can two depths give the same fringe, and how large is the depth error of one period at each distance?"
 
-    def run(
-        self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, folder: Path, progress: Progress
-    ) -> Finding:
+    def run(self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, progress: Progress) -> Finding:
         progress(0, 2, "two scenes, one frame")
         twins = twins_of(dataset, SceneRenderer.of(dataset))
         progress(1, 2, "one period, many distances")
         curves = error_curves(dataset.rig, twins.direction)
         keys = "name", "periods", "exponent", "fitted_m", "quadratic_m"
-        shown = [{key: curve[key] for key in keys} for curve in curves]
         values = {
             "twins": twins.to_dict(),
             "kappa_per_m": kappa_per_m(dataset.rig, twins.direction),
-            "curves": shown,
+            "curves": [{key: curve[key] for key in keys} for curve in curves],
             "choices": choices(twins.depths_mm),
         }
-        figures = _draw_twins(twins, folder), _draw_curves(curves, folder)
-        return self.finding(summary(values), values, tables(values, curves), *figures)
+        return self.finding(summary(values), values, tables(values, curves), _draw_twins(twins), _draw_curves(curves))
 
 
 def twins_of(dataset: DatasetFolder, renderer: SceneRenderer, direction: Direction = "horizontal") -> Twins:
@@ -127,7 +152,7 @@ def _photographed(renderer: SceneRenderer, first: Original, pair: Sequence[Surfa
     paint = np.divide(least, most, out=np.ones_like(most), where=most > 0)
     scenes = [replace(first.scene, lit=replace(light, gain=least.astype(np.float32))) for light in lights]
 
-    def frames(index: int, camera: SceneRenderer = renderer) -> list[NDArray[np.uint8]]:
+    def frames(index: int, camera: SceneRenderer = renderer) -> Frames:
         return [np.asarray(camera.frames(scene, [index])[index]) for scene in scenes]
 
     sinusoids = renderer.rig.sequence.sinusoids
@@ -136,6 +161,37 @@ def _photographed(renderer: SceneRenderer, first: Original, pair: Sequence[Surfa
     noiseless = frames(frame, quiet)
     depths_mm = [surface.depth_mm(renderer.shape) for surface in pair]
     return Twins(first.sample, direction, frame, across, depths_mm, frames(frame), noiseless, frames(across), paint)
+
+
+def choice_of(
+    depths_mm: Sequence[NDArray[np.float64]], loss: str, chance: float, batch: int, alpha: float | None = None
+) -> tuple[float, float]:
+    """Least and largest c of least expected ``loss``: 0 is the first of two depth maps (H, W), 0 outside the object, 1
+    the second, which comes with ``chance``, and between them is a depth of neither; in batches of so many images."""
+    inside = np.flatnonzero((depths_mm[0] > 0) & (depths_mm[1] > 0))
+    some = inside[np.linspace(0, inside.size - 1, min(PIXELS, inside.size)).astype(np.int64)]
+    first, second = (torch.from_numpy(depth.ravel()[some] / MM_PER_M).view(1, 1, 1, -1) for depth in depths_mm)
+    function = loss_function(loss, alpha)
+    places = np.linspace(0, 1, STEPS + 1)
+    expected = np.zeros(places.size)
+    for count in range(batch + 1):
+        weight = comb(batch, count) * chance**count * (1 - chance) ** (batch - count)
+        target = torch.cat([second] * count + [first] * (batch - count))
+        answers = ((first + c * (second - first)).expand_as(target) for c in places.tolist())
+        expected += weight * np.array([float(function(answer, target)) for answer in answers])
+    chosen = places[expected <= expected.min() * (1 + _SAME)]
+    return float(chosen[0]), float(chosen[-1])
+
+
+def choices(depths_mm: Sequence[NDArray[np.float64]]) -> list[dict[str, Any]]:
+    """`choice_of` for each loss of the paper's comparison, each of `BATCHES` and each of `CHANCES`."""
+    rows = []
+    for loss in LOSSES:
+        alpha = ALPHA if loss.startswith("hybrid") else None
+        for batch in BATCHES:
+            chosen = {str(chance): choice_of(depths_mm, loss, chance, batch, alpha) for chance in CHANCES}
+            rows.append({"loss": loss, "alpha": alpha, "batch": batch, "chosen": chosen})
+    return rows
 
 
 def _axis(rig: Rig, direction: Direction) -> CalibrationLayer:
@@ -172,9 +228,9 @@ def error_curves(rig: Rig, direction: Direction) -> list[Curve]:
     small_behind = depth_error_mm(behind, direction, distances, SMALL_PERIODS)
     return [
         _curve("1/64 period", SMALL_PERIODS, distances, small),
-        _curve("one period, away", 1.0, distances, away),
+        _curve(AWAY, 1.0, distances, away),
         _curve("one period, toward", -1.0, distances, toward),
-        _curve("one period, mean of both", 1.0, distances, (away + toward) / 2),
+        _curve(BOTH, 1.0, distances, (away + toward) / 2),
         _curve(f"1/64 period, projector {SET_BACK_M:g} m behind", SMALL_PERIODS, distances, small_behind),
     ]
 
@@ -201,10 +257,10 @@ def _curve(name: str, periods: float, distances: NDArray[np.float64], error_mm: 
 def summary(values: Mapping[str, Any]) -> str:
     """Both theorems with their numbers."""
     twins, curves = values["twins"], {curve["name"]: curve for curve in values["curves"]}
-    small = next(iter(curves.values()))
+    small = values["curves"][0]
     away, both = (
-        f"from {_span(curve['quadratic_m'])}" if curve["quadratic_m"] else "at no distance from 0.3 m"
-        for curve in (curves["one period, away"], curves["one period, mean of both"])
+        f"from {_span(curves[name]['quadratic_m'])}" if curves[name]["quadratic_m"] else "at no distance from 0.3 m"
+        for name in (AWAY, BOTH)
     )
     return (
         f"{twins['sample']} and a surface {twins['depth_apart_mean_mm']:.0f} mm from it on average give the same "
@@ -220,11 +276,7 @@ def _span(ends: Sequence[float] | None) -> str:
 
 
 def tables(values: Mapping[str, Any], curves: Sequence[Curve]) -> list[Table]:
-    """Exponents, and errors at some distances."""
-    errors = []
-    for curve in curves:
-        shown = np.interp(np.log(_SHOWN_M), np.log(curve["distances_m"]), curve["error_mm"])
-        errors.append((curve["name"], *("no depth" if not np.isfinite(value) else f"{value:.4g}" for value in shown)))
+    """The two scenes, the choices of losses, exponents, and errors at some distances."""
     same = {
         "pixels of the object": "object_pixels",
         "depth between the two, mean, mm": "depth_apart_mean_mm",
@@ -233,53 +285,61 @@ def tables(values: Mapping[str, Any], curves: Sequence[Curve]) -> list[Table]:
         "pixels that differ in the other direction's frame": "differing_pixels_other_direction",
         "least albedo factor on the brighter surface": "paint_least",
     }
-    exponents = [(one["name"], one["exponent"], _span(one["fitted_m"]), _span(one["quadratic_m"])) for one in curves]
-    header = ("Phase error", "Fitted exponent", "Fitted over", "Within 1% of 2")
+    chosen = {}
+    for row in values["choices"]:
+        alpha = "" if row["alpha"] is None else f", alpha {row['alpha']:g}"
+        chosen[f"{row['loss']}{alpha}, batches of {row['batch']}"] = row["chosen"]
+    errors = []
+    for curve in curves:
+        shown = np.interp(np.log(_SHOWN_M), np.log(curve["distances_m"]), curve["error_mm"])
+        errors.append((curve["name"], *("no depth" if not np.isfinite(value) else f"{value:.4g}" for value in shown)))
     return [
         Table("Two scenes, one frame", ("What", "Value"), [(what, values["twins"][key]) for what, key in same.items()]),
-        choices_table(values["choices"]),
-        Table("Exponent of distance in the depth error", header, exponents),
+        Table.of(
+            "Which depth a loss chooses for one image of two scenes: 0 the first, 1 the second, between them neither",
+            "Loss",
+            chosen,
+            {str(chance): f"second scene in {chance:.0%}" for chance in CHANCES},
+        ),
+        Table.of(
+            "Exponent of distance in the depth error",
+            "Phase error",
+            {curve["name"]: curve for curve in values["curves"]},
+            {"exponent": "Fitted exponent", "fitted_m": "Fitted over, m", "quadratic_m": "Within 1% of 2, m"},
+        ),
         Table("Depth error, mm", ("Phase error", *(f"{z:g} m" for z in _SHOWN_M)), errors),
     ]
 
 
-def _draw_twins(twins: Twins, folder: Path) -> Figure:
-    sheet = Sheet(2, 4, 10, 5.0)
+def _draw_twins(twins: Twins) -> Figure:
     inside = twins.depths_mm[0] > 0
-    depths = np.stack(twins.depths_mm)[:, inside]
-    for row, (name, axis, depth) in enumerate(zip("AB", sheet.axes, twins.depths_mm, strict=True)):
-        depth_mm = np.where(inside, depth, np.nan)
-        shown = sheet.picture(axis[0], depth_mm, f"scene {name}: depth, mm", "viridis", depths.min(), depths.max())
-        sheet.picture(axis[1], twins.frames[row], f"its {twins.direction} fringe", "gray", 0, 255)
-        sheet.picture(axis[2], twins.other_frames[row], "its other direction", "gray", 0, 255)
-        sheet.scale(shown, axis[0], fraction=0.05, pad=0.03)
-    pairs = (twins.frames, twins.direction), (twins.other_frames, "other direction")
-    for axis, ((first, second), direction) in zip(sheet.axes[:, 3], pairs, strict=True):
-        difference = second.astype(np.int64) - first
-        title = f"B - A, {direction}:\n{np.count_nonzero(difference)} pixels differ"
-        shown = sheet.picture(axis, difference, title, "coolwarm", -60, 60)
-    sheet.scale(shown, sheet.axes[:, 3], fraction=0.05, pad=0.03, label="grey levels")
+    low, high = np.stack(twins.depths_mm)[:, inside].min(), np.stack(twins.depths_mm)[:, inside].max()
+    depths = [Picture(np.where(inside, depth, np.nan), "viridis", low, high) for depth in twins.depths_mm]
+    rows = {f"depth,\n{low:.0f} to {high:.0f} mm": depths}
+    for name, pair in ((f"{twins.direction} fringe", twins.frames), ("other direction", twins.other_frames)):
+        difference = pair[1].astype(np.int64) - pair[0]
+        label = f"{name},\n{np.count_nonzero(difference)} pixels differ"
+        rows[label] = [*map(Picture, pair), Picture(difference, "coolwarm", -60, 60)]
+    png = gallery(rows, ("scene A", "scene B", "B - A, blue -60 to red 60"), 2.2)
     alt = "Two depths a period apart, their identical fringes, and their difference"
-    return sheet.save(folder, "theory_twins.png", "Two scenes, one frame", alt)
+    return Figure("Two scenes, one frame", "theory_twins.png", alt, png)
 
 
-def _draw_curves(curves: Sequence[Curve], folder: Path) -> Figure:
-    sheet = Sheet(1, 2, 10, 3.8)
-    errors, exponents = sheet.axes[0]
-    for curve, name in zip(curves, ("edges", "depth", "phase", "order", "raw"), strict=True):
-        finite, style = np.isfinite(curve["error_mm"]), {"color": sheet.COLOURS[name], "linewidth": 1.4}
-        errors.loglog(curve["distances_m"][finite], curve["error_mm"][finite], label=curve["name"], **style)
-        exponents.semilogx(curve["distances_m"], curve["local"], **style)
-    exponents.axhspan(1.98, 2.02, color=sheet.GRID)
-    exponents.text(0.31, 2.2, "grey: 2 within 1%", fontsize=7)
-    exponents.set_ylim(1.0, 3.5)
-    sheet.tidy(errors, "Depth error of a phase error", "distance, m", "mm")
-    sheet.tidy(exponents, "Local exponent of distance", "distance, m")
-    for axis in (errors, exponents):
-        axis.axvspan(1.5, 2.1, color="#f0e6d2", zorder=0)
-        axis.set_xticks([0.3, 1, 3, 10], ["0.3", "1", "3", "10"])
-        axis.minorticks_off()
-    errors.legend(fontsize=7, frameon=False)
-    errors.text(1.53, errors.get_ylim()[0] * 1.3, "working\nrange", fontsize=7)
+def _draw_curves(curves: Sequence[Curve]) -> Figure:
+    def lines(key: str) -> list[Line]:
+        drawn = []
+        for curve, colour in zip(curves, ("edges", "depth", "phase", "order", "raw"), strict=True):
+            values = np.where(np.isfinite(curve[key]), curve[key], np.nan)
+            drawn.append(Line(curve["name"], curve["distances_m"], values, COLOURS[colour], "-"))
+        return drawn
+
+    across = {"xscale": "log", "xticks": [0.3, 1, 3, 10], "xticklabels": ["0.3", "1", "3", "10"]}
+    local = [*lines("local"), Line("exponent 2", DISTANCES_M, (2.0, 2.0), COLOURS["ink"], ":")]
+    panels = [
+        Panel("Depth error of a phase error", lines("error_mm"), "distance, m", "mm", across | {"yscale": "log"}),
+        Panel("Local exponent of distance", local, "distance, m", "", across | {"ylim": (1.0, 3.5)}),
+    ]
+    panels = [replace(panel, shaded=(1.5, 2.1)) for panel in panels]
     alt = "Depth error of a phase error from 0.3 to 10 m, and its exponent"
-    return sheet.save(folder, "theory_range.png", "Depth error against distance", alt)
+    title = "Depth error against distance; shaded: the working range of the paper's rig"
+    return Figure(title, "theory_range.png", alt, chart(panels, 2))

@@ -1,20 +1,30 @@
-"""FPP-C's axes: what disturbs a scene, each one stage of the image formation at five severities (``axes.yaml``).
+"""FPP-C's rules: what disturbs a scene, each one stage of the image formation at five severities (``axes.yaml``), and
+what a prediction of it is worth: errors with a fixed charge for silence, and honesty about them.
+
+Scored are the object pixels of the undisturbed scene that are not void, against its exact depth. A pixel without an
+answer is charged half an order, so that "I don't know" is better than a wrong order and worse than a right one.
 
 After Hendrycks and Dietterich 2019, Benchmarking Neural Network Robustness to Common Corruptions and Perturbations; but
 every corruption is caused in the scene, not painted on the image.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from fpp_ml_bench.constants import GREY_LEVELS, TEST_OBJECTS, UNSEEN
+from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation.score import states_sigma
 from fpp_ml_bench.files import strict_yaml
 from fpp_ml_bench.loaders.render import Light, named_light
+from fpp_ml_bench.loaders.sample import void_pixels
 from fpp_ml_bench.schema import StrictModel, Text, validate
 
 FILE = Path(__file__).with_name("axes.yaml")
@@ -87,3 +97,68 @@ class Corruptions(StrictModel):
 def corruptions() -> Corruptions:
     """The axes that come with the package."""
     return validate(Corruptions, strict_yaml(FILE.read_text(encoding="utf-8")), FILE, "axes", PredictionError)
+
+
+Scores = dict[str, float | None]
+SCORES = ("mae_mm", "protocol_mae_mm", "wrong_share", "unanswered_share", "confident_share", "coverage")
+"""Of a view: mean error with `Corruptions.unanswered_mm` for a pixel without an answer; the same with its whole depth,
+as the protocol has it; shares of wrong orders and of pixels without an answer; of confident errors, and of pixels that
+state a sigma, both None for a method that states none."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """``depth_mm`` float32 (H, W) and ``scored`` bool (H, W) of an undisturbed view."""
+
+    depth_mm: NDArray[np.float32]
+    scored: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, depth_mm: NDArray[np.float32], flags: NDArray[np.uint8]) -> "Truth":
+        return cls(depth_mm, object_mask(depth_mm) & ~void_pixels(flags))
+
+
+def score(
+    depth_mm: NDArray[np.floating], sigma_mm: NDArray[np.floating] | None, truth: Truth, rules: Corruptions
+) -> Scores:
+    """`SCORES` of a prediction (H, W) in mm, 0 or less without an answer (a network may go below 0), whose standard
+    uncertainty is ``sigma_mm`` (H, W), above 0 where it is stated. Raises PredictionError for a depth that is not
+    finite, a sigma that is not finite or below 0, and for another size."""
+    for name, values in (("depth", depth_mm), ("sigma", sigma_mm)):
+        if values is None:
+            continue
+        if values.shape != truth.depth_mm.shape:
+            raise PredictionError(f"{name}: expected a map of {truth.depth_mm.shape}, got {values.shape}")
+        if not np.isfinite(values).all() or (name == "sigma" and (values < 0).any()):
+            raise PredictionError(f"{name}: expected finite mm, a sigma of 0 and more; the method is at fault")
+    target = truth.depth_mm[truth.scored].astype(np.float64)
+    if target.size == 0:
+        return dict.fromkeys(SCORES)
+    given = depth_mm[truth.scored].astype(np.float64)
+    answered = given > 0
+    error = np.abs(given - target)
+    wrong = answered & (error > rules.wrong_order_mm)
+    scores: Scores = {
+        "mae_mm": float(np.where(answered, error, rules.unanswered_mm).mean()),
+        "protocol_mae_mm": float(error.mean()),
+        "wrong_share": float(wrong.mean()),
+        "unanswered_share": float((~answered).mean()),
+        "confident_share": None,
+        "coverage": None,
+    }
+    if sigma_mm is not None:
+        sigma = sigma_mm[truth.scored].astype(np.float64)
+        stated = states_sigma(given, sigma)
+        scores["confident_share"] = float((wrong & stated & (sigma < rules.confident_below * error)).mean())
+        scores["coverage"] = float(stated.mean())
+    return scores
+
+
+def severity_means(views: Sequence[Mapping[str, Any]]) -> dict[int, Scores]:
+    """Mean of each score over the views of a severity that have it."""
+    means = {}
+    for severity in sorted({view["severity"] for view in views}):
+        of_severity = [view for view in views if view["severity"] == severity]
+        columns = {key: [view[key] for view in of_severity if view.get(key) is not None] for key in SCORES}
+        means[severity] = {key: float(np.mean(values)) if values else None for key, values in columns.items()}
+    return means

@@ -1,4 +1,5 @@
-"""Measuring a method axis by axis: predictions of disturbed views in processes, a file for each finished axis."""
+"""Measuring a method axis by axis: predictions of disturbed views in processes, a file for each finished axis; and what
+they make together: means by severity, the mean over all of them, and its interval."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -9,11 +10,12 @@ from typing import Any
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corruptions
-from fpp_ml_bench.baselines.robustness.scenes import Condition, FrameCache, conditions_of
-from fpp_ml_bench.baselines.robustness.scores import score
+from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corruptions, score, severity_means
+from fpp_ml_bench.baselines.robustness.scenes import Condition, FrameCache
 from fpp_ml_bench.constants import sample_name
 from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation.result import Robustness, SeverityScores
+from fpp_ml_bench.evaluation.score import object_interval
 from fpp_ml_bench.files import LOCK_FILE, exclusive, read_json, write_atomically
 from fpp_ml_bench.pool import mapping
 
@@ -58,7 +60,12 @@ class Setup:
         return [CLEAN, *(name for name, axis in chosen.items() if axis.applies(SETS[self.set_name], frames))]
 
     def conditions(self, axis: str) -> list[Condition]:
-        return conditions_of(axis, self.severities, self.set_name, self.size, self.rig)
+        """Those of an axis of `corruptions`, or of `CLEAN`, on the objects of the set that it disturbs."""
+        objects = tuple(SETS[self.set_name])
+        if axis == CLEAN:
+            return [Condition(CLEAN, 0, objects, self.size, self.rig)]
+        disturbed = corruptions().axes[axis].seen_on(objects)
+        return [Condition(axis, severity, disturbed, self.size, self.rig) for severity in self.severities]
 
     def key(self) -> dict[str, Any]:
         """What must be equal for two measurements to be parts of one."""
@@ -91,46 +98,28 @@ def measure(
     the Ray cluster at an address. ``progress`` is called with an axis and a number of views, ``saved`` after each file.
     Raises PredictionError for files of another setup, `BuildError` where another process is at it, `PoolError`."""
     with exclusive(out / LOCK_FILE, out, "measuring there"):
-        rows: dict[str, list[View]] = {}
-        missing = []
-        for axis in setup.axes(axes):
-            kept = _rows(out / f"{axis}.json", setup.key())
-            if kept is None:
-                missing.append(axis)
-            else:
-                rows[axis] = kept
-                progress(axis, len(kept))
-        if missing:
-            _measure_missing(setup, out, missing, workers, FrameCache(cache), rows, progress, cluster, saved)
-        return {axis: rows[axis] for axis in setup.axes(axes)}
-
-
-def _measure_missing(
-    setup: Setup,
-    out: Path,
-    axes: Sequence[str],
-    workers: int,
-    cache: FrameCache,
-    rows: dict[str, list[View]],
-    progress: Progress,
-    cluster: str | None,
-    saved: Callable[[], None],
-) -> None:
-    work = setup.method, setup.conditions(CLEAN)[0], cache, setup.views
-    with mapping(work, workers, cluster) as mapped:
-        for axis in axes:
-            conditions = setup.conditions(axis)
-            frame_bytes = len(setup.method.frames_used) * setup.size**2
-            cache.make_room(sum(len(c.objects) for c in conditions) * len(setup.views) * frame_bytes)
-            tasks = [(condition, name) for condition in conditions for name in condition.objects]
-            found: list[View] = []
-            for views in mapped(_measure_object, *zip(*tasks, strict=True)):
-                found += views
-                progress(axis, len(views))
-            content = {"setup": setup.key(), "axis": axis, "views": found}
-            write_atomically(out / f"{axis}.json", (json.dumps(content, indent=1) + "\n").encode())
-            saved()
-            rows[axis] = found
+        files = {axis: out / f"{axis}.json" for axis in setup.axes(axes)}
+        kept = {axis: _rows(file, setup.key()) for axis, file in files.items()}
+        rows = {axis: found for axis, found in kept.items() if found is not None}
+        for axis, found in rows.items():
+            progress(axis, len(found))
+        missing = [axis for axis in files if axis not in rows]
+        frames = FrameCache(cache)
+        work = setup.method, setup.conditions(CLEAN)[0], frames, setup.views
+        if not missing:
+            return rows
+        with mapping(work, workers, cluster) as mapped:
+            for axis in missing:
+                tasks = [(condition, name) for condition in setup.conditions(axis) for name in condition.objects]
+                frames.make_room(len(tasks) * len(setup.views) * len(setup.method.frames_used) * setup.size**2)
+                rows[axis] = []
+                for views in mapped(_measure_object, *zip(*tasks, strict=True)):
+                    rows[axis] += views
+                    progress(axis, len(views))
+                content = {"setup": setup.key(), "axis": axis, "views": rows[axis]}
+                write_atomically(files[axis], (json.dumps(content, indent=1) + "\n").encode())
+                saved()
+        return {axis: rows[axis] for axis in files}
 
 
 def _measure_object(work: Work, condition: Condition, name: str) -> list[View]:
@@ -180,3 +169,48 @@ def _rows(file: Path, key: Mapping[str, Any]) -> list[View] | None:
         )
     views: list[View] = content["views"]
     return views
+
+
+def by_severity(rows: Sequence[View]) -> dict[int, SeverityScores]:
+    """Means over the views of each severity."""
+    return {severity: SeverityScores.model_validate(means) for severity, means in severity_means(rows).items()}
+
+
+def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
+    """The block of ``result.json``. Raises PredictionError for a quick look, and where an axis is missing."""
+    missing = [axis for axis in setup.axes(()) if axis not in rows]
+    if setup.quick or missing:
+        lacking = "a --quick look" if setup.quick else f"without {', '.join(missing)}"
+        raise PredictionError(f"robustness is a mean over all axes and severities, and this is {lacking}")
+    clean = list(rows[CLEAN])
+    axes = {axis: list(by_severity(found).values()) for axis, found in rows.items() if axis != CLEAN}
+    sha256 = setup.method.settings.get("weights_sha256")
+    found = object_interval(*_shares_of_the_mean(rows))
+    every = [scores.mae_mm for severities in axes.values() for scores in severities]
+    return Robustness(
+        version=corruptions().version,
+        set=setup.set_name,
+        mae_mm=sum(every) / len(every),
+        interval=[None, None] if found is None else [max(found[0], 0.0), found[1]],
+        clean=by_severity(clean)[0],
+        axes=axes,
+        samples=len(clean),
+        objects=len({row["object"] for row in clean}),
+        size_px=setup.size,
+        weights_sha256=sha256 if isinstance(sha256, str) else None,
+    )
+
+
+def _shares_of_the_mean(rows: Mapping[str, Sequence[View]]) -> tuple[list[float], list[str]]:
+    """For each sample what it adds to the mean over axes and severities, times the number of samples, and its object:
+    the mean of these numbers is that mean, also where an axis disturbs a few objects only."""
+    objects = {row["sample"]: row["object"] for row in rows[CLEAN]}
+    sums = dict.fromkeys(objects, 0.0)
+    conditions = 0
+    for views in (views for axis, views in rows.items() if axis != CLEAN):
+        for severity in sorted({row["severity"] for row in views}):
+            found = [row for row in views if row["severity"] == severity]
+            conditions += 1
+            for row in found:
+                sums[row["sample"]] += (row["mae_mm"] or 0.0) * len(objects) / len(found)
+    return [total / conditions for total in sums.values()], list(objects.values())

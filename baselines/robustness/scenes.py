@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corruptions
-from fpp_ml_bench.baselines.robustness.scores import Truth
+from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, Truth, corruptions
 from fpp_ml_bench.constants import MM_PER_M, sample_name
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.loaders.render import BuildSettings, SolidMesh, Studio, solid_mesh
@@ -51,17 +50,6 @@ class Condition:
         return f"{self.axis}-{self.severity}-{_digest(self, tuple(frames))}"
 
 
-def conditions_of(
-    axis: str, severities: Sequence[int], set_name: SetName, size: int, rig: str = "paper"
-) -> list[Condition]:
-    """The conditions of an axis of `corruptions`, or of `CLEAN`, on the objects of a set of `SETS` that it disturbs."""
-    objects = tuple(SETS[set_name])
-    if axis == CLEAN:
-        return [Condition(CLEAN, 0, objects, size, rig)]
-    disturbed = corruptions().axes[axis].seen_on(objects)
-    return [Condition(axis, severity, disturbed, size, rig) for severity in severities]
-
-
 class FrameCache:
     """Frames and truths below ``folder``, None for no cache."""
 
@@ -72,22 +60,17 @@ class FrameCache:
         """The sequence of a view with the frames ``wanted``, uint8 (H, W) each, and None for the others. A moving
         object rests halfway through the frames, which are captured one after another."""
         studio = _studio(condition)
-        out: Frames = [None] * len(studio.rig.sequence)
         shape = studio.rig.camera.height, studio.rig.camera.width
         files = {index: self._file(condition, wanted, f"{sample_name(name, view)}-{index:02d}") for index in wanted}
-        missing = []
+        out: Frames = [None] * len(studio.rig.sequence)
         for index, file in files.items():
             out[index] = _load(file, shape, np.dtype(np.uint8))
-            if out[index] is None:
-                missing.append(index)
-        if not missing:
-            return out
-        mesh = _mesh(name)
-        if studio.light.motion_mm:
+        missing = tuple(index for index in wanted if out[index] is None)
+        if missing and studio.light.motion_mm:
             middle = (len(wanted) - 1) / 2
-            studio.expose_moving(mesh, view, {index: wanted.index(index) - middle for index in missing})
-        else:
-            studio.expose(studio.trace(mesh, view), tuple(missing))
+            studio.expose_moving(_mesh(name), view, {index: wanted.index(index) - middle for index in missing})
+        elif missing:
+            studio.expose(studio.trace(_mesh(name), view), missing)
         for index in missing:
             out[index] = frame = studio.frame(index).copy()
             _save(files[index], frame)

@@ -4,8 +4,8 @@ from .cases import Row as Row
 from .cases import Verdict as Verdict
 from .cases import all_cases as all_cases
 from .cases import run_cases as run_cases
-from .coded_frames import coded_rig as coded_rig
-from .coded_frames import plane_stack as plane_stack
+from .frames import coded_rig as coded_rig
+from .frames import plane_stack as plane_stack
 from .report import document as document
 from .report import short as short
 from .report import summary as summary

@@ -32,15 +32,15 @@ U64, U32, UB16 = 2.0**-53, 2.0**-24, 2.0**-8
 """Unit round-offs."""
 
 MODULES = {
-    "phase": "phase",
-    "order": "order",
-    "triangulation": "triangulation",
-    "rig": "rig",
+    "phase": "frames",
+    "order": "frames",
+    "triangulation": "geometry",
+    "rig": "geometry",
     "normalisation": "scores",
     "metrics": "scores",
     "networks": "networks",
     "scenes": "scenes",
-    "crossed": "crossed_fringes",
+    "crossed": "scenes",
 }
 """Groups of cases, and the module whose constant of that name declares them; only ``networks`` imports torch."""
 

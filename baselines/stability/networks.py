@@ -43,14 +43,11 @@ def _seeded(seed: int) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def normal(shape: tuple[int, ...], seed: int, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Normal random numbers, seeded."""
-    return torch.randn(shape, generator=_seeded(seed), dtype=dtype)
-
-
-def uniform(shape: tuple[int, ...], seed: int, dtype: torch.dtype = torch.float64) -> Tensor:
-    """Uniform random numbers in [0, 1), seeded."""
-    return torch.rand(shape, generator=_seeded(seed), dtype=dtype)
+def random(
+    shape: tuple[int, ...], seed: int, draw: Callable[..., Tensor] = torch.randn, dtype: torch.dtype = torch.float64
+) -> Tensor:
+    """Seeded random numbers, normal ones or by ``torch.rand`` uniform in [0, 1)."""
+    return draw(shape, generator=_seeded(seed), dtype=dtype)
 
 
 def small_network(name: str) -> nn.Module:
@@ -65,9 +62,9 @@ def _loss(name: str) -> Callable[[Tensor, Tensor], Tensor]:
 
 def _scene(scale: float, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
     """A prediction and its target, 0 in the background."""
-    target = uniform(_SHAPE, 1) + 0.5
+    target = random(_SHAPE, 1, torch.rand) + 0.5
     target[..., :9, :] = 0
-    prediction = target + 0.1 * normal(_SHAPE, 2)
+    prediction = target + 0.1 * random(_SHAPE, 2)
     return (scale * prediction).to(dtype), (scale * target).to(dtype)
 
 
@@ -167,7 +164,7 @@ def constant_input(value: float, dtype: str) -> Outcome:
         layer.bias.copy_(torch.tensor([0.5, -1.0, 2.0]))
     x = torch.full((1, 3, 56, 56), value, dtype=kind, requires_grad=True)
     out = layer(x)
-    (gradient,) = torch.autograd.grad((out * normal(tuple(out.shape), 3, kind)).sum(), x)
+    (gradient,) = torch.autograd.grad((out * random(tuple(out.shape), 3, dtype=kind)).sum(), x)
     if not _finite(gradient):
         return wrong("a gradient that is not finite")
     unit = U32 if dtype == "float32" else U64
@@ -184,7 +181,7 @@ def constant_input(value: float, dtype: str) -> Outcome:
 def nearly_constant(offset: float) -> Outcome:
     """normalised map of amplitude 1 on this offset, float32; against float64 on the same input; bound: 2 (min(g
     |offset|, 1e-3 + g^2 |offset|) + g |x| + g), g = (log2 n + 16) u32"""
-    x = (normal((1, 2, 48, 48), 4) + offset).float()  # where one-pass formulas for the variance cancel
+    x = (random((1, 2, 48, 48), 4) + offset).float()  # where one-pass formulas for the variance cancel
     output = InstanceNorm(2, affine=False)(x).double()
     centred = x.double() - x.double().mean((2, 3), keepdim=True)
     exact = centred / (centred.square().mean((2, 3), keepdim=True) + 1e-5).sqrt()
@@ -197,10 +194,10 @@ def nearly_constant(offset: float) -> Outcome:
 @NETWORKS.family("instance norm gradient", "1")
 def instance_norm_gradient() -> Outcome:
     """closed-form gradient in float64; against torch's own instance norm in float64; bound: 12 u sum |seed|"""
-    x, seed = normal((2, 3, 12, 10), 6).requires_grad_(), normal((2, 3, 12, 10), 7)
+    x, seed = random((2, 3, 12, 10), 6).requires_grad_(), random((2, 3, 12, 10), 7)
     gradients = []
     for layer in InstanceNorm(3, affine=True).double(), nn.InstanceNorm2d(3, affine=True).double():
-        layer.load_state_dict({name: normal((3,), 5) for name in ("weight", "bias")})
+        layer.load_state_dict({name: random((3,), 5) for name in ("weight", "bias")})
         gradients.append(torch.autograd.grad((layer(x) * seed).sum(), [x, *layer.parameters()]))
     errors = [float((a - b).abs().max()) for a, b in zip(*gradients, strict=True)]
     return worst(errors, gamma(12) * np.float32(seed.abs().sum()))
@@ -208,7 +205,7 @@ def instance_norm_gradient() -> Outcome:
 
 def directional(function: Callable[[Tensor], Tensor], x: Tensor, step: float = 1e-3) -> Outcome:
     """Autograd's derivative along a random direction against Richardson's extrapolated difference quotient."""
-    seed = normal(tuple(x.shape), 8, x.dtype)
+    seed = random(tuple(x.shape), 8, dtype=x.dtype)
     seed = seed / seed.norm()
     inner = x.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(function(inner), inner)
@@ -243,8 +240,8 @@ def layer_gradient(direction: Direction) -> Outcome:
 @torch_threads(1)
 def network_gradient(name: str) -> Outcome:
     """directional derivative of the whole network, float64"""
-    network, seed = small_network(name).double().eval(), normal((1, 1, 64, 64), 10)
-    return directional(lambda image: (network(image) * seed).sum(), uniform((1, 1, 64, 64), 9), step=1e-7)
+    network, seed = small_network(name).double().eval(), random((1, 1, 64, 64), 10)
+    return directional(lambda image: (network(image) * seed).sum(), random((1, 1, 64, 64), 9, torch.rand), step=1e-7)
 
 
 @NETWORKS.family("network in float32", "1", name=NAMES)
@@ -252,7 +249,7 @@ def network_gradient(name: str) -> Outcome:
 def network_single(name: str) -> Outcome:
     """output in float32; against the same weights in float64; bound: 16 x what rounding each weight and pixel once
     (2^-24) does: condition number x unit round-off"""
-    network, x = small_network(name).double().eval(), uniform((1, 1, 64, 64), 11)
+    network, x = small_network(name).double().eval(), random((1, 1, 64, 64), 11, torch.rand)
     weights = [*copy.deepcopy(network).parameters()]
 
     def output(values: Sequence[Tensor], image: Tensor) -> Tensor:
@@ -291,11 +288,11 @@ def network_half(name: str, dtype: str) -> Outcome:
     the last layer runs in float32; bfloat16 alone would be 4 mm off"""
     network = small_network(name).eval()
     head = nn.Conv2d(8, 1, 1)
-    features = uniform((1, 8, 16, 16), 12, torch.float32).to(getattr(torch, dtype))
+    features = random((1, 8, 16, 16), 12, torch.rand, torch.float32).to(getattr(torch, dtype))
     with torch.no_grad():
         head.bias.fill_(1800.0)  # type: ignore[union-attr]
         with torch.autocast("cpu", dtype=getattr(torch, dtype)):
-            out = network(uniform((1, 1, 64, 64), 13, torch.float32))
+            out = network(random((1, 1, 64, 64), 13, torch.rand, torch.float32))
             depth = in_full_precision(head, features)
         exact = head.double()(features.double())
     if out.dtype != torch.float32 or not _finite(out):

@@ -1,15 +1,19 @@
-"""Scenes: walls edge-on, needles, broken meshes, one to ten million triangles, the camera inside the object."""
+"""Scenes with walls edge-on, needles, broken meshes, one to ten million triangles, and the camera inside the object;
+crossed fringes that are dim, clipped, painted, or whose second direction is lost; rivals on the truth."""
 
-import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
+import trimesh
 from numpy.typing import ArrayLike, NDArray
 
+from fpp_ml_bench.baselines import crossed_route
 from fpp_ml_bench.baselines.stability.cases import U64, Floats, Group, Outcome, worst, wrong
-from fpp_ml_bench.errors import MeshError
+from fpp_ml_bench.coding import Crossed
+from fpp_ml_bench.errors import FppBenchError, MeshError
 from fpp_ml_bench.loaders import render
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.optics import Rig, crossed_rig, paper_rig
 
 SCENES = Group("scenes")
 RIG = paper_rig(176)
@@ -26,9 +30,10 @@ def seen(vertices_m: ArrayLike, faces: ArrayLike = ((0, 1, 2), (0, 2, 3))) -> re
     return render.TracedObject(mesh, vertices).primary(render.PixelRays.of(RIG.camera))
 
 
-def rays_of(hits: render.Hits) -> tuple[Floats, ...]:
-    """x and y of the rays that hit, at z = 1."""
-    return tuple(axis.ravel()[hits.pixels] for axis in RIG.camera.rays())
+def rays_of(hits: render.Hits) -> Floats:
+    """The rays that hit, (n, 3), at z = 1."""
+    x, y = RIG.camera.rays()
+    return np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)[hits.pixels]
 
 
 def image(hits: render.Hits) -> Floats:
@@ -60,13 +65,12 @@ def edge_on(off_deg: float) -> Outcome:
         width_px = float(abs(corners[0][0] / corners[0][2] - corners[1][0] / corners[1][2]) * RIG.camera.fx)
         unseen = Outcome(None, flagged=1.0, note=f"no pixel sees it: it is {width_px:.2g} px wide")
         return unseen if width_px < 1 else wrong("a wall of a pixel's width is not seen")
-    x, y = rays_of(hits)
     wide = np.asarray(corners, dtype=np.longdouble)
     normal = np.cross(wide[1] - wide[0], wide[2] - wide[0])
-    facing = normal[0] * x + normal[1] * y + normal[2]
-    exact, low, high = (normal @ wide[0] / facing).astype(float), float(wide[:, 2].min()), float(wide[:, 2].max())
-    size = np.abs(normal[0] * x) + np.abs(normal[1] * y) + np.abs(normal[2])
-    condition = (size / np.abs(facing)).astype(float)
+    terms = normal * rays_of(hits)
+    facing, low, high = terms.sum(axis=1), float(wide[:, 2].min()), float(wide[:, 2].max())
+    exact = (normal @ wide[0] / facing).astype(float)
+    condition = (np.abs(terms).sum(axis=1) / np.abs(facing)).astype(float)
     # Rounding of normal (12), plane (6) and products (4), times the condition; clipped to the wall's own extent, which
     # also bounds the error of a ray on the wrong side of an edge.
     bound = np.minimum(22 * U64 * condition * 1.9 * 12, high - low)
@@ -92,8 +96,6 @@ def needle(width_px: float, centre_px: float) -> Outcome:
 
 
 def _ball(subdivisions: int = 3, radius_m: float = 0.12) -> tuple[Floats, NDArray[np.int32]]:
-    import trimesh
-
     mesh = trimesh.creation.icosphere(subdivisions, radius_m)
     return np.asarray(mesh.vertices) + AHEAD_M, np.asarray(mesh.faces, np.int32)
 
@@ -141,9 +143,7 @@ def broken(kind: str) -> Outcome:
         return wrong("the outline or the normals changed")
     # At an edge between facets either may be the nearer; both planes agree there to rounding, times the condition of
     # the facet that is seen most obliquely.
-    x, y = rays_of(hits)
-    facing = hits.normals[:, 0] * x + hits.normals[:, 1] * y + hits.normals[:, 2]
-    condition = float((1.5 / np.abs(facing)).max())
+    condition = float((1.5 / np.abs((hits.normals * rays_of(hits)).sum(axis=1))).max())
     return worst(whole - depth_m, 64 * U64 * 1.8 * condition, condition=condition)
 
 
@@ -162,7 +162,7 @@ def triangles(count: float) -> Outcome:
     step^2 / 2 and 64 u x 1.8 m; one triangle: 64 u"""
     if count == 1:
         hits = seen([[-0.3, -0.3, 1.9], [0.3, -0.3, 1.7], [0.0, 0.4, 1.8]], [[0, 1, 2]])
-        exact = 1.8 / (1 + rays_of(hits)[0] / 3)  # the plane Z = 1.8 - X / 3
+        exact = 1.8 / (1 + rays_of(hits)[:, 0] / 3)  # the plane Z = 1.8 - X / 3
         return worst(hits.depth_m - exact, 64 * U64) if len(hits.pixels) else wrong()
     side = math.isqrt(round(count) // 2)
     across = np.linspace(-0.3, 0.3, side + 1)
@@ -172,7 +172,7 @@ def triangles(count: float) -> Outcome:
     corners = np.array([[0, 1, side + 2], [0, side + 2, side + 1]], np.int32)
     faces = (cell[:, None] + corners).reshape(-1, 3)
     hits = seen(vertices, faces)
-    x, y = rays_of(hits)
+    x, y, _ = rays_of(hits).T
     # Z = 1.7 + Z^2 (x^2 + y^2), the nearer root, without cancellation.
     square = x * x + y * y
     exact = 2 * 1.7 / (1 + np.sqrt(1 - 4 * 1.7 * square))
@@ -189,28 +189,15 @@ def triangles(count: float) -> Outcome:
 @SCENES.family("camera inside the object", "m", turn_deg=(0.0, 45.0, 10.0, 89.9))
 def camera_inside(turn_deg: float) -> Outcome:
     """depth of the walls of a 2 m box around the camera; against 1 / max |d|, closed form; bound: 64 u"""
-    corners = np.array(list(itertools.product((-1, 1), repeat=3)), float)
+    box = np.asarray(trimesh.creation.box((2.0, 2.0, 2.0)).vertices)
+    sides = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]])
     cos, sin = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
     turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
-    faces = [
-        [0, 1, 3],
-        [0, 3, 2],
-        [4, 6, 7],
-        [4, 7, 5],
-        [0, 4, 5],
-        [0, 5, 1],
-        [2, 3, 7],
-        [2, 7, 6],
-        [0, 2, 6],
-        [0, 6, 4],
-        [1, 5, 7],
-        [1, 7, 3],
-    ]
-    hits = seen(corners @ turn.T, faces)
-    x, y = (axis.ravel() for axis in RIG.camera.rays())
-    if len(hits.pixels) != x.size:
-        return wrong(f"{x.size - len(hits.pixels)} rays leave a closed box")
-    own = np.column_stack([x, y, np.ones(x.size)]) @ turn  # in the box's own axes
+    hits = seen(box @ turn.T, sides[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3))
+    missed = RIG.camera.width * RIG.camera.height - len(hits.pixels)
+    if missed:
+        return wrong(f"{missed} rays leave a closed box")
+    own = rays_of(hits) @ turn  # in the box's own axes
     return worst(hits.depth_m - 1 / np.abs(own).max(axis=1), 64 * U64)
 
 
@@ -242,3 +229,101 @@ def light_at_projector() -> Outcome:
     pattern = render.PatternLight.of(RIG, light.projector)
     gain = render.light_surface(points, np.array([[0.0, 0.0, -1.0]] * len(points)), RIG, light, pattern).gain
     return worst(np.where(np.isfinite(gain) & (gain >= 0), 0.0, math.inf))
+
+
+CROSSED = Group(
+    "crossed",
+    "the plane's depth, closed form",
+    "pi / 2 of the joint phase: a rival order is further off, and a pixel that may be one must say so",
+)
+CROSSED_RIG = replace(crossed_rig(320), background_m=None)
+CARRIERS: Crossed = CROSSED_RIG.crossed  # type: ignore[assignment]
+DEPTH_MM, WHITE, AMBIENT, NOISE = 1780.0, 160.0, 6.0, 0.7
+MIDDLE = slice(120, 200), slice(120, 200)
+"""Pixels that are judged: no window of theirs leaves the mask."""
+
+
+def plane_outcome(
+    family: Crossed,
+    white: NDArray | float = WHITE,
+    rig: Rig = CROSSED_RIG,
+    measured_as: Crossed | None = None,
+    bound_rad: float = math.pi / 2,
+) -> Outcome:
+    """The worst pixel of a plane that ``family`` lights, flagged where the route gives a reason or no depth.
+    ``measured_as``: the family that the route takes it for."""
+    x, y = rig.camera.rays()
+    z = np.full(x.shape, DEPTH_MM / 1000)
+    u, v = rig.project(np.stack([x * z, y * z, z], axis=-1))
+    pairs = zip(family.weights, family.cycles_per_px, strict=True)
+    waves = sum(weight * np.cos(2 * np.pi * (a * u + b * v)) for weight, (a, b) in pairs)
+    noise = np.random.default_rng(4).normal(0, NOISE, x.shape)
+    grey = np.clip(np.rint(AMBIENT + white * (0.5 + 0.5 * waves) + noise), 0, 255).astype(np.uint8)
+    mask = np.zeros(x.shape, bool)
+    mask[60:260, 60:260] = True
+    route = crossed_route.CrossedRoute(rig, family=measured_as or family)
+    measured = route.measure(grey, mask)
+    depth_mm, reason = measured.depth_mm[MIDDLE], measured.reason[MIDDLE]
+    flagged = (depth_mm == 0) | (reason != crossed_route.CrossedReason.MEASURED)
+    bound_mm = float(np.median(route.carriers.mm_per_rad(np.full(x.shape, DEPTH_MM)))) * bound_rad
+    return worst(depth_mm - DEPTH_MM, bound_mm, flagged)
+
+
+# Decorators apply from the bottom: the lower family comes first.
+@CROSSED.family(
+    "saturated half-waves",
+    "mm",
+    expects="either",
+    about="depth of a plane whose crests are clipped at 255, at this grey level of white",
+    white=(260.0, 300.0, 400.0, 600.0, 2000.0),
+)
+@CROSSED.family(
+    "dim",
+    "mm",
+    expects=lambda white: "number" if white >= 40 else "either",
+    about="depth of a plane at this grey level of white, noise 0.7",
+    white=(220.0, 160.0, 80.0, 40.0, 20.0, 10.0, 5.0, 2.0, 0.0),
+)
+def exposed(white: float) -> Outcome:
+    return plane_outcome(CARRIERS, white)
+
+
+@CROSSED.family(
+    "one direction lost",
+    "mm",
+    expects=lambda weight: "number" if weight >= 0.3 else "either",
+    weight=(0.5, 0.3, 0.1, 0.05, 0.02, 1e-9),
+)
+def lost(weight: float) -> Outcome:
+    """depth of a plane whose second carrier has this weight, and not the 0.5 that the route knows of"""
+    return plane_outcome(replace(CARRIERS, weights=(0.5, weight)), measured_as=CARRIERS)
+
+
+@CROSSED.family("a rival on the truth", "mm", expects="either", ratio=(0.5, 1 / 3, 0.25, 0.2))
+def rival(ratio: float) -> Outcome:
+    """depth of a plane by periods of 12 px whose gains have this ratio, over four and more periods: with 1 / 2 and
+    1 / 3 another order fits exactly"""
+    turn_deg = math.degrees(math.atan(ratio))
+    along_deg = 128.66  # of the paper's epipolar lines
+    return plane_outcome(Crossed((12.0, 12.0), (along_deg + turn_deg, along_deg - 90 + turn_deg)))
+
+
+@CROSSED.family("baseline along one axis", "mm", expects="either", refuses=FppBenchError, angle_deg=(0.0, 20.0, 45.0))
+def along_one_axis(angle_deg: float) -> Outcome:
+    """depth of a plane where the projector is above the camera and the carriers are turned by this angle: at 0 the
+    second carrier tells no depth"""
+    return plane_outcome(
+        Crossed((18.0, 18.0), (angle_deg, angle_deg + 90)), rig=replace(CROSSED_RIG, translation_m=(0.0, -0.16, 0.0))
+    )
+
+
+@CROSSED.family("stripes in the paint", "mm", expects="either", period_px=(60.0, 23.0, 7.6, 4.0, 2.0))
+def painted(period_px: float) -> Outcome:
+    """depth of a plane painted with stripes of this period in the image, along the first carrier's, dark ones with 0.3
+    of the albedo; against the plane's depth, closed form; bound: pi of the joint phase, since stripes at a carrier's
+    period are a carrier themselves, and nothing in the image tells them apart"""
+    carriers = crossed_route.Carriers.of(CROSSED_RIG, CARRIERS)
+    across, down = carriers.step_rad[0] / np.linalg.norm(carriers.step_rad[0])
+    y, x = np.indices((CROSSED_RIG.camera.height, CROSSED_RIG.camera.width))
+    stripes = 0.65 + 0.35 * np.cos(2 * np.pi * (across * x + down * y) / period_px)
+    return plane_outcome(CARRIERS, WHITE * stripes, bound_rad=math.pi)

@@ -73,13 +73,12 @@ class Scatter:
     front: Sequence[Mark]
     across: str
     labelled: Sequence[Mark]
-    up: str = "object MAE, mm"
     names: bool = True
     numbers: bool = True
 
     def draw(self, axes: Axes) -> list[Mark]:
         """Draw into ``axes``, whose place in the figure is fixed. Returns the marks that are shown by a number."""
-        axes.set(xlabel=self.across, ylabel=self.up, xscale="log", yscale="log")
+        axes.set(xlabel=self.across, ylabel="object MAE, mm", xscale="log", yscale="log")
         left, right = axes.set_xlim(_ends([end for m in self.marks for end in (m.x, *(m.x_span or ()))]))
         bottom, top = axes.set_ylim(_ends([end for m in self.marks for end in (m.y, *(m.y_span or ()))]))
         log_axes(axes)

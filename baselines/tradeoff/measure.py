@@ -1,261 +1,328 @@
-"""Measuring every setting of every method on one machine, and what each stage costs as its input grows.
+"""Measuring every method on one machine: its error, and what it costs in time, frames and memory.
 
-A setting is measured once and stored; a stopped run continues where it stopped. A setting that can't be measured says
-why in its row, and the others are measured. Times are taken on frames in memory: warm-up, bounded runs, their spread,
-and the machine's pace beside each setting.
+A point is a method with the options of one of its variants. Each is measured once and stored; a stopped run continues
+where it stopped. A point that can't be measured says why, and the others are measured.
 """
 
-import os
-import tempfile
-from collections import Counter
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
-from functools import partial
-from importlib.metadata import PackageNotFoundError, version
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property, partial
+from hashlib import sha256
 from pathlib import Path
-from platform import python_version
-from statistics import median
-from textwrap import shorten
+from statistics import fmean, linear_regression, median
 from time import perf_counter, process_time
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, get_args
 
 import cv2
 import numpy as np
-from scipy.special import stdtrit
+from pydantic import Field
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.tradeoff.ladders import Ladder
-from fpp_ml_bench.baselines.tradeoff.points import GROUPS, JOURNAL, Growth, Journal, Point, Tradeoff
-from fpp_ml_bench.baselines.tradeoff.settings import Plan, Setting, TradeoffSettings
+from fpp_ml_bench.baselines import training
+from fpp_ml_bench.baselines.method import Frames, Method
+from fpp_ml_bench.baselines.registry import find, load_method, methods
+from fpp_ml_bench.baselines.run import captured_frames
+from fpp_ml_bench.baselines.timing import added_mib, four_digits
 from fpp_ml_bench.constants import split_sample_name
-from fpp_ml_bench.errors import FppBenchError
-from fpp_ml_bench.evaluation.result import HardwareInfo
-from fpp_ml_bench.evaluation.score import object_interval, score_sample, scored_pair
-from fpp_ml_bench.files import LOCK_FILE, NAME_LIMIT, exclusive, printable
+from fpp_ml_bench.errors import DatasetError, FppBenchError, PredictionError, RigError, SubmissionError
+from fpp_ml_bench.evaluation.result import HardwareInfo, write_json
+from fpp_ml_bench.evaluation.score import score_sample, scored_pair
+from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, read_json
+from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
+from fpp_ml_bench.loaders.storage import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
+from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.schema import Count, NonNegative, Positive, Scalar, Share, StrictModel, Text, validate
 
-T = TypeVar("T")
-
-PACE_VALUES, PACE_RUNS = 100_000, 5
-"""Numbers that the pace is measured with: about 10 ms of sorting and arctangents, in and out of the cache."""
-ROUNDS, LEAST_ROUNDS, LIMIT_S = 40, 2, 4.0
-"""Rounds over all rungs of a ladder, fewer (but two) once the seconds are used up. The least time of each rung counts:
-other work on the machine can only add to it. Rounds spread a busy minute over all rungs."""
-LINEAR_LIMIT = 1.3
-"""Every stage goes through its input once, so its power should be 1, or less with a fixed cost. Input that no longer
-fits the caches adds some tenths; a second loop over the input gives 2."""
-TAIL_POINTS, CONFIDENCE = 3, 0.95
-_PACKAGE = Path(__file__).resolve().parents[2]
+Cost = Literal["seconds", "frames", "working_memory_mib"]
+COST_KEYS: tuple[Cost, ...] = get_args(Cost)
+TRADEOFF_FILE = "tradeoff.json"
+BATCH = 4
+"""Views at most that are predicted in one batch, to see what a view costs among others."""
+SHARES = (0.25, 0.5, 1.0)
+"""Shares of the image's pixels at which a method is timed on a scene; four times as many where a quarter of the pixels
+is too coarse for the fringes."""
+OBJECT, VIEW = "power_drill", "A60"
+"""That scene."""
+RUNS, LIMIT_S = 5, 1.0
+"""Timed runs of each view, fewer once these seconds are used up: a short run is timed badly."""
+REASON_LENGTH = 400
+_PACKAGE = f"{Path(__file__).resolve().parents[2]}/"
 """The package's folder, which is removed from messages that go into a result."""
 
 
-@dataclass(frozen=True)
-class Rules:
-    """Timed ``runs`` of each setting, fewer (but ``least``) once ``limit_s`` is used up, after ``warm_up`` runs.
-    ``clock``: wall-clock time, or the time that processors worked for this process. For one thread that waits for
-    nothing both agree on an idle machine; on a shared machine only processor time stays the same."""
+class Point(StrictModel):
+    """A ``method`` as `registry.find` takes it, with ``options``; ``source_sha256`` of the file that it comes from.
 
-    clock: Literal["wall", "processor"] = "wall"
-    threads: int = 1
-    runs: int = 15
-    least: int = 3
-    limit_s: float = 3.0
-    warm_up: int = 2
+    ``seconds`` a view, the median, and a view of a batch of up to `BATCH`; ``working_memory_mib`` that one prediction
+    adds at its peak. ``object_mae_mm`` is the leaderboard's error, where an object pixel without a depth counts with
+    its whole depth, and ``missing_share`` the share of such pixels, both means over the views. ``pixel_seconds``: on a
+    scene at each of the run's ``pixels``. ``aside``: why it is on no front. ``failed``: why it, or its time at other
+    sizes, could not be measured."""
 
-    def timed(self, call: Callable[[], T]) -> tuple[float, T]:
-        """Seconds of a single run of ``call``, and what it returned."""
+    method: Text
+    options: dict[Text, Scalar]
+    source_sha256: Text | None = None
+    title: Text | None = None
+    software: dict[Text, Text] | None = None
+    aside: Text | None = None
+    frames: Count = 0
+    seconds: Positive | None = None
+    batch_seconds: Positive | None = None
+    working_memory_mib: NonNegative | None = None
+    object_mae_mm: NonNegative | None = None
+    missing_share: Share | None = None
+    pixel_seconds: list[Positive] | None = None
+    failed: Text | None = None
+
+    @property
+    def key(self) -> str:
+        """Tells it from the other points of a run."""
+        return f"{self.method} {self.options}"
+
+    @property
+    def label(self) -> str:
+        """The method's name and options, as short as a table needs them."""
+        said = [name if value is True else f"{name}={value}" for name, value in self.options.items()]
+        return " ".join([Path(self.method).name, *said])
+
+
+class Tradeoff(StrictModel):
+    """A whole run: the data, its ``settings``, the machine, and the points."""
+
+    tradeoff_schema_version: Literal["2.0.0"] = "2.0.0"
+    dataset: Text
+    fingerprint: Text
+    image_size: Annotated[list[Count], Field(min_length=2, max_length=2)]
+    target: Text
+    views: list[Text]
+    settings: dict[Text, Scalar]
+    hardware: HardwareInfo
+    pixels: list[Count]
+    points: list[Point]
+
+    def front(self, cost: Cost) -> list[Point]:
+        """The points that no other beats in both ``cost`` and object MAE, the cheapest first. Of those that have both,
+        above 0, and are not `Point.aside`."""
+        points = [point for point in self.points if not point.aside and point.object_mae_mm and getattr(point, cost)]
+        return [points[i] for i in pareto_front([(getattr(p, cost), p.object_mae_mm or 0) for p in points])]
+
+
+def pareto_front(points: Sequence[tuple[float, float]]) -> list[int]:
+    """Indices of the ``points`` (cost, error) that no other beats (as good in both, better in one), by cost. Smaller is
+    better. Points that are equal in both are all on the front or all off it."""
+    front: list[int] = []
+    for index in sorted(range(len(points)), key=points.__getitem__):
+        if not front or points[index][1] < points[front[-1]][1] or points[index] == points[front[-1]]:
+            front.append(index)
+    return front
+
+
+def power(costs: Iterable[tuple[float, float]]) -> float | None:
+    """The power p of seconds = c amount^p by least squares of the logarithms of ``costs``, (amount, seconds); those
+    with a 0 are left out. None where all amounts are equal."""
+    known = [cost for cost in costs if all(cost)]
+    logarithms = zip(*([math.log(value) for value in cost] for cost in known), strict=True)
+    return linear_regression(*logarithms).slope if len({amount for amount, _ in known}) > 1 else None
+
+
+def read_tradeoff(path: Path) -> Tradeoff:
+    """A ``tradeoff.json``, read strictly. SubmissionError names the file and what is wrong with it."""
+    content = read_json(path, SubmissionError, "measure again into another --out")
+    return validate(Tradeoff, content, path, "file of this version's fpp-bench tradeoff (measure into another --out)")
+
+
+def shipped_tradeoff() -> Tradeoff | None:
+    """The trade-off that ships with the package and is shown on the leaderboard's page; None where none does."""
+    path = Path(__file__).with_name(TRADEOFF_FILE)
+    return read_tradeoff(path) if path.is_file() else None
+
+
+@dataclass
+class Plan:
+    """The ``points`` to measure, still without numbers, on ``views`` of a dataset, and where the results go.
+    ``clock``: "wall", or "processor" for the processor time of this process, which other work on the machine does not
+    change."""
+
+    opened: DatasetFolder
+    out: Path
+    views: list[str]
+    points: list[Point]
+    threads: int
+    clock: str
+
+    @property
+    def target(self) -> str:
+        """What is scored against: the exact depth where it is known."""
+        return "depth_exact" if self.opened.has_exact else "depth"
+
+    @cached_property
+    def rigs(self) -> list[Rig]:
+        """The dataset's rig at each size that methods are timed at."""
+        rig, times = self.opened.rig, 1
+        try:
+            rig.scaled(rig.camera.width // 2).check_sampling()
+        except RigError:
+            times = 4
+        return [rig.scaled(round(rig.camera.width * math.sqrt(times * share))) for share in SHARES]
+
+    @cached_property
+    def scenes(self) -> list[Frames]:
+        """All frames of the scene at each size, rendered into memory."""
+        mesh, studios = solid_mesh(OBJECT), [Studio(BuildSettings(rig, (OBJECT,))) for rig in self.rigs]
+        rows = [studio.photograph(mesh, VIEW) for studio in studios]
+        return [[row.frames[index] for index in range(len(self.opened.sequence))] for row in rows]
+
+    def load(self, point: Point, source: DatasetFolder | Rig) -> Method:
+        """The method of ``point``, with the run's threads where it takes them."""
+        has_threads = "threads" in {field.name for field in fields(find(point.method).method.Options)}
+        return load_method(point.method, source, **point.options, **({"threads": self.threads} if has_threads else {}))
+
+    def timed(self, call: Callable[..., Any], *given: Any) -> tuple[float, Any]:
+        """Median seconds of a call, of `RUNS` or of fewer once `LIMIT_S` is used up, after one that is not counted and
+        whose result is the second value."""
         clock = perf_counter if self.clock == "wall" else process_time
-        started = clock()
-        result = call()
-        return clock() - started, result
+        result, runs = call(*given), list[float]()
+        while len(runs) < RUNS and sum(runs) < LIMIT_S:
+            started = clock()
+            call(*given)
+            runs.append(clock() - started)
+        return median(runs), result
 
 
-def pace_ms(rules: Rules) -> float:
-    """Median milliseconds that a fixed piece of work takes now. Other load, clock frequency and temperature change it:
-    times of two settings are comparable where their paces agree."""
-    values = np.random.Generator(np.random.PCG64(7)).random(PACE_VALUES)
-    return 1000 * median(rules.timed(lambda: np.arctan2(np.sort(values), values))[0] for _ in range(PACE_RUNS))
+def planned(
+    dataset: Path, out: Path, names: Sequence[str] = (), views: int = 2, threads: int = 1, clock: str = "wall"
+) -> Plan:
+    """The plan of a run that measures methods by ``names`` as `registry.find` takes them, without any all that
+    `registry.methods` lists and the shipped networks of the image's size, on ``views`` of each test object. Raises
+    `DatasetError` for a folder that is no dataset or has no test split, `PredictionError` for an unknown method."""
+    opened, points = DatasetFolder(dataset), []
+    for name in names or [*methods(), *_networks(opened.size)]:
+        source = Path(name.rpartition(":")[0] if ".py:" in name else name)
+        digest = sha256(source.read_bytes()).hexdigest() if source.is_file() else None
+        variants = find(name).method.variants(opened.rig)
+        if names and not variants:
+            variants = [{}]  # it was asked for: the point says why it can't be measured
+        points += [Point(method=name, options=dict(options), source_sha256=digest) for options in variants]
+    return Plan(opened, out, choose_views(opened, views), points, threads, clock)
 
 
-def measured(setting: Setting, rules: Rules) -> Point:
-    """The point of ``setting``. An error of the package (a frame is not stored, a package is missing) becomes its
+def _networks(size: tuple[int, int]) -> list[str]:
+    """Names of the shipped networks from image to depth that were trained for images of ``size`` (H, W)."""
+    names = training.shipped_names()
+    return [name for name in names if training.open_weights(training.weights_path(name)).config.image_size == size]
+
+
+def choose_views(opened: DatasetFolder, per_object: int, split: str = "test") -> list[str]:
+    """``per_object`` views of each object of ``split``, spread over its views, in row order. `DatasetError` for a split
+    without samples."""
+    samples_by_object: dict[str, list[str]] = {}
+    for sample in opened.samples(split):
+        samples_by_object.setdefault(split_sample_name(sample)[0], []).append(sample)
+    if not samples_by_object:
+        raise DatasetError(f"{opened.path}: split {split} holds no sample; there is nothing to measure")
+    chosen: list[str] = []
+    for number, names in enumerate(samples_by_object.values()):
+        # Each object begins one view later, so that the views differ between objects.
+        places = {(number + place * len(names) // per_object) % len(names) for place in range(per_object)}
+        chosen += [names[place] for place in sorted(places)]
+    return chosen
+
+
+def tradeoff(plan: Plan, progress: Callable[[str], object] = lambda label: None) -> Tradeoff:
+    """Measure what the ``tradeoff.json`` in the plan's folder lacks, calling ``progress`` with the label of each point
+    before it is measured; what it has of other methods stays. Raises BuildError when another process works in the same
+    folder, SubmissionError for a file of other data, settings or of another machine."""
+    path, opened = plan.out / TRADEOFF_FILE, plan.opened
+    cv2.setNumThreads(plan.threads)  # the phase route's filters take all threads by default
+    run = Tradeoff(
+        dataset=opened.path.resolve().name,
+        fingerprint=opened.fingerprint,
+        image_size=list(opened.size),
+        target=plan.target,
+        views=plan.views,
+        settings={"package": __version__, "threads": plan.threads, "clock": plan.clock},
+        hardware=HardwareInfo.model_validate(describe_hardware().to_dict()),
+        pixels=[rig.camera.width * rig.camera.height for rig in plan.rigs],
+        points=[],
+    )
+    with exclusive(plan.out / LOCK_FILE, plan.out, "measuring into this folder"):
+        points = {point.key: point for point in _points_before(path, run)}
+        for wanted in plan.points:
+            progress(wanted.label)
+            earlier = points.get(wanted.key, wanted)
+            # A point that failed is tried again: a package may have been installed since.
+            if earlier.seconds is None or earlier.source_sha256 != wanted.source_sha256:
+                points[wanted.key] = measured(plan, wanted)
+            run = run.model_copy(update={"points": list(points.values())})
+            write_json(run.model_dump(mode="json"), path)
+    return run
+
+
+def _points_before(path: Path, run: Tradeoff) -> list[Point]:
+    """The points in the file ``path`` that ``run`` continues. SubmissionError for one of other data, settings or of
+    another machine: costs are only compared within a run."""
+    if not path.exists():
+        return []
+    earlier = read_tradeoff(path)
+    for key in ("fingerprint", "views", "settings", "hardware"):
+        there, here = getattr(earlier, key), getattr(run, key)
+        if there != here:
+            raise SubmissionError(
+                f"{path}: holds a run with another {key} ({there} there, {here} now); costs are only compared within "
+                "one run: give another --out"
+            )
+    return earlier.points
+
+
+def measured(plan: Plan, point: Point) -> Point:
+    """``point`` with its numbers. An error of the package (a frame is not stored, weights are missing) becomes its
     ``failed``, and the run goes on."""
-    about: dict[str, Any] = {name: getattr(setting, name) for name in ("key", "group", "title", "note")}
-    with suppress(OSError):  # where the system does not provide it
-        about["load"] = round(os.getloadavg()[0], 2)
-    pace_before = pace_ms(rules)
+    figures = point.model_dump(include={"method", "options", "source_sha256"})
     try:
-        figures = _figures(setting, rules)
+        method = plan.load(point, plan.opened)
+        told = ["depth range"] * method.uses_ground_truth_range + ["object mask"] * method.uses_ground_truth_mask
+        if told or find(point.method).method.trivial:
+            figures["aside"] = f"told the view's {' and '.join(told)}" if told else "trivial"
+        figures |= _figures(plan, method)
+        pixel_seconds = []
+        for rig, frames in zip(plan.rigs, plan.scenes, strict=True):
+            pixel_seconds.append(four_digits(plan.timed(plan.load(point, rig).predict, frames)[0]))
+        figures["pixel_seconds"] = pixel_seconds
     except FppBenchError as error:
-        message = " ".join(str(error).split()).replace(f"{_PACKAGE}{os.sep}", "")
-        return Point(**about, failed=shorten(printable(message, 1000), NAME_LIMIT, placeholder=" ..."))
-    pace = (pace_before + pace_ms(rules)) / 2
-    return Point(**about, pace_ms=float(f"{pace:.4g}"), **figures)
+        figures["failed"] = printable(" ".join(str(error).split()).replace(_PACKAGE, ""), REASON_LENGTH)
+    return Point(**figures)
 
 
-def _figures(setting: Setting, rules: Rules) -> dict[str, Any]:
-    """Times and scores of ``setting``, as fields of a `Point`."""
-    method, views = setting.make(), setting.views
-    seconds: list[float] = []
-    scores: list[tuple[float | None, ...]] = []
-    for number, name in enumerate(views.names if setting.scored else views.names[:1]):
-        predict = partial(method.predict, views.frames(method, name))
-        for _ in range(rules.warm_up if number == 0 else 0):
-            if rules.timed(predict)[0] > rules.limit_s:
-                break
-        run_s, depth = rules.timed(predict)
+def _figures(plan: Plan, method: Method) -> dict[str, Any]:
+    """Errors, seconds and memory of ``method`` on the plan's views, as fields of a `Point`. Frames are in memory before
+    the clock starts."""
+    opened, target = plan.opened, plan.target
+    seconds, errors_mm, missing = list[float](), list[float](), list[float]()
+    memory_mib = None
+    for name in plan.views:
+        frames = captured_frames(opened, method, name)
+        run_s, depth = plan.timed(method.predict, frames)
+        if not seconds:
+            memory_mib = added_mib(partial(method.predict, frames))
         seconds.append(run_s)
-        if setting.scored:
-            void = views.void(name) if method.mode == "standard" else None
-            left_out = views.left_out(name, method.range_rule)
-            pair = scored_pair(depth, views.target_mm(name), method.units, method.mode, name, left_out)
-            sample = score_sample(*pair, void=void)
-            missing_share = sample.missing / max(sample.object.pixels, 1)
-            scores.append((sample.object.mae_mm, sample.valid.mae_mm, missing_share))
-    # A run longer than the limit is not repeated.
-    while len(seconds) < rules.runs and (len(seconds) < rules.least or sum(seconds) < rules.limit_s):
-        if min(seconds) > rules.limit_s:
-            break
-        seconds.append(rules.timed(predict)[0])
-    low, middle, high = (float(f"{float(np.percentile(seconds, q)):.4g}") for q in (5, 50, 95))
-    given = ["depth range"] * method.uses_ground_truth_range + ["object mask"] * method.uses_ground_truth_mask
-    figures: dict[str, Any] = {
+        if depth.shape != opened.size or not np.isfinite(depth).all():
+            raise PredictionError(f"{name}: expected finite depth (H, W) {opened.size}, the method gave another")
+        left_out = opened.left_out(name, method.range_rule, target)
+        pair = scored_pair(depth, opened.target_mm(name, target), method.units, method.mode, name, left_out)
+        sample = score_sample(*pair, void=opened.void(name, target) if method.mode == "standard" else None)
+        if sample.object.mae_mm is not None:
+            errors_mm.append(sample.object.mae_mm)
+            missing.append(sample.missing / sample.object.pixels)
+    batch = [captured_frames(opened, method, name) for name in plan.views[:BATCH]]
+    return {
+        "title": method.title,
+        "software": method.software,
         "frames": len(method.frames_used),
-        "image_px": int(depth.shape[1]),
-        "runs": len(seconds),
-        "seconds": middle,
-        "seconds_p5": low,
-        "seconds_p95": high,
-        "parameters": method.parameters,
-        "given": " and ".join(given) or None,
+        "seconds": four_digits(median(seconds)),
+        "batch_seconds": four_digits(plan.timed(method.predict_batch, batch)[0] / len(batch)),
+        "working_memory_mib": memory_mib,
+        "object_mae_mm": fmean(errors_mm) if errors_mm else None,
+        "missing_share": fmean(missing) if missing else None,
     }
-    if scores:
-        object_mae, valid_mae, missing = zip(*scores, strict=True)
-        interval = object_interval(list(object_mae), [split_sample_name(name)[0] for name in views.names])
-        figures |= {
-            "object_mae_mm": _mean(object_mae),
-            "interval_mm": None if interval is None else list(interval),
-            "measured_mae_mm": _mean(valid_mae),
-            "missing_share": _mean(missing),
-        }
-    return figures
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    numbers = [value for value in values if value is not None]
-    return float(np.mean(numbers, dtype=np.float64)) if numbers else None
-
-
-def time_ladder(ladder: Ladder, rules: Rules = Rules()) -> list[Growth]:
-    """The growth of the ladder's stage and of each part of it that its runs time themselves, the slowest first. Runs
-    time their parts by the wall clock, so parts are left out where ``rules`` use the processor clock. A stage counts
-    where every rung has it, with a time that a clock can tell from 0."""
-    least: list[dict[str, float]] = [{} for _ in ladder.steps]
-    with tempfile.TemporaryDirectory(prefix="fpp-bench-costs-") as folder:
-        rungs = []
-        for step in ladder.steps:
-            (own := Path(folder) / str(step)).mkdir()
-            rungs.append(ladder.prepare(step, own))
-        for rung in rungs[:2]:  # compiled code and caches; also the second, because some code runs only on larger input
-            rung.run()
-        total_s = 0.0
-        for number in range(ROUNDS):
-            for rung, best in zip(rungs, least, strict=True):
-                run_s, result = rules.timed(rung.run)
-                total_s += run_s
-                stages = {ladder.stage: run_s}
-                if isinstance(result, dict) and rules.clock == "wall":
-                    stages |= {f"{ladder.stage}: {part}": seconds for part, seconds in result.items()}
-                for name, seconds in stages.items():
-                    best[name] = min(seconds, best.get(name, float("inf")))
-            if number + 1 >= LEAST_ROUNDS and total_s > LIMIT_S * rules.limit_s / Rules.limit_s:
-                break
-    amounts = [rung.amount for rung in rungs]
-    of_all = [stage for stage in least[0] if all(best.get(stage, 0.0) > 1e-6 for best in least)]
-    growths = [growth(stage, ladder.over, amounts, [best[stage] for best in least]) for stage in of_all]
-    return sorted(growths, key=lambda stage_growth: -stage_growth.seconds[-1])
-
-
-def growth(stage: str, over: str, amounts: Sequence[float], seconds: Sequence[float]) -> Growth:
-    """The power p of seconds = c amount^p by least squares of the logarithms, its 95% interval by Student's t over the
-    residuals, and the power over the largest amounts alone (``tail``), where a fixed cost no longer hides a steep term.
-    A power above `LINEAR_LIMIT` is flagged, over all amounts or over the largest. Where the interval includes the
-    limit, the flag says that the times do not prove it."""
-    x, y = np.log(amounts), np.log(seconds)
-    (slope, _), covariance = np.polyfit(x, y, 1, cov=True)
-    half = stdtrit(len(x) - 2, 0.5 + CONFIDENCE / 2) * np.sqrt(covariance[0, 0])
-    low, high = float(slope - half), float(slope + half)
-    exponent, tail = round(float(slope), 10), round(float(np.polyfit(x[-TAIL_POINTS:], y[-TAIL_POINTS:], 1)[0]), 10)
-    flag = None
-    if exponent > LINEAR_LIMIT:
-        proven = low > LINEAR_LIMIT
-        flag = "steeper than linear" if proven else "perhaps steeper than linear: times scatter, run it again"
-    elif tail > LINEAR_LIMIT:
-        flag = "steeper than linear at the largest amounts"
-    return Growth(
-        stage=stage,
-        over=over,
-        amounts=[float(a) for a in amounts],
-        seconds=[float(f"{s:.4g}") for s in seconds],
-        exponent=round(exponent, 3),
-        low=round(low, 3),
-        high=round(high, 3),
-        tail=round(tail, 3),
-        flag=flag,
-    )
-
-
-def tradeoff(settings: TradeoffSettings, plan: Plan, progress: Callable[[str], object] = lambda key: None) -> Tradeoff:
-    """Measure what ``settings.out`` lacks of ``plan``, calling ``progress`` with the key of each setting and ladder
-    before it is measured. Raises BuildError when another process works in the same folder, SubmissionError for a folder
-    with a run of other rules or of another machine."""
-    fewer: dict[str, Any] = {"runs": 5, "limit_s": 1.0} if settings.quick else {}
-    rules = Rules(settings.clock, settings.threads, **fewer)
-    hardware, views = describe_hardware(), list(plan.views.names)
-    # What two sittings of a run must share. Their groups may differ: a later sitting can add a group.
-    about = {
-        "tradeoff": 2,
-        "package": __version__,
-        "dataset": plan.opened.fingerprint,
-        "views": views,
-        "rules": asdict(rules),
-        "cpu": hardware.cpu,
-        "cores": hardware.cores,
-    }
-    cv2.setNumThreads(settings.threads)  # the phase route's filters take all threads by default; torch: see networks
-    with exclusive(settings.out / LOCK_FILE, settings.out, "measuring into this folder"):
-        path = settings.out / JOURNAL
-        journal = Journal.of(path, about)
-        journal.write(path)
-        for setting in plan.settings:
-            progress(setting.key)
-            if setting.key not in journal.points:
-                journal.points[setting.key] = measured(setting, rules)
-                journal.write(path)
-        for ladder in plan.ladders:
-            progress(ladder.key)
-            if ladder.key not in journal.growth:
-                journal.growth[ladder.key] = time_ladder(ladder, rules)
-                journal.write(path)
-    per_object = max(Counter(split_sample_name(name)[0] for name in views).values())
-    versions = {}
-    for package in ("numpy", "numba", "torch", "onnxruntime"):
-        with suppress(PackageNotFoundError):
-            versions[package] = version(package)
-    return Tradeoff(
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
-        dataset=plan.opened.path.resolve().name,
-        fingerprint=plan.opened.fingerprint,
-        image_size=list(plan.opened.size),
-        target=plan.views.target,
-        views=views,
-        settings={**asdict(rules), "quick": settings.quick, "views_an_object": per_object},
-        hardware=HardwareInfo.model_validate(hardware.to_dict()),
-        software={"fpp_ml_bench": __version__, "python": python_version(), **versions},
-        sittings=journal.sittings,
-        # Everything in this folder, so that a group measured on its own adds to the earlier ones.
-        points=sorted(journal.points.values(), key=lambda point: GROUPS.index(point.group)),
-        growth=[growth for growths in journal.growth.values() for growth in growths],
-    )

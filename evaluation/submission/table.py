@@ -1,8 +1,6 @@
 """Predictions in one Arrow (IPC stream or file) or Parquet file: columns ``sample`` (text) and ``depth`` (floats).
 
-Each row of ``depth`` holds H lists of W values, one list of H W values, or a tensor; float16, float32 or float64. The
-file is unpacked in a process with a memory limit (`isolated`), for a file's own word for its unpacked size can't be
-trusted.
+Each row of ``depth`` holds H lists of W values, one list of H W values, or a tensor; float16, float32 or float64.
 """
 
 import hashlib
@@ -12,17 +10,14 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from fpp_ml_bench.containers import parse_table
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.submission.isolated import ReadingProcess
 from fpp_ml_bench.files import printable, read_bounded
 
-_ARROW_MAGIC, _PARQUET_MAGIC = b"ARROW1\0\0", b"PAR1"
 _FLOATS = {pa.float16(): np.float16, pa.float32(): np.float32, pa.float64(): np.float64}
 _SLACK_BYTES, _SLACK_PER_SAMPLE = 1 << 20, 1 << 16
-_ROWS_AT_ONCE = 8
 _ADVICE = "write columns sample (text) and depth (list of H lists of W floats) with pyarrow"
 
 
@@ -34,8 +29,11 @@ def depth_maps(path: Path, samples: Sequence[str], size: tuple[int, int]) -> Cal
     try:
         content = read_bounded(path, largest)
         # Twice what is needed, so that an extra row is refused by its name and not by the size of the file.
-        unpacked = ReadingProcess(__name__, 2 * largest, 2 * count * (pixels + 1))(content)
-        table = pa.ipc.open_stream(unpacked).read_all()
+        try:
+            table = parse_table(content, 2 * largest, 2 * count * (pixels + 1))
+        except PredictionError as error:
+            raise PredictionError(f"{error}; {_ADVICE}") from None
+        _check_columns(table.schema)
         rows = _rows(table.column("sample").to_pylist(), samples)
     except PredictionError as error:
         raise PredictionError(f"{printable(str(path), 500)} {error}") from None
@@ -46,42 +44,6 @@ def depth_maps(path: Path, samples: Sequence[str], size: tuple[int, int]) -> Cal
         return _depth_map(column.chunk(0) if isinstance(column, pa.ChunkedArray) else column, size), digest
 
     return depth_map
-
-
-def read(content: bytes, largest: int, most_values: int) -> pa.Buffer:
-    """The table as an uncompressed Arrow stream of at most ``largest`` bytes; what `ReadingProcess` calls."""
-    try:
-        if content.startswith(_PARQUET_MAGIC):
-            limits = {"thrift_string_size_limit": 1 << 20, "thrift_container_size_limit": 1 << 16}
-            file = pq.ParquetFile(pa.py_buffer(content), **limits)
-            groups = [file.metadata.row_group(index) for index in range(file.metadata.num_row_groups)]
-            chunks = [group.column(index) for group in groups for index in range(group.num_columns)]
-            total, values = sum(c.total_uncompressed_size for c in chunks), sum(c.num_values for c in chunks)
-            if total > largest or values > most_values:
-                limit = f"expected at most {largest} and {most_values} for this split"
-                sizes = f"{total} bytes and {values} values"
-                raise PredictionError(f"would unpack to {sizes}, {limit}; write one float32 map per sample")
-            schema, batches = file.schema_arrow, file.iter_batches(_ROWS_AT_ONCE, use_threads=False)
-        else:
-            # An IPC file is an IPC stream between a mark and a footer.
-            body = pa.py_buffer(content.removeprefix(_ARROW_MAGIC))
-            batches = pa.ipc.open_stream(body, options=pa.ipc.IpcReadOptions(use_threads=False))
-            schema = batches.schema
-        _check_columns(schema)
-        unpacked = pa.BufferOutputStream()
-        with pa.ipc.new_stream(unpacked, schema) as stream:
-            for batch in batches:
-                batch.validate(full=True)
-                stream.write_batch(batch)
-                if unpacked.tell() > largest:
-                    too_large = f"unpacks to more than {largest} bytes, which this split can't need"
-                    raise PredictionError(f"{too_large}; write one float32 map per sample")
-        return unpacked.getvalue()
-    except (PredictionError, MemoryError):
-        raise
-    except (pa.ArrowException, OSError, EOFError, IndexError, KeyError, ValueError) as error:
-        reason = printable(str(error).split("\n")[0], 120)
-        raise PredictionError(f"can't be read as Arrow or Parquet ({reason}); {_ADVICE}") from None
 
 
 def _check_columns(schema: pa.Schema) -> None:

@@ -3,17 +3,25 @@ own points, by least squares over all image and projector coordinates with OpenC
 
 The parameters are one vector: (fx, fy, cx, cy, coefficients) of the camera, the same of the projector, rotation vector
 and translation from camera to projector, the same from the board to the camera for each pose, the board's points.
+
+Two things are corrected by the rig as known so far. The centroid of a circle's image is not the image of its centre:
+perspective shifts an ellipse's centre, and lens distortion shifts it further (Heikkila, Geometric camera calibration
+using circular control points, IEEE TPAMI 2000); the shift is computed from a polygon of the outline (`without_bias`).
+And a board that looks alike when turned may be labelled from either end. That makes no difference to a perfect board;
+where its points are estimated, a label has to mean the same point in all poses, and the board's irregularities, which
+all poses share, tell which (`same_labels`).
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from fpp_ml_bench.calibration.lens import Lens
-from fpp_ml_bench.calibration.projector_points import Pose
+from fpp_ml_bench.calibration.boards import Board
+from fpp_ml_bench.calibration.projector_points import Pose, ProjectorPoints
+from fpp_ml_bench.calibration.result import Lens
 from fpp_ml_bench.errors import CalibrationError
 
 BOARD_SHARE = 0.01
@@ -24,6 +32,8 @@ TOLERANCE = 1e-11
 
 Blocks = list[tuple[slice, NDArray]]
 """Non-zero columns of a Jacobian: which, and what is in them."""
+OUTLINE_POINTS = 180
+SWEEPS = 5
 
 
 class Bundle:
@@ -42,6 +52,10 @@ class Bundle:
     def pose(self, index: int) -> slice:
         return slice(self.boards.start + 6 * index, self.boards.start + 6 * index + 6)
 
+    def joined(self, of_pose: Callable[[int], Sequence[NDArray]]) -> list[NDArray]:
+        """What ``of_pose`` gives for camera and projector, (n, 2) each, of all poses one after the other."""
+        return [np.concatenate(parts) for parts in zip(*map(of_pose, range(len(self.poses))), strict=True)]
+
     def free(self, poses: Sequence[int], only_poses: bool = False) -> NDArray[np.float64]:
         """Matrix from the free parameters to the whole vector: the given board poses, and unless ``only_poses`` the
         lenses' free intrinsics, the pose of the projector and the board's points if they are estimated."""
@@ -59,21 +73,14 @@ class Bundle:
         (2 n, k) in blocks of columns."""
         points, board, stereo = x[self.board].reshape(-1, 3), x[self.pose(index)], x[self.stereo]
         composed = cv2.composeRT(board[:3], board[3:], stereo[:3], stereo[3:])
-        turn, shift = composed[0], composed[1]
         projections, derivatives = [], []
-        for part, rotation, translation in (
-            (self.camera, board[:3], board[3:]),
-            (self.projector, turn, shift),
-        ):
-            fx, fy, cx, cy = x[part][:4]
-            matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-            image, jacobian = cv2.projectPoints(points, rotation, translation, matrix, x[part][4:])[:2]
+        for part, rotation, translation in ((self.camera, board[:3], board[3:]), (self.projector, *composed[:2])):
+            image, jacobian = cv2.projectPoints(points, rotation, translation, *opencv_lens(x[part]))[:2]
             projections.append(image.reshape(-1, 2))
-            intrinsics = jacobian[:, 6 : 6 + part.stop - part.start]
             of_turn, of_shift = jacobian[:, :3], jacobian[:, 3:6]
-            blocks: Blocks = [(part, intrinsics)]
+            blocks: Blocks = [(part, jacobian[:, 6 : 6 + part.stop - part.start])]
             if part is self.camera:
-                blocks.append((self.pose(index), np.hstack([of_turn, of_shift])))
+                blocks.append((self.pose(index), jacobian[:, :6]))
             else:
                 chain = [
                     sum(outer @ composed[k] for outer, k in ((of_turn, first), (of_shift, first + 4)))
@@ -154,21 +161,25 @@ class Bundle:
             raise CalibrationError(f"the fit of the rig failed ({error}): look at the poses") from error
         return start + free @ found.x, system(found.x)[1], free
 
-    def weigh(self, x: NDArray[np.float64], unknowns: int) -> tuple[float, float]:
+    def weigh(self, x: NDArray[np.float64], unknowns: int) -> None:
         """Set the common standard deviations of camera and projector coordinates from the residuals at ``x``: what is
         left of their mean square after the points' own uncertainty, freed from the fit's ``unknowns``."""
-        squares: list[list[NDArray]] = [[], []]
-        for index in range(len(self.poses)):
-            owns = [np.zeros_like(self.targets[index][0]), self.poses[index].projector.sigma_px]
-            for device, residual in enumerate(self.residuals(x, index)):
-                seen = np.isfinite(residual)
-                squares[device].append(np.stack([residual[seen] ** 2, np.nan_to_num(owns[device][seen]) ** 2]))
-        joined = [np.concatenate(parts, axis=1) for parts in squares]
-        count = sum(part.shape[1] for part in joined)
+        residuals = self.joined(lambda index: self.residuals(x, index))
+        own = np.nan_to_num(np.concatenate([pose.projector.sigma_px for pose in self.poses]))
+        seen = [np.isfinite(residual) for residual in residuals]
+        count = sum(int(part.sum()) for part in seen)
         inflation = count / max(count - unknowns, 1)
-        camera, projector = (max(inflation * part[0].mean() - part[1].mean(), 0.0) ** 0.5 for part in joined)
-        self.extra_px = (float(max(camera, LEAST_SIGMA_PX)), float(max(projector, LEAST_SIGMA_PX)))
-        return self.extra_px
+        camera, projector = (
+            max(inflation * (residual[part] ** 2).mean() - (known[part] ** 2).mean(), LEAST_SIGMA_PX**2) ** 0.5
+            for residual, known, part in zip(residuals, (np.zeros_like(own), own), seen, strict=True)
+        )
+        self.extra_px = float(camera), float(projector)
+
+
+def opencv_lens(intrinsics: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """OpenCV's camera matrix (3, 3) and coefficients, of (fx, fy, cx, cy, coefficients)."""
+    fx, fy, cx, cy = intrinsics[:4]
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), intrinsics[4:]
 
 
 def spread(jacobian: NDArray[np.float64], free: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -180,3 +191,68 @@ def spread(jacobian: NDArray[np.float64], free: NDArray[np.float64]) -> NDArray[
     except np.linalg.LinAlgError:
         return np.full_like(free, np.inf)
     return free @ (inverse / norm[:, None])
+
+
+def without_bias(
+    pose: Pose, bundle: Bundle, x: NDArray[np.float64], index: int, radius_mm: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Image and projector coordinates (n, 2) px of the circles' centres, from those measured at their centroids."""
+    points = x[bundle.board].reshape(-1, 3)
+    board, lens = x[bundle.pose(index)], opencv_lens(x[bundle.camera])
+    angle = np.linspace(0, 2 * np.pi, OUTLINE_POINTS, endpoint=False)
+    circle = radius_mm * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
+    outlines = (points[:, None] + circle).reshape(-1, 3)
+    image = cv2.projectPoints(outlines, board[:3], board[3:], *lens)[0].reshape(len(points), -1, 2)
+    centres = cv2.projectPoints(points, board[:3], board[3:], *lens)[0].reshape(-1, 2)
+    offset = polygon_centroids(image - centres[:, None])
+    moved = np.einsum("nij,nj->ni", pose.projector.jacobian, offset)
+    return pose.corners_px - offset, pose.projector.points_px - moved
+
+
+def polygon_centroids(polygons: NDArray) -> NDArray[np.float64]:
+    """Centroids of area (n, 2) of polygons (n, k, 2)."""
+    following = np.roll(polygons, -1, axis=1)
+    cross = polygons[..., 0] * following[..., 1] - polygons[..., 1] * following[..., 0]
+    return ((polygons + following) * cross[..., None]).sum(1) / (3 * cross.sum(1))[:, None]
+
+
+def same_labels(poses: Sequence[Pose], board: Board, bundle: Bundle, x: NDArray[np.float64]) -> list[Pose]:
+    """The poses, relabelled by the turns of the grid that make the points' deviations agree best between poses."""
+    if board.kind not in ("checker", "circles"):
+        return list(poses)
+    grid = np.arange(board.columns * board.rows).reshape(board.rows, board.columns)
+    quarters = (0, 1, 2, 3) if board.columns == board.rows else (0, 2)
+    labels = [np.rot90(grid, quarter).ravel() for quarter in quarters]
+    points = board.points_mm()[:, :2] - board.points_mm()[:, :2].mean(0)
+    # A turned label's deviation, in the axes of the new labels: row vectors, p[label] @ turn = p.
+    turns = [np.linalg.lstsq(points[label], points, rcond=None)[0] for label in labels]
+    choices = []
+    for index in range(len(poses)):
+        deviations = np.nan_to_num(deviations_mm(bundle, x, index))
+        choices.append([deviations[label] @ turn for label, turn in zip(labels, turns, strict=True)])
+    chosen = [0] * len(poses)
+    for _ in range(SWEEPS):
+        for index, alternatives in enumerate(choices):
+            others = sum(choices[i][chosen[i]] for i in range(len(poses)) if i != index)
+            chosen[index] = int(np.argmax([(alternative * others).sum() for alternative in alternatives]))
+    return [_relabelled(pose, labels[choice]) for pose, choice in zip(poses, chosen, strict=True)]
+
+
+def _relabelled(pose: Pose, label: NDArray[np.int64]) -> Pose:
+    points = pose.projector
+    reasons = {new: points.reasons[old] for new, old in enumerate(label.tolist()) if old in points.reasons}
+    projector = ProjectorPoints(points.points_px[label], points.sigma_px[label], points.jacobian[label], reasons)
+    return pose._replace(corners_px=pose.corners_px[label], projector=projector)
+
+
+def deviations_mm(bundle: Bundle, x: NDArray[np.float64], index: int) -> NDArray[np.float64]:
+    """Where the camera's rays of a pose meet the board's plane, less where the points are thought to be, (n, 2) mm."""
+    corners = bundle.targets[index][0]
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+    ideal = cv2.undistortPoints(corners[:, None], *opencv_lens(x[bundle.camera]), criteria=criteria)[:, 0]
+    rays = np.column_stack([ideal, np.ones(len(ideal))])
+    board = x[bundle.pose(index)]
+    rotation, shift = cv2.Rodrigues(board[:3])[0], board[3:]
+    distance = (rotation[:, 2] @ shift) / (rays @ rotation[:, 2])
+    met = (rays * distance[:, None] - shift) @ rotation
+    return met[:, :2] - x[bundle.board].reshape(-1, 3)[:, :2]

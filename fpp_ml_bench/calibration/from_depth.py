@@ -17,9 +17,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.calibration.depth_views import MOST_PX, DepthView
-from fpp_ml_bench.calibration.projection import Projection, projection_from
-from fpp_ml_bench.calibration.refinement import CENTRE, NAMES, PITCH, POSE, Measured, Projector, measured_in, refined
+from fpp_ml_bench.calibration.projection import (
+    CENTRE,
+    MOST_PX,
+    NAMES,
+    PITCH,
+    POSE,
+    DepthView,
+    Measured,
+    Projection,
+    Projector,
+    measured_in,
+    projection_from,
+    refined,
+)
 from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
 from fpp_ml_bench.decoding import depth_from_both
 from fpp_ml_bench.errors import CalibrationError, RigError

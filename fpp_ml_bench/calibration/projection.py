@@ -1,18 +1,31 @@
-"""The projector as a projection matrix in periods: linear start, decomposition, and what can't be a projector.
+"""The projector from points whose depth is known: what a view says of it, its projection in periods, and the fit.
+
+Absolute phase is counted in periods of the fringes, w / P for a projector coordinate w and a pitch P. The Gray code
+counts half periods, so that frames give it without knowing the pitch.
 
 Absolute phase / 2 pi = w / P, so points X in metres and phases in periods give M (3 x 4) with ``(w_u / P_u, w_v / P_v,
 1) ~ M (X, 1)``, and M = K [R | t] with K in periods: focal length / pitch and principal point / pitch of each
 direction. The linear solution is Abdel-Aziz and Karara's DLT, normalised as by Hartley and Zisserman, *Multiple View
-Geometry*, 2nd ed., algorithm 7.1; the decomposition is theirs too (6.2.4).
+Geometry*, 2nd ed., algorithm 7.1; the decomposition is theirs too (6.2.4). Robust least squares then fit the
+projector's thirteen numbers, of which some are free.
 """
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
+from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import CalibrationError
+from fpp_ml_bench.optics import AXES, Direction, Pinhole, Rig, distortion_polynomial, rotation_matrix
 
+MOST_PX = 50_000
+"""Pixels that a fit uses, of all views together."""
+_CODED_PX = 65536
 LEAST_THICKNESS = 0.01
 """Of the surface across its mean plane, as a part of its extent along it (RMS): below, the surface is taken as flat."""
 LEAST_GAP = 5.0
@@ -23,6 +36,99 @@ MOST_SKEW = 0.05
 _MOST_TRIMMINGS = 30
 _KEPT_MEDIANS = 5.0
 _SMALLEST_PERIODS = 1e-9
+POSE = frozenset({"turn_x", "turn_y", "turn_z", "t_x", "t_y", "t_z"})
+CENTRE, PITCH = frozenset({"c_u", "c_v"}), frozenset({"pitch_u", "pitch_v"})
+NAMES = ("turn_x", "turn_y", "turn_z", "t_x", "t_y", "t_z", "focal", "aspect", "c_u", "c_v", "pitch_u", "pitch_v", "k1")
+"""``turn`` a rotation vector (rad) applied after the start's rotation, t in m, ``focal`` that of u in px, ``aspect``
+that of v over it, c and pitch in px, ``k1`` the first radial term of the lens."""
+MOST_CONDITION = 1e7
+"""Of the Jacobian with its columns scaled to equal length; the benchmark's objects give some thousands."""
+_SMALLEST_PX = 1e-3
+_BANDS = 16
+_MOST_EVALUATIONS = 100
+
+
+@dataclass(frozen=True)
+class DepthView:
+    """n pixels of a view, float64: ``rays`` (2, n) normalised x and y, ``depth_mm`` (n,), and of the vertical and the
+    horizontal fringes ``periods`` (2, n), absolute phase / 2 pi, and ``modulation`` (2, n), of which only ratios
+    count."""
+
+    name: str
+    rays: NDArray[np.float64]
+    depth_mm: NDArray[np.float64]
+    periods: NDArray[np.float64]
+    modulation: NDArray[np.float64]
+
+    @property
+    def points_m(self) -> NDArray[np.float64]:
+        """The surface in the camera's frame, (n, 3)."""
+        return np.stack([*self.rays, np.ones(len(self.depth_mm))], axis=1) * self.depth_mm[:, None] / MM_PER_M
+
+
+def view_from_maps(
+    name: str,
+    camera: Pinhole,
+    periods: Mapping[Direction, NDArray],
+    depth_mm: NDArray,
+    modulation: Mapping[Direction, NDArray] | None = None,
+    most_px: int = MOST_PX,
+) -> DepthView:
+    """A view from maps (H, W) of the camera's size: absolute phase / 2 pi of both directions, NaN = not decoded, and
+    depth in mm, 0 = none. ``modulation`` in grey levels (default: the same at all pixels). At most ``most_px`` pixels
+    are kept, spread evenly. Raises `CalibrationError` for an absent direction, maps of another size, or depth that is
+    negative or not finite."""
+    size = (camera.height, camera.width)
+    for direction in AXES:
+        if direction not in periods:
+            raise CalibrationError(
+                f"{name}: has no phase of the {direction} fringes; the projector is found only from both directions"
+            )
+    strengths = modulation or {direction: np.ones(size) for direction in AXES}
+    maps = (
+        {"depth": depth_mm} | {f"{d} phase": periods[d] for d in AXES} | {f"{d} modulation": strengths[d] for d in AXES}
+    )
+    for title, values in maps.items():
+        if np.shape(values) != size:
+            raise CalibrationError(f"{name}: expected {title} of shape {size} like the camera, got {np.shape(values)}")
+    if not np.isfinite(depth_mm).all() or np.min(depth_mm) < 0:
+        raise CalibrationError(
+            f"{name}: depth is negative, NaN or infinite at some pixels; write 0 where there is none"
+        )
+    rays = np.stack([axis.reshape(-1) for axis in camera.rays()])
+    measured = np.stack([np.asarray(periods[d], dtype=np.float64).reshape(-1) for d in AXES])
+    strength = np.stack([np.asarray(strengths[d], dtype=np.float64).reshape(-1) for d in AXES])
+    usable = np.isfinite(rays).all(axis=0) & np.isfinite(measured).all(axis=0) & (strength > 0).all(axis=0)
+    pixels = np.flatnonzero(object_mask(np.asarray(depth_mm)).reshape(-1) & usable)
+    pixels = pixels[:: max(1, -(-len(pixels) // most_px))]
+    depth = np.asarray(depth_mm, dtype=np.float64).reshape(-1)[pixels]
+    return DepthView(name, rays[:, pixels], depth, measured[:, pixels], strength[:, pixels])
+
+
+def view_from_frames(
+    name: str,
+    frames: Sequence[NDArray[np.uint8]] | NDArray[np.uint8],
+    depth_mm: NDArray,
+    rig: Rig,
+    most_px: int = MOST_PX,
+) -> DepthView:
+    """A view from all frames of ``rig.sequence``, uint8 (H, W) each, and depth in mm (H, W), 0 = none. Of ``rig``, only
+    the camera and the sequence are used. Raises `DecodeError` as `decode_stack`, `CalibrationError` as
+    `view_from_maps`."""
+    # The decoder wants a pitch, and any gives the same periods. A long one in a pattern of as many cells as the bits
+    # can tell apart puts each cell's centre where it is without knowing the projector's pixels.
+    middle = (_CODED_PX - 1) / 2
+    pitch_px = {direction: 2.0 * (_CODED_PX >> rig.sequence.bits(direction)) for direction in AXES}
+    coded = replace(
+        rig,
+        projector=Pinhole(_CODED_PX, _CODED_PX, _CODED_PX, _CODED_PX, middle, middle),
+        pitch_horizontal_px=pitch_px["horizontal"],
+        pitch_vertical_px=pitch_px["vertical"],
+    )
+    measured = decode_stack(frames, coded, details=True).details
+    periods = {direction: measured[direction].coordinate_px / pitch_px[direction] for direction in AXES}
+    modulation = {direction: measured[direction].modulation for direction in AXES}
+    return view_from_maps(name, rig.camera, periods, depth_mm, modulation, most_px)
 
 
 class Projection(NamedTuple):
@@ -103,3 +209,119 @@ def _decomposed(matrix: NDArray[np.float64], kept: NDArray[np.bool_]) -> Project
             f"under {MOST_SKEW}); check the camera, the frame order, and that the depth belongs to these frames"
         )
     return Projection(rotation, translation, np.diag(upper)[:2].copy(), upper[:2, 2].copy(), kept)
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The pixels of all views: points (n, 3) in m, periods and weights (2, n), and a number for each band of rows of
+    each view (n,). Errors of neighbouring pixels go together; those of bands are taken as independent."""
+
+    points_m: NDArray[np.float64]
+    periods: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    bands: NDArray[np.intp]
+
+    def only(self, kept: NDArray[np.bool_]) -> "Measured":
+        return Measured(self.points_m[kept], self.periods[:, kept], self.weights[:, kept], self.bands[kept])
+
+
+def measured_in(views: list[DepthView], most_px: int) -> Measured:
+    """What ``views`` measure, thinned evenly to about ``most_px`` pixels."""
+    step = max(1, -(-sum(len(view.depth_mm) for view in views) // most_px))
+    strength = np.concatenate([view.modulation[:, ::step] for view in views], axis=1)
+    counts = [len(view.depth_mm[::step]) for view in views]
+    bands = [number * _BANDS + np.arange(count) * _BANDS // max(count, 1) for number, count in enumerate(counts)]
+    return Measured(
+        np.concatenate([view.points_m[::step] for view in views]),
+        np.concatenate([view.periods[:, ::step] for view in views], axis=1),
+        strength / np.median(strength, axis=1, keepdims=True),  # the noise of a phase goes as 1 / modulation
+        np.concatenate(bands),
+    )
+
+
+@dataclass(frozen=True)
+class Projector:
+    """``values`` of `NAMES` and their standard errors (0 where not fitted), the start's rotation (3, 3), and the robust
+    standard deviation of the residuals in px, weighted."""
+
+    values: dict[str, float]
+    start: NDArray[np.float64]
+    errors: dict[str, float]
+    sigma_px: float = np.inf
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        x, y, z = (self.values[name] for name in ("turn_x", "turn_y", "turn_z"))
+        return rotation_matrix((x, y, z)) @ self.start
+
+    def pair(self, first: str, second: str) -> tuple[float, float]:
+        return self.values[first], self.values[second]
+
+    def having(self, **values: float) -> "Projector":
+        """The projector with other numbers, not fitted yet."""
+        return replace(self, values=self.values | values, errors={}, sigma_px=np.inf)
+
+
+def projected(points_m: NDArray[np.float64], p: Projector) -> NDArray[np.float64]:
+    """Absolute phase / 2 pi of points (n, 3) in the camera's frame, (2, n)."""
+    v = p.values
+    x, y, z = p.rotation @ points_m.T + np.array([[v["t_x"]], [v["t_y"]], [v["t_z"]]])
+    with np.errstate(all="ignore"):
+        x, y = distortion_polynomial(x / z, y / z, (v["k1"], 0.0, 0.0, 0.0, 0.0))
+    u, w = v["focal"] * x + v["c_u"], v["focal"] * v["aspect"] * y + v["c_v"]
+    return np.stack([u / v["pitch_u"], w / v["pitch_v"]])
+
+
+def refined(measured: Measured, start: Projector, free: frozenset[str]) -> Projector:
+    """The projector whose ``free`` numbers fit the phases best (soft L1 loss beyond three robust standard deviations of
+    the start), with standard errors that allow for errors shared within a band. Raises `CalibrationError` where the
+    numbers can't be told apart."""
+    from scipy.optimize import least_squares
+
+    names = [name for name in NAMES if name in free]
+    # One unit for both directions: noise is the same in periods, whatever their pitches.
+    scale_px = measured.weights * float(np.mean(start.pair("pitch_u", "pitch_v")))
+
+    def residuals_px(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+        tried = start.having(**dict(zip(names, numbers.tolist(), strict=True)))
+        difference = (projected(measured.points_m, tried) - measured.periods) * scale_px
+        # A step of the search that turns a point behind the projector is refused by its cost.
+        return np.nan_to_num(difference, nan=1e6, posinf=1e6, neginf=-1e6).ravel()
+
+    begin = np.array([start.values[name] for name in names])
+    knee_px = max(3 * _sigma(residuals_px(begin)), _SMALLEST_PX)
+    solution = least_squares(
+        residuals_px,
+        begin,
+        jac="3-point",
+        loss="soft_l1",
+        f_scale=knee_px,
+        x_scale="jac",
+        max_nfev=_MOST_EVALUATIONS,
+        xtol=1e-12,
+        ftol=1e-12,
+        gtol=1e-12,
+    )
+    jacobian = solution.jac
+    lengths = np.linalg.norm(jacobian, axis=0)
+    condition = np.inf if not (lengths > 0).all() else float(np.linalg.cond(np.linalg.qr(jacobian / lengths, mode="r")))
+    if condition > MOST_CONDITION:
+        raise CalibrationError(
+            f"the views don't tell {', '.join(names)} apart (condition {condition:.1g}); give views at more places and "
+            "distances, or the pitch"
+        )
+    # least_squares scales the Jacobian for its loss; with these residuals, their products are the gradient's terms.
+    bent = solution.fun * (1 + (solution.fun / knee_px) ** 2) ** 0.25
+    terms = (jacobian * bent[:, None]).reshape(2, -1, len(names)).sum(axis=0)
+    by_band = np.stack([np.bincount(measured.bands, weights=column) for column in terms.T], axis=1)
+    solved = np.linalg.pinv(jacobian / lengths)
+    inverse = solved @ solved.T / np.outer(lengths, lengths)
+    errors = np.sqrt(np.maximum(np.diag(inverse @ (by_band.T @ by_band) @ inverse), 0.0))
+    values = start.values | dict(zip(names, solution.x.tolist(), strict=True))
+    return replace(
+        start, values=values, errors=dict(zip(names, errors.tolist(), strict=True)), sigma_px=_sigma(solution.fun)
+    )
+
+
+def _sigma(values: NDArray[np.float64]) -> float:
+    return MAD_TO_SIGMA * float(np.median(np.abs(values)))

@@ -1,17 +1,71 @@
-"""What a calibration found: both devices, the pose between them, errors, and how sure it is of each."""
+"""What a calibration found: lens models, both devices, the pose between them, errors, and how sure it is of each; its
+residuals as a picture; and how far a rig's depth is from another's over the working volume."""
 
 from dataclasses import dataclass, field
+from io import BytesIO
+from typing import TYPE_CHECKING, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.calibration.lens import Lens
 from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
-from fpp_ml_bench.optics import Pinhole
+from fpp_ml_bench.decoding import depth_from_both, depth_from_coordinate
+from fpp_ml_bench.errors import CalibrationError
+from fpp_ml_bench.optics import AXES, Pinhole, Rig
 
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+MODELS: dict[str, tuple[tuple[int, ...], int]] = {
+    "none": ((), cv2.CALIB_FIX_K1 + cv2.CALIB_FIX_K2 + cv2.CALIB_FIX_K3 + cv2.CALIB_ZERO_TANGENT_DIST),
+    "radial-1": ((0,), cv2.CALIB_FIX_K2 + cv2.CALIB_FIX_K3 + cv2.CALIB_ZERO_TANGENT_DIST),
+    "radial-2": ((0, 1), cv2.CALIB_FIX_K3 + cv2.CALIB_ZERO_TANGENT_DIST),
+    "radial-3+tangential": ((0, 1, 2, 3, 4), 0),
+    "rational": ((0, 1, 2, 3, 4, 5, 6, 7), cv2.CALIB_RATIONAL_MODEL),
+}
+"""Free coefficients, by their place in OpenCV's (k1, k2, p1, p2, k3, k4, k5, k6), and OpenCV's flags."""
 SPOILER_SIGMAS, SPOILER_SHARE = 3.5, 1.2
 """A pose is named when its held-out error lies above the median by this many robust sigmas and by half of the median,
 and its error in the fit is this many times the median: one that is only unlike the others predicts badly, but fits."""
+ACROSS, DEPTHS = 24, 9
+"""Points across the image, along each side, and along the range."""
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A lens ``model`` of `MODELS`; ``square_pixels``: fx = fy; ``centred``: the principal point is the image's centre,
+    ((W - 1) / 2, (H - 1) / 2). Raises `CalibrationError` for an unknown model."""
+
+    model: str = "radial-3+tangential"
+    square_pixels: bool = False
+    centred: bool = False
+
+    def __post_init__(self) -> None:
+        if self.model not in MODELS:
+            raise CalibrationError(f"lens: expected one of {', '.join(MODELS)}, got {self.model!r}")
+
+    def __str__(self) -> str:
+        return self.model + ", fx = fy" * self.square_pixels + ", centred" * self.centred
+
+    @property
+    def coefficients(self) -> int:
+        """Number of OpenCV's coefficients: 5, or 8 of the rational model."""
+        return 8 if self.model == "rational" else 5
+
+    @property
+    def flags(self) -> int:
+        """For cv2.calibrateCamera."""
+        square = cv2.CALIB_FIX_ASPECT_RATIO * self.square_pixels
+        return MODELS[self.model][1] + square + cv2.CALIB_FIX_PRINCIPAL_POINT * self.centred
+
+    @property
+    def free(self) -> NDArray[np.float64]:
+        """Matrix (4 + coefficients, f) from the free parameters to (fx, fy, cx, cy, coefficients)."""
+        unit = np.eye(4 + self.coefficients)
+        focal = [unit[0] + unit[1]] if self.square_pixels else [unit[0], unit[1]]
+        centre = [] if self.centred else [unit[2], unit[3]]
+        return np.stack([*focal, *centre, *(unit[4 + i] for i in MODELS[self.model][0])], axis=1)
 
 
 @dataclass(frozen=True)
@@ -109,3 +163,110 @@ class Calibration:
         limit = middle + max(SPOILER_SIGMAS * MAD_TO_SIGMA * np.median(np.abs(errors - middle)), 0.5 * middle)
         bad = (errors > limit) & (fitted > SPOILER_SHARE * np.median(fitted))
         return tuple(pose.name for pose, named in zip(self.poses, bad, strict=True) if named)
+
+
+def draw_residuals(calibration: Calibration) -> bytes:
+    """PNG of a calibration: for camera and projector the residuals by pose and the points in the image, and the RMS of
+    each pose."""
+    from matplotlib import colormaps
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    poses = calibration.poses
+    colours = colormaps["turbo"](np.linspace(0.05, 0.95, len(poses)))
+    figure = Figure(figsize=(13, 8), layout="constrained", dpi=90)
+    plots = figure.subplots(2, 3)
+    for row, (name, device) in enumerate((("camera", calibration.camera), ("projector", calibration.projector))):
+        scatter, cover = plots[row, 0], plots[row, 1]
+        for pose, colour in zip(poses, colours, strict=True):
+            errors = pose.projector_residuals_px if row else pose.camera_residuals_px
+            pixels = pose.projector_px if row else pose.corners_px
+            scatter.plot(*errors.T, ".", ms=3, color=colour, label=pose.name)
+            cover.quiver(*pixels.T, *errors.T, color=colour, angles="xy", width=0.003)
+        rms = calibration.projector_rms_px if row else calibration.camera_rms_px
+        scatter.set(title=f"{name}: residuals, RMS {rms:.3f} px", xlabel="x, px", ylabel="y, px", aspect="equal")
+        scatter.axhline(0, color="0.6", lw=0.6)
+        scatter.axvline(0, color="0.6", lw=0.6)
+        cover.set(
+            title=f"{name}: points and residuals (enlarged)",
+            xlabel="column, px",
+            ylabel="row, px",
+            aspect="equal",
+            xlim=(-0.5, device.width - 0.5),
+            ylim=(device.height - 0.5, -0.5),
+        )
+    _bars(plots[0, 2], calibration)
+    plots[1, 2].axis("off")
+    handles, labels = plots[0, 0].get_legend_handles_labels()
+    plots[1, 2].legend(handles, labels, loc="upper left", ncols=1 + len(poses) // 20, fontsize=8, markerscale=3)
+    picture = BytesIO()
+    FigureCanvasAgg(figure).print_png(picture)
+    return picture.getvalue()
+
+
+def _bars(axes: "Axes", calibration: Calibration) -> None:
+    """RMS of each pose in camera and projector, and held out; poses that spoil the fit are marked."""
+    poses, place = calibration.poses, np.arange(len(calibration.poses))
+    series = {
+        "camera": [pose.camera_rms_px for pose in poses],
+        "projector": [pose.projector_rms_px for pose in poses],
+        "both, held out": [pose.held_out_rms_px for pose in poses],
+    }
+    for number, (label, values) in enumerate(series.items()):
+        if np.isfinite(values).all():
+            axes.bar(place + 0.27 * (number - 1), values, 0.27, label=label)
+    marks = [pose.name + (" (!)" if pose.name in calibration.spoilers else "") for pose in poses]
+    axes.set_xticks(place, marks, rotation=90 if len(poses) > 6 else 20, fontsize=7)
+    axes.set(title="RMS by pose, (!) fits the others badly", ylabel="px")
+    axes.legend(fontsize=8)
+
+
+class VolumeError(NamedTuple):
+    """Depth by one rig minus depth by the true one: ``rms_mm``, ``worst_mm``, and ``scale``, the factor between the two
+    by least squares (0.95 where a board's spacing was given 5% too small)."""
+
+    rms_mm: float
+    worst_mm: float
+    scale: float
+
+
+def volume_error_mm(rig: Rig, true_rig: Rig) -> VolumeError:
+    """Depth error of ``rig`` where ``true_rig`` captures: a grid of points of the true working range, seen from the
+    centres of as many parts of the image, goes to image and projector px by the true rig and back to depth by the
+    other. Both are depths along the camera's axis, each of its own. Points beside the pattern don't count.
+
+    Raises `CalibrationError` for images or patterns of different sizes, and where no point is left or one has no depth
+    by ``rig``."""
+    for device in ("camera", "projector"):
+        sizes = [(part.width, part.height) for part in (getattr(rig, device), getattr(true_rig, device))]
+        if sizes[0] != sizes[1]:
+            (w, h), (true_w, true_h) = sizes
+            raise CalibrationError(f"{device}: expected {true_w} x {true_h} px as in the true rig, got {w} x {h} px")
+    camera, projector = true_rig.camera, true_rig.projector
+    sides = ((np.arange(ACROSS) + 0.5) * (length / ACROSS) - 0.5 for length in (camera.width, camera.height))
+    column, row = (axis.ravel() for axis in np.meshgrid(*sides))
+    x, y = camera.normalised(column, row)
+    near_m, far_m = (limit / MM_PER_M for limit in true_rig.working_range_mm)
+    depth_m = np.linspace(near_m, far_m, DEPTHS)[:, None]
+    u, v = true_rig.project(np.stack([x * depth_m, y * depth_m, np.broadcast_to(depth_m, (DEPTHS, x.size))], axis=-1))
+    shown = (u >= -0.5) & (u <= projector.width - 0.5) & (v >= -0.5) & (v <= projector.height - 0.5)
+    if not shown.any():
+        raise CalibrationError("no point of the true rig's working range is on both image and pattern; check that rig")
+    rays = rig.camera.normalised(column, row)
+    if len(rig.directions) == 2:
+        weights = (1.0 / true_rig.code(direction).sigma_px(1.0, 1.0) ** 2 for direction in AXES)  # as the decoder's
+        found_mm = depth_from_both(rays, u, v, rig, *weights).depth_mm
+    else:
+        (direction,) = rig.directions
+        found_mm = depth_from_coordinate(rays, u if direction == "vertical" else v, rig, direction)
+    true_mm = np.broadcast_to(depth_m * MM_PER_M, u.shape)[shown]
+    found_mm = found_mm[shown]
+    lost = int(np.isnan(found_mm).sum())
+    if lost:
+        raise CalibrationError(
+            f"{lost} of {len(found_mm)} points of the true rig's working range have no depth by the other rig, so the "
+            "two have nothing in common; check rotation, translation and the sign of the axes"
+        )
+    error = found_mm - true_mm
+    scale = float((found_mm * true_mm).sum() / (true_mm * true_mm).sum())
+    return VolumeError(float(np.sqrt((error * error).mean())), float(np.abs(error).max()), scale)

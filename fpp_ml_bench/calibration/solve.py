@@ -1,25 +1,94 @@
-"""From board poses to a calibrated rig: start by OpenCV, joint refinement, circle bias, what each pose does to it."""
+"""From board poses to a calibrated rig: start by OpenCV, joint refinement, circle bias, what each pose does to it. What
+makes captures unfit for a calibration is answered with a sentence that names the pose."""
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from fpp_ml_bench.calibration.boards import Board
-from fpp_ml_bench.calibration.bundle import Bundle, spread
-from fpp_ml_bench.calibration.checks import check_poses, check_solution, check_start
-from fpp_ml_bench.calibration.circles import without_bias
-from fpp_ml_bench.calibration.lens import Lens
+from fpp_ml_bench.calibration.bundle import Bundle, same_labels, spread, without_bias
 from fpp_ml_bench.calibration.projector_points import Pose
-from fpp_ml_bench.calibration.relabel import same_labels
-from fpp_ml_bench.calibration.result import Calibration, Device, FittedPose
+from fpp_ml_bench.calibration.result import Calibration, Device, FittedPose, Lens
 from fpp_ml_bench.errors import CalibrationError
 
+FEWEST_POSES = 3
+FEWEST_POINTS = 6
+LEAST_TILT_RAD = np.deg2rad(5.0)
+LARGEST_FOCAL_SIGMA = 0.05
+"""Relative standard uncertainty of a focal length."""
+MARGIN = 0.1
+"""By which projector coordinates may lie outside the projector, in its sizes: the fringes end there."""
 Lenses = str | Lens | tuple[Lens, Lens]
 WEIGHT_ROUNDS = 4
 CIRCLE_ROUNDS = 10
 CIRCLE_TOLERANCE_PX = 1e-7
+
+
+def check_poses(poses: Sequence[Pose], board: Board, sizes: tuple[tuple[int, int], tuple[int, int]]) -> None:
+    """Raise `CalibrationError` for poses that are too few, of another image size, with too few points or too far from
+    the projector, or in which camera and projector don't see the same side of the board."""
+    if len(poses) < FEWEST_POSES:
+        raise CalibrationError(f"expected at least {FEWEST_POSES} poses of the board, got {len(poses)}: capture more")
+    (width, height), projector = sizes
+    for pose in poses:
+        if tuple(pose.size) != (width, height):
+            got = f"{pose.size[0]} x {pose.size[1]}"
+            raise CalibrationError(f"pose {pose.name}: the image is {got} px, the camera's are {width} x {height} px")
+        corners, points = pose.corners_px, pose.projector.points_px
+        if not len(corners) == len(points) == board.columns * board.rows:
+            expected = board.columns * board.rows
+            raise CalibrationError(f"pose {pose.name}: expected {expected} points, got {len(corners)}")
+        both = np.isfinite(corners).all(1) & np.isfinite(points).all(1)
+        if both.sum() < FEWEST_POINTS:
+            reason = next(iter(pose.projector.reasons.items()), None)
+            why = f" (point {reason[0]}: {reason[1]})" if reason else ""
+            raise CalibrationError(
+                f"pose {pose.name}: only {both.sum()} of {len(points)} points have projector coordinates, expected at "
+                f"least {FEWEST_POINTS}{why}: light the whole board with the fringes"
+            )
+        for axis, (size, name) in enumerate(zip(projector, ("columns", "rows"), strict=True)):
+            low, high = points[both, axis].min(), points[both, axis].max()
+            if low < -MARGIN * size or high > (1 + MARGIN) * size:
+                raise CalibrationError(
+                    f"pose {pose.name}: the board lies at projector {name} {low:.0f} to {high:.0f}, but the "
+                    f"projector has {size}: look at its size, the pitch, and which frames code which direction"
+                )
+        plane = np.column_stack([corners[both], np.ones(both.sum())])
+        affine = np.linalg.lstsq(plane, points[both], rcond=None)[0][:2]
+        if np.linalg.det(affine) < 0:
+            raise CalibrationError(
+                f"pose {pose.name}: the camera sees the board mirrored, compared with the projector; mirror the "
+                "images, or look at the direction in which the projector's columns and rows are counted"
+            )
+
+
+def check_start(poses: Sequence[Pose], turns: Sequence[NDArray]) -> None:
+    """Raise `CalibrationError` where all boards are parallel, given their rotation vectors."""
+    normals = [cv2.Rodrigues(np.asarray(turn))[0][:, 2] for turn in turns]
+    if not np.isfinite(normals).all():
+        raise CalibrationError("the poses don't determine the intrinsics: show the board from other directions")
+    tilt = max(np.arctan2(np.linalg.norm(np.cross(a, b)), abs(a @ b)) for a, b in combinations(normals, 2))
+    if tilt < LEAST_TILT_RAD:
+        names = ", ".join(pose.name for pose in poses)
+        raise CalibrationError(
+            f"poses {names}: the board is parallel in all of them, within {np.rad2deg(tilt):.1f} degrees, so that "
+            "focal length and distance can't be told apart; tilt it by 20 degrees or more, about both axes"
+        )
+
+
+def check_solution(bundle: Bundle, x: NDArray[np.float64], sigma: NDArray[np.float64]) -> None:
+    """Raise `CalibrationError` where a focal length is not determined, given all parameters' standard uncertainties."""
+    for name, part in (("camera", bundle.camera), ("projector", bundle.projector)):
+        focal = x[part][:2]
+        if not (focal > 0).all() or (sigma[part][:2] > LARGEST_FOCAL_SIGMA * focal).any():
+            raise CalibrationError(
+                f"the poses don't determine the {name}'s focal length: {focal[0]:.0f} ± {sigma[part][0]:.0f} px; tilt "
+                "the board more and in other directions, or choose a lens with fewer terms"
+            )
 
 
 def calibrate(
@@ -122,24 +191,15 @@ def _start(
         distortion = np.resize(np.ravel(distortion), lens.coefficients)
         if not (np.isfinite(matrix).all() and np.isfinite(distortion).all()):
             raise CalibrationError("the poses don't determine the intrinsics: show the board from other directions")
-        intrinsics.append((matrix, distortion))
+        intrinsics.append(np.concatenate([matrix[[0, 1, 0, 1], [0, 1, 2, 2]], distortion]))
         rms.append(float(error))
         views.append((turns, shifts))
-    rotations, centres = [], []
-    for pose in range(len(poses)):
-        turn = [cv2.Rodrigues(np.asarray(turns[pose]))[0] for turns, _ in views]
-        shift = [np.asarray(shifts[pose]).ravel() for _, shifts in views]
-        rotations.append(turn[1] @ turn[0].T)
-        centres.append(shift[1] - rotations[-1] @ shift[0])
-    u, _, vt = np.linalg.svd(np.sum(rotations, axis=0))  # the mean rotation
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    parts = [
-        np.concatenate([[matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]], distortion])
-        for matrix, distortion in intrinsics
-    ]
-    stereo = [cv2.Rodrigues(rotation)[0].ravel(), np.median(centres, axis=0)]
-    boards = [np.ravel(part) for turn, shift in zip(*views[0], strict=True) for part in (turn, shift)]
-    return np.concatenate([*parts, *stereo, *boards, board.points_mm().ravel()]), (rms[0], rms[1])
+    first, second = (Rotation.from_rotvec(np.reshape(vectors, (-1, 3))) for vectors, _ in views)
+    shifts = [np.reshape(vectors, (-1, 3)) for _, vectors in views]
+    between = second * first.inv()
+    stereo = [between.mean().as_rotvec(), np.median(shifts[1] - between.apply(shifts[0]), axis=0)]
+    boards = np.hstack([np.reshape(views[0][0], (-1, 3)), shifts[0]]).ravel()
+    return np.concatenate([*intrinsics, *stereo, boards, board.points_mm().ravel()]), (rms[0], rms[1])
 
 
 def _weighted_fit(bundle: Bundle, start: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
@@ -198,11 +258,8 @@ def _result(
         scale = f"from the baseline of {baseline_mm:g} mm; the board's spacing is then {spacing} mm"
         of_shift, baseline_sigma = of_shift - np.outer(along, along @ of_shift), 0.0
     fitted = []
-    every: list[list[NDArray]] = [[], []]
     for index, pose in enumerate(bundle.poses):
         residuals = bundle.residuals(x, index)
-        for all_residuals, residual in zip(every, residuals, strict=True):
-            all_residuals.append(residual)
         place = x[bundle.pose(index)]
         fitted.append(
             FittedPose(
@@ -217,6 +274,7 @@ def _result(
                 *residuals,
             )
         )
+    of_camera, of_projector = bundle.joined(lambda index: bundle.residuals(x, index))
     rotation = cv2.Rodrigues(turn)[0].tolist()
     return Calibration(
         devices[0],
@@ -228,9 +286,9 @@ def _result(
         factor * baseline_sigma,
         board.spacing_mm * factor,
         scale,
-        rms_px(*every[0]),
-        rms_px(*every[1]),
-        rms_px(*every[0], *every[1]),
+        rms_px(of_camera),
+        rms_px(of_projector),
+        rms_px(of_camera, of_projector),
         alone,
         bundle.extra_px,
         _bic(bundle, x, unknowns),
@@ -242,10 +300,8 @@ def _result(
 
 def _bic(bundle: Bundle, x: NDArray, unknowns: int) -> float:
     """Bayesian information criterion: -2 log likelihood + unknowns x log(coordinates)."""
-    total, count = 0.0, 0
-    for index in range(len(bundle.poses)):
-        for residual, sigma in zip(bundle.residuals(x, index), bundle.sigmas(index), strict=True):
-            seen = np.isfinite(residual)
-            total += float(((residual[seen] / sigma[seen]) ** 2 + np.log(2 * np.pi * sigma[seen] ** 2)).sum())
-            count += int(seen.sum())
-    return total + (unknowns + 2) * float(np.log(count))
+    residuals = np.concatenate(bundle.joined(lambda index: bundle.residuals(x, index)))
+    sigmas = np.concatenate(bundle.joined(bundle.sigmas))
+    seen = np.isfinite(residuals)
+    terms = (residuals[seen] / sigmas[seen]) ** 2 + np.log(2 * np.pi * sigmas[seen] ** 2)
+    return float(terms.sum()) + (unknowns + 2) * float(np.log(terms.size))

@@ -15,8 +15,7 @@ from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings, OfMethods
 from fpp_ml_bench.cli.options import COUNT, command, command_line, names, value
 from fpp_ml_bench.evaluation import result
-from fpp_ml_bench.leaderboard.measured import check_same_method, write_reliance
-from fpp_ml_bench.leaderboard.rows import read_entry
+from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_reliance
 from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.options import REQUIRED, argument, option

@@ -1,11 +1,9 @@
 """``fpp-bench leaderboard``: rank result files, and show the paper's rows apart."""
 
-import sys
 from pathlib import Path
 
 from fpp_ml_bench import leaderboard
 from fpp_ml_bench.baselines import tradeoff
-from fpp_ml_bench.cli import CHECK_FAILED
 from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import SubmissionError
@@ -25,7 +23,6 @@ fpp-bench leaderboard --pairs --paper none
 fpp-bench leaderboard --csv leaderboard.csv
 fpp-bench leaderboard --paper loss
 fpp-bench leaderboard --page page
-fpp-bench leaderboard --readme README.md --check
 fpp-bench leaderboard result.json --row leaderboard/rows/mine.json
 """
 )
@@ -66,12 +63,6 @@ def rank(
         "FILE",
         flag="--tradeoff",
     ),
-    readme: Path | None = option(
-        None,
-        "write the ranking between the leaderboard markers of this file, from the rows shipped with the package",
-        "FILE",
-    ),
-    check: bool = option(False, "with --readme: write nothing; exit status 1 when the block is not up to date"),
     row_file: Path | None = option(
         None,
         "make a row file for the leaderboard of the given result, and print what a maintainer adds to "
@@ -79,39 +70,25 @@ def rank(
         "FILE",
         flag="--row",
     ),
-) -> int | None:
-    """Rank result files: error and run time side by side, as a table, a static page and a block for README.
+) -> None:
+    """Rank result files: error and run time side by side, as a table and a static page.
 
     Raises SubmissionError naming a file that is not valid."""
-    if check and readme is None:
-        raise SubmissionError("--check checks a README; give it with --readme FILE")
     if measured is not None and out is None:
         raise SubmissionError("--tradeoff adds settings to a page; give it with --page DIR")
     if out is not None and sort != RANK_KEY:
         raise SubmissionError(f"--page is by {RANK_KEY}, and a click sorts it otherwise; leave out --sort")
-    if row_file is not None and readme is None:
+    if row_file is not None:
         if len(results) != 1:
             raise SubmissionError(f"--row makes a row of one result, {len(results)} were given")
         row = leaderboard.read_entry(results[0]).row
         data = leaderboard.write_row(row, row_file)
         print(f"{row_file}: {len(data):,} bytes, self-reported until a maintainer adds to leaderboard/vouched.txt:")
         print(leaderboard.vouching_line(row, data, "measured", "THE COMMAND THAT MAKES IT AGAIN"))
-        return None
-    # Page and README hold the shipped rows or the named files, never results that happen to be in the current folder.
-    published = out is not None or readme is not None
-    unnamed = leaderboard.shipped_rows() if published else leaderboard.discover(Path.cwd())
+        return
+    # A page holds the shipped rows or the named files, never results that happen to be in the current folder.
+    unnamed = leaderboard.discover(Path.cwd()) if out is None else leaderboard.shipped_rows()
     entries = leaderboard.read_entries(leaderboard.expand(results) if results else unnamed)
-    if readme is not None:
-        same = leaderboard.update_readme(readme, leaderboard.rank(entries), check)
-        if check and not same:
-            print(
-                f"{readme}: the ranking is not up to date with the rows; don't edit it by hand, run: "
-                f"fpp-bench leaderboard --readme {readme}",
-                file=sys.stderr,
-            )
-            return CHECK_FAILED
-        print(f"{readme}: {'the ranking is up to date with the rows' if same else 'written'}")
-        return None
     groups, papers = leaderboard.rank(entries, sort), leaderboard.chosen_tables(paper)
     for path, text in ((markdown, leaderboard.markdown), (json, leaderboard.table_json)):
         if path is not None:
@@ -123,7 +100,7 @@ def rank(
         settings = shipped if measured is None else tradeoff.read_tradeoff(measured)
         written = page.write_page(groups, papers, out, settings)
         print(f"{out}: {len(written)} files; open {written[0]}")
-        return None
+        return
     not_shown = len(papers) if results and paper is None else 0
     tables = leaderboard.group_tables(groups, sort, pairs)
     show(*tables, *leaderboard.paper_rich_tables(papers[not_shown:]))
@@ -132,4 +109,3 @@ def rank(
             f"Not shown: {not_shown} tables that others reported on other data (--paper all), and the "
             f"leaderboard's own {len(leaderboard.shipped_rows())} rows (fpp-bench leaderboard without a file)."
         )
-    return None

@@ -13,8 +13,7 @@ from fpp_ml_bench.cli.options import Pool, command, names
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation import report
-from fpp_ml_bench.leaderboard.measured import check_same_method, write_robustness
-from fpp_ml_bench.leaderboard.rows import read_entry
+from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_robustness
 from fpp_ml_bench.loaders import render, storage
 from fpp_ml_bench.options import REQUIRED, option
 from fpp_ml_bench.remote import RemoteFolder, place, working_copy

@@ -1,22 +1,18 @@
-"""``fpp-bench tradeoff``: error against run time and captured frames, and what each stage costs as its input grows."""
+"""``fpp-bench tradeoff``: error against run time, frames and memory, and how the time grows."""
 
 from pathlib import Path
 from typing import Literal
 
 from fpp_ml_bench.baselines import tradeoff
 from fpp_ml_bench.cli.console import progress_bar, show
-from fpp_ml_bench.cli.options import command, names, value, whole
-from fpp_ml_bench.leaderboard import page
+from fpp_ml_bench.cli.options import command, whole
 from fpp_ml_bench.options import argument, option
-
-_GROUPS = ("classical", "phase", "networks", "precision", "sizes", "costs")
 
 
 @command(
     """\
 fpp-bench tradeoff data/full
-fpp-bench tradeoff data/cpu224 --runs runs --out tradeoff-224
-fpp-bench tradeoff data/mini --quick --only classical --only phase
+fpp-bench tradeoff data/mini --quick --method phase --method mine.py:Mine
 fpp-bench tradeoff data/full --list
 fpp-bench leaderboard --page page --tradeoff tradeoff/tradeoff.json
 """
@@ -29,14 +25,16 @@ def measure(
         "folder for the results, or the folder of a stopped run to continue (default: tradeoff)",
         "DIR",
     ),
-    only: tuple[str, ...] = option(
+    method: tuple[str, ...] = option(
         (),
-        f"measure only this group; may be repeated: {', '.join(_GROUPS)} (default: all)",
-        "GROUP",
-        choices=_GROUPS,
+        "measure only this method: a name, file.py:Class, or weights; may be repeated. What the folder holds of others "
+        "stays (default: every method, and the shipped networks of the image's size)",
+        "METHOD",
+        parse=str,
         many=True,
     ),
-    quick: bool = option(False, "fewer settings, views, runs and sizes"),
+    views: int | None = option(None, "views of each test object (default: 2, quick: 1)", "N", parse=whole(1, 1000)),
+    quick: bool = option(False, "one view of each test object"),
     listed: bool = option(False, "show what would be measured, and stop", flag="--list"),
     threads: int = option(1, "threads a method may use (default: 1)", "N", parse=whole(1, 1000)),
     clock: Literal["wall", "processor"] = option(
@@ -44,46 +42,21 @@ def measure(
         "processor: processor time of this process, for a shared machine (default: wall)",
         choices=("wall", "processor"),
     ),
-    views: int | None = option(None, "views of each test object (default: 2, quick: 1)", "N", parse=whole(1, 1000)),
-    runs: Path | None = option(None, "also measure the networks trained below DIR", "DIR"),
-    widths: tuple[int, ...] | None = option(
-        None,
-        "widths of untrained UNets to time, or none (default: 4,8,16,32; on large images 4,8)",
-        "A,B",
-        parse=value(
-            "widths such as 4,8 or none",
-            lambda text: tuple(int(width) for width in names(text) if text != "none"),
-            lambda widths: all(1 <= width <= 1000 for width in widths),
-        ),
-    ),
 ) -> None:
-    """Error against run time and frames for every method and setting on this machine, and how each cost grows.
+    """Error against run time, frames and memory for every method on this machine, and how the time grows.
 
-    Measures what is missing, writes all files, prints fronts, growths and remarks."""
-    asked = tradeoff.TradeoffSettings(
-        dataset,
-        out,
-        only,
-        quick,
-        threads,
-        clock,
-        views,
-        runs,
-        widths,
-    )
-    plan = tradeoff.planned(asked, [page.board_ladder(quick)] if not only or "costs" in only else [])
+    Measures what is missing, writes all files, prints both tables and remarks."""
+    plan = tradeoff.planned(dataset, out, method, views or (1 if quick else 2), threads, clock)
     if listed:
-        show(tradeoff.plan_table(plan))
-        print(f"{len(plan.settings)} settings and {len(plan.ladders)} ladders of costs.")
+        for point in plan.points:
+            print(point.label)
+        print(f"{len(plan.points)} points on {len(plan.views)} views.")
         return
-    with progress_bar("measuring", len(plan.settings) + len(plan.ladders), "settings") as advance:
-        measurements = tradeoff.tradeoff(asked, plan, lambda key: advance(1))
-    written = tradeoff.write_report(measurements, out)
-    if measurements.points:
-        show(tradeoff.front_table(measurements))
-    if measurements.growth:
-        show(tradeoff.growth_table(measurements.growth))
-    for line in tradeoff.remarks(measurements):
+    with progress_bar("measuring", len(plan.points), "points") as advance:
+        measured = tradeoff.tradeoff(plan, lambda label: advance(1))
+    written = tradeoff.write_report(measured, out)
+    show(*tradeoff.rich_tables(measured))
+    for line in tradeoff.remarks(measured):
         print(line)
     for path in written:
         print(f"Written: {path}")

@@ -1,6 +1,5 @@
 from .assumptions import Assumptions as Assumptions
-from .epipolar import EpipolarLines as EpipolarLines
-from .picture import draw_design as draw_design
+from .rivals import EpipolarLines as EpipolarLines
 from .rivals import background_distance as background_distance
 from .rivals import nearest as nearest
 from .rivals import rival_distance as rival_distance
@@ -9,4 +8,5 @@ from .search import ANGLES_DEG as ANGLES_DEG
 from .search import Candidate as Candidate
 from .search import Design as Design
 from .search import describe as describe
+from .search import draw_design as draw_design
 from .search import search as search

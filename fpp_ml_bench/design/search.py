@@ -1,19 +1,31 @@
-"""The search for two carriers: every pair of periods and angles within limits, what it costs, and the one to take."""
+"""The search for two carriers: every pair of periods and angles within limits, what it costs, and the one to take; and
+a picture of it: the lines on the torus, the rival distance over depth and over the two periods."""
 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.coding import LEAST_ANGLE_DEG, Crossed
 from fpp_ml_bench.design.assumptions import SIGMA_PERIOD_PX, Assumptions
-from fpp_ml_bench.design.epipolar import EpipolarLines
-from fpp_ml_bench.design.rivals import TAU, background_distance, rival_distance, wrong_order_rate
+from fpp_ml_bench.design.rivals import (
+    TAU,
+    EpipolarLines,
+    background_distance,
+    nearest,
+    rival_distance,
+    wrong_order_rate,
+)
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.optics import Rig
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 ANGLES_DEG = tuple(float(angle) for angle in range(0, 180, 15))
 FLAT_TURNS = 0.05
@@ -22,6 +34,7 @@ BACKGROUND_SIGMAS = 3.0
 """Phase errors that the background must be away from every depth, so that it is known as background. Rivals must be
 much farther: each is a depth like the true one, and half of the way to it is enough."""
 _CHUNK = 20_000
+_PLACES = np.linspace(0.0, 1.0, 400)
 
 
 @dataclass(frozen=True)
@@ -81,20 +94,16 @@ def describe(rig: Rig, families: Sequence[Crossed], assumed: Assumptions) -> lis
     slopes = np.stack([lines.far_px_per_mm @ pair.T for pair in cycles])
     noise = _depth_noise_mm(slopes, pitches, weights, lines, assumed)
     wrong = wrong_order_rate(turns, sigma, (first, last)).max(axis=-1)
-    most = np.abs(turns).max(axis=1)
-    return [
-        Candidate(
-            family,
-            float(rival[k]),
-            None if background is None else float(background[k]),
-            float(sigma[k].max()),
-            float(noise[k]),
-            float(wrong[k]),
-            (float(image_px[k, 0]), float(image_px[k, 1])),
-            (float(most[k, 0]), float(most[k, 1])),
-        )
-        for k, family in enumerate(families)
-    ]
+    figures = (
+        rival.tolist(),
+        [None] * len(families) if background is None else background.tolist(),
+        sigma.max(axis=1).tolist(),
+        noise.tolist(),
+        wrong.tolist(),
+        map(tuple, image_px.tolist()),
+        map(tuple, np.abs(turns).max(axis=1).tolist()),
+    )
+    return [Candidate(*of_pair) for of_pair in zip(families, *figures, strict=True)]
 
 
 def search(
@@ -114,8 +123,7 @@ def search(
             f"{assumed.image_px[1]:g} px in an image of {rig.camera.width} x {rig.camera.height} px; give other "
             "--pitches and --angles, or wider limits (--image-px)"
         )
-    lines, cycles = EpipolarLines.of(rig), _cycles(carriers)
-    pitches = np.array([pitch for pitch, _ in carriers])
+    lines, cycles, pitches = EpipolarLines.of(rig), _cycles(carriers), carriers[:, 0]
     image_px = np.array([rig.image_px_of_carrier(tuple(carrier)) for carrier in cycles])
     sigmas = _sigmas(assumed, pitches, image_px)
     turns, slopes = (
@@ -137,7 +145,7 @@ def search(
             f"all {len(pairs):,} pairs show the background at {rig.background:g} m as they show a depth in the range; "
             "give other --pitches and --angles, or leave background_m out of the rig"
         )
-    families = [_family(carriers, pairs[index]) for index in _front(clearance, noise)]
+    families = [Crossed(*map(tuple, carriers[pairs[index]].T.tolist())) for index in _front(clearance, noise)]
     front = tuple(describe(rig, families, assumed))
     limit = f"{100 * assumed.wrong_share:g}% wrong orders"
     few = [candidate for candidate in front if candidate.wrong_share <= assumed.wrong_share]
@@ -148,9 +156,9 @@ def search(
 
 def _carriers(
     rig: Rig, assumed: Assumptions, pitches_px: Iterable[float] | None, angles_deg: Iterable[float]
-) -> list[tuple[float, float]]:
-    """Period and angle of every carrier whose period in the image is within the limits."""
-    carriers = []
+) -> NDArray[np.float64]:
+    """Period and angle of every carrier whose period in the image is within the limits, (n, 2)."""
+    carriers: list[tuple[float, float]] = []
     for angle in sorted({float(angle) % 180.0 for angle in angles_deg}):
         (cycles, _) = Crossed((10.0, 10.0), (angle, angle + 90.0)).cycles_per_px
         per_px = rig.image_px_of_carrier(cycles) / 10.0
@@ -163,16 +171,15 @@ def _carriers(
         else:
             pitches = [float(pitch) for pitch in pitches_px if least <= pitch <= most]
         carriers += [(pitch, angle) for pitch in sorted(set(pitches))]
-    return carriers
+    return np.array(carriers).reshape(-1, 2)
 
 
-def _cycles(carriers: list[tuple[float, float]]) -> NDArray[np.float64]:
-    turned = np.radians([angle for _, angle in carriers])
-    pitches = np.array([pitch for pitch, _ in carriers])
-    return np.column_stack([np.sin(turned), np.cos(turned)]) / pitches[:, None]
+def _cycles(carriers: NDArray[np.float64]) -> NDArray[np.float64]:
+    turned = np.radians(carriers[:, 1])
+    return np.column_stack([np.sin(turned), np.cos(turned)]) / carriers[:, :1]
 
 
-def _apart(rig: Rig, carriers: list[tuple[float, float]], assumed: Assumptions) -> NDArray[np.intp]:
+def _apart(rig: Rig, carriers: NDArray[np.float64], assumed: Assumptions) -> NDArray[np.intp]:
     """Indices of pairs of carriers that can be told apart in the image, (n, 2)."""
     pairs = np.array(list(combinations(range(len(carriers)), 2)), dtype=np.intp).reshape(-1, 2)
     if not len(pairs):
@@ -183,14 +190,9 @@ def _apart(rig: Rig, carriers: list[tuple[float, float]], assumed: Assumptions) 
     first, second = cycles[pairs[:, 0]], cycles[pairs[:, 1]]
     least = 1.0 / assumed.image_px[1]
     apart = [np.hypot(*(first + sign * second).T) >= least for sign in (1, -1)]
-    angles = np.array([angle for _, angle in carriers])[pairs]
-    across = np.abs((angles[:, 0] - angles[:, 1] + 90.0) % 180.0 - 90.0) >= LEAST_ANGLE_DEG
+    first_deg, second_deg = carriers[pairs, 1].T
+    across = np.abs((first_deg - second_deg + 90.0) % 180.0 - 90.0) >= LEAST_ANGLE_DEG
     return pairs[apart[0] & apart[1] & across]
-
-
-def _family(carriers: list[tuple[float, float]], pair: NDArray[np.intp]) -> Crossed:
-    (first_px, first_deg), (second_px, second_deg) = (carriers[index] for index in pair)
-    return Crossed((first_px, second_px), (first_deg, second_deg))
 
 
 def _distances(
@@ -248,3 +250,89 @@ def _front(clearance: NDArray[np.float64], noise: NDArray[np.float64]) -> list[i
         if clearance[index] > 0 and (not front or noise[index] < noise[front[-1]]):
             front.append(index)
     return front
+
+
+def draw_design(rig: Rig, proposed: Candidate, other: Candidate, assumed: Assumptions) -> bytes:
+    """PNG of the ``proposed`` pair beside an ``other`` one on ``rig``: both lines on the torus, the distance of the
+    nearest rival over depth, and that distance for all pairs of periods at the proposed angles."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    lines = EpipolarLines.of(rig)
+    figure = Figure(figsize=(11, 10), layout="constrained", dpi=90)
+    plots = figure.subplots(2, 2)
+    for axes, candidate in zip(plots[0], (other, proposed), strict=True):
+        _draw_torus(axes, lines, candidate)
+    for candidate in (other, proposed):
+        turns = lines.turns(candidate.crossed)[:, None, :]
+        distance = nearest(turns, -_PLACES, 1.0 - _PLACES).min(axis=0)
+        plots[1, 0].plot(lines.depths_mm(_PLACES), distance, label=_title(candidate.crossed))
+    plots[1, 0].set(
+        title="nearest rival over depth", xlabel="depth, mm", ylabel="distance of the phases, rad", ylim=(0, None)
+    )
+    plots[1, 0].legend()
+    _draw_map(plots[1, 1], rig, lines, proposed, assumed)
+    picture = BytesIO()
+    FigureCanvasAgg(figure).print_png(picture)
+    return picture.getvalue()
+
+
+def _title(crossed: Crossed) -> str:
+    (first, second), (first_deg, second_deg) = crossed.pitches_px, crossed.angles_deg
+    return f"{first:g} / {second:g} px at {first_deg:g} / {second_deg:g} degrees"
+
+
+def _draw_torus(axes: "Axes", lines: EpipolarLines, candidate: Candidate) -> None:
+    """The phases of both carriers in turns, of the pixel with the nearest rival."""
+    turns = lines.turns(candidate.crossed)
+    pixel = int(np.argmin(rival_distance(turns)))
+    wrapped = _wrapped(turns[pixel], _PLACES)
+    axes.plot(*wrapped.T, lw=2, color="C0", label="working range")
+    for place, marker, label in ((0.0, "o", "near end"), (1.0, "s", "far end")):
+        axes.plot(*_wrapped(turns[pixel], np.array([place]))[0], marker, ms=9, color="C0", label=label)
+    if lines.background is not None:
+        axes.plot(
+            *_wrapped(turns[pixel], lines.background[pixel : pixel + 1])[0],
+            "x",
+            ms=11,
+            mew=3,
+            color="C3",
+            label="background",
+        )
+    axes.set(
+        title=f"{_title(candidate.crossed)}\nnearest rival {candidate.rival_rad:.2f} rad",
+        xlim=(0, 1),
+        ylim=(0, 1),
+        xlabel="phase of carrier 1, turns (near end: 0.5)",
+        ylabel="phase of carrier 2, turns",
+        aspect="equal",
+    )
+    axes.legend(loc="best", fontsize=8)
+
+
+def _wrapped(turns: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Phases (n, 2) in turns from 0 to 1, NaN where the line leaves the square."""
+    phases = (places[:, None] * turns + 0.5) % 1.0
+    phases[1:][(np.abs(np.diff(phases, axis=0)) > 0.5).any(axis=1)] = np.nan
+    return phases
+
+
+def _draw_map(axes: "Axes", rig: Rig, lines: EpipolarLines, proposed: Candidate, assumed: Assumptions) -> None:
+    first, second = (
+        np.arange(round(assumed.image_px[0] * pitch / image_px), round(assumed.image_px[1] * pitch / image_px) + 1.0)
+        for pitch, image_px in zip(proposed.crossed.pitches_px, proposed.image_px, strict=True)
+    )
+    turns = lines.turns(proposed.crossed) * np.array(proposed.crossed.pitches_px)
+    grid = np.stack(np.meshgrid(first, second, indexing="ij"), axis=-1)
+    distance = rival_distance(turns / grid[:, :, None, :]).min(axis=-1)
+    image = axes.imshow(
+        distance.T, origin="lower", extent=(first[0] - 0.5, first[-1] + 0.5, second[0] - 0.5, second[-1] + 0.5)
+    )
+    axes.plot(*proposed.crossed.pitches_px, "*", ms=14, color="white", mec="black")
+    first_deg, second_deg = proposed.crossed.angles_deg
+    axes.set(
+        title=f"nearest rival by periods, at {first_deg:g} / {second_deg:g} degrees",
+        xlabel="period of carrier 1, projector px",
+        ylabel="period of carrier 2, projector px",
+    )
+    axes.figure.colorbar(image, ax=axes, label="distance of the phases, rad")

@@ -11,17 +11,18 @@ from scipy.ndimage import uniform_filter1d
 from fpp_ml_bench.coding import Limits, PhaseShift
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.examination.findings import Examination, Finding
-from fpp_ml_bench.examination.lines import Lines, take_lines
 from fpp_ml_bench.examination.readings import AS_GIVEN, Fit, fit, search
 from fpp_ml_bench.examination.signals import (
     LEAST_PX,
     Edges,
     FringeSet,
+    Lines,
     equal_frames,
     fringe_sets,
     gray_edges,
     ripples,
     step_errors,
+    take_lines,
 )
 from fpp_ml_bench.optics import Direction, Rig
 

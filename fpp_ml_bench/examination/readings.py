@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.coding import GrayCells, GrayOnly, Limits, Reason
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.decoding import depth_and_reason, plan_direction
-from fpp_ml_bench.examination.lines import Lines
-from fpp_ml_bench.examination.signals import fringe_sets, gray_edges
+from fpp_ml_bench.examination.signals import Lines, fringe_sets, gray_edges
 from fpp_ml_bench.optics import AXES, Direction, Frame, Rig
 
 LARGEST_MISFIT = 0.2
@@ -191,13 +190,10 @@ def _single(rig: Rig, solid: bool) -> Iterator[Reading]:
         inverse = replace(rig, rotation=turned, translation_m=tuple((-rig.R.T @ rig.t).tolist()))
         change = "invert rotation and translation of the rig"
         yield Reading("a pose that goes from the projector to the camera", change, rig=inverse)
-    for ways in _direction_sets(rig):
-        of = f"{' and '.join(ways)} " if len(ways) < len(rig.directions) else ""
-        for what, change, frames_or_levels in _of_code(rig, runs, ways):
-            if callable(frames_or_levels):
-                yield Reading(of + what, change, levels=frames_or_levels)
-            else:
-                yield Reading(of + what, change, frames_or_levels)
+    alone = rig.directions if len(rig.directions) > 1 else ()
+    for ways, of in ((rig.directions, ""), *(((way,), f"{way} ") for way in alone)):
+        for reading in _of_code(rig, runs, ways):
+            yield replace(reading, what=of + reading.what)
     yield Reading("all frames inverted (black for white)", "invert the images", levels=_inverted)
     change = "rename the files in the opposite order"
     yield Reading("all frames in the opposite order", change, _placed(rig, everything[::-1]))
@@ -213,25 +209,22 @@ def _single(rig: Rig, solid: bool) -> Iterator[Reading]:
             yield Reading(f"frames in the order {', '.join(_names(frames, captured))}", change, _placed(rig, captured))
 
 
-def _of_code(
-    rig: Rig, runs: list[list[int]], ways: Sequence[Direction]
-) -> Iterator[tuple[str, str, tuple[int, ...] | Callable[[NDArray], NDArray]]]:
-    """What may be different in the codes of ``ways``: what, what to change, and where each frame is, or a change of the
-    grey levels."""
+def _of_code(rig: Rig, runs: list[list[int]], ways: Sequence[Direction]) -> Iterator[Reading]:
+    """What may be different in the codes of ``ways``."""
     frames, everything = rig.sequence.frames, list(range(len(rig.sequence)))
     own = [run for run in runs if frames[run[0]].direction in ways]
     sinusoids = [run for run in own if frames[run[0]].kind == "sinusoid" and len(run) > 2]
     bits = [run for run in own if frames[run[0]].kind == "gray"]
     if sinusoids:
         flipped = _moved(everything, sinusoids, lambda run: [run[0], *run[:0:-1]])
-        yield "phase shifts of the other sign", "change the entry sign of the sequence (1, -1)", flipped
+        yield Reading("phase shifts of the other sign", "change the entry sign of the sequence (1, -1)", flipped)
         for quarters in (1, 2, 3):
             if all(quarters * len(run) % 4 == 0 for run in sinusoids):
-                turned = _moved(everything, sinusoids, lambda run, q=quarters: _turned(run, -q))  # type: ignore[misc]
+                turned = _moved(everything, sinusoids, partial(_turned, quarters))
                 what = f"phases that are {90 * quarters} degrees further (sine for cosine)"
-                yield what, "give shifts_deg with this angle added", turned
-        backward = _moved(everything, sinusoids, lambda run: run[::-1])
-        yield "phase steps in the opposite order", "rename the files, or give shifts_deg in this order", backward
+                yield Reading(what, "give shifts_deg with this angle added", turned)
+        backward, change = _moved(everything, sinusoids, lambda run: run[::-1]), "give shifts_deg in this order"
+        yield Reading("phase steps in the opposite order", f"rename the files, or {change}", backward)
     if bits:
         for key, value, what in (
             ("least_first", True, "with the least significant bit first"),
@@ -241,15 +234,12 @@ def _of_code(
         ):
             place = _rearranged(rig, bits, **{key: value})
             if place != tuple(everything):
-                yield f"Gray code {what}", f"write {key}: {str(value).lower()}", place
+                yield Reading(f"Gray code {what}", f"write {key}: {str(value).lower()}", place)
         change = "project it as the rig file says, or exchange white and black of its images"
-        yield "Gray code that is inverted (black for white)", change, partial(_gray_levels, bits, True)
+        levels = partial(_gray_levels, bits, True)
+        yield Reading("Gray code that is inverted (black for white)", change, levels=levels)
         change = "project Gray code: at the edges of binary numbers several bits change at once"
-        yield "binary numbers for Gray code", change, partial(_gray_levels, bits, False)
-
-
-def _direction_sets(rig: Rig) -> list[tuple[Direction, ...]]:
-    return [rig.directions, *((way,) for way in rig.directions if len(rig.directions) > 1)]
+        yield Reading("binary numbers for Gray code", change, levels=partial(_gray_levels, bits, False))
 
 
 def _moved(everything: list[int], runs: list[list[int]], change: Callable[[list[int]], list[int]]) -> tuple[int, ...]:
@@ -275,8 +265,8 @@ def _rearranged(rig: Rig, runs: list[list[int]], **changes: Any) -> tuple[int, .
     return _moved(list(range(len(rig.sequence))), runs, captured)
 
 
-def _turned(run: list[int], quarters: int) -> list[int]:
-    start = quarters * len(run) // 4
+def _turned(quarters: int, run: list[int]) -> list[int]:
+    start = len(run) - quarters * len(run) // 4
     return run[start:] + run[:start]
 
 

@@ -1,5 +1,4 @@
 from .page import INDEX as INDEX
 from .page import SUBMISSIONS as SUBMISSIONS
-from .page import board_ladder as board_ladder
 from .page import page_files as page_files
 from .page import write_page as write_page

@@ -6,11 +6,10 @@ The page works from disk and from any web server and loads no other file. The sa
 import hashlib
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from fpp_ml_bench.baselines.tradeoff import Ladder, Rung, Tradeoff
+from fpp_ml_bench.baselines.tradeoff import Tradeoff
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS, RANGE_KEY, with_column
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
@@ -24,18 +23,16 @@ from fpp_ml_bench.leaderboard.data_files import table_csv, table_json
 from fpp_ml_bench.leaderboard.groups import Group, Ranked, scenes_of
 from fpp_ml_bench.leaderboard.page.pictures import CLASS_COLOURS
 from fpp_ml_bench.leaderboard.page.sections import blocks, tradeoff_section
-from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, rank, shipped_rows
+from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
 from fpp_ml_bench.leaderboard.reported import ReportedTable
 from fpp_ml_bench.leaderboard.row_file import Row
-from fpp_ml_bench.leaderboard.rows import MEANING, Entry, read_entry
+from fpp_ml_bench.leaderboard.rows import MEANING, Entry
 from fpp_ml_bench.leaderboard.trivial import more_than_trivial
 
 INDEX, DATA, TABLE, SUBMISSIONS = "index.html", "data.json", "data.csv", "submissions"
 _HERE, _PACKAGE = Path(__file__).resolve().parent, "fpp_ml_bench.leaderboard.page"
 _OWN_PAGES = re.compile(r"[a-z0-9-]+-[0-9a-f]{12}\.html")
 NOT_SAID = "not said"
-_BOARD_ROWS, _QUICK_BOARD_ROWS = (8, 16, 32, 64, 128), (4, 8, 16)
-_BOARD_ROW = "classical-18-vertical.json"
 
 
 def write_page(
@@ -157,32 +154,3 @@ def _search(row: Ranked) -> str:
     """What the search field finds a row by."""
     words = row.entry.name, row.short_name, row.entry.row.submission.method, columns.device(row.entry)
     return " ".join(words).casefold()
-
-
-def board_ladder(quick: bool = False) -> Ladder:
-    """For `fpp-bench tradeoff`: what ranking and the page cost over rows."""
-    return Ladder("rank and render the leaderboard", "rows", _QUICK_BOARD_ROWS if quick else _BOARD_ROWS, _board_rung)
-
-
-def _board_rung(rows: int, folder: Path) -> Rung:
-    """One shipped row under many names, each with its own error and time, so that marks and names do not coincide."""
-    first = read_entry(next(path for path in shipped_rows() if path.name == _BOARD_ROW))
-    entries = []
-    for number in range(rows):
-        row, factor = first.row, 1.03**number
-        about = row.submission.model_copy(update={"name": f"Method {number}"})
-        if (timing := row.timing) is not None:
-            keys = ("latency_median_ms", "latency_p5_ms", "latency_p95_ms")
-            changed = timing.model_copy(update={key: getattr(timing, key) * factor for key in keys})
-            about = about.model_copy(update={"timing": changed})
-        changes = {
-            "submission": about,
-            "metrics": row.metrics.model_copy(update={DEFAULT_SORT: factor}),
-            "predictions_sha256": f"{number:064x}",
-        }
-        entries.append(replace(first, row=row.model_copy(update=changes)))
-
-    def run() -> None:  # a dictionary that a run returns would be taken for the seconds of its parts
-        page_files(rank(entries), [])
-
-    return Rung(rows, run)

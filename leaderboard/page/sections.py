@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
-from fpp_ml_bench.baselines.tradeoff import COST_KEYS, Tradeoff, scatter
-from fpp_ml_bench.evaluation.report import interval_text, millimetres, signed
+from fpp_ml_bench.baselines.tradeoff import COST_KEYS, Tradeoff, scatter, tables
+from fpp_ml_bench.evaluation.report import interval_text, signed
 from fpp_ml_bench.leaderboard import columns
 from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, Group
 from fpp_ml_bench.leaderboard.page.pictures import MOST_LABELLED, drawn, overview_figures
@@ -21,8 +21,8 @@ _SHADES = 6
 
 
 def blocks(groups: Sequence[Group], slugs: Mapping[int, str]) -> list[dict[str, Any]]:
-    """What the template needs of each dataset: its title and a ``short`` one, whether it is ``main`` (the first, or of
-    today and not `GroupKey.aside`), notes on earlier data or rules, the pictures of all its rows, and its tables."""
+    """What the template needs of each dataset: its title and a ``short`` one, whether it is ``main`` (the first, or
+    not `GroupKey.aside`), the pictures of all its rows, and its tables."""
     datasets: list[dict[str, Any]] = []
     for data, members in groupby(groups, key=lambda group: group.key.data_title):
         of_data = list(members)
@@ -34,9 +34,8 @@ def blocks(groups: Sequence[Group], slugs: Mapping[int, str]) -> list[dict[str, 
                 "numbered": numbered if len(rows) <= MOST_LABELLED else [],
                 "id": f"data-{hashlib.sha256(data.encode()).hexdigest()[:8]}",
                 "title": data,
-                "short": f"earlier, {name}" if key.notes else key.aside or name,
-                "main": not datasets or not (key.notes or key.aside),
-                "notes": key.notes,
+                "short": key.aside or name,
+                "main": not datasets or not key.aside,
                 "figures": overview_figures(of_data, slugs),
                 "targets": sorted({group.key.against for group in of_data}),
                 "sections": [_section(group, _link(group, of_data)) for group in of_data],
@@ -105,40 +104,15 @@ def _matrix(group: Group) -> list[tuple[str, list[tuple[str, str, str] | None]]]
 
 
 def tradeoff_section(run: Tradeoff | None) -> dict[str, Any] | None:
-    """The section of a trade-off; None without one, or where no setting has both an error and a time."""
-    if run is None or not run.comparable():
+    """The section of a trade-off; None without one, or where no point is on a front."""
+    if run is None or not run.front("seconds"):
         return None
     pictures = []
     for cost in COST_KEYS:
         if picture := scatter(run, cost):
             about = f"Object MAE in mm against {picture.across}, both logarithmic"
             pictures.append(drawn(picture, "scatter", *_TRADEOFF_PICTURE, about))
-    by_time, by_frames = (run.front(cost) for cost in COST_KEYS)
-    rows = []
-    for point in sorted({p.key: p for p in (*by_time, *by_frames)}.values(), key=lambda p: p.object_mae_mm or 0):
-        fronts = " and ".join(name for name, front in (("time", by_time), ("frames", by_frames)) if point in front)
-        ms, low, high = point.ms
-        missing = "-" if point.missing_share is None else f"{100 * point.missing_share:.2g}%"
-        rows.append(
-            (
-                point.title,
-                fronts,
-                millimetres(point.object_mae_mm),
-                millimetres(point.measured_mae_mm),
-                missing,
-                f"{ms:.3g}",
-                f"{low:.3g} to {high:.3g}",
-                str(point.frames),
-            )
-        )
-    return {
-        "run": run,
-        "benchmark": benchmark_before(run.fingerprint),
-        "pictures": pictures,
-        "rows": rows,
-        "steepest": max(run.growth, key=lambda growth: growth.exponent, default=None),
-        "flagged": [f"{growth.stage} over {growth.over}" for growth in run.growth if growth.flag],
-    }
+    return {"benchmark": benchmark_before(run.fingerprint), "pictures": pictures, "tables": tables(run)}
 
 
 def _shade(error: float | None, low: float, high: float) -> int | None:

@@ -11,6 +11,7 @@ from fpp_ml_bench.calibration import Board, Calibration, Levels, Pose, Response,
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.errors import CalibrationError
 from fpp_ml_bench.examination import Examination, RefusedCapture, examine
+from fpp_ml_bench.files import visible
 from fpp_ml_bench.loaders.captures.images import read_frames
 from fpp_ml_bench.optics import AXES, Rig, load_projection, rotation_matrix
 
@@ -23,7 +24,7 @@ def pose_folders(captures: Path) -> list[Path]:
     """The folders of the poses below ``captures``, by name. Raises `CalibrationError` for fewer than three."""
     if not captures.is_dir():
         raise CalibrationError(f"{captures}: no such folder; expected one that holds a folder of frames for each pose")
-    folders = sorted(path for path in captures.iterdir() if path.is_dir() and not path.name.startswith("."))
+    folders = [path for path in visible(captures, CalibrationError) if path.is_dir()]
     if len(folders) < FEWEST_POSES:
         raise CalibrationError(
             f"{captures}: expected folders of at least {FEWEST_POSES} poses of the board, found {len(folders)}"

@@ -1,10 +1,14 @@
-"""A capture to depth: decoding with everything a user wants to know about it, and the files that hold it."""
+"""A capture to depth: decoding with everything a user wants to know about it, and a dataset of a scanner's captures.
+
+Each is decoded by the scanner's rig into the ground truth ``depth``, through the same crash-safe assembly as a build.
+What the rig can't decode is background there.
+"""
 
 import io
-import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +26,26 @@ from fpp_ml_bench.decoding import (
 )
 from fpp_ml_bench.errors import CaptureError, DecodeError
 from fpp_ml_bench.examination import Examination, RefusedCapture, examine
-from fpp_ml_bench.files import file_content, write_atomically
-from fpp_ml_bench.loaders.captures.exports import FORMS, REPORT, clear_outputs, export_capture
-from fpp_ml_bench.loaders.captures.images import CapturedFrames, read_frames
-from fpp_ml_bench.loaders.captures.picture import capture_picture
+from fpp_ml_bench.files import file_content
+from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.loaders.captures.images import (
+    Capture,
+    CapturedFrames,
+    Splits,
+    check_options,
+    find_captures,
+    read_frames,
+    split_captures,
+)
+from fpp_ml_bench.loaders.published.importing import ImportPlan, RowReader, import_plan, run_import
+from fpp_ml_bench.loaders.sample import Row
+from fpp_ml_bench.loaders.storage import CAPTURED, Manifest, Progress, ShardPlan
 from fpp_ml_bench.optics import Direction, Rig
 
 CLIPPED_SHARE = 0.02
 """A frame in which more of the lit pixels than this are at full scale is named."""
+LEAST_DECODED_SHARE = 0.005
+"""Of a capture's pixels. Below it nothing was measured but noise that passed by chance."""
 CAUSES = {
     Reason.NO_RAY: "the rig's lens model or pose is not this scanner's",
     Reason.LOW_MODULATION: "the fringes are too faint (too dark, overexposed, --min-modulation), or the frames are not "
@@ -76,9 +92,7 @@ def decode_capture(
     `RefusedCapture` where a finding makes the depth untrustworthy, unless ``anyway``; `CaptureError` for images of
     another size than the rig's, `DecodeError` where nothing can be decoded."""
     frames, names = capture.frames, [file.name for file in capture.files]
-    examination = examine_capture(capture, rig, direction, mask=mask, min_modulation=min_modulation)
-    if examination.refused and not anyway:
-        raise RefusedCapture(str(capture.files[0].parent), examination)
+    examination = examine_capture(capture, rig, direction, mask=mask, min_modulation=min_modulation, anyway=anyway)
     limits = Limits(min_modulation=min_modulation)
     decoded = decode_stack(frames, rig, direction, mask=mask, limits=limits, details=True, threads=threads)
     modulation = np.nanmax([measured.modulation for measured in decoded.details.values()], axis=0)
@@ -106,9 +120,11 @@ def examine_capture(
     *,
     mask: NDArray[np.bool_] | None = None,
     min_modulation: float = MIN_MODULATION,
+    anyway: bool = True,
 ) -> Examination:
     """What the frames of a capture say about themselves (`fpp_ml_bench.examination`), before they are decoded. Raises
-    `CaptureError` for images of another size than the rig's, `RigError` for a direction that it does not code."""
+    `CaptureError` for images of another size than the rig's, `RigError` for a direction that it does not code, and
+    unless ``anyway`` `RefusedCapture` where a finding makes the depth untrustworthy."""
     height, width = capture.frames.shape[1:]
     if (height, width) != (rig.camera.height, rig.camera.width):
         raise CaptureError(
@@ -119,7 +135,10 @@ def examine_capture(
     limits = Limits(min_modulation=min_modulation)
     check_limits(limits)
     names = [file.name for file in capture.files]
-    return examine(capture.frames, rig, names, directions=directions, mask=mask, limits=limits)
+    examination = examine(capture.frames, rig, names, directions=directions, mask=mask, limits=limits)
+    if examination.refused and not anyway:
+        raise RefusedCapture(str(capture.files[0].parent), examination)
+    return examination
 
 
 def main_reason(decoded: Decoded) -> Reason:
@@ -158,48 +177,127 @@ def read_mask(file: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
     return mask
 
 
-def write_capture(
-    folder: Path, capture: CapturedFrames, rig: Rig, result: DecodedCapture, forms: Sequence[str] = FORMS
-) -> None:
-    """Write a decoded capture in place of what an earlier decoding left in ``folder``: the ``forms`` of
-    `export_capture`, maps as .npy, a picture, and `REPORT` at last."""
-    clear_outputs(folder)
-    decoded, found = result.decoded, result.decoded.depth_mm > 0
-    export_capture(folder, decoded.depth_mm, rig.camera, result.grey, forms)
-    for name, values in (("sigma_mm", result.sigma_mm), ("modulation", result.modulation), ("reason", decoded.reason)):
-        buffer = io.BytesIO()
-        np.save(buffer, values)
-        write_atomically(folder / f"{name}.npy", buffer.getvalue())
-    title = f"{capture.files[0].parent.name}: {100 * found.mean():.1f}% of the pixels with depth"
-    maps = result.grey, decoded.depth_mm, result.sigma_mm, result.modulation, decoded.reason
-    findings = [str(finding) for finding in result.examination.findings]
-    write_atomically(folder / "picture.png", capture_picture(title, *maps, findings))
-    content = {
-        "pixels": decoded.counts,
-        "noise_grey": result.noise_grey,
-        "noise_measured": result.noise_measured,
-        "median_sigma_mm": float(np.median(result.sigma_mm[found])),
-        "notes": list(result.notes),
-        "reasons": {reason.name.lower(): int(reason) for reason in Reason},
+@dataclass(frozen=True)
+class CaptureReader(RowReader):
+    """Reads and decodes captures."""
+
+    captures: Mapping[str, Capture]
+    rig: Rig
+    limits: Limits
+    bits: int | None
+    colour: str | None
+    anyway: bool = False
+
+    @property
+    def samples(self) -> Mapping[str, Capture]:
+        return self.captures
+
+    def read(self, capture: Capture) -> Row:
+        """The capture's row: frames of 8 bits, and depth from the frames as they were captured. Raises `CaptureError`
+        for frames that can't be read, that are of another size than the rig's camera, that the examination refuses
+        (unless ``anyway``), and that give almost no depth."""
+        captured = read_frames(capture.files, bits=self.bits, colour=self.colour)
+        least = self.limits.min_modulation
+        examination = examine_capture(captured, self.rig, min_modulation=least, anyway=self.anyway)
+        try:
+            decoded = decode_stack(captured.frames, self.rig, limits=self.limits, details=True)
+        except DecodeError as error:
+            raise CaptureError(f"{capture.folder}: {error}") from error
+        measured = _measured(decoded, captured) | {"findings": [str(finding) for finding in examination.findings]}
+        if measured["decoded_share"] < LEAST_DECODED_SHARE:
+            reason = main_reason(decoded)
+            share = decoded.counts[reason.name.lower()] / decoded.reason.size
+            raise CaptureError(
+                f"{capture.folder}: only {100 * measured['decoded_share']:.2f}% of the pixels can be decoded, expected "
+                f"at least {100 * LEAST_DECODED_SHARE:g}%; {100 * share:.0f}% are refused as "
+                f"{reason.name.lower().replace('_', ' ')}: probably {CAUSES[reason]}"
+            )
+        frames = {index: _eight_bits(frame) for index, frame in enumerate(captured.frames)}
+        names = capture.sample, capture.object, capture.view
+        return Row(*names, frames, decoded.depth_mm, None, measured)
+
+
+def _eight_bits(frame: NDArray[Any]) -> NDArray[np.uint8]:
+    return frame if frame.dtype == np.uint8 else np.rint(frame).astype(np.uint8)
+
+
+def _measured(decoded: Decoded, captured: CapturedFrames) -> dict[str, Any]:
+    """Measurements for the manifest: share of the pixels with a depth, their median modulation in grey levels (of the
+    weaker direction), the share refused for each reason, and how the frames' levels were read."""
+    good = decoded.reason == Reason.DECODED
+    weakest = np.minimum.reduce([measured.modulation for measured in decoded.details.values()])
+    counts = {name: count for name, count in decoded.counts.items() if count and name != "decoded"}
+    return {
+        "decoded_share": float(good.mean()),
+        "median_modulation": float(np.median(weakest[good])) if good.any() else 0.0,
+        "refused_share": {name: count / good.size for name, count in counts.items()},
+        "full_scale": captured.full_scale,
+        "rounded": captured.frames.dtype != np.uint8,
+        "note": captured.note,
     }
-    _write_report(folder, capture, rig, result.examination, content)
 
 
-def write_refusal(folder: Path, capture: CapturedFrames, rig: Rig, examination: Examination) -> None:
-    """Write `REPORT` alone, in place of what an earlier decoding left in ``folder``."""
-    clear_outputs(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    _write_report(folder, capture, rig, examination, {})
+def _views(captures: list[Capture]) -> dict[str, list[str]]:
+    """Views of each object."""
+    views: dict[str, list[str]] = {}
+    for capture in captures:
+        views.setdefault(capture.object, []).append(capture.view)
+    return views
 
 
-def _write_report(
-    folder: Path, capture: CapturedFrames, rig: Rig, examination: Examination, content: Mapping[str, object]
-) -> None:
-    report = {
-        "rig": rig.to_dict(),
-        "frames": [file.name for file in capture.files],
-        "full_scale": capture.full_scale,
-        "examination": examination.to_dict(),
-        **content,
+def plan_captures(
+    root: Path,
+    rig: Rig,
+    splits: Splits | None = None,
+    limits: Limits | None = None,
+    bits: int | None = None,
+    colour: str | None = None,
+    anyway: bool = False,
+) -> ImportPlan[CaptureReader]:
+    """Find the captures ``root/{object}/{view}/`` or ``root/{object}/``, each a folder of all frames of
+    ``rig.sequence``. ``splits``: which objects are in which; None puts all into ``test``. ``limits``: of the decoder;
+    ``bits`` and ``colour``: see `read_frames`; ``anyway``: captures that the examination refuses too.
+    Raises `CaptureError` with a line for each folder that is no capture, `BuildError` for splits that are not of these
+    objects, `DecodeError` for an impossible limit."""
+    check_options(bits, colour)
+    check_limits(limits := limits or Limits())
+    captures = find_captures(root, len(rig.sequence))
+    by_split = split_captures(captures, splits)
+    pixels = rig.camera.height * rig.camera.width
+    plans: list[ShardPlan] = []
+    for split, chosen in by_split.items():
+        plans += storage.plan_rows(split, [(c.sample, c.object, c.view) for c in chosen], pixels)
+    settings = {
+        "layout": "captures",
+        "splits": "all in test" if splits is None else "given",
+        **asdict(limits),
+        "bits": bits,
+        "colour": colour,
+        "objects": {split: _views(chosen) for split, chosen in by_split.items()},
     }
-    write_atomically(folder / REPORT, (json.dumps(report, indent=1) + "\n").encode())
+    reader = CaptureReader({capture.sample: capture for capture in captures}, rig, limits, bits, colour, anyway)
+    return import_plan(reader, plans, CAPTURED, settings, "all")
+
+
+def import_captures(
+    folder: Path, plan: ImportPlan[CaptureReader], workers: int, progress: Progress = lambda rows: None
+) -> Manifest:
+    """Write the planned dataset into ``folder`` as `run_import`; the `CaptureError` lists every wrong capture."""
+    return run_import(folder, plan, workers, progress, lambda problems: CaptureError("\n  ".join(problems)))
+
+
+def capture_notes(manifest: Manifest) -> list[str]:
+    """Notes about a finished import for the user, a sentence each."""
+    rows = [row for part in manifest.samples.values() for row in part]
+    notes = []
+    if manifest.settings["splits"] != "given":
+        notes.append("no --splits given: all objects are in split test")
+    scales = sorted({row["full_scale"] for row in rows})
+    if any(row["rounded"] for row in rows):
+        notes.append("depth was decoded from the frames as captured; they are stored rounded to 8 bits")
+    notes += sorted({row["note"] for row in rows} - {""})
+    if len(scales) > 1:
+        listed = ", ".join(map(str, scales))
+        notes.append(f"white was taken as different levels ({listed}); give the camera's --bits to read all alike")
+    notes += [f"{row['sample']}: {finding}" for row in rows for finding in row["findings"]]
+    return notes

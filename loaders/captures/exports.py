@@ -1,21 +1,28 @@
-"""Depth of a capture in the forms that other programs read: .npy, .mat, 16-bit PNG, point cloud and mesh as PLY.
+"""What a decoding writes: depth in the forms that other programs read (.npy, .mat, 16-bit PNG, point cloud and mesh as
+PLY), other maps, a picture and a report.
 
 Points are in mm in the camera's frame (x right, y down, z forward), their normals point at the camera.
 """
 
 import io
+import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from textwrap import wrap
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fpp_ml_bench.coding import Reason
 from fpp_ml_bench.constants import GREY_LEVELS
+from fpp_ml_bench.containers import matrix_bytes
 from fpp_ml_bench.errors import CaptureError
-from fpp_ml_bench.files import write_files
-from fpp_ml_bench.loaders.published import matrix_bytes
-from fpp_ml_bench.optics import Pinhole
+from fpp_ml_bench.examination import Examination
+from fpp_ml_bench.files import write_atomically, write_files
+from fpp_ml_bench.loaders.captures.decoding import DecodedCapture
+from fpp_ml_bench.loaders.captures.images import CapturedFrames
+from fpp_ml_bench.optics import Pinhole, Rig
 
 FORMS = ("npy", "mat", "png", "ply", "mesh")
 REPORT = "decode.json"
@@ -67,29 +74,28 @@ def export_capture(
         raise CaptureError("depth_mm: no pixel has a depth, so there is nothing to write; check the capture's light")
     shade = None if grey is None else _checked(grey, camera, "grey", GREY_LEVELS)
     normals = pixel_normals(depth, camera, step_mm) if {"ply", "mesh"} & set(forms) else np.zeros((0, 0, 3))
-    contents: dict[str, bytes] = {}
-    for form in forms:
-        if form == "npy":
-            buffer = io.BytesIO()
-            np.save(buffer, depth)
-            contents["depth.npy"] = buffer.getvalue()
-        elif form == "mat":
-            contents["depth.mat"] = matrix_bytes({"depthMap": depth})
-        elif form == "png":
-            unit = _unit(float(depth.max()))
-            contents[f"depth_{unit:g}mm.png"] = _png(depth, unit)
-        elif form == "ply":
-            contents["points.ply"] = _ply(depth, camera, normals, shade, np.zeros((0, 3), np.int64))
-        else:
-            contents["mesh.ply"] = _ply(depth, camera, normals, shade, triangles(depth, camera, step_mm))
-    return write_files(Path(folder), contents, CaptureError)
+    no_faces = np.zeros((0, 3), np.int64)
+    written = {
+        "npy": lambda: ("depth.npy", _npy(depth)),
+        "mat": lambda: ("depth.mat", matrix_bytes({"depthMap": depth})),
+        "png": lambda: _png(depth),
+        "ply": lambda: ("points.ply", _ply(depth, camera, normals, shade, no_faces)),
+        "mesh": lambda: ("mesh.ply", _ply(depth, camera, normals, shade, triangles(depth, camera, step_mm))),
+    }
+    return write_files(Path(folder), dict(written[form]() for form in forms), CaptureError)
+
+
+def _npy(values: NDArray) -> bytes:
+    buffer = io.BytesIO()
+    np.save(buffer, values)
+    return buffer.getvalue()
 
 
 def pixel_normals(depth_mm: ArrayLike, camera: Pinhole, step_mm: float | None = None) -> NDArray[np.float64]:
     """Unit normals float64 (H, W, 3) of a depth map (H, W) in mm, towards the camera; 0 where there is no depth. From
     the differences to the neighbours that belong to the same surface (``step_mm`` as in `export_capture`), and along
     the ray where there are too few. Raises `CaptureError` as `export_capture`."""
-    rays, depth = _rays_and_depth(_checked(depth_mm, camera, "depth_mm"), camera)
+    rays, depth = _rays_and_depth(depth_mm, camera)
     points = rays * depth[..., None]
     tangents = []
     for one, other in (((_BEFORE, _ALL), (_AFTER, _ALL)), ((_ALL, _BEFORE), (_ALL, _AFTER))):
@@ -111,7 +117,7 @@ def triangles(depth_mm: ArrayLike, camera: Pinhole, step_mm: float | None = None
     pixels, row * W + column, in the order that makes their normals point at the camera. A square of four pixels is
     divided along the diagonal that gives more triangles, or has the smaller step. Raises `CaptureError` as
     `export_capture`."""
-    rays, depth = _rays_and_depth(_checked(depth_mm, camera, "depth_mm"), camera)
+    rays, depth = _rays_and_depth(depth_mm, camera)
     index = np.arange(depth.size).reshape(depth.shape)
     sides = (_FIRST, _RIGHT), (_FIRST, _BELOW), (_RIGHT, _ACROSS), (_BELOW, _ACROSS)
     top, left, right, bottom = (_joined(rays, depth, one, other, step_mm) for one, other in sides)
@@ -149,12 +155,12 @@ def _checked(values: ArrayLike, camera: Pinhole, name: str, most: float = np.inf
     return array
 
 
-def _rays_and_depth(depth_mm: NDArray[np.float64], camera: Pinhole) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rays (H, W, 3) with z = 1 and depth in mm; both 0 where the lens has no ray."""
+def _rays_and_depth(depth_mm: ArrayLike, camera: Pinhole) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rays (H, W, 3) with z = 1 and the checked depth in mm; both 0 where the lens has no ray."""
     x, y = camera.rays()
     seen = np.isfinite(x) & np.isfinite(y)
     rays = np.where(seen[..., None], np.stack([x, y, np.ones_like(x)], axis=-1), 0.0)
-    return rays, np.where(seen, depth_mm, 0.0)
+    return rays, np.where(seen, _checked(depth_mm, camera, "depth_mm"), 0.0)
 
 
 def _joined(
@@ -168,27 +174,25 @@ def _joined(
     return (near > 0) & (far > 0) & (np.abs(near - far) <= (STEEPEST * apart if step_mm is None else step_mm))
 
 
-def _unit(largest_mm: float) -> float:
-    """mm per level."""
+def _png(depth: NDArray[np.float32]) -> tuple[str, bytes]:
+    """Name and content, in the finest unit that fits."""
+    from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    largest_mm = float(depth.max())
     fitting = [unit for unit in MM_PER_LEVEL if largest_mm <= LARGEST_LEVEL * unit]
     if not fitting:
         limit = LARGEST_LEVEL * MM_PER_LEVEL[-1]
         raise CaptureError(
             f"depth_mm: {largest_mm:g} mm do not fit in a 16-bit PNG, whose limit is {limit:g} mm; use npy"
         )
-    return fitting[0]
-
-
-def _png(depth: NDArray[np.float32], unit: float) -> bytes:
-    from PIL import Image
-    from PIL.PngImagePlugin import PngInfo
-
+    unit = fitting[0]
     levels = np.rint(depth.astype(np.float64) / unit)
     levels = np.where(depth > 0, np.clip(levels, 1, LARGEST_LEVEL), 0).astype(np.uint16)
     text, buffer = PngInfo(), io.BytesIO()
     text.add_text("mm_per_level", f"{unit:g}")
     Image.fromarray(levels).save(buffer, format="PNG", pnginfo=text)
-    return buffer.getvalue()
+    return f"depth_{unit:g}mm.png", buffer.getvalue()
 
 
 def _ply(
@@ -201,7 +205,7 @@ def _ply(
     """The points with depth and the triangles between them."""
     import trimesh
 
-    rays, z = _rays_and_depth(depth.astype(np.float64), camera)
+    rays, z = _rays_and_depth(depth, camera)
     there = z > 0
     if not there.any():
         raise CaptureError("depth_mm: the camera's lens has no ray where there is depth; check its calibration")
@@ -239,3 +243,114 @@ def clear_outputs(folder: Path) -> None:
             path.unlink()
     except OSError as error:
         raise CaptureError(f"{error.filename}: can't be removed ({error.strerror}); give a new folder") from error
+
+
+def write_capture(
+    folder: Path, capture: CapturedFrames, rig: Rig, result: DecodedCapture, forms: Sequence[str] = FORMS
+) -> None:
+    """Write a decoded capture in place of what an earlier decoding left in ``folder``: the ``forms`` of
+    `export_capture`, maps as .npy, a picture, and `REPORT` at last."""
+    clear_outputs(folder)
+    decoded, found = result.decoded, result.decoded.depth_mm > 0
+    export_capture(folder, decoded.depth_mm, rig.camera, result.grey, forms)
+    for name, values in (("sigma_mm", result.sigma_mm), ("modulation", result.modulation), ("reason", decoded.reason)):
+        write_atomically(folder / f"{name}.npy", _npy(values))
+    title = f"{capture.files[0].parent.name}: {100 * found.mean():.1f}% of the pixels with depth"
+    maps = result.grey, decoded.depth_mm, result.sigma_mm, result.modulation, decoded.reason
+    findings = [str(finding) for finding in result.examination.findings]
+    write_atomically(folder / "picture.png", capture_picture(title, *maps, findings))
+    content = {
+        "pixels": decoded.counts,
+        "noise_grey": result.noise_grey,
+        "noise_measured": result.noise_measured,
+        "median_sigma_mm": float(np.median(result.sigma_mm[found])),
+        "notes": list(result.notes),
+        "reasons": {reason.name.lower(): int(reason) for reason in Reason},
+    }
+    _write_report(folder, capture, rig, result.examination, content)
+
+
+def write_refusal(folder: Path, capture: CapturedFrames, rig: Rig, examination: Examination) -> None:
+    """Write `REPORT` alone, in place of what an earlier decoding left in ``folder``."""
+    clear_outputs(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_report(folder, capture, rig, examination, {})
+
+
+def _write_report(
+    folder: Path, capture: CapturedFrames, rig: Rig, examination: Examination, content: Mapping[str, object]
+) -> None:
+    report = {
+        "rig": rig.to_dict(),
+        "frames": [file.name for file in capture.files],
+        "full_scale": capture.full_scale,
+        "examination": examination.to_dict(),
+        **content,
+    }
+    write_atomically(folder / REPORT, (json.dumps(report, indent=1) + "\n").encode())
+
+
+_REASONS = {
+    Reason.DECODED: "decoded",
+    Reason.NO_RAY: "no ray",
+    Reason.LOW_MODULATION: "low modulation",
+    Reason.SATURATED: "saturated",
+    Reason.INCONSISTENT_ORDER: "order not clear",
+    Reason.OUTSIDE_PATTERN: "outside the pattern",
+    Reason.DIRECTIONS_DISAGREE: "directions disagree",
+    Reason.OUTSIDE_RANGE: "outside the range",
+    Reason.NOT_ASKED: "not asked",
+}
+_COLUMNS = 250
+_COLOURS = ("#3ca951", "#9498a0", "#22252b", "#ff725c", "#efb118", "#a463f2", "#ff8ab7", "#4269d0", "#ffffff")
+
+
+def capture_picture(
+    title: str,
+    grey: NDArray,
+    depth_mm: NDArray[np.float32],
+    sigma_mm: NDArray[np.float32],
+    modulation: NDArray,
+    reason: NDArray[np.uint8],
+    findings: Sequence[str] = (),
+) -> bytes:
+    """PNG of maps (H, W): a frame in grey levels, depth and standard uncertainty in mm (0 = none), modulation in grey
+    levels, and `Reason` codes; the ``findings`` stand below it."""
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+
+    lines = [line for finding in findings for line in wrap(finding, _COLUMNS)]
+    figure = Figure(figsize=(17, 3.9 + 0.17 * len(lines)), dpi=100, layout="constrained")
+    if lines:
+        figure.supxlabel("\n".join(lines), fontsize=8, x=0.01, ha="left", color="#b00020")
+    figure.suptitle(title, fontsize=11)
+    found = depth_mm > 0
+    low, high = np.quantile(depth_mm[found], (0.005, 0.995)) if found.any() else (0.0, 1.0)
+    top = np.quantile(sigma_mm[found], 0.95) if found.any() else 1.0
+    panels = (
+        ("mean of the frames, grey levels", grey, "gray", 0.0, max(float(np.quantile(grey, 0.999)), 1.0)),
+        ("depth, mm", np.where(found, depth_mm, np.nan), "viridis", low, high),
+        ("standard uncertainty by noise, mm", np.where(found, sigma_mm, np.nan), "magma", 0.0, top),
+        ("modulation, grey levels", modulation, "gray", 0.0, float(max(np.nanmax(modulation, initial=1.0), 1.0))),
+    )
+    axes = figure.subplots(1, 5)
+    for plot, (name, image, colours, bottom, most) in zip(axes, panels, strict=False):
+        drawn = plot.imshow(image, cmap=colours, vmin=bottom, vmax=most, interpolation="nearest")
+        figure.colorbar(drawn, ax=plot, fraction=0.046, pad=0.02).ax.tick_params(labelsize=7)
+        plot.set_title(name, fontsize=9)
+    axes[4].imshow(reason, cmap=ListedColormap(_COLOURS), vmin=0, vmax=len(_COLOURS) - 1, interpolation="nearest")
+    axes[4].set_title("pixels", fontsize=9)
+    shares = np.bincount(reason.ravel(), minlength=len(_COLOURS)) / reason.size
+    handles = [
+        Patch(facecolor=_COLOURS[code], edgecolor="0.6", label=f"{name} {100 * shares[code]:.1f}%")
+        for code, name in _REASONS.items()
+        if shares[code] > 0
+    ]
+    axes[4].legend(handles=handles, fontsize=7, loc="upper left", bbox_to_anchor=(0.0, -0.02), ncols=2, frameon=False)
+    for plot in axes:
+        plot.set_xticks([])
+        plot.set_yticks([])
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    return content.getvalue()

@@ -1,14 +1,8 @@
-"""Frames that a camera captured: lossless image files of 8 to 16 bits, in the order of their names.
+"""Frames that a camera captured: lossless image files of 8 to 16 bits, in the order of their names; and a scanner's
+captures in folders, ``{object}/{view}/`` or ``{object}/``, with the split that each object belongs to."""
 
-Pillow decodes them, since it refuses files that are cut off where OpenCV returns part of an image. It reduces colour of
-16 bits to 8, which OpenCV therefore decodes, after Pillow found the file complete.
-"""
-
-import io
 import re
-import struct
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -17,11 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from fpp_ml_bench.constants import GREY_LEVELS
-from fpp_ml_bench.errors import CaptureError, LayoutError
-from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.published import png_chunks
+from fpp_ml_bench.constants import GREY_LEVELS, OBJECT_NAME, SPLITS, VIEW_NAME, sample_name
+from fpp_ml_bench.containers import LARGEST_BYTES, StoredImage, parse_image
+from fpp_ml_bench.errors import BuildError, CaptureError, PredictionError
+from fpp_ml_bench.files import file_content, read_yaml, visible
+from fpp_ml_bench.schema import StrictModel, Text, validate
 
 COLOURS = {
     "luminance": (0.299, 0.587, 0.114),
@@ -33,23 +29,13 @@ COLOURS = {
 """Weights of red, green and blue; luminance as in Rec. 601 and OpenCV's conversion to grey."""
 SUFFIXES = (".png", ".bmp", ".tif", ".tiff")
 _OTHER_IMAGES = (".jpg", ".jpeg", ".jpe", ".jp2", ".webp", ".gif", ".pgm", ".ppm", ".exr", ".hdr", ".raw", ".dng")
-_LOSSY = ("jpeg", "tiff_jpeg", "webp")
-_GREY_MODES, _COLOUR_MODES = ("L", "LA", "I", "I;16", "I;16L", "I;16B"), ("RGB", "RGBA", "P", "PA")
+_MODES = ("L", "LA", "I", "I;16", "I;16L", "I;16B", "RGB", "RGBA", "P", "PA")
 _WHOLE_BITS = (8, 10, 12, 14, 16)
-_LARGEST_BYTES = 1 << 30
-_BITS_PER_SAMPLE, _PHOTOMETRIC = 258, 262
-_THREADS = 4
-_ORIENTATION = 274
-_UPRIGHT: dict[int, Callable[[NDArray[Any]], NDArray[Any]]] = {
-    2: np.fliplr,
-    3: lambda levels: np.rot90(levels, 2),
-    4: np.flipud,
-    5: lambda levels: np.swapaxes(levels, 0, 1),
-    6: lambda levels: np.rot90(levels, -1),
-    7: lambda levels: np.swapaxes(np.rot90(levels, 2), 0, 1),
-    8: np.rot90,
-}
-"""What makes an image upright, by its EXIF orientation."""
+CAPTURE_AGAIN = "capture or copy it again"
+_THREADS = 2
+"""Each has a process that reads (`fpp_ml_bench.containers`)."""
+_QUARTER_TURNS, _MIRRORED = {3: 2, 4: 2, 5: -1, 6: -1, 7: 1, 8: 1}, (2, 4, 5, 7)
+"""What makes an image upright, by its EXIF orientation: a turn to the left, then left and right exchanged."""
 
 
 @dataclass(frozen=True)
@@ -95,8 +81,7 @@ def read_frames(
             f"{files[0].parent}: expected {count} frames, found {len(files)} ({first} to {last}); "
             "capture what is missing, or give a pattern that matches the frames only"
         )
-    with warnings.catch_warnings(), ThreadPoolExecutor(_THREADS) as pool:
-        warnings.simplefilter("ignore")  # of Pillow, about files that are refused below
+    with ThreadPoolExecutor(_THREADS) as pool:
         images = list(pool.map(lambda file: _read(file, colour), files))
     first_image = images[0]
     for file, image in zip(files, images, strict=True):
@@ -136,8 +121,7 @@ def frame_files(source: str | Path | Sequence[str | Path]) -> list[Path]:
         return files
     path, forms = Path(source), ", ".join(SUFFIXES)
     if path.is_dir():
-        files = [file for file in path.iterdir() if file.is_file() and not file.name.startswith(".")]
-        files = [file for file in files if file.suffix.lower() in (*SUFFIXES, *_OTHER_IMAGES)]
+        files = _images(path, (*SUFFIXES, *_OTHER_IMAGES))
         if not files:
             raise CaptureError(f"{path}: expected a folder with images ({forms}), found none; give the frames' folder")
     elif path.is_file():
@@ -196,94 +180,44 @@ def _full_scale(used: int, stored_bits: int, bits: int | None, where: Path) -> t
 
 def _read(file: Path, colour: str | None) -> _Image:
     """An image as grey levels, checked."""
-    from PIL import Image
-
-    forms = "expected a PNG, BMP or TIFF image"
-    if file.suffix.lower() in _OTHER_IMAGES and file.suffix.lower() not in (".jpg", ".jpeg", ".jpe"):
+    forms, suffix = "expected a PNG, BMP or TIFF image", file.suffix.lower()
+    if suffix in _OTHER_IMAGES and suffix not in (".jpg", ".jpeg", ".jpe"):
         raise CaptureError(f"{file}: {forms}, found a {file.suffix} file; convert it without loss, or leave it out")
+    if not file.is_file():
+        raise CaptureError(f"{file}: {forms}, found {'a folder' if file.is_dir() else 'nothing there'}")
+    content = file_content(file, LARGEST_BYTES, CaptureError, CAPTURE_AGAIN)
+    if not content:
+        raise CaptureError(f"{file}: {forms}, found a file of 0 bytes; {CAPTURE_AGAIN}")
     try:
-        if not file.is_file():
-            raise CaptureError(f"{file}: {forms}, found {'a folder' if file.is_dir() else 'nothing there'}")
-        if not 0 < (size := file.stat().st_size) <= _LARGEST_BYTES:
-            raise CaptureError(f"{file}: {forms}, found a file of {size} bytes; capture or copy it again")
-        content = file.read_bytes()
-    except OSError as error:
-        raise CaptureError(f"{file}: can't be read ({error.strerror or error})") from error
-    try:
-        image = Image.open(io.BytesIO(content), formats=("PNG", "BMP", "TIFF", "JPEG"))
-        if image.format in ("JPEG", "MPO") or image.info.get("compression") in _LOSSY:
-            lossy = "is compressed with loss (JPEG), and its blocks distort the phase"
-            raise CaptureError(f"{file}: {lossy}; capture the frames as PNG, BMP or TIFF")
-        if getattr(image, "n_frames", 1) != 1:
-            raise CaptureError(f"{file}: expected one image, found {image.n_frames}; write each frame to its own file")  # type: ignore[attr-defined]
-        _check_complete(content, image.format, file)
-        orientation = image.getexif().get(_ORIENTATION, 1)
-        image.load()
-        bits = _stored_bits(image, content)
-        levels = _levels(image, content, bits, orientation, file)
-    except CaptureError:
-        raise
-    except Exception as error:  # Pillow's readers raise errors of any kind on damaged files
-        damaged = f"found a file that is cut off, damaged or of another form ({printable(str(error), 100)})"
-        raise CaptureError(f"{file}: {forms}, {damaged}; capture or copy it again") from error
-    return _Image(_grey(levels, colour, file), bits, int(np.bitwise_or.reduce(levels, axis=None)))
-
-
-def _check_complete(content: bytes, form: str | None, file: Path) -> None:
-    """What Pillow lets pass: wrong checksums and a missing end of a PNG, a BMP shorter than it says."""
-    if form == "PNG":
-        try:
-            complete = [kind for kind, _ in png_chunks(content)][-1:] == [b"IEND"]
-        except LayoutError as error:
-            raise CaptureError(f"{file}: the PNG {error}; capture or copy it again") from error
-        if not complete:
-            raise CaptureError(f"{file}: the PNG is cut off; capture or copy it again")
-    elif form == "BMP" and len(content) < (expected := struct.unpack("<I", content[2:6])[0]):
-        raise CaptureError(
-            f"{file}: the BMP is cut off: expected {expected} bytes, found {len(content)}; copy it again"
-        )
-
-
-def _stored_bits(image: Any, content: bytes) -> int:
-    """Bits of a stored level or palette entry, as the file says."""
-    if image.format == "PNG":
-        return 8 if image.mode in ("P", "PA") else content[24]
-    if image.format == "TIFF":
-        return max(image.tag_v2.get(_BITS_PER_SAMPLE, (1,)))
-    pixel_bits = struct.unpack("<H", content[28:30])[0]
-    return 5 if pixel_bits == 16 else min(pixel_bits, 8)
-
-
-def _levels(image: Any, content: bytes, bits: int, orientation: int, file: Path) -> NDArray[Any]:
-    """Stored levels uint8 or uint16 (H, W), or (H, W, 3) red, green, blue, upright by the EXIF ``orientation``; opaque
-    alpha dropped."""
-    upright = _UPRIGHT.get(orientation, lambda levels: levels)
-    if image.mode not in _GREY_MODES + _COLOUR_MODES or not 8 <= bits <= 16:
-        kind = f"mode {image.mode} of {bits} bits; write whole grey levels"
-        raise CaptureError(f"{file}: expected grey levels or RGB of 8 to 16 bits, found {kind}")
-    if image.format == "TIFF" and bits > 8 and image.tag_v2.get(_PHOTOMETRIC) == 0:
-        raise CaptureError(f"{file}: the TIFF stores white as 0 (photometric 0); write it with black as 0")
-    transparent = CaptureError(f"{file}: has transparent pixels; write it without an alpha channel")
-    if "transparency" in image.info:
-        raise transparent
-    if bits > 8 and image.mode in (*_COLOUR_MODES, "LA"):
-        import cv2
-
-        stored = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-        if stored is None or stored.dtype != np.uint16 or stored.shape[:2] != image.size[::-1]:
-            raise CaptureError(f"{file}: colour of {bits} bits that OpenCV can't decode; write it as grey levels")
-        levels = stored[..., [2, 1, 0, *range(3, stored.shape[2])]]
-    else:
-        shown = image.convert("RGBA" if image.mode == "PA" else "RGB") if image.mode in ("P", "PA") else image
-        levels = np.asarray(shown).astype(np.uint16 if bits > 8 else np.uint8)
-    if image.format != "TIFF":  # Pillow and OpenCV turn a TIFF themselves
-        levels = upright(levels)
+        image = parse_image(content)
+    except PredictionError as error:
+        raise CaptureError(f"{file}: {error}; {CAPTURE_AGAIN}") from None
+    if problem := _problem(image):
+        raise CaptureError(f"{file}: {problem}")
+    levels = np.rot90(image.levels, _QUARTER_TURNS.get(image.orientation, 0))
+    if image.orientation in _MIRRORED:
+        levels = np.fliplr(levels)
     if levels.ndim == 3 and levels.shape[2] in (2, 4):
-        opaque = (1 << bits) - 1
-        if not (levels[..., -1] == opaque).all():
-            raise transparent
         levels = levels[..., 0] if levels.shape[2] == 2 else levels[..., :3]
-    return levels
+    return _Image(_grey(levels, colour, file), image.bits, int(np.bitwise_or.reduce(levels, axis=None)))
+
+
+def _problem(image: StoredImage) -> str | None:
+    """Why an image is no frame, and what to do."""
+    if image.lossy:
+        lossy = "is compressed with loss (JPEG), and its blocks distort the phase"
+        return f"{lossy}; capture the frames as PNG, BMP or TIFF"
+    if image.images != 1:
+        return f"expected one image, found {image.images}; write each frame to its own file"
+    if image.mode not in _MODES or not 8 <= image.bits <= 16:
+        kind = f"mode {image.mode} of {image.bits} bits; write whole grey levels"
+        return f"expected grey levels or RGB of 8 to 16 bits, found {kind}"
+    if image.bits > 8 and image.white_is_0:
+        return "the TIFF stores white as 0 (photometric 0); write it with black as 0"
+    alpha = image.levels[..., -1] if image.levels.ndim == 3 and image.levels.shape[2] in (2, 4) else None
+    if image.transparent or (alpha is not None and (alpha < (1 << image.bits) - 1).any()):
+        return "has transparent pixels; write it without an alpha channel"
+    return None
 
 
 def _grey(levels: NDArray[Any], colour: str | None, file: Path) -> NDArray[Any]:
@@ -299,3 +233,117 @@ def _grey(levels: NDArray[Any], colour: str | None, file: Path) -> NDArray[Any]:
         return np.ascontiguousarray(levels[..., ("red", "green", "blue").index(colour)])
     weights = COLOURS[colour]
     return (weights[0] * red + weights[1] * green + weights[2] * blue).astype(np.float32)
+
+
+SINGLE_VIEW = "single"
+"""View of an object whose folder holds the frames themselves."""
+
+
+@dataclass(frozen=True)
+class Capture:
+    """The frames of one view, in order."""
+
+    object: str
+    view: str
+    folder: Path
+    files: tuple[Path, ...]
+
+    @property
+    def sample(self) -> str:
+        return sample_name(self.object, self.view)
+
+
+class Splits(StrictModel):
+    """Objects of each split, as a YAML file lists them."""
+
+    train: list[Text] = Field(default_factory=list)
+    validation: list[Text] = Field(default_factory=list)
+    test: list[Text] = Field(default_factory=list)
+
+
+def read_splits(file: Path) -> Splits:
+    """The splits of a YAML file with lists of objects under train, validation and test. Raises `BuildError` naming the
+    file and every key that is wrong."""
+    return validate(Splits, read_yaml(file, BuildError), file, f"list of {', '.join(SPLITS)}", BuildError)
+
+
+def split_captures(captures: Iterable[Capture], splits: Splits | None) -> dict[str, list[Capture]]:
+    """The captures of each split that has any; all in ``test`` without ``splits``. Raises `BuildError` for an object in
+    two splits or twice in one, in none, or without captures."""
+    captures = list(captures)
+    if splits is None:
+        return {"test": captures}
+    objects = list(dict.fromkeys(capture.object for capture in captures))
+    places: dict[str, list[str]] = {}
+    for split in SPLITS:
+        for name in getattr(splits, split):
+            places.setdefault(name, []).append(split)
+    problems = [
+        f"object {name!r} is listed under {' and '.join(found)}; keep it in one split"
+        for name, found in places.items()
+        if len(found) > 1
+    ]
+    problems += [f"object {name!r} has no captures; remove it" for name in places if name not in objects]
+    problems += [f"object {name!r} is in no split; add it" for name in objects if name not in places]
+    if problems:
+        raise BuildError("\n  ".join([f"splits: expected each of {len(objects)} objects in one split", *problems]))
+    by_split = {split: [c for c in captures if places[c.object] == [split]] for split in SPLITS}
+    return {split: chosen for split, chosen in by_split.items() if chosen}
+
+
+def find_captures(root: Path, frames: int) -> list[Capture]:
+    """The captures below ``root``, of ``frames`` images each, by object and view in the order of their names. Names
+    that begin with a dot and other files are left out. Raises `CaptureError` with a line for each folder that is no
+    capture."""
+    if not root.is_dir():
+        raise CaptureError(f"{root}: expected a folder with a folder of frames for each object, found none there")
+    problems: list[str] = []
+    if _images(root):
+        problems.append(f"{root}: holds frames itself; move the frames of each object into a folder of its name")
+    captures: list[Capture] = []
+    for folder in _folders(root):
+        if not OBJECT_NAME.fullmatch(folder.name):
+            problems.append(f"{folder}: expected an object name of letters, digits, - and _; rename the folder")
+            continue
+        captures += _of_object(folder, frames, problems)
+    if not captures and not problems:
+        problems.append(f"{root}: holds no folder of an object; expected {root / 'OBJECT' / 'VIEW'} with the frames")
+    if problems:
+        raise CaptureError("\n  ".join(problems))
+    return captures
+
+
+def _of_object(folder: Path, frames: int, problems: list[str]) -> Iterable[Capture]:
+    views = _folders(folder)
+    if views and _images(folder):
+        problems.append(f"{folder}: holds frames and folders; give a folder of frames for each view, or frames alone")
+        return
+    for view in views or [folder]:
+        name = view.name if views else SINGLE_VIEW
+        if not VIEW_NAME.fullmatch(name):
+            suggested = f", such as {name.replace('_', '-')}" if "_" in name else ""
+            problems.append(
+                f"{view}: expected a view name of letters, digits and - (no _){suggested}; rename the folder"
+            )
+            continue
+        try:
+            files = frame_files(view)
+        except CaptureError as error:
+            problems.append(str(error))
+            continue
+        if len(files) != frames:
+            problems.append(
+                f"{view}: expected the {frames} frames of the rig's sequence, found {len(files)} ({files[0].name} to "
+                f"{files[-1].name}); capture what is missing, or give the rig that took them"
+            )
+            continue
+        yield Capture(folder.name, name, view, tuple(files))
+
+
+def _folders(folder: Path) -> list[Path]:
+    found = [path for path in visible(folder, CaptureError) if path.is_dir()]
+    return sorted(found, key=lambda path: natural_key(path.name))
+
+
+def _images(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> list[Path]:
+    return [path for path in visible(folder, CaptureError) if path.is_file() and path.suffix.lower() in suffixes]

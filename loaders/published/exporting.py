@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench import optics
 from fpp_ml_bench.constants import PUBLISHED_SPLIT_FOLDERS, VIEWS
+from fpp_ml_bench.containers import matrix_bytes, png_bytes
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import normalise, object_mask
 from fpp_ml_bench.errors import BuildError, DatasetError
 from fpp_ml_bench.files import LOCK_FILE, exclusive
 from fpp_ml_bench.loaders.published import tree
-from fpp_ml_bench.loaders.published.files import matrix_bytes, png_bytes
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
 from fpp_ml_bench.loaders.storage import (
     ALL_SPLITS,

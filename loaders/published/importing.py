@@ -1,22 +1,26 @@
 """Importing a published tree into the dataset format, through the same crash-safe assembly as a build. `SampleReader`
-reads a sample, fringe, depth in mm and raw frames, with every check on their contents."""
+reads a sample, fringe, depth in mm and raw frames, with every check on their contents. And what a tree's raw scans and
+depths say about the rig, whose pitch and projector are not published."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench import __version__
+from fpp_ml_bench.calibration import MOST_PX, DepthView, view_from_frames
+from fpp_ml_bench.containers import from_file, parse_image, parse_matrix
+from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mask
-from fpp_ml_bench.errors import LayoutError, RigError
+from fpp_ml_bench.errors import CaptureError, DecodeError, LayoutError, PredictionError, RigError
 from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.loaders.published import tree as published_tree
-from fpp_ml_bench.loaders.published.files import read_grey_png, read_matrix, read_scalar
 from fpp_ml_bench.loaders.published.order import AUTO, FrameOrder, check_order, find_order, parse_order
 from fpp_ml_bench.loaders.published.tree import VARIABLES, VARIANT_FOLDERS, PublishedSample, PublishedTree
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME, Row
@@ -24,14 +28,51 @@ from fpp_ml_bench.loaders.storage import Assembly, Manifest, Progress, ShardPlan
 from fpp_ml_bench.optics import Rig, paper_rig, rig_from_dict
 
 IMPORTED = "imported"
-_CHECK_THREADS = 4
+_CHECK_THREADS = 2
 _MOST_SCANS_TRIED = 6
+AGREEING_MM = 1.0
+"""Largest median difference between a tree's depth and what its own rig decodes from its frames: twice the error of
+the benchmark's ground truth."""
+_LEAST_PX_A_VIEW = 2000
 AGREEMENT_MM = 0.01
 """Accepted difference between variants of a depth map: float32 in m is exact to 0.0001 mm, and a wrong unit or file
 differs by mm."""
 _UNIT_SLACK = 10.0
 _ROUNDING = 1e-6
 _SHOWN_MISFITS = 3
+
+
+def read_grey_png(path: Path) -> NDArray[np.uint8]:
+    """Grey levels of an 8-bit PNG, uint8 (H, W); RGB is accepted where its three channels are equal. Raises
+    `LayoutError` naming the file when it is not a PNG, is cut off or damaged, has another bit depth or colour type, or
+    its channels differ."""
+    return from_file(_grey_levels, path, LayoutError)
+
+
+def _grey_levels(content: bytes) -> NDArray[np.uint8]:
+    published_tree.png_size(content)
+    image = parse_image(content)
+    if image.transparent:
+        raise PredictionError("has transparent colours; expected plain grey levels")
+    if image.levels.ndim == 2:
+        return image.levels
+    if (image.levels != image.levels[..., :1]).any():
+        raise PredictionError("an RGB image whose channels differ; expected grey levels")
+    return np.ascontiguousarray(image.levels[..., 0])
+
+
+def read_matrix(path: Path, variable: str) -> NDArray:
+    """Variable ``variable`` of a MATLAB file as `containers.parse_matrix`; `LayoutError` naming the file."""
+    return from_file(parse_matrix, path, LayoutError, variable)
+
+
+def read_scalar(path: Path, variable: str) -> float:
+    """A scalar that MATLAB stores as a 1 x 1 matrix. Raises `LayoutError` as `read_matrix`, or for another shape."""
+    matrix = read_matrix(path, variable)
+    if matrix.shape != (1, 1) or not np.isfinite(matrix).all():
+        shape = " x ".join(map(str, matrix.shape))
+        raise LayoutError(f"{path}: {variable}: expected a finite number stored as 1 x 1, got {shape} {matrix.dtype}")
+    return float(matrix[0, 0])
 
 
 @contextmanager
@@ -43,25 +84,80 @@ def _listed(problems: list[str]) -> Iterator[None]:
         problems.append(str(error))
 
 
+class RowReader:
+    """Picklable source of an import's rows: reads and checks one sample after the other."""
+
+    rig: Rig
+
+    @property
+    def samples(self) -> Mapping[str, Any]:
+        """What `read` takes, by sample; each has its ``files``."""
+        raise NotImplementedError
+
+    def read(self, sample: Any) -> Row:
+        """The row of one of ``samples``. Raises `LayoutError` or `CaptureError` for a wrong file."""
+        raise NotImplementedError
+
+    def __call__(self, plan: ShardPlan, folder: Path) -> Iterator[Row]:
+        for name, _, _ in plan.samples:
+            yield self.read(self.samples[name])
+
+    def problem(self, sample: Any) -> str | None:
+        """What is wrong with a sample; None where it can be read."""
+        try:
+            self.read(sample)
+        except (LayoutError, CaptureError) as error:
+            return str(error)
+        return None
+
+
+Reader = TypeVar("Reader", bound=RowReader)
+
+
+class ImportPlan(NamedTuple, Generic[Reader]):
+    """An import that is ready to start: the reader of the samples found, and the dataset to assemble."""
+
+    reader: Reader
+    assembly: Assembly
+
+
+def import_plan(
+    reader: Reader, plans: list[ShardPlan], origin: str, settings: dict[str, Any], stored: str
+) -> ImportPlan[Reader]:
+    """The plan of a dataset of ``reader``'s rows, with ``stored`` frames of its rig."""
+    camera, generator = reader.rig.camera, {"name": "fpp-ml-bench", "version": __version__}
+    size = camera.height, camera.width
+    manifest = Manifest(origin, generator, settings, reader.rig.to_dict(), size, stored, exact=False)
+    return ImportPlan(reader, Assembly(plans, reader, manifest))
+
+
+def run_import(
+    folder: Path, plan: ImportPlan, workers: int, progress: Progress, refusal: Callable[[list[str]], Exception]
+) -> Manifest:
+    """Write the planned dataset into ``folder``, or go on with one that was interrupted. When a sample can't be read,
+    all others are tried too, and ``refusal`` of all problems is raised. Raises `BuildError` as a build does, and when a
+    file changed after ``folder`` was finished."""
+    reader = plan.reader
+    storage.forget_outdated(folder, plan.assembly.plans, lambda name: reader.samples[name].files)
+    try:
+        return storage.assemble(folder, plan.assembly, workers, progress)
+    except (LayoutError, CaptureError) as error:
+        with ThreadPoolExecutor(_CHECK_THREADS) as pool:
+            problems = [problem for problem in pool.map(reader.problem, reader.samples.values()) if problem]
+        raise refusal(problems or [str(error)]) from error
+
+
 @dataclass(frozen=True)
-class SampleReader:
-    """Picklable source of an import's rows: reads and checks the files of one sample of ``tree`` after the other.
-    ``order`` None: raw frames are only checked, not read as frames of a sequence."""
+class SampleReader(RowReader):
+    """Reads the samples of ``tree``. ``order`` None: raw frames are only checked, not read as frames of a sequence."""
 
     tree: PublishedTree
     rig: Rig
     order: FrameOrder | None
 
-    def __call__(self, plan: ShardPlan, folder: Path) -> Iterator[Row]:
-        for stem, _, _ in plan.samples:
-            yield self.read(self.tree.by_name[stem])
-
-    def problems(self, sample: PublishedSample) -> list[str]:
-        """Problems of the sample's files, a line each; empty when the sample can be read."""
-        problems: list[str] = []
-        with _listed(problems):
-            self.read(sample)
-        return "\n".join(problems).splitlines()
+    @property
+    def samples(self) -> Mapping[str, PublishedSample]:
+        return self.tree.by_name
 
     def read(self, sample: PublishedSample) -> Row:
         """The sample's row, depth float32 mm, 0 = background. Raises `LayoutError` with a line for each wrong file."""
@@ -181,14 +277,7 @@ def _disagreement_mm(variant_mm: NDArray[np.float64], depth_mm: NDArray[np.float
     return float(np.abs(variant_mm - expected).max())
 
 
-class ImportPlan(NamedTuple):
-    """An import that is ready to start: the reader of the scanned tree, and the dataset to assemble."""
-
-    reader: SampleReader
-    assembly: Assembly
-
-
-def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> ImportPlan:
+def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> ImportPlan[SampleReader]:
     """Scan the tree at ``root`` and determine how it is read. ``rig``: the rig that took the images; None assumes the
     paper's rig, scaled to the image size. ``frame_order``: see `FrameOrder`; ``auto`` determines it from the first
     sample's images, and checks all others against it. Raises `LayoutError` listing all files that break the layout,
@@ -216,24 +305,15 @@ def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> 
         "ignored": list(tree.ignored),
         "objects": {split: list(dict.fromkeys(s.object for s in samples)) for split, samples in tree.samples.items()},
     }
-    generator = {"name": "fpp-ml-bench", "version": __version__}
-    manifest = Manifest(IMPORTED, generator, settings, rig_used.to_dict(), tree.size, stored, exact=False)
     reader = SampleReader(tree, rig_used, order)
-    return ImportPlan(reader, Assembly(plans, reader, manifest))
+    return import_plan(reader, plans, IMPORTED, settings, stored)
 
 
-def import_tree(folder: Path, plan: ImportPlan, workers: int, progress: Progress = lambda rows: None) -> Manifest:
-    """Write the planned import into ``folder``, or resume an interrupted import. Contents are checked as they are read.
-    When a file is wrong, all others are checked too, so that the `LayoutError` lists every wrong file. Raises
-    `BuildError` as a build does, and when the tree changed after ``folder`` was finished."""
-    samples = plan.reader.tree.by_name
-    storage.forget_outdated(folder, plan.assembly.plans, lambda sample: samples[sample].files)
-    try:
-        return storage.assemble(folder, plan.assembly, workers, progress)
-    except LayoutError as error:
-        with ThreadPoolExecutor(_CHECK_THREADS) as pool:
-            problems = [line for lines in pool.map(plan.reader.problems, samples.values()) for line in lines]
-        raise published_tree.layout_error(plan.reader.tree.root, problems or str(error).splitlines()) from error
+def import_tree(
+    folder: Path, plan: ImportPlan[SampleReader], workers: int, progress: Progress = lambda rows: None
+) -> Manifest:
+    """Write the planned import into ``folder`` as `run_import`; the `LayoutError` lists every wrong file."""
+    return run_import(folder, plan, workers, progress, partial(published_tree.layout_error, plan.reader.tree.root))
 
 
 def import_notes(manifest: Manifest) -> list[str]:
@@ -297,3 +377,47 @@ def _order_of(tree: PublishedTree, rig: Rig) -> FrameOrder:
         "give a rough rig, from which fpp-bench calibrate --from-depth TREE --camera ROUGH finds the exact one"
     )
     raise published_tree.layout_error(tree.root, [*refusals, hint])
+
+
+def tree_views(
+    reader: SampleReader, threads: int = 1, progress: Callable[[int], None] = lambda views: None
+) -> list[DepthView]:
+    """Phase and depth of all samples of a tree, some pixels of each. ``reader``: that of `plan_import`; of its rig,
+    camera, sequence and frame order are used. ``progress`` is called with numbers of views read. Raises `LayoutError`
+    for a tree without raw scans or a file that is wrong, `DecodeError` for frames that can't be decoded."""
+    if reader.order is None:
+        raise LayoutError(
+            f"{reader.tree.root}: has no raw scans; the rig is found from all frames of a view, in "
+            f"{published_tree.RAW_SCANS}/"
+        )
+    samples = list(reader.samples.values())
+    most_px = max(_LEAST_PX_A_VIEW, MOST_PX // len(samples))
+
+    def view(sample: PublishedSample) -> DepthView:
+        row = reader.read(sample)
+        measured = view_from_frames(sample.sample, _frames(row, reader.rig), row.depth_mm, reader.rig, most_px)
+        progress(1)
+        return measured
+
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(view, samples))
+
+
+def depth_difference_mm(reader: SampleReader) -> float | None:
+    """Median difference (absolute, mm) between the first sample's depth and what ``reader.rig`` decodes from its
+    frames; inf where it decodes less than half of the pixels or none, None for a tree without raw scans."""
+    if reader.order is None:
+        return None
+    row = reader.read(next(iter(reader.samples.values())))
+    try:
+        decoded_mm = decode_stack(_frames(row, reader.rig), reader.rig, mask=object_mask(row.depth_mm)).depth_mm
+    except DecodeError:
+        return float("inf")
+    both = object_mask(decoded_mm) & object_mask(row.depth_mm)
+    if 2 * np.count_nonzero(both) < np.count_nonzero(object_mask(row.depth_mm)):
+        return float("inf")
+    return float(np.median(np.abs(decoded_mm[both].astype(np.float64) - row.depth_mm[both])))
+
+
+def _frames(row: Row, rig: Rig) -> list[np.ndarray]:
+    return [row.frames[index] for index in range(len(rig.sequence))]

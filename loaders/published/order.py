@@ -21,13 +21,10 @@ AUTO = "auto"
 _Run = tuple[str, Direction]
 _Lit = list[NDArray[np.bool_]]
 """Which pixels of `_Lines.parts` the projector reaches: (lines, W) and (lines, H)."""
-_RUNS: tuple[_Run, _Run, _Run, _Run] = (
-    ("sinusoid", "horizontal"),
-    ("sinusoid", "vertical"),
-    ("gray", "horizontal"),
-    ("gray", "vertical"),
-)
-_SH, _SV, _GH, _GV = _RUNS
+_SH: _Run = "sinusoid", "horizontal"
+_SV: _Run = "sinusoid", "vertical"
+_GH: _Run = "gray", "horizontal"
+_GV: _Run = "gray", "vertical"
 LAYOUTS: dict[str, tuple[_Run, ...]] = {
     "paper": (_SH, _SV, _GH, _GV),
     "vertical-first": (_SV, _SH, _GV, _GH),

@@ -9,9 +9,10 @@ from functools import cached_property
 from pathlib import Path
 
 from fpp_ml_bench.constants import OBJECT_NAME, OBJECTS, PUBLISHED_SPLIT_FOLDERS, VIEWS, sample_name, split_sample_name
+from fpp_ml_bench.containers import PNG_GREY, PNG_HEADER_BYTES, PNG_RGB, png_header
 from fpp_ml_bench.depth import Normalisation
-from fpp_ml_bench.errors import LayoutError
-from fpp_ml_bench.loaders.published.files import read_png_size
+from fpp_ml_bench.errors import LayoutError, PredictionError
+from fpp_ml_bench.files import opened, visible
 
 TRAINING = "training_datasets"
 RAW_SCANS = "fpp_synthetic_dataset"
@@ -45,13 +46,30 @@ FilesBySplit = dict[str, dict[str, Path]]
 """The files of each split by stem (sample name); keys are this package's split names."""
 
 
+_COLOURS = {PNG_GREY: "grey", PNG_RGB: "RGB", 3: "palette", 4: "grey + alpha", 6: "RGB + alpha"}
+
+
+def png_size(start: bytes) -> tuple[int, int]:
+    """Size (H, W) of an 8-bit grey or RGB PNG, by the first bytes of its file; PredictionError for any other."""
+    header = png_header(start)
+    if header is None:
+        raise PredictionError("expected a PNG file, got other content")
+    if header.bits != 8:
+        raise PredictionError(f"expected an 8-bit PNG, got {header.bits} bits per channel; convert it to 8 bits")
+    if header.colour not in (PNG_GREY, PNG_RGB):
+        colour = _COLOURS.get(header.colour, header.colour)
+        raise PredictionError(f"expected a grey PNG, or RGB with equal channels, got {colour}")
+    return header.size
+
+
 def frame_file(index: int) -> str:
     """File name of frame ``index`` in a raw scan."""
     return f"A_{index}.png"
 
 
 def layout_error(root: object, problems: list[str]) -> LayoutError:
-    """The error that lists the problems of a tree, at most `LISTED_PROBLEMS` of them."""
+    """The error that lists the problems of a tree, a line each, at most `LISTED_PROBLEMS` of them."""
+    problems = "\n".join(problems).splitlines()
     shown = problems[:LISTED_PROBLEMS]
     if len(problems) > len(shown):
         shown.append(f"... and {len(problems) - len(shown)} more")
@@ -116,13 +134,6 @@ def _locate(root: Path) -> tuple[Path, Path | None]:
     )
 
 
-def _entries(folder: Path) -> list[Path]:
-    try:
-        return sorted(path for path in folder.iterdir() if not path.name.startswith("."))
-    except OSError as error:
-        raise LayoutError(f"{folder}: can't be read ({error.strerror or error})") from error
-
-
 def scan_tree(root: Path, frames: int) -> PublishedTree:
     """Scan the tree at ``root``, whose raw scans have ``frames`` files. Raises `LayoutError` listing all problems.
     ``root`` holds ``training_datasets/`` and maybe ``fpp_synthetic_dataset/``, or is ``training_datasets`` itself."""
@@ -162,7 +173,7 @@ class _Scan:
     def _folders(self, folder: Path, names: Collection[str], listed: str) -> list[Path]:
         """Folders called ``names`` in a folder; reports everything else in it."""
         folders = []
-        for entry in _entries(folder):
+        for entry in visible(folder, LayoutError):
             if entry.name in names and entry.is_dir():
                 folders.append(entry)
             else:
@@ -174,7 +185,7 @@ class _Scan:
             self.problems.append(f"{folder}: the folder is missing")
             return {}
         files = {}
-        for entry in _entries(folder):
+        for entry in visible(folder, LayoutError):
             name, _, view = entry.stem.rpartition("_")
             if entry.suffix != suffix or not entry.is_file():
                 self._foreign(entry, f"files ending in {suffix}")
@@ -239,7 +250,7 @@ class _Scan:
         stems_with_depth = {stem for split in fringes.values() for stem in split}
         names = [frame_file(index) for index in range(frames)]
         scans: dict[str, tuple[Path, ...]] = {}
-        for folder in _entries(root):
+        for folder in visible(root, LayoutError):
             if not folder.is_dir():
                 self._foreign(folder, "one folder per object")
                 continue
@@ -248,7 +259,7 @@ class _Scan:
                 if stem not in stems_with_depth:
                     self.problems.append(f"{view}: a raw scan without depth; {TRAINING} has no sample {stem}")
                     continue
-                present = {entry.name: entry for entry in _entries(view)}
+                present = {entry.name: entry for entry in visible(view, LayoutError)}
                 self.problems += [f"{view / name}: is missing" for name in names if name not in present]
                 for name in sorted(set(present) - set(names) - set(NOT_STORED)):
                     self._foreign(present[name], f"{names[0]} to {names[-1]}, {', '.join(NOT_STORED)}")
@@ -300,9 +311,10 @@ class _Scan:
         sizes: dict[Path, tuple[int, int]] = {}
         for path in (path for sample in samples for path in (*sample.fringes, *sample.frames)):
             try:
-                sizes[path] = read_png_size(path)
-            except LayoutError as error:
-                self.problems.append(str(error))
+                with opened(path, links=True) as (stream, _):
+                    sizes[path] = png_size(stream.read(PNG_HEADER_BYTES))
+            except PredictionError as error:
+                self.problems.append(f"{path}: {error}")
         if not sizes:
             return 0, 0
         common = Counter(sizes.values()).most_common(1)[0][0]

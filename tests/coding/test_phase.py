@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.restoration import unwrap_phase
 
-from fpp_ml_bench.coding.phase import choose_steps, phase_weights, wrapped_phase
+from fpp_ml_bench.coding.phase_shift import choose_steps, phase_weights, wrapped_phase
 from fpp_ml_bench.decoding.blocks import CLIPPED_STEPS_DIVISOR
 from fpp_ml_bench.errors import DecodeError
 

@@ -93,19 +93,19 @@ def test_direct_light_keeps_projector_sensor_and_brightness():
 def test_a_move_shifts_the_phase_and_keeps_outline_and_brightness(opened, renderer, scenes):
     sample_scene, sequence = scenes.original, opened.sequence
     before = scenes.layer.at(sample_scene.target).absolute_phase(sample_scene.depth_mm[sample_scene.target])
-    names = [move.name for move in scenes.moves]
-    assert set(names) == {"constant", "ramp across", "ramp down", "bump"}
+    moves = scenes.of_kind("phase", "constant")
+    assert {move.name for move in moves} == {"constant", "ramp across", "ramp down", "bump"}
     near_mm, far_mm = renderer.rig.working_range_mm
-    for move in scenes.moves:
+    for move in moves:
         assert ((move.depth_mm > 0) == (sample_scene.depth_mm > 0)).all()
         object_depths = move.depth_mm[move.depth_mm > 0]
         assert near_mm - 1e-6 <= object_depths.min() and object_depths.max() <= far_mm + 1e-6
         shift = scenes.layer.at(sample_scene.target).absolute_phase(move.depth_mm[sample_scene.target]) - before
         assert np.abs(shift).max() <= abs(move.amplitude_rad) + 1e-9 <= LARGEST_SHIFT_RAD + 2e-9
-        white = renderer.frames(move.phase, [sequence.white])[sequence.white]
+        white = renderer.frames(move.scene, [sequence.white])[sequence.white]
         np.testing.assert_array_equal(white, renderer.frames(sample_scene.scene, [sequence.white])[sequence.white])
-    bump = next(move for move in scenes.moves if move.name == "bump")
-    fringe, unmoved = (renderer.frames(scene, [0])[0] for scene in (bump.light, sample_scene.scene))
+    bump = next(move for move in scenes.of_kind("light") if move.name == "bump")
+    fringe, unmoved = (renderer.frames(scene, [0])[0] for scene in (bump.scene, sample_scene.scene))
     assert (fringe != unmoved).any()
 
 
@@ -169,12 +169,13 @@ def test_crossed_fringes_are_mirrored_and_widened():
 def test_another_outline_leaves_what_is_kept_as_it_was(renderer, scenes):
     sample_scene = scenes.original
     frame = renderer.frames(sample_scene.scene, [0])[0]
-    assert [outline_change.name for outline_change in scenes.outline_changes] == [
+    outline_changes = scenes.of_kind("outline")
+    assert [outline_change.name for outline_change in outline_changes] == [
         "ellipse",
         "another object's outline",
         "grown",
     ]
-    for outline_change in scenes.outline_changes:
+    for outline_change in outline_changes:
         unchanged = outline_change.scene.mask & sample_scene.target
         assert unchanged.any() and (outline_change.name == "grown" or (outline_change.scene.mask == unchanged).all())
         changed_frame = renderer.frames(outline_change.scene, [0])[0]
@@ -182,26 +183,27 @@ def test_another_outline_leaves_what_is_kept_as_it_was(renderer, scenes):
         assert (changed_frame != frame).any()
         masked_frame = renderer.frames(outline_change.scene, [0], masked=True)[0]
         assert (masked_frame[~outline_change.scene.mask] == 0).all()
-    ellipse, _, grown = scenes.outline_changes
+    ellipse, _, grown = outline_changes
     assert 0.45 < ellipse.scene.mask.sum() / sample_scene.target.sum() < 0.55
     assert (sample_scene.target <= grown.scene.mask).all() and sample_scene.target.sum() < grown.scene.mask.sum()
 
 
 def test_fringes_are_removed_swapped_and_widened_where_it_says(opened, renderer, scenes):
     sample_scene, sequence = scenes.original, opened.sequence
+    reprojected = {variant.name: variant.scene for variant in scenes.of_kind("projected")}
     inside = np.zeros(renderer.shape, dtype=bool)
     inside.ravel()[sample_scene.surface.pixels] = True
     steps = [*sequence.sinusoids("horizontal")[:6]]
     usual = np.stack([renderer.frames(sample_scene.scene, steps)[index] for index in steps]).astype(float)
 
     def swing(name):
-        frames = renderer.frames(scenes.reprojected[name], steps)
+        frames = renderer.frames(reprojected[name], steps)
         return np.ptp(np.stack([frames[index] for index in steps]).astype(float), axis=0)
 
     bright = np.ptp(usual, axis=0) > 30
     assert (swing("no fringe inside")[bright & inside] < 15).all()
     # The mean of whole periods is half of white light.
-    level = renderer.frames(scenes.reprojected["no fringe inside"], steps)[steps[0]][inside].astype(float)
+    level = renderer.frames(reprojected["no fringe inside"], steps)[steps[0]][inside].astype(float)
     white, black = (
         renderer.frames(sample_scene.scene, [index])[index][inside].astype(float)
         for index in (sequence.white, sequence.black)
@@ -209,12 +211,12 @@ def test_fringes_are_removed_swapped_and_widened_where_it_says(opened, renderer,
     assert np.median(level - (white + black) / 2) == pytest.approx(0, abs=1.0)
     np.testing.assert_array_equal(swing("no fringe inside")[~inside], np.ptp(usual, axis=0)[~inside])
     np.testing.assert_array_equal(swing("no fringe outside")[inside], np.ptp(usual, axis=0)[inside])
-    swapped = renderer.frames(scenes.reprojected["other direction"], [0, sequence.white])
+    swapped = renderer.frames(reprojected["other direction"], [0, sequence.white])
     np.testing.assert_array_equal(swapped[0], renderer.frames(sample_scene.scene, [sequence.steps])[sequence.steps])
     np.testing.assert_array_equal(
         swapped[sequence.white], renderer.frames(sample_scene.scene, [sequence.white])[sequence.white]
     )
-    column = renderer.frames(scenes.reprojected["other pitch"], [0])[0][:, 4].astype(float)
+    column = renderer.frames(reprojected["other pitch"], [0])[0][:, 4].astype(float)
     plain = renderer.frames(sample_scene.scene, [0])[0][:, 4].astype(float)
 
     def period(values):

@@ -215,7 +215,7 @@ class Counted:
     def applies_to(self, model):
         return None
 
-    def run(self, model, dataset, settings, folder, progress):
+    def run(self, model, dataset, settings, progress):
         self.runs += 1
         if settings.samples == 13:
             raise KeyboardInterrupt
@@ -249,9 +249,8 @@ def test_findings_come_back_as_they_were_and_only_whole(tmp_path):
         "Said.",
         {"a": [1, None], "b": {"c": 0.5}},
         (Table("T", ("x", "y"), (("a", 1.5), ("b", None))),),
-        (Figure("F", "f.png", "alt"),),
+        (Figure("F", "f.png", "alt", b"png"),),
     )
-    (tmp_path / "f.png").write_bytes(b"png")
     save_finding(tmp_path, "key", finding, 1.25)
     stored, seconds = load_finding(tmp_path, "linear", "key")
     assert seconds == 1.25 and stored.values == finding.values and stored.figures == finding.figures
@@ -277,7 +276,7 @@ def test_text_of_a_finding_can_only_be_text(tmp_path):
         "hardware": {"cpu": "c", "cores": 1},
     }
     table = Table("<u>", ("<u>",), (("<script>",), (0.123456,), (None,)))
-    page = diagnosis.report_page(context, [("<q>?", Finding("linear", "<t>", "<s>", tables=(table,)))], tmp_path)
+    page = diagnosis.report_page(context, [("<q>?", Finding("linear", "<t>", "<s>", tables=(table,)))])
     for tag in ("<b>x", "<script>", "<s>", "<t>", "<u>", "<q>", "fpp-bench <i>"):
         assert tag not in page
     assert "0.1235" in page

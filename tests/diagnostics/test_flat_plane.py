@@ -10,8 +10,9 @@ import torch
 from fpp_ml_bench.baselines.diagnostics import flat_plane
 from fpp_ml_bench.baselines.diagnostics.counterfactual import Counterfactual
 from fpp_ml_bench.baselines.diagnostics.diagnosis import save_finding
-from fpp_ml_bench.baselines.diagnostics.flat_plane import FlatPlane, Scale
-from fpp_ml_bench.baselines.diagnostics.plane_attention import (
+from fpp_ml_bench.baselines.diagnostics.flat_plane import (
+    FlatPlane,
+    Scale,
     attention_table,
     draw_attention,
     plane_heat,
@@ -42,14 +43,13 @@ def answering(dataset, answer, units="mm"):
 
 
 @pytest.fixture(scope="module")
-def decoded(opened, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("planes")
+def decoded(opened):
     exact = subject_of_method(load_method("classical", opened.rig, direction="horizontal"), opened)
-    return FlatPlane().run(exact, opened, ProbeSettings(quick=True), folder, silent), folder
+    return FlatPlane().run(exact, opened, ProbeSettings(quick=True), silent)
 
 
-def test_the_exact_decoder_finds_every_plane(decoded):
-    finding, folder = decoded
+def test_the_exact_decoder_finds_every_plane(decoded, tmp_path):
+    finding = decoded
     planes = finding.values["planes"]
     assert {row["distance_m"] for row in planes} == {1.6, 1.8, 2.0}
     assert {row["outline"] for row in planes} == {*flat_plane.SIDES, "power_drill_A0"}
@@ -57,14 +57,14 @@ def test_the_exact_decoder_finds_every_plane(decoded):
         assert row["collapsed_share"] == 0 and row["mae_mm"] < 1
         assert row["mean_mm"] == pytest.approx(1000 * row["distance_m"], abs=0.5)
     assert finding.values["objects"]["collapsed_share"] <= 0.02 and finding.values["range_mm"] is None
-    assert all((folder / figure.file).stat().st_size > 5000 for figure in finding.figures)
-    save_finding(folder, "key", finding, 1.0)
+    assert all(len(figure.png) > 5000 for figure in finding.figures)
+    save_finding(tmp_path, "key", finding, 1.0)
 
 
-def test_background_everywhere_is_a_collapse(opened, tmp_path, monkeypatch):
+def test_background_everywhere_is_a_collapse(opened, monkeypatch):
     monkeypatch.setattr(flat_plane, "draw", lambda *arguments: [])
     background = answering(opened, lambda frames: np.full(frames[51].shape, 0.05), "normalised")
-    finding = FlatPlane().run(background, opened, ProbeSettings(quick=True), tmp_path, silent)
+    finding = FlatPlane().run(background, opened, ProbeSettings(quick=True), silent)
     assert all(row["collapsed_share"] == 1 for row in finding.values["planes"])
     low, high = finding.values["range_mm"]
     records = [opened.measured(sample) for sample in opened.samples("test")]
@@ -76,11 +76,11 @@ def test_background_everywhere_is_a_collapse(opened, tmp_path, monkeypatch):
     assert "100% of a rectangular plane" in finding.summary
 
 
-def test_the_rectangle_grows_and_a_collapse_from_a_side_on_is_told(opened, tmp_path, monkeypatch):
+def test_the_rectangle_grows_and_a_collapse_from_a_side_on_is_told(opened, monkeypatch):
     """A model that predicts background where less than half of its image is lit."""
     monkeypatch.setattr(flat_plane, "draw", lambda *arguments: [])
     half_lit = answering(opened, lambda frames: np.full(frames[51].shape, (frames[51] < 60).mean()), "normalised")
-    finding = FlatPlane().run(half_lit, opened, ProbeSettings(quick=True), tmp_path, silent)
+    finding = FlatPlane().run(half_lit, opened, ProbeSettings(quick=True), silent)
     sizes = [row for row in finding.values["planes"] if row["outline"] in flat_plane.GROWING]
     height, width = opened.size
     assert len(sizes) == 9
@@ -108,14 +108,14 @@ def test_who_is_told_the_mask_is_not_asked(opened):
 
 def test_the_counterfactual_probe_reports_and_draws(opened, tmp_path):
     still = answering(opened, lambda frames: np.full(frames[51].shape, 1800.0))
-    finding = Counterfactual().run(still, opened, ProbeSettings(quick=True), tmp_path, silent)
+    finding = Counterfactual().run(still, opened, ProbeSettings(quick=True), silent)
     assert finding.values["reliance"]["score"] == 0
     assert "does not follow the phase" in finding.summary
-    assert all((tmp_path / figure.file).stat().st_size > 5000 for figure in finding.figures)
+    assert all(len(figure.png) > 5000 for figure in finding.figures)
     save_finding(tmp_path, "key", finding, 1.0)
 
 
-def test_heat_on_the_plane_is_where_a_linear_network_looks(tmp_path):
+def test_heat_on_the_plane_is_where_a_linear_network_looks():
     """Of out = 2 (0.5 x) the heatmap is the image over the number of pixels; random weights here look away from it."""
     network = torch.nn.Sequential(torch.nn.Conv2d(1, 1, 1, bias=False), torch.nn.Conv2d(1, 1, 1, bias=False))
     for layer, weight in zip(network, (0.5, 2.0), strict=True):
@@ -139,4 +139,4 @@ def test_heat_on_the_plane_is_where_a_linear_network_looks(tmp_path):
     assert shares["trained"]["first"] == pytest.approx(expected, rel=64 * U32)
     assert shares["untrained"]["first"] is None
     assert attention_table(shares).rows == [("first", shares["trained"]["first"], None)]
-    assert (tmp_path / draw_attention(frame, heat, tmp_path).file).stat().st_size > 3000
+    assert len(draw_attention(frame, heat).png) > 3000

@@ -1,6 +1,6 @@
 """Grad-CAM against gradients by hand, and the correlations that are made of it."""
 
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -13,14 +13,12 @@ from fpp_ml_bench.baselines.diagnostics.grad_cam import (
     EDGES,
     FRINGES,
     OWN,
-    Correlations,
     GradCam,
-    Mean,
     cam_layers,
     correlation,
     heatmaps,
+    means_of,
     measure,
-    ratio,
     ratio_text,
 )
 from fpp_ml_bench.baselines.diagnostics.probe import silent
@@ -83,19 +81,20 @@ def test_correlation_is_pearsons():
 
 
 def test_means_leave_out_maps_that_are_constant_and_average_layers_as_the_paper_does():
-    correlations = Correlations(("a", "b"), ["x", "x", "y"])
-    for layer, edges in (("a", [0.4, 0.2, None]), ("b", [0.1, 0.1, 0.1])):
-        for r in edges:
-            correlations.add("trained", layer, EDGES, r)
-            correlations.add("trained", layer, FRINGES, 0.1)
+    correlations = {("trained", layer, target): [0.1] * 3 for layer in "ab" for target in (EDGES, FRINGES)}
+    correlations["trained", "a", EDGES] = [0.4, 0.2, None]
     for seed, r in ((0, 0.2), (1, 0.4)):
-        for _ in range(3):
-            correlations.add(f"untrained {seed}", "a", OWN, r)
-    assert correlations.mean("a", EDGES).r == pytest.approx(0.3) and correlations.mean("a", EDGES).samples == 2
-    assert correlations.mean("a", OWN, trained=False).r == pytest.approx(0.3)
-    assert correlations.average(EDGES).r == pytest.approx(0.2)
-    assert ratio(correlations.average(EDGES).r, correlations.average(FRINGES).r) == pytest.approx(2)
-    assert ratio(0.1, 0.0) is None and ratio(None, 0.1) is None
+        for layer, target in product("ab", (EDGES, FRINGES, OWN)):
+            correlations[f"untrained {seed}", layer, target] = [r if target == OWN else None] * 3
+    means = means_of(correlations, ("a", "b"), ["x", "x", "y"])
+    first = means["layers"]["a"]
+    assert first[EDGES]["r"] == pytest.approx(0.3) and first[EDGES]["samples"] == 2
+    assert first["random"][OWN]["r"] == pytest.approx(0.3) and first["random"][EDGES]["r"] is None
+    assert means["average"][EDGES]["r"] == pytest.approx(0.2) and means["average"][EDGES]["samples"] == 2
+    assert means["average"]["ratio"] == pytest.approx(2)
+    for missing in (0.0, None):
+        correlations["trained", "a", FRINGES] = [missing] * 3
+        assert means_of(correlations, ("a", "b"), ["x", "x", "y"])["layers"]["a"]["ratio"] is None
 
 
 @pytest.mark.parametrize(("fields", "wins"), [(("edges",), EDGES), (("inside",), FRINGES)])
@@ -103,14 +102,16 @@ def test_a_reader_of_edges_looks_at_edges_and_one_of_the_lit_object_at_fringes(o
     """A network that outputs the Sobel map correlates with it by 1, at the layer where it is."""
     subject = oracle(opened, fields)
     correlations = measure(subject, opened, opened.samples("test")[:3], ("out",), 1, silent)
-    edges, fringes = correlations.mean("out", EDGES).r, correlations.mean("out", FRINGES).r
+    layer = correlations["layers"]["out"]
+    edges, fringes = layer[EDGES]["r"], layer[FRINGES]["r"]
     assert (edges > fringes) == (wins == EDGES)
     if wins == EDGES:
         assert edges == pytest.approx(1, abs=1e-6)
-        assert ratio(edges, fringes) > 1.5
+        assert layer["ratio"] > 1.5
     # The stand-in for random weights is the network itself: the sanity check must say that nothing changed.
-    assert correlations.mean("out", OWN, trained=False).r == pytest.approx(1, abs=1e-6)
-    assert correlations.references.r == pytest.approx(fringes if wins == EDGES else correlations.references.r)
+    assert layer["random"][OWN]["r"] == pytest.approx(1, abs=1e-6)
+    if wins == EDGES:
+        assert correlations["edges_with_fringes"]["r"] == pytest.approx(fringes)
 
 
 def test_random_weights_come_from_the_seed_alone():
@@ -144,12 +145,12 @@ def test_the_papers_six_layers_are_taken_where_there_are_nine(opened):
 
 
 @pytest.mark.parametrize(
-    ("fringes", "says"),
+    ("ratio", "interval", "says"),
     [
-        (Mean(0.1, (0.05, 0.2), 3), "ratio 2.00"),
-        (Mean(0.1, (-0.05, 0.2), 3), "ratio 2.00, which says nothing: its divisor can't be told from 0"),
-        (Mean(None, None, 0), "no ratio"),
+        (2.0, (0.05, 0.2), "ratio 2.00"),
+        (2.0, (-0.05, 0.2), "ratio 2.00, which says nothing: its divisor can't be told from 0"),
+        (None, None, "no ratio"),
     ],
 )
-def test_a_ratio_over_something_near_zero_says_so(fringes, says):
-    assert ratio_text(Mean(0.2, (0.1, 0.3), 3), fringes) == says
+def test_a_ratio_over_something_near_zero_says_so(ratio, interval, says):
+    assert ratio_text({"ratio": ratio, FRINGES: {"interval": interval}}) == says

@@ -21,7 +21,7 @@ from fpp_ml_bench.baselines.diagnostics.fits import (
     truth,
 )
 from fpp_ml_bench.baselines.diagnostics.grad_cam import fringe_variation
-from fpp_ml_bench.baselines.diagnostics.linear_report import CONTROLS, score
+from fpp_ml_bench.baselines.diagnostics.linear import CONTROLS, score
 from fpp_ml_bench.baselines.stability import U32
 from fpp_ml_bench.coding import wrapped_phase
 from fpp_ml_bench.decoding import depth_from_coordinate
@@ -220,8 +220,11 @@ def experiment_of(subject, opened, step):
 
 
 def linear_r2(subject, opened):
-    errors, reference = experiment_of(subject, opened, 2).linear_errors(subject.network, controls=True)
-    return {key: 1 - np.mean(sample_errors) / np.mean(reference[key[1]]) for key, sample_errors in errors.items()}
+    errors, reference = experiment_of(subject, opened, 2).linear_errors("trained", subject.network, controls=True)
+    return {
+        (layer, target): 1 - np.mean(sample_errors) / np.mean(reference[target])
+        for ((_, layer), target, _), sample_errors in errors.items()
+    }
 
 
 @pytest.mark.parametrize("target", linear.TARGETS)

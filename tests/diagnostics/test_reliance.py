@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import SceneSet
-from fpp_ml_bench.baselines.diagnostics.phase_reliance import (
+from fpp_ml_bench.baselines.diagnostics.counterfactual import (
     Change,
     follows,
     measure,
@@ -18,6 +17,7 @@ from fpp_ml_bench.baselines.diagnostics.phase_reliance import (
     rms_expected,
     sample_score,
 )
+from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import SceneSet
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.score import object_interval

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scored_dataset import make_dataset, write_predictions
 
-from fpp_ml_bench.baselines.tradeoff import points
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli.evaluate import main as evaluate_main
 from fpp_ml_bench.evaluation.result import write_result
@@ -270,7 +269,7 @@ def test_unsound_files_are_refused_by_name(make, capsys, tmp_path):
         ('{"shards": [], "samples": {}, "schema_version": "2.0.0"}', "the manifest of a dataset"),
         ('{"sorted_by": "object_mae_mm", "groups": []}', "a ranking"),
         ('{"differences": {}, "per_sample": []}', "a comparison"),
-        ('{"tradeoff_schema_version": "1.0.0"}', "what fpp-bench tradeoff measured"),
+        ('{"tradeoff_schema_version": "2.0.0"}', "what fpp-bench tradeoff measured"),
     ],
 )
 def test_another_file_is_called_by_what_it_is_in_one_line(content, what, make, capsys):
@@ -289,8 +288,8 @@ def test_the_files_that_this_package_writes_are_told_apart(tiny, make, capsys, t
     first, second = make("a.json", 1.0, name="a"), make("b.json", 2.0, name="b")
     board(capsys, first, second, "--json", "board.json")
     assert evaluate_main(["compare", str(first), str(second), "--json", "comparison.json"]) == 0
-    measured = Path(points.__file__).with_name("tradeoff.json")
-    for path in (tiny / "manifest.json", "board.json", "comparison.json", measured):
+    assert main(["tradeoff", str(tiny), "--quick", "--method", "constant"]) == 0
+    for path in (tiny / "manifest.json", "board.json", "comparison.json", "tradeoff/tradeoff.json"):
         capsys.readouterr()
         assert main(["leaderboard", str(path)]) == 2
         assert "is not a result file but " in capsys.readouterr().err

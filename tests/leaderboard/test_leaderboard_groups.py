@@ -1,4 +1,4 @@
-"""Rank ranges, groups and their titles, legacy data, short names, and what a method assumes."""
+"""Rank ranges, groups and their titles, short names, and what a method assumes."""
 
 from dataclasses import replace
 from html import unescape
@@ -8,16 +8,14 @@ from board_rows import named_benchmarks, some_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scored_dataset import make_dataset
+from upkeep import readme_block
 
 from fpp_ml_bench.evaluation.submission import Submission
 from fpp_ml_bench.leaderboard.assumptions import assumption, assumption_sentences
 from fpp_ml_bench.leaderboard.columns import CODE
-from fpp_ml_bench.leaderboard.groups import EARLIER_PROTOCOL_NOTE
 from fpp_ml_bench.leaderboard.names import LONGEST_NAME, cut_at_word, short_names
 from fpp_ml_bench.leaderboard.page import page_files
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
-from fpp_ml_bench.leaderboard.readme import readme_block
-from fpp_ml_bench.leaderboard.tables import markdown_text
 
 
 @pytest.fixture(scope="module")
@@ -49,24 +47,20 @@ def with_content(entry, digit):
     return replace(entry, row=entry.row.model_copy(update={"dataset": dataset}))
 
 
-def test_groups_are_headed_by_their_benchmark_and_earlier_protocols_come_last(files, monkeypatch):
+def test_groups_are_headed_by_their_benchmark_and_other_data_come_last(files, monkeypatch):
     entry = read_entries(files[:1])[0]
     named = with_content(entry, "a")
-    earlier = with_content(replace(entry, row=entry.row.model_copy(update={"protocol_version": "2.0.0"})), "b")
     named_benchmarks(monkeypatch, full=named.row.dataset.content, unseen={})
-    groups = rank([earlier, entry, named])
-    rest, truth = "40 x 32 px", earlier.row.dataset.truth[:8]
+    groups = rank([entry, named])
+    rest, truth = "40 x 32 px", entry.row.dataset.truth[:8]
     words = ": few frames, no code, metric track, test split, against decoded depth"
     assert [group.title for group in groups] == [
         f"fpp-bench-full version 2, {rest}{words}",
-        f"{rest}, data {entry.row.dataset.truth[:8]}{words}",
-        f"{rest}, data {truth}, protocol 2.0.0{words}",
+        f"{rest}, data {truth}{words}",
     ]
     block, index = readme_block(groups), page_files(groups, [])["index.html"].decode()
-    for text, note in ((block, markdown_text(EARLIER_PROTOCOL_NOTE)), (unescape(index), EARLIER_PROTOCOL_NOTE)):
-        assert text.count(note) == 1
+    for text in (block, unescape(index)):
         assert text.index("fpp-bench-full version 2") < text.index(truth)
-    assert markdown_text(EARLIER_PROTOCOL_NOTE) not in readme_block(groups[:2])
 
 
 def test_a_table_is_of_scenes_whatever_was_projected(files):
@@ -81,15 +75,14 @@ def test_a_table_is_of_scenes_whatever_was_projected(files):
     assert '<td class="text" data-v="crossed">crossed</td>' in index and "| crossed |" in readme_block([group])
 
 
-def test_shipped_rows_are_of_a_benchmark_or_an_earlier_protocol(shipped):
+def test_shipped_rows_are_of_a_benchmark(shipped):
     for group in rank(shipped):
-        assert group.key.benchmark is not None or group.key.notes
+        assert group.key.benchmark is not None
 
 
 def test_what_stands_aside(shipped):
     """Lights that nothing is trained in, and small images: on the page in one line, in README not at all."""
-    groups = [group for group in rank(shipped) if not group.key.notes]
-    aside = {group.key.benchmark.name: group.key.aside for group in groups}
+    aside = {group.key.benchmark.name: group.key.aside for group in rank(shipped)}
     assert aside == {
         "fpp-bench-full": "",
         "fpp-bench-full-224": "224 px",
@@ -124,14 +117,12 @@ def test_short_names_of_shipped_rows(shipped):
         "classical-18-both": "Classical 18+Gray, both",
         "classical-net-03-vertical": "classical-net 3+Gray, vertical",
         "classical-03-both-fewest": "Classical 3, both, no Gray",
-        "cpu-unet-individual-rmse-range-mean": "UNet RMSE, mean range",
-        "cpu-transunet-individual-hybrid_l1_0.7-range-predicted": "TransUNet hybrid L1 0.7, pred. range",
-        "cpu-unet-individual-rmse-all": "UNet RMSE all frames",
+        "cpu-long-unet-individual-rmse-range-mean": "UNet RMSE, mean range",
+        "cpu-long-transunet-individual-hybrid_l1_0.7-range-predicted": "TransUNet hybrid L1 0.7, pred. range",
         "cpu-long-unet-global-rmse": "UNet global RMSE",
         "cpu-long-pix2pix_unet-individual-gan_0.7": "Pix2Pix GAN 0.7",
         "cpu-long-unet-global-rmse-guided": "UNet global RMSE, guided",
         "cpu-long-unet-global-rmse_physics_0.05": "UNet global RMSE + physics 0.05",
-        "cpu-unet-raw-rmse-bgremoved": "UNet raw RMSE, no background",
     }
     assert {stem: names[stem] for stem in expected} == expected
 
@@ -169,6 +160,8 @@ UNET = {
         ("A better phase route", "phase", {}, "A better phase route"),
         ("UNet, mine", "unet", {"network": "unet", "loss": "hybrid_l1_x"}, "UNet, mine"),
         ("UNet, global, rmse", "unet", UNET, "UNet global RMSE"),
+        ("UNet, global, rmse", "unet", UNET | {"trained_frames": "all"}, "UNet global RMSE all frames"),
+        ("UNet, global, rmse", "unet", UNET | {"background_removed": True}, "UNet global RMSE, no background"),
         ("UNet, global, rmse, batch normalisation", "unet", UNET, "UNet global RMSE, batch norm"),
         ("UNet, global, rmse, input standardised", "unet", UNET, "UNet global RMSE, standardised"),
     ],

@@ -22,7 +22,7 @@ from fpp_ml_bench.evaluation.submission import LearnedFrom, Submission
 from fpp_ml_bench.leaderboard.assumptions import learned_from, told
 from fpp_ml_bench.leaderboard.columns import columns, uncertainty
 from fpp_ml_bench.leaderboard.data_files import table_json
-from fpp_ml_bench.leaderboard.pairs import behind, pairs
+from fpp_ml_bench.leaderboard.groups import behind, pairs
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.leaderboard.row_file import RowUncertainty, _uncertainty, write_row
 
@@ -326,12 +326,3 @@ def test_rows_of_others_say_where_they_are_from(capsys, tmp_path, monkeypatch):
     assert "PhiCalNet, 1 frame" in printed and "4.46" in printed and "1.16" in printed
     assert "Reported by its authors (arXiv 2607.11928)" in printed
     assert "oracle order: told the test sample's fringe order." in printed
-
-
-def test_results_of_an_earlier_protocol_keep_their_own_table(base):
-    errors = dict.fromkeys(EIGHT, 1.0)
-    entry = entry_with_errors(base, errors, "new")
-    old = replace(entry, row=entry.row.model_copy(update={"protocol_version": "0.9.0"}))
-    now, earlier = rank([old, entry])
-    assert (now.key.notes, len(earlier.key.notes)) == ([], 1) and "protocol 0.9.0" in earlier.title
-    assert "protocol" not in now.title

@@ -1,8 +1,7 @@
-"""Row files and their provenance, ranks by interval, and README's generated block."""
+"""Row files and their provenance, and ranks by interval."""
 
 import json
 import re
-from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from board_rows import reliance, robustness, some_rows, timing, write_result_file
 from scored_dataset import disk_depth, make_dataset
+from upkeep import readme_block
 
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli.evaluate import main as fpp_eval
@@ -19,7 +19,6 @@ from fpp_ml_bench.evaluation.result import read_result
 from fpp_ml_bench.leaderboard import columns, rows
 from fpp_ml_bench.leaderboard.page import page_files
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
-from fpp_ml_bench.leaderboard.readme import BEGIN, END, SHOWN, readme_block
 from fpp_ml_bench.leaderboard.row_file import (
     LARGEST_ROW_BYTES,
     interval_over,
@@ -180,7 +179,8 @@ def test_fpp_eval_verifies_a_row_from_its_predictions(files, dataset, tmp_path, 
     ]
     content["protocol_version"] = "2.0.0"
     row.write_text(json.dumps(content))
-    assert fpp_eval(words) == 2 and "was scored by protocol 2.0.0" in capsys.readouterr().err
+    for command, arguments in ((fpp_eval, words), (main, ["leaderboard", str(row)])):
+        assert command(arguments) == 2 and "was scored by protocol 2.0.0" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -325,86 +325,10 @@ def test_no_rank_by_what_missing_pixels_improve(key, dataset, tmp_path, capsys):
         rank(read_entries([path]), key)
 
 
-@pytest.fixture
-def readme(tmp_path):
-    path = tmp_path / "README.md"
-    path.write_text(f"# Title\n\n{BEGIN}\n{END}\n\nMore.\n")
-    return path
-
-
-def block(path: Path, *arguments: object) -> int:
-    return main(["leaderboard", *map(str, arguments), "--readme", str(path)])
-
-
-def test_readme_block_is_made_and_stays(readme, files, capsys):
-    assert block(readme, *files) == 0
-    text = readme.read_text()
-    assert text.startswith(f"# Title\n\n{BEGIN}\n\n") and text.endswith(f"\n{END}\n\nMore.\n")
-    lines = [line.split(" | ")[0][2:] for line in text.splitlines() if re.search(r"\| \d+ \|.* \| local file", line)]
-    assert lines == ["Slow and fine", "Fast and rough", "Beaten", "Was told"]
-    assert block(readme, *files[::-1]) == 0 and readme.read_text() == text
-    assert block(readme, *files, "--check") == 0
-    assert "is up to date with the rows" in capsys.readouterr().out
-
-
-@pytest.mark.parametrize("extra", [0, 1, 4])
-def test_readme_shows_the_best_of_a_group(extra, files):
-    count = SHOWN + extra
-    entry = read_entry(files[0])
-    about = entry.row.submission
-    named = [
-        replace(
-            entry,
-            row=entry.row.model_copy(
-                update={
-                    "submission": about.model_copy(update={"name": f"Method {number:02}"}),
-                    "predictions_sha256": f"{number:064}",
-                }
-            ),
-        )
-        for number in range(count)
-    ]
-    text = readme_block(rank([*named, read_entry(files[3])]))
-    # All share one error, so names decide.
-    assert [n for n in range(count) if f"Method {n:02}" in text] == list(range(5))
-    assert [line for line in text.splitlines() if "more on the page" in line] == (
-        [f"… and {extra} more on the page"] if extra else []
-    )
-    assert "Was told" in text
-
-
-def test_a_hand_edited_block_fails_the_check_and_is_left_alone(readme, files, capsys):
-    assert block(readme, *files) == 0
-    made = readme.read_text()
-    for edited in (made.replace("| Slow", "| Slowest"), made.replace(END, f"A line too many.\n{END}")):
-        readme.write_text(edited)
-        assert block(readme, *files, "--check") == 1
-        assert "don't edit it by hand, run: fpp-bench leaderboard --readme" in capsys.readouterr().err
-        assert readme.read_text() == edited
-    readme.write_text(made.replace("More.", "Text outside of the markers."))
-    assert block(readme, *files, "--check") == 0
-
-
-@pytest.mark.parametrize("text", ["no markers", f"{END}\n{BEGIN}\n", f"{BEGIN}\n{BEGIN}\n{END}\n", f"{BEGIN}\n"])
-def test_markers_must_be_there(text, readme, files, capsys):
-    readme.write_text(text)
-    for more in ([], ["--check"]):
-        assert block(readme, *files, *more) == 2
-        assert "each once" in capsys.readouterr().err
-    assert readme.read_text() == text
-
-
-def test_check_needs_a_readme(files, tmp_path, capsys):
-    assert main(["leaderboard", str(files[0]), "--check"]) == 2
-    assert "--readme" in capsys.readouterr().err
-    assert block(tmp_path / "none.md", files[0]) == 2
-
-
-def test_unnamed_results_get_into_neither_page_nor_readme(readme, files, tmp_path, monkeypatch):
+def test_unnamed_results_do_not_get_into_a_page(files, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(rows, "SHIPPED_ROWS", tmp_path / "none")
     (tmp_path / "result.json").write_bytes(files[0].read_bytes())
-    assert main(["leaderboard", "--readme", str(readme)]) == 0 and "Fast and rough" not in readme.read_text()
     assert main(["leaderboard", "--page", str(tmp_path / "page")]) == 0
     assert "Fast and rough" not in (tmp_path / "page" / "index.html").read_text()
 

@@ -18,7 +18,7 @@ from fpp_ml_bench.cli.evaluate import main as evaluate
 from fpp_ml_bench.decoding import decode_stack
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.captures import Splits, import_captures, plan_captures
-from fpp_ml_bench.loaders.captures.importing import CaptureReader
+from fpp_ml_bench.loaders.captures.decoding import CaptureReader
 from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
 from fpp_ml_bench.loaders.storage import DatasetFolder, plan_rows, verify
 from fpp_ml_bench.optics import paper_rig, rig_from_dict, save_rig

@@ -8,8 +8,9 @@ import pytest
 import scipy.io
 from published_trees import v73_bytes
 
+from fpp_ml_bench.containers import matrix_bytes
 from fpp_ml_bench.errors import LayoutError
-from fpp_ml_bench.loaders.published.files import matrix_bytes, read_matrix, read_scalar
+from fpp_ml_bench.loaders.published.importing import read_matrix, read_scalar
 
 WRITTEN_BY_MATLAB = Path(scipy.io.matlab.__file__).parent / "tests" / "data"
 DEPTH = np.where(np.add.outer(np.arange(11), np.arange(7)) > 6, 1800 + np.arange(77.0).reshape(11, 7) / 3, 0)
@@ -88,6 +89,8 @@ REFUSED = {
     "no variables": (v5_bytes(), "got none"),
     "cut off": (v5_bytes(depthMap=DEPTH)[:-9], "cut off"),
     "cut off, not compressed": (v5_bytes(False, depthMap=DEPTH)[:-9], "cut off"),
+    "cut off in its checksum": (v5_bytes(depthMap=DEPTH)[:-2], "cut off"),
+    "cut off after the matrix": (v5_bytes(depthMap=DEPTH, z="text")[:-9], "cut off"),
     "cut off, v7.3": (v73_bytes(depthMap=DEPTH)[:900], "v7.3"),
 }
 
@@ -113,7 +116,7 @@ def test_a_missing_file_and_a_value_that_is_not_a_scalar(tmp_path):
 
 @pytest.mark.parametrize("kind", ["compressed", "plain", "v7.3", "written here"])
 def test_damage_is_refused_or_harmless_never_a_crash(tmp_path, kind):
-    """SciPy 1.17 ends the process (segmentation fault) on some of the uncompressed files."""
+    """SciPy 1.17 ends its process (segmentation fault) on some of the uncompressed files."""
     content = {
         "compressed": v5_bytes(True, depthMap=DEPTH),
         "plain": v5_bytes(False, depthMap=DEPTH),

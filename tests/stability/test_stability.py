@@ -118,7 +118,7 @@ def break_arctangent(monkeypatch):
     def arctan(sine, cosine):
         return -np.arctan(sine / cosine)  # loses the quadrant
 
-    monkeypatch.setattr("fpp_ml_bench.coding.phase.minus_atan2", arctan)
+    monkeypatch.setattr("fpp_ml_bench.coding.phase_shift.minus_atan2", arctan)
     return cases_of("phase", "modulation, real frames", "gamma")
 
 

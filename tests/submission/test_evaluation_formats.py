@@ -2,10 +2,12 @@
 
 import io
 import json
+import os
 import re
 import struct
 import zipfile
 import zlib
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -17,9 +19,9 @@ import pytest
 from scipy.io import savemat
 from scored_dataset import make_dataset, write_description, write_predictions
 
+from fpp_ml_bench import containers
 from fpp_ml_bench.cli.evaluate import main
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.submission import isolated
 
 SIZE = (32, 40)
 SAMPLE = "power_drill_A60"
@@ -386,19 +388,26 @@ def test_page_headers_that_contradict_the_footer(capsys, dataset, tmp_path):
 @pytest.mark.parametrize("answer", ["os.abort()", "time.sleep(60)", "bytearray(10**9)"])
 def test_a_process_that_reads_is_bounded_and_its_end_is_a_refusal(answer, tmp_path, monkeypatch):
     (tmp_path / "reader_of_test.py").write_text(
-        f"import os, time\ndef read(content, largest):\n    return content or bytes({answer})\n"
+        "import os, time\nfrom fpp_ml_bench.containers import limit_memory\ndef read(content, largest):\n"
+        f"    limit_memory(largest)\n    return {{}}, content or bytes({answer})\n"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    reader = isolated.ReadingProcess("reader_of_test", 1000)
-    assert reader(b"good") == b"good"
+    monkeypatch.setattr(containers, "_idle", {})
+    read = partial(containers.guarded, "reader_of_test:read", largest=1000)
+    assert read(b"good") == ({}, b"good")
+    (first,) = containers._idle[os.getpid()]
+    process = first.process
+    del first
     with monkeypatch.context() as impatient:
         if "sleep" in answer:
-            impatient.setattr(isolated, "TIMEOUT_S", 0.1)
+            impatient.setattr(containers, "TIMEOUT_S", 0.1)
         with pytest.raises(PredictionError, match=r"it ended the process|within 0.1 s|more memory than 1000 bytes"):
-            reader(b"")
-    assert reader(b"good") == b"good"  # by the same process, or by a new one
-    process = reader._process
-    del reader
+            read(b"")
+    assert (process.returncode is None) == ("bytearray" in answer)
+    assert read(b"good") == ({}, b"good")  # by the same process, or by a new one
+    (last,) = containers._idle.pop(os.getpid())
+    process = last.process
+    del last
     assert process.returncode is not None
 
 

@@ -1,39 +1,50 @@
-"""Error against run time: points against the evaluator, fronts against brute force, resuming, refusals, the page."""
+"""Error against run time, frames and memory: points against the evaluator, fronts against brute force, powers against
+SciPy, resuming, refusals, the page."""
 
-import csv
 import json
 import re
-from dataclasses import dataclass, field
-from functools import partial
+import subprocess
+import sys
+from dataclasses import make_dataclass
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import stats
 from scored_dataset import make_dataset, write_predictions
 
-from fpp_ml_bench.baselines.classical import ClassicalMethod
+from fpp_ml_bench.baselines import training
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.baselines.tradeoff import report as tradeoff_report
-from fpp_ml_bench.baselines.tradeoff.measure import Rules, measured, tradeoff
-from fpp_ml_bench.baselines.tradeoff.points import JOURNAL, Point, Tradeoff, read_tradeoff
-from fpp_ml_bench.baselines.tradeoff.report import remarks, write_report
-from fpp_ml_bench.baselines.tradeoff.settings import (
-    DecodeInType,
-    Plan,
-    Setting,
-    TradeoffSettings,
-    choose_views,
-    planned,
-)
+from fpp_ml_bench.baselines.tradeoff import measure, planned, read_tradeoff, remarks, write_report
+from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, TRADEOFF_FILE, Point, Tradeoff, choose_views, power
+from fpp_ml_bench.baselines.tradeoff.report import growth_rows, point_rows
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.errors import BuildError, DatasetError, SubmissionError
+from fpp_ml_bench.errors import BuildError, DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.files import exclusive
 from fpp_ml_bench.leaderboard.page import page_files
 from fpp_ml_bench.leaderboard.ranking import shipped_rows
+from fpp_ml_bench.optics import Rig, paper_rig
 
-QUICK = Rules(runs=3, limit_s=0.05)
+OWN_METHOD = """
+import numpy as np
+from fpp_ml_bench.baselines.method import Method
+
+class Flat(Method):
+    name, title, frames_used, settings = "flat", "Everything lit is 1.5 m away", (0,), {}
+
+    def __init__(self, rig, **options):
+        self.rig = rig
+
+    @classmethod
+    def variants(cls, rig):
+        return [{}]
+
+    def predict(self, frames):
+        return np.where(frames[0] > 60, np.float32(1500), np.float32(0))
+"""
 
 
 @pytest.fixture(scope="module")
@@ -42,17 +53,19 @@ def small(tmp_path_factory):
     return make_dataset(tmp_path_factory.mktemp("data") / "small")
 
 
-@dataclass
 class Answer(Method):
     """A method that knows the answers, off by ``offset_mm``; ``rows`` rows of each image it leaves out."""
 
-    dataset: object
-    offset_mm: float = 0.0
-    rows: int = 0
-    frames_used: tuple = (0,)
-    uses_ground_truth_range: bool = False
-    name = title = "answer"
-    settings: dict = field(default_factory=dict)
+    name, title, settings = "answer", "Answer", {}
+
+    def __init__(self, dataset, offset_mm=0.0, rows=0, frame=0, threads=1):
+        self.dataset, self.offset_mm, self.rows, self.frames_used, self.threads = (
+            dataset,
+            offset_mm,
+            rows,
+            (frame,),
+            threads,
+        )
 
     def predict(self, frames):
         # The dataset's frames hold one grey level each: the sample's number among those of its split.
@@ -62,18 +75,38 @@ class Answer(Method):
         return depth
 
 
-def setting(dataset, key="a", calls=(), **changes):
-    method = Answer(dataset, **changes)
+@pytest.fixture
+def answers(small, monkeypatch):
+    """A registry of `Answer` under any name. Returns, by name, the variants (to be changed), and the calls."""
+    known = SimpleNamespace(variants={"good": [{}], "bad": [{"offset_mm": 9.0}]}, made=[], trivial=False)
 
-    def make():
-        if isinstance(calls, list):
-            calls.append(key)
-        return method
+    def find(name):
+        options = make_dataclass("Options", ("offset_mm", "threads"))
+        if name not in known.variants:
+            raise PredictionError(f"unknown method {name}")
+        kind = SimpleNamespace(Options=options, trivial=known.trivial, variants=lambda rig: known.variants[name])
+        return SimpleNamespace(method=kind)
 
-    return Setting(key, "classical", f"Setting {key}", make, choose_views(dataset, 2))
+    def load_method(name, source, **options):
+        if isinstance(source, Rig):
+            raise PredictionError("works at one size only")
+        known.made.append((name, options))
+        return Answer(small, **options)
+
+    monkeypatch.setattr(measure, "find", find)
+    monkeypatch.setattr(measure, "load_method", load_method)
+    monkeypatch.setattr(measure, "methods", lambda: dict.fromkeys(known.variants))
+    return known
 
 
-def test_a_point_is_what_the_evaluator_says(small, tmp_path):
+def plan_of(dataset, out, *names, **changes):
+    """A plan whose only scene is empty: nothing is rendered."""
+    plan = planned(dataset.path, out, names, **{"views": 1, **changes})
+    plan.rigs, plan.scenes = [paper_rig(240)], [[]]
+    return plan
+
+
+def test_a_point_is_what_the_evaluator_says(small, tmp_path, answers):
     folder = write_predictions(tmp_path / "predictions", small, offset_mm=0.0)
     for sample in small.samples("test"):
         depth = small.depth_mm(sample).copy()
@@ -81,71 +114,85 @@ def test_a_point_is_what_the_evaluator_says(small, tmp_path):
         depth[:16] = 0
         np.save(folder / f"{sample}.npy", depth)
     expected = evaluate(folder, small, target="depth_exact")
-    point = measured(setting(small, offset_mm=3.0, rows=16), QUICK)
-    assert point.failed is None and point.frames == 1 and point.image_px == 40 and point.runs >= 4
+    answers.variants["good"] = [{"offset_mm": 3.0, "rows": 16}]
+    (point,) = measure.tradeoff(plan_of(small, tmp_path / "out", "good", views=2)).points
+    assert point.frames == 1 and point.seconds > 0 and point.batch_seconds > 0 and point.title == "Answer"
     assert point.object_mae_mm == pytest.approx(expected.metrics.object_mae_mm)
-    assert point.interval_mm == pytest.approx(list(expected.intervals.of("object_mae_mm")))
-    assert point.measured_mae_mm == pytest.approx(2.5)
-    assert 0 < point.missing_share < 1
-    assert point.seconds_p5 <= point.seconds <= point.seconds_p95 and point.pace_ms > 0
+    assert 0 < point.missing_share < 1 and point.working_memory_mib in (None, pytest.approx(0, abs=5))
+    assert point.label == "good offset_mm=3.0 rows=16" and point.software["numpy"] == np.__version__
 
 
-def test_what_cant_be_measured_says_why_and_has_no_numbers(small):
-    point = measured(setting(small, frames_used=(7,)), QUICK)
-    assert "frame 7 is not stored" in point.failed and point.seconds is None and point.object_mae_mm is None
+def test_what_cant_be_measured_says_why_and_has_no_numbers(small, tmp_path, answers, monkeypatch):
+    answers.variants["good"] = [{"frame": 7}]
+    run = measure.tradeoff(plan_of(small, tmp_path / "out", "good", "bad"))
+    failed, one_size = run.points
+    assert "frame 7 is not stored" in failed.failed and failed.seconds is None and failed.object_mae_mm is None
+    assert one_size.object_mae_mm == 8.5 and one_size.pixel_seconds is None
+    assert remarks(run)[0].startswith("Not measured: good frame=7: ")
+    assert remarks(run)[1] == "Not measured at other sizes: bad offset_mm=9.0: works at one size only"
+    assert point_rows(run)[0][1:] == ["", "-", "-", "-", "-", "-"] and len(growth_rows(run)) == 1
+    for wrong in (np.float32([[1]]), np.full(small.size, np.nan, np.float32)):
+        monkeypatch.setattr(Answer, "predict", lambda self, frames, wrong=wrong: wrong)
+        (point,) = measure.tradeoff(plan_of(small, tmp_path / "wrong", "bad")).points
+        assert "expected finite depth (H, W) (32, 40)" in point.failed and point.object_mae_mm is None
 
 
-def test_untrained_is_timed_and_never_scored(small):
-    base = setting(small)
-    point = measured(
-        Setting("width", "networks", "UNet", base.make, base.views, scored=False, note="not trained"), QUICK
-    )
-    assert point.seconds > 0 and point.object_mae_mm is None and point.note == "not trained"
-    assert tradeoff_of(small, [point]).comparable() == []
+def test_told_and_trivial_methods_are_on_no_front(small, tmp_path, answers, monkeypatch):
+    monkeypatch.setattr(Answer, "uses_ground_truth_mask", True)
+    run = measure.tradeoff(plan_of(small, tmp_path / "told", "bad"))
+    assert run.points[0].aside == "told the view's object mask" == point_rows(run)[0][1]
+    monkeypatch.setattr(Answer, "uses_ground_truth_mask", False)
+    answers.trivial = True
+    run = measure.tradeoff(plan_of(small, tmp_path / "trivial", "bad"))
+    assert run.points[0].aside == "trivial" and all(run.front(cost) == [] for cost in COST_KEYS)
 
 
 def test_views_are_spread_and_differ_between_objects(small):
-    views = choose_views(small, 1)
-    assert views.names == ["power_drill_A0", "wooden_boards_A60"]
-    assert list(choose_views(small, 9).names) == small.samples("test")
+    assert choose_views(small, 1) == ["power_drill_A0", "wooden_boards_A60"]
+    assert choose_views(small, 2) == choose_views(small, 9) == small.samples("test")
     with pytest.raises(DatasetError, match="no split"):
         choose_views(small, 1, "nowhere")
 
 
-def point(key, seconds, frames, error, group="classical", **changes):
+def test_threads_go_to_the_methods_that_take_them(small, tmp_path, answers):
+    measure.tradeoff(plan_of(small, tmp_path / "out", "bad", threads=2))
+    assert answers.made == [("bad", {"offset_mm": 9.0, "threads": 2})]
+
+
+def test_all_methods_and_networks_of_the_size_are_measured(small, tmp_path, answers):
+    answers.variants |= {name: [{}] for name in training.shipped_names()} | {"other rigs": []}
+    assert [point.method for point in planned(small.path, tmp_path).points][:2] == ["good", "bad"]
+    assert [point.method for point in planned(small.path, tmp_path, ["other rigs"]).points] == ["other rigs"]
+    networks = measure._networks((224, 224))
+    assert "unet-individual-rmse" in networks and not measure._networks(small.size)
+
+
+def point(method, seconds, frames, error, **changes):
     return Point(
-        key=key,
-        group=group,
-        title=f"Setting {key}",
+        method=method,
+        options={},
+        title=f"Method {method}",
         frames=frames,
-        image_px=40,
-        runs=3,
         seconds=seconds,
-        seconds_p5=seconds,
-        seconds_p95=seconds,
+        batch_seconds=seconds,
+        working_memory_mib=2.0,
         object_mae_mm=error,
-        measured_mae_mm=error,
         missing_share=0.0,
-        pace_ms=5.0,
-        load=0.5,
         **changes,
     )
 
 
-def tradeoff_of(dataset, points, growth=()):
+def tradeoff_of(dataset, points):
     return Tradeoff(
-        created="2026-01-01T00:00:00+00:00",
         dataset="small",
         fingerprint=dataset.fingerprint,
         image_size=[32, 40],
         target="depth_exact",
         views=["power_drill_A0"],
-        settings={"threads": 1, "clock": "wall"},
+        settings={"package": "1", "threads": 1, "clock": "wall"},
         hardware={"cpu": "Some CPU", "cores": 2, "memory_gib": 8.0, "gpu": None, "platform": "Linux"},
-        software={"numpy": "2"},
-        sittings=1,
+        pixels=[100, 200, 400],
         points=list(points),
-        growth=list(growth),
     )
 
 
@@ -168,167 +215,170 @@ def test_the_front_is_what_no_point_beats(triples, cost):
     assert {p.key for p in run.front(cost)} == {p.key for p in points} - beaten
 
 
-def test_only_comparable_points_are_on_a_front(small):
-    points = [
-        point("a", 1.0, 10, 2.0),
-        point("told", 0.1, 1, 0.1, given="depth range"),
-        point("other size", 0.1, 1, 0.1, group="sizes"),
-        point("arithmetic", 0.1, 1, 0.1, group="precision"),
-        Point(key="absent", group="networks", title="Absent", failed="onnxruntime is not installed"),
+@pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 2.0])
+def test_a_pure_power_is_found_exactly(exponent):
+    amounts = [10, 20, 40, 80]
+    assert power([(n, 3e-4 * n**exponent) for n in amounts]) == pytest.approx(exponent, abs=1e-12)
+    assert power([(5, 1.0), (5, 2.0)]) is None and power([]) is None and power([(0, 1.0), (5, 2.0)]) is None
+
+
+def test_a_power_is_that_of_least_squares():
+    amounts = [10, 20, 40, 80, 160]
+    seconds = 2e-3 * np.array(amounts) ** 1.4 * np.exp(0.1 * np.random.default_rng(1).standard_normal(5))
+    assert power(zip(amounts, seconds, strict=True)) == pytest.approx(
+        stats.linregress(np.log(amounts), np.log(seconds)).slope
+    )
+
+
+def test_growth_over_pixels_and_frames(small):
+    first = point("a", 1.0, 10, 2.0, pixel_seconds=[0.001, 0.002, 0.004])
+    second = point("a", 4.0, 20, 1.0).model_copy(update={"options": {"steps": 9, "fewest": True}})
+    run = tradeoff_of(small, [first, second, point("b", 1.0, 1, 9.0)])
+    assert growth_rows(run) == [
+        ["a", "1, 2, 4", "1", "2", "1,000"],
+        ["a steps=9 fewest", "-", "-", "2", "4,000"],
+        ["b", "-", "-", "-", "1,000"],
     ]
-    sparse = point("sparse", 0.1, 1, 5.0).model_copy(update={"measured_mae_mm": 0.1, "missing_share": 0.5})
-    run = tradeoff_of(small, [*points, sparse])
-    assert [p.key for p in run.front("seconds")] == [p.key for p in run.front("frames")] == ["sparse", "a"]
-    assert [p.key for p in run.front("seconds", "measured_mae_mm")] == ["a"]
-    assert any("onnxruntime is not installed" in line for line in remarks(run))
 
 
-def test_a_busy_machine_shows(small):
-    points = [point(f"k{n}", 1.0, 1, 1.0) for n in range(4)] + [point("busy", 1.0, 1, 1.0)]
-    points[-1] = points[-1].model_copy(update={"pace_ms": 6.5, "load": 9.0})
-    run = tradeoff_of(small, points)
-    assert [run.slowed(p) for p in points] == [False] * 4 + [True]
-    assert "0.5 to 9 on 2 cores" in remarks(run)[0] and remarks(run)[1].startswith("1 of 5 settings")
-
-
-def test_a_stopped_run_goes_on_and_failures_are_tried_again(small, tmp_path):
-    calls: list[str] = []
-    settings_of_run = TradeoffSettings(small.path, tmp_path / "out", quick=True)
-    plan = Plan(small, choose_views(small, 1), [setting(small, key, calls) for key in "ab"], [])
-    plan.settings.append(setting(small, "lost", calls, frames_used=(7,)))
+def test_a_stopped_run_goes_on_and_failures_are_tried_again(small, tmp_path, answers):
+    answers.variants = {"a": [{}, {"offset_mm": 2.0}], "lost": [{"frame": 7}]}
     seen: list[str] = []
-    first = tradeoff(settings_of_run, plan, seen.append)
-    assert seen == calls == ["a", "b", "lost"] and first.sittings == 1
-    journal = tmp_path / "out" / JOURNAL
-    second = tradeoff(settings_of_run, plan)
-    assert calls == ["a", "b", "lost", "lost"] and second.sittings == 2
-    assert second.points[:2] == first.points[:2]
-    assert list(json.loads(journal.read_text())["points"]) == ["a", "b", "lost"]
+    first = measure.tradeoff(plan_of(small, tmp_path, "a", "lost"), seen.append)
+    assert seen == ["a", "a offset_mm=2.0", "lost frame=7"] and len(answers.made) == 3
+    assert read_tradeoff(tmp_path / TRADEOFF_FILE) == first
+    second = measure.tradeoff(plan_of(small, tmp_path, "a", "lost"))
+    assert len(answers.made) == 4 and answers.made[-1][0] == "lost" and second == first
+    answers.variants["more"] = [{}]
+    third = measure.tradeoff(plan_of(small, tmp_path, "more"))  # what the folder holds of others stays
+    assert [p.label for p in third.points] == ["a", "a offset_mm=2.0", "lost frame=7", "more"]
 
 
-def test_runs_of_other_rules_do_not_mix(small, tmp_path):
-    plan = Plan(small, choose_views(small, 1), [setting(small)], [])
-    tradeoff(TradeoffSettings(small.path, tmp_path, quick=True), plan)
-    with pytest.raises(SubmissionError, match=r"another rules .*give another --out"):
-        tradeoff(TradeoffSettings(small.path, tmp_path), plan)
+def test_a_changed_file_is_measured_again(small, tmp_path, answers, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    answers.variants = {"mine.py:Mine": [{}]}
+    for content, times in (("1", 1), ("1", 1), ("2", 2)):
+        (tmp_path / "mine.py").write_text(content)
+        measure.tradeoff(plan_of(small, tmp_path / "out", "mine.py:Mine"))
+        assert len(answers.made) == times
+
+
+def test_runs_of_other_data_settings_or_machines_do_not_mix(small, tmp_path, answers, monkeypatch):
+    measure.tradeoff(plan_of(small, tmp_path, "bad"))
+    with pytest.raises(SubmissionError, match=r"another settings .*give another --out"):
+        measure.tradeoff(plan_of(small, tmp_path, "bad", clock="processor"))
     with pytest.raises(SubmissionError, match="another views"):
-        tradeoff(TradeoffSettings(small.path, tmp_path, quick=True), Plan(small, choose_views(small, 2), [], []))
-    (tmp_path / JOURNAL).write_text("nonsense\n")
-    with pytest.raises(SubmissionError, match="expected what a run of fpp-bench tradeoff left"):
-        tradeoff(TradeoffSettings(small.path, tmp_path, quick=True), plan)
+        measure.tradeoff(plan_of(small, tmp_path, "bad", views=2))
+    machine = measure.describe_hardware().to_dict() | {"cpu": "Another"}
+    with (
+        monkeypatch.context() as patched,
+        pytest.raises(SubmissionError, match=r"another hardware .*cpu='Another' .* now"),
+    ):
+        patched.setattr(measure, "describe_hardware", lambda: SimpleNamespace(to_dict=lambda: machine))
+        measure.tradeoff(plan_of(small, tmp_path, "bad"))
+    other = make_dataset(tmp_path / "other", scene=lambda n: (np.full((32, 40), n, np.uint8), small_depth(n)))
+    with pytest.raises(SubmissionError, match="another fingerprint"):
+        measure.tradeoff(plan_of(other, tmp_path, "bad"))
     with exclusive(tmp_path / ".lock", tmp_path, "measuring"), pytest.raises(BuildError, match="another process"):
-        tradeoff(TradeoffSettings(small.path, tmp_path, quick=True), plan)
+        measure.tradeoff(plan_of(small, tmp_path, "bad"))
+    for content in ("nonsense\n", '{"tradeoff_schema_version": "1.0.0"}'):
+        (tmp_path / TRADEOFF_FILE).write_text(content)
+        with pytest.raises(SubmissionError, match="into another --out"):
+            measure.tradeoff(plan_of(small, tmp_path, "bad"))
+
+
+def small_depth(number):
+    depth = np.zeros((32, 40), np.float32)
+    depth[8:24, 8:24] = 1700 + number
+    return depth
+
+
+def test_the_clock_is_the_wall_or_the_processor_and_long_runs_are_not_repeated(small, tmp_path, monkeypatch):
+    monkeypatch.setattr(measure, "perf_counter", iter([1.0, 3.0]).__next__)
+    ticks = [0.0, 0.5, 1.0, 1.3, 2.0, 2.4]  # three runs, until a second is used up
+    monkeypatch.setattr(measure, "process_time", iter(ticks).__next__)
+    assert planned(small.path, tmp_path, ["constant"]).timed(len, "four") == (2.0, 4)
+    assert planned(small.path, tmp_path, ["constant"], clock="processor").timed(len, "four") == (pytest.approx(0.4), 4)
 
 
 def test_files_hold_what_was_measured(small, tmp_path):
-    growth = [
-        {
-            "stage": "s",
-            "over": "rows",
-            "amounts": [1, 2, 4],
-            "seconds": [1, 4, 16],
-            "exponent": 2.0,
-            "low": 2.0,
-            "high": 2.0,
-            "tail": 2.0,
-            "flag": "steeper than linear",
-        }
-    ]
-    points = [
-        point("classical-both-03", 0.02, 10, 0.5),
-        point("phase-x", 0.2, 1, 9.0),
-        point("size-0240", 1, 1, 1, "sizes"),
-    ]
-    run = tradeoff_of(small, points)
-    run = run.model_copy(update={"growth": Tradeoff.model_validate({**run.model_dump(), "growth": growth}).growth})
-    written = {path.name for path in write_report(run, tmp_path)}
-    pictures = {"tradeoff.png", "tradeoff_measured.png", "sizes.png", "costs.png"}
-    assert written == {"tradeoff.json", "tradeoff.csv", "costs.csv", *pictures}
-    assert read_tradeoff(tmp_path / "tradeoff.json") == run
-    rows = list(csv.DictReader((tmp_path / "tradeoff.csv").open()))
-    assert [row["front_seconds"] for row in rows] == ["true", "false", "false"]
-    assert [row["front_frames"] for row in rows] == ["true", "true", "false"]
-    with pytest.raises(SubmissionError, match=r"points\.0\.group"):
-        broken = json.loads((tmp_path / "tradeoff.json").read_text())
-        broken["points"][0]["group"] = "magic"
-        (tmp_path / "broken.json").write_text(json.dumps(broken))
+    run = tradeoff_of(small, [point("exact", 0.02, 10, 0.5), point("few|frames", 0.2, 1, 9.0)])
+    measure.write_json(run.model_dump(mode="json"), tmp_path / TRADEOFF_FILE)
+    assert [path.name for path in write_report(run, tmp_path)] == ["tradeoff.json", "tradeoff.md", "tradeoff.png"]
+    lines = (tmp_path / "tradeoff.md").read_text().splitlines()
+    assert lines[0].startswith("small, 40 x 32 px, 1 test views, against depth_exact; wall-clock time, 1 thread(s)")
+    assert lines[4] == "| exact | time, frames, memory | 0.500 | 0.0% | 20 | 10 | 2 |"
+    assert lines[5] == "| few\\|frames | frames | 9.000 | 0.0% | 200 | 1 | 2 |"
+    assert read_tradeoff(tmp_path / TRADEOFF_FILE) == run
+    broken = json.loads((tmp_path / TRADEOFF_FILE).read_text())
+    broken["points"][0]["frames"] = "ten"
+    (tmp_path / "broken.json").write_text(json.dumps(broken))
+    with pytest.raises(SubmissionError, match=r"points\.0\.frames"):
+        read_tradeoff(tmp_path / "broken.json")
+    (tmp_path / "broken.json").write_text(json.dumps(run.model_dump(mode="json") | {"image_size": [32]}))
+    with pytest.raises(SubmissionError, match="image_size"):
         read_tradeoff(tmp_path / "broken.json")
 
 
-def test_the_page_shows_settings_as_text(small):
+def test_the_page_shows_methods_as_text(small):
     hostile = '"><script>hacked=1</script>'
-    points = [point("a", 1.0, 10, 2.0), point("b", 0.5, 1, 9.0, group="phase")]
-    points[0] = points[0].model_copy(update={"title": hostile})
+    points = [point(hostile, 1.0, 10, 2.0), point("b", 0.5, 1, 9.0)]
     index = page_files([], [], tradeoff_of(small, points))["index.html"].decode()
     section = re.search(r'<section id="tradeoff">.*?</section>', index, flags=re.DOTALL)[0]
-    assert "<script" not in section and "&lt;script&gt;" in section and section.count("<svg") == 2
-    assert 'href="#tradeoff"' in index and "time and frames" in section
+    assert "<script" not in section and "&lt;script&gt;" in section and section.count("<svg") == len(COST_KEYS)
+    assert 'href="#tradeoff"' in index and "time, frames" in section and "Power of pixels" in section
     assert "tradeoff" not in page_files([], [])["index.html"].decode()
-
-
-def test_types_of_the_decoder(opened):
-    """In float64 the plain formulas are the package's decoder; in float32 the depth moves, by far less than noise."""
-    sample = opened.samples("test")[0]
-    frames = opened.frames(sample, range(len(opened.sequence)))
-    for direction in ("vertical", "horizontal"):
-        packaged = ClassicalMethod(opened.rig, direction=direction, steps=18).predict(frames)
-        double = DecodeInType(opened.rig, direction, 18, dtype="float64").predict(frames)
-        single = DecodeInType(opened.rig, direction, 18, dtype="float32").predict(frames)
-        both = (packaged > 0) & (double > 0) & (single > 0)
-        assert both.sum() > 0.99 * (packaged > 0).sum()
-        assert (
-            np.abs(packaged - double)[both].max() < 2e-4
-        )  # one unit in the last place of the float32 that they end in
-        assert 0 < np.abs(single - double)[both].mean() < 0.01
+    longer = points[1].model_copy(update={"frames": 0, "pixel_seconds": [1.0] * 9})
+    assert b"<svg" in page_files([], [], tradeoff_of(small, [points[0], longer]))["index.html"]
+    nothing = tradeoff_of(small, [Point(method="lost", options={}, failed="frame 7 is not stored")])
+    assert page_files([], [], nothing) == page_files([], [])
 
 
 def test_the_command_measures_and_feeds_the_page(tiny, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(tradeoff_report, "PICTURES", {})
-    out = tmp_path / "out"
-    command = ["tradeoff", str(tiny), "--out", str(out), "--quick", "--only", "precision", "--only", "classical"]
-    assert main([*command, "--list"]) == 0 and not out.exists()
-    assert "11 settings and 0 ladders" in capsys.readouterr().out
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text(OWN_METHOD)
+    command = ["tradeoff", str(tiny), "--quick", "--method", "classical", "--method", "mine.py:Flat"]
+    assert main([*command, "--list"]) == 0 and not (tmp_path / "tradeoff").exists()
+    listed = capsys.readouterr().out
+    assert "classical steps=3 fewest\n" in listed and listed.endswith("8 points on 1 views.\n")
     assert main(command) == 0
     printed = capsys.readouterr().out
-    assert "Fronts of object MAE" in printed and "Load of the machine" in printed
-    run = read_tradeoff(out / "tradeoff.json")
-    by_key = {point.key: point for point in run.points}
-    assert len(by_key) == 11 and not any(point.failed for point in run.points)
-    many, few = by_key["classical-both-18"], by_key["classical-vertical-03"]
-    assert (many.frames, few.frames) == (50, 10) and many.measured_mae_mm < few.measured_mae_mm < 2
-    assert many.key in {point.key for point in run.front("frames")}
-    page = ["leaderboard", str(shipped_rows()[0]), "--page", str(tmp_path / "page")]
-    page += ["--tradeoff", str(out / "tradeoff.json")]
+    assert "Front of" in printed and "How time grows" in printed and "Written: tradeoff/tradeoff.png" in printed
+    run = read_tradeoff(tmp_path / "tradeoff" / TRADEOFF_FILE)
+    assert len(run.points) == 8 and not any(p.failed for p in run.points) and len(run.pixels) == 3
+    by_label = {p.label: p for p in run.points}
+    many, few, own = by_label["classical steps=18"], by_label["classical steps=3"], by_label["mine.py:Flat"]
+    assert (many.frames, few.frames, own.frames) == (50, 20, 1) and many.object_mae_mm < few.object_mae_mm < 2
+    assert many in run.front("frames") and own in run.front("frames") and len(own.pixel_seconds) == 3
+    page = ["leaderboard", str(shipped_rows()[0]), "--page", "page", "--tradeoff", "tradeoff/tradeoff.json"]
     assert main(page) == 0 and 'id="tradeoff"' in (tmp_path / "page" / "index.html").read_text()
 
 
-def test_sizes_are_photographed_and_scored(tiny):
-    plan = planned(TradeoffSettings(tiny, tiny, only=("sizes",), quick=True))
-    first, second, third = (
-        size_setting for size_setting in plan.settings if size_setting.views.rig.camera.width == 240
-    )
-    assert first.title == second.title.replace("vertical", "both").replace("=3", "=18") and third.key.endswith("phase")
-    scored_point = measured(first, QUICK)
-    # 0.76 mm with pixels that mix surfaces and bounced light; 0.18 mm in direct light, one ray a pixel.
-    assert scored_point.image_px == 240 and scored_point.frames == 50 and 0.5 < scored_point.measured_mae_mm < 1.2
+def test_sizes_are_smaller_where_the_fringes_allow_it(tiny, tmp_path):
+    plan = planned(tiny, tmp_path, ["constant"])
+    assert [rig.camera.width for rig in plan.rigs] == [176, 249, 352]
+    plan = planned(tiny, tmp_path, ["constant"])
+    plan.opened.__dict__["rig"] = paper_rig(480)
+    assert [rig.camera.width for rig in plan.rigs] == [240, 339, 480]
+    assert [len(frames) for frames in plan.scenes[:1]] == [52]
 
 
 def test_refusals(small, tiny, tmp_path, capsys):
     assert main(["tradeoff", str(tmp_path / "absent")]) == 2
-    assert main(["tradeoff", str(tiny), "--only", "networks", "--runs", str(tmp_path / "none"), "--list"]) == 2
-    assert "expected a folder of trainings" in capsys.readouterr().err
+    assert main(["tradeoff", str(tiny), "--method", "nothing-known", "--list"]) == 2
+    assert "nothing-known" in capsys.readouterr().err
     (tmp_path / "file").write_text("")
-    assert main(["tradeoff", str(small.path), "--out", str(tmp_path / "file"), "--only", "precision"]) == 2
+    assert main(["tradeoff", str(small.path), "--out", str(tmp_path / "file"), "--method", "constant"]) == 2
     assert main(["leaderboard", "--tradeoff", str(tmp_path / "file")]) == 2
     assert "--page" in capsys.readouterr().err
-    for words in (["--threads", "0"], ["--only", "everything"]):
+    for words in (["--threads", "0"], ["--views", "0"], ["--clock", "sun"]):
         assert main(["tradeoff", str(tiny), *words]) == 2
 
 
-def test_settings_without_their_frames_do_not_stop_the_others(small, tmp_path):
-    """A dataset of single shots: classical steps are refused one by one, and the run ends well."""
-    settings_of_run = TradeoffSettings(small.path, tmp_path / "out", only=("precision",), quick=True)
-    run = tradeoff(settings_of_run, planned(settings_of_run))
-    assert [("frame" in point.failed) for point in run.points] == [True, True] and run.front() == []
-    assert {path.name for path in write_report(run, settings_of_run.out)} == {"tradeoff.json", "tradeoff.csv"}
-    assert partial(page_files, [], [])(run) == page_files([], [])
+def test_torch_is_left_alone_unless_a_method_needs_it(tiny):
+    command = ["tradeoff", str(tiny), "--list", "--method", "classical", "--method", "phase"]
+    code = (
+        f"import sys; from fpp_ml_bench.cli import main; assert main({command!r}) == 0; "
+        "assert 'torch' not in sys.modules and 'onnxruntime' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, capture_output=True)

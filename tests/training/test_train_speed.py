@@ -1,18 +1,14 @@
 """The training benchmark's two ways: the same images, the same network, one pass each."""
 
-import math
-from pathlib import Path
-
 import numpy as np
 import pytest
 import scipy.io
+import train_speed
 from conftest import TINY_SIZE, tiny_settings
 
 from fpp_ml_bench.loaders.published.exporting import write_tree
 from fpp_ml_bench.loaders.render import build
 from fpp_ml_bench.loaders.storage import DatasetFolder
-
-BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
 @pytest.fixture(scope="module")
@@ -25,12 +21,9 @@ def data(tmp_path_factory):
 
 
 @pytest.fixture
-def ways(monkeypatch):
-    monkeypatch.syspath_prepend(BENCHMARKS)
-    import train_ways
-
-    yield train_ways
-    train_ways._surroundings.close()
+def ways():
+    yield train_speed
+    train_speed._surroundings.close()
 
 
 def job(ways, data, tmp_path, **changes):
@@ -39,8 +32,6 @@ def job(ways, data, tmp_path, **changes):
 
 
 def test_both_ways_read_the_same_images(monkeypatch, ways, data):
-    import train_speed
-
     train_speed.check_same(*data)
     monkeypatch.setattr(ways.PngAndMat, "__len__", lambda self: 5)
     with pytest.raises(SystemExit, match="holds 6 training pairs, the exported tree 5"):
@@ -48,8 +39,6 @@ def test_both_ways_read_the_same_images(monkeypatch, ways, data):
 
 
 def test_a_difference_is_noticed(ways, data, tmp_path):
-    import train_speed
-
     dataset, tree = data
     reader = ways.PngAndMat(tree)
     content = reader.depths[2].read_bytes()
@@ -73,9 +62,3 @@ def test_an_epoch_of_each(ways, data, tmp_path):
         assert epoch.memory_gib > 0
         losses.append(epoch.loss)
     assert losses[0] == pytest.approx(losses[1], rel=0.02)
-
-
-def test_the_cost_of_a_step(monkeypatch, ways, tmp_path):
-    monkeypatch.setattr(ways, "ENOUGH_S", 0.0)
-    seconds = ways.step_seconds(job(ways, tmp_path, tmp_path, size=32, batch=1))
-    assert 0 < seconds < math.inf

@@ -1,0 +1,379 @@
+"""Upkeep of what the repository shows of the leaderboard: its rows, the list of those that are vouched for, README's
+table and the tables of docs/robustness.md. Every step is a command of the package, printed before it runs.
+
+    python benchmarks/upkeep.py rows data/full --work rows-work          every row of that dataset
+    python benchmarks/upkeep.py measured leaderboard/rows/phase-horizontal.json reliance phase data/full
+    python benchmarks/upkeep.py readme [--check]
+    python benchmarks/upkeep.py robustness results
+
+rows: predict, time, score on the test split, and write a row file and its line in ``leaderboard/vouched.txt`` for each
+method. At 960 px rows are scored against the exact depth, which is the same whatever is projected, and at 224 px
+against ``depth``, as the paper's networks are. A dataset without a training split is the set of unseen objects; its
+rows are called ``NAME-unseen.json``, and ``--suffix=-hard`` names those of another light. One with crossed fringes has
+the methods for them. The same data gives the same scores; times depend on the machine. Phase reliance and robustness,
+which other commands measured, stay in the row of a method that has not changed.
+
+measured: run ``fpp-bench reliance`` or ``fpp-bench robustness`` with ``--into ROW``, and keep the row vouched for.
+
+readme: write the block between README's markers from the rows; with ``--check`` only say whether it is up to date.
+
+robustness: the tables and curves of every whole result that holds a block of ``test`` or ``unseen`` (`Robustness`), the
+least error first. The leaderboard's rows hold it in brief, without the severities. The tables go between the markers
+``<!-- SET:begin -->`` and ``<!-- SET:end -->`` of the page, and the curves of ``test`` beside it.
+"""
+
+import argparse
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from functools import partial
+from hashlib import sha256
+from pathlib import Path
+
+from fpp_ml_bench.baselines.phase_route.method import ONE_ALBEDO
+from fpp_ml_bench.baselines.robustness import CLEAN, SETS, Measured, SetName, corruptions, draw_curves
+from fpp_ml_bench.cli import main as fpp_bench
+from fpp_ml_bench.cli.evaluate import main as fpp_eval
+from fpp_ml_bench.constants import FULL_SIZE
+from fpp_ml_bench.errors import FppBenchError, SubmissionError
+from fpp_ml_bench.evaluation.report import percent
+from fpp_ml_bench.evaluation.result import Result, Robustness, read_result
+from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.leaderboard import columns
+from fpp_ml_bench.leaderboard.assumptions import assumption, told
+from fpp_ml_bench.leaderboard.columns import NOT_CHECKED, Column, device, error
+from fpp_ml_bench.leaderboard.groups import Group
+from fpp_ml_bench.leaderboard.names import short_names
+from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
+from fpp_ml_bench.leaderboard.reported import PAPER_DEPTHS, REPORTED_HEADING, chosen_tables
+from fpp_ml_bench.leaderboard.row_file import row_json, write_row
+from fpp_ml_bench.leaderboard.rows import VOUCHED, Entry, read_entry, vouching_line
+from fpp_ml_bench.leaderboard.tables import markdown_columns, markdown_rows, markdown_text
+from fpp_ml_bench.leaderboard.trivial import more_than_trivial
+from fpp_ml_bench.loaders.storage import DatasetFolder
+
+ROOT = Path(__file__).resolve().parent.parent
+ROWS, README, ROBUSTNESS = ROOT / "leaderboard" / "rows", ROOT / "README.md", ROOT / "docs" / "robustness.md"
+REFUSED, OUTDATED = 2, 1
+
+METHODS = {
+    "classical-18-both": "classical --steps 18 --direction both",
+    "classical-18-vertical": "classical --steps 18 --direction vertical",
+    "classical-18-horizontal": "classical --steps 18 --direction horizontal",
+    "classical-09-both": "classical --steps 9 --direction both",
+    "classical-09-vertical": "classical --steps 9 --direction vertical",
+    "classical-06-vertical": "classical --steps 6 --direction vertical",
+    # 18 is not divisible by 4, so these phases are not evenly spaced.
+    "classical-04-vertical": "classical --steps 4 --direction vertical",
+    "classical-03-vertical": "classical --steps 3 --direction vertical",
+    "classical-03-both-fewest": "classical --steps 3 --direction both --fewest",
+    "classical-net-03-vertical": "classical-net",
+    "phase-horizontal": "phase --fringe horizontal",
+    "phase-vertical": "phase --fringe vertical",
+    "phase-02-horizontal": "phase --frames 2 --fringe horizontal",
+    "phase-03-horizontal": "phase --frames 3 --fringe horizontal",
+    "phase-03-vertical": "phase --frames 3 --fringe vertical",
+    "phase-net-horizontal": "phase-net --fringe horizontal",
+    "phase-net-vertical": "phase-net --fringe vertical",
+    "phase-net-any-horizontal": "phase-net --fringe horizontal --albedo any",
+    "phase-net-any-vertical": "phase-net --fringe vertical --albedo any",
+    "constant-standoff": "constant --at standoff",
+    "constant-training-mean": "constant --at training-mean",
+    "constant-range-middle": "constant --at range-middle",
+    "constant-range-training": "constant --at range-training",
+    "nearest": "nearest",
+}
+"""File name of a row: method and options. The trivial methods that are told the range are scored by the rules of the
+paper's networks. The middle of the working range is the standoff, so it is no row of its own."""
+CROSSED = {"crossed": "crossed", "crossed-03": "crossed --frames 3", "crossed-net": "crossed-net"}
+"""The same for datasets with crossed fringes. The trivial methods see no code, so theirs would be the same rows."""
+
+
+def run(command: str, *words: object) -> None:
+    """Run a command; exit where it fails."""
+    arguments = [str(word) for word in words]
+    print("$", command, shlex.join(arguments), flush=True)
+    status = (fpp_eval if command == "fpp-eval" else fpp_bench)(arguments)
+    if status != 0:
+        sys.exit(status)
+
+
+def make_row(dataset: Path, work: Path, row: Path, name: str, repeats: int, training: Path | None) -> None:
+    """Predictions, time, result and row of a setting."""
+    predictions, result = work / name, work / f"{name}.json"
+    method, *options = (METHODS | CROSSED)[name].split()
+    options += ["--training", str(training)] if training is not None and method == "nearest" else []
+    settings = [method, dataset, *options]
+    run("fpp-bench", "predict", *settings, "--split", "test", "--out", predictions)
+    run("fpp-bench", "time", *settings, "--repeats", repeats, "--into", predictions / "submission.yaml")
+    target = "depth_exact" if DatasetFolder(dataset).size[0] == FULL_SIZE else "depth"
+    mode = "paper" if name.startswith("constant-range") else "standard"
+    run("fpp-eval", predictions, dataset, "--target", target, "--mode", mode, "--json", result)
+    before = read_entry(row) if row.exists() else None
+    run("fpp-bench", "leaderboard", result, "--row", row)
+    keep_measured(before, row)
+    vouch(row, dataset, name, before)
+
+
+def keep_measured(before: Entry | None, row: Path) -> None:
+    """Write the reliance and robustness of ``before`` into the row again, if it is of the same method."""
+    if before is None or _method_of(before) != _method_of(read_entry(row)):
+        return
+    made = read_entry(row).row
+    write_row(made.model_copy(update={key: getattr(before.row, key) for key in ("reliance", "robustness")}), row)
+
+
+def vouch(row: Path, dataset: Path, name: str, before: Entry | None) -> None:
+    """The line of the row in the ``vouched.txt`` above it, in place of that of the row before it."""
+    suffix = row.stem.removeprefix(name)
+    words = ["python", "benchmarks/upkeep.py", "rows", str(dataset), "--work", "rows-work", "--only", name]
+    words += [f"--suffix={suffix}"] if suffix not in ("", "-unseen") else []
+    line = vouching_line(read_entry(row).row, row.read_bytes(), "measured", shlex.join(words))
+    listed = row.parent.parent / VOUCHED.name
+    lines = listed.read_text(encoding="utf-8").splitlines() if listed.is_file() else []
+    outdated = "listed by none" if before is None else sha256(row_json(before.row)).hexdigest()
+    kept = [other for other in lines if not other.startswith(outdated)]
+    write_atomically(listed, "\n".join([*kept, line, ""]).encode())
+
+
+def write_measured(row: Path, words: Sequence[str]) -> None:
+    """Run ``fpp-bench`` with these words and ``--into`` the row, which stays vouched for if it was."""
+    before = sha256(row.read_bytes()).hexdigest()
+    run("fpp-bench", *words, "--into", row)
+    listed = row.parent.parent / VOUCHED.name
+    after = sha256(row.read_bytes()).hexdigest()
+    write_atomically(listed, listed.read_text(encoding="utf-8").replace(before, after).encode())
+
+
+def _method_of(entry: Entry) -> tuple[object, ...]:
+    about = entry.row.submission
+    settings = {key: value for key, value in about.settings.items() if key != "threads"}
+    return about.method, about.frames_used, about.units, settings
+
+
+def filled(path: Path, blocks: Mapping[str, str]) -> str:
+    """The text of ``path`` with each block between ``<!-- NAME:begin -->`` and ``<!-- NAME:end -->``. SubmissionError
+    where these are not there, each once."""
+    try:
+        text = path.read_bytes().decode("utf-8")
+    except UnicodeDecodeError:
+        raise SubmissionError(f"{path} is no UTF-8 text") from None
+    for name, block in blocks.items():
+        begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
+        before, _, rest = text.partition(begin)
+        between, _, after = rest.partition(end)
+        if f"{before}{begin}{between}{end}{after}" != text or text.count(begin) != 1 or text.count(end) != 1:
+            raise SubmissionError(f"{path}: expected {begin} and below it {end}, each once; put them where it belongs")
+        text = f"{before}{begin}\n\n{block}\n{end}{after}"
+    return text
+
+
+SHOWN = 5
+"""Rows of a group that README shows; the page shows them all."""
+_MADE_BY = "Made by `python benchmarks/upkeep.py readme` from the files in `leaderboard/rows/`."
+_NOTE = (
+    f"{_MADE_BY} Errors in mm. {columns.RANK_NOTE} {columns.TRUST_NOTE} Intervals: bootstrap over objects. "
+    f"{columns.RATIO_NOTE} Time: median latency of one image. Phase reliance: 1 follows the fringe's phase and nothing "
+    "else, 0 does not follow it (docs/reliance.md). Disturbed: object MAE over all axes and severities of disturbed "
+    "scenes, with 150 mm for a pixel without an answer (docs/robustness.md)."
+).replace(NOT_CHECKED, f"\\{NOT_CHECKED}")
+_ERRORS = (
+    Column("Object MAE, mm", partial(error, "object_mae_mm")),
+    Column("Object RMSE", partial(error, "object_rmse_mm")),
+    Column("Overall MAE", partial(error, "overall_mae_mm")),
+)
+_COLUMNS = (
+    columns.RANK,
+    columns.METHOD,
+    columns.CODE,
+    _ERRORS[0],
+    Column("95% interval", partial(columns.interval, between=" - ")),
+    *columns.PARTS,
+    columns.RATIO,
+    columns.RANGE,
+    *_ERRORS[1:],
+    Column("Time, ms", columns.milliseconds_text),
+    columns.FRAMES,
+    columns.RELIANCE,
+    columns.ROBUSTNESS,
+    columns.PROVENANCE,
+)
+
+
+def readme_block(groups: Sequence[Group]) -> str:
+    """What is between README's markers: the best `SHOWN` rows of each group that is not `GroupKey.aside`, and the
+    paper's architectures."""
+    if not groups:
+        return f"No row yet. {_MADE_BY}\n"
+    others = list(dict.fromkeys(group.key.aside for group in groups if group.key.aside))
+    groups, lines = [group for group in groups if not group.key.aside], []
+    for group in more_than_trivial(groups):
+        machines = sorted({device(row.entry) for row in group.rows if row.entry.time_measured})
+        timed = f"; measured on {', '.join(machines)}" if machines else ""
+        lines += [f"**{markdown_text(group.title + timed)}**", ""]
+        lines += [*markdown_columns(_COLUMNS, group.rows[:SHOWN]), ""]
+        more = len(group.rows) - SHOWN
+        lines += [f"… and {more} more on the page", ""] if more > 0 else []
+    shown = [row.entry.row for group in groups for row in group.rows]
+    assuming = sorted({row.submission.method for row in shown if assumption(row)})
+    notes = [_NOTE] + ([f"{' and '.join(assuming)} assume {ONE_ALBEDO.words}."] if assuming else [])
+    notes += [f"Rows of other data ({'; '.join(others)}) are on the page."] if others else []
+    notes += dict.fromkeys(markdown_text(note) for group in groups for note in group.notes)
+    keys, titles = ("object_mae_mm", "object_rmse_mm", "overall_mae_mm"), [column.title for column in _ERRORS]
+    reported = [
+        [
+            row.label,
+            *(f"{row.errors_mm[key]:.2f}" if key in row.errors_mm else "-" for key in keys),
+            f"{table.source}, told {told(row.track)}",
+        ]
+        for table in (*chosen_tables("architecture"), *chosen_tables("oracle_order"))
+        for row in table.rows
+    ]
+    rows = [list(map(markdown_text, cells)) for cells in reported]
+    lines += [f"**{REPORTED_HEADING}, not ranked with the rows above**", ""]
+    lines += [*markdown_rows(["Method", *titles, "Note"], (False, True, True, True, False), rows), ""]
+    return "\n".join([*lines, " ".join([PAPER_DEPTHS, *notes])]) + "\n"
+
+
+CURVES = "robustness_curves.png"
+"""The picture of the test objects, below their tables."""
+SCORES = ("wrong_share", "unanswered_share", "confident_share", "coverage")
+TITLES = (
+    "method",
+    "mean, mm",
+    "95% interval",
+    "clean, mm",
+    "ratio",
+    "wrong orders",
+    "unanswered",
+    "confident errors",
+    "coverage",
+)
+Row = tuple[str, Robustness]
+
+
+def of_set(name: SetName, results: Sequence[Result]) -> list[Row]:
+    """Names and blocks of a set, the least error first."""
+    blocks = [(result, block) for result in results if (block := (result.robustness or {}).get(name))]
+    names = short_names([result.submission for result, _ in blocks])
+    found = [
+        (f"{short}, {block.size_px} px" if block.size_px != FULL_SIZE else short, block)
+        for short, (_, block) in zip(names, blocks, strict=True)
+    ]
+    return sorted(found, key=lambda row: (row[1].mae_mm, row[0]))
+
+
+def robustness_tables(rows: Sequence[Row]) -> str:
+    """Both tables in Markdown: means over all axes, then each axis by itself."""
+    overall, by_axis = [], []
+    axes = [axis for axis in corruptions().axes if any(axis in block.axes for _, block in rows)]
+    for name, block in rows:
+        low, high = block.interval
+        interval = "-" if low is None or high is None else f"{low:.1f} to {high:.1f}"
+        ratio = "-" if block.ratio is None else f"{block.ratio:.1f}"
+        numbers = [f"{block.mae_mm:.1f}", interval, f"{block.clean.mae_mm:.1f}", ratio]
+        overall.append([markdown_text(name), *numbers, *(percent(block.mean(key)) for key in SCORES)])
+        means = []
+        for axis in axes:
+            errors = [scores.mae_mm for scores in block.axes.get(axis, [])]
+            means.append(f"{sum(errors) / len(errors):.1f}, {errors[-1]:.1f}" if errors else "")
+        by_axis.append([markdown_text(name), *means])
+    lines = markdown_rows(TITLES, [False] + [True] * (len(TITLES) - 1), overall)
+    lines += ["", "By axis, mean over the five severities and the last one, mm:", ""]
+    lines += markdown_rows(("method", *axes), [False] + [True] * len(axes), by_axis)
+    return "\n".join(lines) + "\n"
+
+
+def curves(rows: Sequence[Row]) -> bytes:
+    """The curves of the test objects as the page of ``fpp-bench robustness`` draws them; PNG."""
+    measured = []
+    for title, block in rows:
+        means = {axis: dict(enumerate((s.model_dump() for s in found), 1)) for axis, found in block.axes.items()}
+        setup = {"title": title, "set": "test", "quick": False}
+        measured.append(Measured(Path(), setup, {CLEAN: {0: block.clean.model_dump()}, **means}))
+    return draw_curves(measured)
+
+
+def parser() -> argparse.ArgumentParser:
+    """Of the words after the script's name."""
+    summary = __doc__.split("\n\n", 1)[0]
+    words = argparse.ArgumentParser(description=summary, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    jobs = words.add_subparsers(dest="job", required=True)
+    add = jobs.add_parser("rows", help="make rows again").add_argument
+    add("dataset", type=Path, help="dataset folder with all frames")
+    add("--work", type=Path, required=True, help="new or empty folder for predictions and results")
+    add("--out", type=Path, default=ROWS, help="folder for the rows")
+    add("--only", nargs="+", choices=METHODS | CROSSED, metavar="NAME", help="only these rows")
+    add("--suffix", help="of the rows' names (default: -unseen for a dataset without a training split)")
+    add("--training", type=Path, help="for nearest: the dataset with the training split")
+    add("--repeats", type=int, default=40, help="timed runs of each method")
+    add = jobs.add_parser("measured", help="measure reliance or robustness of a row").add_argument
+    add("row", type=Path, help="row file")
+    add("words", nargs=argparse.REMAINDER, help="words of fpp-bench, without --into")
+    add = jobs.add_parser("readme", help="write README's table").add_argument
+    add("page", type=Path, nargs="?", default=README, help="Markdown with the markers")
+    add("--check", action="store_true", help="write nothing; exit status 1 where it is not up to date")
+    add = jobs.add_parser("robustness", help="write the tables of docs/robustness.md").add_argument
+    add("results", type=Path, nargs="+", help="result files, or folders of them")
+    add("--page", type=Path, default=ROBUSTNESS, help="Markdown with the markers")
+    return words
+
+
+def make_rows(args: argparse.Namespace) -> None:
+    """Make the rows that ``args`` name; SubmissionError for a folder of earlier work."""
+    if args.work.exists() and any(args.work.iterdir()):
+        raise SubmissionError(f"{args.work} is not empty")
+    args.work.mkdir(parents=True, exist_ok=True)
+    args.out.mkdir(parents=True, exist_ok=True)
+    opened = DatasetFolder(args.dataset)
+    suffix = args.suffix if args.suffix is not None else "" if "train" in opened.splits else "-unseen"
+    for name in args.only or (METHODS if opened.rig.crossed is None else CROSSED):
+        make_row(args.dataset, args.work, args.out / f"{name}{suffix}.json", name, args.repeats, args.training)
+
+
+def write_readme(page: Path, groups: Sequence[Group], check: bool) -> int:
+    """Write the block of ``groups``; with ``check`` only say whether it is there, by the exit status."""
+    text = filled(page, {"leaderboard": readme_block(groups)}).encode()
+    same = text == page.read_bytes()
+    if check and not same:
+        print(
+            f"{page}: the ranking is not up to date with the rows; don't edit it by hand, run: "
+            "python benchmarks/upkeep.py readme",
+            file=sys.stderr,
+        )
+        return OUTDATED
+    if not same:
+        write_atomically(page, text)
+    print(f"{page}: {'the ranking is up to date with the rows' if same else 'written'}")
+    return 0
+
+
+def write_robustness(args: argparse.Namespace) -> None:
+    """Write the tables into the page and the curves beside it."""
+    results = list(map(read_result, expand(args.results)))
+    rows = {name: of_set(name, results) for name in SETS}
+    blocks = {name: robustness_tables(rows[name]) for name in SETS}
+    blocks["test"] += f"\n![Error against severity for each axis, a line for each method](pictures/{CURVES})\n"
+    write_atomically(args.page, filled(args.page, blocks).encode())
+    write_atomically(args.page.parent / "pictures" / CURVES, curves(rows["test"]))
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    args = parser().parse_args(words)
+    try:
+        if args.job == "readme":
+            return write_readme(args.page, rank(read_entries(shipped_rows())), args.check)
+        if args.job == "measured":
+            write_measured(args.row, args.words)
+        elif args.job == "rows":
+            make_rows(args)
+        else:
+            write_robustness(args)
+        return 0
+    except (FppBenchError, OSError) as error:
+        print(f"upkeep.py: error: {error}", file=sys.stderr)
+        return REFUSED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,173 @@
+"""What keeps the repository's own rows and the tables of its pages: `benchmarks/upkeep.py`."""
+
+import json
+import re
+from dataclasses import replace
+from hashlib import sha256
+from types import SimpleNamespace
+
+import pytest
+import upkeep
+from board_rows import some_rows
+from scored_dataset import make_dataset
+from upkeep import SHOWN, readme_block
+
+from fpp_ml_bench.cli import BENCH
+from fpp_ml_bench.cli.robustness import Scenes
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.result import Robustness, SeverityScores
+from fpp_ml_bench.leaderboard.ranking import rank, read_entries
+from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, check_same_method, read_entry
+
+BEGIN, END = "<!-- leaderboard:begin -->", "<!-- leaderboard:end -->"
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    work = tmp_path_factory.mktemp("rows")
+    return some_rows(work / "rows", make_dataset(work / "tiny"))
+
+
+@pytest.fixture
+def readme(tmp_path):
+    path = tmp_path / "README.md"
+    path.write_text(f"# Title\n\n{BEGIN}\n{END}\n\nMore.\n")
+    return path
+
+
+def block(path, files, check=False):
+    return upkeep.write_readme(path, rank(read_entries(files)), check)
+
+
+def test_readme_block_is_made_and_stays(readme, files, capsys):
+    assert block(readme, files) == 0
+    text = readme.read_text()
+    assert text.startswith(f"# Title\n\n{BEGIN}\n\n") and text.endswith(f"\n{END}\n\nMore.\n")
+    lines = [line.split(" | ")[0][2:] for line in text.splitlines() if re.search(r"\| \d+ \|.* \| local file", line)]
+    assert lines == ["Slow and fine", "Fast and rough", "Beaten", "Was told"]
+    assert block(readme, files[::-1]) == 0 and readme.read_text() == text
+    assert block(readme, files, check=True) == 0
+    assert "is up to date with the rows" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("extra", [0, 1, 4])
+def test_readme_shows_the_best_of_a_group(extra, files):
+    count = SHOWN + extra
+    entry = read_entry(files[0])
+    about = entry.row.submission
+    named = [
+        replace(
+            entry,
+            row=entry.row.model_copy(
+                update={
+                    "submission": about.model_copy(update={"name": f"Method {number:02}"}),
+                    "predictions_sha256": f"{number:064}",
+                }
+            ),
+        )
+        for number in range(count)
+    ]
+    text = readme_block(rank([*named, read_entry(files[3])]))
+    # All share one error, so names decide.
+    assert [n for n in range(count) if f"Method {n:02}" in text] == list(range(5))
+    assert [line for line in text.splitlines() if "more on the page" in line] == (
+        [f"… and {extra} more on the page"] if extra else []
+    )
+    assert "Was told" in text
+
+
+def test_a_hand_edited_block_fails_the_check_and_is_left_alone(readme, files, capsys):
+    assert block(readme, files) == 0
+    made = readme.read_text()
+    for edited in (made.replace("| Slow", "| Slowest"), made.replace(END, f"A line too many.\n{END}")):
+        readme.write_text(edited)
+        assert block(readme, files, check=True) == 1
+        assert "don't edit it by hand, run: python benchmarks/upkeep.py readme" in capsys.readouterr().err
+        assert readme.read_text() == edited
+    readme.write_text(made.replace("More.", "Text outside of the markers."))
+    assert block(readme, files, check=True) == 0
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        b"no markers",
+        f"{END}\n{BEGIN}\n".encode(),
+        f"{BEGIN}\n{BEGIN}\n{END}\n".encode(),
+        f"{BEGIN}\n".encode(),
+        b"\xff",
+    ],
+)
+def test_markers_must_be_there(text, readme, capsys):
+    readme.write_bytes(text)
+    for more in ([], ["--check"]):
+        assert upkeep.main(["readme", str(readme), *more]) == 2
+        assert re.search("each once|is no UTF-8 text", capsys.readouterr().err)
+    assert readme.read_bytes() == text
+    assert upkeep.main(["readme", str(readme.with_name("none.md"))]) == 2
+
+
+@pytest.mark.parametrize(
+    "row", ["classical-18-both", "classical-net-03-vertical", "phase-horizontal", "phase-net-any-vertical"]
+)
+def test_a_rows_command_is_of_the_method_that_was_scored(row):
+    name, *options = upkeep.METHODS[row].split()
+    words = [name, "data", *options, "--out", "predictions"]
+    command = BENCH.command("predict")
+    chosen = command.values(command.make_context("fpp-bench predict", words))["chosen"]
+    method = chosen.load(Scenes.of("test", 960, "paper"), warn=False)
+    check_same_method(read_entry(SHIPPED_ROWS / f"{row}.json"), method)
+
+
+def test_a_row_stays_vouched_for_when_more_of_it_is_measured(files, tmp_path, monkeypatch):
+    folder = tmp_path / "rows"
+    folder.mkdir()
+    row = folder / "mine.json"
+    row.write_bytes(files[0].read_bytes())
+    before = sha256(row.read_bytes()).hexdigest()
+    (tmp_path / "vouched.txt").write_text(f"{before} | measured\n")
+    ran = []
+
+    def measure(words):
+        ran.append(words)
+        row.write_text(json.dumps(json.loads(row.read_text())))
+        return 0
+
+    monkeypatch.setattr(upkeep, "fpp_bench", measure)
+    assert upkeep.main(["measured", str(row), "reliance", "phase", "data/full", "--direction", "vertical"]) == 0
+    assert ran == [["reliance", "phase", "data/full", "--direction", "vertical", "--into", str(row)]]
+    after = sha256(row.read_bytes()).hexdigest()
+    assert after != before and (tmp_path / "vouched.txt").read_text() == f"{after} | measured\n"
+
+
+def test_the_tables_of_robustness_stand_between_their_markers(tmp_path):
+    assert all(
+        f"<!-- {name}:{end} -->" in upkeep.ROBUSTNESS.read_text() for name in upkeep.SETS for end in ("begin", "end")
+    )
+    page = tmp_path / "page.md"
+    page.write_text("a page without them")
+    with pytest.raises(SubmissionError, match="expected <!-- test:begin -->"):
+        upkeep.filled(page, {"test": ""})
+    scores = SeverityScores(
+        mae_mm=3.0, protocol_mae_mm=3.0, wrong_share=0.1, unanswered_share=0.0, confident_share=None, coverage=None
+    )
+    block = Robustness(
+        version=1,
+        set="test",
+        mae_mm=3.0,
+        interval=[2.0, 4.0],
+        clean=scores,
+        axes={"motion": [scores] * 5},
+        samples=2,
+        objects=2,
+        size_px=960,
+        weights_sha256=None,
+    )
+    results = [
+        SimpleNamespace(
+            submission=SimpleNamespace(name="A | method", method="mine", settings={}), robustness={"test": block}
+        )
+    ]
+    assert upkeep.of_set("unseen", results) == []
+    table = upkeep.robustness_tables(upkeep.of_set("test", results))
+    assert "| A &#124; method | 3.0 | 2.0 to 4.0 | 3.0 | 1.0 |" in table
