@@ -19,8 +19,8 @@ from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.submission import REPORTS_FILE, SIGMA, SUBMISSION_FILE, UNFINISHED_FILE, check_submission
 from fpp_ml_bench.files import LOCK_FILE, exclusive, write_atomically
-from fpp_ml_bench.loaders.sample import stored_frames
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.sample import row_columns, stored_frames
+from fpp_ml_bench.loaders.storage import ALL_SPLITS, DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by, seconds_of, skipping
 
@@ -86,7 +86,7 @@ def _predict_split(
         write_atomically(out / REPORTS_FILE, (json.dumps(reports, indent=1, allow_nan=False) + "\n").encode("utf-8"))
         summary = method.summary(list(reports.values()))
     timed = {"seconds_per_sample": float(f"{median:.6g}"), "seconds_source": "measured"}
-    described = _described(method)
+    described = {**_described(method), **_predicted(opened, method, split)}
     described["settings"] |= summary
     submission = check_submission(out, {**described, **timed})
     write_atomically(out / SUBMISSION_FILE, submission.to_yaml().encode("utf-8"))
@@ -156,6 +156,15 @@ def _described(method: Method) -> dict[str, Any]:
         "settings": {**method.settings},
         **({"seeds": dict(method.seeds)} if method.seeds else {}),
     }
+
+
+def _predicted(opened: DatasetFolder, method: Method, split: str) -> dict[str, Any]:
+    """What the submission says of the data; nothing of a dataset whose manifest has no hashes of its content."""
+    columns = row_columns(opened.sequence, method.frames_used, opened.has_exact)
+    splits = opened.splits if split == ALL_SPLITS else (split,)
+    names = [f"{part}/{column}" for part in splits for column in columns]
+    content = {name: opened.content[name] for name in names if name in opened.content}
+    return {"predicted": {"dataset": str(opened.path.resolve()), "split": split, "content": content}} if content else {}
 
 
 COUNTED_SAMPLES = 6

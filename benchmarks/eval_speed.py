@@ -2,7 +2,7 @@
 
     python benchmarks/eval_speed.py [--size 960] [--samples 30] [--repeats 7]
 
-- ``fpp-eval PREDICTIONS --dataset DATASET --json FILE``: imports, reading, hashing, checking, all scores, intervals,
+- ``fpp-eval PREDICTIONS DATASET --json FILE``: imports, reading, hashing, checking, all scores, intervals,
   table and result file.
 - `LOAD`: imports NumPy and loads the predictions and targets, nothing else.
 - `PLAIN`: what a careful user writes: loads the same files, checks shapes and values, and computes the six headline
@@ -134,7 +134,7 @@ def main() -> None:
         )
         prepare(Path(data), Path(predictions), Path(targets), args.size, args.samples)
         commands = {
-            "fpp-eval": [str(COMMAND), predictions, "--dataset", data, "--json", result],
+            "fpp-eval": [str(COMMAND), predictions, data, "--json", result],
             "load": [sys.executable, "-c", LOAD, predictions, targets],
             "plain": [sys.executable, "-c", PLAIN, predictions, targets],
         }

@@ -173,7 +173,7 @@ def peaks_mib(folder: Path, rows: int, size: int) -> dict[str, float]:
     with tempfile.TemporaryDirectory(prefix="fpp-memory-", dir=folder) as scratch:
         data, out, split = f"{scratch}/set", f"{scratch}/predictions", ("--split", "train")
         commands = {
-            "build": ("build", data, "--size", str(size), "--objects", ",".join(names), "--workers", "1"),
+            "build": ("build", "--out", data, "--size", str(size), "--objects", ",".join(names), "--workers", "1"),
             "predict classical": ("predict", "classical", data, *split, "--out", f"{scratch}/classical"),
             "predict classical --fewest": (
                 *("predict", "classical", data, "--fewest", "--steps", "3"),
@@ -182,7 +182,7 @@ def peaks_mib(folder: Path, rows: int, size: int) -> dict[str, float]:
             "predict phase": ("predict", "phase", data, *split, "--out", out),
         }
         peaks = {name: peak_mib("fpp-bench", *words) for name, words in commands.items()}
-        peaks["fpp-eval"] = peak_mib("fpp-eval", out, "--dataset", data, *split)
+        peaks["fpp-eval"] = peak_mib("fpp-eval", out, data, *split)
         return peaks | {name: peak_mib("fpp-bench", name, data) for name in ("verify", "info")}
 
 

@@ -70,7 +70,7 @@ def fingerprints(way: str, settings: list[str], work: Path) -> tuple[str, str, s
     if "NUMBA_CPU_NAME" in WAYS[way]:
         environment["NUMBA_CACHE_DIR"] = str(work / "compiled")
     folder = work / way.replace(" ", "-")
-    command = [sys.executable, "-c", MESHES, "build", str(folder), *settings, "--workers", workers]
+    command = [sys.executable, "-c", MESHES, "build", "--out", str(folder), *settings, "--workers", workers]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     if done.returncode:
         sys.exit(f"{way}: the build failed:\n{done.stderr}")

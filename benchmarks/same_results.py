@@ -5,6 +5,8 @@
 
 Knows only the installed commands and plain file formats, and nothing of the package: modules can move between the two.
 Every item is a hash, with the numbers beside it where they are small. Left out are times, dates, machine and versions.
+Items are named after the spelling that commands had at first, so that an old record can be compared: `spelled` has that
+of today.
 ``compare`` prints one line for each item that differs; exit status 1 if there is one. Sections: build, train, predict,
 leaderboard, reports. About eight minutes on one core.
 """
@@ -109,6 +111,27 @@ METHODS = (
 )
 
 
+SPELLINGS = (
+    (r"^fpp-bench build (\w\S*)", r"fpp-bench build --out \1"),
+    (r"^(fpp-bench build .*)--frames (\S+)", r"\1--config \2"),
+    (r"^(fpp-bench (?:import|export) \w\S*) (\w\S*)", r"\1 --out \2"),
+    (r"^(fpp-bench info .*)--json$", r"\1--json -"),
+    (r"--dataset ", ""),
+    (r"--fringe ", "--direction "),
+    (r" --no-skip", ""),
+)
+"""Patterns of the first spellings of commands, and what they are today."""
+
+
+def spelled(command: str) -> tuple[str, dict[str, str]]:
+    """A command in the spelling of today, and what it needs in the environment."""
+    for pattern, now in SPELLINGS:
+        command, before = re.sub(pattern, now, command), command
+        if "--no-skip" in before and "--no-skip" not in command:
+            return command, {"FPP_BENCH_SKIP": "0"}
+    return command, {}
+
+
 def digest(value: bytes) -> dict[str, Any]:
     return {"sha256": hashlib.sha256(value).hexdigest()}
 
@@ -190,9 +213,10 @@ class Recorder:
     def run(self, section: str, command: str, *written: str, output: bool = False) -> bool:
         """One command, and items of the files or folders that it wrote, and of its standard output if asked."""
         start = perf_counter()
-        arguments = command.split()
+        now, needed = spelled(command)
+        arguments = now.split()
         program = Path(sys.executable).parent / arguments[0]
-        variables = {"OMP_NUM_THREADS": "1", "COLUMNS": "160", "NO_COLOR": "1"}
+        variables = {"OMP_NUM_THREADS": "1", "COLUMNS": "160", "NO_COLOR": "1", **needed}
         done = subprocess.run(
             [program, *arguments[1:]], cwd=self.work, env={**os.environ, **variables}, capture_output=True, text=True
         )

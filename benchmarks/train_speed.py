@@ -228,8 +228,8 @@ def make_data(scratch: Path, size: int, count: int) -> tuple[Path, Path]:
     command = [sys.executable, "-m", "fpp_ml_bench"]
     root = Path(__file__).resolve().parent.parent
     for arguments in (
-        ["build", dataset, "--size", size, "--objects", objects, "--frames", "single_shot"],
-        ["export", dataset, tree, "--mat"],
+        ["build", "--out", dataset, "--size", size, "--objects", objects, "--config", "single_shot"],
+        ["export", dataset, "--out", tree, "--mat"],
     ):
         completed = subprocess.run([*command, *map(str, arguments)], cwd=root, capture_output=True, text=True)
         if completed.returncode:

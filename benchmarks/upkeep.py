@@ -68,15 +68,15 @@ METHODS = {
     "classical-03-vertical": "classical --steps 3 --direction vertical",
     "classical-03-both-fewest": "classical --steps 3 --direction both --fewest",
     "classical-net-03-vertical": "classical-net",
-    "phase-horizontal": "phase --fringe horizontal",
-    "phase-vertical": "phase --fringe vertical",
-    "phase-02-horizontal": "phase --frames 2 --fringe horizontal",
-    "phase-03-horizontal": "phase --frames 3 --fringe horizontal",
-    "phase-03-vertical": "phase --frames 3 --fringe vertical",
-    "phase-net-horizontal": "phase-net --fringe horizontal",
-    "phase-net-vertical": "phase-net --fringe vertical",
-    "phase-net-any-horizontal": "phase-net --fringe horizontal --albedo any",
-    "phase-net-any-vertical": "phase-net --fringe vertical --albedo any",
+    "phase-horizontal": "phase --direction horizontal",
+    "phase-vertical": "phase --direction vertical",
+    "phase-02-horizontal": "phase --frames 2 --direction horizontal",
+    "phase-03-horizontal": "phase --frames 3 --direction horizontal",
+    "phase-03-vertical": "phase --frames 3 --direction vertical",
+    "phase-net-horizontal": "phase-net --direction horizontal",
+    "phase-net-vertical": "phase-net --direction vertical",
+    "phase-net-any-horizontal": "phase-net --direction horizontal --albedo any",
+    "phase-net-any-vertical": "phase-net --direction vertical --albedo any",
     "constant-standoff": "constant --at standoff",
     "constant-training-mean": "constant --at training-mean",
     "constant-range-middle": "constant --at range-middle",
@@ -108,7 +108,7 @@ def make_row(dataset: Path, work: Path, row: Path, name: str, repeats: int, trai
     run("fpp-bench", "time", *settings, "--repeats", repeats, "--into", predictions / "submission.yaml")
     target = "depth_exact" if DatasetFolder(dataset).size[0] == FULL_SIZE else "depth"
     mode = "paper" if name.startswith("constant-range") else "standard"
-    run("fpp-eval", predictions, "--dataset", dataset, "--target", target, "--mode", mode, "--json", result)
+    run("fpp-eval", predictions, dataset, "--target", target, "--mode", mode, "--json", result)
     before = read_entry(row) if row.exists() else None
     run("fpp-bench", "leaderboard", result, "--row", row)
     keep_measured(before, row)

@@ -4,60 +4,93 @@
 >>> @dataclass(frozen=True)
 ... class Options:
 ...     steps: int = option(4, "phase steps", metavar="N")
->>> Options().steps, described(Options)["steps"].help
-(4, 'phase steps')
+>>> (steps,) = options_of(Options)
+>>> Options().steps, flag_of(steps), described(steps).help
+(4, '--steps', 'phase steps')
 """
 
-from collections.abc import Collection, Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import MISSING, Field, dataclass, field, fields
 from difflib import get_close_matches
 from typing import Any
 
 from fpp_ml_bench.files import printable
 
 _KEY = "fpp_ml_bench.option"
+MOST_LISTED = 80
+REQUIRED: Any = MISSING
+"""In place of a default: the command line must give it."""
 
 
 @dataclass(frozen=True)
 class Description:
     """What the command line says of an option: ``help``, ``metavar`` of its value, the ``choices`` that there are, and
-    ``flag``, its spelling where that is not made of the field's name."""
+    ``flag``, its spelling where that is not made of the field's name. ``parse`` makes a value of its text where the
+    field's type does not say how; it raises ValueError with what it expected. ``many``: may be given again, the field
+    is a tuple. ``positional``: an argument without a flag."""
 
     help: str
     metavar: str | None = None
     choices: tuple[str, ...] = ()
     flag: str | None = None
+    parse: Callable[[str], Any] | None = None
+    many: bool = False
+    positional: bool = False
 
 
 def option(
-    default: Any, help: str, metavar: str | None = None, choices: Collection[str] = (), flag: str | None = None
+    default: Any,
+    help: str,
+    metavar: str | None = None,
+    choices: Collection[str] = (),
+    flag: str | None = None,
+    parse: Callable[[str], Any] | None = None,
+    many: bool = False,
 ) -> Any:
     """A dataclass field that is an option of the command line: its ``default``, and the rest as of `Description`."""
-    return field(default=default, metadata={_KEY: Description(help, metavar, tuple(choices), flag)})
+    description = Description(help, metavar, tuple(choices), flag, parse, many)
+    return field(default=default, metadata={_KEY: description})
 
 
-def described(options: type) -> dict[str, Description]:
+def argument(
+    help: str, metavar: str, default: Any = REQUIRED, choices: Collection[str] = (), many: bool = False
+) -> Any:
+    """A dataclass field that is an argument of the command line, told by its place; else as `option`."""
+    description = Description(help, metavar, tuple(choices), many=many, positional=True)
+    return field(default=default, metadata={_KEY: description})
+
+
+def options_of(settings: type | None) -> "list[Field[Any]]":
     """The fields of a dataclass that are options of the command line, in order; its other fields are for code alone."""
-    return {entry.name: entry.metadata[_KEY] for entry in fields(options) if _KEY in entry.metadata}
+    return [entry for entry in (fields(settings) if settings else ()) if _KEY in entry.metadata]
 
 
-def defaults(options: type) -> dict[str, Any]:
-    """The default of each field of a dataclass that has one."""
-    return {entry.name: entry.default for entry in fields(options) if entry.default is not MISSING}
+def described(entry: "Field[Any]") -> Description:
+    """What the command line says of a field that is an option."""
+    description: Description = entry.metadata[_KEY]
+    return description
 
 
-def flag_of(name: str, description: Description) -> str:
-    """``--its-name`` of a field called ``name``."""
-    return description.flag or f"--{name.replace('_', '-')}"
+def flag_of(entry: "Field[Any]") -> str:
+    """Its spelling on the command line: ``--its-name``, or what it says itself."""
+    return described(entry).flag or f"--{entry.name.replace('_', '-')}"
+
+
+def nearest(name: str, known: Collection[str] | Mapping[str, Any], count: int = 1) -> list[str]:
+    """The known names, at most ``count``, that an unknown ``name`` is probably meant as; none that is far from it."""
+    return get_close_matches(name, known, n=count)
 
 
 def did_you_mean(name: str, known: Collection[str] | Mapping[str, Any]) -> str:
-    """How a message about an unknown ``name`` ends: the nearest known one, or all of them.
+    """How a message about an unknown ``name`` ends: the nearest known one, or all of them, up to `MOST_LISTED`.
 
     >>> did_you_mean("clasical", ["classical", "phase"])
     "did you mean 'classical'?"
     >>> did_you_mean("x", ["classical", "phase"])
     'there are classical, phase'
     """
-    nearest = get_close_matches(name, known, n=1)
-    return f"did you mean {printable(nearest[0])!r}?" if nearest else f"there are {', '.join(known) or 'none'}"
+    meant = nearest(name, known)
+    if meant:
+        return f"did you mean {printable(meant[0])!r}?"
+    listed = [*known][:MOST_LISTED] + ["..."] * (len(known) > MOST_LISTED)
+    return f"there are {', '.join(listed) or 'none'}"

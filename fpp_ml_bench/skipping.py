@@ -1,7 +1,7 @@
 """The switch for skipping: leaving out work that a scene does not need (the default), or doing all of it.
 
-The results are the same bit by bit either way. ``FPP_BENCH_SKIP=0`` in the environment, or the option ``--no-skip`` of
-a command, switches skipping off, to measure its gain or to exclude it as the cause of a problem.
+The results are the same bit by bit either way. ``FPP_BENCH_SKIP=0`` in the environment switches
+skipping off, to measure its gain or to exclude it as the cause of a problem.
 """
 
 import os

@@ -16,7 +16,7 @@ from fpp_ml_bench.tables import Table
 NO_RESULTS = """\
 No results here yet. Score predictions, and their row appears:
   fpp-bench predict classical data/mini --split test --out predictions
-  fpp-eval predictions --dataset data/mini --split test --json result.json
+  fpp-eval predictions data/mini --split test --json result.json
   fpp-bench leaderboard result.json
 Without arguments, result*.json and results/*.json of the current folder are read.
 """

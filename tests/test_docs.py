@@ -5,10 +5,12 @@ import shlex
 from importlib import import_module
 from pathlib import Path
 
+import click
 import pytest
 from conftest import tiny_settings
 
-from fpp_ml_bench.cli import COMMANDS, evaluate, parser_for
+from fpp_ml_bench.cli import BENCH, COMMANDS, EVAL, Program
+from fpp_ml_bench.cli.options import flags_of
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted(
@@ -43,22 +45,32 @@ FENCED = re.compile(r"^ *```(\w*)\n(.*?)^ *```$", flags=re.DOTALL | re.MULTILINE
 ENDS_A_COMMAND = {"|", "||", "&&", ";", ">", ">>", "<"}
 
 
-def _parser_and_words(words):
-    """The parser of a command line, and the words that it parses."""
-    program, first = [*words, ""][:2]
-    if program == "fpp-eval":
-        command = evaluate.SUBCOMMANDS.get(first)
-        return parser_for(command or evaluate, program), words[2:] if command else words[1:]
-    module = import_module(f"fpp_ml_bench.cli.{COMMANDS[first][0]}")
-    return parser_for(module, f"fpp-bench {first}"), words[2:]
+def _command_and_words(words):
+    """The command that a command line runs, or the program where it names none, and the words that it parses."""
+    program, *rest = words
+    command = {"fpp-bench": BENCH, "fpp-eval": EVAL}[program]
+    while isinstance(command, Program):
+        name = rest[0] if rest and rest[0] in command.commands else command.default
+        if not name:
+            break
+        rest = rest[1:] if rest and rest[0] == name else rest
+        command = command.command(name)
+    return command, rest
 
 
-def _options(parser):
-    for action in parser._actions:
-        yield from action.option_strings
-        if isinstance(action.choices, dict):  # subcommands
-            for inner in action.choices.values():
-                yield from _options(inner)
+def _options(command):
+    """Flags of a command, or of all commands of a program."""
+    if isinstance(command, Program):
+        return set().union(*(_options(command.command(name)) for name in command.commands))
+    return set(flags_of(_context(command, [])))
+
+
+def _context(command, words):
+    """The context of a command that parses the words, or of its help where they lack an argument."""
+    try:
+        return command.make_context("x", [*words])
+    except click.MissingParameter as error:
+        return error.ctx
 
 
 def _commands(text):
@@ -74,11 +86,13 @@ def _commands(text):
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_the_commands_of_a_page_are_accepted_by_their_parsers(page):
     for words in _commands(page.read_text(encoding="utf-8")):
-        parser, rest = _parser_and_words(words)
+        command, rest = _command_and_words(words)
         try:
-            parser.parse_args(rest)
-        except SystemExit:
-            pytest.fail(f"{page.name}: {' '.join(words)}")
+            command.make_context("x", rest)
+        except click.exceptions.Exit:  # of --help
+            pass
+        except (click.UsageError, AttributeError) as error:
+            pytest.fail(f"{page.name}: {' '.join(words)}: {error}")
 
 
 def test_commands_are_found_in_the_pages():
@@ -87,9 +101,9 @@ def test_commands_are_found_in_the_pages():
     assert len(readme) >= 30 and ["fpp-bench", "leaderboard", "result.json"] in readme
     ((wrong,),) = [list(_commands("```bash\nx && fpp-bench predict phase d --fringes both | cat # why\n```\n"))]
     assert wrong == ["fpp-bench", "predict", "phase", "d", "--fringes", "both"]
-    parser, rest = _parser_and_words(wrong)
-    with pytest.raises(SystemExit):
-        parser.parse_args(rest)
+    command, rest = _command_and_words(wrong)
+    with pytest.raises(click.NoSuchOption):
+        command.make_context("x", rest)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -99,11 +113,9 @@ def test_options_named_in_the_text_of_a_page_exist(page):
     for span in re.findall(r"`(fpp-(?:bench|eval) [^`]*)`", text):
         words = span.split()
         if words[0] == "fpp-eval" or words[1] in COMMANDS:
-            known = set(_options(_parser_and_words(words)[0]))
+            known = _options(_command_and_words(words)[0])
             assert set(re.findall(r"(?<![\w-])--[a-z][\w-]*", span)) <= known, span
-    parsers = [_parser_and_words(["fpp-bench", name])[0] for name in COMMANDS]
-    parsers += [_parser_and_words(["fpp-eval", name])[0] for name in ("", *evaluate.SUBCOMMANDS)]
-    known = {option for parser in parsers for option in _options(parser)}
+    known = _options(BENCH) | _options(EVAL)
     scripts = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "benchmarks").glob("*.py"))
     known |= set(re.findall(r"--[a-z][\w-]*", scripts)) | OF_OTHER_PROGRAMS
     assert set(re.findall(r"(?<![\w-])--[a-z][\w-]*", text)) <= known
@@ -113,7 +125,7 @@ def test_options_in_the_readmes_table_of_commands_are_options_of_their_command()
     rows = re.findall(r"^\| `(fpp-(?:bench|eval) [^`]*)`[^|]*\|(.*)\|$", (ROOT / "README.md").read_text(), re.MULTILINE)
     assert len(rows) >= len(COMMANDS)
     for command, does in rows:
-        known = set(_options(_parser_and_words(command.split())[0]))
+        known = _options(_command_and_words(command.split())[0])
         assert set(re.findall(r"`(--[a-z][\w-]*)", does)) <= known, command
 
 

@@ -13,8 +13,7 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from fpp_ml_bench.cli import COMMANDS, EXTRAS
-from fpp_ml_bench.cli.evaluate import SUBCOMMANDS
+from fpp_ml_bench.cli import COMMANDS, EVAL, EXTRAS
 
 ROOT = Path(__file__).resolve().parent.parent
 SUBPACKAGES = ("loaders", "evaluation", "baselines", "leaderboard")
@@ -130,9 +129,9 @@ def _without_extras(folder, *words):
 
 def test_the_main_job_needs_no_extra(tiny, tmp_path):
     for words in (
-        ("build", "built", "--objects", "cork", "--size", "176"),
+        ("build", "--out", "built", "--objects", "cork", "--size", "176"),
         ("predict", "classical", tiny, "--out", "predictions"),
-        ("fpp-eval", "predictions", "--dataset", tiny, "--json", "result.json", "--report", "report"),
+        ("fpp-eval", "predictions", tiny, "--json", "result.json", "--report", "report"),
         ("leaderboard", "result.json"),
         ("leaderboard", "result.json", "--page", "page"),
     ):
@@ -147,7 +146,11 @@ def test_the_main_job_needs_no_extra(tiny, tmp_path):
         (("predict", "phase-net", "DATA", "--out", "predictions"), "torch", "train"),
         (("tradeoff", "DATA", "--quick", "--out", "tradeoff"), "safetensors", "train"),
         (("diagnose", "unet-individual-rmse", "DATA", "--quick", "--out", "report"), "torch", "train"),
-        (("build", "more", "--objects", "cork", "--size", "176", "--cluster", "127.0.0.1:1"), "ray", "cluster"),
+        (
+            ("build", "--out", "more", "--objects", "cork", "--size", "176", "--cluster", "127.0.0.1:1"),
+            "ray",
+            "cluster",
+        ),
         (("stability", "--quick", "--out", "out"), "(mpmath|torch)", "(diagnose|train)"),
     ],
 )
@@ -189,7 +192,7 @@ def test_ci_runs_every_command_without_extras():
     script = (ROOT / ".ci/without_extras").read_text()
     for name in set(COMMANDS) - {"publish"}:  # which needs the network
         assert re.search(rf"^ *(needs \w+ )?fpp-bench {name} ", script, flags=re.MULTILINE), name
-    for name in SUBCOMMANDS:
+    for name in EVAL.commands:
         assert f"fpp-eval {name} " in script
     assert ".ci/without_extras" in (ROOT / ".ci/run").read_text()
 

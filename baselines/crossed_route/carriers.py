@@ -66,7 +66,7 @@ class Carriers:
             raise PredictionError(
                 f"crossed: over the working range {rig.working_range_mm[0]:g} to {rig.working_range_mm[1]:g} mm the "
                 f"carriers change by {span:.2g} rad, too little for a depth: turn them towards the line between camera "
-                "and projector, or make them finer (fpp-bench design)"
+                "and projector, or make them finer (fpp-bench patterns --design)"
             )
         return carriers
 

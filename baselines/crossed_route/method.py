@@ -35,7 +35,7 @@ def frames_of(rig: Rig, name: str) -> tuple[int, ...]:
     listed = " and ".join(rig.fringe_directions) or "no"
     raise PredictionError(
         f"{name}: needs a crossed frame, or one fringe of each direction to make it from; this rig projects {listed} "
-        "fringes. fpp-bench design proposes crossed fringes for a rig"
+        "fringes. fpp-bench patterns --design proposes crossed fringes for a rig"
     )
 
 

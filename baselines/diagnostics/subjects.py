@@ -4,10 +4,11 @@ import hashlib
 import importlib.util
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -175,13 +176,15 @@ def subject(
     units: OutputUnits | None = None,
     frame: int | None = None,
     threads: int = 1,
+    options: Mapping[str, Any] = MappingProxyType({}),
 ) -> Subject:
     """The model called ``name``, ready to be diagnosed on ``dataset``. ``name``: a method of
     `fpp_ml_bench.baselines.registry.methods`, shipped weights, a ``.safetensors`` file, or ``file.py:factory``, where
     ``factory()`` returns a torch module that maps fringes (B, 1, H, W) in [0, 1] to depth (B, 1, H, W) in ``units``
     (default: normalised). ``layers``: names of the layers to probe, by default the network's ``probe_layers``, or every
     child of a module without them. ``frame``: number of the network's input frame, by default the first that it was
-    trained on. ``threads``: torch threads of the process. Raises `DiagnosisError` for a name, layer or module that
+    trained on. ``threads``: torch threads of the process. ``options``: those of a method.
+    Raises `DiagnosisError` for a name, layer or module that
     can't be used, and other `FppBenchError` of the model."""
     if FACTORY_MARK in name:
         return _subject_of_factory(name, dataset, layers, units or "normalised", frame or 0, threads)
@@ -191,7 +194,7 @@ def subject(
         return _subject_of_weights(name, dataset, layers, frame, threads)
     if given := [option for option, value in (("layers", layers), ("frame", frame)) if value is not None]:
         raise DiagnosisError(f"{name} is a method without a network, so it has no {given[0]}; leave it out")
-    return subject_of_method(load_method(name, dataset), dataset)
+    return subject_of_method(load_method(name, dataset, **options), dataset)
 
 
 def subject_of_method(depth_method: Method, dataset: DatasetFolder, **network: Any) -> Subject:

@@ -175,7 +175,7 @@ class NetworkMethod(Method):
         fringes = [frame for frame in (stack[self.frame] for stack in stacks) if frame is not None]
         if len(fringes) != len(stacks):
             raise PredictionError(
-                f"{self.name} needs frame {self.frame}, which was not captured; build with --frames all"
+                f"{self.name} needs frame {self.frame}, which was not captured; build with --config all"
             )
         from fpp_ml_bench.baselines.networks.base import torch_threads
 

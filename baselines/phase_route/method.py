@@ -92,6 +92,8 @@ class PhaseMethod(Method):
     @classmethod
     def for_rig(cls, rig: Rig, **options: Any) -> Method:
         """`FewestFrames` where ``error_mm`` is given."""
+        if options.get("error_mm") is not None and "frames" in options:
+            raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
         options = fringe_options(cls.name, rig, options)
         return cls(rig, **options) if options.get("error_mm") is None else FewestFrames(rig, **options)
 

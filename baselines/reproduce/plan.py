@@ -113,7 +113,7 @@ def open_dataset(folder: Path | None, jobs: list[Job], folders: Folders, report:
         report(f"{folder}: building {len(OBJECTS)} objects at {size} px, all frames")
         render.build(folder, render.BuildSettings(rig=paper_rig(size), objects=OBJECTS), usable_cores())
     opened = DatasetFolder(folder)
-    command = f"fpp-bench build DIR --preset full{'' if size == FULL_SIZE else f' --size {size}'}"
+    command = f"fpp-bench build --out DIR --preset full{'' if size == FULL_SIZE else f' --size {size}'}"
     if opened.size != (size, size):
         height, width = opened.size
         raise DatasetError(
@@ -141,7 +141,7 @@ def _check_same_dataset(opened: DatasetFolder, folders: Folders) -> None:
             return
     except OSError as error:
         raise DatasetError(f"{record}: {error.strerror or error}") from None
-    cure = "damaged; give another --runs, or remove it if --data is the dataset that was used"
+    cure = "damaged; give another --out, or remove it if DATASET is the dataset that was used"
     recorded = read_json(record, DatasetError, f"it is {cure}")
     try:
         fingerprint, folder = recorded["fingerprint"], recorded["folder"]
@@ -150,5 +150,5 @@ def _check_same_dataset(opened: DatasetFolder, folders: Folders) -> None:
     if fingerprint != opened.fingerprint:
         raise DatasetError(
             f"{opened.path}: has fingerprint {opened.fingerprint[:8]}, but the trainings in {folders.runs} are of "
-            f"{str(fingerprint)[:8]} ({folder}); give that dataset as --data, or another --runs"
+            f"{str(fingerprint)[:8]} ({folder}); give that dataset as DATASET, or another --out"
         )

@@ -196,7 +196,7 @@ def check_run_folders(jobs: Sequence[Job], folders: Folders) -> None:
             out = shlex.quote(str(path.parent))
             raise TrainingError(
                 f"{path.parent}: holds a training of another recipe, {job.rows[0]} differs in {differs}; to keep both, "
-                f"mv {out} {out}-before, or give another --runs"
+                f"mv {out} {out}-before, or give another --out"
             )
 
 
@@ -251,7 +251,7 @@ def _made_from(target: Path, source: str) -> bool:
 
 
 def _stored(path: Path) -> Any:
-    return read_json(path, TrainingError, "give another --runs, or remove it")
+    return read_json(path, TrainingError, "give another --out, or remove it")
 
 
 def file_sha256(path: Path) -> str:

@@ -186,7 +186,7 @@ def check_folder(folder: str | Path, dataset: DatasetFolder | None = None, split
     samples = submission.samples_in(folder) if dataset is None else dataset.samples(split)
     if not samples:
         expected = "expected one {sample}.npy for each sample, found none"
-        raise PredictionError(f"{printable(str(folder), 500)}: {expected}; tables need --dataset")
+        raise PredictionError(f"{printable(str(folder), 500)}: {expected}; tables need DATASET")
     split_of = {} if dataset is None else {name: part for part, names in dataset.splits.items() for name in names}
     listing = submission.list_folder(folder, samples, split, split_of)
     problems, notes = list(listing.problems), []
@@ -225,7 +225,7 @@ def check_folder(folder: str | Path, dataset: DatasetFolder | None = None, split
 def _declared_size(folder: Path, listing: submission.Listing) -> tuple[int, int]:
     """The size (H, W) that most of the files declare. PredictionError where it is too large to be read."""
     if listing.form == ".mat":
-        raise PredictionError(f"{printable(str(folder), 500)}: .mat files can only be checked with --dataset")
+        raise PredictionError(f"{printable(str(folder), 500)}: .mat files can only be checked with DATASET")
     files = [folder / f"{sample}{listing.form}" for sample in listing.present]
     declared = {file: size for file in files if (size := submission.declared_size(file)) and min(size) > 0}
     if not declared:
@@ -234,6 +234,6 @@ def _declared_size(folder: Path, listing: submission.Listing) -> tuple[int, int]
     size = Counter(declared.values()).most_common(1)[0][0]
     if max(size) > LARGEST_SIDE_PX:
         file = next(file for file in declared if declared[file] == size)
-        most = f"expected at most {LARGEST_SIDE_PX} without a dataset; write the depth map itself, or give --dataset"
+        most = f"expected at most {LARGEST_SIDE_PX} without a dataset; write the depth map itself, or give DATASET"
         raise PredictionError(f"{printable(str(file), 500)}: declares {size[1]} x {size[0]} px, {most}")
     return size

@@ -107,7 +107,7 @@ def evaluate(
         uncertainty=result.uncertainty_of(stated, owners) if listing.sigmas else None,
         protocol_version=protocol.PROTOCOL_VERSION,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
-        submission=description,
+        submission=description.model_copy(update={"predicted": None}),
         dataset={
             "name": printable(Path(dataset.path).resolve().name, 100).strip() or "dataset",
             "content": content,

@@ -33,6 +33,15 @@ class LearnedFrom(StrictModel):
         return self
 
 
+class Predicted(StrictModel):
+    """What ``fpp-bench predict`` read: the folder of the ``dataset``, the ``split``, and the hashes of that ``content``
+    of it (``split/column``, as in a manifest) that the method reads or is scored on."""
+
+    dataset: str = Field(min_length=1, max_length=4096)
+    split: Text
+    content: dict[Text, Text] = Field(max_length=1000)
+
+
 class Submission(SparseModel):
     """Content of ``submission.yaml``. ``frames_used`` are indices into the dataset's frame sequence (0 based).
 
@@ -42,9 +51,10 @@ class Submission(SparseModel):
     pixels are object (for example an input that is black outside the object), ``uses_ground_truth_order`` when it was
     given their true fringe orders; defaults of these three are never written, so that files without the keys stay as
     they are. ``learned_from`` is absent where it is unknown.
+    ``predicted`` says what ``fpp-bench predict`` read, so that fpp-eval finds it; a result does not repeat it.
     ``seconds_per_sample`` is null when unknown; a number needs ``hardware`` and ``seconds_source`` beside it."""
 
-    SPARSE = ("range_rule", "uses_ground_truth_mask", "uses_ground_truth_order", "learned_from")
+    SPARSE = ("range_rule", "uses_ground_truth_mask", "uses_ground_truth_order", "learned_from", "predicted")
 
     name: Text
     method: Text
@@ -56,6 +66,7 @@ class Submission(SparseModel):
     uses_ground_truth_mask: bool = False
     uses_ground_truth_order: bool = False
     learned_from: LearnedFrom | None = None
+    predicted: Predicted | None = None
     seconds_per_sample: Positive | None
     seconds_source: Literal["measured", "self-reported"] | None = None
     hardware: HardwareInfo | None = None
@@ -121,6 +132,10 @@ uses_ground_truth_range: false   # was the method given depth_min and depth_max 
 # learned_from:              # what data it learned from
 #   data: train-split        # train-split | generated (by this package's renderer) | other | none
 #   versions: [fpp-bench-full version 1]
+# predicted:                 # what was predicted, for fpp-eval without DATASET; fpp-bench predict writes it
+#   dataset: data/mini
+#   split: test
+#   content: {}              # hashes of its columns, from its manifest.json: test/depth and others
 
 seconds_per_sample: null     # median time for one sample; a number needs the next two keys
 # seconds_source: self-reported

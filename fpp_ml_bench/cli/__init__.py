@@ -1,13 +1,12 @@
 """The commands ``fpp-bench`` and ``fpp-eval``.
 
-Each command is a module of this package with ``SUMMARY``, ``EXAMPLES``, ``add_arguments(parser)`` and ``run(args)``.
-Only the module of the command that runs is imported, and such a module imports numpy and the rest inside ``run``, so
-``--help`` answers at once. This package may import every subpackage; none of them imports it.
+Each command is a function of a module of this package, made a command by `options.command`. Only the module of the
+command that runs is imported. This package may import every subpackage; none of them imports it.
 """
 
-import argparse
 import math
 import os
+import re
 import signal
 import sys
 import threading
@@ -16,18 +15,21 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from textwrap import indent
 from time import monotonic
-from types import FrameType, ModuleType, SimpleNamespace
-from typing import Any
+from types import FrameType
+from typing import Any, NamedTuple
+
+import click
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.errors import FppBenchError, PoolError
+from fpp_ml_bench.cli.options import HELP_WIDTH, problem_of, write_sections
+from fpp_ml_bench.errors import FppBenchError
 from fpp_ml_bench.files import DISK_FULL, cause_of
-from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.machine import limit_threads, usable_cores
+from fpp_ml_bench.options import did_you_mean, nearest
 
 OK, CHECK_FAILED, BAD_INPUT, INTERRUPTED, CUT_OFF, TERMINATED = 0, 1, 2, 130, 141, 143
-SPLITS = ("train", "validation", "test", "all")
-Command = ModuleType | SimpleNamespace
 
 EXTRAS = {
     "train": ("torch", "torchmetrics", "accelerate", "safetensors"),
@@ -38,108 +40,153 @@ EXTRAS = {
 }
 """The optional parts of the package (pyproject.toml) and the libraries that only they need."""
 
-COMMANDS: dict[str, tuple[str, str]] = {
-    "build": ("build", "generate the benchmark: virtual rig, 50 objects, 6 views, 52 frames"),
-    "import": ("import_tree", "read a published tree, or a scanner's captures, into the same dataset format"),
-    "calibrate": ("calibrate", "find the rig that took captures, from frames and their depth"),
-    "patterns": ("patterns", "write the images to project, for any sequence"),
-    "design": ("design", "find two carriers for crossed fringes whose phases leave one order"),
-    "decode": ("decode", "decode captured frames: depth, point cloud, uncertainty, reasons"),
-    "info": ("info", "describe a dataset: sizes, splits, rig, ground-truth uncertainty"),
-    "verify": ("verify", "check a dataset: checksums, missing and foreign files, split leaks"),
-    "show": ("show", "one sample as a picture: frames, depth, mask, mesh"),
-    "export": ("export", "write Parquet, the published .mat tree, meshes or patterns"),
-    "train": ("train", "train a recipe, shipped or yours, into a weights file"),
-    "predict": ("predict", "run a method over a split and write predictions that fpp-eval scores"),
-    "conformal": ("conformal", "scale a stated uncertainty so that its intervals hold what they say"),
-    "fuse": ("fuse", "put an object's views into one point cloud, and find the pixels that other views contradict"),
-    "time": ("time", "measure a method: latency, throughput, memory, parameters, frames"),
-    "tradeoff": ("tradeoff", "error against run time and captures, and how each cost grows"),
-    "reproduce": ("reproduce", "train and score the rows of the paper's tables, beside its numbers"),
-    "reliance": ("reliance", "measure phase reliance: does a prediction follow the fringes or the outline"),
-    "robustness": ("robustness", "disturb the scene, axis by axis: light, camera, surface, calibration, motion"),
-    "diagnose": ("diagnose", "probe a model: does it read fringes or shapes; an HTML report"),
-    "leaderboard": ("leaderboard", "rank result files: error and run time side by side"),
-    "stability": ("stability", "stiff and extreme cases against higher precision and theory"),
-    "publish": ("publish", "put a dataset, the leaderboard or results on the Hugging Face Hub"),
-}
 
-_EPILOG = """\
-examples:
-  fpp-bench build data/mini --preset mini
-  fpp-bench predict classical data/mini --split test --out predictions
-  fpp-eval predictions --dataset data/mini --split test --json result.json
-  fpp-bench leaderboard result.json
+class Program(NamedTuple):
+    """A program of several commands: ``groups`` has, by heading and name, the place of each as ``module:function``
+    below this package and its line in the help. ``default``: the command that runs where the first word names none."""
 
-fpp-bench COMMAND --help shows its options. Exit status: 0 done, 1 a check failed, 2 bad input or failed, 130 stopped
-(143 by SIGTERM), 141 nobody reads the output.
+    name: str
+    purpose: str
+    groups: dict[str, dict[str, tuple[str, str]]]
+    examples: str
+    default: str = ""
+
+    @property
+    def commands(self) -> dict[str, str]:
+        """The place of each command by its name."""
+        return {name: place for group in self.groups.values() for name, (place, _) in group.items()}
+
+    def command(self, name: str) -> Any:
+        """The `Command` of that name, or a `Program` of several, whose module is imported."""
+        module, _, function = self.commands[name].partition(":")
+        return getattr(import_module(f"fpp_ml_bench.cli.{module}"), function)
+
+
+BENCH = Program(
+    "fpp-bench",
+    "FPP-ML-Bench: build, load, predict, score and rank single-shot fringe projection profilometry.",
+    {
+        "start": {
+            "build": ("build:build", "generate the benchmark: virtual rig, 50 objects, 6 views, 52 frames"),
+            "import": (
+                "import_tree:import_tree",
+                "read a published tree, or a scanner's captures, into the same dataset format",
+            ),
+            "info": ("dataset:info", "describe a dataset: sizes, splits, rig, ground-truth uncertainty"),
+            "show": ("dataset:show_sample", "one sample as a picture: frames, depth, mask, mesh"),
+        },
+        "score": {
+            "predict": ("predict:predict", "run a method over a split and write predictions that fpp-eval scores"),
+            "time": ("predict:time", "measure a method: latency, throughput, memory, parameters, frames"),
+            "leaderboard": ("leaderboard:rank", "rank result files: error and run time side by side"),
+        },
+        "understand": {
+            "diagnose": ("diagnose:diagnose", "probe a model: does it read fringes or shapes; an HTML report"),
+            "reliance": (
+                "diagnose:reliance",
+                "measure phase reliance: does a prediction follow the fringes or the outline",
+            ),
+            "robustness": (
+                "robustness:robust",
+                "disturb the scene, axis by axis: light, camera, surface, calibration, motion",
+            ),
+            "tradeoff": ("tradeoff:measure", "error against run time and captures, and how each cost grows"),
+            "stability": ("stability:check", "stiff and extreme cases against higher precision and theory"),
+        },
+        "learn": {
+            "train": ("train:train", "train a recipe, shipped or yours, into a weights file"),
+            "reproduce": (
+                "train:reproduce_tables",
+                "train and score the rows of the paper's tables, beside its numbers",
+            ),
+        },
+        "your rig": {
+            "patterns": (
+                "patterns:patterns",
+                "write the images to project, for any sequence; find two carriers for crossed fringes",
+            ),
+            "calibrate": ("calibrate:calibrate", "find the rig that took captures, from frames and their depth"),
+            "decode": ("decode:decode", "decode captured frames: depth, point cloud, uncertainty, reasons"),
+            "fuse": (
+                "fuse:fuse",
+                "put an object's views into one point cloud, and find the pixels that other views contradict",
+            ),
+        },
+        "share": {
+            "export": ("dataset:export", "write Parquet, the published .mat tree, meshes or patterns"),
+            "publish": ("publish:publish", "put a dataset, the leaderboard or results on the Hugging Face Hub"),
+            "verify": ("dataset:verify", "check a dataset: checksums, missing and foreign files, split leaks"),
+        },
+    },
+    """\
+fpp-bench build --out data/mini --preset mini
+fpp-bench predict classical data/mini --split test --out predictions
+fpp-eval predictions --json result.json
+fpp-bench leaderboard result.json
+""",
+)
+
+EVAL = Program(
+    "fpp-eval",
+    "Score a folder of predictions (fpp-eval PREDICTIONS), and work on results.",
+    {
+        "commands": {
+            "score": ("evaluate:score_folder", "score a folder of predictions: what fpp-eval does without a command"),
+            "init": ("evaluate:init", "write a submission.yaml to fill in"),
+            "check": ("evaluate:check", "check a submission before it is scored, without ground truth"),
+            "compare": ("evaluate:compare", "compare two results of the same samples"),
+            "verify": ("evaluate:verify", "score the predictions again: is this result what they give"),
+            "conformal": (
+                "evaluate:conformal",
+                "scale a stated uncertainty so that its intervals hold what they say",
+            ),
+            "schema": ("evaluate:schema", "print the JSON Schema of result.json or submission.yaml"),
+        }
+    },
+    """\
+fpp-eval predictions --json result.json
+fpp-eval predictions data/mini --split test --target depth_exact --report report
+fpp-eval init predictions
+fpp-eval check predictions
+fpp-eval compare result.json leaderboard/rows/phase-net-vertical.json
+fpp-eval verify result.json predictions data/mini
+fpp-eval schema
+""",
+    default="score",
+)
+COMMANDS = BENCH.commands
+ONE_THREAD = "predict", "time", "reliance", "robustness", "tradeoff"
+"""Commands that compute with one thread unless ``--threads`` says otherwise; `diagnose` with one for each core."""
+
+_STREAMS = "stdout", "stderr"
+_MEANINGS = """\
+{name} COMMAND --help shows its options.
+Exit status: 0 done, 1 a check failed, 2 bad input or failed, 130 stopped (143 by SIGTERM), 141 nobody reads the output.
 """
 
 
-def count(most: int = 100_000) -> Callable[[str], int]:
-    """Type of an option: a whole number from 1 to ``most``."""
-
-    def parsed(text: str) -> int:
-        if not text.isdecimal() or not 1 <= int(text) <= most:
-            raise argparse.ArgumentTypeError(f"expected a whole number from 1 to {most}, got {text!r}")
-        return int(text)
-
-    return parsed
-
-
-def add_pool_options(parser: argparse.ArgumentParser) -> None:
-    """``--workers`` and ``--cluster``, for `workers_of`."""
-    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: as many as there are processors)")
-    parser.add_argument(
-        "--cluster",
-        metavar="ADDRESS",
-        help="all CPUs of a Ray cluster instead: ray://HOST:10001, or HOST:6379 on one of its nodes; "
-        "they must share the output folder, or write to a URL (docs/scale.md)",
-    )
-
-
-def workers_of(args: argparse.Namespace) -> int:
-    """Processes of this machine. Raises `PoolError` for less than one, or beside a cluster."""
-    if args.workers is None:
-        return usable_cores()
-    if args.workers < 1:
-        raise PoolError(f"--workers {args.workers}: expected 1 or more")
-    if args.cluster is not None:
-        raise PoolError("--workers counts processes of this machine, --cluster takes a cluster; give one of them")
-    return int(args.workers)
-
-
-_STREAMS = "stdout", "stderr"
-_FORMATTER = partial(argparse.RawDescriptionHelpFormatter, max_help_position=30, width=110)
-_STYLE: dict[str, Any] = {"formatter_class": _FORMATTER, "allow_abbrev": False}
-
-
-def parser_for(command: Command, prog: str) -> argparse.ArgumentParser:
-    """Argument parser of one command module."""
-    epilog = "examples:\n" + "\n".join(f"  {line}" for line in command.EXAMPLES)
-    parser = argparse.ArgumentParser(prog, None, command.SUMMARY, epilog, **_STYLE)
-    command.add_arguments(parser)
-    return parser
-
-
-def run_command(command: Command, prog: str, argv: Sequence[str]) -> int:
+def run_command(command: click.Command, prog: str, argv: Sequence[str]) -> int:
     """Parse ``argv`` and run the command. An error of this package, an unreadable file, a full disk, Ctrl-C or SIGTERM
     becomes a message and a status; where nobody reads the output any more, there is a status alone."""
-    return _guarded(prog, lambda: command.run(parser_for(command, prog).parse_args(argv)))
+
+    def parsed_and_run() -> int:
+        with command.make_context(prog, list(argv)) as ctx:
+            status: int = command.invoke(ctx)
+            return status
+
+    return _guarded(prog, parsed_and_run)
 
 
 def _guarded(prog: str, action: Callable[[], int]) -> int:
     for name in _STREAMS:
         if getattr(sys, name) is None:  # closed by the caller: its number must not become that of a data file
             setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115
-    status, leaving = OK, None
     try:
         status = _status_of(prog, action)
-    except SystemExit as stop:  # of --help or a wrong option, and of rich where its output is closed
-        if isinstance(stop.__context__, BrokenPipeError):
-            status = CUT_OFF
-        else:
-            leaving = stop
+    except SystemExit as stop:  # of rich where its output is closed
+        if not isinstance(stop.__context__, BrokenPipeError):
+            raise
+        status = CUT_OFF
     for name in _STREAMS:
         try:
             getattr(sys, name).flush()
@@ -148,8 +195,6 @@ def _guarded(prog: str, action: Callable[[], int]) -> int:
             if status == OK:
                 closed = isinstance(error, BrokenPipeError)
                 status = CUT_OFF if closed else _refused(prog, f"standard output: {cause_of(error)}")
-    if leaving is not None and status == OK:
-        raise leaving
     return status
 
 
@@ -157,6 +202,10 @@ def _status_of(prog: str, action: Callable[[], int]) -> int:
     try:
         with _terminable():
             return action()
+    except click.exceptions.Exit as leaving:  # of --help
+        return leaving.exit_code
+    except click.UsageError as error:
+        return _refused(error.ctx.command_path if error.ctx else prog, problem_of(error))
     except BrokenPipeError:
         return CUT_OFF
     except FppBenchError as error:
@@ -221,30 +270,55 @@ def _say(text: str) -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point of ``fpp-bench``."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    if arguments and arguments[0] in COMMANDS:
-        module = import_module(f"fpp_ml_bench.cli.{COMMANDS[arguments[0]][0]}")
-        return run_command(module, f"fpp-bench {arguments[0]}", arguments[1:])
-    return _guarded("fpp-bench", partial(_without_command, arguments))
+    return run_program(BENCH, argv)
 
 
-def _without_command(arguments: list[str]) -> int:
+def run_program(program: Program, argv: Sequence[str] | None = None) -> int:
+    """Run the command that the first word of ``argv`` (default: the process's) names, or the default one."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    first = words[0] if words else "--help"
+    if first in program.commands:
+        if first in (*ONE_THREAD, "diagnose"):  # before the command's module loads NumPy
+            told = re.search(r"--threads[ =](\d+)", " ".join(words))
+            limit_threads(int(told[1]) if told else 1 if first in ONE_THREAD else usable_cores())
+        command = program.command(first)
+        if isinstance(command, Program):
+            return run_program(command, words[1:])
+        return run_command(command, f"{program.name} {first}", words[1:])
+    # A folder of predictions has any name; one that is not there and almost that of a command is a slip.
+    slip = nearest(first, program.commands) and not Path(first).exists()
+    if program.default and first not in ("--help", "-h", "--version") and not slip:
+        return run_command(program.command(program.default), program.name, words)
+    return _guarded(program.name, partial(_without_command, program, words))
+
+
+def _without_command(program: Program, words: list[str]) -> int:
     """Help, version, or what is wrong with the command's name."""
-    width = max(map(len, COMMANDS))
-    listing = "\n".join(f"  {name:<{width}}  {summary}" for name, (_, summary) in COMMANDS.items())
-    usage = "fpp-bench [--help] [--version] COMMAND ..."
-    description = "FPP-ML-Bench: build, load, predict, score and rank single-shot fringe projection profilometry."
-    parser = argparse.ArgumentParser("fpp-bench", usage, description, f"commands:\n{listing}\n\n{_EPILOG}", **_STYLE)
-    parser.add_argument("--version", action="version", version=f"fpp-ml-bench {__version__}")
-    parser.add_argument("command", nargs="?", metavar="COMMAND", help=argparse.SUPPRESS)
-    args, unknown = parser.parse_known_args(arguments)
-    if unknown and unknown[0] == arguments[0]:
-        return _refused("fpp-bench", f"unknown option {arguments[0]!r} before a command; see fpp-bench --help")
-    if args.command is not None:
-        from difflib import get_close_matches
+    first = words[0] if words else ""
+    if first == "--version":
+        print(f"fpp-ml-bench {__version__}")
+        return OK
+    if first.startswith("-") and first not in ("--help", "-h"):
+        return _refused(program.name, f"unknown option {first!r} before a command; see {program.name} --help")
+    if first and first not in ("--help", "-h"):
+        return _refused(program.name, f"unknown command {first!r}; {did_you_mean(first, program.commands)}")
+    print(help_of(program), end="", file=sys.stdout if first else sys.stderr)
+    return OK if first else BAD_INPUT
 
-        matches = get_close_matches(args.command, COMMANDS, n=1)
-        hint = f"; did you mean {matches[0]!r}?" if matches else f"; there are {', '.join(COMMANDS)}"
-        return _refused("fpp-bench", f"unknown command {args.command!r}{hint}")
-    parser.print_help(sys.stderr if not arguments else sys.stdout)
-    return BAD_INPUT
+
+def help_of(program: Program) -> str:
+    """The help of a program: its commands by group, and the options of its default command."""
+    formatter = click.HelpFormatter(width=HELP_WIDTH)
+    formatter.write_usage(program.name, "[--help] [--version] COMMAND ...", "usage: ")
+    sections = {
+        group: [(name, line) for name, (_, line) in commands.items()] for group, commands in program.groups.items()
+    }
+    if program.default:
+        command = program.command(program.default)
+        ctx = click.Context(command, info_name=program.name)
+        formatter.write_usage(program.name, command.usage(ctx), "usage: ")
+        sections |= command.sections(ctx)
+    formatter.write(f"\n{program.purpose}\n")
+    write_sections(sections, formatter)
+    formatter.write(f"\nexamples:\n{indent(program.examples, '  ')}\n{_MEANINGS.format(name=program.name)}")
+    return formatter.getvalue()

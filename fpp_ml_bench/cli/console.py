@@ -1,15 +1,17 @@
-"""Console output: a progress bar on standard error, and numbers with units for tables."""
+"""Console output: a progress bar on standard error, numbers with units for tables, and accounts of skipped work."""
 
-import argparse
 import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from rich.console import Console, RenderableType
+from rich.text import Text
 
 from fpp_ml_bench.examination import Examination
 from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.skipping import Explanation
+from fpp_ml_bench.tables import Table
 
 WIDTH_IN_PIPES = 140
 
@@ -19,7 +21,6 @@ def progress_bar(title: str, total: int, unit: str, per_step: int = 1) -> Iterat
     """A rich progress bar over ``total`` steps; yields the function that advances it. Shows the time left and the rate
     of ``unit``, of which a step counts ``per_step`` (52 images a sample)."""
     from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
-    from rich.text import Text
 
     class Rate(ProgressColumn):
         def render(self, task: object) -> Text:
@@ -37,17 +38,6 @@ def progress_bar(title: str, total: int, unit: str, per_step: int = 1) -> Iterat
     with Progress(*columns, console=Console(stderr=True)) as progress:
         task = progress.add_task(title, total=total)
         yield lambda steps: progress.advance(task, steps)
-
-
-def working_range(text: str) -> tuple[float, float]:
-    """Type of an option: NEAR,FAR in mm."""
-    try:
-        near, far = (float(part) for part in text.split(","))
-    except ValueError:
-        near, far = 1.0, 0.0
-    if not 0 < near < far < 1e9:
-        raise argparse.ArgumentTypeError(f"expected NEAR,FAR in mm such as 350,450, got {text!r}")
-    return near, far
 
 
 def gigabytes(count: float) -> str:
@@ -93,3 +83,30 @@ def show(*parts: RenderableType) -> None:
     console = Console(width=output_width(), highlight=False, markup=False, emoji=False)
     for part in parts:
         console.print(part)
+
+
+def explanation_table(explanation: Explanation) -> Table:
+    """What was left out, with the rules for the seconds below."""
+    state = "left out" if explanation.skipping else "nothing left out (skipping is off); it would have been"
+    rules = list(dict.fromkeys(line.rule for line in explanation.lines))
+    table = Table(
+        "what",
+        "unit",
+        numbers=("done", "left out", "share", "bytes", "seconds"),
+        title=Text(f"{explanation.command}: {state} ({explanation.subject})"),
+        elsewhere="--explain-json FILE",
+        caption=Text("\n".join(f"[{number}] {rule}" for number, rule in enumerate(rules, 1))),
+    )
+    for line in explanation.lines:
+        saved = line.seconds_saved
+        seconds = "-" if saved is None else f"{saved:,.2g}" if abs(saved) < 10 else f"{saved:,.0f}"
+        table.add_row(
+            Text(line.what),
+            line.unit,
+            f"{line.done:,}",
+            f"{line.left_out:,}",
+            f"{100 * line.share:.1f}%",
+            "-" if line.bytes_saved is None else gigabytes(line.bytes_saved),
+            Text(f"{seconds} [{rules.index(line.rule) + 1}]"),
+        )
+    return table

@@ -1,104 +1,101 @@
 """``fpp-bench decode``: captured frames to depth."""
 
-import argparse
 import sys
 from pathlib import Path
 from time import perf_counter
 
 from fpp_ml_bench import optics
-from fpp_ml_bench.cli.console import progress_bar, say_findings, show, working_range
-from fpp_ml_bench.errors import CaptureError, DecodeError
+from fpp_ml_bench.baselines.classical import DIRECTIONS
+from fpp_ml_bench.cli.console import progress_bar, say_findings, show
+from fpp_ml_bench.cli.options import AT_LEAST_ONE, WORKING_RANGE, command, names, value
+from fpp_ml_bench.decoding import Directions
 from fpp_ml_bench.examination import RefusedCapture
 from fpp_ml_bench.loaders import captures
 from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.tables import Table
 
-SUMMARY = "Decode captured frames: depth, point cloud, uncertainty, and the reason for every pixel without depth."
-EXAMPLES = (
-    "fpp-bench decode rig.yaml scan --out scan-decoded               scan/: one image a frame, in the order of names",
-    "fpp-bench decode rig.yaml 'scan/left_*.bmp' --out decoded --range 350,450",
-    "fpp-bench decode rig.yaml scan --out decoded --bits 12 --colour green --forms npy,ply",
-    "",
-    "RIG says what was projected in which order, how the devices see, and the range in which depth is looked for",
-    "(fpp_ml_bench.optics.rig_file, docs/own_rig.md). Images: PNG, BMP or TIFF of 8 to 16 bits.",
+
+@command(
+    """\
+fpp-bench decode rig.yaml scan --out scan-decoded               scan/: one image a frame, in the order of names
+fpp-bench decode rig.yaml 'scan/left_*.bmp' --out decoded --working-range 350,450
+fpp-bench decode rig.yaml scan --out decoded --bits 12 --colour green --forms npy,ply
+
+RIG says what was projected in which order, how the devices see, and the range in which depth is looked for
+(fpp_ml_bench.optics.rig_file, docs/own_rig.md). Images: PNG, BMP or TIFF of 8 to 16 bits.
+"""
 )
+def decode(
+    *,
+    file: Path = argument("rig file (.yaml, .json)", "RIG"),
+    frames: str = argument("folder of images, or a pattern in quotes", "FRAMES"),
+    out: Path = option(REQUIRED, "folder for the results", "DIR"),
+    direction: Directions = option(
+        "both", "which of the coded directions to use (default: all there are)", choices=DIRECTIONS
+    ),
+    working_range: tuple[float, float] | None = option(
+        None, "working range in mm (default: the rig's)", "NEAR,FAR", parse=WORKING_RANGE
+    ),
+    mask: Path | None = option(None, "image or .npy: decode where it is not 0", "FILE"),
+    min_modulation: float | None = option(
+        None, "least modulation of a pixel in grey levels of 255 (default: 5)", "GREY"
+    ),
+    noise: float | None = option(
+        None,
+        "noise of a frame in grey levels of 255 (default: measured with four steps and more, else 1)",
+        "GREY",
+    ),
+    bits: int | None = option(None, "bits of the camera, 8 to 16, where files of 16 bits hold fewer", "N"),
+    colour: str | None = option(None, "of colour images: luminance, mean, red, green, blue", "NAME"),
+    forms: tuple[str, ...] = option(
+        captures.FORMS,
+        "what to write of npy, mat, png, ply, mesh (default: all)",
+        "A,B",
+        parse=value(
+            f"some of {', '.join(captures.FORMS)}", names, lambda some: some != () and set(some) <= {*captures.FORMS}
+        ),
+    ),
+    anyway: bool = option(False, "decode a capture that its examination refuses"),
+    threads: int = option(usable_cores(), "threads (default: one for each core)", "N", parse=AT_LEAST_ONE),
+) -> None:
+    """Decode captured frames: depth, point cloud, uncertainty, and the reason for every pixel without depth.
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("rig", type=Path, metavar="RIG", help="rig file (.yaml, .json)")
-    add("frames", metavar="FRAMES", help="folder of images, or a pattern in quotes")
-    add("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
-    add(
-        "--direction",
-        choices=("horizontal", "vertical", "both"),
-        default="both",
-        help="which of the coded directions to use (default: all there are)",
-    )
-    add("--range", type=working_range, metavar="NEAR,FAR", help="working range in mm (default: the rig's)")
-    add("--mask", type=Path, metavar="FILE", help="image or .npy: decode where it is not 0")
-    add(
-        "--min-modulation",
-        type=float,
-        metavar="GREY",
-        help="least modulation of a pixel in grey levels of 255 (default: 5)",
-    )
-    add(
-        "--noise",
-        type=float,
-        metavar="GREY",
-        help="noise of a frame in grey levels of 255 (default: measured with four steps and more, else 1)",
-    )
-    add("--bits", type=int, metavar="N", help="bits of the camera, 8 to 16, where files of 16 bits hold fewer")
-    add("--colour", metavar="NAME", help="of colour images: luminance, mean, red, green, blue")
-    add("--forms", metavar="A,B", help="what to write of npy, mat, png, ply, mesh (default: all)")
-    add("--anyway", action="store_true", help="decode a capture that its examination refuses")
-    add("--threads", type=int, default=usable_cores(), metavar="N", help="threads (default: one for each core)")
-
-
-def run(args: argparse.Namespace) -> int:
-    """Decode and write. Raises FppBenchError for an unusable rig, capture or folder."""
-    named = captures.FORMS if args.forms is None else args.forms.split(",")
-    forms = tuple(part.strip() for part in named if part.strip())
-    if not forms or not set(forms) <= set(captures.FORMS):
-        raise CaptureError(f"--forms {args.forms}: expected some of {', '.join(captures.FORMS)}")
-    if args.threads < 1:
-        raise DecodeError(f"--threads {args.threads}: expected 1 or more")
-    captures.check_outputs(args.out)
-    rig = optics.load_rig(args.rig)
-    if args.range is not None:
-        rig = rig.with_range(args.range)
-        optics.check_lengths(rig, args.rig.name)
+    Raises FppBenchError for an unusable rig, capture or folder."""
+    captures.check_outputs(out)
+    rig = optics.load_rig(file)
+    if working_range is not None:
+        rig = rig.with_range(working_range)
+        optics.check_lengths(rig, file.name)
     started = perf_counter()
     with progress_bar("decoding", 4, "steps") as advance:
-        capture = captures.read_frames(args.frames, count=len(rig.sequence), bits=args.bits, colour=args.colour)
+        capture = captures.read_frames(frames, count=len(rig.sequence), bits=bits, colour=colour)
         advance(1)
-        mask = None if args.mask is None else captures.read_mask(args.mask, capture.frames.shape[1:])
-        least = {} if args.min_modulation is None else {"min_modulation": args.min_modulation}
+        asked = None if mask is None else captures.read_mask(mask, capture.frames.shape[1:])
+        least = {} if min_modulation is None else {"min_modulation": min_modulation}
         try:
             result = captures.decode_capture(
                 capture,
                 rig,
-                args.direction,
-                mask=mask,
-                noise_grey=args.noise,
-                threads=args.threads,
-                anyway=args.anyway,
+                direction,
+                mask=asked,
+                noise_grey=noise,
+                threads=threads,
+                anyway=anyway,
                 **least,
             )
         except RefusedCapture as refused:
-            captures.write_refusal(args.out, capture, rig, refused.examination)
+            captures.write_refusal(out, capture, rig, refused.examination)
             raise
         advance(2)
-        captures.write_capture(args.out, capture, rig, result, forms)
+        captures.write_capture(out, capture, rig, result, forms)
         advance(1)
     say_findings(result.examination)
     for note in result.notes:
         print(f"note: {note}", file=sys.stderr)
     _print(result)
-    listed = ", ".join(sorted(path.name for path in args.out.iterdir()))
-    print(f"{args.out}: {listed}; {perf_counter() - started:.1f} s")
-    return 0
+    listed = ", ".join(sorted(path.name for path in out.iterdir()))
+    print(f"{out}: {listed}; {perf_counter() - started:.1f} s")
 
 
 def _print(result: "captures.DecodedCapture") -> None:

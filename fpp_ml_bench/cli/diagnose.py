@@ -1,74 +1,83 @@
-"""``fpp-bench diagnose``: does a model read fringes or shapes? An HTML report."""
+"""What a model reads: ``fpp-bench diagnose`` probes it, ``fpp-bench reliance`` measures how far it follows the fringe's
+phase."""
 
-import argparse
-import shlex
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Literal
 
 from rich import progress as bar
 from rich.console import Console
 from rich.text import Text
 
-from fpp_ml_bench.baselines import diagnostics
-from fpp_ml_bench.cli import count
-from fpp_ml_bench.cli.console import show
+from fpp_ml_bench.baselines import diagnostics, registry
+from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.cli.console import progress_bar, show
+from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings, OfMethods
+from fpp_ml_bench.cli.options import COUNT, command, command_line, names, value
+from fpp_ml_bench.evaluation import result
+from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_reliance
 from fpp_ml_bench.loaders import storage
-from fpp_ml_bench.machine import limit_threads, usable_cores
+from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.tables import Table
 
-SUMMARY = (
-    "Diagnose a network or method with the paper's probes and further ones; writes an HTML report and a JSON file."
+
+class DiagnoseCommand(MethodCommand):
+    """A command whose options are also those of the methods without a network that is probed layer by layer."""
+
+    def methods(self, words: Sequence[str]) -> list[type[Method]]:
+        return list(registry.methods().values())
+
+
+@command(
+    """\
+fpp-bench diagnose unet-individual-rmse data/cpu224 --out report
+fpp-bench diagnose unet-individual-rmse data/cpu224 --probe grad-cam --out report   adds to the report
+fpp-bench diagnose phase data/cpu224 --out report-phase
+fpp-bench diagnose runs/mine.safetensors data/cpu224 --layers enc1,bottleneck,dec1 --quick --out look
+fpp-bench diagnose my_net.py:make data/cpu224 --units mm --layers encoder,decoder.2 --out report-mine
+""",
+    DiagnoseCommand,
 )
-EXAMPLES = (
-    "fpp-bench diagnose unet-individual-rmse data/cpu224 --out report",
-    "fpp-bench diagnose unet-individual-rmse data/cpu224 --probe grad-cam --out report   adds to the report",
-    "fpp-bench diagnose phase data/cpu224 --out report-phase",
-    "fpp-bench diagnose runs/mine.safetensors data/cpu224 --layers enc1 bottleneck dec1 --quick --out look",
-    "fpp-bench diagnose my_net.py:make data/cpu224 --units mm --layers encoder decoder.2 --out report-mine",
-)
-UNITS = ("mm", "m", "normalised")
+def diagnose(
+    *,
+    model: str = argument(
+        "weights that come with the package, a .safetensors file, a method (classical, phase, ...), or your own torch "
+        "module as file.py:factory; that file is executed",
+        "MODEL",
+    ),
+    dataset: Path = argument("dataset folder, of the model's image size", "DATASET"),
+    out: Path = option(REQUIRED, "index.html and diagnose.json go here", "DIR"),
+    probe: tuple[str, ...] = option(
+        (), f"run only this probe; can be repeated: {', '.join(diagnostics.PROBES)} (default: all)", "NAME", many=True
+    ),
+    samples: int | None = option(
+        None, "most samples of a split, taken evenly (default: the probe's)", "N", parse=COUNT
+    ),
+    seeds: int | None = option(None, "repeats of what depends on random numbers (default: 2)", "N", parse=COUNT),
+    frame: int | None = option(None, "number of a network's input frame (default: its first)", "N"),
+    units: Literal["mm", "m", "normalised"] | None = option(
+        None,
+        "output of your own module: depth in mm, in m, or normalised to the sample's range (default)",
+        choices=("mm", "m", "normalised"),
+    ),
+    quick: bool = option(False, "a short run for a first look; its numbers are not reliable"),
+    layers: tuple[str, ...] | None = option(
+        None, "layers to probe, comma separated (default: the model's own)", "A,B", parse=names
+    ),
+    threads: int | None = option(None, "threads (default: every core)", "N", parse=COUNT),
+    options: OfMethods,
+) -> None:
+    """Diagnose a network or method with the paper's probes and further ones; writes an HTML report and a JSON file.
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's arguments."""
-    parser.add_argument(
-        "model",
-        metavar="MODEL",
-        help="weights that come with the package, a .safetensors file, a method (classical, phase, ...), or your own "
-        "torch module as file.py:factory; that file is executed",
-    )
-    parser.add_argument("dataset", type=Path, metavar="DATASET", help="dataset folder, of the model's image size")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="index.html and diagnose.json go here")
-    parser.add_argument(
-        "--probe",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help=f"run only this probe; can be repeated: {', '.join(diagnostics.PROBES)} (default: all)",
-    )
-    text = "most samples of a split, taken evenly (default: the probe's)"
-    parser.add_argument("--samples", type=count(), metavar="N", help=text)
-    text = "repeats of what depends on random numbers (default: 2)"
-    parser.add_argument("--seeds", type=count(), metavar="N", help=text)
-    text = "a short run for a first look; its numbers are not reliable"
-    parser.add_argument("--quick", action="store_true", help=text)
-    parser.add_argument("--layers", nargs="+", metavar="NAME", help="layers to probe (default: the model's own)")
-    parser.add_argument("--frame", type=int, metavar="N", help="number of a network's input frame (default: its first)")
-    parser.add_argument("--threads", type=count(), metavar="N", help="threads (default: every core)")
-    parser.add_argument(
-        "--units",
-        choices=UNITS,
-        help="output of your own module: depth in mm, in m, or normalised to the sample's range (default)",
-    )
-
-
-def run(args: argparse.Namespace) -> int:
-    """Run the probes, write the report, print the summaries. Raises FppBenchError for what can't be diagnosed."""
-    threads = args.threads or usable_cores()
-    limit_threads(threads)  # before NumPy is loaded
-    probe_names = diagnostics.checked_names(args.probe)
-    dataset = storage.DatasetFolder(args.dataset)
-    model = diagnostics.subject(args.model, dataset, args.layers, args.units, args.frame, threads)
-    settings = diagnostics.ProbeSettings(args.samples, args.seeds, args.quick)
+    Raises FppBenchError for what can't be diagnosed."""
+    probe_names = diagnostics.checked_names(probe)
+    opened = storage.DatasetFolder(dataset)
+    method = registry.methods().get(model, registry.network_method())
+    of_method = options.of(method, model)
+    subject = diagnostics.subject(model, opened, layers, units, frame, threads or usable_cores(), of_method)
+    probing = diagnostics.ProbeSettings(samples, seeds, quick)
+    again = command_line(without=("threads",))
     columns = (
         bar.TextColumn("{task.description}"),
         bar.BarColumn(),
@@ -84,22 +93,76 @@ def run(args: argparse.Namespace) -> int:
                 task, completed=done, total=total, description=f"{probe.title}: {activity}"
             )
 
-        results = diagnostics.diagnose(model, dataset, probe_names, settings, args.out, progress, _command(args))
-    table = Table("Probe", "Summary", numbers=("Seconds",), title=Text(model.title))
-    for result in results:
-        text = f"not run: {result.finding.skipped}" if result.finding.skipped else result.finding.summary
-        table.add_row(result.probe.name, Text(text), "reused" if result.reused else f"{result.seconds:.1f}")
+        results = diagnostics.diagnose(subject, opened, probe_names, probing, out, progress, again)
+    table = Table("Probe", "Summary", numbers=("Seconds",), title=Text(subject.title))
+    for probed in results:
+        text = f"not run: {probed.finding.skipped}" if probed.finding.skipped else probed.finding.summary
+        table.add_row(probed.probe.name, Text(text), "reused" if probed.reused else f"{probed.seconds:.1f}")
     show(table)
-    print(f"Written: {args.out / diagnostics.REPORT_FILE}\nWritten: {args.out / diagnostics.JSON_FILE}")
-    return 0
+    print(f"Written: {out / diagnostics.REPORT_FILE}\nWritten: {out / diagnostics.JSON_FILE}")
 
 
-def _command(args: argparse.Namespace) -> str:
-    """The command that makes the same report, without the machine's settings."""
-    words = ["fpp-bench", "diagnose", args.model, str(args.dataset), "--out", str(args.out)]
-    options = [("probe", name) for name in args.probe]
-    options += [(name, getattr(args, name)) for name in ("samples", "seeds", "frame", "units")]
-    words += [word for name, value in options if value is not None for word in (f"--{name}", str(value))]
-    words += ["--quick"] if args.quick else []
-    words += ["--layers", *args.layers] if args.layers else []
-    return shlex.join(words)
+@command(
+    """\
+fpp-bench reliance classical data/cpu224
+fpp-bench reliance phase data/cpu224 --direction vertical
+fpp-bench reliance unet-individual-rmse data/cpu224 --range oracle --into result.json
+""",
+    MethodCommand,
+)
+def reliance(
+    *,
+    chosen: MethodSettings,
+    dataset: Path = argument("dataset folder; scenes are made from its test objects", "DATASET"),
+    views: int = option(
+        2,
+        "samples of each test object, 1 to 6 (default: 2)",
+        "N",
+        parse=value("1 to 6, an object has six views", int, lambda views: 1 <= views <= 6),
+    ),
+    into: Path | None = option(
+        None, "write the score into this result or leaderboard row of the same method (.json)", "FILE"
+    ),
+    json: Path | None = option(None, "write the score and its parts to this file; - is standard output", "FILE"),
+) -> None:
+    """Measure phase reliance: does the predicted depth follow the fringe's phase, or the object's outline?
+
+    A file that can't take the score raises FppBenchError before measuring."""
+    opened = storage.DatasetFolder(dataset)
+    method = chosen.load(opened)
+    entry = None if into is None else read_entry(into)
+    if entry is not None:
+        check_same_method(entry, method)
+    scene_set = diagnostics.SceneSet(opened, views)
+    found = method.settings.get("weights_sha256")
+    sha256 = found if isinstance(found, str) else None
+    with progress_bar(f"reliance of {chosen.name}", len(scene_set.samples), "samples") as advance:
+        # Called before each sample, so the first call is for none.
+        measured, _ = diagnostics.measure(method, scene_set, sha256, lambda done, total, sample: advance(min(done, 1)))
+    if json is not None:
+        result.write_json(measured.model_dump(mode="json"), json)
+    if entry is not None:
+        write_reliance(entry, measured)
+    moved = [value for key, value in measured.parts if not key.startswith("answered")]
+    if any(moved):
+        show(_reliance_table(method.title, measured))
+    else:
+        print(
+            f"{method.title}: gives the same answer whatever phase, light and outline of {measured.samples} samples "
+            "are, so it reads nothing of them. Phase reliance 0."
+        )
+
+
+def _reliance_table(title: str, reliance: "result.Reliance") -> Table:
+    heading = Text(f"{title}: {reliance.samples} samples of {reliance.objects} objects")
+    table = Table("", numbers=("value",), title=heading)
+    low, high = reliance.interval
+    interval = "" if low is None or high is None else f" ({low:.2f} to {high:.2f})"
+    table.add_row("phase reliance, 0 to 1", f"{reliance.score:.3f}{interval}")
+    if reliance.order_free_score is not None:
+        table.add_row("  whole periods aside", f"{reliance.order_free_score:.3f}")
+    for key, words in result.PART_TITLES.items():
+        value = getattr(reliance.parts, key)
+        if value is not None:
+            table.add_row(words, f"{value:.3f}")
+    return table

@@ -1,107 +1,134 @@
-"""``fpp-eval``: score a folder of predictions against one split of a dataset; its subcommands work on results."""
+"""``fpp-eval``: score a folder of predictions against one split of a dataset, and work on results."""
 
-import argparse
-import json
 import sys
 from collections.abc import Sequence
+from json import dumps
 from pathlib import Path
-from types import SimpleNamespace
 
-from fpp_ml_bench.cli import CHECK_FAILED, OK, SPLITS, run_command
-from fpp_ml_bench.cli.explain import add_explain_options, as_asked, explain
-from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.cli import CHECK_FAILED, EVAL, OK, run_program
+from fpp_ml_bench.cli.options import SPLITS, Explain, command, value
+from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import report, result, score, submission
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, MODES, TARGETS
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.machine import prepare_process
+from fpp_ml_bench.options import REQUIRED, argument, option
 
-SUMMARY = "Score a folder of predictions: MAE and RMSE in mm over the full grid, the object and the background."
-EXAMPLES = (
-    "fpp-eval predictions --dataset data/mini --split test --json result.json",
-    "fpp-eval predictions --dataset data/mini --split test --target depth_exact --report report",
-    "fpp-eval init predictions",
-    "fpp-eval check predictions",
-    "fpp-eval compare result.json leaderboard/rows/phase-net-vertical.json",
-    "fpp-eval verify result.json predictions --dataset data/mini",
-    "fpp-eval schema",
+LISTED = 20
+"""Differences that ``verify`` prints."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point of ``fpp-eval``."""
+    return run_program(EVAL, argv)
+
+
+@command(
+    """\
+fpp-eval predictions --json result.json
+fpp-eval predictions data/mini --split test --target depth_exact --report report
+"""
 )
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """The command's arguments."""
-    add = parser.add_argument
-    add(
-        "folder",
-        type=Path,
-        metavar="DIR",
-        help="folder of submission.yaml and one {sample}.npy, .npz, .mat or 16-bit .png per sample, or one "
+def score_folder(
+    *,
+    predictions: Path = argument(
+        "folder of submission.yaml and one {sample}.npy, .npz, .mat or 16-bit .png per sample, or one "
         "predictions.parquet or .arrow: depth (H, W), 0 = background, in the units that submission.yaml declares; "
         "every problem is listed by file, and then no JSON is written",
-    )
-    add("--dataset", type=Path, required=True, metavar="DATASET", help="folder of the dataset")
-    add("--split", choices=SPLITS, default="test", help="samples to score (default: test)")
-    add(
-        "--target",
+        "PREDICTIONS",
+    ),
+    dataset: Path | None = argument(
+        "folder of the dataset (default: the one that fpp-bench predict read, by submission.yaml)", "DATASET", None
+    ),
+    split: str | None = option(
+        None, "samples to score (default: those that were predicted by submission.yaml, else test)", choices=SPLITS
+    ),
+    target: str = option(
+        TARGETS[0],
+        "depth: decoded from the noisy frames, as in the paper (default); depth_exact: from the ray cast",
         choices=TARGETS,
-        default=TARGETS[0],
-        help="depth: decoded from the noisy frames, as in the paper (default); depth_exact: from the ray cast",
-    )
-    add(
-        "--edge-band",
-        type=_band,
-        default=EDGE_BAND_PX,
-        metavar="PX",
-        help=f"object pixels nearer than this to a depth edge count as edge (default: {EDGE_BAND_PX})",
-    )
-    add(
-        "--mode",
+    ),
+    edge_band: int = option(
+        EDGE_BAND_PX,
+        f"object pixels nearer than this to a depth edge count as edge (default: {EDGE_BAND_PX})",
+        "PX",
+        parse=value("whole pixels from 0 to 1000", int, lambda band: 0 <= band <= 1000),
+    ),
+    mode: str = option(
+        MODES[0],
+        "standard: void pixels (unlit or mixed) count in no set (default); paper: the paper's sets, without void, and "
+        "its rule for normalised depth; never ranked with the others",
         choices=MODES,
-        default=MODES[0],
-        help="standard: void pixels (unlit or mixed) count in no set (default); paper: the paper's sets, without void, "
-        "and its rule for normalised depth; never ranked with the others",
+    ),
+    json: Path | None = option(None, "write the result here, per-sample scores included; - is standard output", "FILE"),
+    page: Path | None = option(None, "write an HTML page with figures into this folder", "DIR", flag="--report"),
+    account: Explain,
+) -> None:
+    """Score a folder of predictions: MAE and RMSE in mm over the full grid, the object and the background.
+
+    Raises FppBenchError for anything that can't be scored."""
+    prepare_process()
+    account.check()
+    _check_outputs(json, page, predictions)
+    opened, split = scored_data(predictions, dataset, split)
+    scored = score.evaluate(
+        predictions,
+        opened,
+        split,
+        target,
+        edge_band,
+        mode,
+        while_scoring=lambda: report.result_table,
     )
-    add("--json", type=Path, metavar="FILE", help="write the result here, per-sample scores included")
-    add("--report", type=Path, metavar="OUT", help="write an HTML page with figures into this folder")
-    add_explain_options(parser)
+    if json is not None:
+        result.write_result(scored, json)
+    if page is not None:
+        report.write_report(scored, opened, predictions, page)
+    from fpp_ml_bench.cli.console import show  # imports rich, which --help must not
+
+    show(report.result_table(scored))  # when all is written: printing ends where nobody reads any more
+    for written in (json, page):
+        if written is not None:
+            print(f"Written: {written}")
+    has_expected_bytes, sentence = storage.benchmark_sentence(opened.manifest)
+    if not has_expected_bytes:
+        print(f"fpp-eval: warning: {opened.path}: {sentence}", file=sys.stderr)
+    account.say(lambda: score.explain_eval(opened, split, target, edge_band))
 
 
-def _band(text: str) -> int:
-    if not text.isdecimal() or int(text) > 1000:
-        raise argparse.ArgumentTypeError(f"expected whole pixels from 0 to 1000, got {text!r}")
-    return int(text)
-
-
-def run(args: argparse.Namespace) -> int:
-    """Score, write the JSON if requested, print the table. Raises FppBenchError for anything that can't be scored."""
-    with as_asked(args):
-        prepare_process()
-        _check_outputs(args.json, args.report, args.folder)
-        dataset = storage.DatasetFolder(args.dataset)
-        scored = score.evaluate(
-            args.folder,
-            dataset,
-            args.split,
-            args.target,
-            args.edge_band,
-            args.mode,
-            while_scoring=lambda: report.result_table,
+def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[storage.DatasetFolder, str]":
+    """The dataset in ``place`` and the ``split`` to score; where they are not given, those that ``folder`` was
+    predicted from, by its submission.yaml. Raises `SubmissionError` where that does not say, and `DatasetError` where
+    the dataset is gone or another one now."""
+    shown, told, content = printable(str(folder), 500), Path(), {}
+    if not folder.is_dir():
+        raise PredictionError(f"expected a folder of predictions, found none at {shown}")
+    give = f"give the dataset: fpp-eval {shown} DATASET"
+    try:  # by hand: pydantic, which takes long to import, checks the file while the first samples are scored
+        predicted = submission.read_plain(folder).get("predicted") or {}
+        told, content = Path(predicted["dataset"]), dict(predicted["content"])
+        split = split or str(predicted["split"])
+    except SubmissionError as error:
+        if place is None:
+            raise SubmissionError(f"{error}; {give}") from None
+    except (AttributeError, KeyError, TypeError, ValueError):
+        if place is None:
+            file = submission.SUBMISSION_FILE
+            raise SubmissionError(f"{shown}: {file} does not say (predicted:) what was predicted; {give}") from None
+    if place is not None:
+        return storage.DatasetFolder(place), split or "test"
+    try:
+        dataset = storage.DatasetFolder(told)
+    except DatasetError as error:
+        raise DatasetError(f"{error}. {shown} was predicted from there; if the data was moved, {give}") from None
+    changed = next((name for name, digest in content.items() if dataset.content.get(name) != digest), None)
+    if changed is not None:
+        raise DatasetError(
+            f"{dataset.path}: is not what {shown} was predicted from, {printable(changed)} is another now; {give}, or "
+            "predict again"
         )
-        if args.json is not None:
-            result.write_result(scored, args.json)
-        if args.report is not None:
-            report.write_report(scored, dataset, args.folder, args.report)
-        from fpp_ml_bench.cli.console import show  # imports rich, which --help must not
-
-        show(report.result_table(scored))  # when all is written: printing ends where nobody reads any more
-        for written in (args.json, args.report):
-            if written is not None:
-                print(f"Written: {written}")
-        has_expected_bytes, sentence = storage.benchmark_sentence(dataset.manifest)
-        if not has_expected_bytes:
-            print(f"fpp-eval: warning: {dataset.path}: {sentence}", file=sys.stderr)
-        explain(args, lambda: score.explain_eval(dataset, args.split, args.target, args.edge_band))
-    return OK
+    return dataset, split or "test"
 
 
 def _check_outputs(file: Path | None, page: Path | None, folder: Path) -> None:
@@ -121,102 +148,38 @@ def _check_outputs(file: Path | None, page: Path | None, folder: Path) -> None:
             raise SubmissionError(f"--report {page}: {inside}")
 
 
-def _compare_arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("first", type=Path, metavar="A.json", help="a result of fpp-eval --json, or a row of the leaderboard")
-    add(
-        "second",
-        type=Path,
-        metavar="B.json",
-        help="a result of another method on the same data, split, target and track",
-    )
-    add("--json", type=Path, metavar="FILE", help="write the comparison here, each sample's included")
+@command(
+    """\
+fpp-eval init predictions
+"""
+)
+def init(
+    *,
+    predictions: Path = argument("folder of the predictions, made if absent", "PREDICTIONS"),
+) -> None:
+    """Write a submission.yaml to fill in; one that is there is not overwritten."""
+    print(f"Written: {submission.write_template(predictions)}")
+    print(f"next: fill it in, write one {{sample}}.npy for each sample beside it, then: fpp-eval check {predictions}")
 
 
-def _compare(args: argparse.Namespace) -> int:
-    """Print the table and the sentence. Raises SubmissionError for results that can't be compared."""
-    from fpp_ml_bench.cli.console import show
-    from fpp_ml_bench.leaderboard.rows import alike, read_scored
+@command(
+    """\
+fpp-eval check predictions
+fpp-eval check predictions data/mini --split test
+"""
+)
+def check(
+    *,
+    predictions: Path = argument("folder of predictions and submission.yaml", "PREDICTIONS"),
+    dataset: Path | None = argument("check names, sizes and frames against this dataset, too", "DATASET", None),
+    split: str = option("test", "samples expected with DATASET (default: test)", choices=SPLITS),
+) -> int:
+    """Check a submission before it is scored, without ground truth: exit status 0 sound, 1 refused.
 
-    comparison = report.compare(*alike(read_scored(args.first), read_scored(args.second)))
-    if args.json is not None:
-        result.write_json(comparison.model_dump(mode="json"), args.json)
-    show(report.comparison_table(comparison))
-    return OK
-
-
-def _schema_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "file",
-        nargs="?",
-        choices=("result", "submission", "comparison"),
-        default="result",
-        help="result: what fpp-eval writes (default); submission: submission.yaml; comparison: fpp-eval compare --json",
-    )
-
-
-def _schema(args: argparse.Namespace) -> int:
-    print(json.dumps(result.json_schema(args.file), indent=1))
-    return OK
-
-
-LISTED = 20
-"""Differences that ``verify`` prints."""
-
-
-def _verify_arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("result", type=Path, metavar="RESULT.json", help="a result of fpp-eval --json, or a row of the leaderboard")
-    add("folder", type=Path, metavar="DIR", help="the predictions it was made from")
-    add("--dataset", type=Path, required=True, metavar="DATASET", help="folder of the dataset")
-
-
-def _verify(args: argparse.Namespace) -> int:
-    """Say verified or not, and what differs. Raises FppBenchError where nothing can be recomputed at all."""
-    from fpp_ml_bench.leaderboard import rows
-
-    scored = rows.read_scored(args.result)
-    dataset = storage.DatasetFolder(args.dataset)
-    if isinstance(scored, result.Result):
-        problems = score.differences(scored, args.folder, dataset)
-    else:
-        problems = rows.differences(scored, args.folder, dataset)
-    file = printable(str(args.result), 500)
-    unchecked = f"not checked: {', '.join(rows.not_checked(scored))}: predictions don't tell them"
-    if not problems:
-        print(f"verified: {file} is what {scored.dataset.samples} predictions give\n{unchecked}")
-        return OK
-    print(f"not verified: {file} differs from what the predictions give in {len(problems)} places")
-    for line in problems[:LISTED]:
-        print(f"  {line}")
-    if len(problems) > LISTED:
-        print(f"  ... and {len(problems) - LISTED} more")
-    print(unchecked)
-    return CHECK_FAILED
-
-
-def _init_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("folder", type=Path, metavar="DIR", help="folder of the predictions, made if absent")
-
-
-def _init(args: argparse.Namespace) -> int:
-    print(f"Written: {submission.write_template(args.folder)}")
-    print(f"next: fill it in, write one {{sample}}.npy for each sample beside it, then: fpp-eval check {args.folder}")
-    return OK
-
-
-def _check_arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("folder", type=Path, metavar="DIR", help="folder of predictions and submission.yaml")
-    add("--dataset", type=Path, metavar="DATASET", help="check names, sizes and frames against this dataset, too")
-    add("--split", choices=SPLITS, default="test", help="samples expected with --dataset (default: test)")
-
-
-def _check(args: argparse.Namespace) -> int:
-    """Say whether a submission would be scored, as far as its own files tell. Raises FppBenchError for no folder."""
-    dataset = None if args.dataset is None else storage.DatasetFolder(args.dataset)
-    checked = score.check_folder(args.folder, dataset, args.split)
-    folder = printable(str(args.folder), 500)
+    Raises FppBenchError for no folder."""
+    opened = None if dataset is None else storage.DatasetFolder(dataset)
+    checked = score.check_folder(predictions, opened, split)
+    folder = printable(str(predictions), 500)
     for note in checked.notes:
         print(f"fpp-eval: note: {note}", file=sys.stderr)
     if checked.problems:
@@ -226,7 +189,7 @@ def _check(args: argparse.Namespace) -> int:
         return CHECK_FAILED
     height, width = checked.size
     sigma = ", with an uncertainty" if checked.sigmas else ""
-    against = "" if dataset is None else f" of split {args.split}"
+    against = "" if dataset is None else f" of split {split}"
     print(f"{folder}: {len(checked.samples)} samples{against}, {checked.form}, {width}x{height} px{sigma}; sound")
     if checked.description is not None:
         frames, track = len(checked.description.frames_used), checked.description.track
@@ -234,48 +197,123 @@ def _check(args: argparse.Namespace) -> int:
     return OK
 
 
-SUBCOMMANDS = {
-    "init": SimpleNamespace(
-        SUMMARY="Write a submission.yaml to fill in; one that is there is not overwritten.",
-        EXAMPLES=("fpp-eval init predictions",),
-        add_arguments=_init_arguments,
-        run=_init,
-    ),
-    "check": SimpleNamespace(
-        SUMMARY="Check a submission before it is scored, without ground truth: exit status 0 sound, 1 refused.",
-        EXAMPLES=("fpp-eval check predictions", "fpp-eval check predictions --dataset data/mini --split test"),
-        add_arguments=_check_arguments,
-        run=_check,
-    ),
-    "compare": SimpleNamespace(
-        SUMMARY="Compare two results of the same samples: paired differences, their 95% intervals, and a plain "
-        "sentence.",
-        EXAMPLES=("fpp-eval compare a.json b.json", "fpp-eval compare a.json b.json --json difference.json"),
-        add_arguments=_compare_arguments,
-        run=_compare,
-    ),
-    "verify": SimpleNamespace(
-        SUMMARY="Score the predictions again and say whether the result or row is verified (exit status 0) or not (1).",
-        EXAMPLES=(
-            "fpp-eval verify result.json predictions --dataset data/mini",
-            "fpp-eval verify leaderboard/rows/mine.json predictions --dataset data/full",
-        ),
-        add_arguments=_verify_arguments,
-        run=_verify,
-    ),
-    "schema": SimpleNamespace(
-        SUMMARY="Print the JSON Schema (2020-12) of result.json or of submission.yaml.",
-        EXAMPLES=("fpp-eval schema > result.schema.json", "fpp-eval schema submission"),
-        add_arguments=_schema_arguments,
-        run=_schema,
-    ),
-}
-"""First words that select a subcommand. A folder of such a name is given as ./compare."""
+@command(
+    """\
+fpp-eval compare a.json b.json
+fpp-eval compare a.json b.json --json difference.json
+"""
+)
+def compare(
+    *,
+    first: Path = argument("a result of fpp-eval --json, or a row of the leaderboard", "A.json"),
+    second: Path = argument("a result of another method on the same data, split, target and track", "B.json"),
+    json: Path | None = option(None, "write the comparison here, each sample's included; - is standard output", "FILE"),
+) -> None:
+    """Compare two results of the same samples: paired differences, their 95% intervals, and a plain sentence.
+
+    Raises SubmissionError for results that can't be compared."""
+    from fpp_ml_bench.cli.console import show
+    from fpp_ml_bench.leaderboard.rows import alike, read_scored
+
+    comparison = report.compare(*alike(read_scored(first), read_scored(second)))
+    if json is not None:
+        result.write_json(comparison.model_dump(mode="json"), json)
+    show(report.comparison_table(comparison))
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point of ``fpp-eval``: exit status 0, 1 where ``verify`` finds a difference, 2 with the error on stderr."""
-    words = list(sys.argv[1:] if argv is None else argv)
-    if words and words[0] in SUBCOMMANDS:
-        return run_command(SUBCOMMANDS[words[0]], f"fpp-eval {words[0]}", words[1:])
-    return run_command(sys.modules[__name__], "fpp-eval", words)
+@command(
+    """\
+fpp-eval verify result.json predictions data/mini
+fpp-eval verify leaderboard/rows/mine.json predictions data/full
+"""
+)
+def verify(
+    *,
+    file: Path = argument("a result of fpp-eval --json, or a row of the leaderboard", "RESULT.json"),
+    predictions: Path = argument("the predictions it was made from", "PREDICTIONS"),
+    dataset: Path = argument("folder of the dataset", "DATASET"),
+) -> int:
+    """Score the predictions again and say whether the result or row is verified (exit status 0) or not (1).
+
+    Raises FppBenchError where nothing can be recomputed at all."""
+    from fpp_ml_bench.leaderboard import rows
+
+    scored, opened = rows.read_scored(file), storage.DatasetFolder(dataset)
+    differences = score.differences if isinstance(scored, result.Result) else rows.differences
+    problems, shown = differences(scored, predictions, opened), printable(str(file), 500)  # type: ignore[arg-type]
+    unchecked = f"not checked: {', '.join(rows.not_checked(scored))}: predictions don't tell them"
+    if not problems:
+        print(f"verified: {shown} is what {scored.dataset.samples} predictions give\n{unchecked}")
+        return OK
+    print(f"not verified: {shown} differs from what the predictions give in {len(problems)} places")
+    for line in problems[:LISTED]:
+        print(f"  {line}")
+    if len(problems) > LISTED:
+        print(f"  ... and {len(problems) - LISTED} more")
+    print(unchecked)
+    return CHECK_FAILED
+
+
+@command(
+    """\
+fpp-bench predict phase data/full --split validation --out predictions-validation
+fpp-bench predict phase data/full --split test --out predictions
+fpp-eval conformal predictions data/full --from predictions-validation --out predictions-conformal
+fpp-eval predictions-conformal
+"""
+)
+def conformal(
+    *,
+    predictions: Path = argument("predictions with {sample}.sigma.npy, whose sigma is scaled", "PREDICTIONS"),
+    dataset: Path = argument("folder of the dataset", "DATASET"),
+    split: str = option("test", "split of PREDICTIONS (default: test)", choices=SPLITS),
+    calibration: Path = option(
+        REQUIRED, "the same method's predictions of the split that is calibrated on", "DIR", flag="--from"
+    ),
+    calibrate: str = option(
+        "validation",
+        "split of --from (default: validation); not one that the method learned from",
+        choices=("train", "validation"),
+    ),
+    coverage: float = option(
+        0.68,
+        "what the interval of +- sigma x its Gaussian quantile shall hold (default: 0.68); n calibration objects "
+        "support at most n / (n + 1)",
+        "SHARE",
+    ),
+    target: str = option(TARGETS[0], "depth that errors are taken against (default: depth)", choices=TARGETS),
+    out: Path = option(REQUIRED, "new folder: a copy with the scaled sigma", "DIR"),
+) -> None:
+    """Scale a method's stated sigma by split-conformal calibration over objects, from its predictions of another
+    split."""
+    opened = storage.DatasetFolder(dataset)
+    found = score.calibrate(calibration, opened, calibrate, coverage, target)
+    samples = score.write_calibrated(found, predictions, opened, split, out)
+    share, most = f"{100 * found.coverage:g}%", 100 * score.largest_coverage(found.objects)
+    print(f"{calibration}: {found.samples} samples")
+    print(f"  {score.counted(found.objects)} can support at most {most:.1f}%")
+    print(f"  {100 * found.before:.1f}% of the pixels are in their {share} interval as it was stated")
+    print(
+        f"  factor {found.factor:.4g}: the {share} interval of a new object's pixel holds in {share} of cases or more,"
+    )
+    print("  over objects that are like these and pixels that state a sigma")
+    print(f"{out}: {samples} predictions with the scaled sigma")
+
+
+@command(
+    """\
+fpp-eval schema > result.schema.json
+fpp-eval schema submission
+"""
+)
+def schema(
+    *,
+    file: str = argument(
+        "result: what fpp-eval writes (default); submission: submission.yaml; comparison: fpp-eval compare --json",
+        "result|submission|comparison",
+        "result",
+        choices=("result", "submission", "comparison"),
+    ),
+) -> None:
+    """Print the JSON Schema (2020-12) of result.json or of submission.yaml."""
+    print(dumps(result.json_schema(file), indent=1))

@@ -1,69 +1,56 @@
 """``fpp-bench fuse``: an object's views in one point cloud, and the pixels that other views contradict."""
 
-import argparse
 from pathlib import Path
 
 from fpp_ml_bench.baselines import views
-from fpp_ml_bench.cli import SPLITS
+from fpp_ml_bench.cli.console import progress_bar, show
+from fpp_ml_bench.cli.options import SPLITS, command
 from fpp_ml_bench.evaluation import score
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.options import REQUIRED, argument, option
+from fpp_ml_bench.tables import Table
 
-SUMMARY = (
-    "Put the views of each object into one point cloud by their known placement, and compare them with each other."
+
+@command(
+    """\
+fpp-bench predict phase data/full --out predictions
+fpp-bench fuse predictions data/full --out fused
+fpp-bench fuse predictions data/full --object power_drill --out fused
+fpp-bench fuse depth_exact data/full --out fused-exact          what the views can cover at best
+"""
 )
-EXAMPLES = (
-    "fpp-bench predict phase data/full --out predictions",
-    "fpp-bench fuse predictions --dataset data/full --out fused",
-    "fpp-bench fuse predictions --dataset data/full --object power_drill --out fused",
-    "fpp-bench fuse depth_exact --dataset data/full --out fused-exact          what the views can cover at best",
-)
+def fuse(
+    *,
+    predictions: str = argument(
+        "predictions of a split; or depth or depth_exact, the dataset's own (a folder: ./depth)", "PREDICTIONS"
+    ),
+    dataset: Path = argument("folder of a generated dataset", "DATASET"),
+    split: str = option("test", "split of PREDICTIONS (default: test)", choices=SPLITS),
+    only: str | None = option(None, "only this object (default: all of the split)", "NAME", flag="--object"),
+    cell_mm: float = option(views.CELL_MM, "edge of the cells in which points are averaged (default: 2)", "MM"),
+    out: Path = option(
+        REQUIRED, "folder for {object}.ply (metres, object coordinates), {object}.png and fusion.json", "DIR"
+    ),
+) -> None:
+    """Put the views of each object into one point cloud by their known placement, and compare them with each other.
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add(
-        "predictions",
-        metavar="PREDICTIONS",
-        help="predictions of a split; or depth or depth_exact, the dataset's own (a folder: ./depth)",
-    )
-    add("--dataset", type=Path, required=True, metavar="DATASET", help="folder of a generated dataset")
-    add("--split", choices=SPLITS, default="test", help="split of PREDICTIONS (default: test)")
-    add("--object", metavar="NAME", help="only this object (default: all of the split)")
-    add("--cell-mm", type=float, metavar="MM", help="edge of the cells in which points are averaged (default: 2)")
-    add(
-        "--out",
-        type=Path,
-        required=True,
-        metavar="DIR",
-        help="folder for {object}.ply (metres, object coordinates), {object}.png and fusion.json",
-    )
-
-
-def run(args: argparse.Namespace) -> int:
-    """Fuse, write, print means over objects. Raises FppBenchError for unusable predictions or data."""
-    from fpp_ml_bench.cli.console import progress_bar
-
-    dataset = storage.DatasetFolder(args.dataset)
-    cell_mm = views.CELL_MM if args.cell_mm is None else args.cell_mm
-    name, objects = views.fuse_split(args.predictions, dataset, args.split, args.object, cell_mm)
+    Prints means over objects. Raises FppBenchError for unusable predictions or data."""
+    opened = storage.DatasetFolder(dataset)
+    name, objects = views.fuse_split(predictions, opened, split, only, cell_mm)
     scores = {}
-    with progress_bar("fusing", len(views.views_by_object(dataset, args.split, args.object)), "objects") as advance:
+    with progress_bar("fusing", len(views.views_by_object(opened, split, only)), "objects") as advance:
         for fused in objects:
-            views.write_object(args.out, fused)
+            views.write_object(out, fused)
             scores[fused.name] = fused.scores
             advance(1)
-    views.write_scores(args.out, name, dataset, args.split, cell_mm, scores)
+    views.write_scores(out, name, opened, split, cell_mm, scores)
     _print(name, scores)
-    print(f"{args.out}: {{object}}.ply, {{object}}.png, {views.FUSION_FILE}")
-    return 0
+    print(f"{out}: {{object}}.ply, {{object}}.png, {views.FUSION_FILE}")
 
 
 def _print(name: str, scores: "dict[str, views.Row]") -> None:
     """Means over objects: the clouds, the contradicted pixels, the error with and without them."""
-    from fpp_ml_bench.cli.console import show
-    from fpp_ml_bench.tables import Table
-
     means = views.means(scores)
     objects = f"{len(scores)} object{'' if len(scores) == 1 else 's'}"
     near = f"within {views.WITHIN_MM:g} mm"

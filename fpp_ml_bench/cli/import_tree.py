@@ -1,126 +1,117 @@
 """``fpp-bench import``: a published tree, or a scanner's captures, into the dataset format."""
 
-import argparse
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
+from typing import Any
 
 from fpp_ml_bench import calibration, coding, optics
 from fpp_ml_bench.cli.calibrate import print_fit
 from fpp_ml_bench.cli.console import gigabytes, progress_bar, show
+from fpp_ml_bench.cli.options import AT_LEAST_ONE, command, given
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders import captures, published, storage
 from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.tables import Table
 
-SUMMARY = (
-    "Read a published tree (PNG fringes, .mat depth, raw scans), or the captures of a scanner, into the same dataset\n\
-format as a build."
-)
-EXAMPLES = (
-    "fpp-bench import fpp-ml-bench data/published",
-    "fpp-bench import fpp-ml-bench data/published --frame-order paper",
-    "fpp-bench import my-scans data/mine --rig my-rig.yaml",
-    "fpp-bench import my-scans data/mine --fit-rig               find the rig from frames and depth, as calibrate does",
-    "fpp-bench import --captures my-captures data/mine --rig my-rig.yaml --splits splits.yaml",
-    "",
-    "TREE holds training_datasets/ (training_data_depth_raw, or the global or individual variant) and, if there are",
-    "raw scans, fpp_synthetic_dataset/. The tree's split is used. If files break the layout, they are all listed and",
-    "nothing is imported. Frame orders: paper, vertical-first, by-direction, by-direction-vertical-first, with any of",
-    "+white-first, +backward-steps, +least-bit-first; the order is checked on the images.",
-    "",
-    "With --captures, TREE holds a folder for each object, with a folder of frames for each view, or with the frames",
-    "of a single view: as many images as the rig's sequence has, in the order of their names. The rig decodes them",
-    "into the ground truth. splits.yaml lists the objects under train, validation and test.",
-)
-_CAPTURE_OPTIONS = "splits", "bits", "colour", "min_modulation", "max_clipped_steps", "max_disagreement", "anyway"
 _MOST_SHOWN = 30
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("tree", type=Path, metavar="TREE", help="folder that holds training_datasets/, or captures")
-    parser.add_argument("out", type=Path, metavar="OUT", help="new folder, or the folder of an interrupted import")
-    parser.add_argument("--workers", type=int, metavar="N", help="processes (default: one per processor)")
-    rig = parser.add_mutually_exclusive_group()
-    rig.add_argument(
-        "--rig", type=Path, metavar="FILE", help="rig that took the images, YAML or JSON (default: the paper's, scaled)"
+@dataclass(frozen=True, kw_only=True)
+class CaptureSettings:
+    """How captures without depth are read and decoded."""
+
+    HEADING = "captures without depth"
+    splits: Path | None = option(
+        None, "YAML lists of objects under train, validation and test (default: all in test)", "FILE"
     )
-    rig.add_argument(
-        "--fit-rig", action="store_true", help="find projector and pitch from raw scans and depth (fpp-bench calibrate)"
+    bits: int | None = option(None, "bits of the camera, 8 to 16 (default: found in the images)", "N")
+    colour: str | None = option(
+        None, "what to take of colour images: luminance, red, green, blue or mean (default: refuse them)", "NAME"
     )
-    parser.add_argument(
-        "--frame-order",
-        default="auto",
-        metavar="NAME",
-        help="order of the raw scans' files (default: auto, determined from the images)",
+    min_modulation: float | None = option(
+        None, "least modulation of a pixel with depth, grey levels of 255 (default: 5)", "GREY"
     )
-    add = parser.add_argument_group("captures without depth").add_argument
-    add("--captures", action="store_true", help="TREE holds captures, which --rig decodes into the ground truth")
-    add(
-        "--splits",
-        type=Path,
-        metavar="FILE",
-        help="YAML lists of objects under train, validation and test (default: all in test)",
+    max_clipped_steps: int | None = option(
+        None, "phase steps that may be saturated at a pixel (default: a ninth of them)", "N"
     )
-    add("--bits", type=int, metavar="N", help="bits of the camera, 8 to 16 (default: found in the images)")
-    add(
-        "--colour",
-        metavar="NAME",
-        help="what to take of colour images: luminance, red, green, blue or mean (default: refuse them)",
-    )
-    add(
-        "--min-modulation",
-        type=float,
-        metavar="GREY",
-        help="least modulation of a pixel with depth, grey levels of 255 (default: 5)",
-    )
-    add(
-        "--max-clipped-steps",
-        type=int,
-        metavar="N",
-        help="phase steps that may be saturated at a pixel (default: a ninth of them)",
-    )
-    add("--anyway", action="store_true", default=None, help="import captures that their examination refuses, too")
-    add(
-        "--max-disagreement",
-        type=float,
-        metavar="PX",
-        help="largest distance of both directions' coordinates from the epipolar line (default: 1.5)",
+    anyway: bool = option(False, "import captures that their examination refuses, too")
+    max_disagreement: float | None = option(
+        None, "largest distance of both directions' coordinates from the epipolar line (default: 1.5)", "PX"
     )
 
 
-def run(args: argparse.Namespace) -> int:
-    """Import, and print a summary. Raises FppBenchError for an unusable tree, captures, rig or folder."""
-    workers = usable_cores() if args.workers is None else args.workers
-    if workers < 1:
-        raise BuildError(f"--workers {workers}: expected 1 or more")
-    return _run_captures(args, workers) if args.captures else _run_tree(args, workers)
+@dataclass(frozen=True, kw_only=True)
+class ImportSettings(CaptureSettings):
+    """Settings of `import_tree`."""
+
+    tree: Path = argument("folder that holds training_datasets/, or captures", "TREE")
+    out: Path = option(REQUIRED, "new folder, or the folder of an interrupted import", "DIR")
+    workers: int | None = option(None, "processes (default: one per processor)", "N", parse=AT_LEAST_ONE)
+    captures: bool = option(False, "TREE holds captures, which --rig decodes into the ground truth")
+    rig: Path | None = option(None, "rig that took the images, YAML or JSON (default: the paper's, scaled)", "FILE")
+    fit_rig: bool = option(False, "find projector and pitch from raw scans and depth (fpp-bench calibrate)")
+    frame_order: str = option(
+        "auto", "order of the raw scans' files (default: auto, determined from the images)", "NAME"
+    )
 
 
-def _run_captures(args: argparse.Namespace, workers: int) -> int:
-    if args.rig is None:
+@command(
+    """\
+fpp-bench import fpp-ml-bench --out data/published
+fpp-bench import fpp-ml-bench --out data/published --frame-order paper
+fpp-bench import my-scans --out data/mine --rig my-rig.yaml
+fpp-bench import my-scans --out data/mine --fit-rig         find the rig from frames and depth, as calibrate does
+fpp-bench import my-captures --captures --out data/mine --rig my-rig.yaml --splits splits.yaml
+
+TREE holds training_datasets/ (training_data_depth_raw, or the global or individual variant) and, if there are
+raw scans, fpp_synthetic_dataset/. The tree's split is used. If files break the layout, they are all listed and
+nothing is imported. Frame orders: paper, vertical-first, by-direction, by-direction-vertical-first, with any of
++white-first, +backward-steps, +least-bit-first; the order is checked on the images.
+
+With --captures, TREE holds a folder for each object, with a folder of frames for each view, or with the frames
+of a single view: as many images as the rig's sequence has, in the order of their names. The rig decodes them
+into the ground truth. splits.yaml lists the objects under train, validation and test.
+"""
+)
+def import_tree(settings: ImportSettings) -> None:
+    """Read a published tree (PNG fringes, .mat depth, raw scans), or the captures of a scanner, into the same dataset
+    format as a build.
+
+    Prints a summary. Raises FppBenchError for an unusable tree, captures, rig or folder."""
+    if settings.rig is not None and settings.fit_rig:
+        raise BuildError("--rig and --fit-rig: the first gives the rig that the second finds; give one of them")
+    if settings.captures:
+        _import_captures(settings)
+    else:
+        _import_tree(settings)
+
+
+def _import_captures(settings: ImportSettings) -> None:
+    if settings.rig is None:
         raise BuildError(
             "--captures: the rig that took them is missing; give its file with --rig (fpp-bench calibrate)"
         )
-    if args.frame_order != "auto":
+    if settings.frame_order != "auto":
         raise BuildError("--frame-order belongs to published trees; captures have the order of their rig's sequence")
-    given = {
-        "min_modulation": args.min_modulation,
-        "max_clipped_steps": args.max_clipped_steps,
-        "max_disagreement_px": args.max_disagreement,
+    options: dict[str, Any] = {
+        "min_modulation": settings.min_modulation,
+        "max_clipped_steps": settings.max_clipped_steps,
+        "max_disagreement_px": settings.max_disagreement,
     }
-    limits = coding.Limits(**{name: value for name, value in given.items() if value is not None})
-    splits = None if args.splits is None else captures.read_splits(args.splits)
+    limits = coding.Limits(**{name: value for name, value in options.items() if value is not None})
+    splits = None if settings.splits is None else captures.read_splits(settings.splits)
     plan = captures.plan_captures(
-        args.tree, optics.load_rig(args.rig), splits, limits, args.bits, args.colour, bool(args.anyway)
+        settings.tree, optics.load_rig(settings.rig), splits, limits, settings.bits, settings.colour, settings.anyway
     )
     count, images = len(plan.reader.captures), len(plan.reader.rig.sequence)
     started = perf_counter()
     with progress_bar("importing", count, "images", images) as advance:
-        manifest = captures.import_captures(args.out, plan, workers, advance)
+        manifest = captures.import_captures(settings.out, plan, settings.workers or usable_cores(), advance)
     _print_captures(manifest)
-    _print_end(args.out, manifest, images, perf_counter() - started, captures.capture_notes(manifest))
-    return 0
+    _print_end(settings.out, manifest, images, perf_counter() - started, captures.capture_notes(manifest))
 
 
 def _print_captures(manifest: "storage.Manifest") -> None:
@@ -147,27 +138,25 @@ def _print_end(out: Path, manifest: "storage.Manifest", images: int, seconds: fl
     print(f"next: fpp-bench info {out}")
 
 
-def _run_tree(args: argparse.Namespace, workers: int) -> int:
-    for name in _CAPTURE_OPTIONS:
-        if getattr(args, name) is not None:
-            raise BuildError(f"--{name.replace('_', '-')} belongs to captures without depth; give --captures too")
-    rig = None if args.rig is None else optics.load_rig(args.rig)
-    plan = published.plan_import(args.tree, rig, args.frame_order)
-    if args.fit_rig:
+def _import_tree(settings: ImportSettings) -> None:
+    if of_captures := given(settings, CaptureSettings):
+        raise BuildError(f"{of_captures[0]} belongs to captures without depth; give --captures too")
+    rig = None if settings.rig is None else optics.load_rig(settings.rig)
+    plan = published.plan_import(settings.tree, rig, settings.frame_order)
+    if settings.fit_rig:
         with progress_bar("reading", len(plan.reader.tree.by_name), "views") as advance:
-            views = published.tree_views(plan.reader, workers, advance)
+            views = published.tree_views(plan.reader, settings.workers or usable_cores(), advance)
         rig, fit = calibration.fit_projector(views, plan.reader.rig)
         print_fit(rig, fit)
-        plan = published.plan_import(args.tree, rig, args.frame_order)
+        plan = published.plan_import(settings.tree, rig, settings.frame_order)
     sample_count = len(plan.reader.tree.by_name)
     images = len(plan.assembly.manifest.stored_frames)
     started = perf_counter()
     with progress_bar("importing", sample_count, "images", images) as advance:
-        manifest = published.import_tree(args.out, plan, workers, advance)
-    _print_end(args.out, manifest, images, perf_counter() - started, published.import_notes(manifest))
+        manifest = published.import_tree(settings.out, plan, settings.workers or usable_cores(), advance)
+    _print_end(settings.out, manifest, images, perf_counter() - started, published.import_notes(manifest))
     if rig is None:
-        _warn_of_other_rig(args.tree, published.depth_difference_mm(plan.reader))
-    return 0
+        _warn_of_other_rig(settings.tree, published.depth_difference_mm(plan.reader))
 
 
 def _warn_of_other_rig(tree: Path, difference_mm: float | None) -> None:

@@ -1,36 +1,173 @@
-"""``fpp-bench patterns``: the images to project."""
+"""``fpp-bench patterns``: the images to project, and the design of crossed fringes among them."""
 
-import argparse
 import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from fpp_ml_bench import optics
-from fpp_ml_bench.errors import CaptureError
+from fpp_ml_bench import coding, design, optics
+from fpp_ml_bench.cli.console import show
+from fpp_ml_bench.cli.options import POSITIVE, WORKING_RANGE, command, given, number_pair, value
+from fpp_ml_bench.errors import CaptureError, RigError
 from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.options import argument, option
+from fpp_ml_bench.tables import Table
 
-SUMMARY = "Write the images that a rig's projector shows, in order, and a manifest of what each of them is."
-EXAMPLES = (
-    "fpp-bench patterns rig.yaml patterns                 patterns/A_0.png, A_1.png, ... and patterns.json",
-    "fpp-bench patterns paper patterns                    the paper's 52 frames",
-    "fpp-bench patterns crossed patterns                  the same after three crossed frames",
-    "",
-    "RIG may be a whole rig file, or one with the entries projector: {width: ..., height: ...} and sequence alone,",
-    "since patterns come before the calibration. Project them without scaling; capture an image each, in this order.",
+ROWS = 8
+"""Pairs of the front that are shown, evenly spread, beside the proposed one."""
+MOST_WRONG = 0.05
+"""Share of wrong orders beyond which a pair of the front is not shown."""
+_DEFAULT = design.Assumptions()
+
+
+def _numbers(text: str) -> tuple[float, ...]:
+    """Numbers with commas, or two whole ones with a hyphen for all between them."""
+    if "," not in text and "-" in text:
+        low, high = (int(part) for part in text.split("-"))
+        return tuple(float(number) for number in range(low, min(high, low + 10_000) + 1))
+    return tuple(float(part) for part in text.split(","))
+
+
+def _family(text: str) -> "coding.Crossed":
+    values = PERIODS(text)
+    if len(values) not in (2, 4):
+        raise ValueError("expected two periods, or two periods and two angles")
+    try:
+        return coding.Crossed((values[0], values[1]), values[2:] or (0.0, 90.0))
+    except RigError as error:
+        raise ValueError(str(error)) from error
+
+
+PERIODS = value(
+    "numbers such as 12,14,18 or 12-18", _numbers, lambda found: found != () and all(0 <= one < 1e5 for one in found)
 )
+INTERVAL = value("LEAST,MOST such as 10,40", number_pair, lambda ends: 0 < ends[0] < ends[1] < 1e5)
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("rig", metavar="RIG", help="rig file (.yaml, .json), or paper or crossed")
-    parser.add_argument("out", type=Path, metavar="OUT", help="folder for the images")
+@dataclass(frozen=True, kw_only=True)
+class DesignSettings:
+    """What crossed fringes are searched, and by what they are judged."""
+
+    HEADING = "design of crossed fringes"
+    pitches: tuple[float, ...] | None = option(
+        None, "periods to search, projector px (default: all whole ones that fit the image)", "A,B|A-B", parse=PERIODS
+    )
+    angles: tuple[float, ...] | None = option(
+        None,
+        "angles to search, 0: as horizontal fringes, 90: as vertical ones (default: 0, 15, ... 165)",
+        "A,B|A-B",
+        parse=PERIODS,
+    )
+    pair: "tuple[coding.Crossed, ...]" = option(
+        (),
+        "also describe these periods and angles (0 and 90 degrees unless said); repeatable",
+        "P,Q[,A,B]",
+        parse=_family,
+        many=True,
+    )
+    image_px: tuple[float, float] = option(
+        _DEFAULT.image_px,
+        "limits of a period in the image, px; MOST of a beat too (default: "
+        f"{_DEFAULT.image_px[0]:g},{_DEFAULT.image_px[1]:g})",
+        "LEAST,MOST",
+        parse=INTERVAL,
+    )
+    surfaces: tuple[float, float] | None = option(
+        None,
+        "where surfaces are expected, mm, for the share of wrong orders (default: the whole range)",
+        "NEAR,FAR",
+        parse=WORKING_RANGE,
+    )
+    phase_sigma: float = option(
+        _DEFAULT.phase_sigma,
+        f"error of a phase at 20 image px a period, for orders (default: {_DEFAULT.phase_sigma:g})",
+        "RAD",
+        parse=POSITIVE,
+    )
+    blur: float = option(
+        _DEFAULT.blur_px,
+        f"sigma of the projector's blur, projector px (default: {_DEFAULT.blur_px:g})",
+        "PX",
+        parse=POSITIVE,
+    )
+    wrong: float = option(
+        100 * _DEFAULT.wrong_share,
+        f"wrong orders that may be left to the neighbours (default: {100 * _DEFAULT.wrong_share:g})",
+        "PERCENT",
+        parse=POSITIVE,
+    )
+    noise: float = option(
+        _DEFAULT.noise_grey,
+        f"camera noise, grey levels of 255, for the depth noise (default: {_DEFAULT.noise_grey:g})",
+        "GREY",
+        parse=POSITIVE,
+    )
+    white: float = option(
+        _DEFAULT.white_grey,
+        f"grey level of white at the near end (default: {_DEFAULT.white_grey:g})",
+        "GREY",
+        parse=POSITIVE,
+    )
+    window: float = option(
+        _DEFAULT.window_px,
+        f"Gaussian window, sigma in image px, for the depth noise (default: {_DEFAULT.window_px:g})",
+        "PX",
+        parse=POSITIVE,
+    )
+    picture: Path | None = option(None, "draw the proposed pair beside the rig's own or 18/18", "FILE.png")
 
 
-def run(args: argparse.Namespace) -> int:
-    """Write images and manifest. Raises FppBenchError for an unusable rig file or folder."""
-    rig = optics.NAMED_RIGS[args.rig]() if args.rig in optics.NAMED_RIGS else optics.load_projection(args.rig)
-    if args.out.is_dir() and any(args.out.iterdir()):
-        raise CaptureError(f"{args.out}: not empty; give a new folder, so that no old pattern is projected by mistake")
-    paths = optics.export_patterns(rig, args.out)
+@dataclass(frozen=True, kw_only=True)
+class PatternSettings(DesignSettings):
+    """Settings of `patterns`."""
+
+    rig: str = argument("rig file (.yaml, .json), or paper or crossed", "RIG")
+    out: Path | None = option(
+        None,
+        "folder for the images; with --design: write the rig with three frames of the proposed pair (.yaml, .json)",
+        "DIR|FILE",
+    )
+    design: bool = option(
+        False,
+        "write no images: find two carriers for crossed fringes whose phases agree at the true depth alone, and say "
+        "what they cost",
+    )
+
+
+@command(
+    """\
+fpp-bench patterns rig.yaml --out patterns           patterns/A_0.png, A_1.png, ... and patterns.json
+fpp-bench patterns paper --out patterns              the paper's 52 frames
+fpp-bench patterns crossed --out patterns            the same after three crossed frames
+
+RIG may be a whole rig file, or one with the entries projector: {width: ..., height: ...} and sequence alone,
+since patterns come before the calibration. Project them without scaling; capture an image each, in this order.
+
+fpp-bench patterns paper --design
+fpp-bench patterns rig.yaml --design --out crossed.yaml --picture design.png     the rig with the proposed pair
+fpp-bench patterns rig.yaml --design --pitches 12-30 --angles 0,45,90            these periods and angles only
+fpp-bench patterns paper --design --pair 18,18 --pair 18,14 --pair 24,13,0,45    beside pairs of yours (px, deg)
+
+Rival: another depth in the working range at which both phases nearly are what they are at the true one; its
+distance is what errors of the phases must cross half of. Finer fringes have less depth noise and more rivals.
+"""
+)
+def patterns(settings: PatternSettings) -> None:
+    """Write the images that a rig's projector shows, in order, and a manifest of what each of them is. Or find two
+    carriers for crossed fringes whose phases agree at the true depth alone, and say what they cost.
+
+    Raises FppBenchError for an unusable rig file or folder."""
+    if settings.design:
+        _design(settings)
+        return
+    if of_design := given(settings, DesignSettings):
+        raise RigError(f"{of_design[0]} belongs to the design of crossed fringes; give --design too")
+    if (out := settings.out) is None:
+        raise CaptureError("--out DIR is missing: folder for the images")
+    named = settings.rig in optics.NAMED_RIGS
+    rig = optics.NAMED_RIGS[settings.rig]() if named else optics.load_projection(settings.rig)
+    if out.is_dir() and any(out.iterdir()):
+        raise CaptureError(f"{out}: not empty; give a new folder, so that no old pattern is projected by mistake")
+    paths = optics.export_patterns(rig, out)
     frames = [
         {"file": path.name, "shows": frame.title.partition(": ")[2], **asdict(frame)}
         for path, frame in zip(paths, rig.sequence, strict=True)
@@ -41,8 +178,105 @@ def run(args: argparse.Namespace) -> int:
         "pitch_px": {direction: rig.pitch(direction) for direction in rig.fringe_directions},
         "frames": frames,
     }
-    write_atomically(args.out / "patterns.json", (json.dumps(content, indent=1) + "\n").encode())
+    write_atomically(out / "patterns.json", (json.dumps(content, indent=1) + "\n").encode())
     size = f"{rig.projector.width} x {rig.projector.height} px"
-    print(f"{args.out}: {len(paths)} images of {size}, {paths[0].name} to {paths[-1].name}, and patterns.json")
+    print(f"{out}: {len(paths)} images of {size}, {paths[0].name} to {paths[-1].name}, and patterns.json")
     print("next: project them in this order, one capture each; then fpp-bench decode RIG CAPTURE --out OUT")
-    return 0
+
+
+def _design(settings: PatternSettings) -> None:
+    """Search, print, and write what is asked for. Raises `RigError` for a rig that can't be used."""
+    named = settings.rig in optics.NAMED_RIGS
+    rig = optics.NAMED_RIGS[settings.rig]() if named else optics.load_rig(settings.rig)
+    assumed = design.Assumptions(
+        settings.image_px,
+        settings.phase_sigma,
+        settings.blur,
+        settings.noise,
+        settings.white,
+        settings.window,
+        settings.surfaces,
+        settings.wrong / 100,
+    )
+    found = design.search(rig, assumed, settings.pitches, settings.angles or design.ANGLES_DEG)
+    families = dict.fromkeys(settings.pair, "asked for")
+    if len(rig.fringe_directions) == 2:
+        families.setdefault(replace(coding.Crossed.of_pair(rig), shifts_deg=((0.0, 0.0),)), "its pair")
+    if rig.crossed is not None:
+        families.setdefault(rig.crossed, "its crossed")
+    others = design.describe(rig, list(families), assumed)
+    _print_design(rig, assumed, found, list(zip(others, families.values(), strict=True)))
+    if settings.picture is not None:
+        beside = others[0] if others else design.describe(rig, [coding.Crossed((18.0, 18.0))], assumed)[0]
+        write_atomically(settings.picture, design.draw_design(rig, found.proposed, beside, assumed))
+        print(f"wrote {settings.picture}")
+    if settings.out is not None:
+        family = replace(found.proposed.crossed, shifts_deg=optics.FIRST_SHIFTED_DEG)
+        optics.save_rig(rig.with_crossed(family), settings.out)
+        print(f"wrote {settings.out}; next: fpp-bench patterns {settings.out} --out DIR")
+
+
+def _print_design(
+    rig: "optics.Rig",
+    assumed: "design.Assumptions",
+    found: "design.Design",
+    others: "list[tuple[design.Candidate, str]]",
+) -> None:
+    (near_mm, far_mm), flat_deg = rig.working_range_mm, design.EpipolarLines.of(rig).flat_angle_deg
+    print(
+        f"rig             range {near_mm:g} to {far_mm:g} mm; a carrier at {flat_deg:.0f} degrees runs along the "
+        "epipolar lines and tells no depth"
+    )
+    print(
+        f"orders          by a phase error of {assumed.phase_sigma:g} rad at 20 image px a period, before neighbours "
+        "help"
+    )
+    print(
+        f"depth noise     at {far_mm:g} mm, of {assumed.noise_grey:g} grey levels, white {assumed.white_grey:g} at "
+        f"{near_mm:g} mm, window {assumed.window_px:g} px, projector blur {assumed.blur_px:g} px"
+    )
+    names = (
+        "projector px",
+        "degrees",
+        "image px",
+        "rival, rad",
+        "background",
+        "error",
+        "noise, mm",
+        "wrong orders",
+        "periods in range",
+    )
+    table = Table("", numbers=names, names=3)
+    front = [candidate for candidate in found.front if candidate.wrong_share <= MOST_WRONG]
+    every = max(-(-len(front) // ROWS), 1)
+    shown = {id(candidate): candidate for candidate in (*front[::every], found.proposed)}
+    rows = [(candidate, "proposed" if candidate is found.proposed else "") for candidate in shown.values()]
+    for candidate, about in sorted(rows, key=lambda row: -row[0].noise_mm) + others:
+        crossed = candidate.crossed
+        background = "-" if candidate.background_rad is None else f"{candidate.background_rad:.2f}"
+        table.add_row(
+            about,
+            _two(crossed.pitches_px, "g"),
+            _two(crossed.angles_deg, "g"),
+            _two(candidate.image_px, ".1f"),
+            f"{candidate.rival_rad:.2f}",
+            background,
+            f"{candidate.sigma_rad:.2f}",
+            f"{candidate.noise_mm:.3f}",
+            f"{100 * candidate.wrong_share:.3f}%",
+            _two(candidate.turns, ".2f"),
+        )
+    show(table)
+    for candidate, about in others:
+        for carrier in candidate.flat:
+            pitch, angle = candidate.crossed.pitches_px[carrier], candidate.crossed.angles_deg[carrier]
+            print(f"note: {about}: the carrier of {pitch:g} px at {angle:g} degrees tells no depth")
+    crossed = found.proposed.crossed
+    print(
+        f"proposed        {_two(crossed.pitches_px, 'g')} px at {_two(crossed.angles_deg, 'g')} degrees, out of "
+        f"{found.searched:,} pairs: {found.reason}"
+    )
+
+
+def _two(pair: tuple[float, float], form: str) -> str:
+    return " / ".join(format(value, form) for value in pair)

@@ -1,70 +1,139 @@
-"""``fpp-bench predict``: run a method over a split."""
+"""``fpp-bench predict`` and ``fpp-bench time``: run a method over a split, and measure what it costs."""
 
-import argparse
 from pathlib import Path
 
+from rich.table import Table
+from rich.text import Text
+
 from fpp_ml_bench import baselines
-from fpp_ml_bench.cli import SPLITS
-from fpp_ml_bench.cli.explain import add_explain_options, as_asked, explain
-from fpp_ml_bench.cli.method_options import METHOD_HELP, add_method_options, chosen_method
+from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.cli.console import progress_bar, show
+from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
+from fpp_ml_bench.cli.options import COUNT, SPLITS, Explain, command
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation import result
 from fpp_ml_bench.loaders import storage
-from fpp_ml_bench.machine import limit_threads
-from fpp_ml_bench.remote import place, working_copy
+from fpp_ml_bench.options import REQUIRED, argument, option
+from fpp_ml_bench.remote import RemoteFolder, place, working_copy
 
-SUMMARY = "Run a method over a split and write predictions that fpp-eval scores."
-EXAMPLES = (
-    "fpp-bench predict classical data/mini --split test --out predictions",
-    "fpp-bench predict classical data/mini --split test --steps 4 --direction vertical --out predictions-4",
-    "fpp-bench predict unet.safetensors data/mini --range oracle --out predictions-oracle",
-    "fpp-bench predict phase data/mini --frames 3 --out predictions-3",
-    "fpp-bench predict phase data/mini --error-mm 3 --out predictions-fewest     frames chosen scene by scene",
-    "fpp-eval predictions --dataset data/mini --split test --target depth_exact --json result.json",
+
+@command(
+    """\
+fpp-bench predict classical data/mini --split test --out predictions
+fpp-bench predict classical data/mini --split test --steps 4 --direction vertical --out predictions-4
+fpp-bench predict unet.safetensors data/mini --range oracle --out predictions-oracle
+fpp-bench predict phase data/mini --frames 3 --out predictions-3
+fpp-bench predict phase data/mini --error-mm 3 --out predictions-fewest     frames chosen scene by scene
+fpp-bench predict mine.py:Mine data/mini --out predictions-mine             a method of yours
+fpp-eval predictions --target depth_exact --json result.json
+""",
+    MethodCommand,
 )
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("method", metavar="METHOD", help=METHOD_HELP)
-    add("dataset", type=Path, metavar="DATASET", help="dataset folder")
-    add("--split", default="test", choices=SPLITS, help="default: test")
-    add(
-        "--out",
-        type=place,
-        required=True,
-        metavar="DIR",
-        help="new or empty folder, or a URL, written at the end; a run that was stopped continues",
+def predict(
+    *,
+    chosen: MethodSettings,
+    dataset: Path = argument("dataset folder", "DATASET"),
+    split: str = option("test", "default: test", choices=SPLITS),
+    out: Path | RemoteFolder = option(
+        REQUIRED,
+        "new or empty folder, or a URL, written at the end; a run that was stopped continues",
+        "DIR",
+        parse=place,
+    ),
+    account: Explain,
+) -> None:
+    """Run a method over a split and write predictions that fpp-eval scores."""
+    account.check()
+    opened = storage.DatasetFolder(dataset)
+    method = chosen.load(opened)
+    samples = len(opened.samples(split))
+    bar = progress_bar(f"{chosen.name}, {split}", samples, "samples")
+    with working_copy(out) as (folder, _), bar as advance:
+        finished = baselines.predict_split(opened, method, split, folder, advance)
+    print(
+        f"{out}: {finished.samples} predictions by {method.title}; {len(method.frames_used)} frames and "
+        f"{finished.seconds_per_sample:.3f} s a sample (median)"
     )
-    add_method_options(parser)
-    add_explain_options(parser)
+    how = f"{_scoring(method, opened)} --json result.json"
+    if isinstance(out, Path):
+        print(f"next: fpp-eval {out}{how}")
+    else:
+        print(f"next: copy {out} to a disk, then: fpp-eval COPY {dataset}{how}")
+    account.say(lambda: baselines.explain_predict(opened, method, split))
 
 
-def run(args: argparse.Namespace) -> int:
-    from fpp_ml_bench.cli.console import progress_bar
-
-    limit_threads(args.threads)
-    with as_asked(args):
-        opened = storage.DatasetFolder(args.dataset)
-        method = chosen_method(args, opened)
-        samples = len(opened.samples(args.split))
-        bar = progress_bar(f"{args.method}, {args.split}", samples, "samples")
-        with working_copy(args.out) as (out, _), bar as advance:
-            finished = baselines.predict_split(opened, method, args.split, out, advance)
-        print(
-            f"{args.out}: {finished.samples} predictions by {method.title}; {len(method.frames_used)} frames and "
-            f"{finished.seconds_per_sample:.3f} s a sample (median)"
-        )
-        how = f"--dataset {args.dataset} --split {args.split}{_scoring(method, opened)}"
-        if isinstance(args.out, Path):
-            print(f"next: fpp-eval {args.out} {how} --json result.json")
-        else:
-            print(f"next: copy {args.out} to a disk, then: fpp-eval COPY {how} --json result.json")
-        explain(args, lambda: baselines.explain_predict(opened, method, args.split))
-    return 0
-
-
-def _scoring(method: "baselines.Method", opened: "storage.DatasetFolder") -> str:
+def _scoring(method: Method, opened: "storage.DatasetFolder") -> str:
     """Options of fpp-eval that make the method's row: a network is scored against the decoded depth that it learnt
     from, but against that depth the process that made it would score 0."""
     target = method.target if opened.has_exact else "depth"
     mode = "" if method.mode == "standard" else f" --mode {method.mode}"
     return mode + ("" if target == "depth" else f" --target {target}")
+
+
+@command(
+    """\
+fpp-bench time classical data/mini
+fpp-bench time classical data/mini --steps 4 --direction vertical --batch 8 --json timing.json
+fpp-bench time unet.safetensors data/mini --range predicted --threads 2
+fpp-bench time classical data/mini --into predictions/submission.yaml --into result.json
+""",
+    MethodCommand,
+)
+def time(
+    *,
+    chosen: MethodSettings,
+    dataset: Path = argument("dataset folder", "DATASET"),
+    split: str = option("test", "default: test", choices=SPLITS),
+    batch: int = option(4, "images a batch (default: 4)", "N", parse=COUNT),
+    repeats: int = option(20, "timed runs (default: 20)", "N", parse=COUNT),
+    json: Path | None = option(None, "write the timing here; - is standard output", "FILE"),
+    into: tuple[Path, ...] = option(
+        (),
+        "put it into this submission.yaml or result file of the same method; may be given again",
+        "FILE",
+        parse=Path,
+        many=True,
+    ),
+) -> None:
+    """Measure a method's latency at batch 1, throughput, memory, parameters and frames, on a named machine."""
+    opened = storage.DatasetFolder(dataset)
+    method = chosen.load(opened)
+    for path in into:
+        baselines.check_target(path, method)
+    if json is not None and not json.absolute().parent.is_dir():
+        raise SubmissionError(f"--json {json}: the folder {json.parent} does not exist; make it first")
+    with progress_bar(f"timing {chosen.name}", repeats, "images") as advance:
+        timing = baselines.time_method(opened, method, split, batch, repeats, advance)
+    if json is not None:
+        content = {"name": method.title, "method": method.name, "settings": dict(method.settings)}
+        result.write_json({**content, "timing": timing.model_dump(mode="json")}, json)
+    for path in into:
+        baselines.write_timing(path, timing)
+    show(_timing_table(method.title, timing))
+    for path in (*([json] if json else []), *into):
+        print(f"Written: {path}")
+
+
+def _timing_table(title: str, timing: "result.Timing") -> Table:
+    def mib(value: float | None) -> str:
+        return "unknown" if value is None else f"{value:,.0f} MiB"
+
+    (height, width), machine = timing.image_size, timing.hardware
+    table = Table("", show_header=False, title=Text(f"{title}, measured here"), title_justify="left")
+    table.add_column(justify="right", overflow="fold")
+    ways = "at once" if timing.batched else "one after another"
+    for name, value in (
+        ("latency at batch 1, median", f"{timing.latency_median_ms:.4g} ms"),
+        ("  5th to 95th percentile", f"{timing.latency_p5_ms:.4g} to {timing.latency_p95_ms:.4g} ms"),
+        ("  runs", f"{timing.repeats}, images of {width}x{height} px"),
+        (f"throughput at batch {timing.batch}", f"{timing.throughput_per_s:.4g} images/s, {ways}"),
+        ("frames needed", str(timing.frames)),
+        ("parameters", f"{timing.parameters:,}"),
+        ("memory one image adds", mib(timing.working_memory_mib)),
+        ("peak memory of the process", mib(timing.peak_memory_mib)),
+        *([("peak GPU memory", mib(timing.gpu_memory_mib))] if timing.gpu_memory_mib is not None else []),
+        ("device", timing.device),
+        ("machine", f"{machine.gpu or 'no GPU'}; {machine.cpu}, {machine.cores} cores, {machine.memory_gib} GiB"),
+    ):
+        table.add_row(name, Text(value))
+    return table

@@ -1,101 +1,90 @@
 """``fpp-bench robustness``: how a method's error grows when the scene is disturbed, axis by axis."""
 
-import argparse
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from fpp_ml_bench import optics
 from fpp_ml_bench.baselines import robustness
-from fpp_ml_bench.cli import add_pool_options, workers_of
 from fpp_ml_bench.cli.console import progress_bar, show
-from fpp_ml_bench.cli.method_options import METHOD_HELP, add_method_options, chosen_method
+from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
+from fpp_ml_bench.cli.options import Pool, command, names
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation import report
+from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_robustness
 from fpp_ml_bench.loaders import render, storage
-from fpp_ml_bench.machine import limit_threads
-from fpp_ml_bench.remote import place, working_copy
+from fpp_ml_bench.options import REQUIRED, option
+from fpp_ml_bench.remote import RemoteFolder, place, working_copy
 from fpp_ml_bench.tables import Table
-
-SUMMARY = (
-    "Measure what breaks a method: scenes disturbed axis by axis, at five severities each, in the image formation."
-)
-EXAMPLES = (
-    "fpp-bench robustness phase --quick --out robustness                    a look, some minutes",
-    "fpp-bench robustness phase --out robustness                            the test set, resumable axis by axis",
-    "fpp-bench robustness classical --steps 6 --set unseen --axes motion,gloss --out robustness-unseen",
-    "fpp-bench robustness phase-net --out robustness --into leaderboard/rows/phase-net-horizontal.json",
-    "fpp-bench robustness unet-global-rmse --size 224 --out robustness-224",
-    "fpp-bench robustness phase --out s3://bucket/robustness --cluster ray://head:10001",
-)
 
 CROSSED = "crossed", "crossed-net"
 """Methods whose scenes are photographed by the rig that projects crossed fringes."""
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("method", metavar="METHOD", help=METHOD_HELP)
-    add(
-        "--out",
-        type=place,
-        required=True,
-        metavar="DIR",
-        help="folder of measurements: each method has its own below it, and one page shows all; or a URL",
-    )
-    add("--axes", default="", metavar="A,B", help="only these axes (default: all that apply to the method)")
-    add("--set", dest="objects", default="test", choices=("test", "unseen"), help="objects (default: test)")
-    add("--size", type=int, default=FULL_SIZE, metavar="PX", help=f"image size (default: {FULL_SIZE})")
-    add("--quick", action="store_true", help="one view of each object and three severities, for a look")
-    add(
-        "--into",
-        type=Path,
-        metavar="FILE",
-        help="write the block into this result or row of the same method (.json); needs all axes",
-    )
-    add_pool_options(parser)
-    add(
-        "--cache",
-        type=Path,
-        metavar="DIR",
-        help="rendered frames, at most 10 GB (default: the user's cache folder; with --cluster none)",
-    )
-    add("--no-cache", action="store_true", help="render every frame anew, keep none")
-    add_method_options(parser)
+@command(
+    """\
+fpp-bench robustness phase --quick --out robustness                    a look, some minutes
+fpp-bench robustness phase --out robustness                            the test set, resumable axis by axis
+fpp-bench robustness classical --steps 6 --set unseen --axes motion,gloss --out robustness-unseen
+fpp-bench robustness phase-net --out robustness --into leaderboard/rows/phase-net-horizontal.json
+fpp-bench robustness unet-global-rmse --size 224 --out robustness-224
+fpp-bench robustness phase --out s3://bucket/robustness --cluster ray://head:10001
+""",
+    MethodCommand,
+)
+def robust(
+    *,
+    chosen: MethodSettings,
+    pool: Pool,
+    out: Path | RemoteFolder = option(
+        REQUIRED,
+        "folder of measurements: each method has its own below it, and one page shows all; or a URL",
+        "DIR",
+        parse=place,
+    ),
+    axes: tuple[str, ...] = option((), "only these axes (default: all that apply to the method)", "A,B", parse=names),
+    objects: Literal["test", "unseen"] = option(
+        "test", "objects (default: test)", choices=("test", "unseen"), flag="--set"
+    ),
+    size: int = option(FULL_SIZE, f"image size (default: {FULL_SIZE})", "PX"),
+    quick: bool = option(False, "one view of each object and three severities, for a look"),
+    into: Path | None = option(
+        None, "write the block into this result or row of the same method (.json); needs all axes", "FILE"
+    ),
+    cache: Path | None = option(
+        None, "rendered frames, at most 10 GB (default: the user's cache folder; with --cluster none)", "DIR"
+    ),
+    no_cache: bool = option(False, "render every frame anew, keep none"),
+) -> None:
+    """Measure what breaks a method: scenes disturbed axis by axis, at five severities each, in the image formation.
 
-
-def run(args: argparse.Namespace) -> int:
-    """Measure, write the page, print. A file that can't take the block raises FppBenchError before measuring."""
-    limit_threads(args.threads)
-    from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_robustness
-
-    workers = workers_of(args)
-    names = [name.strip() for name in args.axes.split(",") if name.strip()]
-    if args.into is not None and (names or args.quick):
+    A file that can't take the block raises FppBenchError before measuring."""
+    workers = pool.processes
+    if into is not None and (axes or quick):
         raise PredictionError("--into: needs all axes and severities; leave out --axes and --quick")
-    rig = "crossed" if args.method in CROSSED else "paper"
-    method = chosen_method(args, Scenes.of(args.objects, args.size, rig), warn=False)
-    entry = None if args.into is None else read_entry(args.into)
+    rig = "crossed" if chosen.name in CROSSED else "paper"
+    method = chosen.load(Scenes.of(objects, size, rig), warn=False)
+    entry = None if into is None else read_entry(into)
     if entry is not None:
         check_same_method(entry, method)
-    setup = robustness.Setup(method, args.objects, args.size, args.quick, rig)
+    setup = robustness.Setup(method, objects, size, quick, rig)
     # The nodes of a cluster have folders of their own, which nobody would keep small.
-    cache = None if args.no_cache else args.cache or (None if args.cluster else robustness.CACHE)
-    views = sum(len(c.objects) * len(setup.views) for axis in setup.axes(names) for c in setup.conditions(axis))
-    with working_copy(args.out) as (out, save):
-        folder = out / slug(setup)
-        with progress_bar(f"{args.method}, {args.objects}", views, "views") as advance:
+    cache = None if no_cache else cache or (None if pool.cluster else robustness.CACHE)
+    views = sum(len(c.objects) * len(setup.views) for axis in setup.axes(axes) for c in setup.conditions(axis))
+    with working_copy(out) as (below, save):
+        folder = below / slug(setup)
+        with progress_bar(f"{chosen.name}, {objects}", views, "views") as advance:
             rows = robustness.measure(
-                setup, folder, names, workers, cache, lambda axis, count: advance(count), args.cluster, save
+                setup, folder, axes, workers, cache, lambda axis, count: advance(count), pool.cluster, save
             )
         robustness.write_worst(setup, rows, folder, cache)
-        page = f"{args.out}/{robustness.write_page(out).name}"
+        page = f"{out}/{robustness.write_page(below).name}"
     if entry is not None:
         write_robustness(entry, robustness.robustness(setup, rows))
     show(_table(setup, rows))
     print(f"{page}: curves of all methods measured there")
-    return 0
 
 
 @dataclass(frozen=True)

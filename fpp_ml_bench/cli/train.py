@@ -1,159 +1,202 @@
-"""``fpp-bench train``: one recipe, one weights file."""
+"""``fpp-bench train``: one recipe, one weights file; and ``fpp-bench reproduce``: the paper's tables and its further
+directions, trained and scored here."""
 
-import argparse
+import sys
+from datetime import datetime
 from pathlib import Path
-from typing import Any
 
-from fpp_ml_bench.baselines import classical_network, crossed_network, networks, phase_network, training
-from fpp_ml_bench.cli import CHECK_FAILED
-from fpp_ml_bench.errors import RecipeError
-from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.baselines import networks, registry, reproduce, training
+from fpp_ml_bench.baselines.training import PRESETS, TABLES, table_rows
+from fpp_ml_bench.cli import CHECK_FAILED, OK
+from fpp_ml_bench.cli.console import show
+from fpp_ml_bench.cli.methods import MethodCommand, OfMethods
+from fpp_ml_bench.cli.options import MINUTES, command, command_line
+from fpp_ml_bench.errors import RecipeError, TrainingError
+from fpp_ml_bench.files import printable
+from fpp_ml_bench.leaderboard import reproduced
+from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, read_entry
+from fpp_ml_bench.options import REQUIRED, argument, did_you_mean, nearest, option
+from fpp_ml_bench.tables import Table
 
-SUMMARY = "Train one recipe, a shipped one or a YAML file of yours, into a weights file that predict takes."
-EXAMPLES = (
-    "fpp-bench train loss/hybrid_l1_0.7 data/cpu224 --out runs/mine",
-    "fpp-bench train phase-net --out runs/phase-net      the network of the phase route; it renders its own views",
-    "fpp-bench train phase-net --albedo any --out runs/phase-net-any      without brightness",
-    "fpp-bench train crossed-net --out runs/crossed-net      the network of crossed fringes; the same",
-    "fpp-bench train classical-net --out runs/classical-net      noise and missed pixels of three steps; the same",
-    "fpp-bench train mine.yaml data/full --preset paper --out runs/big --minutes 10     in pieces",
-    "accelerate launch -m fpp_ml_bench train mine.yaml data/full --preset paper --out runs/big      several GPUs",
-    "fpp-bench predict runs/mine/model.safetensors data/cpu224 --out predictions",
+
+class TrainCommand(MethodCommand):
+    """A command whose options are also those of the trainings that methods have."""
+
+    part = "Training"
+
+
+@command(
+    """\
+fpp-bench train loss/hybrid_l1_0.7 data/cpu224 --out runs/mine
+fpp-bench train phase-net --out runs/phase-net      the network of the phase route; it renders its own views
+fpp-bench train phase-net --albedo any --out runs/phase-net-any      without brightness
+fpp-bench train crossed-net --out runs/crossed-net      the network of crossed fringes; the same
+fpp-bench train classical-net --out runs/classical-net      noise and missed pixels of three steps; the same
+fpp-bench train mine.yaml data/full --preset paper --out runs/big --minutes 10     in pieces
+accelerate launch -m fpp_ml_bench train mine.yaml data/full --preset paper --out runs/big      several GPUs
+fpp-bench predict runs/mine/model.safetensors data/cpu224 --out predictions
+""",
+    TrainCommand,
 )
-_OPTIONS = "steps", "unions", "rate", "lights", "albedo", "start"  # of those that render their own views
-_OWN_VIEWS = "classical-net", "phase-net", "crossed-net"
+def train(
+    *,
+    recipe: str = argument(
+        "a name like loss/l1 (fpp-bench reproduce --list), a .yaml, or one of the methods below", "RECIPE"
+    ),
+    dataset: Path | None = argument(
+        "dataset folder, of the preset's image size (those methods: none)", "DATASET", None
+    ),
+    out: Path = option(REQUIRED, "new folder, or that of a training to resume", "DIR"),
+    preset: str = option("cpu", "what a shipped recipe is scaled to (default: cpu)", choices=training.PRESETS),
+    minutes: float | None = option(
+        None, "stop before an epoch that would not finish in time, everything saved", "M", parse=MINUTES
+    ),
+    options: OfMethods,
+) -> int:
+    """Train one recipe, a shipped one or a YAML file of yours, into a weights file that predict takes.
 
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add(
-        "recipe",
-        metavar="RECIPE",
-        help=f"a name like loss/l1 (fpp-bench reproduce --list), a .yaml, or {', '.join(_OWN_VIEWS)}",
-    )
-    add(
-        "dataset",
-        type=Path,
-        metavar="DATASET",
-        nargs="?",
-        help="dataset folder, of the preset's image size (those three: none)",
-    )
-    add("--out", type=Path, required=True, metavar="DIR", help="new folder, or that of a training to resume")
-    add("--preset", choices=training.PRESETS, default="cpu", help="what a shipped recipe is scaled to (default: cpu)")
-    add(
-        "--minutes",
-        type=float,
-        metavar="M",
-        help="stop before an epoch that would not finish in time, everything saved",
-    )
-    add("--steps", type=int, metavar="N", help="those three: training steps (default: as the shipped weights)")
-    add(
-        "--unions",
-        type=int,
-        metavar="N",
-        help="the same: images that join several objects, made from each sample (default: as the shipped weights)",
-    )
-    add("--lights", type=int, metavar="N", help="the same: lights that are drawn (default: as the shipped weights)")
-    add("--rate", type=float, metavar="R", help="the same: largest learning rate (default: as the shipped weights)")
-    add(
-        "--albedo",
-        choices=("one", "any"),
-        help="phase-net: one, with brightness as a cue for the order, or any, without (default: one)",
-    )
-    add("--start", type=Path, metavar="FILE", help="phase-net: weights to start from (default: none)")
-
-
-def run(args: argparse.Namespace) -> int:
-    """Train, add range heads where the weights need them, and print the result. Raises FppBenchError."""
-    if args.minutes is not None and not 0 < args.minutes < 1e6:
-        raise RecipeError(f"--minutes {args.minutes}: expected a number above 0")
-    if args.recipe in _OWN_VIEWS:
+    Adds range heads where the weights need them, and prints the result. Raises FppBenchError."""
+    methods = registry.methods()
+    if recipe in methods or registry.FILE_MARK in recipe:
+        method = registry.find(recipe).method
+        if method.Training is None:
+            learned = ", ".join(name for name, other in methods.items() if other.Training)
+            raise RecipeError(f"{recipe}: there is nothing to train; methods with a training: {learned}")
+        if dataset is not None:
+            raise RecipeError(f"{dataset}: {recipe} renders what it learns from, and takes none; leave it out")
         import cv2
 
-        if args.dataset is not None:
-            raise RecipeError(
-                f"{args.dataset}: {args.recipe} renders what it learns from, and takes none; leave it out"
-            )
         cv2.setNumThreads(1)
-        train = dict(zip(_OWN_VIEWS, (_classical_net, _phase_net, _crossed_net), strict=True))[args.recipe]
-        return train(args)
-    if args.dataset is None:
-        raise RecipeError(f"{args.recipe}: expected a dataset folder to train on, got none")
-    _given(args)
+        finished = method.train(method.Training(**options.of(method, recipe, "Training")), out, minutes)
+        return OK if finished else CHECK_FAILED
+    options.of(registry.network_method(), recipe, "Training")
+    if not Path(recipe).exists() and nearest(recipe, methods):
+        raise RecipeError(f"no recipe {recipe!r}; {did_you_mean(recipe, methods)}")
+    if dataset is None:
+        raise RecipeError(f"{recipe}: expected a dataset folder to train on, got none")
     from accelerate import PartialState
 
-    recipe = training.load_recipe(args.recipe, args.preset)
-    trained = training.train(recipe, args.dataset, args.out, minutes=args.minutes)
+    resolved = training.load_recipe(recipe, preset)
+    trained = training.train(resolved, dataset, out, minutes=minutes)
     if not PartialState().is_main_process:
-        return 0 if trained.finished else CHECK_FAILED
+        return OK if trained.finished else CHECK_FAILED
     if not trained.finished:
-        print(f"{args.out}: stopped after {trained.epochs} epochs, everything saved; run the same command to resume")
+        print(f"{out}: stopped after {trained.epochs} epochs, everything saved; run the same command to resume")
         return CHECK_FAILED
     weights = trained.weights
-    if recipe.normalisation == "individual" and not recipe.background_removed:
-        weights = args.out / "model.safetensors"
-        networks.save_with_heads(trained.weights, args.dataset, weights)
-    print(f"{weights}: {recipe.title}, epoch {trained.best_epoch} of {trained.epochs}, {trained.seconds:.0f} s")
+    if resolved.normalisation == "individual" and not resolved.background_removed:
+        weights = out / "model.safetensors"
+        networks.save_with_heads(trained.weights, dataset, weights)
+    print(f"{weights}: {resolved.title}, epoch {trained.best_epoch} of {trained.epochs}, {trained.seconds:.0f} s")
     print(f"curve: {trained.curve}")
-    print(f"next: fpp-bench predict {weights} {args.dataset} --out predictions")
-    return 0
+    print(f"next: fpp-bench predict {weights} {dataset} --out predictions")
+    return OK
 
 
-def _phase_net(args: argparse.Namespace) -> int:
-    recipe = phase_network.Recipe(**_given(args, "steps", "unions", "rate", "lights", "albedo", "start"))
-    trained = phase_network.train_phase_net(
-        recipe,
-        args.out,
-        start=args.start,
-        minutes=args.minutes,
-        workers=usable_cores(),
-        show=True,
-        print_line=print,
-    )
-    return _window_training_said(args, recipe.steps, trained)
+ALL = "all"
+EMPTY_BECAUSE = {
+    "cpu": "a training takes 2 to 8 minutes on two cores; cpu-long has these networks, trained to their ends",
+    "cpu-long": "a training takes half an hour to two hours on a core",
+    "paper": "a training needs a GPU (weeks without), and none was at hand",
+}
 
 
-def _classical_net(args: argparse.Namespace) -> int:
-    recipe = classical_network.FilterRecipe(**_given(args, "steps", "unions", "rate", "lights"))
-    trained = classical_network.train_classical_net(
-        recipe,
-        args.out,
-        minutes=args.minutes,
-        workers=usable_cores(),
-        show=True,
-        print_line=print,
-    )
-    return _window_training_said(args, recipe.steps, trained)
+@command(
+    """\
+fpp-bench reproduce --list
+fpp-bench reproduce normalization                      the small preset: 224 px, for a laptop
+fpp-bench reproduce loss/hybrid_l1_0.7 --preset cpu-long      one row, to the paper's stopping rule
+fpp-bench reproduce all --only-missing                 every table; up-to-date rows are kept
+fpp-bench reproduce loss --preset paper --minutes 10   the paper's own settings, on a GPU, in pieces
+"""
+)
+def reproduce_tables(
+    *,
+    table: str | None = argument(f"{', '.join(TABLES)} or {ALL}; or one row, like loss/l1", "TABLE", None),
+    dataset: Path | None = argument("dataset, built when missing (default: data/cpu224 or data/full)", "DATASET", None),
+    preset: str = option(
+        "cpu",
+        "cpu: 224 px, narrow networks, 8 epochs (default); cpu-long: the same until the rate is at its minimum; paper: "
+        "960 px and full width, needs a GPU",
+        choices=PRESETS,
+    ),
+    out: Path = option(Path("runs"), "trainings, predictions and tables go below DIR/PRESET (default: runs)", "DIR"),
+    rows: Path | None = option(None, "leaderboard rows (default: OUT/PRESET/rows)", "DIR"),
+    only_missing: bool = option(
+        False,
+        "keep rows that are up to date with the dataset and the weights; without it, all rows are made again. Finished "
+        "trainings are always kept",
+    ),
+    minutes: float | None = option(
+        None,
+        "stop before an epoch that would exceed M minutes, everything saved (exit status 1); the same command "
+        "continues",
+        "M",
+        parse=MINUTES,
+    ),
+    anyway: bool = option(False, "train preset paper even without a GPU"),
+    listed: bool = option(False, "show rows, recipes and their state, and stop", flag="--list"),
+) -> int:
+    """Train, predict, time and score the rows of the paper's tables, and show them beside its numbers.
 
+    Does what is missing. Raises FppBenchError where a step can't be done or a training failed."""
+    below = out / preset
+    folders = reproduce.Folders(preset, below, below / "rows" if rows is None else rows)
+    name, slash, row = (table or ALL).partition("/")
+    tables = TABLES if name == ALL else (name,)
+    if slash and row not in table_rows(name):
+        raise RecipeError(f"{name} has no row {printable(row)!r}; {did_you_mean(row, table_rows(name))}")
+    if listed:
+        _list(tables, folders)
+        return OK
+    if table is None:
+        raise RecipeError(f"expected a table: {', '.join(TABLES)} or {ALL}; --list shows their rows")
 
-def _crossed_net(args: argparse.Namespace) -> int:
-    recipe = crossed_network.CrossedRecipe(**_given(args, "steps", "unions", "rate", "lights"))
-    trained = crossed_network.train_crossed_net(
-        recipe,
-        args.out,
-        minutes=args.minutes,
-        workers=usable_cores(),
-        show=True,
-        print_line=print,
-    )
-    return _window_training_said(args, recipe.steps, trained)
+    def report(line: str) -> None:  # with the time, where the engine's progress is too
+        print(f"{datetime.now():%H:%M:%S} {line}", file=sys.stderr, flush=True)
 
-
-def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """The options that were given; the others are refused."""
-    for option in _OPTIONS:
-        if option not in names and getattr(args, option) is not None:
-            raise RecipeError(f"--{option} is no option of {args.recipe}; leave it out")
-    return {name: getattr(args, name) for name in names if name != "start" and getattr(args, name) is not None}
-
-
-def _window_training_said(args: argparse.Namespace, steps: int, trained: "phase_network.Trained") -> int:
-    """Print how a training of windows ended; the exit status."""
-    if trained.weights is None:
-        done = f"{trained.steps} of {steps} steps"
-        print(f"{args.out}: stopped after {done}, all saved; run the same command to resume")
+    again = command_line(without=("only_missing",), more=("--only-missing",))
+    options = (dataset, only_missing, minutes, anyway)
+    asked = reproduce.ReproduceSettings(tables, folders, again, reproduced, *options, report, row=row)
+    outcome = reproduce.reproduce(asked)
+    for name, path in zip(tables, outcome.tables, strict=True):
+        lines = reproduced.table_lines(name, outcome.jobs, folders, outcome.opened)
+        show(reproduced.table_rich(name, lines, preset), reproduced.conclusion(name, lines))
+        print(f"Written: {path}")
+    if outcome.failed:
+        each = "\n".join(f"  {name}: {why}" for name, why in outcome.failed.items())
+        raise TrainingError(f"{len(outcome.failed)} of {len(outcome.jobs)} rows could not be made:\n{each}")
+    if outcome.stopped is not None:
+        print(f"Stopped at {outcome.stopped} after {minutes:g} minutes. Continue with: {again}")
         return CHECK_FAILED
-    scores = ", ".join(f"{key} {value:.3g}" for key, value in trained.validation.items())
-    print(f"{trained.weights}: {trained.steps} steps, mask threshold {trained.threshold:g}; validation: {scores}")
-    print(f"next: fpp-bench predict {args.recipe} DATASET --weights {trained.weights} --out predictions")
-    return 0
+    return OK
+
+
+def _list(tables: tuple[str, ...], folders: reproduce.Folders) -> None:
+    jobs = reproduce.planned(tables, folders.preset)
+    titles = "Row", "Training", "State", "Rows written", "Published: object MAE"
+    first_out = "Rows written", "Published: object MAE", "Training"
+    table = Table(*titles, first_out=first_out, title=f"preset {folders.preset}, {folders.runs}")
+    empty = 0
+    for job in jobs:
+        row_files = [folders.row(job.recipe, depth_range) for depth_range in reproduce.variants(job.recipe)]
+        written = f"{sum(path.is_file() for path in row_files)} of {len(row_files)}"
+        published = _published(SHIPPED_ROWS / row_files[0].name)
+        empty += len(job.rows) if published is None else 0
+        state = reproduce.state_of(folders.training(job.recipe))
+        table.add_row("\n".join(job.rows), job.recipe.name, state, written, published or "-")
+    show(table)
+    rows = sum(len(job.rows) for job in jobs)
+    print(f"{len(jobs)} trainings fill {rows} rows; {rows - empty} of them come with the package.")
+    if empty:
+        print(f"The other {empty} are not measured yet: {EMPTY_BECAUSE[folders.preset]}.")
+
+
+def _published(path: Path) -> str | None:
+    """The error of the row that comes with the package, with the version of its benchmark; None where there is none."""
+    if not path.is_file():
+        return None
+    row = read_entry(path).row
+    benchmark, error_mm = row.dataset.benchmark, row.metrics.object_mae_mm
+    data = "an earlier build" if benchmark is None else f"version {benchmark.version}"
+    return f"{'-' if error_mm is None else f'{error_mm:.1f} mm'}, {data}"

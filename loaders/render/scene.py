@@ -8,7 +8,6 @@ z forward. At angle 0 the object's +x axis points away from the camera (paper Se
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, replace
-from difflib import get_close_matches
 from hashlib import blake2b
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -19,6 +18,7 @@ from fpp_ml_bench.constants import CONFIGS, MM_PER_M, OBJECTS, PRESETS, UNSEEN, 
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.light import Light, named_light
 from fpp_ml_bench.optics import NAMED_RIGS, Rig
+from fpp_ml_bench.options import did_you_mean
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
 if TYPE_CHECKING:  # the name of a benchmark needs settings alone
@@ -71,8 +71,7 @@ class BuildSettings:
         names = {*OBJECTS, *UNSEEN, *(mesh.name for mesh in self.user_meshes)}
         for name in self.objects:
             if name not in names:
-                near = ", ".join(get_close_matches(name, sorted(names), n=3)) or "see fpp_ml_bench.constants.OBJECTS"
-                raise BuildError(f"unknown object {name!r}; did you mean {near}?")
+                raise BuildError(f"unknown object {name!r}; {did_you_mean(name, sorted(names))}")
         if not self.objects:
             raise BuildError("no object to build: name at least one")
         if len(set(self.objects)) != len(self.objects):
@@ -92,7 +91,7 @@ class BuildSettings:
         if not self.rig.directions:
             raise BuildError(
                 "this rig projects crossed fringes alone, from which no ground truth can be decoded; add the "
-                "horizontal or vertical code to its sequence (it need not be stored: --frames crossed)"
+                "horizontal or vertical code to its sequence (it need not be stored: --config crossed)"
             )
         if not self.rig.sequence.config(self.stored):
             raise BuildError(f"frames {self.stored!r}: this rig's sequence has none of them")
@@ -155,7 +154,7 @@ def preset_settings(preset: str, size: int | None = None, light: str = "paper", 
 
 
 def default_frames(rig: str) -> str:
-    """The configuration that ``fpp-bench build --rig RIG`` stores unless ``--frames`` says otherwise: of the crossed
+    """The configuration that ``fpp-bench build --rig RIG`` stores unless ``--config`` says otherwise: of the crossed
     rig its crossed frames, of any other all frames."""
     return "crossed" if rig == "crossed" else "all"
 

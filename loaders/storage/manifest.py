@@ -111,7 +111,7 @@ def read_manifest(folder: Path) -> Manifest:
     """Manifest of a dataset folder. Raises `DatasetError` for a folder that is none, is unfinished or is damaged."""
     path = folder / MANIFEST
     if not folder.is_dir():
-        raise DatasetError(f"{folder}: no such folder; build one with: fpp-bench build {folder} --preset mini")
+        raise DatasetError(f"{folder}: no such folder; build one with: fpp-bench build --out {folder} --preset mini")
     if not path.is_file():
         if (folder / WORK_FOLDER).is_dir():
             raise DatasetError(f"{folder}: this build is not finished; run the same command again and it resumes")

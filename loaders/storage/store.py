@@ -34,6 +34,7 @@ from fpp_ml_bench.loaders.sample import (
 )
 from fpp_ml_bench.loaders.storage.manifest import MANIFEST, ShardFile, read_manifest
 from fpp_ml_bench.optics import AnySequence, Rig, rig_from_dict
+from fpp_ml_bench.options import did_you_mean
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -147,11 +148,7 @@ class DatasetFolder:
 
     def _find(self, sample: str) -> tuple[str, int]:
         if sample not in self._position:
-            from difflib import get_close_matches
-
-            matches = get_close_matches(sample, self._position, n=3)
-            hint = f"; similar names: {', '.join(matches)}" if matches else ""
-            raise DatasetError(f"{self.path}: no sample {sample!r}{hint}")
+            raise DatasetError(f"{self.path}: no sample {sample!r}; {did_you_mean(sample, self._position)}")
         return self._position[sample]
 
     def depth_mm(self, sample: str, column: str = DEPTH) -> NDArray[np.float32]:
@@ -202,7 +199,7 @@ class DatasetFolder:
                 return self._image(sample, group, self.sequence.frames[index].column)
         raise DatasetError(
             f"{self.path}: frame {index} is not stored here (configurations: {', '.join(self.configs)}); build with "
-            "--frames all"
+            "--config all"
         )
 
     def frames(self, sample: str, indices: Iterable[int]) -> list[NDArray[np.uint8]]:
@@ -308,7 +305,7 @@ def load_dataset(folder: str | Path, config: str = "single_shot", split: str | N
     if config not in dataset.configs:
         raise DatasetError(
             f"{folder}: configuration {config!r} is not stored; this dataset has {', '.join(dataset.configs)}. Build "
-            f"it with --frames {config} or --frames all"
+            f"it with --config {config} or --config all"
         )
     if split is not None:
         dataset.samples(split)

@@ -159,10 +159,9 @@ def test_a_time_is_not_written_into_another_methods_file(predicted, small, tmp_p
 
 
 @pytest.mark.parametrize("value", ["0", "-1", "x", "1e9"])
-def test_counts_are_counts(value, predicted):
-    with pytest.raises(SystemExit) as stopped:
-        main(["time", *predicted[0], "--batch", value])
-    assert stopped.value.code == 2
+def test_counts_are_counts(value, predicted, capsys):
+    assert main(["time", *predicted[0], "--batch", value]) == 2
+    assert f"--batch {value}: expected a whole number from 1 to 100000" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

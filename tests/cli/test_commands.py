@@ -2,6 +2,8 @@
 
 import json
 import os
+import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -13,7 +15,7 @@ import pytest
 import trimesh
 from conftest import TINY_SIZE
 
-from fpp_ml_bench.cli import COMMANDS, evaluate, main
+from fpp_ml_bench.cli import BENCH, COMMANDS, EVAL, Program, evaluate, main
 from fpp_ml_bench.constants import VIEWS
 from fpp_ml_bench.loaders.sample import VOID
 
@@ -32,6 +34,10 @@ def call(*arguments, command=main):
 # ---- help
 
 
+AT_ONCE = "", "fpp-eval"
+"""Help that no heavy import precedes. That of a command may import what the command needs at once, but no torch."""
+
+
 @pytest.mark.parametrize("name", [*COMMANDS, "", "fpp-eval"])
 def test_help_answers_without_importing_anything_heavy(name):
     code = (
@@ -40,20 +46,31 @@ def test_help_answers_without_importing_anything_heavy(name):
         f"words, name = sys.argv[1:], {name!r}\n"
         "if name == 'fpp-eval':\n"
         "    from fpp_ml_bench.cli.evaluate import main\n"
-        "try:\n"
-        "    status = main([*([name] if name in words else []), '--help'])\n"
-        "except SystemExit as stop:\n"
-        "    status = stop.code\n"
+        "status = main([*([name] if name in words and name else []), '--help'])\n"
         f"print('HEAVY', [m for m in {HEAVY!r} if m in sys.modules], status)\n"
     )
     done = subprocess.run([sys.executable, "-c", code, name], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.rstrip().endswith(("HEAVY [] 0", "HEAVY [] None")), done.stdout[-200:]
+    heavy = done.stdout.rstrip().rpartition("HEAVY ")[2]
+    loaded = set(re.findall(r"[a-z]\w+", heavy))
+    assert heavy.endswith(" 0") and not loaded & (
+        set(HEAVY) if name in AT_ONCE else {"torch", "datasets", "matplotlib"}
+    )
     assert "usage:" in done.stdout and "examples:" in done.stdout
     if name and name != "fpp-eval":
         assert f"usage: fpp-bench {name}" in done.stdout
     for line in done.stdout.splitlines():
         assert len(line) <= 125
+
+
+def test_help_and_version_of_the_programs_import_no_command():
+    for program, words in (("main", "['--help']"), ("main", "['--version']")):
+        code = f"import sys\nfrom fpp_ml_bench.cli import {program}\n{program}({words})\n"
+        code += "print([m for m in sys.modules if m.startswith('fpp_ml_bench.')])"
+        done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+        loaded = set(json.loads(done.stdout.splitlines()[-1].replace("'", '"')))
+        core = {"cli", "cli.options", "errors", "files", "machine", "options"}
+        assert loaded <= {f"fpp_ml_bench.{name}" for name in core}
 
 
 def test_version_and_no_arguments(capsys):
@@ -63,30 +80,45 @@ def test_version_and_no_arguments(capsys):
     assert "usage: fpp-bench" in capsys.readouterr().err
 
 
-def test_every_command_of_the_table_has_what_a_command_needs():
-    from importlib import import_module
-
-    for module, _ in COMMANDS.values():
-        command = import_module(f"fpp_ml_bench.cli.{module}")
-        assert command.SUMMARY and command.EXAMPLES and callable(command.run) and callable(command.add_arguments)
+def _parsed(command, words):
+    """Whether the command's parser accepts the words; raises click's error."""
+    command.make_context("x", list(words))
 
 
-def test_examples_in_the_help_are_accepted_by_their_parsers():
+def test_every_command_of_the_tables_is_grouped_and_says_what_it_does():
+    for program in (BENCH, EVAL):
+        assert len(program.commands) == sum(map(len, program.groups.values()))
+        for name in program.commands:
+            command = program.command(name)
+            if isinstance(command, Program):
+                assert all(command.command(inner).help for inner in command.commands) and command.purpose
+            else:
+                assert command.help and command.examples
+
+
+def test_examples_in_the_help_are_accepted_by_their_parsers(tmp_path, monkeypatch):
     """All examples of all commands are parsed: the help shows no option that a command lacks."""
-    import shlex
-    from importlib import import_module
-
-    from fpp_ml_bench.cli import parser_for
-
-    for name, (module, _) in COMMANDS.items():
-        command = import_module(f"fpp_ml_bench.cli.{module}")
-        lines = [line for line in command.EXAMPLES if line.startswith("fpp-bench ")]
-        assert lines, name
-        for line in lines:
-            words = shlex.split(line.split("   ")[0].split(" && ")[0].split(" | ")[0])
-            assert words[1] in COMMANDS, line
-            if words[1] == name:
-                parser_for(command, "x").parse_args(words[2:])
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(
+        "from fpp_ml_bench.baselines.method import Method\nclass Mine(Method):\n    name = 'mine'\n"
+    )
+    found = 0
+    for program in (BENCH, EVAL):
+        for name in program.commands:
+            command = program.command(name)
+            lines = [line for line in command.examples.splitlines() if line.startswith("fpp-")]
+            assert lines, name
+            for line in lines:
+                first, *words = shlex.split(line.split("   ")[0].split(" && ")[0].split(" | ")[0].split(" > ")[0])
+                other = {"fpp-bench": BENCH, "fpp-eval": EVAL}[first]
+                default = other.default and words[0] not in other.commands
+                target = other.command(other.default if default else words[0])
+                words = words if default else words[1:]
+                if isinstance(target, Program):
+                    target, words = target.command(words[0]), words[1:]
+                _parsed(target, words)
+                found += 1
+    assert found > 90
 
 
 # ---- bad input
@@ -99,37 +131,37 @@ def test_examples_in_the_help_are_accepted_by_their_parsers():
         (["xyz"], "unknown command 'xyz'"),
         (["--bogus"], "unknown option '--bogus'"),
         (["--bogus", "build"], "unknown option '--bogus'"),
-        (["build"], "OUT"),
-        (["build", "OUT", "--sise", "9"], "--sise"),
-        (["build", "OUT", "--size", "big"], "--size"),
-        (["build", "OUT", "--size", "0"], "1 to 8192"),
-        (["build", "OUT", "--size", "-5"], "1 to 8192"),
-        (["build", "OUT", "--size", "9000"], "1 to 8192"),
-        (["build", "OUT", "--size", "120"], "pitch of at least"),
-        (["build", "OUT", "--preset", "huge"], "--preset"),
-        (["build", "OUT", "--frames", "some"], "--frames"),
-        (["build", "OUT", "--placement", "random"], "--placement"),
-        (["build", "OUT", "--objects", "mugg"], "did you mean mug"),
-        (["build", "OUT", "--objects", ","], "name at least one"),
-        (["build", "OUT", "--objects", "mug,mug"], "named twice"),
-        (["build", "OUT", "--seed", "-1"], "seed -1"),
-        (["build", "OUT", "--seed", "1.5"], "--seed"),
-        (["build", "OUT", "--seed", "9" * 20], "seed 9999"),
-        (["build", "OUT", "--workers", "0"], "--workers 0"),
-        (["build", "OUT", "--workers", "two"], "--workers"),
-        (["build", "OUT", "--noise-sigma", "nan"], "--noise-sigma nan: expected 0 to 50"),
-        (["build", "OUT", "--noise-sigma", "-1"], "--noise-sigma -1: expected 0 to 50"),
-        (["build", "OUT", "--pitch", "nan"], "pitch"),
-        (["build", "OUT", "--pitch", "inf"], "pitch"),
-        (["build", "OUT", "--pitch", "0"], "pitch"),
-        (["build", "OUT", "--pitch", "3"], "pitch"),
-        (["build", "OUT", "--pitch", "5000"], "pitch"),
-        (["build", "OUT", "--rig", "none.yaml"], "none.yaml"),
-        (["build", "OUT", "--rig", "FILE.txt"], "FILE.txt"),
-        (["build", "OUT", "--mesh", "none.stl"], "none.stl"),
-        (["build", "OUT", "--meshes", "none.yaml"], "none.yaml"),
-        (["build", "FILE", "--objects", "mug"], "is a file"),
-        (["build", "FILE/inside", "--objects", "mug"], "FILE"),
+        (["build"], "--out DIR is missing"),
+        (["build", "--out", "OUT", "--sise", "9"], "--sise"),
+        (["build", "--out", "OUT", "--size", "big"], "--size"),
+        (["build", "--out", "OUT", "--size", "0"], "1 to 8192"),
+        (["build", "--out", "OUT", "--size", "-5"], "1 to 8192"),
+        (["build", "--out", "OUT", "--size", "9000"], "1 to 8192"),
+        (["build", "--out", "OUT", "--size", "120"], "pitch of at least"),
+        (["build", "--out", "OUT", "--preset", "huge"], "--preset"),
+        (["build", "--out", "OUT", "--config", "some"], "--config some: there are single_shot"),
+        (["build", "--out", "OUT", "--placement", "random"], "--placement"),
+        (["build", "--out", "OUT", "--objects", "mugg"], "did you mean 'mug'"),
+        (["build", "--out", "OUT", "--objects", ","], "name at least one"),
+        (["build", "--out", "OUT", "--objects", "mug,mug"], "named twice"),
+        (["build", "--out", "OUT", "--seed", "-1"], "seed -1"),
+        (["build", "--out", "OUT", "--seed", "1.5"], "--seed"),
+        (["build", "--out", "OUT", "--seed", "9" * 20], "seed 9999"),
+        (["build", "--out", "OUT", "--workers", "0"], "--workers 0"),
+        (["build", "--out", "OUT", "--workers", "two"], "--workers"),
+        (["build", "--out", "OUT", "--noise-sigma", "nan"], "--noise-sigma nan: expected 0 to 50"),
+        (["build", "--out", "OUT", "--noise-sigma", "-1"], "--noise-sigma -1: expected 0 to 50"),
+        (["build", "--out", "OUT", "--pitch", "nan"], "pitch"),
+        (["build", "--out", "OUT", "--pitch", "inf"], "pitch"),
+        (["build", "--out", "OUT", "--pitch", "0"], "pitch"),
+        (["build", "--out", "OUT", "--pitch", "3"], "pitch"),
+        (["build", "--out", "OUT", "--pitch", "5000"], "pitch"),
+        (["build", "--out", "OUT", "--rig", "none.yaml"], "none.yaml"),
+        (["build", "--out", "OUT", "--rig", "FILE.txt"], "FILE.txt"),
+        (["build", "--out", "OUT", "--mesh", "none.stl"], "none.stl"),
+        (["build", "--out", "OUT", "--meshes", "none.yaml"], "none.yaml"),
+        (["build", "--out", "FILE", "--objects", "mug"], "is a file"),
+        (["build", "--out", "FILE/inside", "--objects", "mug"], "FILE"),
         (["info"], "DATASET"),
         (["info", "OUT"], "no such folder"),
         (["info", "."], "no manifest.json"),
@@ -137,7 +169,7 @@ def test_examples_in_the_help_are_accepted_by_their_parsers():
         (["verify", "FILE"], "no such folder"),
         (["show", "TINY"], "expected either a SAMPLE or --sheet"),
         (["show", "TINY", "mug_A0", "--sheet"], "expected either a SAMPLE or --sheet"),
-        (["show", "TINY", "mug_A1", "--out", "x.png"], "similar names: mug_A"),
+        (["show", "TINY", "mug_A1", "--out", "x.png"], "did you mean 'mug_A"),
         (["show", "TINY", "mug_A0", "--out", "x.jpg"], "ending in .png"),
         (["show", "TINY", "mug_A0", "--out", "FILE/x.png"], "can't be written"),
         (["show", "TINY", "--sheet", "--split", "val", "--out", "x.png"], "no split 'val'"),
@@ -156,7 +188,10 @@ def test_examples_in_the_help_are_accepted_by_their_parsers():
         (["train", "phase-net", "--out", "OUT", "--steps", "0"], "steps 0"),
         (["train", "phase-net", "--out", "OUT", "--albedo", "two"], "--albedo"),
         (["train", "phase-net", "TINY", "--out", "OUT"], "renders what it learns from"),
-        (["train", "loss/l1", "TINY", "--out", "OUT", "--rate", "0.1"], "--rate is no option of loss/l1"),
+        (
+            ["train", "loss/l1", "TINY", "--out", "OUT", "--rate", "0.1"],
+            "--rate is an option of classical-net, phase-net, crossed-net, not of loss/l1",
+        ),
     ],
 )
 def test_bad_input_exits_2_with_a_message_and_makes_nothing(tiny, tmp_path, monkeypatch, capsys, arguments, message):
@@ -211,7 +246,7 @@ def test_output_cut_off_by_its_reader_is_no_traceback(tiny):
 
 
 def test_info_json_says_what_is_there(tiny, opened, capsys):
-    assert call("info", tiny, "--json") == 0
+    assert call("info", tiny, "--json", "-") == 0
     content = json.loads(capsys.readouterr().out)
     assert content["fingerprint"] == opened.fingerprint and content["size"] == [TINY_SIZE, TINY_SIZE]
     assert content["samples"] == opened.splits
@@ -283,7 +318,20 @@ def test_show_by_default_writes_into_the_current_folder(tiny, tmp_path, monkeypa
 def test_show_works_with_one_frame_without_meshes_and_with_few_gray_bits(tmp_path):
     out, folder = tmp_path / "x.png", tmp_path / "set"
     assert (
-        call("build", folder, "--size", TINY_SIZE, "--objects", "cork", "--frames", "single_shot", "--workers", 1) == 0
+        call(
+            "build",
+            "--out",
+            folder,
+            "--size",
+            TINY_SIZE,
+            "--objects",
+            "cork",
+            "--config",
+            "single_shot",
+            "--workers",
+            1,
+        )
+        == 0
     )
     shutil.rmtree(folder / "meshes")
     assert call("show", folder, "cork_A0", "--out", out) == 0
@@ -294,7 +342,10 @@ def test_show_works_with_one_frame_without_meshes_and_with_few_gray_bits(tmp_pat
 
     coarse = replace(paper_rig(TINY_SIZE), pitch_horizontal_px=1140, pitch_vertical_px=912, sequence=Sequence(3, 1, 1))
     save_rig(coarse, tmp_path / "rig.yaml")
-    assert call("build", tmp_path / "few", "--rig", tmp_path / "rig.yaml", "--objects", "bowl", "--workers", 1) == 0
+    assert (
+        call("build", "--out", tmp_path / "few", "--rig", tmp_path / "rig.yaml", "--objects", "bowl", "--workers", 1)
+        == 0
+    )
     assert call("show", tmp_path / "few", "bowl_A0", "--out", tmp_path / "y.png") == 0
 
 
@@ -318,13 +369,13 @@ def test_contact_sheet_shows_every_object_and_view(tiny, opened, tmp_path):
 def test_build_predict_and_evaluate_with_a_users_mesh(tmp_path, capsys):
     trimesh.creation.icosphere(3, 0.08).export(tmp_path / "ball.ply")
     data, out = tmp_path / "data", tmp_path / "predictions"
-    assert call("build", data, "--mesh", tmp_path / "ball.ply", "--size", TINY_SIZE, "--workers", 1) == 0
+    assert call("build", "--out", data, "--mesh", tmp_path / "ball.ply", "--size", TINY_SIZE, "--workers", 1) == 0
     assert "6 samples, 312 images" in capsys.readouterr().out
     assert call("verify", data) == 0
     assert call("predict", "classical", data, "--out", out, "--steps", 6, "--direction", "vertical") == 0
     assert "next: fpp-eval" in capsys.readouterr().out
     result = tmp_path / "result.json"
-    options = ("--dataset", data, "--split", "test", "--target", "depth_exact", "--json", result)
+    options = (data, "--split", "test", "--target", "depth_exact", "--json", result)
     assert call(out, *options, command=evaluate.main) == 0
     metrics = json.loads(result.read_text())["metrics"]
     assert 0 < metrics["object_mae_mm"] < 5

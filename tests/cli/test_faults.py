@@ -25,6 +25,7 @@ from fpp_ml_bench.baselines import classical_network, crossed_network, diagnosti
 from fpp_ml_bench.baselines.training import CHECKPOINT, alone_in
 from fpp_ml_bench.baselines.training.records import save_checkpoint
 from fpp_ml_bench.cli import evaluate, main, run_command
+from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import DatasetError, DiagnosisError, PoolError, RemoteError, TrainingError
 from fpp_ml_bench.files import LOCK_FILE, exclusive, file_hash, write_atomically
 from fpp_ml_bench.loaders.render import build
@@ -57,12 +58,12 @@ def test_what_a_killed_run_left_locks_nothing_and_the_evaluator_says_what_it_is(
     out.mkdir()
     for name in (LOCK_FILE, ".power_drill_A0.npy.123.tmp", "unfinished.jsonl"):
         (out / name).write_text("")
-    evaluate.main([str(out), "--dataset", str(tiny)])
+    evaluate.main([str(out), str(tiny)])
     problems = capsys.readouterr().err
     assert "unfinished.jsonl: is extra (a stopped fpp-bench predict left it: run the same command again" in problems
     assert LOCK_FILE not in problems
     assert predict(tiny, out) == 0
-    assert evaluate.main([str(out), "--dataset", str(tiny)]) == 0
+    assert evaluate.main([str(out), str(tiny)]) == 0
 
 
 def test_of_two_that_train_in_a_folder_one_is_told(tmp_path):
@@ -187,17 +188,17 @@ def files_of_at_most(count):
 def test_full_disks_are_answered_with_file_and_cure(tiny, tmp_path, capsys):
     predictions, again, rig = tmp_path / "predictions", tmp_path / "again", tmp_path / "rig.yaml"
     assert predict(tiny, predictions) == 0
-    score = [str(predictions), "--dataset", str(tiny), "--json", str(tmp_path / "result.json")]
+    score = [str(predictions), str(tiny), "--json", str(tmp_path / "result.json")]
     board = ["calibrate", "--virtual", str(tmp_path / "v"), "--size", "256", "--poses", "4", "--out", str(rig)]
     words = ["predict", "constant", str(tiny), "--out", str(again)]
-    for command, arguments, count, name in (
+    for run, arguments, count, name in (
         (main, words, 100, "again/unfinished.jsonl"),
         (main, words, 10_000, "again/power_drill_A0.npy"),
         (evaluate.main, score, 100, "result.json"),
         (main, board, 100, "/v: "),
     ):
         with files_of_at_most(count):
-            assert command(arguments) == 2
+            assert run(arguments) == 2
         message = capsys.readouterr().err.splitlines()[-1]
         assert name in message and FREE_SPACE in message and "Errno" not in message, message
     assert evaluate.main(score) == 0 and predict(tiny, again) == 0  # nothing is in the way
@@ -285,7 +286,17 @@ def test_without_shared_memory_there_is_a_message(tmp_path, monkeypatch, capsys)
     with pytest.raises(PoolError, match=message), pool.mapping(None, 2):
         pass
     monkeypatch.setattr(shard_processes, "get_context", lambda method: SimpleNamespace(Value=read_only))
-    words = ["build", str(tmp_path / "set"), "--objects", "cork,mug", "--size", str(TINY_SIZE), "--workers", "2"]
+    words = [
+        "build",
+        "--out",
+        str(tmp_path / "set"),
+        "--objects",
+        "cork,mug",
+        "--size",
+        str(TINY_SIZE),
+        "--workers",
+        "2",
+    ]
     assert main(words) == 2
     assert "shared memory (/dev/shm) can't be used" in capsys.readouterr().err
 
@@ -325,7 +336,7 @@ def test_everything_is_written_before_a_table_that_nobody_reads(tiny, tmp_path, 
     monkeypatch.setattr("fpp_ml_bench.cli.console.show", closed)
     predictions = tmp_path / "predictions"
     assert predict(tiny, predictions) == 0
-    words = [str(predictions), "--dataset", str(tiny), "--report", str(tmp_path / "report")]
+    words = [str(predictions), str(tiny), "--report", str(tmp_path / "report")]
     assert evaluate.main(words) == 141
     assert (tmp_path / "report" / "index.html").exists()
 
@@ -333,12 +344,10 @@ def test_everything_is_written_before_a_table_that_nobody_reads(tiny, tmp_path, 
 # ---- SIGTERM
 
 
-def _command(run):
-    return SimpleNamespace(SUMMARY="", EXAMPLES=(), add_arguments=lambda parser: None, run=run)
-
-
 def test_sigterm_ends_a_command_as_ctrl_c_does(capsys, tmp_path):
-    def run(args):
+    @command("")
+    def run() -> None:
+        """Stop."""
         try:
             os.kill(os.getpid(), signal.SIGTERM)
             time.sleep(10)
@@ -347,7 +356,7 @@ def test_sigterm_ends_a_command_as_ctrl_c_does(capsys, tmp_path):
             write_atomically(tmp_path / "saved", b"x")
 
     before = signal.getsignal(signal.SIGTERM)
-    assert run_command(_command(run), "fpp-bench x", []) == 143
+    assert run_command(run, "fpp-bench x", []) == 143
     assert capsys.readouterr().err == "fpp-bench x: stopped\n"
     assert (tmp_path / "saved").exists() and signal.getsignal(signal.SIGTERM) == before
 
@@ -356,9 +365,10 @@ def test_sigterm_during_an_import_is_not_swallowed(tmp_path):
     swallows = "import os, signal\ntry:\n    os.kill(os.getpid(), signal.SIGTERM)\nexcept BaseException:\n    pass\n"
     (tmp_path / "swallows.py").write_text(swallows)
     code = (
-        "from types import SimpleNamespace as N\nfrom fpp_ml_bench.cli import run_command\n"
-        "command = N(SUMMARY='', EXAMPLES=(), add_arguments=lambda p: 0, run=lambda a: __import__('swallows'))\n"
-        "run_command(command, 'x', [])"
+        "from fpp_ml_bench.cli import run_command\n"
+        "from fpp_ml_bench.cli.options import command\n"
+        "@command('')\ndef stopped():\n    import swallows\n"
+        "run_command(stopped, 'x', [])"
     )
     done = _python(code, tmp_path)
     assert (done.returncode, done.stderr) == (-signal.SIGTERM, "")

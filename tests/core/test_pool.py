@@ -92,7 +92,7 @@ def test_what_is_no_address_is_said(fake_ray, address):
 def test_an_address_where_nobody_answers(fake_ray, tmp_path, capsys):
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
-    words = ["build", str(tmp_path / "set"), "--objects", "cork", "--size", "176"]
+    words = ["build", "--out", str(tmp_path / "set"), "--objects", "cork", "--size", "176"]
     assert main([*words, "--cluster", f"127.0.0.1:{port}"]) == 2
     assert f"nobody answers at 127.0.0.1:{port} (Connection refused)" in capsys.readouterr().err
     assert fake_ray.addresses == []
@@ -102,6 +102,16 @@ def test_an_address_where_nobody_answers(fake_ray, tmp_path, capsys):
 
 def test_without_ray_the_extra_is_named(monkeypatch, tmp_path, capsys):
     monkeypatch.setitem(sys.modules, "ray", None)
-    words = ["build", str(tmp_path / "set"), "--objects", "cork", "--size", "176", "--cluster", "ray://head:10001"]
+    words = [
+        "build",
+        "--out",
+        str(tmp_path / "set"),
+        "--objects",
+        "cork",
+        "--size",
+        "176",
+        "--cluster",
+        "ray://head:10001",
+    ]
     assert main(words) == 2
     assert "this needs ray, which is not installed; pip install 'fpp-ml-bench[cluster]'" in capsys.readouterr().err

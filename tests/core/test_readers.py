@@ -324,8 +324,8 @@ def test_no_command_writes_or_reads_outside_by_a_manifests_names(copied, tmp_pat
         ["predict", "phase", copied, "--split", "train", "--out", out],
         ["verify", copied],
         ["info", copied],
-        ["export", copied, out, "--mat"],
-        ["export", copied, out, "--parquet"],
+        ["export", copied, "--out", out, "--mat"],
+        ["export", copied, "--out", out, "--parquet"],
         ["publish", "dataset", copied, "--repo", "a/b", "--dry-run"],
     ):
         assert main([str(word) for word in command]) == 2, command
@@ -342,7 +342,7 @@ def test_no_command_follows_a_link_out_of_the_dataset(copied, tmp_path, capsys):
         ["predict", "phase", copied, "--split", "train", "--out", out],
         ["verify", copied],
         ["info", copied],
-        ["export", copied, out, "--parquet"],
+        ["export", copied, "--out", out, "--parquet"],
         ["publish", "dataset", copied, "--repo", "a/b", "--dry-run"],
     ):
         assert main([str(word) for word in command]) == 2, command
@@ -369,7 +369,7 @@ def test_a_mesh_that_the_manifest_does_not_list_is_not_exported(copied, tmp_path
     (copied / "meshes").mkdir()
     for name in ("bowl", "mug"):
         (copied / "meshes" / f"{name}.ply").symlink_to("/etc/passwd")
-    assert main(["export", str(copied), str(tmp_path / "out"), "--meshes"]) == 2
+    assert main(["export", str(copied), "--out", str(tmp_path / "out"), "--meshes"]) == 2
     assert "bowl.ply: the mesh is missing" in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 

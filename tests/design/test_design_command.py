@@ -1,4 +1,4 @@
-"""``fpp-bench design``: the table, the rig file and the picture it writes, and what it refuses."""
+"""``fpp-bench patterns --design``: the table, the rig file and the picture it writes, and what it refuses."""
 
 import pytest
 
@@ -7,10 +7,7 @@ from fpp_ml_bench.optics import load_rig, paper_rig, rig_from_dict, save_rig
 
 
 def call(*arguments):
-    try:
-        return main(["design", *map(str, arguments)])
-    except SystemExit as stop:  # argparse
-        return stop.code
+    return main(["patterns", *map(str, arguments), "--design"])
 
 
 def test_a_rig_gets_the_proposed_pair(tmp_path, capsys):

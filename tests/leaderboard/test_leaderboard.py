@@ -279,7 +279,7 @@ def test_another_file_is_called_by_what_it_is_in_one_line(content, what, make, c
         assert main(command) == 2
         line = capsys.readouterr().err
         assert line.count("\n") == 1 and f"other.json is not a result file but {what}" in line
-    for words in (["compare", str(good), "other.json"], ["verify", "other.json", "predictions", "--dataset", "data"]):
+    for words in (["compare", str(good), "other.json"], ["verify", "other.json", "predictions", "data"]):
         assert evaluate_main(words) == 2
         assert f"other.json is not a result file but {what}" in capsys.readouterr().err
 
@@ -306,7 +306,7 @@ def test_named_results_are_shown_without_tables_of_others(make, capsys):
         "(fpp-bench leaderboard without a file).\n"
     )
     assert out.count("Not shown") == 1
-    for shown in (board(capsys), board(capsys, first, "--paper"), board(capsys, first, "--paper", "loss")):
+    for shown in (board(capsys), board(capsys, first, "--paper", "all"), board(capsys, first, "--paper", "loss")):
         assert "Reported by others" in shown and "Not shown" not in shown
     assert "Not shown" not in board(capsys, first, "--paper", "none")
     board(capsys, first, "--markdown", "board.md")

@@ -156,7 +156,7 @@ def test_fpp_eval_compares_results_and_rows(files, tmp_path, capsys):
 
 def test_fpp_eval_verifies_a_row_from_its_predictions(files, dataset, tmp_path, capsys):
     row, predictions = write_row_of(files[0], tmp_path / "row.json"), files[0].parent / "fast-predictions"
-    words = ["verify", str(row), str(predictions), "--dataset", str(dataset.path)]
+    words = ["verify", str(row), str(predictions), str(dataset.path)]
     assert fpp_eval(words) == 0
     assert capsys.readouterr().out == (
         f"verified: {row} is what 4 predictions give\n"

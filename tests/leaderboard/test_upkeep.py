@@ -12,9 +12,7 @@ from board_rows import some_rows
 from scored_dataset import make_dataset
 from upkeep import SHOWN, readme_block
 
-from fpp_ml_bench.cli import parser_for
-from fpp_ml_bench.cli import predict as predict_command
-from fpp_ml_bench.cli.method_options import chosen_method
+from fpp_ml_bench.cli import BENCH
 from fpp_ml_bench.cli.robustness import Scenes
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result import Robustness, SeverityScores
@@ -115,8 +113,9 @@ def test_markers_must_be_there(text, readme, capsys):
 def test_a_rows_command_is_of_the_method_that_was_scored(row):
     name, *options = upkeep.METHODS[row].split()
     words = [name, "data", *options, "--out", "predictions"]
-    args = parser_for(predict_command, "fpp-bench predict").parse_args(words)
-    method = chosen_method(args, Scenes.of("test", 960, "paper"), warn=False)
+    command = BENCH.command("predict")
+    chosen = command.values(command.make_context("fpp-bench predict", words))["chosen"]
+    method = chosen.load(Scenes.of("test", 960, "paper"), warn=False)
     check_same_method(read_entry(SHIPPED_ROWS / f"{row}.json"), method)
 
 
@@ -135,8 +134,8 @@ def test_a_row_stays_vouched_for_when_more_of_it_is_measured(files, tmp_path, mo
         return 0
 
     monkeypatch.setattr(upkeep, "fpp_bench", measure)
-    assert upkeep.main(["measured", str(row), "reliance", "phase", "data/full", "--fringe", "vertical"]) == 0
-    assert ran == [["reliance", "phase", "data/full", "--fringe", "vertical", "--into", str(row)]]
+    assert upkeep.main(["measured", str(row), "reliance", "phase", "data/full", "--direction", "vertical"]) == 0
+    assert ran == [["reliance", "phase", "data/full", "--direction", "vertical", "--into", str(row)]]
     after = sha256(row.read_bytes()).hexdigest()
     assert after != before and (tmp_path / "vouched.txt").read_text() == f"{after} | measured\n"
 

@@ -184,7 +184,7 @@ def test_the_stated_uncertainty_holds_the_error_of_gamma(steps, gamma):
 @pytest.mark.parametrize(
     "words, said",
     [
-        (["--range", "1,2"], "1 to 2 mm, where no rig looks"),
+        (["--working-range", "1,2"], "1 to 2 mm, where no rig looks"),
         (["--min-modulation", "200"], "too faint"),
         (["--min-modulation", "0"], "min_modulation: expected a positive"),
         (["--direction", "horizontal"], "no horizontal"),
@@ -225,13 +225,13 @@ def test_patterns_come_with_a_manifest(tmp_path, capsys):
         "projector: {width: 200, height: 100}\n"
         "sequence: {order: [white, vertical, black], vertical: {scheme: gray, cell_px: 2}}\n"
     )
-    assert main(["patterns", str(file), str(tmp_path / "images")]) == 0
+    assert main(["patterns", str(file), "--out", str(tmp_path / "images")]) == 0
     manifest = json.loads((tmp_path / "images" / "patterns.json").read_text())
     assert manifest["projector_px"] == [200, 100] and len(manifest["frames"]) == 9
     assert manifest["frames"][1]["shows"] == "vertical Gray bit 0"
     white = cv2.imread(str(tmp_path / "images" / "A_0.png"), cv2.IMREAD_UNCHANGED)
     assert white.shape == (100, 200) and (white == 255).all()
-    assert main(["patterns", str(file), str(tmp_path / "images")]) == 2
+    assert main(["patterns", str(file), "--out", str(tmp_path / "images")]) == 2
     assert "not empty" in capsys.readouterr().err
 
 
@@ -250,7 +250,7 @@ def test_patterns_come_with_a_manifest(tmp_path, capsys):
 )
 def test_a_projector_that_is_not_described_is_a_sentence(tmp_path, capsys, text, said):
     (tmp_path / "projector.yaml").write_text(text)
-    assert main(["patterns", str(tmp_path / "projector.yaml"), str(tmp_path / "images")]) == 2
+    assert main(["patterns", str(tmp_path / "projector.yaml"), "--out", str(tmp_path / "images")]) == 2
     assert said in capsys.readouterr().err and not (tmp_path / "images").exists()
 
 

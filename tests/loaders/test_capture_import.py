@@ -76,7 +76,7 @@ def run(*words, command=main):
 
 
 def importing(folder, *more):
-    return run("import", "--captures", folder / "scans", folder / "set", "--rig", folder / "rig.yaml", *more)
+    return run("import", folder / "scans", "--captures", "--out", folder / "set", "--rig", folder / "rig.yaml", *more)
 
 
 def test_captures_become_a_dataset_like_any_other(scanned, capsys):
@@ -115,14 +115,14 @@ def test_captures_become_a_dataset_like_any_other(scanned, capsys):
     assert run("show", folder, "--sheet", "--out", scanned / "b.png") == 0
     assert cv2.imread(str(scanned / "b.png")).shape[:2] == (93 + 18, 2 * 2 * 120 + 8)
     assert "license: unknown" in (folder / "README.md").read_text()
-    assert run("export", folder, scanned / "tree", "--mat") == 2
+    assert run("export", folder, "--out", scanned / "tree", "--mat") == 2
 
     assert run("predict", "classical", folder, "--out", scanned / "predictions") == 0
     submission = yaml.safe_load((scanned / "predictions" / "submission.yaml").read_text())
     assert submission["name"] == "Classical, vertical phase-shift 57 + 912 px"
     assert submission["frames_used"] == [1, 2, 3, 4, 5, 6]
     result = scanned / "result.json"
-    assert run(scanned / "predictions", "--dataset", folder, "--json", result, command=evaluate) == 0
+    assert run(scanned / "predictions", folder, "--json", result, command=evaluate) == 0
     assert json.loads(result.read_text())["metrics"]["object_mae_mm"] == 0.0  # the process that made the ground truth
     assert importing(scanned, "--splits", scanned / "splits.yaml") == 0  # finished: nothing is done again
 
@@ -131,7 +131,10 @@ def test_a_generated_set_exported_as_frames_is_imported_to_its_own_ground_truth(
     """The builder's frames of a rig with one direction, as PNG files: the same depth where it was decoded there."""
     rig = rig_from_dict({**coded_rig(96, 96, vertical=UNIT_CUE).to_dict(), "background_m": 3.2})
     save_rig(rig, tmp_path / "rig.yaml")
-    assert run("build", tmp_path / "made", "--rig", tmp_path / "rig.yaml", "--objects", "mug", "--workers", 1) == 0
+    assert (
+        run("build", "--out", tmp_path / "made", "--rig", tmp_path / "rig.yaml", "--objects", "mug", "--workers", 1)
+        == 0
+    )
     made = DatasetFolder(tmp_path / "made")
     for sample in made.samples("all"):
         view = made.measured(sample)["view"]
@@ -352,11 +355,13 @@ def test_what_is_no_capture_is_refused(scanned, name, capsys):
 
 
 def test_options_belong_to_one_kind_of_import(scanned, capsys):
-    assert run("import", "--captures", scanned / "scans", scanned / "set") == 2
+    assert run("import", scanned / "scans", "--captures", "--out", scanned / "set") == 2
     assert "give its file with --rig" in capsys.readouterr().err
-    assert run("import", scanned / "scans", scanned / "set", "--bits", 12) == 2
+    assert run("import", scanned / "scans", "--out", scanned / "set", "--bits", 12) == 2
     assert "--bits belongs to captures" in capsys.readouterr().err
-    assert run("import", scanned / "scans", scanned / "set") == 2  # the published layout stays as strict as it is
+    assert (
+        run("import", scanned / "scans", "--out", scanned / "set") == 2
+    )  # the published layout stays as strict as it is
 
 
 @pytest.mark.parametrize(
@@ -365,9 +370,9 @@ def test_options_belong_to_one_kind_of_import(scanned, capsys):
         (["classical", "--steps", "3"], "leave steps out"),
         (["classical", "--direction", "horizontal"], "no horizontal fringes or codes, only vertical"),
         (["classical", "--fewest"], "leave fewest out"),
-        (["phase", "--fringe", "horizontal"], "vertical fringes, and no horizontal ones"),
+        (["phase", "--direction", "horizontal"], "vertical fringes, and no horizontal ones"),
         (["unet-individual-rmse"], "was trained at 224x224 px"),
-        (["phase-net", "--fringe", "horizontal"], "vertical fringes, and no horizontal ones"),
+        (["phase-net", "--direction", "horizontal"], "vertical fringes, and no horizontal ones"),
     ],
 )
 def test_methods_that_can_not_run_say_what_they_need(scanned, method, said, capsys):

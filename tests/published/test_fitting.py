@@ -55,10 +55,10 @@ def test_the_hidden_pitch_is_found_exactly_and_the_depth_to_a_twentieth_of_a_mm(
 
 
 def test_import_warns_of_another_rig_and_finds_it_where_asked(tree, tmp_path, capsys):
-    assert command("import", tree, tmp_path / "assumed", "--workers", 1) == 0
+    assert command("import", tree, "--out", tmp_path / "assumed", "--workers", 1) == 0
     message = capsys.readouterr().err
     assert "warning: the paper's rig did not take" in message and "calibrate --from-depth" in message
-    assert command("import", tree, tmp_path / "fitted", "--workers", 1, "--fit-rig") == 0
+    assert command("import", tree, "--out", tmp_path / "fitted", "--workers", 1, "--fit-rig") == 0
     assert "warning" not in capsys.readouterr().err
     rig = DatasetFolder(tmp_path / "fitted").rig
     assert (rig.pitch_vertical_px, rig.pitch_horizontal_px) == (30, 26)

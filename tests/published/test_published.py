@@ -374,7 +374,7 @@ def test_a_finished_import_is_left_alone_unless_the_tree_changed(tmp_path):
 def test_the_command_imports_and_prints_a_summary(tmp_path, capsys):
     tree = make_tree(tmp_path / "tree", ALL_VARIANTS)
     save_rig(paper_rig(24), tmp_path / "rig.yaml")
-    assert command("import", tree, tmp_path / "out", "--workers", 1, "--rig", tmp_path / "rig.yaml") == 0
+    assert command("import", tree, "--out", tmp_path / "out", "--workers", 1, "--rig", tmp_path / "rig.yaml") == 0
     message = capsys.readouterr().out
     assert "train 6, validation 6, test 12 samples" in message and f"depth taken from {FOLDERS['raw']}" in message
     assert "assumed" not in message
@@ -383,13 +383,13 @@ def test_the_command_imports_and_prints_a_summary(tmp_path, capsys):
 @pytest.mark.parametrize(
     "words",
     [
-        ("import", "nowhere", "out"),
-        ("import", "tree", "out", "--workers", "0"),
-        ("import", "tree", "out", "--frame-order", "sideways"),
-        ("import", "tree", "out", "--rig", "nowhere.yaml"),
-        ("import", "tree", "tree"),
-        ("import", "tree", "a_file"),
-        ("import", "broken", "out"),
+        ("import", "nowhere", "--out", "out"),
+        ("import", "tree", "--out", "out", "--workers", "0"),
+        ("import", "tree", "--out", "out", "--frame-order", "sideways"),
+        ("import", "tree", "--out", "out", "--rig", "nowhere.yaml"),
+        ("import", "tree", "--out", "tree"),
+        ("import", "tree", "--out", "a_file"),
+        ("import", "broken", "--out", "out"),
     ],
 )
 def test_bad_input_to_the_command_is_a_message_and_status_2(tmp_path, monkeypatch, capsys, words):

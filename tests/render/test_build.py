@@ -130,12 +130,12 @@ def test_a_view_without_an_object_pixel_ends_the_build_with_its_cause(tmp_path, 
     trimesh.creation.box((4e-4,) * 3).export(tmp_path / "tiny.stl")
     trimesh.creation.box((0.2,) * 3).export(tmp_path / "box.stl")
     (tmp_path / "dark.yaml").write_text("name: dark\ncamera: {exposure: 0.01}\n")
-    words = ["--size", "224", "--frames", "single_shot", "--workers", "1"]
-    assert main(["build", str(tmp_path / "a"), "--mesh", str(tmp_path / "tiny.stl"), *words]) == 2
+    words = ["--size", "224", "--config", "single_shot", "--workers", "1"]
+    assert main(["build", "--out", str(tmp_path / "a"), "--mesh", str(tmp_path / "tiny.stl"), *words]) == 2
     said = capsys.readouterr().err
     assert "object 'tiny' is on no pixel in view A0: it is 0.4 mm large" in said and "scale it up" in said
     words += ["--light", str(tmp_path / "dark.yaml")]
-    assert main(["build", str(tmp_path / "b"), "--mesh", str(tmp_path / "box.stl"), *words]) == 2
+    assert main(["build", "--out", str(tmp_path / "b"), "--mesh", str(tmp_path / "box.stl"), *words]) == 2
     said = capsys.readouterr().err
     assert "sample 'box_A0': none of its" in said and "(low modulation" in said and "--light" in said
 
@@ -195,7 +195,7 @@ def test_groups_hold_every_frame_once(stored, count, configs):
     ("change", "message"),
     [
         ({"objects": ()}, "no object"),
-        ({"objects": ("mugg",)}, "did you mean mug"),
+        ({"objects": ("mugg",)}, "did you mean 'mug'"),
         ({"objects": ("mug", "bowl", "mug")}, "'mug' is named twice"),
         ({"placement": "random"}, "fixed or varied"),
         ({"stored": "both"}, "single_shot"),

@@ -28,7 +28,7 @@ def lab(tmp_path_factory):
     """Folder of a dataset built by the command with --decode-with, and the dataset."""
     folder = tmp_path_factory.mktemp("lab")
     save_rig(FOUND, folder / "found.yaml")
-    asked = ["build", str(folder / "data"), "--objects", "cork", "--size", str(TINY_SIZE), "--workers", "1"]
+    asked = ["build", "--out", str(folder / "data"), "--objects", "cork", "--size", str(TINY_SIZE), "--workers", "1"]
     assert main([*asked, "--decode-with", str(folder / "found.yaml")]) == 0
     return DatasetFolder(folder / "data")
 
@@ -51,14 +51,14 @@ def test_info_says_that_another_rig_photographed_and_how_far_both_are_apart(lab,
     assert main(["info", str(lab.path)]) == 0
     out = capsys.readouterr().out
     assert "photographed by another" in out and f"{error.rms_mm:.3f} mm RMS" in out and "photographed_by" not in out
-    assert main(["info", str(lab.path), "--json"]) == 0
+    assert main(["info", str(lab.path), "--json", "-"]) == 0
     content = json.loads(capsys.readouterr().out)
     assert content["calibration_error"] == pytest.approx(error._asdict())
     assert content["settings"]["photographed_by"]["translation_m"] == [0.125, -0.1, 0.0]
     assert content["splits"][0]["gt_rmse_mm"] == pytest.approx(
         np.mean([lab.measured(sample)["gt_rmse_mm"] for sample in lab.samples("train")])
     )
-    assert main(["info", str(tiny), "--json"]) == 0
+    assert main(["info", str(tiny), "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out)["calibration_error"] is None
     assert "photographed_by" not in opened.manifest.settings
 

@@ -145,5 +145,5 @@ def test_another_process_gives_the_same_bytes(meshes):
 def test_an_unknown_name_is_refused_with_near_ones():
     with pytest.raises(MeshError, match=r"'wooden_board'.*wooden_boards"):
         object_mesh("wooden_board")
-    with pytest.raises(MeshError, match="they are: master_chef_can"):
+    with pytest.raises(MeshError, match="there are master_chef_can"):
         object_mesh("zzzz")

@@ -181,7 +181,7 @@ def test_command_and_browser(dataset, tmp_path):
     folder = write_predictions(
         tmp_path / "p", dataset, offset_mm=1.0, noise_mm=2.0, name="</title><script>hacked = 1</script>"
     )
-    assert fpp_eval([str(folder), "--dataset", str(dataset.path), "--report", str(tmp_path / "out")]) == 0
+    assert fpp_eval([str(folder), str(dataset.path), "--report", str(tmp_path / "out")]) == 0
     page = tmp_path / "out" / "index.html"
     browser = Browser()
     try:

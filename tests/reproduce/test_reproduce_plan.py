@@ -12,7 +12,7 @@ from scored_dataset import make_dataset, write_predictions
 from fpp_ml_bench.baselines.reproduce import Folders, plan, planned, variants
 from fpp_ml_bench.baselines.reproduce.plan import default_folder, open_dataset
 from fpp_ml_bench.baselines.training import PRESETS, TABLES, load_recipe
-from fpp_ml_bench.cli import reproduce as command
+from fpp_ml_bench.cli import train as command
 from fpp_ml_bench.errors import DatasetError, RecipeError
 from fpp_ml_bench.evaluation.report import compare
 from fpp_ml_bench.evaluation.score import evaluate
@@ -118,7 +118,7 @@ def test_one_runs_folder_is_of_one_dataset(tmp_path, dataset):
     record = run_folders.runs / "dataset.json"
     recorded = json.loads(record.read_text())
     record.write_text(json.dumps({**recorded, "fingerprint": 64 * "a"}))
-    with pytest.raises(DatasetError, match=r"are of aaaaaaaa .*give that dataset as --data, or another --runs"):
+    with pytest.raises(DatasetError, match=r"are of aaaaaaaa .*give that dataset as DATASET, or another --out"):
         open_dataset(dataset.path, jobs, run_folders, print)
     record.write_text("{")
     with pytest.raises(DatasetError, match="damaged"):

@@ -58,19 +58,19 @@ def test_a_result_on_a_benchmark_says_its_name_and_version(named, tmp_path, caps
     path = result_file(named, tmp_path)
     assert json.loads(path.read_text())["dataset"]["benchmark"] == {"name": "tiny-bench", "version": 4}
     assert result_json(read_result(path)) == path.read_bytes()
-    command = [str(tmp_path / "predictions"), "--dataset", str(named.path), "--report", str(tmp_path / "report")]
+    command = [str(tmp_path / "predictions"), str(named.path), "--report", str(tmp_path / "report")]
     assert main(command) == 0
     printed = capsys.readouterr()
     truth = read_result(path).dataset.truth
     assert f"(tiny-bench version 4, content {truth[:8]})" in printed.out and printed.err == ""
     assert "tiny-bench version 4" in (tmp_path / "report" / "index.html").read_text()
-    assert main(["verify", str(path), str(tmp_path / "predictions"), "--dataset", str(named.path)]) == 0
+    assert main(["verify", str(path), str(tmp_path / "predictions"), str(named.path)]) == 0
 
 
 def test_a_result_on_any_other_dataset_has_no_such_key(dataset, tmp_path, capsys):
     path = result_file(dataset, tmp_path)
     assert "benchmark" not in json.loads(path.read_text())["dataset"]
-    assert main([str(tmp_path / "predictions"), "--dataset", str(dataset.path)]) == 0
+    assert main([str(tmp_path / "predictions"), str(dataset.path)]) == 0
     printed = capsys.readouterr()
     truth = read_result(path).dataset.truth
     assert f"(no named benchmark, content {truth[:8]})" in printed.out and printed.err == ""
@@ -80,7 +80,7 @@ def test_settings_of_a_benchmark_with_other_bytes_are_warned_of(dataset, tmp_pat
     intended = Benchmark("tiny-bench", 4, "mini", 32)
     monkeypatch.setattr(benchmarks, "intended_benchmark", lambda manifest: intended)
     folder = write_predictions(tmp_path / "predictions", dataset)
-    assert main([str(folder), "--dataset", str(dataset.path), "--json", str(tmp_path / "r.json")]) == 0
+    assert main([str(folder), str(dataset.path), "--json", str(tmp_path / "r.json")]) == 0
     printed = capsys.readouterr()
     assert printed.err.startswith(f"fpp-eval: warning: {dataset.path}: built with the settings of tiny-bench version 4")
     assert "warning" not in printed.out and read_result(tmp_path / "r.json").dataset.benchmark is None
@@ -123,7 +123,7 @@ def test_compare_and_verify_name_both(named, dataset, tmp_path, capsys, monkeypa
     assert main(["compare", str(path), str(other)]) == 2
     first, second = (read_result(file).dataset.identity for file in (path, other))
     assert f"dataset: {first} against {second}" in capsys.readouterr().err and first.startswith("tiny-bench version 4")
-    assert main(["verify", str(other), str(tmp_path / "predictions"), "--dataset", str(named.path)]) == 1
+    assert main(["verify", str(other), str(tmp_path / "predictions"), str(named.path)]) == 1
     printed = capsys.readouterr().out
     assert "dataset.content.test/depth: " + "e" * 32 in printed and named.content["test/depth"] in printed
 
@@ -172,7 +172,7 @@ def test_a_dataset_that_was_changed_is_not_scored(named, tmp_path, capsys):
     changed = bytes_before.replace(depth, np.load(predictions / f"{sample}.npy").tobytes())
     assert changed != bytes_before and len(changed) == len(bytes_before)
     (copy / shard.path).write_bytes(changed)
-    command = [str(predictions), "--dataset", str(copy), "--json", str(tmp_path / "r.json")]
+    command = [str(predictions), str(copy), "--json", str(tmp_path / "r.json")]
     assert main(command) == 2
     error = capsys.readouterr().err
     assert str(copy) in error and "depth of split test is not what manifest.json says" in error

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scored_dataset import make_dataset, write_description
 
-from fpp_ml_bench.cli import main
+from fpp_ml_bench.cli.evaluate import main
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.evaluation.score.conformal import calibrate, conformal_quantile, write_calibrated
@@ -60,9 +60,7 @@ def folders(tmp_path, dataset):
 
 def command(folders, dataset, out, *arguments):
     test, validation = map(str, folders)
-    return main(
-        ["conformal", test, "--dataset", str(dataset.path), "--from", validation, "--out", str(out), *arguments]
-    )
+    return main(["conformal", test, str(dataset.path), "--from", validation, "--out", str(out), *arguments])
 
 
 def test_the_command_scales_sigma_and_nothing_else(folders, dataset, tmp_path, capsys):

@@ -118,11 +118,11 @@ def test_metres_score_like_millimetres(dataset, tmp_path):
 
 def test_modes_and_tracks_cannot_be_mixed_up(dataset, tmp_path, capsys):
     normalised = write_normalised(tmp_path / "n", dataset, uses_ground_truth_range=False)
-    assert main([str(normalised), "--dataset", str(dataset.path)]) == 2
+    assert main([str(normalised), str(dataset.path)]) == 2
     assert "units: normalised needs uses_ground_truth_range: true" in capsys.readouterr().err
     write_description(normalised, **ORACLE)
     written = tmp_path / "r.json"
-    command = [str(normalised), "--dataset", str(dataset.path), "--mode", "paper", "--json", str(written)]
+    command = [str(normalised), str(dataset.path), "--mode", "paper", "--json", str(written)]
     assert main(command) == 0
     assert "oracle range track, mode paper" in capsys.readouterr().out
     assert json.loads(written.read_text())["mode"] == "paper"

@@ -242,7 +242,7 @@ def test_results_of_other_data_are_not_compared(make, dataset, tmp_path, capsys)
 
 def test_verify_says_verified_or_not(make, dataset, tmp_path, capsys):
     file, folder = make("p", noise_mm=2.0), tmp_path / "p"
-    command = ["verify", str(file), str(folder), "--dataset", str(dataset.path)]
+    command = ["verify", str(file), str(folder), str(dataset.path)]
     assert main(command) == 0
     assert capsys.readouterr().out.startswith("verified: ")
     sample = dataset.samples("test")[0]
@@ -265,10 +265,10 @@ def test_verify_says_verified_or_not(make, dataset, tmp_path, capsys):
 def test_verify_on_other_data_and_other_protocol(make, dataset, tmp_path, capsys):
     other_dataset = make_dataset(tmp_path / "other", size=(40, 32))
     file = make("p", noise_mm=2.0)
-    assert main(["verify", str(file), str(tmp_path / "p"), "--dataset", str(other_dataset.path)]) == 1
+    assert main(["verify", str(file), str(tmp_path / "p"), str(other_dataset.path)]) == 1
     assert "dataset.content.test/depth" in capsys.readouterr().out
     file.write_text(file.read_text().replace('"protocol_version": "', '"protocol_version": "9'))
-    assert main(["verify", str(file), str(tmp_path / "p"), "--dataset", str(dataset.path)]) == 2
+    assert main(["verify", str(file), str(tmp_path / "p"), str(dataset.path)]) == 2
     assert "scored by protocol 9" in capsys.readouterr().err
 
 
@@ -298,4 +298,4 @@ def test_schema_needs_no_library_to_be_read(capsys):
 def test_a_folder_named_like_a_subcommand_is_scored_by_its_path(dataset, tmp_path, monkeypatch):
     write_predictions(tmp_path / "compare", dataset)
     monkeypatch.chdir(tmp_path)
-    assert main(["./compare", "--dataset", str(dataset.path)]) == 0
+    assert main(["./compare", str(dataset.path)]) == 0

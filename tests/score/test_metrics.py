@@ -38,10 +38,10 @@ assert sort_keys()[-3:] == ("toy_mm", "seconds_per_sample", "frames_used")
 scored = evaluate(folder, DatasetFolder(data))
 assert [row.toy_mm for row in scored.per_sample] == [row.object_median_mm for row in scored.per_sample]
 assert scored.metrics.toy_mm == scored.metrics.object_median_mm
-assert main([str(folder), "--dataset", str(data), "--json", str(out), "--report", str(out.parent / "report")]) == 0
+assert main([str(folder), str(data), "--json", str(out), "--report", str(out.parent / "report")]) == 0
 assert "A toy" in (out.parent / "report" / "index.html").read_text()
 assert result.read_result(out).metrics.toy_mm == scored.metrics.toy_mm
-assert main(["verify", str(out), str(folder), "--dataset", str(data)]) == 0
+assert main(["verify", str(out), str(folder), str(data)]) == 0
 assert result.result_json(result.read_result(old)) == old.read_bytes()  # of before the toy
 assert "toy_mm" in result.json_schema("result")["$defs"]["Metrics"]["properties"]
 print("BOARD")

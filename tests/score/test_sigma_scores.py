@@ -107,8 +107,8 @@ def test_the_block_is_written_read_verified_and_shown(scored, tmp_path, capsys):
     assert block.per_object["power_drill"].coverage_68 == pytest.approx(np.mean(views), rel=1e-12)
     write_result(result, tmp_path / "r.json")
     assert read_result(tmp_path / "r.json") == result
-    assert main(["verify", str(tmp_path / "r.json"), str(predictions), "--dataset", str(dataset.path)]) == 0
-    assert main([str(predictions), "--dataset", str(dataset.path)]) == 0
+    assert main(["verify", str(tmp_path / "r.json"), str(predictions), str(dataset.path)]) == 0
+    assert main([str(predictions), str(dataset.path)]) == 0
     assert "Stated uncertainty" in capsys.readouterr().out
     page = write_report(result, dataset, predictions, tmp_path / "report").read_text()
     assert page.count("<polyline") == 4 and "AUSE, RMSE" in page

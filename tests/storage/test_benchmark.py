@@ -124,7 +124,7 @@ def test_what_the_commands_say(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(module.render, "preset_settings", lambda preset, size, light, rig: settings)
     assert main(["verify", str(tmp_path / "data")]) == 0
     assert "benchmark: this is fpp-bench-tiny version 2" in capsys.readouterr().out
-    assert main(["info", str(tmp_path / "data"), "--json"]) == 0
+    assert main(["info", str(tmp_path / "data"), "--json", "-"]) == 0
     assert json.loads(capsys.readouterr().out)["benchmark"] == {"name": "fpp-bench-tiny", "version": 2}
     monkeypatch.setattr(module, "BENCHMARKS", (replace(known, name="fpp-bench-other"),))
     assert main(["verify", str(tmp_path / "data")]) == 0

@@ -270,7 +270,7 @@ def test_an_imported_dataset_exports_too(returned, tmp_path):
 
 
 def test_several_forms_each_get_a_folder(opened, tiny, tmp_path, capsys):
-    assert command("export", tiny, tmp_path / "out", "--meshes", "--patterns") == 0
+    assert command("export", tiny, "--out", tmp_path / "out", "--meshes", "--patterns") == 0
     assert "meshes, patterns of 24 samples" in capsys.readouterr().out
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"meshes", "patterns"}
     assert {path.stem for path in (tmp_path / "out/meshes").iterdir()} == set(TINY_OBJECTS)
@@ -280,7 +280,7 @@ def test_several_forms_each_get_a_folder(opened, tiny, tmp_path, capsys):
 
 def test_one_form_and_one_split_go_straight_into_the_folder(tiny, tmp_path):
     (tmp_path / "out").mkdir()
-    assert command("export", tiny, tmp_path / "out", "--meshes", "--split", "test") == 0
+    assert command("export", tiny, "--out", tmp_path / "out", "--meshes", "--split", "test") == 0
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["power_drill.ply"]
 
 
@@ -325,13 +325,13 @@ def test_two_exports_into_one_folder_and_folders_that_hold_something(opened, tmp
 @pytest.mark.parametrize(
     "words",
     [
-        ("{data}", "out"),
-        ("nowhere", "out", "--mat"),
-        ("{data}", "file", "--mat"),
-        ("{data}", "full", "--mat"),
-        ("{data}", "{data}", "--parquet"),
-        ("/dev/null", "out", "--patterns"),
-        ("{data}", "/proc/none/out", "--patterns"),
+        ("{data}", "--out", "out"),
+        ("nowhere", "--out", "out", "--mat"),
+        ("{data}", "--out", "file", "--mat"),
+        ("{data}", "--out", "full", "--mat"),
+        ("{data}", "--out", "{data}", "--parquet"),
+        ("/dev/null", "--out", "out", "--patterns"),
+        ("{data}", "--out", "/proc/none/out", "--patterns"),
     ],
 )
 def test_bad_input_to_the_command_is_a_message_and_status_2(tiny, tmp_path, monkeypatch, capsys, words):
@@ -350,4 +350,4 @@ def test_an_unknown_split(opened, tmp_path, tiny):
     dataset = imported(tmp_path / "tree", folder)
     with pytest.raises(DatasetError, match="no split 'train'"):
         chosen_splits(dataset, "train")
-    assert command("export", folder, tmp_path / "out", "--parquet", "--split", "train") == 2
+    assert command("export", folder, "--out", tmp_path / "out", "--parquet", "--split", "train") == 2

@@ -31,6 +31,7 @@ SMALL = {"objects": ("cork",), "stored": "single_shot"}
 def build_arguments(folder, *more, workers=1):
     return [
         "build",
+        "--out",
         str(folder),
         "--size",
         str(TINY_SIZE),
@@ -250,7 +251,17 @@ def test_half_a_dataset_of_another_version_is_not_finished(half_built, monkeypat
 def test_finished_folder_is_left_alone_unless_a_shard_is_gone(half_built, uninterrupted, capsys):
     build(half_built, half_settings(), workers=1)
     stamps = {path: path.stat().st_mtime_ns for path in half_built.rglob("*") if path.is_file()}
-    arguments = ["build", str(half_built), "--size", str(TINY_SIZE), "--objects", "mug,cork", "--frames", "single_shot"]
+    arguments = [
+        "build",
+        "--out",
+        str(half_built),
+        "--size",
+        str(TINY_SIZE),
+        "--objects",
+        "mug,cork",
+        "--config",
+        "single_shot",
+    ]
     assert main(arguments) == 0
     assert "complete already" in capsys.readouterr().out
     assert {path: path.stat().st_mtime_ns for path in half_built.rglob("*") if path.is_file()} == stamps
@@ -311,7 +322,7 @@ def test_death_of_a_worker_is_an_error_that_says_so_and_the_rest_is_kept(tmp_pat
 
 def test_sigterm_to_a_build_in_processes_makes_no_noise(tmp_path, uninterrupted):
     folder = tmp_path / "set"
-    process = start(folder, "--objects", "cork,mug", "--frames", "single_shot", workers=2)
+    process = start(folder, "--objects", "cork,mug", "--config", "single_shot", workers=2)
     assert wait_for(lambda: list(folder.glob(".build/*.tmp")), process)
     os.killpg(process.pid, signal.SIGTERM)
     errors = process.communicate(timeout=60)[1]
@@ -336,7 +347,17 @@ def full_disk(tmp_path):
 
 
 def test_full_disk_is_refused_beforehand(full_disk, capsys):
-    arguments = ["build", str(full_disk / "set"), "--size", str(TINY_SIZE), "--objects", "cork", "--workers", "1"]
+    arguments = [
+        "build",
+        "--out",
+        str(full_disk / "set"),
+        "--size",
+        str(TINY_SIZE),
+        "--objects",
+        "cork",
+        "--workers",
+        "1",
+    ]
     assert main(arguments) == 2
     message = capsys.readouterr().err
     assert "GB free" in message and str(full_disk) in message
@@ -368,12 +389,13 @@ def test_files_that_can_not_grow(tmp_path, uninterrupted):
     arguments = [
         *COMMAND,
         "build",
+        "--out",
         str(folder),
         "--size",
         str(TINY_SIZE),
         "--objects",
         "cork,mug",
-        "--frames",
+        "--config",
         "single_shot",
         "--workers",
         "1",

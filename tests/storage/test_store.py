@@ -121,7 +121,7 @@ def test_pickles_by_path(opened):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda d: d.frame("mug_A61", 0), "no sample 'mug_A61'; similar names: mug_A"),
+        (lambda d: d.frame("mug_A61", 0), "no sample 'mug_A61'; did you mean 'mug_A"),
         (lambda d: d.frame("mug_A60", 52), "frame 52 is not stored"),
         (lambda d: d.frame("mug_A60", -1), "frame -1 is not stored"),
         (

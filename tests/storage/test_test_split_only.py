@@ -27,7 +27,7 @@ def unseen(tmp_path_factory):
 
 def test_it_is_intact_and_says_what_it_is(unseen, capsys):
     assert verify(unseen) == []
-    assert main(["info", str(unseen), "--json"]) == 0
+    assert main(["info", str(unseen), "--json", "-"]) == 0
     (split,) = json.loads(capsys.readouterr().out)["splits"]
     assert (split["split"], split["objects"], split["samples"]) == ("test", 2, 12)
     assert main(["info", str(unseen)]) == 0
@@ -54,7 +54,7 @@ def test_the_hub_libraries_own_readers_take_it(unseen):
 def test_a_method_runs_on_it_and_is_scored(unseen, tmp_path, capsys):
     predictions, result = tmp_path / "predictions", tmp_path / "result.json"
     assert main(["predict", "classical", str(unseen), "--out", str(predictions)]) == 0
-    command = [str(predictions), "--dataset", str(unseen), "--target", "depth_exact", "--json", str(result)]
+    command = [str(predictions), str(unseen), "--target", "depth_exact", "--json", str(result)]
     assert evaluate(command) == 0
     content = json.loads(result.read_text())
     assert len(content["per_sample"]) == 12

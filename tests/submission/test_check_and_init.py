@@ -41,7 +41,7 @@ def test_the_description_to_fill_in_names_every_key_and_each_is_valid(tmp_path):
 
 
 def test_a_sound_submission(predictions, dataset, capsys):
-    for arguments in ([], ["--dataset", str(dataset.path)]):
+    for arguments in ([], [str(dataset.path)]):
         assert main(["check", str(predictions), *arguments]) == 0
         captured = capsys.readouterr()
         assert "4 samples" in captured.out and "40x32 px" in captured.out and captured.err == ""
@@ -78,7 +78,7 @@ FAULTS = {
 def test_faults_are_named(case, with_dataset, predictions, dataset, capsys):
     change, message = FAULTS[case]
     change(predictions)
-    assert main(["check", str(predictions), *(["--dataset", str(dataset.path)] if with_dataset else [])]) == 1
+    assert main(["check", str(predictions), *([str(dataset.path)] if with_dataset else [])]) == 1
     captured = capsys.readouterr()
     assert message in captured.out and "Traceback" not in captured.err
 
@@ -87,7 +87,7 @@ def test_only_a_dataset_knows_names_and_frames(predictions, dataset, capsys):
     (predictions / "power_drill_A0.npy").rename(predictions / "mug_A0.npy")
     write_description(predictions, frames_used=[99])
     assert main(["check", str(predictions)]) == 0
-    assert main(["check", str(predictions), "--dataset", str(dataset.path)]) == 1
+    assert main(["check", str(predictions), str(dataset.path)]) == 1
     said = capsys.readouterr().out
     for part in ("power_drill_A0.npy: is missing", "a sample of split validation", "frames_used: expected indices"):
         assert part in said
@@ -110,4 +110,4 @@ def test_what_holds_no_predictions_is_an_error(name, tmp_path, capsys):
 def test_a_folder_of_that_name_is_scored_by_its_path(word, dataset, tmp_path, monkeypatch):
     write_predictions(tmp_path / word, dataset)
     monkeypatch.chdir(tmp_path)
-    assert main([f"./{word}", "--dataset", str(dataset.path)]) == 0
+    assert main([f"./{word}", str(dataset.path)]) == 0

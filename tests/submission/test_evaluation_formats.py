@@ -157,7 +157,7 @@ def test_every_form_gives_the_same_numbers(form, dataset, tmp_path):
     results = []
     for number, folder in enumerate((plain, converted)):
         path = tmp_path / f"{number}.json"
-        assert main([str(folder), "--dataset", str(dataset.path), "--json", str(path)]) == 0
+        assert main([str(folder), str(dataset.path), "--json", str(path)]) == 0
         results.append(json.loads(path.read_text()))
     plain_metrics, metrics = (result["metrics"] for result in results)
     for key, value in plain_metrics.items():
@@ -168,7 +168,7 @@ def test_every_form_gives_the_same_numbers(form, dataset, tmp_path):
 
 
 def refused(capsys, dataset, folder: Path, *arguments: str) -> str:
-    status = main([str(folder), "--dataset", str(dataset.path), *arguments])
+    status = main([str(folder), str(dataset.path), *arguments])
     captured = capsys.readouterr()
     assert status == 2 and captured.out == "" and "Traceback" not in captured.err, captured
     return captured.err

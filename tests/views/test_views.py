@@ -213,7 +213,7 @@ def fused(*arguments) -> int:
 
 def test_fuse_writes_a_cloud_without_the_wrong_order(spheres, predictions, tmp_path, capsys):
     out = tmp_path / "out"
-    assert fused(predictions, "--dataset", spheres, "--out", out) == 0
+    assert fused(predictions, spheres, "--out", out) == 0
     scores = json.loads((out / FUSION_FILE).read_text())["objects"]["power_drill"]
     assert scores["wrong_px"] == scores["found_px"] == 121
     assert scores["found_share"] == 1 and scores["false_share"] == 0
@@ -227,14 +227,14 @@ def test_fuse_writes_a_cloud_without_the_wrong_order(spheres, predictions, tmp_p
 
 
 def test_the_datasets_own_depth_has_no_wrong_orders(spheres, tmp_path, capsys):
-    assert fused("depth_exact", "--dataset", spheres, "--object", "power_drill", "--out", tmp_path / "out") == 0
+    assert fused("depth_exact", spheres, "--object", "power_drill", "--out", tmp_path / "out") == 0
     assert "wrong orders: 0 of" in capsys.readouterr().out
 
 
 def test_a_method_without_answers_has_an_empty_cloud(spheres, predictions, tmp_path, capsys):
     for path in predictions.glob("*.npy"):
         np.save(path, np.zeros((SIZE, SIZE), np.float32))
-    assert fused(predictions, "--dataset", spheres, "--out", tmp_path / "out") == 0
+    assert fused(predictions, spheres, "--out", tmp_path / "out") == 0
     scores = json.loads((tmp_path / "out" / FUSION_FILE).read_text())["objects"]["power_drill"]
     assert scores["all_covered_share"] == 0 and scores["all_accuracy_mm"] is None and scores["mae_mm"] is None
     assert "element vertex 0" in (tmp_path / "out/power_drill.ply").read_text()
@@ -289,7 +289,7 @@ def without_description(spheres, predictions, folder):
 )
 def test_refusals(prepare, message, spheres, predictions, tmp_path, capsys):
     given, dataset = prepare(spheres, predictions, tmp_path)
-    assert fused(given, "--dataset", dataset, "--out", tmp_path / "out") == 2
+    assert fused(given, dataset, "--out", tmp_path / "out") == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -305,7 +305,7 @@ def test_refusals(prepare, message, spheres, predictions, tmp_path, capsys):
     ],
 )
 def test_refused_options(options, message, spheres, predictions, tmp_path, capsys):
-    assert fused(predictions, "--dataset", spheres, "--out", tmp_path / "out", *options) == 2
+    assert fused(predictions, spheres, "--out", tmp_path / "out", *options) == 2
     assert message in capsys.readouterr().err
 
 
@@ -313,6 +313,6 @@ def test_units_of_a_submission_are_read(spheres, predictions, tmp_path):
     for path in predictions.glob("*.npy"):
         np.save(path, np.load(path) / 1000)
     write_description(predictions, units="m")
-    assert fused(predictions, "--dataset", spheres, "--out", tmp_path / "out") == 0
+    assert fused(predictions, spheres, "--out", tmp_path / "out") == 0
     scores = json.loads((tmp_path / "out" / FUSION_FILE).read_text())["objects"]["power_drill"]
     assert scores["found_px"] == 121 and scores["kept_mae_mm"] < 1e-3

@@ -7,8 +7,6 @@ less than about 80 mm in depth. Source: own shapes after the names of the YCB an
 scanned. The unseen ones are drawn at the size that they have in the scene.
 """
 
-import difflib
-
 import numpy as np
 import trimesh
 
@@ -16,6 +14,7 @@ from fpp_ml_bench.constants import MM_PER_M, UNSEEN
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.loaders.render.objects import containers, household, tools, unseen
 from fpp_ml_bench.loaders.render.objects.solids import Solid, on_grid
+from fpp_ml_bench.options import did_you_mean
 
 __all__ = ["ENLARGED", "object_mesh"]
 
@@ -84,9 +83,9 @@ def object_mesh(name: str) -> trimesh.Trimesh:
     at the origin. The turning axis is z; the camera of the first view looks along +x. Raises `MeshError` for an
     unknown name."""
     if name not in _SCALE:
-        near = difflib.get_close_matches(name, _SCALE, n=3, cutoff=0.4)
-        hint = f"did you mean {' or '.join(near)}?" if near else f"they are: {', '.join(_SCALE)}"
-        raise MeshError(f"expected one of the benchmark's {len(_SCALE)} objects, got {name!r}; {hint}")
+        raise MeshError(
+            f"expected one of the benchmark's {len(_SCALE)} objects, got {name!r}; {did_you_mean(name, _SCALE)}"
+        )
     drawn: Solid = _DRAWN[name]()
     solid = on_grid(drawn.scale((_SCALE[name],) * 3), FINAL_GRID_MM).as_original().simplify(SLIVER_MM)
     mesh = solid.to_mesh64()

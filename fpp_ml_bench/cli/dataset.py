@@ -1,0 +1,216 @@
+"""Commands that open a dataset: ``fpp-bench info``, ``show``, ``verify`` and ``export``."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from fpp_ml_bench import calibration, optics
+from fpp_ml_bench.cli import CHECK_FAILED
+from fpp_ml_bench.cli.console import gigabytes, millimetres, progress_bar, say_benchmark, show
+from fpp_ml_bench.cli.options import SPLITS, command
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.errors import BuildError, DatasetError
+from fpp_ml_bench.evaluation import result
+from fpp_ml_bench.loaders import published, render, storage
+from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.options import REQUIRED, argument, option
+from fpp_ml_bench.tables import Table
+
+
+@command("""\
+fpp-bench info data/mini
+fpp-bench info data/mini --json - | jq .splits
+""")
+def info(
+    *,
+    dataset: Path = argument("dataset folder", "DATASET"),
+    json: Path | None = option(None, "write all of it as JSON; - is standard output, without the table", "FILE"),
+) -> None:
+    """What a dataset holds: sizes, configurations, splits, rig, and how exact its ground truth is."""
+    opened = storage.DatasetFolder(dataset)
+    benchmark = storage.benchmark_of(opened.content)
+    statistics = storage.split_statistics(opened.manifest)
+    if json is not None:
+        content = {
+            "path": str(opened.path),
+            "fingerprint": opened.fingerprint,
+            "benchmark": None if benchmark is None else {"name": benchmark.name, "version": benchmark.version},
+            "origin": opened.manifest.origin,
+            "size": list(opened.size),
+            "configs": list(opened.configs),
+            "bytes": sum(file.bytes for file in opened.manifest.files),
+            "settings": opened.manifest.settings,
+            "rig": opened.manifest.rig,
+            "calibration_error": None if (error := _calibration_error(opened.manifest)) is None else error._asdict(),
+            "splits": statistics,
+            "all": storage.whole_statistics(opened.manifest),
+            "samples": opened.splits,
+        }
+        result.write_json(content, json)
+    manifest, rig = opened.manifest, opened.rig
+    groups: dict[str, int] = {}
+    for shard in manifest.shards:
+        groups[shard.group] = groups.get(shard.group, 0) + shard.bytes
+    near, far = rig.working_range_mm
+    long = ("objects", "user_meshes", render.PHOTOGRAPHED_BY)
+    built_with = {key: value for key, value in manifest.settings.items() if key not in long}
+    if isinstance(built_with.get("light"), dict):
+        built_with["light"] = built_with["light"].get("name")
+    generator = manifest.generator
+    height, width = opened.size
+    print(f"dataset         {opened.path}")
+    print(f"origin          {manifest.origin}, by {generator.get('name')} {generator.get('version')}")
+    print(f"fingerprint     {opened.fingerprint}")
+    print(f"benchmark       by its manifest: {storage.benchmark_sentence(manifest)[1]}")
+    print("                (fpp-bench verify reads the images)")
+    print(f"images          {height} x {width} px, {len(opened.sequence)} frames a sequence, stored: {manifest.stored}")
+    print(f"configurations  {', '.join(opened.configs)}")
+    print(f"on disk         {', '.join(f'{name} {gigabytes(size)}' for name, size in groups.items())}")
+    print(f"rig             baseline {MM_PER_M * rig.baseline_m:.1f} mm, range {near:g}-{far:g} mm")
+    if error := _calibration_error(manifest):
+        lengths = f"{error.rms_mm:.3f} mm RMS, {error.worst_mm:.3f} mm at most"
+        print(f"calibration     decoded with this rig, photographed by another; depths differ by {lengths}")
+    for line in _fringe_lines(rig):
+        print(line)
+    print(f"settings        {', '.join(f'{key} {value}' for key, value in built_with.items())}")
+    title = "lengths in mm, means over samples; ground-truth error: decoded - exact depth"
+    statistics = [*statistics, storage.whole_statistics(manifest)]
+    table = Table("", numbers=[split["split"] for split in statistics], title=title, elsewhere="--json FILE")
+    for row_title, cell in _ROWS:
+        table.add_row(row_title, *map(cell, statistics))
+    show(table)
+
+
+def _calibration_error(manifest: "storage.Manifest") -> "calibration.VolumeError | None":
+    """Depth error of the stated rig over the working range, where another rig photographed."""
+    photographed_by = manifest.settings.get(render.PHOTOGRAPHED_BY)
+    if photographed_by is None:
+        return None
+    return calibration.volume_error_mm(optics.rig_from_dict(manifest.rig), optics.rig_from_dict(photographed_by))
+
+
+def _fringe_lines(rig: "optics.Rig") -> list[str]:
+    """How the rig codes, and how the camera samples the fringes: the vertical ones where there are both."""
+    ways = rig.fringe_directions
+    if isinstance(rig.sequence, optics.Sequence):
+        coded = f"pitch {rig.pitch('horizontal'):g} / {rig.pitch('vertical'):g} px"
+    else:
+        crossed = [rig.crossed.title] if rig.crossed else []
+        coded = "; ".join([*crossed, *(f"{way} {rig.code(way).title}" for way in rig.directions)])
+    if not ways:
+        return [f"code            {coded}"]
+    periods = " / ".join(f"{rig.periods_in_range(way):.2f} {way}" for way in ways)
+    sampled = f"{rig.image_px_per_period(ways[-1]):.1f} image px a period at the standoff"
+    return [f"fringes         {coded}; periods in range {periods}", f"sampling        {sampled}"]
+
+
+def _share(value: float | None) -> str:
+    return "-" if value is None else f"{100 * value:.2f}%"
+
+
+_ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
+    ("objects, samples", lambda s: f"{s['objects']}, {s['samples']}"),
+    ("cover, mean", lambda s: _share(s["cover_mean"])),
+    ("cover, least-most", lambda s: f"{100 * s['cover_min']:.1f}-{100 * s['cover_max']:.1f}%"),
+    ("depth range, median", lambda s: f"{s['depth_range_median_mm']:.0f}"),
+    ("depth range, largest", lambda s: f"{s['depth_range_max_mm']:.0f}"),
+    ("ground-truth error, MAE", lambda s: millimetres(s["gt_mae_mm"])),
+    ("  RMSE", lambda s: millimetres(s["gt_rmse_mm"])),
+    ("  MAE inside (3 px from edges)", lambda s: millimetres(s["gt_interior_mae_mm"])),
+    ("  largest", lambda s: millimetres(s["gt_max_mm"])),
+    ("pixels without ground truth", lambda s: _share(s["undecoded_share"])),
+)
+
+
+@command("""\
+fpp-bench show data/mini power_drill_A60                 writes power_drill_A60.png
+fpp-bench show data/mini mug_A0 --out pictures/mug.png
+fpp-bench show data/full --sheet --out sheet.png         all 50 objects x 6 views
+""")
+def show_sample(
+    *,
+    dataset: Path = argument("dataset folder", "DATASET"),
+    sample: str | None = argument("sample such as power_drill_A60", "SAMPLE", None),
+    sheet: bool = option(False, "all objects and views on one sheet instead"),
+    split: str = option("all", "split that --sheet shows (default: all)", "SPLIT"),
+    out: Path | None = option(None, "picture to write (default: SAMPLE.png or sheet.png)", "FILE.png"),
+) -> None:
+    """One sample as a picture (frames, depth, error, mask, mesh), or a contact sheet of every object and view."""
+    if sheet == (sample is not None):
+        raise DatasetError("expected either a SAMPLE or --sheet; `fpp-bench info DATASET --json -` lists the samples")
+    picture = out or Path("sheet.png" if sheet else f"{sample}.png")
+    if picture.suffix.lower() != ".png":
+        raise DatasetError(f"--out {out}: expected a file ending in .png")
+    opened = storage.DatasetFolder(dataset)
+    from fpp_ml_bench.loaders.pictures import contact_sheet, sample_picture
+
+    if sample is None:
+        contact_sheet(opened, split, picture)
+    else:
+        opened.split_of_sample(sample)
+        sample_picture(opened, sample, picture)
+    print(picture)
+
+
+@command("""\
+fpp-bench verify data/mini
+fpp-bench verify data/mini && echo safe to train on
+""")
+def verify(
+    *,
+    dataset: Path = argument("dataset folder", "DATASET"),
+) -> int | None:
+    """Prove a dataset intact: checksums, files, labels, split leaks, duplicated images; and name its benchmark."""
+    manifest = storage.read_manifest(dataset)
+    files = manifest.files
+    with progress_bar("verifying", len(files), "files") as advance:
+        findings = storage.verify(dataset, advance)
+    for finding in findings:
+        print(finding)
+    size = gigabytes(sum(file.bytes for file in files))
+    samples = sum(len(rows) for rows in manifest.samples.values())
+    if findings:
+        print(f"{dataset}: {len(findings)} finding(s) in {len(files)} files, {size}")
+        return CHECK_FAILED
+    print(f"{dataset}: intact; {len(files)} files, {size}, {samples} samples, no object or image in two splits")
+    print(f"fingerprint {manifest.fingerprint}")
+    say_benchmark(manifest)
+    return None
+
+
+@command("""\
+fpp-bench export data/mini --out hub --parquet              plain load_dataset opens every configuration
+fpp-bench export data/mini --out tree --mat                 the published layout; fpp-bench import reads it back
+fpp-bench export data/mini --out out --meshes --patterns    several forms: out/meshes and out/patterns
+fpp-bench export data/mini --out test --parquet --split test
+""")
+def export(
+    *,
+    dataset: Path = argument("folder of the dataset", "DATASET"),
+    out: Path = option(REQUIRED, "new or empty folder; written completely or not at all", "DIR"),
+    parquet: bool = option(False, "Parquet and a card, ready for the Hugging Face Hub"),
+    mat: bool = option(False, "the published tree: PNG fringes, .mat depth, raw scans"),
+    meshes: bool = option(False, "the objects' meshes as PLY (metres)"),
+    patterns: bool = option(False, "the projected patterns as PNG"),
+    split: str = option("all", "samples to export (default: all)", choices=SPLITS),
+) -> None:
+    """Write a dataset as Parquet, as the published .mat tree, or its meshes and patterns.
+
+    Raises FppBenchError for an unusable dataset, form or folder."""
+    asked = {"parquet": parquet, "mat": mat, "meshes": meshes, "patterns": patterns}
+    forms = [form for form in published.FORMS if asked[form]]
+    if not forms:
+        raise BuildError("nothing to export: give at least one of --parquet, --mat, --meshes, --patterns")
+    opened = storage.DatasetFolder(dataset)
+    splits = published.chosen_splits(opened, split)
+    samples = sum(len(opened.samples(part)) for part in splits)
+    steps = samples * sum(form in published.SAMPLE_FORMS for form in forms)
+    with progress_bar("exporting", steps, "samples") as advance:
+        published.export(opened, out, forms, splits, usable_cores(), advance)
+    files = [path for path in out.rglob("*") if path.is_file()]
+    size = gigabytes(sum(path.stat().st_size for path in files))
+    print(f"{out}: {', '.join(forms)} of {samples} samples, {len(files):,} files, {size}")
+    if "mat" in forms:
+        scans = "with raw scans" if "all" in opened.configs else "without raw scans: not all frames are stored"
+        exact = "; depth_exact has no place in the published layout" if opened.has_exact else ""
+        print(f"  published layout {scans}{exact}")

@@ -1,0 +1,277 @@
+"""Commands made of functions and dataclasses: what the command line gives, what it refuses, and methods of a user."""
+
+import json
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+import yaml
+from scored_dataset import make_dataset, write_description, write_predictions
+
+from fpp_ml_bench.cli import COMMANDS, main, run_command
+from fpp_ml_bench.cli.evaluate import main as fpp_eval
+from fpp_ml_bench.cli.options import WORKING_RANGE, command, command_line, given, names, value
+from fpp_ml_bench.options import REQUIRED, argument, described, did_you_mean, flag_of, option, options_of
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lens:
+    """Settings in a section of their own."""
+
+    HEADING = "lens"
+    focal: float = option(8.0, "focal length", "MM")
+    kind: str = option("wide", "kind of lens", choices=("wide", "tele"))
+    sharp: bool = option(True, "use a dull one", flag="--dull")
+
+
+@command("fpp-bench shoot mug --out x\n")
+def shoot(
+    *,
+    subject: str = argument("what to shoot", "SUBJECT"),
+    frames: tuple[int, ...] = argument("frame numbers", "N", (), many=True),
+    out: Path = option(REQUIRED, "where to", "DIR"),
+    count: int = option(2, "how many", "N"),
+    near: "tuple[float, float] | None" = option(None, "range", "NEAR,FAR", parse=WORKING_RANGE),
+    mesh: tuple[Path, ...] = option((), "meshes", "FILE", parse=Path, many=True),
+    json: Path | None = option(None, "write it here", "FILE"),
+    lens: Lens,
+) -> None:
+    """Shoot a picture.
+
+    What the help leaves out."""
+    found = {"subject": subject, "frames": frames, "out": str(out), "count": count, "near": near}
+    found |= {"mesh": [str(path) for path in mesh], "focal": lens.focal, "kind": lens.kind, "sharp": lens.sharp}
+    if json is not None:
+        json.write_text(globals()["json"].dumps(found))
+    print(found, given(lens, Lens), command_line(without=("count",), more=("--again",)))
+
+
+def shot(capsys, words):
+    status = run_command(shoot, "fpp-bench shoot", words.split())
+    captured = capsys.readouterr()
+    return status, captured.out if status == 0 else captured.err
+
+
+def test_a_command_gets_what_the_line_says_and_defaults_of_its_fields(capsys):
+    status, out = shot(capsys, "mug --out here")
+    assert status == 0 and "'frames': ()" in out and "'count': 2, 'near': None, 'mesh': []" in out
+    assert "'focal': 8.0, 'kind': 'wide', 'sharp': True} [] fpp-bench shoot mug --out here --again" in out
+    words = "mug 3 4 --mesh a.ply --mesh b.ply --near 1,2.5 --count 7 --out=here --focal 4 --dull --kind tele"
+    status, out = shot(capsys, words)
+    assert status == 0 and "'frames': (3, 4)" in out and "'near': (1.0, 2.5), 'mesh': ['a.ply', 'b.ply']" in out
+    assert "'focal': 4.0, 'kind': 'tele', 'sharp': False} ['--focal', '--kind', '--dull']" in out
+    again = "fpp-bench shoot mug 3 4 --out here --near 1,2.5 --mesh a.ply --mesh b.ply --focal 4 --kind tele --dull"
+    assert f"{again} --again" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--out here", "SUBJECT is missing: what to shoot"),
+        ("mug", "--out DIR is missing: where to"),
+        ("mug --out", "'--out' requires an argument"),
+        ("mug --out --dull", "--out: expected a value behind it, got the option --dull"),
+        ("mug --out here --conut 3", "unknown option '--conut'; did you mean '--count'?"),
+        ("mug --out here --xyz", "unknown option '--xyz'; there are --out, --count"),
+        ("mug --out here --coun 3", "did you mean '--count'"),
+        ("mug --out here --count 1.5", "--count 1.5: expected a whole number"),
+        ("mug --out here --focal far", "--focal far: expected a number"),
+        ("mug --out here --kind tle", "--kind tle: did you mean 'tele'?"),
+        ("mug --out here --kind macro", "--kind macro: there are wide, tele"),
+        ("mug --out here --near 5,4", "--near 5,4: expected NEAR,FAR in mm such as 350,450"),
+        ("mug x --out here", "N x: expected a whole number"),
+        ("mug --out here --dull=1", "does not take a value"),
+    ],
+)
+def test_what_a_line_can_not_mean_is_refused(capsys, words, message):
+    status, error = shot(capsys, words)
+    assert status == 2 and error.startswith("fpp-bench shoot: error: ") and message in error, error
+
+
+def test_help_lists_arguments_options_and_sections(capsys):
+    status, out = shot(capsys, "--help")
+    assert status == 0 and out.startswith(
+        "usage: fpp-bench shoot [options] SUBJECT [N ...] --out DIR\n\nShoot a picture.\n"
+    )
+    assert "leaves out" not in out and out.endswith("examples:\n  fpp-bench shoot mug --out x\n")
+    assert "\nlens:\n  --focal MM" in out and "--kind wide|tele" in out and "--near NEAR,FAR" in out
+
+
+def test_json_on_standard_output_stands_alone(tmp_path, capsys):
+    status, out = shot(capsys, "mug --out here --json -")
+    assert status == 0 and json.loads(out)["subject"] == "mug"
+    assert shot(capsys, f"mug --out here --json {tmp_path / 'a.json'}")[1].startswith("{'subject'")
+    assert (tmp_path / "a.json").read_text() == out
+
+
+def test_fields_describe_themselves():
+    focal, kind, sharp = options_of(Lens)
+    assert [flag_of(entry) for entry in options_of(Lens)] == ["--focal", "--kind", "--dull"]
+    assert described(kind).choices == ("wide", "tele") and described(focal).metavar == "MM" and sharp.default
+    assert options_of(None) == []
+    assert names(" a, b,,c ") == ("a", "b", "c")
+    with pytest.raises(ValueError, match="expected an even number"):
+        value("an even number", int, lambda number: number % 2 == 0)("3")
+    assert did_you_mean("x", [f"name {number}" for number in range(200)]).endswith("name 79, ...")
+
+
+@pytest.mark.parametrize("name", sorted({"build", "predict", "time", "train", "stability", "leaderboard", "tradeoff"}))
+def test_almost_right_names_of_options_are_named(name, capsys):
+    assert name in COMMANDS and main([name, "--halp"]) == 2
+    assert "unknown option '--halp'; did you mean '--help'?" in capsys.readouterr().err
+
+
+# ---- methods of a user
+
+MINE = """
+from dataclasses import dataclass
+import numpy as np
+from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.options import option
+
+@dataclass(frozen=True)
+class Settings:
+    lit: int = option(60, "grey level above which a pixel is lit", "GREY")
+    steps: bool = option(False, "fail")
+
+class Mine(Method):
+    name, title, frames_used, purpose = "mine", "Everything lit is 1.5 m away", (0,), "everything lit"
+    Options = Settings
+
+    def predict(self, frames):
+        if self.options.steps:
+            raise KeyError("a fault of mine")
+        return np.where(frames[0] > self.options.lit, np.float32(1500), np.float32(0))
+
+class Clashing(Mine):
+    @dataclass(frozen=True)
+    class Options:
+        split: int = option(1, "a name that is taken")
+"""
+
+
+@pytest.fixture
+def mine(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text(MINE)
+
+
+def test_options_of_a_method_in_a_file_are_options_of_the_command(mine, tiny, capsys):
+    assert main(["predict", "mine.py:Mine", str(tiny), "--out", "bright", "--lit", "200"]) == 0
+    settings = yaml.safe_load(Path("bright/submission.yaml").read_text())["settings"]
+    assert settings == {"lit": 200, "steps": False}
+    assert main(["predict", "mine.py:Mine", "--help"]) == 0
+    out = capsys.readouterr().out
+    assert "mine (everything lit):\n  --lit GREY  grey level above which a pixel is lit" in out and "classical (" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["mine.py:Mine", "--steps"], "a method of yours failed"),
+        (["mine.py:Mine", "--lit", "dark"], "--lit dark: expected a whole number"),
+        (
+            ["mine.py:Mine", "--frames", "3"],
+            "--frames is an option of phase, crossed, not of mine.py:Mine; leave it out",
+        ),
+        (["mine.py:Clashing"], "its option --split is one of fpp-bench predict; give it another flag"),
+        (["mine.py:Min"], "did you mean 'Mine'"),
+        (["phase", "--lit", "3"], "unknown option '--lit'"),
+        (["phase", "--direction", "both"], "--direction both: there are horizontal, vertical"),
+        (["phase", "--direction", "vertcal"], "--direction vertcal: did you mean 'vertical'"),
+        (["phase", "--steps", "3"], "--steps is an option of classical, classical-net, not of phase; leave it out"),
+        (["phase", "--frames", "3", "--error-mm", "1"], "--frames and --error-mm: give one of them"),
+        (["phas"], "unknown method 'phas'; did you mean 'phase'"),
+    ],
+)
+def test_options_of_another_method_are_refused(mine, tiny, capsys, words, message):
+    assert main(["predict", words[0], str(tiny), "--out", "out", *words[1:]]) == 2
+    error = capsys.readouterr().err
+    assert message in error and "Traceback" not in error
+
+
+# ---- scoring without naming the dataset
+
+
+@pytest.fixture
+def predicted(tiny, tmp_path, monkeypatch):
+    """A copy of a dataset, and predictions of it, in the current folder."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(tiny, "data")
+    assert main(["predict", "constant", "data", "--split", "validation", "--out", "predictions"]) == 0
+
+
+def score(*words):
+    status = fpp_eval(["predictions", *words, "--json", "result.json"])
+    return status, json.loads(Path("result.json").read_text()) if status == 0 else None
+
+
+def test_predictions_say_what_was_predicted(predicted, tmp_path, monkeypatch):
+    block = yaml.safe_load(Path("predictions/submission.yaml").read_text())["predicted"]
+    assert block["dataset"] == str(tmp_path / "data") and block["split"] == "validation"
+    assert {"validation/frame_00", "validation/depth", "validation/flags"} <= set(block["content"])
+    status, result = score()
+    assert status == 0 and result["dataset"]["split"] == "validation" and "predicted" not in result["submission"]
+    assert result["metrics"] == score("data", "--split", "validation")[1]["metrics"]
+    assert score("data")[1]["dataset"]["split"] == "validation"
+    assert score("--split", "test")[0] == 2  # those were not predicted
+    monkeypatch.chdir("/")
+    assert fpp_eval([str(tmp_path / "predictions")]) == 0
+
+
+def test_a_dataset_that_was_moved_is_asked_for(predicted, capsys):
+    Path("data").rename("elsewhere")
+    assert score()[0] == 2
+    error = capsys.readouterr().err
+    assert (
+        "data: no such folder" in error
+        and "if the data was moved, give the dataset: fpp-eval predictions DATASET" in error
+    )
+    assert score("elsewhere")[0] == 0
+
+
+def test_a_dataset_that_was_changed_is_refused(predicted, capsys):
+    shutil.rmtree("data")
+    words = ["--objects", "mug,cork,bowl,power_drill", "--size", "176", "--seed", "1", "--workers", "1"]
+    assert main(["build", "--out", "data", *words]) == 0
+    assert score()[0] == 2
+    error = capsys.readouterr().err
+    assert "is not what predictions was predicted from, validation/frame_00 is another now" in error
+    assert "give the dataset: fpp-eval predictions DATASET, or predict again" in error
+
+
+def test_a_description_by_hand_needs_the_dataset(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    dataset = make_dataset(tmp_path / "data")
+    write_predictions(tmp_path / "predictions", dataset)
+    assert score()[0] == 2
+    assert (
+        "does not say (predicted:) what was predicted; give the dataset: fpp-eval predictions DATASET"
+        in capsys.readouterr().err
+    )
+    assert score("data")[0] == 0
+    for block in ("text", {"dataset": 3}, {"dataset": "data", "split": "test"}):
+        write_description(tmp_path / "predictions", predicted=block)
+        assert score()[0] == 2 and score("data")[0] == 2  # the second is refused with the description
+    Path("predictions/submission.yaml").unlink()
+    assert score()[0] == 2
+    assert "give the dataset" in capsys.readouterr().err
+
+
+def test_a_slip_in_the_name_of_a_command_is_no_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert fpp_eval(["chek", "predictions"]) == 2
+    assert "unknown command 'chek'; did you mean 'check'?" in capsys.readouterr().err
+    Path("chek").mkdir()
+    assert fpp_eval(["chek", "data"]) == 2
+    assert "can't be scored" not in (error := capsys.readouterr().err) and "unknown command" not in error
+
+
+def test_click_is_told_to_take_no_defaults_from_the_environment(monkeypatch):
+    monkeypatch.setenv("FPP_BENCH_SHOOT_COUNT", "9")
+    context = shoot.make_context("x", ["mug", "--out", "here"])
+    assert shoot.values(context)["count"] == 2 and isinstance(context, click.Context)
+    assert np.isfinite(shoot.values(context)["lens"].focal)
