@@ -8,6 +8,7 @@ An installed package offers methods by the entry point group `GROUP`:
 """
 
 import inspect
+import pickle
 import sys
 import traceback
 from functools import cache
@@ -64,7 +65,10 @@ def find(name: str | Path) -> Found:
     `PredictionError`, for an unknown name with what it might have meant."""
     text = str(name)
     if FILE_MARK in text:
-        return Found(_checked(load_from_file(text), text), {})
+        method = _checked(load_from_file(text), text)
+        path, _, attribute = text.rpartition(":")
+        _let_workers_have(method, f"{Path(path).resolve()}:{attribute}")
+        return Found(method, {})
     known = methods()
     if text in known:
         return Found(known[text], {})
@@ -121,6 +125,24 @@ def failure_in_file(error: BaseException) -> str | None:
     return f"{own[-1].filename}, line {own[-1].lineno}, in {own[-1].name}: {_cause(error)}" if own else None
 
 
+def _let_workers_have(method: type[Method], place: str) -> None:
+    """Instances of a class of a file go to other processes with its ``place``, for its module can't be imported there
+    by name."""
+
+    def reduced(self: Method, protocol: object) -> tuple[Any, ...]:
+        return _of_file, (place, pickle.dumps(vars(self)))
+
+    method.__reduce_ex__ = reduced  # type: ignore[assignment]
+
+
+def _of_file(place: str, state: bytes) -> Method:
+    """The instance that `_let_workers_have` sent."""
+    method = find(place).method
+    instance = method.__new__(method)
+    vars(instance).update(pickle.loads(state))  # of the parent process
+    return instance
+
+
 _FILES: set[Path] = set()
 """The files that were executed."""
 
@@ -141,8 +163,10 @@ def _module_of(path: Path) -> Any:
         spec.loader.exec_module(module)
     except FppBenchError:
         raise
-    except Exception as error:
-        raise PredictionError(f"can't be executed: {failure_in_file(error) or f'{path}: {_cause(error)}'}") from error
+    except (Exception, SystemExit) as error:  # the user's code can raise anything
+        own = [frame for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        line = f" (line {own[-1].lineno})" if own else ""
+        raise PredictionError(f"{path}: importing it failed: {_cause(error)}{line}") from error
     finally:
         sys.path.remove(str(path.parent))
     return module

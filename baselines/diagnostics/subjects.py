@@ -1,9 +1,7 @@
 """The model under diagnosis: shipped weights, a weights file, a method without a network, or a user's torch module."""
 
 import hashlib
-import importlib.util
 import json
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
@@ -19,10 +17,10 @@ from torch import Tensor, nn
 from fpp_ml_bench.baselines.diagnostics.probe import spread
 from fpp_ml_bench.baselines.method import Frames, Method
 from fpp_ml_bench.baselines.networks import NetworkMethod, build, fringe_batch, load
-from fpp_ml_bench.baselines.registry import load_method, methods
+from fpp_ml_bench.baselines.registry import FILE_MARK, load_from_file, load_method, methods
 from fpp_ml_bench.baselines.training import shipped_names, weights_path
 from fpp_ml_bench.depth import Normalisation, denormalise, object_mask
-from fpp_ml_bench.errors import DiagnosisError, FppBenchError, WeightsError
+from fpp_ml_bench.errors import DiagnosisError, FppBenchError, PredictionError, WeightsError
 from fpp_ml_bench.evaluation.protocol import Units
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.storage import DatasetFolder
@@ -30,7 +28,6 @@ from fpp_ml_bench.optics import Direction
 
 OutputUnits = Literal["mm", "m", "normalised"]
 NORMALISATION_OF: dict[str, Normalisation] = {"mm": "raw", "m": "global", "normalised": "individual"}
-FACTORY_MARK = ".py:"
 BATCH = 8
 PIXELS_AT_ONCE = BATCH * 224 * 224  # most images in a batch, and most pixels: at 960 px a batch is one image
 NORMALISED_BACKGROUND = 0.1
@@ -179,18 +176,20 @@ def subject(
     options: Mapping[str, Any] = MappingProxyType({}),
 ) -> Subject:
     """The model called ``name``, ready to be diagnosed on ``dataset``. ``name``: a method of
-    `fpp_ml_bench.baselines.registry.methods`, shipped weights, a ``.safetensors`` file, or ``file.py:factory``, where
+    `fpp_ml_bench.baselines.registry`, shipped weights, a ``.safetensors`` file, or ``file.py:factory``, where
     ``factory()`` returns a torch module that maps fringes (B, 1, H, W) in [0, 1] to depth (B, 1, H, W) in ``units``
     (default: normalised). ``layers``: names of the layers to probe, by default the network's ``probe_layers``, or every
     child of a module without them. ``frame``: number of the network's input frame, by default the first that it was
     trained on. ``threads``: torch threads of the process. ``options``: those of a method.
     Raises `DiagnosisError` for a name, layer or module that
     can't be used, and other `FppBenchError` of the model."""
-    if FACTORY_MARK in name:
-        return _subject_of_factory(name, dataset, layers, units or "normalised", frame or 0, threads)
+    made = _of_file(name) if FILE_MARK in name else None
+    is_method = name in methods() or (isinstance(made, type) and issubclass(made, Method))
+    if made is not None and not is_method:
+        return _subject_of_factory(name, made, dataset, layers, units or "normalised", frame or 0, threads)
     if units is not None:
         raise DiagnosisError(f"{name}: its units are known; set units only for your own module, file.py:factory")
-    if name not in methods():
+    if not is_method:
         return _subject_of_weights(name, dataset, layers, frame, threads)
     if given := [option for option, value in (("layers", layers), ("frame", frame)) if value is not None]:
         raise DiagnosisError(f"{name} is a method without a network, so it has no {given[0]}; leave it out")
@@ -265,17 +264,34 @@ def _direction_of(dataset: DatasetFolder, frames: Sequence[int]) -> Direction | 
     return "both" if first is None or others else first
 
 
+def _of_file(name: str) -> Any:
+    """What ``file.py:name`` means: a class of methods or something that makes a torch module. The file is executed."""
+    try:
+        made = load_from_file(name)
+    except PredictionError as error:
+        raise DiagnosisError(str(error)) from error
+    if not callable(made):
+        raise DiagnosisError(f"{name}: expected a method or a function, got {type(made).__name__}")
+    return made
+
+
 def _subject_of_factory(
-    name: str, dataset: DatasetFolder, layers: Sequence[str] | None, units: OutputUnits, frame: int, threads: int
+    name: str,
+    factory: Any,
+    dataset: DatasetFolder,
+    layers: Sequence[str] | None,
+    units: OutputUnits,
+    frame: int,
+    threads: int,
 ) -> Subject:
-    """The module that ``file.py:factory`` makes, as a subject. The file is the user's own code and is executed, and the
-    module is run on a sample, so that misfits show early."""
+    """The module that ``factory`` of ``file.py:factory`` makes, as a subject. It is run on a sample, so that misfits
+    show early."""
     if units not in NORMALISATION_OF:
         raise DiagnosisError(f"unknown units {units!r}; there are {', '.join(NORMALISATION_OF)}")
     if not 0 <= frame < len(dataset.sequence):
         raise DiagnosisError(f"frame {frame}: expected 0 to {len(dataset.sequence) - 1}, the frames of the sequence")
     torch.set_num_threads(threads)
-    path, factory = _factory(name)
+    path = Path(name.rpartition(":")[0])
     network = _build_network(name, factory)
     normalisation = NORMALISATION_OF[units]
 
@@ -336,32 +352,6 @@ def _layers(network: nn.Module, every: bool) -> dict[str, nn.Module]:
         return own
     named = {name: module for name, module in network.named_modules() if name}
     return {**named, **(own or {})} if every else dict(network.named_children())
-
-
-def _factory(name: str) -> tuple[Path, Any]:
-    file, _, attribute = name.rpartition(":")
-    path = Path(file)
-    if not path.is_file():
-        raise DiagnosisError(f"{file}: no such file; expected path/to/file{FACTORY_MARK}factory")
-    spec = importlib.util.spec_from_file_location(f"fpp_bench_user_{path.stem}", path)
-    if spec is None or spec.loader is None:
-        raise DiagnosisError(f"{file}: can't be imported as Python")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    sys.path.insert(0, str(path.parent.resolve()))  # for imports from its own folder
-    try:
-        spec.loader.exec_module(module)
-    except FppBenchError:
-        raise
-    except (Exception, SystemExit) as error:  # the user's code can raise anything
-        raise DiagnosisError(f"{file}: importing it failed: {_error_text(error)}") from error
-    finally:
-        sys.path.remove(str(path.parent.resolve()))
-    factory = getattr(module, attribute, None)
-    if not callable(factory):
-        names = ", ".join(key for key, value in vars(module).items() if callable(value) and not key.startswith("_"))
-        raise DiagnosisError(f"{file}: holds no function {attribute!r}; there are {names or 'none'}")
-    return path, factory
 
 
 def _build_network(name: str, factory: Any) -> nn.Module:

@@ -42,8 +42,8 @@ fpp-bench diagnose my_net.py:make data/cpu224 --units mm --layers encoder,decode
 def diagnose(
     *,
     model: str = argument(
-        "weights that come with the package, a .safetensors file, a method (classical, phase, ...), or your own torch "
-        "module as file.py:factory; that file is executed",
+        "weights that come with the package, a .safetensors file, one of the methods below, or your own method or "
+        "torch module as file.py:Class or file.py:factory; that file is executed",
         "MODEL",
     ),
     dataset: Path = argument("dataset folder, of the model's image size", "DATASET"),

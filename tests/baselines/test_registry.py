@@ -11,7 +11,7 @@ from fpp_ml_bench.baselines import registry
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.optics import paper_rig
-from fpp_ml_bench.options import described
+from fpp_ml_bench.options import described, options_of
 
 RIG = paper_rig(224)
 MINE = """
@@ -55,7 +55,8 @@ def test_a_method_of_a_file_with_its_options(mine):
     assert (method.predict([frame]) == 900).all()
     found = registry.find(f"{mine}:Mine")
     assert found is not registry.find(f"{mine}:Mine") and found.method is registry.find(f"{mine}:Mine").method
-    assert described(found.method.Options)["depth"].metavar == "MM"
+    (depth,) = options_of(found.method.Options)
+    assert (depth.name, described(depth).metavar) == ("depth", "MM")
     with pytest.raises(PredictionError, match=r"mine: has no option dept; did you mean 'depth'\?"):
         registry.load_method(f"{mine}:Mine", RIG, dept=1.0)
 
@@ -67,7 +68,7 @@ def test_a_method_of_a_file_with_its_options(mine):
         ("mine.py:Half", "does not define predict"),
         ("mine.py:here", "expected a subclass of fpp_ml_bench.Method, got int"),
         ("none.py:Mine", "none.py: no such file"),
-        ("broken.py:Mine", r"broken.py, line 1, in <module>: ZeroDivisionError"),
+        ("broken.py:Mine", r"broken.py: importing it failed: ZeroDivisionError: division by zero \(line 1\)"),
         ("spaces.py:Mine", "its name is 'a b'; expected text without spaces"),
     ],
 )
@@ -137,6 +138,5 @@ def test_a_method_says_what_it_needs_to(method):
     """One line for ``--help``, and help for each option; no option that its class does not take."""
     assert method.purpose and method.name
     for options in filter(None, (method.Options, method.Training)):
-        for name, description in described(options).items():
-            assert description.help and name in options.__dataclass_fields__
+        assert all(described(entry).help for entry in options_of(options))
     assert all(set(options) <= set(method.Options.__dataclass_fields__) for options in method.variants(RIG))

@@ -172,7 +172,7 @@ def test_layers_that_are_constant_get_a_sentence_though_the_network_predicts(tin
         ("MINE:make", ("--layers", "encodr"), "has no layer 'encodr'; there are encoder"),
         ("MINE:make", ("--layers", "unused", "--probe", "linear"), "'unused' takes no part in a forward pass"),
         ("MINE:make", ("--frame", "99"), "expected 0 to 51"),
-        ("MINE:nothing", (), "holds no function 'nothing'"),
+        ("MINE:nothing", (), "has no 'nothing'"),
         ("MINE:shape", (), "expected an output of shape (1, 1, 176, 176), one depth per pixel, got (1, 1, 88, 176)"),
         ("MINE:nan", (), "30976 of 30976 values of its output are NaN"),
         ("MINE:several", (), "got tuple"),
