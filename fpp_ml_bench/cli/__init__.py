@@ -168,13 +168,16 @@ Exit status: 0 done, 1 a check failed, 2 bad input or failed, 130 stopped (143 b
 def run_command(command: click.Command, prog: str, argv: Sequence[str]) -> int:
     """Parse ``argv`` and run the command. An error of this package, an unreadable file, a full disk, Ctrl-C or SIGTERM
     becomes a message and a status; where nobody reads the output any more, there is a status alone."""
+    return _guarded(prog, partial(_parsed_and_run, lambda: command, prog, argv))
 
-    def parsed_and_run() -> int:
-        with command.make_context(prog, list(argv)) as ctx:
-            status: int = command.invoke(ctx)
-            return status
 
-    return _guarded(prog, parsed_and_run)
+def _parsed_and_run(command: Callable[[], Any], prog: str, argv: Sequence[str]) -> int:
+    found = command()
+    if isinstance(found, Program):
+        return run_program(found, argv)
+    with found.make_context(prog, list(argv)) as ctx:
+        status: int = found.invoke(ctx)
+        return status
 
 
 def _guarded(prog: str, action: Callable[[], int]) -> int:
@@ -281,14 +284,13 @@ def run_program(program: Program, argv: Sequence[str] | None = None) -> int:
         if first in (*ONE_THREAD, "diagnose"):  # before the command's module loads NumPy
             told = re.search(r"--threads[ =](\d+)", " ".join(words))
             limit_threads(int(told[1]) if told else 1 if first in ONE_THREAD else usable_cores())
-        command = program.command(first)
-        if isinstance(command, Program):
-            return run_program(command, words[1:])
-        return run_command(command, f"{program.name} {first}", words[1:])
+        name = f"{program.name} {first}"
+        return _guarded(name, partial(_parsed_and_run, partial(program.command, first), name, words[1:]))
     # A folder of predictions has any name; one that is not there and almost that of a command is a slip.
     slip = nearest(first, program.commands) and not Path(first).exists()
     if program.default and first not in ("--help", "-h", "--version") and not slip:
-        return run_command(program.command(program.default), program.name, words)
+        load = partial(program.command, program.default)
+        return _guarded(program.name, partial(_parsed_and_run, load, program.name, words))
     return _guarded(program.name, partial(_without_command, program, words))
 
 

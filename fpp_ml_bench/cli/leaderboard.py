@@ -8,10 +8,12 @@ from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation import result
-from fpp_ml_bench.evaluation.metrics import RANK_KEY, sort_keys
+from fpp_ml_bench.evaluation.metrics import METRICS, RANK_KEY, sort_keys
 from fpp_ml_bench.leaderboard import page
 from fpp_ml_bench.options import argument, option
 
+_SORTED = tuple(dict.fromkeys((*METRICS, *sort_keys())))
+"""Also those that the ranking refuses, since a method could lead by answering few pixels."""
 _TABLES = ("normalization", "background_removed", "multi_frame", "loss", "architecture", "oracle_order", "all", "none")
 
 
@@ -36,7 +38,7 @@ def rank(
         many=True,
     ),
     sort: str = option(
-        RANK_KEY, f"what to rank by (default: {RANK_KEY}): {', '.join(sort_keys())}", "KEY", choices=sort_keys()
+        RANK_KEY, f"what to rank by (default: {RANK_KEY}): {', '.join(sort_keys())}", "KEY", choices=_SORTED
     ),
     markdown: Path | None = option(None, "also write the tables as Markdown", "FILE"),
     json: Path | None = option(

@@ -13,7 +13,6 @@ from fpp_ml_bench.cli.methods import MethodCommand, OfMethods
 from fpp_ml_bench.cli.options import MINUTES, command, command_line
 from fpp_ml_bench.errors import RecipeError, TrainingError
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.leaderboard import reproduced
 from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, read_entry
 from fpp_ml_bench.options import REQUIRED, argument, did_you_mean, nearest, option
 from fpp_ml_bench.tables import Table
@@ -151,6 +150,7 @@ def reproduce_tables(
         return OK
     if table is None:
         raise RecipeError(f"expected a table: {', '.join(TABLES)} or {ALL}; --list shows their rows")
+    from fpp_ml_bench.leaderboard import reproduced  # imports torch, which --help and --list do without
 
     def report(line: str) -> None:  # with the time, where the engine's progress is too
         print(f"{datetime.now():%H:%M:%S} {line}", file=sys.stderr, flush=True)
@@ -172,7 +172,7 @@ def reproduce_tables(
     return OK
 
 
-def _list(tables: tuple[str, ...], folders: reproduce.Folders) -> None:
+def _list(tables: tuple[str, ...], folders: "reproduce.Folders") -> None:
     jobs = reproduce.planned(tables, folders.preset)
     titles = "Row", "Training", "State", "Rows written", "Published: object MAE"
     first_out = "Rows written", "Published: object MAE", "Training"

@@ -111,7 +111,7 @@ def test_a_module_of_the_users_is_diagnosed_and_nothing_is_run_twice(tiny, modul
     page = (out / "index.html").read_text()
     assert page.count("data:image/png;base64,") == 4 and "encoder" in page
     assert not re.search(r'(?:src|href)="(?!data:|#)', page)
-    assert "fpp-bench diagnose" in page and "--layers encoder decoder" in page
+    assert "fpp-bench diagnose" in page and "--layers encoder,decoder" in page
 
     def never(*args):
         raise AssertionError("run again")

@@ -120,7 +120,7 @@ def test_results_of_the_current_folder_are_read(make, capsys):
 
 def test_new_user_is_told_what_to_do(capsys):
     out = board(capsys)
-    assert "No results here yet" in out and "fpp-eval predictions --dataset" in out
+    assert "No results here yet" in out and "fpp-eval predictions data/mini --split test" in out
     assert "Reported by others on other data (not measured here)" in out and "TransUNet" in out
     assert "oracle range: told the test sample's depth range." in out
 
@@ -302,7 +302,7 @@ def test_named_results_are_shown_without_tables_of_others(make, capsys):
     out = board(capsys, first)
     assert "Reported by others" not in out and out.count("┡") == 1
     assert out.endswith(
-        "Not shown: 3 tables that others reported on other data (--paper), and the leaderboard's own 0 rows "
+        "Not shown: 3 tables that others reported on other data (--paper all), and the leaderboard's own 0 rows "
         "(fpp-bench leaderboard without a file).\n"
     )
     assert out.count("Not shown") == 1
