@@ -17,7 +17,7 @@ _DIRECTIONS = ("horizontal", "vertical", "both")
 _LOSSES = {"rmse": "RMSE", "l1": "L1", "gan": "GAN"}
 _RANGES = {"oracle": "", "mean": "mean range", "predicted": "pred. range", None: ""}
 """By the setting ``depth_range``. That the range was told is the group's track."""
-_OPTIONS = {"input standardised": "standardised", "guided by phase": "guided", "batch normalisation": "batch norm"}
+_OPTIONS = {"input standardised": "standardised", "guided by phase": "guided"}
 """A recipe's title and the short name of each option of a network."""
 
 

@@ -169,7 +169,6 @@ UNET = {
         ("A better phase route", "phase", {}, "A better phase route"),
         ("UNet, mine", "unet", {"network": "unet", "loss": "hybrid_l1_x"}, "UNet, mine"),
         ("UNet, global, rmse", "unet", UNET, "UNet global RMSE"),
-        ("UNet, global, rmse, batch normalisation", "unet", UNET, "UNet global RMSE, batch norm"),
         ("UNet, global, rmse, input standardised", "unet", UNET, "UNet global RMSE, standardised"),
     ],
 )
