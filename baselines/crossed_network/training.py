@@ -80,11 +80,13 @@ class CrossedRecipe(WindowRecipe):
     vary: Variation = field(default_factory=Variation)
 
     title: ClassVar[str] = "Fringe order, mask and bounded phase correction of a crossed frame"
-    usual_rig = staticmethod(crossed_rig)
 
     @property
     def channels(self) -> int:
         return len(CHANNELS)
+
+    def usual_rig(self) -> Rig:
+        return crossed_rig()
 
     def task(self, rig: Rig) -> "CrossedTask":
         return CrossedTask(self, rig)
@@ -97,7 +99,6 @@ class CrossedTask(CandidateTask):
     thresholds = tuple(float(value) for value in np.arange(-6, 2.01, 0.5))
     leads = tuple(float(value) for value in range(6))
     chosen_share = 8
-    decided = staticmethod(decided_mask)
 
     def __init__(self, recipe: CrossedRecipe, rig: Rig) -> None:
         super().__init__(rig)
@@ -136,6 +137,9 @@ class CrossedTask(CandidateTask):
 
     def answers(self, network: PhaseNet, sample: CrossedSample) -> Answers:
         return network_answers(network, sample.scene.single(), self.route.carriers)
+
+    def decided(self, answers: Answers, scene: Scene, threshold: float) -> Mask:
+        return decided_mask(answers, scene, threshold)
 
     def score(self, answers: Answers, sample: CrossedSample, inside: Mask) -> dict[str, float | None]:
         scene, target = sample.scene.single(), sample.target

@@ -192,7 +192,6 @@ class PhaseTask(CandidateTask):
     """What phase-net learns: one fringe of each direction of its recipe."""
 
     scored_share = 5
-    decided = staticmethod(decided_mask)
     thresholds = tuple(float(value) for value in np.arange(-5, 3.01, 0.5))
     leads = tuple(float(value) for value in range(8))
     tolerance_mm = 0.1
@@ -249,6 +248,9 @@ class PhaseTask(CandidateTask):
     def answers(self, network: PhaseNet, sample: PhaseSample) -> Answers:
         return network_answers(network, sample.scene.single(), self.geometries[sample.direction])
 
+    def decided(self, answers: Answers, scene: Scene, threshold: float) -> Mask:
+        return decided_mask(answers, scene, threshold)
+
     def score(self, answers: Answers, sample: PhaseSample, inside: Mask) -> dict[str, float | None]:
         scene, target = sample.scene.single(), sample.target
         layer = self.geometries[sample.direction].layer.at(scene.crop)
@@ -269,9 +271,7 @@ class PhaseTask(CandidateTask):
         row, column = (JUDGED_PX * place for place in places)
         return Judged(sample.group, answers.logits[:, row, column], choice[row, column], wrong[row, column])
 
-    def answered(
-        self, network: PhaseNet, samples: list[PhaseSample], validation: list[PhaseSample]
-    ) -> tuple[list[Judged], dict[str, Any]]:  # type: ignore[override]
+    def answered(self, network: PhaseNet, samples: list[PhaseSample], validation: list[PhaseSample]) -> Any:
         answers, fields = super().answered(network, samples, validation)
         pairs = zip(answers, validation, strict=True)
         return [self.judged(one, sample, fields["threshold"]) for one, sample in pairs], fields

@@ -92,7 +92,6 @@ class StepRecipe(ABC):
     family: ClassVar[training.Family] = training.PHASE_NETWORKS
     makes: ClassVar[type[nn.Module]] = PhaseNet
     """The network's class."""
-    usual_rig: ClassVar[Callable[[], Rig]] = staticmethod(paper_rig)
     main_loss: ClassVar[str]
     """Which is shown while it trains."""
     scores: ClassVar[dict[str, dict[str, str]]]
@@ -136,6 +135,10 @@ class StepRecipe(ABC):
     @abstractmethod
     def task(self, rig: Rig) -> "Task":
         """What the network learns from views of ``rig``."""
+
+    def usual_rig(self) -> Rig:
+        """For which it trains unless told otherwise."""
+        return paper_rig()
 
     def rate_at(self, step: int) -> float:
         """Learning rate of step 0, 1, ..."""
@@ -338,11 +341,10 @@ class Task(ABC):
 
 
 class CandidateTask(Task):
-    """That of a `PhaseNet`. ``decided``: a scene's object pixels by answers and a threshold of the mask's logit.
-    ``thresholds``, and ``leads`` of the base order, are tried on the validation samples, thresholds also on every
-    ``chosen_share``-th training sample; sums of errors ``tolerance_mm`` from the least count as equal."""
+    """That of a `PhaseNet`. ``thresholds`` of the mask's logit and ``leads`` of the base order are tried on the
+    validation samples, thresholds also on every ``chosen_share``-th training sample; sums of errors ``tolerance_mm``
+    from the least count as equal."""
 
-    decided: ClassVar[Callable[[Answers, Any, float], Mask]]
     thresholds: ClassVar[tuple[float, ...]]
     leads: ClassVar[tuple[float, ...]]
     tolerance_mm: ClassVar[float] = 0.0
@@ -354,6 +356,10 @@ class CandidateTask(Task):
     @abstractmethod
     def answers(self, network: PhaseNet, sample: Any) -> Answers:
         """The network's answers for a sample."""
+
+    @abstractmethod
+    def decided(self, answers: Answers, scene: Any, threshold: float) -> Mask:
+        """A scene's object pixels."""
 
     @abstractmethod
     def score(self, answers: Answers, sample: Any, inside: Mask) -> dict[str, float | None]:
@@ -370,9 +376,7 @@ class CandidateTask(Task):
     def scores(self, network: PhaseNet, samples: list[Any]) -> dict[str, float]:
         return self.scores_of((self.answers(network, sample) for sample in samples), samples)
 
-    def answered(
-        self, network: PhaseNet, samples: list[Any], validation: list[Any]
-    ) -> tuple[list[Answers], dict[str, Any]]:
+    def answered(self, network: PhaseNet, samples: list[Any], validation: list[Any]) -> Any:
         """The answers with the lead that was chosen, by which the fewest orders are wrong; threshold, lead, scores."""
         answers = [self.answers(network, sample) for sample in validation]
         further = samples[:: self.chosen_share] if self.chosen_share else []
