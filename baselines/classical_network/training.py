@@ -1,44 +1,84 @@
-"""Training classical-net: views in drawn lights are rendered, decoded and cut into windows; no dataset is needed.
+"""Training classical-net: the decoded scene of each view with the exact depth, windows of them, and what is chosen on
+validation views."""
 
-``out`` holds ``views/``, the files of the engine and, at the end, classical-net.safetensors instead of the checkpoint.
-A stopped training continues at every stage.
-"""
-
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from time import perf_counter
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines import training
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.classical_network.network import DepthFilter
 from fpp_ml_bench.baselines.classical_network.route import Filtered, decided, filtered
-from fpp_ml_bench.baselines.classical_network.samples import Sample, draw, sample_of
-from fpp_ml_bench.baselines.classical_network.scene import CHANNELS
+from fpp_ml_bench.baselines.classical_network.scene import CHANNELS, DepthScene, channels
 from fpp_ml_bench.baselines.phase_network import (
     Batch,
+    Sample,
     StepRecipe,
-    Trained,
-    WindowTraining,
+    Task,
+    edge_points,
+    mask_loss,
+    mean_over,
     mean_scores,
-    read_net,
-    save_net,
+    place_of,
+    scale_loss,
+    train_net,
 )
-from fpp_ml_bench.optics import Direction, Rig, paper_rig
+from fpp_ml_bench.baselines.phase_route import Image, Mask
+from fpp_ml_bench.baselines.training import FILTER_NETWORKS, Family, View
+from fpp_ml_bench.depth import depth_edges
+from fpp_ml_bench.optics import Direction, Rig
 
-VIEWS, WEIGHTS = "views", "classical-net.safetensors"
 SMALL_UNITS = 0.1  # error below which its loss is quadratic, in the scene's median sigma
 LARGEST_UNITS = 30.0  # at which an error is clipped: a wrong order can't be averaged away
 THRESHOLDS = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 1e3)
 """Logits from which on a pixel without a depth is filled, tried on the validation views; the last fills none."""
-VALIDATED_SHARE = 3  # every so many-th validation view is scored during training
+ORIENTATIONS = 8
+STRIDES, STRIDE_SHARES = (1, 2, 4), (0.6, 0.25, 0.15)
+"""Every so many-th pixel of a view makes a window, and how often: a coarser camera sees steeper, more bent surfaces."""
+
+
+@dataclass(frozen=True)
+class DepthSample(Sample):
+    """``exact_mm`` (h, w): exact depth less the scene's ``middle_mm``; pixels without a depth are of interest too."""
+
+    exact_mm: Image
+
+
+@dataclass(frozen=True)
+class Window:
+    """One training example, maps (n, n) of a `DepthSample`; ``x`` (C, n, n); ``valid``: neither void nor padding;
+    ``unit_mm``: median sigma of the scene, the unit of the errors."""
+
+    x: Image
+    depth_mm: Image
+    sigma_mm: Image
+    found: Mask
+    exact_mm: Image
+    target: Mask
+    valid: Mask
+    unit_mm: NDArray[np.float32]
+
+
+def sample_of(view: View, method: ClassicalMethod) -> DepthSample | None:
+    """The sample of a view, decoded by ``method``; None where nothing was decoded."""
+    frames: list[NDArray[np.uint8] | None] = [None] * len(method.rig.sequence)
+    for index, frame in zip(method.frames_used, view.frames, strict=True):
+        frames[index] = frame
+    answer, modulation = method.measure(frames)
+    scene = None if answer.sigma_mm is None else DepthScene.of(answer.depth, answer.sigma_mm, modulation)
+    if scene is None:
+        return None
+    depth_mm, void = view.depth_mm[scene.crop], view.void[scene.crop]
+    target = (depth_mm > 0) & ~void
+    exact = np.where(target, depth_mm - np.float32(scene.middle_mm), 0).astype(np.float32)
+    edges = edge_points(depth_edges(depth_mm) | (target & ~scene.found))
+    return DepthSample(view.name, scene, target, void, edges, exact)
 
 
 @dataclass(frozen=True)
@@ -59,15 +99,14 @@ class FilterRecipe(StepRecipe):
     weight_mask: float = 0.5
     weight_scale: float = 0.1
 
+    title: ClassVar[str] = "Weights of neighbouring depths, and which missing pixels are object"
+    family: ClassVar[Family] = FILTER_NETWORKS
+    makes: ClassVar[type[nn.Module]] = DepthFilter
     main_loss: ClassVar[str] = "depth"
     scores: ClassVar[dict[str, dict[str, str]]] = {
         "validation MAE, mm": {"object_mae_mm": "filtered", "input_mae_mm": "decoded"},
         "validation, % of object pixels": {"missed_percent": "missed", "input_missed_percent": "missed before"},
     }
-
-    @property
-    def weights(self) -> dict[str, float]:
-        return {"depth": self.weight_depth, "mask": self.weight_mask, "scale": self.weight_scale}
 
     def network(self) -> DepthFilter:
         return DepthFilter(len(CHANNELS), self.widths)
@@ -78,81 +117,71 @@ class FilterRecipe(StepRecipe):
         depth, inside, scale, near = network(batch["x"], batch["depth_mm"], batch["sigma_mm"], batch["found"])
         unit = batch["unit_mm"][:, None, None]
         counted = batch["target"] & near
-        pixels = counted.sum().clamp(min=1)
         error = ((depth - batch["exact_mm"]) / unit).clamp(-LARGEST_UNITS, LARGEST_UNITS)
         by_pixel = functional.smooth_l1_loss(error, torch.zeros_like(error), beta=SMALL_UNITS, reduction="none")
-        left = error.detach().abs()
-        open_px = near & ~batch["found"] & batch["valid"]
-        by_mask = functional.binary_cross_entropy_with_logits(inside, batch["target"].float(), reduction="none")
         return {
-            "depth": (by_pixel * counted).sum() / pixels,
-            "mask": (by_mask * open_px).sum() / open_px.sum().clamp(min=1),
-            "scale": ((left * torch.exp(-scale) + scale) * counted).sum() / pixels,
+            "depth": mean_over(by_pixel, counted),
+            "mask": mask_loss(inside, batch["target"], near & ~batch["found"] & batch["valid"]),
+            "scale": scale_loss(error.detach().abs(), scale, counted),
         }
 
+    def task(self, rig: Rig) -> "FilterTask":
+        return FilterTask(self, rig)
 
-def train_classical_net(
-    recipe: FilterRecipe,
-    out: Path,
-    *,
-    rig: Rig | None = None,
-    minutes: float | None = None,
-    workers: int = 1,
-    show: bool = False,
-    print_line: Callable[[str], None] = lambda line: None,
-) -> Trained:
-    """Train for ``rig`` (default: the paper's); the same call resumes a training that was stopped. ``show``: progress
-    on stderr. Raises `TrainingError` for a folder of another recipe or rig."""
-    started, rig = perf_counter(), rig or paper_rig()
-    method = ClassicalMethod(rig, direction=recipe.direction, steps=recipe.phase_steps)
-    groups = training.groups_of(recipe.lights, recipe.views_a_light, recipe.seed)
-    described = recipe.to_dict() | {"rig": rig.to_dict()}
-    fingerprint = training.fingerprint_of(described, groups)
-    with training.alone_in(out):
-        training.claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
-        weights = out / WEIGHTS
-        if weights.exists():
-            return Trained.before(weights, read_net(weights, DepthFilter, training.FILTER_NETWORKS)[0])
 
-        def measured(views: Iterable[training.View]) -> list[Sample]:
-            return [sample for view in views if (sample := sample_of(view, method)) is not None]
+class FilterTask(Task):
+    """What classical-net learns: the frames of a decoded depth."""
 
-        samples, validation = training.measured_views(
-            groups, rig, method.frames_used, out / VIEWS, measured, recipe.unions, recipe.seed, workers, show
+    def __init__(self, recipe: FilterRecipe, rig: Rig) -> None:
+        self.recipe, self.method = recipe, ClassicalMethod(rig, direction=recipe.direction, steps=recipe.phase_steps)
+        self.frames = self.method.frames_used
+
+    def samples(self, views: Iterable[View]) -> list[DepthSample]:
+        return [sample for view in views if (sample := sample_of(view, self.method)) is not None]
+
+    def draw(self, samples: list[DepthSample], random: np.random.Generator) -> Window:
+        """A random window of one of ``samples``, of one of `STRIDES`, in one of 8 orientations."""
+        size, near_edge = self.recipe.window, self.recipe.near_edge
+        sample = samples[random.integers(len(samples))]
+        orientation, every = int(random.integers(ORIENTATIONS)), int(random.choice(STRIDES, p=STRIDE_SHARES))
+        rows, columns = place_of(sample.edges, sample.target.shape, size * every, random.random() < near_edge, random)
+
+        def cut(maps: NDArray) -> NDArray:
+            part = np.rot90(maps[rows, columns][::every, ::every], orientation % 4)
+            part = part[:, ::-1] if orientation >= 4 else part
+            return np.pad(part, [(0, size - length) for length in part.shape])
+
+        scene = sample.scene.with_maps(cut)
+        return Window(
+            channels(scene),
+            scene.depth_mm,
+            scene.sigma_mm,
+            scene.found,
+            cut(sample.exact_mm),
+            cut(sample.target),
+            cut(~sample.void),
+            np.asarray(scene.unit_mm, dtype=np.float32),
         )
 
-        def validated(network: DepthFilter) -> dict[str, float]:
-            scored = validation[::VALIDATED_SHARE]
-            return mean_scores(score(filtered(network, one.scene), one, 0.0) for one in scored)
+    def scores(self, network: DepthFilter, samples: list[DepthSample]) -> dict[str, float]:
+        return mean_scores(score(filtered(network, sample.scene), sample, 0.0) for sample in samples)
 
-        with training.reproducible(cpu=True):
-            one_window = partial(draw, samples, recipe.window, recipe.near_edge)
-            ongoing = WindowTraining(recipe, one_window, validated, out, print_line=print_line)
-            ongoing.run(started, minutes, show)
-            if not ongoing.over:
-                return Trained(None, ongoing.steps_done, 0.0, {})
-            network = ongoing.network
-            answers = [filtered(network.folded(), sample.scene) for sample in validation]
-        threshold = chosen_threshold(answers, validation)
-        means = mean_scores(score(one, sample, threshold) for one, sample in zip(answers, validation, strict=True))
-        config = training.NetConfig(
-            name=recipe.name,
-            title="Weights of neighbouring depths, and which missing pixels are object",
-            options=network.options,
-            threshold=threshold,
-            period_px={},
-            dataset_fingerprint=fingerprint,
-            benchmark=training.TrainingBenchmark("classical-net views", 1),
-            steps=recipe.steps,
-            recipe=described,
-            validation=dict(means),
-        )
-        save_net(weights, network, config, training.FILTER_NETWORKS)
-        (out / training.CHECKPOINT).unlink(missing_ok=True)
-        return Trained(weights, recipe.steps, threshold, means)
+    def answered(
+        self, network: DepthFilter, samples: list[DepthSample], validation: list[DepthSample]
+    ) -> list[Filtered]:
+        return [filtered(network.folded(), sample.scene) for sample in validation]
+
+    def chosen(self, answered: list[Filtered], validation: list[DepthSample], out: Path) -> dict[str, Any]:
+        threshold = chosen_threshold(answered, validation)
+        pairs = zip(answered, validation, strict=True)
+        means = mean_scores(score(answer, sample, threshold) for answer, sample in pairs)
+        return {"threshold": threshold, "period_px": {}, "validation": means}
 
 
-def score(answer: Filtered, sample: Sample, threshold: float) -> dict[str, float | None]:
+train_classical_net = train_net
+
+
+def score(answer: Filtered, sample: DepthSample, threshold: float) -> dict[str, float | None]:
     """Of a view: MAE of object pixels in mm, filtered and as decoded, where a missed one counts with its whole depth;
     the shares that are missed; background pixels that were given a depth, in thousands; and the share of errors within
     the stated standard uncertainty."""
@@ -174,7 +203,7 @@ def score(answer: Filtered, sample: Sample, threshold: float) -> dict[str, float
     }
 
 
-def chosen_threshold(answers: Sequence[Filtered], samples: Sequence[Sample]) -> float:
+def chosen_threshold(answers: Sequence[Filtered], samples: Sequence[DepthSample]) -> float:
     """The lowest of `THRESHOLDS` at which no validation view loses: what filling saves on the object is at least what
     it adds on the background, each pixel counted with its whole depth."""
     for threshold in THRESHOLDS:
@@ -183,6 +212,6 @@ def chosen_threshold(answers: Sequence[Filtered], samples: Sequence[Sample]) -> 
     return THRESHOLDS[-1]
 
 
-def _gain_px(answer: Filtered, sample: Sample, threshold: float) -> int:
+def _gain_px(answer: Filtered, sample: DepthSample, threshold: float) -> int:
     new = decided(answer, sample.scene, threshold) & ~sample.scene.found
     return int((new & sample.target).sum()) - int((new & ~sample.target & ~sample.void).sum())

@@ -11,8 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.crossed_route import Carriers, CrossedObservation, fringes
-from fpp_ml_bench.baselines.phase_network import LARGEST_RAD, SIDE_PERIODS, SIDES, from_the_sides
-from fpp_ml_bench.baselines.phase_route import Crop, Image, Mask, phase_slopes, wrapped
+from fpp_ml_bench.baselines.phase_network import (
+    LARGEST_RAD,
+    SIDE_CHANNELS,
+    SIDE_PERIODS,
+    SIDES,
+    CroppedMaps,
+    from_the_sides,
+)
+from fpp_ml_bench.baselines.phase_route import Image, Mask, phase_slopes, wrapped
 
 CHANNELS = (
     "light",
@@ -39,9 +46,7 @@ CHANNELS = (
     "nearer exists",
     "relief",
     "first guess",
-    *(f"from {row:+.1f} {column:+.1f}: correction" for row, column in SIDES),
-    "own misfit around",
-    *(f"from {row:+.1f} {column:+.1f}: misfit around" for row, column in SIDES),
+    *SIDE_CHANNELS,
 )
 DOWN, RIGHT = CHANNELS.index("slope down"), CHANNELS.index("slope right")
 FIRST_SIDE = CHANNELS.index("first guess") + 1
@@ -50,12 +55,10 @@ RELIEF_RAD = 1.5  # unit of the relief, small enough that the corrections show i
 SLOPE_FLOOR = 0.1
 LEAST_BRIGHT = 0.05  # least brightness that is divided by, as a multiple of the object's median
 LEAST_SHARE = 0.02  # of the fit's window that must lie on the object for the fit to count
-_REAL_MAPS = ("light", "plane_misfit", "bright", "share", "window_rad", "modulation", "step_rad", "misfit_rad")
-_OTHER_MAPS = ("inside", "nearness", "exists")
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(CroppedMaps):
     """The part ``crop`` of an image; maps (h, w), or (n, h, w). ``light`` without ambient light, and ``bright``, of the
     fit, as multiples of the object's median brightness; ``plane_misfit``: arcsinh of the light less the plane's in
     sigmas, 0 where no plane is ``shown``; ``inside``: mask of the measured route; ``nearness`` float32: of the fit;
@@ -64,7 +67,9 @@ class Scene:
     the base's; ``misfit_rad`` (3) and ``exists`` (3): of further, base and nearer; ``contrast`` of both carriers;
     ``strength``: the object's median modulation in sigmas of the noise."""
 
-    crop: Crop
+    real_maps = "light", "plane_misfit", "bright", "share", "window_rad", "modulation", "step_rad", "misfit_rad"
+    other_maps = "inside", "nearness", "exists"
+
     light: Image
     plane_misfit: Image
     shown: bool
@@ -110,17 +115,6 @@ class Scene:
             contrast=seen.contrast,
             strength=float(level * np.mean(seen.contrast) / background.noise_grey),
         )
-
-    def window(self, rows: slice, columns: slice) -> "Scene":
-        """A part of this scene; slices of its maps, with start and stop."""
-        top, left = self.crop[0].start, self.crop[1].start
-        crop = slice(top + rows.start, top + rows.stop), slice(left + columns.start, left + columns.stop)
-        maps = {name: getattr(self, name)[..., rows, columns] for name in (*_REAL_MAPS, *_OTHER_MAPS)}
-        return replace(self, crop=crop, **maps)
-
-    def single(self, real: type = np.float32) -> "Scene":
-        """In single precision, or in another: half saves memory, and is not for use. The nearness stays single."""
-        return replace(self, **{name: getattr(self, name).astype(real) for name in _REAL_MAPS})
 
     def with_base(self, candidate: int, where: Mask, carriers: Carriers) -> "Scene":
         """The same with a turn further (0) or nearer (2) as the base on the pixels ``where`` (h, w) at which it exists;

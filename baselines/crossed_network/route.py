@@ -18,6 +18,7 @@ from fpp_ml_bench.baselines.phase_network import (
     Answers,
     PhaseNet,
     answers_of_maps,
+    decided_object,
     least_energy_order,
     probabilities,
     threshold_at,
@@ -48,17 +49,13 @@ def stated_rad(sigma_rad: Image) -> Image:
 
 
 def decided_mask(answers: Answers, scene: Scene, threshold: float) -> Mask:
-    """Object pixels (h, w): those whose logit is above the `threshold_at` the scene's strength, and those of the
-    measured route's mask whose logit is at most `DENIED` below it."""
-    logit, threshold = answers.object_logit, threshold_at(scene.strength, threshold)
-    return (logit > threshold) | (scene.inside & (logit > threshold - DENIED))
+    """`decided_object` pixels (h, w)."""
+    return decided_object(answers, scene.inside, scene.strength, threshold, DENIED)
 
 
-def decided_order(answers: Answers, scene: Scene, carriers: Carriers, inside: Mask, stride: int) -> NDArray[np.intp]:
-    """Index of each pixel's order (h, w): `least_energy_order` of the joint phase."""
-    psi = scene.nearness * carriers.at(scene.crop).joint_gain
-    offers = np.stack([psi + scene.step_rad[0], psi, psi + scene.step_rad[1]])
-    return least_energy_order(probabilities(answers.logits), offers, inside, stride, JUMP_RAD)
+def offers_rad(scene: Scene) -> Image:
+    """Joint phase of the candidates further, base and nearer less that of the base, (3, h, w)."""
+    return np.stack([scene.step_rad[0], np.zeros_like(scene.step_rad[0]), scene.step_rad[1]])
 
 
 class CrossedNetRoute:
@@ -88,12 +85,13 @@ class CrossedNetRoute:
 
     def conclude(self, seen: CrossedObservation, scene: Scene, answers: Answers) -> CrossedMeasurement:
         """The measurement from the network's answers."""
-        joint = seen.carriers.joint_gain
+        joint, offers = seen.carriers.joint_gain, offers_rad(scene)
         inside = decided_mask(answers, scene, self.threshold)
         # Orders are labelled on all that may be object: a hole in the mask must not part a surface.
         perhaps = scene.inside | (answers.object_logit > threshold_at(scene.strength, self.threshold) - PERHAPS)
-        choice = decided_order(answers, scene, self.route.carriers, perhaps, self.route.stride)
-        offers = np.stack([scene.step_rad[0], np.zeros_like(joint), scene.step_rad[1]])
+        psi = scene.nearness * joint
+        candidates = np.stack([psi + scene.step_rad[0], psi, psi + scene.step_rad[1]])
+        choice = least_energy_order(answers.logits, candidates, perhaps, self.route.stride, JUMP_RAD)
         nearness = scene.nearness + (of_choice(offers, choice) + answers.correction_rad) / joint
         known = scene.share > LEAST_SHARE
         if not known[inside].all():  # beyond the reach of any window: as the nearest pixel within it

@@ -1,44 +1,71 @@
-"""Training crossed-net: views in drawn lights are rendered, measured, and cut into windows; no dataset is needed.
+"""Training crossed-net: the measured route's scene of each view with the truth, windows of them, and what is chosen on
+validation views."""
 
-``out`` holds ``views/``, the files of the engine and, at the end, crossed-net.safetensors instead of the checkpoint. A
-stopped training continues at every stage.
-"""
-
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
-from time import perf_counter
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines import training
-from fpp_ml_bench.baselines.crossed_network.inputs import CHANNELS
-from fpp_ml_bench.baselines.crossed_network.route import decided_mask, network_answers
-from fpp_ml_bench.baselines.crossed_network.samples import Sample, Variation, draw, sample_of
-from fpp_ml_bench.baselines.crossed_route import Carriers, CrossedRoute
+from fpp_ml_bench.baselines.crossed_network import inputs
+from fpp_ml_bench.baselines.crossed_network.inputs import CHANNELS, Scene
+from fpp_ml_bench.baselines.crossed_network.route import decided_mask, network_answers, offers_rad
+from fpp_ml_bench.baselines.crossed_route import CrossedRoute
 from fpp_ml_bench.baselines.phase_network import (
+    IGNORED,
     Answers,
+    CandidateTask,
     PhaseNet,
-    Trained,
+    Sample,
+    Window,
     WindowRecipe,
-    WindowTraining,
-    chosen_lead,
-    chosen_threshold,
-    load_net,
-    mean_scores,
-    save_net,
+    candidate_scores,
+    edge_points,
+    padded,
+    place_of,
+    train_net,
+    wrong_place,
 )
-from fpp_ml_bench.baselines.phase_route import of_choice
+from fpp_ml_bench.baselines.phase_route import Mask, of_choice
+from fpp_ml_bench.baselines.training import View
+from fpp_ml_bench.depth import depth_edges
 from fpp_ml_bench.optics import Rig, crossed_rig
 
-WEIGHTS, VIEWS = "crossed-net.safetensors", "views"
-THRESHOLDS = tuple(float(value) for value in np.arange(-6, 2.01, 0.5))
-"""Mask logits that are tried on the validation views, and on every `CHOSEN_SHARE`-th training sample: the validation
-objects have simple silhouettes, and two lights."""
-CHOSEN_SHARE = 8
-LEADS = tuple(float(value) for value in range(6))
-VALIDATED_SHARE = 3  # every so many-th validation view is scored during training
+FURTHEST_RAD = 2.2
+"""Distance in rad of the joint phase from a candidate beyond which it is not the right one: rivals are 2 pi away."""
+
+
+@dataclass(frozen=True)
+class CrossedSample(Sample):
+    """``missing_rad`` float16 (h, w): joint phase of the true nearness less that of the scene's, 0 outside the
+    object."""
+
+    missing_rad: NDArray[np.float16]
+
+
+def sample_of(view: View, route: CrossedRoute) -> CrossedSample:
+    """The sample of a view; its void pixels are no target, and no background either."""
+    seen = route.observe(view.frames[0])
+    crop = seen.carriers.crop
+    depth_mm, void = view.depth_mm[crop], view.void[crop]
+    target = (depth_mm > 0) & ~void
+    truth = seen.carriers.nearness(np.where(target, depth_mm, 1000.0))
+    missing = np.where(target, (truth - seen.fit.nearness) * seen.carriers.joint_gain, 0.0)
+    half, edges = np.clip(missing, -100, 100).astype(np.float16), edge_points(depth_edges(depth_mm))
+    return CrossedSample(view.name, Scene.of(seen).single(np.float16), target, void, edges, half)
+
+
+@dataclass(frozen=True)
+class Variation:
+    """How often (0 to 1) windows lie near an edge, get a wrong base order in the whole or in patches, and lose what the
+    plane tells."""
+
+    near_edge: float = 0.7
+    wrong_window: float = 0.1
+    wrong_patch: float = 0.25
+    no_plane: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -52,119 +79,81 @@ class CrossedRecipe(WindowRecipe):
     weight_mask: float = 1.0
     vary: Variation = field(default_factory=Variation)
 
+    title: ClassVar[str] = "Fringe order, mask and bounded phase correction of a crossed frame"
+
     @property
     def channels(self) -> int:
         return len(CHANNELS)
 
+    def usual_rig(self) -> Rig:
+        return crossed_rig()
 
-def train_crossed_net(
-    recipe: CrossedRecipe,
-    out: Path,
-    *,
-    rig: Rig | None = None,
-    minutes: float | None = None,
-    workers: int = 1,
-    show: bool = False,
-    print_line: Callable[[str], None] = lambda line: None,
-) -> Trained:
-    """Train for ``rig`` (default: `optics.crossed_rig`); the same call resumes a training that was stopped. ``show``:
-    progress on stderr. Raises `TrainingError` for a folder of another recipe or rig."""
-    started, rig = perf_counter(), rig or crossed_rig()
-    groups = training.groups_of(recipe.lights, recipe.views_a_light, recipe.seed)
-    described = recipe.to_dict() | {"rig": rig.to_dict()}
-    fingerprint = training.fingerprint_of(described, groups)
-    with training.alone_in(out):
-        training.claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
-        weights = out / WEIGHTS
-        if weights.exists():
-            return Trained.before(weights, load_net(weights).config)
-        route, frame = CrossedRoute(rig), rig.sequence.crossed_frames[0]
-        samples, validation = training.measured_views(
-            groups,
-            rig,
-            (frame,),
-            out / VIEWS,
-            lambda views: [sample_of(view, route) for view in views],
-            recipe.unions,
-            recipe.seed,
-            workers,
-            show,
+    def task(self, rig: Rig) -> "CrossedTask":
+        return CrossedTask(self, rig)
+
+
+class CrossedTask(CandidateTask):
+    """What crossed-net learns: one crossed frame. The validation objects have simple silhouettes, and two lights, so
+    that thresholds are tried on training samples too."""
+
+    thresholds = tuple(float(value) for value in np.arange(-6, 2.01, 0.5))
+    leads = tuple(float(value) for value in range(6))
+    chosen_share = 8
+
+    def __init__(self, recipe: CrossedRecipe, rig: Rig) -> None:
+        super().__init__(rig)
+        self.recipe, self.route, self.frames = recipe, CrossedRoute(rig), (rig.sequence.crossed_frames[0],)
+
+    def samples(self, views: Iterable[View]) -> list[CrossedSample]:
+        return [sample_of(view, self.route) for view in views]
+
+    def draw(self, samples: list[CrossedSample], random: np.random.Generator) -> Window:
+        """A random window of one of ``samples``, varied, in one of 8 orientations."""
+        size, vary, carriers = self.recipe.window, self.recipe.vary, self.route.carriers
+        sample = samples[random.integers(len(samples))]
+        rows, columns = place_of(sample.edges, sample.target.shape, size, random.random() < vary.near_edge, random)
+        scene, missing = (
+            sample.scene.window(rows, columns).single(),
+            sample.missing_rad[rows, columns].astype(np.float32),
         )
-        carriers = route.carriers
+        target, void = sample.target[rows, columns], sample.void[rows, columns]
+        before = scene.nearness
+        where, _ = wrong_place(scene.light.shape, vary.wrong_window, vary.wrong_patch, random)
+        if where is not None:
+            scene = scene.with_base(int(random.choice((0, 2))), where, carriers)
+            missing = np.where(target, missing - (scene.nearness - before) * carriers.at(scene.crop).joint_gain, 0)
+        if random.random() < vary.no_plane:
+            scene = inputs.without_plane(scene)
+        x, exists = inputs.channels(scene, carriers)
+        distance = missing - offers_rad(scene)
+        apart = np.where(exists, np.abs(distance), np.inf)
+        place = apart.argmin(axis=0)
+        possible = target & (apart.min(axis=0) < FURTHEST_RAD)
+        correction = np.take_along_axis(distance, place[None], axis=0)[0] * possible
+        order = np.where(possible, place, IGNORED)
+        maps, x = inputs.symmetric([exists, order, correction, possible, target, ~void], x, int(random.integers(8)))
+        exists, order, correction, *others = maps
+        return padded(size, x, exists, order, correction.astype(np.float32), *others)
 
-        def answers_of(network: PhaseNet, some: list[Sample]) -> list[Answers]:
-            return [network_answers(network, sample.scene.single(), carriers) for sample in some]
+    def answers(self, network: PhaseNet, sample: CrossedSample) -> Answers:
+        return network_answers(network, sample.scene.single(), self.route.carriers)
 
-        def scores_of(answers: list[Answers], some: list[Sample], threshold: float = 0.0) -> dict[str, float]:
-            return mean_scores(
-                score(one, sample, carriers, threshold) for one, sample in zip(answers, some, strict=True)
-            )
+    def decided(self, answers: Answers, scene: Scene, threshold: float) -> Mask:
+        return decided_mask(answers, scene, threshold)
 
-        def validated(network: PhaseNet) -> dict[str, float]:
-            scored = validation[::VALIDATED_SHARE]
-            return scores_of(answers_of(network, scored), scored)
-
-        with training.reproducible(cpu=True):
-            one_window = partial(draw, samples, carriers, recipe.window, recipe.vary)
-            ongoing = WindowTraining(recipe, one_window, validated, out, print_line=print_line)
-            ongoing.run(started, minutes, show)
-            if not ongoing.over:
-                return Trained(None, ongoing.steps_done, 0.0, {})
-            network = ongoing.network
-            answers, some = answers_of(network, validation), samples[::CHOSEN_SHARE]
-            masks = [
-                (sample, partial(decided_mask, one, sample.scene.single()))
-                for one, sample in zip(answers + answers_of(network, some), validation + some, strict=True)
-            ]
-            threshold = chosen_threshold(masks, THRESHOLDS, rig.camera.width * rig.camera.height)
-
-            def wrong_percent(lead: float) -> float:
-                return scores_of([one.with_lead(lead) for one in answers], validation)["wrong_percent"]
-
-            lead = chosen_lead(wrong_percent, LEADS)
-            means = scores_of([one.with_lead(lead) for one in answers], validation, threshold)
-        config = training.NetConfig(
-            name=recipe.name,
-            title="Fringe order, mask and bounded phase correction of a crossed frame",
-            options=network.options,
-            threshold=threshold,
-            lead=lead,
-            period_px={"crossed": carriers.period_px},
-            dataset_fingerprint=fingerprint,
-            benchmark=training.TrainingBenchmark("crossed-net views", 1),
-            steps=recipe.steps,
-            recipe=described,
-            validation=dict(means),
+    def score(self, answers: Answers, sample: CrossedSample, inside: Mask) -> dict[str, float | None]:
+        scene, target = sample.scene.single(), sample.target
+        part = self.route.carriers.at(scene.crop)
+        joint = part.joint_gain
+        change = of_choice(offers_rad(scene), answers.logits.argmax(axis=0)) + answers.correction_rad
+        found_mm, true_mm = (
+            part.depth_mm(scene.nearness + rad / joint)[target] for rad in (change, sample.missing_rad)
         )
-        save_net(weights, network, config)
-        (out / training.CHECKPOINT).unlink(missing_ok=True)
-        return Trained(weights, recipe.steps, threshold, means)
+        error = (change - sample.missing_rad)[target]
+        return candidate_scores(found_mm, true_mm, error, answers.sigma_rad[target], inside, sample, np.pi / 2)
+
+    def chosen(self, answered: Any, validation: list[CrossedSample], out: Path) -> dict[str, Any]:
+        return super().chosen(answered, validation, out) | {"period_px": {"crossed": self.route.carriers.period_px}}
 
 
-def score(answers: Answers, sample: Sample, carriers: Carriers, threshold: float = 0.0) -> dict[str, float | None]:
-    """Scores of a view, each pixel's likeliest order taken. ``object_mae_mm`` counts a missed pixel with its whole
-    depth; ``right_mae_mm``: MAE of pixels with the right order; ``wrong_percent`` and ``missed_percent``: shares of the
-    object; ``invented_kpx``: background pixels with a depth, in thousands; ``within_percent``: errors of the joint
-    phase within the stated standard uncertainty, 68 of a normal distribution. Where no order is right, it and
-    ``right_mae_mm`` are None."""
-    scene, target = sample.scene.single(), sample.target
-    part = carriers.at(scene.crop)
-    joint = part.joint_gain
-    offers = np.stack([scene.step_rad[0], np.zeros_like(joint), scene.step_rad[1]])
-    change = of_choice(offers, answers.logits.argmax(axis=0)) + answers.correction_rad
-    inside = decided_mask(answers, scene, threshold)
-    truth = scene.nearness + sample.missing_rad / joint
-    true_mm, found_mm = part.depth_mm(truth)[target], part.depth_mm(scene.nearness + change / joint)[target]
-    apart = np.abs(change - sample.missing_rad)[target]
-    detected, wrong = inside[target], apart > np.pi / 2
-    error = np.abs(np.nan_to_num(found_mm) - true_mm)
-    error = np.where(detected, np.minimum(error, true_mm), true_mm)
-    right = detected & ~wrong
-    return {
-        "object_mae_mm": float(error.mean()),
-        "right_mae_mm": float(error[right].mean()) if right.any() else None,
-        "wrong_percent": 100 * float(wrong.mean()),
-        "missed_percent": 100 * float((~detected).mean()),
-        "within_percent": 100 * float((apart < answers.sigma_rad[target])[right].mean()) if right.any() else None,
-        "invented_kpx": float((inside & ~target & ~sample.void).sum()) / 1000,
-    }
+train_crossed_net = train_net

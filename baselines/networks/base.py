@@ -206,19 +206,14 @@ class InstanceNorm(nn.InstanceNorm2d):
 
 
 class DoubleConvolution(nn.Sequential):
-    """Twice: 3x3 convolution without bias, affine instance normalisation (or ``over_batch``: batch normalisation),
-    ReLU. (B, c_in, h, w) -> (B, c_out, h, w)."""
+    """Twice: 3x3 convolution without bias, affine instance normalisation, ReLU. (B, c_in, h, w) -> (B, c_out, h, w)."""
 
-    def __init__(self, c_in: int, c_out: int, over_batch: bool = False) -> None:
-        norm = nn.BatchNorm2d if over_batch else InstanceNorm
-        super().__init__(
-            nn.Conv2d(c_in, c_out, 3, padding=1, bias=False),
-            norm(c_out, affine=True),
-            nn.ReLU(inplace=True),
-            nn.Conv2d(c_out, c_out, 3, padding=1, bias=False),
-            norm(c_out, affine=True),
-            nn.ReLU(inplace=True),
-        )
+    def __init__(self, c_in: int, c_out: int) -> None:
+        layers: list[nn.Module] = []
+        for channels in (c_in, c_out):
+            layers.append(nn.Conv2d(channels, c_out, 3, padding=1, bias=False))
+            layers += [InstanceNorm(c_out, affine=True), nn.ReLU(inplace=True)]
+        super().__init__(*layers)
 
 
 class ResidualBlock(nn.Module):

@@ -26,7 +26,6 @@ _SHORT_RANGES = {"oracle": "", "mean": "mean range", "predicted": "pred. range",
 _SHORT_OPTIONS = {
     "input standardised": "standardised",
     "guided by phase": "guided",
-    "batch normalisation": "batch norm",
 }
 """A recipe's title and the short name of each option of a network."""
 _SHORT_LOSSES = {"rmse": "RMSE", "l1": "L1", "gan": "GAN"}

@@ -7,6 +7,7 @@ map holds a distance. Maps are rotated so that phase grows downwards and with ne
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Self
 
 import cv2
 import numpy as np
@@ -24,6 +25,12 @@ SIDE_PERIODS = 0.45
 LARGEST_RAD = 1.5708  # largest correction that is proposed
 AROUND_PX = 1.5
 """Gaussian over which the misfit of a proposal is averaged: the light of a single pixel fits many phases."""
+SIDE_CHANNELS = (
+    *(f"from {row:+.1f} {column:+.1f}: correction" for row, column in SIDES),
+    "own misfit around",
+    *(f"from {row:+.1f} {column:+.1f}: misfit around" for row, column in SIDES),
+)
+"""The maps of `from_the_sides`, the last of a network's input."""
 CHANNELS = (
     "light",
     "plane light",
@@ -43,9 +50,7 @@ CHANNELS = (
     "nearer exists",
     "relief",
     "first guess",
-    *(f"from {row:+.1f} {column:+.1f}: correction" for row, column in SIDES),
-    "own misfit around",
-    *(f"from {row:+.1f} {column:+.1f}: misfit around" for row, column in SIDES),
+    *SIDE_CHANNELS,
 )
 FIRST_SIDE = CHANNELS.index("first guess") + 1
 FIRST_MISFIT = FIRST_SIDE + len(SIDES)
@@ -56,7 +61,6 @@ LEAST_WEIGHT = 0.02  # least share of the fit's window that must lie on the obje
 RELIEF_RAD = 1.5  # unit of the channel ``relief``, small enough that the corrections show in it
 SINE_FLOOR = 0.1
 STEP_PX = 2  # brightness of the candidates is computed on every second pixel
-_REAL_MAPS = ("light", "plane_light", "phase_rad", "bright", "weight")
 
 
 @dataclass(frozen=True)
@@ -85,8 +89,9 @@ class Rotation:
         unturned = image[..., ::-1, :] if self.reversed else image
         return unturned.swapaxes(-1, -2) if self.transposed else unturned
 
-    def down_and_right(self, slopes: tuple[Image, Image]) -> tuple[Image, Image]:
-        """Slopes down and to the right in rotated maps, from those along an image's x and y; not rotated themselves."""
+    def down_and_right(self, slopes: Image) -> tuple[Image, Image]:
+        """Slopes down and to the right in rotated maps, from those along an image's x and y (2, h, w); not rotated
+        themselves."""
         right, down = slopes[::-1] if self.transposed else slopes
         return (-self.sign if self.reversed else self.sign) * down, self.sign * right
 
@@ -109,6 +114,11 @@ class Geometry:
     def layer(self) -> CalibrationLayer:
         return self.route.layer
 
+    @property
+    def shading(self) -> bool:
+        """Whether brightness is a cue for the order: one albedo for all surfaces."""
+        return self.route.settings.shading
+
     def in_range(self, depth_mm: NDArray) -> Mask:
         """Whether a depth lies in the working range, or its slack."""
         (near, far), slack = self.rig.working_range_mm, self.route.settings.slack_mm
@@ -116,15 +126,40 @@ class Geometry:
 
 
 @dataclass(frozen=True)
-class Scene:
+class CroppedMaps:
+    """Maps (..., h, w) of the part ``crop`` of an image: those named in ``real_maps``, and in ``other_maps``."""
+
+    real_maps: ClassVar[tuple[str, ...]]
+    other_maps: ClassVar[tuple[str, ...]]
+
+    crop: phase_route.Crop
+
+    def window(self, rows: slice, columns: slice) -> Self:
+        """A part of these maps; slices with start and stop."""
+        top, left = self.crop[0].start, self.crop[1].start
+        crop = slice(top + rows.start, top + rows.stop), slice(left + columns.start, left + columns.stop)
+        names = *self.real_maps, *self.other_maps
+        maps: dict[str, Any] = {name: getattr(self, name)[..., rows, columns] for name in names}
+        return replace(self, crop=crop, **maps)
+
+    def single(self, real: type = np.float32) -> Self:
+        """Real maps in single precision, or in another: half saves memory, and is not for use."""
+        maps: dict[str, Any] = {name: getattr(self, name).astype(real) for name in self.real_maps}
+        return replace(self, **maps)
+
+
+@dataclass(frozen=True)
+class Scene(CroppedMaps):
     """The part ``crop`` of an image, maps (h, w) in the image's own orientation. ``light``: captured light without the
     ambient light, and ``plane_light``: the empty scene's prediction of it, both as multiples of a plane like the
     background at the standoff, or of the object's median brightness; ``noise`` in the same unit; ``inside``: mask of
     the measured route; ``phase_rad`` in [-pi, pi] and ``order``: the base order; ``bright``: half the modulation, in
-    units of light; ``weight``: of the fit's window; ``slopes`` of the residual phase, rad a px along x and y;
+    units of light; ``weight``: of the fit's window; ``slopes`` (2, h, w) of the residual phase, rad a px along x and y;
     ``middle_rad``: median residual phase of the object."""
 
-    crop: phase_route.Crop
+    real_maps = "light", "plane_light", "phase_rad", "bright", "weight", "slopes"
+    other_maps = "inside", "order"
+
     light: Image
     plane_light: Image
     noise: float
@@ -133,11 +168,11 @@ class Scene:
     order: NDArray[np.int32]
     bright: Image
     weight: Image
-    slopes: tuple[Image, Image]
+    slopes: Image
     middle_rad: float
 
     @classmethod
-    def of(cls, observation: Observation, order: NDArray[np.int32], shading: bool = True) -> "Scene":
+    def of(cls, observation: Observation, order: NDArray[np.int32], shading: bool) -> "Scene":
         """From an observation of the measured route, with that route's ``order`` (h, w) as the base order. ``shading``:
         whether the unit of light is that of the background, which tells distances of surfaces with its albedo."""
         background, fit = observation.background, observation.fit
@@ -158,7 +193,7 @@ class Scene:
             order=order,
             bright=(fit.brightness * unit).astype(np.float32),
             weight=fit.weight,
-            slopes=observation.slopes,
+            slopes=np.stack(observation.slopes),
             middle_rad=float(np.median(residual[on_object])) if on_object.any() else 0.0,
         )
 
@@ -168,19 +203,8 @@ class Scene:
         lit = self.bright[self.inside & (self.bright > 0)]
         return float(np.median(lit)) / self.noise if lit.size else 0.0
 
-    def window(self, rows: slice, columns: slice) -> "Scene":
-        """A part of this scene; slices of its maps, with start and stop."""
-        top, left = self.crop[0].start, self.crop[1].start
-        crop = slice(top + rows.start, top + rows.stop), slice(left + columns.start, left + columns.stop)
-        inside, slopes = self.inside[rows, columns], (self.slopes[0][rows, columns], self.slopes[1][rows, columns])
-        maps = {name: getattr(self, name)[rows, columns] for name in (*_REAL_MAPS, "order")}
-        return replace(self, crop=crop, inside=inside, slopes=slopes, **maps)
-
-    def single(self, real: type = np.float32, whole: type = np.int32) -> "Scene":
-        """In single precision, or in another: half saves memory, and is not for use."""
-        maps = {name: getattr(self, name).astype(real) for name in _REAL_MAPS}
-        slopes: tuple[Image, Image] = (self.slopes[0].astype(real), self.slopes[1].astype(real))
-        return replace(self, **maps, slopes=slopes, order=self.order.astype(whole))
+    def single(self, real: type = np.float32) -> "Scene":
+        return replace(super().single(real), order=self.order.astype(np.int16 if real is np.float16 else np.int32))
 
 
 def coarse_irradiance(scene: Scene, geometry: Geometry, residuals_rad: Sequence[NDArray]) -> NDArray[np.float32]:
@@ -190,10 +214,10 @@ def coarse_irradiance(scene: Scene, geometry: Geometry, residuals_rad: Sequence[
     return np.stack([phase_route.irradiance(layer, rad[grid], slopes, geometry.rig, where) for rad in residuals_rad])
 
 
-def channels(scene: Scene, geometry: Geometry, shading: bool = True) -> tuple[Image, Mask]:
+def channels(scene: Scene, geometry: Geometry) -> tuple[Image, Mask]:
     """Input of the network (`CHANNELS`, h', w') float32, rotated, and which candidates exist, bool (3, h', w'): those
-    in the working range, so that a single one settles the order, or the base where none is. Without ``shading`` the
-    maps that assume one albedo are 0."""
+    in the working range, so that a single one settles the order, or the base where none is. Without shading the maps
+    that assume one albedo are 0."""
     rig, rotation, layer = geometry.rig, geometry.rotation, geometry.layer.at(scene.crop)
     residual = layer.residual_phase(scene.phase_rad, scene.order)
     candidates = [residual + rotation.sign * TAU * step for step in STEPS]
@@ -225,9 +249,7 @@ def channels(scene: Scene, geometry: Geometry, shading: bool = True) -> tuple[Im
             np.clip(misfit, -2, 2),
             unit * down,
             unit * right,
-            ratio[0],
-            ratio[1],
-            ratio[2],
+            *ratio,
             exists[0],
             exists[2],
             np.clip(relief, -4, 4),
@@ -238,7 +260,7 @@ def channels(scene: Scene, geometry: Geometry, shading: bool = True) -> tuple[Im
     image_maps = np.stack([scene.light, scene.plane_light, plane_misfit, scene.inside]).astype(np.float32)
     turned_maps = rotation.turn(np.nan_to_num(np.concatenate([image_maps, fitted])))
     x = np.concatenate([turned_maps, _turned_sides(scene, layer, geometry)])
-    if not shading:
+    if not geometry.shading:
         x[list(SHADING)] = 0
     return x, np.ascontiguousarray(rotation.turn(exists))
 

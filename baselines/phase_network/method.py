@@ -1,7 +1,7 @@
 """The learned route as a method of ``fpp-bench predict``: one captured fringe, metric depth, no range given."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +28,6 @@ from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.phase_network.net_file import NetFile
-    from fpp_ml_bench.baselines.phase_network.route import Levers
     from fpp_ml_bench.baselines.phase_network.training import Trained
     from fpp_ml_bench.baselines.training import NetConfig
     from fpp_ml_bench.evaluation.submission import Submission
@@ -58,7 +57,7 @@ def _shipped(albedo: str) -> str:
 
 @dataclass(frozen=True)
 class PhaseNetOptions:
-    """Options of `PhaseNetMethod`; ``weights``: also a file that was read, ``levers``: of `NetworkRoute`."""
+    """Options of `PhaseNetMethod`; ``weights``: also a file that was read."""
 
     direction: Direction = option("horizontal", DIRECTION, choices=DIRECTIONS)
     weights: "str | Path | NetFile | None" = option(None, WEIGHTS, "FILE")
@@ -69,7 +68,6 @@ class PhaseNetOptions:
         "order is ambiguous unless range and shape tell it (default: one)",
         choices=ALBEDOS,
     )
-    levers: "Levers | None" = None
     threads: int = 1
     white_grey: float | None = option(None, WHITE_GREY, "GREY")
     ambient_grey: float | None = option(None, AMBIENT_GREY, "GREY")
@@ -135,7 +133,7 @@ class PhaseNetMethod(Method):
     def __init__(self, rig: Rig, **options: Any) -> None:
         from fpp_ml_bench.baselines.phase_network.net_file import NetFile, load_net
         from fpp_ml_bench.baselines.phase_network.odds import Odds
-        from fpp_ml_bench.baselines.phase_network.route import Levers, NetworkRoute
+        from fpp_ml_bench.baselines.phase_network.route import NetworkRoute
 
         given = self.checked_options(options)
         direction, weights, albedo, threads = given.direction, given.weights, given.albedo, given.threads
@@ -172,7 +170,6 @@ class PhaseNetMethod(Method):
             self.options,
             self.file.network,
             config.threshold,
-            replace(given.levers or Levers(), shading=shading),
             config.lead,
             odds,
             periods,

@@ -54,10 +54,11 @@ def fold(body: UNet) -> None:
 
 
 class PhaseNet(nn.Module):
-    """(B, C, H, W) -> order logits (B, 3, H, W), mask logits (B, H, W), phase correction in rad (B, H, W). The
-    correction is a weighted average of the corrections that a pixel's surroundings propose (`inputs.SIDES`) and of
-    none, with weights from the network, plus a free part of at most half of ``bound_rad``, clipped at ``bound_rad``.
-    ``uncertain``: it also gives the logarithm of the scale in rad of the phase error it expects, (B, H, W).
+    """(B, C, H, W) -> order logits (B, 3, H, W), mask logits (B, H, W), phase correction in rad (B, H, W), and the
+    logarithm of the scale in rad of the phase error that is left (B, H, W). The correction is a weighted average of the
+    corrections that a pixel's surroundings propose (`inputs.SIDES`) and of none, with weights from the network, plus a
+    free part of at most half of ``bound_rad``, clipped at ``bound_rad``.
+    ``uncertain``: that it states this scale; networks of earlier versions, which did not, are refused.
     ``channels``: maps that it takes, the last of them the corrections of the sides, the misfit of none, and theirs.
     ``widths``: channels of each level, the first at half the image's resolution; ``squeezed`` and ``fine``: of the maps
     at full resolution, before and after them; ``order_widths``: of the branch that looks for the order, at a quarter of
@@ -71,7 +72,7 @@ class PhaseNet(nn.Module):
         order_widths: tuple[int, ...] = (32, 48, 64),
         bound_rad: float = 1.5708,
         channels: int = len(CHANNELS),
-        uncertain: bool = False,
+        uncertain: bool = True,
     ) -> None:
         super().__init__()
         widths, order_widths = tuple(widths), tuple(order_widths)
@@ -80,6 +81,8 @@ class PhaseNet(nn.Module):
                 f"expected positive widths and bound_rad between 0 and pi; got widths {widths}, order_widths "
                 f"{order_widths}, fine {fine}, squeezed {squeezed}, bound_rad {bound_rad}"
             )
+        if not uncertain:
+            raise NetworkError("expected a network that states its uncertainty, uncertain true; train it again")
         self.options: dict[str, Any] = {
             "widths": list(widths),
             "fine": fine,
@@ -95,7 +98,7 @@ class PhaseNet(nn.Module):
         self.body = UNet(squeezed * BLOCK**2, widths)
         self.spread = nn.Conv2d(widths[0], fine * BLOCK**2, 1)
         self.fine = nn.Sequential(nn.Conv2d(fine + squeezed, fine, 3, padding=1), nn.ReLU(inplace=True))
-        self.answer = nn.Conv2d(fine, len(STEPS) + 2 + 1 + len(SIDES) + uncertain, 1)
+        self.answer = nn.Conv2d(fine, len(STEPS) + 2 + 1 + len(SIDES) + 1, 1)
         self.trust = nn.Parameter(torch.tensor(TRUST))
         self.order_body = UNet(channels, order_widths)
         self.order_answer = nn.Conv2d(order_widths[0], len(STEPS), 1)
@@ -110,16 +113,6 @@ class PhaseNet(nn.Module):
         for body in (network.body, network.order_body):
             fold(body)
         return network.to(memory_format=torch.channels_last)  # type: ignore[no-any-return,call-overload]
-
-    def stating_scale(self) -> "PhaseNet":
-        """The same network with an output for the scale of the phase error, untrained if it had none."""
-        if self.uncertain:
-            return self
-        network, weights = PhaseNet(**{**self.options, "uncertain": True}), self.state_dict()
-        for name in ("answer.weight", "answer.bias"):
-            weights[name] = torch.cat([weights[name], torch.zeros_like(weights[name][:1])])
-        network.load_state_dict(weights)
-        return network
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
         if x.shape[-2] % self.stride or x.shape[-1] % self.stride:
@@ -137,5 +130,5 @@ class PhaseNet(nn.Module):
         proposed, misfits = x[:, -2 * sides - 1 : -sides - 1], x[:, -sides - 1 :]
         shares = torch.softmax(answers[:, 5 : 6 + sides] - self.trust * misfits, dim=1)[:, 1:]
         correction = (shares * proposed).sum(dim=1) + 0.5 * self.bound_rad * torch.tanh(answers[:, 4])
-        told = order, answers[:, 3], correction.clamp(-self.bound_rad, self.bound_rad)
-        return (*told, answers[:, -1].clamp(*LOG_SCALES)) if self.uncertain else told
+        bounded = correction.clamp(-self.bound_rad, self.bound_rad)
+        return order, answers[:, 3], bounded, answers[:, -1].clamp(*LOG_SCALES)

@@ -1,43 +1,65 @@
-"""Training phase-net: views in drawn lights are rendered, measured, and cut into windows; no dataset is needed.
+"""Training phase-net: the measured route's scene of each view with the true phase, windows varied as other scenes would
+vary them, and what is chosen on validation views. ``out`` also holds reliability.png.
 
-``out`` holds ``views/``, the files of the engine and, at the end, phase-net.safetensors instead of the checkpoint, and
-reliability.png. A stopped training continues at every stage.
+Whole objects are moved to another distance, with the light that the calibrated lamp would give and the measured route's
+errors as they were. Wrong base orders are made up in patches and whole windows, because the training objects have few.
+Columns are mirrored, as with a projector on the other side. Brightness varies a little.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
-from functools import partial
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from time import perf_counter
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines import training
-from fpp_ml_bench.baselines.phase_network.answers import Answers
-from fpp_ml_bench.baselines.phase_network.inputs import STEPS, Geometry
-from fpp_ml_bench.baselines.phase_network.net_file import load_net, save_net
+from fpp_ml_bench.baselines.phase_network import inputs
+from fpp_ml_bench.baselines.phase_network.inputs import FIRST_MISFIT, FIRST_SIDE, SIDES, STEPS, Geometry, Scene
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.phase_network.odds import Judged, chosen_odds, confident_shares, draw_reliability
+from fpp_ml_bench.baselines.phase_network.odds import Answers, Judged, chosen_odds, confident_shares, draw_reliability
 from fpp_ml_bench.baselines.phase_network.route import decided_mask, decided_order, network_answers
-from fpp_ml_bench.baselines.phase_network.samples import Sample, samples_of
-from fpp_ml_bench.baselines.phase_network.validation import chosen_lead, chosen_threshold, mean_scores
-from fpp_ml_bench.baselines.phase_network.window_training import WindowRecipe, WindowTraining
-from fpp_ml_bench.baselines.phase_network.windows import Variation, draw
-from fpp_ml_bench.baselines.phase_route import TAU, Settings
+from fpp_ml_bench.baselines.phase_network.window_training import CandidateTask, WindowRecipe, train_net
+from fpp_ml_bench.baselines.phase_network.windows import (
+    IGNORED,
+    Sample,
+    Window,
+    candidate_scores,
+    edge_points,
+    padded,
+    place_of,
+    wrong_place,
+)
+from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask, Settings, of_choice, repeated
+from fpp_ml_bench.baselines.training import View
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.depth import depth_edges, object_mask
 from fpp_ml_bench.errors import RecipeError
-from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig, paper_rig
+from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig
 
 Albedo = Literal["one", "any"]
-VIEWS, RELIABILITY = "views", "reliability.png"
-VALIDATED_SHARE = 5  # every so many-th validation sample is scored during training
+RELIABILITY = "reliability.png"
 JUDGED_PX = 3  # the stated chances are calibrated on every so many-th pixel
-THRESHOLDS = tuple(float(value) for value in np.arange(-5, 3.01, 0.5))
-"""Mask logits that are tried on the validation views; sums of errors this close to the least count as equal:"""
-TOLERANCE_MM = 0.1
-LEADS = tuple(float(value) for value in range(8))
+_MIRRORED = inputs.CHANNELS.index("slope across")
+_PARTNERS = [SIDES.index((row, -column)) for row, column in SIDES]
+_SWAPPED = [FIRST_SIDE + n for n in _PARTNERS] + [FIRST_MISFIT] + [FIRST_MISFIT + 1 + n for n in _PARTNERS]
 
 Geometries = Mapping[Direction, Geometry]
+
+
+@dataclass(frozen=True)
+class Variation:
+    """How often (0 to 1) and how much windows are varied; with 0 throughout they stay as captured. ``shift``: how often
+    objects are moved to any distance of the working range; ``shift_blind``: the same for a network without brightness,
+    so that it does not learn where they mostly stand."""
+
+    near_edge: float = 0.7
+    shift: float = 0.5
+    shift_blind: float = 0.8
+    brightness: float = 0.04
+    wrong_window: float = 0.15
+    wrong_patch: float = 0.3
+    mirror: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -67,172 +89,205 @@ class Recipe(WindowRecipe):
             )
 
     @property
-    def shading(self) -> bool:
-        """Whether brightness is a cue for the order."""
-        return self.albedo == "one"
+    def title(self) -> str:  # type: ignore[override]
+        return f"Fringe order, mask and bounded phase correction, {self.albedo} albedo"
+
+    @property
+    def drawn(self) -> tuple[int, ...]:
+        return *super().drawn, self.textured_every, self.validation_lights
 
     @property
     def weights_name(self) -> str:
-        """Of the file, and of the weights that come with the package."""
         return f"{self.name}-{self.albedo}-albedo"
 
-
-def answers_of(network: PhaseNet, samples: list[Sample], geometries: Geometries, shading: bool) -> Iterator[Answers]:
-    """The network's answers for each sample."""
-    for sample in samples:
-        yield network_answers(network, sample.scene.single(), geometries[sample.direction], shading)
-
-
-def scores_of(
-    answers: Iterable[Answers], samples: list[Sample], geometries: Geometries, threshold: float = 0.0
-) -> dict[str, float]:
-    """Means of each `score` over the samples that have it."""
-    pairs = zip(answers, samples, strict=True)
-    return mean_scores(score(answer, sample, geometries[sample.direction], threshold) for answer, sample in pairs)
-
-
-def score(answers: Answers, sample: Sample, geometry: Geometry, threshold: float = 0.0) -> dict[str, float | None]:
-    """Scores of one whole image with ``threshold`` on the mask's logit. ``object_mae_mm`` counts a missed pixel with
-    its whole depth; ``right_mae_mm``: MAE of pixels with the right order; ``wrong_percent`` and ``missed_percent``:
-    shares of the object's pixels; ``invented_kpx``: background pixels with a depth, in thousands; ``within_percent``:
-    errors of the phase within the stated standard uncertainty, 68 of a normal distribution. Both are None where no
-    order is right."""
-    scene = sample.scene.single()
-    layer = geometry.layer.at(scene.crop)
-    steps, inside = np.array(STEPS, np.int32)[answers.logits.argmax(axis=0)], decided_mask(answers, scene, threshold)
-    base_residual = layer.residual_phase(scene.phase_rad, scene.order)
-    true_mm = layer.depth_of_residual_mm(base_residual + sample.missing_rad)
-    phase_change = TAU * steps + answers.correction_rad
-    predicted_mm = np.nan_to_num(layer.depth_of_residual_mm(base_residual + phase_change))
-    target = sample.target
-    phase_error = phase_change - sample.missing_rad
-    error = np.where(inside, np.minimum(np.abs(predicted_mm - true_mm), true_mm), true_mm)[target]
-    wrong = (np.abs(phase_error) > np.pi)[target]
-    within = np.abs(phase_error) < answers.sigma_rad
-    detected = inside[target]
-    right = detected & ~wrong
-    return {
-        "object_mae_mm": float(error.mean()),
-        "right_mae_mm": float(error[right].mean()) if right.any() else None,
-        "wrong_percent": 100 * float(wrong.mean()),
-        "missed_percent": 100 * float((~detected).mean()),
-        "within_percent": 100 * float(within[target][right].mean()) if right.any() else None,
-        "invented_kpx": float((inside & ~target & ~sample.void).sum()) / 1000,
-    }
-
-
-def judged(answers: Answers, sample: Sample, geometry: Geometry, threshold: float) -> Judged:
-    """Every `JUDGED_PX`-th object pixel of a sample, with the order that the method would choose."""
-    scene = sample.scene.single()
-    inside = decided_mask(answers, scene, threshold)
-    choice = decided_order(answers, scene, inside, geometry)
-    change = TAU * np.array(STEPS, np.int32)[choice] + answers.correction_rad
-    wrong = np.abs(change - sample.missing_rad) > np.pi
-    places = np.nonzero((sample.target & inside)[::JUDGED_PX, ::JUDGED_PX])
-    row, column = (JUDGED_PX * place for place in places)
-    return Judged(sample.group, answers.logits[:, row, column], choice[row, column], wrong[row, column])
+    def task(self, rig: Rig) -> "PhaseTask":
+        return PhaseTask(self, rig)
 
 
 @dataclass(frozen=True)
-class Trained:
-    """The weights file (None for a training that stopped because its minutes were over), validation scores, and the
-    mask threshold that was chosen there."""
+class PhaseSample(Sample):
+    """Of an image of the light ``group``. ``missing_rad`` float16 (h, w): true absolute phase minus that of the base
+    order, 0 outside the object."""
 
-    weights: Path | None
-    steps: int
-    threshold: float
-    validation: dict[str, float]
-
-    @classmethod
-    def before(cls, weights: Path, config: training.NetConfig) -> "Trained":
-        """Of a training that an earlier call finished."""
-        scores = {key: float(value or 0) for key, value in config.validation.items()}
-        return cls(weights, config.steps, config.threshold, scores)
+    group: str
+    direction: Direction
+    missing_rad: NDArray[np.float16]
 
 
-def train_phase_net(
-    recipe: Recipe,
-    out: Path,
-    *,
-    rig: Rig | None = None,
-    start: Path | None = None,
-    minutes: float | None = None,
-    workers: int = 1,
-    show: bool = False,
-    print_line: Callable[[str], None] = lambda line: None,
-) -> Trained:
-    """Train for ``rig`` (default: `optics.paper_rig`), starting from the weights in ``start`` or from random ones; the
-    same call resumes a training that was stopped. ``show``: progress on stderr; ``print_line`` is given a line for
-    every validation. Raises `TrainingError` for a folder of another recipe or rig."""
-    started, rig = perf_counter(), rig or paper_rig()
-    groups = training.groups_of(
-        recipe.lights, recipe.views_a_light, recipe.seed, recipe.textured_every, recipe.validation_lights
+def sample_of(view: View, image: NDArray[np.uint8], geometry: Geometry) -> PhaseSample | None:
+    """Sample of an image uint8 (H, W) of a view, whose void pixels count nowhere, in half precision; None where nothing
+    calibrates its brightness, or no object is seen."""
+    observation = geometry.route.observe(image)
+    if not observation.background.calibrated or not observation.inside.any():
+        return None
+    order, _ = geometry.route.choose(observation)
+    scene = Scene.of(observation, order, geometry.shading)
+    depth_mm, void = view.depth_mm[observation.crop], view.void[observation.crop]
+    target = object_mask(depth_mm) & ~void
+    if not target.any():
+        return None
+    true_phase = observation.layer.absolute_phase(np.where(target, depth_mm, 1000.0))
+    missing = np.where(target, true_phase - observation.phase_rad - TAU * order, 0.0)
+    direction, half = geometry.route.settings.direction, np.nan_to_num(missing).astype(np.float16)
+    edges = edge_points(depth_edges(depth_mm))
+    own = view.name, scene.single(np.float16), target, void, edges
+    return PhaseSample(*own, view.group, direction, half)
+
+
+def _moved(
+    scene: Scene, missing: Image, target: Mask, geometry: Geometry, vary: Variation, random: np.random.Generator
+) -> Scene:
+    """The object at another distance within the working range."""
+    near, far = geometry.rig.working_range_mm
+    layer = geometry.layer.at(scene.crop)
+    true_rad = (layer.residual_phase(scene.phase_rad, scene.order) + missing).astype(np.float32)
+    middle = float(np.median(true_rad[target]))
+    gain, forward = float(np.median(layer.gain)), float(np.median(layer.forward))
+    depth_m = random.uniform(near, far) / MM_PER_M
+    delta = np.float32(gain / (forward * depth_m + layer.back_m) - middle)
+    with np.errstate(all="ignore"):
+        before, after = np.maximum(inputs.coarse_irradiance(scene, geometry, (true_rad, true_rad + delta)), 1e-3)
+        ratio = np.clip(np.nan_to_num(after / before, nan=1.0), 0.4, 2.5)
+    ratio = repeated(ratio, inputs.STEP_PX, scene.light.shape).astype(np.float32)
+    ratio = np.where(target, ratio * np.float32(np.exp(random.normal(0, vary.brightness))), np.float32(1))
+    true_phase = scene.phase_rad + missing
+    light = ratio * (scene.light + scene.bright * (np.cos(true_phase + delta) - np.cos(true_phase)))
+    phase = scene.phase_rad + delta
+    carry = np.rint(phase / TAU)
+    return replace(
+        scene,
+        light=np.where(target, light, scene.light),
+        bright=(scene.bright * ratio).astype(np.float32),
+        phase_rad=(phase - TAU * carry).astype(np.float32),
+        order=scene.order + carry.astype(np.int32),
+        middle_rad=scene.middle_rad + float(delta),
     )
-    start_weights = None if start is None else load_net(start, folded=False)
-    described = recipe.to_dict() | {"rig": rig.to_dict()}
-    described |= {} if start_weights is None else {"start_sha256": start_weights.sha256}
-    fingerprint = training.fingerprint_of(described, groups)
-    with training.alone_in(out):
-        training.claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
-        weights = out / f"{recipe.weights_name}.safetensors"
-        if weights.exists():
-            return Trained.before(weights, load_net(weights).config)
-        geometries = {
-            direction: Geometry.of(rig, Settings(direction=direction, shading=recipe.shading))
+
+
+def _wrong(
+    scene: Scene, missing: Image, geometry: Geometry, vary: Variation, random: np.random.Generator
+) -> tuple[Scene, Image]:
+    """Wrong base orders, where the working range allows them."""
+    where, whole = wrong_place(scene.light.shape, vary.wrong_window, vary.wrong_patch, random)
+    if where is None:
+        return scene, missing
+    step = int(random.choice((-1, 1)))
+    if not where.any():
+        return scene, missing
+    with np.errstate(all="ignore"):
+        depth_mm = geometry.layer.at(scene.crop).depth_mm(scene.phase_rad, scene.order + where * np.int32(step))
+        off = np.where(geometry.in_range(depth_mm), where * step, 0).astype(np.int32)
+    changed = replace(scene, order=scene.order + off, middle_rad=scene.middle_rad + TAU * step * whole)
+    return changed, missing - np.float32(TAU) * off
+
+
+def _mirrored(window: Window) -> Window:
+    flipped = {name: getattr(window, name)[..., ::-1].copy() for name in Window.__dataclass_fields__}
+    flipped["x"][_MIRRORED] *= -1
+    flipped["x"][FIRST_SIDE:] = flipped["x"][_SWAPPED]
+    return Window(**flipped)
+
+
+class PhaseTask(CandidateTask):
+    """What phase-net learns: one fringe of each direction of its recipe."""
+
+    scored_share = 5
+    thresholds = tuple(float(value) for value in np.arange(-5, 3.01, 0.5))
+    leads = tuple(float(value) for value in range(8))
+    tolerance_mm = 0.1
+
+    def __init__(self, recipe: Recipe, rig: Rig) -> None:
+        super().__init__(rig)
+        self.recipe = recipe
+        self.geometries: Geometries = {
+            direction: Geometry.of(rig, Settings(direction=direction, shading=recipe.albedo == "one"))
             for direction in recipe.directions
         }
-        frames = tuple(rig.sequence.sinusoids(direction)[0] for direction in recipe.directions)
-        measure = partial(samples_of, geometries=geometries, shading=recipe.shading)
-        samples, validation = training.measured_views(
-            groups, rig, frames, out / VIEWS, measure, recipe.unions, recipe.seed, workers, show
+        self.frames = tuple(rig.sequence.sinusoids(direction)[0] for direction in recipe.directions)
+
+    def samples(self, views: Iterable[View]) -> list[PhaseSample]:
+        """Samples of ``views``, whose frames are the first fringes of the recipe's directions, in their order; of a
+        union for one direction alone, in turn. A view whose light the background does not calibrate is left out, since
+        the network is not used on it."""
+        samples: list[PhaseSample] = []
+        unions = 0
+        for view in views:
+            pairs = list(zip(self.geometries.values(), view.frames, strict=True))
+            if view.united:
+                pairs = [pairs[unions % len(pairs)]]
+                unions += 1
+            found = (sample_of(view, frame, geometry) for geometry, frame in pairs)
+            samples += [sample for sample in found if sample is not None]
+        return samples
+
+    def draw(self, samples: list[PhaseSample], random: np.random.Generator) -> Window:
+        """A random window of one of ``samples``, varied."""
+        size, vary = self.recipe.window, self.recipe.vary
+        sample = samples[random.integers(len(samples))]
+        geometry = self.geometries[sample.direction]
+        rows, columns = place_of(sample.edges, sample.target.shape, size, random.random() < vary.near_edge, random)
+        scene, missing = (
+            sample.scene.window(rows, columns).single(),
+            sample.missing_rad[rows, columns].astype(np.float32),
         )
+        target, void = sample.target[rows, columns], sample.void[rows, columns]
+        moved = random.random() < (vary.shift if geometry.shading else vary.shift_blind) and target.any()
+        if moved:
+            scene = _moved(scene, missing, target, geometry, vary, random)
+        scene, missing = _wrong(scene, missing, geometry, vary, random)
+        x, exists = inputs.channels(scene, geometry)
+        turn = geometry.rotation.turn
+        missing, target = turn(missing) * np.float32(geometry.rotation.sign), turn(target)
+        steps = np.rint(missing / TAU).astype(np.int64)
+        place = np.clip(steps, -1, 1) + 1
+        possible = target & (np.abs(steps) <= 1) & of_choice(exists, place)
+        order, correction = np.where(possible, place, IGNORED), (missing - TAU * steps).astype(np.float32)
+        window = padded(size, x, exists, order, correction, possible, target, turn(~void & (not moved)))
+        return _mirrored(window) if random.random() < vary.mirror else window
 
-        def validated(network: PhaseNet) -> dict[str, float]:
-            scored = validation[::VALIDATED_SHARE]
-            return scores_of(answers_of(network, scored, geometries, recipe.shading), scored, geometries)
+    def answers(self, network: PhaseNet, sample: PhaseSample) -> Answers:
+        return network_answers(network, sample.scene.single(), self.geometries[sample.direction])
 
-        with training.reproducible(cpu=True):
-            one_window = partial(draw, samples, geometries, recipe.window, recipe.vary, recipe.shading)
-            first = None if start_weights is None else start_weights.network
-            ongoing = WindowTraining(recipe, one_window, validated, out, first, print_line)
-            ongoing.run(started, minutes, show)
-            if not ongoing.over:
-                return Trained(None, ongoing.steps_done, 0.0, {})
-            network = ongoing.network
-            answers = list(answers_of(network, validation, geometries, recipe.shading))
-            masks = [
-                (sample, partial(decided_mask, one, sample.scene.single()))
-                for one, sample in zip(answers, validation, strict=True)
-            ]
-            threshold = chosen_threshold(masks, THRESHOLDS, rig.camera.width * rig.camera.height, TOLERANCE_MM)
+    def decided(self, answers: Answers, scene: Scene, threshold: float) -> Mask:
+        return decided_mask(answers, scene, threshold)
 
-            def wrong_percent(lead: float) -> float:
-                return scores_of((one.with_lead(lead) for one in answers), validation, geometries)["wrong_percent"]
+    def score(self, answers: Answers, sample: PhaseSample, inside: Mask) -> dict[str, float | None]:
+        scene, target = sample.scene.single(), sample.target
+        layer = self.geometries[sample.direction].layer.at(scene.crop)
+        change = TAU * np.array(STEPS, np.int32)[answers.logits.argmax(axis=0)] + answers.correction_rad
+        base = layer.residual_phase(scene.phase_rad, scene.order)
+        true_mm, found_mm = (layer.depth_of_residual_mm(base + rad)[target] for rad in (sample.missing_rad, change))
+        error = (change - sample.missing_rad)[target]
+        return candidate_scores(found_mm, true_mm, error, answers.sigma_rad[target], inside, sample, np.pi)
 
-            lead = chosen_lead(wrong_percent, LEADS)
-            led = [one.with_lead(lead) for one in answers]
-            means = scores_of(led, validation, geometries, threshold)
-            pairs = zip(led, validation, strict=True)
-            seen = [judged(one, sample, geometries[sample.direction], threshold) for one, sample in pairs]
+    def judged(self, answers: Answers, sample: PhaseSample, threshold: float) -> Judged:
+        """Every `JUDGED_PX`-th object pixel of a sample, with the order that the method would choose."""
+        scene = sample.scene.single()
+        inside = decided_mask(answers, scene, threshold)
+        choice = decided_order(answers, scene, inside, self.geometries[sample.direction])
+        change = TAU * np.array(STEPS, np.int32)[choice] + answers.correction_rad
+        wrong = np.abs(change - sample.missing_rad) > np.pi
+        places = np.nonzero((sample.target & inside)[::JUDGED_PX, ::JUDGED_PX])
+        row, column = (JUDGED_PX * place for place in places)
+        return Judged(sample.group, answers.logits[:, row, column], choice[row, column], wrong[row, column])
+
+    def answered(self, network: PhaseNet, samples: list[PhaseSample], validation: list[PhaseSample]) -> Any:
+        answers, fields = super().answered(network, samples, validation)
+        pairs = zip(answers, validation, strict=True)
+        return [self.judged(one, sample, fields["threshold"]) for one, sample in pairs], fields
+
+    def chosen(self, answered: Any, validation: list[PhaseSample], out: Path) -> dict[str, Any]:
+        """Also the odds of a wrong order, of which a picture is drawn."""
+        seen, fields = answered
         odds = chosen_odds(seen)
         draw_reliability(out / RELIABILITY, seen, odds)
-        means["confident_percent"] = 100 * max(confident_shares(seen, odds).values())
-        config = training.NetConfig(
-            name=recipe.weights_name,
-            title=f"Fringe order, mask and bounded phase correction, {recipe.albedo} albedo",
-            options=network.options,
-            threshold=threshold,
-            lead=lead,
-            temperature=odds.temperature,
-            offset=odds.offset,
-            doubted=odds.doubted,
-            period_px={direction: g.route.period_px for direction, g in geometries.items()},
-            dataset_fingerprint=fingerprint,
-            benchmark=training.TrainingBenchmark("phase-net views", 1),
-            steps=recipe.steps,
-            recipe=described,
-            validation=dict(means),
-        )
-        save_net(weights, network, config)
-        (out / training.CHECKPOINT).unlink(missing_ok=True)
-        return Trained(weights, recipe.steps, threshold, means)
+        confident = 100 * max(confident_shares(seen, odds).values())
+        return {
+            **fields,
+            **vars(odds),
+            "validation": fields["validation"] | {"confident_percent": confident},
+            "period_px": {direction: g.route.period_px for direction, g in self.geometries.items()},
+        }
+
+
+train_phase_net = train_net

@@ -1,12 +1,19 @@
-"""Training a network on windows of images: four losses, a moving average of the weights, resumable."""
+"""Training a network on windows of rendered views; no dataset is needed: what phase-net, crossed-net and classical-net
+have in common. Views in drawn lights are rendered, measured, and cut into windows; a moving average of the weights is
+kept; mask and order are chosen on validation views.
+
+``out`` holds ``views/``, the files of the engine and, at the end, the weights instead of the checkpoint. A stopped
+training continues at every stage.
+"""
 
 import hashlib
 import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import Any, ClassVar
@@ -19,14 +26,44 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from fpp_ml_bench.baselines import training
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS
+from fpp_ml_bench.baselines.phase_network.net_file import load_net, read_net, save_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.phase_network.windows import IGNORED
+from fpp_ml_bench.baselines.phase_network.odds import Answers
+from fpp_ml_bench.baselines.phase_network.windows import IGNORED, chosen_threshold, mean_scores
+from fpp_ml_bench.baselines.phase_route import Mask
 from fpp_ml_bench.baselines.training import Panel, Record
 from fpp_ml_bench.errors import RecipeError, TrainingError
+from fpp_ml_bench.optics import Rig, paper_rig
 
+VIEWS = "views"
 SMALL_RAD = 0.05  # error of the phase below which its loss is quadratic
 IMPOSSIBLE = -1e4  # logit of an order that puts its pixel out of the working range: finite, for gradients to stay so
 LARGEST_GRADIENT = 50.0
+
+Batch = dict[str, Tensor]  # the fields of a window with a leading axis B
+
+
+def mean_over(values: Tensor, where: Tensor) -> Tensor:
+    """Mean of ``values`` over the pixels ``where``; 0 without one."""
+    return (values * where).sum() / where.sum().clamp(min=1)
+
+
+def mask_loss(logit: Tensor, target: Tensor, valid: Tensor) -> Tensor:
+    """Binary cross-entropy of the object's ``logit`` over ``valid`` pixels."""
+    by_pixel = functional.binary_cross_entropy_with_logits(logit, target.float(), reduction="none")
+    return mean_over(by_pixel, valid)
+
+
+def scale_loss(error: Tensor, scale: Tensor, where: Tensor) -> Tensor:
+    """Negative log-likelihood of an absolute ``error`` under a Laplace distribution of ``scale``, a logarithm."""
+    return mean_over(error * torch.exp(-scale) + scale, where)
+
+
+def batch_of(windows: Sequence[Any]) -> Batch:
+    fields = windows[0].__dataclass_fields__
+    batch = {name: torch.from_numpy(np.stack([getattr(window, name) for window in windows])) for name in fields}
+    batch["x"] = batch["x"].contiguous(memory_format=torch.channels_last)
+    return batch
 
 
 @dataclass(frozen=True)
@@ -50,6 +87,11 @@ class StepRecipe(ABC):
     views_a_light: int = 8
     unions: int = 1
 
+    title: ClassVar[str]
+    """Of the weights."""
+    family: ClassVar[training.Family] = training.PHASE_NETWORKS
+    makes: ClassVar[type[nn.Module]] = PhaseNet
+    """The network's class."""
     main_loss: ClassVar[str]
     """Which is shown while it trains."""
     scores: ClassVar[dict[str, dict[str, str]]]
@@ -68,9 +110,19 @@ class StepRecipe(ABC):
             )
 
     @property
-    @abstractmethod
+    def drawn(self) -> tuple[int, ...]:
+        """Arguments of `training.groups_of`."""
+        return self.lights, self.views_a_light, self.seed
+
+    @property
+    def weights_name(self) -> str:
+        """Of the file, and of the weights that come with the package."""
+        return self.name
+
+    @property
     def weights(self) -> dict[str, float]:
-        """Of the losses, by name."""
+        """Of the losses, by name: the fields ``weight_*``."""
+        return {name.removeprefix("weight_"): value for name, value in vars(self).items() if name.startswith("weight_")}
 
     @abstractmethod
     def network(self) -> nn.Module:
@@ -79,6 +131,14 @@ class StepRecipe(ABC):
     @abstractmethod
     def losses(self, network: nn.Module, batch: "Batch") -> dict[str, Tensor]:
         """Of ``network`` on a batch, by the names of `weights`."""
+
+    @abstractmethod
+    def task(self, rig: Rig) -> "Task":
+        """What the network learns from views of ``rig``."""
+
+    def usual_rig(self) -> Rig:
+        """For which it trains unless told otherwise."""
+        return paper_rig()
 
     def rate_at(self, step: int) -> float:
         """Learning rate of step 0, 1, ..."""
@@ -118,64 +178,29 @@ class WindowRecipe(StepRecipe):
     }
 
     @property
-    def weights(self) -> dict[str, float]:
-        weights = {"order": self.weight_order, "mask": self.weight_mask, "phase": self.weight_phase}
-        return weights | {"scale": self.weight_scale}
-
-    @property
     def channels(self) -> int:
         """Input maps of the network."""
         return len(CHANNELS)
 
     def network(self) -> PhaseNet:
-        return PhaseNet(
-            self.widths, self.fine, self.squeezed, self.order_widths, self.bound_rad, self.channels, uncertain=True
-        )
+        return PhaseNet(self.widths, self.fine, self.squeezed, self.order_widths, self.bound_rad, self.channels)
 
     def losses(self, network: nn.Module, batch: "Batch") -> dict[str, Tensor]:
-        return losses(network, batch, self.bound_rad)
-
-
-Batch = dict[str, Tensor]  # the fields of a window with a leading axis B
-
-
-def batch_of(windows: Sequence[Any]) -> Batch:
-    fields = windows[0].__dataclass_fields__
-    batch = {name: torch.from_numpy(np.stack([getattr(window, name) for window in windows])) for name in fields}
-    batch["x"] = batch["x"].contiguous(memory_format=torch.channels_last)
-    return batch
-
-
-def losses(network: torch.nn.Module, batch: Batch, bound_rad: float) -> dict[str, Tensor]:
-    """``order``: cross-entropy over the candidates; ``mask``: binary cross-entropy; ``phase``: smooth L1 in rad;
-    ``scale``: negative log-likelihood of its phase error under a Laplace distribution."""
-    order, inside, correction, scale = network(batch["x"])
-    logits = torch.where(batch["exists"], order, torch.tensor(IMPOSSIBLE))
-    pixels = batch["fitted"].sum().clamp(min=1)
-    by_order = functional.cross_entropy(logits, batch["order"], ignore_index=IGNORED, reduction="sum") / pixels
-    by_pixel = functional.binary_cross_entropy_with_logits(inside, batch["target"].float(), reduction="none")
-    by_mask = (by_pixel * batch["mask_valid"]).sum() / batch["mask_valid"].sum().clamp(min=1)
-    target_rad = batch["correction_rad"].clamp(-bound_rad, bound_rad)
-    by_phase = functional.smooth_l1_loss(correction, target_rad, beta=SMALL_RAD, reduction="none")
-    error = (correction.detach() - batch["correction_rad"]).abs()
-    by_scale = ((error * torch.exp(-scale) + scale) * batch["fitted"]).sum() / pixels
-    phase = (by_phase * batch["fitted"]).sum() / pixels
-    return {"order": by_order, "mask": by_mask, "phase": phase, "scale": by_scale}
-
-
-class WindowObjective:
-    """The weighted losses of a recipe's network, and the moving average of its weights, updated after every step."""
-
-    def __init__(self, network: nn.Module, recipe: StepRecipe) -> None:
-        self.modules: dict[str, nn.Module] = {"network": network}
-        self.recipe, self.weights = recipe, recipe.weights
-        self.averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(recipe.averaged), use_buffers=True)
-
-    def steps(self, batch: Batch) -> Iterator[tuple[str, Tensor, dict[str, Tensor]]]:
-        parts = self.recipe.losses(self.modules["network"], batch)
-        total = torch.stack([self.weights[name] * parts[name] for name in self.weights]).sum()
-        yield "network", total, {name: value.detach() for name, value in parts.items()}
-        self.averaged.update_parameters(self.modules["network"])
+        """``order``: cross-entropy over the candidates; ``mask``: binary cross-entropy; ``phase``: smooth L1 in rad;
+        ``scale``: negative log-likelihood of its phase error under a Laplace distribution."""
+        order, inside, correction, scale = network(batch["x"])
+        logits = torch.where(batch["exists"], order, torch.tensor(IMPOSSIBLE))
+        fitted = batch["fitted"]
+        by_order = functional.cross_entropy(logits, batch["order"], ignore_index=IGNORED, reduction="sum")
+        target_rad = batch["correction_rad"].clamp(-self.bound_rad, self.bound_rad)
+        by_phase = functional.smooth_l1_loss(correction, target_rad, beta=SMALL_RAD, reduction="none")
+        error = (correction.detach() - batch["correction_rad"]).abs()
+        return {
+            "order": by_order / fitted.sum().clamp(min=1),
+            "mask": mask_loss(inside, batch["target"], batch["mask_valid"]),
+            "phase": mean_over(by_phase, fitted),
+            "scale": scale_loss(error, scale, fitted),
+        }
 
 
 class WindowTraining(training.Training):
@@ -202,21 +227,27 @@ class WindowTraining(training.Training):
         network = recipe.network()
         network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         if start is not None:
-            start = start.stating_scale()
             if start.options != network.options:
                 raise TrainingError(f"weights to start from: expected {network.options}, got {start.options}")
             network.load_state_dict(start.state_dict())
-        self.objective = self.windows = WindowObjective(network, recipe)
-        self.bare = {"network": network, "averaged": self.windows.averaged}
+        self.averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(recipe.averaged), use_buffers=True)
+        self.bare = {"network": network, "averaged": self.averaged}
         optimizer = torch.optim.AdamW(network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
-        self.windows.modules["network"], prepared = self.accelerator.prepare(network, optimizer)
-        self.optimizers = {"network": prepared}
+        prepared, prepared_optimizer = self.accelerator.prepare(network, optimizer)
+        self.modules, self.optimizers, self.objective = {"network": prepared}, {"network": prepared_optimizer}, self
         self.resume()
+
+    def steps(self, batch: Batch) -> Iterator[tuple[str, Tensor, dict[str, Tensor]]]:
+        """As of `training.Objective`: the weighted losses; the average is updated after every step."""
+        parts = self.recipe.losses(self.modules["network"], batch)
+        total = torch.stack([weight * parts[name] for name, weight in self.recipe.weights.items()]).sum()
+        yield "network", total, {name: value.detach() for name, value in parts.items()}
+        self.averaged.update_parameters(self.modules["network"])
 
     @property
     def network(self) -> Any:
         """The averaged network, to be used."""
-        return self.windows.averaged.module.eval()
+        return self.averaged.module.eval()
 
     @property
     def steps_done(self) -> int:
@@ -277,3 +308,163 @@ class WindowTraining(training.Training):
         shown = {f"loss_{name}": name for name in self.recipe.weights if name != "scale"}  # a log-likelihood
         scores = [panel(title, labels) for title, labels in self.recipe.scores.items()]
         return [panel("training losses", shown, log=True), *scores]
+
+
+class Task(ABC):
+    """What a network learns from rendered views of a rig: samples of the views, windows of the samples, and what
+    is chosen on validation samples. ``frames``: those it takes; of the validation samples every ``scored_share``-th is
+    scored during training."""
+
+    frames: tuple[int, ...]
+    scored_share: ClassVar[int] = 3
+
+    @abstractmethod
+    def samples(self, views: Iterable[training.View]) -> list[Any]:
+        """The samples of views; a view that can't be used has none."""
+
+    @abstractmethod
+    def draw(self, samples: list[Any], random: np.random.Generator) -> Any:
+        """A random window, see `WindowTraining`."""
+
+    @abstractmethod
+    def scores(self, network: Any, samples: list[Any]) -> dict[str, float]:
+        """Mean scores of a network."""
+
+    @abstractmethod
+    def answered(self, network: Any, samples: list[Any], validation: list[Any]) -> Any:
+        """The trained network's answers for the validation samples, computed reproducibly, and what follows."""
+
+    @abstractmethod
+    def chosen(self, answered: Any, validation: list[Any], out: Path) -> dict[str, Any]:
+        """From `answered`, the fields of `training.NetConfig` that are chosen on validation samples, and their scores;
+        pictures of that go to ``out``."""
+
+
+class CandidateTask(Task):
+    """That of a `PhaseNet`. ``thresholds`` of the mask's logit and ``leads`` of the base order are tried on the
+    validation samples, thresholds also on every ``chosen_share``-th training sample; sums of errors ``tolerance_mm``
+    from the least count as equal."""
+
+    thresholds: ClassVar[tuple[float, ...]]
+    leads: ClassVar[tuple[float, ...]]
+    tolerance_mm: ClassVar[float] = 0.0
+    chosen_share: ClassVar[int | None] = None
+
+    def __init__(self, rig: Rig) -> None:
+        self.image_px = rig.camera.width * rig.camera.height
+
+    @abstractmethod
+    def answers(self, network: PhaseNet, sample: Any) -> Answers:
+        """The network's answers for a sample."""
+
+    @abstractmethod
+    def decided(self, answers: Answers, scene: Any, threshold: float) -> Mask:
+        """A scene's object pixels."""
+
+    @abstractmethod
+    def score(self, answers: Answers, sample: Any, inside: Mask) -> dict[str, float | None]:
+        """`candidate_scores` of a sample whose pixels ``inside`` are object; each pixel's likeliest order is taken."""
+
+    def scores_of(self, answers: Iterable[Answers], samples: list[Any], threshold: float = 0.0) -> dict[str, float]:
+        """Means of each `score` over the samples that have it."""
+        scores = []
+        for one, sample in zip(answers, samples, strict=True):
+            inside = self.decided(one, sample.scene.single(), threshold)
+            scores.append(self.score(one, sample, inside))
+        return mean_scores(scores)
+
+    def scores(self, network: PhaseNet, samples: list[Any]) -> dict[str, float]:
+        return self.scores_of((self.answers(network, sample) for sample in samples), samples)
+
+    def answered(self, network: PhaseNet, samples: list[Any], validation: list[Any]) -> Any:
+        """The answers with the lead that was chosen, by which the fewest orders are wrong; threshold, lead, scores."""
+        answers = [self.answers(network, sample) for sample in validation]
+        further = samples[:: self.chosen_share] if self.chosen_share else []
+        masked = answers + [self.answers(network, sample) for sample in further]
+        masks = [
+            (sample, partial(self.decided, one, sample.scene.single()))
+            for one, sample in zip(masked, validation + further, strict=True)
+        ]
+        threshold = chosen_threshold(masks, self.thresholds, self.image_px, self.tolerance_mm)
+        with_leads = ([one.with_lead(lead) for one in answers] for lead in self.leads)
+        wrong = [self.scores_of(led, validation)["wrong_percent"] for led in with_leads]
+        lead = self.leads[int(np.argmin(wrong))]
+        led = [one.with_lead(lead) for one in answers]
+        return led, {"threshold": threshold, "lead": lead, "validation": self.scores_of(led, validation, threshold)}
+
+    def chosen(self, answered: Any, validation: list[Any], out: Path) -> dict[str, Any]:
+        _, fields = answered
+        return dict(fields)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """The weights file (None for a training that stopped because its minutes were over), validation scores, and the
+    mask threshold that was chosen there."""
+
+    weights: Path | None
+    steps: int
+    threshold: float
+    validation: dict[str, float]
+
+
+def train_net(
+    recipe: StepRecipe,
+    out: Path,
+    *,
+    rig: Rig | None = None,
+    start: Path | None = None,
+    minutes: float | None = None,
+    workers: int = 1,
+    show: bool = False,
+    print_line: Callable[[str], None] = lambda line: None,
+) -> Trained:
+    """Train for ``rig`` (default: that of the recipe), starting from the weights in ``start`` or from random ones; the
+    same call resumes a training that was stopped. ``show``: progress on stderr; ``print_line`` is given a line for
+    every validation. Raises `TrainingError` for a folder of another recipe or rig."""
+    started, rig = perf_counter(), rig or recipe.usual_rig()
+    groups = training.groups_of(*recipe.drawn)
+    first = None if start is None else load_net(start, folded=False)
+    described = recipe.to_dict() | {"rig": rig.to_dict()}
+    described |= {} if first is None else {"start_sha256": first.sha256}
+    fingerprint = training.fingerprint_of(described, groups)
+    with training.alone_in(out):
+        training.claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
+        weights = out / f"{recipe.weights_name}.safetensors"
+        if weights.exists():
+            config = read_net(weights, recipe.makes, recipe.family)[0]
+            scores = {key: float(value or 0) for key, value in config.validation.items()}
+            return Trained(weights, config.steps, config.threshold, scores)
+        task = recipe.task(rig)
+        samples, validation = training.measured_views(
+            groups, rig, task.frames, out / VIEWS, task.samples, recipe.unions, recipe.seed, workers, show
+        )
+        scored = validation[:: task.scored_share]
+        with training.reproducible(cpu=True):
+            ongoing = WindowTraining(
+                recipe,
+                partial(task.draw, samples),
+                lambda network: task.scores(network, scored),
+                out,
+                None if first is None else first.network,
+                print_line,
+            )
+            ongoing.run(started, minutes, show)
+            if not ongoing.over:
+                return Trained(None, ongoing.steps_done, 0.0, {})
+            network = ongoing.network
+            answered = task.answered(network, samples, validation)
+        fields = task.chosen(answered, validation, out)
+        config = training.NetConfig(
+            name=recipe.weights_name,
+            title=recipe.title,
+            options=network.options,
+            dataset_fingerprint=fingerprint,
+            benchmark=training.TrainingBenchmark(f"{recipe.name} views", 1),
+            steps=recipe.steps,
+            recipe=described,
+            **fields,
+        )
+        save_net(weights, network, config, recipe.family)
+        (out / training.CHECKPOINT).unlink(missing_ok=True)
+        return Trained(weights, recipe.steps, config.threshold, dict(fields["validation"]))

@@ -1,44 +1,34 @@
-"""Windows of training samples, varied as other scenes would vary them.
+"""Windows of training samples, and how a network is judged on whole views: what phase-net, crossed-net and
+classical-net have in common."""
 
-Whole objects are moved to another distance, with the light that the calibrated lamp would give and the measured route's
-errors as they were. Wrong base orders are made up in patches and whole windows, because the training objects have few.
-Columns are mirrored, as with a projector on the other side. Brightness varies a little.
-"""
-
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_network import inputs
-from fpp_ml_bench.baselines.phase_network.inputs import FIRST_MISFIT, FIRST_SIDE, SIDES, Geometry, Scene
-from fpp_ml_bench.baselines.phase_network.samples import Sample
-from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask, of_choice, repeated
-from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.optics import Direction
+from fpp_ml_bench.baselines.phase_route import Image, Mask
 
 IGNORED = -100
 """Class of a pixel that is left out of the order's loss: background, or none of the three candidates is right."""
-_MIRRORED = inputs.CHANNELS.index("slope across")
-_PARTNERS = [SIDES.index((row, -column)) for row, column in SIDES]
-_SWAPPED = [FIRST_SIDE + n for n in _PARTNERS] + [FIRST_MISFIT] + [FIRST_MISFIT + 1 + n for n in _PARTNERS]
+EDGE_POINTS = 2000  # pixels of interest that a sample holds, as centres of training windows
+TYPICAL_MM = 1800.0
+"""Depth error that a missed or invented pixel counts with."""
 
 
 @dataclass(frozen=True)
-class Variation:
-    """How often (0 to 1) and how much windows are varied; with 0 throughout they stay as captured. ``shift``: how often
-    objects are moved to any distance of the working range; ``shift_blind``: the same for a network without brightness,
-    so that it does not learn where they mostly stand."""
+class Sample:
+    """A measured view: its ``scene``, the maps that a network is given, and the truth, (h, w) each: ``target``: object
+    pixels that are not ``void``, which are neither object nor background; ``edges`` int32 (n, 2): rows and columns of
+    interest, beside depth edges and silhouettes."""
 
-    near_edge: float = 0.7
-    shift: float = 0.5
-    shift_blind: float = 0.8
-    brightness: float = 0.04
-    wrong_window: float = 0.15
-    wrong_patch: float = 0.3
-    mirror: float = 0.5
+    name: str
+    scene: Any
+    target: Mask
+    void: Mask
+    edges: NDArray[np.int32]
 
 
 @dataclass(frozen=True)
@@ -56,29 +46,10 @@ class Window:
     mask_valid: Mask
 
 
-def draw(
-    samples: list[Sample],
-    geometries: Mapping[Direction, Geometry],
-    size: int,
-    vary: Variation,
-    shading: bool,
-    random: np.random.Generator,
-) -> Window:
-    """A random window of ``size`` px of one of ``samples``; ``shading``: as of `inputs.channels`."""
-    sample = samples[random.integers(len(samples))]
-    geometry = geometries[sample.direction]
-    rows, columns = place_of(sample.edges, sample.target.shape, size, random.random() < vary.near_edge, random)
-    scene, missing = sample.scene.window(rows, columns).single(), sample.missing_rad[rows, columns].astype(np.float32)
-    target, void = sample.target[rows, columns], sample.void[rows, columns]
-    moved = random.random() < (vary.shift if shading else vary.shift_blind) and target.any()
-    if moved:
-        scene = _moved(scene, missing, target, geometry, vary, random)
-    scene, missing = _wrong(scene, missing, geometry, vary, random)
-    x, exists = inputs.channels(scene, geometry, shading)
-    turn = geometry.rotation.turn
-    missing = turn(missing) * np.float32(geometry.rotation.sign)
-    window = _labelled(x, exists, missing, turn(target), size, turn(~void & (not moved)))
-    return _mirrored(window) if random.random() < vary.mirror else window
+def edge_points(interesting: Mask) -> NDArray[np.int32]:
+    """Rows and columns int32 (n, 2) of at most `EDGE_POINTS` of the ``interesting`` pixels, always the same."""
+    places = np.argwhere(interesting).astype(np.int32)
+    return places[np.random.default_rng(0).permutation(len(places))[:EDGE_POINTS]]
 
 
 def place_of(
@@ -96,80 +67,90 @@ def place_of(
     return slice(top, min(top + size, height)), slice(left, min(left + size, width))
 
 
-def _moved(
-    scene: Scene, missing: Image, target: Mask, geometry: Geometry, vary: Variation, random: np.random.Generator
-) -> Scene:
-    """The object at another distance within the working range."""
-    near, far = geometry.rig.working_range_mm
-    layer = geometry.layer.at(scene.crop)
-    true_rad = (layer.residual_phase(scene.phase_rad, scene.order) + missing).astype(np.float32)
-    middle = float(np.median(true_rad[target]))
-    gain, forward = float(np.median(layer.gain)), float(np.median(layer.forward))
-    depth_m = random.uniform(near, far) / MM_PER_M
-    delta = np.float32(gain / (forward * depth_m + layer.back_m) - middle)
-    with np.errstate(all="ignore"):
-        before, after = np.maximum(inputs.coarse_irradiance(scene, geometry, (true_rad, true_rad + delta)), 1e-3)
-        ratio = np.clip(np.nan_to_num(after / before, nan=1.0), 0.4, 2.5)
-    ratio = repeated(ratio, inputs.STEP_PX, scene.light.shape).astype(np.float32)
-    ratio = np.where(target, ratio * np.float32(np.exp(random.normal(0, vary.brightness))), np.float32(1))
-    true_phase = scene.phase_rad + missing
-    light = ratio * (scene.light + scene.bright * (np.cos(true_phase + delta) - np.cos(true_phase)))
-    phase = scene.phase_rad + delta
-    carry = np.rint(phase / TAU)
-    return replace(
-        scene,
-        light=np.where(target, light, scene.light),
-        bright=(scene.bright * ratio).astype(np.float32),
-        phase_rad=(phase - TAU * carry).astype(np.float32),
-        order=scene.order + carry.astype(np.int32),
-        middle_rad=scene.middle_rad + float(delta),
-    )
+def wrong_place(
+    shape: tuple[int, ...], whole: float, patch: float, random: np.random.Generator
+) -> tuple[Mask | None, bool]:
+    """Where in a window of ``shape`` wrong base orders are made up, because training objects have few: everywhere, as
+    often as ``whole`` says, or in a patch, as often as ``patch`` says of the others; None: nowhere. And whether it is
+    everywhere."""
+    if random.random() < whole:
+        return np.ones(shape, bool), True
+    if random.random() >= patch:
+        return None, False
+    coarse = random.standard_normal((12, 12)).astype(np.float32)
+    noise: Image = cv2.resize(coarse, shape[::-1], interpolation=cv2.INTER_CUBIC)  # type: ignore[assignment]
+    return noise > random.uniform(0.5, 1.5), False
 
 
-def _wrong(
-    scene: Scene, missing: Image, geometry: Geometry, vary: Variation, random: np.random.Generator
-) -> tuple[Scene, Image]:
-    """Wrong base orders, where the working range allows them."""
-    height, width = scene.light.shape
-    off, middle = np.zeros((height, width), np.int32), 0
-    if random.random() < vary.wrong_window:
-        middle = int(random.choice((-1, 1)))
-        off += middle
-    elif random.random() < vary.wrong_patch:
-        coarse = random.standard_normal((12, 12)).astype(np.float32)
-        noise = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC)
-        off += (noise > random.uniform(0.5, 1.5)) * int(random.choice((-1, 1)))
-    if not off.any():
-        return scene, missing
-    with np.errstate(all="ignore"):
-        depth_mm = geometry.layer.at(scene.crop).depth_mm(scene.phase_rad, scene.order + off)
-        off = np.where(geometry.in_range(depth_mm), off, 0).astype(np.int32)
-    changed = replace(scene, order=scene.order + off, middle_rad=scene.middle_rad + TAU * middle)
-    return changed, missing - np.float32(TAU) * off
-
-
-def _labelled(x: Image, exists: Mask, missing: Image, target: Mask, size: int, mask_valid: Mask) -> Window:
-    steps = np.rint(missing / TAU).astype(np.int64)
-    possible = target & (np.abs(steps) <= 1)
-    place = np.clip(steps, -1, 1) + 1
-    possible &= of_choice(exists, place)
-    correction = (missing - TAU * steps).astype(np.float32)
-    _, height, width = x.shape
+def padded(size: int, x: Image, exists: Mask, *maps: NDArray) -> Window:
+    """A `Window` of ``size`` px of its fields in their order, which may be smaller; what is added counts nowhere."""
+    height, width = x.shape[-2:]
     pad = ((0, size - height), (0, size - width))
-    deep = ((0, 0), *pad)
+    order, *others = maps
     return Window(
-        np.pad(x, deep),
-        np.pad(exists, deep, constant_values=True),
-        np.pad(np.where(possible, place, IGNORED), pad, constant_values=IGNORED),
-        np.pad(correction, pad),
-        np.pad(possible, pad),
-        np.pad(target, pad),
-        np.pad(mask_valid, pad),
+        np.pad(x, ((0, 0), *pad)),
+        np.pad(exists, ((0, 0), *pad), constant_values=True),
+        np.pad(order, pad, constant_values=IGNORED).astype(np.int64),
+        *(np.pad(values, pad) for values in others),
     )
 
 
-def _mirrored(window: Window) -> Window:
-    flipped = {name: getattr(window, name)[..., ::-1].copy() for name in Window.__dataclass_fields__}
-    flipped["x"][_MIRRORED] *= -1
-    flipped["x"][FIRST_SIDE:] = flipped["x"][_SWAPPED]
-    return Window(**flipped)
+def candidate_scores(
+    found_mm: NDArray,
+    true_mm: NDArray,
+    error_rad: NDArray,
+    sigma_rad: NDArray,
+    inside: Mask,
+    truth: Sample,
+    wrong_rad: float,
+) -> dict[str, float | None]:
+    """Scores of a view from its depth, true depth, error of the phase and its stated uncertainty at the pixels of
+    ``truth.target``, (n,) each, and its mask ``inside`` (h, w). ``object_mae_mm`` counts a missed pixel with its whole
+    depth; ``right_mae_mm``: MAE of pixels with the right order, whose phase is less than ``wrong_rad`` off;
+    ``wrong_percent`` and ``missed_percent``: shares of the object's pixels; ``invented_kpx``: background pixels with a
+    depth, in thousands; ``within_percent``: errors of the phase within the stated standard uncertainty, 68 of a normal
+    distribution. Where no order is right, it and ``right_mae_mm`` are None."""
+    detected, apart = inside[truth.target], np.abs(error_rad)
+    error = np.minimum(np.abs(np.nan_to_num(found_mm) - true_mm), true_mm)
+    error, wrong = np.where(detected, error, true_mm), apart > wrong_rad
+    right = detected & ~wrong
+    return {
+        "object_mae_mm": float(error.mean()),
+        "right_mae_mm": float(error[right].mean()) if right.any() else None,
+        "wrong_percent": 100 * float(wrong.mean()),
+        "missed_percent": 100 * float((~detected).mean()),
+        "within_percent": 100 * float((apart < sigma_rad)[right].mean()) if right.any() else None,
+        "invented_kpx": float((inside & ~truth.target & ~truth.void).sum()) / 1000,
+    }
+
+
+def mean_scores(rows: Iterable[Mapping[str, float | None]]) -> dict[str, float]:
+    """Mean of each score over the rows that have it; a score that none has is left out."""
+    known: dict[str, list[float]] = {}
+    for row in rows:
+        for key, value in row.items():
+            if value is not None:
+                known.setdefault(key, []).append(value)
+    return {key: float(np.mean(values)) for key, values in known.items()}
+
+
+def chosen_threshold(
+    views: Iterable[tuple[Sample, Callable[[float], Mask]]],
+    thresholds: Sequence[float],
+    pixels: int,
+    tolerance_mm: float = 0.0,
+) -> float:
+    """The threshold, out of the rising ``thresholds`` on the mask's logit, with the least sum of object and background
+    error: a missed object pixel and an invented background pixel are off by the same distance, each divided by the
+    number of pixels of its kind. ``views``: each with the mask that it gets by a threshold; ``pixels``: of a whole
+    image. Among the thresholds within ``tolerance_mm`` of the least, the lowest: it misses the fewest pixels."""
+    costs = []
+    for truth, decided in views:
+        object_px, row = max(int(truth.target.sum()), 1), []
+        for threshold in thresholds:
+            inside = decided(threshold)
+            missed, invented = (truth.target & ~inside).sum(), (inside & ~truth.target & ~truth.void).sum()
+            row.append(TYPICAL_MM * (missed / object_px + invented / (pixels - object_px)))
+        costs.append(row)
+    means = np.mean(costs, axis=0)
+    return thresholds[int(np.flatnonzero(means <= means.min() + tolerance_mm)[0])]

@@ -4,6 +4,7 @@ from .depth_training import WEIGHTS as WEIGHTS
 from .depth_training import DepthTraining as DepthTraining
 from .depth_training import TrainingRun as TrainingRun
 from .depth_training import model_config as model_config
+from .depth_training import open_data as open_data
 from .depth_training import train as train
 from .engine import CHECKPOINT as CHECKPOINT
 from .engine import RECIPE as RECIPE
@@ -11,7 +12,6 @@ from .engine import Training as Training
 from .engine import alone_in as alone_in
 from .engine import claim_folder as claim_folder
 from .engine import reproducible as reproducible
-from .epochs import open_data as open_data
 from .losses import EPSILON as EPSILON
 from .losses import loss_function as loss_function
 from .losses import sample_losses as sample_losses

@@ -3,11 +3,14 @@
 The weights kept are those of the lowest validation loss, the mean over samples of each one's own; the scores beside it
 are the evaluator's, under individual normalisation with the sample's range, as on the leaderboard. Beside the engine's
 files a folder holds ``weights.safetensors`` and, at the end, ``done.json``.
+
+The order of an epoch depends on the seed and its number alone, so that a resumed training gives the same result as one
+that never stopped.
 """
 
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,14 +23,13 @@ from accelerate import PartialState
 from accelerate.utils import gather_object, set_seed
 from torch import Tensor, nn
 from torch.optim import RMSprop
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset, Sampler
 
 from fpp_ml_bench.baselines import networks
 from fpp_ml_bench.baselines.phase_route import CalibrationLayer
 from fpp_ml_bench.baselines.training.engine import DIVERGED, Training, alone_in, claim_folder, reproducible
-from fpp_ml_bench.baselines.training.epochs import EpochSampler, Schedule, open_data, spread, training_loader
 from fpp_ml_bench.baselines.training.losses import Adversarial, AdversarialSettings, Regression
-from fpp_ml_bench.baselines.training.recipe import Linear, Recipe
+from fpp_ml_bench.baselines.training.recipe import Linear, Plateau, Recipe
 from fpp_ml_bench.baselines.training.records import CURVE_FILE, LOG_FILE, Panel, Record
 from fpp_ml_bench.baselines.training.tables import GAN
 from fpp_ml_bench.baselines.training.weights import ModelConfig, save_weights, training_benchmark
@@ -48,6 +50,11 @@ SCORING: dict[Normalisation, tuple[Units, Mode]] = {
 }
 """How a network's output is scored: its unit, and the evaluator's mode."""
 LOGGED = ("object_mae_mm", "background_mae_mm", "overall_mae_mm")
+LEAST_GAIN = 1e-4
+"""Share by which a loss must be below the best one to count as lower."""
+_GOLDEN = (5**0.5 - 1) / 2
+_RELATIVE = 1e-9
+"""1e-4 x 0.1 x 0.1 is 1.0000000000000002e-06: a rate this near to its minimum has reached it."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +111,123 @@ def finished_run(out: Path) -> TrainingRun | None:
 
 def _run(out: Path, epochs: int, best: int, seconds: float, finished: bool) -> TrainingRun:
     return TrainingRun(out / WEIGHTS, epochs, best, seconds, finished, out / LOG_FILE, out / CURVE_FILE)
+
+
+def epoch_order(pairs: int, drawn: int | None, seed: int, epoch: int) -> list[int]:
+    """Indices of epoch ``epoch`` (from 0): all ``pairs`` in a new order, or the next ``drawn`` of one shuffled round of
+    all pairs after the other: every pair comes once before any comes twice."""
+    drawn = min(drawn or pairs, pairs)
+    first = epoch * drawn
+    order: list[int] = []
+    for turn in range(first // pairs, (first + drawn - 1) // pairs + 1):
+        shuffled = np.random.default_rng([seed, turn]).permutation(pairs)
+        start = max(0, first - turn * pairs)
+        order += shuffled[start : first + drawn - turn * pairs].tolist()
+    return order
+
+
+def spread(pairs: int, drawn: int | None) -> list[int]:
+    """``drawn`` indices (all, if None) evenly over ``pairs``, always the same: each in its own stretch of the pairs, at
+    a place that walks through it by the golden ratio, so that views and the frames within them come evenly."""
+    if drawn is None or drawn >= pairs:
+        return list(range(pairs))
+    return [int((place + place * _GOLDEN % 1) * pairs / drawn) for place in range(drawn)]
+
+
+class BatchRead(Dataset[FringeDepth]):
+    """`FringeDepthDataset` read a batch at a time, as torch's loader asks of what offers ``__getitems__``."""
+
+    def __init__(self, source: FringeDepthDataset) -> None:
+        self.source = source
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    def __getitem__(self, index: int) -> FringeDepth:
+        return self.source[index]
+
+    def __getitems__(self, indices: list[int]) -> FringeDepth:
+        return self.source.read(indices)
+
+
+class EpochSampler(Sampler[int]):
+    """`epoch_order` as a sampler; set ``epoch`` before each pass."""
+
+    def __init__(self, pairs: int, drawn: int | None, seed: int) -> None:
+        self.pairs, self.drawn, self.seed, self.epoch = pairs, drawn, seed, 0
+
+    def __len__(self) -> int:
+        return min(self.drawn or self.pairs, self.pairs)
+
+    def __iter__(self) -> Iterator[int]:
+        return iter(epoch_order(self.pairs, self.drawn, self.seed, self.epoch))
+
+
+def training_loader(source: FringeDepthDataset, sampler: EpochSampler, batch: int, pin: bool) -> DataLoader:
+    """Batches in the sampler's order, read in this process (that takes less time than a step), as `BatchRead` gives
+    them: there is nothing to collate."""
+    return DataLoader(BatchRead(source), batch_size=batch, sampler=sampler, collate_fn=lambda b: b, pin_memory=pin)
+
+
+def open_data(recipe: Recipe, dataset: Path) -> tuple[FringeDepthDataset, FringeDepthDataset]:
+    """Training and validation pairs. TrainingError for another image size than the recipe's, or an empty split."""
+    datasets = []
+    for split in ("train", "validation"):
+        data = FringeDepthDataset(dataset, split, recipe.frames, recipe.normalisation, recipe.background_removed)
+        if data.source.size != (recipe.size, recipe.size):
+            height, width = data.source.size
+            raise TrainingError(
+                f"{dataset}: holds images of {width} x {height} px, recipe {recipe.name} with preset {recipe.preset} "
+                f"expects {recipe.size} x {recipe.size}; build the size it needs: fpp-bench build DIR --preset full "
+                f"--size {recipe.size}"
+            )
+        if not len(data):
+            raise TrainingError(f"{dataset}: split {split} holds no sample; training needs train and validation")
+        datasets.append(data)
+    return datasets[0], datasets[1]
+
+
+class Schedule:
+    """``rate`` of the coming epoch, of all optimisers; a plateau as torch's ``ReduceLROnPlateau`` counts it."""
+
+    def __init__(self, rule: Plateau | Linear, rate: float) -> None:
+        self.rule, self.first, self.rate = rule, rate, rate
+        self.epochs, self.bad, self.best = 0, 0, math.inf
+
+    @property
+    def finished(self) -> bool:
+        """The rate is at its minimum (plateau), or all epochs are over (linear)."""
+        if isinstance(self.rule, Linear):
+            return self.epochs >= self.rule.constant + self.rule.decay
+        return self.rate <= self.rule.minimum * (1 + _RELATIVE)
+
+    def step(self, validation_loss: float) -> None:
+        """An epoch with this validation loss has ended."""
+        rule = self.rule
+        self.epochs += 1
+        if isinstance(rule, Linear):
+            left = rule.constant + rule.decay - self.epochs
+            self.rate = self.first * min(1.0, max(0, left) / rule.decay)
+        elif validation_loss < self.best * (1 - LEAST_GAIN):
+            self.best, self.bad = validation_loss, 0
+        elif self.bad < rule.patience:
+            self.bad += 1
+        else:
+            self.rate, self.bad = max(self.rate * rule.factor, rule.minimum), 0
+
+    def state(self) -> dict[str, Any]:
+        if isinstance(self.rule, Linear):
+            return {"epochs": self.epochs}
+        best = self.best if math.isfinite(self.best) else None
+        return {"epochs": self.epochs, "rate": self.rate, "bad": self.bad, "best": best}
+
+    def restore(self, state: Mapping[str, Any]) -> None:
+        if isinstance(self.rule, Linear):
+            for _ in range(state["epochs"]):
+                self.step(0.0)
+            return
+        self.epochs, self.rate, self.bad = state["epochs"], state["rate"], state["bad"]
+        self.best = math.inf if state["best"] is None else state["best"]
 
 
 class DepthTraining(Training):

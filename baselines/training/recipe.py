@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
-from fpp_ml_bench.baselines.networks import NETWORKS
 from fpp_ml_bench.baselines.training.tables import GAN, GENERATORS, NETWORK_TITLES, PRESETS, ROWS, TABLES, check_loss
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.depth import Normalisation
@@ -21,11 +20,7 @@ from fpp_ml_bench.schema import Positive, StrictModel, Text, problems_of
 
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"
 _LONGEST_CHAIN = 8
-_OPTION_TITLES = {
-    "standardised": "input standardised",
-    "guided": "guided by phase",
-    "batch_normalised": "batch normalisation",
-}
+_OPTION_TITLES = {"standardised": "input standardised", "guided": "guided by phase"}
 """What the UNet's options are called in a title; in a name they stand as they are."""
 
 
@@ -104,8 +99,8 @@ class Recipe(StrictModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> "Recipe":
-        if self.network not in NETWORKS:
-            raise ValueError(f"network: expected one of {', '.join(NETWORKS)}, got {self.network!r}")
+        if self.network not in NETWORK_TITLES:
+            raise ValueError(f"network: expected one of {', '.join(NETWORK_TITLES)}, got {self.network!r}")
         if {"width", "name"} & set(self.options):
             raise ValueError("options: width and network are keys of their own, and no options")
         if self.frames not in CONFIGS:
@@ -166,8 +161,10 @@ def load_recipe(name_or_path: str | Path, preset: str = "cpu") -> Recipe:
     shipped, own = _resolved(path, 0)
     content = _merge(shipped, own)
     network = content.get("network")
-    if not isinstance(network, str) or network not in NETWORKS:
-        raise RecipeError(f"{path}: network: expected one of {', '.join(NETWORKS)}, got {printable(repr(network), 60)}")
+    if not isinstance(network, str) or network not in NETWORK_TITLES:
+        raise RecipeError(
+            f"{path}: network: expected one of {', '.join(NETWORK_TITLES)}, got {printable(repr(network), 60)}"
+        )
     scale = _preset(preset)
     merged = _merge(shipped, scale["every"], pick=True)
     merged = _merge(merged, scale["normalisations"].get(str(content.get("normalisation")), {}), pick=True)

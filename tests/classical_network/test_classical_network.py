@@ -21,9 +21,14 @@ from fpp_ml_bench.baselines.classical_network import (
 )
 from fpp_ml_bench.baselines.classical_network.network import BOUND_SIGMAS, REACH
 from fpp_ml_bench.baselines.classical_network.route import Filtered, decided, filtered
-from fpp_ml_bench.baselines.classical_network.samples import Sample, draw, sample_of
 from fpp_ml_bench.baselines.classical_network.scene import channels
-from fpp_ml_bench.baselines.classical_network.training import THRESHOLDS, chosen_threshold, score
+from fpp_ml_bench.baselines.classical_network.training import (
+    THRESHOLDS,
+    DepthSample,
+    chosen_threshold,
+    sample_of,
+    score,
+)
 from fpp_ml_bench.errors import NetworkError, TrainingError, WeightsError
 from fpp_ml_bench.loaders.render import named_light
 from fpp_ml_bench.optics import paper_rig
@@ -49,7 +54,7 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Views:
 
 
 @pytest.fixture(scope="module")
-def samples(views: Views) -> list[Sample]:
+def samples(views: Views) -> list[DepthSample]:
     found = [sample_of(view, method()) for view in views]
     assert all(found)
     return found  # type: ignore[return-value]
@@ -71,7 +76,7 @@ def wild(seed: int = 0) -> DepthFilter:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_no_depth_that_no_neighbour_has(samples: list[Sample], seed: int) -> None:
+def test_no_depth_that_no_neighbour_has(samples: list[DepthSample], seed: int) -> None:
     scene = samples[0].scene
     holes = replace(scene, found=scene.found & (np.random.default_rng(seed).random(scene.found.shape) > 0.2))
     scene = replace(holes, depth_mm=holes.depth_mm * holes.found, sigma_mm=holes.sigma_mm * holes.found)
@@ -87,7 +92,7 @@ def test_no_depth_that_no_neighbour_has(samples: list[Sample], seed: int) -> Non
     assert not (decided(answer, scene, -np.inf) & ~answer.near & ~scene.found).any()
 
 
-def test_what_the_network_sees_has_no_distance_unit_or_direction(samples: list[Sample]) -> None:
+def test_what_the_network_sees_has_no_distance_unit_or_direction(samples: list[DepthSample]) -> None:
     scene = samples[0].scene
     seen = channels(scene)
     assert seen.shape == (len(CHANNELS), *scene.found.shape) and np.isfinite(seen).all()
@@ -103,23 +108,23 @@ def test_what_the_network_sees_has_no_distance_unit_or_direction(samples: list[S
     np.testing.assert_allclose(channels(scene.with_maps(np.rot90)), np.rot90(seen, axes=(-2, -1)), atol=2e-3)
 
 
-def test_a_sample_holds_the_exact_depth(views: Views, samples: list[Sample]) -> None:
+def test_a_sample_holds_the_exact_depth(views: Views, samples: list[DepthSample]) -> None:
     view, sample = views[0], samples[0]
     exact = sample.exact_mm + sample.scene.middle_mm
     np.testing.assert_allclose(exact[sample.target], view.depth_mm[sample.scene.crop][sample.target], atol=2e-3)
     error = (sample.scene.depth_mm - sample.exact_mm)[sample.target & sample.scene.found]
     assert 0.05 < np.median(np.abs(error)) < 2
-    random = np.random.default_rng(1)
+    random, task = np.random.default_rng(1), FilterRecipe(window=96).task(paper_rig(SIZE))
     for _ in range(8):
-        window = draw(samples, 96, 0.5, random)
+        window = task.draw(samples, random)
         assert window.x.shape == (len(CHANNELS), 96, 96) and window.depth_mm.shape == window.valid.shape == (96, 96)
         assert (window.x[0] == window.found).all() and not (window.target & ~window.valid).any()
     blank = replace(view, frames=np.zeros_like(view.frames))
     assert sample_of(blank, method()) is None
 
 
-def test_the_threshold_lets_no_view_lose(samples: list[Sample]) -> None:
-    def filling(sample: Sample, logits: np.ndarray) -> Filtered:
+def test_the_threshold_lets_no_view_lose(samples: list[DepthSample]) -> None:
+    def filling(sample: DepthSample, logits: np.ndarray) -> Filtered:
         zeros = np.zeros_like(sample.exact_mm)
         return Filtered(zeros, zeros, logits.astype(np.float32), np.ones_like(sample.target))
 
@@ -161,7 +166,7 @@ def test_the_shipped_weights_take_noise_away_on_every_view(views: Views) -> None
         np.testing.assert_array_equal(filter_method.predict(frames_of(view)), answer.depth)
 
 
-def test_scores_count_a_missed_pixel_with_its_whole_depth(samples: list[Sample]) -> None:
+def test_scores_count_a_missed_pixel_with_its_whole_depth(samples: list[DepthSample]) -> None:
     sample = samples[0]
     exact = Filtered(
         sample.exact_mm,

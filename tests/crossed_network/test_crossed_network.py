@@ -11,7 +11,7 @@ from fpp_ml_bench.baselines import load_method, training
 from fpp_ml_bench.baselines.crossed_network import CrossedRecipe, inputs, train_crossed_net
 from fpp_ml_bench.baselines.crossed_network.method import CrossedNetMethod
 from fpp_ml_bench.baselines.crossed_network.route import CrossedNetRoute, decided_mask, stated_rad
-from fpp_ml_bench.baselines.crossed_network.samples import Sample, Variation, draw, sample_of
+from fpp_ml_bench.baselines.crossed_network.training import CrossedSample, Variation, sample_of
 from fpp_ml_bench.baselines.crossed_route import CrossedRoute
 from fpp_ml_bench.baselines.phase_network import IGNORED, Answers, load_net, threshold_at
 from fpp_ml_bench.cli import main
@@ -40,12 +40,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def samples(folder: Path) -> list[Sample]:
+def samples(folder: Path) -> list[CrossedSample]:
     learned = training.with_unions(training.read_views(folder, GROUPS, "train"), unions=1, seed=1)
     return [sample_of(view, route()) for view in learned]
 
 
-def test_the_truth_of_a_sample_is_the_exact_depth(samples: list[Sample], folder: Path) -> None:
+def test_the_truth_of_a_sample_is_the_exact_depth(samples: list[CrossedSample], folder: Path) -> None:
     sample, view = samples[0], next(training.read_views(folder, GROUPS, "train"))
     part = route().carriers.at(sample.scene.crop)
     truth = sample.scene.nearness + sample.missing_rad.astype(np.float32) / part.joint_gain
@@ -55,7 +55,7 @@ def test_the_truth_of_a_sample_is_the_exact_depth(samples: list[Sample], folder:
     assert np.abs(part.depth_mm(truth) - exact)[near].max() < 0.1
 
 
-def test_a_union_shows_the_nearer_object(samples: list[Sample]) -> None:
+def test_a_union_shows_the_nearer_object(samples: list[CrossedSample]) -> None:
     names = [sample.name for sample in samples]
     assert names[:2] == ["wood_block_A0", "duct_tape_A60"] and all("+" in name for name in names[2:])
     # All that both objects show, but for what the nearer hides and pixels that mix them.
@@ -63,7 +63,7 @@ def test_a_union_shows_the_nearer_object(samples: list[Sample]) -> None:
 
 
 @pytest.mark.parametrize("turn", range(8))
-def test_windows_mean_the_same_in_every_orientation(samples: list[Sample], turn: int) -> None:
+def test_windows_mean_the_same_in_every_orientation(samples: list[CrossedSample], turn: int) -> None:
     # Turning the picture and measuring is turning what was measured: sides and slopes point to the turned places.
     scene = samples[0].scene.single()
     size = min(scene.light.shape)
@@ -80,12 +80,12 @@ def test_windows_mean_the_same_in_every_orientation(samples: list[Sample], turn:
     assert np.array_equal(back, x)
 
 
-def test_labels_say_which_candidate_and_how_far(samples: list[Sample]) -> None:
+def test_labels_say_which_candidate_and_how_far(samples: list[CrossedSample]) -> None:
     rng = np.random.default_rng(5)
     for vary in (STILL, replace(STILL, wrong_window=1.0)):
-        seen = []
+        seen, task = [], CrossedRecipe(window=64, vary=vary).task(crossed_rig(SIZE))
         for _ in range(12):
-            window = draw(samples, route().carriers, 64, vary, rng)
+            window = task.draw(samples, rng)
             assert np.isfinite(window.x).all() and window.x.shape == (len(inputs.CHANNELS), 64, 64)
             labelled = window.order != IGNORED
             assert np.array_equal(labelled, window.fitted)
@@ -176,7 +176,7 @@ def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
         next(training.read_views(tmp_path, GROUPS, "train"))
 
 
-def test_the_mask_asks_for_less_in_a_weak_frame(samples: list[Sample]) -> None:
+def test_the_mask_asks_for_less_in_a_weak_frame(samples: list[CrossedSample]) -> None:
     scene = samples[0].scene.single()
     assert scene.strength > 25  # the light paper
     limits = [threshold_at(strength, -0.5) for strength in (0.0, 5.0, 20.0, 40.0, 200.0)]

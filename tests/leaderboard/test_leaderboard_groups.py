@@ -162,7 +162,6 @@ UNET = {
         ("UNet, global, rmse", "unet", UNET, "UNet global RMSE"),
         ("UNet, global, rmse", "unet", UNET | {"trained_frames": "all"}, "UNet global RMSE all frames"),
         ("UNet, global, rmse", "unet", UNET | {"background_removed": True}, "UNet global RMSE, no background"),
-        ("UNet, global, rmse, batch normalisation", "unet", UNET, "UNet global RMSE, batch norm"),
         ("UNet, global, rmse, input standardised", "unet", UNET, "UNet global RMSE, standardised"),
     ],
 )

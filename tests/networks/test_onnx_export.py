@@ -10,7 +10,7 @@ import torch
 from tiny_network import SMALL, one_thread, rounding_error  # noqa: F401
 
 from fpp_ml_bench.baselines.networks import NETWORKS, build
-from fpp_ml_bench.baselines.networks.onnx_export import INPUT, OUTPUT, export_onnx
+from fpp_ml_bench.baselines.networks.model import INPUT, OUTPUT, export_onnx
 from fpp_ml_bench.errors import FppBenchError, NetworkError
 
 

@@ -6,7 +6,7 @@ import torch
 from tiny_network import one_thread  # noqa: F401
 
 from fpp_ml_bench.baselines.networks import PhaseGuide, build, re_projection_loss
-from fpp_ml_bench.baselines.networks.phase_guide import CHANNELS, ORDERS
+from fpp_ml_bench.baselines.networks.unet import GUIDED_CHANNELS, ORDERS
 from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
 from fpp_ml_bench.baselines.stability import U32
 from fpp_ml_bench.errors import NetworkError
@@ -26,7 +26,7 @@ def test_a_plane_is_one_of_the_candidates(depth_mm):
     maps = PhaseGuide()(fringe_of(depth_mm))[0]
     inner = slice(16, -16), slice(16, -16)  # beyond the window's reach from the border
     cosine, sine, strength, *candidates = (m[inner].double() for m in maps[1:])
-    assert maps.shape == (CHANNELS, SIZE, SIZE) and len(candidates) == len(ORDERS)
+    assert maps.shape == (GUIDED_CHANNELS, SIZE, SIZE) and len(candidates) == len(ORDERS)
     error_mm = 600 * torch.stack([(c - (depth_mm - 1500) / 600).abs() for c in candidates]).amin(0)
     # The window leaves exp(-(2 pi 0.5)^2 / 2) = 0.7% of the mean's carrier: 1% of phase here, 2 mm.
     assert error_mm.max() < 4

@@ -11,8 +11,8 @@ from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS
 from fpp_ml_bench.baselines.phase_network.method import PhaseNetMethod
 from fpp_ml_bench.baselines.phase_network.net_file import load_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.phase_network.route import Levers, NetworkRoute
-from fpp_ml_bench.baselines.phase_route import TAU, PhaseRoute, Reason, Settings
+from fpp_ml_bench.baselines.phase_network.route import NetworkRoute
+from fpp_ml_bench.baselines.phase_route import TAU, Reason, Settings
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.errors import DecodeError, NetworkError, PredictionError
 from fpp_ml_bench.optics import Rig, paper_rig
@@ -28,7 +28,7 @@ def part_of(rig: Rig, size: int) -> Rig:
 def wild(bound_rad: float) -> PhaseNet:
     """A network that says anything, loudly."""
     torch.manual_seed(3)
-    network = PhaseNet((8, 8), 4, 6, (6, 8), bound_rad, uncertain=True)
+    network = PhaseNet((8, 8), 4, 6, (6, 8), bound_rad)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=1.0)
     return network.eval()
@@ -42,9 +42,10 @@ def test_random_weights_stay_on_the_candidates(direction: str) -> None:
     settings = Settings(direction=direction)
     network_route = NetworkRoute(RIG, settings, wild(bound), threshold=-1e9)
     image = photograph("cork", "A60").frames[FIRST[direction]]
-    answered = network_route.observe(image)
-    measurement = network_route.conclude(answered)
-    observation, on_object = answered.observation, measurement.depth_mm[answered.observation.crop] > 0
+    measurement, measured = network_route.measure(image), network_route.geometry.route
+    observation = measured.observe(image)
+    base, _ = measured.choose(observation)
+    on_object = measurement.depth_mm[observation.crop] > 0
     assert on_object.sum() > 3000
     absolute = observation.layer.absolute_phase(np.where(on_object, measurement.depth_mm[observation.crop], 1000.0))
     order = np.rint((absolute - observation.phase_rad) / TAU)
@@ -53,22 +54,9 @@ def test_random_weights_stay_on_the_candidates(direction: str) -> None:
     assert np.abs(correction).max() > 0.9 * bound  # it did try
     first, count = observation.candidates.first, observation.candidates.count
     allowed = (order >= first) & (order < first + count)
-    allowed |= (order == answered.base) & (count == 0)
+    allowed |= (order == base) & (count == 0)
     assert allowed[on_object].all()
-    assert len(np.unique((order - answered.base)[on_object])) > 1
-
-
-def test_without_its_levers_it_is_the_measured_route() -> None:
-    image = photograph("cork", "A60").frames[0]
-    no_levers = Levers(order=False, mask=False, phase=False)
-    measured, network_route = (
-        PhaseRoute(RIG, Settings()).measure(image),
-        NetworkRoute(RIG, Settings(), wild(0.5), levers=no_levers),
-    )
-    measurement = network_route.measure(image)
-    assert np.array_equal(measurement.depth_mm, measured.depth_mm)
-    assert np.array_equal(measurement.order, measured.order)
-    assert np.array_equal(measurement.confidence, measured.confidence)
+    assert len(np.unique((order - base)[on_object])) > 1
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
@@ -77,12 +65,12 @@ def test_a_range_under_one_period_settles_the_order(direction: str) -> None:
     short = replace(RIG, working_range_mm=(1685.0, 1915.0))
     assert short.periods_in_range(direction) < 1  # type: ignore[arg-type]
     image = photograph("cork", "A60").frames[FIRST[direction]]
-    answered = (route := NetworkRoute(short, Settings(direction=direction), wild(0.5), threshold=-1e9)).observe(image)
-    measurement = route.conclude(answered)
-    crop, candidates = answered.observation.crop, answered.observation.candidates
+    route = NetworkRoute(short, Settings(direction=direction), wild(0.5), threshold=-1e9)  # type: ignore[arg-type]
+    measurement, observation = route.measure(image), route.geometry.route.observe(image)
+    crop, candidates = observation.crop, observation.candidates
     one = (candidates.count == 1) & (measurement.depth_mm[crop] > 0)
-    absolute = answered.observation.layer.absolute_phase(np.where(one, measurement.depth_mm[crop], 1000.0))
-    order = np.rint((absolute - answered.observation.phase_rad) / TAU)
+    absolute = observation.layer.absolute_phase(np.where(one, measurement.depth_mm[crop], 1000.0))
+    order = np.rint((absolute - observation.phase_rad) / TAU)
     assert one.sum() > 300 and (order == candidates.first)[one].all()
     assert measurement.order_doubt_mm[crop][one].max() < 0.01
     assert "order by range" in PhaseNetMethod(short, direction=direction).title  # type: ignore[arg-type]
@@ -108,7 +96,7 @@ def test_brighter_or_darker_frames_have_the_same_depth() -> None:
     method = PhaseNetMethod(RIG)
     full = method.route.measure(image)
     # Light above the ambient grey level, halved; what is rounded to whole grey levels is noise of half a level.
-    background = method.route.observe(image).observation.background
+    background = method.route.geometry.route.observe(image).background
     half_grey = background.ambient_grey + (image - background.ambient_grey) / 2
     half = method.route.measure(np.rint(half_grey).astype(np.uint8))
     both = (full.depth_mm > 0) & (half.depth_mm > 0)
@@ -209,3 +197,5 @@ def test_refusals_name_what_came() -> None:
         PhaseNet().forward(torch.zeros(1, len(CHANNELS), 40, 32))
     with pytest.raises(NetworkError, match="bound_rad"):
         PhaseNet(bound_rad=4.0)
+    with pytest.raises(NetworkError, match="states its uncertainty"):
+        PhaseNet(uncertain=False)

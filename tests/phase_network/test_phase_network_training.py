@@ -15,12 +15,17 @@ from fpp_ml_bench.baselines import load_method, training
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, Geometry, Rotation
 from fpp_ml_bench.baselines.phase_network.net_file import load_net, save_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.phase_network.samples import Sample, sample_of, samples_of
-from fpp_ml_bench.baselines.phase_network.training import Recipe, answers_of, scores_of, train_phase_net
+from fpp_ml_bench.baselines.phase_network.training import (
+    PhaseSample,
+    PhaseTask,
+    Recipe,
+    Variation,
+    sample_of,
+    train_phase_net,
+)
 from fpp_ml_bench.baselines.phase_network.window_training import WindowTraining
-from fpp_ml_bench.baselines.phase_network.windows import Variation, draw
 from fpp_ml_bench.baselines.phase_route import Settings
-from fpp_ml_bench.baselines.training import CHECKPOINT, SHIPPED, Group, NetConfig, read_views, reproducible
+from fpp_ml_bench.baselines.training import CHECKPOINT, SHIPPED, Group, NetConfig, View, read_views, reproducible
 from fpp_ml_bench.errors import RecipeError, TrainingError, WeightsError
 from fpp_ml_bench.loaders.render import named_light
 from fpp_ml_bench.optics import paper_rig
@@ -56,15 +61,23 @@ def geometry(direction: str = "horizontal") -> Geometry:
     return Geometry.of(RIG, Settings(direction=direction, **USERS_WORD))  # type: ignore[arg-type]
 
 
-def plane(distance_m: float, direction: str = "horizontal") -> Sample:
+def plane(distance_m: float, direction: str = "horizontal") -> PhaseSample:
     """A tilted plane that fills the frame; one ray a pixel, since the fringe is to be as deep as it is bright."""
     tilt = (0.1, -0.1)
     depth_m = plane_depth_m(RIG, distance_m, tilt)
     image = plane_fringe(RIG, 0 if direction == "horizontal" else 18, depth_m, tilt, noise=0.3, light=DIRECT)
-    nothing = np.zeros(depth_m.shape, bool)
-    sample = sample_of(image, (1000 * depth_m).astype(np.float32), nothing, "plane_A0", "paper", geometry(direction))
+    depth_mm, nothing = (1000 * depth_m).astype(np.float32), np.zeros(depth_m.shape, bool)
+    view = View("plane_A0", "plane", "paper", image[None], depth_mm, nothing)
+    sample = sample_of(view, image, geometry(direction))
     assert sample is not None
     return sample
+
+
+def task(window: int, vary: Variation = AS_CAPTURED, direction: str = "horizontal") -> PhaseTask:
+    """Of windows of so many px, and a calibrated lamp."""
+    its_task = replace(SMALL, window=window, vary=vary).task(RIG)
+    its_task.geometries = {direction: geometry(direction)}  # type: ignore[dict-item]
+    return its_task
 
 
 class ToTheMiddle(np.random.Generator):
@@ -77,10 +90,9 @@ class ToTheMiddle(np.random.Generator):
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 def test_an_object_that_is_moved_looks_as_if_it_stood_there(direction: str) -> None:
     """Against the benchmark's own light and sensor on a plane at the other distance: fringe, brightness, candidates."""
-    own_geometry = geometry(direction)
     moved, random = replace(AS_CAPTURED, shift=1.0), [ToTheMiddle(np.random.PCG64(1)) for _ in range(2)]
-    moved_window = draw([plane(1.7, direction)], {direction: own_geometry}, 240, moved, True, random[0])
-    captured_window = draw([plane(1.8, direction)], {direction: own_geometry}, 240, AS_CAPTURED, True, random[1])
+    moved_window = task(240, moved, direction).draw([plane(1.7, direction)], random[0])
+    captured_window = task(240, AS_CAPTURED, direction).draw([plane(1.8, direction)], random[1])
     lit = moved_window.fitted & captured_window.fitted & (moved_window.x[CHANNELS.index("window share")] > 0.9)
     lit &= moved_window.x[CHANNELS.index("brightness")] > -0.5  # the projector's field ends before the camera's
     assert lit.mean() > 0.5
@@ -95,15 +107,15 @@ def test_an_object_that_is_moved_looks_as_if_it_stood_there(direction: str) -> N
 
 def test_wrong_first_orders_are_labelled_as_such() -> None:
     vary = replace(AS_CAPTURED, wrong_window=1.0)
-    samples, geometries = [plane(1.8)], {"horizontal": geometry()}
+    samples = [plane(1.8)]
     orders = []
     for seed in range(4):
-        window = draw(samples, geometries, 96, vary, True, np.random.default_rng(seed))
+        window = task(96, vary).draw(samples, np.random.default_rng(seed))
         assert np.take_along_axis(window.exists, np.maximum(window.order, 0)[None], 0)[0][window.fitted].all()
         orders += [window.order[window.fitted]]
     labels = np.unique(np.concatenate(orders))
     assert {0, 2} & set(labels.tolist())
-    captured = draw(samples, geometries, 96, AS_CAPTURED, True, np.random.default_rng(0))
+    captured = task(96).draw(samples, np.random.default_rng(0))
     assert (captured.order[captured.fitted] == 1).mean() > 0.95
 
 
@@ -117,16 +129,15 @@ def test_turning_for_the_network_and_back() -> None:
 
 
 def test_stopping_and_going_on_gives_the_same_weights(tmp_path: Path) -> None:
-    samples, geometries = [plane(1.7), plane(1.9)], {"horizontal": geometry()}
+    samples, small = [plane(1.7), plane(1.9)], task(SMALL.window, SMALL.vary)
 
     def scores(network: PhaseNet) -> dict[str, float]:
-        return scores_of(answers_of(network, samples[:1], geometries, True), samples[:1], geometries)
+        return small.scores(network, samples[:1])
 
     def trained(name: str, recipe: Recipe = SMALL, minutes: float | None = None) -> WindowTraining:
         (tmp_path / name).mkdir(exist_ok=True)
         with reproducible(cpu=True):
-            one_window = partial(draw, samples, geometries, recipe.window, recipe.vary, True)
-            training = WindowTraining(recipe, one_window, scores, tmp_path / name)
+            training = WindowTraining(recipe, partial(small.draw, samples), scores, tmp_path / name)
             training.run(perf_counter(), minutes, show=False)
         return training
 
@@ -230,5 +241,5 @@ def test_a_training_in_small_is_resumed_and_predicts(tmp_path: Path, monkeypatch
     answer = method.answer([view.frames[0]] + [None] * (len(rig.sequence) - 1))
     assert answer.depth.dtype == np.float32 and np.array_equal(answer.sigma_mm > 0, answer.depth > 0)
     dark = replace(view, frames=view.frames // 50)
-    geometries = {"horizontal": Geometry.of(rig, Settings())}
-    assert len(samples_of([view], geometries, True)) == 1 and samples_of([dark], geometries, True) == []
+    its_task = replace(recipe, albedo="one").task(rig)
+    assert len(its_task.samples([view])) == 1 and its_task.samples([dark]) == []

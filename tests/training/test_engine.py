@@ -13,9 +13,8 @@ import torch
 from conftest import TINY_SIZE
 
 from fpp_ml_bench.baselines.networks import load
-from fpp_ml_bench.baselines.training.depth_training import DONE, WEIGHTS, train
+from fpp_ml_bench.baselines.training.depth_training import DONE, WEIGHTS, Schedule, epoch_order, spread, train
 from fpp_ml_bench.baselines.training.engine import CHECKPOINT, reproducible
-from fpp_ml_bench.baselines.training.epochs import Schedule, epoch_order, spread
 from fpp_ml_bench.baselines.training.recipe import Linear, Plateau, load_recipe, recipe_from_dict
 from fpp_ml_bench.baselines.training.records import CURVE_FILE, Display, read_checkpoint, save_checkpoint
 from fpp_ml_bench.depth import denormalise
@@ -292,6 +291,20 @@ def test_a_restored_schedule_goes_on():
             for loss, rate in zip(losses[stop:], rates[stop:], strict=True):
                 second.step(loss)
                 assert second.rate == rate
+
+
+@pytest.mark.parametrize("patience", [0, 2, 10])
+def test_a_plateau_is_torchs(patience):
+    holder = torch.optim.SGD([torch.zeros(1)], lr=1e-4)
+    rule = Plateau(name="plateau", factor=0.3, patience=patience, minimum=2e-6)
+    torchs = torch.optim.lr_scheduler.ReduceLROnPlateau(holder, factor=0.3, patience=patience, min_lr=2e-6, eps=0.0)
+    schedule = Schedule(rule, 1e-4)
+    for loss in np.random.default_rng(patience).uniform(0.99, 1.0, 200) * np.linspace(1, 0.95, 200):
+        holder.step()
+        torchs.step(float(loss))
+        schedule.step(float(loss))
+        state = {"rate": holder.param_groups[0]["lr"], "bad": torchs.num_bad_epochs, "best": torchs.best}
+        assert schedule.state() == {"epochs": torchs.last_epoch, **state}
 
 
 def test_a_linear_schedule_is_constant_and_then_falls_to_zero():

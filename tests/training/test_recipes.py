@@ -26,11 +26,11 @@ def test_further_directions_differ_from_the_plain_unet_in_one_thing():
         other = load_recipe(name).to_dict()
         assert {key for key in other if other[key] != plain[key]} == {changed}
     assert load_recipe("further/guided").name == "unet-global-rmse-guided"
-    options = {"guided": 1, "batch_normalised": 1}
+    options = {"guided": 1, "standardised": 1}
     both = recipe_from_dict({**plain, "options": options})
     assert (both.name, both.title.split(", ")[3:]) == (
-        "unet-global-rmse-guided-batch_normalised",
-        ["guided by phase", "batch normalisation"],
+        "unet-global-rmse-standardised-guided",
+        ["input standardised", "guided by phase"],
     )
     assert load_recipe("further/physics").name == "unet-global-rmse_physics_0.05"
     with pytest.raises(RecipeError, match="physics needs depth in mm or m"):
