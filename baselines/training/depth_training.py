@@ -178,7 +178,7 @@ def open_data(recipe: Recipe, dataset: Path) -> tuple[FringeDepthDataset, Fringe
             height, width = data.source.size
             raise TrainingError(
                 f"{dataset}: holds images of {width} x {height} px, recipe {recipe.name} with preset {recipe.preset} "
-                f"expects {recipe.size} x {recipe.size}; build the size it needs: fpp-bench build DIR --preset full "
+                f"expects {recipe.size} x {recipe.size}; build the size it needs: fpp-bench build --out DIR --preset full "
                 f"--size {recipe.size}"
             )
         if not len(data):

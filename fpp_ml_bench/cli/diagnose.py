@@ -77,7 +77,7 @@ def diagnose(
     of_method = options.of(method, model)
     subject = diagnostics.subject(model, opened, layers, units, frame, threads or usable_cores(), of_method)
     probing = diagnostics.ProbeSettings(samples, seeds, quick)
-    again = command_line(without=("threads",))
+    again = command_line(threads=None)
     columns = (
         bar.TextColumn("{task.description}"),
         bar.BarColumn(),

@@ -185,19 +185,18 @@ def given(settings: Any, part: type) -> list[str]:
     return [flag_of(entry) for entry in options_of(part) if getattr(settings, entry.name) != entry.default]
 
 
-def command_line(*, without: tuple[str, ...] = (), more: tuple[str, ...] = ()) -> str:
-    """The command that runs, with all it was given but the parameters ``without``, and ``more`` words."""
+def command_line(**changed: Any) -> str:
+    """The command that runs, with all it was given, but for the parameters ``changed``; None leaves one out."""
     ctx = click.get_current_context()
+    values = {name: value for name, value in ctx.params.items() if given_in(ctx, name)} | changed
     words = ctx.command_path.split()
     for param in ctx.command.get_params(ctx):
-        if param.name in without or not given_in(ctx, str(param.name)):
-            continue
-        value = ctx.params[str(param.name)]
+        value = values.get(str(param.name))
         many = getattr(param, "multiple", False) or param.nargs != 1
-        for one in value if many else [value]:
+        for one in () if value is None else value if many else (value,):
             flag = [] if isinstance(param, click.Argument) else param.opts[:1]
             words += flag if isinstance(one, bool) else [*flag, _text_of(one)]
-    return shlex.join([*words, *more])
+    return shlex.join(words)
 
 
 def _text_of(value: Any) -> str:

@@ -155,7 +155,7 @@ def reproduce_tables(
     def report(line: str) -> None:  # with the time, where the engine's progress is too
         print(f"{datetime.now():%H:%M:%S} {line}", file=sys.stderr, flush=True)
 
-    again = command_line(without=("only_missing",), more=("--only-missing",))
+    again = command_line(preset=preset, only_missing=True)
     options = (dataset, only_missing, minutes, anyway)
     asked = reproduce.ReproduceSettings(tables, folders, again, reproduced, *options, report, row=row)
     outcome = reproduce.reproduce(asked)

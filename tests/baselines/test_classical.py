@@ -374,6 +374,6 @@ def test_dataset_without_the_frames(tmp_path):
     settings = BuildSettings(paper_rig(TINY_SIZE), ("cork",), stored="vertical")
     build(tmp_path / "set", settings, workers=1)
     opened = DatasetFolder(tmp_path / "set")
-    with pytest.raises(DatasetError, match=r"frame 43 is not stored.*--frames all"):
+    with pytest.raises(DatasetError, match=r"frame 43 is not stored.*--config all"):
         predict_split(opened, ClassicalMethod(opened.rig, direction="vertical"), "train", tmp_path / "out")
     shutil.rmtree(tmp_path / "out")

@@ -169,7 +169,7 @@ def test_the_frame_is_the_first_it_was_trained_on(tmp_path, dataset):
 
 def test_predict_score_and_time_on_the_command_line(dataset, weights, tmp_path, capsys):
     out, data, path = str(tmp_path / "p"), str(dataset.path), str(weights / "full.safetensors")
-    for depth_range, words in (("oracle", " --mode paper --json"), ("predicted", "--split test --json")):
+    for depth_range, words in (("oracle", " --mode paper --json"), ("predicted", "p-predicted --json")):
         assert main(["predict", path, data, "--range", depth_range, "--out", f"{out}-{depth_range}"]) == 0
         printed = capsys.readouterr().out.splitlines()[-1]
         assert words in printed and "depth_exact" not in printed
@@ -194,7 +194,7 @@ def test_predict_score_and_time_on_the_command_line(dataset, weights, tmp_path, 
         (["no-such.safetensors"], "expected a weights file (*.safetensors), found nothing"),
         (["recipe.yaml"], "recipe.yaml"),
         (["{w}/raw.safetensors", "--range", "mean"], "leave out the depth range 'mean'"),
-        (["{w}/raw.safetensors", "--steps", "4"], "--steps is an option of classical, not of"),
+        (["{w}/raw.safetensors", "--steps", "4"], "--steps is an option of classical, classical-net, not of"),
         (["classical", "--range", "mean"], "--range is an option of trained networks, not of classical"),
         (["{w}/raw.safetensors", "--frame", "3"], "frame 3 is not stored here"),
         (["{w}/raw.safetensors", "--device", "abacus"], "device 'abacus' can't be used"),

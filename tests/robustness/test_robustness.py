@@ -323,7 +323,7 @@ def test_the_command_measures_draws_and_says_where(tmp_path, capsys):
     ("words", "said"),
     [
         (["constant", "--at", "nowhere"], "at 'nowhere': expected standoff"),
-        (["constant", "--steps", "3"], "--steps is an option of classical, not of constant"),
+        (["constant", "--steps", "3"], "--steps is an option of classical, classical-net, not of constant"),
         (["constant", "--axes", "glos"], "unknown axis 'glos'"),
         (["constant", "--workers", "0"], "--workers 0: expected 1 or more"),
         (["constant", "--quick", "--into", "x.json"], "--into: needs all axes"),
