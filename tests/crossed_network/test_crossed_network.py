@@ -160,7 +160,7 @@ def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert main(["train", "crossed-net", str(tmp_path), "--out", str(tmp_path / "x")]) == 2
     assert "takes none" in capsys.readouterr().err
     assert main(["train", "crossed-net", "--albedo", "any", "--out", str(tmp_path / "x")]) == 2
-    assert "--albedo is no option of crossed-net" in capsys.readouterr().err
+    assert "--albedo is an option of phase-net, not of crossed-net" in capsys.readouterr().err
     assert main(["train", "loss/l1", "--out", str(tmp_path / "x")]) == 2
     assert "expected a dataset folder" in capsys.readouterr().err
     view = training.View(
