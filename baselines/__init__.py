@@ -7,7 +7,3 @@
 
 Importing this package does not import torch; using these two names does.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

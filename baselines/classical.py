@@ -14,29 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Answer, Frames, Method, Photographed
-from fpp_ml_bench.coding import Limits, PhaseShift
-from fpp_ml_bench.decoding import (
-    ASSUMED_NOISE_GREY,
-    SYSTEMATIC_RAD,
-    Decoded,
-    DirectionPlan,
-    Directions,
-    decode_stack,
-    depth_sigma_mm,
-    fewest_plans,
-    fewest_steps,
-    noise_by_light,
-    plan_direction,
-)
+from fpp_ml_bench.coding.code import Limits
+from fpp_ml_bench.coding.phase_shift import PhaseShift
+from fpp_ml_bench.decoding.blocks import DirectionPlan, plan_direction
+from fpp_ml_bench.decoding.decode import Decoded, Directions, decode_stack
+from fpp_ml_bench.decoding.fewest import fewest_plans, fewest_steps
+from fpp_ml_bench.decoding.triangulation import ASSUMED_NOISE_GREY, SYSTEMATIC_RAD, depth_sigma_mm, noise_by_light
 from fpp_ml_bench.errors import DecodeError, PredictionError
-from fpp_ml_bench.loaders import render
-from fpp_ml_bench.optics import Rig
-from fpp_ml_bench.optics import Sequence as FrameSequence
+from fpp_ml_bench.loaders.render.light import Light
+from fpp_ml_bench.loaders.render.scene import modulation_at
+from fpp_ml_bench.loaders.render.sensor import fringe_noise_at
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import Sequence as FrameSequence
 from fpp_ml_bench.options import option
 from fpp_ml_bench.schema import validate
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.evaluation.submission import Submission
+    from fpp_ml_bench.evaluation.submission.description import Submission
 
 DIRECTIONS = ("horizontal", "vertical", "both")
 
@@ -173,10 +167,10 @@ def _steps_for(dataset: Photographed, depth_noise_mm: float, options: Mapping[st
         raise PredictionError(f"--depth-noise {depth_noise_mm:g}: expected mm above 0, and not together with --steps")
     if not isinstance(described, dict):
         raise PredictionError("--depth-noise: this dataset does not say how noisy its frames are; give --steps")
-    light = validate(render.Light, described, dataset.path / "manifest.json", "light", PredictionError)
+    light = validate(Light, described, dataset.path / "manifest.json", "light", PredictionError)
     far_mm = dataset.rig.working_range_mm[1]
-    modulation = render.modulation_at(dataset.rig, far_mm, light)
-    noise_grey = render.fringe_noise_at(dataset.rig, far_mm, light)
+    modulation = modulation_at(dataset.rig, far_mm, light)
+    noise_grey = fringe_noise_at(dataset.rig, far_mm, light)
     direction = options.get("direction", "both")
     steps = fewest_steps(dataset.rig, direction, depth_noise_mm, modulation, noise_grey)
     if steps is None:

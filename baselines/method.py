@@ -29,13 +29,14 @@ from fpp_ml_bench import __version__
 from fpp_ml_bench.depth import RangeRule
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.protocol import Mode, Target, Units
-from fpp_ml_bench.optics import AnySequence, Rig
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import AnySequence
 from fpp_ml_bench.options import did_you_mean, option
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.baselines.training import ModelConfig, NetConfig
-    from fpp_ml_bench.evaluation.submission import Submission
-    from fpp_ml_bench.loaders.storage import Manifest
+    from fpp_ml_bench.baselines.training.weights import ModelConfig, NetConfig
+    from fpp_ml_bench.evaluation.submission.description import Submission
+    from fpp_ml_bench.loaders.storage.manifest import Manifest
 
 Frames = Sequence[NDArray[np.uint8] | None]
 """A captured sequence by frame number, with None for frames that are not needed."""
@@ -206,7 +207,7 @@ class Method(ABC):
         """What data the method learned from, as `evaluation.submission.LearnedFrom` has it."""
         if (config := self.weights_config) is None:
             return {"data": "none"}
-        from fpp_ml_bench.baselines.training import trained_on
+        from fpp_ml_bench.baselines.training.weights import trained_on
 
         benchmark = trained_on(config)
         title = f"dataset {config.dataset_fingerprint[:8]}" if benchmark is None else benchmark.title

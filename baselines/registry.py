@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 from fpp_ml_bench.baselines.method import Method, Photographed
 from fpp_ml_bench.errors import FppBenchError, PredictionError, WeightsError
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.options import did_you_mean
 
 GROUP = "fpp_ml_bench.methods"
@@ -74,7 +74,8 @@ def find(name: str | Path) -> Found:
         return Found(known[text], {})
     if text in (unusable := _installed()[1]):
         raise PredictionError(unusable[text])
-    from fpp_ml_bench.baselines.training import TABLES, shipped_names, weights_path
+    from fpp_ml_bench.baselines.training.tables import TABLES
+    from fpp_ml_bench.baselines.training.weights import shipped_names, weights_path
 
     try:
         if text.endswith((".yaml", ".yml")) or (text.split("/")[0] in TABLES and not text.endswith(".safetensors")):

@@ -17,10 +17,11 @@ from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.unfinished import Finished, UnfinishedRun
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.submission import REPORTS_FILE, SIGMA, SUBMISSION_FILE, UNFINISHED_FILE, check_submission
+from fpp_ml_bench.evaluation.submission.description import check_submission
+from fpp_ml_bench.evaluation.submission.prediction_files import REPORTS_FILE, SIGMA, SUBMISSION_FILE, UNFINISHED_FILE
 from fpp_ml_bench.files import LOCK_FILE, exclusive, write_atomically
 from fpp_ml_bench.loaders.sample import row_columns, stored_frames
-from fpp_ml_bench.loaders.storage import ALL_SPLITS, DatasetFolder
+from fpp_ml_bench.loaders.storage.store import ALL_SPLITS, DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by, seconds_of, skipping
 

@@ -17,10 +17,12 @@ import numpy as np
 from fpp_ml_bench.baselines.method import Frames, Method
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.errors import DatasetError, SubmissionError
-from fpp_ml_bench.evaluation.result import HardwareInfo, Timing, read_result, write_file, write_result
-from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE, Submission, read_submission
+from fpp_ml_bench.evaluation.result.file import read_result, write_file, write_result
+from fpp_ml_bench.evaluation.result.parts import HardwareInfo, Timing
+from fpp_ml_bench.evaluation.submission.description import Submission, read_submission
+from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
 
 WARM_UP = 3

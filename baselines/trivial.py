@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.method import Frames, Method, Photographed
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.loaders.storage import DatasetFolder
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.options import option
 
 STANDOFF, MIDDLE, TRAINING_MEAN = "standoff", "middle", "training-mean"

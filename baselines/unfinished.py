@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.submission import UNFINISHED_FILE
+from fpp_ml_bench.evaluation.submission.prediction_files import UNFINISHED_FILE
 from fpp_ml_bench.files import file_content, naming, printable, strict_json
 
 _LARGEST_BYTES = 1 << 28

@@ -19,14 +19,15 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import FULL_SIZE, MM_PER_M, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.errors import DatasetError, PredictionError
-from fpp_ml_bench.evaluation import submission
 from fpp_ml_bench.evaluation.protocol import TARGETS
-from fpp_ml_bench.evaluation.score import check_folder, scored_pair
+from fpp_ml_bench.evaluation.score.check import check_folder, scored_pair
+from fpp_ml_bench.evaluation.submission.prediction_files import read_sigma, reader_for
 from fpp_ml_bench.files import printable, write_files
-from fpp_ml_bench.loaders.render import turned, unturned
+from fpp_ml_bench.loaders.render.scene import turned, unturned
 from fpp_ml_bench.loaders.sample import DEPTH_EXACT
-from fpp_ml_bench.loaders.storage import GENERATED, DatasetFolder
-from fpp_ml_bench.optics import Pinhole
+from fpp_ml_bench.loaders.storage.manifest import GENERATED
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.pinhole import Pinhole
 
 FUSION_FILE = "fusion.json"
 CELL_MM = 2.0
@@ -198,13 +199,13 @@ def prediction_maps(predictions: str | Path, dataset: DatasetFolder, split: str)
             f"{printable(str(folder), 500)} can't be used, {len(checked.problems)} problems:", checked.problems
         )
     described = checked.description
-    reader = submission.reader_for(checked.form, folder, checked.samples, dataset.size, described.png_mm_per_level)
+    reader = reader_for(checked.form, folder, checked.samples, dataset.size, described.png_mm_per_level)
 
     def read(sample: str) -> tuple[Map, Map | None]:
         target_mm = dataset.target_mm(sample, DEPTH_EXACT)
         left_out = dataset.left_out(sample, described.range_rule, DEPTH_EXACT)
         depth_mm, _ = scored_pair(reader.read(sample)[0], target_mm, described.units, "standard", sample, left_out)
-        sigma_mm = submission.read_sigma(folder, sample, dataset.size) if checked.sigmas else None
+        sigma_mm = read_sigma(folder, sample, dataset.size) if checked.sigmas else None
         return np.array(depth_mm), sigma_mm
 
     return described.name, read

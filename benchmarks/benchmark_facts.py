@@ -18,7 +18,9 @@ import numpy as np
 
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.evaluation.protocol import MODES, TARGETS
-from fpp_ml_bench.loaders.storage import BENCHMARKS, FACTS, DatasetFolder, intended_benchmark, verify
+from fpp_ml_bench.loaders.storage.benchmark import BENCHMARKS, FACTS, intended_benchmark
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.loaders.storage.verification import verify
 
 
 def counts(dataset: DatasetFolder, split: str, mode: str, target: str) -> dict[str, list[int]]:

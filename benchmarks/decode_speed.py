@@ -35,9 +35,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.decoding import decode_stack, depth_from_both, depth_from_coordinate
+from fpp_ml_bench.decoding.decode import decode_stack
+from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate
 from fpp_ml_bench.machine import NUMBA_SWITCH, numba_enabled
-from fpp_ml_bench.optics import Rig, paper_rig, pattern_image
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.patterns import pattern_image
+from fpp_ml_bench.optics.rig import Rig
 
 ALBEDO, AMBIENT, NOISE = 0.45, 4.0, 1.0
 

@@ -32,8 +32,11 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import TEST_OBJECTS, VIEWS
 from fpp_ml_bench.evaluation.metrics import HEADLINE
 from fpp_ml_bench.loaders.sample import Row
-from fpp_ml_bench.loaders.storage import Assembly, Manifest, ShardWriter, plan_shards
-from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
+from fpp_ml_bench.loaders.storage.assembly import Assembly
+from fpp_ml_bench.loaders.storage.manifest import Manifest
+from fpp_ml_bench.loaders.storage.shards import ShardWriter, plan_shards
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
 COVER = 0.1
 COMMAND = Path(sys.executable).with_name("fpp-eval")

@@ -33,22 +33,19 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import numpy as np
 
 from fpp_ml_bench.constants import OBJECTS, VIEW_DEGREES, VIEWS, split_of
-from fpp_ml_bench.decoding import decode_stack
-from fpp_ml_bench.loaders.render import (
-    BuildSettings,
-    Hits,
-    PixelRays,
-    Studio,
-    TracedObject,
-    build,
-    load_light,
-    place,
-    solid_mesh,
-)
+from fpp_ml_bench.decoding.decode import decode_stack
+from fpp_ml_bench.loaders.render.builder import build
+from fpp_ml_bench.loaders.render.light import load_light
+from fpp_ml_bench.loaders.render.meshes import solid_mesh
 from fpp_ml_bench.loaders.render.pixels import mixed_pixels
+from fpp_ml_bench.loaders.render.raycast import Hits, PixelRays, TracedObject
+from fpp_ml_bench.loaders.render.scene import BuildSettings, place
 from fpp_ml_bench.loaders.render.surfels import Surfels
+from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.machine import describe_hardware
-from fpp_ml_bench.optics import Rig, paper_rig, pattern_image
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.patterns import pattern_image
+from fpp_ml_bench.optics.rig import Rig
 
 FULL_IMAGES = 15_600
 VIEW = "A60"

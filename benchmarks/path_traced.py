@@ -32,22 +32,18 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion, gaussian_filter
 
-from fpp_ml_bench.loaders.render import (
-    BuildSettings,
-    Light,
-    SolidMesh,
-    Studio,
-    named_light,
-    place,
-    projector_centre_m,
-)
-from fpp_ml_bench.loaders.render import solid_mesh as benchmark_mesh
-from fpp_ml_bench.loaders.render.illumination import grey_of_white
+from fpp_ml_bench.loaders.render.illumination import grey_of_white, projector_centre_m
+from fpp_ml_bench.loaders.render.light import Light, named_light
+from fpp_ml_bench.loaders.render.meshes import solid_mesh as benchmark_mesh
 from fpp_ml_bench.loaders.render.pixels import blur_image
+from fpp_ml_bench.loaders.render.scene import BuildSettings, SolidMesh, place
 from fpp_ml_bench.loaders.render.sensor import Sensor, normal_table, sense_kernel, stream_keys
 from fpp_ml_bench.loaders.render.surfels import Surfels
+from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.sample import Flag
-from fpp_ml_bench.optics import Rig, paper_rig, pattern_profiles
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.patterns import pattern_profiles
+from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.portable import gaussian_weights
 
 SCENES = ("plane", "sphere", "open_book", "bowl", "cleaning_bucket", "magazine_stack")

@@ -24,10 +24,11 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 import numpy as np
 
 from fpp_ml_bench.constants import OBJECTS
-from fpp_ml_bench.loaders.render import BuildSettings, build
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.render.builder import build
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 EPOCHS = 10
 Batch = tuple[np.ndarray, np.ndarray]

@@ -19,16 +19,29 @@ import scipy.io
 from numpy.typing import NDArray
 from PIL import Image
 
-from fpp_ml_bench import calibration, coding, decoding, optics
-from fpp_ml_bench.baselines import robustness
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.classical_network import ClassicalNetMethod
-from fpp_ml_bench.baselines.crossed_network import CrossedNetMethod
-from fpp_ml_bench.baselines.crossed_route import CrossedRoute
+from fpp_ml_bench.baselines.classical_network.method import ClassicalNetMethod
+from fpp_ml_bench.baselines.crossed_network.method import CrossedNetMethod
+from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.baselines.phase_route import PhaseMethod
+from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
+from fpp_ml_bench.baselines.robustness.axes import corruptions
+from fpp_ml_bench.calibration.boards import Board
+from fpp_ml_bench.calibration.result import Lens, draw_residuals
+from fpp_ml_bench.calibration.solve import calibrate as calibrate_rig
+from fpp_ml_bench.coding.crossed import crossed_from_pair
 from fpp_ml_bench.constants import MAD_TO_SIGMA
-from fpp_ml_bench.loaders import captures, render
+from fpp_ml_bench.decoding.decode import decode_stack
+from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm
+from fpp_ml_bench.loaders.captures.board_poses import board_poses, calibrated_rig
+from fpp_ml_bench.loaders.captures.images import read_frames
+from fpp_ml_bench.loaders.render.meshes import load_user_mesh, single_mesh
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.render.view import Studio
+from fpp_ml_bench.optics.opencv_files import OpenCvCalibration, read_opencv_calibration, write_opencv_calibration
+from fpp_ml_bench.optics.pinhole import Pinhole
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.rig_file import load_rig
 
 SPACING_MM = 10.0
 """Not recorded with the captures; with it our point clouds have the size of the authors' to 0.06%."""
@@ -57,7 +70,7 @@ def main() -> int:
     if missing:
         print(f"{args.captures}: missing {', '.join(missing)}", file=sys.stderr)
         return 2
-    theirs = optics.read_opencv_calibration(args.captures / "calibration" / "calibration.xml")
+    theirs = read_opencv_calibration(args.captures / "calibration" / "calibration.xml")
     with tempfile.TemporaryDirectory() as scratch:
         ours = calibrate(args.captures / "calibration", theirs, Path(scratch), args.out)
         cloud = scipy.io.loadmat(args.captures / "skull_gray" / "pointCloud.mat")["xyz"].astype(np.float64)
@@ -80,18 +93,16 @@ def main() -> int:
     return 0
 
 
-def calibrate(
-    folder: Path, theirs: "optics.OpenCvCalibration", scratch: Path, out: Path | None
-) -> "optics.OpenCvCalibration":
+def calibrate(folder: Path, theirs: "OpenCvCalibration", scratch: Path, out: Path | None) -> "OpenCvCalibration":
     """Print errors and rigs of several models, and return the one whose held-out error is the least."""
     poses_folder, sequence = scratch / "poses", scratch / "board.yaml"
     poses_folder.mkdir()
     for number in range(1, 7):
         (poses_folder / f"calseq{number}").symlink_to((folder / f"calseq{number}").resolve())
     sequence.write_text(BOARD + "order: [vertical, horizontal]}\n", encoding="utf-8")
-    board = calibration.Board("checker", 9, 13, SPACING_MM)
+    board = Board("checker", 9, 13, SPACING_MM)
     started = perf_counter()
-    poses, stand_in, response = captures.board_poses(poses_folder, board, sequence)
+    poses, stand_in, response = board_poses(poses_folder, board, sequence)
     found_in = perf_counter() - started
     sizes = (theirs.camera.width, theirs.camera.height), (theirs.projector.width, theirs.projector.height)
     print(f"six poses, {sum(len(pose.corners_px) for pose in poses)} corners, found in {found_in:.0f} s")
@@ -103,7 +114,7 @@ def calibrate(
     print("calibration, RMS in px                            camera  alone  projector  alone  stereo  left out")
     errors = theirs.camera_error_px, theirs.projector_error_px, theirs.stereo_error_px
     print(f"{'authors':<50}{errors[0]:6.3f}{'':9}{errors[1]:8.3f}{'':7}{errors[2]:8.3f}")
-    own = (calibration.Lens("radial-1", True, True), calibration.Lens("radial-1", True))
+    own = (Lens("radial-1", True, True), Lens("radial-1", True))
     results = []
     for title, lens, free in (
         ("their model, perfect board", own, False),
@@ -111,7 +122,7 @@ def calibrate(
         ("radial-1, board estimated", "radial-1", True),
         ("radial-3+tangential, board estimated", "radial-3+tangential", True),
     ):
-        found = calibration.calibrate(poses, board, *sizes, lens, estimate_board=free)
+        found = calibrate_rig(poses, board, *sizes, lens, estimate_board=free)
         alone = found.alone_rms_px
         print(
             f"{title:<50}{found.camera_rms_px:6.3f} {alone[0]:6.3f}  {found.projector_rms_px:8.3f} {alone[1]:6.3f}"
@@ -119,7 +130,7 @@ def calibrate(
         )
         results.append(found)
     best = min(results, key=lambda found: found.held_out_rms_px)
-    rig = captures.calibrated_rig(best, stand_in)
+    rig = calibrated_rig(best, stand_in)
     for name in ("camera", "projector"):
         for who, device in (("authors", getattr(theirs, name)), ("ours", getattr(rig, name))):
             print(
@@ -131,26 +142,26 @@ def calibrate(
         print(f"translation {who:<8} {x:8.2f} {y:8.2f} {z:8.2f} mm, baseline {np.linalg.norm([x, y, z]):.2f} mm")
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-        (out / "calibration.png").write_bytes(calibration.draw_residuals(best))
-    return optics.OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m)
+        (out / "calibration.png").write_bytes(draw_residuals(best))
+    return OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m)
 
 
-def rig_of(found: "optics.OpenCvCalibration", name: str, scratch: Path) -> "optics.Rig":
+def rig_of(found: "OpenCvCalibration", name: str, scratch: Path) -> "Rig":
     """A rig with a calibration and the sequence of a capture."""
-    optics.write_opencv_calibration(found, scratch / "found.yml", unit="m")
+    write_opencv_calibration(found, scratch / "found.yml", unit="m")
     text = (
         f"calibration: {{file: found.yml, unit: m}}\nworking_range_mm: {list(RANGE_MM)}\nsequence: {SEQUENCES[name]}\n"
     )
     (scratch / "rig.yaml").write_text(text, encoding="utf-8")
-    return optics.load_rig(scratch / "rig.yaml")
+    return load_rig(scratch / "rig.yaml")
 
 
 def decode(
-    folder: Path, rig: "optics.Rig", camera: "optics.Pinhole", cloud: NDArray, title: str, method: Method | None = None
+    folder: Path, rig: "Rig", camera: "Pinhole", cloud: NDArray, title: str, method: Method | None = None
 ) -> None:
     """Decode a capture (by ``method``) and compare with the authors' cloud, which lies on the undistorted grid of their
     ``camera``: in depth, and as points after a rigid motion, since another principal point turns the camera's frame."""
-    frames = captures.read_frames(folder, count=len(rig.sequence)).frames
+    frames = read_frames(folder, count=len(rig.sequence)).frames
     method = method or ClassicalMethod(rig, threads=2)
     started = perf_counter()
     answer = method.answer(frames)
@@ -186,19 +197,19 @@ def after_motion(points: NDArray[np.float64], target: NDArray[np.float64]) -> tu
     return float(np.median(apart)), float(scale)
 
 
-def twin(folder: Path, rig: "optics.Rig", scratch: Path) -> None:
+def twin(folder: Path, rig: "Rig", scratch: Path) -> None:
     """Render a ball before the same rig by the light `paper`, and compare modulation and noise with the real frames."""
     import trimesh
 
     trimesh.creation.icosphere(subdivisions=5, radius=0.04).export(scratch / "ball.stl")
     virtual = replace(rig, working_range_mm=(350.0, 450.0), standoff_m=0.4, background_m=0.6)
-    mesh = render.single_mesh(scratch / "ball.stl")
-    studio = render.Studio(render.BuildSettings(virtual, ("ball",), user_meshes=(mesh,)))
-    row = studio.photograph(render.load_user_mesh(mesh), "A0")
+    mesh = single_mesh(scratch / "ball.stl")
+    studio = Studio(BuildSettings(virtual, ("ball",), user_meshes=(mesh,)))
+    row = studio.photograph(load_user_mesh(mesh), "A0")
     rendered = [row.frames[index] for index in range(len(rig.sequence))]
-    real = list(captures.read_frames(folder, count=len(rig.sequence)).frames)
+    real = list(read_frames(folder, count=len(rig.sequence)).frames)
     for title, frames in (("twin, light paper", rendered), ("real frames", real)):
-        decoded = decoding.decode_stack(frames, virtual if title != "real frames" else rig, details=True, threads=2)
+        decoded = decode_stack(frames, virtual if title != "real frames" else rig, details=True, threads=2)
         found, noise_mm = decoded.depth_mm > 0, bend_noise_mm(decoded.depth_mm)
         modulation = float(np.median(decoded.details["vertical"].modulation[found]))
         print(
@@ -215,10 +226,10 @@ def bend_noise_mm(depth_mm: NDArray[np.float32]) -> float:
     return MAD_TO_SIGMA * float(np.median(np.abs(bends - np.median(bends)))) / float(np.sqrt(6))
 
 
-def one_frame(folder: Path, rig: "optics.Rig", scratch: Path) -> None:
+def one_frame(folder: Path, rig: "Rig", scratch: Path) -> None:
     """The phase route with its defaults on the first frame alone, against the depth that all six frames give."""
-    frames = captures.read_frames(folder, count=len(rig.sequence)).frames
-    decoded = decoding.decode_stack(frames, rig, threads=2)
+    frames = read_frames(folder, count=len(rig.sequence)).frames
+    decoded = decode_stack(frames, rig, threads=2)
     on_object = decoded.depth_mm > 0
     single: list[NDArray | None] = [frames[0], *[None] * (len(rig.sequence) - 1)]
     for near, far in ((350.0, 450.0), (360.0, 430.0)):
@@ -229,7 +240,7 @@ def one_frame(folder: Path, rig: "optics.Rig", scratch: Path) -> None:
             / float(
                 np.median(
                     np.abs(
-                        decoding.coordinate_slope_px_per_mm(
+                        coordinate_slope_px_per_mm(
                             rig,
                             decoded.depth_mm[in_range],
                             "vertical",
@@ -252,7 +263,7 @@ def one_frame(folder: Path, rig: "optics.Rig", scratch: Path) -> None:
             answered = given[in_range]
             sigma = np.zeros_like(error) if answer.sigma_mm is None else answer.sigma_mm[in_range]
             wrong = answered & (error > half_mm)
-            confident = wrong & (sigma > 0) & (sigma < robustness.corruptions().confident_below * error)
+            confident = wrong & (sigma > 0) & (sigma < corruptions().confident_below * error)
             median = float(np.median(error[answered])) if answered.any() else float("nan")
             print(
                 f"one frame, {near:g} to {far:g} mm, {title:<10} answered {100 * answered.mean():.1f}% of "
@@ -262,13 +273,13 @@ def one_frame(folder: Path, rig: "optics.Rig", scratch: Path) -> None:
             )
 
 
-def crossed_frames(folder: Path, rig: "optics.Rig") -> None:
+def crossed_frames(folder: Path, rig: "Rig") -> None:
     """The crossed route, and crossed-net with its own mask, on the mean of a vertical and a horizontal fringe of each
     board pose: a frame with both, on a printed checkerboard. Against the depth that all twelve frames give, in the
     range that the board spans."""
     for number in range(1, 7):
-        frames = captures.read_frames(folder / f"calseq{number}", count=len(rig.sequence)).frames
-        decoded = decoding.decode_stack(frames, rig, threads=2)
+        frames = read_frames(folder / f"calseq{number}", count=len(rig.sequence)).frames
+        decoded = decode_stack(frames, rig, threads=2)
         on_board = decoded.depth_mm > 0
         near, far = np.percentile(decoded.depth_mm[on_board], (1, 99))
         ranged = rig.with_range((float(near) - BOARD_MARGIN_MM, float(far) + BOARD_MARGIN_MM))
@@ -276,7 +287,7 @@ def crossed_frames(folder: Path, rig: "optics.Rig") -> None:
         vertical, horizontal = (
             np.ascontiguousarray(frames[rig.sequence.sinusoids(way)[0]]) for way in ("vertical", "horizontal")
         )
-        measured = route.measure(coding.crossed_from_pair(horizontal, vertical), on_board)
+        measured = route.measure(crossed_from_pair(horizontal, vertical), on_board)
         learned = CrossedNetMethod(ranged).answer(frames)
         for title, depth_mm, sigma_mm in (
             ("crossed", measured.depth_mm, measured.sigma_mm),
@@ -285,7 +296,7 @@ def crossed_frames(folder: Path, rig: "optics.Rig") -> None:
             both = on_board & (depth_mm > 0)
             error = np.abs(depth_mm - decoded.depth_mm)[both]
             wrong = error > WRONG_ORDER_MM
-            confident = wrong & (sigma_mm[both] < robustness.corruptions().confident_below * error)
+            confident = wrong & (sigma_mm[both] < corruptions().confident_below * error)
             print(
                 f"one crossed frame, pose {number}, {ranged.working_range_mm[0]:.0f} to "
                 f"{ranged.working_range_mm[1]:.0f} mm, {title}: answered {100 * both.sum() / on_board.sum():.1f}% of "

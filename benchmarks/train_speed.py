@@ -39,10 +39,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import torch
 from torch.utils.data import DataLoader, Dataset
 
-from fpp_ml_bench.baselines import networks
-from fpp_ml_bench.baselines.training import DepthTraining, Recipe, load_recipe, open_data, reproducible
+from fpp_ml_bench.baselines.networks.model import build as build_network
+from fpp_ml_bench.baselines.training.depth_training import DepthTraining, open_data
+from fpp_ml_bench.baselines.training.engine import reproducible
+from fpp_ml_bench.baselines.training.recipe import Recipe, load_recipe
 from fpp_ml_bench.constants import OBJECTS, PUBLISHED_SPLIT_FOLDERS, VALIDATION_OBJECTS, split_of
-from fpp_ml_bench.loaders.published import DEPTH, FRINGE, TRAINING, VARIABLES, VARIANT_FOLDERS
+from fpp_ml_bench.loaders.published.tree import DEPTH, FRINGE, TRAINING, VARIABLES, VARIANT_FOLDERS
 from fpp_ml_bench.loaders.training import FringeDepth, FringeDepthDataset
 from fpp_ml_bench.machine import describe_hardware
 
@@ -106,7 +108,7 @@ class Plain:
     def __init__(self, job: Job) -> None:
         torch.manual_seed(42)
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-        self.network = networks.build(job.network, width=job.width).to(self.device)
+        self.network = build_network(job.network, width=job.width).to(self.device)
         self.optimizer = torch.optim.RMSprop(self.network.parameters(), lr=1e-4, alpha=0.99, weight_decay=1e-5)
         self.loader: DataLoader = DataLoader(
             PngAndMat(job.data), batch_size=job.batch, shuffle=True, num_workers=job.loader_workers

@@ -31,13 +31,16 @@ from hashlib import sha256
 from pathlib import Path
 
 from fpp_ml_bench.baselines.phase_route.method import ONE_ALBEDO
-from fpp_ml_bench.baselines.robustness import CLEAN, SETS, Measured, SetName, corruptions, draw_curves
+from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corruptions
+from fpp_ml_bench.baselines.robustness.report import Measured, draw_curves
 from fpp_ml_bench.cli import main as fpp_bench
 from fpp_ml_bench.cli.evaluate import main as fpp_eval
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import FppBenchError, SubmissionError
-from fpp_ml_bench.evaluation.report import percent
-from fpp_ml_bench.evaluation.result import Result, Robustness, read_result
+from fpp_ml_bench.evaluation.report.html import percent
+from fpp_ml_bench.evaluation.result.file import read_result
+from fpp_ml_bench.evaluation.result.model import Result
+from fpp_ml_bench.evaluation.result.parts import Robustness
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.leaderboard import columns
 from fpp_ml_bench.leaderboard.assumptions import assumption, told
@@ -50,7 +53,7 @@ from fpp_ml_bench.leaderboard.row_file import row_json, write_row
 from fpp_ml_bench.leaderboard.rows import VOUCHED, Entry, read_entry, vouching_line
 from fpp_ml_bench.leaderboard.tables import markdown_columns, markdown_rows, markdown_text
 from fpp_ml_bench.leaderboard.trivial import more_than_trivial
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 ROOT = Path(__file__).resolve().parent.parent
 ROWS, README, ROBUSTNESS = ROOT / "leaderboard" / "rows", ROOT / "README.md", ROOT / "docs" / "robustness.md"

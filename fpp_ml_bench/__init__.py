@@ -6,11 +6,10 @@ core and those to its left. Nothing heavy is imported until it is used: ``import
 """
 
 import sys as _sys
+from importlib import import_module as _import_module
 from importlib.machinery import ModuleSpec as _ModuleSpec
 from importlib.machinery import PathFinder as _PathFinder
 from pathlib import Path as _Path
-
-import lazy_loader as _lazy_loader
 
 __version__ = "0.3.0"
 
@@ -30,4 +29,17 @@ class _Checkout:
 if (_ROOT / "pyproject.toml").is_file() and (_ROOT / "loaders" / "__init__.py").is_file():
     _sys.meta_path.insert(0, _Checkout)  # type: ignore[arg-type]
 
-__getattr__, __dir__, __all__ = _lazy_loader.attach_stub(__name__, __file__)
+__all__ = ["Method", "compare", "decode", "evaluate", "load_dataset", "load_method", "open_dataset", "rank"]
+
+
+def __getattr__(name: str) -> object:
+    """The front door's names, imported when one is used."""
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module = "baselines.method" if name == "Method" else "api"
+    value = globals()[name] = getattr(_import_module(f"{__name__}.{module}"), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *__all__])

@@ -15,11 +15,16 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
-from fpp_ml_bench import decoding
+from fpp_ml_bench.decoding.decode import Decoded, decode_stack
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation import report, result, score
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
-from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.evaluation.report.comparison import Comparison
+from fpp_ml_bench.evaluation.report.comparison import compare as compare_results
+from fpp_ml_bench.evaluation.result.model import ArrayScores, Result
+from fpp_ml_bench.evaluation.score.evaluator import evaluate as evaluate_folder
+from fpp_ml_bench.evaluation.score.evaluator import evaluate_arrays
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import load_dataset as load_stored
 
 if TYPE_CHECKING:
     import numpy as np
@@ -29,7 +34,7 @@ if TYPE_CHECKING:
     from fpp_ml_bench.baselines.method import Method
     from fpp_ml_bench.evaluation.score.evaluator import Maps
     from fpp_ml_bench.leaderboard.groups import Group
-    from fpp_ml_bench.optics import Rig
+    from fpp_ml_bench.optics.rig import Rig
 
 __all__ = ["compare", "decode", "evaluate", "load_dataset", "load_method", "open_dataset", "rank"]
 
@@ -67,10 +72,10 @@ def load_dataset(folder: str | Path, config: str = "single_shot", split: str | N
     >>> row["frame_00"].shape == row["depth"].shape
     True
     """
-    return storage.load_dataset(folder, config, split=split)
+    return load_stored(folder, config, split=split)
 
 
-def open_dataset(folder: str | Path) -> "storage.DatasetFolder":
+def open_dataset(folder: str | Path) -> "DatasetFolder":
     """Open a dataset folder for single images as read-only NumPy views, without a copy.
 
     Parameters
@@ -96,10 +101,10 @@ def open_dataset(folder: str | Path) -> "storage.DatasetFolder":
     >>> dataset.frame(dataset.samples("test")[0], 0).dtype
     dtype('uint8')
     """
-    return storage.DatasetFolder(folder)
+    return DatasetFolder(folder)
 
 
-def load_method(name: str | Path, dataset: "storage.DatasetFolder", **options: Any) -> "Method":
+def load_method(name: str | Path, dataset: "DatasetFolder", **options: Any) -> "Method":
     """A method that turns frames into depth, ready for a dataset's rig and image size.
 
     Parameters
@@ -143,7 +148,7 @@ def decode(
     direction: str = "both",
     steps: int | None = None,
     mask: "NDArray[np.bool_] | None" = None,
-) -> "decoding.Decoded":
+) -> "Decoded":
     """Depth from a captured sequence: N-step phase, Gray-code order, triangulation (paper Section 2.1).
 
     Parameters
@@ -178,19 +183,19 @@ def decode(
     >>> bool((fpp.decode(frames, dataset.rig, steps=4).depth_mm > 0).any())
     True
     """
-    return decoding.decode_stack(frames, rig, direction, steps, mask)  # type: ignore[arg-type]
+    return decode_stack(frames, rig, direction, steps, mask)  # type: ignore[arg-type]
 
 
 @overload
 def evaluate(
     predictions: str | Path,
-    dataset: "str | Path | storage.DatasetFolder",
+    dataset: "str | Path | DatasetFolder",
     split: str = "test",
     target: str = "depth",
     *,
     mode: str = "standard",
     edge_band_px: int = EDGE_BAND_PX,
-) -> "result.Result": ...
+) -> "Result": ...
 
 
 @overload
@@ -203,7 +208,7 @@ def evaluate(
     objects: Sequence[str] | None = None,
     units: str | None = None,
     edge_band_px: int = EDGE_BAND_PX,
-) -> "result.ArrayScores": ...
+) -> "ArrayScores": ...
 
 
 def evaluate(
@@ -218,7 +223,7 @@ def evaluate(
     sigma: Any = None,
     objects: Any = None,
     units: Any = None,
-) -> "result.Result | result.ArrayScores":
+) -> "Result | ArrayScores":
     """Score a folder of predictions, as ``fpp-eval`` does, or arrays in memory by the same rules.
 
     Parameters
@@ -269,16 +274,16 @@ def evaluate(
     """
     in_memory = {"flags": flags, "sigma": sigma, "objects": objects, "units": units}
     if not isinstance(predictions, (str, Path)):
-        if isinstance(dataset, (str, Path, storage.DatasetFolder)):
+        if isinstance(dataset, (str, Path, DatasetFolder)):
             raise PredictionError("predictions in memory need the targets as arrays; or give a folder and a dataset")
-        return score.evaluate_arrays(predictions, dataset, **in_memory, edge_band_px=edge_band_px)
+        return evaluate_arrays(predictions, dataset, **in_memory, edge_band_px=edge_band_px)
     if given := [name for name, values in in_memory.items() if values is not None]:
         raise PredictionError(f"{', '.join(given)}: belongs to arrays; a folder of predictions has its own")
-    opened = dataset if isinstance(dataset, storage.DatasetFolder) else storage.DatasetFolder(dataset)
-    return score.evaluate(predictions, opened, split, target, edge_band_px, mode)
+    opened = dataset if isinstance(dataset, DatasetFolder) else DatasetFolder(dataset)
+    return evaluate_folder(predictions, opened, split, target, edge_band_px, mode)
 
 
-def compare(first: "str | Path | result.Result", second: "str | Path | result.Result") -> "report.Comparison":
+def compare(first: "str | Path | Result", second: "str | Path | Result") -> "Comparison":
     """The paired difference of two results on the same samples, with intervals over objects.
 
     Parameters
@@ -307,7 +312,7 @@ def compare(first: "str | Path | result.Result", second: "str | Path | result.Re
     from fpp_ml_bench.leaderboard.rows import alike, read_scored
 
     scored = (read_scored(Path(given)) if isinstance(given, (str, Path)) else given for given in (first, second))
-    return report.compare(*alike(*scored))
+    return compare_results(*alike(*scored))
 
 
 def rank(results: "Iterable[str | Path]", sort: str = "object_mae_mm") -> "list[Group]":

@@ -1,5 +1,1 @@
 """Leaderboard: result files ranked by group, and the paper's own rows beside them."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

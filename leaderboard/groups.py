@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.evaluation.metrics import HEADLINE
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, FramesClass, Track
-from fpp_ml_bench.evaluation.score import (
+from fpp_ml_bench.evaluation.score.uncertainty import (
     SIGNIFICANT,
     Interval,
     holm,
@@ -27,7 +27,7 @@ from fpp_ml_bench.evaluation.score import (
 )
 from fpp_ml_bench.leaderboard.row_file import ObjectMeans, Row, interval_over, mean_over
 from fpp_ml_bench.leaderboard.rows import MEANING, Entry
-from fpp_ml_bench.loaders.storage import BENCHMARKS, Benchmark, benchmark_of
+from fpp_ml_bench.loaders.storage.benchmark import BENCHMARKS, Benchmark, benchmark_of
 
 TEST, UNSEEN = "fpp-bench-full", "fpp-bench-unseen"
 """The benchmark whose test split, and the set of unseen objects that, make one row."""

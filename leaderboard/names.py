@@ -4,7 +4,7 @@ submission keeps its own name, cut at a word."""
 from collections.abc import Collection, Sequence
 
 from fpp_ml_bench.baselines.registry import methods, network_method
-from fpp_ml_bench.evaluation.submission import Submission
+from fpp_ml_bench.evaluation.submission.description import Submission
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.row_file import name_key
 

@@ -15,14 +15,14 @@ from urllib.parse import urlsplit
 from huggingface_hub import EvalResultEntry, eval_result_entries_to_yaml
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.tradeoff import shipped_tradeoff
+from fpp_ml_bench.baselines.tradeoff.measure import shipped_tradeoff
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.evaluation.protocol import Track
-from fpp_ml_bench.evaluation.report import millimetres, percent
+from fpp_ml_bench.evaluation.report.html import millimetres, percent
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.assumptions import told
-from fpp_ml_bench.leaderboard.page import INDEX, SUBMISSIONS, write_page
+from fpp_ml_bench.leaderboard.page.page import INDEX, SUBMISSIONS, write_page
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.reported import chosen_tables
 from fpp_ml_bench.leaderboard.row_file import Row
@@ -31,7 +31,8 @@ from fpp_ml_bench.leaderboard.tables import markdown_text
 from fpp_ml_bench.loaders.hub import MARK, Publication, mark_bytes, staged_files, yaml_text
 from fpp_ml_bench.loaders.hub_dataset import NAME, card_head
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
-from fpp_ml_bench.loaders.storage import PREVIEW, DatasetFolder
+from fpp_ml_bench.loaders.storage.parquet import PREVIEW
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 FRAMEWORK = "fpp-ml-bench"
 SPLIT, TARGET, MODE = "test", "depth", "standard"

@@ -11,7 +11,7 @@ import numpy as np
 
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS, RANK_KEY, sort_keys
-from fpp_ml_bench.evaluation.score import FEWEST_OBJECTS
+from fpp_ml_bench.evaluation.score.uncertainty import FEWEST_OBJECTS
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import rows
 from fpp_ml_bench.leaderboard.groups import UNSEEN, Group, GroupKey, Ranked, is_unseen, rank_ranges

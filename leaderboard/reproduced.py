@@ -16,19 +16,21 @@ from typing import Literal
 
 from rich.text import Text
 
-from fpp_ml_bench.baselines import reproduce
-from fpp_ml_bench.baselines.reproduce import MAIN_KEY, AllFrames, Folders, Job
-from fpp_ml_bench.baselines.training import Recipe, table_rows
+from fpp_ml_bench.baselines.reproduce.plan import Folders, Job, variants
+from fpp_ml_bench.baselines.reproduce.scoring import MAIN_KEY, AllFrames, all_frames_that_hold
+from fpp_ml_bench.baselines.reproduce.work import Outcome, ReproduceSettings, current_weights, file_sha256, state_of
+from fpp_ml_bench.baselines.training.recipe import Recipe, table_rows
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.report import percent
-from fpp_ml_bench.evaluation.result import Result, write_file
-from fpp_ml_bench.evaluation.score import object_interval
+from fpp_ml_bench.evaluation.report.html import percent
+from fpp_ml_bench.evaluation.result.file import write_file
+from fpp_ml_bench.evaluation.result.model import Result
+from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 from fpp_ml_bench.leaderboard.columns import device
 from fpp_ml_bench.leaderboard.reported import PAPER_DEPTHS, paper_tables
 from fpp_ml_bench.leaderboard.row_file import Row, row_of, view_means, write_row
 from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEASURED_HERE, Entry, read_entry
 from fpp_ml_bench.leaderboard.tables import markdown_rows, markdown_text
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.tables import Table
 
 _NOT_IN_THE_PAPER = {
@@ -89,7 +91,7 @@ class Line:
     row: str
     label: str
     recipe: Recipe
-    scores: Row | reproduce.AllFrames | None
+    scores: Row | AllFrames | None
     entry: Entry | None
     paper_mm: dict[str, float] | None
     twins: dict[str, Entry] = field(default_factory=dict)
@@ -110,14 +112,14 @@ def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: Datas
         if sha256 is None:
             lines.append(Line(row, label, recipe, None, None, paper_mm))
             continue
-        rows = {name: row_that_holds(folders.row(recipe, name), opened, sha256) for name in reproduce.variants(recipe)}
+        rows = {name: row_that_holds(folders.row(recipe, name), opened, sha256) for name in variants(recipe)}
         entry, *_ = rows.values()
         twins = {str(name): twin for name, twin in list(rows.items())[1:] if twin is not None}
         first = None if entry is None else entry.row
         if table != "multi_frame" or len(opened.sequence.config(recipe.frames)) == 1:
             lines.append(Line(row, label, recipe, first, entry, paper_mm, twins))
             continue
-        every = reproduce.all_frames_that_hold(folders.all_frames(recipe), opened.fingerprint, sha256)
+        every = all_frames_that_hold(folders.all_frames(recipe), opened.fingerprint, sha256)
         lines.append(Line(row, label, recipe, every, entry, paper_mm))
         lines.append(Line(row, f"{label}, its first frame only", recipe, first, entry, None, twins))
     return lines
@@ -126,12 +128,12 @@ def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: Datas
 def _weights_sha256(recipe: Recipe, folders: Folders, opened: DatasetFolder) -> str | None:
     """The weights whose rows are shown: those trained below ``folders``; where no training was begun there, those of
     the main row, if that is of this recipe; else None."""
-    weights = reproduce.current_weights(recipe, folders)
+    weights = current_weights(recipe, folders)
     if weights is not None:
-        return reproduce.file_sha256(weights)
-    if reproduce.state_of(folders.training(recipe)) != "missing":
+        return file_sha256(weights)
+    if state_of(folders.training(recipe)) != "missing":
         return None
-    main_row = folders.row(recipe, reproduce.variants(recipe)[0])
+    main_row = folders.row(recipe, variants(recipe)[0])
     entry = _row_with(main_row, opened, "recipe_digest", recipe.digest)
     sha256 = None if entry is None else entry.row.submission.settings.get("weights_sha256")
     return sha256 if isinstance(sha256, str) else None
@@ -303,7 +305,7 @@ def _columns(table: str, lines: Sequence[Line], preset: str) -> list[tuple[str, 
     return [column for column in shown if table in paper_tables() or set(column[2]) != {"-"}]
 
 
-def write_table(table: str, settings: reproduce.ReproduceSettings, outcome: reproduce.Outcome) -> Path:
+def write_table(table: str, settings: ReproduceSettings, outcome: Outcome) -> Path:
     """Write the page of a table from the rows that there are; its path. SubmissionError where it can't be written."""
     folders = settings.folders
     lines = table_lines(table, outcome.jobs, folders, outcome.opened)

@@ -18,7 +18,9 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.metrics import HEADLINE
 from fpp_ml_bench.evaluation.protocol import FramesClass, Mode, Target, Track
-from fpp_ml_bench.evaluation.result import (
+from fpp_ml_bench.evaluation.result.file import result_json, write_file
+from fpp_ml_bench.evaluation.result.model import Result, check_data, check_reliance
+from fpp_ml_bench.evaluation.result.parts import (
     DatasetInfo,
     HardwareInfo,
     Headline,
@@ -27,21 +29,16 @@ from fpp_ml_bench.evaluation.result import (
     Metrics,
     ObjectResult,
     Reliance,
-    Result,
     Robustness,
     Sha256,
     Timing,
     Uncertainty,
     Whole,
-    check_data,
-    check_reliance,
-    result_json,
-    write_file,
 )
-from fpp_ml_bench.evaluation.score import object_interval
-from fpp_ml_bench.evaluation.submission import Submission
+from fpp_ml_bench.evaluation.score.uncertainty import object_interval
+from fpp_ml_bench.evaluation.submission.description import Submission
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.storage import Counts
+from fpp_ml_bench.loaders.storage.benchmark import Counts
 from fpp_ml_bench.schema import Count, NonNegative, Share, SparseModel, StrictModel, Text, validate
 
 ROW_SCHEMA_VERSION = "2.0.0"

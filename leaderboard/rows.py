@@ -18,8 +18,10 @@ from typing import Any
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
-from fpp_ml_bench.evaluation.result import Reliance, Result, Robustness, parse_result, read_json, write_result
-from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.evaluation.result.file import parse_result, read_json, write_result
+from fpp_ml_bench.evaluation.result.model import Result
+from fpp_ml_bench.evaluation.result.parts import Reliance, Robustness
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.files import file_content, printable
 from fpp_ml_bench.leaderboard.row_file import (
     DIGITS,
@@ -33,7 +35,8 @@ from fpp_ml_bench.leaderboard.row_file import (
     row_of,
     write_row,
 )
-from fpp_ml_bench.loaders.storage import DatasetFolder, benchmark_of
+from fpp_ml_bench.loaders.storage.benchmark import benchmark_of
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.schema import validate
 
 SHIPPED_ROWS = Path(__file__).resolve().parent / "rows"

@@ -6,7 +6,7 @@ from functools import partial
 
 from rich.text import Text
 
-from fpp_ml_bench.evaluation.report import interval_text, millimetres
+from fpp_ml_bench.evaluation.report.html import interval_text, millimetres
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.columns import METHOD, NOTE, ONLY_IN_FILES, Column, columns
 from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, Group, Pair, Ranked

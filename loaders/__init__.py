@@ -1,7 +1,3 @@
 """Datasets: generate or import fringe stacks, store them as Arrow shards, read them. ``load_dataset(FOLDER, CONFIG,
 split=...)`` gives a ``datasets.Dataset`` on the memory-mapped shards; ``DatasetFolder`` gives single images as NumPy
 views; ``FringeDepthDataset`` gives torch tensors for training."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -14,10 +14,12 @@ import pyarrow
 from fpp_ml_bench import __version__
 from fpp_ml_bench.errors import DatasetError, PublishError
 from fpp_ml_bench.files import file_hash, write_atomically
-from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.loaders.hub import MARK, Publication, mark_bytes, yaml_text
-from fpp_ml_bench.loaders.storage import MESH_FOLDER, RIG_FILE, DatasetFolder
-from fpp_ml_bench.optics import save_rig
+from fpp_ml_bench.loaders.storage.card import RIG_FILE
+from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER
+from fpp_ml_bench.loaders.storage.parquet import card_configs, data_shards, write_shard
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.rig_file import save_rig
 
 NAME = "FPP-ML-Bench"
 OWNED = ("data/", f"{MESH_FOLDER}/")
@@ -56,7 +58,7 @@ def staging_folder(chosen: Path | None, identity: str) -> Iterator[Path]:
 def dataset_licence(dataset: DatasetFolder, license_id: str | None) -> str:
     """Licence identifier for the card: ``license_id``, or MIT for generated data. `PublishError` for other data."""
     origin = dataset.manifest.origin
-    if license_id is None and origin != storage.GENERATED:
+    if license_id is None and origin != GENERATED:
         raise PublishError(f"{dataset.path}: {origin} data; say under which --license it may be shared")
     licence = license_id or "mit"
     if not _LICENCE.fullmatch(licence):
@@ -68,7 +70,7 @@ def card_head(dataset: DatasetFolder, licence: str) -> str:
     """Front matter of the card, from which the Hub's viewer and ``load_dataset`` know configurations and files."""
     rows = sum(len(samples) for samples in dataset.splits.values())
     files: dict[str, list[str]] = {split: [] for split in dataset.splits}
-    for name, shard in storage.data_shards(dataset).items():
+    for name, shard in data_shards(dataset).items():
         files[shard.split].append(name)
     head = {
         "license": licence,
@@ -77,7 +79,7 @@ def card_head(dataset: DatasetFolder, licence: str) -> str:
         "size_categories": ["n<1K" if rows < 1000 else "1K<n<10K" if rows < 10_000 else "10K<n<100K"],
         "tags": ["fringe-projection-profilometry", "structured-light", "metrology", "fpp-ml-bench"],
         # Files by name, not by pattern: a stray file can never join the data.
-        "configs": storage.card_configs(dataset, dataset.fingerprint, files, preview=True),
+        "configs": card_configs(dataset, dataset.fingerprint, files, preview=True),
     }
     return f"---\n{yaml_text(head)}---\n"
 
@@ -93,11 +95,11 @@ def stage_dataset(
     """Write all that is published of ``dataset``, and ``texts`` by file name, into ``folder``: same data, same bytes.
     Parquet files that are already there are kept (see `staging_folder`). Raises `DatasetError` for a damaged dataset,
     ``OSError`` when a file can't be written."""
-    for name, shard in storage.data_shards(dataset).items():
+    for name, shard in data_shards(dataset).items():
         if (folder / name).is_file():
             row_done(shard.rows)
         else:
-            storage.write_shard(dataset, shard, folder / name, threads, row_done)
+            write_shard(dataset, shard, folder / name, threads, row_done)
     for mesh in (file for file in dataset.manifest.others if file.path.startswith(f"{MESH_FOLDER}/")):
         source = dataset.path / mesh.path
         if not source.is_file() or file_hash(source) != mesh.xxh3_128:

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.loaders import render
-from fpp_ml_bench.loaders.storage import DatasetFolder
-from fpp_ml_bench.optics import DIRECTIONS
+from fpp_ml_bench.loaders.render.meshes import load_user_mesh
+from fpp_ml_bench.loaders.render.raycast import PixelRays, TracedObject
+from fpp_ml_bench.loaders.render.scene import UserMesh, turned
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.sequence import DIRECTIONS
 
 _TILE_PX = 120
 _DPI = 110
@@ -82,8 +84,8 @@ def _save(save: Callable[..., None], path: Path) -> None:
 
 def _mesh_picture(path: Path, size: int) -> NDArray[np.uint8]:
     """The mesh seen from above and the side, lit from the viewer; uint8 (size, size)."""
-    mesh = render.load_user_mesh(render.UserMesh(path.stem, str(path), centre=False))
-    vertices_m = render.turned(mesh.vertices_m - mesh.vertices_m.mean(axis=0), 30.0)
+    mesh = load_user_mesh(UserMesh(path.stem, str(path), centre=False))
+    vertices_m = turned(mesh.vertices_m - mesh.vertices_m.mean(axis=0), 30.0)
     tilt = np.deg2rad(25.0)
     rotation = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
     vertices_m = vertices_m @ rotation.T
@@ -91,8 +93,8 @@ def _mesh_picture(path: Path, size: int) -> NDArray[np.uint8]:
     distance = 4.0 * radius
     line = np.linspace(-1, 1, size) * (1.05 * radius / distance)
     x, y = np.meshgrid(line, line)
-    traced = render.TracedObject(mesh, vertices_m + np.array([0, 0, distance]))
-    hits = traced.primary(render.PixelRays(x, y))
+    traced = TracedObject(mesh, vertices_m + np.array([0, 0, distance]))
+    hits = traced.primary(PixelRays(x, y))
     toward = -np.column_stack([x.ravel()[hits.pixels], y.ravel()[hits.pixels], np.ones(hits.pixels.size)])
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     picture = np.full(size * size, 255, dtype=np.uint8)

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import CONFIGS
-from fpp_ml_bench.optics import DIRECTIONS, AnySequence
+from fpp_ml_bench.optics.sequence import DIRECTIONS, AnySequence
 
 DATA_GROUP = "data"
 LABELS = ("sample", "object", "view", "split")

@@ -12,7 +12,7 @@ from torch.utils.data import Dataset
 from fpp_ml_bench.constants import CONFIGS, GREY_LEVELS
 from fpp_ml_bench.depth import NORMALISATIONS, Normalisation, RangeRule, depth_range_mm, normalise, object_mask
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import njit, numba_enabled
 
 

@@ -9,19 +9,15 @@ from scored_dataset import write_predictions
 
 from fpp_ml_bench.evaluation.metrics import HEADLINE
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
-from fpp_ml_bench.evaluation.result import (
-    RELIANCE_VERSION,
-    Intervals,
-    Metrics,
-    Reliance,
-    RelianceParts,
-    write_result,
-)
-from fpp_ml_bench.evaluation.score import ErrorStats, combine, evaluate
+from fpp_ml_bench.evaluation.result.file import write_result
+from fpp_ml_bench.evaluation.result.parts import RELIANCE_VERSION, Intervals, Metrics, Reliance, RelianceParts
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats, combine
 from fpp_ml_bench.leaderboard import groups
 from fpp_ml_bench.leaderboard.row_file import ObjectMeans, Row, RowRobustness, interval_over, mean_over
 from fpp_ml_bench.leaderboard.rows import Entry
-from fpp_ml_bench.loaders.storage import Benchmark, benchmark
+from fpp_ml_bench.loaders.storage import benchmark
+from fpp_ml_bench.loaders.storage.benchmark import Benchmark
 
 HARDWARE = {"cpu": "Some CPU", "cores": 2, "memory_gib": 8.0, "gpu": None, "platform": "Linux"}
 

@@ -5,7 +5,11 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from fpp_ml_bench.optics import Pinhole, Rig, Sequence, paper_rig, pattern_image, rotation_matrix
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.patterns import pattern_image
+from fpp_ml_bench.optics.pinhole import Pinhole
+from fpp_ml_bench.optics.rig import Rig, rotation_matrix
+from fpp_ml_bench.optics.sequence import Sequence
 
 
 def capture(rig, depth_m, noise=1.0, seed=0, albedo=0.45, ambient=4.0):

@@ -28,8 +28,8 @@ TINY_CONFIGS = ("single_shot", "horizontal", "vertical", "sinusoidal", "all")
 
 def tiny_settings(**changes):
     """Settings of the tiny dataset, with ``changes``."""
-    from fpp_ml_bench.loaders.render import BuildSettings
-    from fpp_ml_bench.optics import paper_rig
+    from fpp_ml_bench.loaders.render.scene import BuildSettings
+    from fpp_ml_bench.optics.named_rigs import paper_rig
 
     return BuildSettings(**{"rig": paper_rig(TINY_SIZE), "objects": TINY_OBJECTS, **changes})
 
@@ -43,7 +43,7 @@ def file_bytes(folder):
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory):
     """Folder of the tiny dataset, all 52 frames. Shared by all tests: copy it before changing it."""
-    from fpp_ml_bench.loaders.render import build
+    from fpp_ml_bench.loaders.render.builder import build
 
     folder = tmp_path_factory.mktemp("tiny") / "dataset"
     build(folder, tiny_settings(), workers=1)
@@ -53,6 +53,6 @@ def tiny(tmp_path_factory):
 @pytest.fixture(scope="session")
 def opened(tiny):
     """The tiny dataset, opened for reading."""
-    from fpp_ml_bench.loaders.storage import DatasetFolder
+    from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
     return DatasetFolder(tiny)

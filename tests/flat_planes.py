@@ -7,17 +7,14 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.loaders.render import (
-    BuildSettings,
-    Exposure,
-    Light,
-    Studio,
-    camera_noise,
-    light_surface,
-    named_light,
-    solid_mesh,
-)
-from fpp_ml_bench.optics import Rig, paper_rig
+from fpp_ml_bench.loaders.render.illumination import light_surface
+from fpp_ml_bench.loaders.render.light import Light, named_light
+from fpp_ml_bench.loaders.render.meshes import solid_mesh
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.render.sensor import Exposure, camera_noise
+from fpp_ml_bench.loaders.render.view import Studio
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig import Rig
 
 RIG = paper_rig(480)
 OTHER_RIG = replace(

@@ -20,20 +20,22 @@ import yaml
 from scored_dataset import make_dataset, write_predictions
 from synthetic import make
 
-from fpp_ml_bench.baselines.training import load_recipe
+from fpp_ml_bench.baselines.training.recipe import load_recipe
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import FppBenchError
-from fpp_ml_bench.evaluation.result import read_result, write_result
-from fpp_ml_bench.evaluation.score import evaluate
-from fpp_ml_bench.evaluation.submission import read_submission
+from fpp_ml_bench.evaluation.result.file import read_result, write_result
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.evaluation.submission.description import read_submission
 from fpp_ml_bench.leaderboard.row_file import row_of, write_row
 from fpp_ml_bench.leaderboard.rows import read_entry
-from fpp_ml_bench.loaders.captures import read_splits
-from fpp_ml_bench.loaders.published import import_tree, plan_import
-from fpp_ml_bench.loaders.render import load_light
+from fpp_ml_bench.loaders.captures.images import read_splits
+from fpp_ml_bench.loaders.published.importing import import_tree, plan_import
+from fpp_ml_bench.loaders.render.light import load_light
 from fpp_ml_bench.loaders.render.meshes import read_mesh_list
-from fpp_ml_bench.loaders.storage import DatasetFolder, verify
-from fpp_ml_bench.optics import load_projection, load_rig, paper_rig
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.loaders.storage.verification import verify
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig_file import load_projection, load_rig
 
 ODD: tuple[Any, ...] = (
     None,

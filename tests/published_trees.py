@@ -10,8 +10,8 @@ import numpy as np
 import scipy.io
 
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.loaders.published import import_tree, plan_import
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.published.importing import import_tree, plan_import
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 SIZE = (24, 24)
 SPLITS = {"train": ("bowl",), "val": ("mug",), "test": ("power_drill", "my_own_part")}

@@ -15,8 +15,12 @@ from hub_server import HubServer
 from scored_dataset import disk_depth
 
 from fpp_ml_bench.loaders.sample import Row
-from fpp_ml_bench.loaders.storage import Assembly, DatasetFolder, Manifest, ShardWriter, describe_file, plan_shards
-from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
+from fpp_ml_bench.loaders.storage.assembly import Assembly
+from fpp_ml_bench.loaders.storage.manifest import Manifest, describe_file
+from fpp_ml_bench.loaders.storage.shards import ShardWriter, plan_shards
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
 ROOT = Path(__file__).resolve().parent.parent
 SIZE = (30, 26)

@@ -6,7 +6,7 @@ from fpp_ml_bench.loaders.render.light import Light, named_light
 from fpp_ml_bench.loaders.render.scene import BuildSettings, SolidMesh
 from fpp_ml_bench.loaders.render.sensor import camera_noise
 from fpp_ml_bench.loaders.render.view import Studio
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 RIG = paper_rig(176)
 X, Y = RIG.camera.rays()

@@ -11,16 +11,14 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.evaluation.protocol import MODES, TARGETS
 from fpp_ml_bench.loaders.sample import Flag, Row
-from fpp_ml_bench.loaders.storage import (
-    Assembly,
-    Benchmark,
-    DatasetFolder,
-    Manifest,
-    ShardWriter,
-    benchmark,
-    plan_shards,
-)
-from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
+from fpp_ml_bench.loaders.storage import benchmark
+from fpp_ml_bench.loaders.storage.assembly import Assembly
+from fpp_ml_bench.loaders.storage.benchmark import Benchmark
+from fpp_ml_bench.loaders.storage.manifest import Manifest
+from fpp_ml_bench.loaders.storage.shards import ShardWriter, plan_shards
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
 OBJECTS = {"train": ("bowl",), "validation": ("mug",), "test": ("power_drill", "wooden_boards")}
 VIEWS = ("A0", "A60")

@@ -6,8 +6,10 @@ import numpy as np
 
 from fpp_ml_bench.constants import VIEWS
 from fpp_ml_bench.loaders.sample import Row
-from fpp_ml_bench.loaders.storage import Assembly, Manifest, assemble, plan_shards
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.loaders.storage.assembly import Assembly, assemble
+from fpp_ml_bench.loaders.storage.manifest import Manifest
+from fpp_ml_bench.loaders.storage.shards import plan_shards
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 SIZE = (12, 16)
 SPLITS = {"train": ("bowl", "cork"), "validation": ("mug",), "test": ("power_drill",)}

@@ -131,8 +131,8 @@ def test_options_in_the_readmes_table_of_commands_are_options_of_their_command()
 
 def test_python_of_the_readme_runs(tiny, tmp_path, monkeypatch):
     """Block by block, with small datasets in the place of the named ones."""
-    from fpp_ml_bench.loaders.render import build
-    from fpp_ml_bench.optics import paper_rig
+    from fpp_ml_bench.loaders.render.builder import build
+    from fpp_ml_bench.optics.named_rigs import paper_rig
 
     monkeypatch.chdir(tmp_path)
     Path("data").mkdir()

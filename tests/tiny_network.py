@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import nn
 
-from fpp_ml_bench.baselines import networks
-from fpp_ml_bench.baselines.training import ModelConfig
+from fpp_ml_bench.baselines.networks.model import build as build_network
+from fpp_ml_bench.baselines.training.weights import ModelConfig
 
 # Small networks and a size they take, 64 px; TransUNet is built for it: 4x4 map, 2x2 patches.
 SMALL: dict[str, dict[str, int | float]] = {
@@ -31,7 +31,7 @@ RECIPE: dict[str, Any] = {
 def tiny_network(name: str = "unet", width: int = 4, seed: int = 0, **options: Any) -> torch.nn.Module:
     """A network with random weights, in eval mode; the same ``seed`` gives the same."""
     torch.manual_seed(seed)
-    return networks.build(name, width=width, **options).eval()
+    return build_network(name, width=width, **options).eval()
 
 
 def config_of(network: torch.nn.Module, **changes: Any) -> ModelConfig:

@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.classical import DIRECTIONS, ClassicalMethod
 from fpp_ml_bench.baselines.method import Answer, Frames, Method, OwnViews
 from fpp_ml_bench.baselines.phase_network.method import WEIGHTS, recipe_values, rendered_data, say_trained
-from fpp_ml_bench.coding import PhaseShift
-from fpp_ml_bench.decoding import Directions
+from fpp_ml_bench.coding.phase_shift import PhaseShift
+from fpp_ml_bench.decoding.decode import Directions
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.machine import usable_cores
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.evaluation.submission import Submission
+    from fpp_ml_bench.evaluation.submission.description import Submission
 
 SHIPPED = Path(__file__).resolve().parent / "weights"  # folder of the weights that come with the package
 DEFAULT = "classical-net"
@@ -74,7 +74,7 @@ class ClassicalNetMethod(Method):
     def __init__(self, rig: Rig, **options: Any) -> None:
         from fpp_ml_bench.baselines.classical_network.network import DepthFilter
         from fpp_ml_bench.baselines.phase_network.net_file import read_net
-        from fpp_ml_bench.baselines.training import FILTER_NETWORKS, weights_path
+        from fpp_ml_bench.baselines.training.weights import FILTER_NETWORKS, weights_path
 
         given = self.checked_options(options)
         direction, steps, weights, threads = given.direction, given.steps, given.weights, given.threads
@@ -117,7 +117,7 @@ class ClassicalNetMethod(Method):
         """Depth, and the standard uncertainty that the network expects."""
         from fpp_ml_bench.baselines.classical_network.route import decided, filtered, written
         from fpp_ml_bench.baselines.classical_network.scene import DepthScene
-        from fpp_ml_bench.baselines.networks import torch_threads
+        from fpp_ml_bench.baselines.networks.base import torch_threads
 
         decoded, modulation = self.classical.measure(frames)
         scene = None if decoded.sigma_mm is None else DepthScene.of(decoded.depth, decoded.sigma_mm, modulation)

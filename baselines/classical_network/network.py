@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.phase_network import UNet, fold
+from fpp_ml_bench.baselines.phase_network.network import UNet, fold
 from fpp_ml_bench.errors import NetworkError
 
 REACH = 2  # px to the farthest neighbour along an axis

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.classical_network.network import DepthFilter
 from fpp_ml_bench.baselines.classical_network.scene import DepthScene, channels
-from fpp_ml_bench.baselines.phase_network import SCALE_TO_SIGMA
-from fpp_ml_bench.baselines.phase_route import Image, Mask
+from fpp_ml_bench.baselines.phase_network.odds import SCALE_TO_SIGMA
+from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route import Image, Mask
+from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask
 
 CHANNELS = (
     "found",

@@ -16,23 +16,22 @@ from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.classical_network.network import DepthFilter
 from fpp_ml_bench.baselines.classical_network.route import Filtered, decided, filtered
 from fpp_ml_bench.baselines.classical_network.scene import CHANNELS, DepthScene, channels
-from fpp_ml_bench.baselines.phase_network import (
+from fpp_ml_bench.baselines.phase_network.window_training import (
     Batch,
-    Sample,
     StepRecipe,
     Task,
-    edge_points,
     mask_loss,
     mean_over,
-    mean_scores,
-    place_of,
     scale_loss,
     train_net,
 )
-from fpp_ml_bench.baselines.phase_route import Image, Mask
-from fpp_ml_bench.baselines.training import FILTER_NETWORKS, Family, View
+from fpp_ml_bench.baselines.phase_network.windows import Sample, edge_points, mean_scores, place_of
+from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask
+from fpp_ml_bench.baselines.training.views import View
+from fpp_ml_bench.baselines.training.weights import FILTER_NETWORKS, Family
 from fpp_ml_bench.depth import depth_edges
-from fpp_ml_bench.optics import Direction, Rig
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import Direction
 
 SMALL_UNITS = 0.1  # error below which its loss is quadratic, in the scene's median sigma
 LARGEST_UNITS = 30.0  # at which an error is clipped: a wrong order can't be averaged away

@@ -10,8 +10,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.crossed_route import Carriers, CrossedObservation, fringes
-from fpp_ml_bench.baselines.phase_network import (
+from fpp_ml_bench.baselines.crossed_route.carriers import Carriers
+from fpp_ml_bench.baselines.crossed_route.observation import CrossedObservation
+from fpp_ml_bench.baselines.crossed_route.refinement import fringes
+from fpp_ml_bench.baselines.phase_network.inputs import (
     LARGEST_RAD,
     SIDE_CHANNELS,
     SIDE_PERIODS,
@@ -19,7 +21,8 @@ from fpp_ml_bench.baselines.phase_network import (
     CroppedMaps,
     from_the_sides,
 )
-from fpp_ml_bench.baselines.phase_route import Image, Mask, phase_slopes, wrapped
+from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase_route.local_fit import phase_slopes
 
 CHANNELS = (
     "light",

@@ -8,20 +8,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.crossed_route import CrossedMeasurement, Settings, crossed_image, frames_of
-from fpp_ml_bench.baselines.crossed_route.method import crossed_name, has_crossed_fringes
+from fpp_ml_bench.baselines.crossed_route.method import crossed_image, crossed_name, frames_of, has_crossed_fringes
+from fpp_ml_bench.baselines.crossed_route.observation import CrossedMeasurement, Settings
 from fpp_ml_bench.baselines.method import Answer, Frames, Method, OwnViews
 from fpp_ml_bench.baselines.phase_network.method import WEIGHTS, recipe_values, rendered_data, say_trained
-from fpp_ml_bench.baselines.phase_route import Periods
 from fpp_ml_bench.baselines.phase_route.method import MIN_CONFIDENCE
+from fpp_ml_bench.baselines.phase_route.resampling import Periods
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.machine import usable_cores
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.phase_network.net_file import NetFile
-    from fpp_ml_bench.evaluation.submission import Submission
+    from fpp_ml_bench.evaluation.submission.description import Submission
 
 SHIPPED = Path(__file__).resolve().parent / "weights"  # folder of the weights that come with the package
 DEFAULT = "crossed-net"
@@ -107,7 +107,7 @@ class CrossedNetMethod(Method):
 
     def measure(self, frames: Frames) -> CrossedMeasurement:
         """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
-        from fpp_ml_bench.baselines.networks import torch_threads
+        from fpp_ml_bench.baselines.networks.base import torch_threads
 
         with torch_threads(self.threads):
             return self.route.measure(crossed_image(frames, self.frames_used))

@@ -6,25 +6,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.crossed_network.inputs import LEAST_SHARE, Scene, channels
-from fpp_ml_bench.baselines.crossed_route import (
-    JUMP_RAD,
-    Carriers,
-    CrossedMeasurement,
-    CrossedObservation,
-    CrossedRoute,
-    Settings,
-)
-from fpp_ml_bench.baselines.phase_network import (
+from fpp_ml_bench.baselines.crossed_route.carriers import Carriers
+from fpp_ml_bench.baselines.crossed_route.observation import CrossedMeasurement, CrossedObservation, Settings
+from fpp_ml_bench.baselines.crossed_route.orders import JUMP_RAD
+from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute
+from fpp_ml_bench.baselines.phase_network.network import PhaseNet
+from fpp_ml_bench.baselines.phase_network.odds import (
     Answers,
-    PhaseNet,
     answers_of_maps,
     decided_object,
     least_energy_order,
     probabilities,
     threshold_at,
 )
-from fpp_ml_bench.baselines.phase_route import Image, Mask, Periods, nearest_inside, of_choice
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask
+from fpp_ml_bench.baselines.phase_route.orders import nearest_inside, of_choice
+from fpp_ml_bench.baselines.phase_route.resampling import Periods
+from fpp_ml_bench.optics.rig import Rig
 
 DENIED = 6.0  # a pixel of the measured mask stays object unless its logit is this far below the threshold
 PERHAPS = 4.0  # a pixel whose logit is this far below the threshold still takes part in the labelling of orders

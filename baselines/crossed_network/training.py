@@ -12,26 +12,26 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.crossed_network import inputs
 from fpp_ml_bench.baselines.crossed_network.inputs import CHANNELS, Scene
 from fpp_ml_bench.baselines.crossed_network.route import decided_mask, network_answers, offers_rad
-from fpp_ml_bench.baselines.crossed_route import CrossedRoute
-from fpp_ml_bench.baselines.phase_network import (
+from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute
+from fpp_ml_bench.baselines.phase_network.network import PhaseNet
+from fpp_ml_bench.baselines.phase_network.odds import Answers
+from fpp_ml_bench.baselines.phase_network.window_training import CandidateTask, WindowRecipe, train_net
+from fpp_ml_bench.baselines.phase_network.windows import (
     IGNORED,
-    Answers,
-    CandidateTask,
-    PhaseNet,
     Sample,
     Window,
-    WindowRecipe,
     candidate_scores,
     edge_points,
     padded,
     place_of,
-    train_net,
     wrong_place,
 )
-from fpp_ml_bench.baselines.phase_route import Mask, of_choice
-from fpp_ml_bench.baselines.training import View
+from fpp_ml_bench.baselines.phase_route.calibration_layer import Mask
+from fpp_ml_bench.baselines.phase_route.orders import of_choice
+from fpp_ml_bench.baselines.training.views import View
 from fpp_ml_bench.depth import depth_edges
-from fpp_ml_bench.optics import Rig, crossed_rig
+from fpp_ml_bench.optics.named_rigs import crossed_rig
+from fpp_ml_bench.optics.rig import Rig
 
 FURTHEST_RAD = 2.2
 """Distance in rad of the joint phase from a candidate beyond which it is not the right one: rivals are 2 pi away."""

@@ -12,12 +12,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.baselines.phase_route import TAU, Crop, Image, wrapped
-from fpp_ml_bench.coding import Crossed
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, Image, wrapped
+from fpp_ml_bench.baselines.phase_route.object_mask import Crop
+from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.decoding import rotated_ray
+from fpp_ml_bench.decoding.triangulation import rotated_ray
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 
 LEAST_RANGE_RAD = 1.0
 """Least change of the joint phase over the working range for crossed fringes to tell a depth at all."""

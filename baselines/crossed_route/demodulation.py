@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from fpp_ml_bench.baselines.crossed_route.carriers import Carriers
-from fpp_ml_bench.baselines.phase_route import TAU, Image, wrapped
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, Image, wrapped
 
 WINDOW_PERIODS = 0.4  # sigma of the window, in periods of the longer carrier
 WINDOW_SIGMAS = 3.0

@@ -10,15 +10,13 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.crossed_route.carriers import Carriers
 from fpp_ml_bench.baselines.crossed_route.demodulation import Demodulated
-from fpp_ml_bench.baselines.phase_route import (
+from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase_route.object_mask import (
     DEFAULT_NOISE_GREY,
     FLOOR_NOISE_GREY,
     Background,
-    Image,
-    Mask,
     image_noise_grey,
     plane_irradiance,
-    wrapped,
 )
 from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
 

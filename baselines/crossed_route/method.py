@@ -13,16 +13,17 @@ from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute
 from fpp_ml_bench.baselines.crossed_route.three_frames import FRAMES, ThreeFrameRoute, shifted_carrier
 from fpp_ml_bench.baselines.method import Answer, Frames, Method
 from fpp_ml_bench.baselines.phase_route.method import MASK, MIN_CONFIDENCE
-from fpp_ml_bench.coding import crossed_from_pair
-from fpp_ml_bench.decoding import grey_levels
+from fpp_ml_bench.coding.crossed import crossed_from_pair
+from fpp_ml_bench.decoding.decode import grey_levels
 from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.captures import read_mask
-from fpp_ml_bench.optics import DIRECTIONS, Rig
+from fpp_ml_bench.loaders.captures.decoding import read_mask
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import DIRECTIONS
 from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.evaluation.submission import Submission
+    from fpp_ml_bench.evaluation.submission.description import Submission
 
 
 def frames_of(rig: Rig, name: str) -> tuple[int, ...]:

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.crossed_route.carriers import Carriers
 from fpp_ml_bench.baselines.crossed_route.orders import Candidates
 from fpp_ml_bench.baselines.crossed_route.refinement import Fit
-from fpp_ml_bench.baselines.phase_route import Background, Image, Mask, Watch
+from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask
+from fpp_ml_bench.baselines.phase_route.object_mask import Background
+from fpp_ml_bench.baselines.phase_route.observation import Watch
 from fpp_ml_bench.errors import PredictionError
 
 

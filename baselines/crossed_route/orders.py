@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.crossed_route.carriers import Carriers
-from fpp_ml_bench.baselines.phase_route import LARGE, TAU, Image, Mask, least_energy, links_between, of_choice, wrapped
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase_route.labels import LARGE, least_energy
+from fpp_ml_bench.baselines.phase_route.orders import links_between, of_choice
 
 PHASE_SIGMA_RAD = 0.35  # of a carrier's phase in a window, edges and texture included
 MOST_SIGMAS = 2.83

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.crossed_route.carriers import Carriers
-from fpp_ml_bench.baselines.phase_route import CURVED, Image, Mask, Window, solve_symmetric
+from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask
+from fpp_ml_bench.baselines.phase_route.local_fit import CURVED, Window, solve_symmetric
 
 WINDOW_PERIODS = 0.27
 LARGEST_STEP_RAD = 0.7  # largest change of the joint phase: beyond it the linear model does not hold

@@ -19,29 +19,18 @@ from fpp_ml_bench.baselines.crossed_route.observation import (
 )
 from fpp_ml_bench.baselines.crossed_route.orders import Candidates, candidates, chosen, neighbours, rival
 from fpp_ml_bench.baselines.crossed_route.refinement import WINDOW_PERIODS, refined
-from fpp_ml_bench.baselines.phase_route import (
-    Background,
-    Crop,
-    Image,
-    Mask,
-    Periods,
-    Resampling,
-    Watch,
-    Window,
-    modulated_region,
-    nearest_inside,
-    object_region,
-    of_choice,
-    repeated,
-    stride_of,
-    unlit,
-    wrapped,
-)
-from fpp_ml_bench.coding import MIN_MODULATION, Crossed
+from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase_route.local_fit import Window
+from fpp_ml_bench.baselines.phase_route.object_mask import Background, Crop, modulated_region, object_region, unlit
+from fpp_ml_bench.baselines.phase_route.observation import Watch
+from fpp_ml_bench.baselines.phase_route.orders import nearest_inside, of_choice, repeated, stride_of
+from fpp_ml_bench.baselines.phase_route.resampling import Periods, Resampling
+from fpp_ml_bench.coding.code import MIN_MODULATION
+from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.constants import GREY_LEVELS
-from fpp_ml_bench.decoding import grey_levels
+from fpp_ml_bench.decoding.decode import grey_levels
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 
 MARGIN_PERIODS = 0.5  # of the crop around the object, which the windows and the mask's rim need
 LEAST_CONTRAST = 0.08

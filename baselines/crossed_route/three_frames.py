@@ -20,29 +20,18 @@ from fpp_ml_bench.baselines.crossed_route.observation import CrossedMeasurement,
 from fpp_ml_bench.baselines.crossed_route.orders import Candidates, candidates, chosen, neighbours, rival
 from fpp_ml_bench.baselines.crossed_route.refinement import LEAST_GREY, WINDOW_PERIODS, Fit, fringes
 from fpp_ml_bench.baselines.crossed_route.route import LEAST_TRUST, WELL_LIT, CrossedRoute
-from fpp_ml_bench.baselines.phase_route import (
-    FLOOR_NOISE_GREY,
-    LARGE,
-    Background,
-    Image,
-    Mask,
-    Watch,
-    Window,
-    differs,
-    first_mask,
-    jump_links,
-    links_between,
-    lit_object,
-    modulated_region,
-    nearest_inside,
-    of_choice,
-    repeated,
-    wrapped,
-)
-from fpp_ml_bench.coding import Crossed, wrapped_phase
+from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase_route.labels import LARGE
+from fpp_ml_bench.baselines.phase_route.local_fit import Window
+from fpp_ml_bench.baselines.phase_route.object_mask import FLOOR_NOISE_GREY, Background, modulated_region
+from fpp_ml_bench.baselines.phase_route.observation import Watch
+from fpp_ml_bench.baselines.phase_route.orders import jump_links, links_between, nearest_inside, of_choice, repeated
+from fpp_ml_bench.baselines.phase_route.several_frames import differs, first_mask, lit_object
+from fpp_ml_bench.coding.crossed import Crossed
+from fpp_ml_bench.coding.phase_shift import wrapped_phase
 from fpp_ml_bench.constants import GREY_LEVELS, MAD_TO_SIGMA
 from fpp_ml_bench.errors import DecodeError, PredictionError
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 
 FRAMES = 3
 SMOOTHNESS = 33.0

@@ -3,7 +3,3 @@
 A `Subject` is the model that is diagnosed, a `Probe` is one test of it, and a `Finding` is the probe's result;
 ``fpp-bench diagnose`` puts them on one page. Importing this package imports neither numpy nor torch.
 """
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

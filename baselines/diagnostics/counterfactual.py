@@ -38,9 +38,9 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import MovedPhase, Scene, SceneRenderer
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
-from fpp_ml_bench.evaluation.result import PART_TITLES, RELIANCE_VERSION, Reliance, RelianceParts
-from fpp_ml_bench.evaluation.score import caution, object_interval
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.evaluation.result.parts import PART_TITLES, RELIANCE_VERSION, Reliance, RelianceParts
+from fpp_ml_bench.evaluation.score.uncertainty import caution, object_interval
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.diagnostics.subjects import Subject

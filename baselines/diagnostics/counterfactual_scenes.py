@@ -23,12 +23,12 @@ from fpp_ml_bench.baselines.diagnostics.scene_renderer import (
     Surface,
     layer_of,
 )
-from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.loaders.render import LitPixels
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.render.illumination import LitPixels
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 LARGEST_SHIFT_RAD = 0.4 * TAU
 SMALLEST_SHIFT_RAD = 0.05 * TAU  # where the working range allows only smaller shifts, the move is left out

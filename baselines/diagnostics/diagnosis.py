@@ -26,9 +26,9 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
 )
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.evaluation.report import data_uri, page, render
+from fpp_ml_bench.evaluation.report.html import data_uri, page, render
 from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, read_json, write_atomically
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
 
 JSON_FILE, REPORT_FILE = "diagnose.json", "index.html"

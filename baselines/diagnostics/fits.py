@@ -17,11 +17,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fpp_ml_bench.baselines.diagnostics.subjects import checked_output
-from fpp_ml_bench.baselines.phase_route import TAU
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import normalise, object_mask
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.optics import Direction, Rig
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import Direction
 
 Image = NDArray[np.float32]
 Source = tuple[str, str]  # a network, or `INPUT`, and a layer

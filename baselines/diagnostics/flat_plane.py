@@ -38,7 +38,7 @@ from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene, SceneRender
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject, background_below
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.paper import paper_rows
 
 TILTS_DEG = ((0.0, 0.0), (20.0, 0.0), (0.0, 20.0))

@@ -35,8 +35,8 @@ from fpp_ml_bench.baselines.diagnostics.probe import with_interval as text_of
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.evaluation.score import object_interval
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.evaluation.score.uncertainty import object_interval
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.paper import AVERAGE, paper_layers, said_by_paper
 
 Image = NDArray[np.float32]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from fpp_ml_bench.baselines.diagnostics.subjects import Subject
-    from fpp_ml_bench.loaders.storage import DatasetFolder
+    from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 TRAINED, UNTRAINED = "trained", "untrained"
 Cell = str | int | float | Sequence[float] | Mapping[str, Any] | None

@@ -15,15 +15,24 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M, VIEW_DEGREES, VIEWS
-from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.loaders import render
+from fpp_ml_bench.loaders.render.illumination import LitPixels, light_surface
+from fpp_ml_bench.loaders.render.light import Light, named_light
+from fpp_ml_bench.loaders.render.meshes import load_user_mesh
+from fpp_ml_bench.loaders.render.raycast import PixelRays, TracedObject
+from fpp_ml_bench.loaders.render.scene import UserMesh
+from fpp_ml_bench.loaders.render.scene import turned as render_turned
+from fpp_ml_bench.loaders.render.sensor import Exposure
 from fpp_ml_bench.loaders.sample import DEPTH, DEPTH_EXACT
-from fpp_ml_bench.loaders.storage import MESH_FOLDER, DatasetFolder
-from fpp_ml_bench.optics import Direction, Maps, Rig
+from fpp_ml_bench.loaders.storage.manifest import MESH_FOLDER
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.pinhole import Maps
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import Direction
 
 Field = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 """A smooth function of normalised ray coordinates x, y (n,), with values (n,)."""
@@ -76,10 +85,10 @@ def surface_of_sample(dataset: DatasetFolder, sample: str) -> Surface:
     record = dataset.measured(sample)
     mesh_file = dataset.path / MESH_FOLDER / f"{record['object']}.ply"
     if mesh_file.is_file() and record.get("distance_mm") is not None:
-        solid = render.load_user_mesh(render.UserMesh(mesh_file.stem, str(mesh_file), centre=False))
-        vertices_m = render.turned(solid.vertices_m, VIEW_DEGREES[VIEWS.index(record["view"])])
+        solid = load_user_mesh(UserMesh(mesh_file.stem, str(mesh_file), centre=False))
+        vertices_m = render_turned(solid.vertices_m, VIEW_DEGREES[VIEWS.index(record["view"])])
         placed_m = vertices_m + np.array([0, 0, record["distance_mm"] / MM_PER_M])
-        hits = render.TracedObject(solid, placed_m).primary(render.PixelRays.of(dataset.rig.camera))
+        hits = TracedObject(solid, placed_m).primary(PixelRays.of(dataset.rig.camera))
         _, seen, hit = np.intersect1d(pixels, hits.pixels, assume_unique=True, return_indices=True)
         same = np.abs(hits.depth_m[hit] - depth_m[seen]) < _SAME_SURFACE_M
         normals[seen[same]] = hits.normals[hit[same]]
@@ -177,13 +186,13 @@ class Scene:
     both angles mirrored; turned by 90 degrees, a square pair would be itself."""
 
     pixels: NDArray[np.uint32]
-    lit: render.LitPixels
+    lit: LitPixels
     mask: NDArray[np.bool_]
     stream: tuple[object, ...]
     projected: Projected = "sequence"
 
 
-def direct_light(light: render.Light) -> render.Light:
+def direct_light(light: Light) -> Light:
     """What a surface without a mesh or pixels around it can show of ``light``: no further bounces, shadows, gloss,
     albedo maps, lens or movement, and one exposure, the middle of a range; ambient light is that in the open. A
     camera pixel's width still blurs the pattern where the light has pixels with an area."""
@@ -200,10 +209,10 @@ def direct_light(light: render.Light) -> render.Light:
 class SceneRenderer:
     """Renders scenes with the direct light, sensor and empty background of a rig; keeps the last background."""
 
-    def __init__(self, rig: Rig, light: render.Light | None = None) -> None:
-        self.rig, self.lamp = rig, direct_light(light or render.named_light("paper"))
+    def __init__(self, rig: Rig, light: Light | None = None) -> None:
+        self.rig, self.lamp = rig, direct_light(light or named_light("paper"))
         self.shape = (rig.camera.height, rig.camera.width)
-        self._exposures: dict[str, render.Exposure] = {}
+        self._exposures: dict[str, Exposure] = {}
         self._background_stream: tuple[object, ...] = ()
         self._backgrounds: dict[tuple[str, int], NDArray[np.uint8]] = {}
 
@@ -211,9 +220,9 @@ class SceneRenderer:
     def of(cls, dataset: DatasetFolder) -> "SceneRenderer":
         """The renderer for ``dataset``: its light, and the paper's for an imported one."""
         light = dataset.manifest.settings.get("light")
-        return cls(dataset.rig, None if light is None else render.Light.model_validate(light))
+        return cls(dataset.rig, None if light is None else Light.model_validate(light))
 
-    def _exposure(self, pattern: str) -> render.Exposure:
+    def _exposure(self, pattern: str) -> Exposure:
         """With the pattern ``sequence``, its mean light (``uniform``), ``other pitch`` or ``other direction``; kept."""
         if pattern not in self._exposures:
             rig, pair = self.rig, self.rig.crossed
@@ -224,23 +233,23 @@ class SceneRenderer:
                 key, factor = ("pitches_px", PITCH_FACTOR) if pattern == "other pitch" else ("angles_deg", -1)
                 first, second = getattr(pair, key)
                 rig = rig.with_crossed(replace(pair, **{key: (factor * first, factor * second)}))
-            exposure = render.Exposure.of(rig, self.lamp)
+            exposure = Exposure.of(rig, self.lamp)
             uniform = pattern == "uniform"
             self._exposures[pattern] = replace(exposure, pattern=exposure.pattern.uniform(rig)) if uniform else exposure
         return self._exposures[pattern]
 
     @cached_property
-    def _empty(self) -> render.LitPixels:
+    def _empty(self) -> LitPixels:
         x, y = (rays.ravel() for rays in self.rig.camera.rays())
         points_m = np.column_stack([x, y, np.ones_like(x)]) * self.rig.background
         return self._lit(points_m, np.broadcast_to([0.0, 0.0, -1.0], points_m.shape))
 
-    def light(self, surface: Surface) -> render.LitPixels:
+    def light(self, surface: Surface) -> LitPixels:
         """The direct light on ``surface``."""
         return self._lit(surface.points_m(), surface.normals)
 
-    def _lit(self, points_m: NDArray[np.float64], normals: NDArray[np.float64]) -> render.LitPixels:
-        lit = render.light_surface(points_m, normals, self.rig, self.lamp, self._exposure("sequence").pattern)
+    def _lit(self, points_m: NDArray[np.float64], normals: NDArray[np.float64]) -> LitPixels:
+        lit = light_surface(points_m, normals, self.rig, self.lamp, self._exposure("sequence").pattern)
         return lit.brighter(np.float32(self.lamp.camera.exposure))  # type: ignore[arg-type]  # direct light has one
 
     def frames(self, scene: Scene, indices: Sequence[int], masked: bool = False) -> list[NDArray[np.uint8] | None]:

@@ -16,15 +16,16 @@ from torch import Tensor, nn
 
 from fpp_ml_bench.baselines.diagnostics.probe import spread
 from fpp_ml_bench.baselines.method import Frames, Method
-from fpp_ml_bench.baselines.networks import NetworkMethod, build, fringe_batch, load
+from fpp_ml_bench.baselines.networks.model import build, fringe_batch, load
+from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
 from fpp_ml_bench.baselines.registry import FILE_MARK, load_from_file, load_method, methods
-from fpp_ml_bench.baselines.training import shipped_names, weights_path
+from fpp_ml_bench.baselines.training.weights import shipped_names, weights_path
 from fpp_ml_bench.depth import Normalisation, denormalise, object_mask
 from fpp_ml_bench.errors import DiagnosisError, FppBenchError, PredictionError, WeightsError
 from fpp_ml_bench.evaluation.protocol import Units
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.storage import DatasetFolder
-from fpp_ml_bench.optics import Direction
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.sequence import Direction
 
 OutputUnits = Literal["mm", "m", "normalised"]
 NORMALISATION_OF: dict[str, Normalisation] = {"mm": "raw", "m": "global", "normalised": "individual"}

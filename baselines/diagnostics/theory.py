@@ -37,13 +37,15 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
 )
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import SceneRenderer, Surface, constant, moved
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
-from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
-from fpp_ml_bench.baselines.training import LOSSES, loss_function
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.training.losses import loss_function
+from fpp_ml_bench.baselines.training.tables import LOSSES
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.loaders.render import camera_noise
-from fpp_ml_bench.loaders.storage import DatasetFolder
-from fpp_ml_bench.optics import Direction, Rig
+from fpp_ml_bench.loaders.render.sensor import camera_noise
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import Direction
 
 DISTANCES_M = (0.3, 10.0)
 POINTS = 400

@@ -21,8 +21,8 @@ from fpp_ml_bench.baselines.networks.base import FringeNetwork, tiny_floats_are_
 from fpp_ml_bench.baselines.networks.hformer import Hformer
 from fpp_ml_bench.baselines.networks.pix2pix import Discriminator, Pix2Pix, Pix2PixUNet
 from fpp_ml_bench.baselines.networks.unet import ResUNet, TransUNet, UNet
-from fpp_ml_bench.baselines.training import ModelConfig, open_weights, weights_path
-from fpp_ml_bench.decoding import grey_levels
+from fpp_ml_bench.baselines.training.weights import ModelConfig, open_weights, weights_path
+from fpp_ml_bench.decoding.decode import grey_levels
 from fpp_ml_bench.depth import denormalise
 from fpp_ml_bench.errors import FppBenchError, NetworkError, PredictionError, WeightsError
 from fpp_ml_bench.loaders.training import unit_range

@@ -9,15 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Frames, Method, Photographed, Setting
-from fpp_ml_bench.baselines.training import NETWORK_TITLES, PRESETS, Loss, load_recipe
+from fpp_ml_bench.baselines.training.recipe import Loss, load_recipe
+from fpp_ml_bench.baselines.training.tables import NETWORK_TITLES, PRESETS
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.errors import PredictionError, RecipeError, WeightsError
-from fpp_ml_bench.optics import PAPER_SEQUENCE, AnySequence, Rig
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE, AnySequence
 from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.networks.model import Model
-    from fpp_ml_bench.evaluation.submission import Submission
+    from fpp_ml_bench.evaluation.submission.description import Submission
 
 DepthRange = Literal["oracle", "predicted", "mean"]
 DEPTH_RANGES: tuple[DepthRange, ...] = get_args(DepthRange)
@@ -225,7 +227,8 @@ def _short_loss(label: str) -> str:
 def weights_of_recipe(recipe: str, size: int) -> Path:
     """The weights that ``fpp-bench reproduce`` left of ``recipe`` below ``runs/``, by the preset of images ``size`` px
     wide. Raises FppBenchError where there are none."""
-    from fpp_ml_bench.baselines.reproduce import RUNS, Folders, current_weights
+    from fpp_ml_bench.baselines.reproduce.plan import RUNS, Folders
+    from fpp_ml_bench.baselines.reproduce.work import current_weights
 
     resolved = [load_recipe(recipe, preset) for preset in PRESETS]
     searched = []

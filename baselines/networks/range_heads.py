@@ -11,7 +11,7 @@ from torch.nn import functional
 
 from fpp_ml_bench.baselines.networks.base import FringeNetwork
 from fpp_ml_bench.baselines.networks.model import TWINS, HeadReport, Probe, RangeHeads, load, probed, represent
-from fpp_ml_bench.baselines.training import ModelConfig, save_weights
+from fpp_ml_bench.baselines.training.weights import ModelConfig, save_weights
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import WeightsError
 from fpp_ml_bench.loaders.training import FringeDepthDataset

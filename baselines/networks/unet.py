@@ -20,10 +20,10 @@ from torch.nn import functional
 
 from fpp_ml_bench.baselines.networks import base
 from fpp_ml_bench.baselines.networks.base import DoubleConvolution, FringeNetwork, Join, ResidualBlock
-from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import NetworkError
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 
 class Levels(FringeNetwork):

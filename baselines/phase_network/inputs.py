@@ -13,9 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines import phase_route
-from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer, Image, Mask, Observation, wrapped
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer, Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase_route.object_mask import Crop
+from fpp_ml_bench.baselines.phase_route.observation import Observation, Settings
+from fpp_ml_bench.baselines.phase_route.orders import LEAST_BRIGHTNESS, grid_of, irradiance, repeated
+from fpp_ml_bench.baselines.phase_route.resampling import Periods
+from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
+from fpp_ml_bench.optics.rig import Rig
 
 STEPS = (-1, 0, 1)  # the candidates: a period further than the base order, the base order, a period nearer
 SIDES = ((0.0, 1.0), (0.7, 0.7), (1.0, 0.0), (0.7, -0.7), (0.0, -1.0), (-0.7, -0.7), (-1.0, 0.0), (-0.7, 0.7))
@@ -101,13 +105,13 @@ class Geometry:
     """Route and rotation for all images of a rig and fringe direction."""
 
     rig: Rig
-    route: phase_route.PhaseRoute
+    route: PhaseRoute
     rotation: Rotation
 
     @classmethod
-    def of(cls, rig: Rig, settings: phase_route.Settings, periods: phase_route.Periods | None = None) -> "Geometry":
+    def of(cls, rig: Rig, settings: Settings, periods: Periods | None = None) -> "Geometry":
         """As `phase_route.PhaseRoute`: ``rig`` of the geometry is that of the images resampled to ``periods``."""
-        route = phase_route.PhaseRoute(rig, settings, periods=periods)
+        route = PhaseRoute(rig, settings, periods=periods)
         return cls(route.rig, route, Rotation.of(route.layer, settings.direction))
 
     @property
@@ -132,7 +136,7 @@ class CroppedMaps:
     real_maps: ClassVar[tuple[str, ...]]
     other_maps: ClassVar[tuple[str, ...]]
 
-    crop: phase_route.Crop
+    crop: Crop
 
     def window(self, rows: slice, columns: slice) -> Self:
         """A part of these maps; slices with start and stop."""
@@ -209,9 +213,9 @@ class Scene(CroppedMaps):
 
 def coarse_irradiance(scene: Scene, geometry: Geometry, residuals_rad: Sequence[NDArray]) -> NDArray[np.float32]:
     """`irradiance` (n, h', w') with each of ``residuals_rad`` (h, w), on every `STEP_PX`-th pixel."""
-    grid, where = phase_route.grid_of(STEP_PX), phase_route.grid_of(STEP_PX, scene.crop)
+    grid, where = grid_of(STEP_PX), grid_of(STEP_PX, scene.crop)
     layer, slopes = geometry.layer.at(where), (scene.slopes[0][grid], scene.slopes[1][grid])
-    return np.stack([phase_route.irradiance(layer, rad[grid], slopes, geometry.rig, where) for rad in residuals_rad])
+    return np.stack([irradiance(layer, rad[grid], slopes, geometry.rig, where) for rad in residuals_rad])
 
 
 def channels(scene: Scene, geometry: Geometry) -> tuple[Image, Mask]:
@@ -225,9 +229,9 @@ def channels(scene: Scene, geometry: Geometry) -> tuple[Image, Mask]:
         # Brightness with each candidate, in units of light; NaN where a candidate lies behind a device.
         light = coarse_irradiance(scene, geometry, [candidate.astype(np.float32) for candidate in candidates])
         exists = geometry.in_range(np.stack([layer.depth_of_residual_mm(candidate) for candidate in candidates]))
-    expected = phase_route.repeated((light * rig.standoff_m**2).astype(np.float32), STEP_PX, scene.light.shape)
+    expected = repeated((light * rig.standoff_m**2).astype(np.float32), STEP_PX, scene.light.shape)
     exists[1] |= ~exists.any(axis=0)
-    floor = np.float32(phase_route.LEAST_BRIGHTNESS * rig.standoff_m**2)
+    floor = np.float32(LEAST_BRIGHTNESS * rig.standoff_m**2)
     bright = np.maximum(scene.bright, floor)
     with np.errstate(invalid="ignore"):
         ratio = np.log(bright / np.maximum(np.nan_to_num(expected, nan=1.0), floor))

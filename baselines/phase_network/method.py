@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method, OwnViews
-from fpp_ml_bench.baselines.phase_route import Measurement, Periods, Settings
 from fpp_ml_bench.baselines.phase_route.method import (
     AMBIENT_GREY,
     DIRECTION,
@@ -20,17 +19,20 @@ from fpp_ml_bench.baselines.phase_route.method import (
     direction_of,
     fringe_options,
 )
+from fpp_ml_bench.baselines.phase_route.observation import Measurement, Settings
+from fpp_ml_bench.baselines.phase_route.resampling import Periods
 from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.machine import usable_cores
-from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
 from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.phase_network.net_file import NetFile
     from fpp_ml_bench.baselines.phase_network.training import Trained
-    from fpp_ml_bench.baselines.training import NetConfig
-    from fpp_ml_bench.evaluation.submission import Submission
+    from fpp_ml_bench.baselines.training.weights import NetConfig
+    from fpp_ml_bench.evaluation.submission.description import Submission
 
 PERIOD_TOLERANCE = 1.4
 """Factor by which an image's fringe period in px may differ from that of the training images; beyond, the image is
@@ -207,7 +209,7 @@ class PhaseNetMethod(Method):
 
     def measure(self, frames: Frames) -> Measurement:
         """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
-        from fpp_ml_bench.baselines.networks import torch_threads
+        from fpp_ml_bench.baselines.networks.base import torch_threads
 
         with torch_threads(self.threads):
             return self.route.measure(self._image(frames))

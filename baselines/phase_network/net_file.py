@@ -9,7 +9,14 @@ import torch
 from torch import nn
 
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.training import PHASE_NETWORKS, Family, NetConfig, read_file, weights_path, write_file
+from fpp_ml_bench.baselines.training.weights import (
+    PHASE_NETWORKS,
+    Family,
+    NetConfig,
+    read_file,
+    weights_path,
+    write_file,
+)
 from fpp_ml_bench.errors import NetworkError, WeightsError
 from fpp_ml_bench.files import printable
 

@@ -11,18 +11,11 @@ import torch
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
-from fpp_ml_bench.baselines.phase_route import (
-    LARGE,
-    MARGIN_SCALE,
-    Image,
-    Mask,
-    least_energy,
-    links_between,
-    nearest_inside,
-    of_choice,
-    repeated,
-)
-from fpp_ml_bench.baselines.training import Panel, draw_curves
+from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask
+from fpp_ml_bench.baselines.phase_route.confidence import MARGIN_SCALE
+from fpp_ml_bench.baselines.phase_route.labels import LARGE, least_energy
+from fpp_ml_bench.baselines.phase_route.orders import links_between, nearest_inside, of_choice, repeated
+from fpp_ml_bench.baselines.training.records import Panel, draw_curves
 
 GRAPH = 3.0  # weight of smoothness between neighbours in the labelling of the orders, in which depth may jump
 SCALE_TO_SIGMA = float(np.sqrt(2))  # of a Laplace distribution

@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines import phase_route
 from fpp_ml_bench.baselines.phase_network.inputs import LEAST_WEIGHT, STEPS, Geometry, Scene, channels
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.odds import (
@@ -20,8 +19,11 @@ from fpp_ml_bench.baselines.phase_network.odds import (
     margin_of,
     wrong_chance,
 )
-from fpp_ml_bench.baselines.phase_route import TAU, Mask, Measurement, Settings, wrapped
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, Mask, wrapped
+from fpp_ml_bench.baselines.phase_route.observation import Measurement, Settings
+from fpp_ml_bench.baselines.phase_route.orders import stride_of
+from fpp_ml_bench.baselines.phase_route.resampling import Periods
+from fpp_ml_bench.optics.rig import Rig
 
 OPEN_MARGIN = 1e-6
 """Least margin of an order that gets a depth where brightness can't tell it: a wrong one is less likely than not."""
@@ -47,7 +49,7 @@ def decided_order(answers: Answers, scene: Scene, inside: Mask, geometry: Geomet
     """Index of each pixel's candidate (h, w): `least_energy_order`."""
     base = geometry.layer.at(scene.crop).residual_phase(scene.phase_rad, scene.order)
     phases = np.stack([base + TAU * step for step in STEPS]).astype(np.float32)
-    stride, jump_rad = phase_route.stride_of(geometry.route.period_px), geometry.route.settings.jump_rad
+    stride, jump_rad = stride_of(geometry.route.period_px), geometry.route.settings.jump_rad
     return least_energy_order(answers.logits, phases, inside, stride, jump_rad)
 
 
@@ -64,7 +66,7 @@ class NetworkRoute:
         threshold: float = 0.0,
         lead: float = 0.0,
         odds: Odds | None = None,
-        periods: phase_route.Periods | None = None,
+        periods: Periods | None = None,
     ) -> None:
         self.geometry = Geometry.of(rig, settings, periods)
         self.network, self.threshold, self.lead, self.odds = network, threshold, lead, odds or Odds()

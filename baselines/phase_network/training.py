@@ -30,12 +30,15 @@ from fpp_ml_bench.baselines.phase_network.windows import (
     place_of,
     wrong_place,
 )
-from fpp_ml_bench.baselines.phase_route import TAU, Image, Mask, Settings, of_choice, repeated
-from fpp_ml_bench.baselines.training import View
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, Image, Mask
+from fpp_ml_bench.baselines.phase_route.observation import Settings
+from fpp_ml_bench.baselines.phase_route.orders import of_choice, repeated
+from fpp_ml_bench.baselines.training.views import View
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import depth_edges, object_mask
 from fpp_ml_bench.errors import RecipeError
-from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
 
 Albedo = Literal["one", "any"]
 RELIABILITY = "reliability.png"

@@ -24,16 +24,19 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from fpp_ml_bench.baselines import training
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS
 from fpp_ml_bench.baselines.phase_network.net_file import load_net, read_net, save_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.odds import Answers
 from fpp_ml_bench.baselines.phase_network.windows import IGNORED, chosen_threshold, mean_scores
-from fpp_ml_bench.baselines.phase_route import Mask
-from fpp_ml_bench.baselines.training import Panel, Record
+from fpp_ml_bench.baselines.phase_route.calibration_layer import Mask
+from fpp_ml_bench.baselines.training.engine import CHECKPOINT, Training, alone_in, claim_folder, reproducible
+from fpp_ml_bench.baselines.training.records import Panel, Record
+from fpp_ml_bench.baselines.training.views import View, fingerprint_of, groups_of, measured_views
+from fpp_ml_bench.baselines.training.weights import PHASE_NETWORKS, Family, NetConfig, TrainingBenchmark
 from fpp_ml_bench.errors import RecipeError, TrainingError
-from fpp_ml_bench.optics import Rig, paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig import Rig
 
 VIEWS = "views"
 SMALL_RAD = 0.05  # error of the phase below which its loss is quadratic
@@ -89,7 +92,7 @@ class StepRecipe(ABC):
 
     title: ClassVar[str]
     """Of the weights."""
-    family: ClassVar[training.Family] = training.PHASE_NETWORKS
+    family: ClassVar[Family] = PHASE_NETWORKS
     makes: ClassVar[type[nn.Module]] = PhaseNet
     """The network's class."""
     main_loss: ClassVar[str]
@@ -203,7 +206,7 @@ class WindowRecipe(StepRecipe):
         }
 
 
-class WindowTraining(training.Training):
+class WindowTraining(Training):
     """Training in intervals between two validations, on the processor. ``draw`` gives a random window, a dataclass of
     arrays with the network's input ``x``; ``validate``: scores of a network, those of ``recipe.scores`` among them, or
     nothing. ``start``: the network whose weights it starts from (None: random ones). ``print_line`` is given a line for
@@ -319,7 +322,7 @@ class Task(ABC):
     scored_share: ClassVar[int] = 3
 
     @abstractmethod
-    def samples(self, views: Iterable[training.View]) -> list[Any]:
+    def samples(self, views: Iterable[View]) -> list[Any]:
         """The samples of views; a view that can't be used has none."""
 
     @abstractmethod
@@ -423,24 +426,24 @@ def train_net(
     same call resumes a training that was stopped. ``show``: progress on stderr; ``print_line`` is given a line for
     every validation. Raises `TrainingError` for a folder of another recipe or rig."""
     started, rig = perf_counter(), rig or recipe.usual_rig()
-    groups = training.groups_of(*recipe.drawn)
+    groups = groups_of(*recipe.drawn)
     first = None if start is None else load_net(start, folded=False)
     described = recipe.to_dict() | {"rig": rig.to_dict()}
     described |= {} if first is None else {"start_sha256": first.sha256}
-    fingerprint = training.fingerprint_of(described, groups)
-    with training.alone_in(out):
-        training.claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
+    fingerprint = fingerprint_of(described, groups)
+    with alone_in(out):
+        claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
         weights = out / f"{recipe.weights_name}.safetensors"
         if weights.exists():
             config = read_net(weights, recipe.makes, recipe.family)[0]
             scores = {key: float(value or 0) for key, value in config.validation.items()}
             return Trained(weights, config.steps, config.threshold, scores)
         task = recipe.task(rig)
-        samples, validation = training.measured_views(
+        samples, validation = measured_views(
             groups, rig, task.frames, out / VIEWS, task.samples, recipe.unions, recipe.seed, workers, show
         )
         scored = validation[:: task.scored_share]
-        with training.reproducible(cpu=True):
+        with reproducible(cpu=True):
             ongoing = WindowTraining(
                 recipe,
                 partial(task.draw, samples),
@@ -455,16 +458,16 @@ def train_net(
             network = ongoing.network
             answered = task.answered(network, samples, validation)
         fields = task.chosen(answered, validation, out)
-        config = training.NetConfig(
+        config = NetConfig(
             name=recipe.weights_name,
             title=recipe.title,
             options=network.options,
             dataset_fingerprint=fingerprint,
-            benchmark=training.TrainingBenchmark(f"{recipe.name} views", 1),
+            benchmark=TrainingBenchmark(f"{recipe.name} views", 1),
             steps=recipe.steps,
             recipe=described,
             **fields,
         )
         save_net(weights, network, config, recipe.family)
-        (out / training.CHECKPOINT).unlink(missing_ok=True)
+        (out / CHECKPOINT).unlink(missing_ok=True)
         return Trained(weights, recipe.steps, config.threshold, dict(fields["validation"]))

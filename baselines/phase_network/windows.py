@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route import Image, Mask
+from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask
 
 IGNORED = -100
 """Class of a pixel that is left out of the order's loss: background, or none of the three candidates is right."""

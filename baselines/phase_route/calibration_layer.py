@@ -14,9 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.decoding import FIXED_POINT_STEPS, rotated_ray
+from fpp_ml_bench.decoding.triangulation import FIXED_POINT_STEPS, rotated_ray
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.optics import DIRECTIONS, Coefficients, Direction, Maps, Rig, distortion_polynomial, is_distorted
+from fpp_ml_bench.optics.pinhole import Coefficients, Maps, distortion_polynomial, is_distorted
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
 
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]

@@ -13,7 +13,8 @@ from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, Image, Mas
 from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit, Window
 from fpp_ml_bench.baselines.phase_route.object_mask import disk
 from fpp_ml_bench.baselines.phase_route.observation import Capture, Observation, Reason, Settings
-from fpp_ml_bench.coding import MIN_MODULATION, phase_weights
+from fpp_ml_bench.coding.code import MIN_MODULATION
+from fpp_ml_bench.coding.phase_shift import phase_weights
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
 
 LEAST_MARGIN = 0.1

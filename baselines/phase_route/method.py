@@ -18,15 +18,16 @@ from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method
 from fpp_ml_bench.baselines.phase_route.observation import PIXELWISE, Measurement, Prior, Reason, Settings
 from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
 from fpp_ml_bench.baselines.phase_route.several_frames import steps_of
-from fpp_ml_bench.coding import PhaseShift
-from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.coding.phase_shift import PhaseShift
+from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.errors import DecodeError, PredictionError
-from fpp_ml_bench.loaders.captures import read_mask
-from fpp_ml_bench.optics import DIRECTIONS, PAPER_SEQUENCE, Direction, Rig
+from fpp_ml_bench.loaders.captures.decoding import read_mask
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import DIRECTIONS, PAPER_SEQUENCE, Direction
 from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.evaluation.submission import Submission
+    from fpp_ml_bench.evaluation.submission.description import Submission
 
 ORDER_SHARE = (0.16, 0.10, 0.05)
 """Actual error from wrong orders as a share of the expected one, with 1, 2, and 3 or more frames, over training views

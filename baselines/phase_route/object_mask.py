@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer, Image, Mask
-from fpp_ml_bench.coding import MIN_MODULATION
+from fpp_ml_bench.coding.code import MIN_MODULATION
 from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 
 Crop = tuple[slice, slice]
 

@@ -13,7 +13,8 @@ from fpp_ml_bench.baselines.phase_route.local_fit import FringeFit
 from fpp_ml_bench.baselines.phase_route.object_mask import Background, Crop
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.optics import DIRECTIONS, Direction, Rig
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
 
 Prior = Literal["none", "standoff"]
 PIXELWISE = 3  # frames from which on every pixel has a phase of its own

@@ -18,7 +18,7 @@ from fpp_ml_bench.baselines.phase_route.labels import LARGE, least_energy
 from fpp_ml_bench.baselines.phase_route.object_mask import Crop
 from fpp_ml_bench.baselines.phase_route.observation import Observation, Settings
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 
 NODES_PER_PERIOD = 7.5  # grid points along a period: every third pixel at 960 px
 EVIDENCE_PERIODS = 2.0

@@ -17,7 +17,8 @@ from fpp_ml_bench.baselines.phase_route.object_mask import Crop
 from fpp_ml_bench.baselines.phase_route.observation import Measurement, Reason
 from fpp_ml_bench.baselines.phase_route.orders import nearest_inside
 from fpp_ml_bench.constants import GREY_LEVELS
-from fpp_ml_bench.optics import Direction, Rig
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import Direction
 
 JUMP_RAD = 1.0  # difference of residual phase from which on a pixel lies beside a jump, and nothing is interpolated
 CLIPPED_SHARE = 0.1  # of an averaged pixel that makes it saturated

@@ -33,11 +33,11 @@ from fpp_ml_bench.baselines.phase_route.object_mask import (
 )
 from fpp_ml_bench.baselines.phase_route.observation import Capture, Measurement, Observation, Reason, Settings, Watch
 from fpp_ml_bench.baselines.phase_route.resampling import Periods, Resampling
-from fpp_ml_bench.coding import MIN_MODULATION
+from fpp_ml_bench.coding.code import MIN_MODULATION
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.decoding import grey_levels
+from fpp_ml_bench.decoding.decode import grey_levels
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 
 Frames = NDArray[np.uint8] | Sequence[NDArray[np.uint8]]
 

@@ -21,7 +21,8 @@ from fpp_ml_bench.baselines.phase_route.object_mask import (
     without_small,
 )
 from fpp_ml_bench.baselines.phase_route.observation import PIXELWISE, Capture
-from fpp_ml_bench.coding import MIN_MODULATION, choose_steps, phase_weights, wrapped_phase
+from fpp_ml_bench.coding.code import MIN_MODULATION
+from fpp_ml_bench.coding.phase_shift import choose_steps, phase_weights, wrapped_phase
 from fpp_ml_bench.errors import PredictionError
 
 PAIR_DEGREES = 120.0

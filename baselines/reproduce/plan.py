@@ -9,14 +9,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from fpp_ml_bench.baselines.training import Recipe, load_recipe, table_rows
+from fpp_ml_bench.baselines.training.recipe import Recipe, load_recipe, table_rows
 from fpp_ml_bench.constants import FULL_SIZE, OBJECTS
 from fpp_ml_bench.errors import DatasetError, RecipeError
 from fpp_ml_bench.files import read_json, write_atomically
-from fpp_ml_bench.loaders import render
-from fpp_ml_bench.loaders.storage import MANIFEST, DatasetFolder
+from fpp_ml_bench.loaders.render.builder import build as build_dataset
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.storage.manifest import MANIFEST
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 Report = Callable[[str], object]
 DepthRange = Literal["oracle", "predicted", "mean"] | None
@@ -111,7 +113,7 @@ def open_dataset(folder: Path | None, jobs: list[Job], folders: Folders, report:
     folder = default_folder(folders.preset, size) if folder is None else folder
     if not (folder / MANIFEST).is_file():
         report(f"{folder}: building {len(OBJECTS)} objects at {size} px, all frames")
-        render.build(folder, render.BuildSettings(rig=paper_rig(size), objects=OBJECTS), usable_cores())
+        build_dataset(folder, BuildSettings(rig=paper_rig(size), objects=OBJECTS), usable_cores())
     opened = DatasetFolder(folder)
     command = f"fpp-bench build --out DIR --preset full{'' if size == FULL_SIZE else f' --size {size}'}"
     if opened.size != (size, size):

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from fpp_ml_bench.baselines.networks import NetworkMethod
+from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
 from fpp_ml_bench.baselines.reproduce.plan import Folders
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.baselines.timing import time_method, write_timing
@@ -25,10 +25,15 @@ from fpp_ml_bench.depth import RangeRule
 from fpp_ml_bench.errors import PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION, Mode, Units
-from fpp_ml_bench.evaluation.result import Headline, Intervals, Result, Sha256, read_json, write_result
-from fpp_ml_bench.evaluation.score import evaluate, intervals_over_objects, score_sample, scored_pair
-from fpp_ml_bench.evaluation.submission import SUBMISSION_FILE
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.evaluation.result.file import read_json, write_result
+from fpp_ml_bench.evaluation.result.model import Result
+from fpp_ml_bench.evaluation.result.parts import Headline, Intervals, Sha256
+from fpp_ml_bench.evaluation.score.check import scored_pair
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.evaluation.score.sample_scores import score_sample
+from fpp_ml_bench.evaluation.score.uncertainty import intervals_over_objects
+from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.schema import Count, StrictModel, Text, validate
 
 MAIN_KEY = "object_mae_mm"

@@ -17,14 +17,19 @@ from typing import Any
 import torch
 
 from fpp_ml_bench.baselines.method import Setting
-from fpp_ml_bench.baselines.networks import Model, NetworkMethod, load, save_with_heads, torch_threads
+from fpp_ml_bench.baselines.networks.base import torch_threads
+from fpp_ml_bench.baselines.networks.model import Model, load
+from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
+from fpp_ml_bench.baselines.networks.range_heads import save_with_heads
 from fpp_ml_bench.baselines.reproduce import plan, scoring
 from fpp_ml_bench.baselines.reproduce.plan import Folders, Job, Report, variants
-from fpp_ml_bench.baselines.training import DONE, RECIPE, SCORING, WEIGHTS, Recipe, TrainingRun, train
+from fpp_ml_bench.baselines.training.depth_training import DONE, SCORING, WEIGHTS, TrainingRun, train
+from fpp_ml_bench.baselines.training.engine import RECIPE
+from fpp_ml_bench.baselines.training.recipe import Recipe
 from fpp_ml_bench.errors import PredictionError, TrainingError, WeightsError
-from fpp_ml_bench.evaluation.result import write_json
+from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.files import exclusive, read_json, write_atomically
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 PAPER_PRESET = "paper"
 REASON_LENGTH = 400

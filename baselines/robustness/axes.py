@@ -21,9 +21,9 @@ from pydantic import Field
 from fpp_ml_bench.constants import GREY_LEVELS, TEST_OBJECTS, UNSEEN
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.score import states_sigma
+from fpp_ml_bench.evaluation.score.sample_scores import states_sigma
 from fpp_ml_bench.files import strict_yaml
-from fpp_ml_bench.loaders.render import Light, named_light
+from fpp_ml_bench.loaders.render.light import Light, named_light
 from fpp_ml_bench.loaders.sample import void_pixels
 from fpp_ml_bench.schema import StrictModel, Text, validate
 

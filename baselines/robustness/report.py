@@ -11,7 +11,7 @@ from fpp_ml_bench.baselines.diagnostics.probe import Line, Panel, Picture, chart
 from fpp_ml_bench.baselines.robustness.axes import CLEAN, corruptions, severity_means
 from fpp_ml_bench.baselines.robustness.run import Setup, View, read_axis
 from fpp_ml_bench.baselines.robustness.scenes import FrameCache
-from fpp_ml_bench.evaluation.report import data_uri, page, render
+from fpp_ml_bench.evaluation.report.html import data_uri, page, render
 from fpp_ml_bench.files import write_atomically
 
 PAGE, CURVES, WORST = "index.html", "curves.png", "worst.png"

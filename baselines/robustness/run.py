@@ -14,8 +14,8 @@ from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corrupt
 from fpp_ml_bench.baselines.robustness.scenes import Condition, FrameCache
 from fpp_ml_bench.constants import sample_name
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.result import Robustness, SeverityScores
-from fpp_ml_bench.evaluation.score import object_interval
+from fpp_ml_bench.evaluation.result.parts import Robustness, SeverityScores
+from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 from fpp_ml_bench.files import LOCK_FILE, exclusive, read_json, write_atomically
 from fpp_ml_bench.pool import mapping
 

@@ -20,8 +20,10 @@ from fpp_ml_bench import __version__
 from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, Truth, corruptions
 from fpp_ml_bench.constants import MM_PER_M, sample_name
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.loaders.render import BuildSettings, SolidMesh, Studio, solid_mesh
-from fpp_ml_bench.optics import NAMED_RIGS
+from fpp_ml_bench.loaders.render.meshes import solid_mesh
+from fpp_ml_bench.loaders.render.scene import BuildSettings, SolidMesh
+from fpp_ml_bench.loaders.render.view import Studio
+from fpp_ml_bench.optics.named_rigs import NAMED_RIGS
 
 CACHE = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "fpp-ml-bench" / "robustness"
 LIMIT_BYTES = 10_000_000_000

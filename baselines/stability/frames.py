@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench import coding, decoding, optics
 from fpp_ml_bench.baselines.stability.cases import (
     U64,
     Expects,
@@ -21,8 +20,26 @@ from fpp_ml_bench.baselines.stability.cases import (
     wide,
     worst,
 )
+from fpp_ml_bench.coding.code import MIN_MODULATION, Limits, Reason
+from fpp_ml_bench.coding.gray_code import (
+    INCONSISTENT_RAD,
+    absolute_phase,
+    binary_to_gray,
+    bits_needed,
+    cell_centres_rad,
+    cell_count,
+    cell_of,
+    gray_to_binary,
+)
+from fpp_ml_bench.coding.phase_shift import choose_steps, minus_atan2, phase_weights, wrapped_phase
 from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.decoding.blocks import decode_direction, plain_plan
+from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.errors import DecodeError, RigError
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.pinhole import Pinhole
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import AXES, Direction, Sequence
 from fpp_ml_bench.portable import arctangent2
 
 PHASE = Group("phase", "the phase that the frames were made from")
@@ -56,7 +73,7 @@ def grey(values: NDArray) -> NDArray[np.uint8]:
 
 def phase_error(frames: NDArray, deltas: NDArray | None = None) -> Floats:
     """Error in rad, on the circle, of the wrapped phase of frames of `phases`."""
-    return np.angle(np.exp(1j * (coding.wrapped_phase(frames, deltas).phase - phases())))
+    return np.angle(np.exp(1j * (wrapped_phase(frames, deltas).phase - phases())))
 
 
 def rounding(steps: int = 18) -> float:
@@ -70,28 +87,28 @@ def worst_angle(shift: float, modulation: float = MODULATION) -> float:
     return math.asin(shift / modulation) if shift < modulation else math.pi
 
 
-def coded_rig(pitch_px: float = 18.0, steps: int = 18, size: int = 32, length: int | None = None) -> optics.Rig:
+def coded_rig(pitch_px: float = 18.0, steps: int = 18, size: int = 32, length: int | None = None) -> Rig:
     """The paper's rig with another pitch and number of steps, and as many Gray bits as these need; ``length``: sides of
     the projector's image in px."""
-    rig = optics.paper_rig(size)
+    rig = paper_rig(size)
     device = rig.projector
     if length is not None:
         focal = device.fx * length / device.width
-        device = optics.Pinhole(length, length, focal, focal, (length - 1) / 2, (length - 1) / 2)
-    sequence = optics.Sequence(steps, *(coding.bits_needed(side, pitch_px) for side in (device.height, device.width)))
-    return optics.Rig(rig.camera, device, rig.rotation, rig.translation_m, pitch_px, pitch_px, sequence)
+        device = Pinhole(length, length, focal, focal, (length - 1) / 2, (length - 1) / 2)
+    sequence = Sequence(steps, *(bits_needed(side, pitch_px) for side in (device.height, device.width)))
+    return Rig(rig.camera, device, rig.rotation, rig.translation_m, pitch_px, pitch_px, sequence)
 
 
 def gray_levels(cells: NDArray, bits: int, mean: float = MEAN, modulation: float = MODULATION) -> NDArray:
     """Grey levels of the Gray bits of cells (n,), float64 (bits, n)."""
-    bright = (coding.binary_to_gray(cells) >> np.arange(bits - 1, -1, -1)[:, None]) & 1
+    bright = (binary_to_gray(cells) >> np.arange(bits - 1, -1, -1)[:, None]) & 1
     return mean + modulation * (2.0 * bright - 1.0)
 
 
 def direction_levels(
-    rig: optics.Rig,
+    rig: Rig,
     coordinate_px: NDArray,
-    direction: optics.Direction = "vertical",
+    direction: Direction = "vertical",
     mean: float = MEAN,
     modulation: float = MODULATION,
 ) -> Floats:
@@ -99,19 +116,19 @@ def direction_levels(
     A pixel sees one projector pixel's Gray code, the one its coordinate rounds to."""
     pitch, sequence = rig.pitch(direction), rig.sequence
     waves = sinusoids(2 * np.pi * coordinate_px / pitch, sequence.steps, mean, modulation)
-    cells = coding.cell_of(np.rint(coordinate_px), pitch)
+    cells = cell_of(np.rint(coordinate_px), pitch)
     return np.concatenate([waves, gray_levels(cells, sequence.bits(direction), mean, modulation)])
 
 
 def plane_stack(
-    rig: optics.Rig, depth_m: float = 1.8, mean: float = MEAN, modulation: float = MODULATION
+    rig: Rig, depth_m: float = 1.8, mean: float = MEAN, modulation: float = MODULATION
 ) -> tuple[list[NDArray[np.uint8] | None], NDArray]:
     """All frames of a plane square to the axis, and the pixels more than 3 px inside the projector's image, (H, W)."""
     x, y = rig.camera.rays()
     exact = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * depth_m)
     frames: list[NDArray[np.uint8] | None] = [None] * len(rig.sequence)
     inside, sides = np.ones(x.shape, bool), (rig.projector.width, rig.projector.height)
-    for direction, px, side in zip(optics.AXES, exact, sides, strict=True):
+    for direction, px, side in zip(AXES, exact, sides, strict=True):
         levels = grey(direction_levels(rig, px.ravel(), direction, mean, modulation)).reshape(-1, *x.shape)
         for index, level in zip(
             [*rig.sequence.sinusoids(direction), *rig.sequence.gray(direction)], levels, strict=True
@@ -121,20 +138,20 @@ def plane_stack(
     return frames, inside
 
 
-def coordinate_error(rig: optics.Rig, levels: NDArray, exact_px: NDArray) -> tuple[Floats, NDArray]:
+def coordinate_error(rig: Rig, levels: NDArray, exact_px: NDArray) -> tuple[Floats, NDArray]:
     """Error in px of the vertical coordinate, decoded with the default limits, and the flagged pixels."""
-    plan = decoding.plain_plan(rig, "vertical", rig.sequence.steps, coding.Limits())
-    decoded = decoding.decode_direction(grey(levels), plan, coding.Limits())
-    return decoded.coordinate_px - exact_px, decoded.reason != coding.Reason.DECODED
+    plan = plain_plan(rig, "vertical", rig.sequence.steps, Limits())
+    decoded = decode_direction(grey(levels), plan, Limits())
+    return decoded.coordinate_px - exact_px, decoded.reason != Reason.DECODED
 
 
-def rounding_px(rig: optics.Rig) -> float:
+def rounding_px(rig: Rig) -> float:
     """Largest error of a coordinate in px by rounding frames to whole grey levels."""
     return rig.pitch("vertical") / (2 * np.pi) * worst_angle(rounding(rig.sequence.steps))
 
 
 def decoded_coordinate(
-    rig: optics.Rig, exact_px: NDArray, levels: NDArray | None = None, further_px: float | NDArray = 0.0
+    rig: Rig, exact_px: NDArray, levels: NDArray | None = None, further_px: float | NDArray = 0.0
 ) -> Outcome:
     """The outcome of coordinates with the error of 8-bit frames and of ``further_px``; ``levels``: what the camera sees
     of them, where disturbed."""
@@ -142,7 +159,7 @@ def decoded_coordinate(
     return worst(error_px, rounding_px(rig) + further_px, flagged)
 
 
-def px_per_m(rig: optics.Rig) -> float:
+def px_per_m(rig: Rig) -> float:
     """Change of u with depth at 1.8 m: f b / Z^2."""
     return rig.projector.fx * rig.translation_m[0] / 1.8**2
 
@@ -167,7 +184,7 @@ def _least_squares(
     model = mp.matrix([[1, mp.cos(delta), mp.sin(delta)] for delta in deltas])
     solve = (model.T * model) ** -1 * model.T
     _, cosine, sine = np.array(solve.tolist()) @ wide(frames[:, 0])
-    error = difference(coding.wrapped_phase(frames, shifts).phase[0], -by_mpmath("atan2", sine, cosine))
+    error = difference(wrapped_phase(frames, shifts).phase[0], -by_mpmath("atan2", sine, cosine))
     return worst(error, bound, condition=condition)
 
 
@@ -182,9 +199,9 @@ def modulation_exact(modulation: float) -> Outcome:
 
 def _expects(modulation: float, spread: float) -> Expects:
     """What is expected of a modulation that is measured within ``spread`` of its value."""
-    if abs(modulation - coding.MIN_MODULATION) <= spread:
+    if abs(modulation - MIN_MODULATION) <= spread:
         return "either"
-    return "number" if modulation > coding.MIN_MODULATION else "refusal"
+    return "number" if modulation > MIN_MODULATION else "refusal"
 
 
 @PHASE.family(
@@ -292,7 +309,7 @@ def few_steps(steps: int) -> Outcome:
 def uneven_steps(chosen: int) -> Outcome:
     """wrapped phase of this number of 18 steps, 8-bit frames; bound: asin(g' / 2B), g' = max over directions of sum
     |least-squares weight|"""
-    deltas = 2 * np.pi * np.array(coding.choose_steps(18, chosen)) / 18
+    deltas = 2 * np.pi * np.array(choose_steps(18, chosen)) / 18
     model = np.stack([np.ones(chosen), np.cos(deltas), np.sin(deltas)], axis=1)
     _, cosine, sine = np.linalg.inv(model.T @ model) @ model.T
     turn = np.linspace(0, np.pi, 3601)[:, None]
@@ -326,7 +343,7 @@ PHASE.family(
     refuses=DecodeError,
     about="weights of the shifts 0, 1, 1 rad; against "
     "there is no such phase; bound: two different shifts do not determine the phase",
-)(lambda: coding.phase_weights([0.0, 1.0, 1.0]))
+)(lambda: phase_weights([0.0, 1.0, 1.0]))
 
 
 @PHASE.family("dead frame", "mm", expects="refusal", refuses=DecodeError, steps=(18, 9, 6, 4), level=(0, 255))
@@ -336,7 +353,7 @@ def dead_frame(steps: int, level: int) -> Outcome:
     rig = coded_rig(steps=steps)
     frames, _ = plane_stack(rig, mean=120.0)
     frames[rig.sequence.sinusoids("vertical")[1]] = np.full((32, 32), level, np.uint8)
-    depth = decoding.decode_stack(frames, rig).depth_mm
+    depth = decode_stack(frames, rig).depth_mm
     # The epipolar check allows 1.5 px across the line, and e px of u alone are e sin(alpha) across.
     tx, ty, _ = rig.translation_m
     slip_px = 1.5 / (abs(ty) / math.hypot(tx, ty))
@@ -381,7 +398,7 @@ def pitch(pitch_px: float) -> Outcome:
 def edge_blend(pitch_px: float, blend: float) -> Outcome:
     """coordinate of pixels that see both cells, at every edge of the code"""
     rig = coded_rig(pitch_px)
-    cells = coding.cell_count(rig.pattern_length("vertical"), pitch_px)
+    cells = cell_count(rig.pattern_length("vertical"), pitch_px)
     edges = np.ceil(np.arange(1, cells) * (pitch_px / 2))
     positions_px = edges - 1 + blend  # between the last pixel of a cell and the first of the next
     levels, below, above = (direction_levels(rig, px) for px in (positions_px, edges - 1, edges))
@@ -410,13 +427,13 @@ def wrap_at_pi(pitch_px: float, bit_noise: float) -> Outcome:
 def order_of_pi(phase_rad: float) -> Outcome:
     """absolute phase in each of 102 cells; against the same rule in 50 digits; bound: 4 u |Phi|: one product and two
     sums"""
-    centres = coding.cell_centres_rad(912, 18.0)
+    centres = cell_centres_rad(912, 18.0)
     cells = np.arange(len(centres), dtype=np.int32)
-    absolute, agrees = coding.absolute_phase(np.full(len(cells), phase_rad), cells, centres)
+    absolute, agrees = absolute_phase(np.full(len(cells), phase_rad), cells, centres)
     two_pi = 2 * high_precision().pi
     exact = phase_rad + two_pi * by_mpmath("floor", (wide(centres) - phase_rad) / two_pi + 0.5)
     near = np.abs(exact.astype(float) - centres)
-    may_flag = float(np.mean(near > coding.INCONSISTENT_RAD - 1e-9))
+    may_flag = float(np.mean(near > INCONSISTENT_RAD - 1e-9))
     return worst(difference(absolute, exact), 4 * U64 * np.abs(absolute).max(), ~agrees, may_flag)
 
 
@@ -428,7 +445,7 @@ def arctangent(scale: float, code: str) -> Outcome:
     turn = np.concatenate([np.linspace(-np.pi, np.pi, 97), np.pi - beside, -np.pi + beside, eighth])
     cosine = scale * np.concatenate([np.cos(turn), [1.0, -1, 0, 0, -1, 1]])
     sine = scale * np.concatenate([np.sin(turn), [0.0, 0, 1, -1, -1e-17, 1e-300]])
-    phase = coding.minus_atan2(sine, cosine) if code == "compiled" else -arctangent2(sine, cosine)
+    phase = minus_atan2(sine, cosine) if code == "compiled" else -arctangent2(sine, cosine)
     error = difference(phase, -by_mpmath("atan2", wide(sine), wide(cosine)))
     error = error - 2 * np.pi * np.rint(error / (2 * np.pi))  # +pi and -pi are the same angle
     bound = np.maximum(4 * U64 * np.abs(phase), 2.0**-1073)
@@ -439,21 +456,21 @@ def arctangent(scale: float, code: str) -> Outcome:
 def order_range() -> Outcome:
     """-atan2 of signed zeros and the smallest sines at a negative cosine; against the interval [-pi, pi); bound: exact:
     +pi is mapped to -pi"""
-    phase = coding.minus_atan2(np.array([0.0, -0.0, 1e-300, -1e-300, -0.0]), np.array([-1.0] * 4 + [-1e-300]))
+    phase = minus_atan2(np.array([0.0, -0.0, 1e-300, -1e-300, -0.0]), np.array([-1.0] * 4 + [-1e-300]))
     return worst(np.maximum(phase - np.nextafter(np.pi, 0), 0) + np.maximum(-np.pi - phase, 0))
 
 
-@ORDER.family("flipped bit, both directions", "mm", expects="either", direction=optics.AXES, bit=range(7))
-def flipped_bit_both(bit: int, direction: optics.Direction) -> Outcome:
+@ORDER.family("flipped bit, both directions", "mm", expects="either", direction=AXES, bit=range(7))
+def flipped_bit_both(bit: int, direction: Direction) -> Outcome:
     """depth of a plane with one Gray bit inverted in the whole image; against the plane, 1800 mm; bound: 8-bit frames,
     by rig.md's slope; slipped pixels flagged: 18 px are 11 px off the epipolar line"""
     rig = coded_rig(size=96)
     frames, inside = plane_stack(rig)
     flipped = rig.sequence.gray(direction)[bit]
     frames[flipped] = 255 - np.asarray(frames[flipped])
-    decoded = decoding.decode_stack(frames, rig, mask=inside)
+    decoded = decode_stack(frames, rig, mask=inside)
     bound_mm = rounding_px(rig) / px_per_m(rig) * MM_PER_M * np.sqrt(2) * 1.01
-    return worst(decoded.depth_mm[inside] - 1800.0, bound_mm, decoded.reason[inside] != coding.Reason.DECODED)
+    return worst(decoded.depth_mm[inside] - 1800.0, bound_mm, decoded.reason[inside] != Reason.DECODED)
 
 
 @ORDER.family("flipped bit, one direction", "px", expects="either", bit=range(7))
@@ -465,17 +482,17 @@ def flipped_bit_alone(bit: int) -> Outcome:
     levels, row = direction_levels(rig, positions_px), rig.sequence.steps + bit
     levels[row] = 2 * MEAN - levels[row]
     cells, bits = np.floor(np.rint(positions_px) / (pitch / 2)).astype(int), rig.sequence.bits("vertical")
-    read = np.asarray(coding.gray_to_binary(coding.binary_to_gray(cells) ^ (1 << (bits - 1 - bit))))
-    centres = coding.cell_centres_rad(912, pitch)
+    read = np.asarray(gray_to_binary(binary_to_gray(cells) ^ (1 << (bits - 1 - bit))))
+    centres = cell_centres_rad(912, pitch)
     centre = centres[np.minimum(read, len(centres) - 1)]
     absolute = positions_px * 2 * np.pi / pitch
     slip = np.floor((centre - absolute) / (2 * np.pi) + 0.5)
     slipped_px = positions_px + pitch * slip
     off = np.abs(absolute + 2 * np.pi * slip - centre)
-    refused = (read >= len(centres)) | (off > coding.INCONSISTENT_RAD) | (slipped_px < -0.5) | (slipped_px > 911.5)
+    refused = (read >= len(centres)) | (off > INCONSISTENT_RAD) | (slipped_px < -0.5) | (slipped_px > 911.5)
     error, flagged = coordinate_error(rig, levels, slipped_px)
     # Within half a grey level of a limit both results are correct.
-    wrong_flag = (flagged != refused) & ~(np.abs(off - coding.INCONSISTENT_RAD) < 0.01)
+    wrong_flag = (flagged != refused) & ~(np.abs(off - INCONSISTENT_RAD) < 0.01)
     silent = float(np.mean(~flagged & (slip != 0)))
     note = f"{silent:.0%} of the pixels are wrong by whole periods, which only both directions together can detect"
     return worst(np.where(wrong_flag, np.inf, error), rounding_px(rig), flagged & ~wrong_flag, note=note)
@@ -489,7 +506,7 @@ ORDER.family(
     bits=(1, 4, 5, 6),
     about="a rig of 51 "
     "periods with this number of Gray bits; against 102 cells need 7 bits; bound: the code would repeat",
-)(lambda bits: replace(optics.paper_rig(32), sequence=optics.Sequence(18, 7, bits)))
+)(lambda bits: replace(paper_rig(32), sequence=Sequence(18, 7, bits)))
 
 
 @ORDER.family("cell off the pattern", "px", expects="refusal", cell=(102, 103, 111, 127))
@@ -497,7 +514,7 @@ def cell_off_pattern(cell: int) -> Outcome:
     """a pixel whose code names a cell beyond the pattern; against there is no such cell; bound: must be masked"""
     waves = sinusoids(np.linspace(-3, 3, 50), 18)
     levels = np.concatenate([waves, gray_levels(np.full(50, cell), 7)])
-    return worst(0.0, flagged=coordinate_error(optics.paper_rig(32), levels, np.zeros(50))[1])
+    return worst(0.0, flagged=coordinate_error(paper_rig(32), levels, np.zeros(50))[1])
 
 
 @ORDER.family("code length", "px", bits=(1, 2, 7, 10, 13, 15))

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench import coding, decoding, optics
-from fpp_ml_bench.baselines.phase_route import CalibrationLayer
+from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer
 from fpp_ml_bench.baselines.stability.cases import (
     U32,
     U64,
@@ -26,9 +25,19 @@ from fpp_ml_bench.baselines.stability.cases import (
     wrong,
 )
 from fpp_ml_bench.baselines.stability.frames import plane_stack
+from fpp_ml_bench.coding.code import Reason
 from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.decoding.decode import decode_stack
+from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate, depth_noise_mm
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.loaders.render import PatternLight, light_surface, named_light
+from fpp_ml_bench.loaders.render.illumination import light_surface
+from fpp_ml_bench.loaders.render.light import named_light
+from fpp_ml_bench.loaders.render.projector import PatternLight
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.pinhole import Maps, Pinhole, distort, fold_radius_squared, undistort
+from fpp_ml_bench.optics.rig import Rig, rotation_matrix
+from fpp_ml_bench.optics.rig_file import load_rig, rig_from_dict, save_rig
+from fpp_ml_bench.optics.sequence import AXES, Direction
 
 TRIANGULATION = Group(
     "triangulation",
@@ -37,18 +46,18 @@ TRIANGULATION = Group(
 )
 RIG = Group("rig")
 BASELINES = (160.0, 50.0, 10.0, 1.0, 0.1, 0.01)
-PAPER = optics.paper_rig(24)
-TURN = optics.rotation_matrix((0.05, -0.09, 0.12))
+PAPER = paper_rig(24)
+TURN = rotation_matrix((0.05, -0.09, 0.12))
 _WEIGHTS = (0.7, 1.3)
 
 
-def _rays(count: int) -> optics.Maps:
+def _rays(count: int) -> Maps:
     """Normalised coordinates of camera rays across the paper's field of view, seeded."""
     x, y = np.random.default_rng(5).uniform(-0.2, 0.2, (2, count))
     return x, y
 
 
-def _ahead(rays: optics.Maps) -> Floats:
+def _ahead(rays: Maps) -> Floats:
     """Rays as points at z = 1, (3, n)."""
     return np.stack([*rays, np.ones(len(rays[0]))])
 
@@ -56,32 +65,32 @@ def _ahead(rays: optics.Maps) -> Floats:
 RAYS = _rays(40)
 
 
-def scaled_baseline(baseline_mm: float, ahead: float = 0.0, turned: bool = False) -> optics.Rig:
+def scaled_baseline(baseline_mm: float, ahead: float = 0.0, turned: bool = False) -> Rig:
     """The paper's rig with a shorter baseline and the projector ``ahead`` of the camera by that share of it."""
     t = np.array([*PAPER.translation_m[:2], -ahead * PAPER.baseline_m])
     t *= baseline_mm / MM_PER_M / np.linalg.norm(t)
     return replace(PAPER, rotation=(TURN if turned else np.eye(3)).tolist(), translation_m=tuple(t.tolist()))
 
 
-def _device(rig: optics.Rig) -> tuple[Floats, Floats]:
+def _device(rig: Rig) -> tuple[Floats, Floats]:
     """Focal lengths and principal point of the projector in px, (2, 1)."""
     device = rig.projector
     return np.array([[device.fx], [device.fy]]), np.array([[device.cx], [device.cy]])
 
 
-def _turned(rig: optics.Rig, rays: optics.Maps) -> NDArray[np.object_]:
+def _turned(rig: Rig, rays: Maps) -> NDArray[np.object_]:
     """Rays in the projector's axes in 50 digits, (3, n)."""
     return wide(rig.R) @ wide(_ahead(rays))
 
 
-def exact_coordinates(depth_m: float, rig: optics.Rig, rays: optics.Maps = RAYS) -> Floats:
+def exact_coordinates(depth_m: float, rig: Rig, rays: Maps = RAYS) -> Floats:
     """Projector px (2, n) of points at ``depth_m`` on the rays, in 50 digits, rounded once."""
     focal, centre = _device(rig)
     points = _turned(rig, rays) * depth_m + wide(rig.t)[:, None]
     return (wide(focal) * points[:2] / points[2] + centre).astype(float)
 
 
-def exact_depth_mm(coordinate: NDArray, rig: optics.Rig, axis: int = 0) -> NDArray[np.object_]:
+def exact_depth_mm(coordinate: NDArray, rig: Rig, axis: int = 0) -> NDArray[np.object_]:
     """Depth of these float64 inputs in 50 digits, by the closed form."""
     focal, centre = _device(rig)
     a, ideal = _turned(rig, RAYS), (wide(coordinate) - centre[axis]) / focal[axis]
@@ -93,12 +102,12 @@ def relative(depth_mm: NDArray, exact: NDArray[np.object_]) -> Floats:
     return difference(depth_mm, exact) / np.abs(exact.astype(float))
 
 
-def depth_of(coordinate: NDArray, rig: optics.Rig, axis: int = 0) -> Floats:
+def depth_of(coordinate: NDArray, rig: Rig, axis: int = 0) -> Floats:
     """The benchmark's depth in mm."""
-    return decoding.depth_from_coordinate(RAYS, coordinate, rig, optics.AXES[axis])
+    return depth_from_coordinate(RAYS, coordinate, rig, AXES[axis])
 
 
-def conditioning(coordinate: NDArray, rig: optics.Rig, axis: int = 0, rays: optics.Maps = RAYS) -> tuple[Floats, ...]:
+def conditioning(coordinate: NDArray, rig: Rig, axis: int = 0, rays: Maps = RAYS) -> tuple[Floats, ...]:
     """Bound of the closed form's relative error, and its condition number: sum of magnitudes over |a - x_p a_2|.
     Running error analysis: x_p has 2 roundings; a, a_2 have 3 each of sums of magnitudes; the difference and the top
     cancel; 4 more for the last quotient and the change to mm."""
@@ -110,7 +119,7 @@ def conditioning(coordinate: NDArray, rig: optics.Rig, axis: int = 0, rays: opti
     return U64 * (8 * condition + 5 * above + 4), condition
 
 
-def closed_form(coordinate: NDArray, rig: optics.Rig, axis: int = 0, indistinct: NDArray | bool = False) -> Outcome:
+def closed_form(coordinate: NDArray, rig: Rig, axis: int = 0, indistinct: NDArray | bool = False) -> Outcome:
     """The outcome of depths from one coordinate; the ``indistinct`` ones may be masked."""
     exact, depth_mm = exact_depth_mm(coordinate, rig, axis), depth_of(coordinate, rig, axis)
     bound, condition = conditioning(coordinate, rig, axis)
@@ -125,7 +134,7 @@ def closed_form(coordinate: NDArray, rig: optics.Rig, axis: int = 0, indistinct:
     "turned projector ahead of the camera",
     "relative",
     about="depth from one coordinate, general pose",
-    direction=optics.AXES,
+    direction=AXES,
     range_m=(0.3, 1.8, 100.0),
     baseline_mm=(160.0, 0.01),
     turned=(1,),
@@ -140,7 +149,7 @@ def closed_form(coordinate: NDArray, rig: optics.Rig, axis: int = 0, indistinct:
 @TRIANGULATION.family(
     "range",
     "relative",
-    direction=optics.AXES,
+    direction=AXES,
     baseline_mm=(160.0,),
     range_m=(0.3, 1.0, 1.8, 5.0, 20.0, 100.0),
 )
@@ -148,17 +157,17 @@ def closed_form(coordinate: NDArray, rig: optics.Rig, axis: int = 0, indistinct:
     "baseline",
     "relative",
     about="depth from one coordinate at 1.8 m",
-    direction=optics.AXES,
+    direction=AXES,
     range_m=(1.8,),
     baseline_mm=BASELINES,
 )
-def one_coordinate(baseline_mm: float, range_m: float, direction: optics.Direction, turned: int = 0) -> Outcome:
+def one_coordinate(baseline_mm: float, range_m: float, direction: Direction, turned: int = 0) -> Outcome:
     """depth from one coordinate"""
-    rig, axis = scaled_baseline(baseline_mm, 0.3 * turned, turned > 0), optics.AXES.index(direction)
+    rig, axis = scaled_baseline(baseline_mm, 0.3 * turned, turned > 0), AXES.index(direction)
     return closed_form(exact_coordinates(range_m, rig)[axis], rig, axis)
 
 
-def _least_squares(measured_px: NDArray, rig: optics.Rig, rays: optics.Maps) -> tuple[NDArray, Floats, Floats]:
+def _least_squares(measured_px: NDArray, rig: Rig, rays: Maps) -> tuple[NDArray, Floats, Floats]:
     """Depth mm that minimises the weighted misfit, by Newton in 50 digits; contraction of Gauss-Newton; its start's
     relative error."""
     focal, centre = _device(rig)
@@ -191,7 +200,7 @@ def both_coordinates(baseline_mm: float, ahead: float, noise_px: float) -> Outco
     measured_px = exact_coordinates(1.8, rig, rays)
     measured_px += noise_px * rng.standard_normal(measured_px.shape)
     exact, contraction, start = _least_squares(measured_px, rig, rays)
-    depth_mm = decoding.depth_from_both(rays, measured_px[0], measured_px[1], rig, *_WEIGHTS).depth_mm
+    depth_mm = depth_from_both(rays, measured_px[0], measured_px[1], rig, *_WEIGHTS).depth_mm
     bounds, conditions = zip(*(conditioning(measured_px[i], rig, i, rays) for i in (0, 1)), strict=True)
     in_front = exact.astype(float) > 0
     bound = 8 * np.maximum(*bounds) + start * (contraction + 4 * start) ** 3
@@ -199,17 +208,17 @@ def both_coordinates(baseline_mm: float, ahead: float, noise_px: float) -> Outco
     return worst(error, bound, np.isnan(depth_mm), float(np.mean(~in_front)), float(np.max(conditions)))
 
 
-@TRIANGULATION.family("noise law", "1", direction=optics.AXES, baseline_mm=BASELINES)
-def noise_law(baseline_mm: float, direction: optics.Direction) -> Outcome:
+@TRIANGULATION.family("noise law", "1", direction=AXES, baseline_mm=BASELINES)
+def noise_law(baseline_mm: float, direction: Direction) -> Outcome:
     """rms depth error over sigma_u Z^2 / (f_p b), minus 1; or the share without depth, minus Phi; against rig.md's law;
     where noise is over a fifth of the depth, the normal law of inverse depth; bound: 4 standard errors of 20,000 draws,
     and 8 (sigma_Z / Z)^2 of second order"""
     rig, count, modulation, axis = scaled_baseline(baseline_mm), 20_000, 60.0, np.zeros(20_000)
-    coordinate = exact_coordinates(1.8, rig, (axis[:1], axis[:1]))[optics.AXES.index(direction)][0]
+    coordinate = exact_coordinates(1.8, rig, (axis[:1], axis[:1]))[AXES.index(direction)][0]
     sigma_px = rig.pitch(direction) * math.sqrt(2 / 18) / modulation / (2 * math.pi)
     noisy = coordinate + sigma_px * np.random.default_rng(8).standard_normal(count)
-    depths_mm = decoding.depth_from_coordinate((axis, axis), noisy, rig, direction)
-    law = float(decoding.depth_noise_mm(rig, 1800.0, direction, 18, modulation))
+    depths_mm = depth_from_coordinate((axis, axis), noisy, rig, direction)
+    law = float(depth_noise_mm(rig, 1800.0, direction, 18, modulation))
     share = law / 1800.0
     if share < 0.2:
         rms = float(np.sqrt(np.mean((depths_mm - 1800.0) ** 2)))
@@ -240,15 +249,15 @@ def point_at_infinity() -> Outcome:
     """depth where ray and projector plane are exactly parallel; against there is none; bound: must be masked"""
     rays = np.array([0.0, 0.125, -0.25]), np.zeros(3)  # where its coordinate is exact
     coordinate = PAPER.projector.fx * rays[0] + PAPER.projector.cx
-    return worst(0.0, flagged=np.isnan(decoding.depth_from_coordinate(rays, coordinate, PAPER, "vertical")))
+    return worst(0.0, flagged=np.isnan(depth_from_coordinate(rays, coordinate, PAPER, "vertical")))
 
 
 @TRIANGULATION.family("far plane through the decoder", "mm", expects="refusal", range_m=(0.3, 1.0, 3.2, 20.0, 100.0))
 def decoded_far(range_m: float) -> Outcome:
     """decoded depth of a plane outside the working range; against the working range; bound: must be masked"""
-    rig = optics.paper_rig(32)
+    rig = paper_rig(32)
     frames, inside = plane_stack(rig, range_m)  # at the farthest its parallax is under a hundredth of a pixel
-    depth_mm = decoding.decode_stack(frames, rig, mask=inside).depth_mm[inside]
+    depth_mm = decode_stack(frames, rig, mask=inside).depth_mm[inside]
     return worst(depth_mm, 0.0, depth_mm == 0)
 
 
@@ -265,7 +274,7 @@ def behind_projector(ahead_m: float) -> Outcome:
 def lit_from_behind() -> Outcome:
     """projector light on a surface lit from its far side; against none reaches the camera; bound: exactly 0, so the
     decoder masks it for want of modulation"""
-    turn = optics.rotation_matrix((0.0, math.pi, 0.0))
+    turn = rotation_matrix((0.0, math.pi, 0.0))
     shift = -turn @ np.array([-0.125, 0.1, 3.0])
     rig = replace(PAPER, rotation=turn.tolist(), translation_m=tuple(shift.tolist()))
     light = named_light("paper")
@@ -321,7 +330,7 @@ def overflowing(value: float) -> Outcome:
     """depth from coordinates that no projector has; against finite and positive, or masked; bound: must be masked where
     there is no depth"""
     u = np.full(RAYS[0].shape, value)
-    depths = np.stack([depth_of(u, PAPER), decoding.depth_from_both(RAYS, u, u, PAPER).depth_mm])
+    depths = np.stack([depth_of(u, PAPER), depth_from_both(RAYS, u, u, PAPER).depth_mm])
     legal = np.isnan(depths) | (np.isfinite(depths) & (depths > 0))
     return worst(np.where(legal.all(axis=0), 0.0, np.inf), 0.0, np.isnan(depths).all(axis=0))
 
@@ -330,11 +339,11 @@ def overflowing(value: float) -> Outcome:
 def no_weight() -> Outcome:
     """depth from two directions without modulation; against there is none; bound: must be masked"""
     u, v = exact_coordinates(1.8, PAPER)
-    return worst(0.0, flagged=np.isnan(decoding.depth_from_both(RAYS, u, v, PAPER, 0.0, 0.0).depth_mm))
+    return worst(0.0, flagged=np.isnan(depth_from_both(RAYS, u, v, PAPER, 0.0, 0.0).depth_mm))
 
 
 def intrinsics(focal_px: float, centre_px: float) -> Outcome:
-    camera, u = optics.Pinhole(960, 960, focal_px, focal_px, centre_px, centre_px), np.linspace(-0.5, 959.5, 97)
+    camera, u = Pinhole(960, 960, focal_px, focal_px, centre_px, centre_px), np.linspace(-0.5, 959.5, 97)
     if not np.isfinite(camera.rays()).all():
         return Outcome(math.inf, 1.0, note="rays that are not finite")
     size = np.abs(u - centre_px) + abs(centre_px)
@@ -396,7 +405,7 @@ def rotation_vector(angle_rad: float) -> Outcome:
     """rotation matrix by Rodrigues' formula; against the same formula in 50 digits; bound: 8 u (1 + angle): the angle
     carries its own rounding; refused where that is over 1e-6"""
     vector = np.array([0.48, -0.6, 0.64]) * angle_rad
-    matrix = optics.rotation_matrix(tuple(vector.tolist()))
+    matrix = rotation_matrix(tuple(vector.tolist()))
     replace(PAPER, rotation=matrix.tolist())  # which may refuse it
     mp, (x, y, z) = high_precision(), wide(vector)
     angle, cross = mp.sqrt(x * x + y * y + z * z), np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -409,8 +418,8 @@ def lens_inverse(k1: float, k2: float, k3: float) -> Outcome:
     """ideal radius of distorted ones up to 1.6; against bisection in 50 digits below the fold; bound: 32 u / slope of
     the model: a residual of some roundings; masked where no point maps there"""
     coefficients = (k1, k2, 0.0, 0.0, k3)
-    fold, radius = math.sqrt(optics.fold_radius_squared(coefficients)), np.linspace(0.0, 1.6, 81)[1:]
-    radii = np.hypot(*optics.undistort(radius * math.cos(0.7), radius * math.sin(0.7), coefficients))
+    fold, radius = math.sqrt(fold_radius_squared(coefficients)), np.linspace(0.0, 1.6, 81)[1:]
+    radii = np.hypot(*undistort(radius * math.cos(0.7), radius * math.sin(0.7), coefficients))
     a, b, c = wide((k1, k2, k3))
 
     def forward(r: Any) -> Any:
@@ -442,8 +451,8 @@ def tangential(p1: float) -> Outcome:
     another branch is no answer; bound: 32 u / least slope of the model there: a residual of some roundings"""
     coefficients = (-0.2, 0.0, p1, -p1, 0.0)
     xd, yd = (axis.ravel() for axis in np.meshgrid(*[np.linspace(-0.8, 0.8, 33)] * 2))
-    x, y = optics.undistort(xd, yd, coefficients)
-    residual = np.hypot(*(a - b for a, b in zip(optics.distort(x, y, coefficients), (xd, yd), strict=True)))
+    x, y = undistort(xd, yd, coefficients)
+    residual = np.hypot(*(a - b for a, b in zip(distort(x, y, coefficients), (xd, yd), strict=True)))
     px, py, lost = np.zeros_like(xd), np.zeros_like(yd), np.zeros(xd.shape, bool)
     k1, _, q1, q2, _ = coefficients
     for step in np.linspace(0, 1, 201)[1:]:
@@ -457,7 +466,7 @@ def tangential(p1: float) -> Outcome:
             determinant = jxx * jyy - jxy * jxy
             lost |= ~(determinant > 1e-6)
             px, py = px - (jyy * fx - jxy * fy) / determinant, py - (jxx * fy - jxy * fx) / determinant
-    right = ~lost & (px * px + py * py < optics.fold_radius_squared(coefficients))
+    right = ~lost & (px * px + py * py < fold_radius_squared(coefficients))
     trace = jxx + jyy
     slope = (trace - np.sqrt(np.maximum(trace * trace - 4 * determinant, 0))) / 2  # the Jacobian is symmetric
     off = np.where(right, np.hypot(x - px, y - py), np.inf)  # no solution off that branch
@@ -469,13 +478,13 @@ def tangential(p1: float) -> Outcome:
 @RIG.family("lens without inverse at the corner", "mm", expects="either", k1=(-0.1, -0.5, -2.0, -10.0))
 def folding_camera(k1: float) -> Outcome:
     """decoded depth where the lens model has no inverse; against there is none; bound: must be masked"""
-    base, none = optics.paper_rig(32), (0.0,) * 4
+    base, none = paper_rig(32), (0.0,) * 4
     camera = replace(base.camera, fx=base.camera.fx / 4, fy=base.camera.fy / 4, distortion=(k1, *none))
     frames, _ = plane_stack(replace(base, camera=replace(camera, distortion=(0.0, *none))))
     x, y = camera.rays()
     without = np.isnan(x) | np.isnan(y)
-    decoded = decoding.decode_stack(frames, replace(base, camera=camera), direction="vertical")
-    given = without & ((decoded.depth_mm != 0) | (decoded.reason == coding.Reason.DECODED))
+    decoded = decode_stack(frames, replace(base, camera=camera), direction="vertical")
+    given = without & ((decoded.depth_mm != 0) | (decoded.reason == Reason.DECODED))
     note = f"{without.mean():.0%} of the pixels have no ray; the corner {'has none' if without[0, 0] else 'has a ray'}"
     return worst(np.where(given, np.inf, 0.0), 0.0, decoded.depth_mm == 0, note=note)
 
@@ -500,7 +509,7 @@ def impossible_rig(change: str) -> None:
     for key in way:
         part = part[key]
     part[last] = value
-    optics.rig_from_dict(data)
+    rig_from_dict(data)
 
 
 @RIG.family("file round trip", "bits", suffix=(".yaml", ".json"))
@@ -512,11 +521,11 @@ def file_round_trip(suffix: str) -> Outcome:
         camera=replace(PAPER.camera, cx=math.pi * 1e2, cy=2 / 3 * 1e2, distortion=awkward),
         translation_m=(math.nextafter(0.125, 0.0), -0.1 - 1e-17, 1e-300),
         pitch_vertical_px=18 + 2**-48,
-        rotation=optics.rotation_matrix((1e-9, 2e-9, -3e-9)).tolist(),
+        rotation=rotation_matrix((1e-9, 2e-9, -3e-9)).tolist(),
     )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"rig{suffix}"
-        optics.save_rig(rig, path)
-        loaded = optics.load_rig(path)
+        save_rig(rig, path)
+        loaded = load_rig(path)
     same = loaded == rig and json.dumps(loaded.to_dict()) == json.dumps(rig.to_dict())
     return Outcome(0.0) if same else wrong()

@@ -11,15 +11,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from fpp_ml_bench.baselines.networks import NETWORKS as NAMES
-from fpp_ml_bench.baselines.networks import RECENTRED_FROM, InstanceNorm, build, in_full_precision, torch_threads
-from fpp_ml_bench.baselines.phase_route import CalibrationLayer, Reason
+from fpp_ml_bench.baselines.networks.base import RECENTRED_FROM, InstanceNorm, in_full_precision, torch_threads
+from fpp_ml_bench.baselines.networks.model import NETWORKS as NAMES
+from fpp_ml_bench.baselines.networks.model import build
+from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer
+from fpp_ml_bench.baselines.phase_route.observation import Reason
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.stability.cases import U32, U64, UB16, Group, Outcome, gamma, worst, wrong
-from fpp_ml_bench.baselines.training import EPSILON, LOSSES, loss_function, sample_losses
+from fpp_ml_bench.baselines.training.losses import EPSILON, loss_function, sample_losses
+from fpp_ml_bench.baselines.training.tables import LOSSES
 from fpp_ml_bench.errors import FppBenchError, PredictionError
-from fpp_ml_bench.evaluation.score import DepthScores
-from fpp_ml_bench.optics import DIRECTIONS, Direction, paper_rig
+from fpp_ml_bench.evaluation.score.torch_metric import DepthScores
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
 
 NETWORKS = Group(
     "networks",

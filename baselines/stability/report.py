@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from fpp_ml_bench.baselines.stability.cases import Row, Verdict, parameter_text
-from fpp_ml_bench.evaluation.report import data_uri, page, render
-from fpp_ml_bench.evaluation.result import environment
+from fpp_ml_bench.evaluation.report.html import data_uri, page, render
+from fpp_ml_bench.evaluation.result.file import environment
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.machine import numba_enabled
 

@@ -8,12 +8,19 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.baselines import crossed_route
+from fpp_ml_bench.baselines.crossed_route.carriers import Carriers
+from fpp_ml_bench.baselines.crossed_route.observation import CrossedReason
+from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute
 from fpp_ml_bench.baselines.stability.cases import U64, Floats, Group, Outcome, worst, wrong
-from fpp_ml_bench.coding import Crossed
+from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.errors import FppBenchError, MeshError
-from fpp_ml_bench.loaders import render
-from fpp_ml_bench.optics import Rig, crossed_rig, paper_rig
+from fpp_ml_bench.loaders.render.illumination import light_surface, projector_centre_m
+from fpp_ml_bench.loaders.render.light import named_light
+from fpp_ml_bench.loaders.render.projector import PatternLight
+from fpp_ml_bench.loaders.render.raycast import Hits, PixelRays, TracedObject
+from fpp_ml_bench.loaders.render.scene import SolidMesh, place
+from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
+from fpp_ml_bench.optics.rig import Rig
 
 SCENES = Group("scenes")
 RIG = paper_rig(176)
@@ -23,20 +30,20 @@ EDGE_PX = 1e-9
 over, at 419 px focal length."""
 
 
-def seen(vertices_m: ArrayLike, faces: ArrayLike = ((0, 1, 2), (0, 2, 3))) -> render.Hits:
+def seen(vertices_m: ArrayLike, faces: ArrayLike = ((0, 1, 2), (0, 2, 3))) -> Hits:
     """What the camera sees of a mesh, of a quadrilateral without ``faces``."""
     vertices = np.asarray(vertices_m, dtype=np.float64)
-    mesh = render.SolidMesh("mesh", vertices, np.asarray(faces, dtype=np.int32))
-    return render.TracedObject(mesh, vertices).primary(render.PixelRays.of(RIG.camera))
+    mesh = SolidMesh("mesh", vertices, np.asarray(faces, dtype=np.int32))
+    return TracedObject(mesh, vertices).primary(PixelRays.of(RIG.camera))
 
 
-def rays_of(hits: render.Hits) -> Floats:
+def rays_of(hits: Hits) -> Floats:
     """The rays that hit, (n, 3), at z = 1."""
     x, y = RIG.camera.rays()
     return np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)[hits.pixels]
 
 
-def image(hits: render.Hits) -> Floats:
+def image(hits: Hits) -> Floats:
     """Depth (H, W) in metres, 0 = nothing."""
     depth = np.zeros((RIG.camera.height, RIG.camera.width))
     depth.flat[hits.pixels] = hits.depth_m
@@ -210,8 +217,8 @@ def misplaced(name: str) -> None:
     """placing an object that does not fit range and image; against there is no such sample; bound: must be refused"""
     radius_m, aside_m = _MISPLACED[name]
     vertices, faces = _ball(1, radius_m)
-    mesh = render.SolidMesh("mesh", vertices - AHEAD_M + np.array([aside_m, 0.0, 0.0]), faces)
-    render.place(mesh, "A0", RIG, "fixed", 0)
+    mesh = SolidMesh("mesh", vertices - AHEAD_M + np.array([aside_m, 0.0, 0.0]), faces)
+    place(mesh, "A0", RIG, "fixed", 0)
 
 
 @SCENES.family("behind the camera", "m", expects="refusal")
@@ -223,11 +230,11 @@ def behind_camera() -> Outcome:
 @SCENES.family("light at distance 0", "grey")
 def light_at_projector() -> Outcome:
     """light on a point in the projector's centre; against finite and not negative; bound: must be finite"""
-    centre = render.projector_centre_m(RIG)
+    centre = projector_centre_m(RIG)
     points = np.array([centre, centre + 1e-200 * AHEAD_M, centre + 1e-6 * AHEAD_M, 0.0 * AHEAD_M, AHEAD_M])
-    light = render.named_light("paper")
-    pattern = render.PatternLight.of(RIG, light.projector)
-    gain = render.light_surface(points, np.array([[0.0, 0.0, -1.0]] * len(points)), RIG, light, pattern).gain
+    light = named_light("paper")
+    pattern = PatternLight.of(RIG, light.projector)
+    gain = light_surface(points, np.array([[0.0, 0.0, -1.0]] * len(points)), RIG, light, pattern).gain
     return worst(np.where(np.isfinite(gain) & (gain >= 0), 0.0, math.inf))
 
 
@@ -261,10 +268,10 @@ def plane_outcome(
     grey = np.clip(np.rint(AMBIENT + white * (0.5 + 0.5 * waves) + noise), 0, 255).astype(np.uint8)
     mask = np.zeros(x.shape, bool)
     mask[60:260, 60:260] = True
-    route = crossed_route.CrossedRoute(rig, family=measured_as or family)
+    route = CrossedRoute(rig, family=measured_as or family)
     measured = route.measure(grey, mask)
     depth_mm, reason = measured.depth_mm[MIDDLE], measured.reason[MIDDLE]
-    flagged = (depth_mm == 0) | (reason != crossed_route.CrossedReason.MEASURED)
+    flagged = (depth_mm == 0) | (reason != CrossedReason.MEASURED)
     bound_mm = float(np.median(route.carriers.mm_per_rad(np.full(x.shape, DEPTH_MM)))) * bound_rad
     return worst(depth_mm - DEPTH_MM, bound_mm, flagged)
 
@@ -322,7 +329,7 @@ def painted(period_px: float) -> Outcome:
     """depth of a plane painted with stripes of this period in the image, along the first carrier's, dark ones with 0.3
     of the albedo; against the plane's depth, closed form; bound: pi of the joint phase, since stripes at a carrier's
     period are a carrier themselves, and nothing in the image tells them apart"""
-    carriers = crossed_route.Carriers.of(CROSSED_RIG, CARRIERS)
+    carriers = Carriers.of(CROSSED_RIG, CARRIERS)
     across, down = carriers.step_rad[0] / np.linalg.norm(carriers.step_rad[0])
     y, x = np.indices((CROSSED_RIG.camera.height, CROSSED_RIG.camera.width))
     stripes = 0.65 + 0.35 * np.cos(2 * np.pi * (across * x + down * y) / period_px)

@@ -11,7 +11,16 @@ from fpp_ml_bench.baselines.stability import cases
 from fpp_ml_bench.baselines.stability.cases import U32, U64, Floats, Group, Outcome, gamma, wide, worst, wrong
 from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mask
 from fpp_ml_bench.errors import DatasetError, PredictionError
-from fpp_ml_bench.evaluation import score
+from fpp_ml_bench.evaluation.score.check import scored_pair
+from fpp_ml_bench.evaluation.score.sample_scores import (
+    BLOCK,
+    EMPTY,
+    ErrorStats,
+    combine,
+    mean_of,
+    score_sample,
+    stats_of,
+)
 
 NORMALISATION = Group("normalisation")
 METRICS = Group(
@@ -23,7 +32,7 @@ SPANS = (1e-6, 1e-3, 1.0, 200.0, 1e3, 1e6)
 LIKELY = 6.0
 """Roundings of unrelated numbers add up like a random walk: n of them stay within 6 sqrt(n) u but for one case in a
 hundred million (Higham and Mary 2019). Where the numbers are all alike the worst case n u is used."""
-RANDOM = LIKELY * math.sqrt(score.BLOCK)
+RANDOM = LIKELY * math.sqrt(BLOCK)
 _TINY = 2.0**-149
 _STREAM_BLOCK, _STREAM_KINDS = 1_000_000, 20
 
@@ -146,7 +155,7 @@ def scored(kind: str, mode: str) -> Outcome:
     target = depth_map(kind, 1700.0, 200.0).astype(np.float32)
     inside = object_mask(target)
     values = np.where(inside, np.float32(0.5), np.float32(0.0))
-    prediction, _ = score.scored_pair(values, target, "normalised", mode, "sample")  # type: ignore[arg-type]
+    prediction, _ = scored_pair(values, target, "normalised", mode, "sample")  # type: ignore[arg-type]
     low, high = _range(target)
     exact = 0.5 * (high - low) + (low if mode == "standard" else 0.0)
     return worst(prediction[inside] - exact, 4 * U64 * high) if inside.any() else worst(prediction)
@@ -164,7 +173,7 @@ def _exact(*parts: tuple[Floats, int]) -> tuple[float, float]:
     return float(absolute / pixels), float(cases.high_precision(digits).sqrt(squares / pixels))
 
 
-def _compared(stats: score.ErrorStats, exact: tuple[float, float], operations: float = RANDOM) -> Outcome:
+def _compared(stats: ErrorStats, exact: tuple[float, float], operations: float = RANDOM) -> Outcome:
     """Relative errors of MAE and RMSE; below the normal numbers a whole last place counts."""
     if stats.mae_mm is None or stats.rmse_mm is None:
         return wrong("no score of pixels that there are")
@@ -176,7 +185,7 @@ def _compared(stats: score.ErrorStats, exact: tuple[float, float], operations: f
 
 
 def _scored(errors: Floats, operations: float = RANDOM) -> Outcome:
-    return _compared(score.stats_of(errors), _exact((errors, 1)), operations)
+    return _compared(stats_of(errors), _exact((errors, 1)), operations)
 
 
 @METRICS.family("streamed pixels", "relative", scale_mm=(1e-30, 1.0, 1e30), pixels=(1e6, 1e8, 1e10))
@@ -188,12 +197,12 @@ def streamed(pixels: float, scale_mm: float) -> Outcome:
     rng, blocks = np.random.default_rng(11), round(pixels / _STREAM_BLOCK)
     levels = scale_mm * rng.lognormal(0, 3, 64)
     kinds = [levels[rng.integers(0, 64, _STREAM_BLOCK)] for _ in range(_STREAM_KINDS)]
-    states = [score.stats_of(kind) for kind in kinds]
-    total = reduce(score.combine, (states[number % _STREAM_KINDS] for number in range(blocks)), score.EMPTY)
+    states = [stats_of(kind) for kind in kinds]
+    total = reduce(combine, (states[number % _STREAM_KINDS] for number in range(blocks)), EMPTY)
     times = [blocks // _STREAM_KINDS + (kind < blocks % _STREAM_KINDS) for kind in range(_STREAM_KINDS)]
     if total.pixels != blocks * _STREAM_BLOCK:
         return wrong(f"{total.pixels} pixels counted, {blocks * _STREAM_BLOCK} streamed")
-    return _compared(total, _exact(*zip(kinds, times, strict=True)), LIKELY * math.sqrt(score.BLOCK + 6 * blocks))
+    return _compared(total, _exact(*zip(kinds, times, strict=True)), LIKELY * math.sqrt(BLOCK + 6 * blocks))
 
 
 @METRICS.family(
@@ -222,7 +231,7 @@ def one_large(large_mm: float) -> Outcome:
     added exactly"""
     errors = np.ones(10_000_000)  # summed naively in float32 the small ones vanish from 2^24 on
     errors[0] = large_mm
-    return _scored(errors, score.BLOCK)
+    return _scored(errors, BLOCK)
 
 
 @METRICS.family(
@@ -238,12 +247,12 @@ def sample(scale_mm: float, stored: str) -> Outcome:
     target = np.zeros((100, 100), stored)
     target[20:70, 30:80] = max(scale_mm, 1.0) if scale_mm > 1e-6 else scale_mm
     prediction = (target.astype(np.float64) + errors).astype(stored)
-    scores = score.score_sample(prediction, target)
+    scores = score_sample(prediction, target)
     outcomes = []
     for stats, where in ((scores.object, target > 0), (scores.background, ~(target > 0))):
         if where.any():
             outcomes.append(_compared(stats, _exact((prediction[where].astype(np.float64) - target[where], 1))))
-        elif stats != score.EMPTY:  # a target of 1e-160 mm is 0 in float32
+        elif stats != EMPTY:  # a target of 1e-160 mm is 0 in float32
             return wrong()
     return max(outcomes, key=lambda outcome: outcome.ratio or 0.0)
 
@@ -255,7 +264,7 @@ def distribution(scale_mm: float) -> Outcome:
     errors = scale_mm * np.random.default_rng(6).integers(-500, 1000, (100, 100)).astype(np.float64)
     target = np.full((100, 100), 4096.0 * scale_mm)
     prediction = target + errors
-    measured = score.score_sample(prediction, target).metrics()
+    measured = score_sample(prediction, target).metrics()
     exact = np.sort((prediction - target).ravel())
     size, last = np.sort(np.abs(exact)), exact.size - 1
     parts = (exact, 0.5), (size, 0.5), (size, 0.95)
@@ -263,7 +272,7 @@ def distribution(scale_mm: float) -> Outcome:
     means = (math.fsum(values.tolist()) / exact.size for values in (exact, np.abs(exact - median)))
     expected = np.array([middle, p95, size[-1], *means])
     computed = [measured[f"object_{name}_mm"] for name in ("median", "p95", "max", "bias", "shift_free_mae")]
-    bound = gamma(score.BLOCK) * float(np.abs(exact).mean()) + 4 * U64 * np.abs(expected)
+    bound = gamma(BLOCK) * float(np.abs(exact).mean()) + 4 * U64 * np.abs(expected)
     return worst(np.array(computed, float) - expected, bound)
 
 
@@ -274,10 +283,10 @@ def cancelling(large_mm: float) -> Outcome:
     half = np.random.default_rng(7).uniform(0.5, 1.0, 100_000) * large_mm
     errors = np.concatenate([half, -half]) + 1e-3
     np.random.default_rng(8).shuffle(errors)
-    bias_mm = score.mean_of(errors)
+    bias_mm = mean_of(errors)
     exact = math.fsum(errors.tolist()) / errors.size
     # NumPy's pairwise sum: log2(n) + 16 roundings of sums no larger than the sum of magnitudes.
-    bound = gamma(math.log2(score.BLOCK) + 16) * float(np.abs(errors).mean())
+    bound = gamma(math.log2(BLOCK) + 16) * float(np.abs(errors).mean())
     return worst(math.inf if bias_mm is None else bias_mm - exact, bound, condition=large_mm / 1e-3)
 
 
@@ -286,12 +295,12 @@ def merged(order: str) -> Outcome:
     """200 states of 1e-30 to 1e30 mm merged; against all at once; bound: 6 sqrt(6 merges) u"""
     rng = np.random.default_rng(9)
     sized = [10.0 ** rng.uniform(-30, 30) * rng.uniform(0.5, 1, int(rng.integers(1, 2000))) for _ in range(200)]
-    parts = [score.stats_of(errors) for errors in sized]
-    whole = score.combine(*parts)
-    total, level = reduce(score.combine, parts, score.EMPTY), parts[::-1]
+    parts = [stats_of(errors) for errors in sized]
+    whole = combine(*parts)
+    total, level = reduce(combine, parts, EMPTY), parts[::-1]
     if order == "as a tree, backwards":
         while len(level) > 1:
-            level = [score.combine(*level[i : i + 2]) for i in range(0, len(level), 2)]
+            level = [combine(*level[i : i + 2]) for i in range(0, len(level), 2)]
         total = level[0]
     if whole.mae_mm is None or whole.rmse_mm is None or total.pixels != whole.pixels:
         return wrong("pixels lost")
@@ -305,14 +314,14 @@ METRICS.family(
     refuses=PredictionError,
     value=(math.nan, math.inf, -math.inf, 1e300),
     about="a score of a prediction with a pixel of this value; against there is none; bound: must be refused",
-)(lambda value: score.score_sample(np.array([[1800.0, value]]), np.full((1, 2), 1800.0)))
+)(lambda value: score_sample(np.array([[1800.0, value]]), np.full((1, 2), 1800.0)))
 
 
 @METRICS.family("perfect and empty", "mm")
 def flawless() -> Outcome:
     """scores of a perfect prediction and of an empty set; against 0, and none; bound: exact"""
     target = np.pad(np.full((30, 30), 1234.567, np.float32), 17)
-    scores, empty = score.score_sample(target, target), score.score_sample(*np.zeros((2, 4, 4))).object
+    scores, empty = score_sample(target, target), score_sample(*np.zeros((2, 4, 4))).object
     parts = scores.overall, scores.object, scores.background
-    good = all(part.mae_mm == 0 and part.rmse_mm == 0 for part in parts) and empty == score.EMPTY
+    good = all(part.mae_mm == 0 and part.rmse_mm == 0 for part in parts) and empty == EMPTY
     return Outcome(0.0) if good else wrong()

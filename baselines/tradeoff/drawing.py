@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import Bbox
 
-from fpp_ml_bench.evaluation.report import escaped
+from fpp_ml_bench.evaluation.report.html import escaped
 
 COLOURS = {
     "ink": "#191c20",

@@ -19,20 +19,24 @@ import numpy as np
 from pydantic import Field
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines import training
 from fpp_ml_bench.baselines.method import Frames, Method
 from fpp_ml_bench.baselines.registry import find, load_method, methods
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.baselines.timing import added_mib, four_digits
+from fpp_ml_bench.baselines.training.weights import open_weights, shipped_names, weights_path
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DatasetError, FppBenchError, PredictionError, RigError, SubmissionError
-from fpp_ml_bench.evaluation.result import HardwareInfo, write_json
-from fpp_ml_bench.evaluation.score import score_sample, scored_pair
+from fpp_ml_bench.evaluation.result.file import write_json
+from fpp_ml_bench.evaluation.result.parts import HardwareInfo
+from fpp_ml_bench.evaluation.score.check import scored_pair
+from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, read_json
-from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.render.meshes import solid_mesh
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.render.view import Studio
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.schema import Count, NonNegative, Positive, Scalar, Share, StrictModel, Text, validate
 
 Cost = Literal["seconds", "frames", "working_memory_mib"]
@@ -210,8 +214,8 @@ def planned(
 
 def _networks(size: tuple[int, int]) -> list[str]:
     """Names of the shipped networks from image to depth that were trained for images of ``size`` (H, W)."""
-    names = training.shipped_names()
-    return [name for name in names if training.open_weights(training.weights_path(name)).config.image_size == size]
+    names = shipped_names()
+    return [name for name in names if open_weights(weights_path(name)).config.image_size == size]
 
 
 def choose_views(opened: DatasetFolder, per_object: int, split: str = "test") -> list[str]:

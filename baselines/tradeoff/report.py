@@ -9,8 +9,8 @@ from rich.text import Text
 
 from fpp_ml_bench.baselines.tradeoff.drawing import Mark, Scatter
 from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, TRADEOFF_FILE, Cost, Tradeoff, power
-from fpp_ml_bench.evaluation.report import millimetres, percent
-from fpp_ml_bench.evaluation.result import write_file
+from fpp_ml_bench.evaluation.report.html import millimetres, percent
+from fpp_ml_bench.evaluation.result.file import write_file
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.tables import Table
 

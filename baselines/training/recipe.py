@@ -14,7 +14,7 @@ from fpp_ml_bench.baselines.training.tables import GAN, GENERATORS, NETWORK_TITL
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import RecipeError
-from fpp_ml_bench.evaluation.submission import read_plain_file
+from fpp_ml_bench.evaluation.submission.prediction_files import read_plain_file
 from fpp_ml_bench.files import is_file, printable
 from fpp_ml_bench.schema import Positive, StrictModel, Text, problems_of
 

@@ -22,9 +22,12 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.training.records import Display
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M, OBJECTS, VIEWS, split_of
 from fpp_ml_bench.errors import TrainingError
-from fpp_ml_bench.loaders.render import BuildSettings, Light, Studio, named_light, solid_mesh
+from fpp_ml_bench.loaders.render.light import Light, named_light
+from fpp_ml_bench.loaders.render.meshes import solid_mesh
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.sample import VOID
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.pool import mapping
 
 Measured = TypeVar("Measured")

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from pydantic.dataclasses import dataclass as checked_dataclass
 
-from fpp_ml_bench.baselines import networks
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.depth import Normalisation, RangeRule
 from fpp_ml_bench.errors import FppBenchError, WeightsError
 from fpp_ml_bench.files import file_content, printable, strict_json, write_atomically
-from fpp_ml_bench.loaders.storage import Manifest, benchmark_before, benchmark_of, intended_benchmark
+from fpp_ml_bench.loaders.storage.benchmark import benchmark_before, benchmark_of, intended_benchmark
+from fpp_ml_bench.loaders.storage.manifest import Manifest
 from fpp_ml_bench.schema import Count, Scalar, Text, problems_of
 
 if TYPE_CHECKING:
@@ -306,9 +306,11 @@ def _check_tensors(path: Path, config: ModelConfig, tensors: "Mapping[str, Tenso
     """Refuse tensors that are not exactly those of the network that ``config`` builds, or that are not finite."""
     import torch
 
+    from fpp_ml_bench.baselines.networks.model import build  # imports this module
+
     try:
         with torch.device("meta"):
-            network = networks.build(config.network, **config.options)
+            network = build(config.network, **config.options)
         network.check_size(*config.image_size)
         expected = network.state_dict()
     except (FppBenchError, TypeError, ValueError, RuntimeError) as error:

@@ -14,7 +14,7 @@ from PIL import Image
 
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.evaluation.report.html import data_uri, millimetres, percent
-from fpp_ml_bench.evaluation.result import Uncertainty
+from fpp_ml_bench.evaluation.result.parts import Uncertainty
 
 _BELOW = 44
 """Height in px of the numbers and the name below an axis."""

@@ -10,11 +10,13 @@ from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation.metrics import METRICS, UNCERTAINTY, WIDE, listed, with_column
 from fpp_ml_bench.evaluation.report.figures import Panel, histogram, sample_panels, uncertainty_plots
 from fpp_ml_bench.evaluation.report.html import interval_text, page, render, score_text
-from fpp_ml_bench.evaluation.result import Result, SampleResult, Uncertainty, write_file
-from fpp_ml_bench.evaluation.score import scored_pair
-from fpp_ml_bench.evaluation.submission import list_folder, reader_for
+from fpp_ml_bench.evaluation.result.file import write_file
+from fpp_ml_bench.evaluation.result.model import Result
+from fpp_ml_bench.evaluation.result.parts import SampleResult, Uncertainty
+from fpp_ml_bench.evaluation.score.check import scored_pair
+from fpp_ml_bench.evaluation.submission.prediction_files import list_folder, reader_for
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 REPORT_FILE = "index.html"
 _PLACES = (("Best", 0.0), ("Worst", 1.0), ("Median", 0.5), ("Lower quartile", 0.25), ("Upper quartile", 0.75))

@@ -10,12 +10,12 @@ from string import Formatter
 from rich.console import Group
 from rich.text import Text
 
-from fpp_ml_bench.evaluation import report
 from fpp_ml_bench.evaluation.metrics import METRICS, NOTES, UNCERTAINTY, Metric, listed
 from fpp_ml_bench.evaluation.protocol import PIXEL_SETS
+from fpp_ml_bench.evaluation.report.comparison import Comparison
 from fpp_ml_bench.evaluation.report.html import interval_text, millimetres, score_text, seconds, signed
-from fpp_ml_bench.evaluation.result import Result
-from fpp_ml_bench.evaluation.score import SIGNIFICANT, caution
+from fpp_ml_bench.evaluation.result.model import Result
+from fpp_ml_bench.evaluation.score.uncertainty import SIGNIFICANT, caution
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.tables import Table
 
@@ -123,7 +123,7 @@ def _worst(result: Result) -> Table | None:
     return table
 
 
-def comparison_table(compared: report.Comparison) -> Group:
+def comparison_table(compared: Comparison) -> Group:
     """The comparison as rich tables."""
     titles = ["Second - first", "95% interval", "p", "Second lower in", "Second higher in", "Samples", "Objects"]
     about = "mm; mean of second - first over samples, 95% interval and p value of a sign-flip test over objects"

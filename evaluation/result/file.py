@@ -13,10 +13,11 @@ import pydantic
 
 from fpp_ml_bench import __version__, depth
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation import report, submission
 from fpp_ml_bench.evaluation.protocol import MOST_OBJECTS, MOST_SAMPLES, RESULT_SCHEMA_VERSION, SchemaVersion
+from fpp_ml_bench.evaluation.report.comparison import Comparison
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import Environment, HardwareInfo
+from fpp_ml_bench.evaluation.submission.description import Submission
 from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.files import read_json as read_strict_json
 from fpp_ml_bench.machine import describe_hardware
@@ -103,8 +104,8 @@ def json_schema(name: str) -> dict[str, Any]:
     hold. Whether averages follow from the samples is checked on reading."""
     models: dict[str, type[pydantic.BaseModel]] = {
         "result": Result,
-        "submission": submission.Submission,
-        "comparison": report.Comparison,
+        "submission": Submission,
+        "comparison": Comparison,
     }
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

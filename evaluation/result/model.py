@@ -36,9 +36,10 @@ from fpp_ml_bench.evaluation.result.parts import (
     Sparsification,
     Uncertainty,
 )
-from fpp_ml_bench.evaluation.score import ErrorStats, SigmaSample, combine, intervals_over_objects
-from fpp_ml_bench.evaluation.submission import Submission
-from fpp_ml_bench.loaders.storage import Counts, known_problem
+from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats, SigmaSample, combine
+from fpp_ml_bench.evaluation.score.uncertainty import intervals_over_objects
+from fpp_ml_bench.evaluation.submission.description import Submission
+from fpp_ml_bench.loaders.storage.benchmark import Counts, known_problem
 from fpp_ml_bench.schema import Count, SparseModel, StrictModel, Text
 
 AGREES = 1e-9

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS, UNCERTAINTY, Metric
 from fpp_ml_bench.evaluation.protocol import LEFT_OUT, NOMINAL
-from fpp_ml_bench.evaluation.score import ErrorStats
+from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats
 from fpp_ml_bench.loaders.storage import benchmark as benchmarks
 from fpp_ml_bench.schema import Count, NonNegative, Positive, Share, SparseModel, StrictModel, Text
 

@@ -14,10 +14,22 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import LARGEST_SIDE_PX, MM_PER_M
 from fpp_ml_bench.depth import depth_range_mm, extremes, object_mask
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
-from fpp_ml_bench.evaluation import protocol, submission
+from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import Mode, Units
+from fpp_ml_bench.evaluation.submission.description import Submission, check_submission
+from fpp_ml_bench.evaluation.submission.prediction_files import (
+    SIGMA,
+    SUBMISSION_FILE,
+    Listing,
+    declared_size,
+    list_folder,
+    read_plain,
+    read_sigma,
+    reader_for,
+    samples_in,
+)
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 Depth = NDArray[np.floating[Any]]
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "normalised": 1000.0}
@@ -151,18 +163,16 @@ class Checked:
 
     problems: list[str]
     notes: list[str]
-    description: submission.Submission | None
+    description: Submission | None
     samples: list[str]
     form: str
     size: tuple[int, int]
     sigmas: bool
 
 
-def checked_description(
-    folder: Path, content: dict[Any, Any], form: str, frames: int | None = None
-) -> submission.Submission:
+def checked_description(folder: Path, content: dict[Any, Any], form: str, frames: int | None = None) -> Submission:
     """The folder's description, checked against the predictions' ``form`` and a sequence of ``frames``, where known."""
-    description = submission.check_submission(folder, content)
+    description = check_submission(folder, content)
     outside = [index for index in description.frames_used if frames is not None and index >= frames]
     if frames is not None and outside:
         expected = f"expected indices from 0 to {frames - 1} of this dataset's sequence"
@@ -173,7 +183,7 @@ def checked_description(
         problem = f"png_mm_per_level is given, but the predictions are {form}; remove the key"
     else:
         return description
-    raise SubmissionError(f"{printable(str(folder / submission.SUBMISSION_FILE), 500)}: {problem}")
+    raise SubmissionError(f"{printable(str(folder / SUBMISSION_FILE), 500)}: {problem}")
 
 
 def check_folder(folder: str | Path, dataset: DatasetFolder | None = None, split: str = "test") -> Checked:
@@ -183,16 +193,16 @@ def check_folder(folder: str | Path, dataset: DatasetFolder | None = None, split
     folder = Path(folder)
     if not folder.is_dir():
         raise PredictionError(f"expected a folder of predictions, found none at {printable(str(folder), 500)}")
-    samples = submission.samples_in(folder) if dataset is None else dataset.samples(split)
+    samples = samples_in(folder) if dataset is None else dataset.samples(split)
     if not samples:
         expected = "expected one {sample}.npy for each sample, found none"
         raise PredictionError(f"{printable(str(folder), 500)}: {expected}; tables need DATASET")
     split_of = {} if dataset is None else {name: part for part, names in dataset.splits.items() for name in names}
-    listing = submission.list_folder(folder, samples, split, split_of)
+    listing = list_folder(folder, samples, split, split_of)
     problems, notes = list(listing.problems), []
     description = None
     try:
-        content = submission.read_plain(folder)
+        content = read_plain(folder)
         description = checked_description(
             folder, content, listing.form, None if dataset is None else len(dataset.sequence)
         )
@@ -203,7 +213,7 @@ def check_folder(folder: str | Path, dataset: DatasetFolder | None = None, split
     units = "mm" if description is None else description.units
     largest = 0.0
     if listing.form != ".png" or level_mm is not None:
-        reader = submission.reader_for(listing.form, folder, listing.present, size, level_mm)
+        reader = reader_for(listing.form, folder, listing.present, size, level_mm)
         for sample in listing.present:
             try:
                 values, _ = reader.read(sample)
@@ -214,20 +224,20 @@ def check_folder(folder: str | Path, dataset: DatasetFolder | None = None, split
             problems += [f"{printable(reader.named(sample))}: {problem}" for problem in found]
     for sample in listing.present if listing.sigmas else ():
         try:
-            submission.read_sigma(folder, sample, size)
+            read_sigma(folder, sample, size)
         except PredictionError as error:
-            problems.append(f"{printable(sample)}{submission.SIGMA}: {error}")
+            problems.append(f"{printable(sample)}{SIGMA}: {error}")
     if note := unit_note(largest, units):
         notes.append(note)
     return Checked(problems, notes, description, listing.present, listing.form, size, listing.sigmas)
 
 
-def _declared_size(folder: Path, listing: submission.Listing) -> tuple[int, int]:
+def _declared_size(folder: Path, listing: Listing) -> tuple[int, int]:
     """The size (H, W) that most of the files declare. PredictionError where it is too large to be read."""
     if listing.form == ".mat":
         raise PredictionError(f"{printable(str(folder), 500)}: .mat files can only be checked with DATASET")
     files = [folder / f"{sample}{listing.form}" for sample in listing.present]
-    declared = {file: size for file in files if (size := submission.declared_size(file)) and min(size) > 0}
+    declared = {file: size for file in files if (size := declared_size(file)) and min(size) > 0}
     if not declared:
         named = printable(str(folder), 500)
         raise PredictionError(f"{named}: no file holds a depth map (H, W); write them with np.save")

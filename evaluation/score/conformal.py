@@ -18,12 +18,19 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation import submission
 from fpp_ml_bench.evaluation.score.check import check_folder, scored_pair
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.sample_scores import gaussian_quantile, states_sigma
+from fpp_ml_bench.evaluation.submission.description import Submission, check_submission
+from fpp_ml_bench.evaluation.submission.prediction_files import (
+    SIGMA,
+    SUBMISSION_FILE,
+    list_folder,
+    read_sigma,
+    reader_for,
+)
 from fpp_ml_bench.files import write_atomically
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 FACTOR_KEY = "conformal_factor"
 Scores = NDArray[np.float64]
@@ -41,7 +48,7 @@ class Calibration:
     samples: int
     split: str
     target: str
-    described: submission.Submission
+    described: Submission
 
 
 def largest_coverage(objects: int) -> float:
@@ -102,26 +109,26 @@ def calibrate(
 
 
 def _scores(
-    folder: Path, dataset: DatasetFolder, split: str, target: str, description: submission.Submission
+    folder: Path, dataset: DatasetFolder, split: str, target: str, description: Submission
 ) -> Iterator[tuple[str, Scores]]:
     """|error| / sigma of the stated object pixels that are not void, (n,), of each sample."""
     samples = dataset.samples(split)
-    form = submission.list_folder(folder, samples, split, {}).form
-    reader = submission.reader_for(form, folder, samples, dataset.size, description.png_mm_per_level)
+    form = list_folder(folder, samples, split, {}).form
+    reader = reader_for(form, folder, samples, dataset.size, description.png_mm_per_level)
     for sample in samples:
         pair = scored_pair(
             reader.read(sample)[0], dataset.target_mm(sample, target), description.units, "standard", sample
         )
-        sigma_mm = submission.read_sigma(folder, sample, dataset.size)
+        sigma_mm = read_sigma(folder, sample, dataset.size)
         scored = object_mask(pair[1]) & ~dataset.void(sample, target) & states_sigma(pair[0], sigma_mm)
         depth, true, sigma = (np.asarray(values[scored], np.float64) for values in (*pair, sigma_mm))
         dataset.release(sample)
         yield sample, np.abs(depth - true) / sigma
 
 
-def _check_stated(folder: Path, description: submission.Submission, stated: bool) -> None:
+def _check_stated(folder: Path, description: Submission, stated: bool) -> None:
     if not stated:
-        missing = f"states no uncertainty; write {{sample}}{submission.SIGMA} for each sample"
+        missing = f"states no uncertainty; write {{sample}}{SIGMA} for each sample"
         raise PredictionError(f"{folder}: {missing} (fpp-bench predict does for methods that state one)")
     if FACTOR_KEY in description.settings:
         raise PredictionError(
@@ -153,11 +160,11 @@ def write_calibrated(calibration: Calibration, folder: Path, dataset: DatasetFol
         raise PredictionError(f"{out} is there already; give a new folder")
     out.mkdir(parents=True)
     for path in sorted(folder.iterdir()):
-        if not path.name.endswith(submission.SIGMA) and path.name != submission.SUBMISSION_FILE:
+        if not path.name.endswith(SIGMA) and path.name != SUBMISSION_FILE:
             shutil.copyfile(path, out / path.name)
     for sample in checked.samples:
-        sigma_mm = submission.read_sigma(folder, sample, dataset.size).astype(np.float64) * calibration.factor
-        np.save(out / f"{sample}{submission.SIGMA}", sigma_mm.astype(np.float32))
+        sigma_mm = read_sigma(folder, sample, dataset.size).astype(np.float64) * calibration.factor
+        np.save(out / f"{sample}{SIGMA}", sigma_mm.astype(np.float32))
     settings = {
         FACTOR_KEY: calibration.factor,
         "conformal_coverage": calibration.coverage,
@@ -169,6 +176,6 @@ def write_calibrated(calibration: Calibration, folder: Path, dataset: DatasetFol
         "name": f"{description.name}, conformal sigma",
         "settings": {**description.settings, **settings},
     }
-    text = submission.check_submission(out, content).to_yaml()
-    write_atomically(out / submission.SUBMISSION_FILE, text.encode("utf-8"))
+    text = check_submission(out, content).to_yaml()
+    write_atomically(out / SUBMISSION_FILE, text.encode("utf-8"))
     return len(checked.samples)

@@ -18,16 +18,36 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.depth import RangeRule, edge_jump_mm, extremes, object_box, object_mask, object_near_edges
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
-from fpp_ml_bench.evaluation import protocol, result, submission
+from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.metrics import METRICS, UNCERTAINTY, Metric
 from fpp_ml_bench.evaluation.protocol import Mode, Units
+from fpp_ml_bench.evaluation.result.file import environment
+from fpp_ml_bench.evaluation.result.model import (
+    ArrayScores,
+    Result,
+    array_scores,
+    result_from_rows,
+    same,
+    uncertainty_of,
+)
+from fpp_ml_bench.evaluation.result.parts import Uncertainty
 from fpp_ml_bench.evaluation.score.check import checked_description, declared_units, in_mm, scored_pair, value_problems
 from fpp_ml_bench.evaluation.score.sample_scores import SigmaSample, score_sample, score_sigma
+from fpp_ml_bench.evaluation.submission.prediction_files import (
+    SIGMA,
+    SUBMISSION_FILE,
+    Reader,
+    list_folder,
+    read_plain,
+    read_sigma,
+    reader_for,
+)
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.sample import Flag, image_hash, stored_frames, void_pixels
-from fpp_ml_bench.loaders.storage import DatasetFolder, benchmark_of
+from fpp_ml_bench.loaders.storage.benchmark import benchmark_of
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
-from fpp_ml_bench.optics import DIRECTIONS, AnySequence
+from fpp_ml_bench.optics.sequence import DIRECTIONS, AnySequence
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by
 
 Maps = NDArray[Any] | Sequence[NDArray[Any]]
@@ -44,7 +64,7 @@ def evaluate(
     edge_band_px: int = protocol.EDGE_BAND_PX,
     mode: str = "standard",
     while_scoring: Callable[[], object] = lambda: None,
-) -> result.Result:
+) -> Result:
     """Score ``folder`` (predictions in one of the accepted forms, and ``submission.yaml``) on a split of ``dataset``.
 
     ``target`` is ``depth`` (decoded, as in the paper) or ``depth_exact`` (from the ray cast); ``mode`` is ``standard``
@@ -58,11 +78,11 @@ def evaluate(
     samples = _samples(folder, dataset, split, target, mode)
     content, description_error = None, None
     try:
-        content = submission.read_plain(folder)
+        content = read_plain(folder)
     except SubmissionError as error:
         description_error = error
     split_of = {sample: name for name, names in dataset.splits.items() for sample in names}
-    listing = submission.list_folder(folder, samples, split, split_of)
+    listing = list_folder(folder, samples, split, split_of)
     units, level_mm = (content or {}).get("units", "mm"), (content or {}).get("png_mm_per_level")
     rule: RangeRule = "valid" if (content or {}).get("range_rule") == "valid" else "object"
     # What is no number is refused with the description, which is checked while the first files are scored, for pydantic
@@ -72,7 +92,7 @@ def evaluate(
     rows: list[dict[str, Any]] = []
     outcomes: Iterable[Outcome] = ()
     if units in get_args(Units):
-        reader = submission.reader_for(listing.form, folder, listing.present, dataset.size, level_mm)
+        reader = reader_for(listing.form, folder, listing.present, dataset.size, level_mm)
         sigmas = folder if listing.sigmas else None
         outcomes = _scored(
             reader, listing.present, dataset, target, units, rule, cast(Mode, mode), edge_band_px, sigmas
@@ -83,7 +103,7 @@ def evaluate(
             description = checked_description(folder, content, listing.form, len(dataset.sequence))
         except SubmissionError as error:
             description_error = error
-        result.environment  # noqa: B018  imported while the threads score
+        environment  # noqa: B018  imported while the threads score
         while_scoring()
     for file_problems, file_rows in outcomes:
         problems += file_problems
@@ -102,9 +122,9 @@ def evaluate(
     benchmark = benchmark_of(content)
     stated = {row["sample"]: row.pop("stated") for row in rows}
     owners = {row["sample"]: row["object"] for row in rows}
-    return result.result_from_rows(
+    return result_from_rows(
         rows,
-        uncertainty=result.uncertainty_of(stated, owners) if listing.sigmas else None,
+        uncertainty=uncertainty_of(stated, owners) if listing.sigmas else None,
         protocol_version=protocol.PROTOCOL_VERSION,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         submission=description.model_copy(update={"predicted": None}),
@@ -122,7 +142,7 @@ def evaluate(
         frames_class=frames_class(dataset.sequence, description.frames_used),
         edge_band_px=edge_band_px,
         edge_jump_mm=edge_jump_mm(dataset.size[1]),
-        environment=result.environment(),
+        environment=environment(),
     )
 
 
@@ -165,7 +185,7 @@ def _samples(folder: Path, dataset: DatasetFolder, split: str, target: str, mode
 
 
 def _scored(
-    reader: submission.Reader,
+    reader: Reader,
     samples: list[str],
     dataset: DatasetFolder,
     target_name: str,
@@ -205,10 +225,10 @@ def _scored(
         stated = None
         if sigmas is not None:
             try:
-                sigma_mm = submission.read_sigma(sigmas, sample, dataset.size)
+                sigma_mm = read_sigma(sigmas, sample, dataset.size)
                 stated = None if problems else score_sigma(*pair, sigma_mm, void)
             except PredictionError as error:
-                problems.append(f"{sample}{submission.SIGMA}: {error}")
+                problems.append(f"{sample}{SIGMA}: {error}")
         with dataset_lock:
             dataset.release(sample)
         if problems:
@@ -227,7 +247,7 @@ def evaluate_arrays(
     objects: Sequence[str] | None = None,
     edge_band_px: int = protocol.EDGE_BAND_PX,
     units: str | None = None,
-) -> result.ArrayScores:
+) -> ArrayScores:
     """Score depth in mm, 0 = background or not measured, against depth in mm, 0 = background: floats (N, H, W), or N
     maps (H, W) that may differ in size. Pixels that a masked array of targets masks count in no set. ``flags``: whole
     numbers, bits of `loaders.sample.Flag`, whose void pixels count in no set. ``sigma``: the standard uncertainty in
@@ -261,7 +281,7 @@ def evaluate_arrays(
         rows.append({"sample": f"sample {number}", "object": names[number], **row})
         if uncertainty is not None:
             stated[f"sample {number}"] = uncertainty
-    return result.array_scores(rows, stated)
+    return array_scores(rows, stated)
 
 
 def _sequence(name: str, values: Any) -> Any:
@@ -341,7 +361,7 @@ _TIME_KEYS = ("seconds_per_sample", "seconds_source", "hardware", "timing")
 """`fpp-bench time` may write these into a result later; run times can't be recomputed from predictions."""
 
 
-def differences(scored: result.Result, folder: Path, dataset: DatasetFolder) -> list[str]:
+def differences(scored: Result, folder: Path, dataset: DatasetFolder) -> list[str]:
     """What of a result does not follow from the predictions in ``folder`` on ``dataset``, a line for each difference.
     Everything is scored again. Time and place of scoring and the method's run time are not compared. Raises what
     `evaluate` raises, and SubmissionError for a result of another protocol version, which this one can't recompute."""
@@ -361,7 +381,7 @@ def differences(scored: result.Result, folder: Path, dataset: DatasetFolder) -> 
     described, description = scored.submission.model_dump(), again.submission.model_dump()
     for key in dict.fromkeys((*described, *description)):
         pair = (None, None) if key in _TIME_KEYS else (described.get(key), description.get(key))
-        pairs.append((f"submission.{key}", *pair, f"in {submission.SUBMISSION_FILE}"))
+        pairs.append((f"submission.{key}", *pair, f"in {SUBMISSION_FILE}"))
     problems = [
         f"{name}: {_value_text(stored)} in the result, {_value_text(value)} {origin}"
         for name, stored, value, origin in pairs
@@ -377,7 +397,7 @@ def differences(scored: result.Result, folder: Path, dataset: DatasetFolder) -> 
     return problems + _uncertainty_differences(scored.uncertainty, again.uncertainty)
 
 
-def _uncertainty_differences(stored: result.Uncertainty | None, recomputed: result.Uncertainty | None) -> list[str]:
+def _uncertainty_differences(stored: Uncertainty | None, recomputed: Uncertainty | None) -> list[str]:
     if stored is None or recomputed is None:
         blocks = [("there is none" if block is None else "there is one") for block in (stored, recomputed)]
         return [] if stored is recomputed else [f"uncertainty: {blocks[0]} in the result, {blocks[1]} recomputed"]
@@ -388,7 +408,7 @@ def _uncertainty_differences(stored: result.Uncertainty | None, recomputed: resu
             for part in (getattr(stored, name), getattr(recomputed, name))
         )
         pairs = [pair for curves in zip(first, second, strict=False) for pair in zip(*curves, strict=True)]
-        if len(first) != len(second) or not all(result.same(*pair, 1e-12) for pair in pairs):
+        if len(first) != len(second) or not all(same(*pair, 1e-12) for pair in pairs):
             lines.append(f"uncertainty.{name}: the curve in the result is not the one recomputed")
     for sample, scores in recomputed.per_sample.items():
         pair = stored.per_sample[sample], scores
@@ -411,7 +431,7 @@ def _different(
     lines = []
     for key in (*exact, *metrics):
         first, second = getattr(stored, key), getattr(recomputed, key)
-        if not (result.same(first, second, limits[key]) if key in limits else first == second):
+        if not (same(first, second, limits[key]) if key in limits else first == second):
             lines.append(f"{name}{key}: {_value_text(first)} in the result, {_value_text(second)} recomputed")
     return lines
 

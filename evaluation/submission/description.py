@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from fpp_ml_bench.depth import RangeRule
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import Track, Units
-from fpp_ml_bench.evaluation.result import HardwareInfo, Timing
+from fpp_ml_bench.evaluation.result.parts import HardwareInfo, Timing
 from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE, read_plain
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.schema import Count, Positive, Scalar, SparseModel, StrictModel, Text, validate

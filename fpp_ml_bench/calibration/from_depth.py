@@ -32,9 +32,11 @@ from fpp_ml_bench.calibration.projection import (
     refined,
 )
 from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
-from fpp_ml_bench.decoding import depth_from_both
+from fpp_ml_bench.decoding.triangulation import depth_from_both
 from fpp_ml_bench.errors import CalibrationError, RigError
-from fpp_ml_bench.optics import AXES, Pinhole, Rig
+from fpp_ml_bench.optics.pinhole import Pinhole
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import AXES
 
 LEAST_PX = 200
 MOST_SIGMA_PX = 1.5

@@ -18,10 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
-from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import CalibrationError
-from fpp_ml_bench.optics import AXES, Direction, Pinhole, Rig, distortion_polynomial, rotation_matrix
+from fpp_ml_bench.optics.pinhole import Pinhole, distortion_polynomial
+from fpp_ml_bench.optics.rig import Rig, rotation_matrix
+from fpp_ml_bench.optics.sequence import AXES, Direction
 
 MOST_PX = 50_000
 """Pixels that a fit uses, of all views together."""

@@ -15,7 +15,9 @@ from scipy.optimize import minimize_scalar
 
 from fpp_ml_bench.calibration.projector_points import Pose
 from fpp_ml_bench.constants import GREY_LEVELS
-from fpp_ml_bench.optics import AXES, Rig, pattern_profiles
+from fpp_ml_bench.optics.patterns import pattern_profiles
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import AXES
 
 GAMMAS = (0.3, 4.0)
 LEAST_LEVELS = 4

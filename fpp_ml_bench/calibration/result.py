@@ -10,9 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
-from fpp_ml_bench.decoding import depth_from_both, depth_from_coordinate
+from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate
 from fpp_ml_bench.errors import CalibrationError
-from fpp_ml_bench.optics import AXES, Pinhole, Rig
+from fpp_ml_bench.optics.pinhole import Pinhole
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import AXES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

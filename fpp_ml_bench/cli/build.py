@@ -5,11 +5,20 @@ from pathlib import Path
 from time import perf_counter
 from typing import Literal
 
-from fpp_ml_bench import coding, optics
 from fpp_ml_bench.cli.console import gigabytes, progress_bar, say_benchmark
 from fpp_ml_bench.cli.options import Explain, Pool, command, names, value, whole
+from fpp_ml_bench.coding.gray_code import bits_needed
 from fpp_ml_bench.constants import CONFIGS, LARGEST_SIDE_PX, PRESETS
-from fpp_ml_bench.loaders import render, storage
+from fpp_ml_bench.loaders.render.builder import assembly_of, explain_build
+from fpp_ml_bench.loaders.render.builder import build as build_dataset
+from fpp_ml_bench.loaders.render.light import load_light
+from fpp_ml_bench.loaders.render.meshes import read_mesh_list, single_mesh
+from fpp_ml_bench.loaders.render.scene import BuildSettings, default_frames
+from fpp_ml_bench.loaders.render.sensor import camera_noise
+from fpp_ml_bench.loaders.storage.card import ground_truth_summary
+from fpp_ml_bench.optics.named_rigs import NAMED_RIGS
+from fpp_ml_bench.optics.rig_file import load_rig
+from fpp_ml_bench.optics.sequence import DIRECTIONS
 from fpp_ml_bench.options import REQUIRED, option
 from fpp_ml_bench.remote import RemoteFolder, place
 
@@ -60,36 +69,36 @@ class BuildCommandSettings(Explain, Pool):
     meshes: Path | None = option(None, "meshes of yours with scale, pose and split", "LIST.yaml")
 
 
-def settings_of(given: BuildCommandSettings) -> "render.BuildSettings":
+def settings_of(given: BuildCommandSettings) -> "BuildSettings":
     """Build settings that the options ask for; raises `BuildError`, `MeshError` or `RigError`."""
     objects, size = PRESETS[given.preset]
-    if given.rig in optics.NAMED_RIGS:
-        rig = optics.NAMED_RIGS[given.rig](given.size or size)
+    if given.rig in NAMED_RIGS:
+        rig = NAMED_RIGS[given.rig](given.size or size)
     else:
-        rig = optics.load_rig(given.rig)
+        rig = load_rig(given.rig)
         rig = rig if given.size is None else rig.scaled(given.size)
     if given.pitch is not None:
         sequence = rig.paper_sequence
         if given.pitch >= 4:  # below that the rig itself refuses, with its own words
-            lengths = (rig.pattern_length(direction) for direction in optics.DIRECTIONS)
-            horizontal, vertical = (coding.bits_needed(length, given.pitch) for length in lengths)
+            lengths = (rig.pattern_length(direction) for direction in DIRECTIONS)
+            horizontal, vertical = (bits_needed(length, given.pitch) for length in lengths)
             horizontal, vertical = max(sequence.bits_horizontal, horizontal), max(sequence.bits_vertical, vertical)
             sequence = replace(sequence, bits_horizontal=horizontal, bits_vertical=vertical)
         rig = replace(rig, pitch_horizontal_px=given.pitch, pitch_vertical_px=given.pitch, sequence=sequence)
-    own = (render.read_mesh_list(given.meshes) if given.meshes else ()) + tuple(map(render.single_mesh, given.mesh))
+    own = (read_mesh_list(given.meshes) if given.meshes else ()) + tuple(map(single_mesh, given.mesh))
     if given.objects is not None:
         objects = given.objects
     elif own:
         objects = ()
     everything = (*objects, *(mesh.name for mesh in own))
-    light = render.load_light(given.light)
+    light = load_light(given.light)
     if given.noise_sigma is not None:
-        light = light.changed("camera", **render.camera_noise(given.noise_sigma))
+        light = light.changed("camera", **camera_noise(given.noise_sigma))
     if given.shadows:
         light = light.changed("bounces", shadows=True)
-    found = None if given.decode_with is None else optics.load_rig(given.decode_with)
-    stored = given.config or render.default_frames(given.rig)
-    return render.BuildSettings(rig, everything, given.placement, stored, given.seed, light, own, found)
+    found = None if given.decode_with is None else load_rig(given.decode_with)
+    stored = given.config or default_frames(given.rig)
+    return BuildSettings(rig, everything, given.placement, stored, given.seed, light, own, found)
 
 
 @command(
@@ -112,7 +121,7 @@ def build(settings: BuildCommandSettings) -> None:
     """Generate the benchmark: virtual rig, objects, six views each, decoded and exact ground truth."""
     settings.check()
     asked, workers = settings_of(settings), settings.processes
-    assembly = render.assembly_of(asked)
+    assembly = assembly_of(asked)
     rows = sum(len(plan.samples) for plan in assembly.plans)
     frames = len(assembly.manifest.stored_frames)
     out, steps = settings.out, list[int]()
@@ -123,7 +132,7 @@ def build(settings: BuildCommandSettings) -> None:
             steps.append(finished)
             advance(finished)
 
-        manifest = render.build(out, asked, workers, count, settings.cluster)
+        manifest = build_dataset(out, asked, workers, count, settings.cluster)
     seconds = perf_counter() - started
     # The first step is what an interrupted run had left: it took no time now.
     made = sum(steps[1:]) * frames
@@ -131,9 +140,9 @@ def build(settings: BuildCommandSettings) -> None:
     parts = ", ".join(f"{split} {len(rows)}" for split, rows in manifest.samples.items())
     size = gigabytes(sum(file.bytes for file in manifest.files))
     print(f"{out}: {parts} samples, {rows * frames:,} images, {size}; {rate}")
-    for line in storage.ground_truth_summary(manifest):
+    for line in ground_truth_summary(manifest):
         print(f"  {line}")
     say_benchmark(manifest)
     if isinstance(out, Path):
         print(f"next: fpp-bench info {out}")
-    settings.say(lambda: render.explain_build(manifest, asked))
+    settings.say(lambda: explain_build(manifest, asked))

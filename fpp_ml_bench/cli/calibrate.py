@@ -4,15 +4,26 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from fpp_ml_bench import calibration, optics
+from fpp_ml_bench.calibration.boards import Board, parse_board
+from fpp_ml_bench.calibration.from_depth import DepthFit, Residual, fit_projector
+from fpp_ml_bench.calibration.result import Calibration, Lens, draw_residuals, volume_error_mm
+from fpp_ml_bench.calibration.solve import calibrate as calibrate_rig
 from fpp_ml_bench.cli.console import progress_bar, say_findings, show
 from fpp_ml_bench.cli.options import AT_LEAST_ONE, WORKING_RANGE, command, value, whole
 from fpp_ml_bench.constants import LARGEST_SIDE_PX, MM_PER_M
 from fpp_ml_bench.errors import CalibrationError, RigError
-from fpp_ml_bench.examination import Examination
+from fpp_ml_bench.examination.findings import Examination
 from fpp_ml_bench.files import write_atomically
-from fpp_ml_bench.loaders import captures, published, render
+from fpp_ml_bench.loaders.captures.board_poses import board_poses as read_board_poses
+from fpp_ml_bench.loaders.captures.board_poses import calibrated_rig, pose_folders
+from fpp_ml_bench.loaders.published.importing import plan_import, tree_views
+from fpp_ml_bench.loaders.render.boards.captures import photograph_board
+from fpp_ml_bench.loaders.render.boards.poses import BOARD_POSES, PAPER_BOARD, board_poses, fitting_board
 from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.opencv_files import OpenCvCalibration, write_opencv_calibration
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.rig_file import check_lengths, load_rig, save_rig
 from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.tables import Table
 
@@ -151,25 +162,25 @@ def calibrate(settings: CalibrateSettings) -> None:
     elif settings.captures is not None:
         if settings.board is None or settings.sequence is None:
             raise CalibrationError("captures of a board need --board KIND:COLUMNSxROWS:SPACING and --sequence FILE")
-        _from_board(settings, settings.captures, calibration.parse_board(settings.board), settings.sequence)
+        _from_board(settings, settings.captures, parse_board(settings.board), settings.sequence)
 
 
 def _virtual(settings: CalibrateSettings, folder: Path) -> None:
     """Photograph a board, calibrate from the images alone, and compare with the rig that took them."""
-    true_rig = optics.paper_rig() if settings.true_rig is None else optics.load_rig(settings.true_rig)
+    true_rig = paper_rig() if settings.true_rig is None else load_rig(settings.true_rig)
     true_rig = true_rig if settings.size is None else true_rig.scaled(settings.size)
     if settings.board is not None:
-        board = calibration.parse_board(settings.board)
-    elif true_rig == optics.paper_rig():
-        board = render.PAPER_BOARD
+        board = parse_board(settings.board)
+    elif true_rig == paper_rig():
+        board = PAPER_BOARD
     else:
-        board = render.fitting_board(true_rig)
-    poses = render.board_poses(true_rig, board, settings.poses or render.BOARD_POSES)
+        board = fitting_board(true_rig)
+    poses = board_poses(true_rig, board, settings.poses or BOARD_POSES)
     with progress_bar("photographing", len(poses) * len(true_rig.sequence), "images") as advance:
-        render.photograph_board(folder, true_rig, board, poses, progress=advance)
+        photograph_board(folder, true_rig, board, poses, progress=advance)
     range_mm = settings.working_range or true_rig.working_range_mm
     found = _from_board(settings, folder, board, folder / "rig.yaml", range_mm, true_rig)
-    error = calibration.volume_error_mm(found, true_rig)
+    error = volume_error_mm(found, true_rig)
     print(
         f"against truth   depth over the working range: {error.rms_mm:.3f} mm RMS, {error.worst_mm:.3f} mm at most, "
         f"scale {error.scale:.5f}; baseline {MM_PER_M * true_rig.baseline_m:.2f} mm"
@@ -177,31 +188,31 @@ def _virtual(settings: CalibrateSettings, folder: Path) -> None:
 
 
 def _from_depth(settings: CalibrateSettings, tree: Path) -> None:
-    known_rig = None if settings.camera is None else optics.load_rig(settings.camera)
-    reader = published.plan_import(tree, known_rig, settings.frame_order).reader
+    known_rig = None if settings.camera is None else load_rig(settings.camera)
+    reader = plan_import(tree, known_rig, settings.frame_order).reader
     with progress_bar("reading", len(reader.tree.by_name), "views") as advance:
-        views = published.tree_views(reader, settings.workers or usable_cores(), advance)
-    rig, fit = calibration.fit_projector(
+        views = tree_views(reader, settings.workers or usable_cores(), advance)
+    rig, fit = fit_projector(
         views, reader.rig, settings.projector, pitch_px=settings.pitch, focal_px=settings.focal, lens=settings.lens_term
     )
     print_fit(rig, fit)
-    optics.save_rig(rig, settings.out)
+    save_rig(rig, settings.out)
     print(f"wrote {settings.out}; next: fpp-bench import {tree} --out OUT --rig {settings.out}")
 
 
 def _from_board(
     settings: CalibrateSettings,
     folder: Path,
-    board: "calibration.Board",
+    board: "Board",
     sequence: Path,
     range_mm: tuple[float, float] | None = None,
-    like: "optics.Rig | None" = None,
-) -> "optics.Rig":
+    like: "Rig | None" = None,
+) -> "Rig":
     """Calibrate, print and write; the rig, with standoff and background of ``like``."""
     lenses = _lenses(settings)
     examined: dict[str, Examination] = {}
-    with progress_bar("finding the board", len(captures.pose_folders(folder)), "poses") as advance:
-        poses, rig, response = captures.board_poses(
+    with progress_bar("finding the board", len(pose_folders(folder)), "poses") as advance:
+        poses, rig, response = read_board_poses(
             folder, board, sequence, settings.bits, settings.colour, advance, settings.anyway, examined.__setitem__
         )
     for name, examination in examined.items():
@@ -212,7 +223,7 @@ def _from_board(
     with progress_bar("fitting", len(lenses), "lens models") as advance:
         found = []
         for lens in lenses:
-            found.append(calibration.calibrate(poses, board, *sizes, lens, **options))
+            found.append(calibrate_rig(poses, board, *sizes, lens, **options))
             advance(1)
     if len(found) > 1:
         compared = Table("lens model", numbers=("RMS, px", "left out, px", "BIC"))
@@ -222,39 +233,39 @@ def _from_board(
             )
         show(compared)
     best = min(found, key=lambda one: one.held_out_rms_px) if len(found) > 1 else found[0]
-    rig = captures.calibrated_rig(best, rig, range_mm or settings.working_range)
+    rig = calibrated_rig(best, rig, range_mm or settings.working_range)
     if like is not None:
         rig = replace(rig, standoff_m=like.standoff_m, background_m=like.background_m)
-    optics.check_lengths(rig, "the spacing of --board, in mm,")
+    check_lengths(rig, "the spacing of --board, in mm,")
     print_calibration(best)
     if response is not None:
         print(
             f"response        gamma {response.gamma:.3f} +- {response.sigma:.4f} of projector and camera together; "
             f"white on the board: {response.white_grey:.0f} of 255 grey levels"
         )
-    optics.save_rig(rig, settings.out)
+    save_rig(rig, settings.out)
     written = [settings.out, settings.out.with_suffix(".png")]
-    write_atomically(written[-1], calibration.draw_residuals(best))
+    write_atomically(written[-1], draw_residuals(best))
     if settings.opencv is not None:
         errors = (best.camera_rms_px, best.projector_rms_px, best.stereo_rms_px)
-        content = optics.OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m, *errors)
-        optics.write_opencv_calibration(content, settings.opencv)
+        content = OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m, *errors)
+        write_opencv_calibration(content, settings.opencv)
         written.append(settings.opencv)
     print(f"wrote {', '.join(map(str, written))}; next: fpp-bench decode {settings.out} FRAMES --out OUT")
     return rig
 
 
-def _lenses(settings: CalibrateSettings) -> list[tuple["calibration.Lens", "calibration.Lens"]]:
+def _lenses(settings: CalibrateSettings) -> list[tuple["Lens", "Lens"]]:
     """Camera and projector models to try: one pair, or those that `AUTO` compares."""
     pairs = []
     for name in AUTO_MODELS if settings.lens == AUTO else (settings.lens,):
         first, _, second = name.partition(",")
-        camera = calibration.Lens(first.strip(), settings.square_pixels, settings.centred)
-        pairs.append((camera, calibration.Lens((second or first).strip(), settings.square_pixels)))
+        camera = Lens(first.strip(), settings.square_pixels, settings.centred)
+        pairs.append((camera, Lens((second or first).strip(), settings.square_pixels)))
     return pairs
 
 
-def print_calibration(found: "calibration.Calibration") -> None:
+def print_calibration(found: "Calibration") -> None:
     """Print the errors of every pose, and the rig with its standard uncertainties."""
     columns = "camera", "projector", "both", "left out"
     table = Table("", numbers=columns, title="reprojection error (RMS, px; no point rejected)")
@@ -287,7 +298,7 @@ def print_calibration(found: "calibration.Calibration") -> None:
     print(f"translation     {x}, {y}, {z} mm; baseline {found.baseline_mm:.2f} mm; scale {found.scale}")
 
 
-def print_fit(rig: "optics.Rig", fit: "calibration.DepthFit") -> None:
+def print_fit(rig: "Rig", fit: "DepthFit") -> None:
     """Print a fitted rig and its residuals: of all views together, and of the views with the largest RMS."""
     columns = "pixels", "no depth", "median", "sigma", "RMS", "RMS, px"
     shown = sorted(fit.views, key=lambda view: -view.rms_mm if view.pixels else float("-inf"))[:_MOST_SHOWN]
@@ -309,6 +320,6 @@ def print_fit(rig: "optics.Rig", fit: "calibration.DepthFit") -> None:
     print(f"translation     {x:.2f}, {y:.2f}, {z:.2f} mm; baseline {MM_PER_M * rig.baseline_m:.2f} mm")
 
 
-def _cells(view: "calibration.Residual") -> list[str]:
+def _cells(view: "Residual") -> list[str]:
     lengths = (f"{view.median_mm:.4f}", f"{view.sigma_mm:.4f}", f"{view.rms_mm:.4f}", f"{view.rms_px:.3f}")
     return [view.name, str(view.pixels), str(view.missing), *(lengths if view.pixels else "----")]

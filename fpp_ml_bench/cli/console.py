@@ -8,8 +8,9 @@ from contextlib import contextmanager
 from rich.console import Console, RenderableType
 from rich.text import Text
 
-from fpp_ml_bench.examination import Examination
-from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.examination.findings import Examination
+from fpp_ml_bench.loaders.storage.benchmark import benchmark_sentence
+from fpp_ml_bench.loaders.storage.manifest import Manifest
 from fpp_ml_bench.skipping import Explanation
 from fpp_ml_bench.tables import Table
 
@@ -54,9 +55,9 @@ def millimetres(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
 
 
-def say_benchmark(manifest: "storage.Manifest") -> None:
+def say_benchmark(manifest: "Manifest") -> None:
     """Print which benchmark a dataset is; a warning on standard error where it should be one and is not."""
-    as_expected, sentence = storage.benchmark_sentence(manifest)
+    as_expected, sentence = benchmark_sentence(manifest)
     print(f"benchmark: {sentence}" if as_expected else f"warning: {sentence}", file=None if as_expected else sys.stderr)
 
 

@@ -4,15 +4,25 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from fpp_ml_bench import calibration, optics
+from fpp_ml_bench.calibration.result import VolumeError, volume_error_mm
 from fpp_ml_bench.cli import CHECK_FAILED
 from fpp_ml_bench.cli.console import gigabytes, millimetres, progress_bar, say_benchmark, show
 from fpp_ml_bench.cli.options import SPLITS, command
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import BuildError, DatasetError
-from fpp_ml_bench.evaluation import result
-from fpp_ml_bench.loaders import published, render, storage
+from fpp_ml_bench.evaluation.result.file import write_json
+from fpp_ml_bench.loaders.published.exporting import FORMS, SAMPLE_FORMS, chosen_splits
+from fpp_ml_bench.loaders.published.exporting import export as export_published
+from fpp_ml_bench.loaders.render.scene import PHOTOGRAPHED_BY
+from fpp_ml_bench.loaders.storage.benchmark import benchmark_of, benchmark_sentence
+from fpp_ml_bench.loaders.storage.card import split_statistics, whole_statistics
+from fpp_ml_bench.loaders.storage.manifest import Manifest, read_manifest
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.loaders.storage.verification import verify as verify_dataset
 from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.rig_file import rig_from_dict
+from fpp_ml_bench.optics.sequence import Sequence
 from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.tables import Table
 
@@ -27,9 +37,9 @@ def info(
     json: Path | None = option(None, "write all of it as JSON; - is standard output, without the table", "FILE"),
 ) -> None:
     """What a dataset holds: sizes, configurations, splits, rig, and how exact its ground truth is."""
-    opened = storage.DatasetFolder(dataset)
-    benchmark = storage.benchmark_of(opened.content)
-    statistics = storage.split_statistics(opened.manifest)
+    opened = DatasetFolder(dataset)
+    benchmark = benchmark_of(opened.content)
+    statistics = split_statistics(opened.manifest)
     if json is not None:
         content = {
             "path": str(opened.path),
@@ -43,16 +53,16 @@ def info(
             "rig": opened.manifest.rig,
             "calibration_error": None if (error := _calibration_error(opened.manifest)) is None else error._asdict(),
             "splits": statistics,
-            "all": storage.whole_statistics(opened.manifest),
+            "all": whole_statistics(opened.manifest),
             "samples": opened.splits,
         }
-        result.write_json(content, json)
+        write_json(content, json)
     manifest, rig = opened.manifest, opened.rig
     groups: dict[str, int] = {}
     for shard in manifest.shards:
         groups[shard.group] = groups.get(shard.group, 0) + shard.bytes
     near, far = rig.working_range_mm
-    long = ("objects", "user_meshes", render.PHOTOGRAPHED_BY)
+    long = ("objects", "user_meshes", PHOTOGRAPHED_BY)
     built_with = {key: value for key, value in manifest.settings.items() if key not in long}
     if isinstance(built_with.get("light"), dict):
         built_with["light"] = built_with["light"].get("name")
@@ -61,7 +71,7 @@ def info(
     print(f"dataset         {opened.path}")
     print(f"origin          {manifest.origin}, by {generator.get('name')} {generator.get('version')}")
     print(f"fingerprint     {opened.fingerprint}")
-    print(f"benchmark       by its manifest: {storage.benchmark_sentence(manifest)[1]}")
+    print(f"benchmark       by its manifest: {benchmark_sentence(manifest)[1]}")
     print("                (fpp-bench verify reads the images)")
     print(f"images          {height} x {width} px, {len(opened.sequence)} frames a sequence, stored: {manifest.stored}")
     print(f"configurations  {', '.join(opened.configs)}")
@@ -74,25 +84,25 @@ def info(
         print(line)
     print(f"settings        {', '.join(f'{key} {value}' for key, value in built_with.items())}")
     title = "lengths in mm, means over samples; ground-truth error: decoded - exact depth"
-    statistics = [*statistics, storage.whole_statistics(manifest)]
+    statistics = [*statistics, whole_statistics(manifest)]
     table = Table("", numbers=[split["split"] for split in statistics], title=title, elsewhere="--json FILE")
     for row_title, cell in _ROWS:
         table.add_row(row_title, *map(cell, statistics))
     show(table)
 
 
-def _calibration_error(manifest: "storage.Manifest") -> "calibration.VolumeError | None":
+def _calibration_error(manifest: "Manifest") -> "VolumeError | None":
     """Depth error of the stated rig over the working range, where another rig photographed."""
-    photographed_by = manifest.settings.get(render.PHOTOGRAPHED_BY)
+    photographed_by = manifest.settings.get(PHOTOGRAPHED_BY)
     if photographed_by is None:
         return None
-    return calibration.volume_error_mm(optics.rig_from_dict(manifest.rig), optics.rig_from_dict(photographed_by))
+    return volume_error_mm(rig_from_dict(manifest.rig), rig_from_dict(photographed_by))
 
 
-def _fringe_lines(rig: "optics.Rig") -> list[str]:
+def _fringe_lines(rig: "Rig") -> list[str]:
     """How the rig codes, and how the camera samples the fringes: the vertical ones where there are both."""
     ways = rig.fringe_directions
-    if isinstance(rig.sequence, optics.Sequence):
+    if isinstance(rig.sequence, Sequence):
         coded = f"pitch {rig.pitch('horizontal'):g} / {rig.pitch('vertical'):g} px"
     else:
         crossed = [rig.crossed.title] if rig.crossed else []
@@ -141,7 +151,7 @@ def show_sample(
     picture = out or Path("sheet.png" if sheet else f"{sample}.png")
     if picture.suffix.lower() != ".png":
         raise DatasetError(f"--out {out}: expected a file ending in .png")
-    opened = storage.DatasetFolder(dataset)
+    opened = DatasetFolder(dataset)
     from fpp_ml_bench.loaders.pictures import contact_sheet, sample_picture
 
     if sample is None:
@@ -161,10 +171,10 @@ def verify(
     dataset: Path = argument("dataset folder", "DATASET"),
 ) -> int | None:
     """Prove a dataset intact: checksums, files, labels, split leaks, duplicated images; and name its benchmark."""
-    manifest = storage.read_manifest(dataset)
+    manifest = read_manifest(dataset)
     files = manifest.files
     with progress_bar("verifying", len(files), "files") as advance:
-        findings = storage.verify(dataset, advance)
+        findings = verify_dataset(dataset, advance)
     for finding in findings:
         print(finding)
     size = gigabytes(sum(file.bytes for file in files))
@@ -198,15 +208,15 @@ def export(
 
     Raises FppBenchError for an unusable dataset, form or folder."""
     asked = {"parquet": parquet, "mat": mat, "meshes": meshes, "patterns": patterns}
-    forms = [form for form in published.FORMS if asked[form]]
+    forms = [form for form in FORMS if asked[form]]
     if not forms:
         raise BuildError("nothing to export: give at least one of --parquet, --mat, --meshes, --patterns")
-    opened = storage.DatasetFolder(dataset)
-    splits = published.chosen_splits(opened, split)
+    opened = DatasetFolder(dataset)
+    splits = chosen_splits(opened, split)
     samples = sum(len(opened.samples(part)) for part in splits)
-    steps = samples * sum(form in published.SAMPLE_FORMS for form in forms)
+    steps = samples * sum(form in SAMPLE_FORMS for form in forms)
     with progress_bar("exporting", steps, "samples") as advance:
-        published.export(opened, out, forms, splits, usable_cores(), advance)
+        export_published(opened, out, forms, splits, usable_cores(), advance)
     files = [path for path in out.rglob("*") if path.is_file()]
     size = gigabytes(sum(path.stat().st_size for path in files))
     print(f"{out}: {', '.join(forms)} of {samples} samples, {len(files):,} files, {size}")

@@ -4,14 +4,16 @@ import sys
 from pathlib import Path
 from time import perf_counter
 
-from fpp_ml_bench import optics
 from fpp_ml_bench.baselines.classical import DIRECTIONS
 from fpp_ml_bench.cli.console import progress_bar, say_findings, show
 from fpp_ml_bench.cli.options import AT_LEAST_ONE, WORKING_RANGE, command, names, value
-from fpp_ml_bench.decoding import Directions
-from fpp_ml_bench.examination import RefusedCapture
-from fpp_ml_bench.loaders import captures
+from fpp_ml_bench.decoding.decode import Directions
+from fpp_ml_bench.examination.findings import RefusedCapture
+from fpp_ml_bench.loaders.captures.decoding import DecodedCapture, decode_capture, read_mask
+from fpp_ml_bench.loaders.captures.exports import FORMS, check_outputs, write_capture, write_refusal
+from fpp_ml_bench.loaders.captures.images import read_frames
 from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.optics.rig_file import check_lengths, load_rig
 from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.tables import Table
 
@@ -49,12 +51,10 @@ def decode(
     bits: int | None = option(None, "bits of the camera, 8 to 16, where files of 16 bits hold fewer", "N"),
     colour: str | None = option(None, "of colour images: luminance, mean, red, green, blue", "NAME"),
     forms: tuple[str, ...] = option(
-        captures.FORMS,
+        FORMS,
         "what to write of npy, mat, png, ply, mesh (default: all)",
         "A,B",
-        parse=value(
-            f"some of {', '.join(captures.FORMS)}", names, lambda some: some != () and set(some) <= {*captures.FORMS}
-        ),
+        parse=value(f"some of {', '.join(FORMS)}", names, lambda some: some != () and set(some) <= {*FORMS}),
     ),
     anyway: bool = option(False, "decode a capture that its examination refuses"),
     threads: int = option(usable_cores(), "threads (default: one for each core)", "N", parse=AT_LEAST_ONE),
@@ -62,19 +62,19 @@ def decode(
     """Decode captured frames: depth, point cloud, uncertainty, and the reason for every pixel without depth.
 
     Raises FppBenchError for an unusable rig, capture or folder."""
-    captures.check_outputs(out)
-    rig = optics.load_rig(file)
+    check_outputs(out)
+    rig = load_rig(file)
     if working_range is not None:
         rig = rig.with_range(working_range)
-        optics.check_lengths(rig, file.name)
+        check_lengths(rig, file.name)
     started = perf_counter()
     with progress_bar("decoding", 4, "steps") as advance:
-        capture = captures.read_frames(frames, count=len(rig.sequence), bits=bits, colour=colour)
+        capture = read_frames(frames, count=len(rig.sequence), bits=bits, colour=colour)
         advance(1)
-        asked = None if mask is None else captures.read_mask(mask, capture.frames.shape[1:])
+        asked = None if mask is None else read_mask(mask, capture.frames.shape[1:])
         least = {} if min_modulation is None else {"min_modulation": min_modulation}
         try:
-            result = captures.decode_capture(
+            result = decode_capture(
                 capture,
                 rig,
                 direction,
@@ -85,10 +85,10 @@ def decode(
                 **least,
             )
         except RefusedCapture as refused:
-            captures.write_refusal(out, capture, rig, refused.examination)
+            write_refusal(out, capture, rig, refused.examination)
             raise
         advance(2)
-        captures.write_capture(out, capture, rig, result, forms)
+        write_capture(out, capture, rig, result, forms)
         advance(1)
     say_findings(result.examination)
     for note in result.notes:
@@ -98,7 +98,7 @@ def decode(
     print(f"{out}: {listed}; {perf_counter() - started:.1f} s")
 
 
-def _print(result: "captures.DecodedCapture") -> None:
+def _print(result: "DecodedCapture") -> None:
     import numpy as np
 
     counts, decoded = result.decoded.counts, result.decoded

@@ -9,14 +9,21 @@ from rich import progress as bar
 from rich.console import Console
 from rich.text import Text
 
-from fpp_ml_bench.baselines import diagnostics, registry
+from fpp_ml_bench.baselines import registry
+from fpp_ml_bench.baselines.diagnostics.counterfactual import measure as measure_reliance
+from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import SceneSet
+from fpp_ml_bench.baselines.diagnostics.diagnosis import JSON_FILE, REPORT_FILE, checked_names
+from fpp_ml_bench.baselines.diagnostics.diagnosis import diagnose as run_diagnosis
+from fpp_ml_bench.baselines.diagnostics.probe import PROBES, Probe, ProbeSettings, Progress
+from fpp_ml_bench.baselines.diagnostics.subjects import subject as subject_of
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings, OfMethods
 from fpp_ml_bench.cli.options import COUNT, command, command_line, names, value
-from fpp_ml_bench.evaluation import result
+from fpp_ml_bench.evaluation.result.file import write_json
+from fpp_ml_bench.evaluation.result.parts import PART_TITLES, Reliance
 from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_reliance
-from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.tables import Table
@@ -49,7 +56,7 @@ def diagnose(
     dataset: Path = argument("dataset folder, of the model's image size", "DATASET"),
     out: Path = option(REQUIRED, "index.html and diagnose.json go here", "DIR"),
     probe: tuple[str, ...] = option(
-        (), f"run only this probe; can be repeated: {', '.join(diagnostics.PROBES)} (default: all)", "NAME", many=True
+        (), f"run only this probe; can be repeated: {', '.join(PROBES)} (default: all)", "NAME", many=True
     ),
     samples: int | None = option(
         None, "most samples of a split, taken evenly (default: the probe's)", "N", parse=COUNT
@@ -71,12 +78,12 @@ def diagnose(
     """Diagnose a network or method with the paper's probes and further ones; writes an HTML report and a JSON file.
 
     Raises FppBenchError for what can't be diagnosed."""
-    probe_names = diagnostics.checked_names(probe)
-    opened = storage.DatasetFolder(dataset)
+    probe_names = checked_names(probe)
+    opened = DatasetFolder(dataset)
     method = registry.methods().get(model, registry.network_method())
     of_method = options.of(method, model)
-    subject = diagnostics.subject(model, opened, layers, units, frame, threads or usable_cores(), of_method)
-    probing = diagnostics.ProbeSettings(samples, seeds, quick)
+    subject = subject_of(model, opened, layers, units, frame, threads or usable_cores(), of_method)
+    probing = ProbeSettings(samples, seeds, quick)
     again = command_line(threads=None)
     columns = (
         bar.TextColumn("{task.description}"),
@@ -87,19 +94,19 @@ def diagnose(
     )
     with bar.Progress(*columns, console=Console(stderr=True)) as bars:
 
-        def progress(probe: "diagnostics.Probe") -> "diagnostics.Progress":
+        def progress(probe: "Probe") -> "Progress":
             task = bars.add_task(probe.title, total=None)
             return lambda done, total, activity: bars.update(
                 task, completed=done, total=total, description=f"{probe.title}: {activity}"
             )
 
-        results = diagnostics.diagnose(subject, opened, probe_names, probing, out, progress, again)
+        results = run_diagnosis(subject, opened, probe_names, probing, out, progress, again)
     table = Table("Probe", "Summary", numbers=("Seconds",), title=Text(subject.title))
     for probed in results:
         text = f"not run: {probed.finding.skipped}" if probed.finding.skipped else probed.finding.summary
         table.add_row(probed.probe.name, Text(text), "reused" if probed.reused else f"{probed.seconds:.1f}")
     show(table)
-    print(f"Written: {out / diagnostics.REPORT_FILE}\nWritten: {out / diagnostics.JSON_FILE}")
+    print(f"Written: {out / REPORT_FILE}\nWritten: {out / JSON_FILE}")
 
 
 @command(
@@ -128,19 +135,19 @@ def reliance(
     """Measure phase reliance: does the predicted depth follow the fringe's phase, or the object's outline?
 
     A file that can't take the score raises FppBenchError before measuring."""
-    opened = storage.DatasetFolder(dataset)
+    opened = DatasetFolder(dataset)
     method = chosen.load(opened)
     entry = None if into is None else read_entry(into)
     if entry is not None:
         check_same_method(entry, method)
-    scene_set = diagnostics.SceneSet(opened, views)
+    scene_set = SceneSet(opened, views)
     found = method.settings.get("weights_sha256")
     sha256 = found if isinstance(found, str) else None
     with progress_bar(f"reliance of {chosen.name}", len(scene_set.samples), "samples") as advance:
         # Called before each sample, so the first call is for none.
-        measured, _ = diagnostics.measure(method, scene_set, sha256, lambda done, total, sample: advance(min(done, 1)))
+        measured, _ = measure_reliance(method, scene_set, sha256, lambda done, total, sample: advance(min(done, 1)))
     if json is not None:
-        result.write_json(measured.model_dump(mode="json"), json)
+        write_json(measured.model_dump(mode="json"), json)
     if entry is not None:
         write_reliance(entry, measured)
     moved = [value for key, value in measured.parts if not key.startswith("answered")]
@@ -153,7 +160,7 @@ def reliance(
         )
 
 
-def _reliance_table(title: str, reliance: "result.Reliance") -> Table:
+def _reliance_table(title: str, reliance: "Reliance") -> Table:
     heading = Text(f"{title}: {reliance.samples} samples of {reliance.objects} objects")
     table = Table("", numbers=("value",), title=heading)
     low, high = reliance.interval
@@ -161,7 +168,7 @@ def _reliance_table(title: str, reliance: "result.Reliance") -> Table:
     table.add_row("phase reliance, 0 to 1", f"{reliance.score:.3f}{interval}")
     if reliance.order_free_score is not None:
         table.add_row("  whole periods aside", f"{reliance.order_free_score:.3f}")
-    for key, words in result.PART_TITLES.items():
+    for key, words in PART_TITLES.items():
         value = getattr(reliance.parts, key)
         if value is not None:
             table.add_row(words, f"{value:.3f}")

@@ -8,10 +8,23 @@ from pathlib import Path
 from fpp_ml_bench.cli import CHECK_FAILED, EVAL, OK, run_program
 from fpp_ml_bench.cli.options import SPLITS, Explain, command, value
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
-from fpp_ml_bench.evaluation import report, result, score, submission
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, MODES, TARGETS
+from fpp_ml_bench.evaluation.report.comparison import compare as compare_results
+from fpp_ml_bench.evaluation.report.report_page import write_report
+from fpp_ml_bench.evaluation.report.terminal import comparison_table, result_table
+from fpp_ml_bench.evaluation.result.file import json_schema, write_json, write_result
+from fpp_ml_bench.evaluation.result.model import Result
+from fpp_ml_bench.evaluation.score.check import check_folder
+from fpp_ml_bench.evaluation.score.conformal import calibrate as conformal_calibration
+from fpp_ml_bench.evaluation.score.conformal import counted, largest_coverage, write_calibrated
+from fpp_ml_bench.evaluation.score.evaluator import differences as result_differences
+from fpp_ml_bench.evaluation.score.evaluator import evaluate as evaluate_folder
+from fpp_ml_bench.evaluation.score.evaluator import explain_eval
+from fpp_ml_bench.evaluation.submission.description import write_template
+from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE, read_plain
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.loaders.storage.benchmark import benchmark_sentence
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import prepare_process
 from fpp_ml_bench.options import REQUIRED, argument, option
 
@@ -72,32 +85,32 @@ def score_folder(
     account.check()
     _check_outputs(json, page, predictions)
     opened, split = scored_data(predictions, dataset, split)
-    scored = score.evaluate(
+    scored = evaluate_folder(
         predictions,
         opened,
         split,
         target,
         edge_band,
         mode,
-        while_scoring=lambda: report.result_table,
+        while_scoring=lambda: result_table,
     )
     if json is not None:
-        result.write_result(scored, json)
+        write_result(scored, json)
     if page is not None:
-        report.write_report(scored, opened, predictions, page)
+        write_report(scored, opened, predictions, page)
     from fpp_ml_bench.cli.console import show  # imports rich, which --help must not
 
-    show(report.result_table(scored))  # when all is written: printing ends where nobody reads any more
+    show(result_table(scored))  # when all is written: printing ends where nobody reads any more
     for written in (json, page):
         if written is not None:
             print(f"Written: {written}")
-    has_expected_bytes, sentence = storage.benchmark_sentence(opened.manifest)
+    has_expected_bytes, sentence = benchmark_sentence(opened.manifest)
     if not has_expected_bytes:
         print(f"fpp-eval: warning: {opened.path}: {sentence}", file=sys.stderr)
-    account.say(lambda: score.explain_eval(opened, split, target, edge_band))
+    account.say(lambda: explain_eval(opened, split, target, edge_band))
 
 
-def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[storage.DatasetFolder, str]":
+def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[DatasetFolder, str]":
     """The dataset in ``place`` and the ``split`` to score; where they are not given, those that ``folder`` was
     predicted from, by its submission.yaml. Raises `SubmissionError` where that does not say, and `DatasetError` where
     the dataset is gone or another one now."""
@@ -106,7 +119,7 @@ def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[s
         raise PredictionError(f"expected a folder of predictions, found none at {shown}")
     give = f"give the dataset: fpp-eval {shown} DATASET"
     try:  # by hand: pydantic, which takes long to import, checks the file while the first samples are scored
-        predicted = submission.read_plain(folder).get("predicted") or {}
+        predicted = read_plain(folder).get("predicted") or {}
         told, content = Path(predicted["dataset"]), dict(predicted["content"])
         split = split or str(predicted["split"])
     except SubmissionError as error:
@@ -114,12 +127,12 @@ def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[s
             raise SubmissionError(f"{error}; {give}") from None
     except (AttributeError, KeyError, TypeError, ValueError):
         if place is None:
-            file = submission.SUBMISSION_FILE
+            file = SUBMISSION_FILE
             raise SubmissionError(f"{shown}: {file} does not say (predicted:) what was predicted; {give}") from None
     if place is not None:
-        return storage.DatasetFolder(place), split or "test"
+        return DatasetFolder(place), split or "test"
     try:
-        dataset = storage.DatasetFolder(told)
+        dataset = DatasetFolder(told)
     except DatasetError as error:
         raise DatasetError(f"{error}. {shown} was predicted from there; if the data was moved, {give}") from None
     changed = next((name for name, digest in content.items() if dataset.content.get(name) != digest), None)
@@ -158,7 +171,7 @@ def init(
     predictions: Path = argument("folder of the predictions, made if absent", "PREDICTIONS"),
 ) -> None:
     """Write a submission.yaml to fill in; one that is there is not overwritten."""
-    print(f"Written: {submission.write_template(predictions)}")
+    print(f"Written: {write_template(predictions)}")
     print(f"next: fill it in, write one {{sample}}.npy for each sample beside it, then: fpp-eval check {predictions}")
 
 
@@ -177,8 +190,8 @@ def check(
     """Check a submission before it is scored, without ground truth: exit status 0 sound, 1 refused.
 
     Raises FppBenchError for no folder."""
-    opened = None if dataset is None else storage.DatasetFolder(dataset)
-    checked = score.check_folder(predictions, opened, split)
+    opened = None if dataset is None else DatasetFolder(dataset)
+    checked = check_folder(predictions, opened, split)
     folder = printable(str(predictions), 500)
     for note in checked.notes:
         print(f"fpp-eval: note: {note}", file=sys.stderr)
@@ -215,10 +228,10 @@ def compare(
     from fpp_ml_bench.cli.console import show
     from fpp_ml_bench.leaderboard.rows import alike, read_scored
 
-    comparison = report.compare(*alike(read_scored(first), read_scored(second)))
+    comparison = compare_results(*alike(read_scored(first), read_scored(second)))
     if json is not None:
-        result.write_json(comparison.model_dump(mode="json"), json)
-    show(report.comparison_table(comparison))
+        write_json(comparison.model_dump(mode="json"), json)
+    show(comparison_table(comparison))
 
 
 @command(
@@ -238,8 +251,8 @@ def verify(
     Raises FppBenchError where nothing can be recomputed at all."""
     from fpp_ml_bench.leaderboard import rows
 
-    scored, opened = rows.read_scored(file), storage.DatasetFolder(dataset)
-    differences = score.differences if isinstance(scored, result.Result) else rows.differences
+    scored, opened = rows.read_scored(file), DatasetFolder(dataset)
+    differences = result_differences if isinstance(scored, Result) else rows.differences
     problems, shown = differences(scored, predictions, opened), printable(str(file), 500)  # type: ignore[arg-type]
     unchecked = f"not checked: {', '.join(rows.not_checked(scored))}: predictions don't tell them"
     if not problems:
@@ -286,12 +299,12 @@ def conformal(
 ) -> None:
     """Scale a method's stated sigma by split-conformal calibration over objects, from its predictions of another
     split."""
-    opened = storage.DatasetFolder(dataset)
-    found = score.calibrate(calibration, opened, calibrate, coverage, target)
-    samples = score.write_calibrated(found, predictions, opened, split, out)
-    share, most = f"{100 * found.coverage:g}%", 100 * score.largest_coverage(found.objects)
+    opened = DatasetFolder(dataset)
+    found = conformal_calibration(calibration, opened, calibrate, coverage, target)
+    samples = write_calibrated(found, predictions, opened, split, out)
+    share, most = f"{100 * found.coverage:g}%", 100 * largest_coverage(found.objects)
     print(f"{calibration}: {found.samples} samples")
-    print(f"  {score.counted(found.objects)} can support at most {most:.1f}%")
+    print(f"  {counted(found.objects)} can support at most {most:.1f}%")
     print(f"  {100 * found.before:.1f}% of the pixels are in their {share} interval as it was stated")
     print(
         f"  factor {found.factor:.4g}: the {share} interval of a new object's pixel holds in {share} of cases or more,"
@@ -316,4 +329,4 @@ def schema(
     ),
 ) -> None:
     """Print the JSON Schema (2020-12) of result.json or of submission.yaml."""
-    print(dumps(result.json_schema(file), indent=1))
+    print(dumps(json_schema(file), indent=1))

@@ -6,7 +6,7 @@ from fpp_ml_bench.baselines import views
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.options import SPLITS, command
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.tables import Table
 
@@ -33,7 +33,7 @@ def fuse(
     """Put the views of each object into one point cloud by their known placement, and compare them with each other.
 
     Prints what was counted. Raises FppBenchError for unusable predictions or data."""
-    opened = storage.DatasetFolder(dataset)
+    opened = DatasetFolder(dataset)
     name, objects = views.fuse_split(predictions, opened, split, only, cell_mm)
     counts = {}
     with progress_bar("fusing", len(views.views_by_object(opened, split, only)), "objects") as advance:

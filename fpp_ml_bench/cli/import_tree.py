@@ -6,13 +6,25 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-from fpp_ml_bench import calibration, coding, optics
+from fpp_ml_bench.calibration.from_depth import fit_projector
 from fpp_ml_bench.cli.calibrate import print_fit
 from fpp_ml_bench.cli.console import gigabytes, progress_bar, show
 from fpp_ml_bench.cli.options import AT_LEAST_ONE, command, given
+from fpp_ml_bench.coding.code import Limits, Reason
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.loaders import captures, published, storage
+from fpp_ml_bench.loaders.captures.decoding import capture_notes, import_captures, plan_captures
+from fpp_ml_bench.loaders.captures.images import read_splits
+from fpp_ml_bench.loaders.published.importing import (
+    AGREEING_MM,
+    depth_difference_mm,
+    import_notes,
+    plan_import,
+    tree_views,
+)
+from fpp_ml_bench.loaders.published.importing import import_tree as import_published
+from fpp_ml_bench.loaders.storage.manifest import Manifest
 from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.optics.rig_file import load_rig
 from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.tables import Table
 
@@ -101,24 +113,24 @@ def _import_captures(settings: ImportSettings) -> None:
         "max_clipped_steps": settings.max_clipped_steps,
         "max_disagreement_px": settings.max_disagreement,
     }
-    limits = coding.Limits(**{name: value for name, value in options.items() if value is not None})
-    splits = None if settings.splits is None else captures.read_splits(settings.splits)
-    plan = captures.plan_captures(
-        settings.tree, optics.load_rig(settings.rig), splits, limits, settings.bits, settings.colour, settings.anyway
+    limits = Limits(**{name: value for name, value in options.items() if value is not None})
+    splits = None if settings.splits is None else read_splits(settings.splits)
+    plan = plan_captures(
+        settings.tree, load_rig(settings.rig), splits, limits, settings.bits, settings.colour, settings.anyway
     )
     count, images = len(plan.reader.captures), len(plan.reader.rig.sequence)
     started = perf_counter()
     with progress_bar("importing", count, "images", images) as advance:
-        manifest = captures.import_captures(settings.out, plan, settings.workers or usable_cores(), advance)
+        manifest = import_captures(settings.out, plan, settings.workers or usable_cores(), advance)
     _print_captures(manifest)
-    _print_end(settings.out, manifest, images, perf_counter() - started, captures.capture_notes(manifest))
+    _print_end(settings.out, manifest, images, perf_counter() - started, capture_notes(manifest))
 
 
-def _print_captures(manifest: "storage.Manifest") -> None:
+def _print_captures(manifest: "Manifest") -> None:
     """Print what was decoded of each capture, those with the least first where there are many."""
     rows = [row for part in manifest.samples.values() for row in part]
     shown = rows if len(rows) <= _MOST_SHOWN else sorted(rows, key=lambda row: row["decoded_share"])[:_MOST_SHOWN]
-    reasons = [reason.name.lower() for reason in coding.Reason]
+    reasons = [reason.name.lower() for reason in Reason]
     reasons = [name for name in reasons if any(name in row["refused_share"] for row in shown)]
     more = f", the {len(shown)} of {len(rows)} captures with the least decoded" if len(shown) < len(rows) else ""
     titles = "decoded", "modulation", *(name.replace("_", " ") for name in reasons)
@@ -129,7 +141,7 @@ def _print_captures(manifest: "storage.Manifest") -> None:
     show(table)
 
 
-def _print_end(out: Path, manifest: "storage.Manifest", images: int, seconds: float, notes: list[str]) -> None:
+def _print_end(out: Path, manifest: "Manifest", images: int, seconds: float, notes: list[str]) -> None:
     size, count = sum(file.bytes for file in manifest.files), sum(map(len, manifest.samples.values()))
     parts = ", ".join(f"{split} {len(rows)}" for split, rows in manifest.samples.items())
     print(f"{out}: {parts} samples, {count * images:,} images, {gigabytes(size)} in {seconds:.1f} s")
@@ -141,27 +153,27 @@ def _print_end(out: Path, manifest: "storage.Manifest", images: int, seconds: fl
 def _import_tree(settings: ImportSettings) -> None:
     if of_captures := given(settings, CaptureSettings):
         raise BuildError(f"{of_captures[0]} belongs to captures without depth; give --captures too")
-    rig = None if settings.rig is None else optics.load_rig(settings.rig)
-    plan = published.plan_import(settings.tree, rig, settings.frame_order)
+    rig = None if settings.rig is None else load_rig(settings.rig)
+    plan = plan_import(settings.tree, rig, settings.frame_order)
     if settings.fit_rig:
         with progress_bar("reading", len(plan.reader.tree.by_name), "views") as advance:
-            views = published.tree_views(plan.reader, settings.workers or usable_cores(), advance)
-        rig, fit = calibration.fit_projector(views, plan.reader.rig)
+            views = tree_views(plan.reader, settings.workers or usable_cores(), advance)
+        rig, fit = fit_projector(views, plan.reader.rig)
         print_fit(rig, fit)
-        plan = published.plan_import(settings.tree, rig, settings.frame_order)
+        plan = plan_import(settings.tree, rig, settings.frame_order)
     sample_count = len(plan.reader.tree.by_name)
     images = len(plan.assembly.manifest.stored_frames)
     started = perf_counter()
     with progress_bar("importing", sample_count, "images", images) as advance:
-        manifest = published.import_tree(settings.out, plan, settings.workers or usable_cores(), advance)
-    _print_end(settings.out, manifest, images, perf_counter() - started, published.import_notes(manifest))
+        manifest = import_published(settings.out, plan, settings.workers or usable_cores(), advance)
+    _print_end(settings.out, manifest, images, perf_counter() - started, import_notes(manifest))
     if rig is None:
-        _warn_of_other_rig(settings.tree, published.depth_difference_mm(plan.reader))
+        _warn_of_other_rig(settings.tree, depth_difference_mm(plan.reader))
 
 
 def _warn_of_other_rig(tree: Path, difference_mm: float | None) -> None:
     """Say so where the assumed rig decodes other depths than the tree has."""
-    if difference_mm is None or difference_mm <= published.AGREEING_MM:
+    if difference_mm is None or difference_mm <= AGREEING_MM:
         return
     off = f"{difference_mm:.1f} mm off in the median" if difference_mm < float("inf") else "none at most pixels"
     print(

@@ -2,14 +2,21 @@
 
 from pathlib import Path
 
-from fpp_ml_bench import leaderboard
-from fpp_ml_bench.baselines import tradeoff
+from fpp_ml_bench.baselines.tradeoff.measure import read_tradeoff, shipped_tradeoff
 from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation import result
 from fpp_ml_bench.evaluation.metrics import METRICS, RANK_KEY, sort_keys
-from fpp_ml_bench.leaderboard import page
+from fpp_ml_bench.evaluation.result.file import write_file
+from fpp_ml_bench.leaderboard.data_files import table_csv, table_json
+from fpp_ml_bench.leaderboard.page.page import write_page
+from fpp_ml_bench.leaderboard.ranking import discover, expand, read_entries, shipped_rows
+from fpp_ml_bench.leaderboard.ranking import rank as rank_files
+from fpp_ml_bench.leaderboard.reported import chosen_tables
+from fpp_ml_bench.leaderboard.row_file import write_row
+from fpp_ml_bench.leaderboard.rows import read_entry, vouching_line
+from fpp_ml_bench.leaderboard.tables import group_tables, paper_rich_tables
+from fpp_ml_bench.leaderboard.tables import markdown as board_markdown
 from fpp_ml_bench.options import argument, option
 
 _SORTED = tuple(dict.fromkeys((*METRICS, *sort_keys())))
@@ -83,31 +90,31 @@ def rank(
     if row_file is not None:
         if len(results) != 1:
             raise SubmissionError(f"--row makes a row of one result, {len(results)} were given")
-        row = leaderboard.read_entry(results[0]).row
-        data = leaderboard.write_row(row, row_file)
+        row = read_entry(results[0]).row
+        data = write_row(row, row_file)
         print(f"{row_file}: {len(data):,} bytes, self-reported until a maintainer adds to leaderboard/vouched.txt:")
-        print(leaderboard.vouching_line(row, data, "measured", "THE COMMAND THAT MAKES IT AGAIN"))
+        print(vouching_line(row, data, "measured", "THE COMMAND THAT MAKES IT AGAIN"))
         return
     # A page holds the shipped rows or the named files, never results that happen to be in the current folder.
-    unnamed = leaderboard.discover(Path.cwd()) if out is None else leaderboard.shipped_rows()
-    entries = leaderboard.read_entries(leaderboard.expand(results) if results else unnamed)
-    groups, papers = leaderboard.rank(entries, sort), leaderboard.chosen_tables(paper)
-    for path, text in ((markdown, leaderboard.markdown), (json, leaderboard.table_json)):
+    unnamed = discover(Path.cwd()) if out is None else shipped_rows()
+    entries = read_entries(expand(results) if results else unnamed)
+    groups, papers = rank_files(entries, sort), chosen_tables(paper)
+    for path, text in ((markdown, board_markdown), (json, table_json)):
         if path is not None:
-            result.write_file(text(groups, papers, sort).encode("utf-8"), path)
+            write_file(text(groups, papers, sort).encode("utf-8"), path)
     if csv is not None:
-        result.write_file(leaderboard.table_csv(groups).encode("utf-8"), csv)
+        write_file(table_csv(groups).encode("utf-8"), csv)
     if out is not None:
-        shipped = None if results else tradeoff.shipped_tradeoff()
-        settings = shipped if measured is None else tradeoff.read_tradeoff(measured)
-        written = page.write_page(groups, papers, out, settings)
+        shipped = None if results else shipped_tradeoff()
+        settings = shipped if measured is None else read_tradeoff(measured)
+        written = write_page(groups, papers, out, settings)
         print(f"{out}: {len(written)} files; open {written[0]}")
         return
     not_shown = len(papers) if results and paper is None else 0
-    tables = leaderboard.group_tables(groups, sort, pairs)
-    show(*tables, *leaderboard.paper_rich_tables(papers[not_shown:]))
+    tables = group_tables(groups, sort, pairs)
+    show(*tables, *paper_rich_tables(papers[not_shown:]))
     if not_shown:
         print(
             f"Not shown: {not_shown} tables that others reported on other data (--paper all), and the "
-            f"leaderboard's own {len(leaderboard.shipped_rows())} rows (fpp-bench leaderboard without a file)."
+            f"leaderboard's own {len(shipped_rows())} rows (fpp-bench leaderboard without a file)."
         )

@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from fpp_ml_bench.baselines import registry, training
+from fpp_ml_bench.baselines import registry
 from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.training.weights import training_data_warning
 from fpp_ml_bench.cli.options import (
     AT_LEAST_ONE,
     Command,
@@ -74,7 +75,7 @@ class MethodSettings(OfMethods):
             given["threads"] = self.threads
         method = registry.load_method(self.name, dataset, **given)
         config = method.weights_config
-        warning = None if config is None else training.training_data_warning(config, dataset.manifest)
+        warning = None if config is None else training_data_warning(config, dataset.manifest)
         if warn and config is not None and warning is not None:
             print(f"warning: {config.name} was {warning}", file=sys.stderr)
         return method

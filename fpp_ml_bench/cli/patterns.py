@@ -4,11 +4,18 @@ import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from fpp_ml_bench import coding, design, optics
 from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.cli.options import POSITIVE, WORKING_RANGE, command, given, number_pair, value
+from fpp_ml_bench.coding.crossed import Crossed
+from fpp_ml_bench.design.assumptions import Assumptions
+from fpp_ml_bench.design.rivals import EpipolarLines
+from fpp_ml_bench.design.search import ANGLES_DEG, Candidate, Design, describe, draw_design, search
 from fpp_ml_bench.errors import CaptureError, RigError
 from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.optics.named_rigs import FIRST_SHIFTED_DEG, NAMED_RIGS
+from fpp_ml_bench.optics.patterns import export_patterns
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.rig_file import load_projection, load_rig, save_rig
 from fpp_ml_bench.options import argument, option
 from fpp_ml_bench.tables import Table
 
@@ -16,7 +23,7 @@ ROWS = 8
 """Pairs of the front that are shown, evenly spread, beside the proposed one."""
 MOST_WRONG = 0.05
 """Share of wrong orders beyond which a pair of the front is not shown."""
-_DEFAULT = design.Assumptions()
+_DEFAULT = Assumptions()
 
 
 def _numbers(text: str) -> tuple[float, ...]:
@@ -27,12 +34,12 @@ def _numbers(text: str) -> tuple[float, ...]:
     return tuple(float(part) for part in text.split(","))
 
 
-def _family(text: str) -> "coding.Crossed":
+def _family(text: str) -> "Crossed":
     values = PERIODS(text)
     if len(values) not in (2, 4):
         raise ValueError("expected two periods, or two periods and two angles")
     try:
-        return coding.Crossed((values[0], values[1]), values[2:] or (0.0, 90.0))
+        return Crossed((values[0], values[1]), values[2:] or (0.0, 90.0))
     except RigError as error:
         raise ValueError(str(error)) from error
 
@@ -57,7 +64,7 @@ class DesignSettings:
         "A,B|A-B",
         parse=PERIODS,
     )
-    pair: "tuple[coding.Crossed, ...]" = option(
+    pair: "tuple[Crossed, ...]" = option(
         (),
         "also describe these periods and angles (0 and 90 degrees unless said); repeatable",
         "P,Q[,A,B]",
@@ -163,11 +170,11 @@ def patterns(settings: PatternSettings) -> None:
         raise RigError(f"{of_design[0]} belongs to the design of crossed fringes; give --design too")
     if (out := settings.out) is None:
         raise CaptureError("--out DIR is missing: folder for the images")
-    named = settings.rig in optics.NAMED_RIGS
-    rig = optics.NAMED_RIGS[settings.rig]() if named else optics.load_projection(settings.rig)
+    named = settings.rig in NAMED_RIGS
+    rig = NAMED_RIGS[settings.rig]() if named else load_projection(settings.rig)
     if out.is_dir() and any(out.iterdir()):
         raise CaptureError(f"{out}: not empty; give a new folder, so that no old pattern is projected by mistake")
-    paths = optics.export_patterns(rig, out)
+    paths = export_patterns(rig, out)
     frames = [
         {"file": path.name, "shows": frame.title.partition(": ")[2], **asdict(frame)}
         for path, frame in zip(paths, rig.sequence, strict=True)
@@ -186,9 +193,9 @@ def patterns(settings: PatternSettings) -> None:
 
 def _design(settings: PatternSettings) -> None:
     """Search, print, and write what is asked for. Raises `RigError` for a rig that can't be used."""
-    named = settings.rig in optics.NAMED_RIGS
-    rig = optics.NAMED_RIGS[settings.rig]() if named else optics.load_rig(settings.rig)
-    assumed = design.Assumptions(
+    named = settings.rig in NAMED_RIGS
+    rig = NAMED_RIGS[settings.rig]() if named else load_rig(settings.rig)
+    assumed = Assumptions(
         settings.image_px,
         settings.phase_sigma,
         settings.blur,
@@ -198,31 +205,31 @@ def _design(settings: PatternSettings) -> None:
         settings.surfaces,
         settings.wrong / 100,
     )
-    found = design.search(rig, assumed, settings.pitches, settings.angles or design.ANGLES_DEG)
+    found = search(rig, assumed, settings.pitches, settings.angles or ANGLES_DEG)
     families = dict.fromkeys(settings.pair, "asked for")
     if len(rig.fringe_directions) == 2:
-        families.setdefault(replace(coding.Crossed.of_pair(rig), shifts_deg=((0.0, 0.0),)), "its pair")
+        families.setdefault(replace(Crossed.of_pair(rig), shifts_deg=((0.0, 0.0),)), "its pair")
     if rig.crossed is not None:
         families.setdefault(rig.crossed, "its crossed")
-    others = design.describe(rig, list(families), assumed)
+    others = describe(rig, list(families), assumed)
     _print_design(rig, assumed, found, list(zip(others, families.values(), strict=True)))
     if settings.picture is not None:
-        beside = others[0] if others else design.describe(rig, [coding.Crossed((18.0, 18.0))], assumed)[0]
-        write_atomically(settings.picture, design.draw_design(rig, found.proposed, beside, assumed))
+        beside = others[0] if others else describe(rig, [Crossed((18.0, 18.0))], assumed)[0]
+        write_atomically(settings.picture, draw_design(rig, found.proposed, beside, assumed))
         print(f"wrote {settings.picture}")
     if settings.out is not None:
-        family = replace(found.proposed.crossed, shifts_deg=optics.FIRST_SHIFTED_DEG)
-        optics.save_rig(rig.with_crossed(family), settings.out)
+        family = replace(found.proposed.crossed, shifts_deg=FIRST_SHIFTED_DEG)
+        save_rig(rig.with_crossed(family), settings.out)
         print(f"wrote {settings.out}; next: fpp-bench patterns {settings.out} --out DIR")
 
 
 def _print_design(
-    rig: "optics.Rig",
-    assumed: "design.Assumptions",
-    found: "design.Design",
-    others: "list[tuple[design.Candidate, str]]",
+    rig: "Rig",
+    assumed: "Assumptions",
+    found: "Design",
+    others: "list[tuple[Candidate, str]]",
 ) -> None:
-    (near_mm, far_mm), flat_deg = rig.working_range_mm, design.EpipolarLines.of(rig).flat_angle_deg
+    (near_mm, far_mm), flat_deg = rig.working_range_mm, EpipolarLines.of(rig).flat_angle_deg
     print(
         f"rig             range {near_mm:g} to {far_mm:g} mm; a carrier at {flat_deg:.0f} degrees runs along the "
         "epipolar lines and tells no depth"

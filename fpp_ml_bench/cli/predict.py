@@ -5,14 +5,16 @@ from pathlib import Path
 from rich.table import Table
 from rich.text import Text
 
-from fpp_ml_bench import baselines
 from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.run import explain_predict, predict_split
+from fpp_ml_bench.baselines.timing import check_target, time_method, write_timing
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
 from fpp_ml_bench.cli.options import COUNT, SPLITS, Explain, command
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation import result
-from fpp_ml_bench.loaders import storage
+from fpp_ml_bench.evaluation.result.file import write_json
+from fpp_ml_bench.evaluation.result.parts import Timing
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.remote import RemoteFolder, place, working_copy
 
@@ -44,12 +46,12 @@ def predict(
 ) -> None:
     """Run a method over a split and write predictions that fpp-eval scores."""
     account.check()
-    opened = storage.DatasetFolder(dataset)
+    opened = DatasetFolder(dataset)
     method = chosen.load(opened)
     samples = len(opened.samples(split))
     bar = progress_bar(f"{chosen.name}, {split}", samples, "samples")
     with working_copy(out) as (folder, _), bar as advance:
-        finished = baselines.predict_split(opened, method, split, folder, advance)
+        finished = predict_split(opened, method, split, folder, advance)
     print(
         f"{out}: {finished.samples} predictions by {method.title}; {len(method.frames_used)} frames and "
         f"{finished.seconds_per_sample:.3f} s a sample (median)"
@@ -59,10 +61,10 @@ def predict(
         print(f"next: fpp-eval {out}{how}")
     else:
         print(f"next: copy {out} to a disk, then: fpp-eval COPY {dataset}{how}")
-    account.say(lambda: baselines.explain_predict(opened, method, split))
+    account.say(lambda: explain_predict(opened, method, split))
 
 
-def _scoring(method: Method, opened: "storage.DatasetFolder") -> str:
+def _scoring(method: Method, opened: "DatasetFolder") -> str:
     """Options of fpp-eval that make the method's row: a network is scored against the decoded depth that it learnt
     from, but against that depth the process that made it would score 0."""
     target = method.target if opened.has_exact else "depth"
@@ -96,25 +98,25 @@ def time(
     ),
 ) -> None:
     """Measure a method's latency at batch 1, throughput, memory, parameters and frames, on a named machine."""
-    opened = storage.DatasetFolder(dataset)
+    opened = DatasetFolder(dataset)
     method = chosen.load(opened)
     for path in into:
-        baselines.check_target(path, method)
+        check_target(path, method)
     if json is not None and not json.absolute().parent.is_dir():
         raise SubmissionError(f"--json {json}: the folder {json.parent} does not exist; make it first")
     with progress_bar(f"timing {chosen.name}", repeats, "images") as advance:
-        timing = baselines.time_method(opened, method, split, batch, repeats, advance)
+        timing = time_method(opened, method, split, batch, repeats, advance)
     if json is not None:
         content = {"name": method.title, "method": method.name, "settings": dict(method.settings)}
-        result.write_json({**content, "timing": timing.model_dump(mode="json")}, json)
+        write_json({**content, "timing": timing.model_dump(mode="json")}, json)
     for path in into:
-        baselines.write_timing(path, timing)
+        write_timing(path, timing)
     show(_timing_table(method.title, timing))
     for path in (*([json] if json else []), *into):
         print(f"Written: {path}")
 
 
-def _timing_table(title: str, timing: "result.Timing") -> Table:
+def _timing_table(title: str, timing: "Timing") -> Table:
     def mib(value: float | None) -> str:
         return "unknown" if value is None else f"{value:,.0f} MiB"
 

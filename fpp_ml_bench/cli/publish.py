@@ -4,11 +4,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from fpp_ml_bench import leaderboard, loaders
 from fpp_ml_bench.cli import Program
 from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.files import printable
+from fpp_ml_bench.leaderboard import publish as board_publish
+from fpp_ml_bench.loaders import hub as hub_client
+from fpp_ml_bench.loaders import hub_dataset
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.options import REQUIRED, argument, option
 
@@ -45,7 +48,7 @@ class RepositorySettings:
     def __post_init__(self) -> None:
         for repo in (self.repo, getattr(self, "dataset_repo", None)):
             if repo is not None:
-                loaders.hub.check_repo_name(repo)
+                hub_client.check_repo_name(repo)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,18 +82,18 @@ def publish_dataset(settings: DatasetSettings) -> None:
     """Publish a built or imported dataset: Parquet that the Hub's viewer shows, card, meshes.
 
     Raises FppBenchError for files that can't be published and for errors of the Hub or the network."""
-    hub = loaders.hub.Hub()
+    hub = hub_client.Hub()
     from fpp_ml_bench.cli.console import progress_bar  # imports rich, which --help must not
 
-    dataset = loaders.DatasetFolder(settings.dataset)
-    licence = loaders.hub_dataset.dataset_licence(dataset, settings.license)
+    dataset = DatasetFolder(settings.dataset)
+    licence = hub_dataset.dataset_licence(dataset, settings.license)
     remote = _remote(settings, hub, "dataset")
-    texts = leaderboard.publish.dataset_texts(dataset, settings.repo, licence)
+    texts = board_publish.dataset_texts(dataset, settings.repo, licence)
     rows = sum(len(samples) for samples in dataset.splits.values())
-    with loaders.hub_dataset.staging_folder(settings.staging, dataset.fingerprint) as folder:
+    with hub_dataset.staging_folder(settings.staging, dataset.fingerprint) as folder:
         try:
             with progress_bar("preparing", rows, "samples") as advance:
-                stage = loaders.hub_dataset.stage_dataset
+                stage = hub_dataset.stage_dataset
                 publication = stage(dataset, settings.repo, folder, texts, usable_cores(), advance)
         except OSError as error:
             raise PublishError(
@@ -121,14 +124,14 @@ fpp-bench publish leaderboard --repo me/fpp-leaderboard --dataset-repo me/fpp
 )
 def publish_leaderboard(settings: LeaderboardSettings) -> None:
     """Publish the leaderboard's page as a static Space."""
-    hub = loaders.hub.Hub()
+    hub = hub_client.Hub()
     if settings.page is not None and settings.results:
         raise PublishError("expected result files or --page, got both; give one of them")
     with TemporaryDirectory(prefix="fpp-bench-publish-") as folder, TemporaryDirectory() as written:
         if settings.page is None:
-            leaderboard.publish.write_page_of(settings.results, Path(written))
+            board_publish.write_page_of(settings.results, Path(written))
         page = settings.page or Path(written)
-        publication = leaderboard.publish.stage_page(page, settings.repo, Path(folder), settings.dataset_repo)
+        publication = board_publish.stage_page(page, settings.repo, Path(folder), settings.dataset_repo)
         _carry_out(settings, hub, publication, _remote(settings, hub, "space"))
 
 
@@ -148,17 +151,17 @@ fpp-bench publish results result.json --repo me/my-model --dataset-repo me/fpp
 )
 def publish_results(settings: ResultSettings) -> None:
     """Publish results as .eval_results/*.yaml of a model's repository."""
-    hub = loaders.hub.Hub()
+    hub = hub_client.Hub()
     remote = _remote(settings, hub, "model")
     dataset = hub.state("dataset", settings.dataset_repo)
     content = hub.mark("dataset", settings.dataset_repo, dataset).get("content")
     scored_on = settings.dataset_repo, dataset.commit or "", content, settings.source_url
     with TemporaryDirectory(prefix="fpp-bench-publish-") as folder:
-        publication = leaderboard.publish.stage_results(settings.results, settings.repo, Path(folder), *scored_on)
+        publication = board_publish.stage_results(settings.results, settings.repo, Path(folder), *scored_on)
         _carry_out(settings, hub, publication, remote)
 
 
-def _remote(settings: RepositorySettings, hub: "loaders.hub.Hub", kind: "loaders.hub.Kind") -> "loaders.hub.Remote":
+def _remote(settings: RepositorySettings, hub: "hub_client.Hub", kind: "hub_client.Kind") -> "hub_client.Remote":
     """The current state of the repository, after checking that token, owner and visibility allow the run."""
     names = set() if settings.dry_run else hub.check_token()
     remote = hub.state(kind, settings.repo)
@@ -175,16 +178,16 @@ def _remote(settings: RepositorySettings, hub: "loaders.hub.Hub", kind: "loaders
 
 def _carry_out(
     settings: RepositorySettings,
-    hub: "loaders.hub.Hub",
-    publication: "loaders.hub.Publication",
-    remote: "loaders.hub.Remote",
+    hub: "hub_client.Hub",
+    publication: "hub_client.Publication",
+    remote: "hub_client.Remote",
 ) -> None:
     """Print what changes and send it, unless nothing changes or this is a dry run."""
     from fpp_ml_bench.cli.console import gigabytes, progress_bar
 
     private = getattr(settings, "private", False)
-    loaders.hub.check_replaceable(publication, remote, getattr(settings, "adopt", False))
-    planned = loaders.hub.changes(publication, remote)
+    hub_client.check_replaceable(publication, remote, getattr(settings, "adopt", False))
+    planned = hub_client.changes(publication, remote)
     visibility = "private" if (remote.private if remote.exists else private) else "public"
     kind = publication.kind
     print(f"{kind} {hub.url(kind, publication.repo)} ({'' if remote.exists else 'new, '}{visibility})")

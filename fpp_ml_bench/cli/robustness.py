@@ -5,16 +5,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from fpp_ml_bench import optics
-from fpp_ml_bench.baselines import robustness
+from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName
+from fpp_ml_bench.baselines.robustness.report import write_page, write_worst
+from fpp_ml_bench.baselines.robustness.run import Setup, View, by_severity
+from fpp_ml_bench.baselines.robustness.run import measure as measure_robustness
+from fpp_ml_bench.baselines.robustness.run import robustness as robustness_block
+from fpp_ml_bench.baselines.robustness.scenes import CACHE, Condition
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
 from fpp_ml_bench.cli.options import Pool, command, names
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation import report
+from fpp_ml_bench.evaluation.report.html import millimetres, percent
 from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_robustness
-from fpp_ml_bench.loaders import render, storage
+from fpp_ml_bench.loaders.render.builder import assembly_of
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.storage.manifest import Manifest
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import AnySequence
 from fpp_ml_bench.options import REQUIRED, option
 from fpp_ml_bench.remote import RemoteFolder, place, working_copy
 from fpp_ml_bench.tables import Table
@@ -69,20 +77,20 @@ def robust(
     entry = None if into is None else read_entry(into)
     if entry is not None:
         check_same_method(entry, method)
-    setup = robustness.Setup(method, objects, size, quick, rig)
+    setup = Setup(method, objects, size, quick, rig)
     # The nodes of a cluster have folders of their own, which nobody would keep small.
-    cache = None if no_cache else cache or (None if pool.cluster else robustness.CACHE)
+    cache = None if no_cache else cache or (None if pool.cluster else CACHE)
     views = sum(len(c.objects) * len(setup.views) for axis in setup.axes(axes) for c in setup.conditions(axis))
     with working_copy(out) as (below, save):
         folder = below / slug(setup)
         with progress_bar(f"{chosen.name}, {objects}", views, "views") as advance:
-            rows = robustness.measure(
+            rows = measure_robustness(
                 setup, folder, axes, workers, cache, lambda axis, count: advance(count), pool.cluster, save
             )
-        robustness.write_worst(setup, rows, folder, cache)
-        page = f"{out}/{robustness.write_page(below).name}"
+        write_worst(setup, rows, folder, cache)
+        page = f"{out}/{write_page(below).name}"
     if entry is not None:
-        write_robustness(entry, robustness.robustness(setup, rows))
+        write_robustness(entry, robustness_block(setup, rows))
     show(_table(setup, rows))
     print(f"{page}: curves of all methods measured there")
 
@@ -91,16 +99,16 @@ def robust(
 class Scenes:
     """What a method is chosen for, in place of a dataset: the scenes are rendered when they are needed."""
 
-    settings: "render.BuildSettings"
+    settings: "BuildSettings"
 
     @classmethod
-    def of(cls, objects: "robustness.SetName", size: int, rig: str) -> "Scenes":
-        return cls(robustness.Condition(robustness.CLEAN, 0, tuple(robustness.SETS[objects]), size, rig).settings)
+    def of(cls, objects: "SetName", size: int, rig: str) -> "Scenes":
+        return cls(Condition(CLEAN, 0, tuple(SETS[objects]), size, rig).settings)
 
     path = Path("the robustness scenes")
 
     @property
-    def rig(self) -> "optics.Rig":
+    def rig(self) -> "Rig":
         return self.settings.rig
 
     @property
@@ -108,34 +116,34 @@ class Scenes:
         return self.rig.camera.height, self.rig.camera.width
 
     @property
-    def sequence(self) -> "optics.AnySequence":
+    def sequence(self) -> "AnySequence":
         return self.rig.sequence
 
     @property
-    def manifest(self) -> "storage.Manifest":
-        return render.assembly_of(self.settings).manifest
+    def manifest(self) -> "Manifest":
+        return assembly_of(self.settings).manifest
 
 
-def slug(setup: "robustness.Setup") -> str:
+def slug(setup: "Setup") -> str:
     """Name of a measurement's folder."""
     plain = re.sub(r"[^a-z0-9]+", "-", setup.method.title.casefold()).strip("-")[:80]
     return f"{plain}-{setup.set_name}-{setup.size}{'-quick' if setup.quick else ''}"
 
 
-def _table(setup: "robustness.Setup", rows: "dict[str, list[robustness.View]]") -> Table:
+def _table(setup: "Setup", rows: "dict[str, list[View]]") -> Table:
     """Errors by axis, clean and at each severity; shares at the last severity."""
     severities = (0, *setup.severities)
     columns = [f"severity {severity}" if severity else "clean" for severity in severities]
     columns += ["wrong orders", "unanswered", "confident errors"]
     table = Table("axis", numbers=columns, title=f"{setup.method.title}: object MAE in mm")
     for axis, found in rows.items():
-        means = robustness.by_severity(found)
+        means = by_severity(found)
         last = means[max(means)]
-        cells = [report.millimetres(means[severity].mae_mm) if severity in means else "" for severity in severities]
+        cells = [millimetres(means[severity].mae_mm) if severity in means else "" for severity in severities]
         shares = [
-            report.percent(last.wrong_share),
-            report.percent(last.unanswered_share),
-            report.percent(last.confident_share),
+            percent(last.wrong_share),
+            percent(last.unanswered_share),
+            percent(last.confident_share),
         ]
         table.add_row(axis, *cells, *shares)
     return table

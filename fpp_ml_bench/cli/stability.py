@@ -6,12 +6,13 @@ from pathlib import Path
 
 from rich.text import Text
 
-from fpp_ml_bench.baselines import stability
+from fpp_ml_bench.baselines.stability.cases import Case, Row, Verdict, all_cases, run_cases
+from fpp_ml_bench.baselines.stability.report import document, short, summary, write_report
 from fpp_ml_bench.cli import CHECK_FAILED, OK
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import StabilityError
-from fpp_ml_bench.evaluation import result
+from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.options import option
 from fpp_ml_bench.tables import Table
 
@@ -46,35 +47,35 @@ def check(
     groups = [name for name in _GROUPS if name in group]
     if out is not None and out.exists() and not out.is_dir():
         raise StabilityError(f"--out {out}: expected a folder or a new path, got a file")
-    cases = stability.all_cases(groups, quick=quick)
+    cases = all_cases(groups, quick=quick)
     if listed:
         _list(cases)
         return OK
     with progress_bar("stability", len(cases), "cases") as advance:
-        rows = stability.run_cases(cases, lambda _: advance(1))
-    written = [] if out is None else stability.write_report(rows, out)
+        rows = run_cases(cases, lambda _: advance(1))
+    written = [] if out is None else write_report(rows, out)
     if json is not None:
-        result.write_json(stability.document(rows), json)
+        write_json(document(rows), json)
     _show(rows)
     for path in written:
         show(f"Written: {path}")
-    return CHECK_FAILED if any(row.verdict is stability.Verdict.FAIL for row in rows) else OK
+    return CHECK_FAILED if any(row.verdict is Verdict.FAIL for row in rows) else OK
 
 
-def _show(rows: Sequence[stability.Row]) -> None:
+def _show(rows: Sequence[Row]) -> None:
     numbers = "cases", "within bound", "flagged", "FAIL", "largest error / bound", "CPU s"
     table = Table("group", numbers=numbers, elsewhere="--json FILE")
-    for group, part in stability.summary(rows).items():
+    for group, part in summary(rows).items():
         *counts, ratio, cpu_s = part.values()
-        text = ratio if isinstance(ratio, str) else stability.short(ratio)
+        text = ratio if isinstance(ratio, str) else short(ratio)
         table.add_row(group, *map(str, counts), text, f"{cpu_s:.1f}")
     show(table)
     for row in rows:
-        if row.verdict is stability.Verdict.FAIL:
+        if row.verdict is Verdict.FAIL:
             show(Text(f"FAIL {row.case.group}: {row.case.name}: {row.against}"))
 
 
-def _list(cases: Sequence[stability.Case]) -> None:
+def _list(cases: Sequence[Case]) -> None:
     for (group, family), members in groupby(cases, lambda case: (case.group, case.family)):
         case, *others = members
         show(Text(f"{group}: {family} ({1 + len(others)}): {case.computes}; against {case.reference}"))

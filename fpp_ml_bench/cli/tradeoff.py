@@ -3,7 +3,9 @@
 from pathlib import Path
 from typing import Literal
 
-from fpp_ml_bench.baselines import tradeoff
+from fpp_ml_bench.baselines.tradeoff.measure import planned
+from fpp_ml_bench.baselines.tradeoff.measure import tradeoff as run_tradeoff
+from fpp_ml_bench.baselines.tradeoff.report import remarks, rich_tables, write_report
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.options import command, whole
 from fpp_ml_bench.options import argument, option
@@ -46,17 +48,17 @@ def measure(
     """Error against run time, frames and memory for every method on this machine, and how the time grows.
 
     Measures what is missing, writes all files, prints both tables and remarks."""
-    plan = tradeoff.planned(dataset, out, method, views or (1 if quick else 2), threads, clock)
+    plan = planned(dataset, out, method, views or (1 if quick else 2), threads, clock)
     if listed:
         for point in plan.points:
             print(point.label)
         print(f"{len(plan.points)} points on {len(plan.views)} views.")
         return
     with progress_bar("measuring", len(plan.points), "points") as advance:
-        measured = tradeoff.tradeoff(plan, lambda label: advance(1))
-    written = tradeoff.write_report(measured, out)
-    show(*tradeoff.rich_tables(measured))
-    for line in tradeoff.remarks(measured):
+        measured = run_tradeoff(plan, lambda label: advance(1))
+    written = write_report(measured, out)
+    show(*rich_tables(measured))
+    for line in remarks(measured):
         print(line)
     for path in written:
         print(f"Written: {path}")

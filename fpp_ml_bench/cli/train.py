@@ -5,8 +5,14 @@ import sys
 from datetime import datetime
 from pathlib import Path
 
-from fpp_ml_bench.baselines import networks, registry, reproduce, training
-from fpp_ml_bench.baselines.training import PRESETS, TABLES, table_rows
+from fpp_ml_bench.baselines import registry
+from fpp_ml_bench.baselines.networks.range_heads import save_with_heads
+from fpp_ml_bench.baselines.reproduce.plan import Folders, planned, variants
+from fpp_ml_bench.baselines.reproduce.work import ReproduceSettings, state_of
+from fpp_ml_bench.baselines.reproduce.work import reproduce as run_reproduce
+from fpp_ml_bench.baselines.training.depth_training import train as train_recipe
+from fpp_ml_bench.baselines.training.recipe import load_recipe, table_rows
+from fpp_ml_bench.baselines.training.tables import PRESETS, TABLES
 from fpp_ml_bench.cli import CHECK_FAILED, OK
 from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.cli.methods import MethodCommand, OfMethods
@@ -46,7 +52,7 @@ def train(
         "dataset folder, of the preset's image size (those methods: none)", "DATASET", None
     ),
     out: Path = option(REQUIRED, "new folder, or that of a training to resume", "DIR"),
-    preset: str = option("cpu", "what a shipped recipe is scaled to (default: cpu)", choices=training.PRESETS),
+    preset: str = option("cpu", "what a shipped recipe is scaled to (default: cpu)", choices=PRESETS),
     minutes: float | None = option(
         None, "stop before an epoch that would not finish in time, everything saved", "M", parse=MINUTES
     ),
@@ -75,8 +81,8 @@ def train(
         raise RecipeError(f"{recipe}: expected a dataset folder to train on, got none")
     from accelerate import PartialState
 
-    resolved = training.load_recipe(recipe, preset)
-    trained = training.train(resolved, dataset, out, minutes=minutes)
+    resolved = load_recipe(recipe, preset)
+    trained = train_recipe(resolved, dataset, out, minutes=minutes)
     if not PartialState().is_main_process:
         return OK if trained.finished else CHECK_FAILED
     if not trained.finished:
@@ -85,7 +91,7 @@ def train(
     weights = trained.weights
     if resolved.normalisation == "individual" and not resolved.background_removed:
         weights = out / "model.safetensors"
-        networks.save_with_heads(trained.weights, dataset, weights)
+        save_with_heads(trained.weights, dataset, weights)
     print(f"{weights}: {resolved.title}, epoch {trained.best_epoch} of {trained.epochs}, {trained.seconds:.0f} s")
     print(f"curve: {trained.curve}")
     print(f"next: fpp-bench predict {weights} {dataset} --out predictions")
@@ -140,7 +146,7 @@ def reproduce_tables(
 
     Does what is missing. Raises FppBenchError where a step can't be done or a training failed."""
     below = out / preset
-    folders = reproduce.Folders(preset, below, below / "rows" if rows is None else rows)
+    folders = Folders(preset, below, below / "rows" if rows is None else rows)
     name, slash, row = (table or ALL).partition("/")
     tables = TABLES if name == ALL else (name,)
     if slash and row not in table_rows(name):
@@ -157,8 +163,8 @@ def reproduce_tables(
 
     again = command_line(preset=preset, only_missing=True)
     options = (dataset, only_missing, minutes, anyway)
-    asked = reproduce.ReproduceSettings(tables, folders, again, reproduced, *options, report, row=row)
-    outcome = reproduce.reproduce(asked)
+    asked = ReproduceSettings(tables, folders, again, reproduced, *options, report, row=row)
+    outcome = run_reproduce(asked)
     for name, path in zip(tables, outcome.tables, strict=True):
         lines = reproduced.table_lines(name, outcome.jobs, folders, outcome.opened)
         show(reproduced.table_rich(name, lines, preset), reproduced.conclusion(name, lines))
@@ -172,18 +178,18 @@ def reproduce_tables(
     return OK
 
 
-def _list(tables: tuple[str, ...], folders: "reproduce.Folders") -> None:
-    jobs = reproduce.planned(tables, folders.preset)
+def _list(tables: tuple[str, ...], folders: "Folders") -> None:
+    jobs = planned(tables, folders.preset)
     titles = "Row", "Training", "State", "Rows written", "Published: object MAE"
     first_out = "Rows written", "Published: object MAE", "Training"
     table = Table(*titles, first_out=first_out, title=f"preset {folders.preset}, {folders.runs}")
     empty = 0
     for job in jobs:
-        row_files = [folders.row(job.recipe, depth_range) for depth_range in reproduce.variants(job.recipe)]
+        row_files = [folders.row(job.recipe, depth_range) for depth_range in variants(job.recipe)]
         written = f"{sum(path.is_file() for path in row_files)} of {len(row_files)}"
         published = _published(SHIPPED_ROWS / row_files[0].name)
         empty += len(job.rows) if published is None else 0
-        state = reproduce.state_of(folders.training(job.recipe))
+        state = state_of(folders.training(job.recipe))
         table.add_row("\n".join(job.rows), job.recipe.name, state, written, published or "-")
     show(table)
     rows = sum(len(job.rows) for job in jobs)

@@ -22,7 +22,7 @@ from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.optics import Rig
+    from fpp_ml_bench.optics.rig import Rig
 
 Pair = tuple[float, float]
 LEAST_ANGLE_DEG = 5.0

@@ -1,5 +1,1 @@
 """From fringe frames to depth: phase, fringe order, triangulation, and the checks of the frames."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -7,25 +7,17 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench import coding
-from fpp_ml_bench.coding import (
-    CLIPPED_STEPS_DIVISOR,
-    STAGE_REASONS,
-    Code,
-    Coordinates,
-    Limits,
-    PhaseShift,
-    Reason,
-    choose_steps,
-    minus_atan2,
-    phase_weights,
-    weighted_sums,
-)
+from fpp_ml_bench.coding.code import CLIPPED_STEPS_DIVISOR, STAGE_REASONS, Code, Coordinates, Limits, Reason
+from fpp_ml_bench.coding.gray_code import INCONSISTENT_RAD, absolute_phase, cell_centres_rad, decode_cells
+from fpp_ml_bench.coding.phase_shift import PhaseShift, choose_steps, minus_atan2, phase_weights, weighted_sums
+from fpp_ml_bench.coding.phase_shift import compiled_kernels as compiled_coding_kernels
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
 from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.machine import numba_enabled
-from fpp_ml_bench.optics import AXES, Direction, Maps, Rig, Sequence
+from fpp_ml_bench.optics.pinhole import Maps
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import AXES, Direction, Sequence
 
 SLACK_PX = 1e-3
 """Allowance for rounding: coordinates and residuals are exact to about 1e-9 px."""
@@ -94,7 +86,7 @@ def plan_direction(rig: Rig, direction: Direction, steps: int | None, limits: Li
         (*sinusoids, *rig.sequence.gray(direction)),
         sinusoids=sinusoids,
         weights=phase_weights(2 * np.pi * np.array(chosen) / len(available)),
-        centres_rad=coding.cell_centres_rad(length, code.pitch_px),
+        centres_rad=cell_centres_rad(length, code.pitch_px),
         pitch_px=code.pitch_px,
         max_clipped_steps=len(chosen) // CLIPPED_STEPS_DIVISOR if allowed is None else allowed,
     )
@@ -140,18 +132,18 @@ def projected(rays: Maps, depth_m: float, rig: Rig) -> Maps:
 def decode_direction(grey: NDArray, plan: DirectionPlan, limits: Limits) -> Coordinates:
     """Projector coordinate of a block from its grey levels, uint8 or float32 (rows of the plan, n)."""
     steps, count = len(plan.sinusoids), grey.shape[1]
-    if grey.dtype == np.uint8 and (kernels := coding.compiled_kernels()):
+    if grey.dtype == np.uint8 and (kernels := compiled_coding_kernels()):
         results = np.empty(count), np.empty(count), np.empty(count), np.empty(count, dtype=np.uint8)
         thresholds = float(limits.min_modulation), float(plan.max_clipped_steps), float(limits.ambiguous_fraction)
         code = len(plan.gray), plan.centres_rad, plan.pitch_px, float(plan.length_px)
         reasons = tuple(float(reason) for reason in STAGE_REASONS)
-        kernels.decode_block(grey, plan.weights, code, (*thresholds, coding.INCONSISTENT_RAD), reasons, results)
+        kernels.decode_block(grey, plan.weights, code, (*thresholds, INCONSISTENT_RAD), reasons, results)
         return Coordinates(*results)
     mean, cosine, sine = weighted_sums(grey[:steps], plan.weights)
     modulation = np.sqrt(cosine * cosine + sine * sine)
     phase = minus_atan2(sine, cosine)
-    cells, trusted = coding.decode_cells(grey[steps:], mean, modulation, limits.ambiguous_fraction)
-    absolute, consistent = coding.absolute_phase(phase, cells, plan.centres_rad)
+    cells, trusted = decode_cells(grey[steps:], mean, modulation, limits.ambiguous_fraction)
+    absolute, consistent = absolute_phase(phase, cells, plan.centres_rad)
     coordinate = absolute * (plan.pitch_px / (2 * np.pi))
     saturated = (grey[:steps] >= GREY_LEVELS).sum(axis=0) > plan.max_clipped_steps
     inconsistent = ~(trusted & consistent)

@@ -19,13 +19,15 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding import Coordinates, Limits, Reason
+from fpp_ml_bench.coding.code import Coordinates, Limits, Reason
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.decoding import blocks
 from fpp_ml_bench.decoding.blocks import CodePlan, DirectionPlan
 from fpp_ml_bench.decoding.fewest import JointCode, decode_wrapped, fewest_plans, nearest_pair, with_order
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.optics import DIRECTIONS, Direction, Maps, Rig
+from fpp_ml_bench.optics.pinhole import Maps
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
 from fpp_ml_bench.skipping import skipping_enabled
 
 SAMPLED_PX = 4096

@@ -14,12 +14,15 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding import MAX_DISAGREEMENT_PX, Coordinates, Limits, Reason, binary_to_gray, cell_count, cell_of
+from fpp_ml_bench.coding.code import MAX_DISAGREEMENT_PX, Coordinates, Limits, Reason
+from fpp_ml_bench.coding.gray_code import binary_to_gray, cell_count, cell_of
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.decoding import blocks
 from fpp_ml_bench.decoding.blocks import CodePlan, DirectionPlan, compiled_kernels
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm
-from fpp_ml_bench.optics import AXES, Direction, Maps, Rig
+from fpp_ml_bench.optics.pinhole import Maps
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import AXES, Direction
 
 _GRID = 33
 """Rays per image side that represent the image: projections are smooth, and the outermost rays are included."""

@@ -16,10 +16,13 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.coding import MIN_MODULATION, PhaseShift, phase_weights, weighted_sums
+from fpp_ml_bench.coding.code import MIN_MODULATION
+from fpp_ml_bench.coding.phase_shift import PhaseShift, phase_weights, weighted_sums
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.optics import AXES, DIRECTIONS, Direction, Maps, Rig, distort
+from fpp_ml_bench.optics.pinhole import Maps, distort
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import AXES, DIRECTIONS, Direction
 
 if TYPE_CHECKING:
     from fpp_ml_bench.decoding.decode import Decoded

@@ -16,10 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding import Crossed
+from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 
 GRID = 5
 """Pixels along each side of the image, corners included."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding import LEAST_ANGLE_DEG, Crossed
+from fpp_ml_bench.coding.crossed import LEAST_ANGLE_DEG, Crossed
 from fpp_ml_bench.design.assumptions import SIGMA_PERIOD_PX, Assumptions
 from fpp_ml_bench.design.rivals import (
     TAU,
@@ -22,7 +22,7 @@ from fpp_ml_bench.design.rivals import (
     wrong_order_rate,
 )
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from fpp_ml_bench.coding import Limits, PhaseShift
+from fpp_ml_bench.coding.code import Limits
+from fpp_ml_bench.coding.phase_shift import PhaseShift
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.examination.findings import Examination, Finding
 from fpp_ml_bench.examination.readings import AS_GIVEN, Fit, fit, search
@@ -24,7 +25,8 @@ from fpp_ml_bench.examination.signals import (
     step_errors,
     take_lines,
 )
-from fpp_ml_bench.optics import Direction, Rig
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import Direction
 
 SIGMAS = 6.0
 """Standard errors above which a figure is none of chance."""

@@ -15,11 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding import GrayCells, GrayOnly, Limits, Reason
+from fpp_ml_bench.coding.code import Limits, Reason
+from fpp_ml_bench.coding.gray_code import GrayCells, GrayOnly
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.decoding import depth_and_reason, plan_direction
+from fpp_ml_bench.decoding.blocks import depth_and_reason, plan_direction
 from fpp_ml_bench.examination.signals import Lines, fringe_sets, gray_edges
-from fpp_ml_bench.optics import AXES, Direction, Frame, Rig
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import AXES, Direction, Frame
 
 LARGEST_MISFIT = 0.2
 """Largest RMS distance of grey levels from their sinusoid, in modulations, where four steps and more tell."""

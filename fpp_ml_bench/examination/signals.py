@@ -16,9 +16,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding import MIN_MODULATION, Limits, PhaseShift, minus_atan2, phase_weights, weighted_sums
+from fpp_ml_bench.coding.code import MIN_MODULATION, Limits
+from fpp_ml_bench.coding.phase_shift import PhaseShift, minus_atan2, phase_weights, weighted_sums
 from fpp_ml_bench.constants import GREY_LEVELS
-from fpp_ml_bench.optics import Direction, Rig
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import Direction
 
 LINES, MOST_PX = 40, 150_000
 LEAST_LIT_GREY = 3 * MIN_MODULATION

@@ -1,6 +1,6 @@
 """The rigs that this package names: the paper's, and the same with crossed fringes."""
 
-from fpp_ml_bench.coding import Crossed
+from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.optics.rig import Rig

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding import Code
+from fpp_ml_bench.coding.code import Code
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import FppBenchError, RigError
 from fpp_ml_bench.optics.rig import Rig

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.coding import LARGEST
+from fpp_ml_bench.coding.code import LARGEST
 from fpp_ml_bench.errors import RigError
 
 Coefficients = tuple[float, ...]

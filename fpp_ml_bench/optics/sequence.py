@@ -16,7 +16,10 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding import Code, Crossed, Fringes, GrayCells, Kind, PhaseShift, equal_shifts
+from fpp_ml_bench.coding.code import Code, Kind
+from fpp_ml_bench.coding.crossed import Crossed
+from fpp_ml_bench.coding.gray_code import GrayCells
+from fpp_ml_bench.coding.phase_shift import Fringes, PhaseShift, equal_shifts
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.errors import RigError
 
@@ -295,7 +298,7 @@ class CodedSequence(AnySequence):
 
 def sequence_from_dict(entries: object, lengths_px: Mapping[Direction, int]) -> Sequence | CodedSequence:
     """The sequence that a rig file describes, on patterns of ``lengths_px``. Raises `RigError` naming the key."""
-    from fpp_ml_bench.coding import code_from_dict
+    from fpp_ml_bench.coding.schemes import code_from_dict
 
     if not isinstance(entries, Mapping):
         raise RigError(f"sequence: expected a mapping, got {entries!r}")

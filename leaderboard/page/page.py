@@ -9,13 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from fpp_ml_bench.baselines.tradeoff import Tradeoff
+from fpp_ml_bench.baselines.tradeoff.measure import Tradeoff
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS, RANGE_KEY, with_column
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
-from fpp_ml_bench.evaluation.report import interval_text, page, render, score_text
-from fpp_ml_bench.evaluation.result import PART_TITLES
-from fpp_ml_bench.evaluation.score import FEWEST_OBJECTS
+from fpp_ml_bench.evaluation.report.html import interval_text, page, render, score_text
+from fpp_ml_bench.evaluation.result.parts import PART_TITLES
+from fpp_ml_bench.evaluation.score.uncertainty import FEWEST_OBJECTS
 from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.leaderboard import columns, tables
 from fpp_ml_bench.leaderboard.assumptions import assumption, assumption_sentences, learned_from, told

@@ -3,7 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from fpp_ml_bench.baselines.tradeoff import Mark, Scatter, pareto_front
+from fpp_ml_bench.baselines.tradeoff.drawing import Mark, Scatter
+from fpp_ml_bench.baselines.tradeoff.measure import pareto_front
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.groups import Group, Ranked

@@ -7,13 +7,14 @@ from collections.abc import Mapping, Sequence
 from itertools import groupby
 from typing import Any
 
-from fpp_ml_bench.baselines.tradeoff import COST_KEYS, Tradeoff, scatter, tables
-from fpp_ml_bench.evaluation.report import interval_text, signed
+from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, Tradeoff
+from fpp_ml_bench.baselines.tradeoff.report import scatter, tables
+from fpp_ml_bench.evaluation.report.html import interval_text, signed
 from fpp_ml_bench.leaderboard import columns
 from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, Group
 from fpp_ml_bench.leaderboard.page.pictures import MOST_LABELLED, drawn, overview_figures
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
-from fpp_ml_bench.loaders.storage import benchmark_before
+from fpp_ml_bench.loaders.storage.benchmark import benchmark_before
 
 _SPARSE = (*columns.PARTS, columns.RATIO, columns.RANGE, *columns.UNCERTAINTY)
 _TRADEOFF_PICTURE = 430, 380

@@ -7,13 +7,19 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.calibration import Board, Calibration, Levels, Pose, Response, fit_response, levels_of, measure_pose
-from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.calibration.boards import Board
+from fpp_ml_bench.calibration.projector_points import Pose, measure_pose
+from fpp_ml_bench.calibration.response import Levels, Response, fit_response, levels_of
+from fpp_ml_bench.calibration.result import Calibration
+from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.errors import CalibrationError
-from fpp_ml_bench.examination import Examination, RefusedCapture, examine
+from fpp_ml_bench.examination.examine import examine
+from fpp_ml_bench.examination.findings import Examination, RefusedCapture
 from fpp_ml_bench.files import visible
 from fpp_ml_bench.loaders.captures.images import read_frames
-from fpp_ml_bench.optics import AXES, Rig, load_projection, rotation_matrix
+from fpp_ml_bench.optics.rig import Rig, rotation_matrix
+from fpp_ml_bench.optics.rig_file import load_projection
+from fpp_ml_bench.optics.sequence import AXES
 
 FEWEST_POSES = 3
 RANGE_MARGIN = 0.1

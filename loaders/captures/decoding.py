@@ -13,21 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding import MIN_MODULATION, Limits, Reason
+from fpp_ml_bench.coding.code import MIN_MODULATION, Limits, Reason
 from fpp_ml_bench.constants import GREY_LEVELS
-from fpp_ml_bench.decoding import (
-    ASSUMED_NOISE_GREY,
-    Decoded,
-    Directions,
-    check_limits,
-    decode_stack,
-    depth_sigma_mm,
-    noise_of_frames,
-)
+from fpp_ml_bench.decoding.decode import Decoded, Directions, check_limits, decode_stack
+from fpp_ml_bench.decoding.triangulation import ASSUMED_NOISE_GREY, depth_sigma_mm, noise_of_frames
 from fpp_ml_bench.errors import CaptureError, DecodeError
-from fpp_ml_bench.examination import Examination, RefusedCapture, examine
+from fpp_ml_bench.examination.examine import examine
+from fpp_ml_bench.examination.findings import Examination, RefusedCapture
 from fpp_ml_bench.files import file_content
-from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.loaders.captures.images import (
     Capture,
     CapturedFrames,
@@ -39,8 +32,11 @@ from fpp_ml_bench.loaders.captures.images import (
 )
 from fpp_ml_bench.loaders.published.importing import ImportPlan, RowReader, import_plan, run_import
 from fpp_ml_bench.loaders.sample import Row
-from fpp_ml_bench.loaders.storage import CAPTURED, Manifest, Progress, ShardPlan
-from fpp_ml_bench.optics import Direction, Rig
+from fpp_ml_bench.loaders.storage.assembly import Progress
+from fpp_ml_bench.loaders.storage.manifest import CAPTURED, Manifest
+from fpp_ml_bench.loaders.storage.shards import ShardPlan, plan_rows
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import Direction
 
 CLIPPED_SHARE = 0.02
 """A frame in which more of the lit pixels than this are at full scale is named."""
@@ -266,7 +262,7 @@ def plan_captures(
     pixels = rig.camera.height * rig.camera.width
     plans: list[ShardPlan] = []
     for split, chosen in by_split.items():
-        plans += storage.plan_rows(split, [(c.sample, c.object, c.view) for c in chosen], pixels)
+        plans += plan_rows(split, [(c.sample, c.object, c.view) for c in chosen], pixels)
     settings = {
         "layout": "captures",
         "splits": "all in test" if splits is None else "given",

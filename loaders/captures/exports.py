@@ -14,15 +14,16 @@ from textwrap import wrap
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.coding import Reason
+from fpp_ml_bench.coding.code import Reason
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.containers import matrix_bytes
 from fpp_ml_bench.errors import CaptureError
-from fpp_ml_bench.examination import Examination
+from fpp_ml_bench.examination.findings import Examination
 from fpp_ml_bench.files import write_atomically, write_files
 from fpp_ml_bench.loaders.captures.decoding import DecodedCapture
 from fpp_ml_bench.loaders.captures.images import CapturedFrames
-from fpp_ml_bench.optics import Pinhole, Rig
+from fpp_ml_bench.optics.pinhole import Pinhole
+from fpp_ml_bench.optics.rig import Rig
 
 FORMS = ("npy", "mat", "png", "ply", "mesh")
 REPORT = "decode.json"

@@ -11,24 +11,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench import optics
 from fpp_ml_bench.constants import PUBLISHED_SPLIT_FOLDERS, VIEWS
 from fpp_ml_bench.containers import matrix_bytes, png_bytes
-from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.depth import normalise, object_mask
 from fpp_ml_bench.errors import BuildError, DatasetError
 from fpp_ml_bench.files import LOCK_FILE, exclusive
 from fpp_ml_bench.loaders.published import tree
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
-from fpp_ml_bench.loaders.storage import (
-    ALL_SPLITS,
-    GENERATED,
-    MESH_FOLDER,
-    DatasetFolder,
-    depth_range_mm,
-    write_parquet,
-)
-from fpp_ml_bench.optics import Direction, Sequence
+from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER
+from fpp_ml_bench.loaders.storage.parquet import write_parquet
+from fpp_ml_bench.loaders.storage.shards import depth_range_mm
+from fpp_ml_bench.loaders.storage.store import ALL_SPLITS, DatasetFolder
+from fpp_ml_bench.optics.patterns import export_patterns
+from fpp_ml_bench.optics.sequence import Direction, Sequence
 
 FORMS = ("parquet", "mat", "meshes", "patterns")
 SAMPLE_FORMS = ("parquet", "mat")
@@ -162,7 +158,7 @@ def export(
                 for path in meshes:
                     shutil.copyfile(path, folder / path.name)
             else:
-                optics.export_patterns(dataset.rig, folder)
+                export_patterns(dataset.rig, folder)
 
 
 def _meshes(dataset: DatasetFolder, splits: list[str]) -> list[Path]:

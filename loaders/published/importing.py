@@ -14,18 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.calibration import MOST_PX, DepthView, view_from_frames
+from fpp_ml_bench.calibration.projection import MOST_PX, DepthView, view_from_frames
 from fpp_ml_bench.containers import from_file, parse_image, parse_matrix
-from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mask
 from fpp_ml_bench.errors import CaptureError, DecodeError, LayoutError, PredictionError, RigError
-from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.loaders.published import tree as published_tree
 from fpp_ml_bench.loaders.published.order import AUTO, FrameOrder, check_order, find_order, parse_order
 from fpp_ml_bench.loaders.published.tree import VARIABLES, VARIANT_FOLDERS, PublishedSample, PublishedTree
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME, Row
-from fpp_ml_bench.loaders.storage import Assembly, Manifest, Progress, ShardPlan
-from fpp_ml_bench.optics import Rig, paper_rig, rig_from_dict
+from fpp_ml_bench.loaders.storage.assembly import Assembly, Progress, assemble, forget_outdated
+from fpp_ml_bench.loaders.storage.manifest import Manifest
+from fpp_ml_bench.loaders.storage.shards import ShardPlan, plan_shards
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.rig_file import rig_from_dict
 
 IMPORTED = "imported"
 _CHECK_THREADS = 2
@@ -138,9 +141,9 @@ def run_import(
     all others are tried too, and ``refusal`` of all problems is raised. Raises `BuildError` as a build does, and when a
     file changed after ``folder`` was finished."""
     reader = plan.reader
-    storage.forget_outdated(folder, plan.assembly.plans, lambda name: reader.samples[name].files)
+    forget_outdated(folder, plan.assembly.plans, lambda name: reader.samples[name].files)
     try:
-        return storage.assemble(folder, plan.assembly, workers, progress)
+        return assemble(folder, plan.assembly, workers, progress)
     except (LayoutError, CaptureError) as error:
         with ThreadPoolExecutor(_CHECK_THREADS) as pool:
             problems = [problem for problem in pool.map(reader.problem, reader.samples.values()) if problem]
@@ -295,7 +298,7 @@ def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> 
         objects: dict[str, list[tuple[str, str, str]]] = {}
         for s in samples:
             objects.setdefault(s.object, []).append((s.sample, s.object, s.view))
-        plans += storage.plan_shards(split, objects)
+        plans += plan_shards(split, objects)
     settings = {
         "layout": "published",
         "depth_from": VARIANT_FOLDERS[tree.variants[0]],

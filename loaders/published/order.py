@@ -13,9 +13,10 @@ from itertools import combinations, compress, product
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding import phase_weights, weighted_sums
+from fpp_ml_bench.coding.phase_shift import phase_weights, weighted_sums
 from fpp_ml_bench.errors import LayoutError
-from fpp_ml_bench.optics import DIRECTIONS, Direction, Frame, Rig, Sequence
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction, Frame, Sequence
 
 AUTO = "auto"
 _Run = tuple[str, Direction]

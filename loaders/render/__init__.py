@@ -1,5 +1,1 @@
 """The virtual rig: meshes, scene, ray casting, light, sensor, and building the benchmark from them."""
-
-import lazy_loader
-
-__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

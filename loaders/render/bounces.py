@@ -18,7 +18,7 @@ from fpp_ml_bench.loaders.render.projector import PatternLight
 from fpp_ml_bench.loaders.render.scene import turned
 from fpp_ml_bench.loaders.render.surfels import OFF_PLANE, RAYS, SIDES, SLABS, SurfelGrid, Surfels
 from fpp_ml_bench.machine import njit
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 
 SMALLEST = 2e-4
 """A bounce that adds less everywhere, a twentieth of a grey level, is the last."""

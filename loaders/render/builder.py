@@ -8,15 +8,17 @@ from pathlib import Path
 import numpy as np
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.calibration import volume_error_mm
+from fpp_ml_bench.calibration.result import volume_error_mm
 from fpp_ml_bench.constants import SPLITS, VIEWS, sample_name, split_of
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.loaders import storage
 from fpp_ml_bench.loaders.render.meshes import solid_mesh, write_ply
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.sample import Row
-from fpp_ml_bench.loaders.storage import MESH_FOLDER, Assembly, Manifest, Progress, ShardPlan
+from fpp_ml_bench.loaders.storage.assembly import Assembly, Progress, assemble
+from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER, Manifest
+from fpp_ml_bench.loaders.storage.remote_assembly import assemble_remote
+from fpp_ml_bench.loaders.storage.shards import ShardPlan, plan_shards
 from fpp_ml_bench.remote import RemoteFolder
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by
 
@@ -49,7 +51,7 @@ def plan_build(settings: BuildSettings) -> list[ShardPlan]:
         names = [name for name in settings.objects if user_splits.get(name, split_of(name)) == split]
         if names:
             objects = {name: [(sample_name(name, view), name, view) for view in VIEWS] for name in names}
-            plans += storage.plan_shards(split, objects)
+            plans += plan_shards(split, objects)
     return plans
 
 
@@ -61,7 +63,7 @@ def assembly_of(settings: BuildSettings) -> Assembly:
     rig, generator = settings.stated_rig, {"name": "fpp-ml-bench", "version": __version__}
     size = rig.camera.height, rig.camera.width
     described, stored = settings.describe(), settings.stored
-    manifest = Manifest(storage.GENERATED, generator, described, rig.to_dict(), size, stored, exact=True)
+    manifest = Manifest(GENERATED, generator, described, rig.to_dict(), size, stored, exact=True)
     return Assembly(plan_build(settings), PhotographedRows(settings), manifest, MESH_FOLDER)
 
 
@@ -76,14 +78,14 @@ def build(
     cluster at an address. Same settings, same bytes. Raises `BuildError` (folder in use, other settings, disk full),
     `MeshError` (an object does not fit), and `PoolError` and `RemoteError` for a cluster or URL that fails."""
     if isinstance(folder, RemoteFolder):
-        return storage.assemble_remote(folder, assembly_of(settings), workers, cluster, progress)
-    return storage.assemble(folder, assembly_of(settings), workers, progress, cluster)
+        return assemble_remote(folder, assembly_of(settings), workers, cluster, progress)
+    return assemble(folder, assembly_of(settings), workers, progress, cluster)
 
 
 def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
     """The account of a built dataset. Takes a second or two: it makes one view, that of median cover, several times.
     Raises `BuildError` for a dataset of an earlier version, which counted something else."""
-    if manifest.origin != storage.GENERATED:
+    if manifest.origin != GENERATED:
         raise ValueError(f"only generated datasets are explained, this one is {manifest.origin}")
     rows = [row for part in manifest.samples.values() for row in part]
     if any("mixed_rays" not in row for row in rows):

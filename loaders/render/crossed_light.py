@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding import Crossed
+from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.machine import njit
 from fpp_ml_bench.portable import cosine_of_turns, exponential, sine_of_turns
 

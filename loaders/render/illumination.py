@@ -14,7 +14,7 @@ from fpp_ml_bench.loaders.render.light import Light
 from fpp_ml_bench.loaders.render.projector import PatternLight, PatternPlace
 from fpp_ml_bench.loaders.render.raycast import TracedObject
 from fpp_ml_bench.loaders.render.surface import reflectance
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 
 NEAREST_M = 1e-3
 """A point nearer to a centre of projection is inside that lens and gets no light: the inverse square has no limit."""

@@ -21,7 +21,7 @@ from fpp_ml_bench.loaders.render.raycast import TracedObject
 from fpp_ml_bench.loaders.render.scene import SolidMesh, turned, unturned
 from fpp_ml_bench.loaders.render.surfels import Surfels
 from fpp_ml_bench.loaders.render.textures import material_of
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.skipping import skipping_enabled
 
 _SURFELS: WeakKeyDictionary[SolidMesh, Surfels] = WeakKeyDictionary()

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.loaders.render.raycast import Hits, PixelRays, TracedObject
 from fpp_ml_bench.machine import njit
-from fpp_ml_bench.optics import Pinhole, Rig
+from fpp_ml_bench.optics.pinhole import Pinhole
+from fpp_ml_bench.optics.rig import Rig
 
 APART_MM = 2.0
 """Rays of a pixel see different surfaces where a depth is this far from the plane that the central ray sees."""

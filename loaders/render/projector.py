@@ -17,7 +17,9 @@ from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.render.crossed_light import carrier_waves, fill_crossed, phase_table
 from fpp_ml_bench.loaders.render.light import ProjectorLight
 from fpp_ml_bench.machine import njit
-from fpp_ml_bench.optics import AXES, DIRECTIONS, AnySequence, Frame, Rig, pattern_profile
+from fpp_ml_bench.optics.patterns import pattern_profile
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import AXES, DIRECTIONS, AnySequence, Frame
 from fpp_ml_bench.portable import cosine_of_turns, gaussian_weights, power, sine_of_turns
 
 FINE = 4

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.loaders.render.ray_kernels import SLACK, build_tree, nearest_hit, rasterise
 from fpp_ml_bench.loaders.render.scene import SolidMesh
-from fpp_ml_bench.optics import Pinhole
+from fpp_ml_bench.optics.pinhole import Pinhole
 
 LEAF = 4
 """Most triangles in a leaf of the box tree."""

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import CONFIGS, MM_PER_M, OBJECTS, PRESETS, UNSEEN, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.light import Light, named_light
-from fpp_ml_bench.optics import NAMED_RIGS, Rig
+from fpp_ml_bench.optics.named_rigs import NAMED_RIGS
+from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.options import did_you_mean
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 

@@ -21,7 +21,7 @@ from fpp_ml_bench.loaders.render.light import CameraLight, Light
 from fpp_ml_bench.loaders.render.projector import PatternLight, fill_frame, respond
 from fpp_ml_bench.loaders.render.scene import modulation_at
 from fpp_ml_bench.machine import njit
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 
 TABLE_BITS = 12
 _FLOAT = np.float32

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M, VIEW_DEGREES, VIEWS, sample_name
-from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.depth import object_mask, object_near_edge
 from fpp_ml_bench.errors import BuildError, MeshError
 from fpp_ml_bench.loaders.render.illumination import LitPixels

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fpp_ml_bench.constants import FULL_SIZE, MINI_SIZE
-from fpp_ml_bench.loaders import render
+from fpp_ml_bench.loaders.render.scene import preset_settings
 from fpp_ml_bench.loaders.storage.manifest import GENERATED, Manifest
 
 FACTS = Path(__file__).resolve().parent / "benchmarks"
@@ -139,7 +139,7 @@ def intended_benchmark(manifest: Manifest) -> Benchmark | None:
     for benchmark in BENCHMARKS:
         if benchmark.light != light:
             continue
-        settings = render.preset_settings(benchmark.preset, benchmark.size, light, benchmark.rig)
+        settings = preset_settings(benchmark.preset, benchmark.size, light, benchmark.rig)
         stated = manifest.settings | {"frames": settings.stored}
         if stated == settings.describe() and manifest.rig == settings.rig.to_dict():
             return benchmark

@@ -12,7 +12,7 @@ from fpp_ml_bench import __version__
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.sample import DATA_GROUP, available_configs, features, group_columns, stored_groups
 from fpp_ml_bench.loaders.storage.manifest import CAPTURED, Manifest
-from fpp_ml_bench.optics import rig_from_dict, save_rig
+from fpp_ml_bench.optics.rig_file import rig_from_dict, save_rig
 
 RIG_FILE = "rig.yaml"
 _HEAD = """\

@@ -14,7 +14,8 @@ from fpp_ml_bench.constants import OBJECT_NAME, SAMPLE_NAME, SCHEMA_VERSION, SPL
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import file_hash, path_problem, printable, read_json, text_problem, write_atomically
 from fpp_ml_bench.loaders.sample import available_configs, stored_frames, stored_groups
-from fpp_ml_bench.optics import AnySequence, rig_from_dict
+from fpp_ml_bench.optics.rig_file import rig_from_dict
+from fpp_ml_bench.optics.sequence import AnySequence
 
 MANIFEST = "manifest.json"
 WORK_FOLDER = ".build"

@@ -27,7 +27,7 @@ from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders import sample as layout
 from fpp_ml_bench.loaders.sample import COVER, DATA_GROUP, DEPTH, DEPTH_EXACT, DEPTHS, FLAGS, LABELS, RANGE, Row
 from fpp_ml_bench.loaders.storage.manifest import ShardFile
-from fpp_ml_bench.optics import AnySequence
+from fpp_ml_bench.optics.sequence import AnySequence
 
 BLOCK_BYTES = 1 << 22
 _BLOCKS = 4

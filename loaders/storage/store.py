@@ -33,7 +33,9 @@ from fpp_ml_bench.loaders.sample import (
     void_pixels,
 )
 from fpp_ml_bench.loaders.storage.manifest import MANIFEST, ShardFile, read_manifest
-from fpp_ml_bench.optics import AnySequence, Rig, rig_from_dict
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.rig_file import rig_from_dict
+from fpp_ml_bench.optics.sequence import AnySequence
 from fpp_ml_bench.options import did_you_mean
 
 if TYPE_CHECKING:

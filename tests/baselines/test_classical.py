@@ -13,13 +13,18 @@ from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.registry import load_method, methods
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.decoding import noise_by_light
+from fpp_ml_bench.decoding.triangulation import noise_by_light
 from fpp_ml_bench.depth import edge_distance_px, object_mask
 from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError, PredictionError
-from fpp_ml_bench.loaders.render import BuildSettings, Studio, build, camera_noise, solid_mesh
+from fpp_ml_bench.loaders.render.builder import build
+from fpp_ml_bench.loaders.render.meshes import solid_mesh
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.render.sensor import camera_noise
+from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.sample import VOID, Flag
-from fpp_ml_bench.loaders.storage import DatasetFolder
-from fpp_ml_bench.optics import paper_rig, rig_from_dict
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig_file import rig_from_dict
 
 STEPS = (3, 4, 6, 9, 18)
 

@@ -10,7 +10,7 @@ import pytest
 from fpp_ml_bench.baselines import registry
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.options import described, options_of
 
 RIG = paper_rig(224)

@@ -10,7 +10,7 @@ from scored_dataset import make_dataset
 from fpp_ml_bench.baselines.method import Answer, Method
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
 
 SPLIT = "test"
 

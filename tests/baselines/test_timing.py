@@ -12,9 +12,9 @@ from fpp_ml_bench.baselines import timing
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.evaluation.result import read_result, write_result
-from fpp_ml_bench.evaluation.score import evaluate
-from fpp_ml_bench.evaluation.submission import read_submission
+from fpp_ml_bench.evaluation.result.file import read_result, write_result
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.evaluation.submission.description import read_submission
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +112,7 @@ def test_nothing_to_time_and_frames_that_are_not_there(small):
 @pytest.fixture(scope="module")
 def predicted(tiny, tmp_path_factory):
     """Predictions of the classical method and their result."""
-    from fpp_ml_bench.loaders.storage import DatasetFolder
+    from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
     work = tmp_path_factory.mktemp("timed")
     arguments = ["classical", str(tiny), "--steps", "3", "--direction", "vertical"]

@@ -6,13 +6,14 @@ import numpy as np
 import pytest
 from scored_dataset import disk_depth, make_dataset
 
-from fpp_ml_bench.baselines import ConstantMethod, NearestMethod, predict_split
 from fpp_ml_bench.baselines.registry import load_method
+from fpp_ml_bench.baselines.run import predict_split
+from fpp_ml_bench.baselines.trivial import ConstantMethod, NearestMethod
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.score import evaluate
-from fpp_ml_bench.loaders.storage import DatasetFolder
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 SIZE = (96, 96)
 

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from fpp_ml_bench.calibration import Pose, ProjectorPoints
+from fpp_ml_bench.calibration.projector_points import Pose, ProjectorPoints
 
 CAMERA_SIZE, PROJECTOR_SIZE = (1280, 960), (912, 1140)
 CAMERA = np.array([[1500.0, 0, 630.0], [0, 1503.0, 488.0], [0, 0, 1]])

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fpp_ml_bench.calibration import Board, parse_board
+from fpp_ml_bench.calibration.boards import Board, parse_board
 from fpp_ml_bench.errors import CalibrationError
 
 TO_IMAGE = np.array([[3.0, 0.35, 90.0], [-0.25, 2.8, 110.0], [0.0009, 0.0011, 1.0]])

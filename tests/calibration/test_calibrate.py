@@ -5,9 +5,12 @@ import numpy as np
 import pytest
 from calibration import rigs
 
-from fpp_ml_bench.calibration import Lens, ProjectorPoints, calibrate, draw_residuals, parse_board
+from fpp_ml_bench.calibration.boards import parse_board
+from fpp_ml_bench.calibration.projector_points import ProjectorPoints
+from fpp_ml_bench.calibration.result import Lens, draw_residuals
+from fpp_ml_bench.calibration.solve import calibrate
 from fpp_ml_bench.errors import CalibrationError
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 
 BOARD = parse_board("checker:9x7:18")
 SIZES = (rigs.CAMERA_SIZE, rigs.PROJECTOR_SIZE)

@@ -8,7 +8,9 @@ import pytest
 import yaml
 
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.optics import load_rig, paper_rig, read_opencv_calibration, save_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.opencv_files import read_opencv_calibration
+from fpp_ml_bench.optics.rig_file import load_rig, save_rig
 
 SIZE = 240
 

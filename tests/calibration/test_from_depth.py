@@ -6,9 +6,12 @@ import cv2
 import numpy as np
 import pytest
 
-from fpp_ml_bench.calibration import DepthView, fit_projector, view_from_frames, view_from_maps
+from fpp_ml_bench.calibration.from_depth import fit_projector
+from fpp_ml_bench.calibration.projection import DepthView, view_from_frames, view_from_maps
 from fpp_ml_bench.errors import CalibrationError, DecodeError
-from fpp_ml_bench.optics import Pinhole, paper_rig, pattern_image
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.patterns import pattern_image
+from fpp_ml_bench.optics.pinhole import Pinhole
 
 SIDE = 48
 KNOWN = paper_rig(SIDE)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from fpp_ml_bench.calibration import parse_board, projector_points
-from fpp_ml_bench.calibration.projector_points import measure_pose
+from fpp_ml_bench.calibration.boards import parse_board
+from fpp_ml_bench.calibration.projector_points import measure_pose, projector_points
 from fpp_ml_bench.errors import CalibrationError
 
 TO_PROJECTOR = np.array([[1.3, 0.1, 40.0], [-0.05, 1.2, 60.0], [4e-4, -3e-4, 1.0]])

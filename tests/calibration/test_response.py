@@ -2,11 +2,14 @@
 
 import pytest
 
-from fpp_ml_bench.calibration import fit_response
-from fpp_ml_bench.loaders.captures import board_poses
-from fpp_ml_bench.loaders.render import board_poses as poses_of
-from fpp_ml_bench.loaders.render import fitting_board, named_light, photograph_board
-from fpp_ml_bench.optics import paper_rig, rig_from_dict
+from fpp_ml_bench.calibration.response import fit_response
+from fpp_ml_bench.loaders.captures.board_poses import board_poses
+from fpp_ml_bench.loaders.render.boards.captures import photograph_board
+from fpp_ml_bench.loaders.render.boards.poses import board_poses as poses_of
+from fpp_ml_bench.loaders.render.boards.poses import fitting_board
+from fpp_ml_bench.loaders.render.light import named_light
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig_file import rig_from_dict
 
 
 @pytest.mark.parametrize("gamma", [1.0, 1.6])

@@ -5,12 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fpp_ml_bench.calibration import calibrate, measure_pose, volume_error_mm
-from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.calibration.projector_points import measure_pose
+from fpp_ml_bench.calibration.result import volume_error_mm
+from fpp_ml_bench.calibration.solve import calibrate
+from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.errors import CalibrationError
-from fpp_ml_bench.loaders.captures import read_frames
-from fpp_ml_bench.loaders.render import board_poses, fitting_board, photograph_board
-from fpp_ml_bench.optics import CodedSequence, Sequence, paper_rig, rig_from_dict
+from fpp_ml_bench.loaders.captures.images import read_frames
+from fpp_ml_bench.loaders.render.boards.captures import photograph_board
+from fpp_ml_bench.loaders.render.boards.poses import board_poses, fitting_board
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig_file import rig_from_dict
+from fpp_ml_bench.optics.sequence import CodedSequence, Sequence
 
 RIG = paper_rig(240)
 DEPTHS_MM = np.linspace(1500, 2100, 9)

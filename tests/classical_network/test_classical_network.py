@@ -9,29 +9,25 @@ import pytest
 import torch
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from fpp_ml_bench.baselines import load_method, training
+from fpp_ml_bench.baselines import training
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.classical_network import (
-    CHANNELS,
-    ClassicalNetMethod,
-    DepthFilter,
-    DepthScene,
-    FilterRecipe,
-    train_classical_net,
-)
-from fpp_ml_bench.baselines.classical_network.network import BOUND_SIGMAS, REACH
+from fpp_ml_bench.baselines.classical_network.method import ClassicalNetMethod
+from fpp_ml_bench.baselines.classical_network.network import BOUND_SIGMAS, REACH, DepthFilter
 from fpp_ml_bench.baselines.classical_network.route import Filtered, decided, filtered
-from fpp_ml_bench.baselines.classical_network.scene import channels
+from fpp_ml_bench.baselines.classical_network.scene import CHANNELS, DepthScene, channels
 from fpp_ml_bench.baselines.classical_network.training import (
     THRESHOLDS,
     DepthSample,
+    FilterRecipe,
     chosen_threshold,
     sample_of,
     score,
+    train_classical_net,
 )
+from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.errors import NetworkError, TrainingError, WeightsError
-from fpp_ml_bench.loaders.render import named_light
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.loaders.render.light import named_light
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 SIZE = 224
 GROUPS = [

@@ -338,7 +338,9 @@ def test_show_works_with_one_frame_without_meshes_and_with_few_gray_bits(tmp_pat
     assert cv2.imread(str(out)) is not None
     from dataclasses import replace
 
-    from fpp_ml_bench.optics import Sequence, paper_rig, save_rig
+    from fpp_ml_bench.optics.named_rigs import paper_rig
+    from fpp_ml_bench.optics.rig_file import save_rig
+    from fpp_ml_bench.optics.sequence import Sequence
 
     coarse = replace(paper_rig(TINY_SIZE), pitch_horizontal_px=1140, pitch_vertical_px=912, sequence=Sequence(3, 1, 1))
     save_rig(coarse, tmp_path / "rig.yaml")

@@ -21,15 +21,19 @@ from disks import small_disk
 from scored_dataset import make_dataset
 
 from fpp_ml_bench import pool
-from fpp_ml_bench.baselines import classical_network, crossed_network, diagnostics, phase_network
-from fpp_ml_bench.baselines.training import CHECKPOINT, alone_in
+from fpp_ml_bench.baselines.classical_network.training import FilterRecipe, train_classical_net
+from fpp_ml_bench.baselines.crossed_network.training import CrossedRecipe, train_crossed_net
+from fpp_ml_bench.baselines.diagnostics.diagnosis import diagnose
+from fpp_ml_bench.baselines.phase_network.training import Recipe, train_phase_net
+from fpp_ml_bench.baselines.training.engine import CHECKPOINT, alone_in
 from fpp_ml_bench.baselines.training.records import save_checkpoint
 from fpp_ml_bench.cli import evaluate, main, run_command
 from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import DatasetError, DiagnosisError, PoolError, RemoteError, TrainingError
 from fpp_ml_bench.files import LOCK_FILE, exclusive, file_hash, write_atomically
-from fpp_ml_bench.loaders.render import build
-from fpp_ml_bench.loaders.storage import DatasetFolder, assembly, shard_processes, store
+from fpp_ml_bench.loaders.render.builder import build
+from fpp_ml_bench.loaders.storage import assembly, shard_processes, store
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.remote import RemoteFolder
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -70,9 +74,9 @@ def test_of_two_that_train_in_a_folder_one_is_told(tmp_path):
     out = tmp_path / "run"
     with alone_in(out):
         for recipe, its_training in (
-            (phase_network.Recipe(), phase_network.train_phase_net),
-            (crossed_network.CrossedRecipe(), crossed_network.train_crossed_net),
-            (classical_network.FilterRecipe(), classical_network.train_classical_net),
+            (Recipe(), train_phase_net),
+            (CrossedRecipe(), train_crossed_net),
+            (FilterRecipe(), train_classical_net),
         ):
             with pytest.raises(TrainingError, match=r"another process is training in this folder; wait for it"):
                 its_training(recipe, out)
@@ -84,7 +88,7 @@ def test_of_two_reports_in_a_folder_one_is_told(tmp_path):
         exclusive(tmp_path / LOCK_FILE, tmp_path, "here"),
         pytest.raises(DiagnosisError, match="another process is writing a report there"),
     ):
-        diagnostics.diagnose(None, None, (), None, tmp_path, None)
+        diagnose(None, None, (), None, tmp_path, None)
 
 
 def test_a_lock_of_a_folder_that_was_moved_away_is_not_that_of_the_next(tmp_path):

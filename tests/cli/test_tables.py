@@ -7,9 +7,14 @@ import pytest
 from rich.console import Console
 from rich.text import Text
 
-from fpp_ml_bench import leaderboard
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.evaluation import report, score
+from fpp_ml_bench.evaluation.report.comparison import compare as compare_results
+from fpp_ml_bench.evaluation.report.terminal import comparison_table, result_table
+from fpp_ml_bench.evaluation.score.evaluator import evaluate as evaluate_folder
+from fpp_ml_bench.leaderboard.ranking import rank as rank_files
+from fpp_ml_bench.leaderboard.ranking import read_entries, shipped_rows
+from fpp_ml_bench.leaderboard.reported import chosen_tables
+from fpp_ml_bench.leaderboard.tables import group_tables, paper_rich_tables
 from fpp_ml_bench.tables import Table
 
 WIDTHS = (80, 100, 120, 200)
@@ -20,9 +25,9 @@ def result(tiny, tmp_path_factory):
     """Of a method that states its uncertainty."""
     folder = tmp_path_factory.mktemp("scored") / "predictions"
     assert main(["predict", "classical", str(tiny), "--out", str(folder)]) == 0
-    from fpp_ml_bench.loaders.storage import DatasetFolder
+    from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
-    scored = score.evaluate(folder, DatasetFolder(tiny), "test")
+    scored = evaluate_folder(folder, DatasetFolder(tiny), "test")
     assert scored.uncertainty is not None
     return scored
 
@@ -70,7 +75,7 @@ def check(parts, width, name_column=0):
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_a_result_keeps_its_pixel_sets_objects_and_samples(result, width):
-    scores, uncertainty, worst = check([report.result_table(result)], width)
+    scores, uncertainty, worst = check([result_table(result)], width)
     names = ("overall", "object", "background", "object, 1 px or more from edges", "object, nearer")
     assert scores[0]["Pixel set"][:3] == names[:3] and scores[0]["Pixel set"][4] == names[4]
     assert uncertainty[0]["Stated uncertainty"] == ("all", "power_drill")
@@ -81,20 +86,20 @@ def test_a_result_keeps_its_pixel_sets_objects_and_samples(result, width):
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_a_comparison_keeps_its_errors(result, width):
-    ((columns, _),) = check([report.comparison_table(report.compare(result, result))], width)
+    ((columns, _),) = check([comparison_table(compare_results(result, result))], width)
     assert columns["Error"] == tuple(f"{p} {e}" for p in ("overall", "object", "background") for e in ("MAE", "RMSE"))
 
 
 @pytest.fixture(scope="module")
 def groups():
-    return leaderboard.rank(leaderboard.read_entries(leaderboard.shipped_rows()))
+    return rank_files(read_entries(shipped_rows()))
 
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_the_shipped_rows_keep_their_names_and_their_errors(groups, width):
     for group in groups:
         ranked = any(row.best_rank is not None for row in group.rows)
-        ((columns, left_out),) = check(leaderboard.group_tables([group], "object_mae_mm"), width, int(ranked))
+        ((columns, left_out),) = check(group_tables([group], "object_mae_mm"), width, int(ranked))
         assert columns["Method"] == tuple(row.short_name for row in group.rows)
         assert "Object MAE" in columns and "s/sample" in columns
         assert left_out or width == 200
@@ -102,8 +107,8 @@ def test_the_shipped_rows_keep_their_names_and_their_errors(groups, width):
 
 @pytest.mark.parametrize("width", WIDTHS)
 def test_tables_of_others_keep_their_rows(width):
-    tables = leaderboard.chosen_tables("all")
-    for (columns, _), table in zip(check(leaderboard.paper_rich_tables(tables), width), tables, strict=True):
+    tables = chosen_tables("all")
+    for (columns, _), table in zip(check(paper_rich_tables(tables), width), tables, strict=True):
         assert columns["Row"] == tuple(row.label for row in table.rows) and "Object MAE" in columns
 
 
@@ -116,7 +121,7 @@ def test_what_rows_are_sorted_by_is_never_left_out(groups, sort):
         "seconds_per_sample": "s/sample",
     }
     entries = [row.entry for row in groups[0].rows]
-    text = printed(leaderboard.group_tables(leaderboard.rank(entries, sort), sort), 80)
+    text = printed(group_tables(rank_files(entries, sort), sort), 80)
     assert titles[sort] in tables_in(text, 1 if " Rank " in text.split("┡")[0] else 0)[0][0]
 
 

@@ -7,9 +7,16 @@ import cv2
 import numpy as np
 import pytest
 
-from fpp_ml_bench.coding import SCHEMES, GrayCells, GrayOnly, Limits, PhaseShift, Reason, code_from_dict
+from fpp_ml_bench.coding.code import Limits, Reason
+from fpp_ml_bench.coding.gray_code import GrayCells, GrayOnly
+from fpp_ml_bench.coding.phase_shift import PhaseShift
+from fpp_ml_bench.coding.schemes import SCHEMES, code_from_dict
 from fpp_ml_bench.errors import DecodeError, RigError
-from fpp_ml_bench.optics import CodedSequence, Rig, load_rig, paper_rig, pattern_image, rig_from_dict, save_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.patterns import pattern_image
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.rig_file import load_rig, rig_from_dict, save_rig
+from fpp_ml_bench.optics.sequence import CodedSequence
 
 LENGTH = 912
 LIMITS = Limits()
@@ -83,7 +90,7 @@ def test_noise_is_what_the_code_says_and_no_order_slips(name):
 
 
 def test_the_papers_code_is_one_of_them_bit_for_bit(monkeypatch):
-    from fpp_ml_bench.decoding import decode_direction, plain_plan
+    from fpp_ml_bench.decoding.blocks import decode_direction, plain_plan
 
     rig = paper_rig(64)
     code, plan = rig.code("vertical"), plain_plan(rig, "vertical", None, LIMITS)

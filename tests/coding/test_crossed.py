@@ -3,21 +3,14 @@
 import numpy as np
 import pytest
 
-from fpp_ml_bench.coding import Crossed, crossed_from_pair
-from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.coding.crossed import Crossed, crossed_from_pair
+from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.errors import DecodeError, RigError
-from fpp_ml_bench.optics import (
-    CROSSED,
-    CodedSequence,
-    Rig,
-    crossed_rig,
-    load_rig,
-    paper_rig,
-    pattern_image,
-    pattern_profile,
-    rig_from_dict,
-    save_rig,
-)
+from fpp_ml_bench.optics.named_rigs import CROSSED, crossed_rig, paper_rig
+from fpp_ml_bench.optics.patterns import pattern_image, pattern_profile
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.rig_file import load_rig, rig_from_dict, save_rig
+from fpp_ml_bench.optics.sequence import CodedSequence
 
 FAMILY = {"pitches_px": [18, 14.5], "angles_deg": [30, 100], "weights": [0.6, 0.3], "shifts_deg": [[0, 0], [120, 45]]}
 

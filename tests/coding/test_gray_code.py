@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fpp_ml_bench.coding import wrapped_phase
 from fpp_ml_bench.coding.gray_code import (
     absolute_phase,
     binary_to_gray,
@@ -16,6 +15,7 @@ from fpp_ml_bench.coding.gray_code import (
     decode_cells,
     gray_to_binary,
 )
+from fpp_ml_bench.coding.phase_shift import wrapped_phase
 
 
 def test_code_is_the_reflected_code():

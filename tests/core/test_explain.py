@@ -9,8 +9,8 @@ from conftest import TINY_SIZE, file_bytes, tiny_settings
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli.evaluate import main as evaluate
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.loaders.render import explain_build
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.render.builder import explain_build
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.skipping import SWITCH, Explanation, LeftOut, explained, saved_by, skipping
 
 PIXELS = TINY_SIZE**2

@@ -4,7 +4,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from fpp_ml_bench.coding import minus_atan2
+from fpp_ml_bench.coding.phase_shift import minus_atan2
 from fpp_ml_bench.machine import NUMBA_SWITCH as SWITCH
 from fpp_ml_bench.portable import arctangent2, cosine_of_turns, power, sine_of_turns
 

@@ -12,19 +12,21 @@ from mutations import ODD, sealed_manifest, sources, tree_outcome
 from published_trees import make_tree
 from synthetic import assembly, make
 
-from fpp_ml_bench.baselines.training import DEPTH_NETWORKS
 from fpp_ml_bench.baselines.training import weights as weights_files
+from fpp_ml_bench.baselines.training.weights import DEPTH_NETWORKS
 from fpp_ml_bench.baselines.unfinished import UNFINISHED_FILE, Finished, UnfinishedRun
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import DatasetError, FppBenchError, LayoutError, RemoteError, RigError, SubmissionError
-from fpp_ml_bench.evaluation.result import read_result
+from fpp_ml_bench.evaluation.result.file import read_result
 from fpp_ml_bench.files import DEEPEST, MOST_NODES, MOST_VALUES, path_problem, read_json, strict_json, strict_yaml
 from fpp_ml_bench.loaders.captures.decoding import read_mask
-from fpp_ml_bench.loaders.published import plan_import
-from fpp_ml_bench.loaders.storage import DatasetFolder, assemble, verify
-from fpp_ml_bench.loaders.storage.assembly import planned_receipt
+from fpp_ml_bench.loaders.published.importing import plan_import
+from fpp_ml_bench.loaders.storage.assembly import assemble, planned_receipt
 from fpp_ml_bench.loaders.storage.manifest import read_manifest
-from fpp_ml_bench.optics import load_rig, read_opencv_calibration
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.loaders.storage.verification import verify
+from fpp_ml_bench.optics.opencv_files import read_opencv_calibration
+from fpp_ml_bench.optics.rig_file import load_rig
 from fpp_ml_bench.remote import RemoteFolder
 
 YAML = ("rig", "projection", "mesh list", "light", "recipe", "splits", "submission")

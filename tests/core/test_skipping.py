@@ -11,22 +11,18 @@ from conftest import TINY_SIZE, file_bytes, tiny_settings
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.run import captured_frames
-from fpp_ml_bench.coding import Limits, Reason
-from fpp_ml_bench.decoding import decode_stack
-from fpp_ml_bench.loaders.render import (
-    Exposure,
-    Lighting,
-    PatternLight,
-    PixelRays,
-    SolidMesh,
-    TracedObject,
-    build,
-    named_light,
-    place,
-)
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.coding.code import Limits, Reason
+from fpp_ml_bench.decoding.decode import decode_stack
+from fpp_ml_bench.loaders.render.builder import build
+from fpp_ml_bench.loaders.render.light import named_light
+from fpp_ml_bench.loaders.render.lighting import Lighting
+from fpp_ml_bench.loaders.render.projector import PatternLight
+from fpp_ml_bench.loaders.render.raycast import PixelRays, TracedObject
+from fpp_ml_bench.loaders.render.scene import SolidMesh, place
+from fpp_ml_bench.loaders.render.sensor import Exposure
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import NUMBA_SWITCH as COMPILED
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.skipping import SWITCH, skipping, skipping_enabled
 
 

@@ -7,17 +7,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fpp_ml_bench.baselines import load_method, training
-from fpp_ml_bench.baselines.crossed_network import CrossedRecipe, inputs, train_crossed_net
+from fpp_ml_bench.baselines import training
+from fpp_ml_bench.baselines.crossed_network import inputs
 from fpp_ml_bench.baselines.crossed_network.method import CrossedNetMethod
 from fpp_ml_bench.baselines.crossed_network.route import CrossedNetRoute, decided_mask, stated_rad
-from fpp_ml_bench.baselines.crossed_network.training import CrossedSample, Variation, sample_of
-from fpp_ml_bench.baselines.crossed_route import CrossedRoute
-from fpp_ml_bench.baselines.phase_network import IGNORED, Answers, load_net, threshold_at
+from fpp_ml_bench.baselines.crossed_network.training import (
+    CrossedRecipe,
+    CrossedSample,
+    Variation,
+    sample_of,
+    train_crossed_net,
+)
+from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute
+from fpp_ml_bench.baselines.phase_network.net_file import load_net
+from fpp_ml_bench.baselines.phase_network.odds import Answers, threshold_at
+from fpp_ml_bench.baselines.phase_network.windows import IGNORED
+from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import PredictionError, TrainingError, WeightsError
-from fpp_ml_bench.loaders.render import named_light
-from fpp_ml_bench.optics import crossed_rig, paper_rig
+from fpp_ml_bench.loaders.render.light import named_light
+from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
 
 SIZE = 240
 GROUPS = [

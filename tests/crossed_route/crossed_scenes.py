@@ -6,9 +6,10 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.crossed_route import CrossedRoute
-from fpp_ml_bench.coding import Crossed
-from fpp_ml_bench.optics import Rig, crossed_rig, paper_rig
+from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute
+from fpp_ml_bench.coding.crossed import Crossed
+from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
+from fpp_ml_bench.optics.rig import Rig
 
 SIZE = 320
 RIG = replace(crossed_rig(960), camera=crossed_rig(SIZE).camera)

@@ -8,14 +8,16 @@ from crossed_scenes import FAMILY, NO_PLANE, RIG, frame, route, slab
 from numpy.typing import NDArray
 from skimage.filters import gabor_kernel
 
-from fpp_ml_bench.baselines import load_method
-from fpp_ml_bench.baselines.crossed_route import Carriers, CrossedReason, CrossedRoute
+from fpp_ml_bench.baselines.crossed_route.carriers import Carriers
 from fpp_ml_bench.baselines.crossed_route.demodulation import POWERS, WINDOW_PERIODS, Demodulator, window_kernels
-from fpp_ml_bench.baselines.crossed_route.route import reaching
-from fpp_ml_bench.baselines.phase_route import wrapped
-from fpp_ml_bench.coding import Crossed, crossed_from_pair
+from fpp_ml_bench.baselines.crossed_route.observation import CrossedReason
+from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute, reaching
+from fpp_ml_bench.baselines.phase_route.calibration_layer import wrapped
+from fpp_ml_bench.baselines.registry import load_method
+from fpp_ml_bench.coding.crossed import Crossed, crossed_from_pair
 from fpp_ml_bench.errors import DecodeError, PredictionError
-from fpp_ml_bench.optics import Rig, paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig import Rig
 
 ANGLE = np.deg2rad(5.0)
 TURNED_RIG = replace(

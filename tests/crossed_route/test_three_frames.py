@@ -9,12 +9,19 @@ from crossed_scenes import FAMILY, NO_PLANE, RIG, frame, slab
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from fpp_ml_bench.baselines import load_method
-from fpp_ml_bench.baselines.crossed_route import CrossedMeasurement, ThreeFrameRoute
-from fpp_ml_bench.baselines.crossed_route.three_frames import continued, local_median, phase_noise_grey, same_plane_mean
-from fpp_ml_bench.coding import Crossed
+from fpp_ml_bench.baselines.crossed_route.observation import CrossedMeasurement
+from fpp_ml_bench.baselines.crossed_route.three_frames import (
+    ThreeFrameRoute,
+    continued,
+    local_median,
+    phase_noise_grey,
+    same_plane_mean,
+)
+from fpp_ml_bench.baselines.registry import load_method
+from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.errors import DecodeError, PredictionError
-from fpp_ml_bench.optics import Rig, crossed_rig, paper_rig
+from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
+from fpp_ml_bench.optics.rig import Rig
 
 WHOLE = crossed_rig(960)
 CUT = replace(WHOLE, camera=replace(WHOLE.camera, width=320, height=320, cx=159.5, cy=159.5))

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from captures import LENSES, PAPER, TURNED, capture, tilted
 
-from fpp_ml_bench.baselines.stability import coded_rig, plane_stack
-from fpp_ml_bench.coding import Limits, Reason
+from fpp_ml_bench.baselines.stability.frames import coded_rig, plane_stack
+from fpp_ml_bench.coding.code import Limits, Reason
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm, depth_noise_mm
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.machine import NUMBA_SWITCH, numba_enabled
-from fpp_ml_bench.optics import DIRECTIONS, rig_from_dict
+from fpp_ml_bench.optics.rig_file import rig_from_dict
+from fpp_ml_bench.optics.sequence import DIRECTIONS
 
 MODULATION = 0.45 * 127.5
 RIGS = pytest.mark.parametrize("rig", [PAPER, TURNED, LENSES], ids=["paper", "turned", "lenses"])

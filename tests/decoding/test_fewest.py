@@ -10,14 +10,17 @@ from flat_planes import DIRECT
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.coding import Limits
+from fpp_ml_bench.coding.code import Limits
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.fewest import fewest_steps, gray_levels_in_view, orders_from_phases
-from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
+from fpp_ml_bench.loaders.render.meshes import solid_mesh
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.sample import VOID, Flag
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import NUMBA_SWITCH as COMPILED
-from fpp_ml_bench.optics import DIRECTIONS, paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.sequence import DIRECTIONS
 
 COARSE = replace(
     PAPER, pitch_horizontal_px=36.0, pitch_vertical_px=40.0, sequence=replace(PAPER.sequence, steps=4)

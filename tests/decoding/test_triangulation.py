@@ -7,7 +7,10 @@ from scipy.optimize import least_squares
 
 from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate, depth_noise_mm
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.optics import Pinhole, Rig, Sequence, paper_rig, rotation_matrix
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.pinhole import Pinhole
+from fpp_ml_bench.optics.rig import Rig, rotation_matrix
+from fpp_ml_bench.optics.sequence import Sequence
 
 CAMERA_LENS, PROJECTOR_LENS = (-0.18, 0.09, 0.001, -0.002, -0.01), (0.07, -0.05, -0.001, 0.0015, 0.02)
 

@@ -3,7 +3,8 @@
 import pytest
 
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.optics import load_rig, paper_rig, rig_from_dict, save_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig_file import load_rig, rig_from_dict, save_rig
 
 
 def call(*arguments):

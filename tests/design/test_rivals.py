@@ -5,19 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fpp_ml_bench.coding import Crossed
-from fpp_ml_bench.design import (
-    Assumptions,
-    EpipolarLines,
-    background_distance,
-    describe,
-    draw_design,
-    rival_distance,
-    search,
-    wrong_order_rate,
-)
+from fpp_ml_bench.coding.crossed import Crossed
+from fpp_ml_bench.design.assumptions import Assumptions
+from fpp_ml_bench.design.rivals import EpipolarLines, background_distance, rival_distance, wrong_order_rate
+from fpp_ml_bench.design.search import describe, draw_design, search
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.optics import CROSSED, paper_rig
+from fpp_ml_bench.optics.named_rigs import CROSSED, paper_rig
 
 PAPER = paper_rig()
 TURNED = replace(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import tiny_settings
 
-from fpp_ml_bench.baselines.crossed_route import Carriers
+from fpp_ml_bench.baselines.crossed_route.carriers import Carriers
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import (
     LARGEST_SHIFT_RAD,
     chosen_samples,
@@ -24,9 +24,10 @@ from fpp_ml_bench.baselines.diagnostics.scene_renderer import (
     plane,
 )
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.loaders.render import build, named_light
-from fpp_ml_bench.loaders.storage import DatasetFolder
-from fpp_ml_bench.optics import crossed_rig, paper_rig
+from fpp_ml_bench.loaders.render.builder import build
+from fpp_ml_bench.loaders.render.light import named_light
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
 
 SAMPLE, OTHER = "power_drill_A0", "mug_A60"
 
@@ -110,7 +111,7 @@ def test_a_move_shifts_the_phase_and_keeps_outline_and_brightness(opened, render
 
 
 def test_a_moved_plane_keeps_its_law():
-    from fpp_ml_bench.optics import paper_rig
+    from fpp_ml_bench.optics.named_rigs import paper_rig
 
     rig = paper_rig(176)
     surface = plane(rig, 1.8, (15.0, -10.0))

@@ -15,8 +15,8 @@ from fpp_ml_bench.baselines.diagnostics.grad_cam import GradCam
 from fpp_ml_bench.baselines.diagnostics.linear import LinearProbing
 from fpp_ml_bench.baselines.diagnostics.probe import PROBES, Figure, Finding, ProbeSettings, Table, spread
 from fpp_ml_bench.baselines.diagnostics.subjects import subject
-from fpp_ml_bench.baselines.stability import U32
-from fpp_ml_bench.baselines.training import save_weights
+from fpp_ml_bench.baselines.stability.cases import U32
+from fpp_ml_bench.baselines.training.weights import save_weights
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError

@@ -21,7 +21,7 @@ from fpp_ml_bench.baselines.diagnostics.flat_plane import (
 from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, silent
 from fpp_ml_bench.baselines.diagnostics.subjects import subject_of_method
 from fpp_ml_bench.baselines.registry import load_method
-from fpp_ml_bench.baselines.stability import U32
+from fpp_ml_bench.baselines.stability.cases import U32
 
 
 def answering(dataset, answer, units="mm"):

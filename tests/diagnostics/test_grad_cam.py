@@ -23,7 +23,7 @@ from fpp_ml_bench.baselines.diagnostics.grad_cam import (
 )
 from fpp_ml_bench.baselines.diagnostics.probe import silent
 from fpp_ml_bench.baselines.diagnostics.subjects import randomised
-from fpp_ml_bench.baselines.stability import U32
+from fpp_ml_bench.baselines.stability.cases import U32
 from fpp_ml_bench.errors import DiagnosisError
 
 

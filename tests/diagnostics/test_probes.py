@@ -22,9 +22,9 @@ from fpp_ml_bench.baselines.diagnostics.fits import (
 )
 from fpp_ml_bench.baselines.diagnostics.grad_cam import fringe_variation
 from fpp_ml_bench.baselines.diagnostics.linear import CONTROLS, score
-from fpp_ml_bench.baselines.stability import U32
-from fpp_ml_bench.coding import wrapped_phase
-from fpp_ml_bench.decoding import depth_from_coordinate
+from fpp_ml_bench.baselines.stability.cases import U32
+from fpp_ml_bench.coding.phase_shift import wrapped_phase
+from fpp_ml_bench.decoding.triangulation import depth_from_coordinate
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
 

@@ -20,7 +20,7 @@ from fpp_ml_bench.baselines.diagnostics.counterfactual import (
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import SceneSet
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.evaluation.score import object_interval
+from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 
 
 def change(expected, actual, answered=True):

@@ -18,9 +18,9 @@ from fpp_ml_bench.baselines.diagnostics.theory import (
     kappa_per_m,
     twins_of,
 )
-from fpp_ml_bench.baselines.training import loss_function
+from fpp_ml_bench.baselines.training.losses import loss_function
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 
 @pytest.mark.parametrize("direction, other_frame", [("horizontal", 18), ("vertical", 0)])

@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 from captures import capture, tilted
 
-from fpp_ml_bench.examination import examine
-from fpp_ml_bench.loaders.render import BuildSettings, Studio, named_light, solid_mesh
-from fpp_ml_bench.optics import paper_rig, rig_from_dict
+from fpp_ml_bench.examination.examine import examine
+from fpp_ml_bench.loaders.render.light import named_light
+from fpp_ml_bench.loaders.render.meshes import solid_mesh
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.render.view import Studio
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig_file import rig_from_dict
 
 SIZE = 200
 FOUR = {"scheme": "phase-shift", "pitch_px": 57, "steps": 4, "gray": {}}

@@ -11,7 +11,7 @@ from scored_dataset import make_dataset
 
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE
-from fpp_ml_bench.evaluation.result import Timing
+from fpp_ml_bench.evaluation.result.parts import Timing
 from fpp_ml_bench.leaderboard import columns, rows
 from fpp_ml_bench.leaderboard.data_files import table_csv
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows

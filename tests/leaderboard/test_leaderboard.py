@@ -10,8 +10,8 @@ from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli.evaluate import main as evaluate_main
-from fpp_ml_bench.evaluation.result import write_result
-from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.evaluation.result.file import write_result
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.leaderboard import ranking, rows
 from fpp_ml_bench.leaderboard.names import cut_at_word
 from fpp_ml_bench.leaderboard.reported import SHOWN_BY_DEFAULT, paper_tables

@@ -17,8 +17,8 @@ from scored_dataset import make_dataset
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, Track
-from fpp_ml_bench.evaluation.score import sign_flip_bounds, sign_flip_p
-from fpp_ml_bench.evaluation.submission import LearnedFrom, Submission
+from fpp_ml_bench.evaluation.score.uncertainty import sign_flip_bounds, sign_flip_p
+from fpp_ml_bench.evaluation.submission.description import LearnedFrom, Submission
 from fpp_ml_bench.leaderboard.assumptions import learned_from, told
 from fpp_ml_bench.leaderboard.columns import columns, uncertainty
 from fpp_ml_bench.leaderboard.data_files import table_json

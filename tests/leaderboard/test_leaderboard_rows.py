@@ -15,9 +15,9 @@ from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli.evaluate import main as fpp_eval
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
-from fpp_ml_bench.evaluation.result import read_result
+from fpp_ml_bench.evaluation.result.file import read_result
 from fpp_ml_bench.leaderboard import columns, rows
-from fpp_ml_bench.leaderboard.page import page_files
+from fpp_ml_bench.leaderboard.page.page import page_files
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.row_file import (
     LARGEST_ROW_BYTES,

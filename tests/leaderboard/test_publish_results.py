@@ -14,11 +14,11 @@ from publishing import SIZE, listed, running_hub
 from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.errors import PublishError
-from fpp_ml_bench.evaluation.result import write_result
-from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.evaluation.result.file import write_result
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.leaderboard.publish import score
 from fpp_ml_bench.loaders.hub import Change, Publication, Remote, changes, check_repo_name
-from fpp_ml_bench.loaders.storage import preview
+from fpp_ml_bench.loaders.storage.parquet import preview
 
 HOSTILE = "</script>: [*x]({y}) | `z` - !!python/object:os.system"
 

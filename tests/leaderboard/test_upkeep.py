@@ -15,7 +15,7 @@ from upkeep import SHOWN, readme_block
 from fpp_ml_bench.cli import BENCH
 from fpp_ml_bench.cli.robustness import Scenes
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.result import Robustness, SeverityScores
+from fpp_ml_bench.evaluation.result.parts import Robustness, SeverityScores
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, check_same_method, read_entry
 

@@ -8,11 +8,16 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.coding import Reason
-from fpp_ml_bench.decoding import coordinate_slope_px_per_mm, decode_stack, depth_sigma_mm, noise_of_frames
-from fpp_ml_bench.loaders.captures import CapturedFrames, decode_capture
-from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
-from fpp_ml_bench.optics import load_rig, paper_rig, rig_from_dict, save_rig
+from fpp_ml_bench.coding.code import Reason
+from fpp_ml_bench.decoding.decode import decode_stack
+from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm, depth_sigma_mm, noise_of_frames
+from fpp_ml_bench.loaders.captures.decoding import decode_capture
+from fpp_ml_bench.loaders.captures.images import CapturedFrames
+from fpp_ml_bench.loaders.render.meshes import solid_mesh
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.render.view import Studio
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig_file import load_rig, rig_from_dict, save_rig
 
 SIZE = 120
 
@@ -255,8 +260,7 @@ def test_a_projector_that_is_not_described_is_a_sentence(tmp_path, capsys, text,
 
 
 def test_a_rig_file_may_name_a_calibration_by_opencv(tmp_path):
-    from fpp_ml_bench.optics import read_opencv_calibration, write_opencv_calibration
-    from fpp_ml_bench.optics.opencv_files import OpenCvCalibration
+    from fpp_ml_bench.optics.opencv_files import OpenCvCalibration, read_opencv_calibration, write_opencv_calibration
 
     rig = vertical_rig({"scheme": "gray", "cell_px": 2})
     write_opencv_calibration(

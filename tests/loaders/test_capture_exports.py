@@ -11,8 +11,8 @@ import trimesh
 from PIL import Image
 
 from fpp_ml_bench.errors import CaptureError
-from fpp_ml_bench.loaders.captures import check_outputs, clear_outputs, export_capture, pixel_normals, triangles
-from fpp_ml_bench.optics import Pinhole
+from fpp_ml_bench.loaders.captures.exports import check_outputs, clear_outputs, export_capture, pixel_normals, triangles
+from fpp_ml_bench.optics.pinhole import Pinhole
 
 CAMERA = Pinhole(64, 48, 90.0, 92.0, 30.3, 24.1, (-0.05, 0.01, 0.001, -0.001, 0.0))
 X, Y = CAMERA.rays()

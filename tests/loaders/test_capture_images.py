@@ -10,7 +10,7 @@ import pytest
 from PIL import Image, ImageOps
 
 from fpp_ml_bench.errors import CaptureError
-from fpp_ml_bench.loaders.captures import frame_files, read_frames
+from fpp_ml_bench.loaders.captures.images import frame_files, read_frames
 
 RNG = np.random.default_rng(1)
 GREY = RNG.integers(0, 256, (3, 30, 41), np.uint8)

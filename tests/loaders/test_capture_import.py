@@ -15,13 +15,18 @@ from conftest import file_bytes
 from fpp_ml_bench import load_dataset
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli.evaluate import main as evaluate
-from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.loaders.captures import Splits, import_captures, plan_captures
-from fpp_ml_bench.loaders.captures.decoding import CaptureReader
-from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
-from fpp_ml_bench.loaders.storage import DatasetFolder, plan_rows, verify
-from fpp_ml_bench.optics import paper_rig, rig_from_dict, save_rig
+from fpp_ml_bench.loaders.captures.decoding import CaptureReader, import_captures, plan_captures
+from fpp_ml_bench.loaders.captures.images import Splits
+from fpp_ml_bench.loaders.render.meshes import solid_mesh
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.render.view import Studio
+from fpp_ml_bench.loaders.storage.shards import plan_rows
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.loaders.storage.verification import verify
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig_file import rig_from_dict, save_rig
 
 UNIT_CUE = {"scheme": "phase-shift", "pitches_px": [57, 912], "steps": 3, "sign": -1}
 

@@ -10,10 +10,12 @@ from torch.utils.data import DataLoader
 
 from fpp_ml_bench.constants import FULL_SIZE, OBJECTS
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.loaders.render import BuildSettings, build, plan_build
+from fpp_ml_bench.loaders.render.builder import build, plan_build
+from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.training import FringeDepthDataset, unit_range
 from fpp_ml_bench.machine import NUMBA_SWITCH as SWITCH
-from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
 
 def paper(depth_mm, name, counted=True):

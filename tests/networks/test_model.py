@@ -11,7 +11,7 @@ from tiny_network import config_of, rounding_error, tiny_network
 
 from fpp_ml_bench import baselines
 from fpp_ml_bench.baselines.networks.model import load
-from fpp_ml_bench.baselines.training import save_weights
+from fpp_ml_bench.baselines.training.weights import save_weights
 from fpp_ml_bench.errors import PredictionError, WeightsError
 
 SIZE = (32, 48)

@@ -13,13 +13,13 @@ from fpp_ml_bench.baselines.networks.model import fringe_batch, load
 from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
 from fpp_ml_bench.baselines.networks.range_heads import fit_heads
 from fpp_ml_bench.baselines.run import captured_frames, predict_split
-from fpp_ml_bench.baselines.training import save_weights
+from fpp_ml_bench.baselines.training.weights import save_weights
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli.evaluate import main as fpp_eval
 from fpp_ml_bench.errors import DatasetError, PredictionError, PublishError
-from fpp_ml_bench.evaluation.result import read_result, result_json, write_result
-from fpp_ml_bench.evaluation.score import differences, evaluate
-from fpp_ml_bench.evaluation.submission import Submission, read_submission
+from fpp_ml_bench.evaluation.result.file import read_result, result_json, write_result
+from fpp_ml_bench.evaluation.score.evaluator import differences, evaluate
+from fpp_ml_bench.evaluation.submission.description import Submission, read_submission
 from fpp_ml_bench.leaderboard.publish import task_of
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.loaders.training import FringeDepthDataset

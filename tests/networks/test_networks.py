@@ -9,8 +9,8 @@ import torch
 from tiny_network import SMALL, one_thread, rounding_error  # noqa: F401
 from torch import nn
 
-from fpp_ml_bench.baselines.networks import NETWORKS, build, discriminator
 from fpp_ml_bench.baselines.networks.base import parameter_count
+from fpp_ml_bench.baselines.networks.model import NETWORKS, build, discriminator
 from fpp_ml_bench.errors import NetworkError
 
 SIZE = 64

@@ -6,8 +6,15 @@ from tiny_network import SMALL, one_thread  # noqa: F401
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.networks import NETWORKS, build, trains_channels_last
-from fpp_ml_bench.baselines.networks.base import Attention, DoubleConvolution, DropPath, InstanceNorm, Join
+from fpp_ml_bench.baselines.networks.base import (
+    Attention,
+    DoubleConvolution,
+    DropPath,
+    InstanceNorm,
+    Join,
+    trains_channels_last,
+)
+from fpp_ml_bench.baselines.networks.model import NETWORKS, build
 
 
 @pytest.fixture(autouse=True)

@@ -9,8 +9,7 @@ import pytest
 import torch
 from tiny_network import SMALL, one_thread, rounding_error  # noqa: F401
 
-from fpp_ml_bench.baselines.networks import NETWORKS, build
-from fpp_ml_bench.baselines.networks.model import INPUT, OUTPUT, export_onnx
+from fpp_ml_bench.baselines.networks.model import INPUT, NETWORKS, OUTPUT, build, export_onnx
 from fpp_ml_bench.errors import FppBenchError, NetworkError
 
 

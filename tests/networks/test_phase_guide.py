@@ -5,12 +5,12 @@ import pytest
 import torch
 from tiny_network import one_thread  # noqa: F401
 
-from fpp_ml_bench.baselines.networks import PhaseGuide, build, re_projection_loss
-from fpp_ml_bench.baselines.networks.unet import GUIDED_CHANNELS, ORDERS
-from fpp_ml_bench.baselines.phase_route import TAU, CalibrationLayer
-from fpp_ml_bench.baselines.stability import U32
+from fpp_ml_bench.baselines.networks.model import build
+from fpp_ml_bench.baselines.networks.unet import GUIDED_CHANNELS, ORDERS, PhaseGuide, re_projection_loss
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.stability.cases import U32
 from fpp_ml_bench.errors import NetworkError
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 SIZE = 224
 

@@ -7,16 +7,9 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.optics import (
-    Pinhole,
-    distort,
-    distortion_polynomial,
-    fold_radius_squared,
-    load_rig,
-    paper_rig,
-    save_rig,
-    undistort,
-)
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.pinhole import Pinhole, distort, distortion_polynomial, fold_radius_squared, undistort
+from fpp_ml_bench.optics.rig_file import load_rig, save_rig
 
 SPREAD = np.array([0.2, 0.06, 0.003, 0.003, 0.02, 0.1, 0.05, 0.02, 0.003, 0.003, 0.003, 0.003, 0.1, 0.1])
 COUNTS = (4, 5, 8, 12, 14)

@@ -9,13 +9,9 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.optics import (
-    OpenCvCalibration,
-    Pinhole,
-    opencv_files,
-    read_opencv_calibration,
-    write_opencv_calibration,
-)
+from fpp_ml_bench.optics import opencv_files
+from fpp_ml_bench.optics.opencv_files import OpenCvCalibration, read_opencv_calibration, write_opencv_calibration
+from fpp_ml_bench.optics.pinhole import Pinhole
 
 CAMERA = Pinhole(640, 480, 800.1, 801.7, 319.3, 241.9, (-0.1, 0.02, 0.001, -0.002, 0.01))
 PROJECTOR = Pinhole(912, 1140, 1500.5, 1501.25, 455.5, 1100.0, (0.1, 0.0, 0.0, 0.0, 0.0, 0.2, 0.01, -0.01))

@@ -6,8 +6,10 @@ import pytest
 
 from fpp_ml_bench.coding.gray_code import cell_count
 from fpp_ml_bench.errors import FppBenchError, RigError
-from fpp_ml_bench.optics import Pinhole, Rig, paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.patterns import export_patterns, pattern_image, pattern_profile, pattern_profiles
+from fpp_ml_bench.optics.pinhole import Pinhole
+from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Sequence
 
 SMALL = Rig(

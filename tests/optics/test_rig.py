@@ -11,20 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.optics import (
-    OpenCvCalibration,
-    Pinhole,
-    Rig,
-    check_lengths,
-    load_rig,
-    paper_rig,
-    rig_from_dict,
-    rotation_matrix,
-    save_rig,
-    write_opencv_calibration,
-)
-from fpp_ml_bench.optics.pinhole import distort, fold_radius_squared, undistort
-from fpp_ml_bench.optics.rig_file import _depth_share_of_px
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.opencv_files import OpenCvCalibration, write_opencv_calibration
+from fpp_ml_bench.optics.pinhole import Pinhole, distort, fold_radius_squared, undistort
+from fpp_ml_bench.optics.rig import Rig, rotation_matrix
+from fpp_ml_bench.optics.rig_file import _depth_share_of_px, check_lengths, load_rig, rig_from_dict, save_rig
 from fpp_ml_bench.optics.sequence import Sequence
 
 DISTORTION = (-0.21, 0.11, 0.0013, -0.0021, -0.02)

@@ -14,10 +14,10 @@ from matplotlib.transforms import Bbox
 from scored_dataset import make_dataset
 
 from fpp_ml_bench import leaderboard
-from fpp_ml_bench.baselines.tradeoff import Mark, Scatter, pareto_front
-from fpp_ml_bench.baselines.tradeoff.drawing import free_box
+from fpp_ml_bench.baselines.tradeoff.drawing import Mark, Scatter, free_box
+from fpp_ml_bench.baselines.tradeoff.measure import pareto_front
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.evaluation.report import escaped, page
+from fpp_ml_bench.evaluation.report.html import escaped, page
 from fpp_ml_bench.leaderboard.page.page import page_files, slug
 from fpp_ml_bench.leaderboard.page.pictures import overview
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries

@@ -12,10 +12,12 @@ from fpp_ml_bench.baselines.phase_network.method import PhaseNetMethod
 from fpp_ml_bench.baselines.phase_network.net_file import load_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.route import NetworkRoute
-from fpp_ml_bench.baselines.phase_route import TAU, Reason, Settings
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
+from fpp_ml_bench.baselines.phase_route.observation import Reason, Settings
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.errors import DecodeError, NetworkError, PredictionError
-from fpp_ml_bench.optics import Rig, paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig import Rig
 
 
 def part_of(rig: Rig, size: int) -> Rig:

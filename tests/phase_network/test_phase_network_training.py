@@ -11,7 +11,7 @@ import pytest
 import torch
 from flat_planes import DIRECT, USERS_WORD, plane_depth_m, plane_fringe
 
-from fpp_ml_bench.baselines import load_method, training
+from fpp_ml_bench.baselines import training
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, Geometry, Rotation
 from fpp_ml_bench.baselines.phase_network.net_file import load_net, save_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
@@ -24,11 +24,14 @@ from fpp_ml_bench.baselines.phase_network.training import (
     train_phase_net,
 )
 from fpp_ml_bench.baselines.phase_network.window_training import WindowTraining
-from fpp_ml_bench.baselines.phase_route import Settings
-from fpp_ml_bench.baselines.training import CHECKPOINT, SHIPPED, Group, NetConfig, View, read_views, reproducible
+from fpp_ml_bench.baselines.phase_route.observation import Settings
+from fpp_ml_bench.baselines.registry import load_method
+from fpp_ml_bench.baselines.training.engine import CHECKPOINT, reproducible
+from fpp_ml_bench.baselines.training.views import Group, View, read_views
+from fpp_ml_bench.baselines.training.weights import SHIPPED, NetConfig
 from fpp_ml_bench.errors import RecipeError, TrainingError, WeightsError
-from fpp_ml_bench.loaders.render import named_light
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.loaders.render.light import named_light
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 RIG = paper_rig(240)
 AS_CAPTURED = Variation(near_edge=0, shift=0, wrong_window=0, wrong_patch=0, mirror=0, brightness=0)

@@ -17,13 +17,15 @@ from fpp_ml_bench.baselines.phase_route.method import FewestFrames, PhaseMethod,
 from fpp_ml_bench.baselines.phase_route.several_frames import steps_of
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.run import predict_split
-from fpp_ml_bench.decoding import depth_noise_mm
+from fpp_ml_bench.decoding.triangulation import depth_noise_mm
 from fpp_ml_bench.errors import DecodeError, PredictionError
-from fpp_ml_bench.evaluation.score import evaluate
-from fpp_ml_bench.evaluation.submission import REPORTS_FILE, read_submission
-from fpp_ml_bench.loaders.render import Exposure, camera_noise, light_surface
-from fpp_ml_bench.loaders.storage import DatasetFolder
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.evaluation.submission.description import read_submission
+from fpp_ml_bench.evaluation.submission.prediction_files import REPORTS_FILE
+from fpp_ml_bench.loaders.render.illumination import light_surface
+from fpp_ml_bench.loaders.render.sensor import Exposure, camera_noise
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 SIZE = 480
 RIG = paper_rig(SIZE)

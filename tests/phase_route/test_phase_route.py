@@ -15,11 +15,12 @@ from fpp_ml_bench.baselines.phase_route.observation import Reason, Settings
 from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.decoding import depth_noise_mm
+from fpp_ml_bench.decoding.triangulation import depth_noise_mm
 from fpp_ml_bench.errors import DecodeError, PredictionError
-from fpp_ml_bench.evaluation.submission import read_submission
-from fpp_ml_bench.loaders.render import BuildSettings, build
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.evaluation.submission.description import read_submission
+from fpp_ml_bench.loaders.render.builder import build
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.optics.rig import Rig
 
 SIZE = RIG.camera.width
 ANGLE = np.deg2rad(5.0)

@@ -8,10 +8,12 @@ import pytest
 import torch
 
 from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
-from fpp_ml_bench.decoding import decode_stack, depth_from_coordinate
+from fpp_ml_bench.decoding.decode import decode_stack
+from fpp_ml_bench.decoding.triangulation import depth_from_coordinate
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.loaders.storage import DatasetFolder
-from fpp_ml_bench.optics import Rig, paper_rig
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig import Rig
 
 SIZE = 96
 

@@ -10,12 +10,18 @@ import pytest
 from flat_planes import RIG, photograph, plane_depth_m, plane_fringe
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route import Periods, PhaseMethod, PhaseRoute, Reason, Settings
+from fpp_ml_bench.baselines.phase_route.method import PhaseMethod
+from fpp_ml_bench.baselines.phase_route.observation import Reason, Settings
+from fpp_ml_bench.baselines.phase_route.resampling import Periods
+from fpp_ml_bench.baselines.phase_route.route import PhaseRoute
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import CaptureError
-from fpp_ml_bench.loaders.render import BuildSettings, build
-from fpp_ml_bench.optics import Rig, paper_rig, rig_from_dict
+from fpp_ml_bench.loaders.render.builder import build
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.rig_file import rig_from_dict
 
 SMALL = paper_rig(240)
 NARROW = replace(SMALL, working_range_mm=(1600.0, 2000.0))

@@ -7,12 +7,17 @@ import numpy as np
 import pytest
 from published_trees import command, make_tree
 
-from fpp_ml_bench.calibration import fit_projector
+from fpp_ml_bench.calibration.from_depth import fit_projector
 from fpp_ml_bench.errors import CalibrationError, LayoutError
-from fpp_ml_bench.loaders.published import depth_difference_mm, export, plan_import, tree_views
-from fpp_ml_bench.loaders.render import BuildSettings, build
-from fpp_ml_bench.loaders.storage import DatasetFolder
-from fpp_ml_bench.optics import Pinhole, load_rig, paper_rig, rotation_matrix, save_rig
+from fpp_ml_bench.loaders.published.exporting import export
+from fpp_ml_bench.loaders.published.importing import depth_difference_mm, plan_import, tree_views
+from fpp_ml_bench.loaders.render.builder import build
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.pinhole import Pinhole
+from fpp_ml_bench.optics.rig import rotation_matrix
+from fpp_ml_bench.optics.rig_file import load_rig, save_rig
 
 SIZE = 128
 HIDDEN = replace(

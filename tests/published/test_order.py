@@ -7,7 +7,8 @@ import pytest
 
 from fpp_ml_bench.errors import LayoutError
 from fpp_ml_bench.loaders.published.order import FrameOrder, all_orders, check_order, find_order, parse_order
-from fpp_ml_bench.optics import PAPER_SEQUENCE, Sequence, paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE, Sequence
 
 PAPER = FrameOrder()
 

@@ -26,7 +26,8 @@ from published_trees import (
 
 from fpp_ml_bench.errors import BuildError, LayoutError, RigError
 from fpp_ml_bench.loaders.published.importing import plan_import
-from fpp_ml_bench.optics import paper_rig, save_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig_file import save_rig
 
 ALL_VARIANTS = ("raw", "global", "individual")
 

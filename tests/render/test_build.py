@@ -26,8 +26,10 @@ from fpp_ml_bench.loaders.render.meshes import single_mesh
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.sensor import camera_noise
 from fpp_ml_bench.loaders.sample import Row, available_configs, stored_frames, stored_groups
-from fpp_ml_bench.loaders.storage import DatasetFolder, ShardWriter, plan_shards
-from fpp_ml_bench.optics import PAPER_SEQUENCE, paper_rig
+from fpp_ml_bench.loaders.storage.shards import ShardWriter, plan_shards
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
 PAPER = named_light("paper")
 NOISY = PAPER.changed("camera", **camera_noise(2.0))

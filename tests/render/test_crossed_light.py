@@ -7,15 +7,17 @@ import pytest
 from rendering import DIRECT, PAPER, RIG, kept, studio
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from fpp_ml_bench.coding import Crossed
+from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.constants import VIEWS
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.render.meshes import solid_mesh
 from fpp_ml_bench.loaders.render.projector import PatternLight, defocus_variance_px2, response_table
 from fpp_ml_bench.loaders.render.scene import BuildSettings, preset_settings
-from fpp_ml_bench.loaders.storage import DatasetFolder, verify
-from fpp_ml_bench.optics import CROSSED, CodedSequence, Sequence, crossed_rig, paper_rig
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.loaders.storage.verification import verify
+from fpp_ml_bench.optics.named_rigs import CROSSED, crossed_rig, paper_rig
+from fpp_ml_bench.optics.sequence import CodedSequence, Sequence
 
 SHORT = replace(RIG, sequence=Sequence(steps=3))
 

@@ -7,13 +7,17 @@ import numpy as np
 import pytest
 from conftest import TINY_SIZE, tiny_settings
 
-from fpp_ml_bench.calibration import volume_error_mm
+from fpp_ml_bench.calibration.result import volume_error_mm
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.errors import BuildError, CalibrationError
-from fpp_ml_bench.loaders.render import BuildSettings, assembly_of, build
-from fpp_ml_bench.loaders.storage import DatasetFolder, verify
-from fpp_ml_bench.optics import Sequence, paper_rig, save_rig
+from fpp_ml_bench.loaders.render.builder import assembly_of, build
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.loaders.storage.verification import verify
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig_file import save_rig
+from fpp_ml_bench.optics.sequence import Sequence
 
 TRUE = paper_rig(TINY_SIZE)
 FOUND = replace(

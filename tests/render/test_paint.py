@@ -16,7 +16,7 @@ from fpp_ml_bench.loaders.render.scene import BuildSettings, UserMesh
 from fpp_ml_bench.loaders.render.surfels import Surfels
 from fpp_ml_bench.loaders.render.textures import material_of
 from fpp_ml_bench.loaders.render.view import Studio
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 GREY = 188  # of which 0.503 is left in linear light
 LINEAR_GREY = ((GREY / 255 + 0.055) / 1.055) ** 2.4

@@ -9,16 +9,23 @@ import pytest
 from conftest import file_bytes
 from rendering import PAPER
 
-from fpp_ml_bench.calibration import Board, parse_board
+from fpp_ml_bench.calibration.boards import Board, parse_board
 from fpp_ml_bench.errors import BuildError, CalibrationError, CaptureError
 from fpp_ml_bench.files import strict_yaml
-from fpp_ml_bench.loaders.captures import read_frames
-from fpp_ml_bench.loaders.render.boards import PAPER_BOARD, BoardPose, board_poses, fitting_board, photograph_board
-from fpp_ml_bench.loaders.render.boards.captures import board_frames, board_studio
-from fpp_ml_bench.loaders.render.boards.poses import sheet_corners_mm
+from fpp_ml_bench.loaders.captures.images import read_frames
+from fpp_ml_bench.loaders.render.boards.captures import board_frames, board_studio, photograph_board
+from fpp_ml_bench.loaders.render.boards.poses import (
+    PAPER_BOARD,
+    BoardPose,
+    board_poses,
+    fitting_board,
+    sheet_corners_mm,
+)
 from fpp_ml_bench.loaders.render.boards.sheet import DARK, board_view, dark_share
 from fpp_ml_bench.loaders.render.light import named_light
-from fpp_ml_bench.optics import Sequence, load_rig, paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig_file import load_rig
+from fpp_ml_bench.optics.sequence import Sequence
 
 RIG = replace(paper_rig(240), sequence=Sequence(steps=3))
 BENT = replace(RIG, camera=replace(RIG.camera, distortion=(-0.3, 0.1, 0.004, -0.003, 0.0)))

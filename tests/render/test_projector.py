@@ -17,7 +17,8 @@ from fpp_ml_bench.loaders.render.projector import (
     response_table,
 )
 from fpp_ml_bench.loaders.render.scene import BuildSettings
-from fpp_ml_bench.optics import Sequence, pattern_profiles
+from fpp_ml_bench.optics.patterns import pattern_profiles
+from fpp_ml_bench.optics.sequence import Sequence
 
 SMALL = replace(RIG, sequence=Sequence(steps=3))
 """Fewer frames, the same patterns."""

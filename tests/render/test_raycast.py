@@ -9,7 +9,7 @@ import trimesh
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.loaders.render.raycast import PixelRays, TracedObject
 from fpp_ml_bench.loaders.render.scene import SolidMesh
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 RIG = paper_rig(176)
 RAYS = PixelRays.of(RIG.camera)

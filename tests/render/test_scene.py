@@ -18,7 +18,7 @@ from fpp_ml_bench.loaders.render.scene import (
     place,
     turned,
 )
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 RIG = paper_rig(176)
 

@@ -26,7 +26,8 @@ from fpp_ml_bench.loaders.render.sensor import (
     standard_normal,
     stream_keys,
 )
-from fpp_ml_bench.optics import Sequence, pattern_image
+from fpp_ml_bench.optics.patterns import pattern_image
+from fpp_ml_bench.optics.sequence import Sequence
 
 SIZE = 960
 PIXELS = np.arange(SIZE * SIZE, dtype=np.uint32)

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from fpp_ml_bench.loaders.render import Hits, SolidMesh, TracedObject
 from fpp_ml_bench.loaders.render.bounces import at_points
 from fpp_ml_bench.loaders.render.pixels import mixed_pixels
-from fpp_ml_bench.loaders.render.raycast import PixelRays
+from fpp_ml_bench.loaders.render.raycast import Hits, PixelRays, TracedObject
+from fpp_ml_bench.loaders.render.scene import SolidMesh
 from fpp_ml_bench.loaders.render.surfels import place_surfels
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 SQUARE = np.array([[0.0, 0.0, 0.0], [0.4, 0.0, 0.0], [0.4, 0.4, 0.0], [0.0, 0.4, 0.0]])
 UP = np.array([[0, 1, 2], [0, 2, 3]])

@@ -8,7 +8,7 @@ import trimesh
 from rendering import CENTRE, DIRECT, PAPER, RIG, X, Y, kept, sheet, solid, studio
 from scipy import stats
 
-from fpp_ml_bench.decoding import decode_stack
+from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.depth import edge_distance_px, object_mask
 from fpp_ml_bench.loaders.render import lighting, view
 from fpp_ml_bench.loaders.render.light import named_light
@@ -18,7 +18,8 @@ from fpp_ml_bench.loaders.render.sensor import camera_noise
 from fpp_ml_bench.loaders.render.view import Studio, ground_truth_error
 from fpp_ml_bench.loaders.sample import WEAK_GREY, Flag
 from fpp_ml_bench.machine import NUMBA_SWITCH as SWITCH
-from fpp_ml_bench.optics import Sequence, crossed_rig
+from fpp_ml_bench.optics.named_rigs import crossed_rig
+from fpp_ml_bench.optics.sequence import Sequence
 from fpp_ml_bench.skipping import skipping
 
 BALL = solid(trimesh.creation.icosphere(3, 0.12))

@@ -24,7 +24,7 @@ from fpp_ml_bench.evaluation.report.figures import (
     sample_panels,
 )
 from fpp_ml_bench.evaluation.report.report_page import chosen_samples, write_report
-from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.networks import build
+from fpp_ml_bench.baselines.networks.model import build
 from fpp_ml_bench.baselines.reproduce import plan, scoring, work
 from fpp_ml_bench.baselines.reproduce.scoring import (
     SPLIT,
@@ -19,15 +19,19 @@ from fpp_ml_bench.baselines.reproduce.scoring import (
     score_all_frames,
 )
 from fpp_ml_bench.baselines.timing import time_method
-from fpp_ml_bench.baselines.training import claim_folder, depth_training, load_recipe, model_config, save_weights
+from fpp_ml_bench.baselines.training import depth_training
+from fpp_ml_bench.baselines.training.depth_training import model_config
+from fpp_ml_bench.baselines.training.engine import claim_folder
+from fpp_ml_bench.baselines.training.recipe import load_recipe
+from fpp_ml_bench.baselines.training.weights import save_weights
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli.evaluate import main as fpp_eval
 from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError
-from fpp_ml_bench.evaluation.result import read_result, write_json
-from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.evaluation.result.file import read_result, write_json
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.leaderboard.rows import read_entry
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 TABLE = "normalization"
 ABOUT = {"recipe": "r", "weights_sha256": 64 * "a"}

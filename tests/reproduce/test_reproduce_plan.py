@@ -9,13 +9,14 @@ import pytest
 from board_rows import HARDWARE
 from scored_dataset import make_dataset, write_predictions
 
-from fpp_ml_bench.baselines.reproduce import Folders, plan, planned, variants
-from fpp_ml_bench.baselines.reproduce.plan import default_folder, open_dataset
-from fpp_ml_bench.baselines.training import PRESETS, TABLES, load_recipe
+from fpp_ml_bench.baselines.reproduce import plan
+from fpp_ml_bench.baselines.reproduce.plan import Folders, default_folder, open_dataset, planned, variants
+from fpp_ml_bench.baselines.training.recipe import load_recipe
+from fpp_ml_bench.baselines.training.tables import PRESETS, TABLES
 from fpp_ml_bench.cli import train as command
 from fpp_ml_bench.errors import DatasetError, RecipeError
-from fpp_ml_bench.evaluation.report import compare
-from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.evaluation.report.comparison import compare
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.leaderboard.reported import paper_tables
 from fpp_ml_bench.leaderboard.reproduced import (
     Line,

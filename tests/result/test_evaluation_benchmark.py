@@ -11,12 +11,16 @@ from scored_dataset import make_dataset, name_benchmarks, write_predictions
 
 from fpp_ml_bench.cli.evaluate import main
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.result import model, read_result, result_from_rows, result_json, write_result
-from fpp_ml_bench.evaluation.score import ErrorStats, combine, evaluate
-from fpp_ml_bench.loaders.render import build
+from fpp_ml_bench.evaluation.result import model
+from fpp_ml_bench.evaluation.result.file import read_result, result_json, write_result
+from fpp_ml_bench.evaluation.result.model import result_from_rows
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats, combine
+from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.sample import column_hash, image_hash
-from fpp_ml_bench.loaders.storage import Benchmark, DatasetFolder
 from fpp_ml_bench.loaders.storage import benchmark as benchmarks
+from fpp_ml_bench.loaders.storage.benchmark import Benchmark
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 OTHER = {"test/depth": "e" * 32, "test/flags": "e" * 32}
 

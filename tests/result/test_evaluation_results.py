@@ -13,10 +13,10 @@ from fpp_ml_bench import machine as hardware
 from fpp_ml_bench.cli.evaluate import main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
-from fpp_ml_bench.evaluation.result import read_result, write_result
-from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.evaluation.result.file import read_result, write_result
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.loaders.sample import column_hash
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 
 @pytest.fixture(scope="module")

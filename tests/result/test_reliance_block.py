@@ -10,15 +10,9 @@ from upkeep import readme_block
 
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.result import (
-    PART_TITLES,
-    Reliance,
-    RelianceParts,
-    json_schema,
-    read_result,
-    result_json,
-)
-from fpp_ml_bench.leaderboard.page import page_files
+from fpp_ml_bench.evaluation.result.file import json_schema, read_result, result_json
+from fpp_ml_bench.evaluation.result.parts import PART_TITLES, Reliance, RelianceParts
+from fpp_ml_bench.leaderboard.page.page import page_files
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_reliance
 
@@ -135,7 +129,7 @@ def test_it_belongs_to_the_very_method_that_was_scored(file):
 
 
 def test_the_command_measures_and_writes(tiny, tmp_path, capsys, dataset):
-    from fpp_ml_bench.loaders.storage import DatasetFolder
+    from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
     opened = DatasetFolder(tiny)
     used = [*opened.sequence.sinusoids("horizontal")[::6], *opened.sequence.gray("horizontal")]

@@ -7,29 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fpp_ml_bench.baselines import ConstantMethod
 from fpp_ml_bench.baselines.method import Answer, Method
-from fpp_ml_bench.baselines.robustness import (
-    CLEAN,
-    SETS,
-    Condition,
-    FrameCache,
-    Setup,
-    Truth,
-    axes,
-    corruptions,
-    measure,
-    robustness,
-    run,
-    scenes,
-    score,
-    write_page,
-)
+from fpp_ml_bench.baselines.robustness import axes, run, scenes
+from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, Truth, corruptions, score
+from fpp_ml_bench.baselines.robustness.report import write_page
+from fpp_ml_bench.baselines.robustness.run import Setup, measure, robustness
+from fpp_ml_bench.baselines.robustness.scenes import Condition, FrameCache
+from fpp_ml_bench.baselines.trivial import ConstantMethod
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.constants import VIEWS
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.result import Robustness
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.evaluation.result.parts import Robustness
+from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.schema import validate
 
 SIZE, OBJECT = 176, "v_groove"

@@ -6,10 +6,10 @@ from scored_dataset import make_dataset, write_description
 
 from fpp_ml_bench.cli.evaluate import main
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.score import evaluate
 from fpp_ml_bench.evaluation.score.conformal import calibrate, conformal_quantile, write_calibrated
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.sample_scores import gaussian_quantile
-from fpp_ml_bench.evaluation.submission import read_submission
+from fpp_ml_bench.evaluation.submission.description import read_submission
 
 
 def test_the_quantile_weighs_objects_alike_and_their_views_alike():

@@ -9,7 +9,7 @@ from scored_dataset import disk_depth, make_dataset, write_description, write_pr
 from fpp_ml_bench.cli.evaluate import main
 from fpp_ml_bench.depth import denormalise, normalise
 from fpp_ml_bench.errors import DatasetError, PredictionError
-from fpp_ml_bench.evaluation.result import read_result, write_result
+from fpp_ml_bench.evaluation.result.file import read_result, write_result
 from fpp_ml_bench.evaluation.score.check import scored_pair
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.loaders.sample import Flag

@@ -10,8 +10,8 @@ from scored_dataset import make_dataset, write_predictions
 from fpp_ml_bench.cli.evaluate import main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE
-from fpp_ml_bench.evaluation.report import compare
-from fpp_ml_bench.evaluation.result import read_result, write_result
+from fpp_ml_bench.evaluation.report.comparison import compare
+from fpp_ml_bench.evaluation.result.file import read_result, write_result
 from fpp_ml_bench.evaluation.score import uncertainty
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.uncertainty import holm, object_interval, sign_flip_p

@@ -64,8 +64,8 @@ def scored(tmp_path_factory):
 
 def test_a_toy_metric_is_one_entry(scored):
     """In a fresh interpreter: results are made of the entries that there are when they are first imported."""
-    from fpp_ml_bench.evaluation.result import write_result
-    from fpp_ml_bench.evaluation.score import evaluate
+    from fpp_ml_bench.evaluation.result.file import write_result
+    from fpp_ml_bench.evaluation.score.evaluator import evaluate
 
     folder, dataset, predictions = scored
     write_result(evaluate(predictions[1], dataset), folder / "old.json")

@@ -9,7 +9,7 @@ from extended_precision import sample_scores, sigma_scores
 from scored_dataset import make_dataset, write_description
 
 from fpp_ml_bench.evaluation.metrics import METRICS, UNCERTAINTY
-from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
 
 SIZE = (48, 56)
 

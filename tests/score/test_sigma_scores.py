@@ -11,9 +11,10 @@ from fpp_ml_bench.cli.evaluate import main
 from fpp_ml_bench.errors import PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.metrics import UNCERTAINTY
 from fpp_ml_bench.evaluation.protocol import COVERED, NOMINAL
-from fpp_ml_bench.evaluation.report import write_report
-from fpp_ml_bench.evaluation.result import parse_result, read_result, result_content, write_result
-from fpp_ml_bench.evaluation.score import evaluate, score_sigma
+from fpp_ml_bench.evaluation.report.report_page import write_report
+from fpp_ml_bench.evaluation.result.file import parse_result, read_result, result_content, write_result
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.evaluation.score.sample_scores import score_sigma
 
 
 def case(number, pixels=(23, 31)):
@@ -140,7 +141,7 @@ def test_an_edited_block_contradicts_itself(path, value, message, scored, tmp_pa
 
 
 def test_a_result_that_hides_or_improves_its_uncertainty_is_not_verified(scored):
-    from fpp_ml_bench.evaluation.score import differences
+    from fpp_ml_bench.evaluation.score.evaluator import differences
 
     dataset, predictions, result = scored
     hidden = result.model_copy(update={"uncertainty": None})

@@ -5,9 +5,12 @@ import pytest
 from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
-from fpp_ml_bench.evaluation.report import result_table, score_table
-from fpp_ml_bench.evaluation.result import read_result, write_result
-from fpp_ml_bench.evaluation.score import DepthScores, evaluate, score_sample
+from fpp_ml_bench.evaluation.report.report_page import score_table
+from fpp_ml_bench.evaluation.report.terminal import result_table
+from fpp_ml_bench.evaluation.result.file import read_result, write_result
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.evaluation.score.sample_scores import score_sample
+from fpp_ml_bench.evaluation.score.torch_metric import DepthScores
 from fpp_ml_bench.loaders.sample import VOID, Flag, void_pixels
 
 

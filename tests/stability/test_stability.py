@@ -5,12 +5,22 @@ import json
 import numpy as np
 import pytest
 
-from fpp_ml_bench.baselines.stability import all_cases, document, run_cases, write_report
-from fpp_ml_bench.baselines.stability.cases import MODULES, Case, Group, Outcome, Verdict, judge, worst
+from fpp_ml_bench.baselines.stability.cases import (
+    MODULES,
+    Case,
+    Group,
+    Outcome,
+    Verdict,
+    all_cases,
+    judge,
+    run_cases,
+    worst,
+)
+from fpp_ml_bench.baselines.stability.report import document, write_report
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli import stability as command
 from fpp_ml_bench.errors import DecodeError, StabilityError
-from fpp_ml_bench.evaluation.score import ErrorStats
+from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats
 
 QUICK = {
     "phase": ("modulation, real frames", "gamma", "quantisation", "dead frame", "steps close together"),

@@ -9,7 +9,9 @@ from conftest import tiny_settings
 
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.constants import VIEWS
-from fpp_ml_bench.loaders.render import assembly_of, build, named_light, preset_settings
+from fpp_ml_bench.loaders.render.builder import assembly_of, build
+from fpp_ml_bench.loaders.render.light import named_light
+from fpp_ml_bench.loaders.render.scene import preset_settings
 from fpp_ml_bench.loaders.storage import benchmark as module
 from fpp_ml_bench.loaders.storage.benchmark import (
     BENCHMARKS,

@@ -14,12 +14,13 @@ from published_trees import command, imported, write_png
 from scored_dataset import write_predictions
 
 from fpp_ml_bench.errors import BuildError, DatasetError, LayoutError
-from fpp_ml_bench.evaluation.score import evaluate
-from fpp_ml_bench.loaders.published import FrameOrder, import_notes, parse_order
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.loaders.published import exporting as export_tree
 from fpp_ml_bench.loaders.published.exporting import chosen_splits, export
+from fpp_ml_bench.loaders.published.importing import import_notes
+from fpp_ml_bench.loaders.published.order import FrameOrder, parse_order
 from fpp_ml_bench.loaders.sample import config_columns
-from fpp_ml_bench.optics import PAPER_SEQUENCE
+from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
 TRAINING = Path("training_datasets")
 SCANS = Path("fpp_synthetic_dataset")

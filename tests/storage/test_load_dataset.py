@@ -15,13 +15,12 @@ from synthetic import SyntheticRows, make
 import fpp_ml_bench
 from fpp_ml_bench.constants import OBJECTS, VIEWS, split_sample_name
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.loaders import load_dataset
-from fpp_ml_bench.loaders.render import build
+from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.sample import config_columns, features
 from fpp_ml_bench.loaders.storage.shards import arrow_schema
-from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import DatasetFolder, load_dataset
 from fpp_ml_bench.loaders.storage.verification import verify
-from fpp_ml_bench.optics import PAPER_SEQUENCE
+from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
 datasets.disable_progress_bars()
 IMAGES = ("frame_00", "depth", "depth_exact", "flags", "cover")

@@ -7,8 +7,10 @@ from conftest import file_bytes
 from synthetic import SyntheticRows, assembly
 
 from fpp_ml_bench.errors import BuildError, PoolError
-from fpp_ml_bench.loaders.storage import assemble, assemble_remote, remote_assembly
 from fpp_ml_bench.loaders.storage import assembly as assembling
+from fpp_ml_bench.loaders.storage import remote_assembly
+from fpp_ml_bench.loaders.storage.assembly import assemble
+from fpp_ml_bench.loaders.storage.remote_assembly import assemble_remote
 from fpp_ml_bench.remote import RemoteFolder
 
 SHARDS = [12, 6, 6]

@@ -17,7 +17,9 @@ from disks import small_disk
 
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import BuildError, DatasetError
-from fpp_ml_bench.loaders.render import Studio, assembly_of, build, named_light
+from fpp_ml_bench.loaders.render.builder import assembly_of, build
+from fpp_ml_bench.loaders.render.light import named_light
+from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.storage import assembly as assembling
 from fpp_ml_bench.loaders.storage.assembly import Assembly, assemble
 from fpp_ml_bench.loaders.storage.store import DatasetFolder

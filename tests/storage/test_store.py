@@ -15,7 +15,7 @@ from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders.sample import DATA_GROUP, column_hash, image_hash
 from fpp_ml_bench.loaders.storage.manifest import read_manifest
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.optics import PAPER_SEQUENCE
+from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
 ROOT = Path(__file__).resolve().parent.parent
 

@@ -10,9 +10,10 @@ from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli.evaluate import main as evaluate
 from fpp_ml_bench.constants import VIEWS
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.loaders.render import build
+from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.render.light import named_light
-from fpp_ml_bench.loaders.storage import DatasetFolder, verify
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.loaders.storage.verification import verify
 
 OBJECTS = ("gear", "v_groove")
 

@@ -7,7 +7,7 @@ import pytest
 from scored_dataset import make_dataset, write_description, write_predictions
 
 from fpp_ml_bench.cli.evaluate import main
-from fpp_ml_bench.evaluation.submission import TEMPLATE, Submission, read_submission
+from fpp_ml_bench.evaluation.submission.description import TEMPLATE, Submission, read_submission
 
 
 @pytest.fixture(scope="module")

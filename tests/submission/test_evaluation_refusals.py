@@ -13,7 +13,7 @@ import yaml
 from scored_dataset import DESCRIPTION, make_dataset, write_description, write_predictions
 
 from fpp_ml_bench.cli.evaluate import main
-from fpp_ml_bench.evaluation.submission import Submission, read_submission
+from fpp_ml_bench.evaluation.submission.description import Submission, read_submission
 
 SAMPLE = "power_drill_A60"
 FILE = f"{SAMPLE}.npy"

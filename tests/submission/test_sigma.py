@@ -5,7 +5,7 @@ import pytest
 from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
 
 FIRST = "power_drill_A0.sigma.npy"
 

@@ -15,18 +15,28 @@ from hypothesis import strategies as st
 from scipy import stats
 from scored_dataset import make_dataset, write_predictions
 
-from fpp_ml_bench.baselines import training
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.baselines.tradeoff import measure, planned, read_tradeoff, remarks, write_report
-from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, TRADEOFF_FILE, Point, Tradeoff, choose_views, power
-from fpp_ml_bench.baselines.tradeoff.report import growth_rows, point_rows
+from fpp_ml_bench.baselines.tradeoff import measure
+from fpp_ml_bench.baselines.tradeoff.measure import (
+    COST_KEYS,
+    TRADEOFF_FILE,
+    Point,
+    Tradeoff,
+    choose_views,
+    planned,
+    power,
+    read_tradeoff,
+)
+from fpp_ml_bench.baselines.tradeoff.report import growth_rows, point_rows, remarks, write_report
+from fpp_ml_bench.baselines.training.weights import shipped_names
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import BuildError, DatasetError, PredictionError, SubmissionError
-from fpp_ml_bench.evaluation.score import evaluate
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.files import exclusive
-from fpp_ml_bench.leaderboard.page import page_files
+from fpp_ml_bench.leaderboard.page.page import page_files
 from fpp_ml_bench.leaderboard.ranking import shipped_rows
-from fpp_ml_bench.optics import Rig, paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig import Rig
 
 OWN_METHOD = """
 import numpy as np
@@ -160,7 +170,7 @@ def test_threads_go_to_the_methods_that_take_them(small, tmp_path, answers):
 
 
 def test_all_methods_and_networks_of_the_size_are_measured(small, tmp_path, answers):
-    answers.variants |= {name: [{}] for name in training.shipped_names()} | {"other rigs": []}
+    answers.variants |= {name: [{}] for name in shipped_names()} | {"other rigs": []}
     assert [point.method for point in planned(small.path, tmp_path).points][:2] == ["good", "bad"]
     assert [point.method for point in planned(small.path, tmp_path, ["other rigs"]).points] == ["other rigs"]
     networks = measure._networks((224, 224))

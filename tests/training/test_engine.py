@@ -12,15 +12,15 @@ import pytest
 import torch
 from conftest import TINY_SIZE
 
-from fpp_ml_bench.baselines.networks import load
+from fpp_ml_bench.baselines.networks.model import load
 from fpp_ml_bench.baselines.training.depth_training import DONE, WEIGHTS, Schedule, epoch_order, spread, train
 from fpp_ml_bench.baselines.training.engine import CHECKPOINT, reproducible
 from fpp_ml_bench.baselines.training.recipe import Linear, Plateau, load_recipe, recipe_from_dict
 from fpp_ml_bench.baselines.training.records import CURVE_FILE, Display, read_checkpoint, save_checkpoint
 from fpp_ml_bench.depth import denormalise
 from fpp_ml_bench.errors import TrainingError
-from fpp_ml_bench.evaluation.result import over_samples
-from fpp_ml_bench.evaluation.score import score_sample
+from fpp_ml_bench.evaluation.result.model import over_samples
+from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 from fpp_ml_bench.loaders.training import FringeDepthDataset
 
 
@@ -203,7 +203,7 @@ def test_two_processes_agree(tiny, tmp_path):
 
 def test_nothing_that_is_not_finite_is_kept(tiny, tmp_path, monkeypatch):
     """A network whose training looks sound and whose answer in validation is not."""
-    from fpp_ml_bench.baselines.networks import UNet
+    from fpp_ml_bench.baselines.networks.unet import UNet
 
     forward = UNet.forward
     monkeypatch.setattr(UNet, "forward", lambda self, x: forward(self, x) * (1.0 if self.training else math.nan))

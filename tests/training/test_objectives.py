@@ -8,7 +8,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines import networks
+from fpp_ml_bench.baselines.networks.model import build as build_network
+from fpp_ml_bench.baselines.networks.model import discriminator as build_discriminator
 from fpp_ml_bench.baselines.training.losses import (
     Adversarial,
     AdversarialSettings,
@@ -325,7 +326,7 @@ def test_one_autocast_around_both_steps_uses_the_updated_discriminator():
 
 
 def test_the_real_pair_trains():
-    objective = Adversarial(networks.build("pix2pix", width=2), networks.discriminator(width=8))
+    objective = Adversarial(build_network("pix2pix", width=2), build_discriminator(width=8))
     optimiser = optimisers(objective, 2e-4)
     optimiser["network"] = torch.optim.SGD(objective.modules["network"].parameters(), lr=0.0)
     first = take(objective, optimiser, batch())

@@ -5,15 +5,17 @@ from statistics import fmean
 
 import pytest
 
-from fpp_ml_bench.baselines import load
+from fpp_ml_bench.baselines.networks.model import load
 from fpp_ml_bench.baselines.training.recipe import recipe_from_dict
 from fpp_ml_bench.baselines.training.weights import SHIPPED, shipped_names
 from fpp_ml_bench.constants import VIEWS
-from fpp_ml_bench.evaluation.score import score_sample
+from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, read_entry
-from fpp_ml_bench.loaders.render import BuildSettings, Studio, solid_mesh
+from fpp_ml_bench.loaders.render.meshes import solid_mesh
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.sample import void_pixels
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 OBJECT = "power_drill"
 

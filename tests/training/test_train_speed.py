@@ -7,8 +7,8 @@ import train_speed
 from conftest import TINY_SIZE, tiny_settings
 
 from fpp_ml_bench.loaders.published.exporting import write_tree
-from fpp_ml_bench.loaders.render import build
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.render.builder import build
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,8 @@ import pytest
 from scored_dataset import name_benchmarks
 from tiny_network import config_of, tiny_network
 
-from fpp_ml_bench.baselines.phase_network import PhaseNet, load_net, save_net
+from fpp_ml_bench.baselines.phase_network.net_file import load_net, save_net
+from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.training import weights as training_data
 from fpp_ml_bench.baselines.training.depth_training import model_config
 from fpp_ml_bench.baselines.training.recipe import load_recipe
@@ -23,7 +24,8 @@ from fpp_ml_bench.baselines.training.weights import (
     training_data_warning,
 )
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.loaders.storage import Benchmark, benchmark
+from fpp_ml_bench.loaders.storage import benchmark
+from fpp_ml_bench.loaders.storage.benchmark import Benchmark
 
 OLD = "a" * 64
 NET_OPTIONS = {"widths": [4, 6], "fine": 4, "squeezed": 6, "order_widths": [4, 6], "bound_rad": 1.0, "uncertain": True}

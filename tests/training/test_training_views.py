@@ -3,8 +3,8 @@
 import numpy as np
 from flat_planes import plane_depth_m, plane_fringe
 
-from fpp_ml_bench.baselines.training import View, companions, drawn_light, groups_of, united, with_unions
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.baselines.training.views import View, companions, drawn_light, groups_of, united, with_unions
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 RIG = paper_rig(240)
 

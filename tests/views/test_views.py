@@ -18,10 +18,15 @@ from fpp_ml_bench.baselines.views import (
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.constants import VIEW_DEGREES, VIEWS
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.loaders.render import PixelRays, SolidMesh, TracedObject, place, solid_mesh, write_ply
+from fpp_ml_bench.loaders.render.meshes import solid_mesh, write_ply
+from fpp_ml_bench.loaders.render.raycast import PixelRays, TracedObject
+from fpp_ml_bench.loaders.render.scene import SolidMesh, place
 from fpp_ml_bench.loaders.sample import Row
-from fpp_ml_bench.loaders.storage import Assembly, DatasetFolder, Manifest, assemble, plan_shards
-from fpp_ml_bench.optics import paper_rig
+from fpp_ml_bench.loaders.storage.assembly import Assembly, assemble
+from fpp_ml_bench.loaders.storage.manifest import Manifest
+from fpp_ml_bench.loaders.storage.shards import plan_shards
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 SIZE, RADIUS_M, ORDER_MM = 192, 0.15, 300.0
 RIG = replace(paper_rig(960), camera=paper_rig(960).camera.scaled(SIZE))

@@ -10,7 +10,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from fpp_ml_bench.calibration import Board
+from fpp_ml_bench.calibration.boards import Board
 from fpp_ml_bench.errors import CaptureError
 from fpp_ml_bench.files import LOCK_FILE, exclusive, write_atomically
 from fpp_ml_bench.loaders.render.boards.poses import BoardPose, board_poses
@@ -18,7 +18,8 @@ from fpp_ml_bench.loaders.render.boards.sheet import DARK, board_view, check_pri
 from fpp_ml_bench.loaders.render.light import Light, named_light
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.view import Studio
-from fpp_ml_bench.optics import Rig, load_rig, save_rig
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.rig_file import load_rig, save_rig
 
 BOARD_FILE, RIG_FILE = "board.yaml", "rig.yaml"
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.calibration import Board
+from fpp_ml_bench.calibration.boards import Board
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import CalibrationError
-from fpp_ml_bench.optics import Rig
+from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
 BOARD_POSES = 18

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.calibration import Board
+from fpp_ml_bench.calibration.boards import Board
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import CalibrationError
 from fpp_ml_bench.loaders.render.boards.poses import BoardPose, sheet_corners_mm
