@@ -133,7 +133,7 @@ def test_the_threshold_lets_no_view_lose(samples: list[DepthSample]) -> None:
 
 
 def test_training_resumes_to_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(training, "groups_of", lambda *args: GROUPS)
+    monkeypatch.setattr(window_training, "groups_of", lambda *args: GROUPS)
     recipe = FilterRecipe(steps=4, batch=2, window=64, widths=(4, 6), validate_every=2, lights=0)
     rig = paper_rig(SIZE)
     whole = train_classical_net(recipe, tmp_path / "whole", rig=rig)

@@ -109,7 +109,7 @@ def test_labels_say_which_candidate_and_how_far(samples: list[CrossedSample]) ->
 def test_a_training_in_small_is_resumed_and_predicts(
     tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(training, "groups_of", lambda *args: GROUPS)
+    monkeypatch.setattr(window_training, "groups_of", lambda *args: GROUPS)
     recipe = CrossedRecipe(
         steps=2, validate_every=1, batch=1, window=64, widths=(4, 4), order_widths=(4, 4), fine=4, squeezed=4
     )

@@ -228,7 +228,7 @@ def test_a_training_in_small_is_resumed_and_predicts(tmp_path: Path, monkeypatch
         Group("paper", named_light("paper"), (("wood_block", "A0"), ("duct_tape", "A60"))),
         Group("validation-paper", named_light("paper"), (("mug", "A0"),), "validation"),
     ]
-    monkeypatch.setattr(training, "groups_of", lambda *args: groups)
+    monkeypatch.setattr(window_training, "groups_of", lambda *args: groups)
     out, recipe = tmp_path / "run", replace(SMALL, steps=2, validate_every=1, batch=1, albedo="any")
     first = train_phase_net(recipe, out, rig=rig, minutes=1e-9)
     assert first.weights is None and first.steps == 1
