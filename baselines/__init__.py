@@ -7,3 +7,11 @@
 
 Importing this package does not import torch; using these two names does.
 """
+
+
+def __getattr__(name: str) -> object:
+    if name not in ("build", "load"):
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from fpp_ml_bench.baselines.networks import model
+
+    return getattr(model, name)

@@ -25,8 +25,11 @@ from torch import Tensor, nn
 from torch.optim import RMSprop
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from fpp_ml_bench.baselines import networks
-from fpp_ml_bench.baselines.phase_route import CalibrationLayer
+from fpp_ml_bench.baselines.networks.base import trains_channels_last
+from fpp_ml_bench.baselines.networks.model import build as build_network
+from fpp_ml_bench.baselines.networks.model import discriminator
+from fpp_ml_bench.baselines.networks.unet import re_projection_loss
+from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer
 from fpp_ml_bench.baselines.training.engine import DIVERGED, Training, alone_in, claim_folder, reproducible
 from fpp_ml_bench.baselines.training.losses import Adversarial, AdversarialSettings, Regression
 from fpp_ml_bench.baselines.training.recipe import Linear, Plateau, Recipe
@@ -37,9 +40,10 @@ from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.evaluation.protocol import Mode, Units
-from fpp_ml_bench.evaluation.score import DepthScores, scored_pair
+from fpp_ml_bench.evaluation.score.check import scored_pair
+from fpp_ml_bench.evaluation.score.torch_metric import DepthScores
 from fpp_ml_bench.files import read_json, write_atomically
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.loaders.training import FringeDepth, FringeDepthDataset
 
 WEIGHTS, DONE = "weights.safetensors", "done.json"
@@ -242,17 +246,17 @@ class DepthTraining(Training):
         super().__init__(out, identity, recipe.seed, recipe.precision)
         self.recipe, self.data, self.validation = recipe, data, validation
         self.name, self.title = recipe.name, recipe.title
-        network = networks.build(recipe.network, width=recipe.width, **recipe.options)
+        network = build_network(recipe.network, width=recipe.width, **recipe.options)
         if recipe.loss.name == GAN:
             settings = AdversarialSettings.of(recipe.loss.alpha)
-            self.objective = Adversarial(network, networks.discriminator(width=recipe.width), settings)
+            self.objective = Adversarial(network, discriminator(width=recipe.width), settings)
         else:
             self.objective = Regression(network, recipe.loss.name, recipe.loss.alpha, self._physics(data))
         self.bare = dict(self.objective.modules)
         modules: dict[str, Any] = dict(self.bare)
         on_gpu = self.accelerator.device.type == "cuda"
         for module in self.bare.values():
-            if on_gpu or networks.trains_channels_last(module):
+            if on_gpu or trains_channels_last(module):
                 module.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         if on_gpu and recipe.compile:
             modules = {name: torch.compile(module) for name, module in modules.items()}
@@ -280,7 +284,7 @@ class DepthTraining(Training):
         unit_mm, nearest_mm = MM_PER_M if self.recipe.normalisation == "global" else 1.0, rig.working_range_mm[0] / 2
 
         def term(prediction: Tensor, target: Tensor) -> Tensor:
-            return weight * networks.re_projection_loss(layer, prediction * unit_mm, target * unit_mm, nearest_mm)
+            return weight * re_projection_loss(layer, prediction * unit_mm, target * unit_mm, nearest_mm)
 
         return term
 

@@ -9,7 +9,6 @@ import pytest
 import torch
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from fpp_ml_bench.baselines import training
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.classical_network.method import ClassicalNetMethod
 from fpp_ml_bench.baselines.classical_network.network import BOUND_SIGMAS, REACH, DepthFilter
@@ -24,17 +23,20 @@ from fpp_ml_bench.baselines.classical_network.training import (
     score,
     train_classical_net,
 )
+from fpp_ml_bench.baselines.phase_network import window_training
 from fpp_ml_bench.baselines.registry import load_method
+from fpp_ml_bench.baselines.training.views import Group, View, read_views, render_views
+from fpp_ml_bench.baselines.training.weights import SHIPPED
 from fpp_ml_bench.errors import NetworkError, TrainingError, WeightsError
 from fpp_ml_bench.loaders.render.light import named_light
 from fpp_ml_bench.optics.named_rigs import paper_rig
 
 SIZE = 224
 GROUPS = [
-    training.Group("paper", named_light("paper"), (("wood_block", "A0"), ("duct_tape", "A60"))),
-    training.Group("validation-paper", named_light("paper"), (("mug", "A0"),), "validation"),
+    Group("paper", named_light("paper"), (("wood_block", "A0"), ("duct_tape", "A60"))),
+    Group("validation-paper", named_light("paper"), (("mug", "A0"),), "validation"),
 ]
-Views = list[training.View]
+Views = list[View]
 
 
 @cache
@@ -45,8 +47,8 @@ def method() -> ClassicalMethod:
 @pytest.fixture(scope="module")
 def views(tmp_path_factory: pytest.TempPathFactory) -> Views:
     out = tmp_path_factory.mktemp("views")
-    training.render_views(GROUPS, paper_rig(SIZE), method().frames_used, out, workers=1)
-    return [*training.read_views(out, GROUPS, "train"), *training.read_views(out, GROUPS, "validation")]
+    render_views(GROUPS, paper_rig(SIZE), method().frames_used, out, workers=1)
+    return [*read_views(out, GROUPS, "train"), *read_views(out, GROUPS, "validation")]
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +58,7 @@ def samples(views: Views) -> list[DepthSample]:
     return found  # type: ignore[return-value]
 
 
-def frames_of(view: training.View) -> list:
+def frames_of(view: View) -> list:
     frames: list = [None] * len(method().rig.sequence)
     for index, frame in zip(method().frames_used, view.frames, strict=True):
         frames[index] = frame
@@ -186,7 +188,7 @@ def test_an_image_without_a_depth_and_what_is_refused(tmp_path: Path) -> None:
     with pytest.raises(WeightsError):
         ClassicalNetMethod(rig, weights=tmp_path / "none.safetensors")
     with pytest.raises(WeightsError, match="classical-net"):
-        ClassicalNetMethod(rig, weights=Path(training.SHIPPED) / "unet-global-rmse.safetensors")
+        ClassicalNetMethod(rig, weights=Path(SHIPPED) / "unet-global-rmse.safetensors")
     with pytest.raises(NetworkError, match="positive"):
         DepthFilter(0)
     with pytest.raises(NetworkError, match="multiples of 4"):

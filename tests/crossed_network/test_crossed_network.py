@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fpp_ml_bench.baselines import training
 from fpp_ml_bench.baselines.crossed_network import inputs
 from fpp_ml_bench.baselines.crossed_network.method import CrossedNetMethod
 from fpp_ml_bench.baselines.crossed_network.route import CrossedNetRoute, decided_mask, stated_rad
@@ -19,10 +18,12 @@ from fpp_ml_bench.baselines.crossed_network.training import (
     train_crossed_net,
 )
 from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute
+from fpp_ml_bench.baselines.phase_network import window_training
 from fpp_ml_bench.baselines.phase_network.net_file import load_net
 from fpp_ml_bench.baselines.phase_network.odds import Answers, threshold_at
 from fpp_ml_bench.baselines.phase_network.windows import IGNORED
 from fpp_ml_bench.baselines.registry import load_method
+from fpp_ml_bench.baselines.training.views import Group, View, read_views, render_views, with_unions
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import PredictionError, TrainingError, WeightsError
 from fpp_ml_bench.loaders.render.light import named_light
@@ -30,8 +31,8 @@ from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
 
 SIZE = 240
 GROUPS = [
-    training.Group("paper", named_light("paper"), (("wood_block", "A0"), ("duct_tape", "A60"))),
-    training.Group("validation-paper", named_light("paper"), (("mug", "A0"),), "validation"),
+    Group("paper", named_light("paper"), (("wood_block", "A0"), ("duct_tape", "A60"))),
+    Group("validation-paper", named_light("paper"), (("mug", "A0"),), "validation"),
 ]
 STILL = Variation(near_edge=0.5, wrong_window=0, wrong_patch=0, no_plane=0)
 
@@ -44,18 +45,18 @@ def route() -> CrossedRoute:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("views")
-    training.render_views(GROUPS, crossed_rig(SIZE), (0,), out, workers=1)
+    render_views(GROUPS, crossed_rig(SIZE), (0,), out, workers=1)
     return out
 
 
 @pytest.fixture(scope="module")
 def samples(folder: Path) -> list[CrossedSample]:
-    learned = training.with_unions(training.read_views(folder, GROUPS, "train"), unions=1, seed=1)
+    learned = with_unions(read_views(folder, GROUPS, "train"), unions=1, seed=1)
     return [sample_of(view, route()) for view in learned]
 
 
 def test_the_truth_of_a_sample_is_the_exact_depth(samples: list[CrossedSample], folder: Path) -> None:
-    sample, view = samples[0], next(training.read_views(folder, GROUPS, "train"))
+    sample, view = samples[0], next(read_views(folder, GROUPS, "train"))
     part = route().carriers.at(sample.scene.crop)
     truth = sample.scene.nearness + sample.missing_rad.astype(np.float32) / part.joint_gain
     exact = view.depth_mm[sample.scene.crop]
@@ -123,7 +124,7 @@ def test_a_training_in_small_is_resumed_and_predicts(
         train_crossed_net(replace(recipe, steps=3), out, rig=rig)
     method = load_method("crossed-net", rig, weights=trained.weights)
     assert isinstance(method, CrossedNetMethod) and method.frames_used == (0,)
-    view = next(training.read_views(folder, GROUPS, "train"))
+    view = next(read_views(folder, GROUPS, "train"))
     frames = [None] * len(rig.sequence)
     frames[0] = view.frames[0]
     answer = method.answer(frames)
@@ -135,7 +136,7 @@ def test_a_training_in_small_is_resumed_and_predicts(
 def test_depths_lie_on_measured_candidates_whatever_the_network_says(folder: Path) -> None:
     recipe = CrossedRecipe(widths=(4, 4), order_widths=(4, 4), fine=4, squeezed=4)
     learned = CrossedNetRoute(crossed_rig(SIZE), recipe.network().eval(), threshold=0.0, lead=0.0)
-    view = next(training.read_views(folder, GROUPS, "train"))
+    view = next(read_views(folder, GROUPS, "train"))
     seen = learned.route.observe(view.frames[0])
     scene = inputs.Scene.of(seen)
     shape = scene.light.shape
@@ -172,7 +173,7 @@ def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert "--albedo is an option of phase-net, not of crossed-net" in capsys.readouterr().err
     assert main(["train", "loss/l1", "--out", str(tmp_path / "x")]) == 2
     assert "expected a dataset folder" in capsys.readouterr().err
-    view = training.View(
+    view = View(
         "x",
         "x",
         "x",
@@ -182,7 +183,7 @@ def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
     )
     assert not sample_of(view, route()).target.any()
     with pytest.raises(TrainingError, match=r"delete it"):
-        next(training.read_views(tmp_path, GROUPS, "train"))
+        next(read_views(tmp_path, GROUPS, "train"))
 
 
 def test_the_mask_asks_for_less_in_a_weak_frame(samples: list[CrossedSample]) -> None:

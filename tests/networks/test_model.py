@@ -133,7 +133,7 @@ def test_loading_by_name_and_by_path(folder, monkeypatch):
         baselines.load("vit")
     with pytest.raises(WeightsError, match="device 'abacus' can't be used here"):
         baselines.load("raw", device="abacus")
-    with pytest.raises(AttributeError, match="attribute train"):
+    with pytest.raises(AttributeError, match="attribute 'train'"):
         baselines.train  # noqa: B018
 
 

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from matplotlib.transforms import Bbox
 from scored_dataset import make_dataset
 
-from fpp_ml_bench import leaderboard
 from fpp_ml_bench.baselines.tradeoff.drawing import Mark, Scatter, free_box
 from fpp_ml_bench.baselines.tradeoff.measure import pareto_front
+from fpp_ml_bench.cli import leaderboard as leaderboard_command
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.report.html import escaped, page
 from fpp_ml_bench.leaderboard.page.page import page_files, slug
@@ -69,7 +69,7 @@ def test_same_rows_same_bytes_whatever_their_order(files, tmp_path):
 
 def test_a_page_ranks_once(files, tmp_path, monkeypatch, capsys):
     ranked = []
-    monkeypatch.setattr(leaderboard, "rank", lambda *given: ranked.append(given) or rank(*given))
+    monkeypatch.setattr(leaderboard_command, "rank_files", lambda *given: ranked.append(given) or rank(*given))
     assert main(["leaderboard", *map(str, files), "--page", str(tmp_path), "--csv", str(tmp_path / "t.csv")]) == 0
     assert len(ranked) == 1
     assert main(["leaderboard", *map(str, files), "--page", str(tmp_path), "--sort", "object_rmse_mm"]) == 2

@@ -11,7 +11,7 @@ import pytest
 import torch
 from flat_planes import DIRECT, USERS_WORD, plane_depth_m, plane_fringe
 
-from fpp_ml_bench.baselines import training
+from fpp_ml_bench.baselines.phase_network import window_training
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, Geometry, Rotation
 from fpp_ml_bench.baselines.phase_network.net_file import load_net, save_net
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
