@@ -34,7 +34,7 @@ from fpp_ml_bench.baselines.phase_route.method import ONE_ALBEDO
 from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corruptions
 from fpp_ml_bench.baselines.robustness.report import Measured, draw_curves
 from fpp_ml_bench.cli import main as fpp_bench
-from fpp_ml_bench.cli.evaluate import main as fpp_eval
+from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import FppBenchError, SubmissionError
 from fpp_ml_bench.evaluation.report.html import percent

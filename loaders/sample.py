@@ -2,7 +2,7 @@
 
 There is one row per object and view, and one column PER FRAME, so that reading a frame costs a single frame (a stacked
 column would decode all 52). Columns are stored in *groups* of separate files, so that no pixel is stored twice and a
-configuration opens only the files it needs:
+configuration opens only the files it needs::
 
     data        sample, object, view, split, frame_00, depth, depth_exact, flags, cover, depth_min, depth_max
                                                                                                   <split>/data-*.arrow
@@ -81,8 +81,8 @@ def exact_void(flags: NDArray[np.uint8]) -> NDArray[np.bool_]:
 @dataclass
 class Row:
     """A sample to be written: frames by index uint8 (H, W), depths float32 (H, W) in mm, measurements for the manifest,
-    and for generated data the `Flag`s of each pixel and the share of it, in 255ths, that the surface of its central ray
-    covers, uint8 (H, W).
+    and for generated data the flags (`Flag`) of each pixel and the share of it, in 255ths, that the surface of its
+    central ray covers, uint8 (H, W).
     The images' memory may be reused as soon as the writer takes the next row."""
 
     sample: str

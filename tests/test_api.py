@@ -17,7 +17,7 @@ from fpp_ml_bench import api
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import FppBenchError
-from fpp_ml_bench.evaluation import result
+from fpp_ml_bench.evaluation.result.file import write_result
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_what_the_docstrings_say_of_the_results_is_there(folder):
     dataset = fpp_ml_bench.open_dataset("data/mini")
     rows = fpp_ml_bench.load_dataset("data/mini", "all", split="test")
     scored = fpp_ml_bench.evaluate("predictions", dataset)
-    result.write_result(scored, Path("result.json"))
+    write_result(scored, Path("result.json"))
     returned = {
         "load_dataset": SimpleNamespace(**dict.fromkeys(rows.column_names), frame_NN=None),
         "open_dataset": dataset,

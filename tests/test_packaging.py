@@ -125,7 +125,7 @@ def test_the_project_refers_to_no_outside_folder():
 WITHOUT_EXTRAS = """
 import sys
 from fpp_ml_bench.cli import EXTRAS, main
-from fpp_ml_bench.cli.evaluate import main as evaluate
+from fpp_ml_bench.cli import main_eval as evaluate
 for library in sum(EXTRAS.values(), ()):
     sys.modules[library] = None  # as if it were not installed
 words = sys.argv[1:]

@@ -75,7 +75,7 @@ def activations_of(
 
 
 def at_size(features: Tensor, side: tuple[int, int]) -> Tensor:
-    """Activations (B, C, h, w) resized to a new tensor (B, C, *side): area means to shrink, bilinear to enlarge."""
+    """Activations (B, C, h, w) resized to a new tensor ``(B, C, *side)``: area means to shrink, bilinear to enlarge."""
     if tuple(features.shape[2:]) == side:
         return features.clone()
     if features.shape[2] >= side[0] and features.shape[3] >= side[1]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,6 @@ from fpp_ml_bench.depth import depth_range_mm, extremes, object_mask
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import Mode, Units
-from fpp_ml_bench.evaluation.submission.description import Submission, check_submission
 from fpp_ml_bench.evaluation.submission.prediction_files import (
     SIGMA,
     SUBMISSION_FILE,
@@ -30,6 +29,9 @@ from fpp_ml_bench.evaluation.submission.prediction_files import (
 )
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.evaluation.submission.description import Submission
 
 Depth = NDArray[np.floating[Any]]
 MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "normalised": 1000.0}
@@ -172,6 +174,8 @@ class Checked:
 
 def checked_description(folder: Path, content: dict[Any, Any], form: str, frames: int | None = None) -> Submission:
     """The folder's description, checked against the predictions' ``form`` and a sequence of ``frames``, where known."""
+    from fpp_ml_bench.evaluation.submission.description import check_submission  # imports pydantic
+
     description = check_submission(folder, content)
     outside = [index for index in description.frames_used if frames is not None and index >= frames]
     if frames is not None and outside:

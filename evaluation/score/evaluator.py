@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from operator import attrgetter
 from pathlib import Path
 from threading import Lock
-from typing import Any, cast, get_args
+from typing import TYPE_CHECKING, Any, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,16 +21,6 @@ from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.metrics import METRICS, UNCERTAINTY, Metric
 from fpp_ml_bench.evaluation.protocol import Mode, Units
-from fpp_ml_bench.evaluation.result.file import environment
-from fpp_ml_bench.evaluation.result.model import (
-    ArrayScores,
-    Result,
-    array_scores,
-    result_from_rows,
-    same,
-    uncertainty_of,
-)
-from fpp_ml_bench.evaluation.result.parts import Uncertainty
 from fpp_ml_bench.evaluation.score.check import checked_description, declared_units, in_mm, scored_pair, value_problems
 from fpp_ml_bench.evaluation.score.sample_scores import SigmaSample, score_sample, score_sigma
 from fpp_ml_bench.evaluation.submission.prediction_files import (
@@ -49,6 +39,10 @@ from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.sequence import DIRECTIONS, AnySequence
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.evaluation.result.model import ArrayScores, Result
+    from fpp_ml_bench.evaluation.result.parts import Uncertainty
 
 Maps = NDArray[Any] | Sequence[NDArray[Any]]
 WORKERS = 4
@@ -103,7 +97,8 @@ def evaluate(
             description = checked_description(folder, content, listing.form, len(dataset.sequence))
         except SubmissionError as error:
             description_error = error
-        environment  # noqa: B018  imported while the threads score
+        import fpp_ml_bench.evaluation.result.model  # noqa: F401  pydantic takes long: while the threads score
+
         while_scoring()
     for file_problems, file_rows in outcomes:
         problems += file_problems
@@ -118,6 +113,9 @@ def evaluate(
         raise PredictionError(f"{printable(str(folder), 500)} can't be scored, {summary}:", lines)
     if description_error or description is None:
         raise description_error or SubmissionError(f"{printable(str(folder), 500)}: has no description")
+    from fpp_ml_bench.evaluation.result.file import environment
+    from fpp_ml_bench.evaluation.result.model import result_from_rows, uncertainty_of
+
     content = dict(dataset.content_hash(*column, images) for column, images in hashes.items())
     benchmark = benchmark_of(content)
     stated = {row["sample"]: row.pop("stated") for row in rows}
@@ -281,6 +279,8 @@ def evaluate_arrays(
         rows.append({"sample": f"sample {number}", "object": names[number], **row})
         if uncertainty is not None:
             stated[f"sample {number}"] = uncertainty
+    from fpp_ml_bench.evaluation.result.model import array_scores
+
     return array_scores(rows, stated)
 
 
@@ -401,6 +401,8 @@ def _uncertainty_differences(stored: Uncertainty | None, recomputed: Uncertainty
     if stored is None or recomputed is None:
         blocks = [("there is none" if block is None else "there is one") for block in (stored, recomputed)]
         return [] if stored is recomputed else [f"uncertainty: {blocks[0]} in the result, {blocks[1]} recomputed"]
+    from fpp_ml_bench.evaluation.result.model import same
+
     lines = []
     for name in ("reliability", "sparsification"):
         first, second = (
@@ -427,6 +429,8 @@ def _different(
 ) -> list[str]:
     """A line for each key of ``exact`` and each score that differs; ``error_mm``: the error of which the scores that
     cancel are a small difference."""
+    from fpp_ml_bench.evaluation.result.model import same
+
     limits = {key: 1e-9 * (error_mm or 0.0) if metric.cancels else rounding for key, metric in metrics.items()}
     lines = []
     for key in (*exact, *metrics):

@@ -276,6 +276,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run_program(BENCH, argv)
 
 
+def main_eval(argv: Sequence[str] | None = None) -> int:
+    """Entry point of ``fpp-eval``."""
+    return run_program(EVAL, argv)
+
+
 def run_program(program: Program, argv: Sequence[str] | None = None) -> int:
     """Run the command that the first word of ``argv`` (default: the process's) names, or the default one."""
     words = list(sys.argv[1:] if argv is None else argv)

@@ -12,10 +12,7 @@ from rich.text import Text
 from fpp_ml_bench.baselines import registry
 from fpp_ml_bench.baselines.diagnostics.counterfactual import measure as measure_reliance
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import SceneSet
-from fpp_ml_bench.baselines.diagnostics.diagnosis import JSON_FILE, REPORT_FILE, checked_names
-from fpp_ml_bench.baselines.diagnostics.diagnosis import diagnose as run_diagnosis
 from fpp_ml_bench.baselines.diagnostics.probe import PROBES, Probe, ProbeSettings, Progress
-from fpp_ml_bench.baselines.diagnostics.subjects import subject as subject_of
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings, OfMethods
@@ -78,6 +75,10 @@ def diagnose(
     """Diagnose a network or method with the paper's probes and further ones; writes an HTML report and a JSON file.
 
     Raises FppBenchError for what can't be diagnosed."""
+    from fpp_ml_bench.baselines.diagnostics.diagnosis import JSON_FILE, REPORT_FILE, checked_names
+    from fpp_ml_bench.baselines.diagnostics.diagnosis import diagnose as run_diagnosis
+    from fpp_ml_bench.baselines.diagnostics.subjects import subject as subject_of
+
     probe_names = checked_names(probe)
     opened = DatasetFolder(dataset)
     method = registry.methods().get(model, registry.network_method())

@@ -1,40 +1,25 @@
 """``fpp-eval``: score a folder of predictions against one split of a dataset, and work on results."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable
 from json import dumps
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from fpp_ml_bench.cli import CHECK_FAILED, EVAL, OK, run_program
+from fpp_ml_bench.cli import CHECK_FAILED, OK
 from fpp_ml_bench.cli.options import SPLITS, Explain, command, value
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, MODES, TARGETS
-from fpp_ml_bench.evaluation.report.comparison import compare as compare_results
-from fpp_ml_bench.evaluation.report.report_page import write_report
-from fpp_ml_bench.evaluation.report.terminal import comparison_table, result_table
-from fpp_ml_bench.evaluation.result.file import json_schema, write_json, write_result
-from fpp_ml_bench.evaluation.result.model import Result
-from fpp_ml_bench.evaluation.score.check import check_folder
-from fpp_ml_bench.evaluation.score.conformal import calibrate as conformal_calibration
-from fpp_ml_bench.evaluation.score.conformal import counted, largest_coverage, write_calibrated
-from fpp_ml_bench.evaluation.score.evaluator import differences as result_differences
-from fpp_ml_bench.evaluation.score.evaluator import evaluate as evaluate_folder
-from fpp_ml_bench.evaluation.score.evaluator import explain_eval
-from fpp_ml_bench.evaluation.submission.description import write_template
-from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE, read_plain
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.storage.benchmark import benchmark_sentence
-from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import prepare_process
 from fpp_ml_bench.options import REQUIRED, argument, option
 
+if TYPE_CHECKING:
+    from fpp_ml_bench.evaluation.result.model import Result
+    from fpp_ml_bench.loaders.storage.store import DatasetFolder
+
 LISTED = 20
 """Differences that ``verify`` prints."""
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point of ``fpp-eval``."""
-    return run_program(EVAL, argv)
 
 
 @command(
@@ -81,6 +66,11 @@ def score_folder(
     """Score a folder of predictions: MAE and RMSE in mm over the full grid, the object and the background.
 
     Raises FppBenchError for anything that can't be scored."""
+    from fpp_ml_bench.evaluation.result.file import write_result
+    from fpp_ml_bench.evaluation.score.evaluator import evaluate as evaluate_folder
+    from fpp_ml_bench.evaluation.score.evaluator import explain_eval
+    from fpp_ml_bench.loaders.storage.benchmark import benchmark_sentence
+
     prepare_process()
     account.check()
     _check_outputs(json, page, predictions)
@@ -92,15 +82,17 @@ def score_folder(
         target,
         edge_band,
         mode,
-        while_scoring=lambda: result_table,
+        while_scoring=_result_table,
     )
     if json is not None:
         write_result(scored, json)
     if page is not None:
+        from fpp_ml_bench.evaluation.report.report_page import write_report  # draws with matplotlib
+
         write_report(scored, opened, predictions, page)
     from fpp_ml_bench.cli.console import show  # imports rich, which --help must not
 
-    show(result_table(scored))  # when all is written: printing ends where nobody reads any more
+    show(_result_table()(scored))  # when all is written: printing ends where nobody reads any more
     for written in (json, page):
         if written is not None:
             print(f"Written: {written}")
@@ -110,10 +102,20 @@ def score_folder(
     account.say(lambda: explain_eval(opened, split, target, edge_band))
 
 
+def _result_table() -> "Callable[[Result], Any]":
+    """`report.terminal.result_table`, which imports rich."""
+    from fpp_ml_bench.evaluation.report.terminal import result_table
+
+    return result_table
+
+
 def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[DatasetFolder, str]":
     """The dataset in ``place`` and the ``split`` to score; where they are not given, those that ``folder`` was
     predicted from, by its submission.yaml. Raises `SubmissionError` where that does not say, and `DatasetError` where
     the dataset is gone or another one now."""
+    from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE, read_plain
+    from fpp_ml_bench.loaders.storage.store import DatasetFolder
+
     shown, told, content = printable(str(folder), 500), Path(), {}
     if not folder.is_dir():
         raise PredictionError(f"expected a folder of predictions, found none at {shown}")
@@ -171,6 +173,8 @@ def init(
     predictions: Path = argument("folder of the predictions, made if absent", "PREDICTIONS"),
 ) -> None:
     """Write a submission.yaml to fill in; one that is there is not overwritten."""
+    from fpp_ml_bench.evaluation.submission.description import write_template
+
     print(f"Written: {write_template(predictions)}")
     print(f"next: fill it in, write one {{sample}}.npy for each sample beside it, then: fpp-eval check {predictions}")
 
@@ -190,6 +194,9 @@ def check(
     """Check a submission before it is scored, without ground truth: exit status 0 sound, 1 refused.
 
     Raises FppBenchError for no folder."""
+    from fpp_ml_bench.evaluation.score.check import check_folder
+    from fpp_ml_bench.loaders.storage.store import DatasetFolder
+
     opened = None if dataset is None else DatasetFolder(dataset)
     checked = check_folder(predictions, opened, split)
     folder = printable(str(predictions), 500)
@@ -226,6 +233,9 @@ def compare(
 
     Raises SubmissionError for results that can't be compared."""
     from fpp_ml_bench.cli.console import show
+    from fpp_ml_bench.evaluation.report.comparison import compare as compare_results
+    from fpp_ml_bench.evaluation.report.terminal import comparison_table
+    from fpp_ml_bench.evaluation.result.file import write_json
     from fpp_ml_bench.leaderboard.rows import alike, read_scored
 
     comparison = compare_results(*alike(read_scored(first), read_scored(second)))
@@ -249,7 +259,10 @@ def verify(
     """Score the predictions again and say whether the result or row is verified (exit status 0) or not (1).
 
     Raises FppBenchError where nothing can be recomputed at all."""
+    from fpp_ml_bench.evaluation.result.model import Result
+    from fpp_ml_bench.evaluation.score.evaluator import differences as result_differences
     from fpp_ml_bench.leaderboard import rows
+    from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
     scored, opened = rows.read_scored(file), DatasetFolder(dataset)
     differences = result_differences if isinstance(scored, Result) else rows.differences
@@ -299,6 +312,10 @@ def conformal(
 ) -> None:
     """Scale a method's stated sigma by split-conformal calibration over objects, from its predictions of another
     split."""
+    from fpp_ml_bench.evaluation.score.conformal import calibrate as conformal_calibration
+    from fpp_ml_bench.evaluation.score.conformal import counted, largest_coverage, write_calibrated
+    from fpp_ml_bench.loaders.storage.store import DatasetFolder
+
     opened = DatasetFolder(dataset)
     found = conformal_calibration(calibration, opened, calibrate, coverage, target)
     samples = write_calibrated(found, predictions, opened, split, out)
@@ -329,4 +346,6 @@ def schema(
     ),
 ) -> None:
     """Print the JSON Schema (2020-12) of result.json or of submission.yaml."""
+    from fpp_ml_bench.evaluation.result.file import json_schema
+
     print(dumps(json_schema(file), indent=1))

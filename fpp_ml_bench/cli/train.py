@@ -6,11 +6,7 @@ from datetime import datetime
 from pathlib import Path
 
 from fpp_ml_bench.baselines import registry
-from fpp_ml_bench.baselines.networks.range_heads import save_with_heads
 from fpp_ml_bench.baselines.reproduce.plan import Folders, planned, variants
-from fpp_ml_bench.baselines.reproduce.work import ReproduceSettings, state_of
-from fpp_ml_bench.baselines.reproduce.work import reproduce as run_reproduce
-from fpp_ml_bench.baselines.training.depth_training import train as train_recipe
 from fpp_ml_bench.baselines.training.recipe import load_recipe, table_rows
 from fpp_ml_bench.baselines.training.tables import PRESETS, TABLES
 from fpp_ml_bench.cli import CHECK_FAILED, OK
@@ -61,6 +57,9 @@ def train(
     """Train one recipe, a shipped one or a YAML file of yours, into a weights file that predict takes.
 
     Adds range heads where the weights need them, and prints the result. Raises FppBenchError."""
+    from fpp_ml_bench.baselines.networks.range_heads import save_with_heads
+    from fpp_ml_bench.baselines.training.depth_training import train as train_recipe
+
     methods = registry.methods()
     if recipe in methods or registry.FILE_MARK in recipe:
         method = registry.find(recipe).method
@@ -145,6 +144,9 @@ def reproduce_tables(
     """Train, predict, time and score the rows of the paper's tables, and show them beside its numbers.
 
     Does what is missing. Raises FppBenchError where a step can't be done or a training failed."""
+    from fpp_ml_bench.baselines.reproduce.work import ReproduceSettings
+    from fpp_ml_bench.baselines.reproduce.work import reproduce as run_reproduce
+
     below = out / preset
     folders = Folders(preset, below, below / "rows" if rows is None else rows)
     name, slash, row = (table or ALL).partition("/")
@@ -179,6 +181,8 @@ def reproduce_tables(
 
 
 def _list(tables: tuple[str, ...], folders: "Folders") -> None:
+    from fpp_ml_bench.baselines.reproduce.work import state_of
+
     jobs = planned(tables, folders.preset)
     titles = "Row", "Training", "State", "Rows written", "Published: object MAE"
     first_out = "Rows written", "Published: object MAE", "Training"

@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fpp_ml_bench.constants import FULL_SIZE, MINI_SIZE
-from fpp_ml_bench.loaders.render.scene import preset_settings
 from fpp_ml_bench.loaders.storage.manifest import GENERATED, Manifest
 
 FACTS = Path(__file__).resolve().parent / "benchmarks"
@@ -133,6 +132,8 @@ def known_problem(
 def intended_benchmark(manifest: Manifest) -> Benchmark | None:
     """The benchmark whose settings, but for the frames that are stored, a dataset was built with, whatever its content
     is; None for settings of its own."""
+    from fpp_ml_bench.loaders.render.scene import preset_settings  # reading a dataset needs no renderer
+
     if manifest.origin != GENERATED:
         return None
     light = manifest.settings.get("light", {}).get("name")

@@ -9,7 +9,7 @@ import pytest
 
 from fpp_ml_bench.baselines import registry
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.cli.evaluate import main as evaluate
+from fpp_ml_bench.cli import main_eval as evaluate
 
 README = Path(__file__).resolve().parents[2] / "README.md"
 

@@ -12,7 +12,7 @@ import yaml
 from scored_dataset import make_dataset, write_description, write_predictions
 
 from fpp_ml_bench.cli import COMMANDS, main, run_command
-from fpp_ml_bench.cli.evaluate import main as fpp_eval
+from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.cli.options import WORKING_RANGE, command, command_line, given, names, value
 from fpp_ml_bench.options import REQUIRED, argument, described, did_you_mean, flag_of, option, options_of
 

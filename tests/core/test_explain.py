@@ -7,7 +7,7 @@ import pytest
 from conftest import TINY_SIZE, file_bytes, tiny_settings
 
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.cli.evaluate import main as evaluate
+from fpp_ml_bench.cli import main_eval as evaluate
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.render.builder import explain_build
 from fpp_ml_bench.loaders.storage.store import DatasetFolder

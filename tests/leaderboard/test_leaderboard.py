@@ -9,7 +9,7 @@ import pytest
 from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.cli.evaluate import main as evaluate_main
+from fpp_ml_bench.cli import main_eval as evaluate_main
 from fpp_ml_bench.evaluation.result.file import write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.leaderboard import ranking, rows

@@ -12,7 +12,7 @@ from scored_dataset import disk_depth, make_dataset
 from upkeep import readme_block
 
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.cli.evaluate import main as fpp_eval
+from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
 from fpp_ml_bench.evaluation.result.file import read_result

@@ -14,7 +14,7 @@ from conftest import file_bytes
 
 from fpp_ml_bench import load_dataset
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.cli.evaluate import main as evaluate
+from fpp_ml_bench.cli import main_eval as evaluate
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.captures.decoding import CaptureReader, import_captures, plan_captures

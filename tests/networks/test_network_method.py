@@ -15,7 +15,7 @@ from fpp_ml_bench.baselines.networks.range_heads import fit_heads
 from fpp_ml_bench.baselines.run import captured_frames, predict_split
 from fpp_ml_bench.baselines.training.weights import save_weights
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.cli.evaluate import main as fpp_eval
+from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.errors import DatasetError, PredictionError, PublishError
 from fpp_ml_bench.evaluation.result.file import read_result, result_json, write_result
 from fpp_ml_bench.evaluation.score.evaluator import differences, evaluate

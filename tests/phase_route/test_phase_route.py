@@ -269,7 +269,10 @@ def test_the_users_word_from_the_command_line(tmp_path: Path, capsys: pytest.Cap
     for arguments, message in (
         (["phase", dataset, "--white-grey", "-1"], "white_grey -1.0: expected more than 0"),
         (["phase-net", dataset, "--ambient-grey", "nan"], "ambient_grey nan: expected 0 to 255"),
-        (["classical", dataset, "--ambient-grey", "6"], "--ambient-grey is an option of phase, not of classical"),
+        (
+            ["classical", dataset, "--ambient-grey", "6"],
+            "--ambient-grey is an option of phase, phase-net, not of classical",
+        ),
     ):
         capsys.readouterr()
         assert main(["predict", *arguments, "--out", str(tmp_path / "wrong")]) == 2

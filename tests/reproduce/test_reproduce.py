@@ -25,7 +25,7 @@ from fpp_ml_bench.baselines.training.engine import claim_folder
 from fpp_ml_bench.baselines.training.recipe import load_recipe
 from fpp_ml_bench.baselines.training.weights import save_weights
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.cli.evaluate import main as fpp_eval
+from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError
 from fpp_ml_bench.evaluation.result.file import read_result, write_json
 from fpp_ml_bench.evaluation.score.evaluator import evaluate

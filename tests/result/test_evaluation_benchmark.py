@@ -9,7 +9,7 @@ import pytest
 from conftest import tiny_settings
 from scored_dataset import make_dataset, name_benchmarks, write_predictions
 
-from fpp_ml_bench.cli.evaluate import main
+from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result import model
 from fpp_ml_bench.evaluation.result.file import read_result, result_json, write_result

@@ -10,7 +10,7 @@ import pytest
 from scored_dataset import DESCRIPTION, make_dataset, write_predictions
 
 from fpp_ml_bench import machine as hardware
-from fpp_ml_bench.cli.evaluate import main
+from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
 from fpp_ml_bench.evaluation.result.file import read_result, write_result
@@ -261,7 +261,7 @@ def test_unwritable_result_is_an_error(dataset, predictions, tmp_path, monkeypat
 
 def test_help_is_light_and_scoring_needs_no_torch(dataset, predictions):
     """In fresh interpreters, since a command starts as fast as its imports."""
-    script = "import sys\nfrom fpp_ml_bench.cli.evaluate import main\n"
+    script = "import sys\nfrom fpp_ml_bench.cli import main_eval as main\n"
     script += "main(sys.argv[1:])\n"
     script += "print([m for m in ('numpy', 'pydantic', 'rich', 'yaml', 'cv2', 'numba', 'torch', 'pandas', 'datasets') "
     script += "if m in sys.modules])"

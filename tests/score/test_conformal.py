@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scored_dataset import make_dataset, write_description
 
-from fpp_ml_bench.cli.evaluate import main
+from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.score.conformal import calibrate, conformal_quantile, write_calibrated
 from fpp_ml_bench.evaluation.score.evaluator import evaluate

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scored_dataset import disk_depth, make_dataset, write_description, write_predictions
 
-from fpp_ml_bench.cli.evaluate import main
+from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.depth import denormalise, normalise
 from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation.result.file import read_result, write_result

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scored_dataset import make_dataset, write_predictions
 
-from fpp_ml_bench.cli.evaluate import main
+from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE
 from fpp_ml_bench.evaluation.report.comparison import compare

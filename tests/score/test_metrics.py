@@ -28,10 +28,10 @@ def median_of_inside(sample):
 METRICS["toy_mm"] = Metric("toy_mm", "A toy", "mm", median_of_inside, "median of |e|", column="Toy")
 
 from fpp_ml_bench.cli import main as bench
-from fpp_ml_bench.cli.evaluate import main
-from fpp_ml_bench.evaluation import result
-from fpp_ml_bench.evaluation.score import evaluate
-from fpp_ml_bench.loaders.storage import DatasetFolder
+from fpp_ml_bench.cli import main_eval as main
+from fpp_ml_bench.evaluation.result.file import json_schema, read_result, result_json
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 folder, data, out, old = map(Path, sys.argv[1:])
 assert sort_keys()[-3:] == ("toy_mm", "seconds_per_sample", "frames_used")
@@ -40,10 +40,10 @@ assert [row.toy_mm for row in scored.per_sample] == [row.object_median_mm for ro
 assert scored.metrics.toy_mm == scored.metrics.object_median_mm
 assert main([str(folder), str(data), "--json", str(out), "--report", str(out.parent / "report")]) == 0
 assert "A toy" in (out.parent / "report" / "index.html").read_text()
-assert result.read_result(out).metrics.toy_mm == scored.metrics.toy_mm
+assert read_result(out).metrics.toy_mm == scored.metrics.toy_mm
 assert main(["verify", str(out), str(folder), str(data)]) == 0
-assert result.result_json(result.read_result(old)) == old.read_bytes()  # of before the toy
-assert "toy_mm" in result.json_schema("result")["$defs"]["Metrics"]["properties"]
+assert result_json(read_result(old)) == old.read_bytes()  # of before the toy
+assert "toy_mm" in json_schema("result")["$defs"]["Metrics"]["properties"]
 print("BOARD")
 assert bench(["leaderboard", str(out), str(old), "--sort", "toy_mm", "--markdown", str(out.parent / "table.md")]) == 0
 assert bench(["leaderboard", str(out), "--page", str(out.parent / "page"), "--csv", str(out.parent / "rows.csv")]) == 0

@@ -7,7 +7,7 @@ import pytest
 from extended_precision import sigma_scores
 from scored_dataset import make_dataset, write_description
 
-from fpp_ml_bench.cli.evaluate import main
+from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.metrics import UNCERTAINTY
 from fpp_ml_bench.evaluation.protocol import COVERED, NOMINAL

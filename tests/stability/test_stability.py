@@ -120,7 +120,7 @@ def naive_float32(errors):
 
 
 def break_metrics(monkeypatch):
-    monkeypatch.setattr("fpp_ml_bench.evaluation.score.stats_of", naive_float32)
+    monkeypatch.setattr("fpp_ml_bench.baselines.stability.scores.stats_of", naive_float32)
     return cases_of("metrics", "mixed magnitudes")
 
 
@@ -133,7 +133,7 @@ def break_arctangent(monkeypatch):
 
 
 def break_interval(monkeypatch):
-    monkeypatch.setattr("fpp_ml_bench.coding.minus_atan2", lambda y, x: -np.arctan2(y, x))
+    monkeypatch.setattr("fpp_ml_bench.baselines.stability.frames.minus_atan2", lambda y, x: -np.arctan2(y, x))
     return cases_of("order", "interval of the phase")
 
 
@@ -143,7 +143,7 @@ def break_triangulation(monkeypatch):
         bottom = u - np.float32(device.cx) - np.float32(device.fx) * x
         return (np.float32(device.fx * rig.t[0]) / bottom).astype(float) * 1000
 
-    monkeypatch.setattr("fpp_ml_bench.decoding.depth_from_coordinate", in_single)
+    monkeypatch.setattr("fpp_ml_bench.baselines.stability.geometry.depth_from_coordinate", in_single)
     return [member for member in cases_of("triangulation", "baseline") if member.parameters["direction"] == "vertical"]
 
 
@@ -234,6 +234,6 @@ def test_the_command(tmp_path, capsys, monkeypatch):
     assert main(["stability", "--group", "rig", "--out", str(tmp_path / "file")]) == 2
     assert main(["stability", "--group", "chance"]) == 2
     broken = break_interval(monkeypatch)
-    monkeypatch.setattr("fpp_ml_bench.baselines.stability.all_cases", lambda *_, **__: broken)
+    monkeypatch.setattr("fpp_ml_bench.cli.stability.all_cases", lambda *_, **__: broken)
     assert main(["stability", "--group", "order"]) == 1
     assert "FAIL order: interval of the phase" in capsys.readouterr().out

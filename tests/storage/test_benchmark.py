@@ -123,7 +123,7 @@ def test_what_the_commands_say(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(module, "BENCHMARKS", (known,))
     monkeypatch.setattr(module, "FACTS", tmp_path)
     (tmp_path / "fpp-bench-tiny.json").write_text(json.dumps({"content": manifest.content, "counts": {}}))
-    monkeypatch.setattr(module.render, "preset_settings", lambda preset, size, light, rig: settings)
+    monkeypatch.setattr("fpp_ml_bench.loaders.render.scene.preset_settings", lambda preset, size, light, rig: settings)
     assert main(["verify", str(tmp_path / "data")]) == 0
     assert "benchmark: this is fpp-bench-tiny version 2" in capsys.readouterr().out
     assert main(["info", str(tmp_path / "data"), "--json", "-"]) == 0

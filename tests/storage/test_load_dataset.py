@@ -220,7 +220,7 @@ def test_configuration_that_is_not_stored(tmp_path):
     build(tmp_path / "set", tiny_settings(objects=("cork",), stored="horizontal"), workers=1)
     assert len(load_dataset(tmp_path / "set", "horizontal", split="train")) == 6
     assert list(load_dataset(tmp_path / "set", "single_shot")) == ["train"]
-    with pytest.raises(DatasetError, match=r"'vertical' is not stored.*--frames vertical or --frames all"):
+    with pytest.raises(DatasetError, match=r"'vertical' is not stored.*--config vertical or --config all"):
         load_dataset(tmp_path / "set", "vertical", split="train")
     with pytest.raises(DatasetError, match="no such folder"):
         load_dataset(tmp_path / "none")

@@ -187,7 +187,7 @@ def test_same_length_but_no_arrow_is_an_error_not_a_crash(copied):
 
 def test_reading_imports_neither_torch_nor_datasets_nor_pandas(tiny):
     code = (
-        "import sys; from fpp_ml_bench.loaders import DatasetFolder; d = DatasetFolder(sys.argv[1]);"
+        "import sys; from fpp_ml_bench.loaders.storage.store import DatasetFolder; d = DatasetFolder(sys.argv[1]);"
         "d.depth_mm('mug_A0').sum(); d.frame('mug_A0', 30).sum();"
         "print([m for m in ('torch', 'datasets', 'pandas', 'scipy', 'trimesh', 'numba') if m in sys.modules])"
     )

@@ -7,7 +7,7 @@ from conftest import tiny_settings
 
 from fpp_ml_bench import load_dataset
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.cli.evaluate import main as evaluate
+from fpp_ml_bench.cli import main_eval as evaluate
 from fpp_ml_bench.constants import VIEWS
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders.render.builder import build

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scored_dataset import make_dataset, write_description, write_predictions
 
-from fpp_ml_bench.cli.evaluate import main
+from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.evaluation.submission.description import TEMPLATE, Submission, read_submission
 
 

@@ -20,7 +20,7 @@ from scipy.io import savemat
 from scored_dataset import make_dataset, write_description, write_predictions
 
 from fpp_ml_bench import containers
-from fpp_ml_bench.cli.evaluate import main
+from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import PredictionError
 
 SIZE = (32, 40)

@@ -12,7 +12,7 @@ import pytest
 import yaml
 from scored_dataset import DESCRIPTION, make_dataset, write_description, write_predictions
 
-from fpp_ml_bench.cli.evaluate import main
+from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.evaluation.submission.description import Submission, read_submission
 
 SAMPLE = "power_drill_A60"
