@@ -30,7 +30,7 @@ from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.phase_network.net_file import NetFile
-    from fpp_ml_bench.baselines.phase_network.training import Trained
+    from fpp_ml_bench.baselines.phase_network.window_training import Trained
     from fpp_ml_bench.baselines.training.weights import NetConfig
     from fpp_ml_bench.evaluation.submission.description import Submission
 
