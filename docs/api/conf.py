@@ -10,6 +10,7 @@ author = "The FPP-ML-Bench authors"
 release = fpp_ml_bench.__version__
 extensions = ["sphinx.ext.autodoc", "sphinx.ext.autosummary", "numpydoc"]
 templates_path = ["templates"]
+suppress_warnings = ["ref.python"]  # two rooms may have a class of the same name
 autodoc_default_options = {"member-order": "bysource"}
 autodoc_typehints = "signature"
 numpydoc_show_class_members = False
@@ -24,7 +25,8 @@ def _without_substitutions(app, what, name, obj, options, lines) -> None:
 
 def _skipped(app, what, name, obj, skip, options) -> bool | None:
     """Names of types are said where they are used; autodoc can't format them."""
-    return True if get_origin(obj) is not None or isinstance(obj, UnionType) else None
+    foreign = getattr(obj, "__module__", None) == "_thread"  # a lock says of no module that it is imported
+    return True if get_origin(obj) is not None or isinstance(obj, UnionType) or foreign else None
 
 
 def setup(app) -> None:
