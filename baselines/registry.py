@@ -12,6 +12,7 @@ import pickle
 import sys
 import traceback
 from functools import cache
+from hashlib import sha256
 from importlib import import_module, metadata
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -152,7 +153,7 @@ _FILES: set[Path] = set()
 def _module_of(path: Path) -> Any:
     if not path.is_file():
         raise PredictionError(f"{path}: no such file; expected FILE.py:NAME")
-    name = f"fpp_ml_bench_user_{path.stem}"
+    name = f"fpp_ml_bench_user_{path.stem}_{sha256(str(path).encode()).hexdigest()[:8]}"  # of two mine.py, each its own
     spec = spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise PredictionError(f"{path}: is no Python file; expected FILE.py:NAME")

@@ -27,7 +27,7 @@ from fpp_ml_bench.baselines.diagnostics.diagnosis import diagnose
 from fpp_ml_bench.baselines.phase_network.training import Recipe, train_phase_net
 from fpp_ml_bench.baselines.training.engine import CHECKPOINT, alone_in
 from fpp_ml_bench.baselines.training.records import save_checkpoint
-from fpp_ml_bench.cli import evaluate, main, run_command
+from fpp_ml_bench.cli import main, main_eval, run_command
 from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import DatasetError, DiagnosisError, PoolError, RemoteError, TrainingError
 from fpp_ml_bench.files import LOCK_FILE, exclusive, file_hash, write_atomically
@@ -54,7 +54,7 @@ def test_of_two_that_predict_into_a_folder_one_is_told(tiny, tmp_path, capsys):
         assert predict(tiny, out) == 2
     assert f"{out}: another process is predicting into this folder; wait for it or" in capsys.readouterr().err
     assert predict(tiny, out) == 0
-    assert not (out / LOCK_FILE).exists() and evaluate.main(["check", str(out)]) == 0
+    assert not (out / LOCK_FILE).exists() and main_eval(["check", str(out)]) == 0
 
 
 def test_what_a_killed_run_left_locks_nothing_and_the_evaluator_says_what_it_is(tiny, tmp_path, capsys):
@@ -62,12 +62,12 @@ def test_what_a_killed_run_left_locks_nothing_and_the_evaluator_says_what_it_is(
     out.mkdir()
     for name in (LOCK_FILE, ".power_drill_A0.npy.123.tmp", "unfinished.jsonl"):
         (out / name).write_text("")
-    evaluate.main([str(out), str(tiny)])
+    main_eval([str(out), str(tiny)])
     problems = capsys.readouterr().err
     assert "unfinished.jsonl: is extra (a stopped fpp-bench predict left it: run the same command again" in problems
     assert LOCK_FILE not in problems
     assert predict(tiny, out) == 0
-    assert evaluate.main([str(out), str(tiny)]) == 0
+    assert main_eval([str(out), str(tiny)]) == 0
 
 
 def test_of_two_that_train_in_a_folder_one_is_told(tmp_path):
@@ -198,14 +198,14 @@ def test_full_disks_are_answered_with_file_and_cure(tiny, tmp_path, capsys):
     for run, arguments, count, name in (
         (main, words, 100, "again/unfinished.jsonl"),
         (main, words, 10_000, "again/power_drill_A0.npy"),
-        (evaluate.main, score, 100, "result.json"),
+        (main_eval, score, 100, "result.json"),
         (main, board, 100, "/v: "),
     ):
         with files_of_at_most(count):
             assert run(arguments) == 2
         message = capsys.readouterr().err.splitlines()[-1]
         assert name in message and FREE_SPACE in message and "Errno" not in message, message
-    assert evaluate.main(score) == 0 and predict(tiny, again) == 0  # nothing is in the way
+    assert main_eval(score) == 0 and predict(tiny, again) == 0  # nothing is in the way
 
 
 def test_a_prediction_goes_on_after_a_really_full_disk(tiny, tmp_path, capsys):
@@ -216,7 +216,7 @@ def test_a_prediction_goes_on_after_a_really_full_disk(tiny, tmp_path, capsys):
         assert (disk / "out" / "unfinished.jsonl").exists()
         subprocess.run(["mount", "-o", "remount,size=2m", str(disk)], check=True)
         assert predict(tiny, disk / "out") == 0
-        assert evaluate.main(["check", str(disk / "out")]) == 0
+        assert main_eval(["check", str(disk / "out")]) == 0
 
 
 def test_a_training_names_the_file_that_does_not_fit(tmp_path):
@@ -341,7 +341,7 @@ def test_everything_is_written_before_a_table_that_nobody_reads(tiny, tmp_path, 
     predictions = tmp_path / "predictions"
     assert predict(tiny, predictions) == 0
     words = [str(predictions), str(tiny), "--report", str(tmp_path / "report")]
-    assert evaluate.main(words) == 141
+    assert main_eval(words) == 141
     assert (tmp_path / "report" / "index.html").exists()
 
 
