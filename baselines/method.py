@@ -98,6 +98,7 @@ class Method(ABC):
     Options: a frozen dataclass, whose fields made with `fpp_ml_bench.options.option` are options of every command that
     takes a method. Training: the same for ``fpp-bench train``, None where there is nothing to train. trivial: whether
     it looks at nothing, or only for the nearest training image, so that it says what other errors are worth.
+    scenes_rig: which of `NAMED_RIGS` photographs the scenes that are rendered for it, as of ``fpp-bench robustness``.
     title: name of the submission, with the settings that matter.
     frames_used: frames that must be captured, ascending. settings: everything needed to run it again.
     uses_ground_truth_range: whether it is given depth_min and depth_max of the sample it predicts.
@@ -114,6 +115,7 @@ class Method(ABC):
     Options: ClassVar[type] = NoOptions
     Training: ClassVar[type | None] = None
     trivial: ClassVar[bool] = False
+    scenes_rig: ClassVar[str] = "paper"
 
     title: str
     frames_used: tuple[int, ...]

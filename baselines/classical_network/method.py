@@ -73,7 +73,7 @@ class ClassicalNetMethod(Method):
 
     def __init__(self, rig: Rig, **options: Any) -> None:
         from fpp_ml_bench.baselines.classical_network.network import DepthFilter
-        from fpp_ml_bench.baselines.phase_network.net_file import read_net
+        from fpp_ml_bench.baselines.phase_network.network import read_net
         from fpp_ml_bench.baselines.training.weights import FILTER_NETWORKS, weights_path
 
         given = self.checked_options(options)

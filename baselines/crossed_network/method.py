@@ -20,7 +20,7 @@ from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.baselines.phase_network.net_file import NetFile
+    from fpp_ml_bench.baselines.phase_network.network import NetFile
     from fpp_ml_bench.evaluation.submission.description import Submission
 
 SHIPPED = Path(__file__).resolve().parent / "weights"  # folder of the weights that come with the package
@@ -47,6 +47,7 @@ class CrossedNetMethod(Method):
     name = "crossed-net"
     purpose = "one crossed frame, with order, mask and correction learned"
     Options = CrossedNetOptions
+    scenes_rig = "crossed"
     Training = OwnViews
     packages = ("numpy", "numba", "torch")
 
@@ -69,7 +70,7 @@ class CrossedNetMethod(Method):
     def __init__(self, rig: Rig, **options: Any) -> None:
         from fpp_ml_bench.baselines.crossed_network.inputs import CHANNELS
         from fpp_ml_bench.baselines.crossed_network.route import CrossedNetRoute
-        from fpp_ml_bench.baselines.phase_network.net_file import NetFile, load_net
+        from fpp_ml_bench.baselines.phase_network.network import NetFile, load_net
 
         given = self.checked_options(options)
         weights, min_confidence, threads = given.weights, given.min_confidence, given.threads

@@ -79,6 +79,7 @@ class CrossedMethod(Method):
     name = "crossed"
     purpose = "one frame with two fringe directions, or three, nothing learned"
     Options = CrossedOptions
+    scenes_rig = "crossed"
 
     def __init__(self, rig: Rig, **options: Any) -> None:
         given = self.checked_options(options)

@@ -29,7 +29,7 @@ from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
 from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.baselines.phase_network.net_file import NetFile
+    from fpp_ml_bench.baselines.phase_network.network import NetFile
     from fpp_ml_bench.baselines.phase_network.window_training import Trained
     from fpp_ml_bench.baselines.training.weights import NetConfig
     from fpp_ml_bench.evaluation.submission.description import Submission
@@ -133,7 +133,7 @@ class PhaseNetMethod(Method):
         return ONE_ALBEDO if shading is True else LIT_BACKGROUND if shading is False else None
 
     def __init__(self, rig: Rig, **options: Any) -> None:
-        from fpp_ml_bench.baselines.phase_network.net_file import NetFile, load_net
+        from fpp_ml_bench.baselines.phase_network.network import NetFile, load_net
         from fpp_ml_bench.baselines.phase_network.odds import Odds
         from fpp_ml_bench.baselines.phase_network.route import NetworkRoute
 

@@ -25,8 +25,7 @@ from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS
-from fpp_ml_bench.baselines.phase_network.net_file import load_net, read_net, save_net
-from fpp_ml_bench.baselines.phase_network.network import PhaseNet
+from fpp_ml_bench.baselines.phase_network.network import PhaseNet, load_net, read_net, save_net
 from fpp_ml_bench.baselines.phase_network.odds import Answers
 from fpp_ml_bench.baselines.phase_network.windows import IGNORED, chosen_threshold, mean_scores
 from fpp_ml_bench.baselines.phase_route.calibration_layer import Mask

@@ -3,7 +3,6 @@ Resolved with a preset, which sets what depends on the machine, it is every numb
 
 import hashlib
 import json
-from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,6 +15,7 @@ from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import RecipeError
 from fpp_ml_bench.evaluation.submission.prediction_files import read_plain_file
 from fpp_ml_bench.files import is_file, printable
+from fpp_ml_bench.options import nearest
 from fpp_ml_bench.schema import Positive, StrictModel, Text, problems_of
 
 RECIPES = Path(__file__).resolve().parent.parent / "recipes"
@@ -191,7 +191,7 @@ def _recipe_path(name_or_path: str | Path) -> Path:
     path = RECIPES / f"{text}.yaml"
     if ".." in Path(text).parts or Path(text).is_absolute() or not is_file(path):
         names = [*(f"{table}/{row}" for table in TABLES for row in ROWS[table]), "base"]
-        closest = get_close_matches(text, names, n=3, cutoff=0.4) or names[:3]
+        closest = nearest(text, names, 3) or names[:3]
         raise RecipeError(
             f"no recipe {printable(text, 100)!r}; near it: {', '.join(closest)}. Give one of the shipped names (see "
             "fpp-bench reproduce --list) or a .yaml file"

@@ -8,7 +8,6 @@ Pickles are never opened: that can run code. The same tensors and configuration 
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -22,6 +21,7 @@ from fpp_ml_bench.errors import FppBenchError, WeightsError
 from fpp_ml_bench.files import file_content, printable, strict_json, write_atomically
 from fpp_ml_bench.loaders.storage.benchmark import benchmark_before, benchmark_of, intended_benchmark
 from fpp_ml_bench.loaders.storage.manifest import Manifest
+from fpp_ml_bench.options import did_you_mean
 from fpp_ml_bench.schema import Count, Scalar, Text, problems_of
 
 if TYPE_CHECKING:
@@ -198,10 +198,9 @@ def weights_path(name_or_path: str | Path, folder: Path | None = None) -> Path:
         return (folder or SHIPPED) / f"{text}{SUFFIX}"
     if Path(text).exists():
         return Path(text)
-    closest = get_close_matches(text, names, n=1)
-    hint = f"did you mean {closest[0]!r}?" if closest else f"there are {', '.join(names) or 'none'};"
     raise WeightsError(
-        f"no weights called {printable(text, 100)!r} come with this package; {hint} or give the path of a {SUFFIX} file"
+        f"no weights called {printable(text, 100)!r} come with this package; {did_you_mean(text, names)}; or give the "
+        f"path of a {SUFFIX} file"
     )
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+from fpp_ml_bench.baselines.registry import find
 from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName
 from fpp_ml_bench.baselines.robustness.report import write_page, write_worst
 from fpp_ml_bench.baselines.robustness.run import Setup, View, by_severity
@@ -26,9 +27,6 @@ from fpp_ml_bench.optics.sequence import AnySequence
 from fpp_ml_bench.options import REQUIRED, option
 from fpp_ml_bench.remote import RemoteFolder, place, working_copy
 from fpp_ml_bench.tables import Table
-
-CROSSED = "crossed", "crossed-net"
-"""Methods whose scenes are photographed by the rig that projects crossed fringes."""
 
 
 @command(
@@ -72,7 +70,7 @@ def robust(
     workers = pool.processes
     if into is not None and (axes or quick):
         raise PredictionError("--into: needs all axes and severities; leave out --axes and --quick")
-    rig = "crossed" if chosen.name in CROSSED else "paper"
+    rig = find(chosen.name).method.scenes_rig
     method = chosen.load(Scenes.of(objects, size, rig), warn=False)
     entry = None if into is None else read_entry(into)
     if entry is not None:

@@ -19,7 +19,7 @@ from fpp_ml_bench.baselines.crossed_network.training import (
 )
 from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute
 from fpp_ml_bench.baselines.phase_network import window_training
-from fpp_ml_bench.baselines.phase_network.net_file import load_net
+from fpp_ml_bench.baselines.phase_network.network import load_net
 from fpp_ml_bench.baselines.phase_network.odds import Answers, threshold_at
 from fpp_ml_bench.baselines.phase_network.windows import IGNORED
 from fpp_ml_bench.baselines.registry import load_method

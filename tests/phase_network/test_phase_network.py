@@ -9,8 +9,7 @@ from flat_planes import FIRST, OTHER_RIG, RIG, USERS_WORD, photograph, plane_dep
 
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS
 from fpp_ml_bench.baselines.phase_network.method import PhaseNetMethod
-from fpp_ml_bench.baselines.phase_network.net_file import load_net
-from fpp_ml_bench.baselines.phase_network.network import PhaseNet
+from fpp_ml_bench.baselines.phase_network.network import PhaseNet, load_net
 from fpp_ml_bench.baselines.phase_network.route import NetworkRoute
 from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
 from fpp_ml_bench.baselines.phase_route.observation import Reason, Settings

@@ -13,8 +13,7 @@ from flat_planes import DIRECT, USERS_WORD, plane_depth_m, plane_fringe
 
 from fpp_ml_bench.baselines.phase_network import window_training
 from fpp_ml_bench.baselines.phase_network.inputs import CHANNELS, Geometry, Rotation
-from fpp_ml_bench.baselines.phase_network.net_file import load_net, save_net
-from fpp_ml_bench.baselines.phase_network.network import PhaseNet
+from fpp_ml_bench.baselines.phase_network.network import PhaseNet, load_net, save_net
 from fpp_ml_bench.baselines.phase_network.training import (
     PhaseSample,
     PhaseTask,
