@@ -20,7 +20,7 @@ from pydantic import Field
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.baselines.method import Frames, Method
-from fpp_ml_bench.baselines.registry import find, load_method, methods
+from fpp_ml_bench.baselines.registry import failure_in_file, find, load_method, methods
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.baselines.timing import added_mib, four_digits
 from fpp_ml_bench.baselines.training.weights import open_weights, shipped_names, weights_path
@@ -30,7 +30,7 @@ from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.evaluation.result.parts import HardwareInfo
 from fpp_ml_bench.evaluation.score.check import scored_pair
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
-from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, read_json
+from fpp_ml_bench.files import LOCK_FILE, NAME_LIMIT, exclusive, printable, read_json
 from fpp_ml_bench.loaders.render.meshes import solid_mesh
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.view import Studio
@@ -51,7 +51,7 @@ OBJECT, VIEW = "power_drill", "A60"
 """That scene."""
 RUNS, LIMIT_S = 5, 1.0
 """Timed runs of each view, fewer once these seconds are used up: a short run is timed badly."""
-REASON_LENGTH = 400
+REASON_LENGTH = NAME_LIMIT - 3  # and "..."; what a file of the run may hold
 _PACKAGE = f"{Path(__file__).resolve().parents[2]}/"
 """The package's folder, which is removed from messages that go into a result."""
 
@@ -281,8 +281,8 @@ def _points_before(path: Path, run: Tradeoff) -> list[Point]:
 
 
 def measured(plan: Plan, point: Point) -> Point:
-    """``point`` with its numbers. An error of the package (a frame is not stored, weights are missing) becomes its
-    ``failed``, and the run goes on."""
+    """``point`` with its numbers. An error of the package (a frame is not stored, weights are missing), or in the
+    user's own file, becomes its ``failed``, and the run goes on."""
     figures = point.model_dump(include={"method", "options", "source_sha256"})
     try:
         method = plan.load(point, plan.opened)
@@ -294,8 +294,11 @@ def measured(plan: Plan, point: Point) -> Point:
         for rig, frames in zip(plan.rigs, plan.scenes, strict=True):
             pixel_seconds.append(four_digits(plan.timed(plan.load(point, rig).predict, frames)[0]))
         figures["pixel_seconds"] = pixel_seconds
-    except FppBenchError as error:
-        figures["failed"] = printable(" ".join(str(error).split()).replace(_PACKAGE, ""), REASON_LENGTH)
+    except Exception as error:
+        reason = str(error) if isinstance(error, FppBenchError) else failure_in_file(error)
+        if reason is None:
+            raise
+        figures["failed"] = printable(" ".join(reason.split()).replace(_PACKAGE, ""), REASON_LENGTH)[:NAME_LIMIT]
     return Point(**figures)
 
 

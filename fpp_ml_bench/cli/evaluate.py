@@ -124,6 +124,8 @@ def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[D
         predicted = read_plain(folder).get("predicted") or {}
         told, content = Path(predicted["dataset"]), dict(predicted["content"])
         split = split or str(predicted["split"])
+        if not content:
+            raise ValueError("no content to compare")
     except SubmissionError as error:
         if place is None:
             raise SubmissionError(f"{error}; {give}") from None

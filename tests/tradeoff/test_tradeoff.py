@@ -16,6 +16,7 @@ from scipy import stats
 from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.registry import load_from_file
 from fpp_ml_bench.baselines.tradeoff import measure
 from fpp_ml_bench.baselines.tradeoff.measure import (
     COST_KEYS,
@@ -130,6 +131,24 @@ def test_a_point_is_what_the_evaluator_says(small, tmp_path, answers):
     assert point.object_mae_mm == pytest.approx(expected.metrics.object_mae_mm)
     assert 0 < point.missing_share < 1 and point.working_memory_mib in (None, pytest.approx(0, abs=5))
     assert point.label == "good offset_mm=3.0 rows=16" and point.software["numpy"] == np.__version__
+
+
+def test_a_long_reason_and_a_failure_in_ones_own_file_are_reasons(small, tmp_path, answers, monkeypatch):
+    """Both are in the file of the run, which can be read again."""
+    (tmp_path / "mine.py").write_text("def fail():\n    return 1 / 0\n")
+    failing = load_from_file(f"{tmp_path / 'mine.py'}:fail")
+    for number, (fail, says) in enumerate([(None, "because"), (failing, "line 2, in fail: ZeroDivisionError")]):
+
+        def load_method(name, source, fail=fail, **options):
+            if fail is not None:
+                fail()
+            raise PredictionError("because " * 60)
+
+        monkeypatch.setattr(measure, "load_method", load_method)
+        out = tmp_path / str(number)
+        measure.tradeoff(plan_of(small, out, "good"))
+        (point,) = measure.read_tradeoff(out / measure.TRADEOFF_FILE).points
+        assert says in point.failed and point.seconds is None
 
 
 def test_what_cant_be_measured_says_why_and_has_no_numbers(small, tmp_path, answers, monkeypatch):
