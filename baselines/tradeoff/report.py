@@ -1,5 +1,6 @@
 """A trade-off as tables and pictures: the points with their fronts, and how costs grow."""
 
+from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
 
@@ -8,7 +9,7 @@ from matplotlib.figure import Figure
 from rich.text import Text
 
 from fpp_ml_bench.baselines.tradeoff.drawing import Mark, Scatter
-from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, TRADEOFF_FILE, Cost, Tradeoff, power
+from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, TRADEOFF_FILE, Cost, Point, Tradeoff, power
 from fpp_ml_bench.evaluation.report.html import millimetres, percent
 from fpp_ml_bench.evaluation.result.file import write_file
 from fpp_ml_bench.files import printable
@@ -43,13 +44,20 @@ def point_rows(run: Tradeoff) -> list[list[str]]:
 
 
 def growth_rows(run: Tradeoff) -> list[list[str]]:
-    """Cells of every point that was measured under `GROWTH`. The power of frames is over all points of its method."""
+    """Cells of every point that was measured under `GROWTH`. The power of frames is over the points of its method that
+    have the same options with other values, such as numbers of steps."""
+
+    def alike(point: Point) -> Iterator[tuple[int, float]]:
+        for other in run.points:
+            if other.method == point.method and other.options.keys() == point.options.keys():
+                yield other.frames, other.seconds or 0
+
     return [
         [
             printable(point.label),
             ", ".join(map(_ms, point.pixel_seconds or ())) or "-",
             _number(power(zip(run.pixels, point.pixel_seconds or (), strict=False))),
-            _number(power((other.frames, other.seconds or 0) for other in run.points if other.method == point.method)),
+            _number(power(alike(point))),
             _ms(point.batch_seconds),
         ]
         for point in run.points

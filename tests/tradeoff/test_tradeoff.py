@@ -260,12 +260,14 @@ def test_a_power_is_that_of_least_squares():
 
 
 def test_growth_over_pixels_and_frames(small):
-    first = point("a", 1.0, 10, 2.0, pixel_seconds=[0.001, 0.002, 0.004])
-    second = point("a", 4.0, 20, 1.0).model_copy(update={"options": {"steps": 9, "fewest": True}})
-    run = tradeoff_of(small, [first, second, point("b", 1.0, 1, 9.0)])
+    first = point("a", 1.0, 10, 2.0, pixel_seconds=[0.001, 0.002, 0.004]).model_copy(update={"options": {"steps": 4}})
+    second = point("a", 4.0, 20, 1.0).model_copy(update={"options": {"steps": 9}})
+    other = point("a", 4.0, 5, 1.0).model_copy(update={"options": {"steps": 9, "fewest": True}})
+    run = tradeoff_of(small, [first, second, other, point("b", 1.0, 1, 9.0)])
     assert growth_rows(run) == [
-        ["a", "1, 2, 4", "1", "2", "1,000"],
-        ["a steps=9 fewest", "-", "-", "2", "4,000"],
+        ["a steps=4", "1, 2, 4", "1", "2", "1,000"],
+        ["a steps=9", "-", "-", "2", "4,000"],
+        ["a steps=9 fewest", "-", "-", "-", "4,000"],
         ["b", "-", "-", "-", "1,000"],
     ]
 
