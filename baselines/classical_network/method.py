@@ -9,17 +9,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.classical import DIRECTIONS, ClassicalMethod
-from fpp_ml_bench.baselines.method import Answer, Frames, Method, OwnViews
-from fpp_ml_bench.baselines.phase_network.method import WEIGHTS, recipe_values, rendered_data, say_trained
+from fpp_ml_bench.baselines.method import Answer, Frames
+from fpp_ml_bench.baselines.phase_network.method import WEIGHTS, LearnedMethod
 from fpp_ml_bench.coding.phase_shift import PhaseShift
 from fpp_ml_bench.decoding.decode import Directions
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
+    from fpp_ml_bench.baselines.phase_network.window_training import StepRecipe
     from fpp_ml_bench.evaluation.submission.description import Submission
 
 SHIPPED = Path(__file__).resolve().parent / "weights"  # folder of the weights that come with the package
@@ -40,7 +40,7 @@ class ClassicalNetOptions:
     threads: int = 1
 
 
-class ClassicalNetMethod(Method):
+class ClassicalNetMethod(LearnedMethod):
     """`ClassicalMethod` of one ``direction`` (default: the one it learned) and ``steps`` (default: 3). The weights
     ``weights`` (a shipped name or a file) average its depth over neighbours, by at most three stated standard
     uncertainties, and fill it where it has none. Raises `WeightsError` for weights that can't be used, and
@@ -49,16 +49,12 @@ class ClassicalNetMethod(Method):
     name = "classical-net"
     purpose = "classical frames; noise and missed pixels learned"
     Options = ClassicalNetOptions
-    Training = OwnViews
-    packages = ("numpy", "numba", "torch")
 
     @classmethod
-    def train(cls, training: OwnViews, out: Path, minutes: float | None = None) -> bool:
-        from fpp_ml_bench.baselines.classical_network.training import FilterRecipe, train_classical_net
+    def recipe(cls, **given: Any) -> "StepRecipe":
+        from fpp_ml_bench.baselines.classical_network.training import FilterRecipe
 
-        recipe = FilterRecipe(**recipe_values(training))
-        trained = train_classical_net(recipe, out, minutes=minutes, workers=usable_cores(), show=True, print_line=print)
-        return say_trained(cls.name, out, recipe.steps, trained)
+        return FilterRecipe(**given)
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
@@ -94,21 +90,13 @@ class ClassicalNetMethod(Method):
             steps = STEPS
         self.classical = ClassicalMethod(rig, direction=way, steps=steps, threads=threads)
         self.rig, self.threads, self.frames_used = rig, threads, self.classical.frames_used
-        self.config = self.weights_config = config
-        self.parameters = sum(parameter.numel() for parameter in network.parameters())
+        self.config = config
         more = "" if config.name == DEFAULT else f" ({config.name})"
         self.title = f"{self.classical.title}; noise and missed pixels learned{more}"
         self.settings = {
             **self.classical.settings,
-            "weights": config.name,
-            "weights_sha256": digest,
-            "mask_threshold": config.threshold,
+            **self.use(config, network, digest),
         }
-
-    @property
-    def learned_from(self) -> dict[str, Any]:
-        """Views that its training renders of the training objects."""
-        return rendered_data(self.config)
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         return self.answer(frames).depth

@@ -23,7 +23,6 @@ from fpp_ml_bench.baselines.phase_network.window_training import (
     mask_loss,
     mean_over,
     scale_loss,
-    train_net,
 )
 from fpp_ml_bench.baselines.phase_network.windows import Sample, edge_points, mean_scores, place_of
 from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask
@@ -175,9 +174,6 @@ class FilterTask(Task):
         pairs = zip(answered, validation, strict=True)
         means = mean_scores(score(answer, sample, threshold) for answer, sample in pairs)
         return {"threshold": threshold, "period_px": {}, "validation": means}
-
-
-train_classical_net = train_net
 
 
 def score(answer: Filtered, sample: DepthSample, threshold: float) -> dict[str, float | None]:

@@ -9,18 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.crossed_route.method import crossed_image, crossed_name, frames_of, has_crossed_fringes
-from fpp_ml_bench.baselines.crossed_route.observation import CrossedMeasurement, Settings
-from fpp_ml_bench.baselines.method import Answer, Frames, Method, OwnViews
-from fpp_ml_bench.baselines.phase_network.method import WEIGHTS, recipe_values, rendered_data, say_trained
+from fpp_ml_bench.baselines.crossed_route.observation import Settings
+from fpp_ml_bench.baselines.method import Frames
+from fpp_ml_bench.baselines.phase_network.method import WEIGHTS, LearnedRoute
 from fpp_ml_bench.baselines.phase_route.method import MIN_CONFIDENCE
 from fpp_ml_bench.baselines.phase_route.resampling import Periods
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.phase_network.network import NetFile
+    from fpp_ml_bench.baselines.phase_network.window_training import StepRecipe
     from fpp_ml_bench.evaluation.submission.description import Submission
 
 SHIPPED = Path(__file__).resolve().parent / "weights"  # folder of the weights that come with the package
@@ -39,7 +39,7 @@ class CrossedNetOptions:
     threads: int = 1
 
 
-class CrossedNetMethod(Method):
+class CrossedNetMethod(LearnedRoute):
     """Depth from one crossed frame by the weights ``weights`` (a shipped name or a file), or from the mean of the first
     fringe of both directions where the rig has no crossed frame. ``min_confidence``: pixels below it are masked. Raises
     `WeightsError` for weights that can't be used, and `PredictionError` for a rig whose fringes they did not learn."""
@@ -48,16 +48,12 @@ class CrossedNetMethod(Method):
     purpose = "one crossed frame, with order, mask and correction learned"
     Options = CrossedNetOptions
     scenes_rig = "crossed"
-    Training = OwnViews
-    packages = ("numpy", "numba", "torch")
 
     @classmethod
-    def train(cls, training: OwnViews, out: Path, minutes: float | None = None) -> bool:
-        from fpp_ml_bench.baselines.crossed_network.training import CrossedRecipe, train_crossed_net
+    def recipe(cls, **given: Any) -> "StepRecipe":
+        from fpp_ml_bench.baselines.crossed_network.training import CrossedRecipe
 
-        recipe = CrossedRecipe(**recipe_values(training))
-        trained = train_crossed_net(recipe, out, minutes=minutes, workers=usable_cores(), show=True, print_line=print)
-        return say_trained(cls.name, out, recipe.steps, trained)
+        return CrossedRecipe(**given)
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
@@ -87,40 +83,19 @@ class CrossedNetMethod(Method):
         self.route = CrossedNetRoute(
             rig, self.file.network, config.threshold, config.lead, Settings(min_confidence), periods
         )
-        self.weights_config = config
-        self.parameters = sum(parameter.numel() for parameter in self.file.network.parameters())
         made = "" if len(self.frames_used) == 1 else ", the mean of two"
         more = "" if config.name == DEFAULT else f" ({config.name})"
         self.title = f"Crossed fringes, one frame{made}; order, mask and correction learned{more}"
         self.settings = {
             "min_confidence": min_confidence,
-            "weights": config.name,
-            "weights_sha256": self.file.sha256,
-            "mask_threshold": config.threshold,
+            **self.use(config, self.file.network, self.file.sha256),
             "order_lead": config.lead,
             "threads": threads,
         }
 
-    @property
-    def learned_from(self) -> dict[str, Any]:
-        """Views that its training renders of the training objects."""
-        return rendered_data(self.file.config)
-
-    def measure(self, frames: Frames) -> CrossedMeasurement:
-        """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
-        from fpp_ml_bench.baselines.networks.base import torch_threads
-
-        with torch_threads(self.threads):
-            return self.route.measure(crossed_image(frames, self.frames_used))
+    def image(self, frames: Frames) -> NDArray[np.uint8]:
+        return crossed_image(self.images(frames))
 
     def crop(self, frames: Frames) -> tuple[slice, slice]:
         route = self.route.route
-        return route.resampling.captured_crop(route.observe(crossed_image(frames, self.frames_used)).carriers.crop)
-
-    def predict(self, frames: Frames) -> NDArray[np.float32]:
-        """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""
-        return self.measure(frames).depth_mm
-
-    def answer(self, frames: Frames) -> Answer:
-        measurement = self.measure(frames)
-        return Answer(measurement.depth_mm, measurement.sigma_mm)
+        return route.resampling.captured_crop(route.observe(self.image(frames)).carriers.crop)

@@ -15,7 +15,7 @@ from fpp_ml_bench.baselines.crossed_network.route import decided_mask, network_a
 from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.odds import Answers
-from fpp_ml_bench.baselines.phase_network.window_training import CandidateTask, WindowRecipe, train_net
+from fpp_ml_bench.baselines.phase_network.window_training import CandidateTask, WindowRecipe
 from fpp_ml_bench.baselines.phase_network.windows import (
     IGNORED,
     Sample,
@@ -154,6 +154,3 @@ class CrossedTask(CandidateTask):
 
     def chosen(self, answered: Any, validation: list[CrossedSample], out: Path) -> dict[str, Any]:
         return super().chosen(answered, validation, out) | {"period_px": {"crossed": self.route.carriers.period_px}}
-
-
-train_crossed_net = train_net

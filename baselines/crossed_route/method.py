@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.crossed_route.observation import CrossedMeasurement, CrossedObservation, Settings
 from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute
 from fpp_ml_bench.baselines.crossed_route.three_frames import FRAMES, ThreeFrameRoute, shifted_carrier
-from fpp_ml_bench.baselines.method import Answer, Frames, Method
-from fpp_ml_bench.baselines.phase_route.method import MASK, MIN_CONFIDENCE
+from fpp_ml_bench.baselines.method import Frames
+from fpp_ml_bench.baselines.phase_route.method import MASK, MIN_CONFIDENCE, RouteMethod
 from fpp_ml_bench.coding.crossed import crossed_from_pair
 from fpp_ml_bench.decoding.decode import grey_levels
-from fpp_ml_bench.errors import DecodeError, PredictionError
+from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.captures.decoding import read_mask
 from fpp_ml_bench.optics.rig import Rig
@@ -40,20 +40,10 @@ def frames_of(rig: Rig, name: str) -> tuple[int, ...]:
     )
 
 
-def _captured(frames: Frames, used: tuple[int, ...]) -> list[NDArray[np.uint8]]:
-    images = []
-    for index in used:
-        image = frames[index] if index < len(frames) else None
-        if image is None:
-            raise DecodeError(f"frame {index} is missing: the crossed fringes are measured in frames {used}")
-        images.append(grey_levels(image))
-    return images
-
-
-def crossed_image(frames: Frames, used: tuple[int, ...]) -> NDArray[np.uint8]:
-    """The crossed frame of a captured sequence; raises `DecodeError` for a frame that is missing."""
-    images = _captured(frames, used)
-    return images[0] if len(images) == 1 else crossed_from_pair(images[0], images[1])
+def crossed_image(images: Sequence[NDArray]) -> NDArray[np.uint8]:
+    """The crossed frame of the images of `frames_of`."""
+    grey = [grey_levels(image) for image in images]
+    return grey[0] if len(grey) == 1 else crossed_from_pair(grey[0], grey[1])
 
 
 def has_crossed_fringes(rig: Rig) -> bool:
@@ -70,7 +60,7 @@ class CrossedOptions:
     mask: str | Path | None = option(None, MASK, "FILE")
 
 
-class CrossedMethod(Method):
+class CrossedMethod(RouteMethod):
     """Depth from one crossed frame; where the rig has none, from the mean of the first fringe of both directions, which
     is one. With ``frames`` 3: from three that shift one carrier (`ThreeFrameRoute`). ``mask``: a file
     (`captures.read_mask`) that says where the object is in every sample. Raises `PredictionError` for a rig without
@@ -115,8 +105,8 @@ class CrossedMethod(Method):
     def observe(self, frames: Frames) -> CrossedObservation:
         """What is measured before depth; frames that are not in `frames_used` may be None."""
         if isinstance(self.route, ThreeFrameRoute):
-            return self.route.observe_frames(_captured(frames, self.frames_used), self.mask)
-        return self.route.observe(crossed_image(frames, self.frames_used), self.mask)
+            return self.route.observe_frames([grey_levels(image) for image in self.images(frames)], self.mask)
+        return self.route.observe(crossed_image(self.images(frames)), self.mask)
 
     def measure(self, frames: Frames) -> CrossedMeasurement:
         """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
@@ -124,14 +114,6 @@ class CrossedMethod(Method):
 
     def crop(self, frames: Frames) -> tuple[slice, slice]:
         return self.route.resampling.captured_crop(self.observe(frames).carriers.crop)
-
-    def predict(self, frames: Frames) -> NDArray[np.float32]:
-        """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""
-        return self.measure(frames).depth_mm
-
-    def answer(self, frames: Frames) -> Answer:
-        measurement = self.measure(frames)
-        return Answer(measurement.depth_mm, measurement.sigma_mm)
 
 
 def crossed_name(submission: "Submission", begins: str) -> str | None:

@@ -1,5 +1,6 @@
 """The learned route as a method of ``fpp-bench predict``: one captured fringe, metric depth, no range given."""
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method, OwnViews
+from fpp_ml_bench.baselines.method import Assumption, Frames, Method, OwnViews
 from fpp_ml_bench.baselines.phase_route.method import (
     AMBIENT_GREY,
     DIRECTION,
@@ -16,12 +17,13 @@ from fpp_ml_bench.baselines.phase_route.method import (
     MIN_CONFIDENCE,
     ONE_ALBEDO,
     WHITE_GREY,
+    RouteMethod,
     direction_of,
     fringe_options,
 )
-from fpp_ml_bench.baselines.phase_route.observation import Measurement, Settings
+from fpp_ml_bench.baselines.phase_route.observation import Settings
 from fpp_ml_bench.baselines.phase_route.resampling import Periods
-from fpp_ml_bench.errors import DecodeError, PredictionError
+from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.rig import Rig
@@ -29,8 +31,10 @@ from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
 from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
+    from torch import nn
+
     from fpp_ml_bench.baselines.phase_network.network import NetFile
-    from fpp_ml_bench.baselines.phase_network.window_training import Trained
+    from fpp_ml_bench.baselines.phase_network.window_training import StepRecipe
     from fpp_ml_bench.baselines.training.weights import NetConfig
     from fpp_ml_bench.evaluation.submission.description import Submission
 
@@ -44,11 +48,65 @@ WEIGHTS = "weights: a file, such as training writes (default: those that come wi
 ALBEDOS = ("one", "any")
 
 
-def rendered_data(config: "NetConfig") -> dict[str, Any]:
-    """`Method.learned_from` of weights whose training renders its own views."""
-    recipe = config.recipe
-    lights = f"training objects in the light paper and {recipe.get('lights')} drawn ones, seed {recipe.get('seed')}"
-    return {"data": "generated", "versions": [lights]}
+class LearnedMethod(Method):
+    """A method whose network learns from views that its training renders of the training objects."""
+
+    Training = OwnViews
+    packages = ("numpy", "numba", "torch")
+    weights_config: "NetConfig"
+
+    @classmethod
+    @abstractmethod
+    def recipe(cls, **given: Any) -> "StepRecipe":
+        """The recipe of its training, with the values that were given."""
+
+    @classmethod
+    def train(cls, training: Any, out: Path, minutes: float | None = None) -> bool:
+        from fpp_ml_bench.baselines.phase_network.window_training import train_net
+
+        given = {key: value for key, value in vars(training).items() if value is not None}
+        start = given.pop("start", None)
+        recipe = cls.recipe(**given)
+        trained = train_net(
+            recipe, out, start=start, minutes=minutes, workers=usable_cores(), show=True, print_line=print
+        )
+        if trained.weights is None:
+            steps = f"{trained.steps} of {recipe.steps} steps"
+            print(f"{out}: stopped after {steps}, all saved; run the same command to resume")
+            return False
+        scores = ", ".join(f"{key} {value:.3g}" for key, value in trained.validation.items())
+        print(f"{trained.weights}: {trained.steps} steps, mask threshold {trained.threshold:g}; validation: {scores}")
+        print(f"next: fpp-bench predict {cls.name} DATASET --weights {trained.weights} --out predictions")
+        return True
+
+    def use(self, config: "NetConfig", network: "nn.Module", sha256: str) -> dict[str, Any]:
+        """Note whose weights these are; what they add to the submission's settings."""
+        self.weights_config, self.parameters = config, sum(parameter.numel() for parameter in network.parameters())
+        return {"weights": config.name, "weights_sha256": sha256, "mask_threshold": config.threshold}
+
+    @property
+    def learned_from(self) -> dict[str, Any]:
+        recipe = self.weights_config.recipe
+        lights = f"training objects in the light paper and {recipe.get('lights')} drawn ones, seed {recipe.get('seed')}"
+        return {"data": "generated", "versions": [lights]}
+
+
+class LearnedRoute(LearnedMethod, RouteMethod):
+    """A learned method that measures every map of a sample with `route`, and its network in ``threads``."""
+
+    route: Any
+    threads: int
+
+    @abstractmethod
+    def image(self, frames: Frames) -> NDArray[np.uint8]:
+        """The image (H, W) that is measured, of a captured sequence."""
+
+    def measure(self, frames: Frames) -> Any:
+        """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
+        from fpp_ml_bench.baselines.networks.base import torch_threads
+
+        with torch_threads(self.threads):
+            return self.route.measure(self.image(frames))
 
 
 def _shipped(albedo: str) -> str:
@@ -85,7 +143,7 @@ class PhaseNetTraining(OwnViews):
     start: Path | None = option(None, "weights to start from (default: none)", "FILE")
 
 
-class PhaseNetMethod(Method):
+class PhaseNetMethod(LearnedRoute):
     """Depth from the first sinusoid of one ``direction``. ``albedo``: "one", where all surfaces have the background's,
     so that brightness tells the order, or "any", where it is ambiguous unless range and shape tell it; or
     ``weights``, a shipped name or a file, which say what they learned. ``min_confidence``: pixels below it are masked;
@@ -96,23 +154,16 @@ class PhaseNetMethod(Method):
     purpose = "one fringe; order, mask and correction learned"
     Options = PhaseNetOptions
     Training = PhaseNetTraining
-    packages = ("numpy", "numba", "torch")
 
     @classmethod
     def for_rig(cls, rig: Rig, **options: Any) -> Method:
         return cls(rig, **fringe_options(cls.name, rig, options))
 
     @classmethod
-    def train(cls, training: PhaseNetTraining, out: Path, minutes: float | None = None) -> bool:
-        from fpp_ml_bench.baselines.phase_network.training import Recipe, train_phase_net
+    def recipe(cls, **given: Any) -> "StepRecipe":
+        from fpp_ml_bench.baselines.phase_network.training import Recipe
 
-        given = recipe_values(training)
-        start = given.pop("start", None)
-        recipe = Recipe(**given)
-        trained = train_phase_net(
-            recipe, out, start=start, minutes=minutes, workers=usable_cores(), show=True, print_line=print
-        )
-        return say_trained(cls.name, out, recipe.steps, trained)
+        return Recipe(**given)
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
@@ -176,8 +227,6 @@ class PhaseNetMethod(Method):
             odds,
             periods,
         )
-        self.weights_config = config
-        self.parameters = sum(parameter.numel() for parameter in self.file.network.parameters())
         self.frames_used = (rig.sequence.sinusoids(direction)[0],)
         more = "" if config.name == f"phase-net-{learned}-albedo" else f" ({config.name})"
         # With a range under a period, most pixels have one order in it, whatever the network says.
@@ -190,9 +239,7 @@ class PhaseNetMethod(Method):
             "shading": shading,
             "order_by_range": self.by_range,
             "min_confidence": min_confidence,
-            "weights": config.name,
-            "weights_sha256": self.file.sha256,
-            "mask_threshold": config.threshold,
+            **self.use(config, self.file.network, self.file.sha256),
             "order_lead": config.lead,
             "temperature": config.temperature,
             "offset": config.offset,
@@ -202,49 +249,9 @@ class PhaseNetMethod(Method):
             "ambient_grey": ambient_grey,
         }
 
-    @property
-    def learned_from(self) -> dict[str, Any]:
-        """Views that its training renders of the training objects."""
-        return rendered_data(self.file.config)
-
-    def measure(self, frames: Frames) -> Measurement:
-        """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
-        from fpp_ml_bench.baselines.networks.base import torch_threads
-
-        with torch_threads(self.threads):
-            return self.route.measure(self._image(frames))
+    def image(self, frames: Frames) -> NDArray[np.uint8]:
+        return self.images(frames)[0]
 
     def crop(self, frames: Frames) -> tuple[slice, slice]:
         route = self.route.geometry.route
-        return route.resampling.captured_crop(route.observe(self._image(frames)).crop)
-
-    def _image(self, frames: Frames) -> NDArray[np.uint8]:
-        (index,) = self.frames_used
-        image = frames[index] if index < len(frames) else None
-        if image is None:
-            raise DecodeError(f"frame {index} is missing: phase-net needs that one fringe")
-        return image
-
-    def predict(self, frames: Frames) -> NDArray[np.float32]:
-        """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""
-        return self.measure(frames).depth_mm
-
-    def answer(self, frames: Frames) -> Answer:
-        measurement = self.measure(frames)
-        return Answer(measurement.depth_mm, measurement.sigma_mm)
-
-
-def recipe_values(training: OwnViews) -> dict[str, Any]:
-    """The values that were given; what is None is as the recipe has it."""
-    return {key: value for key, value in vars(training).items() if value is not None}
-
-
-def say_trained(name: str, out: Path, steps: int, trained: "Trained") -> bool:
-    """Print how a training of a method called ``name``, of ``steps``, ended; whether it has finished."""
-    if trained.weights is None:
-        print(f"{out}: stopped after {trained.steps} of {steps} steps, all saved; run the same command to resume")
-        return False
-    scores = ", ".join(f"{key} {value:.3g}" for key, value in trained.validation.items())
-    print(f"{trained.weights}: {trained.steps} steps, mask threshold {trained.threshold:g}; validation: {scores}")
-    print(f"next: fpp-bench predict {name} DATASET --weights {trained.weights} --out predictions")
-    return True
+        return route.resampling.captured_crop(route.observe(self.image(frames)).crop)

@@ -19,7 +19,7 @@ from fpp_ml_bench.baselines.phase_network.inputs import FIRST_MISFIT, FIRST_SIDE
 from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_network.odds import Answers, Judged, chosen_odds, confident_shares, draw_reliability
 from fpp_ml_bench.baselines.phase_network.route import decided_mask, decided_order, network_answers
-from fpp_ml_bench.baselines.phase_network.window_training import CandidateTask, WindowRecipe, train_net
+from fpp_ml_bench.baselines.phase_network.window_training import CandidateTask, WindowRecipe
 from fpp_ml_bench.baselines.phase_network.windows import (
     IGNORED,
     Sample,
@@ -291,6 +291,3 @@ class PhaseTask(CandidateTask):
             "validation": fields["validation"] | {"confident_percent": confident},
             "period_px": {direction: g.route.period_px for direction, g in self.geometries.items()},
         }
-
-
-train_phase_net = train_net

@@ -6,7 +6,7 @@ expected error, from its phase and from its order. While that error is too large
 """
 
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -81,7 +81,33 @@ class PhaseOptions(Settings):
     mask: str | Path | None = option(None, MASK, "FILE")
 
 
-class PhaseMethod(Method):
+class RouteMethod(Method):
+    """A method that measures every map of a sample at once: ``measure`` (frames) gives a measurement with ``depth_mm``
+    and ``sigma_mm``."""
+
+    measure: Callable[[Frames], Any]
+
+    def images(self, frames: Frames) -> list[NDArray[np.uint8]]:
+        """The captured frames of `frames_used`; raises `DecodeError` for one that is missing."""
+        images = []
+        for index in self.frames_used:
+            image = frames[index] if index < len(frames) else None
+            if image is None:
+                used = f"frames {self.frames_used}" if len(self.frames_used) > 1 else "that frame"
+                raise DecodeError(f"frame {index} is missing: {self.name} needs {used}")
+            images.append(image)
+        return images
+
+    def predict(self, frames: Frames) -> NDArray[np.float32]:
+        """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""
+        return self.measure(frames).depth_mm  # type: ignore[no-any-return]
+
+    def answer(self, frames: Frames) -> Answer:
+        measurement = self.measure(frames)
+        return Answer(measurement.depth_mm, measurement.sigma_mm)
+
+
+class PhaseMethod(RouteMethod):
     """Depth from one or more sinusoids of one direction; options are those of `Settings`. ``mask``: a file
     (`captures.read_mask`) that says where the object is in every sample, instead of the route's own mask. Raises
     `PredictionError` for an unknown option or an invalid value, `CaptureError` for a mask that can't be used."""
@@ -141,28 +167,10 @@ class PhaseMethod(Method):
 
     def measure(self, frames: Frames) -> Measurement:
         """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
-        return self.route.measure(self._images(frames), self.mask)
+        return self.route.measure(self.images(frames), self.mask)
 
     def crop(self, frames: Frames) -> tuple[slice, slice]:
-        return self.route.resampling.captured_crop(self.route.observe(self._images(frames), self.mask).crop)
-
-    def _images(self, frames: Frames) -> list[NDArray[np.uint8]]:
-        images = []
-        for index in self.frames_used:
-            image = frames[index] if index < len(frames) else None
-            if image is None:
-                needed = "that fringe" if len(self.frames_used) == 1 else f"frames {self.frames_used}"
-                raise DecodeError(f"frame {index} is missing: the phase route needs {needed}")
-            images.append(image)
-        return images
-
-    def predict(self, frames: Frames) -> NDArray[np.float32]:
-        """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""
-        return self.measure(frames).depth_mm
-
-    def answer(self, frames: Frames) -> Answer:
-        measurement = self.measure(frames)
-        return Answer(measurement.depth_mm, measurement.sigma_mm)
+        return self.route.resampling.captured_crop(self.route.observe(self.images(frames), self.mask).crop)
 
 
 @dataclass(frozen=True)

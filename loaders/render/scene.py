@@ -209,10 +209,14 @@ def photographing_rig(rig: Rig, calibration_px: float, seed: int) -> Rig:
     return other
 
 
+def name_bytes(*name: object) -> bytes:
+    """Eight bytes that depend only on ``name``, such as ``(seed, object, view, frame)``."""
+    return blake2b("\x1f".join(map(str, name)).encode(), digest_size=8).digest()
+
+
 def uniform(*name: object) -> float:
     """A number in [0, 1) that depends only on ``name``."""
-    digest = blake2b("\x1f".join(map(str, name)).encode(), digest_size=8).digest()
-    return int.from_bytes(digest, "little") / 2.0**64
+    return int.from_bytes(name_bytes(*name), "little") / 2.0**64
 
 
 def turned(vertices_m: NDArray[np.float64], degrees: float) -> NDArray[np.float64]:

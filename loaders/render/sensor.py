@@ -9,7 +9,6 @@ Noise follows EMVA 1288: a variance of read noise, and one of shot noise that is
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from hashlib import blake2b
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.loaders.render.illumination import LitPixels
 from fpp_ml_bench.loaders.render.light import CameraLight, Light
 from fpp_ml_bench.loaders.render.projector import PatternLight, fill_frame, respond
-from fpp_ml_bench.loaders.render.scene import modulation_at
+from fpp_ml_bench.loaders.render.scene import modulation_at, name_bytes
 from fpp_ml_bench.machine import njit
 from fpp_ml_bench.optics.rig import Rig
 
@@ -74,8 +73,7 @@ def normal_table() -> NDArray[np.float32]:
 
 def stream_keys(*name: object) -> NDArray[np.uint32]:
     """Two 32-bit keys of a named noise stream, such as ``(seed, object, view, frame)``; uint32 (2,)."""
-    digest = blake2b("\x1f".join(map(str, name)).encode(), digest_size=8).digest()
-    return np.frombuffer(digest, dtype="<u4").astype(np.uint32)
+    return np.frombuffer(name_bytes(*name), dtype="<u4").astype(np.uint32)
 
 
 def hash_pixels(pixels: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDArray[np.uint32]:

@@ -21,9 +21,9 @@ from fpp_ml_bench.baselines.classical_network.training import (
     chosen_threshold,
     sample_of,
     score,
-    train_classical_net,
 )
 from fpp_ml_bench.baselines.phase_network import window_training
+from fpp_ml_bench.baselines.phase_network.window_training import train_net
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.training.views import Group, View, read_views, render_views
 from fpp_ml_bench.baselines.training.weights import SHIPPED
@@ -138,16 +138,16 @@ def test_training_resumes_to_the_same_weights(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(window_training, "groups_of", lambda *args: GROUPS)
     recipe = FilterRecipe(steps=4, batch=2, window=64, widths=(4, 6), validate_every=2, lights=0)
     rig = paper_rig(SIZE)
-    whole = train_classical_net(recipe, tmp_path / "whole", rig=rig)
-    stopped = train_classical_net(recipe, tmp_path / "pieces", rig=rig, minutes=1e-9)
+    whole = train_net(recipe, tmp_path / "whole", rig=rig)
+    stopped = train_net(recipe, tmp_path / "pieces", rig=rig, minutes=1e-9)
     assert stopped.weights is None and stopped.steps == 2
-    pieces = train_classical_net(recipe, tmp_path / "pieces", rig=rig)
+    pieces = train_net(recipe, tmp_path / "pieces", rig=rig)
     assert whole.weights is not None and pieces.weights is not None
     assert whole.weights.read_bytes() == pieces.weights.read_bytes()
-    assert train_classical_net(recipe, tmp_path / "whole", rig=rig) == whole  # as it was
+    assert train_net(recipe, tmp_path / "whole", rig=rig) == whole  # as it was
     assert {"object_mae_mm", "input_mae_mm", "within_percent"} <= whole.validation.keys()
     with pytest.raises(TrainingError, match="another"):
-        train_classical_net(replace(recipe, seed=1), tmp_path / "whole", rig=rig)
+        train_net(replace(recipe, seed=1), tmp_path / "whole", rig=rig)
     own = load_method("classical-net", rig, weights=str(whole.weights))
     assert own.frames_used == method().frames_used and own.learned_from["data"] == "generated"
 

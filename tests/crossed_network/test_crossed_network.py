@@ -10,17 +10,12 @@ import pytest
 from fpp_ml_bench.baselines.crossed_network import inputs
 from fpp_ml_bench.baselines.crossed_network.method import CrossedNetMethod
 from fpp_ml_bench.baselines.crossed_network.route import CrossedNetRoute, decided_mask, stated_rad
-from fpp_ml_bench.baselines.crossed_network.training import (
-    CrossedRecipe,
-    CrossedSample,
-    Variation,
-    sample_of,
-    train_crossed_net,
-)
+from fpp_ml_bench.baselines.crossed_network.training import CrossedRecipe, CrossedSample, Variation, sample_of
 from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute
 from fpp_ml_bench.baselines.phase_network import window_training
 from fpp_ml_bench.baselines.phase_network.network import load_net
 from fpp_ml_bench.baselines.phase_network.odds import Answers, threshold_at
+from fpp_ml_bench.baselines.phase_network.window_training import train_net
 from fpp_ml_bench.baselines.phase_network.windows import IGNORED
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.training.views import Group, View, read_views, render_views, with_unions
@@ -115,13 +110,13 @@ def test_a_training_in_small_is_resumed_and_predicts(
         steps=2, validate_every=1, batch=1, window=64, widths=(4, 4), order_widths=(4, 4), fine=4, squeezed=4
     )
     out, rig = tmp_path / "run", crossed_rig(SIZE)
-    first = train_crossed_net(recipe, out, rig=rig, minutes=1e-9)
+    first = train_net(recipe, out, rig=rig, minutes=1e-9)
     assert first.weights is None and first.steps == 1
-    trained = train_crossed_net(recipe, out, rig=rig)
+    trained = train_net(recipe, out, rig=rig)
     assert trained.weights is not None and 0 <= trained.validation["missed_percent"] <= 100
-    assert train_crossed_net(recipe, out, rig=rig) == trained
+    assert train_net(recipe, out, rig=rig) == trained
     with pytest.raises(TrainingError, match="another training"):
-        train_crossed_net(replace(recipe, steps=3), out, rig=rig)
+        train_net(replace(recipe, steps=3), out, rig=rig)
     method = load_method("crossed-net", rig, weights=trained.weights)
     assert isinstance(method, CrossedNetMethod) and method.frames_used == (0,)
     view = next(read_views(folder, GROUPS, "train"))

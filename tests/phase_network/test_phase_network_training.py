@@ -20,9 +20,8 @@ from fpp_ml_bench.baselines.phase_network.training import (
     Recipe,
     Variation,
     sample_of,
-    train_phase_net,
 )
-from fpp_ml_bench.baselines.phase_network.window_training import WindowTraining
+from fpp_ml_bench.baselines.phase_network.window_training import WindowTraining, train_net
 from fpp_ml_bench.baselines.phase_route.observation import Settings
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.training.engine import CHECKPOINT, reproducible
@@ -229,14 +228,14 @@ def test_a_training_in_small_is_resumed_and_predicts(tmp_path: Path, monkeypatch
     ]
     monkeypatch.setattr(window_training, "groups_of", lambda *args: groups)
     out, recipe = tmp_path / "run", replace(SMALL, steps=2, validate_every=1, batch=1, albedo="any")
-    first = train_phase_net(recipe, out, rig=rig, minutes=1e-9)
+    first = train_net(recipe, out, rig=rig, minutes=1e-9)
     assert first.weights is None and first.steps == 1
-    trained = train_phase_net(recipe, out, rig=rig)
+    trained = train_net(recipe, out, rig=rig)
     assert trained.weights is not None and 0 <= trained.validation["missed_percent"] <= 100
     assert (out / "reliability.png").stat().st_size > 1000
-    assert train_phase_net(recipe, out, rig=rig) == trained
+    assert train_net(recipe, out, rig=rig) == trained
     with pytest.raises(TrainingError, match="another training"):
-        train_phase_net(replace(recipe, albedo="one"), out, rig=rig)
+        train_net(replace(recipe, albedo="one"), out, rig=rig)
     method = load_method("phase-net", rig, weights=trained.weights)
     assert "any albedo" in method.title and method.settings["shading"] is False
     view = next(read_views(out / "views", groups, "validation"))
