@@ -145,11 +145,22 @@ class Group:
         reference; bound: how theory predicts it"."""
 
         def declare(run: Run) -> Run:
-            texts = re.split("; against |; bound: ", " ".join((run.__doc__ or "").split()))
+            computes, reference, predicts = re.split("; against |; bound: ", " ".join((run.__doc__ or "").split()))
             for values in product(*grid.values()):
                 given = dict(zip(grid, values, strict=True))
                 expected = expects(**given) if callable(expects) else expects
-                case = Case(self.name, name, given, *texts, unit, partial(run, **given), expected, heavy(**given))
+                case = Case(
+                    self.name,
+                    name,
+                    given,
+                    computes,
+                    reference,
+                    predicts,
+                    unit,
+                    partial(run, **given),
+                    expected,
+                    heavy(**given),
+                )
                 self.cases.append(case)
             return run
 
