@@ -1,4 +1,5 @@
-"""Stability cases: how they are declared, run and judged.
+"""Stability cases: how they are declared, run, judged and reported: JSON with every case, and a picture with a square
+for each.
 
 A case runs a computation of the benchmark where it is ill-conditioned, and compares it with a reliable reference:
 50-digit arithmetic, a closed form, or exact sums. The error is compared with a bound from theory: a condition number
@@ -6,29 +7,33 @@ times the unit round-off, or the propagation of noise and quantisation. The boun
 case states, never from the measured error.
 """
 
+import io
+import json
 import math
+import re
 import time
+from bisect import bisect_right
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cache, partial
 from importlib import import_module
-from itertools import product
+from itertools import groupby, product
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.errors import StabilityError
+from fpp_ml_bench.errors import FppBenchError, StabilityError
+from fpp_ml_bench.evaluation.result.file import environment, write_file, write_json
+from fpp_ml_bench.machine import numba_enabled
 
-Scalar = float | int | str
 Expects = Literal["number", "refusal", "either"]
-Run = Callable[..., Any]
-"""Of a case; gives its `Outcome`, or anything where a refusal is expected."""
-Refusals = type[Exception] | tuple[type[Exception], ...]
+Run = Callable[..., "Outcome"]
 Floats = NDArray[np.float64]
 
-U64, U32, UB16 = 2.0**-53, 2.0**-24, 2.0**-8
+U64, U32 = 2.0**-53, 2.0**-24
 """Unit round-offs."""
 
 MODULES = {
@@ -44,8 +49,19 @@ MODULES = {
 }
 """Groups of cases, and the module whose constant of that name declares them; only ``networks`` imports torch."""
 
-# A crash of the code under test is a FAIL and does not end the run; numerical code raises these.
-_CRASHES = (ArithmeticError, AttributeError, LookupError, MemoryError, RuntimeError, TypeError, ValueError)
+
+_LIMITS = 1e-3, 0.1, 0.5
+LEVELS = {
+    "error 0": "#dff1ea",
+    "error under 1/1000 of its bound": "#b5dfcf",
+    "1/1000 to 1/10 of the bound": "#74bf9f",
+    "1/10 to 1/2 of the bound": "#2f9470",
+    "1/2 to the whole bound": "#0b6b50",
+    "correctly refused or masked": "#b9c0c8",
+    "FAIL": "#d1242f",
+}
+"""What a square of the heat map says, and its colour."""
+_SQUARE_IN = 0.16
 
 
 class Verdict(StrEnum):
@@ -59,13 +75,13 @@ class Verdict(StrEnum):
 @dataclass(frozen=True)
 class Outcome:
     """The measurement of a case at its worst element, which has the largest error / bound. ``error`` is None where the
-    code refused to compute; ``note`` then holds its message. ``flagged``: share of elements that were refused;
+    code refused to compute; ``note`` then holds its message. ``flagged_share``: share of elements that were refused;
     ``may_flag``: largest share that theory allows (default: none where a number is expected, else all). ``condition``:
     the condition number behind the bound, if any."""
 
     error: float | None
     bound: float = 0.0
-    flagged: float = 0.0
+    flagged_share: float = 0.0
     may_flag: float | None = None
     note: str = ""
     condition: float | None = None
@@ -80,50 +96,38 @@ class Outcome:
 
 def wrong(note: str = "") -> Outcome:
     """The outcome of a result that no bound allows."""
-    return Outcome(math.inf, 0.0, note=note)
+    return Outcome(math.inf, note=note)
 
 
 @dataclass(frozen=True)
 class Case:
     """An ill-conditioned or extreme case. ``run()`` gives the `Outcome`. ``computes``, ``reference`` and ``predicts``
     describe in a line each what is computed, its reference, and how the bound is derived. ``expects``: a number, a
-    refusal, or either; ``refuses``: the exceptions that are a refusal. ``heavy`` cases take seconds or gigabytes and
-    are left out of a quick run."""
+    refusal (an `FppBenchError`, or every element masked), or either. ``heavy`` cases take seconds or gigabytes and are
+    left out of a quick run."""
 
     group: str
     family: str
-    parameters: Mapping[str, Scalar]
+    parameters: Mapping[str, float | str]
     computes: str
     reference: str
     predicts: str
     unit: str
     run: Run = field(repr=False)
     expects: Expects = "number"
-    refuses: Refusals = ()
     heavy: bool = False
 
     @property
     def name(self) -> str:
         """``family, parameter value, ...``"""
-        return ", ".join([self.family, *(f"{key} {parameter_text(value)}" for key, value in self.parameters.items())])
-
-
-def parameter_text(value: Scalar) -> str:
-    """A parameter as text: six digits where they are exact, else all digits."""
-    if not isinstance(value, float):
-        return str(value)
-    short = f"{value:.6g}"
-    return short if float(short) == value or value != value else repr(value)
+        return ", ".join([self.family, *(f"{key} {value}" for key, value in self.parameters.items())])
 
 
 @dataclass
 class Group:
-    """The cases of a group, in the order in which their families are declared; ``reference`` and ``predicts`` are those
-    of the families that do not say theirs."""
+    """The cases of a group, in the order in which their families are declared."""
 
     name: str
-    reference: str = ""
-    predicts: str = ""
     cases: list[Case] = field(default_factory=list)
 
     def family(
@@ -132,24 +136,32 @@ class Group:
         unit: str,
         /,
         *,
-        about: str = "",
         expects: Expects | Callable[..., Expects] = "number",
-        refuses: Refusals = (),
         heavy: Callable[..., bool] = lambda **_: False,
-        **grid: Iterable[Scalar],
+        **grid: Iterable[float | str],
     ) -> Callable[[Run], Run]:
         """Declare a function as a family: a case for each combination of the grid's values, which the function,
-        ``expects`` and ``heavy`` get by name. Its docstring (or ``about``) says in this form what it computes: "depth;
-        against its reference; bound: how theory predicts it"."""
+        ``expects`` and ``heavy`` get by name. Its docstring says in this form what it computes: "depth; against its
+        reference; bound: how theory predicts it"."""
 
         def declare(run: Run) -> Run:
-            of, _, bound = " ".join((about or run.__doc__ or "").split()).partition("; bound: ")
-            of, _, against = of.partition("; against ")
-            texts = of, against or self.reference, bound or self.predicts, unit
+            computes, reference, predicts = re.split("; against |; bound: ", " ".join((run.__doc__ or "").split()))
             for values in product(*grid.values()):
                 given = dict(zip(grid, values, strict=True))
-                expected, call = expects(**given) if callable(expects) else expects, partial(run, **given)
-                self.cases.append(Case(self.name, name, given, *texts, call, expected, refuses, heavy(**given)))
+                expected = expects(**given) if callable(expects) else expects
+                case = Case(
+                    self.name,
+                    name,
+                    given,
+                    computes,
+                    reference,
+                    predicts,
+                    unit,
+                    partial(run, **given),
+                    expected,
+                    heavy(**given),
+                )
+                self.cases.append(case)
             return run
 
         return declare
@@ -167,53 +179,54 @@ def all_cases(groups: Iterable[str] = tuple(MODULES), quick: bool = False) -> li
 
 @dataclass(frozen=True)
 class Row:
-    """A case with its outcome and verdict; ``against`` is the reason where it failed, ``cpu_seconds`` the processor
-    time of all threads, so that a busy machine does not show."""
+    """A case with its outcome; ``against`` is the reason where it failed, ``cpu_seconds`` the processor time of all
+    threads, so that a busy machine does not show."""
 
     case: Case
     outcome: Outcome
-    verdict: Verdict
     against: str
     cpu_seconds: float
 
+    @property
+    def verdict(self) -> Verdict:
+        """FAIL where there is a reason against the outcome."""
+        if self.against:
+            return Verdict.FAIL
+        return Verdict.FLAGGED if self.outcome.error is None else Verdict.WITHIN
+
 
 def run_cases(cases: Sequence[Case], done: Callable[[Row], None] = lambda _: None) -> list[Row]:
-    """Run cases in order; ``done`` is called with each row. A crash of the code under test, even a refusal that the
-    case did not name, is a FAIL."""
+    """Run cases in order; ``done`` is called with each row. An error of the package is a refusal, any other exception
+    of the code under test a FAIL, which does not end the run."""
     rows = []
     for case in cases:
-        started, failure = time.process_time(), ""
+        started = time.process_time()
         try:
             with np.errstate(all="ignore"):
                 outcome = case.run()
-            outcome = outcome if isinstance(outcome, Outcome) else Outcome(0.0)
-        except case.refuses as error:
-            outcome = Outcome(None, flagged=1.0, note=str(error))
-        except _CRASHES as error:
-            outcome = Outcome(None, note=f"{type(error).__name__}: {error}")
-            failure = f"ended in {outcome.note}"
-        verdict, against = (Verdict.FAIL, failure) if failure else judge(case, outcome)
-        rows.append(Row(case, outcome, verdict, against, time.process_time() - started))
+        except FppBenchError as error:
+            outcome = Outcome(None, flagged_share=1.0, note=str(error))
+        except Exception as error:
+            outcome = wrong(f"{type(error).__name__}: {error}")
+        rows.append(Row(case, outcome, judge(case, outcome), time.process_time() - started))
         done(rows[-1])
     return rows
 
 
-def judge(case: Case, outcome: Outcome) -> tuple[Verdict, str]:
-    """The verdict on a case, and the reason where it failed."""
+def judge(case: Case, outcome: Outcome) -> str:
+    """Why a case fails; nothing where it does not."""
     if outcome.error is None:
-        if case.expects == "number":
-            return Verdict.FAIL, f"refused what can be computed: {outcome.note}"
-        return Verdict.FLAGGED, ""
-    if case.expects == "refusal":
-        return Verdict.FAIL, "gave a number where there is none"
+        return f"refused what can be computed: {outcome.note}" if case.expects == "number" else ""
     if not math.isfinite(outcome.bound):
-        return Verdict.FAIL, "theory predicts no finite error, so the number is meaningless and should be refused"
+        return "theory predicts no finite error, so the number is meaningless and should be refused"
     if not outcome.error <= outcome.bound:  # NaN is not
-        return Verdict.FAIL, f"error {outcome.error:.3g} exceeds its bound {outcome.bound:.3g}"
+        return f"error {outcome.error:.3g} exceeds its bound {outcome.bound:.3g}{outcome.note and f': {outcome.note}'}"
+    if case.expects == "refusal":
+        return "gave a number where there is none"
     allowed = float(case.expects != "number") if outcome.may_flag is None else outcome.may_flag
-    if outcome.flagged > allowed:
-        return Verdict.FAIL, f"refused {outcome.flagged:.2%}, theory allows {allowed:.2%}"
-    return Verdict.WITHIN, ""
+    if outcome.flagged_share > allowed:
+        return f"refused {outcome.flagged_share:.2%}, theory allows {allowed:.2%}"
+    return ""
 
 
 def worst(
@@ -222,38 +235,36 @@ def worst(
     flagged: ArrayLike = False,
     may_flag: float | None = None,
     condition: float | None = None,
-    note: str = "",
 ) -> Outcome:
     """The outcome of many elements: the worst of those that are not flagged. Their NaN errors stay NaN."""
     parts = np.broadcast_arrays(np.abs(np.asarray(errors, float)), np.asarray(bounds, float), np.asarray(flagged))
     error, bound, refused = (np.ravel(part) for part in parts)
     if refused.all():
-        return Outcome(None, 0.0, 1.0, may_flag, note or "every element is masked", condition)
+        return Outcome(None, 0.0, 1.0, may_flag, "every element is masked", condition)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(error == 0, 0.0, error / bound)
-    ratio = np.where(refused, -1.0, np.where(np.isnan(ratio), np.inf, ratio))
-    index = int(np.argmax(ratio))
-    return Outcome(float(error[index]), float(bound[index]), float(refused.mean()), may_flag, note, condition)
+    index = int(np.argmax(np.where(refused, -1.0, ratio)))  # the first NaN, if any
+    return Outcome(float(error[index]), float(bound[index]), float(refused.mean()), may_flag, condition=condition)
 
 
 @cache
-def high_precision(digits: int = 50) -> Any:
-    """A separate mpmath context, so that the global precision does not change."""
+def high_precision() -> Any:
+    """A separate mpmath context of 50 digits, so that the global precision does not change."""
     import mpmath
 
     context = mpmath.MPContext()
-    context.dps = digits
+    context.dps = 50
     return context
 
 
-def wide(values: ArrayLike, digits: int = 50) -> NDArray[np.object_]:
-    """Numbers as an array of mpmath's, with which NumPy's operators compute in ``digits`` digits."""
-    return np.asarray(np.frompyfunc(high_precision(digits).mpf, 1, 1)(np.asarray(values, float)))
+def wide(values: ArrayLike) -> NDArray[np.object_]:
+    """Numbers as an array of mpmath's, with which NumPy's operators compute in 50 digits."""
+    return np.asarray(np.frompyfunc(high_precision().mpf, 1, 1)(np.asarray(values, float)))
 
 
-def by_mpmath(name: str, *values: NDArray[np.object_]) -> NDArray[np.object_]:
-    """A function of mpmath, of each element."""
-    return np.frompyfunc(getattr(high_precision(), name), len(values), 1)(*values)
+def minus_arctangent2(sine: NDArray[np.object_], cosine: NDArray[np.object_]) -> NDArray[np.object_]:
+    """-atan2 of mpmath's numbers, in 50 digits."""
+    return -np.frompyfunc(high_precision().atan2, 2, 1)(sine, cosine)
 
 
 def difference(values: NDArray, exact: NDArray[np.object_]) -> Floats:
@@ -264,3 +275,82 @@ def difference(values: NDArray, exact: NDArray[np.object_]) -> Floats:
 def gamma(operations: float, unit: float = U64) -> float:
     """Largest relative error of ``operations`` roundings in a row: n u / (1 - n u)  (Higham, Lemma 3.1)."""
     return operations * unit / (1 - operations * unit)
+
+
+def summary(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
+    """By group, and under "all": cases per verdict, the largest error / bound (None where nothing was computed), and
+    processor time."""
+    groups: dict[str, dict[str, Any]] = {}
+    for group in [*dict.fromkeys(row.case.group for row in rows), "all"]:
+        part = [row for row in rows if group in (row.case.group, "all")]
+        ratios = [row.outcome.ratio for row in part if row.outcome.ratio is not None]
+        groups[group] = {
+            "cases": len(part),
+            **{verdict.value: sum(row.verdict is verdict for row in part) for verdict in Verdict},
+            "largest_ratio": max(ratios, default=None),
+            "cpu_seconds": round(sum(row.cpu_seconds for row in part), 2),
+        }
+    return groups
+
+
+def document(rows: Sequence[Row]) -> dict[str, Any]:
+    """The whole run as JSON values; NaN and infinity by name."""
+    cases = []
+    for row in rows:
+        content = {**vars(row.case), "verdict": row.verdict, **vars(row.outcome), "ratio": row.outcome.ratio}
+        content |= {"against": row.against, "cpu_seconds": round(row.cpu_seconds, 3)}
+        cases.append({key: value for key, value in content.items() if key not in ("run", "heavy", "may_flag")})
+    content = {
+        "schema_version": "1.0.0",
+        "summary": summary(rows),
+        "compiled_decoder": numba_enabled(),
+        "environment": environment().model_dump(mode="json"),
+        "cases": cases,
+    }
+    named: dict[str, Any] = json.loads(json.dumps(content), parse_constant=lambda name: str(float(name)))
+    return named
+
+
+def _level(row: Row) -> int:
+    """The place of a case's square in `LEVELS`."""
+    if row.verdict is Verdict.WITHIN:
+        return 1 + bisect_right(_LIMITS, row.outcome.ratio) if row.outcome.ratio else 0
+    return len(LEVELS) - 1 - (row.verdict is Verdict.FLAGGED)
+
+
+def heat_map(rows: Sequence[Row]) -> bytes:
+    """The heat map as PNG: a line for each family, a square for each case."""
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+
+    families = {
+        name: [*map(_level, part)] for name, part in groupby(rows, lambda row: (row.case.group, row.case.family))
+    }
+    squares = np.full((len(families), max(map(len, families.values()))), np.nan)
+    for line, levels in zip(squares, families.values(), strict=True):
+        line[: len(levels)] = levels
+    height, width = squares.shape
+    figure = Figure((_SQUARE_IN * width + 4, _SQUARE_IN * height + 1), layout="constrained")
+    axes = figure.subplots()
+    colours = ListedColormap([*LEVELS.values()])
+    axes.pcolormesh(squares, cmap=colours, vmin=-0.5, vmax=len(LEVELS) - 0.5, edgecolors="white", linewidth=1.5)
+    axes.set_yticks(np.arange(height) + 0.5, map(": ".join, families), fontsize=7)
+    axes.set_aspect("equal")
+    axes.invert_yaxis()
+    axes.set_xticks([])
+    axes.tick_params(length=0)
+    axes.spines[:].set_visible(False)
+    key = [Patch(color=colour, label=meaning) for meaning, colour in LEVELS.items()]
+    figure.legend(handles=key, ncols=3, fontsize=7, frameon=False, loc="outside upper center")
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=95, bbox_inches="tight", metadata={"Software": None})
+    return stream.getvalue()
+
+
+def write_report(rows: Sequence[Row], folder: Path) -> list[Path]:
+    """Write the data and the picture into ``folder``, which is made; their paths. Raises `SubmissionError`."""
+    data, picture = folder / "stability.json", folder / "stability.png"
+    write_file(heat_map(rows), picture, new_folder=True)
+    write_json(document(rows), data)
+    return [data, picture]

@@ -6,8 +6,16 @@ from pathlib import Path
 
 from rich.text import Text
 
-from fpp_ml_bench.baselines.stability.cases import Case, Row, Verdict, all_cases, run_cases
-from fpp_ml_bench.baselines.stability.report import document, short, summary, write_report
+from fpp_ml_bench.baselines.stability.cases import (
+    Case,
+    Row,
+    Verdict,
+    all_cases,
+    document,
+    run_cases,
+    summary,
+    write_report,
+)
 from fpp_ml_bench.cli import CHECK_FAILED, OK
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.options import command
@@ -36,7 +44,7 @@ def check(
         choices=_GROUPS,
         many=True,
     ),
-    out: Path | None = option(None, "write index.html, stability.json and stability.png here", "DIR"),
+    out: Path | None = option(None, "write stability.json and stability.png here", "DIR"),
     json: Path | None = option(None, "write the run as JSON; - is standard output, without the table", "FILE"),
     quick: bool = option(False, "leave out the case that needs gigabytes (10 million triangles)"),
     listed: bool = option(False, "list the cases and their bounds, and run none", flag="--list"),
@@ -67,8 +75,7 @@ def _show(rows: Sequence[Row]) -> None:
     table = Table("group", numbers=numbers, elsewhere="--json FILE")
     for group, part in summary(rows).items():
         *counts, ratio, cpu_s = part.values()
-        text = ratio if isinstance(ratio, str) else short(ratio)
-        table.add_row(group, *map(str, counts), text, f"{cpu_s:.1f}")
+        table.add_row(group, *map(str, counts), "-" if ratio is None else f"{ratio:.2g}", f"{cpu_s:.1f}")
     show(table)
     for row in rows:
         if row.verdict is Verdict.FAIL:

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from captures import LENSES, PAPER, TURNED, capture, tilted
 
-from fpp_ml_bench.baselines.stability.frames import coded_rig, plane_stack
+from fpp_ml_bench.baselines.stability.frames import coded_rig, direction_levels, plane_stack, sinusoids
 from fpp_ml_bench.coding.code import Limits, Reason
+from fpp_ml_bench.coding.gray_code import binary_to_gray
+from fpp_ml_bench.decoding.blocks import decode_direction, plain_plan
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm, depth_noise_mm
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.machine import NUMBA_SWITCH, numba_enabled
 from fpp_ml_bench.optics.rig_file import rig_from_dict
-from fpp_ml_bench.optics.sequence import DIRECTIONS
+from fpp_ml_bench.optics.sequence import DIRECTIONS, Sequence
 
 MODULATION = 0.45 * 127.5
 RIGS = pytest.mark.parametrize("rig", [PAPER, TURNED, LENSES], ids=["paper", "turned", "lenses"])
@@ -215,6 +217,40 @@ def test_a_coordinate_beyond_the_patterns_border_is_outside():
     rejected = np.isin(decoded.reason, [Reason.OUTSIDE_PATTERN, Reason.INCONSISTENT_ORDER])
     assert rejected[(u > 607) & (u < 905)].all() and not rejected[(u > 2) & (u < 606)].any()
     assert (decoded.reason == Reason.OUTSIDE_PATTERN).any()
+
+
+@pytest.mark.parametrize("bits", [1, 2, 7, 10, 13, 15])
+def test_every_cell_of_a_full_code_has_its_coordinate(bits):
+    """15 bits fill the compiled decoder's 16-bit integers."""
+    side = min(65536, 2**bits * 2)
+    device = replace(PAPER.projector, width=side, height=side)
+    rig = replace(
+        PAPER, projector=device, sequence=Sequence(3, bits, bits), pitch_vertical_px=4.0, pitch_horizontal_px=4.0
+    )
+    exact_px = np.arange(2**bits) * 2 + 0.5
+    levels = np.rint(direction_levels(rig, exact_px)).astype(np.uint8)
+    decoded = decode_direction(levels, plain_plan(rig, "vertical", 3, Limits()), Limits())
+    assert (decoded.reason == Reason.DECODED).all()
+    assert np.abs(decoded.coordinate_px - exact_px).max() < 0.01  # 4 px / 2 pi of half a grey level in 100
+
+
+@pytest.mark.parametrize("bit", range(7))
+def test_a_flipped_bit_alone_is_flagged_or_wrong_by_whole_periods(bit):
+    exact_px = np.arange(3.0, 909.0, 0.25)
+    levels = np.rint(direction_levels(coded_rig(), exact_px)).astype(np.uint8)
+    levels[18 + bit] = 255 - levels[18 + bit]
+    decoded = decode_direction(levels, plain_plan(coded_rig(), "vertical", 18, Limits()), Limits())
+    slip = ((decoded.coordinate_px - exact_px) / 18.0)[decoded.reason == Reason.DECODED]
+    assert np.abs(slip - np.rint(slip)).max() < 0.002
+
+
+def test_a_code_that_names_a_cell_beyond_the_pattern_is_masked():
+    phase = np.linspace(-3, 3, 50)
+    for cell in (102, 103, 111, 127):
+        bits = np.repeat((binary_to_gray(cell) >> np.arange(6, -1, -1)[:, None]) & 1, 50, axis=1)
+        levels = np.rint(np.concatenate([sinusoids(phase, 18), 27.5 + 200 * bits])).astype(np.uint8)
+        decoded = decode_direction(levels, plain_plan(coded_rig(), "vertical", 18, Limits()), Limits())
+        assert (decoded.reason != Reason.DECODED).all()
 
 
 def test_frames_that_are_not_used_may_be_missing():

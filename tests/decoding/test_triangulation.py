@@ -123,6 +123,11 @@ def test_pixels_without_depth_are_nan():
     assert np.isnan(depth_from_coordinate((missing, np.zeros(1)), np.array([500.0]), rig, "vertical")).all()
 
 
+def test_two_directions_without_weight_have_no_depth():
+    rays, _, u, v = scene(RIGS["paper"])
+    assert np.isnan(depth_from_both(rays, u, v, RIGS["paper"], 0.0, 0.0).depth_mm).all()
+
+
 def test_a_point_behind_the_projector_has_no_depth():
     # The projector is 1 m ahead of the camera: a point 0.5 m from the camera lies behind it.
     device = paper_rig().projector

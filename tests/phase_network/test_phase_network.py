@@ -14,7 +14,7 @@ from fpp_ml_bench.baselines.phase_network.route import NetworkRoute
 from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
 from fpp_ml_bench.baselines.phase_route.observation import Reason, Settings
 from fpp_ml_bench.baselines.registry import load_method
-from fpp_ml_bench.errors import DecodeError, NetworkError, PredictionError
+from fpp_ml_bench.errors import DecodeError, FppBenchError, NetworkError, PredictionError
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.rig import Rig
 
@@ -132,6 +132,28 @@ def test_beyond_the_end_of_the_range_there_is_no_depth(translation_m: tuple[floa
     depth_mm, outside = measurement.depth_mm, measurement.reason == Reason.OUT_OF_RANGE
     assert outside.mean() > 0.05 and not depth_mm[outside].any()
     assert rig.in_range(depth_mm[depth_mm > 0]).all()
+
+
+@pytest.mark.parametrize("name", ["phase", "phase-net"])
+@pytest.mark.parametrize("image", ["black", "white", "constant", "noise", "checkerboard"])
+def test_an_image_without_an_object_has_no_depth_outside_the_range(name: str, image: str) -> None:
+    rig = paper_rig(480)
+    shape = rig.camera.height, rig.camera.width
+    levels = {
+        "black": np.zeros(shape),
+        "white": np.full(shape, 255),
+        "constant": np.full(shape, 128),
+        "noise": np.random.default_rng(1).uniform(0, 256, shape),
+        "checkerboard": 255 * (np.indices(shape).sum(axis=0) % 2),
+    }[image]
+    method = load_method(name, rig)
+    frames: list[np.ndarray | None] = [None] * len(rig.sequence)
+    frames[method.frames_used[0]] = levels.astype(np.uint8)
+    try:
+        depth_mm = method.measure(frames).depth_mm  # type: ignore[attr-defined]
+    except FppBenchError:
+        return  # a refusal with a reason
+    assert ((depth_mm == 0) | rig.in_range(depth_mm)).all()
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])

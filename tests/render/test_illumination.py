@@ -1,5 +1,7 @@
 """Brightness of single points against closed forms: inverse square, cosine, falloff, gloss, the pattern's rim."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from rendering import ALL_PIXELS, CENTRE, DIRECT, RIG, TOWARD_CAMERA, X, Y, plane
@@ -7,6 +9,7 @@ from rendering import ALL_PIXELS, CENTRE, DIRECT, RIG, TOWARD_CAMERA, X, Y, plan
 from fpp_ml_bench.loaders.render.illumination import Material, in_pattern, light_surface, projector_centre_m
 from fpp_ml_bench.loaders.render.projector import PatternLight
 from fpp_ml_bench.loaders.render.sensor import Exposure, camera_noise
+from fpp_ml_bench.optics.rig import rotation_matrix
 
 PATTERN = PatternLight.of(RIG, DIRECT.projector)
 REFERENCE_GREY = 180.0
@@ -18,6 +21,13 @@ def lit_by(light, points, normals):
 
 def test_projector_centre_is_where_the_rig_says():
     np.testing.assert_allclose(projector_centre_m(RIG), CENTRE, atol=1e-15)
+
+
+def test_light_on_the_far_side_does_not_reach_the_camera():
+    """A projector 3 m ahead that looks back: exactly 0, so that the decoder masks it for want of modulation."""
+    turn = rotation_matrix((0.0, np.pi, 0.0))
+    behind = replace(RIG, rotation=turn.tolist(), translation_m=tuple((-turn @ np.array([-0.125, 0.1, 3.0])).tolist()))
+    assert not light_surface(*plane(1.8), behind, DIRECT, PATTERN).gain.any()
 
 
 @pytest.mark.parametrize("z_m", [1.5, 1.8, 2.1, 3.2])

@@ -226,6 +226,11 @@ def test_non_manifold_mesh():
     np.testing.assert_allclose(depth_m, expected, atol=1e-12)
 
 
+def test_a_wall_behind_the_camera_is_not_seen():
+    wall = [[-1, -1, -1.8], [1, -1, -1.8], [1, 1, -1.8], [-1, 1, -1.8]]
+    assert not traced(wall, [[0, 1, 2], [0, 2, 3]]).primary(RAYS).pixels.size
+
+
 def test_camera_inside_the_object():
     shell = trimesh.creation.icosphere(4, 2.0)
     hits = traced(shell.vertices, shell.faces).primary(RAYS)
