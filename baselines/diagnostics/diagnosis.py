@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from difflib import get_close_matches
 from functools import cache
 from hashlib import sha256
 from importlib.metadata import version
@@ -30,9 +29,10 @@ from fpp_ml_bench.evaluation.report.html import data_uri, page, render
 from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, read_json, write_atomically
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
+from fpp_ml_bench.options import did_you_mean
 
 JSON_FILE, REPORT_FILE = "diagnose.json", "index.html"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 _PACKAGES = ("numpy", "torch", "captum")
 _STYLE = """
 .drawn img { display: block; width: 100%; min-width: 34rem; background: #fff; border-radius: 6px; }
@@ -112,8 +112,7 @@ def checked_names(names: Sequence[str]) -> tuple[str, ...]:
     """``names``, each once, in the report's order; all probes if empty. Raises `DiagnosisError` for an unknown name."""
     for name in names:
         if name not in PROBES:
-            hint = "".join(f"did you mean {near!r}? " for near in get_close_matches(name, PROBES, n=1))
-            raise DiagnosisError(f"unknown probe {name!r}; {hint}there are {', '.join(PROBES)}")
+            raise DiagnosisError(f"unknown probe {name!r}; {did_you_mean(name, PROBES)}")
     return tuple(name for name in PROBES if not names or name in names)
 
 
@@ -131,12 +130,10 @@ def finding_key(probe: Probe, subject: Subject, dataset: DatasetFolder, settings
 
 
 def save_finding(folder: Path, key: str, finding: Finding, seconds: float) -> None:
-    """Write ``PROBE.json`` and the pictures into ``folder``. Raises ``ValueError`` for NaN and infinity."""
-    for figure in finding.figures:
-        write_atomically(folder / figure.file, figure.png)
+    """Write ``PROBE.json`` and its picture ``PROBE.png`` into ``folder``. Raises ``ValueError`` for NaN, infinity."""
     content = asdict(finding)
-    for figure in content["figures"]:
-        del figure["png"]
+    if content["figure"] is not None:
+        write_atomically(folder / f"{finding.probe}.png", content["figure"].pop("png"))
     _write_json(folder / f"{finding.probe}.json", {"key": key, "seconds": seconds, "finding": content})
 
 
@@ -151,9 +148,10 @@ def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | N
         if content["key"] != key:
             return None
         fields = content["finding"]
-        tables = tuple(Table(**table) for table in fields["tables"])
-        figures = tuple(Figure(**figure, png=(folder / figure["file"]).read_bytes()) for figure in fields["figures"])
-        return Finding(**{**fields, "tables": tables, "figures": figures}), float(content["seconds"])
+        if fields["figure"] is not None:
+            fields["table"] = Table(**fields["table"])
+            fields["figure"] = Figure(**fields["figure"], png=(folder / f"{name}.png").read_bytes())
+        return Finding(**fields), float(content["seconds"])
     except (OSError, ValueError, TypeError, KeyError):
         return None  # absent, half written, or of another version: it is made again
 

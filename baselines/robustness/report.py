@@ -100,8 +100,8 @@ def draw_curves(measured: Sequence[Measured]) -> bytes:
         if lines:
             lines.append(Line("charge for no answer", range(6), [corruptions().unanswered_mm] * 6, "0.6", ":"))
             ticks = {"xticks": range(6), "xticklabels": ["clean", *(f"{value:g}" for value in axis.severities)]}
-            scale = {"yscale": "log", "ylim": (0.1, 1000)}
-            panels.append(Panel(f"{name}, {axis.unit}", lines, "", "object MAE, mm", {**ticks, **scale}))
+            scale = {"yscale": "log", "ylim": (0.1, 1000), "ylabel": "object MAE, mm"}
+            panels.append(Panel(f"{name}, {axis.unit}", lines, {**ticks, **scale}))
     return chart(panels, 4, (3.3, 2.9))
 
 
