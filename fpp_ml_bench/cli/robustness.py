@@ -7,7 +7,7 @@ from typing import Literal
 
 from fpp_ml_bench.baselines.registry import find
 from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName
-from fpp_ml_bench.baselines.robustness.report import write_page, write_worst
+from fpp_ml_bench.baselines.robustness.report import write_page
 from fpp_ml_bench.baselines.robustness.run import Setup, View, by_severity
 from fpp_ml_bench.baselines.robustness.run import measure as measure_robustness
 from fpp_ml_bench.baselines.robustness.run import robustness as robustness_block
@@ -85,7 +85,6 @@ def robust(
             rows = measure_robustness(
                 setup, folder, axes, workers, cache, lambda axis, count: advance(count), pool.cluster, save
             )
-        write_worst(setup, rows, folder, cache)
         page = f"{out}/{write_page(below).name}"
     if entry is not None:
         write_robustness(entry, robustness_block(setup, rows))
