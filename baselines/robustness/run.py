@@ -14,7 +14,7 @@ from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corrupt
 from fpp_ml_bench.baselines.robustness.scenes import Condition, FrameCache
 from fpp_ml_bench.constants import sample_name
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.result.parts import Robustness, SeverityScores
+from fpp_ml_bench.evaluation.result.parts import Robustness
 from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 from fpp_ml_bench.files import LOCK_FILE, exclusive, read_json, write_atomically
 from fpp_ml_bench.pool import mapping
@@ -171,11 +171,6 @@ def _rows(file: Path, key: Mapping[str, Any]) -> list[View] | None:
     return views
 
 
-def by_severity(rows: Sequence[View]) -> dict[int, SeverityScores]:
-    """Means over the views of each severity."""
-    return {severity: SeverityScores.model_validate(means) for severity, means in severity_means(rows).items()}
-
-
 def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
     """The block of ``result.json``. Raises PredictionError for a quick look, and where an axis is missing."""
     missing = [axis for axis in setup.axes(()) if axis not in rows]
@@ -183,16 +178,16 @@ def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
         lacking = "a --quick look" if setup.quick else f"without {', '.join(missing)}"
         raise PredictionError(f"robustness is a mean over all axes and severities, and this is {lacking}")
     clean = list(rows[CLEAN])
-    axes = {axis: list(by_severity(found).values()) for axis, found in rows.items() if axis != CLEAN}
+    axes = {axis: list(severity_means(found).values()) for axis, found in rows.items() if axis != CLEAN}
     sha256 = setup.method.settings.get("weights_sha256")
     found = object_interval(*_shares_of_the_mean(rows))
-    every = [scores.mae_mm for severities in axes.values() for scores in severities]
+    every = [scores["mae_mm"] for severities in axes.values() for scores in severities]
     return Robustness(
         version=corruptions().version,
         set=setup.set_name,
         mae_mm=sum(every) / len(every),
         interval=[None, None] if found is None else [max(found[0], 0.0), found[1]],
-        clean=by_severity(clean)[0],
+        clean=severity_means(clean)[0],
         axes=axes,
         samples=len(clean),
         objects=len({row["object"] for row in clean}),
