@@ -236,6 +236,10 @@ class Probes(ABC):
     def start(self) -> None:
         """When all training samples were observed."""
 
+    def step(self, features: Mapping[Source, Tensor], targets: Mapping[str, Tensor]) -> None:
+        """One training step on a batch, as of `observe`."""
+        raise NotImplementedError("its weights are a closed form")
+
     @abstractmethod
     def predictions(self, features: Mapping[Source, Tensor], name: str) -> dict[tuple[Source, int], Tensor]:
         """The maps (B, T, h, w) of something measured, by source and seed of the probe."""
@@ -316,7 +320,6 @@ class ConvolutionProbes(Probes):
         self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._optimiser, max(1, self.steps))
 
     def step(self, features: Mapping[Source, Tensor], targets: Mapping[str, Tensor]) -> None:
-        """One training step of every probe on a batch, as of `observe`."""
         self._optimiser.zero_grad(set_to_none=True)
         for (source, target, _), probe in self.probes.items():
             # One backward pass per probe: a graph of all probes would hold every intermediate map at once.

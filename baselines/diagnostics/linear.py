@@ -194,8 +194,8 @@ class Grid(View):
     batch = fits.BATCH
 
     def reduce(self, maps: Tensor, names: Sequence[str]) -> Tensor:
-        step = fits.grid_step(self.subject.image_size)
-        return fits.at_size(maps, tuple(max(1, side // step) for side in self.subject.image_size))
+        (height, width), step = self.subject.image_size, fits.grid_step(self.subject.image_size)
+        return fits.at_size(maps, (max(1, height // step), max(1, width // step)))
 
     def masks(self, share: Tensor) -> tuple[Tensor, Tensor]:
         # Cells across the outline mix depth with background; of a tiny object those with the largest share count.

@@ -86,7 +86,7 @@ class Subject:
             depth = np.asarray(self.predict_frames(frames))
         else:
             depth = self.represent(frames)
-            if self.normalisation != "individual":
+            if self.normalisation not in (None, "individual"):
                 depth = denormalise(depth, self.normalisation, 0.0, 0.0).astype(np.float32)
         if depth.shape != self.image_size:
             raise DiagnosisError(f"{self.name}: expected a prediction of {self.image_size} px, got {depth.shape}")

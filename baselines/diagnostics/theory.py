@@ -166,8 +166,8 @@ def depth_error_mm(rig: Rig, direction: Direction, distance_m: float, periods: f
 
 def exponent(rig: Rig, direction: Direction, distance_m: float, periods: float) -> float | None:
     """d log `depth_error_mm` / d log distance; None where there is no depth."""
-    ends = [depth_error_mm(rig, direction, distance_m * factor, periods) for factor in (1 - _STEP, 1 + _STEP)]
-    return None if None in ends else float(np.diff(np.log(ends))[0] / np.log((1 + _STEP) / (1 - _STEP)))
+    low, high = (depth_error_mm(rig, direction, distance_m * factor, periods) for factor in (1 - _STEP, 1 + _STEP))
+    return float(np.log(high / low) / np.log((1 + _STEP) / (1 - _STEP))) if low and high else None
 
 
 def summary(values: Mapping[str, Any]) -> str:

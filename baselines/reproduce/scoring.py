@@ -68,6 +68,14 @@ class FrameMean(StrictModel):
     metrics: Headline
 
 
+class SampleMean(StrictModel):
+    """Mean over frames for one sample."""
+
+    sample: Text
+    object: Text
+    metrics: Headline
+
+
 class AllFrames(StrictModel):
     """The six errors over all pairs of ``frames`` and test samples, with what they were computed from."""
 
@@ -82,6 +90,7 @@ class AllFrames(StrictModel):
     metrics: Headline
     intervals: Intervals
     per_frame: list[FrameMean]
+    per_sample: list[SampleMean]
 
 
 def score_all_frames(
@@ -122,6 +131,10 @@ def score_all_frames(
         metrics=Headline(**_mean(rows)),
         intervals=Intervals(**{key: list(interval or (None, None)) for key, interval in ends.items()}),
         per_frame=[FrameMean(frame=f, metrics=Headline(**row)) for f, row in zip(frames, of_frames, strict=True)],
+        per_sample=[
+            SampleMean(sample=sample, object=name, metrics=Headline(**row))
+            for sample, name, row in zip(samples, objects, rows, strict=True)
+        ],
         **about,
     )
 

@@ -14,7 +14,7 @@ from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corrupt
 from fpp_ml_bench.baselines.robustness.scenes import Condition, FrameCache
 from fpp_ml_bench.constants import sample_name
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.result.parts import Robustness
+from fpp_ml_bench.evaluation.result.parts import Robustness, SeverityScores
 from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 from fpp_ml_bench.files import LOCK_FILE, exclusive, read_json, write_atomically
 from fpp_ml_bench.pool import mapping
@@ -177,20 +177,23 @@ def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
     if setup.quick or missing:
         lacking = "a --quick look" if setup.quick else f"without {', '.join(missing)}"
         raise PredictionError(f"robustness is a mean over all axes and severities, and this is {lacking}")
-    clean = list(rows[CLEAN])
-    axes = {axis: list(severity_means(found).values()) for axis, found in rows.items() if axis != CLEAN}
+    means = {
+        axis: [SeverityScores.model_validate(scores) for scores in severity_means(found).values()]
+        for axis, found in rows.items()
+    }
+    (clean,), axes = means[CLEAN], {axis: scores for axis, scores in means.items() if axis != CLEAN}
     sha256 = setup.method.settings.get("weights_sha256")
     found = object_interval(*_shares_of_the_mean(rows))
-    every = [scores["mae_mm"] for severities in axes.values() for scores in severities]
+    every = [scores.mae_mm for severities in axes.values() for scores in severities]
     return Robustness(
         version=corruptions().version,
         set=setup.set_name,
         mae_mm=sum(every) / len(every),
         interval=[None, None] if found is None else [max(found[0], 0.0), found[1]],
-        clean=severity_means(clean)[0],
+        clean=clean,
         axes=axes,
-        samples=len(clean),
-        objects=len({row["object"] for row in clean}),
+        samples=len(rows[CLEAN]),
+        objects=len({row["object"] for row in rows[CLEAN]}),
         size_px=setup.size,
         weights_sha256=sha256 if isinstance(sha256, str) else None,
     )
