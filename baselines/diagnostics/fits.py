@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fpp_ml_bench.baselines.diagnostics.subjects import checked_output
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import normalise, object_mask
 from fpp_ml_bench.errors import DiagnosisError
@@ -116,9 +116,10 @@ def truth(depth_mm: Image, rig: Rig, direction: Direction) -> dict[str, NDArray]
     inside = object_mask(depth_mm)
     if not inside.any():
         raise ValueError("expected a depth map with an object, got background throughout")
-    periods = np.where(inside, periods_at(depth_mm, rig, direction), 0.0)
-    phase = TAU * (periods - np.floor(periods))
-    order = np.floor(periods) - np.where(inside, np.floor(_standoff_periods(rig, direction)), 0.0)
+    standoff_mm = rig.standoff_m * MM_PER_M
+    # Of the background as if it were at the standoff.
+    phase = _layer(rig, direction).absolute_phase(np.where(inside, depth_mm, standoff_mm))
+    order = np.floor(phase / TAU) - np.floor(_layer(rig, direction).absolute_phase(standoff_mm) / TAU)
     sine, cosine = (np.where(inside, of(phase), 0.0) for of in (np.sin, np.cos))
     maps = {
         "object": inside,
@@ -142,18 +143,9 @@ def edge_map(depth_mm: NDArray) -> Image:
     return (strength / top).astype(np.float32) if top > 0 else strength
 
 
-def periods_at(depth_mm: NDArray, rig: Rig, direction: Direction) -> NDArray[np.float64]:
-    """Position of each pixel's surface point on the pattern, in fringe periods from the projector's first px, (H, W):
-    its integer part is the fringe order, the fraction the wrapped phase / 2 pi. NaN where depth is 0."""
-    x, y = rig.camera.rays()
-    z = np.where(depth_mm > 0, depth_mm, np.nan).astype(np.float64) / MM_PER_M
-    projected = rig.project(np.stack([x * z, y * z, z], axis=-1))
-    return projected[0 if direction == "vertical" else 1] / rig.pitch(direction)
-
-
 @lru_cache(maxsize=2)
-def _standoff_periods(rig: Rig, direction: Direction) -> NDArray[np.float64]:
-    return periods_at(np.full((rig.camera.height, rig.camera.width), rig.standoff_m * MM_PER_M), rig, direction)
+def _layer(rig: Rig, direction: Direction) -> CalibrationLayer:
+    return CalibrationLayer.of(rig, direction)
 
 
 class NormalEquations:

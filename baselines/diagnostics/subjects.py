@@ -19,6 +19,7 @@ from fpp_ml_bench.baselines.method import Frames, Method
 from fpp_ml_bench.baselines.networks.model import build, fringe_batch
 from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
 from fpp_ml_bench.baselines.registry import FILE_MARK, find, load_from_file, load_method
+from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.depth import Normalisation, denormalise, object_mask
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.protocol import Units
@@ -74,11 +75,7 @@ class Subject:
 
     def captured(self, dataset: DatasetFolder, sample: str) -> list[NDArray[np.uint8] | None]:
         """The frames of ``sample`` that the subject uses, uint8 (H, W), by frame number; None for all others."""
-        frames: list[NDArray[np.uint8] | None] = [None] * len(dataset.sequence)
-        mask = object_mask(dataset.depth_mm(sample)) if self.uses_ground_truth_mask else np.True_
-        for index in self.frames_used:
-            frames[index] = dataset.frame(sample, index) * mask
-        return frames
+        return captured_frames(dataset, self, sample)  # type: ignore[arg-type]  # it has what this asks a method for
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in ``units``. Raises `DiagnosisError` for an output of another shape or not finite."""
