@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, shift
 
 from fpp_ml_bench.baselines.diagnostics import scene_renderer as rendering
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import (
@@ -197,11 +197,7 @@ def _grown(sample: Original, renderer: SceneRenderer, inside: NDArray[np.bool_])
 def _laid_over(outline: NDArray[np.bool_], target: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """``outline`` shifted so that its centre lies on the target's."""
     centres = [np.argwhere(mask).mean(axis=0) for mask in (target, outline)]
-    rows, columns = (np.argwhere(outline) + np.rint(centres[0] - centres[1]).astype(int)).T
-    shifted = np.zeros_like(outline)
-    in_image = (rows >= 0) & (rows < shifted.shape[0]) & (columns >= 0) & (columns < shifted.shape[1])
-    shifted[rows[in_image], columns[in_image]] = True
-    return shifted
+    return shift(outline.astype(np.uint8), np.rint(centres[0] - centres[1]), order=0).astype(bool)
 
 
 def _ellipse(sample: Original) -> NDArray[np.bool_]:

@@ -26,6 +26,7 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.report.html import data_uri, page, render
+from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, read_json, write_atomically
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
@@ -102,7 +103,7 @@ def diagnose(
             for one in results
         }
         content = {"format": "fpp-ml-bench diagnosis", "version": FORMAT_VERSION, **context, "findings": findings}
-        _write_json(out / JSON_FILE, content)
+        write_json(content, out / JSON_FILE)
         html = report_page(context, [(one.probe.question, one.finding) for one in results])
         write_atomically(out / REPORT_FILE, html.encode("utf-8"))
         return results
@@ -134,11 +135,7 @@ def save_finding(folder: Path, key: str, finding: Finding, seconds: float) -> No
     content = asdict(finding)
     if content["figure"] is not None:
         write_atomically(folder / f"{finding.probe}.png", content["figure"].pop("png"))
-    _write_json(folder / f"{finding.probe}.json", {"key": key, "seconds": seconds, "finding": content})
-
-
-def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    write_atomically(path, (json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode("utf-8"))
+    write_json({"key": key, "seconds": seconds, "finding": content}, folder / f"{finding.probe}.json")
 
 
 def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | None:
