@@ -309,7 +309,7 @@ def _draw_scenes(predictor: ScenePredictor, scenes: Counterfactuals) -> Figure:
     unit = "mm" if predictor.in_mm else "of the range"
     title = (
         f"{original.sample}: one thing changed at a time; {scenes.direction} phase; blue to red: -{largest:.3g} to "
-        f"{largest:.3g} {unit}; grey: no prediction"
+        f"{largest:.3g} {unit}; white: no prediction"
     )
     alt = f"Scenes of {original.sample} with changed phase, outline or fringes, and the change of its prediction"
     titles = [f"{variant.kind}:\n{variant.name.replace(' ', chr(10), 1)}" for variant in shown]

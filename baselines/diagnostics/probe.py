@@ -171,7 +171,7 @@ COLOURS = {
     "ink": "#191c20",
 }
 """Colours of the targets, edges and depth as in the paper's figure; of the raw input, of random weights, of text."""
-_GRID, _NOTHING = "#dfe1e5", 0.91
+_GRID = "#dfe1e5"
 _GAP = 4  # px between two pictures
 
 
@@ -199,7 +199,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class Picture:
-    """A map (H, W) from ``low`` to ``high``, by default its largest value, in matplotlib's ``colours``; NaN is grey."""
+    """A map (H, W) from ``low`` to ``high`` (default: its largest value) in matplotlib's ``colours``; NaN is white."""
 
     image: NDArray
     colours: str = "gray"
@@ -214,7 +214,7 @@ class Picture:
         values = np.asarray(self.image, dtype=float)
         high = np.nanmax(values) if self.high is None else self.high
         share = np.clip((np.nan_to_num(values) - self.low) / ((high - self.low) or 1.0), 0, 1)
-        return np.where(np.isnan(values)[..., None], _NOTHING, colormaps[self.colours](share)[..., :3])
+        return np.where(np.isnan(values)[..., None], 1.0, colormaps[self.colours](share)[..., :3])
 
 
 def chart(panels: Sequence[Panel], columns: int, panel_size: tuple[float, float] = (5.0, 3.4)) -> bytes:
@@ -277,7 +277,7 @@ def _png(figure: Any) -> bytes:
     from PIL import Image
 
     drawn, reduced = BytesIO(), BytesIO()
-    figure.savefig(drawn, format="png", dpi=130, facecolor="white", metadata={"Software": None})
+    figure.savefig(drawn, format="png", dpi=130, facecolor="white", bbox_inches="tight", metadata={"Software": None})
     image = Image.open(drawn).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     image.save(reduced, format="png", optimize=True)
     return reduced.getvalue()
