@@ -93,13 +93,8 @@ def diagnose(
                 results.append(ProbeResult(probe, finding, seconds, reused=False))
         context = _context(subject, dataset, settings, command)
         findings = {
-            one.probe.name: {
-                "title": one.finding.title,
-                "summary": one.finding.summary,
-                "skipped": one.finding.skipped,
-                "seconds": one.seconds,
-                "values": one.finding.values,
-            }
+            one.probe.name: {"seconds": one.seconds}
+            | {key: getattr(one.finding, key) for key in ("title", "summary", "skipped", "values")}
             for one in results
         }
         content = {"format": "fpp-ml-bench diagnosis", "version": FORMAT_VERSION, **context, "findings": findings}

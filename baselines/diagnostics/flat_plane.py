@@ -61,10 +61,9 @@ class Scale:
 
 @dataclass(frozen=True)
 class PlanePrediction:
-    """A plane's numbers, its mask, image and prediction (H, W)."""
+    """A plane's numbers, its image and prediction (H, W)."""
 
     row: Row
-    mask: NDArray[np.bool_]
     frame: NDArray[np.uint8]
     prediction: NDArray[np.float32]
 
@@ -152,9 +151,8 @@ def predict_plane(
     tilt_deg: tuple[float, float],
     distance_m: float,
 ) -> PlanePrediction:
-    """A plane cut to ``mask`` (H, W), rendered and predicted (`Subject.answer`). Of its row: mean, standard deviation,
-    least and largest prediction, in its own units and in mm, its error, and the share that collapsed to background; in
-    float64."""
+    """A plane cut to ``mask`` (H, W), rendered and predicted (`Subject.answer`). Of its row: mean, least and largest
+    prediction in its own units, the share that collapsed to background, mean and error in mm; in float64."""
     surface = plane(renderer.rig, distance_m, tilt_deg, mask)
     lit, seen = renderer.light(surface), mask.copy()
     seen.ravel()[surface.pixels] &= lit.gain > 0  # no fringe beyond the projector's field
@@ -162,22 +160,19 @@ def predict_plane(
     prediction, true_mm = subject.answer(frames), surface.depth_mm(renderer.shape)[seen]
     values = prediction[seen].astype(np.float64)
     millimetres = scale.mm(values)
-    own = {
-        "answer_mean": values.mean(),
-        "answer_min": values.min(),
-        "answer_max": values.max(),
-        "collapsed_share": (values < scale.limit).mean(),
-        "mean_mm": millimetres.mean(),
-        "mae_mm": np.abs(millimetres - true_mm).mean(),
-    }
     row = {
         "outline": outline,
         "distance_m": distance_m,
         "tilt_deg": list(tilt_deg),
         "pixels": int(seen.sum()),
-        **{key: float(value) for key, value in own.items()},
+        "answer_mean": float(values.mean()),
+        "answer_min": float(values.min()),
+        "answer_max": float(values.max()),
+        "collapsed_share": float((values < scale.limit).mean()),
+        "mean_mm": float(millimetres.mean()),
+        "mae_mm": float(np.abs(millimetres - true_mm).mean()),
     }
-    return PlanePrediction(row, seen, np.asarray(frames[subject.frames_used[0]]), prediction)
+    return PlanePrediction(row, np.asarray(frames[subject.frames_used[0]]), prediction)
 
 
 def control_of(
