@@ -8,6 +8,7 @@ with the edges of the true depth and with the local standard deviation of the fr
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -74,12 +75,14 @@ class GradCam(probe.Probe):
         if not samples:
             raise DiagnosisError(f"{dataset.path}: split test holds no sample, which Grad-CAM needs")
         seeds = settings.seeds or (1 if settings.quick else SEEDS)
-        layers = cam_layers(subject)
-        means = measure(subject, dataset, samples, layers, seeds, progress)
+        subject = replace(subject, layer_names=cam_layers(subject))
+        means = measure(subject, dataset, samples, seeds, progress)
         if means["average"][EDGES]["r"] is None:
-            return self.skip(f"the heatmaps of every layer of {subject.name} ({', '.join(layers)}) are constant.")
+            return self.skip(
+                f"the heatmaps of every layer of {subject.name} ({', '.join(subject.layer_names)}) are constant."
+            )
         protocol = {"samples": len(samples), "seeds": seeds}
-        drawn = _draw_heatmaps(subject, dataset, samples, layers)
+        drawn = _draw_heatmaps(subject, dataset, samples)
         return self.finding(summary(means), {"protocol": protocol, **means}, table(means, len(samples)), drawn)
 
 
@@ -89,9 +92,9 @@ def cam_layers(subject: Subject) -> tuple[str, ...]:
     return six if set(six) | {AVERAGE} == set(paper_layers(PAPER)) else subject.layer_names
 
 
-def heatmaps(network: nn.Module, layers: Mapping[str, nn.Module], fringe: Tensor) -> dict[str, Tensor]:
-    """Grad-CAM of the mean prediction before its ReLU, by layer: (B, H, W) at the size of ``fringe`` (B, 1, H, W).
-    Raises `DiagnosisError` for a layer whose output is not (B, C, h, w) or does not reach the prediction."""
+def heatmaps(network: nn.Module, layers: Mapping[str, nn.Module], fringe: Tensor) -> dict[str, Image]:
+    """Grad-CAM of the mean prediction by layer: float32 (B, H, W) at the size of ``fringe`` (B, 1, H, W). Raises
+    `DiagnosisError` for a layer whose output is not (B, C, h, w) or does not reach the prediction."""
     heatmaps_by_layer = {}
     for name, layer in layers.items():
         cam = LayerGradCam(lambda x: network(x).mean(dim=(1, 2, 3)), layer)
@@ -104,15 +107,8 @@ def heatmaps(network: nn.Module, layers: Mapping[str, nn.Module], fringe: Tensor
         if not isinstance(heat, Tensor) or heat.dim() != 4:
             raise DiagnosisError(f"layer {name!r}: expected activations (B, C, h, w); leave it out")
         scaled = LayerAttribution.interpolate(heat, tuple(fringe.shape[2:]), "bilinear")
-        heatmaps_by_layer[name] = scaled[:, 0].detach()  # type: ignore[index]
+        heatmaps_by_layer[name] = scaled[:, 0].detach().clamp(min=0).numpy()  # type: ignore[index]
     return heatmaps_by_layer
-
-
-def heat_by_layer(subject: Subject, network: nn.Module, fringe: Tensor, layers: Sequence[str]) -> dict[str, Image]:
-    """`heatmaps` of a ``network`` of the subject's architecture after the ReLU, float32 (B, H, W) by layer."""
-    modules = subject.layers_of(network)
-    heat = heatmaps(network, {name: modules[name] for name in layers}, fringe)
-    return {name: values.clamp(min=0).numpy() for name, values in heat.items()}
 
 
 def references(subject: Subject, dataset: DatasetFolder, sample: str) -> dict[str, Image]:
@@ -145,7 +141,6 @@ def measure(
     subject: Subject,
     dataset: DatasetFolder,
     samples: Sequence[str],
-    layers: Sequence[str],
     seeds: int,
     progress: probe.Progress,
 ) -> dict[str, Any]:
@@ -161,15 +156,15 @@ def measure(
         edges_with_fringes += [correlation(*maps.values()) for maps in compared]
         own: dict[str, Image] = {}
         for number, one_network in enumerate(networks):
-            heat = heat_by_layer(subject, one_network, fringe, layers)
+            heat = heatmaps(one_network, subject.layers_of(one_network), fringe)
             own = own or heat
-            for layer, sample in product(layers, range(len(names))):
+            for layer, sample in product(subject.layer_names, range(len(names))):
                 for target, reference in {**compared[sample], OWN: own[layer][sample]}.items():
                     found[number, target, layer].append(correlation(heat[layer][sample], reference))
             done += len(names)
             progress(done, len(samples) * len(networks), "Grad-CAM" + (" of random weights" if number else ""))
     objects = [split_sample_name(name)[0] for name in samples]
-    return means_of(found, layers, objects) | {"edges_with_fringes": _mean([edges_with_fringes], objects)}
+    return means_of(found, subject.layer_names, objects) | {"edges_with_fringes": _mean([edges_with_fringes], objects)}
 
 
 def means_of(found: Correlations, layers: Sequence[str], objects: Sequence[str]) -> dict[str, Any]:
@@ -224,13 +219,13 @@ def table(means: Mapping[str, Any], samples: int) -> Table:
     return Table.of(title, "Layer", rows, COLUMNS | {"ratio": "Ratio edges / fringes"})
 
 
-def _draw_heatmaps(subject: Subject, dataset: DatasetFolder, samples: Sequence[str], layers: Sequence[str]) -> Figure:
-    rows = {}
+def _draw_heatmaps(subject: Subject, dataset: DatasetFolder, samples: Sequence[str]) -> Figure:
+    network, rows = subject.networks()[0], {}
     for sample in dict.fromkeys(samples[round(share * (len(samples) - 1))] for share in np.linspace(0, 1, _EXAMPLES)):
         frames = subject.captured(dataset, sample)
-        heat = heat_by_layer(subject, subject.networks()[0], subject.input_batch([frames]), layers)
+        heat = heatmaps(network, subject.layers_of(network), subject.input_batch([frames]))
         maps = frames[subject.frames_used[0]], *references(subject, dataset, sample).values()
         rows[sample] = [Picture(np.asarray(image)) for image in maps]
         rows[sample] += [Picture(values[0], "inferno") for values in heat.values()]
     title, alt = "Heatmaps, each scaled to its own largest value", "Input, edges, fringes and Grad-CAM by layer"
-    return Figure(title, alt, probe.gallery(rows, ("input", EDGES, FRINGES, *layers)))
+    return Figure(title, alt, probe.gallery(rows, ("input", EDGES, FRINGES, *subject.layer_names)))

@@ -252,11 +252,9 @@ class SceneRenderer:
         turned = scene.projected == "other direction"
         other = scene.projected == "other pitch" or (turned and self.rig.crossed is not None)
         usual: str = scene.projected if other else "sequence"
-        inside = outside = usual
-        if scene.projected == "no fringe inside":
-            inside = "uniform"
-        elif scene.projected == "no fringe outside":
-            outside = "uniform"
+        inside, outside = (
+            "uniform" if scene.projected == f"no fringe {where}" else usual for where in ("inside", "outside")
+        )
         projected_indices = [self._partner(index) if turned else index for index in indices]
         object_values = self._exposure(inside).expose(projected_indices, scene.lit, scene.pixels, scene.stream)
         frames: list[NDArray[np.uint8] | None] = [None] * len(self.rig.sequence)
