@@ -27,9 +27,3 @@ def paper_layers(probe: str) -> dict[str, dict[str, float]]:
     table = paper_rows()["probes"][probe]
     ours = {theirs: name for name, theirs in LAYERS.items()} | {AVERAGE: AVERAGE}
     return {ours[name]: dict(zip(table["columns"], row, strict=True)) for name, row in table["layers"].items()}
-
-
-def said_by_paper(probe: str, layer: str) -> str | None:
-    """A layer's values in a table's cell; None where the paper has none."""
-    values = paper_layers(probe).get(layer)
-    return None if values is None else ", ".join(f"{value:g}" for value in values.values())

@@ -35,7 +35,6 @@ def subject_with(network: nn.Module, size, layers=("out",)) -> Subject:
         normalisation="individual",
         network=network,
         layer_names=layers,
-        find_layers=lambda any_network: dict(any_network.named_children()),
         untrained=lambda seed: network,
     )
 

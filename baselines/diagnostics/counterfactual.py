@@ -23,14 +23,10 @@ from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import (
     SceneSet,
 )
 from fpp_ml_bench.baselines.diagnostics.probe import (
-    COLOURS,
     Figure,
-    Line,
-    Panel,
     Picture,
     Progress,
     Table,
-    chart,
     gallery,
     mean_of,
     silent,
@@ -47,22 +43,6 @@ if TYPE_CHECKING:
     from fpp_ml_bench.baselines.method import Method
 
 MOST_VIEWS = 6
-_FOLLOWS = {
-    "follows_phase": "phase alone",
-    "follows_light": "brightness\nalone",
-    "follows_both": "both, as in\na photograph",
-    "follows_constant": "phase, by\na constant",
-    "order_free_follows_phase": "phase, whole\nperiods aside",
-}
-_CHANGES = {
-    "change_outline": "other\noutline",
-    "change_no_fringe_inside": "no fringe\ninside",
-    "change_no_fringe_outside": "no fringe\noutside",
-    "change_other_direction": "other\ndirection",
-    "change_other_pitch": "other\npitch",
-    "order_free_change_outline": "other outline,\nperiods aside",
-}
-
 Map = NDArray[np.floating]
 
 
@@ -283,114 +263,60 @@ class Counterfactual(probe.Probe):
             for sample in samples
         }
         # The middle sample of the list, which is the same for every method.
-        middle = samples[len(samples) // 2].sample
-        scenes = next(scenes for scenes in scene_set.scenes(reliance.direction) if scenes.original.sample == middle)
+        scenes = scene_set.scenes_of(len(samples) // 2, reliance.direction)
         values = {"reliance": reliance.model_dump(mode="json"), "per_sample": per_sample}
+        rows = [(words, getattr(reliance.parts, key)) for key, words in PART_TITLES.items()]
+        parts = Table("Parts of the score, and further measurements", ("Part", "Mean over samples"), rows)
         drawn = _draw_scenes(ScenePredictor(subject, scene_set.renderer), scenes)
-        return self.finding(
-            summary(reliance), values, tables(reliance, per_sample), drawn, _draw_parts(reliance, samples)
-        )
+        return self.finding(summary(reliance), values, parts, drawn)
 
 
 def summary(reliance: Reliance) -> str:
-    """The score, its parts, and the hypothesis that they support."""
-    parts, (low, high), order_free = reliance.parts, reliance.interval, reliance.order_free_score
+    """The score, and the hypothesis that it supports."""
+    (low, high), order_free = reliance.interval, reliance.order_free_score
     interval = f" (95% interval {low:.2f} to {high:.2f})" if low is not None and high is not None else ""
     whole_periods = "" if order_free is None else f"; {order_free:.2f} ignoring errors of whole periods"
     verdict = "It reads the phase in part." if reliance.score >= 0.1 else "It does not follow the phase."
     if reliance.score >= 0.5 or (order_free or 0.0) >= 0.5:
         verdict = "It reads the phase."
-    phase, light, outline = (
-        "not measured" if value is None else f"{value:.2f}"
-        for value in (parts.follows_phase, parts.follows_light, parts.change_outline)
-    )
-    text = (
-        f"Phase reliance {reliance.score:.2f}{interval}{whole_periods}. The prediction follows a change of phase "
-        f"within the object by {phase}, and a change of brightness alone by {light}. Another outline over the same "
-        f"phase changes it by {outline} of what a moved phase does. {verdict}"
-    )
+    text = f"Phase reliance {reliance.score:.2f}{interval}{whole_periods}. {verdict}"
     return f"{text} {warning}" if (warning := caution(reliance.objects)) else text
 
 
-def tables(reliance: Reliance, per_sample: dict[str, dict[str, float | None]]) -> list[Table]:
-    """The parts of the score, and the score of every sample."""
-    parts = [(words, getattr(reliance.parts, key)) for key, words in PART_TITLES.items()]
-    columns = {
-        "score": "Score",
-        "order_free_score": "Whole periods aside",
-        "follows_phase": "Follows phase",
-        "follows_light": "Follows brightness",
-        "change_outline": "Change by outline",
-    }
-    means = Table("Parts of the score, and further measurements", ("Part", "Mean over samples"), parts)
-    return [means, Table.of("Sample by sample", "Sample", per_sample, columns)]
-
-
 def _draw_scenes(predictor: ScenePredictor, scenes: Counterfactuals) -> Figure:
-    """One column per scene: captured frame, true depth, prediction, expected change and actual change."""
+    """One column per scene: captured frame, expected change and actual change."""
     original = scenes.original
     target = original.target & (original.depth_mm > 0)
     truth, before = predictor.true_depth(original.depth_mm, target), predictor.predict(original.scene)
-    first = {move.name: move for move in reversed(scenes.of_kind("phase"))}
-    shown = [(f"phase moved:\n{name}", first[name]) for name in ("ramp across", "ramp down", "bump") if name in first]
-    shown += [(f"outline:\n{change.name}", change) for change in scenes.of_kind("outline")]
-    shown += [(change.name.replace(" ", "\n", 1), change) for change in scenes.of_kind("projected")]
-    columns = [("as it is", original.scene, original.depth_mm)]
-    columns += [(title, variant.scene, variant.depth_mm) for title, variant in shown]
-    index, masked = predictor.method.frames_used[0], predictor.method.uses_ground_truth_mask
-    margin = 0.5 * (float(np.ptp(truth[target])) or 1.0)
-    low, high = float(truth[target].min()) - margin, float(truth[target].max()) + margin
-    moves = [predictor.true_depth(move.depth_mm, target) - truth for move in scenes.of_kind("phase")]
-    largest = max(float(np.abs(move[target]).max()) for move in moves)
-    unit, digits = ("mm", 0) if predictor.in_mm else ("of range", 2)
-    scales: dict[str, tuple[str, float, float]] = {
-        "captured": ("gray", 0.0, 255.0),
-        f"truth,\n{low:.{digits}f} to\n{high:.{digits}f} {unit}": ("viridis", low, high),
-        "prediction": ("viridis", low, high),
-        f"expected change,\n-+{largest:.{digits}f} {unit}": ("coolwarm", -largest, largest),
-        "actual change": ("coolwarm", -largest, largest),
-    }
-    rows: dict[str, list[Picture]] = {name: [] for name in scales}
-    box = _box(np.logical_or.reduce([scene.mask for _, scene, _ in columns]))
-    for _, scene, depth_mm in columns:
-        mask, answer = scene.mask & (depth_mm > 0), predictor.predict(scene)
-        true_depth, compared = predictor.true_depth(depth_mm, mask), mask & target
-        missing = predictor.in_mm & (answer == 0)
+    shown = [one for one in scenes.of_kind("phase", "outline", "projected") if one.amplitude_rad >= 0]
+    method, box = predictor.method, _box(np.logical_or.reduce([variant.scene.mask for variant in shown]))
+    index, columns = method.frames_used[0], []
+    for variant in shown:
+        scene, after = variant.scene, predictor.predict(variant.scene)
+        mask = scene.mask & (variant.depth_mm > 0)
+        missing = predictor.in_mm & ((before == 0) | (after == 0))
         images = (
-            predictor.renderer.frames(scene, [index], masked)[index],
-            np.where(mask, true_depth, np.nan),
-            np.where(mask & ~missing, answer, np.nan),
-            np.where(compared, true_depth - truth, np.nan),
-            np.where(compared & ~missing & ~(predictor.in_mm & (before == 0)), answer - before, np.nan),
+            predictor.renderer.frames(scene, [index], method.uses_ground_truth_mask)[index],
+            np.where(mask & target, predictor.true_depth(variant.depth_mm, mask) - truth, np.nan),
+            np.where(mask & target & ~missing, after - before, np.nan),
         )
-        for name, image in zip(scales, images, strict=True):
-            rows[name].append(Picture(np.asarray(image)[box], *scales[name]))
-    title = f"{original.sample}: one thing changed at a time; {scenes.direction} phase; grey: no prediction"
-    alt = f"Scenes of {original.sample} with changed phase, outline or fringes; truth, prediction and its change"
-    png = gallery(rows, [column for column, *_ in columns])
-    return Figure(title, "counterfactual_scenes.png", alt, png)
+        columns.append([np.asarray(image)[box] for image in images])
+    frames, *changes = zip(*columns, strict=True)
+    largest = float(np.nanmax(np.abs(changes[0])))
+    rows = {"captured": [Picture(frame) for frame in frames]}
+    for name, maps in zip(("expected change", "actual change"), changes, strict=True):
+        rows[name] = [Picture(one, "coolwarm", -largest, largest) for one in maps]
+    unit = "mm" if predictor.in_mm else "of the range"
+    title = (
+        f"{original.sample}: one thing changed at a time; {scenes.direction} phase; blue to red: -{largest:.3g} to "
+        f"{largest:.3g} {unit}; white: no prediction"
+    )
+    alt = f"Scenes of {original.sample} with changed phase, outline or fringes, and the change of its prediction"
+    titles = [f"{variant.kind}:\n{variant.name.replace(' ', chr(10), 1)}" for variant in shown]
+    return Figure(title, alt, gallery(rows, titles, 1.3))
 
 
 def _box(mask: NDArray[np.bool_], margin: int = 6) -> tuple[slice, ...]:
     """The part of the image around ``mask``."""
     seen = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
     return tuple(slice(max(places[0] - margin, 0), places[-1] + margin + 1) for places in seen)
-
-
-def _draw_parts(reliance: Reliance, samples: Sequence[SampleReliance]) -> Figure:
-    """The means of the parts, with a point for each sample."""
-    panels = []
-    for names, title, colour, top in (
-        (_FOLLOWS, "Follows, share of the expected change", "phase", 1.05),
-        (_CHANGES, "Changes, relative to a moved phase", "depth", None),
-    ):
-        measured = {key: name for key, name in names.items() if getattr(reliance.parts, key) is not None}
-        means = [getattr(reliance.parts, key) for key in measured]
-        lines = [Line("mean", list(measured.values()), means, COLOURS[colour], "D")]
-        for sample in samples:
-            points = [sample.parts.get(key) for key in measured]
-            lines.append(Line("sample", list(measured.values()), points, COLOURS["ink"], "."))
-        panels.append(Panel(title, lines, axes={"ylim": (0, top)}))
-    title = f"What the score is made of: phase reliance {reliance.score:.2f}"
-    alt = "How far the answer follows and what changes it"
-    return Figure(title, "counterfactual_parts.png", alt, chart(panels, 2))

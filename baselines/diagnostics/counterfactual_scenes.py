@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, shift
 
 from fpp_ml_bench.baselines.diagnostics import scene_renderer as rendering
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import (
@@ -34,7 +34,6 @@ LARGEST_SHIFT_RAD = 0.4 * TAU
 SMALLEST_SHIFT_RAD = 0.05 * TAU  # where the working range allows only smaller shifts, the move is left out
 REPROJECTED: tuple[Projected, ...] = ("no fringe inside", "no fringe outside", "other direction", "other pitch")
 VIEWS_PER_OBJECT = 2
-_STORED_PX = 300  # scenes of images up to this width are kept in memory; larger ones are made again for each method
 GROWTH = 0.1  # how far a grown object reaches beyond its outline, in units of sqrt(area): it gains about half its area
 KEPT_SHARE = 0.5
 """Share of the object that an ellipse leaves; of the other objects' outlines the nearest to this share is used."""
@@ -198,11 +197,7 @@ def _grown(sample: Original, renderer: SceneRenderer, inside: NDArray[np.bool_])
 def _laid_over(outline: NDArray[np.bool_], target: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """``outline`` shifted so that its centre lies on the target's."""
     centres = [np.argwhere(mask).mean(axis=0) for mask in (target, outline)]
-    rows, columns = (np.argwhere(outline) + np.rint(centres[0] - centres[1]).astype(int)).T
-    shifted = np.zeros_like(outline)
-    in_image = (rows >= 0) & (rows < shifted.shape[0]) & (columns >= 0) & (columns < shifted.shape[1])
-    shifted[rows[in_image], columns[in_image]] = True
-    return shifted
+    return shift(outline.astype(np.uint8), np.rint(centres[0] - centres[1]), order=0).astype(bool)
 
 
 def _ellipse(sample: Original) -> NDArray[np.bool_]:
@@ -236,20 +231,19 @@ def chosen_samples(dataset: DatasetFolder, split: str, views: int) -> list[tuple
 
 
 class SceneSet:
-    """The counterfactual scenes of ``views`` samples of each object of ``split``, shared by all methods. Raises
+    """The counterfactual scenes of ``views`` samples of each object of ``split``. Raises
     `DiagnosisError` for a split without an object."""
 
     def __init__(self, dataset: DatasetFolder, views: int = VIEWS_PER_OBJECT, split: str = "test") -> None:
         self.dataset, self.renderer = dataset, SceneRenderer.of(dataset)
         self.samples = chosen_samples(dataset, split, views)
-        self._stored: dict[tuple[str, MovedPhase], Counterfactuals] = {}
 
     def scenes(self, direction: MovedPhase) -> Iterator[Counterfactuals]:
         """The scenes of every sample, with the phase of ``direction`` moved."""
-        for sample, outline_samples in self.samples:
-            scenes = self._stored.get((sample, direction))
-            if scenes is None:
-                scenes = counterfactuals(self.dataset, self.renderer, sample, direction, outline_samples)
-            if self.dataset.size[1] <= _STORED_PX:
-                self._stored[sample, direction] = scenes
-            yield scenes
+        for place in range(len(self.samples)):
+            yield self.scenes_of(place, direction)
+
+    def scenes_of(self, place: int, direction: MovedPhase) -> Counterfactuals:
+        """Those of the sample at a place of ``samples``."""
+        sample, outline_samples = self.samples[place]
+        return counterfactuals(self.dataset, self.renderer, sample, direction, outline_samples)

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from difflib import get_close_matches
 from functools import cache
 from hashlib import sha256
 from importlib.metadata import version
@@ -27,12 +26,14 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.report.html import data_uri, page, render
+from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, read_json, write_atomically
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
+from fpp_ml_bench.options import did_you_mean
 
 JSON_FILE, REPORT_FILE = "diagnose.json", "index.html"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 _PACKAGES = ("numpy", "torch", "captum")
 _STYLE = """
 .drawn img { display: block; width: 100%; min-width: 34rem; background: #fff; border-radius: 6px; }
@@ -92,17 +93,12 @@ def diagnose(
                 results.append(ProbeResult(probe, finding, seconds, reused=False))
         context = _context(subject, dataset, settings, command)
         findings = {
-            one.probe.name: {
-                "title": one.finding.title,
-                "summary": one.finding.summary,
-                "skipped": one.finding.skipped,
-                "seconds": one.seconds,
-                "values": one.finding.values,
-            }
+            one.probe.name: {"seconds": one.seconds}
+            | {key: getattr(one.finding, key) for key in ("title", "summary", "skipped", "values")}
             for one in results
         }
         content = {"format": "fpp-ml-bench diagnosis", "version": FORMAT_VERSION, **context, "findings": findings}
-        _write_json(out / JSON_FILE, content)
+        write_json(content, out / JSON_FILE)
         html = report_page(context, [(one.probe.question, one.finding) for one in results])
         write_atomically(out / REPORT_FILE, html.encode("utf-8"))
         return results
@@ -112,8 +108,7 @@ def checked_names(names: Sequence[str]) -> tuple[str, ...]:
     """``names``, each once, in the report's order; all probes if empty. Raises `DiagnosisError` for an unknown name."""
     for name in names:
         if name not in PROBES:
-            hint = "".join(f"did you mean {near!r}? " for near in get_close_matches(name, PROBES, n=1))
-            raise DiagnosisError(f"unknown probe {name!r}; {hint}there are {', '.join(PROBES)}")
+            raise DiagnosisError(f"unknown probe {name!r}; {did_you_mean(name, PROBES)}")
     return tuple(name for name in PROBES if not names or name in names)
 
 
@@ -131,17 +126,11 @@ def finding_key(probe: Probe, subject: Subject, dataset: DatasetFolder, settings
 
 
 def save_finding(folder: Path, key: str, finding: Finding, seconds: float) -> None:
-    """Write ``PROBE.json`` and the pictures into ``folder``. Raises ``ValueError`` for NaN and infinity."""
-    for figure in finding.figures:
-        write_atomically(folder / figure.file, figure.png)
+    """Write ``PROBE.json`` and its picture ``PROBE.png`` into ``folder``. Raises ``ValueError`` for NaN, infinity."""
     content = asdict(finding)
-    for figure in content["figures"]:
-        del figure["png"]
-    _write_json(folder / f"{finding.probe}.json", {"key": key, "seconds": seconds, "finding": content})
-
-
-def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    write_atomically(path, (json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n").encode("utf-8"))
+    if content["figure"] is not None:
+        write_atomically(folder / f"{finding.probe}.png", content["figure"].pop("png"))
+    write_json({"key": key, "seconds": seconds, "finding": content}, folder / f"{finding.probe}.json")
 
 
 def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | None:
@@ -151,9 +140,10 @@ def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | N
         if content["key"] != key:
             return None
         fields = content["finding"]
-        tables = tuple(Table(**table) for table in fields["tables"])
-        figures = tuple(Figure(**figure, png=(folder / figure["file"]).read_bytes()) for figure in fields["figures"])
-        return Finding(**{**fields, "tables": tables, "figures": figures}), float(content["seconds"])
+        if fields["figure"] is not None:
+            fields["table"] = Table(**fields["table"])
+            fields["figure"] = Figure(**fields["figure"], png=(folder / f"{name}.png").read_bytes())
+        return Finding(**fields), float(content["seconds"])
     except (OSError, ValueError, TypeError, KeyError):
         return None  # absent, half written, or of another version: it is made again
 

@@ -5,8 +5,10 @@
 are ours. Both learn from the network's batches as they come, so no activations are stored.
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from functools import lru_cache
+from itertools import product
 from typing import Any
 
 import cv2
@@ -17,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fpp_ml_bench.baselines.diagnostics.subjects import checked_output
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU
+from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import normalise, object_mask
 from fpp_ml_bench.errors import DiagnosisError
@@ -25,13 +27,24 @@ from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Direction
 
 Image = NDArray[np.float32]
-Source = tuple[str, str]  # a network, or `INPUT`, and a layer
-INPUT, SILHOUETTE, POSITION = "input", "silhouette", "position"
-"""Controls, which are probed like layers: the raw input, the object's mask (0 or 1), and the pixel's position as six
-features (1, x, y, x^2, x y, y^2), which uses no image."""
+Source = tuple[str, int, str]
+"""What is probed: a network's name, the seed of its weights, and a layer."""
+MEAN: Source = "controls", 0, "mean"  # predicting each target's mean over the training samples, the reference
 OBJECT_DEPTH = "object_depth"  # depth on object pixels
-MEASURED = {"edges": ("edges", "image"), "depth": ("depth", "image"), OBJECT_DEPTH: ("depth", "object")}
-"""What is measured of the four-convolution probes: the target that they are trained on, and where they are compared."""
+Measured = Mapping[str, tuple[tuple[str, ...], str]]
+"""What is measured: its maps, by the names in `truth`, and the mask of the pixels where they are compared."""
+LINEAR: Measured = {
+    "edges": (("edges",), "image"),
+    "depth": (("depth",), "image"),
+    OBJECT_DEPTH: (("depth",), "object"),
+    "distance": (("depth_mm",), "object"),
+    "phase": (("sine", "cosine"), "object"),
+    "order": (("order",), "object"),
+}
+"""Of the linear probes, each of which is fitted where it is compared; the phase is an angle and so has two maps."""
+FRINGE = ("phase", "order")  # of these, what needs fringes of a single direction
+SPATIAL: Measured = {name: LINEAR[name] for name in ("edges", "depth", OBJECT_DEPTH)}
+"""Of the four-convolution probes, which are trained on the maps of the whole image."""
 RIDGE = 1e-6
 """Ridge strength per pixel for standardised channels; it only makes constant or duplicate channels solvable."""
 WIDTH = 16
@@ -40,7 +53,6 @@ SHARE, LONGEST = 4, 120
 LEARNING_RATE = 3e-3
 EPOCHS = 6
 BATCH = 4
-_LEAST_SPREAD = 1e-6
 
 
 def activations_of(
@@ -97,32 +109,28 @@ def at_pixels(features: Tensor, pixels: Tensor, size: tuple[int, int]) -> Tensor
 
 def truth(depth_mm: Image, rig: Rig, direction: Direction) -> dict[str, NDArray]:
     """Ground truth of a depth map (H, W) in mm, 0 = background, seen by ``rig`` under fringes of ``direction``. Raises
-    ``ValueError`` for a map without an object. ``inside``: the object mask. ``edges``: `edge_map`, [0, 1]. ``depth``:
+    ``ValueError`` for a map without an object. ``object``: its mask. ``edges``: `edge_map`, [0, 1]. ``depth``:
     normalised to the sample's own range, background 0 (the paper's target). ``depth_mm``. ``sine``, ``cosine``: of the
     wrapped phase, 0 outside the object. ``order``: the fringe order minus that of a plane at the rig's standoff, 0
-    outside the object; the plane's order follows from the pixel's position alone. All but ``inside`` are float32."""
+    outside the object; the plane's order follows from the pixel's position alone. All are float32."""
     inside = object_mask(depth_mm)
     if not inside.any():
         raise ValueError("expected a depth map with an object, got background throughout")
-    periods = np.where(inside, periods_at(depth_mm, rig, direction), 0.0)
-    phase = TAU * (periods - np.floor(periods))
-    order = np.floor(periods) - np.where(inside, np.floor(_standoff_periods(rig, direction)), 0.0)
+    standoff_mm = rig.standoff_m * MM_PER_M
+    # Of the background as if it were at the standoff.
+    phase = _layer(rig, direction).absolute_phase(np.where(inside, depth_mm, standoff_mm))
+    order = np.floor(phase / TAU) - np.floor(_layer(rig, direction).absolute_phase(standoff_mm) / TAU)
     sine, cosine = (np.where(inside, of(phase), 0.0) for of in (np.sin, np.cos))
     maps = {
+        "object": inside,
         "edges": edge_map(depth_mm),
-        "depth": normalised_depth(depth_mm),
+        "depth": normalise(depth_mm, "individual", float(depth_mm[inside].min()), float(depth_mm[inside].max())),
         "depth_mm": depth_mm,
         "sine": sine,
         "cosine": cosine,
         "order": order,
     }
-    return {"inside": inside, **{name: np.asarray(values, dtype=np.float32) for name, values in maps.items()}}
-
-
-def normalised_depth(depth_mm: Image) -> Image:
-    """``depth_mm`` normalised to its own range, background 0."""
-    inside = depth_mm[object_mask(depth_mm)]
-    return normalise(depth_mm, "individual", float(inside.min()), float(inside.max()))
+    return {name: np.array(values, dtype=np.float32) for name, values in maps.items()}
 
 
 def edge_map(depth_mm: NDArray) -> Image:
@@ -135,18 +143,9 @@ def edge_map(depth_mm: NDArray) -> Image:
     return (strength / top).astype(np.float32) if top > 0 else strength
 
 
-def periods_at(depth_mm: NDArray, rig: Rig, direction: Direction) -> NDArray[np.float64]:
-    """Position of each pixel's surface point on the pattern, in fringe periods from the projector's first px, (H, W):
-    its integer part is the fringe order, the fraction the wrapped phase / 2 pi. NaN where depth is 0."""
-    x, y = rig.camera.rays()
-    z = np.where(depth_mm > 0, depth_mm, np.nan).astype(np.float64) / MM_PER_M
-    projected = rig.project(np.stack([x * z, y * z, z], axis=-1))
-    return projected[0 if direction == "vertical" else 1] / rig.pitch(direction)
-
-
 @lru_cache(maxsize=2)
-def _standoff_periods(rig: Rig, direction: Direction) -> NDArray[np.float64]:
-    return periods_at(np.full((rig.camera.height, rig.camera.width), rig.standoff_m * MM_PER_M), rig, direction)
+def _layer(rig: Rig, direction: Direction) -> CalibrationLayer:
+    return CalibrationLayer.of(rig, direction)
 
 
 class NormalEquations:
@@ -169,26 +168,31 @@ class NormalEquations:
         """Mean of the targets, (T,)."""
         return self.cross[-1] / self.count
 
+    def standard(self, least_spread: float = 1e-9) -> tuple[Tensor, Tensor]:
+        """Mean and 1 / standard deviation of each feature, (C,); 0 for a constant one, which removes it. Constant: its
+        spread is below ``least_spread``, relative to 1 plus its mean."""
+        mean = self.inner[-1, :-1] / self.count
+        spread = (self.inner.diagonal()[:-1] / self.count - mean * mean).clamp(min=0).sqrt()
+        return mean, torch.where(spread > least_spread * (1 + mean.abs()), 1 / spread, torch.zeros_like(spread))
+
     def solve(self, strength: float = RIDGE) -> Tensor:
         """Weights (C + 1, T) float64, the last row the bias, of least squared error plus ``strength`` times N times
         the squared weights of standardised features; the bias is free."""
-        mean, target = self.inner[-1, :-1] / self.count, self.target_mean
-        spread = (self.inner.diagonal()[:-1] / self.count - mean * mean).clamp(min=0).sqrt()
-        scale = torch.where(spread > 1e-9 * (1 + mean.abs()), spread, torch.full_like(spread, torch.inf))
-        inner = (self.inner[:-1, :-1] / self.count - torch.outer(mean, mean)) / torch.outer(scale, scale)
-        cross = (self.cross[:-1] / self.count - torch.outer(mean, target)) / scale[:, None]
+        (mean, factor), target = self.standard(), self.target_mean
+        inner = (self.inner[:-1, :-1] / self.count - torch.outer(mean, mean)) * torch.outer(factor, factor)
+        cross = (self.cross[:-1] / self.count - torch.outer(mean, target)) * factor[:, None]
         inner.diagonal().add_(strength)
-        weight = torch.linalg.solve(inner, cross) / scale[:, None]
+        weight = torch.linalg.solve(inner, cross) * factor[:, None]
         return torch.cat([weight, (target - mean @ weight)[None]])
 
 
 def apply(weights: Tensor, features: Tensor) -> Tensor:
-    """Predictions (N, T) float64 of a solved probe for features (N, C)."""
+    """Predictions (..., T) float64 of a solved probe for features (..., C)."""
     return _with_bias_column(features) @ weights
 
 
 def _with_bias_column(features: Tensor) -> Tensor:
-    return torch.cat([features.double(), torch.ones(len(features), 1, dtype=torch.float64)], dim=1)
+    return functional.pad(features.double(), (0, 1), value=1.0)
 
 
 def grid_step(size: tuple[int, int]) -> int:
@@ -196,30 +200,70 @@ def grid_step(size: tuple[int, int]) -> int:
     return max(SHARE, -(-max(size) // LONGEST))
 
 
-class Moments:
-    """Mean and standard deviation of each channel, accumulated batch by batch in float64."""
+class Probes(ABC):
+    """Probes of everything in ``measured``, for all sources together: they observe the training samples, start, may
+    be trained in steps, and have errors."""
 
-    def __init__(self) -> None:
-        self.count = 0
-        self.total = self.square = torch.zeros((), dtype=torch.float64)
+    def __init__(self, measured: Measured) -> None:
+        self.measured = measured
+        self.maps = list(dict.fromkeys(name for maps, _ in measured.values() for name in maps))
+        self.equations: dict[tuple[Source, str], NormalEquations] = {}
 
-    def add(self, features: Tensor) -> None:
-        """Add a batch (B, C, h, w)."""
-        flat = features.double().transpose(0, 1).flatten(1)
-        self.count += flat.shape[1]
-        self.total, self.square = self.total + flat.sum(1), self.square + flat.square().sum(1)
+    def observe(self, features: Mapping[Source, Tensor], targets: Mapping[str, Tensor]) -> None:
+        """Take in a batch: activations (B, C, h, w), and maps and masks (B, 1, h, w) by name."""
+        wanted = torch.cat([targets[name] for name in self.maps], dim=1)
+        for (source, maps), where in product(features.items(), ("image", "object")):
+            inside = targets[where][:, 0] > 0
+            if (source, where) not in self.equations:
+                self.equations[source, where] = NormalEquations(maps.shape[1], len(self.maps))
+            self.equations[source, where].add(*(of.movedim(1, -1)[inside] for of in (maps, wanted)))
 
-    def standard(self) -> tuple[Tensor, Tensor]:
-        """Mean and 1 / standard deviation, float32 (C,); 0 for a constant channel, which removes it."""
-        mean = self.total / self.count
-        spread = (self.square / self.count - mean * mean).clamp(min=0).sqrt()
-        factor = torch.where(spread > _LEAST_SPREAD * (1 + mean.abs()), 1 / spread, torch.zeros_like(spread))
-        return mean.float(), factor.float()
+    def mean(self, name: str) -> Tensor:
+        """Mean (T, 1, 1) of the maps of something measured."""
+        maps, place = self.measured[name]
+        means = next(equations for (_, where), equations in self.equations.items() if where == place).target_mean
+        return means[[self.maps.index(one) for one in maps]][:, None, None]
+
+    @abstractmethod
+    def start(self) -> None:
+        """When all training samples were observed."""
+
+    def step(self, features: Mapping[Source, Tensor], targets: Mapping[str, Tensor]) -> None:
+        """One training step on a batch, as of `observe`."""
+        raise NotImplementedError("its weights are a closed form")
+
+    @abstractmethod
+    def predictions(self, features: Mapping[Source, Tensor], name: str) -> dict[tuple[Source, int], Tensor]:
+        """The maps (B, T, h, w) of something measured, by source and seed of the probe."""
+
+    @torch.no_grad()
+    def errors(
+        self, features: Mapping[Source, Tensor], targets: Mapping[str, Tensor]
+    ) -> dict[tuple[Source, str, int], list[float]]:
+        """Mean squared error on each sample of a batch, by source, what is measured, and seed; with `MEAN`'s."""
+        errors = {}
+        for name, (maps, where) in self.measured.items():
+            truth = torch.cat([targets[one] for one in maps], dim=1).double()
+            for (source, seed), predicted in {(MEAN, 0): self.mean(name), **self.predictions(features, name)}.items():
+                square = (predicted - truth).square().mean(1, keepdim=True) * targets[where]
+                errors[source, name, seed] = (square.sum((1, 2, 3)) / targets[where].sum((1, 2, 3))).tolist()
+        return errors
 
 
-def mean_square(errors: Tensor, where: Tensor) -> list[float]:
-    """Mean square of each sample's ``errors`` over ``where``, both (B, 1, h, w)."""
-    return ((errors.double().square() * where).sum((1, 2, 3)) / where.sum((1, 2, 3))).tolist()
+class LinearProbes(Probes):
+    """A weight per channel, the same at every pixel, for each source."""
+
+    def start(self) -> None:
+        self.weights = {key: equations.solve() for key, equations in self.equations.items()}
+
+    def predictions(self, features: Mapping[Source, Tensor], name: str) -> dict[tuple[Source, int], Tensor]:
+        maps, where = self.measured[name]
+        columns = [self.maps.index(one) for one in maps]
+        found = {}
+        for source, activations in features.items():
+            values = apply(self.weights[source, where][:, columns], activations.movedim(1, -1))
+            found[source, 0] = values.movedim(-1, 1)
+        return found
 
 
 class ConvolutionProbe(nn.Module):
@@ -227,9 +271,9 @@ class ConvolutionProbe(nn.Module):
     The first is narrow so that layers of 8 and of 1024 channels get probes of similar capacity. The receptive field is
     5 x 5 grid points."""
 
-    def __init__(self, moments: Moments, target_mean: float) -> None:
+    def __init__(self, observed: NormalEquations, target_mean: float) -> None:
         super().__init__()
-        self.mean, self.factor = (part[:, None, None] for part in moments.standard())
+        self.mean, self.factor = (part.float()[:, None, None] for part in observed.standard(1e-6))
         self.body = nn.Sequential(
             nn.Conv2d(len(self.mean), WIDTH, 1),
             nn.ReLU(),
@@ -247,26 +291,27 @@ class ConvolutionProbe(nn.Module):
         return self.body((features - self.mean) * self.factor)
 
 
-class ProbeSet:
-    """Four-convolution probes that are trained together, one for each (features, target, seed), with Adam and cosine
-    decay over ``steps``. ``seeds``: number of seeds by features."""
+class ConvolutionProbes(Probes):
+    """Four-convolution probes that are trained together, with Adam and cosine decay over ``steps``; ``seeds``: how many
+    each network's layers get."""
 
-    def __init__(
-        self, moments: Mapping[Source, Moments], means: Mapping[str, float], seeds: Mapping[Source, int], steps: int
-    ) -> None:
+    def __init__(self, measured: Measured, seeds: Mapping[str, int], steps: int) -> None:
+        super().__init__(measured)
+        self.seeds, self.steps = seeds, steps
         self.probes: dict[tuple[Source, str, int], ConvolutionProbe] = {}
-        for features in moments:
-            for seed in range(seeds[features]):
-                for target, mean in means.items():
-                    with torch.random.fork_rng(devices=[]):
-                        torch.manual_seed(seed)
-                        self.probes[features, target, seed] = ConvolutionProbe(moments[features], mean)
+
+    def start(self) -> None:
+        for (source, where), target in product(self.equations, self.maps):
+            for seed in range(self.seeds[source[0]] if where == "image" else 0):
+                with torch.random.fork_rng(devices=[]):
+                    torch.manual_seed(seed)
+                    probe = ConvolutionProbe(self.equations[source, where], float(self.mean(target)))
+                self.probes[source, target, seed] = probe
         parameters = [parameter for probe in self.probes.values() for parameter in probe.parameters()]
         self._optimiser = torch.optim.Adam(parameters, lr=LEARNING_RATE, foreach=True)
-        self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._optimiser, max(1, steps))
+        self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._optimiser, max(1, self.steps))
 
     def step(self, features: Mapping[Source, Tensor], targets: Mapping[str, Tensor]) -> None:
-        """One training step of every probe on a batch: activations (B, C, h, w) and targets (B, 1, h, w) by name."""
         self._optimiser.zero_grad(set_to_none=True)
         for (source, target, _), probe in self.probes.items():
             # One backward pass per probe: a graph of all probes would hold every intermediate map at once.
@@ -274,16 +319,8 @@ class ProbeSet:
         self._optimiser.step()
         self._schedule.step()
 
-    @torch.no_grad()
-    def errors(
-        self, features: Mapping[Source, Tensor], targets: Mapping[str, Tensor]
-    ) -> dict[tuple[Source, str, int], list[float]]:
-        """Mean squared error of every probe on each sample of a batch, by the names in `MEASURED`, which also names the
-        masks (B, 1, h, w) that ``targets`` holds."""
-        errors = {}
-        for (source, target, seed), probe in self.probes.items():
-            difference = probe(features[source]) - targets[target]
-            for name, (compared, where) in MEASURED.items():
-                if compared == target:
-                    errors[source, name, seed] = mean_square(difference, targets[where])
-        return errors
+    def predictions(self, features: Mapping[Source, Tensor], name: str) -> dict[tuple[Source, int], Tensor]:
+        ((target,), _) = self.measured[name]
+        return {
+            (source, seed): probe(features[source]) for (source, of, seed), probe in self.probes.items() if of == target
+        }

@@ -5,10 +5,6 @@ each filling the frame (no edge at all), as a rectangle in front of the backgrou
 silhouettes of test objects. The paper does not give the size of its rectangle, so a facing one grows until it fills the
 frame. For an individually normalised network the prediction is its own output, without range heads, converted to mm by
 the mean D_min and D_max of the test split: a facing plane has no depth range of its own.
-
-Grad-CAM on the rectangle (the paper's figure beside Section 7.3) tells whether a layer attends to the plane's fringes.
-A heatmap that is the same everywhere has the plane's share of the area within it. Random weights stand beside: their
-heatmaps may follow the brighter fringes of a near plane without having learnt anything.
 """
 
 from collections import defaultdict
@@ -22,18 +18,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.diagnostics import probe
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import original
-from fpp_ml_bench.baselines.diagnostics.grad_cam import cam_layers, heat_by_layer
-from fpp_ml_bench.baselines.diagnostics.probe import (
-    COLOURS,
-    TRAINED,
-    UNTRAINED,
-    Figure,
-    Line,
-    Panel,
-    Picture,
-    Table,
-    layer_title,
-)
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Picture, Table, gallery
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene, SceneRenderer, plane
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject, background_below
 from fpp_ml_bench.constants import MM_PER_M
@@ -45,6 +30,7 @@ TILTS_DEG = ((0.0, 0.0), (20.0, 0.0), (0.0, 20.0))
 DISTANCES_M = (1.6, 1.8, 2.0)
 OUTLINES, QUICK_OUTLINES = 5, 2
 FRAME, RECTANGLE, SILHOUETTE = "fills the frame", "rectangle", "silhouette"
+KINDS = FRAME, RECTANGLE, SILHOUETTE
 """Kinds of outlines; a silhouette is named by its sample."""
 GROWING = {f"{RECTANGLE}, side {side:g}": side for side in (0.3, 0.45, 0.5, 0.6, 0.7, 0.8, 0.9, 0.96, 1.0)}
 """Sides, as shares of the image's, of rectangles that face the camera at the paper's distance."""
@@ -75,10 +61,9 @@ class Scale:
 
 @dataclass(frozen=True)
 class PlanePrediction:
-    """A plane's numbers, its mask, image and prediction (H, W)."""
+    """A plane's numbers, its image and prediction (H, W)."""
 
     row: Row
-    mask: NDArray[np.bool_]
     frame: NDArray[np.uint8]
     prediction: NDArray[np.float32]
 
@@ -88,7 +73,7 @@ class FlatPlane(probe.Probe):
 
     name = "flat-plane"
     title = "Flat plane"
-    version = 2
+    version = 3
     question = "Is a plane without features predicted at its distance, or as background?"
 
     def applies_to(self, subject: Subject) -> str | None:
@@ -117,14 +102,9 @@ class FlatPlane(probe.Probe):
         rows, range_mm = [one.row for one in planes], [low, high] if normalised else None
         values = {"planes": rows, "objects": control, "range_mm": range_mm, "collapse_below": scale.limit}
         shown = {kind_of(one.row["outline"]): one for one in reversed(planes) if is_facing(one.row, PAPER_DISTANCE_M)}
-        found, figures = tables(rows, control, normalised), draw(shown, rows, normalised)
-        if subject.network is not None:
-            frame, mask = shown[RECTANGLE].frame, shown[RECTANGLE].mask
-            heat = plane_heat(subject, frame)
-            values["grad_cam"] = shares = shares_within(heat, mask)
-            found.append(attention_table(shares))
-            figures.append(draw_attention(frame, heat))
-        return self.finding(summary(rows, control, normalised), values, found, *figures)
+        return self.finding(
+            summary(rows, control, normalised), values, table(rows, normalised), draw(shown, normalised)
+        )
 
 
 def kind_of(outline: str) -> str:
@@ -171,9 +151,8 @@ def predict_plane(
     tilt_deg: tuple[float, float],
     distance_m: float,
 ) -> PlanePrediction:
-    """A plane cut to ``mask`` (H, W), rendered and predicted (`Subject.answer`). Of its row: mean, standard deviation,
-    least and largest prediction, in its own units and in mm, its error, and the share that collapsed to background; in
-    float64."""
+    """A plane cut to ``mask`` (H, W), rendered and predicted (`Subject.answer`). Of its row: mean, least and largest
+    prediction in its own units, the share that collapsed to background, mean and error in mm; in float64."""
     surface = plane(renderer.rig, distance_m, tilt_deg, mask)
     lit, seen = renderer.light(surface), mask.copy()
     seen.ravel()[surface.pixels] &= lit.gain > 0  # no fringe beyond the projector's field
@@ -181,27 +160,19 @@ def predict_plane(
     prediction, true_mm = subject.answer(frames), surface.depth_mm(renderer.shape)[seen]
     values = prediction[seen].astype(np.float64)
     millimetres = scale.mm(values)
-    error = millimetres - true_mm
-    own = {
-        "answer_mean": values.mean(),
-        "answer_std": values.std(),
-        "answer_min": values.min(),
-        "answer_max": values.max(),
-        "collapsed_share": (values < scale.limit).mean(),
-        "mean_mm": millimetres.mean(),
-        "std_mm": millimetres.std(),
-        "bias_mm": error.mean(),
-        "mae_mm": np.abs(error).mean(),
-        "true_std_mm": true_mm.std(),
-    }
     row = {
         "outline": outline,
         "distance_m": distance_m,
         "tilt_deg": list(tilt_deg),
         "pixels": int(seen.sum()),
-        **{key: float(value) for key, value in own.items()},
+        "answer_mean": float(values.mean()),
+        "answer_min": float(values.min()),
+        "answer_max": float(values.max()),
+        "collapsed_share": float((values < scale.limit).mean()),
+        "mean_mm": float(millimetres.mean()),
+        "mae_mm": float(np.abs(millimetres - true_mm).mean()),
     }
-    return PlanePrediction(row, seen, np.asarray(frames[subject.frames_used[0]]), prediction)
+    return PlanePrediction(row, np.asarray(frames[subject.frames_used[0]]), prediction)
 
 
 def control_of(
@@ -221,144 +192,51 @@ def control_of(
     return dict(zip(("collapsed_share", "collapsed_share_true"), means, strict=True))
 
 
-def plane_heat(subject: Subject, frame: NDArray[np.uint8]) -> dict[str, dict[str, NDArray[np.float32]]]:
-    """Heatmaps float32 (H, W) of an image by `TRAINED` or `UNTRAINED` weights and by layer, after the ReLU. Raises
-    `DiagnosisError` as `grad_cam.heatmaps`."""
-    network, untrained = subject.networks()
-    stack: list[NDArray[np.uint8] | None] = [None] * subject.frames_used[0] + [frame]
-    fringe, layers = subject.input_batch([stack]), cam_layers(subject)
-    return {
-        weights: {name: heat[0] for name, heat in heat_by_layer(subject, one, fringe, layers).items()}
-        for weights, one in ((TRAINED, network), (UNTRAINED, untrained(0)))
-    }
-
-
-def shares_within(heat: Mapping[str, Mapping[str, NDArray[np.float32]]], mask: NDArray[np.bool_]) -> dict[str, Any]:
-    """``area``: the share of ``mask`` (H, W) in the image; for each layer the share of its heat within the mask, None
-    where it has no heat at all."""
-
-    def share(values: NDArray[np.float32]) -> float | None:
-        total = float(values.sum(dtype=np.float64))
-        return float(values[mask].sum(dtype=np.float64)) / total if total > 0 else None
-
-    of_layers = {weights: {name: share(values) for name, values in layers.items()} for weights, layers in heat.items()}
-    return {"area": float(mask.mean()), **of_layers}
-
-
-def attention_table(shares: Mapping[str, Any]) -> Table:
-    """A row per layer."""
-    rows = [(layer_title(layer), share, shares[UNTRAINED][layer]) for layer, share in shares[TRAINED].items()]
-    title = f"Grad-CAM on the rectangle at 1.8 m, which covers {shares['area']:.0%} of the image: heat within it"
-    return Table(title, ("Layer", "Share", "Random weights"), rows)
-
-
-def draw_attention(frame: NDArray[np.uint8], heat: Mapping[str, Mapping[str, NDArray[np.float32]]]) -> Figure:
-    """The paper's figure, and the same with random weights."""
-    rows = {
-        weights: [Picture(frame), *(Picture(one, "inferno", high=float(one.max())) for one in layers.values())]
-        for weights, layers in heat.items()
-    }
-    alt = "Grad-CAM by layer on a plane with an outline, with trained and with random weights"
-    png = probe.gallery(rows, ("input", *heat[TRAINED]))
-    return Figure("Grad-CAM on the plane, each to its own largest value", "flat_plane_attention.png", alt, png)
-
-
 def summary(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) -> str:
-    """The share that collapsed in each outline and by size, the mean at the paper's distance, and for mm those at all
-    distances."""
-    frame, rectangles, silhouettes = (
-        float(np.mean([row["collapsed_share"] for row in rows if kind_of(row["outline"]) == kind]))
-        for kind in (FRAME, RECTANGLE, SILHOUETTE)
-    )
-    rectangles_at = {z: row for z in DISTANCES_M for row in rows if row["outline"] == RECTANGLE and is_facing(row, z)}
-    paper = rectangles_at[PAPER_DISTANCE_M]
-    mean_text, range_text = f"{paper['mean_mm']:.0f} mm", ""
-    if normalised:
-        mean_text = f"{paper['answer_mean']:.3f} of the range (paper: {PAPER['answer_mean']})"
-        range_text = " (paper: {:g} to {:g})".format(*PAPER["answer_range"])
-    sizes = ", ".join(
-        f"{row['collapsed_share']:.0%} at {GROWING[row['outline']]:g}" for row in rows if row["outline"] in GROWING
-    )
-    text = (
+    """The share that collapsed in each outline, and the prediction for the paper's rectangle."""
+    shares = {kind: [row["collapsed_share"] for row in rows if kind_of(row["outline"]) == kind] for kind in KINDS}
+    frame, rectangles, silhouettes = (float(np.mean(of_kind)) for of_kind in shares.values())
+    paper = next(row for row in rows if row["outline"] == RECTANGLE and is_facing(row, PAPER_DISTANCE_M))
+    unit = "of the range (paper: {answer_mean})".format(**PAPER) if normalised else "mm"
+    return (
         f"Predicted as background: {rectangles:.0%} of a rectangular plane, {frame:.0%} of a plane that "
         f"fills the frame, {silhouettes:.0%} of a plane in an object's outline; "
         f"{control['collapsed_share']:.0%} of real objects ({control['collapsed_share_true']:.0%} in truth). The "
-        f"prediction for the rectangle at 1.8 m has a mean of {mean_text} and a spread of {paper['answer_std']:.3g}, "
-        f"from {paper['answer_min']:.4g} to {paper['answer_max']:.4g}{range_text}. "
-        f"Share of a facing rectangle there predicted as background, by its side relative to the image's: {sizes}."
+        f"prediction for the rectangle at 1.8 m has a mean of {paper['answer_mean']:.4g} {unit}, from "
+        f"{paper['answer_min']:.4g} to {paper['answer_max']:.4g}."
     )
-    if not normalised:
-        means = ", ".join(f"{row['mean_mm']:.0f}" for row in rectangles_at.values())
-        distances = ", ".join(f"{1000 * distance_m:.0f}" for distance_m in rectangles_at)
-        text += f" Facing planes at {distances} mm are predicted with means of {means} mm."
-    return text
 
 
-def tables(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) -> list[Table]:
+def table(rows: Sequence[Row], normalised: bool) -> Table:
     """A row per plane; silhouettes as means over objects."""
-    unit = "of range" if normalised else "mm"
     columns = {
-        "answer_mean": f"Mean, {unit}",
-        "answer_std": f"Spread, {unit}",
-        "span": f"Least to most, {unit}",
-        "collapsed_share": "Collapsed",
+        "answer_mean": "Mean, of range" if normalised else "Mean, mm",
+        "collapsed_share": "Predicted as background",
         "mean_mm": "Mean, mm",
-        "std_mm": "Spread, mm",
-        "true_std_mm": "True spread, mm",
         "mae_mm": "MAE, mm",
     }
     poses = defaultdict(list)
     for row in rows:  # in the order of `SIDES`, then silhouettes
         across, down = row["tilt_deg"]
-        pose = f"{kind_of(row['outline'])}, {row['distance_m']:g} m, tilt {across:g}, {down:g}"
-        poses[pose].append(row)
-    lines = {}
-    for pose, same_pose in poses.items():
-        span = min(row["answer_min"] for row in same_pose), max(row["answer_max"] for row in same_pose)
-        means = {key: float(np.mean([row[key] for row in same_pose])) for key in columns if key != "span"}
-        lines[pose] = {**means, "span": span}
+        poses[f"{kind_of(row['outline'])}, {row['distance_m']:g} m, tilt {across:g}, {down:g}"].append(row)
+    lines = {
+        pose: {key: float(np.mean([row[key] for row in same_pose])) for key in columns}
+        for pose, same_pose in poses.items()
+    }
     title = "Predictions for planes" + (", mm by the mean range of the test split" if normalised else "")
-    keys = {"real objects, predicted": "collapsed_share", "real objects, in truth": "collapsed_share_true"}
-    shares = [(pixels, control[key]) for pixels, key in keys.items()]
-    return [
-        Table.of(title, "Outline, distance, tilt in degrees", lines, columns),
-        Table("Share of background: the control", ("Pixels of", "Share"), shares),
-    ]
+    return Table.of(title, "Outline, distance, tilt in degrees", lines, columns)
 
 
-def draw(shown: Mapping[str, PlanePrediction], rows: Sequence[Row], normalised: bool) -> list[Figure]:
-    """The paper's figure, input and prediction, for each outline at 1.8 m; and what changes with distance and size,
-    with the distribution of the predictions."""
+def draw(shown: Mapping[str, PlanePrediction], normalised: bool) -> Figure:
+    """The paper's figure, input and prediction, for each outline at 1.8 m."""
     low, high, unit = (-0.2, 1.2, "share of range") if normalised else (0.0, 2400.0, "mm")
-    bins = np.linspace(low, high, 57)
-    columns, frames, predictions, histograms, distances = [], [], [], [], []
-    for kind, colour in ((FRAME, "edges"), (RECTANGLE, "depth"), (SILHOUETTE, "phase")):
-        one = shown[kind]
-        values = one.prediction[one.mask]
-        columns.append(f"{one.row['outline']}\n{values.min():.4g} to {values.max():.4g}, mean {values.mean():.4g}")
-        frames.append(Picture(one.frame))
-        predictions.append(Picture(one.prediction, "viridis", low, high))
-        shares = np.histogram(np.clip(values, low, high), bins)[0] / values.size
-        histograms.append(Line(kind, ((bins[1:] + bins[:-1]) / 2).tolist(), shares, COLOURS[colour], "-"))
-        of_kind = [row for row in rows if kind_of(row["outline"]) == kind]
-        means = [np.mean([row["answer_mean"] for row in of_kind if is_facing(row, z)]) for z in DISTANCES_M]
-        distances.append(Line(kind, DISTANCES_M, means, COLOURS[colour]))
-    if not normalised:
-        distances.append(Line("true", DISTANCES_M, [MM_PER_M * z for z in DISTANCES_M], COLOURS["ink"], ":"))
-    sizes = {side: row for outline, side in GROWING.items() for row in rows if row["outline"] == outline}
-    mean, collapsed = ([Line.of(RECTANGLE, sizes, key, COLOURS["depth"])] for key in ("answer_mean", "collapsed_share"))
-    side = "side of the rectangle, share of the image's"
-    panels = [
-        Panel("Mean prediction of a facing plane", distances, "distance, m", unit),
-        Panel("Predictions at 1.8 m (ends: beyond)", histograms, unit, "share of pixels"),
-        Panel("Mean prediction, 1.8 m", mean, side, unit),
-        Panel("Predicted as background, 1.8 m", collapsed, side, "share of pixels"),
+    planes = [shown[kind] for kind in KINDS]
+    columns = [
+        "{outline}\n{answer_min:.4g} to {answer_max:.4g}, mean {answer_mean:.4g}".format(**one.row) for one in planes
     ]
-    png = probe.gallery({"fringes": frames, f"prediction,\n{low:g} to {high:g}\n{unit}": predictions}, columns, 2.4)
-    curves = probe.chart(panels, 2)
-    return [
-        Figure(
-            "Flat planes at 1.8 m", "flat_plane.png", "Fringes on planes in three outlines, and the predictions", png
-        ),
-        Figure("Predictions by distance and size", "flat_plane_curves.png", "Means against distance and size", curves),
-    ]
+    rows = {
+        "fringes": [Picture(one.frame) for one in planes],
+        f"prediction,\n{low:g} to {high:g}\n{unit}": [Picture(one.prediction, "viridis", low, high) for one in planes],
+    }
+    alt = "Fringes on planes in three outlines, and the predictions"
+    return Figure("Flat planes at 1.8 m", alt, gallery(rows, columns, 2.4))

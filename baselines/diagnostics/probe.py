@@ -14,7 +14,6 @@ from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.paper import AVERAGE, LAYERS, paper_layers, said_by_paper
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -69,18 +68,6 @@ def mean_of(values: Iterable[float | None]) -> float | None:
     return float(np.mean(defined)) if defined else None
 
 
-def layer_title(layer: str) -> str:
-    """Our name of a layer, and the paper's where it has another."""
-    theirs = LAYERS.get(layer, layer)
-    return layer if theirs == layer else f"{layer} (paper's {theirs})"
-
-
-def said_of_layers(probe: str, layers: Iterable[str]) -> dict[str, str | None]:
-    """What the paper's table of a probe says of each layer and of their average; nothing for other layers than its."""
-    names = set(paper_layers(probe))
-    return {name: said_by_paper(probe, name) for name in names} if {*layers, AVERAGE} == names else {}
-
-
 def with_interval(value: float | None, interval: Sequence[float] | None = None) -> str:
     """A mean with its interval as a table's cell; a dash for None."""
     span = "" if interval is None else f" ({interval[0]:.3f} to {interval[1]:.3f})"
@@ -95,11 +82,6 @@ class Table:
     header: Sequence[str]
     rows: Sequence[Sequence[Cell]]
 
-    def __post_init__(self) -> None:
-        uneven = next((row for row in self.rows if len(row) != len(self.header)), None)
-        if uneven is not None:
-            raise ValueError(f"table {self.title!r}: a row has {len(uneven)} cells, its header has {len(self.header)}")
-
     @classmethod
     def of(cls, title: str, first: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> Table:
         """The named ``rows``; ``columns``: titles by the keys of what a row shows, and a dash where it lacks a key."""
@@ -109,10 +91,9 @@ class Table:
 
 @dataclass(frozen=True)
 class Figure:
-    """A picture with its title and a description ``alt``; ``file``: its name in the folder of the report."""
+    """A picture with its title and a description ``alt``."""
 
     title: str
-    file: str
     alt: str
     png: bytes = field(repr=False)
 
@@ -126,8 +107,8 @@ class Finding:
     title: str
     summary: str
     values: Mapping[str, Any] = field(default_factory=dict)
-    tables: Sequence[Table] = ()
-    figures: Sequence[Figure] = ()
+    table: Table | None = None
+    figure: Figure | None = None
     skipped: str | None = None
 
 
@@ -141,11 +122,6 @@ class Probe(ABC):
     version = 1
     without_network: str | None = None
     asks_subject = True
-    known: dict[str, type[Probe]] = {}  # noqa: RUF012
-    """Every subclass by its name, once its module is imported."""
-
-    def __init_subclass__(cls) -> None:
-        Probe.known[cls.name] = cls
 
     def applies_to(self, subject: Subject) -> str | None:
         """None where the probe can run, else the reason why it can't, for the report."""
@@ -161,19 +137,27 @@ class Probe(ABC):
         """Why this probe has no result."""
         return Finding(self.name, self.title, "", skipped=reason)
 
-    def finding(self, summary: str, values: Mapping[str, Any], tables: Sequence[Table], *figures: Figure) -> Finding:
+    def finding(self, summary: str, values: Mapping[str, Any], table: Table, figure: Figure) -> Finding:
         """The result of this probe."""
-        return Finding(self.name, self.title, summary, values, tables, figures)
+        return Finding(self.name, self.title, summary, values, table, figure)
 
 
-PROBES = ("linear", "grad-cam", "flat-plane", "counterfactual", "theory")
-"""The probes in the order of the report; each is in the module of its name, which is imported when it runs."""
+PROBES = {
+    "linear": "LinearProbing",
+    "grad-cam": "GradCam",
+    "flat-plane": "FlatPlane",
+    "counterfactual": "Counterfactual",
+    "theory": "Theory",
+}
+"""The probes in the order of the report, and their classes; each is in the module of its name, which is imported when
+it runs."""
 
 
 def make_probe(name: str) -> Probe:
     """The probe ``name`` of `PROBES`."""
-    import_module(f"{__package__}.{name.replace('-', '_')}")
-    return Probe.known[name]()
+    module = import_module(f"{__package__}.{name.replace('-', '_')}")
+    probe: Probe = getattr(module, PROBES[name])()
+    return probe
 
 
 COLOURS = {
@@ -183,12 +167,11 @@ COLOURS = {
     "distance": "#c0392b",
     "phase": "#1b5bb8",
     "order": "#8a4b00",
-    "raw": "#59616b",
     "random": "#9aa3ad",
     "ink": "#191c20",
 }
 """Colours of the targets, edges and depth as in the paper's figure; of the raw input, of random weights, of text."""
-_GRID, _SHADE, _NOTHING = "#dfe1e5", "#f0e6d2", 0.91
+_GRID = "#dfe1e5"
 _GAP = 4  # px between two pictures
 
 
@@ -204,42 +187,24 @@ class Line:
     style: str = "o-"
     ends: Sequence[Sequence[float] | None] = ()
 
-    @classmethod
-    def of(
-        cls, label: str, rows: Mapping[Any, Mapping[str, Any]], key: str, colour: str, style: str = "o-", ends: str = ""
-    ) -> Line:
-        """The values ``key`` of the named ``rows``, whose intervals are called ``ends``."""
-        return cls(
-            label,
-            list(rows),
-            [row[key] for row in rows.values()],
-            colour,
-            style,
-            [row.get(ends) for row in rows.values()],
-        )
-
 
 @dataclass(frozen=True)
 class Panel:
-    """Lines over one pair of axes. ``axes``: further properties of matplotlib's ``Axes``, such as ``ylim``;
-    ``shaded``: a range of x."""
+    """Lines over one pair of axes; ``axes``: properties of matplotlib's ``Axes``, such as ``ylabel`` and ``ylim``."""
 
     title: str
     lines: Sequence[Line]
-    x: str = ""
-    y: str = ""
-    axes: Mapping[str, Any] = field(default_factory=dict)
-    shaded: tuple[float, float] | None = None
+    axes: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A map (H, W) from ``low`` to ``high`` in matplotlib's ``colours``; NaN is grey."""
+    """A map (H, W) from ``low`` to ``high`` (default: its largest value) in matplotlib's ``colours``; NaN is white."""
 
     image: NDArray
     colours: str = "gray"
     low: float = 0.0
-    high: float = 255.0
+    high: float | None = None
 
     def rgb(self) -> NDArray:
         """Float (H, W, 3) in [0, 1]."""
@@ -247,8 +212,9 @@ class Picture:
         from matplotlib import colormaps
 
         values = np.asarray(self.image, dtype=float)
-        share = np.clip((np.nan_to_num(values) - self.low) / ((self.high - self.low) or 1.0), 0, 1)
-        return np.where(np.isnan(values)[..., None], _NOTHING, colormaps[self.colours](share)[..., :3])
+        high = np.nanmax(values) if self.high is None else self.high
+        share = np.clip((np.nan_to_num(values) - self.low) / ((high - self.low) or 1.0), 0, 1)
+        return np.where(np.isnan(values)[..., None], 1.0, colormaps[self.colours](share)[..., :3])
 
 
 def chart(panels: Sequence[Panel], columns: int, panel_size: tuple[float, float] = (5.0, 3.4)) -> bytes:
@@ -256,6 +222,8 @@ def chart(panels: Sequence[Panel], columns: int, panel_size: tuple[float, float]
     rows = max(-(-len(panels) // columns), 1)
     figure, axes_of = _figure(rows, columns, panel_size[0] * columns, panel_size[1] * rows)
     handles: dict[str, Any] = {}
+    for axes in axes_of.flat[len(panels) :]:
+        axes.axis("off")
     for panel, axes in zip(panels, axes_of.flat, strict=False):
         for line in panel.lines:
             values = [float("nan") if value is None else value for value in line.y]
@@ -264,23 +232,11 @@ def chart(panels: Sequence[Panel], columns: int, panel_size: tuple[float, float]
             for x, ends in zip(line.x, line.ends, strict=False):
                 if ends is not None:
                     axes.plot([x] * len(ends), ends, color=line.colour, linewidth=0.8)
-        if panel.shaded:
-            axes.axvspan(*panel.shaded, color=_SHADE, zorder=0)
         axes.set(**panel.axes)
         axes.set_title(panel.title, fontsize=10, loc="left")
-        axes.set_xlabel(panel.x, fontsize=9)
-        axes.set_ylabel(panel.y, fontsize=9)
-        axes.tick_params(labelsize=8)
-        if isinstance(panel.lines[0].x[0], str):
-            axes.tick_params(axis="x", rotation=40 if len(panel.lines[0].x) > 6 else 0)
-        axes.grid(axis="y", color=_GRID, linewidth=0.8)
-        axes.set_axisbelow(True)
-        axes.spines[["top", "right"]].set_visible(False)
-    for axes in axes_of.flat[len(panels) :]:
-        axes.axis("off")
-    # As many columns as the longest label leaves room for, at 16 letters an inch.
-    across = max(1, int(16 * panel_size[0] * columns / (8 + max(map(len, handles), default=0))))
-    figure.legend(handles.values(), handles, fontsize=8, frameon=False, ncols=across, loc="outside lower center")
+        axes.tick_params(labelsize=8, axis="x", rotation=40)
+        axes.grid(axis="y", color=_GRID)
+    figure.legend(handles.values(), handles, fontsize=8, ncols=max(1, columns - 1), loc="outside lower center")
     return _png(figure)
 
 
@@ -321,7 +277,7 @@ def _png(figure: Any) -> bytes:
     from PIL import Image
 
     drawn, reduced = BytesIO(), BytesIO()
-    figure.savefig(drawn, format="png", dpi=130, facecolor="white", metadata={"Software": None})
+    figure.savefig(drawn, format="png", dpi=130, facecolor="white", bbox_inches="tight", metadata={"Software": None})
     image = Image.open(drawn).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     image.save(reduced, format="png", optimize=True)
     return reduced.getvalue()

@@ -9,7 +9,7 @@ view, frame and pixel, so it is the same in a changed scene.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from functools import cache, cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -207,14 +207,11 @@ def direct_light(light: Light) -> Light:
 
 
 class SceneRenderer:
-    """Renders scenes with the direct light, sensor and empty background of a rig; keeps the last background."""
+    """Renders scenes with the direct light, sensor and empty background of a rig; keeps the last backgrounds."""
 
     def __init__(self, rig: Rig, light: Light | None = None) -> None:
         self.rig, self.lamp = rig, direct_light(light or named_light("paper"))
         self.shape = (rig.camera.height, rig.camera.width)
-        self._exposures: dict[str, Exposure] = {}
-        self._background_stream: tuple[object, ...] = ()
-        self._backgrounds: dict[tuple[str, int], NDArray[np.uint8]] = {}
 
     @classmethod
     def of(cls, dataset: DatasetFolder) -> "SceneRenderer":
@@ -222,21 +219,19 @@ class SceneRenderer:
         light = dataset.manifest.settings.get("light")
         return cls(dataset.rig, None if light is None else Light.model_validate(light))
 
+    @cache  # noqa: B019
     def _exposure(self, pattern: str) -> Exposure:
         """With the pattern ``sequence``, its mean light (``uniform``), ``other pitch`` or ``other direction``; kept."""
-        if pattern not in self._exposures:
-            rig, pair = self.rig, self.rig.crossed
-            if pattern == "other pitch":
-                names = ("pitch_horizontal_px", "pitch_vertical_px")
-                rig = replace(rig, **{name: PITCH_FACTOR * getattr(rig, name) for name in names})
-            if pair is not None and pattern.startswith("other"):
-                key, factor = ("pitches_px", PITCH_FACTOR) if pattern == "other pitch" else ("angles_deg", -1)
-                first, second = getattr(pair, key)
-                rig = rig.with_crossed(replace(pair, **{key: (factor * first, factor * second)}))
-            exposure = Exposure.of(rig, self.lamp)
-            uniform = pattern == "uniform"
-            self._exposures[pattern] = replace(exposure, pattern=exposure.pattern.uniform(rig)) if uniform else exposure
-        return self._exposures[pattern]
+        rig, pair = self.rig, self.rig.crossed
+        if pattern == "other pitch":
+            names = ("pitch_horizontal_px", "pitch_vertical_px")
+            rig = replace(rig, **{name: PITCH_FACTOR * getattr(rig, name) for name in names})
+        if pair is not None and pattern.startswith("other"):
+            key, factor = ("pitches_px", PITCH_FACTOR) if pattern == "other pitch" else ("angles_deg", -1)
+            first, second = getattr(pair, key)
+            rig = rig.with_crossed(replace(pair, **{key: (factor * first, factor * second)}))
+        exposure = Exposure.of(rig, self.lamp)
+        return replace(exposure, pattern=exposure.pattern.uniform(rig)) if pattern == "uniform" else exposure
 
     @cached_property
     def _empty(self) -> LitPixels:
@@ -257,11 +252,9 @@ class SceneRenderer:
         turned = scene.projected == "other direction"
         other = scene.projected == "other pitch" or (turned and self.rig.crossed is not None)
         usual: str = scene.projected if other else "sequence"
-        inside = outside = usual
-        if scene.projected == "no fringe inside":
-            inside = "uniform"
-        elif scene.projected == "no fringe outside":
-            outside = "uniform"
+        inside, outside = (
+            "uniform" if scene.projected == f"no fringe {where}" else usual for where in ("inside", "outside")
+        )
         projected_indices = [self._partner(index) if turned else index for index in indices]
         object_values = self._exposure(inside).expose(projected_indices, scene.lit, scene.pixels, scene.stream)
         frames: list[NDArray[np.uint8] | None] = [None] * len(self.rig.sequence)
@@ -273,21 +266,15 @@ class SceneRenderer:
 
     def decoded_mm(self, scene: Scene) -> NDArray[np.float32]:
         """Depth (H, W) in mm decoded from the whole sequence on the scene's pixels, as a dataset's is; 0 beyond."""
-        count = len(self.rig.sequence)
-        frames, seen = np.zeros((count, *self.shape), dtype=np.uint8), np.zeros(self.shape, dtype=bool)
-        exposed = self._exposure("sequence").expose(range(count), scene.lit, scene.pixels, scene.stream)
-        frames.reshape(count, -1)[:, scene.pixels] = exposed
+        seen = np.zeros(self.shape, dtype=bool)
         seen.ravel()[scene.pixels] = True
+        frames = np.stack(self.frames(scene, range(len(self.rig.sequence))))  # type: ignore[arg-type]  # all are asked
         return decode_stack(frames, self.rig, direction="both", mask=seen, reasons=False).depth_mm
 
+    @lru_cache(maxsize=128)  # noqa: B019  # two patterns of a sample's frames
     def _background(self, stream: tuple[object, ...], index: int, pattern: str) -> NDArray[np.uint8]:
-        if self._background_stream != stream:
-            self._background_stream, self._backgrounds = stream, {}
-        if (pattern, index) not in self._backgrounds:
-            pixels = np.arange(self.shape[0] * self.shape[1], dtype=np.uint32)
-            image = self._exposure(pattern).expose([index], self._empty, pixels, stream)[0]
-            self._backgrounds[pattern, index] = image.reshape(self.shape)
-        return self._backgrounds[pattern, index]
+        pixels = np.arange(self.shape[0] * self.shape[1], dtype=np.uint32)
+        return self._exposure(pattern).expose([index], self._empty, pixels, stream)[0].reshape(self.shape)
 
     def _partner(self, index: int) -> int:
         """The frame of the other direction with the same step or bit; black and white frames map to themselves."""

@@ -16,12 +16,12 @@ from torch import Tensor, nn
 
 from fpp_ml_bench.baselines.diagnostics.probe import spread
 from fpp_ml_bench.baselines.method import Frames, Method
-from fpp_ml_bench.baselines.networks.model import build, fringe_batch, load
+from fpp_ml_bench.baselines.networks.model import build, fringe_batch
 from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
-from fpp_ml_bench.baselines.registry import FILE_MARK, load_from_file, load_method, methods
-from fpp_ml_bench.baselines.training.weights import shipped_names, weights_path
+from fpp_ml_bench.baselines.registry import FILE_MARK, find, load_from_file, load_method
+from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.depth import Normalisation, denormalise, object_mask
-from fpp_ml_bench.errors import DiagnosisError, FppBenchError, PredictionError, WeightsError
+from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.protocol import Units
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -41,10 +41,11 @@ _STRAY = 0.001  # share of pixels at either end that may differ
 class Subject:
     """A model under diagnosis; ``sha256`` identifies it and its settings. ``units`` of `predict`: mm, or normalised to
     the sample's own depth range. ``direction``: that of the fringes in ``frames_used``. With ``uses_ground_truth_mask``
-    it expects frames that are 0 outside the object (`captured`). ``network`` takes the single frame in ``frames_used``
-    as (B, 1, H, W) in [0, 1] and outputs depth in the representation ``normalisation``. Without a network, it and the
-    following fields are None or empty. ``layer_names``: the layers to probe, in forward order. ``untrained(seed)``: the
-    same architecture with random weights. ``find_layers``: the layers of any network of that architecture by name."""
+    it expects frames that are 0 outside the object (`captured`). ``predict_frames``: None where the prediction is the
+    network's own output. ``network`` takes the single frame in ``frames_used`` as (B, 1, H, W) in [0, 1] and outputs
+    depth in the representation ``normalisation``. Without a network, it and the following fields are None or empty.
+    ``layer_names``: the layers to probe, in forward order. ``untrained(seed)``: the same architecture with random
+    weights."""
 
     name: str
     title: str
@@ -53,12 +54,11 @@ class Subject:
     image_size: tuple[int, int]
     frames_used: tuple[int, ...]
     direction: Direction | Literal["both"]
-    predict_frames: Callable[[Frames], NDArray[np.float32]]
+    predict_frames: Callable[[Frames], NDArray[np.float32]] | None
     uses_ground_truth_mask: bool = False
     normalisation: Normalisation | None = None
     network: nn.Module | None = None
     layer_names: tuple[str, ...] = ()
-    find_layers: Callable[[nn.Module], dict[str, nn.Module]] | None = None
     untrained: Callable[[int], nn.Module] | None = None
     weights_sha256: str | None = None
 
@@ -70,20 +70,21 @@ class Subject:
 
     def layers_of(self, network: nn.Module) -> dict[str, nn.Module]:
         """The layers to probe of a ``network`` of this architecture, for example of `untrained`."""
-        all_layers = {} if self.find_layers is None else self.find_layers(network)
-        return {name: all_layers[name] for name in self.layer_names}
+        available = _layers(network)
+        return {name: available[name] for name in self.layer_names}
 
     def captured(self, dataset: DatasetFolder, sample: str) -> list[NDArray[np.uint8] | None]:
         """The frames of ``sample`` that the subject uses, uint8 (H, W), by frame number; None for all others."""
-        frames: list[NDArray[np.uint8] | None] = [None] * len(dataset.sequence)
-        mask = object_mask(dataset.depth_mm(sample)) if self.uses_ground_truth_mask else np.True_
-        for index in self.frames_used:
-            frames[index] = dataset.frame(sample, index) * mask
-        return frames
+        return captured_frames(dataset, self, sample)  # type: ignore[arg-type]  # it has what this asks a method for
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in ``units``. Raises `DiagnosisError` for an output of another shape or not finite."""
-        depth = np.asarray(self.predict_frames(frames))
+        if self.predict_frames is not None:
+            depth = np.asarray(self.predict_frames(frames))
+        else:
+            depth = self.represent(frames)
+            if self.normalisation not in (None, "individual"):
+                depth = denormalise(depth, self.normalisation, 0.0, 0.0).astype(np.float32)
         if depth.shape != self.image_size:
             raise DiagnosisError(f"{self.name}: expected a prediction of {self.image_size} px, got {depth.shape}")
         if not np.isfinite(depth).all():
@@ -118,42 +119,40 @@ class Subject:
 
     def input_batch(self, stacks: Sequence[Frames]) -> Tensor:
         """Input of ``network``, float32 (B, 1, H, W) in [0, 1]. Raises `DiagnosisError` without its frame."""
-        return _input_batch(stacks, self.frames_used[0], self.image_size, self.name)
-
-    @property
-    def batch_size(self) -> int:
-        """Images in a batch, so that memory stays bounded."""
-        return max(1, min(BATCH, PIXELS_AT_ONCE // (self.image_size[0] * self.image_size[1])))
+        index = self.frames_used[0]
+        images = [frame for frame in (frames[index] for frames in stacks) if frame is not None]
+        if len(images) != len(stacks):
+            raise DiagnosisError(f"{self.name} needs frame {index}, which is missing")
+        return fringe_batch(images, self.image_size, self.name)
 
     def batches(
         self, dataset: DatasetFolder, samples: Sequence[str], size: int | None = None
     ) -> Iterator[tuple[list[str], Tensor]]:
-        """``samples`` in batches of ``size`` (default: `batch_size`), with their input (B, 1, H, W)."""
-        size = size or self.batch_size
+        """``samples`` in batches of ``size`` (default: so that memory stays bounded), with their input (B, 1, H, W)."""
+        size = size or max(1, min(BATCH, PIXELS_AT_ONCE // (self.image_size[0] * self.image_size[1])))
         for start in range(0, len(samples), size):
             names = list(samples[start : start + size])
             yield names, self.input_batch([self.captured(dataset, name) for name in names])
 
     def represent(self, frames: Frames) -> NDArray[np.float32]:
-        """The network's output float32 (H, W) in its ``normalisation``. Raises `DiagnosisError` without a network, and
-        for an output of another shape or not finite."""
+        """The network's output float32 (H, W) in its ``normalisation``. Raises `DiagnosisError` without a network, for
+        one that fails, and for an output of another shape or not finite."""
         network, _ = self.networks()
         batch = self.input_batch([frames])
-        with torch.inference_mode():
-            return checked_output(network(batch), batch, self.name)[0, 0].numpy()
+        try:
+            with torch.inference_mode():
+                output = network(batch)
+        except Exception as error:  # the user's code can raise anything
+            reason = f"{type(error).__name__}: {printable(str(error), 400)}"
+            shape = tuple(batch.shape)
+            raise DiagnosisError(f"{self.name}: on fringes of shape {shape} it failed: {reason}") from error
+        return checked_output(output, batch, self.name)[0, 0].numpy()
 
 
 def background_below(normalised: bool, near_mm: float) -> float:
     """Predictions below it, normalised or in mm, are nearer to background than to any object, of which none is nearer
     than ``near_mm``."""
     return NORMALISED_BACKGROUND if normalised else near_mm / 2
-
-
-def _input_batch(stacks: Sequence[Frames], index: int, size: tuple[int, int], name: str) -> Tensor:
-    images = [frame for frame in (frames[index] for frames in stacks) if frame is not None]
-    if len(images) != len(stacks):
-        raise DiagnosisError(f"{name} needs frame {index}, which is missing")
-    return fringe_batch(images, size, name)
 
 
 def checked_output(output: Tensor, batch: Tensor, name: str) -> Tensor:
@@ -184,14 +183,16 @@ def subject(
     trained on. ``threads``: torch threads of the process. ``options``: those of a method.
     Raises `DiagnosisError` for a name, layer or module that
     can't be used, and other `FppBenchError` of the model."""
-    made = _of_file(name) if FILE_MARK in name else None
-    is_method = name in methods() or (isinstance(made, type) and issubclass(made, Method))
-    if made is not None and not is_method:
+    made = load_from_file(name) if FILE_MARK in name else Method
+    if not (isinstance(made, type) and issubclass(made, Method)):
         return _subject_of_factory(name, made, dataset, layers, units or "normalised", frame or 0, threads)
     if units is not None:
         raise DiagnosisError(f"{name}: its units are known; set units only for your own module, file.py:factory")
-    if not is_method:
-        return _subject_of_weights(name, dataset, layers, frame, threads)
+    if issubclass(find(name).method, NetworkMethod):
+        torch.set_num_threads(threads)
+        return _subject_of_network(
+            load_method(name, dataset, frame=frame, threads=threads, device="cpu"), dataset, layers
+        )
     if given := [option for option, value in (("layers", layers), ("frame", frame)) if value is not None]:
         raise DiagnosisError(f"{name} is a method without a network, so it has no {given[0]}; leave it out")
     return subject_of_method(load_method(name, dataset, **options), dataset)
@@ -212,24 +213,9 @@ def subject_of_method(depth_method: Method, dataset: DatasetFolder, **network: A
     )
 
 
-def _subject_of_weights(
-    name: str, dataset: DatasetFolder, layers: Sequence[str] | None, frame: int | None, threads: int
-) -> Subject:
-    try:
-        path = weights_path(name)
-    except WeightsError:
-        raise DiagnosisError(
-            f"unknown model {name!r}; there are {', '.join((*methods(), *shipped_names()))}, every .safetensors file "
-            "of trained weights, and your own module as file.py:factory"
-        ) from None
-    torch.set_num_threads(threads)
-    model = load(path, "cpu")
+def _subject_of_network(method: Any, dataset: DatasetFolder, layers: Sequence[str] | None) -> Subject:
+    model = method.model
     config = model.config
-    if config.image_size != dataset.size:
-        raise WeightsError(
-            f"{path}: was trained at {config.image_size} px (H x W), {dataset.path} has images of {dataset.size} "
-            "px; give a dataset built at the weights' size"
-        )
 
     def untrained(seed: int) -> nn.Module:
         with torch.random.fork_rng(devices=[]):
@@ -239,41 +225,39 @@ def _subject_of_weights(
         return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload, no-any-return]
 
     return subject_of_method(
-        NetworkMethod(model, frame=frame, threads=threads, sequence=dataset.sequence),
+        method,
         dataset,
         normalisation=config.normalisation,
         network=model.network,
         weights_sha256=model.sha256,
-        layer_names=_select_layers(layers, model.network.probe_layers, config.name),
-        find_layers=lambda network: network.probe_layers,
+        layer_names=_select_layers(layers, model.network, config.name),
         untrained=untrained,
     )
 
 
-def _select_layers(requested: Sequence[str] | None, available: dict[str, nn.Module], name: str) -> tuple[str, ...]:
-    """The ``requested`` layers, or all ``available``, in forward order. Raises `DiagnosisError` for unknown ones."""
+def _layers(network: nn.Module) -> dict[str, nn.Module]:
+    """A network's own ``probe_layers``, and all modules below it, by name."""
+    own = getattr(network, "probe_layers", None)
+    named = {name: module for name, module in network.named_modules() if name}
+    return {**own, **named} if isinstance(own, dict) else named
+
+
+def _select_layers(requested: Sequence[str] | None, network: nn.Module, name: str) -> tuple[str, ...]:
+    """The ``requested`` layers in forward order, by default the network's ``probe_layers``, or every child of one
+    without them. Raises `DiagnosisError` for unknown ones."""
+    available = _layers(network)
     for layer in requested or ():
         if layer not in available:
             suggestions = get_close_matches(layer, available, n=3) or list(available)[:12]
             raise DiagnosisError(f"{name} has no layer {layer!r}; there are {', '.join(suggestions)}")
-    return tuple(layer for layer in available if not requested or layer in requested)
+    usual = getattr(network, "probe_layers", None) or dict(network.named_children())
+    return tuple(layer for layer in available if layer in (requested or usual))
 
 
 def _direction_of(dataset: DatasetFolder, frames: Sequence[int]) -> Direction | Literal["both"]:
     """Fringe direction of ``frames``; ``both`` where they differ or have no direction."""
     first, *others = {dataset.sequence.frames[index].direction for index in frames} - {None} or {None}
     return "both" if first is None or others else first
-
-
-def _of_file(name: str) -> Any:
-    """What ``file.py:name`` means: a class of methods or something that makes a torch module. The file is executed."""
-    try:
-        made = load_from_file(name)
-    except PredictionError as error:
-        raise DiagnosisError(str(error)) from error
-    if not callable(made):
-        raise DiagnosisError(f"{name}: expected a method or a function, got {type(made).__name__}")
-    return made
 
 
 def _subject_of_factory(
@@ -292,35 +276,24 @@ def _subject_of_factory(
     if not 0 <= frame < len(dataset.sequence):
         raise DiagnosisError(f"frame {frame}: expected 0 to {len(dataset.sequence) - 1}, the frames of the sequence")
     torch.set_num_threads(threads)
-    path = Path(name.rpartition(":")[0])
-    network = _build_network(name, factory)
-    normalisation = NORMALISATION_OF[units]
-
-    def predict(frames: Frames) -> NDArray[np.float32]:
-        batch = _input_batch([frames], frame, dataset.size, name)
-        try:
-            with torch.inference_mode():
-                values = checked_output(network(batch), batch, name)[0, 0].numpy()
-        except FppBenchError:
-            raise
-        except Exception as error:
-            shape, reason = tuple(batch.shape), _error_text(error)
-            raise DiagnosisError(f"{name}: on fringes of shape {shape} it failed: {reason}") from error
-        return values if units == "normalised" else denormalise(values, normalisation, 0.0, 0.0).astype(np.float32)
-
+    path, network = Path(name.rpartition(":")[0]), _build_network(name, factory)
+    digest = hashlib.sha256(f"{units} {frame}".encode() + path.read_bytes())
+    for key, value in network.state_dict().items():
+        if isinstance(value, Tensor):
+            values = value.detach().cpu().contiguous().flatten().view(torch.uint8)
+            digest.update(key.encode() + values.numpy().tobytes())
     user_subject = Subject(
         name=path.stem,
         title=f"{path.name}:{name.rpartition(':')[2]}",
-        sha256=_digest(path, network, f"{units} {frame}"),
+        sha256=digest.hexdigest(),
         units="normalised" if units == "normalised" else "mm",
         image_size=dataset.size,
         frames_used=(frame,),
         direction=_direction_of(dataset, (frame,)),
-        predict_frames=predict,
-        normalisation=normalisation,
+        predict_frames=None,
+        normalisation=NORMALISATION_OF[units],
         network=network,
-        layer_names=_select_layers(layers, _layers(network, bool(layers)), name),
-        find_layers=lambda model: _layers(model, bool(layers)),
+        layer_names=_select_layers(layers, network, name),
         untrained=lambda seed: randomised(_build_network(name, factory), seed),
     )
     first = next((sample for split in dataset.splits for sample in dataset.samples(split)), None)
@@ -346,36 +319,15 @@ def randomised(network: nn.Module, seed: int) -> nn.Module:
     return network
 
 
-def _layers(network: nn.Module, every: bool) -> dict[str, nn.Module]:
-    """A module's own ``probe_layers``, else its children; with ``every`` also all modules below it."""
-    own = getattr(network, "probe_layers", None)
-    if isinstance(own, dict) and not every:
-        return own
-    named = {name: module for name, module in network.named_modules() if name}
-    return {**named, **(own or {})} if every else dict(network.named_children())
-
-
 def _build_network(name: str, factory: Any) -> nn.Module:
     try:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)  # random weights are the same every time
             network = factory()
     except (Exception, SystemExit) as error:
-        raise DiagnosisError(f"{name}: calling it without arguments failed: {_error_text(error)}") from error
+        raise DiagnosisError(
+            f"{name}: calling it without arguments failed: {type(error).__name__}: {printable(str(error), 400)}"
+        ) from error
     if not isinstance(network, nn.Module):
         raise DiagnosisError(f"{name}: expected it to return a torch module, got {type(network).__name__}")
     return network.eval().requires_grad_(False).cpu()
-
-
-def _digest(path: Path, network: nn.Module, settings: str) -> str:
-    digest = hashlib.sha256(settings.encode() + path.read_bytes())
-    for key, value in network.state_dict().items():
-        if isinstance(value, Tensor):
-            digest.update(
-                key.encode() + value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes()
-            )
-    return digest.hexdigest()
-
-
-def _error_text(error: BaseException) -> str:
-    return printable(f"{type(error).__name__}: {error}", 400)

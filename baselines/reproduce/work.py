@@ -96,17 +96,13 @@ def _work(settings: ReproduceSettings, outcome: Outcome) -> None:
     folders = settings.folders
     jobs = [job for job in outcome.jobs if settings.wants(job)]
     started = perf_counter()
-    training_seconds: list[float] = []
     for number, job in enumerate(jobs, 1):
         name, out = job.recipe.name, folders.training(job.recipe)
         minutes_left = None if settings.minutes is None else settings.minutes - (perf_counter() - started) / 60
         if minutes_left is not None and minutes_left <= 0:
             outcome.stopped = name
             return
-        trained = is_trained(out)
-        left = _time_left(training_seconds, jobs[number - 1 :], folders)
-        settings.report(f"[{number}/{len(jobs)}] {name} ({', '.join(job.rows)}){left}")
-        began = perf_counter()
+        settings.report(f"[{number}/{len(jobs)}] {name} ({', '.join(job.rows)})")
         try:
             run = train(job.recipe, outcome.opened.path, out, minutes=minutes_left)
             if not run.finished:
@@ -117,17 +113,6 @@ def _work(settings: ReproduceSettings, outcome: Outcome) -> None:
             # The other trainings, which take hours, may still succeed.
             outcome.failed[name] = shorten(" ".join(str(error).split()), REASON_LENGTH, placeholder=" ...")
             settings.report(f"  failed, its rows stay as they are: {error}")
-        if not trained:
-            training_seconds.append(perf_counter() - began)
-
-
-def _time_left(training_seconds: Sequence[float], jobs: Sequence[Job], folders: Folders) -> str:
-    """Estimated from the mean of the trainings of this call."""
-    untrained = sum(not is_trained(folders.training(job.recipe)) for job in jobs)
-    if not training_seconds or not untrained:
-        return ""
-    minutes = untrained * sum(training_seconds) / len(training_seconds) / 60
-    return f", about {minutes:.0f} min left for {untrained} trainings"
 
 
 def _score(job: Job, run: TrainingRun, settings: ReproduceSettings, opened: DatasetFolder) -> None:

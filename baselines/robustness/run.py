@@ -171,19 +171,17 @@ def _rows(file: Path, key: Mapping[str, Any]) -> list[View] | None:
     return views
 
 
-def by_severity(rows: Sequence[View]) -> dict[int, SeverityScores]:
-    """Means over the views of each severity."""
-    return {severity: SeverityScores.model_validate(means) for severity, means in severity_means(rows).items()}
-
-
 def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
     """The block of ``result.json``. Raises PredictionError for a quick look, and where an axis is missing."""
     missing = [axis for axis in setup.axes(()) if axis not in rows]
     if setup.quick or missing:
         lacking = "a --quick look" if setup.quick else f"without {', '.join(missing)}"
         raise PredictionError(f"robustness is a mean over all axes and severities, and this is {lacking}")
-    clean = list(rows[CLEAN])
-    axes = {axis: list(by_severity(found).values()) for axis, found in rows.items() if axis != CLEAN}
+    means = {
+        axis: [SeverityScores.model_validate(scores) for scores in severity_means(found).values()]
+        for axis, found in rows.items()
+    }
+    (clean,), axes = means[CLEAN], {axis: scores for axis, scores in means.items() if axis != CLEAN}
     sha256 = setup.method.settings.get("weights_sha256")
     found = object_interval(*_shares_of_the_mean(rows))
     every = [scores.mae_mm for severities in axes.values() for scores in severities]
@@ -192,10 +190,10 @@ def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
         set=setup.set_name,
         mae_mm=sum(every) / len(every),
         interval=[None, None] if found is None else [max(found[0], 0.0), found[1]],
-        clean=by_severity(clean)[0],
+        clean=clean,
         axes=axes,
-        samples=len(clean),
-        objects=len({row["object"] for row in clean}),
+        samples=len(rows[CLEAN]),
+        objects=len({row["object"] for row in rows[CLEAN]}),
         size_px=setup.size,
         weights_sha256=sha256 if isinstance(sha256, str) else None,
     )

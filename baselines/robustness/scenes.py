@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import blake2b
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ from fpp_ml_bench import __version__
 from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, Truth, corruptions
 from fpp_ml_bench.constants import MM_PER_M, sample_name
 from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.render.meshes import solid_mesh
 from fpp_ml_bench.loaders.render.scene import BuildSettings, SolidMesh
 from fpp_ml_bench.loaders.render.view import Studio
@@ -149,12 +151,10 @@ def _load(file: Path | None, shape: tuple[int, ...], dtype: np.dtype) -> NDArray
 def _save(file: Path | None, array: NDArray) -> None:
     if file is None:
         return
-    temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
+    content = BytesIO()
+    np.save(content, array, allow_pickle=False)
     try:
         file.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("wb") as stream:
-            np.save(stream, array, allow_pickle=False)
-        temporary.replace(file)
+        write_atomically(file, content.getvalue(), sync=False)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
         raise PredictionError(f"{file}: can't be written ({error.strerror}); free some space, or --no-cache") from error

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Literal
 
 from fpp_ml_bench.baselines.registry import find
-from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName
-from fpp_ml_bench.baselines.robustness.report import write_page, write_worst
-from fpp_ml_bench.baselines.robustness.run import Setup, View, by_severity
+from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, severity_means
+from fpp_ml_bench.baselines.robustness.report import write_page
+from fpp_ml_bench.baselines.robustness.run import Setup, View
 from fpp_ml_bench.baselines.robustness.run import measure as measure_robustness
 from fpp_ml_bench.baselines.robustness.run import robustness as robustness_block
 from fpp_ml_bench.baselines.robustness.scenes import CACHE, Condition
@@ -85,7 +85,6 @@ def robust(
             rows = measure_robustness(
                 setup, folder, axes, workers, cache, lambda axis, count: advance(count), pool.cluster, save
             )
-        write_worst(setup, rows, folder, cache)
         page = f"{out}/{write_page(below).name}"
     if entry is not None:
         write_robustness(entry, robustness_block(setup, rows))
@@ -135,13 +134,9 @@ def _table(setup: "Setup", rows: "dict[str, list[View]]") -> Table:
     columns += ["wrong orders", "unanswered", "confident errors"]
     table = Table("axis", numbers=columns, title=f"{setup.method.title}: object MAE in mm")
     for axis, found in rows.items():
-        means = by_severity(found)
+        means = severity_means(found)
         last = means[max(means)]
-        cells = [millimetres(means[severity].mae_mm) if severity in means else "" for severity in severities]
-        shares = [
-            percent(last.wrong_share),
-            percent(last.unanswered_share),
-            percent(last.confident_share),
-        ]
+        cells = [millimetres(means[severity]["mae_mm"]) if severity in means else "" for severity in severities]
+        shares = [percent(last[key]) for key in ("wrong_share", "unanswered_share", "confident_share")]
         table.add_row(axis, *cells, *shares)
     return table

@@ -1,23 +1,14 @@
 """Flat planes: what a right, a collapsed and a template answer look like in the numbers."""
 
-import copy
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
 from fpp_ml_bench.baselines.diagnostics import flat_plane
 from fpp_ml_bench.baselines.diagnostics.counterfactual import Counterfactual
 from fpp_ml_bench.baselines.diagnostics.diagnosis import save_finding
-from fpp_ml_bench.baselines.diagnostics.flat_plane import (
-    FlatPlane,
-    Scale,
-    attention_table,
-    draw_attention,
-    plane_heat,
-    shares_within,
-)
+from fpp_ml_bench.baselines.diagnostics.flat_plane import FlatPlane, Scale
 from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, silent
 from fpp_ml_bench.baselines.diagnostics.subjects import subject_of_method
 from fpp_ml_bench.baselines.registry import load_method
@@ -57,12 +48,12 @@ def test_the_exact_decoder_finds_every_plane(decoded, tmp_path):
         assert row["collapsed_share"] == 0 and row["mae_mm"] < 1
         assert row["mean_mm"] == pytest.approx(1000 * row["distance_m"], abs=0.5)
     assert finding.values["objects"]["collapsed_share"] <= 0.02 and finding.values["range_mm"] is None
-    assert all(len(figure.png) > 5000 for figure in finding.figures)
+    assert len(finding.figure.png) > 5000
     save_finding(tmp_path, "key", finding, 1.0)
 
 
 def test_background_everywhere_is_a_collapse(opened, monkeypatch):
-    monkeypatch.setattr(flat_plane, "draw", lambda *arguments: [])
+    monkeypatch.setattr(flat_plane, "draw", lambda *arguments: None)
     background = answering(opened, lambda frames: np.full(frames[51].shape, 0.05), "normalised")
     finding = FlatPlane().run(background, opened, ProbeSettings(quick=True), silent)
     assert all(row["collapsed_share"] == 1 for row in finding.values["planes"])
@@ -78,7 +69,7 @@ def test_background_everywhere_is_a_collapse(opened, monkeypatch):
 
 def test_the_rectangle_grows_and_a_collapse_from_a_side_on_is_told(opened, monkeypatch):
     """A model that predicts background where less than half of its image is lit."""
-    monkeypatch.setattr(flat_plane, "draw", lambda *arguments: [])
+    monkeypatch.setattr(flat_plane, "draw", lambda *arguments: None)
     half_lit = answering(opened, lambda frames: np.full(frames[51].shape, (frames[51] < 60).mean()), "normalised")
     finding = FlatPlane().run(half_lit, opened, ProbeSettings(quick=True), silent)
     sizes = [row for row in finding.values["planes"] if row["outline"] in flat_plane.GROWING]
@@ -89,7 +80,6 @@ def test_the_rectangle_grows_and_a_collapse_from_a_side_on_is_told(opened, monke
         assert (row["distance_m"], row["tilt_deg"]) == (1.8, [0.0, 0.0])
     shares = [row["collapsed_share"] for row in sizes]
     assert shares == sorted(shares) and {shares[0], shares[-1]} == {0, 1}
-    assert "0% at 0.3, " in finding.summary and "100% at 1." in finding.summary
 
 
 def test_collapse_is_nearer_to_background_than_to_any_object():
@@ -111,32 +101,5 @@ def test_the_counterfactual_probe_reports_and_draws(opened, tmp_path):
     finding = Counterfactual().run(still, opened, ProbeSettings(quick=True), silent)
     assert finding.values["reliance"]["score"] == 0
     assert "does not follow the phase" in finding.summary
-    assert all(len(figure.png) > 5000 for figure in finding.figures)
+    assert len(finding.figure.png) > 5000
     save_finding(tmp_path, "key", finding, 1.0)
-
-
-def test_heat_on_the_plane_is_where_a_linear_network_looks():
-    """Of out = 2 (0.5 x) the heatmap is the image over the number of pixels; random weights here look away from it."""
-    network = torch.nn.Sequential(torch.nn.Conv2d(1, 1, 1, bias=False), torch.nn.Conv2d(1, 1, 1, bias=False))
-    for layer, weight in zip(network, (0.5, 2.0), strict=True):
-        layer.weight.data.fill_(weight)
-    away = copy.deepcopy(network)
-    away[1].weight.data.fill_(-2.0)
-    subject = SimpleNamespace(
-        frames_used=(3,),
-        layer_names=("first",),
-        networks=lambda: (network, lambda seed: away),
-        layers_of=lambda one: {"first": one[0]},
-        input_batch=lambda stacks: torch.from_numpy(stacks[0][3][None, None].astype(np.float32) / 255),
-    )
-    frame = np.random.default_rng(0).integers(0, 256, (24, 32), dtype=np.uint8)
-    mask = np.zeros((24, 32), bool)
-    mask[5:20, 8:30] = True
-    heat = plane_heat(subject, frame)
-    shares = shares_within(heat, mask)
-    assert shares["area"] == pytest.approx(15 * 22 / (24 * 32))
-    expected = frame[mask].sum(dtype=np.int64) / frame.sum(dtype=np.int64)
-    assert shares["trained"]["first"] == pytest.approx(expected, rel=64 * U32)
-    assert shares["untrained"]["first"] is None
-    assert attention_table(shares).rows == [("first", shares["trained"]["first"], None)]
-    assert len(draw_attention(frame, heat).png) > 3000

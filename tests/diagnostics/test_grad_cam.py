@@ -13,13 +13,13 @@ from fpp_ml_bench.baselines.diagnostics.grad_cam import (
     EDGES,
     FRINGES,
     OWN,
+    RANDOM,
     GradCam,
     cam_layers,
     correlation,
     heatmaps,
     means_of,
     measure,
-    ratio_text,
 )
 from fpp_ml_bench.baselines.diagnostics.probe import silent
 from fpp_ml_bench.baselines.diagnostics.subjects import randomised
@@ -32,18 +32,20 @@ def convolutions(*channels, kernel=1):
     return nn.Sequential(*layers)
 
 
-def test_a_linear_network_has_the_heatmap_that_pen_and_paper_give():
+@pytest.mark.parametrize("sign", [1, -1])  # each shows what the ReLU hides of the other
+def test_a_linear_network_has_the_heatmap_that_pen_and_paper_give(sign):
     """Output mean = sum_c v_c mean(A_c) + const, so each channel weighs v_c / (H W), whatever the image."""
+    torch.manual_seed(0)
     network = convolutions(1, 3, 1)
-    v = torch.tensor([2.0, -1.0, 0.5])
+    v = sign * torch.tensor([2.0, -1.0, 0.5])
     network[1].weight.data[:] = v.view(1, 3, 1, 1)
     network.requires_grad_(False)
     fringe = torch.rand(2, 1, 6, 8)
-    heatmap = heatmaps(network, {"first": network[0]}, fringe)["first"]
+    heatmap = torch.from_numpy(heatmaps(network, {"first": network[0]}, fringe)["first"])
     weighted = v.view(3, 1, 1) * network[0](fringe) / (6 * 8)
     # A channel's weight is a sum over 6 x 8 pixels; fewer than 64 roundings of the magnitudes in all.
     tolerance = 64 * U32 * float(weighted.abs().sum(1).max())
-    assert torch.allclose(heatmap, weighted.sum(1), rtol=0, atol=tolerance)
+    assert torch.allclose(heatmap, weighted.sum(1).clamp(min=0), rtol=0, atol=tolerance)
 
 
 def test_a_bent_network_at_half_the_size_has_that_of_its_own_gradients():
@@ -57,9 +59,10 @@ def test_a_bent_network_at_half_the_size_has_that_of_its_own_gradients():
         heat = (gradient.mean((2, 3), keepdim=True) * activations).sum(1, keepdim=True)
         magnitudes = (gradient.abs().mean((2, 3), keepdim=True) * activations.abs()).sum(1).detach()
         expected = functional.interpolate(heat, size=(8, 12), mode="bilinear")[0, 0].detach()
-        heatmap = heatmaps(network, {"first": first}, fringe)["first"][sample]
+        assert (expected > 0).any()
+        heatmap = torch.from_numpy(heatmaps(network, {"first": first}, fringe)["first"][sample])
         # Sums over 24 gradients, 9 products, 4 channels and 4 neighbours: fewer than 64 roundings of the magnitudes.
-        assert torch.allclose(heatmap, expected, rtol=0, atol=64 * U32 * float(magnitudes.max()))
+        assert torch.allclose(heatmap, expected.clamp(min=0), rtol=0, atol=64 * U32 * float(magnitudes.max()))
 
 
 def test_layers_that_have_no_heatmap_are_refused():
@@ -81,27 +84,27 @@ def test_correlation_is_pearsons():
 
 
 def test_means_leave_out_maps_that_are_constant_and_average_layers_as_the_paper_does():
-    correlations = {("trained", layer, target): [0.1] * 3 for layer in "ab" for target in (EDGES, FRINGES)}
-    correlations["trained", "a", EDGES] = [0.4, 0.2, None]
-    for seed, r in ((0, 0.2), (1, 0.4)):
+    correlations = {(0, target, layer): [0.1] * 3 for layer in "ab" for target in (EDGES, FRINGES)}
+    correlations[0, EDGES, "a"] = [0.4, 0.2, None]
+    for number, r in ((1, 0.2), (2, 0.4)):
         for layer, target in product("ab", (EDGES, FRINGES, OWN)):
-            correlations[f"untrained {seed}", layer, target] = [r if target == OWN else None] * 3
+            correlations[number, target, layer] = [r if target == OWN else None] * 3
     means = means_of(correlations, ("a", "b"), ["x", "x", "y"])
     first = means["layers"]["a"]
     assert first[EDGES]["r"] == pytest.approx(0.3) and first[EDGES]["samples"] == 2
-    assert first["random"][OWN]["r"] == pytest.approx(0.3) and first["random"][EDGES]["r"] is None
-    assert means["average"][EDGES]["r"] == pytest.approx(0.2) and means["average"][EDGES]["samples"] == 2
+    assert first[RANDOM + OWN]["r"] == pytest.approx(0.3) and first[RANDOM + EDGES]["r"] is None
+    assert means["average"][EDGES]["r"] == pytest.approx(0.2) and means["average"][EDGES]["samples"] == 3
     assert means["average"]["ratio"] == pytest.approx(2)
     for missing in (0.0, None):
-        correlations["trained", "a", FRINGES] = [missing] * 3
+        correlations[0, FRINGES, "a"] = [missing] * 3
         assert means_of(correlations, ("a", "b"), ["x", "x", "y"])["layers"]["a"]["ratio"] is None
 
 
-@pytest.mark.parametrize(("fields", "wins"), [(("edges",), EDGES), (("inside",), FRINGES)])
+@pytest.mark.parametrize(("fields", "wins"), [(("edges",), EDGES), (("object",), FRINGES)])
 def test_a_reader_of_edges_looks_at_edges_and_one_of_the_lit_object_at_fringes(opened, fields, wins):
     """A network that outputs the Sobel map correlates with it by 1, at the layer where it is."""
     subject = oracle(opened, fields)
-    correlations = measure(subject, opened, opened.samples("test")[:3], ("out",), 1, silent)
+    correlations = measure(subject, opened, opened.samples("test")[:3], 1, silent)
     layer = correlations["layers"]["out"]
     edges, fringes = layer[EDGES]["r"], layer[FRINGES]["r"]
     assert (edges > fringes) == (wins == EDGES)
@@ -109,7 +112,7 @@ def test_a_reader_of_edges_looks_at_edges_and_one_of_the_lit_object_at_fringes(o
         assert edges == pytest.approx(1, abs=1e-6)
         assert layer["ratio"] > 1.5
     # The stand-in for random weights is the network itself: the sanity check must say that nothing changed.
-    assert layer["random"][OWN]["r"] == pytest.approx(1, abs=1e-6)
+    assert layer[RANDOM + OWN]["r"] == pytest.approx(1, abs=1e-6)
     if wins == EDGES:
         assert correlations["edges_with_fringes"]["r"] == pytest.approx(fringes)
 
@@ -142,15 +145,3 @@ def test_the_papers_six_layers_are_taken_where_there_are_nine(opened):
     assert cam_layers(subject) == ("enc3", "enc4", "bottleneck", "dec4", "dec2", "dec1")
     object.__setattr__(subject, "network", None)
     assert "no gradient" in GradCam().applies_to(subject)
-
-
-@pytest.mark.parametrize(
-    ("ratio", "interval", "says"),
-    [
-        (2.0, (0.05, 0.2), "ratio 2.00"),
-        (2.0, (-0.05, 0.2), "ratio 2.00, which says nothing: its divisor can't be told from 0"),
-        (None, None, "no ratio"),
-    ],
-)
-def test_a_ratio_over_something_near_zero_says_so(ratio, interval, says):
-    assert ratio_text({"ratio": ratio, FRINGES: {"interval": interval}}) == says

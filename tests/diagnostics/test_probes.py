@@ -10,8 +10,9 @@ from torch.nn import functional
 
 from fpp_ml_bench.baselines.diagnostics import fits, linear
 from fpp_ml_bench.baselines.diagnostics.fits import (
-    INPUT,
-    SILHOUETTE,
+    LINEAR,
+    MEAN,
+    SPATIAL,
     NormalEquations,
     activations_of,
     apply,
@@ -21,7 +22,7 @@ from fpp_ml_bench.baselines.diagnostics.fits import (
     truth,
 )
 from fpp_ml_bench.baselines.diagnostics.grad_cam import fringe_variation
-from fpp_ml_bench.baselines.diagnostics.linear import CONTROLS, score
+from fpp_ml_bench.baselines.diagnostics.linear import CONTROLS, INPUT, SILHOUETTE, score
 from fpp_ml_bench.baselines.stability.cases import U32
 from fpp_ml_bench.coding.phase_shift import wrapped_phase
 from fpp_ml_bench.decoding.triangulation import depth_from_coordinate
@@ -57,7 +58,7 @@ def test_true_phase_is_the_one_that_eighteen_frames_measure(opened, direction):
     sample = opened.samples("test")[0]
     ground_truth = truth(opened.depth_mm(sample), opened.rig, direction)
     measured = wrapped_phase(opened.frames(sample, opened.sequence.sinusoids(direction)))
-    sine, outside = ground_truth["sine"], ~ground_truth["inside"]
+    sine, outside = ground_truth["sine"], ground_truth["object"] == 0
     inside = ndimage.binary_erosion(~outside & (measured.modulation > 20), iterations=3)
     assert inside.sum() > 200
     error_rad = np.angle(np.exp(1j * (measured.phase - np.arctan2(sine, ground_truth["cosine"]))))[inside]
@@ -169,16 +170,16 @@ def test_score_is_share_of_variance_with_an_interval_that_holds_it():
 # ---- four convolutions
 
 
-def test_moments_are_mean_and_spread_of_each_channel():
-    batches = [torch.randn(n, 3, 4, 5) * torch.tensor([1.0, 10.0, 0.0]).view(3, 1, 1) + 2 for n in (2, 3)]
-    moments = fits.Moments()
+def test_standard_is_mean_and_spread_of_each_channel():
+    batches = [torch.randn(n, 3) * torch.tensor([1.0, 10.0, 0.0]) + 2 for n in (40, 60)]
+    equations = NormalEquations(3, 0)
     for batch in batches:
-        moments.add(batch)
-    mean, factor = moments.standard()
-    flat = torch.cat(batches).transpose(0, 1).flatten(1).double()
-    # Sums are in float64; mean and factor are rounded to float32 once.
-    assert torch.allclose(mean.double(), flat.mean(1), rtol=2 * U32, atol=0)
-    assert torch.allclose(1 / factor[:2].double(), flat.std(1, correction=0)[:2], rtol=2 * U32, atol=0)
+        equations.add(batch, torch.zeros(len(batch), 0))
+    mean, factor = equations.standard(1e-6)
+    flat = torch.cat(batches).double()
+    # Sums are in float64, of squares that cancel by the square of mean over spread at most.
+    assert torch.allclose(mean, flat.mean(0), rtol=1e-12, atol=0)
+    assert torch.allclose(1 / factor[:2], flat.std(0, correction=0)[:2], rtol=1e-12, atol=0)
     assert factor[2] == 0  # a constant channel says nothing
 
 
@@ -186,20 +187,21 @@ def test_a_four_convolution_probe_starts_at_the_mean_and_learns_what_is_there():
     torch.manual_seed(0)
 
     def batch():
-        features = {"here/a": torch.randn(8, 3, 12, 12), "else/b": torch.randn(8, 3, 12, 12)}
-        bumps = features["here/a"][:, :1].abs()
+        features = {("here", 0, "a"): torch.randn(8, 3, 12, 12), ("else", 0, "b"): torch.randn(8, 3, 12, 12)}
+        bumps = features["here", 0, "a"][:, :1].abs()
         edges = functional.avg_pool2d(bumps, 3, 1, 1, count_include_pad=False)
-        return features, {"image": torch.ones_like(bumps), "edges": edges}
+        return features, {"image": torch.ones_like(bumps), "object": torch.ones_like(bumps), "edges": edges}
 
     features, target = batch()
-    moments = {name: fits.Moments() for name in features}
-    for name, moment in moments.items():
-        moment.add(features[name])
-    mean = float(target["edges"].mean())
-    probes = fits.ProbeSet(moments, {"edges": mean}, {"here/a": 2, "else/b": 1}, 90)
-    assert set(probes.probes) == {("here/a", "edges", 0), ("here/a", "edges", 1), ("else/b", "edges", 0)}
-    reference = (target["edges"].double() - mean).square().mean((1, 2, 3))
-    for errors in probes.errors(features, target).values():
+    probes = fits.ConvolutionProbes({"edges": SPATIAL["edges"]}, {"here": 2, "else": 1}, 90)
+    probes.observe(features, target)
+    probes.start()
+    here, other = ("here", 0, "a"), ("else", 0, "b")
+    assert set(probes.probes) == {(here, "edges", 0), (here, "edges", 1), (other, "edges", 0)}
+    reference = (target["edges"].double() - target["edges"].double().mean()).square().mean((1, 2, 3))
+    found = probes.errors(features, target)
+    assert set(found) == {*probes.probes, (MEAN, "edges", 0)}
+    for errors in found.values():
         # Each difference is rounded to float32 once, which its square doubles.
         assert errors == pytest.approx(reference.tolist(), rel=4 * U32)
     for _ in range(90):
@@ -207,30 +209,37 @@ def test_a_four_convolution_probe_starts_at_the_mean_and_learns_what_is_there():
     remaining = {
         key: np.mean(moment) / float(reference.mean()) for key, moment in probes.errors(features, target).items()
     }
-    assert remaining["here/a", "edges", 0] < 0.7 and remaining["here/a", "edges", 1] < 0.7
-    assert remaining["else/b", "edges", 0] > 0.9
+    assert remaining[here, "edges", 0] < 0.7 and remaining[here, "edges", 1] < 0.7
+    assert remaining[other, "edges", 0] > 0.9
 
 
 # ---- networks whose answer is known
 
 
-def experiment_of(subject, opened, step):
+def errors_of(subject, opened, probes, view, step, epochs=0):
     train, validation = opened.samples("train")[::step], opened.samples("validation")
-    return linear.Experiment(subject, opened, train, validation, lambda count, activity: None)
+    networks = {("trained", 0): subject.network}
+    view = view(subject, opened, lambda count, activity: None)
+    return linear.errors_of(probes, view, networks, train, validation, epochs)
 
 
 def linear_r2(subject, opened):
-    errors, reference = experiment_of(subject, opened, 2).linear_errors("trained", subject.network, controls=True)
+    errors = errors_of(subject, opened, fits.LinearProbes(LINEAR), linear.Pixels, 2)
     return {
-        (layer, target): 1 - np.mean(sample_errors) / np.mean(reference[target])
-        for ((_, layer), target, _), sample_errors in errors.items()
+        (layer, target): 1 - np.mean(sample_errors) / np.mean(errors[MEAN, target, 0])
+        for ((_, _, layer), target, _), sample_errors in errors.items()
     }
 
 
-@pytest.mark.parametrize("target", linear.TARGETS)
+def spatial_errors(subject, opened, epochs):
+    probes = fits.ConvolutionProbes(SPATIAL, {"trained": 1, CONTROLS: 1}, epochs * len(opened.samples("train")))
+    return errors_of(subject, opened, probes, linear.Grid, 3, epochs)
+
+
+@pytest.mark.parametrize("target", LINEAR)
 def test_what_a_layer_holds_is_read_from_it(opened, target):
     """A network that outputs the Sobel map is a pure edge reader, one that holds sine and cosine reads the phase."""
-    r2 = linear_r2(oracle(opened, linear.TARGETS[target]), opened)
+    r2 = linear_r2(oracle(opened, LINEAR[target][0]), opened)
     assert r2["out", target] > 0.999
     for other_target in {"edges", "phase"} - {target}:
         assert r2["out", other_target] < 0.5
@@ -246,47 +255,44 @@ def test_the_layer_of_an_identity_is_the_raw_input(opened):
             return self.out(fringe)
 
     r2 = linear_r2(subject_with(Same(), opened.size), opened)
-    for target in linear.TARGETS:
+    for target in LINEAR:
         assert r2["out", target] == r2[INPUT, target]
     # One grey level holds the cosine, up to brightness, and nothing of the sine: half of the phase at most.
     assert 0.2 < r2[INPUT, "phase"] < 0.5
-    assert abs(r2["position", "phase"]) < 0.05
 
 
 def test_spatial_probes_of_an_edge_reader_read_edges(opened):
     subject = oracle(opened, ("edges",))
-    networks, seeds = {"trained": subject.network}, {"trained": 1, CONTROLS: 1}
-    errors, reference = experiment_of(subject, opened, 3).spatial_errors(networks, seeds, 25)
-    remaining = {key[:2]: np.mean(sample_errors) / np.mean(reference[key[1]]) for key, sample_errors in errors.items()}
-    trained, raw = remaining[("trained", "out"), "edges"], remaining[(CONTROLS, INPUT), "edges"]
+    errors = spatial_errors(subject, opened, 25)
+    remaining = {key: np.mean(values) / np.mean(errors[MEAN, key[1], 0]) for key, values in errors.items()}
+    trained, raw = remaining[("trained", 0, "out"), "edges", 0], remaining[(CONTROLS, 0, INPUT), "edges", 0]
     assert trained < 0.25 and trained < raw
 
 
 def test_a_layer_that_holds_the_mask_alone_is_the_silhouette_control(opened):
-    subject = oracle(opened, ("inside",))
+    subject = oracle(opened, ("object",))
     r2 = linear_r2(subject, opened)
-    for target in linear.TARGETS:
+    for target in LINEAR:
         assert r2["out", target] == pytest.approx(r2[SILHOUETTE, target], abs=1e-12)
     assert r2[SILHOUETTE, "depth"] > 0.5  # of the whole image's depth: what a silhouette says
-    for target in linear.INSIDE:
+    for target in set(LINEAR) - {"edges", "depth"}:
         assert r2[SILHOUETTE, target] == 0  # and of the depth within it nothing
-    networks, seeds = {"trained": subject.network}, {"trained": 1, CONTROLS: 1}
-    errors, reference = experiment_of(subject, opened, 3).spatial_errors(networks, seeds, 2)
-    for name in fits.MEASURED:
-        assert errors[("trained", "out"), name, 0] == pytest.approx(errors[(CONTROLS, SILHOUETTE), name, 0])
-        assert len(reference[name]) == len(opened.samples("validation"))
+    errors = spatial_errors(subject, opened, 2)
+    for name in SPATIAL:
+        assert errors[("trained", 0, "out"), name, 0] == pytest.approx(errors[(CONTROLS, 0, SILHOUETTE), name, 0])
+        assert len(errors[MEAN, name, 0]) == len(opened.samples("validation"))
 
 
 def test_depth_on_the_object_is_compared_there_and_with_the_mean_there(opened):
-    experiment = experiment_of(oracle(opened, ("depth",)), opened, 3)
-    _, reference = experiment.spatial_errors({}, {CONTROLS: 1}, 1)
+    errors = spatial_errors(oracle(opened, ("depth",)), opened, 1)
     side = tuple(length // fits.grid_step(opened.size) for length in opened.size)
 
     def within(name):
         depth_mm = opened.depth_mm(name)
         full = at_size(torch.from_numpy(object_mask(depth_mm)[None, None].astype(np.float32)), side).numpy() == 1
-        return at_size(torch.from_numpy(fits.normalised_depth(depth_mm)[None, None]), side).numpy()[full].astype(float)
+        depth = truth(depth_mm, opened.rig, "horizontal")["depth"]
+        return at_size(torch.from_numpy(depth[None, None]), side).numpy()[full].astype(float)
 
-    mean = np.concatenate([within(name) for name in experiment.train]).mean()
-    expected = [np.mean((within(name) - mean) ** 2) for name in experiment.validation]
-    assert reference[fits.OBJECT_DEPTH] == pytest.approx(expected)
+    mean = np.concatenate([within(name) for name in opened.samples("train")[::3]]).mean()
+    expected = [np.mean((within(name) - mean) ** 2) for name in opened.samples("validation")]
+    assert errors[MEAN, fits.OBJECT_DEPTH, 0] == pytest.approx(expected)
