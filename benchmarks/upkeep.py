@@ -51,7 +51,7 @@ from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped
 from fpp_ml_bench.leaderboard.reported import PAPER_DEPTHS, REPORTED_HEADING, chosen_tables
 from fpp_ml_bench.leaderboard.row_file import row_json, write_row
 from fpp_ml_bench.leaderboard.rows import VOUCHED, Entry, read_entry, vouching_line
-from fpp_ml_bench.leaderboard.tables import markdown_columns, markdown_rows, markdown_text
+from fpp_ml_bench.leaderboard.tables import markdown_rows, markdown_text, ranking_table
 from fpp_ml_bench.leaderboard.trivial import more_than_trivial
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
@@ -214,7 +214,7 @@ def readme_block(groups: Sequence[Group]) -> str:
         machines = sorted({device(row.entry) for row in group.rows if row.entry.time_measured})
         timed = f"; measured on {', '.join(machines)}" if machines else ""
         lines += [f"**{markdown_text(group.title + timed)}**", ""]
-        lines += [*markdown_columns(_COLUMNS, group.rows[:SHOWN]), ""]
+        lines += [*ranking_table("", _COLUMNS, group.rows[:SHOWN]).markdown(), ""]
         more = len(group.rows) - SHOWN
         lines += [f"… and {more} more on the page", ""] if more > 0 else []
     shown = [row.entry.row for group in groups for row in group.rows]

@@ -14,8 +14,6 @@ from itertools import combinations
 from pathlib import Path
 from typing import Literal
 
-from rich.text import Text
-
 from fpp_ml_bench.baselines.reproduce.plan import Folders, Job, variants
 from fpp_ml_bench.baselines.reproduce.scoring import MAIN_KEY, AllFrames, all_frames_that_hold
 from fpp_ml_bench.baselines.reproduce.work import Outcome, ReproduceSettings, current_weights, file_sha256, state_of
@@ -29,9 +27,8 @@ from fpp_ml_bench.leaderboard.columns import device
 from fpp_ml_bench.leaderboard.reported import PAPER_DEPTHS, paper_tables
 from fpp_ml_bench.leaderboard.row_file import Row, row_of, view_means, write_row
 from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEASURED_HERE, Entry, read_entry
-from fpp_ml_bench.leaderboard.tables import markdown_rows, markdown_text
+from fpp_ml_bench.leaderboard.tables import TextTable, markdown_text
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.tables import Table
 
 _NOT_IN_THE_PAPER = {
     "pix2pixhd": "pix2pixHD",
@@ -238,38 +235,30 @@ def orderings_sentence(judged: Sequence[Ordering]) -> str:
     )
 
 
-def _cells(line: Line, preset: str) -> list[tuple[str, str | None, str]]:
-    """Each cell's title in a file, its title in a terminal, which leaves those without out, and its text: a dash where
-    nothing is known, errors with the paper's two decimals. The first two hold words."""
-    entry, paper = line.entry, line.paper_mm
-    here, interval = (
-        (line.scores.metrics.model_dump(), line.scores.intervals.of(MAIN_KEY)) if line.scores else (None,) * 2
-    )
+def _cells(line: Line, preset: str) -> dict[str, str]:
+    """Each cell by the title of its column: a dash where nothing is known, errors with the paper's two decimals."""
+    entry, scores = line.entry, line.scores
+    here = scores.metrics.model_dump() if scores else None
+    interval = scores.intervals.of(MAIN_KEY) if scores else None
     settings = entry.row.submission.settings if entry else {}
     timing, latency_ms = (entry.row.timing, entry.latency_ms) if entry else (None, None)
-    by_us, by_them = f"{MEASURED_HERE}, {preset} preset", BY_THE_PAPER
-    twin = f"object MAE / of its measured pixels / missing pixels, {MEASURED_HERE}"
-    return [
-        ("Row", "Row", line.label),
-        ("Track", None, entry.row.track if entry else "-"),
-        (f"Object MAE / RMSE, {by_us}", "Object, here", _pair(here, "object")),
-        (
-            f"95% interval of the object MAE, {MEASURED_HERE}",
-            "95% of MAE",
-            " - ".join(map(_mm, interval)) if interval else "-",
-        ),
-        (f"Object MAE / RMSE, {by_them}", "Object, paper", _pair(paper, "object")),
-        (f"Overall MAE / RMSE, {by_us}", "Overall, here", _pair(here, "overall")),
-        (f"Overall MAE / RMSE, {by_them}", "Overall, paper", _pair(paper, "overall")),
-        (f"Background MAE / RMSE, {by_us}", None, _pair(here, "background")),
-        (f"Background MAE / RMSE, {by_them}", None, _pair(paper, "background")),
-        (f"Range predicted: {twin}", "Range predicted", _twin(line, "predicted")),
-        (f"Range of the training mean: {twin}", None, _twin(line, "mean")),
-        ("Parameters", None, _count(timing and timing.parameters)),
-        ("Epochs", "Epochs", _count(settings.get("epochs_trained"))),
-        ("Training, s", "s", _count(settings.get("training_seconds"))),
-        ("Latency, ms", "ms", "-" if latency_ms is None else f"{latency_ms:.3g}"),
-    ]
+    cells = {"Row": line.label, "Track": entry.row.track if entry else "-"}
+    for pixels in ("object", "overall", "background"):
+        title = f"{pixels.capitalize()} MAE / RMSE"
+        cells[f"{title}, {MEASURED_HERE}, {preset} preset"] = _pair(here, pixels)
+        if pixels == "object":
+            ends = " - ".join(map(_mm, interval)) if interval else "-"
+            cells[f"95% interval of the object MAE, {MEASURED_HERE}"] = ends
+        cells[f"{title}, {BY_THE_PAPER}"] = _pair(line.paper_mm, pixels)
+    for name, title in (("predicted", "Range predicted"), ("mean", "Range of the training mean")):
+        cells[f"{title}: object MAE / of its measured pixels / missing pixels, {MEASURED_HERE}"] = _twin(line, name)
+    return {
+        **cells,
+        "Parameters": _count(timing and timing.parameters),
+        "Epochs": _count(settings.get("epochs_trained")),
+        "Training, s": _count(settings.get("training_seconds")),
+        "Latency, ms": "-" if latency_ms is None else f"{latency_ms:.3g}",
+    }
 
 
 def _mm(value: float | None) -> str:
@@ -294,15 +283,12 @@ def _twin(line: Line, depth_range: str) -> str:
     return " / ".join([*errors, percent(entry.value("object_missing_share"))])
 
 
-def _title(table: str) -> str:
-    return _TITLES[table] if table in _TITLES else paper_tables()[table].title
-
-
-def _columns(table: str, lines: Sequence[Line], preset: str) -> list[tuple[str, str | None, tuple[str, ...]]]:
-    """Both titles of each column to show, and its cells. A table that the paper does not have has no empty columns."""
-    columns = zip(*(_cells(line, preset) for line in lines), strict=True)
-    shown = [(*column[0][:2], tuple(text for *_, text in column)) for column in columns]
-    return [column for column in shown if table in paper_tables() or set(column[2]) != {"-"}]
+def text_table(table: str, lines: Sequence[Line], preset: str) -> TextTable:
+    """The lines as a table. One that the paper does not have has no empty columns."""
+    title = _TITLES[table] if table in _TITLES else paper_tables()[table].title
+    rows = [_cells(line, preset) for line in lines]
+    shown = [name for name in rows[0] if table in paper_tables() or {row[name] for row in rows} != {"-"}]
+    return TextTable.of(title, [{name: row[name] for name in shown} for row in rows])
 
 
 def write_table(table: str, settings: ReproduceSettings, outcome: Outcome) -> Path:
@@ -317,35 +303,20 @@ def write_table(table: str, settings: ReproduceSettings, outcome: Outcome) -> Pa
 
 def table_markdown(table: str, lines: Sequence[Line], preset: str, command: str, failed: dict[str, str]) -> str:
     """The page of a table as Markdown. ``command`` makes it again; ``failed`` maps a recipe's name to its error."""
-    titles, _, cells = zip(*_columns(table, lines, preset), strict=True)
-    rows = [list(map(markdown_text, row)) for row in zip(*cells, strict=True)]
+    shown = text_table(table, lines, preset)
     parts = [
-        f"# {markdown_text(_title(table))}",
+        f"# {markdown_text(shown.title)}",
         "",
         f"Made by `{command}`. Errors in mm, mean over samples.",
         *_about(lines, table in paper_tables()),
         "",
-        *markdown_rows(titles, [number > 1 for number in range(len(titles))], rows),
+        *shown.markdown(),
         "",
         *_missing(lines, command, failed),
         *_twins_explained(lines),
         *(_orderings(orderings(lines)) if table in paper_tables() else [conclusion(table, lines)]),
     ]
     return "\n".join(parts).rstrip("\n") + "\n"
-
-
-def table_rich(table: str, lines: Sequence[Line], preset: str) -> Table:
-    """The table for a terminal, with the columns that fit."""
-    title = f"{_title(table)}\nMAE / RMSE in mm. here: {MEASURED_HERE}, {preset} preset"
-    if table in paper_tables():
-        title += f"; paper: {BY_THE_PAPER}. Range predicted: object MAE / of its measured pixels / missing pixels"
-    rich_table = Table(title=Text(title), elsewhere="the page below")
-    shown = [(short, cells) for _, short, cells in _columns(table, lines, preset) if short is not None]
-    for number, (short, _) in enumerate(shown):
-        rich_table.add_column(Text(short), justify="right" if number > 0 else "left")
-    for row in zip(*(cells for _, cells in shown), strict=True):
-        rich_table.add_row(*map(Text, row))
-    return rich_table
 
 
 def _about(lines: Sequence[Line], in_the_paper: bool) -> list[str]:
@@ -403,21 +374,18 @@ def _orderings(judged: Sequence[Ordering]) -> list[str]:
     parts = ["## The paper's orderings", "", orderings_sentence(judged), ""]
     if not judged:
         return parts
-    rows = []
-    for ordering in judged:
-        worse = markdown_text(ordering.worse) + ("" if ordering.same_track else f" \\{_TRACKS_DIFFER}")
-        gaps = f"{ordering.paper_gap_mm:+.2f}", f"{ordering.gap_mm:+.2f}"
-        interval = "-" if ordering.interval_mm is None else between(ordering.interval_mm)
-        rows.append([markdown_text(ordering.better), worse, *gaps, interval, ordering.verdict])
-    titles = (
-        "Better in the paper",
-        "Worse in the paper",
-        f"Worse minus better, mm, {BY_THE_PAPER}",
-        f"Worse minus better, mm, {MEASURED_HERE}",
-        "95% interval",
-        "Here",
-    )
-    parts += [*markdown_rows(titles, (False, False, True, True, True, False), rows), ""]
+    rows = [
+        {
+            "Better in the paper": ordering.better,
+            "Worse in the paper": ordering.worse + ("" if ordering.same_track else f" {_TRACKS_DIFFER}"),
+            f"Worse minus better, mm, {BY_THE_PAPER}": f"{ordering.paper_gap_mm:+.2f}",
+            f"Worse minus better, mm, {MEASURED_HERE}": f"{ordering.gap_mm:+.2f}",
+            "95% interval": "-" if ordering.interval_mm is None else between(ordering.interval_mm),
+            "Here": ordering.verdict,
+        }
+        for ordering in judged
+    ]
+    parts += [*TextTable.of("", rows, (0, 1, 5)).markdown(), ""]
     parts += ["Differences sample by sample; intervals by bootstrap over objects."]
     if not all(ordering.same_track for ordering in judged):
         told = "one of the two was given the test sample's range, which is part of the difference."

@@ -1,8 +1,10 @@
 """The leaderboard as tables in the terminal and as Markdown. The same rows give the same bytes."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 from rich.text import Text
 
@@ -10,7 +12,7 @@ from fpp_ml_bench.evaluation.report.html import interval_text, millimetres
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.columns import METHOD, NOTE, ONLY_IN_FILES, Column, columns
 from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, Group, Pair, Ranked
-from fpp_ml_bench.leaderboard.reported import REPORTED_HEADING, ReportedRow, ReportedTable
+from fpp_ml_bench.leaderboard.reported import REPORTED_HEADING, ReportedTable
 from fpp_ml_bench.tables import Table
 
 NO_RESULTS = """\
@@ -20,69 +22,102 @@ No results here yet. Score predictions, and their row appears:
   fpp-bench leaderboard result.json
 Without arguments, result*.json and results/*.json of the current folder are read.
 """
-PAPER_TITLES = (
-    "Row",
-    "Track",
-    "Test samples",
-    "Object MAE",
-    "Object RMSE",
-    "Overall MAE",
-    "Overall RMSE",
-    "Backgr. MAE",
-    "Backgr. RMSE",
-)
-PAPER_TEXT_COLUMNS = 2
-PAIR_TITLES = ("First", "Second", "Second - first", "95% interval", "p", "p, Holm", "Objects", "Verdict")
-PAIR_TEXT_COLUMNS = 2
 PAIRS_FIRST_OUT = ("Objects", "p", "95% interval", "p, Holm")
 LAST_OUT = ("Frames", "s/sample", "x trivial", "Object MAE")
 """In a narrow terminal, the columns of a ranking that are left out after all others of their width, in this order."""
 _PLAIN = frozenset(" -,+()/%=.")
 
 
-def paper_cells(row: ReportedRow) -> list[str]:
-    """Cells under `PAPER_TITLES`, errors with the two decimals of their tables."""
-    keys = (f"{pixels}_{error}_mm" for pixels in ("object", "overall", "background") for error in ("mae", "rmse"))
-    errors = [f"{row.errors_mm[key]:.2f}" if key in row.errors_mm else "-" for key in keys]
-    return [row.label, row.track, "-" if row.test_samples is None else str(row.test_samples), *errors]
+@dataclass(frozen=True)
+class TextTable:
+    """Rows of text under ``titles``, of which the columns numbered ``words`` are aligned to the left: the same table
+    for the terminal, for Markdown and for the page."""
+
+    title: str
+    titles: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    words: Collection[int] = (0, 1)
+
+    @classmethod
+    def of(cls, title: str, rows: Sequence[Mapping[str, str]], words: Collection[int] = (0, 1)) -> "TextTable":
+        """A table of ``rows`` of cells by the titles of their columns."""
+        return cls(title, tuple(rows[0]) if rows else (), [tuple(row.values()) for row in rows], words)
+
+    def markdown(self) -> list[str]:
+        """Lines of a Markdown table."""
+        right = [number not in self.words for number in range(len(self.titles))]
+        return markdown_rows(self.titles, right, [list(map(markdown_text, row)) for row in self.rows])
+
+    def rich(self, **look: Any) -> Table:
+        """The table in a terminal; text that was submitted is never markup."""
+        table = Table(title=Text(self.title), **{"elsewhere": "--markdown FILE", **look})
+        for number, title in enumerate(self.titles):
+            table.add_column(Text(title), justify="left" if number in self.words else "right")
+        for cells in self.rows:
+            table.add_row(*map(Text, cells))
+        return table
 
 
-def pair_cells(pair: Pair) -> list[str]:
-    """Cells under `PAIR_TITLES`."""
-    verdict = "second is behind" if pair.behind else "not told apart"
-    return [
-        pair.first,
-        pair.second,
-        millimetres(pair.difference),
-        interval_text(pair.interval, " to "),
-        f"{pair.p:.2g}",
-        f"{pair.p_holm:.2g}",
-        str(pair.objects),
-        verdict,
+def paper_table(paper: ReportedTable) -> TextTable:
+    """The rows of a table of others, errors with the two decimals of their tables."""
+    titles = {
+        f"{shown} {error.upper()}": f"{pixels}_{error}_mm"
+        for pixels, shown in (("object", "Object"), ("overall", "Overall"), ("background", "Backgr."))
+        for error in ("mae", "rmse")
+    }
+    rows = [
+        {
+            "Row": row.label,
+            "Track": row.track,
+            "Test samples": "-" if row.test_samples is None else str(row.test_samples),
+            **{title: f"{row.errors_mm[key]:.2f}" if key in row.errors_mm else "-" for title, key in titles.items()},
+        }
+        for row in paper.rows
     ]
+    return TextTable.of(f"{paper.name}: {paper.title}, mm", rows)
+
+
+def pair_row(pair: Pair) -> dict[str, str]:
+    """A pair's cells by the titles of their columns."""
+    return {
+        "First": pair.first,
+        "Second": pair.second,
+        "Second - first": millimetres(pair.difference),
+        "95% interval": interval_text(pair.interval, " to "),
+        "p": f"{pair.p:.2g}",
+        "p, Holm": f"{pair.p_holm:.2g}",
+        "Objects": str(pair.objects),
+        "Verdict": "second is behind" if pair.behind else "not told apart",
+    }
+
+
+def ranking_table(title: str, shown: Sequence[Column], rows: Sequence[Ranked]) -> TextTable:
+    """``rows`` of a ranking with the columns of ``shown`` that any of them has."""
+    shown = [column for column in shown if column.shown_for(rows)]
+    words = [number for number, column in enumerate(shown) if not column.right]
+    cells = [[column.text(row) for column in shown] for row in rows]
+    return TextTable(title, [column.title for column in shown], cells, words)
 
 
 def group_tables(groups: Sequence[Group], sort: str, with_pairs: bool = False) -> list[Table | Text]:
-    """A table for each group, ``with_pairs`` a second one of its pairs; without groups, how to begin. Submitted text
-    goes in as `Text`: it is never markup."""
+    """A table for each group, ``with_pairs`` a second one of its pairs; without groups, how to begin."""
     if not groups:
         return [Text(NO_RESULTS)]
     parts: list[Table | Text] = []
     for group in groups:
-        shown = [c for c in columns(sort) if c.from_width < ONLY_IN_FILES and c.shown_for(group.rows)]
-        titles = [(_two_lines(column.title), column.right) for column in shown]
-        table = _rich_table(group.title, titles, [[column.text(row) for column in shown] for row in group.rows])
-        table.names = 1 + shown.index(METHOD)
+        shown = [column for column in columns(sort) if column.from_width < ONLY_IN_FILES]
+        ranking = ranking_table(group.title, shown, group.rows)
         shown.reverse()  # of equal importance, the rightmost is left out first
-        table.first_out = [_two_lines(column.title) for column in sorted(shown, key=partial(_importance, sort))]
-        parts += [table, Text("".join(f"{note}\n" for note in group.notes))]
+        first_out = [_two_lines(column.title) for column in sorted(shown, key=partial(_importance, sort))]
+        titles = [*map(_two_lines, ranking.titles)]
+        names = 1 + titles.index(METHOD.title)
+        parts += [replace(ranking, titles=titles).rich(names=names, first_out=first_out)]
+        parts += [Text("".join(f"{note}\n" for note in group.notes))]
         if with_pairs and len(group.ranked) > MOST_PAIRED:
             parts.append(Text(f"The pairs of more than {MOST_PAIRED} ranked rows are not listed.\n"))
         elif with_pairs and group.pairs:
-            titles = [(title, number >= PAIR_TEXT_COLUMNS) for number, title in enumerate(PAIR_TITLES)]
-            table = _rich_table("Pairs of these rows", titles, map(pair_cells, group.pairs))
-            table.names, table.first_out, table.elsewhere = PAIR_TEXT_COLUMNS, PAIRS_FIRST_OUT, "--json FILE"
-            parts.append(table)
+            pairs = TextTable.of("Pairs of these rows", [*map(pair_row, group.pairs)])
+            parts.append(pairs.rich(names=2, first_out=PAIRS_FIRST_OUT, elsewhere="--json FILE"))
     return [*parts, Text(f"{NOTE}\n")]
 
 
@@ -96,23 +131,11 @@ def _importance(sort: str, column: Column) -> tuple[bool, int, int]:
     return is_sorted_by, -column.from_width, LAST_OUT.index(column.title) if column.title in LAST_OUT else -1
 
 
-def _rich_table(title: str, titles: Iterable[tuple[str, bool]], rows: Iterable[Sequence[str]]) -> Table:
-    """``titles`` of columns, and whether they are numbers."""
-    table = Table(title=Text(title), elsewhere="--markdown FILE")
-    for name, right in titles:
-        table.add_column(name, justify="right" if right else "left")
-    for cells in rows:
-        table.add_row(*map(Text, cells))
-    return table
-
-
-def paper_rich_tables(tables: Sequence[ReportedTable]) -> list[Table | Text]:
+def paper_rich_tables(papers: Sequence[ReportedTable]) -> list[Table | Text]:
     """The tables of others under their heading."""
-    parts: list[Table | Text] = [Text(REPORTED_HEADING, style="bold")] if tables else []
-    titles = [(title, number >= PAPER_TEXT_COLUMNS) for number, title in enumerate(PAPER_TITLES)]
-    for paper in tables:
-        table = _rich_table(f"{paper.name}: {paper.title}, mm", titles, map(paper_cells, paper.rows))
-        parts += [table, Text(f"{paper.note}\n")]
+    parts: list[Table | Text] = [Text(REPORTED_HEADING, style="bold")] if papers else []
+    for paper in papers:
+        parts += [paper_table(paper).rich(), Text(f"{paper.note}\n")]
     return parts
 
 
@@ -130,25 +153,17 @@ def markdown_rows(titles: Sequence[str], right: Sequence[bool], rows: Sequence[S
     return lines + ["| " + " | ".join(cells) + " |" for cells in rows]
 
 
-def markdown_columns(shown: Sequence[Column], rows: Sequence[Ranked]) -> list[str]:
-    """Lines of a Markdown table of ``rows``."""
-    shown = [column for column in shown if column.shown_for(rows)]
-    cells = [[markdown_text(column.text(row)) for column in shown] for row in rows]
-    return markdown_rows([column.title for column in shown], [column.right for column in shown], cells)
-
-
 def markdown(groups: Sequence[Group], papers: Sequence[ReportedTable], sort: str) -> str:
     """The whole leaderboard as Markdown, ending in a newline."""
     lines: list[str] = []
     for group in groups:
-        lines += [f"### {markdown_text(group.title)}", "", *markdown_columns(columns(sort), group.rows), ""]
+        table = ranking_table(group.title, columns(sort), group.rows)
+        lines += [f"### {markdown_text(table.title)}", "", *table.markdown(), ""]
         for note in group.notes:
             lines += [markdown_text(note), ""]
     lines += [NOTE.replace("*", "\\*"), ""] if groups else []
     lines += [f"### {REPORTED_HEADING}", ""] if papers else []
-    right = [number >= PAPER_TEXT_COLUMNS for number in range(len(PAPER_TITLES))]
     for paper in papers:
-        rows = [list(map(markdown_text, paper_cells(row))) for row in paper.rows]
-        lines += [markdown_text(f"{paper.name}: {paper.title}, mm"), "", *markdown_rows(PAPER_TITLES, right, rows), ""]
-        lines += [paper.note, ""]
+        table = paper_table(paper)
+        lines += [markdown_text(table.title), "", *table.markdown(), "", paper.note, ""]
     return "\n".join(lines).rstrip("\n") + "\n"

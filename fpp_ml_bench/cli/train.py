@@ -169,7 +169,10 @@ def reproduce_tables(
     outcome = run_reproduce(asked)
     for name, path in zip(tables, outcome.tables, strict=True):
         lines = reproduced.table_lines(name, outcome.jobs, folders, outcome.opened)
-        show(reproduced.table_rich(name, lines, preset), reproduced.conclusion(name, lines))
+        show(
+            reproduced.text_table(name, lines, preset).rich(elsewhere="the page below"),
+            reproduced.conclusion(name, lines),
+        )
         print(f"Written: {path}")
     if outcome.failed:
         each = "\n".join(f"  {name}: {why}" for name, why in outcome.failed.items())

@@ -74,7 +74,6 @@ def page_files(
         _PACKAGE,
         "index.html",
         **shared,
-        tables=tables,
         columns=columns,
         range_key=RANGE_KEY,
         errors=[(m.key, f"{m.column}, mm" if m.unit == "mm" else m.column) for m in with_column(0) if not m.role],
@@ -89,7 +88,7 @@ def page_files(
         not_said=NOT_SAID,
         fewest=FEWEST_OBJECTS,
         filters={name: (title, values) for name, (title, values) in filters.items() if len(values) > 1},
-        papers=[(f"{p.title}, mm", list(map(tables.paper_cells, p.rows)), p.note) for p in papers],
+        papers=[(f"{p.title}, mm", tables.paper_table(p), p.note) for p in papers],
     )
     about = "Ranking of single-shot fringe projection profilometry: depth error with intervals, run time and captures."
     index = page("FPP-ML-Bench leaderboard", body, style, script, about)
