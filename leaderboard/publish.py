@@ -5,7 +5,6 @@ The Hub ranks by the greatest value and knows no unit. So an error becomes a sco
 Own definition; 10 mm is the widest tolerance that this benchmark counts pixels within.
 """
 
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,7 +27,7 @@ from fpp_ml_bench.leaderboard.reported import chosen_tables
 from fpp_ml_bench.leaderboard.row_file import Row
 from fpp_ml_bench.leaderboard.rows import Entry, read_entry
 from fpp_ml_bench.leaderboard.tables import markdown_text
-from fpp_ml_bench.loaders.hub import MARK, Publication, mark_bytes, staged_files, yaml_text
+from fpp_ml_bench.loaders.hub import MARK, Publication, mark_bytes, yaml_text
 from fpp_ml_bench.loaders.hub_dataset import NAME, card_head
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
 from fpp_ml_bench.loaders.storage.parquet import PREVIEW
@@ -40,23 +39,6 @@ SCORE_HALF_MM = 10.0
 SCORE_TEXT = "score = 100 / (1 + object MAE / 10 mm), higher is better"
 _SCORE_DIGITS = 6
 CARD_FILE, EVAL_FILE, RESULT_FOLDER = "README.md", "eval.yaml", ".eval_results"
-_SUFFIXES = {
-    ".html",
-    ".css",
-    ".js",
-    ".mjs",
-    ".json",
-    ".csv",
-    ".txt",
-    ".svg",
-    ".png",
-    ".jpg",
-    ".webp",
-    ".avif",
-    ".ico",
-    ".woff2",
-}
-_LARGEST_BYTES = 1 << 30
 _BODY = """\
 # FPP-ML-Bench: single-shot fringe projection profilometry
 
@@ -172,35 +154,13 @@ def dataset_texts(dataset: DatasetFolder, repo: str, licence: str) -> dict[str, 
     return {CARD_FILE: card_head(dataset, licence) + body, EVAL_FILE: yaml_text(evaluation)}
 
 
-def write_page_of(results: Sequence[Path], folder: Path) -> None:
-    """Write the page of result and row files, or of the rows shipped with the package where none are named. Nothing is
-    looked for in the current folder. Raises SubmissionError for a file that is no sound result."""
+def stage_page(results: Sequence[Path], repo: str, folder: Path, dataset_repo: str | None = None) -> Publication:
+    """Write the page of result and row files, or of the rows shipped with the package where none are named, and the
+    Space's README into ``folder``; ``dataset_repo`` is linked from it. Nothing is looked for in the current folder.
+    Raises SubmissionError for a file that is no sound result."""
     rows = expand(results) if results else shipped_rows()
     settings = None if results else shipped_tradeoff()
     write_page(rank(read_entries(rows)), chosen_tables(None), folder, settings)
-
-
-def stage_page(page: Path, repo: str, folder: Path, dataset_repo: str | None = None) -> Publication:
-    """Copy the page in folder ``page`` to ``folder`` and add the Space's README; ``dataset_repo`` is linked from it.
-    Raises `PublishError` for a folder without ``index.html``, or with a file that belongs to no page: a Space publishes
-    every file."""
-    if not (page / INDEX).is_file():
-        raise PublishError(f"{page}: expected a page with {INDEX}; write one with: fpp-bench leaderboard --page {page}")
-    files = staged_files(page)
-    for name, path in files.items():
-        hidden = any(part.startswith(".") for part in Path(name).parts)
-        if hidden or path.suffix.lower() not in _SUFFIXES or name in (CARD_FILE, MARK):
-            raise PublishError(
-                f"{printable(str(path), 300)}: is no part of a page (expected {', '.join(sorted(_SUFFIXES))}); a Space "
-                "publishes every file, so move it out"
-            )
-    total = sum(path.stat().st_size for path in files.values())
-    if total > _LARGEST_BYTES:
-        raise PublishError(f"{page}: {total:,} bytes; a static Space holds at most {_LARGEST_BYTES:,}")
-    for name, path in files.items():
-        target = folder / name
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(path, target)
     head: dict[str, Any] = {
         "title": "FPP-ML-Bench leaderboard",
         "emoji": "📐",
@@ -217,8 +177,7 @@ def stage_page(page: Path, repo: str, folder: Path, dataset_repo: str | None = N
     body = f"The page is `{INDEX}`, written by `fpp-bench leaderboard`, sent by `fpp-bench publish`.\n"
     (folder / CARD_FILE).write_bytes(f"---\n{yaml_text(head, allow_unicode=True)}---\n{body}".encode())
     (folder / MARK).write_bytes(mark_bytes("leaderboard"))
-    owned = {f"{Path(name).parts[0]}/" for name in files if "/" in name} | {f"{SUBMISSIONS}/"}
-    return Publication("space", repo, folder, "FPP-ML-Bench leaderboard", tuple(sorted(owned)))
+    return Publication("space", repo, folder, "FPP-ML-Bench leaderboard", (f"{SUBMISSIONS}/",))
 
 
 def stage_results(

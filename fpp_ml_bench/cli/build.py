@@ -126,7 +126,7 @@ def build(settings: BuildCommandSettings) -> None:
     frames = len(assembly.manifest.stored_frames)
     out, steps = settings.out, list[int]()
     started = perf_counter()
-    with progress_bar("building", rows, "images", frames) as advance:
+    with progress_bar("building", rows, "samples") as advance:
 
         def count(finished: int) -> None:
             steps.append(finished)

@@ -18,25 +18,13 @@ WIDTH_IN_PIPES = 140
 
 
 @contextmanager
-def progress_bar(title: str, total: int, unit: str, per_step: int = 1) -> Iterator[Callable[[int], None]]:
-    """A rich progress bar over ``total`` steps; yields the function that advances it. Shows the time left and the rate
-    of ``unit``, of which a step counts ``per_step`` (52 images a sample)."""
-    from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
+def progress_bar(title: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
+    """A rich progress bar over ``total`` steps, each a ``unit``, on standard error, with the time left; yields the
+    function that advances it."""
+    from rich.progress import MofNCompleteColumn, Progress, TextColumn
 
-    class Rate(ProgressColumn):
-        def render(self, task: object) -> Text:
-            speed = getattr(task, "speed", None) or getattr(task, "finished_speed", None)
-            return Text(f"{speed * per_step:,.0f} {unit}/s" if speed else "", style="cyan")
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TaskProgressColumn(),
-        TextColumn("{task.completed:.0f}/{task.total:.0f}"),
-        Rate(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    counted = MofNCompleteColumn(), TextColumn(unit)
+    with Progress(*Progress.get_default_columns(), *counted, console=Console(stderr=True)) as progress:
         task = progress.add_task(title, total=total)
         yield lambda steps: progress.advance(task, steps)
 

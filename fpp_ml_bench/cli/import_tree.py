@@ -120,7 +120,7 @@ def _import_captures(settings: ImportSettings) -> None:
     )
     count, images = len(plan.reader.captures), len(plan.reader.rig.sequence)
     started = perf_counter()
-    with progress_bar("importing", count, "images", images) as advance:
+    with progress_bar("importing", count, "samples") as advance:
         manifest = import_captures(settings.out, plan, settings.workers or usable_cores(), advance)
     _print_captures(manifest)
     _print_end(settings.out, manifest, images, perf_counter() - started, capture_notes(manifest))
@@ -164,7 +164,7 @@ def _import_tree(settings: ImportSettings) -> None:
     sample_count = len(plan.reader.tree.by_name)
     images = len(plan.assembly.manifest.stored_frames)
     started = perf_counter()
-    with progress_bar("importing", sample_count, "images", images) as advance:
+    with progress_bar("importing", sample_count, "samples") as advance:
         manifest = import_published(settings.out, plan, settings.workers or usable_cores(), advance)
     _print_end(settings.out, manifest, images, perf_counter() - started, import_notes(manifest))
     if rig is None:

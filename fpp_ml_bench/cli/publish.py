@@ -5,6 +5,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from fpp_ml_bench.cli import Program
+from fpp_ml_bench.cli.console import gigabytes, progress_bar
 from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.files import printable
@@ -39,37 +40,20 @@ _SIGNS = {"new": "+", "changed": "~", "deleted": "-", "unchanged": " "}
 
 
 @dataclass(frozen=True, kw_only=True)
-class RepositorySettings:
-    """Settings of all three: where to publish, and whether to."""
+class Repository:
+    """Where to publish, and whether to."""
 
-    repo: str = option(REQUIRED, "repository on the Hub", "OWNER/NAME")
+    private = adopt = False
+    repo: str = option(REQUIRED, "repository on the Hub", "OWNER/NAME", parse=hub_client.check_repo_name)
     dry_run: bool = option(False, "print what would change and send nothing")
-
-    def __post_init__(self) -> None:
-        for repo in (self.repo, getattr(self, "dataset_repo", None)):
-            if repo is not None:
-                hub_client.check_repo_name(repo)
 
 
 @dataclass(frozen=True, kw_only=True)
-class FilledSettings(RepositorySettings):
-    """Settings of what fills a whole repository."""
+class FilledRepository(Repository):
+    """A repository that is filled as a whole."""
 
     private: bool = option(False, "make the repository private if it is new")
     adopt: bool = option(False, "publish into a repository that was not filled by this command")
-
-
-@dataclass(frozen=True, kw_only=True)
-class DatasetSettings(FilledSettings):
-    """Settings of `publish_dataset`."""
-
-    dataset: Path = argument("folder of the dataset", "DATASET")
-    license: str | None = option(None, "licence on the card (default: mit; imported data needs one)", "ID")
-    staging: Path | None = option(
-        None,
-        "put the files together in DIR and keep them, so that a later run continues (default: a temporary folder)",
-        "DIR",
-    )
 
 
 @command(
@@ -78,43 +62,37 @@ fpp-bench publish dataset data/mini --repo me/fpp-mini --dry-run      what would
 fpp-bench publish dataset data/full --repo me/fpp --staging staged    continues where an earlier run stopped
 """
 )
-def publish_dataset(settings: DatasetSettings) -> None:
+def publish_dataset(
+    *,
+    dataset: Path = argument("folder of the dataset", "DATASET"),
+    license: str | None = option(None, "licence on the card (default: mit; imported data needs one)", "ID"),
+    staging: Path | None = option(
+        None,
+        "put the files together in DIR and keep them, so that a later run continues (default: a temporary folder)",
+        "DIR",
+    ),
+    target: FilledRepository,
+) -> None:
     """Publish a built or imported dataset: Parquet that the Hub's viewer shows, card, meshes.
 
     Raises FppBenchError for files that can't be published and for errors of the Hub or the network."""
     hub = hub_client.Hub()
-    from fpp_ml_bench.cli.console import progress_bar  # imports rich, which --help must not
-
-    dataset = DatasetFolder(settings.dataset)
-    licence = hub_dataset.dataset_licence(dataset, settings.license)
-    remote = _remote(settings, hub, "dataset")
-    texts = board_publish.dataset_texts(dataset, settings.repo, licence)
-    rows = sum(len(samples) for samples in dataset.splits.values())
-    with hub_dataset.staging_folder(settings.staging, dataset.fingerprint) as folder:
+    opened = DatasetFolder(dataset)
+    licence = hub_dataset.dataset_licence(opened, license)
+    remote = _remote(target, hub, "dataset")
+    texts = board_publish.dataset_texts(opened, target.repo, licence)
+    rows = sum(len(samples) for samples in opened.splits.values())
+    with hub_dataset.staging_folder(staging, opened.fingerprint) as folder:
         try:
             with progress_bar("preparing", rows, "samples") as advance:
                 stage = hub_dataset.stage_dataset
-                publication = stage(dataset, settings.repo, folder, texts, usable_cores(), advance)
+                publication = stage(opened, target.repo, folder, texts, usable_cores(), advance)
         except OSError as error:
             raise PublishError(
                 f"can't put the files together in {folder} ({error.strerror or error}); free some space, or give a "
                 "folder on another disk with --staging"
             ) from error
-        _carry_out(settings, hub, publication, remote)
-
-
-@dataclass(frozen=True, kw_only=True)
-class LeaderboardSettings(FilledSettings):
-    """Settings of `publish_leaderboard`."""
-
-    results: tuple[Path, ...] = argument(
-        "result or row files, or folders of them (default: the rows shipped with the package)",
-        "RESULT.json",
-        (),
-        many=True,
-    )
-    page: Path | None = option(None, "an existing page instead of results", "DIR")
-    dataset_repo: str | None = option(None, "dataset that the Space links to", "OWNER/NAME")
+        _carry_out(target, hub, publication, remote)
 
 
 @command(
@@ -122,26 +100,24 @@ class LeaderboardSettings(FilledSettings):
 fpp-bench publish leaderboard --repo me/fpp-leaderboard --dataset-repo me/fpp
 """
 )
-def publish_leaderboard(settings: LeaderboardSettings) -> None:
+def publish_leaderboard(
+    *,
+    results: tuple[Path, ...] = argument(
+        "result or row files, or folders of them (default: the rows shipped with the package)",
+        "RESULT.json",
+        (),
+        many=True,
+    ),
+    dataset_repo: str | None = option(
+        None, "dataset that the Space links to", "OWNER/NAME", parse=hub_client.check_repo_name
+    ),
+    target: FilledRepository,
+) -> None:
     """Publish the leaderboard's page as a static Space."""
     hub = hub_client.Hub()
-    if settings.page is not None and settings.results:
-        raise PublishError("expected result files or --page, got both; give one of them")
-    with TemporaryDirectory(prefix="fpp-bench-publish-") as folder, TemporaryDirectory() as written:
-        if settings.page is None:
-            board_publish.write_page_of(settings.results, Path(written))
-        page = settings.page or Path(written)
-        publication = board_publish.stage_page(page, settings.repo, Path(folder), settings.dataset_repo)
-        _carry_out(settings, hub, publication, _remote(settings, hub, "space"))
-
-
-@dataclass(frozen=True, kw_only=True)
-class ResultSettings(RepositorySettings):
-    """Settings of `publish_results`."""
-
-    results: tuple[Path, ...] = argument("result files of fpp-eval", "RESULT.json", many=True)
-    dataset_repo: str = option(REQUIRED, "published dataset that the results were scored on", "OWNER/NAME")
-    source_url: str | None = option(None, "https address where the results come from", "URL")
+    with TemporaryDirectory(prefix="fpp-bench-publish-") as folder:
+        publication = board_publish.stage_page(results, target.repo, Path(folder), dataset_repo)
+        _carry_out(target, hub, publication, _remote(target, hub, "space"))
 
 
 @command(
@@ -149,48 +125,53 @@ class ResultSettings(RepositorySettings):
 fpp-bench publish results result.json --repo me/my-model --dataset-repo me/fpp
 """
 )
-def publish_results(settings: ResultSettings) -> None:
+def publish_results(
+    *,
+    results: tuple[Path, ...] = argument("result files of fpp-eval", "RESULT.json", many=True),
+    dataset_repo: str = option(
+        REQUIRED,
+        "published dataset that the results were scored on",
+        "OWNER/NAME",
+        parse=hub_client.check_repo_name,
+    ),
+    source_url: str | None = option(None, "https address where the results come from", "URL"),
+    target: Repository,
+) -> None:
     """Publish results as .eval_results/*.yaml of a model's repository."""
     hub = hub_client.Hub()
-    remote = _remote(settings, hub, "model")
-    dataset = hub.state("dataset", settings.dataset_repo)
-    content = hub.mark("dataset", settings.dataset_repo, dataset).get("content")
-    scored_on = settings.dataset_repo, dataset.commit or "", content, settings.source_url
+    remote = _remote(target, hub, "model")
+    dataset = hub.state("dataset", dataset_repo)
+    content = hub.mark("dataset", dataset_repo, dataset).get("content")
+    scored_on = dataset_repo, dataset.commit or "", content, source_url
     with TemporaryDirectory(prefix="fpp-bench-publish-") as folder:
-        publication = board_publish.stage_results(settings.results, settings.repo, Path(folder), *scored_on)
-        _carry_out(settings, hub, publication, remote)
+        publication = board_publish.stage_results(results, target.repo, Path(folder), *scored_on)
+        _carry_out(target, hub, publication, remote)
 
 
-def _remote(settings: RepositorySettings, hub: "hub_client.Hub", kind: "hub_client.Kind") -> "hub_client.Remote":
+def _remote(target: Repository, hub: hub_client.Hub, kind: hub_client.Kind) -> hub_client.Remote:
     """The current state of the repository, after checking that token, owner and visibility allow the run."""
-    names = set() if settings.dry_run else hub.check_token()
-    remote = hub.state(kind, settings.repo)
+    names = set() if target.dry_run else hub.check_token()
+    remote = hub.state(kind, target.repo)
     if not remote.exists and kind == "model":
         raise PublishError(
-            f"{settings.repo}: no such model on {hub.endpoint}, or this token may not see it; make it first"
+            f"{target.repo}: no such model on {hub.endpoint}, or this token may not see it; make it first"
         )
-    if not remote.exists and not settings.dry_run:
-        hub.check_may_create(settings.repo, names)
-    if remote.exists and not remote.private and getattr(settings, "private", False):
-        raise PublishError(f"{settings.repo}: --private was asked for, but this {kind} exists and is public")
+    if not remote.exists and not target.dry_run:
+        hub.check_may_create(target.repo, names)
+    if remote.exists and not remote.private and target.private:
+        raise PublishError(f"{target.repo}: --private was asked for, but this {kind} exists and is public")
     return remote
 
 
 def _carry_out(
-    settings: RepositorySettings,
-    hub: "hub_client.Hub",
-    publication: "hub_client.Publication",
-    remote: "hub_client.Remote",
+    target: Repository, hub: hub_client.Hub, publication: hub_client.Publication, remote: hub_client.Remote
 ) -> None:
     """Print what changes and send it, unless nothing changes or this is a dry run."""
-    from fpp_ml_bench.cli.console import gigabytes, progress_bar
-
-    private = getattr(settings, "private", False)
-    hub_client.check_replaceable(publication, remote, getattr(settings, "adopt", False))
+    hub_client.check_replaceable(publication, remote, target.adopt)
     planned = hub_client.changes(publication, remote)
-    visibility = "private" if (remote.private if remote.exists else private) else "public"
-    kind = publication.kind
-    print(f"{kind} {hub.url(kind, publication.repo)} ({'' if remote.exists else 'new, '}{visibility})")
+    visibility = "private" if (remote.private if remote.exists else target.private) else "public"
+    url = hub.url(publication.kind, publication.repo)
+    print(f"{publication.kind} {url} ({'' if remote.exists else 'new, '}{visibility})")
     for change in planned:
         size = gigabytes(change.bytes)
         print(f"  {_SIGNS[change.status]} {change.status:<9}  {size:>9}  {printable(change.path, 300)}")
@@ -198,9 +179,8 @@ def _carry_out(
     counts = [f"{len(sizes)} {status} ({gigabytes(sum(sizes))})" for status, sizes in bytes_of.items() if sizes]
     print(f"{len(planned)} files: {', '.join(counts)}")
     nothing = all(change.status == "unchanged" for change in planned)
-    if nothing or settings.dry_run:
+    if nothing or target.dry_run:
         print("Nothing to send: the Hub has all files." if nothing else "Dry run: nothing was sent.")
         return
     with progress_bar("sending", sum(bytes_of["new"] + bytes_of["changed"]), "bytes") as advance:
-        url = hub.send(publication, planned, remote, private, advance)
-    print(f"Published: {url}")
+        print(f"Published: {hub.send(publication, planned, remote, target.private, advance)}")

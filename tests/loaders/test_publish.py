@@ -187,7 +187,6 @@ def test_refusals(client, small, tmp_path):
     client.server.repos["datasets", "raced/fpp"] = Repo()
     (tmp_path / "occupied").mkdir()
     (tmp_path / "occupied" / "thesis.tex").write_text("mine")
-    (tmp_path / "page").mkdir()
     cases = [
         ([*good, "nobody"], "OWNER/NAME"),
         ([*good, "a/b/c"], "OWNER/NAME"),
@@ -201,7 +200,6 @@ def test_refusals(client, small, tmp_path):
         ([*good, "alice/new", "--staging", str(tmp_path / "occupied")], "holds files"),
         ([*good, "alice/new", "--license", "all rights: reserved"], "--license"),
         (["dataset", str(tmp_path), "--repo", "alice/new"], "no dataset"),
-        (["leaderboard", "--page", str(tmp_path / "page"), "--repo", "alice/new"], "index.html"),
         (["results", "r.json", "--repo", "alice/none", "--dataset-repo", "alice/public"], "no such model"),
     ]
     client.server.writes()
