@@ -43,16 +43,20 @@ from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import Robustness
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.leaderboard import columns
-from fpp_ml_bench.leaderboard.assumptions import assumption, told
 from fpp_ml_bench.leaderboard.columns import NOT_CHECKED, Column, device, error
-from fpp_ml_bench.leaderboard.groups import Group
-from fpp_ml_bench.leaderboard.names import short_names
+from fpp_ml_bench.leaderboard.groups import Group, more_than_trivial
+from fpp_ml_bench.leaderboard.names import assumption, short_names, told
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
-from fpp_ml_bench.leaderboard.reported import PAPER_DEPTHS, REPORTED_HEADING, chosen_tables
 from fpp_ml_bench.leaderboard.row_file import row_json, write_row
 from fpp_ml_bench.leaderboard.rows import VOUCHED, Entry, read_entry, vouching_line
-from fpp_ml_bench.leaderboard.tables import markdown_rows, markdown_text, ranking_table
-from fpp_ml_bench.leaderboard.trivial import more_than_trivial
+from fpp_ml_bench.leaderboard.tables import (
+    PAPER_DEPTHS,
+    REPORTED_HEADING,
+    chosen_tables,
+    markdown_rows,
+    markdown_text,
+    ranking_table,
+)
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 ROOT = Path(__file__).resolve().parent.parent

@@ -7,8 +7,8 @@ from functools import partial
 from fpp_ml_bench.evaluation.metrics import METRICS, RANGE_KEY, RANK_KEY, WIDE, WIDEST, with_column
 from fpp_ml_bench.evaluation.report.html import millimetres, percent, score_text, seconds
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.leaderboard.assumptions import assumption, learned_from
 from fpp_ml_bench.leaderboard.groups import TEST, UNSEEN, Ranked
+from fpp_ml_bench.leaderboard.names import assumption, learned_from
 from fpp_ml_bench.leaderboard.row_file import processor
 from fpp_ml_bench.leaderboard.rows import Entry
 

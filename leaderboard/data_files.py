@@ -11,10 +11,10 @@ from typing import Any
 
 from fpp_ml_bench.evaluation.metrics import HEADLINE, WIDE, with_column
 from fpp_ml_bench.evaluation.metrics import RANK_KEY as _MAIN
-from fpp_ml_bench.leaderboard.assumptions import learned_from, told
 from fpp_ml_bench.leaderboard.columns import device, uncertainty
 from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, TEST, UNSEEN, Group, Ranked
-from fpp_ml_bench.leaderboard.reported import ReportedTable
+from fpp_ml_bench.leaderboard.names import learned_from, told
+from fpp_ml_bench.leaderboard.tables import ReportedTable
 
 _FORMULA = re.compile(r"[^\w=+@-]*[=+@-]")
 """A sign that begins a formula, before any letter or digit: behind spaces, quotes, a byte order mark."""

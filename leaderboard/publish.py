@@ -20,13 +20,12 @@ from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.evaluation.protocol import Track
 from fpp_ml_bench.evaluation.report.html import millimetres, percent
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.leaderboard.assumptions import told
+from fpp_ml_bench.leaderboard.names import told
 from fpp_ml_bench.leaderboard.page.page import INDEX, SUBMISSIONS, write_page
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
-from fpp_ml_bench.leaderboard.reported import chosen_tables
 from fpp_ml_bench.leaderboard.row_file import Row
 from fpp_ml_bench.leaderboard.rows import Entry, read_entry
-from fpp_ml_bench.leaderboard.tables import markdown_text
+from fpp_ml_bench.leaderboard.tables import chosen_tables, markdown_text
 from fpp_ml_bench.loaders.hub import MARK, Publication, mark_bytes, yaml_text
 from fpp_ml_bench.loaders.hub_dataset import NAME, card_head
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME

@@ -14,11 +14,10 @@ from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS, RANK_KEY, sort_ke
 from fpp_ml_bench.evaluation.score.uncertainty import FEWEST_OBJECTS
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import rows
-from fpp_ml_bench.leaderboard.groups import UNSEEN, Group, GroupKey, Ranked, is_unseen, rank_ranges
+from fpp_ml_bench.leaderboard.groups import UNSEEN, Group, GroupKey, Ranked, is_unseen, rank_ranges, with_ratios
 from fpp_ml_bench.leaderboard.names import short_names
 from fpp_ml_bench.leaderboard.row_file import name_key
 from fpp_ml_bench.leaderboard.rows import LOCAL, MEANING, SELF_REPORTED, Entry, read_entry
-from fpp_ml_bench.leaderboard.trivial import with_ratios
 
 DEFAULT_SORT = RANK_KEY
 

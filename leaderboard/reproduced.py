@@ -24,10 +24,9 @@ from fpp_ml_bench.evaluation.result.file import write_file
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 from fpp_ml_bench.leaderboard.columns import device
-from fpp_ml_bench.leaderboard.reported import PAPER_DEPTHS, paper_tables
 from fpp_ml_bench.leaderboard.row_file import Row, row_of, view_means, write_row
 from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEASURED_HERE, Entry, read_entry
-from fpp_ml_bench.leaderboard.tables import TextTable, markdown_text
+from fpp_ml_bench.leaderboard.tables import PAPER_DEPTHS, TextTable, markdown_text, paper_tables
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 _NOT_IN_THE_PAPER = {

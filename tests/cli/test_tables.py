@@ -13,8 +13,7 @@ from fpp_ml_bench.evaluation.report.terminal import comparison_table, result_tab
 from fpp_ml_bench.evaluation.score.evaluator import evaluate as evaluate_folder
 from fpp_ml_bench.leaderboard.ranking import rank as rank_files
 from fpp_ml_bench.leaderboard.ranking import read_entries, shipped_rows
-from fpp_ml_bench.leaderboard.reported import chosen_tables
-from fpp_ml_bench.leaderboard.tables import group_tables, paper_rich_tables
+from fpp_ml_bench.leaderboard.tables import chosen_tables, group_tables, paper_rich_tables
 from fpp_ml_bench.tables import Table
 
 WIDTHS = (80, 100, 120, 200)

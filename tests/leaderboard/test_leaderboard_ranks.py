@@ -19,10 +19,10 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, Track
 from fpp_ml_bench.evaluation.score.uncertainty import sign_flip_bounds, sign_flip_p
 from fpp_ml_bench.evaluation.submission.description import LearnedFrom, Submission
-from fpp_ml_bench.leaderboard.assumptions import learned_from, told
 from fpp_ml_bench.leaderboard.columns import columns, uncertainty
 from fpp_ml_bench.leaderboard.data_files import table_json
 from fpp_ml_bench.leaderboard.groups import behind, pairs
+from fpp_ml_bench.leaderboard.names import learned_from, told
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.leaderboard.row_file import RowUncertainty, _uncertainty, write_row
 

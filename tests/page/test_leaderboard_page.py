@@ -19,9 +19,9 @@ from fpp_ml_bench.cli import leaderboard as leaderboard_command
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.report.html import escaped, page
 from fpp_ml_bench.leaderboard.page.page import page_files, slug
-from fpp_ml_bench.leaderboard.page.pictures import overview
+from fpp_ml_bench.leaderboard.page.sections import overview
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries
-from fpp_ml_bench.leaderboard.reported import chosen_tables
+from fpp_ml_bench.leaderboard.tables import chosen_tables
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,6 @@ from fpp_ml_bench.cli import train as command
 from fpp_ml_bench.errors import DatasetError, RecipeError
 from fpp_ml_bench.evaluation.report.comparison import compare
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
-from fpp_ml_bench.leaderboard.reported import paper_tables
 from fpp_ml_bench.leaderboard.reproduced import (
     Line,
     Ordering,
@@ -29,6 +28,7 @@ from fpp_ml_bench.leaderboard.reproduced import (
 )
 from fpp_ml_bench.leaderboard.row_file import row_of
 from fpp_ml_bench.leaderboard.rows import Entry
+from fpp_ml_bench.leaderboard.tables import paper_tables
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from fpp_ml_bench.baselines.training.recipe import (
     table_rows,
 )
 from fpp_ml_bench.errors import RecipeError
-from fpp_ml_bench.leaderboard.reported import paper_tables
+from fpp_ml_bench.leaderboard.tables import paper_tables
 
 NAMES = [f"{table}/{row}" for table in TABLES for row in table_rows(table)]
 
