@@ -6,7 +6,7 @@ over all pairs of the table, and the ranks that follow.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 from statistics import fmean
@@ -131,7 +131,6 @@ class Ranked:
     worst_rank: int | None = None
     place: int | None = None
     ratio: float | None = None
-    _intervals: dict[str, Interval | None] = field(default_factory=dict, compare=False, repr=False)
 
     @property
     def ranks(self) -> str:
@@ -166,11 +165,11 @@ class Ranked:
 
     def interval(self, key: str) -> Interval | None:
         """The 95% interval of ``key`` over all objects of the row; None where it has none."""
-        if self.unseen is None:
-            return self.entry.row.intervals.of(key)
-        if key not in self._intervals:
-            self._intervals[key] = interval_over(self.objects, key) if key in HEADLINE else None
-        return self._intervals[key]
+        return self.entry.row.intervals.of(key) if self.unseen is None else self._joined.get(key)
+
+    @cached_property
+    def _joined(self) -> dict[str, Interval | None]:
+        return {key: interval_over(self.objects, key) for key in HEADLINE}
 
     def object_means(self, key: str) -> dict[str, float]:
         """Mean of a headline score over the views of each object that has one."""

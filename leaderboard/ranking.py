@@ -3,6 +3,7 @@ that the maintainers vouch for are ranked; in a table without any, those that ar
 
 import math
 import operator
+from bisect import bisect_left
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -87,16 +88,15 @@ def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
         return value is None, *ranks, 0.0 if value is None else turned(value), row.entry.name
 
     shown.sort(key=by_rank)
-    whole = [row for row in shown if row.unseen is not None or not key.takes_unseen]
-    complete = [row for row in whole if row.value(sort) is not None]
+    complete = [row for row in shown if (row.unseen or not key.takes_unseen) and row.value(sort) is not None]
     family = [row for row in complete if row.entry.vouched] or [row for row in complete if row.provenance == LOCAL]
     if why := _no_ranks(key, shown, complete, family, sort):
         return Group(key, tuple(shown), sort, (why, *notes))
     objects = sorted(family[0].object_means(sort))
     errors = np.array([[row.object_means(sort)[name] for name in objects] for row in family])
     ranges = dict(zip(map(id, family), rank_ranges(errors), strict=True))
-    values = np.sort([row.value(sort) for row in family])  # type: ignore[type-var]
-    places = {id(row): 1 + int(np.searchsorted(values, row.value(sort))) for row in complete}  # type: ignore[arg-type]
+    values = sorted(row.value(sort) or 0.0 for row in family)
+    places = {id(row): 1 + bisect_left(values, row.value(sort) or 0.0) for row in complete}
     for number, row in enumerate(shown):
         best, worst = ranges.get(id(row), (None, None))
         shown[number] = replace(row, best_rank=best, worst_rank=worst, place=places.get(id(row)))

@@ -46,12 +46,9 @@ def write_measured(result: Result, path: Path) -> None:
     write_row(row_of(result, path), path)
 
 
-def row_that_holds(path: Path, opened: DatasetFolder, weights_sha256: str) -> Entry | None:
-    """The row in ``path`` if it is sound, of this dataset and these weights; else None."""
-    return _row_with(path, opened, "weights_sha256", weights_sha256)
-
-
-def _row_with(path: Path, opened: DatasetFolder, setting: str, value: str) -> Entry | None:
+def row_that_holds(path: Path, opened: DatasetFolder, value: str, setting: str = "weights_sha256") -> Entry | None:
+    """The row in ``path`` if it is sound, of this dataset, and of a submission with this ``value`` of a ``setting``;
+    else None."""
     entry = _sound_row(path)
     holds = entry is not None and _is_of(entry, opened) and entry.row.submission.settings.get(setting) == value
     return entry if holds else None
@@ -130,7 +127,7 @@ def _weights_sha256(recipe: Recipe, folders: Folders, opened: DatasetFolder) -> 
     if state_of(folders.training(recipe)) != "missing":
         return None
     main_row = folders.row(recipe, variants(recipe)[0])
-    entry = _row_with(main_row, opened, "recipe_digest", recipe.digest)
+    entry = row_that_holds(main_row, opened, recipe.digest, "recipe_digest")
     sha256 = None if entry is None else entry.row.submission.settings.get("weights_sha256")
     return sha256 if isinstance(sha256, str) else None
 
