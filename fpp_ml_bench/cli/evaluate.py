@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fpp_ml_bench.cli import CHECK_FAILED, OK
-from fpp_ml_bench.cli.options import SPLITS, Explain, command, value
+from fpp_ml_bench.cli.options import SPLITS, command, value
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, MODES, TARGETS
 from fpp_ml_bench.files import printable
@@ -61,18 +61,15 @@ def score_folder(
     ),
     json: Path | None = option(None, "write the result here, per-sample scores included; - is standard output", "FILE"),
     page: Path | None = option(None, "write an HTML page with figures into this folder", "DIR", flag="--report"),
-    account: Explain,
 ) -> None:
     """Score a folder of predictions: MAE and RMSE in mm over the full grid, the object and the background.
 
     Raises FppBenchError for anything that can't be scored."""
     from fpp_ml_bench.evaluation.result.file import write_result
     from fpp_ml_bench.evaluation.score.evaluator import evaluate as evaluate_folder
-    from fpp_ml_bench.evaluation.score.evaluator import explain_eval
     from fpp_ml_bench.loaders.storage.benchmark import benchmark_sentence
 
     prepare_process()
-    account.check()
     _check_outputs(json, page, predictions)
     opened, split = scored_data(predictions, dataset, split)
     scored = evaluate_folder(
@@ -99,7 +96,6 @@ def score_folder(
     has_expected_bytes, sentence = benchmark_sentence(opened.manifest)
     if not has_expected_bytes:
         print(f"fpp-eval: warning: {opened.path}: {sentence}", file=sys.stderr)
-    account.say(lambda: explain_eval(opened, split, target, edge_band))
 
 
 def _result_table() -> "Callable[[Result], Any]":
