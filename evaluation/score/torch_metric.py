@@ -3,8 +3,8 @@
 Every sample is scored by `fpp_ml_bench.evaluation.score.sample_scores.score_sample`, on the processor, and `compute` is
 the plain mean over samples. The state is a sum and a count for each score. Any batches, order, device or number of
 processes therefore give the same numbers, up to the rounding of adding a few hundred float64 values. A sampler that
-repeats samples to fill the last batch (``DistributedSampler`` without ``drop_last``) changes the mean; give each process
-its own samples instead.
+repeats samples to fill the last batch (``DistributedSampler`` without ``drop_last``) changes the mean; give each
+process its own samples instead.
 
 Included are the metrics whose entry says ``training``; those of edge bands need the depth edges of every target.
 """

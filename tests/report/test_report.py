@@ -18,8 +18,7 @@ from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.report.figures import (
     CLIP_PERCENTILE,
-    bins,
-    nice_step,
+    errors_figure,
     palette_png,
     sample_panels,
 )
@@ -58,9 +57,10 @@ def test_page_shows_the_best_the_median_and_the_worst(dataset, scored, tmp_path)
     headings = re.findall(r"<h3>(.*?): (.*?)</h3>", text)
     assert headings[0] == ("Best", samples[0]) and headings[-1] == ("Worst", samples[-1])
     assert ("Median", samples[round(0.5 * 7)]) in headings and len(headings) == 5
-    assert len(re.findall(r'<img src="data:image/png;base64,[^"]+" alt="[^"]{20,}"', text)) == 5 * 5
+    assert len(re.findall(r'<img src="data:image/png;base64,[^"]+" alt="[^"]{20,}"', text)) == 1 + 5 * 5
     assert "A &lt;b&gt;method&lt;/b&gt;" in text and "<b>" not in text
     assert f"mean {statistics.fmean(range(1, 9)):.3f} mm" in text
+    assert "95% interval" in text and "Every sample, the largest object MAE first" in text
     outside = [
         address for address in re.findall(r'(?:src|href)="([^"]*)"', text) if not address.startswith(("data:", "#"))
     ]
@@ -118,17 +118,10 @@ def test_flat_and_empty_samples_have_panels(value):
         assert decoded(panel.png).shape == (8, 8, 4) and "nan" not in panel.high + panel.low + panel.description
 
 
-@given(st.lists(st.floats(0, 1e6), min_size=1, max_size=60))
-@settings(max_examples=200, deadline=None)
-def test_histogram_counts_every_sample_once(values):
-    edges, counts = bins(values)
-    assert sum(counts) == len(values) and len(edges) == len(counts) + 1
-    assert edges[0] <= min(values) and max(values) <= edges[-1] * (1 + 1e-12)
-    assert np.allclose(np.diff(edges), edges[1] - edges[0]) and len(counts) <= 40
-
-
-def test_steps_are_round():
-    assert [nice_step(span, 5) for span in (5, 6, 11, 14, 0.03)] == [1, 2, 2.5, 5, 0.01]
+@pytest.mark.parametrize("errors", [[1.0], [0.0, 0.0], [2.0, np.nextafter(2.0, 3)], [1e-320, 1e-300], [0.0, 1e30]])
+def test_any_errors_have_a_figure(errors):
+    image = decoded(base64.b64decode(errors_figure(errors, None).removeprefix("data:image/png;base64,")))
+    assert image.shape[0] > 200 and image[..., :3].min() < 100
 
 
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 99))
@@ -191,7 +184,7 @@ def test_command_and_browser(dataset, tmp_path):
             assert browser.run("document.documentElement.scrollWidth") <= width
             assert browser.run("typeof hacked") == "undefined"
             assert browser.run("[...document.images].every(i => i.complete && i.naturalWidth > 0)") is True
-            assert browser.run("document.images.length") == 4 * (5 + 4)
+            assert browser.run("document.images.length") == 1 + 4 * (5 + 4)
     finally:
         browser.close()
     text = page.read_text()
