@@ -174,9 +174,8 @@ def init(
     from fpp_ml_bench.evaluation.submission.description import write_template
 
     print(f"Written: {write_template(predictions)}")
-    print(
-        f"next: fill it in, write one {{sample}}.npy for each sample beside it, then: fpp-eval check {predictions} DATASET"
-    )
+    then = f"fpp-eval check {predictions} DATASET"
+    print(f"next: fill it in, write one {{sample}}.npy for each sample beside it, then: {then}")
 
 
 @command(
