@@ -7,7 +7,6 @@ import statistics
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import datetime
 from functools import partial
-from itertools import zip_longest
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
@@ -298,9 +297,14 @@ def disagreements(
             metric = METRICS.get(key) or UNCERTAINTY.get(key)
             limit = cancelling if metric is not None and metric.cancels else rounding
             where = f"{name}.{key}" if name else str(key)
-            yield from disagreements(stored.get(key), computed.get(key), where, limit, cancelling)
+            pair = stored.get(key), computed.get(key)
+            if pair == (None, None) and not (key in stored and key in computed):
+                yield where, *pair
+            yield from disagreements(*pair, where, limit, cancelling)
     elif isinstance(stored, list) and isinstance(computed, list):
-        for index, pair in enumerate(zip_longest(stored, computed)):
+        if len(stored) != len(computed):
+            yield name, f"{len(stored)} entries", f"{len(computed)}"
+        for index, pair in enumerate(zip(stored, computed, strict=False)):
             yield from disagreements(*pair, f"{name}.{index}", rounding, cancelling)
     elif not (stored == computed or (isinstance(stored, float) and same(stored, computed, rounding))):
         yield name, stored, computed
@@ -309,6 +313,10 @@ def disagreements(
 def _check_same(name: str, stored: Any, computed: Any, rounding: float = 0.0) -> None:
     """Refuse (ValueError) a stored value, mapping or list that is not what the per-sample scores give."""
     for where, value, expected in disagreements(stored, computed, name, rounding):
+        if value is None and expected is None:
+            raise ValueError(f"{where} is null where per_sample gives no such key, or is missing where it gives null")
+        if where.startswith("samples_without_"):
+            raise ValueError(f"{where} is not the number of such samples, {expected}")
         raise ValueError(f"{where} does not follow from per_sample: {value}, not {expected}")
 
 

@@ -195,7 +195,7 @@ EDITS = {
     "hash": (["per_sample", 0, "prediction_sha256"], "0" * 63, "prediction_sha256"),
     "fingerprint": (["dataset", "fingerprint"], "x" * 64, "fingerprint"),
     "sample count": (["dataset", "samples"], 5, "holds 4 samples, dataset.samples says 5"),
-    "empty samples": (["samples_without_object"], 1, "samples_without_object does not follow from per_sample: 1, not 0"),
+    "empty samples": (["samples_without_object"], 1, "samples_without_object is not the number"),
     "split": (["dataset", "split"], "tests", "dataset.split"),
     "time": (["created"], "yesterday", "created"),
     "name": (["submission", "name"], "x\x1b[2J", "U\\+001B"),
