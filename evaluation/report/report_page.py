@@ -8,7 +8,7 @@ from rich.console import Console
 
 from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation.metrics import WIDE, with_column
-from fpp_ml_bench.evaluation.report.figures import Panel, errors_figure, sample_panels
+from fpp_ml_bench.evaluation.report.figures import errors_figure, figure_uri, sample_panels
 from fpp_ml_bench.evaluation.report.html import page, render, score_text
 from fpp_ml_bench.evaluation.report.terminal import result_table
 from fpp_ml_bench.evaluation.result.file import write_file
@@ -17,6 +17,7 @@ from fpp_ml_bench.evaluation.result.parts import SampleResult
 from fpp_ml_bench.evaluation.score.check import scored_pair
 from fpp_ml_bench.evaluation.submission.prediction_files import list_folder, reader_for
 from fpp_ml_bench.files import printable
+from fpp_ml_bench.loaders.pictures import panel_figure
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 REPORT_FILE = "index.html"
@@ -59,8 +60,8 @@ def _by_object_error(row: SampleResult) -> tuple[float, str]:
     return row.object_mae_mm or 0.0, row.sample
 
 
-def _panels(result: Result, dataset: DatasetFolder, folder: Path) -> Iterator[tuple[str, SampleResult, list[Panel]]]:
-    """The place, the row and the panels of each chosen sample, the best first; one sample's pixels at a time."""
+def _panels(result: Result, dataset: DatasetFolder, folder: Path) -> Iterator[tuple[str, SampleResult, str]]:
+    """The place, the row and the picture of each chosen sample, the best first; one sample's pixels at a time."""
     if not result.dataset.content.items() <= dataset.content.items():
         raise DatasetError(f"{dataset.path}: is not what was scored; give {printable(result.dataset.identity)}")
     submission, samples = result.submission, [row.sample for row in result.per_sample]
@@ -83,7 +84,7 @@ def _panels(result: Result, dataset: DatasetFolder, folder: Path) -> Iterator[tu
             fringe = dataset.frame(row.sample, used[0] if used else 0)
         except DatasetError:
             fringe = dataset.frame(row.sample, 0)
-        yield place, row, sample_panels(fringe, target, prediction_mm, row.sample)
+        yield place, row, figure_uri(panel_figure(sample_panels(fringe, target, prediction_mm)))
 
 
 def _terminal_text(result: Result) -> str:
