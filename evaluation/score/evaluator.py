@@ -382,17 +382,17 @@ def differences(scored: Result, folder: Path, dataset: DatasetFolder) -> list[st
 
     stored, computed = (result.model_dump(include=_COMPARED, exclude=_RUN_TIME) for result in (scored, again))
     rows, again_rows = ({row["sample"]: row for row in part.pop("per_sample")} for part in (stored, computed))
-    blocks = [part.pop("uncertainty", None) for part in (stored, computed)]
+    block, again_block = (part.pop("uncertainty", None) for part in (stored, computed))
     found = list(disagreements(stored, computed))
     if rows.keys() != again_rows.keys():
         return [*_lines(found), "per_sample: other samples than the split has"]
     for sample, row in again_rows.items():
         differing = disagreements(rows[sample], row, cancelling=1e-9 * (row["object_mae_mm"] or 0.0))
         found += [(f"{sample}: {name}", *pair) for name, *pair in differing]
-    if blocks.count(None) == 1:
-        said = ["there is none" if block is None else "there is one" for block in blocks]
+    if (block is None) != (again_block is None):
+        said = ["there is none" if part is None else "there is one" for part in (block, again_block)]
         return [*_lines(found), f"uncertainty: {said[0]} in the result, {said[1]} recomputed"]
-    return _lines([*found, *disagreements(*blocks, "uncertainty", rounding=1e-12)])  # nll is near 0
+    return _lines([*found, *disagreements(block, again_block, "uncertainty", rounding=1e-12)])  # nll is near 0
 
 
 def _lines(found: Iterable[tuple[str, Any, Any]]) -> list[str]:

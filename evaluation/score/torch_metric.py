@@ -59,8 +59,8 @@ class DepthScores(Metric):
         for predicted, truth, pixels in zip(predictions, targets, scored, strict=True):
             mm_per_unit = _mm_per_unit(predicted[pixels], truth[pixels], self.units)
             # What a void pixel holds, as NaN, does not matter.
-            maps_mm = (np.where(pixels, depths, 0.0) * mm_per_unit for depths in (predicted, truth))
-            sample = score_sample(*maps_mm, void=~pixels)
+            predicted_mm, true_mm = (np.where(pixels, depths, 0.0) * mm_per_unit for depths in (predicted, truth))
+            sample = score_sample(predicted_mm, true_mm, void=~pixels)
             for number, key in enumerate(KEYS):
                 if (score := METRICS[key].value(sample)) is not None:
                     self.sums[number] += score

@@ -107,8 +107,8 @@ class ShardWork:
             folder = Path(temporary)
             writer = self.assembly.writer(folder, folder)
             (files, rows), meshes = self._write(writer, folder, folder, plan, row_done)
-            for file in (*files, *meshes):
-                self.place.put(folder / file.path, file.path)
+            for name in [file.path for file in files] + [mesh.path for mesh in meshes]:
+                self.place.put(folder / name, name)
             self.place.put(folder / f"{plan.name}.json", f"{WORK_FOLDER}/{plan.name}.json")
         return (files, rows), meshes
 
@@ -215,7 +215,10 @@ def assemble_remote(
 def _intact(scratch: Path, plan: ShardPlan, whole: Callable[[ShardFile | OtherFile], bool]) -> Written | None:
     """What was written of a shard by its receipt, if every file is ``whole``, else None."""
     written = planned_receipt(scratch / f"{plan.name}.json", plan)
-    return written if written is not None and all(map(whole, (*written[0][0], *written[1]))) else None
+    if written is None:
+        return None
+    files: list[ShardFile | OtherFile] = [*written[0][0], *written[1]]
+    return written if all(map(whole, files)) else None
 
 
 def _write_missing(
@@ -223,14 +226,14 @@ def _write_missing(
 ) -> None:
     """Write the shards whose entry in ``written`` is None, and fill it."""
     plans = work.assembly.plans
-    # The longest shards first, so that no worker is left with a long shard at the end.
-    missing = sorted((p for p in plans if written[p.name] is None), key=lambda plan: -len(plan.samples))
+    missing = [plan for plan in plans if written[plan.name] is None]
     progress(sum(len(plan.samples) for plan in plans if written[plan.name] is not None))
     workers, cluster = min(workers, max(1, len(missing))), cluster if missing else None
     if workers == 1 and cluster is None and isinstance(work.place, Path):
         for plan in missing:
             written[plan.name] = work.write(plan, lambda: progress(1))
         return
+    missing.sort(key=lambda plan: -len(plan.samples))  # so that no worker is left with a long shard at the end
     with mapping(work, workers, cluster) as mapped:
         for plan, done in zip(missing, mapped(ShardWork.write, missing), strict=True):
             written[plan.name] = done
