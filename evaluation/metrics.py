@@ -35,10 +35,9 @@ class Metric:
 
     Roles: ``headline``: one of the paper's six numbers, which have intervals and ranks; ``role``: ``rank``, the
     leaderboard's order, and ``range``, which stands beside it; ``helped_by_missing``: a method improves it by answering
-    fewer pixels, so nothing is sorted by it; ``training``: `DepthScores` has it, and ``of`` reads only what is there,
-    too; ``over``: it is null exactly where this pixel set is empty; ``column``: title of its column in the
-    leaderboard's tables, in terminals of ``column_from`` characters and more; ``terminal``: title of its column in the
-    tables of ``fpp-eval``."""
+    fewer pixels, so nothing is sorted by it; ``training``: `DepthScores` has it; ``over``: it is null exactly where
+    this pixel set is empty; ``column``: title of its column in the leaderboard's tables, in terminals of
+    ``column_from`` characters and more; ``terminal``: title of its column in the tables of ``fpp-eval``."""
 
     key: str
     title: str

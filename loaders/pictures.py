@@ -1,7 +1,8 @@
-"""Pictures of a dataset: a sample with frames, depth, mask and mesh, and a contact sheet of all objects and views."""
+"""Pictures of a dataset: a sample with frames, depth and mask, and a contact sheet of all objects and views."""
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -9,28 +10,28 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.loaders.render.meshes import load_user_mesh
-from fpp_ml_bench.loaders.render.raycast import PixelRays, TracedObject
-from fpp_ml_bench.loaders.render.scene import UserMesh, turned
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.sequence import DIRECTIONS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 _TILE_PX = 120
 _DPI = 110
 _GREY = "gray"
+_COLUMNS = 5
+Panel = tuple[str, NDArray, str, float, float]
+"""Title, image, colour map, and the values at its ends: lengths in mm, or grey levels."""
 
 
-def sample_picture(dataset: DatasetFolder, sample: str, path: Path) -> None:
-    """Write a sample as PNG: frames of each kind, depth, exact depth, their difference, mask, mesh."""
+def panel_figure(panels: list[Panel]) -> "Figure":
+    """A figure of panels, five in a line; a colour bar in mm where they are not grey levels."""
     from matplotlib.figure import Figure
 
-    panels = _panels(dataset, sample)
-    columns = 5
-    rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(3.4 * columns, 3.7 * rows), dpi=_DPI, layout="constrained")
-    figure.suptitle(f"{sample} ({dataset.split_of_sample(sample)})")
+    rows = -(-len(panels) // _COLUMNS)
+    figure = Figure(figsize=(3.4 * _COLUMNS, 3.7 * rows), dpi=_DPI, layout="constrained")
     for number, (title, image, colours, low, high) in enumerate(panels):
-        axes = figure.add_subplot(rows, columns, number + 1)
+        axes = figure.add_subplot(rows, _COLUMNS, number + 1)
         nearest = None if colours == _GREY else "nearest"
         drawn = axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation=nearest)
         if colours != _GREY:
@@ -40,11 +41,14 @@ def sample_picture(dataset: DatasetFolder, sample: str, path: Path) -> None:
         axes.set_title(title, fontsize=9)
         axes.set_xticks([])
         axes.set_yticks([])
+    return figure
+
+
+def sample_picture(dataset: DatasetFolder, sample: str, path: Path) -> None:
+    """Write a sample as PNG: frames of each kind, depth, exact depth, their difference, mask."""
+    figure = panel_figure(_panels(dataset, sample))
+    figure.suptitle(f"{sample} ({dataset.split_of_sample(sample)})")
     _save(figure.savefig, path)
-
-
-Panel = tuple[str, NDArray, str, float, float]
-"""Title, image, colour map, and the values at its ends: lengths in mm, or grey levels."""
 
 
 def _panels(dataset: DatasetFolder, sample: str) -> list[Panel]:
@@ -68,9 +72,6 @@ def _panels(dataset: DatasetFolder, sample: str) -> list[Panel]:
         panels.append((title, np.where(inside, error_mm, np.nan), "coolwarm", -limit, limit))
     title = f"object mask, {100 * inside.mean():.1f}% of the image"
     panels.append((title, inside.astype(np.uint8) * 255, _GREY, 0, 255))
-    mesh = dataset.path / "meshes" / f"{dataset.measured(sample)['object']}.ply"
-    if mesh.is_file():
-        panels.append(("ground-truth mesh", _mesh_picture(mesh, 480), _GREY, 0, 255))
     return panels
 
 
@@ -80,26 +81,6 @@ def _save(save: Callable[..., None], path: Path) -> None:
         save(path)
     except OSError as error:
         raise DatasetError(f"{path}: can't be written ({error.strerror or error})") from error
-
-
-def _mesh_picture(path: Path, size: int) -> NDArray[np.uint8]:
-    """The mesh seen from above and the side, lit from the viewer; uint8 (size, size)."""
-    mesh = load_user_mesh(UserMesh(path.stem, str(path), centre=False))
-    vertices_m = turned(mesh.vertices_m - mesh.vertices_m.mean(axis=0), 30.0)
-    tilt = np.deg2rad(25.0)
-    rotation = np.array([[1, 0, 0], [0, np.cos(tilt), -np.sin(tilt)], [0, np.sin(tilt), np.cos(tilt)]])
-    vertices_m = vertices_m @ rotation.T
-    radius = np.linalg.norm(vertices_m, axis=1).max()
-    distance = 4.0 * radius
-    line = np.linspace(-1, 1, size) * (1.05 * radius / distance)
-    x, y = np.meshgrid(line, line)
-    traced = TracedObject(mesh, vertices_m + np.array([0, 0, distance]))
-    hits = traced.primary(PixelRays(x, y))
-    toward = -np.column_stack([x.ravel()[hits.pixels], y.ravel()[hits.pixels], np.ones(hits.pixels.size)])
-    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    picture = np.full(size * size, 255, dtype=np.uint8)
-    picture[hits.pixels] = 30 + 190 * np.clip(np.einsum("ij,ij->i", hits.normals, toward), 0, 1)
-    return picture.reshape(size, size)
 
 
 def contact_sheet(dataset: DatasetFolder, split: str, path: Path) -> None:

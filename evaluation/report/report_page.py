@@ -1,21 +1,23 @@
-"""The report of a result: a histogram of the errors, the scores, and samples from best to worst on an HTML page."""
+"""The report of a result: a figure of the errors, the scores, and samples from best to worst on an HTML page."""
 
-import statistics
-from collections.abc import Iterable, Iterator, Sequence
+import io
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from markupsafe import Markup
+from rich.console import Console
 
 from fpp_ml_bench.errors import DatasetError, PredictionError
-from fpp_ml_bench.evaluation.metrics import METRICS, UNCERTAINTY, WIDE, listed, with_column
-from fpp_ml_bench.evaluation.report.figures import Panel, histogram, sample_panels, uncertainty_plots
-from fpp_ml_bench.evaluation.report.html import interval_text, page, render, score_text
+from fpp_ml_bench.evaluation.metrics import WIDE, with_column
+from fpp_ml_bench.evaluation.report.figures import errors_figure, figure_uri, sample_panels
+from fpp_ml_bench.evaluation.report.html import page, render, score_text
+from fpp_ml_bench.evaluation.report.terminal import result_table
 from fpp_ml_bench.evaluation.result.file import write_file
 from fpp_ml_bench.evaluation.result.model import Result
-from fpp_ml_bench.evaluation.result.parts import SampleResult, Uncertainty
+from fpp_ml_bench.evaluation.result.parts import SampleResult
 from fpp_ml_bench.evaluation.score.check import scored_pair
 from fpp_ml_bench.evaluation.submission.prediction_files import list_folder, reader_for
 from fpp_ml_bench.files import printable
+from fpp_ml_bench.loaders.pictures import panel_figure
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 REPORT_FILE = "index.html"
@@ -34,11 +36,9 @@ def write_report(result: Result, dataset: DatasetFolder, predictions_folder: str
         "report.html",
         result=result,
         samples=_panels(result, dataset, Path(predictions_folder)),
-        bars=histogram(errors, statistics.fmean(errors), "object MAE of a sample") if errors else None,
-        score_table=Markup(score_table(result)),
-        plots=uncertainty_plots(result.uncertainty),
-        uncertainty_table=Markup(uncertainty_table(result.uncertainty)) if result.uncertainty else "",
-        sample_table=Markup(sample_table(result)),
+        figure=errors_figure(errors, result.uncertainty) if errors else None,
+        scores=_terminal_text(result),
+        table=_sample_rows(result),
     )
     path = Path(out) / REPORT_FILE
     write_file(page(f"{result.submission.name}: report", body).encode("utf-8"), path, new_folder=True)
@@ -60,8 +60,8 @@ def _by_object_error(row: SampleResult) -> tuple[float, str]:
     return row.object_mae_mm or 0.0, row.sample
 
 
-def _panels(result: Result, dataset: DatasetFolder, folder: Path) -> Iterator[tuple[str, SampleResult, list[Panel]]]:
-    """The place, the row and the panels of each chosen sample, the best first; one sample's pixels at a time."""
+def _panels(result: Result, dataset: DatasetFolder, folder: Path) -> Iterator[tuple[str, SampleResult, str]]:
+    """The place, the row and the picture of each chosen sample, the best first; one sample's pixels at a time."""
     if not result.dataset.content.items() <= dataset.content.items():
         raise DatasetError(f"{dataset.path}: is not what was scored; give {printable(result.dataset.identity)}")
     submission, samples = result.submission, [row.sample for row in result.per_sample]
@@ -84,45 +84,21 @@ def _panels(result: Result, dataset: DatasetFolder, folder: Path) -> Iterator[tu
             fringe = dataset.frame(row.sample, used[0] if used else 0)
         except DatasetError:
             fringe = dataset.frame(row.sample, 0)
-        yield place, row, sample_panels(fringe, target, prediction_mm, row.sample)
+        yield place, row, figure_uri(panel_figure(sample_panels(fringe, target, prediction_mm)))
 
 
-def html_table(caption: str, titles: Sequence[str], rows: Sequence[Sequence[str]], text_columns: int = 1) -> str:
-    """A table with column and row headers; every cell is text. The first ``text_columns`` are aligned left."""
-    return render(__package__, "dense_table.html", caption=caption, titles=titles, rows=rows, text_columns=text_columns)
+def _terminal_text(result: Result) -> str:
+    """What `fpp-eval` prints of a result, as plain text."""
+    stream = io.StringIO()
+    Console(file=stream, width=160, color_system=None, highlight=False).print(result_table(result))
+    return stream.getvalue()
 
 
-def score_table(result: Result) -> str:
-    """Every score of a result: mean over samples with its interval, median over samples, pooled over pixels."""
-    rows = []
-    for metric in listed(METRICS.values()):
-        key = metric.key
-        if metric.optional and getattr(result.metrics, key) is None:
-            continue
-        mean, median = (score_text(key, getattr(scores, key)) for scores in (result.metrics, result.median))
-        interval = interval_text(result.intervals.of(key)) if metric.headline else ""
-        pooled = getattr(result.pooled, key, None)
-        rows.append([metric.title, mean, interval, median, "" if pooled is None else score_text(key, pooled)])
-    caption = "Scores in mm. Mean, its 95% interval over objects, and median over samples; pooled over all pixels"
-    return html_table(caption, ("Score", "Mean", "95% interval", "Median", "Pooled"), rows)
-
-
-def uncertainty_table(block: Uncertainty) -> str:
-    """Every score of a stated uncertainty: mean over samples, and over the views of each object."""
-    columns = [block.metrics, *block.per_object.values()]
-    rows = [
-        [metric.title, *(score_text(metric.key, getattr(scores, metric.key)) for scores in columns)]
-        for metric in listed(UNCERTAINTY.values())
-    ]
-    return html_table("Stated uncertainty; mm", ("Score", "All", *block.per_object), rows)
-
-
-def sample_table(result: Result) -> str:
-    """Scores of every sample, the largest object MAE first, with the hash of the prediction it comes from."""
+def _sample_rows(result: Result) -> tuple[list[str], list[list[str]]]:
+    """Titles and cells of every sample, the largest object MAE first, with the hash of the prediction it comes from."""
     shown = with_column(WIDE)
     ordered = sorted(result.per_sample, key=lambda row: (-(row.object_mae_mm or 0.0), row.sample))
     rows = [
         [r.sample, *(score_text(m.key, getattr(r, m.key)) for m in shown), r.prediction_sha256[:12]] for r in ordered
     ]
-    titles = ["Sample", *(metric.title for metric in shown), "Prediction SHA-256"]
-    return html_table("Every sample, the largest object MAE first; mm", titles, rows)
+    return ["Sample", *(metric.title for metric in shown), "Prediction SHA-256"], rows

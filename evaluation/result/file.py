@@ -3,7 +3,7 @@
 import hashlib
 import json
 import platform
-import re
+import subprocess
 from functools import cache
 from pathlib import Path
 from typing import Any, get_args
@@ -115,7 +115,6 @@ def json_schema(name: str) -> dict[str, Any]:
 
 
 _EVALUATION = Path(__file__).resolve().parent.parent
-_COMMIT = re.compile(r"[0-9a-f]{40,64}")
 
 
 def environment() -> Environment:
@@ -126,36 +125,19 @@ def environment() -> Environment:
     return Environment(
         python=platform.python_version(),
         packages={"fpp_ml_bench": __version__, **{name: module.__version__ for name, module in modules.items()}},
-        git=checkout_commit(_EVALUATION.parent),
+        git=_commit(),
         code_sha256=_scoring_code(),
         hardware=HardwareInfo.model_validate(describe_hardware().to_dict()),
     )
 
 
-def checkout_commit(folder: Path) -> str | None:
-    """The commit of the checkout in ``folder``, read from its ``.git``; None where there is none. No ``git`` is run:
-    starting it would take as long as scoring several samples, and it need not be installed."""
-
-    def text_of(path: Path) -> str:
-        return path.read_text(encoding="utf-8").strip()
-
-    own_folder = folder / ".git"
+def _commit() -> str | None:
+    """The commit of the checkout this package runs from; None where there is none, or no git."""
+    command = ["git", f"--git-dir={_EVALUATION.parent / '.git'}", "rev-parse", "--verify", "HEAD"]
     try:
-        if own_folder.is_file():  # a worktree: the file holds the path of its own git folder
-            own_folder = folder / text_of(own_folder).removeprefix("gitdir:").strip()
-        head = text_of(own_folder / "HEAD")
-        if head.startswith("ref:"):
-            name = head.removeprefix("ref:").strip()
-            common = own_folder / "commondir"
-            git_folders = [own_folder, *([own_folder / text_of(common)] if common.is_file() else [])]
-            commits = [text_of(git / name) for git in git_folders if (git / name).is_file()]
-            for packed in (git / "packed-refs" for git in git_folders if (git / "packed-refs").is_file()):
-                lines = (line.partition(" ") for line in text_of(packed).splitlines())
-                commits += [commit for commit, _, ref in lines if ref == name]
-            head = commits[0] if commits else ""
-    except (OSError, UnicodeDecodeError):
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
         return None
-    return head if _COMMIT.fullmatch(head) else None
 
 
 @cache

@@ -4,7 +4,7 @@ file is read, and overall is checked against object and background in every samp
 
 import math
 import statistics
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from datetime import datetime
 from functools import partial
 from typing import Annotated, Any, Literal
@@ -123,9 +123,8 @@ class Result(SparseModel):
         void = self.mode == "standard"
         for row in self.per_sample:
             _check_sample(row, height * width, {"void": void, "unlit": void and self.target == "depth_exact"})
-        stored = self.model_dump(include=set(derived := _derived(self.per_sample)))
-        for key, computed in derived.items():
-            _check_same(key, stored[key], computed)
+        derived = _derived(self.per_sample)
+        _check_same("", self.model_dump(include=set(derived)), derived)
         return self
 
 
@@ -287,26 +286,38 @@ def _check_weights(part: str, measured: str | None, submission: Submission) -> N
         raise ValueError(f"{part} was measured on {pair}; measure it again")
 
 
+def disagreements(
+    stored: Any, computed: Any, name: str = "", rounding: float = 0.0, cancelling: float = 1e-9
+) -> Iterator[tuple[str, Any, Any]]:
+    """Name, stored and computed value of everything in two plain contents that is not the same. ``rounding``: absolute
+    difference up to which two numbers count as the same; ``cancelling``: that of scores which are a small difference of
+    large numbers, so that it depends on the machine."""
+    if isinstance(stored, Mapping) and isinstance(computed, Mapping):
+        for key in dict.fromkeys((*stored, *computed)):
+            metric = METRICS.get(key) or UNCERTAINTY.get(key)
+            limit = cancelling if metric is not None and metric.cancels else rounding
+            where = f"{name}.{key}" if name else str(key)
+            pair = stored.get(key), computed.get(key)
+            if pair == (None, None) and not (key in stored and key in computed):
+                yield where, *pair
+            yield from disagreements(*pair, where, limit, cancelling)
+    elif isinstance(stored, list) and isinstance(computed, list):
+        if len(stored) != len(computed):
+            yield name, f"{len(stored)} entries", f"{len(computed)}"
+        for index, pair in enumerate(zip(stored, computed, strict=False)):
+            yield from disagreements(*pair, f"{name}.{index}", rounding, cancelling)
+    elif not (stored == computed or (isinstance(stored, float) and same(stored, computed, rounding))):
+        yield name, stored, computed
+
+
 def _check_same(name: str, stored: Any, computed: Any, rounding: float = 0.0) -> None:
     """Refuse (ValueError) a stored value, mapping or list that is not what the per-sample scores give."""
-    if isinstance(computed, Mapping):
-        if set(stored) != set(computed):
-            raise ValueError(f"{name} does not hold the keys {', '.join(map(str, computed))}")
-        for key in computed:
-            # A mean of signed values may cancel to rounding errors, which depend on the machine.
-            cancels = key in METRICS and METRICS[key].unit == "signed mm"
-            _check_same(f"{name}.{key}", stored[key], computed[key], 1e-9 if cancels else rounding)
-    elif isinstance(computed, list):
-        if len(stored) != len(computed):
-            raise ValueError(f"{name} holds {len(stored)} entries, per_sample makes {len(computed)}")
-        for index, (stored_item, computed_item) in enumerate(zip(stored, computed, strict=True)):
-            _check_same(f"{name}.{index}", stored_item, computed_item, rounding)
-    elif same(stored, computed, rounding) if isinstance(computed, float) or computed is None else stored == computed:
-        return
-    elif name.startswith("samples_without_"):
-        raise ValueError(f"{name} is not the number of such samples, {computed}")
-    else:
-        raise ValueError(f"{name} does not follow from per_sample: {stored}, not {computed}")
+    for where, value, expected in disagreements(stored, computed, name, rounding):
+        if value is None and expected is None:
+            raise ValueError(f"{where} is null where per_sample gives no such key, or is missing where it gives null")
+        if where.startswith("samples_without_"):
+            raise ValueError(f"{where} is not the number of such samples, {expected}")
+        raise ValueError(f"{where} does not follow from per_sample: {value}, not {expected}")
 
 
 def uncertainty_of(samples: Mapping[str, SigmaSample], owners: Mapping[str, str]) -> Uncertainty:
@@ -352,8 +363,7 @@ def _check_uncertainty(block: Uncertainty, rows: Mapping[str, SampleResult], met
     if set(block.per_object) != set(derived["per_object"]):
         raise ValueError("uncertainty.per_object: other objects than per_sample has")
     agree = partial(_check_same, rounding=1e-12)  # a likelihood may be near 0
-    for name, means in derived.items():
-        agree(f"uncertainty.{name}", stored[name], means)
+    agree("uncertainty", {name: stored[name] for name in derived}, derived)
     if (block.reliability is None) != (block.metrics.coverage_68 is None):
         raise ValueError("uncertainty.reliability must be there exactly where some pixel states an uncertainty")
     if (block.sparsification is None) != (block.metrics.ause_mae_mm is None):

@@ -4,10 +4,9 @@ checked, every problem is named."""
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
-from operator import attrgetter
 from pathlib import Path
 from threading import Lock
 from typing import TYPE_CHECKING, Any, cast, get_args
@@ -16,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import split_sample_name
-from fpp_ml_bench.depth import RangeRule, edge_jump_mm, extremes, object_box, object_mask, object_near_edges
+from fpp_ml_bench.depth import RangeRule, edge_jump_mm, extremes
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import protocol
-from fpp_ml_bench.evaluation.metrics import METRICS, UNCERTAINTY, Metric
 from fpp_ml_bench.evaluation.protocol import Mode, Units
 from fpp_ml_bench.evaluation.score.check import checked_description, declared_units, in_mm, scored_pair, value_problems
 from fpp_ml_bench.evaluation.score.sample_scores import SigmaSample, score_sample, score_sigma
@@ -33,16 +31,14 @@ from fpp_ml_bench.evaluation.submission.prediction_files import (
     reader_for,
 )
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.sample import Flag, image_hash, stored_frames, void_pixels
+from fpp_ml_bench.loaders.sample import Flag, image_hash, void_pixels
 from fpp_ml_bench.loaders.storage.benchmark import benchmark_of
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.sequence import DIRECTIONS, AnySequence
-from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by
 
 if TYPE_CHECKING:
     from fpp_ml_bench.evaluation.result.model import ArrayScores, Result
-    from fpp_ml_bench.evaluation.result.parts import Uncertainty
 
 Maps = NDArray[Any] | Sequence[NDArray[Any]]
 WORKERS = 4
@@ -357,7 +353,13 @@ def _scored_arrays(
     return {"prediction_sha256": digest, **scores.pixels(), **scores.metrics()}, uncertainty
 
 
-_TIME_KEYS = ("seconds_per_sample", "seconds_source", "hardware", "timing")
+_COMPARED: dict[str, Any] = {
+    "dataset": {"size", "samples", "content", "code"},
+    **dict.fromkeys(("frames_class", "edge_jump_mm", "submission", "per_sample"), True),
+    "uncertainty": {"reliability", "sparsification", "per_sample"},
+}
+"""What of a result is compared; the rest follows from it, or is its time and place."""
+_RUN_TIME = {"submission": {"seconds_per_sample", "seconds_source", "hardware", "timing"}}
 """`fpp-bench time` may write these into a result later; run times can't be recomputed from predictions."""
 
 
@@ -376,115 +378,30 @@ def differences(scored: Result, folder: Path, dataset: DatasetFolder) -> list[st
             scored_on = f"{digest} of {_value_text(scored.dataset.identity)} in the result"
             return [f"dataset.content.{key}: {scored_on}, {dataset.content.get(key, 'none')} is what {here} has"]
     again = evaluate(folder, dataset, scored.dataset.split, scored.target, scored.edge_band_px, scored.mode)
-    names = ("dataset.size", "dataset.samples", "dataset.content", "dataset.code", "frames_class", "edge_jump_mm")
-    pairs = [(name, attrgetter(name)(scored), attrgetter(name)(again), "recomputed") for name in names]
-    described, description = scored.submission.model_dump(), again.submission.model_dump()
-    for key in dict.fromkeys((*described, *description)):
-        pair = (None, None) if key in _TIME_KEYS else (described.get(key), description.get(key))
-        pairs.append((f"submission.{key}", *pair, f"in {SUBMISSION_FILE}"))
-    problems = [
-        f"{name}: {_value_text(stored)} in the result, {_value_text(value)} {origin}"
-        for name, stored, value, origin in pairs
-        if stored != value
+    from fpp_ml_bench.evaluation.result.model import disagreements
+
+    stored, computed = (result.model_dump(include=_COMPARED, exclude=_RUN_TIME) for result in (scored, again))
+    rows, again_rows = ({row["sample"]: row for row in part.pop("per_sample")} for part in (stored, computed))
+    block, again_block = (part.pop("uncertainty", None) for part in (stored, computed))
+    found = list(disagreements(stored, computed))
+    if rows.keys() != again_rows.keys():
+        return [*_lines(found), "per_sample: other samples than the split has"]
+    for sample, row in again_rows.items():
+        differing = disagreements(rows[sample], row, cancelling=1e-9 * (row["object_mae_mm"] or 0.0))
+        found += [(f"{sample}: {name}", *pair) for name, *pair in differing]
+    if (block is None) != (again_block is None):
+        said = ["there is none" if part is None else "there is one" for part in (block, again_block)]
+        return [*_lines(found), f"uncertainty: {said[0]} in the result, {said[1]} recomputed"]
+    return _lines([*found, *disagreements(block, again_block, "uncertainty", rounding=1e-12)])  # nll is near 0
+
+
+def _lines(found: Iterable[tuple[str, Any, Any]]) -> list[str]:
+    return [
+        f"{name}: {_value_text(stored)} in the result, {_value_text(value)} "
+        + (f"in {SUBMISSION_FILE}" if name.startswith("submission.") else "recomputed")
+        for name, stored, value in found
     ]
-    stored_rows = {row.sample: row for row in scored.per_sample}
-    if set(stored_rows) != {row.sample for row in again.per_sample}:
-        return [*problems, "per_sample: other samples than the split has"]
-    exact = ("object", "prediction_sha256", *(f"{name}_pixels" for name in ("object", "background", "void", "unlit")))
-    for row in again.per_sample:
-        pair = stored_rows[row.sample], row
-        problems += _different(f"{row.sample}: ", *pair, METRICS, row.object_mae_mm, exact=exact)
-    return problems + _uncertainty_differences(scored.uncertainty, again.uncertainty)
-
-
-def _uncertainty_differences(stored: Uncertainty | None, recomputed: Uncertainty | None) -> list[str]:
-    if stored is None or recomputed is None:
-        blocks = [("there is none" if block is None else "there is one") for block in (stored, recomputed)]
-        return [] if stored is recomputed else [f"uncertainty: {blocks[0]} in the result, {blocks[1]} recomputed"]
-    from fpp_ml_bench.evaluation.result.model import same
-
-    lines = []
-    for name in ("reliability", "sparsification"):
-        first, second = (
-            [] if part is None else list(part.model_dump().values())
-            for part in (getattr(stored, name), getattr(recomputed, name))
-        )
-        pairs = [pair for curves in zip(first, second, strict=False) for pair in zip(*curves, strict=True)]
-        if len(first) != len(second) or not all(same(*pair, 1e-12) for pair in pairs):
-            lines.append(f"uncertainty.{name}: the curve in the result is not the one recomputed")
-    for sample, scores in recomputed.per_sample.items():
-        pair = stored.per_sample[sample], scores
-        lines += _different(f"{sample}: uncertainty.", *pair, UNCERTAINTY, scores.sure_rmse_mm, 1e-12)  # nll is near 0
-    return lines
-
-
-def _different(
-    name: str,
-    stored: object,
-    recomputed: object,
-    metrics: Mapping[str, Metric],
-    error_mm: float | None,
-    rounding: float = 0.0,
-    exact: Iterable[str] = (),
-) -> list[str]:
-    """A line for each key of ``exact`` and each score that differs; ``error_mm``: the error of which the scores that
-    cancel are a small difference."""
-    from fpp_ml_bench.evaluation.result.model import same
-
-    limits = {key: 1e-9 * (error_mm or 0.0) if metric.cancels else rounding for key, metric in metrics.items()}
-    lines = []
-    for key in (*exact, *metrics):
-        first, second = getattr(stored, key), getattr(recomputed, key)
-        if not (same(first, second, limits[key]) if key in limits else first == second):
-            lines.append(f"{name}{key}: {_value_text(first)} in the result, {_value_text(second)} recomputed")
-    return lines
 
 
 def _value_text(value: object) -> str:
     return printable(value if isinstance(value, str) else repr(value), 80)
-
-
-def explain_eval(dataset: DatasetFolder, split: str, target: str, edge_band_px: int) -> Explanation:
-    """What scoring one split skipped: columns that no score needs, and the search for depth edges far from the object.
-    Reads the split's targets again."""
-    samples, (height, width) = dataset.samples(split), dataset.size
-    boxes = {}
-    for sample in samples:
-        boxes[sample] = _box_px(object_mask(dataset.target_mm(sample, target)))
-        dataset.release(sample)
-    frames, depths = len(stored_frames(dataset.sequence, dataset.manifest.stored)), 1 + dataset.has_exact
-    read = 1 + (target != "depth")
-    median = sorted(samples, key=lambda sample: boxes[sample])[len(samples) // 2]
-    depth_mm = dataset.target_mm(median, target)
-    skipped = len(samples) * depth_mm.size - sum(boxes.values())
-    unread_bytes = len(samples) * (frames + (depths - read) * depth_mm.itemsize) * depth_mm.size
-    bands = (edge_band_px, protocol.WIDE_BAND_PX)
-    seconds = saved_by(lambda: object_near_edges(depth_mm, bands), depth_mm.size - boxes[median], skipped)
-    lines = [
-        LeftOut(
-            "columns that no score needs",
-            "images",
-            len(samples) * read,
-            len(samples) * (frames + depths - read),
-            unread_bytes,
-            None,
-            "not read; seconds not measured, they depend on the disk",
-        ),
-        LeftOut(
-            "depth edges far from the object",
-            "pixels",
-            sum(boxes.values()),
-            skipped,
-            None,
-            seconds,
-            f"processor seconds of one sample ({median}) without skipping minus with it, measured now, scaled to the "
-            "pixels that all samples skipped",
-        ),
-    ]
-    return explained("fpp-eval", f"{len(samples)} samples of {width}x{height} px", lines)
-
-
-def _box_px(inside: NDArray[np.bool_]) -> int:
-    """Pixels of the box in which `object_near_edges` searches."""
-    box = object_box(inside)
-    return 0 if box is None else int(inside[box].size)

@@ -1,30 +1,28 @@
 """The evaluator's scores as a `torchmetrics.Metric`, for validation during training.
 
-The rules and the float64 arithmetic are those of `fpp_ml_bench.evaluation.score`: every sample is scored separately,
-and `compute` is the plain mean over samples. The state is a sum and a count for each score. Any batches, order, device
-or number of processes therefore give the same numbers, up to the rounding of adding a few hundred float64 values. A
-sampler that repeats samples to fill the last batch (``DistributedSampler`` without ``drop_last``) changes the mean;
-give each process its own samples instead.
+Every sample is scored by `fpp_ml_bench.evaluation.score.sample_scores.score_sample`, on the processor, and `compute` is
+the plain mean over samples. The state is a sum and a count for each score. Any batches, order, device or number of
+processes therefore give the same numbers, up to the rounding of adding a few hundred float64 values. A sampler that
+repeats samples to fill the last batch (``DistributedSampler`` without ``drop_last``) changes the mean; give each
+process its own samples instead.
 
 Included are the metrics whose entry says ``training``; those of edge bands need the depth edges of every target.
 """
 
-from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torchmetrics import Metric
 
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.metrics import METRICS
-from fpp_ml_bench.evaluation.protocol import WITHIN_MM
 from fpp_ml_bench.evaluation.score.check import MM_PER_UNIT, declared_units, not_in_mm
-from fpp_ml_bench.evaluation.score.sample_scores import EMPTY, NOT_FINITE, ErrorStats, Spread
+from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 
 KEYS = tuple(key for key, metric in METRICS.items() if metric.training)
-SQUARES_VANISH = 1e-140
-"""Errors below this have squares below the smallest normal float64."""
 
 
 class DepthScores(Metric):
@@ -56,16 +54,17 @@ class DepthScores(Metric):
     def update(self, prediction: Tensor, target: Tensor, void: Tensor | None = None) -> None:
         """Add a batch. Raises PredictionError for other shapes or dtypes, for errors that are not finite, for negative
         targets, and for depths that look like another unit."""
-        prediction, target = _maps(prediction, target)
-        scored = torch.ones(target.shape, dtype=torch.bool) if void is None else ~_checked_void(void, target.shape)
-        for predicted, truth, pixels in zip(prediction, target, scored.to(target.device), strict=True):
-            counted = predicted[pixels], truth[pixels]  # what a void pixel holds, as NaN, does not matter
-            mm_per_unit = _mm_per_unit(*counted, self.units)
-            sample = _sample(*(depths * mm_per_unit for depths in counted))
-            scores = [METRICS[key].value(sample) for key in KEYS]
-            values = [predicted.new_zeros(()) if score is None else score for score in scores]
-            self.sums += torch.stack(values).to(self.sums.device)
-            self.counts += torch.tensor([score is not None for score in scores], device=self.counts.device)
+        predictions, targets = _maps(prediction, target)
+        scored = np.ones(targets.shape, bool) if void is None else ~_checked_void(void, targets.shape)
+        for predicted, truth, pixels in zip(predictions, targets, scored, strict=True):
+            mm_per_unit = _mm_per_unit(predicted[pixels], truth[pixels], self.units)
+            # What a void pixel holds, as NaN, does not matter.
+            predicted_mm, true_mm = (np.where(pixels, depths, 0.0) * mm_per_unit for depths in (predicted, truth))
+            sample = score_sample(predicted_mm, true_mm, void=~pixels)
+            for number, key in enumerate(KEYS):
+                if (score := METRICS[key].value(sample)) is not None:
+                    self.sums[number] += score
+                    self.counts[number] += 1
 
     def compute(self) -> dict[str, Tensor]:
         """Mean over the samples so far, of all processes, of every key."""
@@ -73,7 +72,7 @@ class DepthScores(Metric):
         return dict(zip(KEYS, means, strict=True))
 
 
-def _maps(prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+def _maps(prediction: Tensor, target: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Both as float64 (B, H, W)."""
     for name, values in (("prediction", prediction), ("target", target)):
         if not isinstance(values, Tensor):
@@ -87,27 +86,24 @@ def _maps(prediction: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
         prediction, target = prediction[:, 0], target[:, 0]
     if target.dim() != 3 or target[:1].numel() == 0:
         raise PredictionError(f"expected (B, H, W) or (B, 1, H, W), got {shape}")
-    prediction, target = prediction.detach(), target.detach()
-    if prediction.device.type == "mps":  # Apple's GPUs have no float64
-        prediction, target = prediction.cpu(), target.cpu()
-    return prediction.to(torch.float64), target.to(prediction.device, torch.float64)
+    return prediction.detach().cpu().double().numpy(), target.detach().cpu().double().numpy()
 
 
-def _checked_void(void: Tensor, shape: torch.Size) -> Tensor:
+def _checked_void(void: Tensor, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     if not isinstance(void, Tensor) or void.dtype != torch.bool:
         got = getattr(void, "dtype", type(void).__name__)
         raise PredictionError(f"void: expected bool, true for pixels in no set, got {got}; of flags: (flags & 3) != 0")
     if void.shape != shape:
-        raise PredictionError(f"void: expected {tuple(shape)} (B, H, W), got {tuple(void.shape)}")
-    return void
+        raise PredictionError(f"void: expected {shape} (B, H, W), got {tuple(void.shape)}")
+    return void.cpu().numpy()
 
 
-def _mm_per_unit(prediction: Tensor, target: Tensor, units: str | None) -> float:
+def _mm_per_unit(prediction: NDArray[np.float64], target: NDArray[np.float64], units: str | None) -> float:
     """What one unit of a sample's depths (n,) is in mm; raises PredictionError for a target that is no depth, and where
     ``units`` can't be true."""
-    if not bool(torch.isfinite(target).all() and (target >= 0).all()):
+    if not (np.isfinite(target).all() and (target >= 0).all()):
         raise PredictionError("target: expected finite depths of 0 and more")
-    largest, target_max = (float(depths.max()) if depths.numel() else 0.0 for depths in (prediction, target))
+    largest, target_max = (float(depths.max(initial=0.0)) for depths in (prediction, target))
     scale = MM_PER_UNIT[declared_units(target_max, units)]
     if units is None and not_in_mm(largest, target_max):
         raise PredictionError(
@@ -115,54 +111,3 @@ def _mm_per_unit(prediction: Tensor, target: Tensor, units: str | None) -> float
             f"{target_max:.4g}; give both in the same"
         )
     return scale
-
-
-def _sample(prediction: Tensor, target: Tensor) -> SimpleNamespace:
-    """The parts of a `fpp_ml_bench.evaluation.score.SampleScores` that the metrics of the training read, as tensors, of
-    one sample, float64 (n,) in mm."""
-    error = prediction - target
-    if error.numel() and not bool(torch.isfinite(error.square().sum())):
-        raise PredictionError(NOT_FINITE)
-    inside = target > 0
-    errors, measured = error[inside], prediction[inside] > 0
-    valid = errors[measured]
-    sets = {"overall": error, "object": errors, "background": error[~inside], "valid": valid}
-    sample = SimpleNamespace(**{name: _stats(pixels) for name, pixels in sets.items()}, spread=Spread(), range_mm=0.0)
-    if not errors.numel():
-        return sample
-    ascending = errors.abs().sort().values
-    offset = _quantile(errors.sort().values, 0.5)
-    sample.range_mm = target[inside].max() - target[inside].min()
-    sample.spread = Spread(
-        _quantile(ascending, 0.5),
-        _quantile(ascending, 0.95),
-        ascending[-1],
-        tuple((ascending <= limit).to(torch.float64).mean() for limit in WITHIN_MM),
-        errors.mean(),
-        valid.mean() if valid.numel() else None,
-        (errors - offset).abs().mean(),
-    )
-    return sample
-
-
-def _stats(errors: Tensor) -> ErrorStats | SimpleNamespace:
-    """`ErrorStats`, of tensors where there are errors."""
-    if not errors.numel():
-        return EMPTY
-    pixels = errors.new_tensor(errors.numel())
-    return SimpleNamespace(pixels=pixels, mae_mm=errors.abs().mean(), rmse_mm=_root_mean_square(errors))
-
-
-def _root_mean_square(errors: Tensor) -> Tensor:
-    """Root mean square; errors whose squares would underflow are divided by the largest first."""
-    largest = errors.abs().max()
-    scale = torch.where((largest > 0) & (largest < SQUARES_VANISH), largest, torch.ones_like(largest))
-    return (errors / scale).square().mean().sqrt() * scale
-
-
-def _quantile(ascending: Tensor, level: float) -> Tensor:
-    """Linear interpolation between order statistics, as in `sample_scores`."""
-    position = level * (ascending.numel() - 1)
-    low = int(position)
-    below, above = ascending[low], ascending[min(low + 1, ascending.numel() - 1)]
-    return below + (above - below) * (position - low)

@@ -15,9 +15,8 @@ from fpp_ml_bench.loaders.render.meshes import solid_mesh, write_ply
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.sample import Row
-from fpp_ml_bench.loaders.storage.assembly import Assembly, Progress, assemble
+from fpp_ml_bench.loaders.storage.assembly import Assembly, Progress, assemble, assemble_remote
 from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER, Manifest
-from fpp_ml_bench.loaders.storage.remote_assembly import assemble_remote
 from fpp_ml_bench.loaders.storage.shards import ShardPlan, plan_shards
 from fpp_ml_bench.remote import RemoteFolder
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by

@@ -1,15 +1,17 @@
-"""From planned shards to a finished folder: skip finished shards, write the rest, then card, rig and manifest.
-Generated and imported datasets are written alike; only the source of their rows differs. Each finished shard leaves a
-receipt in the work folder. A resumed run trusts a receipt only when every file it names has the hash it states."""
+"""From planned shards to a finished folder, or the same files at a URL: skip finished shards, write the rest, then
+card, rig and manifest. Generated and imported datasets are written alike; only the source of their rows differs. Each
+finished shard leaves a receipt in the work folder. A resumed run trusts a receipt only when every file it names has the
+hash it states, or at a URL its full length."""
 
 import json
 import platform
 import shutil
-from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from fpp_ml_bench.errors import BuildError
@@ -20,22 +22,25 @@ from fpp_ml_bench.loaders.storage.manifest import (
     MANIFEST,
     WORK_FOLDER,
     Manifest,
+    OtherFile,
     ShardFile,
     check_row,
     describe_file,
+    read_manifest,
     strictly,
 )
-from fpp_ml_bench.loaders.storage.shard_processes import write_in_processes
 from fpp_ml_bench.loaders.storage.shards import Receipt, ShardPlan, ShardWriter
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.pool import mapping
-from fpp_ml_bench.remote import RemoteFolder
+from fpp_ml_bench.remote import TEMPORARY, RemoteFolder
 
 SETTINGS = "settings.json"
 RowSource = Callable[[ShardPlan, Path], Iterable[Row]]
 """Makes the rows of a shard, in order, and maybe meshes in the dataset folder. Picklable; a process calls one for all
 its shards, and may hold what they share in it."""
 Progress = Callable[[int], None]
+Written = tuple[Receipt, list[OtherFile]]
+"""Receipt of a shard, and the meshes of its objects."""
 _RESERVE_BYTES = 1 << 26
 
 
@@ -80,18 +85,46 @@ class Assembly:
 
 @dataclass(frozen=True)
 class ShardWork:
-    """What a process needs to write shards into ``folder``; it keeps one for all of them."""
+    """What a process needs to write shards into a folder or to a URL; it keeps one for all of them."""
 
     assembly: Assembly
-    folder: Path
-    scratch: Path
+    place: Path | RemoteFolder
 
     @cached_property
-    def writer(self) -> ShardWriter:
-        return self.assembly.writer(self.folder, self.scratch)
+    def _writer(self) -> ShardWriter:
+        assert isinstance(self.place, Path)
+        return self.assembly.writer(self.place, self.place / WORK_FOLDER)
 
-    def write(self, plan: ShardPlan, row_done: Callable[[], None] = lambda: None) -> Receipt:
-        return self.writer.write(plan, self.assembly.rows(plan, self.folder), row_done)
+    def write(self, plan: ShardPlan, row_done: Callable[[], None] = lambda: None) -> Written:
+        """Write a shard, and last its receipt. Where it goes to a URL, all is written in a scratch folder first."""
+        if isinstance(self.place, Path):
+            if not (self.place / WORK_FOLDER / SETTINGS).is_file():
+                raise BuildError(self._without_files())
+            return self._write(self._writer, self.place, self.place / WORK_FOLDER, plan, row_done)
+        if not self.place.has(f"{WORK_FOLDER}/{SETTINGS}"):
+            raise BuildError(self._without_files())
+        with TemporaryDirectory(prefix="fpp-bench-") as temporary:
+            folder = Path(temporary)
+            writer = self.assembly.writer(folder, folder)
+            (files, rows), meshes = self._write(writer, folder, folder, plan, row_done)
+            for name in [file.path for file in files] + [mesh.path for mesh in meshes]:
+                self.place.put(folder / name, name)
+            self.place.put(folder / f"{plan.name}.json", f"{WORK_FOLDER}/{plan.name}.json")
+        return (files, rows), meshes
+
+    def _write(
+        self, writer: ShardWriter, folder: Path, scratch: Path, plan: ShardPlan, row_done: Callable[[], None]
+    ) -> Written:
+        files, rows = writer.write(plan, self.assembly.rows(plan, folder), row_done)
+        meshes = [describe_file(folder, folder / name) for name in self.assembly.mesh_paths(rows)]
+        content: dict[str, Any] = {"files": [asdict(file) for file in files], "rows": rows}
+        content["meshes"] = [asdict(mesh) for mesh in meshes]
+        write_atomically(scratch / f"{plan.name}.json", json.dumps(content).encode())
+        return (files, rows), meshes
+
+    def _without_files(self) -> str:
+        node = platform.node()
+        return f"{self.place}: node {node} does not find the build there; give a folder that all nodes share, or a URL"
 
 
 def assemble(
@@ -105,14 +138,119 @@ def assemble(
         with writing(folder) as scratch:
             if (folder / MANIFEST).exists():
                 manifest = DatasetFolder(folder).manifest  # every file is there, in full length
-                compare(folder, replace(assembly, manifest=manifest).key(), assembly.key())
+                _compare(folder, replace(assembly, manifest=manifest).key(), assembly.key())
                 return manifest
-            return _assemble(folder, scratch, assembly, workers, progress, cluster)
+            _check_settings(folder, scratch, assembly)
+            for leftover in (*scratch.glob("*.tmp"), *folder.rglob(".*.tmp")):  # of a run that was killed while writing
+                leftover.unlink(missing_ok=True)  # the two patterns overlap
+
+            def whole(file: ShardFile | OtherFile) -> bool:
+                try:
+                    return file_hash(folder / file.path) == file.xxh3_128
+                except OSError:
+                    return False
+
+            written = {plan.name: _intact(scratch, plan, whole) for plan in assembly.plans}
+            _check_space(folder, assembly, [plan for plan in assembly.plans if written[plan.name] is None])
+            _write_missing(ShardWork(assembly, folder), written, workers, cluster, progress)
+            return _finish(folder, assembly, written)[0]
     except OSError as error:
         raise BuildError(
             f"{error.filename or folder}: writing failed ({cause_of(error)}); remove the cause, then run the same "
             "command again: it resumes"
         ) from error
+
+
+def assemble_remote(
+    remote: RemoteFolder,
+    assembly: Assembly,
+    workers: int = 1,
+    cluster: str | None = None,
+    progress: Progress = lambda rows: None,
+) -> Manifest:
+    """Write or finish the dataset at a URL by the processes that `mapping` takes, and return its manifest. ``progress``
+    is called as by `assemble`. Nothing keeps a second run from the same URL; it would write the same files. A resumed
+    run trusts a receipt when every file it names is there in full length. The manifest comes last.
+
+    Raises `BuildError` when the URL holds other files or settings, `RemoteError` when it can't be read or written, and
+    `PoolError`."""
+    with TemporaryDirectory(prefix="fpp-bench-") as temporary:
+        folder, sizes = Path(temporary), remote.sizes()
+        begun = {name for name in sizes if name.startswith(f"{WORK_FOLDER}/")}
+        if MANIFEST in sizes:
+            remote.get(MANIFEST, folder / MANIFEST)
+            manifest = read_manifest(folder)
+            damaged = [file.path for file in manifest.files if sizes.get(file.path) != file.bytes]
+            if damaged:
+                raise BuildError(f"{remote}: {damaged[0]} is missing or cut off; remove all there, and build again")
+            _compare(remote, replace(assembly, manifest=manifest).key(), assembly.key())
+            if begun:  # stopped between the manifest and the end
+                remote.remove(WORK_FOLDER)
+            return manifest
+        if sizes and not begun:
+            raise BuildError(f"{remote}: holds other files and no dataset; give another URL")
+        for name in sizes:
+            if name.endswith(TEMPORARY):  # of a task that was killed while copying
+                remote.remove(name)
+            elif name in begun:
+                remote.get(name, folder / name)
+        scratch = folder / WORK_FOLDER
+        scratch.mkdir(exist_ok=True)
+        _check_settings(remote, scratch, assembly)
+        remote.put(scratch / SETTINGS, f"{WORK_FOLDER}/{SETTINGS}")
+        written = {
+            plan.name: _intact(scratch, plan, lambda file: sizes.get(file.path) == file.bytes)
+            for plan in assembly.plans
+        }
+        _write_missing(ShardWork(assembly, remote), written, workers, cluster, progress)
+        for split in {plan.split for plan in assembly.plans}:
+            (folder / split).mkdir()
+        manifest, names = _finish(folder, assembly, written)
+        for name in (*names, MANIFEST):
+            remote.put(folder / name, name)
+        remote.remove(WORK_FOLDER)
+        return manifest
+
+
+def _intact(scratch: Path, plan: ShardPlan, whole: Callable[[ShardFile | OtherFile], bool]) -> Written | None:
+    """What was written of a shard by its receipt, if every file is ``whole``, else None."""
+    written = planned_receipt(scratch / f"{plan.name}.json", plan)
+    if written is None:
+        return None
+    files: list[ShardFile | OtherFile] = [*written[0][0], *written[1]]
+    return written if all(map(whole, files)) else None
+
+
+def _write_missing(
+    work: ShardWork, written: dict[str, Written | None], workers: int, cluster: str | None, progress: Progress
+) -> None:
+    """Write the shards whose entry in ``written`` is None, and fill it."""
+    plans = work.assembly.plans
+    missing = [plan for plan in plans if written[plan.name] is None]
+    progress(sum(len(plan.samples) for plan in plans if written[plan.name] is not None))
+    workers, cluster = min(workers, max(1, len(missing))), cluster if missing else None
+    if workers == 1 and cluster is None and isinstance(work.place, Path):
+        for plan in missing:
+            written[plan.name] = work.write(plan, lambda: progress(1))
+        return
+    missing.sort(key=lambda plan: -len(plan.samples))  # so that no worker is left with a long shard at the end
+    with mapping(work, workers, cluster) as mapped:
+        for plan, done in zip(missing, mapped(ShardWork.write, missing), strict=True):
+            written[plan.name] = done
+            progress(len(plan.samples))
+
+
+def _finish(folder: Path, assembly: Assembly, written: Mapping[str, Written | None]) -> tuple[Manifest, list[str]]:
+    """Write card and manifest into ``folder``; the manifest, and the names of the files beside it."""
+    whole = [done for done in written.values() if done is not None]
+    manifest = assembly.filled([receipt for receipt, _ in whole])
+    # Only files written here are listed: `fpp-bench verify` reports any other file in the folder as foreign.
+    names = write_card(folder, manifest)
+    others = {mesh.path: mesh for _, meshes in whole for mesh in meshes}
+    others |= {name: describe_file(folder, folder / name) for name in names}
+    manifest = replace(manifest, others=[others[path] for path in sorted(others)])
+    manifest.write(folder)
+    return manifest, names
 
 
 @contextmanager
@@ -155,47 +293,18 @@ def _changed_after(path: Path, moment: Path) -> bool:
     return max(status.st_ctime_ns, status.st_mtime_ns) > moment.stat().st_mtime_ns
 
 
-def _assemble(
-    folder: Path, scratch: Path, assembly: Assembly, workers: int, progress: Progress, cluster: str | None
-) -> Manifest:
-    check_settings(folder, scratch, assembly)
-    for leftover in (*scratch.glob("*.tmp"), *folder.rglob(".*.tmp")):  # of a run that was killed while writing
-        leftover.unlink(missing_ok=True)  # the two patterns overlap
-    receipts = {}
-    for plan in assembly.plans:
-        receipt = _receipt(folder, scratch, plan)
-        if receipt and all((folder / name).is_file() for name in assembly.mesh_paths(receipt[1])):
-            receipts[plan.name] = receipt
-    missing = [plan for plan in assembly.plans if plan.name not in receipts]
-    progress(sum(len(plan.samples) for plan in assembly.plans if plan.name in receipts))
-    _check_space(folder, assembly, missing)
-    work = ShardWork(assembly, folder, scratch)
-    if cluster is not None and missing:
-        written = _write_on_cluster(work, missing, cluster, progress)
-    elif workers > 1 and len(missing) > 1:
-        written = write_in_processes(work, missing, workers, progress)
-    else:
-        written = ((plan, work.write(plan, lambda: progress(1))) for plan in missing)
-    with closing(written):
-        for plan, (files, rows) in written:
-            content = {"files": [asdict(file) for file in files], "rows": rows}
-            write_atomically(scratch / f"{plan.name}.json", json.dumps(content).encode())
-            receipts[plan.name] = files, rows
-    return _finish(folder, assembly, [receipts[plan.name] for plan in assembly.plans])
-
-
-def check_settings(folder: Path | RemoteFolder, scratch: Path, assembly: Assembly) -> None:
+def _check_settings(folder: Path | RemoteFolder, scratch: Path, assembly: Assembly) -> None:
     """Write the settings into the work folder ``scratch``, or raise `BuildError` where it holds others."""
     path = scratch / SETTINGS
     # Another version may make other bytes: its finished dataset is valid, but a dataset must not mix two versions.
     settings = {**assembly.key(), "generator": assembly.manifest.generator}
     if path.exists():
         begun = read_json(path, BuildError, f"delete {folder} and start again")
-        compare(folder, begun if isinstance(begun, dict) else {}, settings)
+        _compare(folder, begun if isinstance(begun, dict) else {}, settings)
     write_atomically(path, json.dumps(settings, indent=1).encode())
 
 
-def compare(folder: Path | RemoteFolder, stored: dict[str, Any], requested: dict[str, Any]) -> None:
+def _compare(folder: Path | RemoteFolder, stored: dict[str, Any], requested: dict[str, Any]) -> None:
     """Raise `BuildError` naming the differences between the folder's settings and the requested settings."""
     stored, requested = json.loads(json.dumps(stored)), json.loads(json.dumps(requested))
     differing = []
@@ -219,21 +328,12 @@ def _short(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-def _receipt(folder: Path, scratch: Path, plan: ShardPlan) -> Receipt | None:
-    """Receipt of a shard that is finished and whose files are intact, else None."""
-    receipt = planned_receipt(scratch / f"{plan.name}.json", plan)
-    try:
-        intact = receipt and all(file_hash(folder / file.path) == file.xxh3_128 for file in receipt[0])
-    except OSError:
-        intact = False
-    return receipt if intact else None
-
-
-def planned_receipt(file: Path, plan: ShardPlan) -> Receipt | None:
+def planned_receipt(file: Path, plan: ShardPlan) -> Written | None:
     """What a receipt says; None for one that is absent, damaged or not of this plan."""
     try:
         content = read_json(file, BuildError)
         files = strictly(list[ShardFile], content["files"])
+        meshes = strictly(list[OtherFile], content["meshes"])
         rows = strictly(list[dict[str, Any]], content["rows"])
         for row in rows:
             check_row(row)
@@ -242,7 +342,7 @@ def planned_receipt(file: Path, plan: ShardPlan) -> Receipt | None:
         return None
     labels = tuple((row["sample"], row["object"], row["view"]) for row in rows)
     named = all(entry.path == plan.path(entry.group) and entry.split == plan.split for entry in files)
-    return (files, rows) if labels == plan.samples and named else None
+    return ((files, rows), meshes) if labels == plan.samples and named else None
 
 
 def _check_space(folder: Path, assembly: Assembly, missing: list[ShardPlan]) -> None:
@@ -253,35 +353,3 @@ def _check_space(folder: Path, assembly: Assembly, missing: list[ShardPlan]) -> 
             f"{folder}: needs {needed / 1e9:.2f} GB more and the disk has {free / 1e9:.2f} GB free; free some space, "
             "choose another disk, a smaller --size or fewer --objects"
         )
-
-
-def _write_on_cluster(
-    work: ShardWork, plans: list[ShardPlan], cluster: str, progress: Progress
-) -> Generator[tuple[ShardPlan, Receipt], None, None]:
-    """Write the shards as tasks of a Ray cluster whose nodes share the folder."""
-    with mapping(work, cluster=cluster) as mapped:
-        for plan, receipt in zip(plans, mapped(_write_shared, plans), strict=True):
-            progress(len(plan.samples))
-            yield plan, receipt
-
-
-def _write_shared(work: ShardWork, plan: ShardPlan) -> Receipt:
-    if not (work.scratch / SETTINGS).is_file():
-        raise BuildError(without_files(work.folder))
-    return work.write(plan)
-
-
-def without_files(folder: Path | RemoteFolder) -> str:
-    """What to say where a task does not find what the command wrote."""
-    node = platform.node()
-    return f"{folder}: node {node} does not find the build there; give a folder that all nodes share, or a URL"
-
-
-def _finish(folder: Path, assembly: Assembly, receipts: list[Receipt]) -> Manifest:
-    manifest = assembly.filled(receipts)
-    rows = [row for part in manifest.samples.values() for row in part]
-    # Only files written here are listed: `fpp-bench verify` reports any other file in the folder as foreign.
-    names = [*write_card(folder, manifest), *assembly.mesh_paths(rows)]
-    manifest = replace(manifest, others=[describe_file(folder, folder / name) for name in sorted(names)])
-    manifest.write(folder)
-    return manifest

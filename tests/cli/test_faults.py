@@ -10,7 +10,6 @@ import sys
 import time
 from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -33,7 +32,7 @@ from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import DatasetError, DiagnosisError, PoolError, RemoteError, TrainingError
 from fpp_ml_bench.files import LOCK_FILE, exclusive, file_hash, write_atomically
 from fpp_ml_bench.loaders.render.builder import build
-from fpp_ml_bench.loaders.storage import assembly, shard_processes, store
+from fpp_ml_bench.loaders.storage import assembly, store
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.remote import RemoteFolder
 
@@ -231,7 +230,7 @@ def test_errors_of_the_system_come_without_numbers(tmp_path, monkeypatch):
     def full(*arguments, **options):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/some/file")
 
-    monkeypatch.setattr(assembly, "_assemble", full)
+    monkeypatch.setattr(assembly, "_check_settings", full)
     with pytest.raises(
         DatasetError, match=r"^/some/file: writing failed \(No space left on device\); remove the cause"
     ):
@@ -286,7 +285,6 @@ def test_without_shared_memory_there_is_a_message(tmp_path, monkeypatch, capsys)
     message = r"shared memory \(/dev/shm\) can't be used \(Read-only file system\).* or give --workers 1"
     with pytest.raises(PoolError, match=message), pool.mapping(None, 2):
         pass
-    monkeypatch.setattr(shard_processes, "get_context", lambda method: SimpleNamespace(Value=read_only))
     words = [
         "build",
         "--out",

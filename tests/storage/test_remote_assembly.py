@@ -7,10 +7,7 @@ from conftest import file_bytes
 from synthetic import SyntheticRows, assembly
 
 from fpp_ml_bench.errors import BuildError, PoolError
-from fpp_ml_bench.loaders.storage import assembly as assembling
-from fpp_ml_bench.loaders.storage import remote_assembly
-from fpp_ml_bench.loaders.storage.assembly import assemble
-from fpp_ml_bench.loaders.storage.remote_assembly import assemble_remote
+from fpp_ml_bench.loaders.storage.assembly import ShardWork, assemble, assemble_remote
 from fpp_ml_bench.remote import RemoteFolder
 
 SHARDS = [12, 6, 6]
@@ -106,9 +103,6 @@ def test_a_cluster_writes_the_same_files_and_goes_on_where_it_died(shared, local
 
 def test_a_node_that_does_not_see_the_folder_or_url_says_so(remote, tmp_path):
     plan, made = noise().plans[0], noise()
-    for write, work in (
-        (assembling._write_shared, assembling.ShardWork(made, tmp_path, tmp_path)),
-        (remote_assembly._write_shard, remote_assembly.RemoteWork(made, remote)),
-    ):
+    for place in (tmp_path, remote):
         with pytest.raises(BuildError, match="does not find the build there; give a folder that all nodes share, or a"):
-            write(work, plan)
+            ShardWork(made, place).write(plan)
