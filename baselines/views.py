@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import FULL_SIZE, MM_PER_M, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation.protocol import TARGETS
-from fpp_ml_bench.evaluation.score.check import scored_pair
-from fpp_ml_bench.evaluation.score.evaluator import evaluate
-from fpp_ml_bench.evaluation.submission.prediction_files import list_folder, read_sigma, reader_for
+from fpp_ml_bench.evaluation.score.check import check_folder, scored_pair
+from fpp_ml_bench.evaluation.submission.prediction_files import read_sigma, reader_for
 from fpp_ml_bench.files import printable, write_files
 from fpp_ml_bench.loaders.render.scene import turned, unturned
 from fpp_ml_bench.loaders.sample import DEPTH_EXACT
@@ -194,15 +193,19 @@ def prediction_maps(predictions: str | Path, dataset: DatasetFolder, split: str)
         column = predictions
         return f"{column} of {printable(dataset.path.name)}", lambda sample: (dataset.depth_mm(sample, column), None)
     folder = Path(predictions)
-    result, samples = evaluate(folder, dataset, split), dataset.samples(split)
-    described, form = result.submission, list_folder(folder, samples, split, {}).form
-    reader = reader_for(form, folder, samples, dataset.size, described.png_mm_per_level)
+    checked = check_folder(folder, dataset, split)
+    if checked.problems or checked.description is None:
+        raise PredictionError(
+            f"{printable(str(folder), 500)} can't be used, {len(checked.problems)} problems:", checked.problems
+        )
+    described = checked.description
+    reader = reader_for(checked.form, folder, checked.samples, dataset.size, described.png_mm_per_level)
 
     def read(sample: str) -> tuple[Map, Map | None]:
         target_mm = dataset.target_mm(sample, DEPTH_EXACT)
         left_out = dataset.left_out(sample, described.range_rule, DEPTH_EXACT)
         depth_mm, _ = scored_pair(reader.read(sample)[0], target_mm, described.units, "standard", sample, left_out)
-        sigma_mm = read_sigma(folder, sample, dataset.size) if result.uncertainty is not None else None
+        sigma_mm = read_sigma(folder, sample, dataset.size) if checked.sigmas else None
         return np.array(depth_mm), sigma_mm
 
     return described.name, read

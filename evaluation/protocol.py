@@ -62,6 +62,8 @@ LARGEST_MM = 1e30
 METRES_BELOW, UNITS_APART = 10.0, 30.0
 """A prediction whose largest value is under METRES_BELOW, and UNITS_APART times smaller than the depths that there are,
 is not in mm: it is nearer to a thousandth of them. One in m whose median is as many times larger is in mm."""
+METRES_AT_MOST = 100.0
+"""Where no rig and no target are known, larger values than this are hardly metres."""
 NORMALISED_AT_MOST = 1.2
 """A normalised prediction whose median over the object is above this can't be a share of the sample's range."""
 

@@ -1,21 +1,34 @@
-"""Checks of what a submission declares: its description, and its units, from which depth becomes the mm that are
-scored."""
+"""Checks of what a submission declares: its units, from which depth becomes the mm that are scored, and all that can be
+checked without ground truth: its description, its files, their size and values."""
 
 from __future__ import annotations
 
+from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.constants import LARGEST_SIDE_PX, MM_PER_M
 from fpp_ml_bench.depth import depth_range_mm, extremes, object_mask
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import Mode, Units
-from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE
+from fpp_ml_bench.evaluation.submission.prediction_files import (
+    SIGMA,
+    SUBMISSION_FILE,
+    Listing,
+    declared_size,
+    list_folder,
+    read_plain,
+    read_sigma,
+    reader_for,
+    samples_in,
+)
 from fpp_ml_bench.files import printable
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 if TYPE_CHECKING:
     from fpp_ml_bench.evaluation.submission.description import Submission
@@ -96,6 +109,17 @@ def _unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, re
     return None
 
 
+def unit_note(largest: float, units: Units) -> str | None:
+    """What looks wrong with ``units`` where no target is known and ``largest`` is the largest value of all samples."""
+    suspicious = {
+        "mm": (0 < largest < protocol.METRES_BELOW, "are these metres or normalised depth?"),
+        "m": (largest > protocol.METRES_AT_MOST, "are these mm?"),
+        "normalised": (largest > protocol.METRES_BELOW, "are these m or mm?"),
+    }
+    wrong, question = suspicious[units]
+    return f"units: {units}, but the largest value of all samples is {largest:.4g}; {question}" if wrong else None
+
+
 def scored_pair(
     values: Depth, target_mm: Depth, units: Units, mode: Mode, sample: str, left_out: NDArray[np.bool_] | None = None
 ) -> tuple[Depth, Depth]:
@@ -134,12 +158,27 @@ def scored_pair(
     return values.astype(np.float64) * (high - low), np.where(inside, target_mm.astype(np.float64) - low, 0.0)
 
 
-def checked_description(folder: Path, content: dict[Any, Any], form: str, frames: int) -> Submission:
-    """The folder's description, checked against the predictions' ``form`` and a sequence of ``frames``."""
+@dataclass(frozen=True)
+class Checked:
+    """``problems``: a line for each reason to refuse the folder, usually none; ``notes``: what is worth a look.
+    ``size`` (H, W) in px; ``sigmas``: whether the samples state their uncertainty."""
+
+    problems: list[str]
+    notes: list[str]
+    description: Submission | None
+    samples: list[str]
+    form: str
+    size: tuple[int, int]
+    sigmas: bool
+
+
+def checked_description(folder: Path, content: dict[Any, Any], form: str, frames: int | None = None) -> Submission:
+    """The folder's description, checked against the predictions' ``form`` and a sequence of ``frames``, where known."""
     from fpp_ml_bench.evaluation.submission.description import check_submission  # imports pydantic
 
     description = check_submission(folder, content)
-    if outside := [index for index in description.frames_used if index >= frames]:
+    outside = [index for index in description.frames_used if frames is not None and index >= frames]
+    if frames is not None and outside:
         expected = f"expected indices from 0 to {frames - 1} of this dataset's sequence"
         problem = f"frames_used: {expected}, got {printable(str(outside), 100)}"
     elif form == ".png" and description.png_mm_per_level is None:
@@ -149,3 +188,66 @@ def checked_description(folder: Path, content: dict[Any, Any], form: str, frames
     else:
         return description
     raise SubmissionError(f"{printable(str(folder / SUBMISSION_FILE), 500)}: {problem}")
+
+
+def check_folder(folder: str | Path, dataset: DatasetFolder | None = None, split: str = "test") -> Checked:
+    """Check everything of a submission that needs no ground truth. With a ``dataset``, its split says which samples of
+    which size are expected; without, the files' names and the size that most of them have do. Raises PredictionError
+    for no folder, and for a form that can't be read without a dataset."""
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise PredictionError(f"expected a folder of predictions, found none at {printable(str(folder), 500)}")
+    samples = samples_in(folder) if dataset is None else dataset.samples(split)
+    if not samples:
+        expected = "expected one {sample}.npy for each sample, found none"
+        raise PredictionError(f"{printable(str(folder), 500)}: {expected}; tables need DATASET")
+    split_of = {} if dataset is None else {name: part for part, names in dataset.splits.items() for name in names}
+    listing = list_folder(folder, samples, split, split_of)
+    problems, notes = list(listing.problems), []
+    description = None
+    try:
+        content = read_plain(folder)
+        description = checked_description(
+            folder, content, listing.form, None if dataset is None else len(dataset.sequence)
+        )
+    except SubmissionError as error:
+        problems.insert(0, str(error))
+    size = _declared_size(folder, listing) if dataset is None else dataset.size
+    level_mm = None if description is None else description.png_mm_per_level
+    units = "mm" if description is None else description.units
+    largest = 0.0
+    if listing.form != ".png" or level_mm is not None:
+        reader = reader_for(listing.form, folder, listing.present, size, level_mm)
+        for sample in listing.present:
+            try:
+                values, _ = reader.read(sample)
+                largest = max(largest, float(values.max()))
+                found = value_problems(values, np.zeros(size), 0.0, units)
+            except PredictionError as error:
+                found = [str(error)]
+            problems += [f"{printable(reader.named(sample))}: {problem}" for problem in found]
+    for sample in listing.present if listing.sigmas else ():
+        try:
+            read_sigma(folder, sample, size)
+        except PredictionError as error:
+            problems.append(f"{printable(sample)}{SIGMA}: {error}")
+    if note := unit_note(largest, units):
+        notes.append(note)
+    return Checked(problems, notes, description, listing.present, listing.form, size, listing.sigmas)
+
+
+def _declared_size(folder: Path, listing: Listing) -> tuple[int, int]:
+    """The size (H, W) that most of the files declare. PredictionError where it is too large to be read."""
+    if listing.form == ".mat":
+        raise PredictionError(f"{printable(str(folder), 500)}: .mat files can only be checked with DATASET")
+    files = [folder / f"{sample}{listing.form}" for sample in listing.present]
+    declared = {file: size for file in files if (size := declared_size(file)) and min(size) > 0}
+    if not declared:
+        named = printable(str(folder), 500)
+        raise PredictionError(f"{named}: no file holds a depth map (H, W); write them with np.save")
+    size = Counter(declared.values()).most_common(1)[0][0]
+    if max(size) > LARGEST_SIDE_PX:
+        file = next(file for file in declared if declared[file] == size)
+        most = f"expected at most {LARGEST_SIDE_PX} without a dataset; write the depth map itself, or give DATASET"
+        raise PredictionError(f"{printable(str(file), 500)}: declares {size[1]} x {size[0]} px, {most}")
+    return size

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.score.check import scored_pair
+from fpp_ml_bench.evaluation.score.check import check_folder, scored_pair
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.sample_scores import gaussian_quantile, states_sigma
 from fpp_ml_bench.evaluation.submission.description import Submission, check_submission
@@ -140,9 +140,11 @@ def write_calibrated(calibration: Calibration, folder: Path, dataset: DatasetFol
     """Copy the predictions of ``split`` in ``folder`` to the new folder ``out``, with every sigma scaled and the factor
     among the settings of ``submission.yaml``; how many samples. Raises PredictionError for predictions that are
     unsound, of another method, or of objects that were calibrated on, and for an ``out`` that is there already."""
-    result = evaluate(folder, dataset, split)  # checks every file
-    description = result.submission
-    _check_stated(folder, description, result.uncertainty is not None)
+    checked = check_folder(folder, dataset, split)
+    if checked.problems or checked.description is None:
+        raise PredictionError(f"{folder} can't be used, {len(checked.problems)} problems:", checked.problems)
+    description = checked.description
+    _check_stated(folder, description, checked.sigmas)
     for key in ("name", "method", "units"):
         pair = getattr(calibration.described, key), getattr(description, key)
         if pair[0] != pair[1]:
@@ -160,7 +162,7 @@ def write_calibrated(calibration: Calibration, folder: Path, dataset: DatasetFol
     for path in sorted(folder.iterdir()):
         if not path.name.endswith(SIGMA) and path.name != SUBMISSION_FILE:
             shutil.copyfile(path, out / path.name)
-    for sample in dataset.samples(split):
+    for sample in checked.samples:
         sigma_mm = read_sigma(folder, sample, dataset.size).astype(np.float64) * calibration.factor
         np.save(out / f"{sample}{SIGMA}", sigma_mm.astype(np.float32))
     settings = {
@@ -176,4 +178,4 @@ def write_calibrated(calibration: Calibration, folder: Path, dataset: DatasetFol
     }
     text = check_submission(out, content).to_yaml()
     write_atomically(out / SUBMISSION_FILE, text.encode("utf-8"))
-    return len(result.per_sample)
+    return len(checked.samples)

@@ -34,6 +34,7 @@ BLOCK = 9600
 """Pixels per block. OpenBLAS spreads dot products over its threads from 10,000 elements on, and the rounding of the sum
 would then depend on the number of cores. Below that a score depends on the type of processor only."""
 
+_BLOCKS_AT_ONCE = 8
 _HALF_LOG_2_PI = 0.9189385332046727
 _SQUARES_LOST = 1e-280
 """Mean square below which squares may have lost digits: the smallest normal number is 2e-308, and an image has about a
@@ -105,22 +106,38 @@ def _from_sums(pixels: int, absolute: list[float], squares: list[float], errors:
 
 def _background(prediction: Map, target: Map, void: NDArray[np.bool_] | None) -> tuple[ErrorStats, NDArray[np.bool_]]:
     """Statistics of every pixel that is neither object nor void, by setting the errors of those to 0, and the mask of
-    the object; all (n,). Not overall minus object: that would leave rounding errors where the background is perfect."""
-    inside = object_mask(target)
-    excluded = inside if void is None else inside | void
-    errors = np.zeros(-(-target.size // BLOCK) * BLOCK)
-    np.copyto(errors[: target.size], prediction)
-    # A target without negative values is exactly 0 on the background: there the prediction is the error.
-    if not target.min() >= 0:
-        errors[: target.size] -= target
-    np.copyto(errors[: target.size], 0.0, where=excluded)
-    blocks = errors.reshape(-1, BLOCK)
-    squares = [float(block.dot(block)) for block in blocks]
-    absolute = np.abs(blocks, out=blocks).sum(axis=1).tolist()
-    pixels = target.size - int(np.count_nonzero(excluded))
-    return _from_sums(
-        pixels, absolute, squares, lambda: prediction[~excluded].astype(np.float64) - target[~excluded]
-    ), inside
+    the object; all (n,). Not overall minus object: that would leave rounding errors where the background is perfect.
+    Everything is done block by block, while the block is in the cache."""
+    inside = np.empty(target.shape, dtype=bool)
+    buffer = np.zeros((_BLOCKS_AT_ONCE, BLOCK))
+    flat, step = buffer.reshape(-1), buffer.size
+    pixels = 0
+    absolute: list[float] = []
+    squares: list[float] = []
+    for start in range(0, target.size, step):
+        part = slice(start, start + step)
+        excluded = inside[part] = object_mask(target[part])
+        if void is not None:
+            excluded = excluded | void[part]
+        errors = flat[: excluded.size]
+        np.copyto(errors, prediction[part])
+        # A target without negative values is exactly 0 on the background: there the prediction is the error.
+        if not target[part].min() >= 0:
+            errors -= target[part]
+        scored = excluded.size - int(np.count_nonzero(excluded))
+        if scored < excluded.size:
+            np.copyto(errors, 0.0, where=excluded)
+        pixels += scored
+        flat[errors.size :] = 0.0
+        squares += [float(block.dot(block)) for block in buffer]
+        np.abs(buffer, out=buffer)
+        absolute += buffer.sum(axis=1).tolist()
+
+    def errors_outside() -> Errors:
+        outside = ~inside if void is None else ~(inside | void)
+        return prediction[outside].astype(np.float64) - target[outside]
+
+    return _from_sums(pixels, absolute, squares, errors_outside), inside
 
 
 _EDGE, _WIDE, _MISSING = 1, 2, 4

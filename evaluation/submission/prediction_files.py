@@ -7,6 +7,7 @@ import os
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from threading import Lock, local
 from tokenize import TokenError
@@ -102,6 +103,16 @@ def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapp
     return Listing(form, problems, present, sigmas)
 
 
+def samples_in(folder: Path) -> list[str]:
+    """The samples that a folder holds a file of its own for, by the files' names, ascending."""
+    try:
+        names = sorted(path.name for path in folder.iterdir())
+    except OSError as error:
+        raise PredictionError(f"{printable(str(folder), 500)} can't be read: {error.strerror}") from None
+    stems = (name.removesuffix(suffix) for name in names for suffix in PER_SAMPLE if name.endswith(suffix))
+    return list(dict.fromkeys(stem.removesuffix(SIGMA.removesuffix(".npy")) for stem in stems))
+
+
 HEADER_BYTES = 16384
 # NumPy parses a header through `ast`, whose recursion counter all threads share (CPython 3.11): two at once may fail.
 _PARSING = Lock()
@@ -132,6 +143,23 @@ def read_npy(path: Path, size: tuple[int, int], memory: local) -> MapAndHash:
 def _largest_npy(size: tuple[int, int]) -> int:
     """Bytes of the largest accepted .npy of an (H, W) map: float64 and its header."""
     return HEADER_BYTES + size[0] * size[1] * 8
+
+
+def declared_size(path: Path) -> tuple[int, int] | None:
+    """The size (H, W) that a .npy, .npz or .png file states; None where it states none. Nothing else is checked."""
+    with suppress(OSError, zipfile.BadZipFile, IndexError, *_NO_HEADER):
+        with opened(path) as (stream, length):
+            head = stream.read(min(HEADER_BYTES, length))
+        if (header := png_header(head)) is not None:
+            return header.size
+        if head.startswith(b"PK"):
+            with zipfile.ZipFile(path) as archive, archive.open(archive.infolist()[0]) as member:
+                head = member.read(HEADER_BYTES)
+        content = io.BytesIO(head)
+        with _PARSING:
+            shape, _, _ = _HEADERS[npy.read_magic(content)](content)
+        return (int(shape[0]), int(shape[1])) if len(shape) == 2 else None
+    return None
 
 
 def parse_npy(content: bytes, size: tuple[int, int]) -> NDArray[Any]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fpp_ml_bench.cli import CHECK_FAILED, OK
-from fpp_ml_bench.cli.options import SPLITS, command, value
+from fpp_ml_bench.cli.options import SPLITS, Explain, command, value
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, MODES, TARGETS
 from fpp_ml_bench.files import printable
@@ -61,15 +61,18 @@ def score_folder(
     ),
     json: Path | None = option(None, "write the result here, per-sample scores included; - is standard output", "FILE"),
     page: Path | None = option(None, "write an HTML page with figures into this folder", "DIR", flag="--report"),
+    account: Explain,
 ) -> None:
     """Score a folder of predictions: MAE and RMSE in mm over the full grid, the object and the background.
 
     Raises FppBenchError for anything that can't be scored."""
     from fpp_ml_bench.evaluation.result.file import write_result
     from fpp_ml_bench.evaluation.score.evaluator import evaluate as evaluate_folder
+    from fpp_ml_bench.evaluation.score.evaluator import explain_eval
     from fpp_ml_bench.loaders.storage.benchmark import benchmark_sentence
 
     prepare_process()
+    account.check()
     _check_outputs(json, page, predictions)
     opened, split = scored_data(predictions, dataset, split)
     scored = evaluate_folder(
@@ -96,6 +99,7 @@ def score_folder(
     has_expected_bytes, sentence = benchmark_sentence(opened.manifest)
     if not has_expected_bytes:
         print(f"fpp-eval: warning: {opened.path}: {sentence}", file=sys.stderr)
+    account.say(lambda: explain_eval(opened, split, target, edge_band))
 
 
 def _result_table() -> "Callable[[Result], Any]":
@@ -174,8 +178,7 @@ def init(
     from fpp_ml_bench.evaluation.submission.description import write_template
 
     print(f"Written: {write_template(predictions)}")
-    then = f"fpp-eval check {predictions} DATASET"
-    print(f"next: fill it in, write one {{sample}}.npy for each sample beside it, then: {then}")
+    print(f"next: fill it in, write one {{sample}}.npy for each sample beside it, then: fpp-eval check {predictions}")
 
 
 @command(
@@ -187,30 +190,32 @@ fpp-eval check predictions data/mini --split test
 def check(
     *,
     predictions: Path = argument("folder of predictions and submission.yaml", "PREDICTIONS"),
-    dataset: Path | None = argument(
-        "folder of the dataset (default: the one that fpp-bench predict read, by submission.yaml)", "DATASET", None
-    ),
-    split: str | None = option(
-        None, "samples expected (default: those that were predicted by submission.yaml, else test)", choices=SPLITS
-    ),
+    dataset: Path | None = argument("check names, sizes and frames against this dataset, too", "DATASET", None),
+    split: str = option("test", "samples expected with DATASET (default: test)", choices=SPLITS),
 ) -> int:
-    """Check a submission as it is when it is scored, and show no score: exit status 0 sound, 1 refused.
+    """Check a submission before it is scored, without ground truth: exit status 0 sound, 1 refused.
 
-    Raises FppBenchError for no folder, and where nothing says which dataset was predicted."""
-    from fpp_ml_bench.evaluation.score.evaluator import evaluate as evaluate_folder
+    Raises FppBenchError for no folder."""
+    from fpp_ml_bench.evaluation.score.check import check_folder
+    from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
-    opened, split = scored_data(predictions, dataset, split)
-    try:
-        checked = evaluate_folder(predictions, opened, split)
-    except (PredictionError, SubmissionError) as error:
-        print(error)
+    opened = None if dataset is None else DatasetFolder(dataset)
+    checked = check_folder(predictions, opened, split)
+    folder = printable(str(predictions), 500)
+    for note in checked.notes:
+        print(f"fpp-eval: note: {note}", file=sys.stderr)
+    if checked.problems:
+        print(f"{folder} would be refused, {len(checked.problems)} problem{'s' * (len(checked.problems) > 1)}:")
+        for line in checked.problems:
+            print(f"  {line}")
         return CHECK_FAILED
-    height, width = opened.size
-    sigma = "" if checked.uncertainty is None else ", with an uncertainty"
-    shown, samples = printable(str(predictions), 500), len(checked.per_sample)
-    print(f"{shown}: {samples} samples of split {split}, {width}x{height} px{sigma}; sound")
-    frames, track = len(checked.submission.frames_used), checked.track
-    print(f"submission.yaml: {track} track, {frames} {'frame' if frames == 1 else 'frames'}; sound")
+    height, width = checked.size
+    sigma = ", with an uncertainty" if checked.sigmas else ""
+    against = "" if dataset is None else f" of split {split}"
+    print(f"{folder}: {len(checked.samples)} samples{against}, {checked.form}, {width}x{height} px{sigma}; sound")
+    if checked.description is not None:
+        frames, track = len(checked.description.frames_used), checked.description.track
+        print(f"submission.yaml: {track} track, {frames} {'frame' if frames == 1 else 'frames'}; sound")
     return OK
 
 

@@ -117,14 +117,18 @@ def test_predictions_scores_and_their_accounts(tiny, tmp_path, capsys):
         and second_direction["done"] + second_direction["left_out"] == 6 * PIXELS
     )
     scores = []
-    for name in ("a.json", "b.json"):
+    for name, options in (("a.json", ["--explain-json", str(account)]), ("b.json", [])):
         result = tmp_path / name
-        command = [str(tmp_path / "on"), str(tiny), "--json", str(result)]
+        command = [str(tmp_path / "on"), str(tiny), "--json", str(result), *options]
         with skipping(name == "a.json"):
             assert evaluate(command) == 0
         content = json.loads(result.read_text())
         scores.append({key: value for key, value in content.items() if key != "created"})
     assert scores[0] == scores[1]
+    _, lines = lines_of(account)
+    columns = lines["columns that no score needs"]
+    assert (columns["done"], columns["left_out"]) == (6, 6 * 53) and columns["bytes_saved"] == 6 * PIXELS * (52 + 4)
+    assert lines["depth edges far from the object"]["done"] > object_px
     assert "left out" in capsys.readouterr().out
 
 
