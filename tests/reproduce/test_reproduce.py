@@ -151,7 +151,7 @@ def test_from_trainings_to_a_table(run, trainer, tmp_path, tiny, capsys):
     assert f" {entries[TWINS[0]].row.metrics.object_mae_mm:.2f} / " in lines["individual"]
     assert "| 5 | 61 |" in lines["raw (mm)"]
     assert "3 among the rows measured here" in text and "of different tracks" in text
-    assert "paper: reported by the paper" in capsys.readouterr().out
+    assert "reported by the paper" in capsys.readouterr().out
 
 
 def stamps(folder):
