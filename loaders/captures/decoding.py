@@ -30,9 +30,8 @@ from fpp_ml_bench.loaders.captures.images import (
     read_frames,
     split_captures,
 )
-from fpp_ml_bench.loaders.published.importing import ImportPlan, RowReader, import_plan, run_import
+from fpp_ml_bench.loaders.published.importing import ImportPlan, RowReader, import_plan
 from fpp_ml_bench.loaders.sample import Row
-from fpp_ml_bench.loaders.storage.assembly import Progress
 from fpp_ml_bench.loaders.storage.manifest import CAPTURED, Manifest
 from fpp_ml_bench.loaders.storage.shards import ShardPlan, plan_rows
 from fpp_ml_bench.optics.rig import Rig
@@ -188,6 +187,9 @@ class CaptureReader(RowReader):
     def samples(self) -> Mapping[str, Capture]:
         return self.captures
 
+    def refusal(self, problems: list[str]) -> CaptureError:
+        return CaptureError("\n  ".join(problems))
+
     def read(self, capture: Capture) -> Row:
         """The capture's row: frames of 8 bits, and depth from the frames as they were captured. Raises `CaptureError`
         for frames that can't be read, that are of another size than the rig's camera, that the examination refuses
@@ -273,13 +275,6 @@ def plan_captures(
     }
     reader = CaptureReader({capture.sample: capture for capture in captures}, rig, limits, bits, colour, anyway)
     return import_plan(reader, plans, CAPTURED, settings, "all")
-
-
-def import_captures(
-    folder: Path, plan: ImportPlan[CaptureReader], workers: int, progress: Progress = lambda rows: None
-) -> Manifest:
-    """Write the planned dataset into ``folder`` as `run_import`; the `CaptureError` lists every wrong capture."""
-    return run_import(folder, plan, workers, progress, lambda problems: CaptureError("\n  ".join(problems)))
 
 
 def capture_notes(manifest: Manifest) -> list[str]:
