@@ -66,7 +66,7 @@ def board_poses(
     seen: dict[int, tuple[Path, int]] = {}
     for folder in pose_folders(captures):
         capture = read_frames(folder, count=len(rig.sequence), bits=bits, colour=colour)
-        frames, names = capture.frames, [file.name for file in capture.files]
+        frames = capture.frames
         height, width = frames.shape[1:]
         if not poses:
             rig = load_projection(sequence, (width, height))
@@ -74,7 +74,7 @@ def board_poses(
             expected = f"{poses[0].size[0]} x {poses[0].size[1]} px as in {poses[0].name}"
             raise CalibrationError(f"{folder}: images of {width} x {height} px, expected {expected}")
         _check_copies(folder, frames, seen)
-        examination = examine(frames, rig, names, calibrated=False)
+        examination = examine(frames, rig, capture.names, calibrated=False)
         if examination.refused and not anyway:
             raise RefusedCapture(str(folder), examination)
         examined(folder.name, examination)

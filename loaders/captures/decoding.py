@@ -5,10 +5,9 @@ What the rig can't decode is background there.
 """
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,21 +85,18 @@ def decode_capture(
     measured where there are four steps and more, else `ASSUMED_NOISE_GREY`. The frames are examined first: raises
     `RefusedCapture` where a finding makes the depth untrustworthy, unless ``anyway``; `CaptureError` for images of
     another size than the rig's, `DecodeError` where nothing can be decoded."""
-    frames, names = capture.frames, [file.name for file in capture.files]
-    examination = examine_capture(capture, rig, direction, mask=mask, min_modulation=min_modulation, anyway=anyway)
-    limits = Limits(min_modulation=min_modulation)
-    decoded = decode_stack(frames, rig, direction, mask=mask, limits=limits, details=True, threads=threads)
+    frames, limits = capture.frames, Limits(min_modulation=min_modulation)
+    decoded, examination = _examined_and_decoded(capture, rig, limits, anyway, direction, mask, threads)
     modulation = np.nanmax([measured.modulation for measured in decoded.details.values()], axis=0)
     measured_grey = noise_of_frames(list(frames), rig) if noise_grey is None else None
     noise = noise_grey if noise_grey is not None else measured_grey or ASSUMED_NOISE_GREY
     notes = [capture.note] if capture.note else []
     if noise_grey is None and measured_grey is None:
         notes.append(f"three steps can't tell their noise; {noise:g} grey level assumed, --noise sets it")
-    notes += _clipped(frames, names, modulation >= min_modulation)
+    notes += _clipped(capture, modulation >= min_modulation)
     if not decoded.depth_mm.any():
-        cause = main_reason(decoded)
-        name = cause.name.lower().replace("_", " ")
-        raise DecodeError(f"no pixel could be decoded; of most pixels: {name}; probably {CAUSES[cause]}")
+        cause = _main_reason(decoded)
+        raise DecodeError(f"no pixel could be decoded; of most pixels: {_words(cause)}; probably {CAUSES[cause]}")
     sigma_mm = depth_sigma_mm(decoded, rig, noise, systematic_rad=examination.systematic_rad)
     grey = frames.mean(axis=0, dtype=np.float64).astype(np.float32)
     return DecodedCapture(
@@ -108,47 +104,51 @@ def decode_capture(
     )
 
 
-def examine_capture(
+def _examined_and_decoded(
     capture: CapturedFrames,
     rig: Rig,
+    limits: Limits,
+    anyway: bool,
     direction: Directions = "both",
-    *,
     mask: NDArray[np.bool_] | None = None,
-    min_modulation: float = MIN_MODULATION,
-    anyway: bool = True,
-) -> Examination:
-    """What the frames of a capture say about themselves (`fpp_ml_bench.examination`), before they are decoded. Raises
+    threads: int = 1,
+) -> tuple[Decoded, Examination]:
+    """The capture decoded, after what its frames say about themselves (`fpp_ml_bench.examination`). Raises
     `CaptureError` for images of another size than the rig's, `RigError` for a direction that it does not code, and
     unless ``anyway`` `RefusedCapture` where a finding makes the depth untrustworthy."""
     height, width = capture.frames.shape[1:]
+    folder = capture.files[0].parent
     if (height, width) != (rig.camera.height, rig.camera.width):
         raise CaptureError(
-            f"{capture.files[0].parent}: frames of {width} x {height} px, and the rig has a camera of "
+            f"{folder}: frames of {width} x {height} px, and the rig has a camera of "
             f"{rig.camera.width} x {rig.camera.height} px; give the rig that took them"
         )
     directions: tuple[Direction, ...] = rig.directions if direction == "both" else (direction,)
-    limits = Limits(min_modulation=min_modulation)
     check_limits(limits)
-    names = [file.name for file in capture.files]
-    examination = examine(capture.frames, rig, names, directions=directions, mask=mask, limits=limits)
+    examination = examine(capture.frames, rig, capture.names, directions=directions, mask=mask, limits=limits)
     if examination.refused and not anyway:
-        raise RefusedCapture(str(capture.files[0].parent), examination)
-    return examination
+        raise RefusedCapture(str(folder), examination)
+    decoded = decode_stack(capture.frames, rig, direction, mask=mask, limits=limits, details=True, threads=threads)
+    return decoded, examination
 
 
-def main_reason(decoded: Decoded) -> Reason:
+def _main_reason(decoded: Decoded) -> Reason:
     """The reason of most pixels without depth."""
     return max(CAUSES, key=lambda reason: decoded.counts[reason.name.lower()])
 
 
-def _clipped(frames: NDArray, names: Sequence[str], lit: NDArray[np.bool_]) -> list[str]:
-    shares = [float((frame[lit] >= GREY_LEVELS).mean()) if lit.any() else 0.0 for frame in frames]
-    high = [(name, share) for name, share in zip(names, shares, strict=True) if share > CLIPPED_SHARE]
-    if not high:
-        return []
-    listed = ", ".join(f"{name} ({100 * share:.0f}%)" for name, share in high[:4])
+def _words(reason: Reason) -> str:
+    return reason.name.lower().replace("_", " ")
+
+
+def _clipped(capture: CapturedFrames, lit: NDArray[np.bool_]) -> list[str]:
+    shares = {
+        name: float((frame[lit] >= GREY_LEVELS).mean()) if lit.any() else 0.0
+        for name, frame in zip(capture.names, capture.frames, strict=True)
+    }
+    high = [f"{name} ({100 * share:.0f}%)" for name, share in shares.items() if share > CLIPPED_SHARE]
     more = f" and {len(high) - 4} more" if len(high) > 4 else ""
-    return [f"saturated on lit pixels: {listed}{more}; expose less"]
+    return [f"saturated on lit pixels: {', '.join(high[:4])}{more}; expose less"] if high else []
 
 
 def read_mask(file: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
@@ -195,52 +195,33 @@ class CaptureReader(RowReader):
         for frames that can't be read, that are of another size than the rig's camera, that the examination refuses
         (unless ``anyway``), and that give almost no depth."""
         captured = read_frames(capture.files, bits=self.bits, colour=self.colour)
-        least = self.limits.min_modulation
-        examination = examine_capture(captured, self.rig, min_modulation=least, anyway=self.anyway)
         try:
-            decoded = decode_stack(captured.frames, self.rig, limits=self.limits, details=True)
+            decoded, examination = _examined_and_decoded(captured, self.rig, self.limits, self.anyway)
         except DecodeError as error:
             raise CaptureError(f"{capture.folder}: {error}") from error
-        measured = _measured(decoded, captured) | {"findings": [str(finding) for finding in examination.findings]}
-        if measured["decoded_share"] < LEAST_DECODED_SHARE:
-            reason = main_reason(decoded)
-            share = decoded.counts[reason.name.lower()] / decoded.reason.size
+        good, rounded = decoded.reason == Reason.DECODED, captured.frames.dtype != np.uint8
+        decoded_share = float(good.mean())
+        shares = {name: count / good.size for name, count in decoded.counts.items() if count and name != "decoded"}
+        if decoded_share < LEAST_DECODED_SHARE:
+            reason = _main_reason(decoded)
+            share = shares.get(reason.name.lower(), 0.0)
             raise CaptureError(
-                f"{capture.folder}: only {100 * measured['decoded_share']:.2f}% of the pixels can be decoded, expected "
+                f"{capture.folder}: only {100 * decoded_share:.2f}% of the pixels can be decoded, expected "
                 f"at least {100 * LEAST_DECODED_SHARE:g}%; {100 * share:.0f}% are refused as "
-                f"{reason.name.lower().replace('_', ' ')}: probably {CAUSES[reason]}"
+                f"{_words(reason)}: probably {CAUSES[reason]}"
             )
-        frames = {index: _eight_bits(frame) for index, frame in enumerate(captured.frames)}
-        names = capture.sample, capture.object, capture.view
-        return Row(*names, frames, decoded.depth_mm, None, measured)
-
-
-def _eight_bits(frame: NDArray[Any]) -> NDArray[np.uint8]:
-    return frame if frame.dtype == np.uint8 else np.rint(frame).astype(np.uint8)
-
-
-def _measured(decoded: Decoded, captured: CapturedFrames) -> dict[str, Any]:
-    """Measurements for the manifest: share of the pixels with a depth, their median modulation in grey levels (of the
-    weaker direction), the share refused for each reason, and how the frames' levels were read."""
-    good = decoded.reason == Reason.DECODED
-    weakest = np.minimum.reduce([measured.modulation for measured in decoded.details.values()])
-    counts = {name: count for name, count in decoded.counts.items() if count and name != "decoded"}
-    return {
-        "decoded_share": float(good.mean()),
-        "median_modulation": float(np.median(weakest[good])) if good.any() else 0.0,
-        "refused_share": {name: count / good.size for name, count in counts.items()},
-        "full_scale": captured.full_scale,
-        "rounded": captured.frames.dtype != np.uint8,
-        "note": captured.note,
-    }
-
-
-def _views(captures: list[Capture]) -> dict[str, list[str]]:
-    """Views of each object."""
-    views: dict[str, list[str]] = {}
-    for capture in captures:
-        views.setdefault(capture.object, []).append(capture.view)
-    return views
+        weakest = np.minimum.reduce([measured.modulation for measured in decoded.details.values()])
+        measured = {
+            "decoded_share": decoded_share,
+            "median_modulation": float(np.median(weakest[good])),
+            "refused_share": shares,
+            "full_scale": captured.full_scale,
+            "rounded": rounded,
+            "note": captured.note,
+            "findings": [str(finding) for finding in examination.findings],
+        }
+        frames = {i: np.rint(frame).astype(np.uint8) if rounded else frame for i, frame in enumerate(captured.frames)}
+        return Row(capture.sample, capture.object, capture.view, frames, decoded.depth_mm, None, measured)
 
 
 def plan_captures(
@@ -271,7 +252,12 @@ def plan_captures(
         **asdict(limits),
         "bits": bits,
         "colour": colour,
-        "objects": {split: _views(chosen) for split, chosen in by_split.items()},
+        "objects": {
+            split: {
+                name: [c.view for c in chosen if c.object == name] for name in dict.fromkeys(c.object for c in chosen)
+            }
+            for split, chosen in by_split.items()
+        },
     }
     reader = CaptureReader({capture.sample: capture for capture in captures}, rig, limits, bits, colour, anyway)
     return import_plan(reader, plans, CAPTURED, settings, "all")

@@ -8,6 +8,7 @@ import io
 import json
 import re
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 from textwrap import wrap
 
@@ -120,22 +121,19 @@ def triangles(depth_mm: ArrayLike, camera: Pinhole, step_mm: float | None = None
     `export_capture`."""
     rays, depth = _rays_and_depth(depth_mm, camera)
     index = np.arange(depth.size).reshape(depth.shape)
-    sides = (_FIRST, _RIGHT), (_FIRST, _BELOW), (_RIGHT, _ACROSS), (_BELOW, _ACROSS)
-    top, left, right, bottom = (_joined(rays, depth, one, other, step_mm) for one, other in sides)
-    falling, rising = (
-        _joined(rays, depth, one, other, step_mm) for one, other in ((_FIRST, _ACROSS), (_RIGHT, _BELOW))
-    )
-    along_falling = falling & left & bottom, falling & right & top
-    along_rising = rising & left & top, rising & right & bottom
-    more = along_falling[0].astype(int) + along_falling[1] - along_rising[0] - along_rising[1]
+
+    def whole(*corners: Part) -> tuple[NDArray[np.bool_], tuple[Part, ...]]:
+        """Where three corners belong to one surface, pair by pair."""
+        pairs = [_joined(rays, depth, one, other, step_mm) for one, other in combinations(corners, 2)]
+        return np.logical_and.reduce(pairs), corners
+
+    falling = whole(_FIRST, _BELOW, _ACROSS), whole(_FIRST, _ACROSS, _RIGHT)
+    rising = whole(_FIRST, _BELOW, _RIGHT), whole(_RIGHT, _BELOW, _ACROSS)
+    more = sum(there.astype(int) for there, _ in falling) - sum(there.astype(int) for there, _ in rising)
     flatter = np.abs(depth[_FIRST] - depth[_ACROSS]) <= np.abs(depth[_RIGHT] - depth[_BELOW])
     chosen = (more > 0) | ((more == 0) & flatter)
-    parts = (
-        (chosen & along_falling[0], (_FIRST, _BELOW, _ACROSS)),
-        (chosen & along_falling[1], (_FIRST, _ACROSS, _RIGHT)),
-        (~chosen & along_rising[0], (_FIRST, _BELOW, _RIGHT)),
-        (~chosen & along_rising[1], (_RIGHT, _BELOW, _ACROSS)),
-    )
+    parts = [(there & chosen, corners) for there, corners in falling]
+    parts += [(there & ~chosen, corners) for there, corners in rising]
     return np.concatenate([np.stack([index[corner][there] for corner in corners], -1) for there, corners in parts])
 
 
@@ -283,7 +281,7 @@ def _write_report(
 ) -> None:
     report = {
         "rig": rig.to_dict(),
-        "frames": [file.name for file in capture.files],
+        "frames": capture.names,
         "full_scale": capture.full_scale,
         "examination": examination.to_dict(),
         **content,

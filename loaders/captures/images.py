@@ -2,8 +2,9 @@
 captures in folders, ``{object}/{view}/`` or ``{object}/``, with the split that each object belongs to."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -15,18 +16,14 @@ from pydantic import Field
 
 from fpp_ml_bench.constants import GREY_LEVELS, OBJECT_NAME, SPLITS, VIEW_NAME, sample_name
 from fpp_ml_bench.containers import LARGEST_BYTES, StoredImage, parse_image
-from fpp_ml_bench.errors import BuildError, CaptureError, PredictionError
+from fpp_ml_bench.errors import BuildError, CaptureError, LayoutError, PredictionError
 from fpp_ml_bench.files import file_content, read_yaml, visible
 from fpp_ml_bench.schema import StrictModel, Text, validate
 
-COLOURS = {
-    "luminance": (0.299, 0.587, 0.114),
-    "red": (1.0, 0.0, 0.0),
-    "green": (0.0, 1.0, 0.0),
-    "blue": (0.0, 0.0, 1.0),
-    "mean": (1 / 3, 1 / 3, 1 / 3),
-}
-"""Weights of red, green and blue; luminance as in Rec. 601 and OpenCV's conversion to grey."""
+_CHANNELS = "red", "green", "blue"
+_LUMINANCE, _MEAN = (0.299, 0.587, 0.114), (1 / 3, 1 / 3, 1 / 3)
+"""Weights of the channels; luminance as in Rec. 601 and OpenCV's conversion to grey."""
+COLOURS = "luminance", *_CHANNELS, "mean"
 SUFFIXES = (".png", ".bmp", ".tif", ".tiff")
 _OTHER_IMAGES = (".jpg", ".jpeg", ".jpe", ".jp2", ".webp", ".gif", ".pgm", ".ppm", ".exr", ".hdr", ".raw", ".dng")
 _MODES = ("L", "LA", "I", "I;16", "I;16L", "I;16B", "RGB", "RGBA", "P", "PA")
@@ -48,6 +45,10 @@ class CapturedFrames:
     files: tuple[Path, ...]
     full_scale: int = GREY_LEVELS
     note: str = ""
+
+    @property
+    def names(self) -> list[str]:
+        return [file.name for file in self.files]
 
 
 class _Image(NamedTuple):
@@ -229,10 +230,10 @@ def _grey(levels: NDArray[Any], colour: str | None, file: Path) -> NDArray[Any]:
         return np.ascontiguousarray(red)
     if colour is None:
         raise CaptureError(f"{file}: the colour channels differ; say which to take by colour ({', '.join(COLOURS)})")
-    if colour in ("red", "green", "blue"):
-        return np.ascontiguousarray(levels[..., ("red", "green", "blue").index(colour)])
-    weights = COLOURS[colour]
-    return (weights[0] * red + weights[1] * green + weights[2] * blue).astype(np.float32)
+    if colour in _CHANNELS:
+        return np.ascontiguousarray(levels[..., _CHANNELS.index(colour)])
+    of_red, of_green, of_blue = _LUMINANCE if colour == "luminance" else _MEAN
+    return (of_red * red + of_green * green + of_blue * blue).astype(np.float32)
 
 
 SINGLE_VIEW = "single"
@@ -302,10 +303,17 @@ def find_captures(root: Path, frames: int) -> list[Capture]:
         problems.append(f"{root}: holds frames itself; move the frames of each object into a folder of its name")
     captures: list[Capture] = []
     for folder in _folders(root):
-        if not OBJECT_NAME.fullmatch(folder.name):
-            problems.append(f"{folder}: expected an object name of letters, digits, - and _; rename the folder")
-            continue
-        captures += _of_object(folder, frames, problems)
+        views = _folders(folder)
+        with listed(problems):
+            if not OBJECT_NAME.fullmatch(folder.name):
+                raise CaptureError(f"{folder}: expected an object name of letters, digits, - and _; rename the folder")
+            if views and _images(folder):
+                raise CaptureError(
+                    f"{folder}: holds frames and folders; give a folder of frames for each view, or frames alone"
+                )
+            for view in views or [folder]:
+                with listed(problems):
+                    captures.append(_capture(folder.name, view, view.name if views else SINGLE_VIEW, frames))
     if not captures and not problems:
         problems.append(f"{root}: holds no folder of an object; expected {root / 'OBJECT' / 'VIEW'} with the frames")
     if problems:
@@ -313,31 +321,28 @@ def find_captures(root: Path, frames: int) -> list[Capture]:
     return captures
 
 
-def _of_object(folder: Path, frames: int, problems: list[str]) -> Iterable[Capture]:
-    views = _folders(folder)
-    if views and _images(folder):
-        problems.append(f"{folder}: holds frames and folders; give a folder of frames for each view, or frames alone")
-        return
-    for view in views or [folder]:
-        name = view.name if views else SINGLE_VIEW
-        if not VIEW_NAME.fullmatch(name):
-            suggested = f", such as {name.replace('_', '-')}" if "_" in name else ""
-            problems.append(
-                f"{view}: expected a view name of letters, digits and - (no _){suggested}; rename the folder"
-            )
-            continue
-        try:
-            files = frame_files(view)
-        except CaptureError as error:
-            problems.append(str(error))
-            continue
-        if len(files) != frames:
-            problems.append(
-                f"{view}: expected the {frames} frames of the rig's sequence, found {len(files)} ({files[0].name} to "
-                f"{files[-1].name}); capture what is missing, or give the rig that took them"
-            )
-            continue
-        yield Capture(folder.name, name, view, tuple(files))
+def _capture(name: str, folder: Path, view: str, frames: int) -> Capture:
+    if not VIEW_NAME.fullmatch(view):
+        suggested = f", such as {view.replace('_', '-')}" if "_" in view else ""
+        raise CaptureError(
+            f"{folder}: expected a view name of letters, digits and - (no _){suggested}; rename the folder"
+        )
+    files = frame_files(folder)
+    if len(files) != frames:
+        raise CaptureError(
+            f"{folder}: expected the {frames} frames of the rig's sequence, found {len(files)} ({files[0].name} to "
+            f"{files[-1].name}); capture what is missing, or give the rig that took them"
+        )
+    return Capture(name, view, folder, tuple(files))
+
+
+@contextmanager
+def listed(problems: list[str]) -> Iterator[None]:
+    """Add a `LayoutError` or `CaptureError` inside the block to ``problems``."""
+    try:
+        yield
+    except (LayoutError, CaptureError) as error:
+        problems.append(str(error))
 
 
 def _folders(folder: Path) -> list[Path]:

@@ -4,7 +4,6 @@ depths say about the rig, whose pitch and projector are not published."""
 
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -18,6 +17,7 @@ from fpp_ml_bench.containers import from_file, parse_image, parse_matrix
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mask
 from fpp_ml_bench.errors import CaptureError, DecodeError, LayoutError, PredictionError, RigError
+from fpp_ml_bench.loaders.captures.images import listed
 from fpp_ml_bench.loaders.published import tree as published_tree
 from fpp_ml_bench.loaders.published.order import AUTO, FrameOrder, check_order, find_order, parse_order
 from fpp_ml_bench.loaders.published.tree import VARIABLES, VARIANT_FOLDERS, PublishedSample, PublishedTree
@@ -77,15 +77,6 @@ def read_scalar(path: Path, variable: str) -> float:
     return float(matrix[0, 0])
 
 
-@contextmanager
-def _listed(problems: list[str]) -> Iterator[None]:
-    """Add a `LayoutError` or `CaptureError` inside the block to ``problems``."""
-    try:
-        yield
-    except (LayoutError, CaptureError) as error:
-        problems.append(str(error))
-
-
 class RowReader:
     """Picklable source of an import's rows: reads and checks one sample after the other."""
 
@@ -137,7 +128,7 @@ def import_rows(folder: Path, plan: ImportPlan, workers: int, progress: Progress
 
     def problems_of(sample: Any) -> list[str]:
         problems: list[str] = []
-        with _listed(problems):
+        with listed(problems):
             reader.read(sample)
         return problems
 
@@ -170,7 +161,7 @@ class SampleReader(RowReader):
         problems: list[str] = []
         images: dict[Path, NDArray[np.uint8]] = {}
         for path in (*sample.fringes, *sample.frames):
-            with _listed(problems):
+            with listed(problems):
                 images[path] = read_grey_png(path)
         first, *copies = sample.fringes
         problems += [
@@ -205,13 +196,13 @@ class SampleReader(RowReader):
         """Depth from the first variant; the other variants and the depth range must agree with it."""
         limits: tuple[float, float] | None = None
         if sample.info is not None:
-            with _listed(problems):
+            with listed(problems):
                 limits = _range_mm(sample.info)
         files = dict(zip(self.tree.variants, sample.depths, strict=True))
         maps: dict[Normalisation, NDArray[np.float64]] = {}
         for variant, path in files.items():
             if limits is not None or variant != "individual":
-                with _listed(problems):
+                with listed(problems):
                     maps[variant] = self._to_mm(path, variant, limits or (0.0, 0.0))
         first, *others = files
         if first not in maps:
