@@ -31,8 +31,8 @@ Status = Literal["new", "changed", "unchanged", "deleted"]
 
 MARK = "fpp-bench.json"
 """File that marks a repository as published by this command, and says what it holds: the next run may replace it."""
-_BATCH_BYTES, _BATCH_FILES = 1 << 26, 64
-"""Files are sent before the commit in batches of about this size, for the progress bar."""
+_BATCH_FILES = 8
+"""Files are sent before the commit so many at a time, for the progress bar."""
 _REPO = re.compile(r"(?!.*(--|\.\.))\w[\w.-]{0,95}/\w[\w.-]{0,95}(?<![.-])", re.ASCII)
 _URL_PREFIX: dict[Kind, str] = {"dataset": "datasets/", "space": "spaces/", "model": ""}
 _ANSWERS = {
@@ -116,8 +116,6 @@ def changes(publication: Publication, remote: Remote) -> list[Change]:
 def _status(path: Path, stored: RepoFile | None) -> Status:
     if stored is None:
         return "new"
-    if stored.size != path.stat().st_size:
-        return "changed"
     if stored.lfs is None:
         return "unchanged" if git_hash(path.read_bytes()) == stored.blob_id else "changed"
     with path.open("rb") as file:
@@ -224,7 +222,8 @@ class Hub:
         with self._explained(f"sending to {kind} {repo}"):
             to_send = [change.path for change in changes if change.status in ("new", "changed")]
             additions = [CommitOperationAdd(path, publication.folder / path) for path in to_send]
-            for batch in _batches(additions):
+            for start in range(0, len(additions), _BATCH_FILES):
+                batch = additions[start : start + _BATCH_FILES]
                 self._api.preupload_lfs_files(repo, batch, repo_type=kind, free_memory=False)
                 sent(sum(addition.upload_info.size for addition in batch))
             deletions = [CommitOperationDelete(c.path, is_folder=False) for c in changes if c.status == "deleted"]
@@ -259,14 +258,3 @@ class Hub:
             # The client's refusals of an answer or a card (ValueError), and its transfer library (RuntimeError).
             lines = " ".join(printable(line) for line in str(error).splitlines())
             raise PublishError(f"{doing}: {lines or type(error).__name__}; run the same command again") from error
-
-
-def _batches(additions: list[CommitOperationAdd]) -> Iterator[list[CommitOperationAdd]]:
-    batch: list[CommitOperationAdd] = []
-    for addition in additions:
-        batch.append(addition)
-        if len(batch) == _BATCH_FILES or sum(queued.upload_info.size for queued in batch) >= _BATCH_BYTES:
-            yield batch
-            batch = []
-    if batch:
-        yield batch

@@ -13,7 +13,6 @@ from fpp_ml_bench.constants import CONFIGS, GREY_LEVELS
 from fpp_ml_bench.depth import NORMALISATIONS, Normalisation, RangeRule, depth_range_mm, normalise, object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.machine import njit, numba_enabled
 
 
 class FringeDepth(NamedTuple):
@@ -133,15 +132,4 @@ class FringeDepthDataset(Dataset[FringeDepth]):
 
 def unit_range(grey: NDArray[np.uint8], out: NDArray[np.float32]) -> None:
     """Grey levels / 255 into ``out``: a product with the float32 reciprocal, within 1 unit in the last place."""
-    factor = np.float32(1 / GREY_LEVELS)
-    if numba_enabled():
-        _scale(grey.reshape(-1), out.reshape(-1), factor)
-    else:
-        np.multiply(grey, factor, out=out)
-
-
-@njit
-def _scale(grey, out, factor):  # type: ignore[no-untyped-def]
-    """``out`` float32 (n,) = ``grey`` uint8 (n,) x ``factor`` float32, in one pass over memory."""
-    for k in range(grey.size):
-        out[k] = np.float32(grey[k]) * factor
+    np.multiply(grey, np.float32(1 / GREY_LEVELS), out=out)

@@ -118,7 +118,7 @@ def _import_captures(settings: ImportSettings) -> None:
     plan = plan_captures(
         settings.tree, load_rig(settings.rig), splits, limits, settings.bits, settings.colour, settings.anyway
     )
-    count, images = len(plan.reader.captures), len(plan.reader.rig.sequence)
+    count, images = len(plan.reader.samples), len(plan.reader.rig.sequence)
     started = perf_counter()
     with progress_bar("importing", count, "images", images) as advance:
         manifest = import_rows(settings.out, plan, settings.workers or usable_cores(), advance)
@@ -156,12 +156,12 @@ def _import_tree(settings: ImportSettings) -> None:
     rig = None if settings.rig is None else load_rig(settings.rig)
     plan = plan_import(settings.tree, rig, settings.frame_order)
     if settings.fit_rig:
-        with progress_bar("reading", len(plan.reader.tree.by_name), "views") as advance:
+        with progress_bar("reading", len(plan.reader.samples), "views") as advance:
             views = tree_views(plan.reader, settings.workers or usable_cores(), advance)
         rig, fit = fit_projector(views, plan.reader.rig)
         print_fit(rig, fit)
         plan = plan_import(settings.tree, rig, settings.frame_order)
-    sample_count = len(plan.reader.tree.by_name)
+    sample_count = len(plan.reader.samples)
     images = len(plan.assembly.manifest.stored_frames)
     started = perf_counter()
     with progress_bar("importing", sample_count, "images", images) as advance:

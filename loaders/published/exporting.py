@@ -99,23 +99,19 @@ def exporting(out: Path) -> Iterator[Path]:
         raise BuildError(f"{out}: is not empty; give a new folder, an export never adds to a folder or overwrites it")
     staging = target.with_name(f".{target.name}.export")
     with exclusive(staging / LOCK_FILE, out, "exporting there"):
+        content = staging / "files"
         try:
-            for remains in staging.iterdir():
-                if remains.is_dir() and not remains.is_symlink():
-                    shutil.rmtree(remains)
-                elif remains.name != LOCK_FILE:
-                    remains.unlink()
-            yield staging
-            (staging / LOCK_FILE).unlink()
-            staging.replace(target)
-        except BaseException as error:
-            shutil.rmtree(staging, ignore_errors=True)
-            if not isinstance(error, OSError):
-                raise
+            shutil.rmtree(content, ignore_errors=True)
+            content.mkdir()
+            yield content
+            content.replace(target)
+        except OSError as error:
             raise BuildError(
                 f"{out}: can't be written ({error.strerror or error}); nothing was left there. Free some "
                 "space or choose another disk"
             ) from error
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
 
 
 def chosen_splits(dataset: DatasetFolder, split: str) -> list[str]:

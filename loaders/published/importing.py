@@ -77,15 +77,13 @@ def read_scalar(path: Path, variable: str) -> float:
     return float(matrix[0, 0])
 
 
+@dataclass(frozen=True)
 class RowReader:
-    """Picklable source of an import's rows: reads and checks one sample after the other."""
+    """Picklable source of an import's rows: reads and checks one sample after the other. ``samples``: what `read`
+    takes, by sample; each has its ``files``."""
 
+    samples: Mapping[str, Any]
     rig: Rig
-
-    @property
-    def samples(self) -> Mapping[str, Any]:
-        """What `read` takes, by sample; each has its ``files``."""
-        raise NotImplementedError
 
     def read(self, sample: Any) -> Row:
         """The row of one of ``samples``. Raises `LayoutError` or `CaptureError` for a wrong file."""
@@ -146,12 +144,7 @@ class SampleReader(RowReader):
     """Reads the samples of ``tree``. ``order`` None: raw frames are only checked, not read as frames of a sequence."""
 
     tree: PublishedTree
-    rig: Rig
     order: FrameOrder | None
-
-    @property
-    def samples(self) -> Mapping[str, PublishedSample]:
-        return self.tree.by_name
 
     def refusal(self, problems: list[str]) -> LayoutError:
         return published_tree.layout_error(self.tree.root, problems)
@@ -295,7 +288,7 @@ def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> 
         "ignored": list(tree.ignored),
         "objects": {split: list(dict.fromkeys(s.object for s in samples)) for split, samples in tree.samples.items()},
     }
-    reader = SampleReader(tree, rig_used, order)
+    reader = SampleReader({s.sample: s for samples in tree.samples.values() for s in samples}, rig_used, tree, order)
     return import_plan(reader, plans, IMPORTED, settings, stored)
 
 
@@ -342,7 +335,7 @@ def _rig_for(tree: PublishedTree, rig: Rig | None) -> Rig:
 def _order_of(tree: PublishedTree, rig: Rig) -> FrameOrder:
     """Frame order of the first readable raw scan that fits a named order; tries a few, as the first may be broken."""
     refusals = []
-    for sample in list(tree.by_name.values())[:_MOST_SCANS_TRIED]:
+    for sample in [s for samples in tree.samples.values() for s in samples][:_MOST_SCANS_TRIED]:
         try:
             files = [read_grey_png(path) for path in sample.frames]
         except LayoutError as error:

@@ -5,7 +5,6 @@ Only directory entries and PNG headers are read here; contents are checked when 
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 from fpp_ml_bench.constants import OBJECT_NAME, OBJECTS, PUBLISHED_SPLIT_FOLDERS, VIEWS, sample_name, split_sample_name
@@ -102,10 +101,6 @@ class PublishedTree:
     samples: dict[str, list[PublishedSample]]
     has_frames: bool
     ignored: tuple[str, ...]
-
-    @cached_property
-    def by_name(self) -> dict[str, PublishedSample]:
-        return {sample.sample: sample for samples in self.samples.values() for sample in samples}
 
 
 def _locate(root: Path) -> tuple[Path, Path | None]:
