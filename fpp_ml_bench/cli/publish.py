@@ -10,7 +10,6 @@ from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import publish as board_publish
 from fpp_ml_bench.loaders import hub as hub_client
-from fpp_ml_bench.loaders import hub_dataset
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.options import REQUIRED, argument, option
@@ -86,14 +85,14 @@ def publish_dataset(settings: DatasetSettings) -> None:
     from fpp_ml_bench.cli.console import progress_bar  # imports rich, which --help must not
 
     dataset = DatasetFolder(settings.dataset)
-    licence = hub_dataset.dataset_licence(dataset, settings.license)
+    licence = hub_client.dataset_licence(dataset, settings.license)
     remote = _remote(settings, hub, "dataset")
     texts = board_publish.dataset_texts(dataset, settings.repo, licence)
     rows = sum(len(samples) for samples in dataset.splits.values())
-    with hub_dataset.staging_folder(settings.staging, dataset.fingerprint) as folder:
+    with hub_client.staging_folder(settings.staging, dataset.fingerprint) as folder:
         try:
             with progress_bar("preparing", rows, "samples") as advance:
-                stage = hub_dataset.stage_dataset
+                stage = hub_client.stage_dataset
                 publication = stage(dataset, settings.repo, folder, texts, usable_cores(), advance)
         except OSError as error:
             raise PublishError(

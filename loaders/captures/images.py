@@ -93,8 +93,7 @@ def read_frames(
             )
     used = int(np.bitwise_or.reduce([image.used for image in images]))
     full_scale, note = _full_scale(used, first_image.bits, bits, files[0].parent)
-    weighted = any(image.levels.dtype == np.float32 for image in images)
-    if full_scale == GREY_LEVELS and first_image.bits == 8 and not weighted:
+    if all(image.levels.dtype == np.uint8 for image in images):
         return CapturedFrames(np.stack([image.levels for image in images]), tuple(files))
     frames = np.empty((len(images), *first_image.levels.shape), np.float32)
     for index, image in enumerate(images):

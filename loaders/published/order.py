@@ -64,17 +64,17 @@ class FrameOrder:
 
     def frames(self, sequence: Sequence) -> tuple[Frame, ...]:
         """The frames in file order."""
-        frames: list[Frame] = []
+        order: list[int] = []
         for kind, direction in LAYOUTS[self.layout]:
             indices = list(sequence.sinusoids(direction) if kind == "sinusoid" else sequence.gray(direction))
             if kind == "sinusoid" and BACKWARD_STEPS in self.modifiers:
-                indices = [indices[-n % len(indices)] for n in range(len(indices))]
+                indices[1:] = indices[:0:-1]
             if kind == "gray" and LEAST_BIT_FIRST in self.modifiers:
                 indices.reverse()
-            frames += [sequence.frames[i] for i in indices]
+            order += indices
         ends = [sequence.black, sequence.white]
-        frames += [sequence.frames[i] for i in (reversed(ends) if WHITE_FIRST in self.modifiers else ends)]
-        return tuple(frames)
+        order += reversed(ends) if WHITE_FIRST in self.modifiers else ends
+        return tuple(sequence.frames[i] for i in order)
 
 
 def parse_order(name: str) -> FrameOrder | None:
