@@ -291,11 +291,11 @@ def staging_folder(chosen: Path | None, identity: str) -> Iterator[Path]:
     if chosen.exists() and not chosen.is_dir():
         raise PublishError(f"--staging {chosen}: is a file; give a folder")
     chosen.mkdir(parents=True, exist_ok=True)
-    if not mark.is_file() and any(chosen.iterdir()):
+    held = mark.read_text(encoding="ascii", errors="replace").strip() if mark.is_file() else None
+    if held is None and any(chosen.iterdir()):
         raise PublishError(f"--staging {chosen}: holds files that this command did not put there; give a new folder")
-    if not mark.is_file() or mark.read_text(encoding="ascii", errors="replace").strip() != expected:
-        if files.is_dir():
-            shutil.rmtree(files)
+    if held != expected:
+        shutil.rmtree(files, ignore_errors=True)
         write_atomically(mark, f"{expected}\n".encode())
     files.mkdir(exist_ok=True)
     for unfinished in files.rglob(".*.tmp"):  # of a run that was killed

@@ -332,7 +332,13 @@ def board_poses(
         elif poses[0].size != (width, height):
             expected = f"{poses[0].size[0]} x {poses[0].size[1]} px as in {poses[0].name}"
             raise CalibrationError(f"{folder}: images of {width} x {height} px, expected {expected}")
-        _check_copies(folder, frames, seen)
+        for index, frame in enumerate(frames):
+            other, of_other = seen.setdefault(hash(frame.tobytes()), (folder, index))
+            if other != folder and np.ptp(frame):
+                raise CalibrationError(
+                    f"{folder}: image {index} is that of {other.name} (image {of_other}), byte for byte: two poses "
+                    "can't share an image; put this pose's own frames there, or remove it"
+                )
         decoded, examination = _examined_and_decoded(capture, rig, Limits(), anyway, calibrated=False)
         examined(folder.name, examination)
         white = rig.sequence.white
@@ -343,20 +349,6 @@ def board_poses(
         levels += [] if measured is None else [measured]
         progress(1)
     return poses, rig, fit_response(levels)
-
-
-def _check_copies(folder: Path, frames: NDArray, seen: dict[int, tuple[Path, int]]) -> None:
-    """Raise `CalibrationError` for an image that an earlier pose holds, too, byte for byte; ``seen`` is filled."""
-    for index, frame in enumerate(frames):
-        if np.ptp(frame) == 0:
-            continue
-        key = hash(frame.tobytes())
-        other, of_other = seen.setdefault(key, (folder, index))
-        if other != folder:
-            raise CalibrationError(
-                f"{folder}: image {index} is that of {other.name} (image {of_other}), byte for byte: two poses "
-                "can't share an image; put this pose's own frames there, or remove it"
-            )
 
 
 def calibrated_rig(found: Calibration, stand_in: Rig, range_mm: tuple[float, float] | None = None) -> Rig:

@@ -110,7 +110,7 @@ def pixel_normals(depth_mm: ArrayLike, camera: Pinhole, step_mm: float | None = 
     normals = np.cross(tangents[0], tangents[1])
     towards = (normals * rays).sum(axis=-1) < 0
     normals = np.where(towards[..., None], normals, -rays)
-    length = np.sqrt((normals * normals).sum(axis=-1, keepdims=True))
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
     return np.where(depth[..., None] > 0, normals / np.where(length > 0, length, 1.0), 0.0)
 
 
@@ -168,8 +168,8 @@ def _joined(
     """Whether the pixels at ``one`` and ``other`` have a depth and belong to the same surface."""
     if step_mm is not None and not 0 < step_mm < np.inf:
         raise CaptureError(f"step_mm: expected a positive number of mm, got {step_mm!r}; leave it out for the default")
-    near, far, difference = depth[one], depth[other], rays[one] - rays[other]
-    apart = (near + far) / 2 * np.sqrt(difference[..., 0] ** 2 + difference[..., 1] ** 2)
+    near, far = depth[one], depth[other]
+    apart = (near + far) / 2 * np.linalg.norm(rays[one] - rays[other], axis=-1)
     return (near > 0) & (far > 0) & (np.abs(near - far) <= (STEEPEST * apart if step_mm is None else step_mm))
 
 
@@ -252,12 +252,12 @@ def write_capture(
     clear_outputs(folder)
     decoded, found = result.decoded, result.decoded.depth_mm > 0
     export_capture(folder, decoded.depth_mm, rig.camera, result.grey, forms)
-    for name, values in (("sigma_mm", result.sigma_mm), ("modulation", result.modulation), ("reason", decoded.reason)):
-        write_atomically(folder / f"{name}.npy", _npy(values))
     title = f"{capture.files[0].parent.name}: {100 * found.mean():.1f}% of the pixels with depth"
-    maps = result.grey, decoded.depth_mm, result.sigma_mm, result.modulation, decoded.reason
     findings = [str(finding) for finding in result.examination.findings]
-    write_atomically(folder / "picture.png", capture_picture(title, *maps, findings))
+    maps = {"sigma_mm": result.sigma_mm, "modulation": result.modulation, "reason": decoded.reason}
+    picture = capture_picture(title, result.grey, decoded.depth_mm, *maps.values(), findings)
+    contents = {f"{name}.npy": _npy(values) for name, values in maps.items()} | {"picture.png": picture}
+    write_files(folder, contents, CaptureError)
     content = {
         "pixels": decoded.counts,
         "noise_grey": result.noise_grey,

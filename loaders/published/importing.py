@@ -273,12 +273,10 @@ def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> 
     elif order is None:
         order = _order_of(tree, rig_used)
     stored = "all" if tree.has_frames else "single_shot"
-    plans = []
-    for split, samples in tree.samples.items():
-        objects: dict[str, list[tuple[str, str, str]]] = {}
-        for s in samples:
-            objects.setdefault(s.object, []).append((s.sample, s.object, s.view))
-        plans += plan_shards(split, objects)
+    by_split: dict[str, dict[str, list[tuple[str, str, str]]]] = {}
+    for s in tree.samples:
+        by_split.setdefault(s.split, {}).setdefault(s.object, []).append((s.sample, s.object, s.view))
+    plans = [plan for split, objects in by_split.items() for plan in plan_shards(split, objects)]
     settings = {
         "layout": "published",
         "depth_from": VARIANT_FOLDERS[tree.variants[0]],
@@ -286,9 +284,9 @@ def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> 
         "frame_order": order.name if order else None,
         "rig_assumed": rig is None,
         "ignored": list(tree.ignored),
-        "objects": {split: list(dict.fromkeys(s.object for s in samples)) for split, samples in tree.samples.items()},
+        "objects": {split: list(objects) for split, objects in by_split.items()},
     }
-    reader = SampleReader({s.sample: s for samples in tree.samples.values() for s in samples}, rig_used, tree, order)
+    reader = SampleReader({s.sample: s for s in tree.samples}, rig_used, tree, order)
     return import_plan(reader, plans, IMPORTED, settings, stored)
 
 
@@ -335,7 +333,7 @@ def _rig_for(tree: PublishedTree, rig: Rig | None) -> Rig:
 def _order_of(tree: PublishedTree, rig: Rig) -> FrameOrder:
     """Frame order of the first readable raw scan that fits a named order; tries a few, as the first may be broken."""
     refusals = []
-    for sample in [s for samples in tree.samples.values() for s in samples][:_MOST_SCANS_TRIED]:
+    for sample in tree.samples[:_MOST_SCANS_TRIED]:
         try:
             files = [read_grey_png(path) for path in sample.frames]
         except LayoutError as error:
@@ -371,7 +369,7 @@ def tree_views(
 
     def view(sample: PublishedSample) -> DepthView:
         row = reader.read(sample)
-        measured = view_from_frames(sample.sample, _frames(row, reader.rig), row.depth_mm, reader.rig, most_px)
+        measured = view_from_frames(sample.sample, _frames(row), row.depth_mm, reader.rig, most_px)
         progress(1)
         return measured
 
@@ -386,7 +384,7 @@ def depth_difference_mm(reader: SampleReader) -> float | None:
         return None
     row = reader.read(next(iter(reader.samples.values())))
     try:
-        decoded_mm = decode_stack(_frames(row, reader.rig), reader.rig, mask=object_mask(row.depth_mm)).depth_mm
+        decoded_mm = decode_stack(_frames(row), reader.rig, mask=object_mask(row.depth_mm)).depth_mm
     except DecodeError:
         return float("inf")
     both = object_mask(decoded_mm) & object_mask(row.depth_mm)
@@ -395,5 +393,5 @@ def depth_difference_mm(reader: SampleReader) -> float | None:
     return float(np.median(np.abs(decoded_mm[both].astype(np.float64) - row.depth_mm[both])))
 
 
-def _frames(row: Row, rig: Rig) -> list[np.ndarray]:
-    return [row.frames[index] for index in range(len(rig.sequence))]
+def _frames(row: Row) -> list[NDArray[np.uint8]]:
+    return [row.frames[index] for index in sorted(row.frames)]

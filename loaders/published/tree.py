@@ -93,12 +93,12 @@ class PublishedSample:
 
 @dataclass(frozen=True)
 class PublishedTree:
-    """A tree with a valid layout: image size (H, W), variants present, samples per split in row order."""
+    """A tree with a valid layout: image size (H, W), variants present, samples split by split in row order."""
 
     root: Path
     size: tuple[int, int]
     variants: tuple[Normalisation, ...]
-    samples: dict[str, list[PublishedSample]]
+    samples: list[PublishedSample]
     has_frames: bool
     ignored: tuple[str, ...]
 
@@ -141,7 +141,7 @@ def scan_tree(root: Path, frames: int) -> PublishedTree:
     elif variants == ("individual",):
         reason = "normalised depth can't be converted to mm without it"
         scan.problems.append(f"{training / INFO}: the folder is missing; {reason}")
-    samples: dict[str, list[PublishedSample]] = {}
+    samples: list[PublishedSample] = []
     for split, name in PUBLISHED_SPLIT_FOLDERS.items():
         parts = [folder / name for folder in folders]
         ranges = info / name / DEPTH if info else None
@@ -149,15 +149,13 @@ def scan_tree(root: Path, frames: int) -> PublishedTree:
             fringes, depths = (tuple(part / kind / f"{stem}{_KINDS[kind]}" for part in parts) for kind in _KINDS)
             label, limits = split_sample_name(stem), ranges / f"{stem}.mat" if ranges else None
             raw = [scans.joinpath(*label, frame_file(index)) for index in range(frames)] if scans else ()
-            sample = PublishedSample(stem, *label, split, fringes, depths, limits, tuple(raw))
-            samples.setdefault(split, []).append(sample)
-    everything = [sample for part in samples.values() for sample in part]
-    scan.objects(everything)
+            samples.append(PublishedSample(stem, *label, split, fringes, depths, limits, tuple(raw)))
+    scan.objects(samples)
     if scans:
-        scan.raw_scans(scans, {sample.sample for sample in everything}, [frame_file(index) for index in range(frames)])
+        scan.raw_scans(scans, {sample.sample for sample in samples}, [frame_file(index) for index in range(frames)])
     if not samples and not scan.problems:
         scan.problems.append(f"{folders[0]}: holds no sample")
-    size = scan.size([path for sample in everything for path in (*sample.fringes, *sample.frames) if path.exists()])
+    size = scan.size([path for sample in samples for path in (*sample.fringes, *sample.frames) if path.exists()])
     if scan.problems:
         raise layout_error(root, scan.problems)
     ignored = [name for name in BACKGROUND_REMOVED_FOLDERS.values() if (training / name).is_dir()]
