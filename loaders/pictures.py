@@ -23,17 +23,6 @@ from fpp_ml_bench.optics.sequence import DIRECTIONS
 
 _TILE_PX = 120
 _GREY = "gray"
-_REASONS = {
-    Reason.DECODED: "decoded",
-    Reason.NO_RAY: "no ray",
-    Reason.LOW_MODULATION: "low modulation",
-    Reason.SATURATED: "saturated",
-    Reason.INCONSISTENT_ORDER: "order not clear",
-    Reason.OUTSIDE_PATTERN: "outside the pattern",
-    Reason.DIRECTIONS_DISAGREE: "directions disagree",
-    Reason.OUTSIDE_RANGE: "outside the range",
-    Reason.NOT_ASKED: "not asked",
-}
 _COLUMNS = 250
 _COLOURS = ("#3ca951", "#9498a0", "#22252b", "#ff725c", "#efb118", "#a463f2", "#ff8ab7", "#4269d0", "#ffffff")
 
@@ -67,7 +56,7 @@ def capture_picture(
     sigma_mm: NDArray[np.float32],
     modulation: NDArray,
     reason: NDArray[np.uint8],
-    findings: Sequence[str] = (),
+    findings: Sequence[object] = (),
 ) -> bytes:
     """PNG of maps (H, W): a frame in grey levels, depth and standard uncertainty in mm (0 = none), modulation in grey
     levels, and `Reason` codes; the ``findings`` stand below it."""
@@ -75,14 +64,14 @@ def capture_picture(
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    lines = [line for finding in findings for line in wrap(finding, _COLUMNS)]
+    lines = [line for finding in findings for line in wrap(str(finding), _COLUMNS)]
     figure = Figure(figsize=(17, 3.9 + 0.17 * len(lines)), dpi=100, layout="constrained")
     if lines:
         figure.supxlabel("\n".join(lines), fontsize=8, x=0.01, ha="left", color="#b00020")
     figure.suptitle(title, fontsize=11)
     found = depth_mm > 0
     low, high = np.quantile(depth_mm[found], (0.005, 0.995)) if found.any() else (0.0, 1.0)
-    top = np.quantile(sigma_mm[found], 0.95) if found.any() else 1.0
+    top = float(np.quantile(sigma_mm[found], 0.95)) if found.any() else 1.0
     *maps, pixels = figure.subplots(1, 5)
     panels: tuple[Panel, ...] = (
         ("mean of the frames, grey levels", grey, _GREY, 0.0, max(float(np.quantile(grey, 0.999)), 1.0)),
@@ -96,8 +85,12 @@ def capture_picture(
     pixels.set_title("pixels", fontsize=9)
     shares = np.bincount(reason.ravel(), minlength=len(_COLOURS)) / reason.size
     handles = [
-        Patch(facecolor=_COLOURS[code], edgecolor="0.6", label=f"{name} {100 * shares[code]:.1f}%")
-        for code, name in _REASONS.items()
+        Patch(
+            facecolor=_COLOURS[code],
+            edgecolor="0.6",
+            label=f"{code.name.lower().replace('_', ' ')} {100 * shares[code]:.1f}%",
+        )
+        for code in Reason
         if shares[code] > 0
     ]
     pixels.legend(handles=handles, fontsize=7, loc="upper left", bbox_to_anchor=(0.0, -0.02), ncols=2, frameon=False)

@@ -135,8 +135,9 @@ def _examined_and_decoded(
         )
     directions: tuple[Direction, ...] = rig.directions if direction == "both" else (direction,)
     check_limits(limits)
-    about = {"directions": directions, "mask": mask, "limits": limits, "calibrated": calibrated}
-    examination = examine(capture.frames, rig, capture.names, **about)
+    examination = examine(
+        capture.frames, rig, capture.names, directions=directions, mask=mask, limits=limits, calibrated=calibrated
+    )
     if examination.refused and not anyway:
         raise RefusedCapture(str(folder), examination)
     decoded = decode_stack(capture.frames, rig, direction, mask=mask, limits=limits, details=True, threads=threads)

@@ -253,10 +253,15 @@ def write_capture(
     decoded, found = result.decoded, result.decoded.depth_mm > 0
     export_capture(folder, decoded.depth_mm, rig.camera, result.grey, forms)
     title = f"{capture.files[0].parent.name}: {100 * found.mean():.1f}% of the pixels with depth"
-    findings = [str(finding) for finding in result.examination.findings]
-    maps = {"sigma_mm": result.sigma_mm, "modulation": result.modulation, "reason": decoded.reason}
-    picture = capture_picture(title, result.grey, decoded.depth_mm, *maps.values(), findings)
-    contents = {f"{name}.npy": _npy(values) for name, values in maps.items()} | {"picture.png": picture}
+    sigma_mm, modulation, reason = result.sigma_mm, result.modulation, decoded.reason
+    contents = {
+        "sigma_mm.npy": _npy(sigma_mm),
+        "modulation.npy": _npy(modulation),
+        "reason.npy": _npy(reason),
+        "picture.png": capture_picture(
+            title, result.grey, decoded.depth_mm, sigma_mm, modulation, reason, result.examination.findings
+        ),
+    }
     write_files(folder, contents, CaptureError)
     content = {
         "pixels": decoded.counts,

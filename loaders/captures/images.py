@@ -132,9 +132,10 @@ def frame_files(source: str | Path | Sequence[str | Path]) -> list[Path]:
             raise CaptureError(f"{source}: no file matches this pattern; check it and the folder's name")
     else:
         raise CaptureError(f"{path}: expected a folder, an image or a pattern such as scan/*.png, found nothing there")
-    files.sort(key=lambda file: (natural_key(str(file.with_suffix(""))), str(file)))
+    keys = {file: natural_key(str(file.with_suffix(""))) for file in files}
+    files.sort(key=lambda file: (keys[file], str(file)))
     for file, following in pairwise(files):
-        if natural_key(str(file.with_suffix(""))) == natural_key(str(following.with_suffix(""))):
+        if keys[file] == keys[following]:
             raise CaptureError(
                 f"{file}: {following.name} has the same name or number, so the frames have no order; remove one of "
                 "them, or give a pattern or a list of files"

@@ -88,7 +88,7 @@ class PublishedSample:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        return (*self.fringes, *self.depths, *([self.info] if self.info else []), *self.frames)
+        return (*self.fringes, *self.depths, *filter(None, [self.info]), *self.frames)
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ def scan_tree(root: Path, frames: int) -> PublishedTree:
     """Scan the tree at ``root``, whose raw scans have ``frames`` files. Raises `LayoutError` listing all problems.
     ``root`` holds ``training_datasets/`` and maybe ``fpp_synthetic_dataset/``, or is ``training_datasets`` itself."""
     training, scans = _locate(root)
-    scan = _Scan()
+    scan, frame_files = _Scan(), [frame_file(index) for index in range(frames)]
     variants = tuple(name for name, folder in VARIANT_FOLDERS.items() if (training / folder).is_dir())
     folders = [training / VARIANT_FOLDERS[name] for name in variants]
     names = PUBLISHED_SPLIT_FOLDERS.values()
@@ -148,11 +148,11 @@ def scan_tree(root: Path, frames: int) -> PublishedTree:
         for stem in sorted(scan.stems(parts, ranges) if name in present else (), key=_place):
             fringes, depths = (tuple(part / kind / f"{stem}{_KINDS[kind]}" for part in parts) for kind in _KINDS)
             label, limits = split_sample_name(stem), ranges / f"{stem}.mat" if ranges else None
-            raw = [scans.joinpath(*label, frame_file(index)) for index in range(frames)] if scans else ()
+            raw = [scans.joinpath(*label, name) for name in frame_files] if scans else ()
             samples.append(PublishedSample(stem, *label, split, fringes, depths, limits, tuple(raw)))
     scan.objects(samples)
     if scans:
-        scan.raw_scans(scans, {sample.sample for sample in samples}, [frame_file(index) for index in range(frames)])
+        scan.raw_scans(scans, {sample.sample for sample in samples}, frame_files)
     if not samples and not scan.problems:
         scan.problems.append(f"{folders[0]}: holds no sample")
     size = scan.size([path for sample in samples for path in (*sample.fringes, *sample.frames) if path.exists()])
