@@ -355,10 +355,9 @@ def board_poses(
 def calibrated_rig(found: Calibration, stand_in: Rig, range_mm: tuple[float, float] | None = None) -> Rig:
     """The rig of a calibration, with the sequence of ``stand_in``; its working range is ``range_mm``, or that of the
     boards' points and a margin."""
-    depths = []
-    for pose in found.poses:
-        turn = rotation_matrix(pose.rotation_vector)
-        depths.append(found.board_mm @ turn[2] + pose.translation_mm[2])
+    depths = [
+        found.board_mm @ rotation_matrix(pose.rotation_vector)[2] + pose.translation_mm[2] for pose in found.poses
+    ]
     near, far = range_mm or (float(np.min(depths)) * (1 - RANGE_MARGIN), float(np.max(depths)) * (1 + RANGE_MARGIN))
     return replace(
         stand_in,

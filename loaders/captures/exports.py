@@ -219,26 +219,24 @@ def _ply(
     return trimesh.exchange.ply.export_ply(solid, vertex_normal=True)
 
 
-def check_outputs(folder: Path) -> None:
-    """Raise `CaptureError` for a folder that holds files which no decoding writes, or a file in its place."""
+def check_outputs(folder: Path) -> list[Path]:
+    """What an earlier decoding left in ``folder``. Raises `CaptureError` for a folder that holds files which no
+    decoding writes, or a file in its place."""
     if folder.exists() and not folder.is_dir():
         raise CaptureError(f"{folder}: expected a folder for the results, found a file; give another name")
-    if not folder.is_dir():
-        return
-    others = sorted(p.name for p in folder.iterdir() if p.is_dir() or not _WRITTEN.fullmatch(p.name))
+    paths = sorted(folder.iterdir()) if folder.is_dir() else []
+    others = [path.name for path in paths if path.is_dir() or not _WRITTEN.fullmatch(path.name)]
     if others:
         listed = ", ".join(others[:4]) + (f" and {len(others) - 4} more" if len(others) > 4 else "")
         raise CaptureError(f"{folder}: holds files that no decoding writes: {listed}; give a new folder")
+    return paths
 
 
 def clear_outputs(folder: Path) -> None:
     """Remove what an earlier decoding left in ``folder``, also one that was killed; its report first, without which the
     rest is no result. Raises `CaptureError` as `check_outputs`, and where a file can't be removed."""
-    check_outputs(folder)
-    if not folder.is_dir():
-        return
     try:
-        for path in sorted(folder.iterdir(), key=lambda path: path.name != REPORT):
+        for path in sorted(check_outputs(folder), key=lambda path: path.name != REPORT):
             path.unlink()
     except OSError as error:
         raise CaptureError(f"{error.filename}: can't be removed ({error.strerror}); give a new folder") from error

@@ -105,7 +105,7 @@ def check_options(bits: int | None, colour: str | None) -> None:
     """Raise `CaptureError` for options that `read_frames` does not take."""
     if colour is not None and colour not in COLOURS:
         raise CaptureError(f"colour: expected {', '.join(COLOURS)}, got {colour!r}")
-    if bits is not None and (isinstance(bits, bool) or not isinstance(bits, int) or not 8 <= bits <= 16):
+    if bits is not None and (type(bits) is not int or not 8 <= bits <= 16):
         raise CaptureError(f"bits: expected a whole number from 8 to 16, got {bits!r}")
 
 
@@ -193,17 +193,17 @@ def _read(file: Path, colour: str | None) -> _Image:
         image = parse_image(content)
     except PredictionError as error:
         raise CaptureError(f"{file}: {error}; {CAPTURE_AGAIN}") from None
-    if problem := _problem(image):
+    levels = np.atleast_3d(image.levels)
+    alpha = levels.shape[2] in (2, 4)
+    if problem := _problem(image, levels[..., -1] if alpha else None):
         raise CaptureError(f"{file}: {problem}")
-    levels = np.rot90(image.levels, _QUARTER_TURNS.get(image.orientation, 0))
+    levels = np.rot90(levels[..., :-1] if alpha else levels, _QUARTER_TURNS.get(image.orientation, 0))
     if image.orientation in _MIRRORED:
         levels = np.fliplr(levels)
-    if levels.ndim == 3 and levels.shape[2] in (2, 4):
-        levels = levels[..., 0] if levels.shape[2] == 2 else levels[..., :3]
     return _Image(_grey(levels, colour, file), image.bits, int(np.bitwise_or.reduce(levels, axis=None)))
 
 
-def _problem(image: StoredImage) -> str | None:
+def _problem(image: StoredImage, alpha: NDArray[Any] | None) -> str | None:
     """Why an image is no frame, and what to do."""
     if image.lossy:
         lossy = "is compressed with loss (JPEG), and its blocks distort the phase"
@@ -215,7 +215,6 @@ def _problem(image: StoredImage) -> str | None:
         return f"expected grey levels or RGB of 8 to 16 bits, found {kind}"
     if image.bits > 8 and image.white_is_0:
         return "the TIFF stores white as 0 (photometric 0); write it with black as 0"
-    alpha = image.levels[..., -1] if image.levels.ndim == 3 and image.levels.shape[2] in (2, 4) else None
     if image.transparent or (alpha is not None and (alpha < (1 << image.bits) - 1).any()):
         return "has transparent pixels; write it without an alpha channel"
     return None
@@ -223,15 +222,13 @@ def _problem(image: StoredImage) -> str | None:
 
 def _grey(levels: NDArray[Any], colour: str | None, file: Path) -> NDArray[Any]:
     """(H, W): the channel, where all are equal, or what ``colour`` says."""
-    if levels.ndim == 2:
-        return levels
-    red, green, blue = np.moveaxis(levels, -1, 0)
-    if np.array_equal(red, green) and np.array_equal(green, blue):
-        return np.ascontiguousarray(red)
+    if (levels == levels[..., :1]).all():
+        return np.ascontiguousarray(levels[..., 0])
     if colour is None:
         raise CaptureError(f"{file}: the colour channels differ; say which to take by colour ({', '.join(COLOURS)})")
     if colour in _CHANNELS:
         return np.ascontiguousarray(levels[..., _CHANNELS.index(colour)])
+    red, green, blue = np.moveaxis(levels, -1, 0)
     of_red, of_green, of_blue = _LUMINANCE if colour == "luminance" else _MEAN
     return (of_red * red + of_green * green + of_blue * blue).astype(np.float32)
 

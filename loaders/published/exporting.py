@@ -135,13 +135,13 @@ def export(
         raise BuildError(f"export: expected some of {', '.join(FORMS)}, got {', '.join(forms) or 'none'}")
     if out.resolve() == dataset.path.resolve() or dataset.path.resolve() in out.resolve().parents:
         raise BuildError(f"{out}: lies in the dataset itself; give another folder")
-    views = {row["view"] for split in splits for row in dataset.manifest.samples[split]}
-    if "mat" in forms and not (isinstance(dataset.sequence, Sequence) and views <= set(VIEWS)):
+    rows = [row for split in splits for row in dataset.manifest.samples[split]]
+    if "mat" in forms and not (isinstance(dataset.sequence, Sequence) and {row["view"] for row in rows} <= set(VIEWS)):
         raise DatasetError(
             f"{dataset.path}: the published layout holds views {', '.join(VIEWS)} and the paper's kind of frames, and "
             "this dataset has others; export it as parquet"
         )
-    meshes = _meshes(dataset, splits) if "meshes" in forms else []
+    meshes = _meshes(dataset, [row["object"] for row in rows]) if "meshes" in forms else []
     with exporting(out) as staging:
         for form in forms:
             folder = staging / form if len(forms) > 1 else staging
@@ -157,10 +157,9 @@ def export(
                 export_patterns(dataset.rig, folder)
 
 
-def _meshes(dataset: DatasetFolder, splits: list[str]) -> list[Path]:
-    rows = (row for split in splits for row in dataset.manifest.samples[split])
+def _meshes(dataset: DatasetFolder, objects: list[str]) -> list[Path]:
     listed = {dataset.path / file.path for file in dataset.manifest.others}
-    paths = [dataset.path / MESH_FOLDER / f"{name}.ply" for name in dict.fromkeys(row["object"] for row in rows)]
+    paths = [dataset.path / MESH_FOLDER / f"{name}.ply" for name in dict.fromkeys(objects)]
     for path in paths:
         if path not in listed or not path.is_file():
             imported = dataset.manifest.origin != GENERATED

@@ -56,11 +56,10 @@ def _grey_levels(content: bytes) -> NDArray[np.uint8]:
     image = parse_image(content)
     if image.transparent:
         raise PredictionError("has transparent colours; expected plain grey levels")
-    if image.levels.ndim == 2:
-        return image.levels
-    if (image.levels != image.levels[..., :1]).any():
+    levels = np.atleast_3d(image.levels)
+    if (levels != levels[..., :1]).any():
         raise PredictionError("an RGB image whose channels differ; expected grey levels")
-    return np.ascontiguousarray(image.levels[..., 0])
+    return np.ascontiguousarray(levels[..., 0])
 
 
 def read_matrix(path: Path, variable: str) -> NDArray:
