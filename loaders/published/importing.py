@@ -15,7 +15,7 @@ from fpp_ml_bench import __version__
 from fpp_ml_bench.calibration.projection import MOST_PX, DepthView, view_from_frames
 from fpp_ml_bench.containers import from_file, parse_image, parse_matrix
 from fpp_ml_bench.decoding.decode import decode_stack
-from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mask
+from fpp_ml_bench.depth import Normalisation, denormalise, object_mask
 from fpp_ml_bench.errors import CaptureError, DecodeError, LayoutError, PredictionError, RigError
 from fpp_ml_bench.loaders.captures.images import listed
 from fpp_ml_bench.loaders.published import tree as published_tree
@@ -253,9 +253,7 @@ def _disagreement_mm(variant_mm: NDArray[np.float64], depth_mm: NDArray[np.float
     expected = depth_mm.astype(np.float64)
     if variant == "individual":
         # By the paper's rule, pixels at the sample's least depth are 0 in this variant.
-        inside = expected[object_mask(expected)]
-        share = normalise(expected, "individual", float(inside.min()), float(inside.max()))
-        expected = np.where(object_mask(share), expected, 0.0)
+        expected[expected == expected[object_mask(expected)].min()] = 0.0
     return float(np.abs(variant_mm - expected).max())
 
 
