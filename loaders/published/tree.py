@@ -155,7 +155,8 @@ def scan_tree(root: Path, frames: int) -> PublishedTree:
         scan.raw_scans(scans, {sample.sample for sample in samples}, frame_files)
     if not samples and not scan.problems:
         scan.problems.append(f"{folders[0]}: holds no sample")
-    size = scan.size([path for sample in samples for path in (*sample.fringes, *sample.frames) if path.exists()])
+    images = [path for sample in samples for path in (*sample.fringes, *sample.frames)]
+    size = scan.size([path for path in images if path.exists() or path.is_symlink()])
     if scan.problems:
         raise layout_error(root, scan.problems)
     ignored = [name for name in BACKGROUND_REMOVED_FOLDERS.values() if (training / name).is_dir()]
@@ -216,7 +217,7 @@ class _Scan:
         suffix, stems = _KINDS[folder.name], set()
         for entry in self._entries(folder):
             name, _, view = entry.stem.rpartition("_")
-            if entry.suffix != suffix:
+            if entry.suffix != suffix or not entry.is_file():
                 self._foreign(entry, f"files ending in {suffix}")
             elif not OBJECT_NAME.fullmatch(name) or view not in VIEWS:
                 self.problems.append(f"{entry}: expected a name like power_drill_A60{suffix}, views {', '.join(VIEWS)}")
