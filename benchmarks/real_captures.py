@@ -33,7 +33,7 @@ from fpp_ml_bench.coding.crossed import crossed_from_pair
 from fpp_ml_bench.constants import MAD_TO_SIGMA
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm
-from fpp_ml_bench.loaders.captures.board_poses import board_poses, calibrated_rig
+from fpp_ml_bench.loaders.captures.decoding import board_poses, calibrated_rig
 from fpp_ml_bench.loaders.captures.images import read_frames
 from fpp_ml_bench.loaders.render.meshes import load_user_mesh, single_mesh
 from fpp_ml_bench.loaders.render.scene import BuildSettings

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from operator import itemgetter
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -27,46 +28,46 @@ class RemoteFolder:
 
     def sizes(self) -> dict[str, int]:
         """Bytes of every file below the folder by name; empty where there is no folder."""
-        with self._opened("can't be read") as (files, root):
+        with self._opened("can't be read") as files:
             files.invalidate_cache()
-            found = files.find(root, detail=True)
-            return {path.removeprefix(root).lstrip("/"): int(info["size"]) for path, info in found.items()}
+            return {name: int(info["size"]) for name, info in files.find("", detail=True).items()}
 
     def has(self, name: str) -> bool:
         """Whether a file is there."""
-        with self._opened("can't be read") as (files, root):
-            return bool(files.exists(f"{root}/{name}"))
+        with self._opened("can't be read") as files:
+            return bool(files.exists(name))
 
     def put(self, file: Path, name: str) -> None:
         """Copy a file there. Under its name it is there whole or not at all."""
-        with self._opened("can't be written") as (files, root):
-            target = PurePosixPath(root) / name
-            temporary = str(target.with_name(f".{target.name}.{uuid4().hex}{TEMPORARY}"))
-            files.makedirs(str(target.parent), exist_ok=True)
+        target = PurePosixPath(name)
+        temporary = str(target.with_name(f".{target.name}.{uuid4().hex}{TEMPORARY}"))
+        with self._opened("can't be written") as files:
+            files.makedirs(name.rpartition("/")[0], exist_ok=True)
             files.put_file(str(file), temporary)
-            files.mv(temporary, str(target))
+            files.mv(temporary, name)
 
     def get(self, name: str, file: Path) -> None:
         """Copy a file from there; its folder is made. A ``name`` that leaves the folder is refused."""
         if problem := path_problem(name):
             raise RemoteError(f"{self.url}: holds a file {printable(name)!r}, {problem}; remove it there")
         file.parent.mkdir(parents=True, exist_ok=True)
-        with self._opened("can't be read") as (files, root):
-            files.get_file(f"{root}/{name}", str(file))
+        with self._opened("can't be read") as files:
+            files.get_file(name, str(file))
 
     def remove(self, name: str) -> None:
         """Remove a file, or a folder with all below it."""
-        with self._opened("can't be written") as (files, root):
-            files.rm(f"{root}/{name}", recursive=True)
+        with self._opened("can't be written") as files:
+            files.rm(name, recursive=True)
 
     @contextmanager
-    def _opened(self, failure: str) -> Iterator[tuple[Any, str]]:
-        """The file system, and the folder's path in it."""
+    def _opened(self, failure: str) -> Iterator[Any]:
+        """The folder as a file system of its own."""
         from fsspec.core import url_to_fs
+        from fsspec.implementations.dirfs import DirFileSystem
 
         try:
             files, root = url_to_fs(self.url)
-            yield files, root.rstrip("/")
+            yield DirFileSystem(root.rstrip("/"), files)
         except Exception as error:  # each service raises errors of its own library
             reason = cause_of(error).strip().partition("\n")[0] or type(error).__name__
             raise RemoteError(f"{self.url}: {failure} ({reason})") from error
@@ -92,14 +93,13 @@ def working_copy(folder: Path | RemoteFolder) -> Iterator[tuple[Path, Callable[[
         saved = _stamps(copy)
 
         def save() -> None:
+            nonlocal saved
             stamps = _stamps(copy)
-            for name in sorted(stamps, key=lambda name: stamps[name]):
-                if saved.get(name) != stamps[name]:
-                    folder.put(copy / name, name)
+            for name, _ in sorted(stamps.items() - saved.items(), key=itemgetter(1)):
+                folder.put(copy / name, name)
             for name in saved.keys() - stamps.keys():
                 folder.remove(name)
-            saved.clear()
-            saved.update(stamps)
+            saved = stamps
 
         try:
             yield copy, save
@@ -112,5 +112,5 @@ def working_copy(folder: Path | RemoteFolder) -> Iterator[tuple[Path, Callable[[
 
 def _stamps(folder: Path) -> dict[str, tuple[int, int]]:
     """Time of change, ns, and bytes of every file below a folder that is not hidden."""
-    paths = [path for path in folder.rglob("*") if path.is_file() and not path.name.startswith(".")]
+    paths = [path for path in folder.rglob("[!.]*") if path.is_file()]
     return {path.relative_to(folder).as_posix(): (path.stat().st_mtime_ns, path.stat().st_size) for path in paths}

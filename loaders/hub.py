@@ -1,4 +1,5 @@
-"""A folder of staged files on the Hugging Face Hub: what publishing would change, and sending it.
+"""A folder of staged files on the Hugging Face Hub: what publishing would change, and sending it; and staging a
+dataset: Parquet that the Hub's viewer shows, meshes, rig, and the head of the card.
 
 Files are compared by the hashes that the Hub stores (SHA-256 of a large file, git's hash of a small one), so a dry run
 can tell what would change. Every error of the client becomes a `PublishError` that says what to do; the client reads
@@ -7,34 +8,42 @@ can tell what would change. Every error of the client becomes a `PublishError` t
 
 import json
 import re
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from hashlib import file_digest
+from hashlib import file_digest, sha256
 from pathlib import Path
 from typing import Any, Literal
 
+import cv2
+import pyarrow
 import yaml
 from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, get_token
 from huggingface_hub import errors as hub_errors
+from huggingface_hub.constants import REPO_TYPES_URL_PREFIXES
 from huggingface_hub.hf_api import RepoFile
 from huggingface_hub.utils import disable_progress_bars
 from huggingface_hub.utils.sha import git_hash
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.errors import PublishError
-from fpp_ml_bench.files import printable, read_json
+from fpp_ml_bench.errors import DatasetError, PublishError
+from fpp_ml_bench.files import file_hash, printable, read_json, write_atomically
+from fpp_ml_bench.loaders.storage.card import RIG_FILE
+from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER
+from fpp_ml_bench.loaders.storage.parquet import card_configs, data_shards, write_shard
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.rig_file import save_rig
 
 Kind = Literal["dataset", "space", "model"]
 Status = Literal["new", "changed", "unchanged", "deleted"]
 
 MARK = "fpp-bench.json"
 """File that marks a repository as published by this command, and says what it holds: the next run may replace it."""
-_BATCH_BYTES, _BATCH_FILES = 1 << 26, 64
-"""Files are sent before the commit in batches of about this size, for the progress bar."""
+_BATCH_FILES = 8
+"""Files are sent before the commit so many at a time, for the progress bar."""
 _REPO = re.compile(r"(?!.*(--|\.\.))\w[\w.-]{0,95}/\w[\w.-]{0,95}(?<![.-])", re.ASCII)
-_URL_PREFIX: dict[Kind, str] = {"dataset": "datasets/", "space": "spaces/", "model": ""}
 _ANSWERS = {
     401: "the Hub does not accept the token (401); run 'hf auth login' again or set another HF_TOKEN",
     403: "the token may not do that (403); it needs write access to this owner and repository",
@@ -44,6 +53,12 @@ _ANSWERS = {
     413: "too large for the Hub (413)",
     429: "too many requests (429); wait some minutes, then run the same command again",
 }
+
+
+NAME = "FPP-ML-Bench"
+OWNED = ("data/", f"{MESH_FOLDER}/")
+_LICENCE = re.compile(r"[a-z0-9][a-z0-9.-]{0,39}")
+_IDENTITY, _FILES = "staged.sha256", "files"
 
 
 @dataclass(frozen=True)
@@ -116,12 +131,12 @@ def changes(publication: Publication, remote: Remote) -> list[Change]:
 def _status(path: Path, stored: RepoFile | None) -> Status:
     if stored is None:
         return "new"
-    if stored.size != path.stat().st_size:
-        return "changed"
     if stored.lfs is None:
-        return "unchanged" if git_hash(path.read_bytes()) == stored.blob_id else "changed"
-    with path.open("rb") as file:
-        return "unchanged" if file_digest(file, "sha256").hexdigest() == stored.lfs.sha256 else "changed"
+        same = git_hash(path.read_bytes()) == stored.blob_id
+    else:
+        with path.open("rb") as file:
+            same = file_digest(file, "sha256").hexdigest() == stored.lfs.sha256
+    return "unchanged" if same else "changed"
 
 
 def check_replaceable(publication: Publication, remote: Remote, adopt: bool) -> None:
@@ -158,15 +173,10 @@ class Hub:
             raise PublishError(f"HF_ENDPOINT: expected a URL like https://huggingface.co, got {self.endpoint!r}")
 
     def url(self, kind: Kind, repo: str) -> str:
-        return f"{self.endpoint}/{_URL_PREFIX[kind]}{repo}"
+        return f"{self.endpoint}/{REPO_TYPES_URL_PREFIXES.get(kind, '')}{repo}"
 
     def check_token(self) -> set[str]:
         """Names that the token may publish under: its user and their organisations. `PublishError` without a token."""
-        if not get_token():
-            raise PublishError(
-                "no token for the Hub: run 'hf auth login' once or set HF_TOKEN, with a token that may write; "
-                "--dry-run needs none for what is public"
-            )
         with self._explained("asking who the token belongs to"):
             me = self._api.whoami()
         return {str(me.get("name"))} | {str(org.get("name")) for org in me.get("orgs") or ()}
@@ -224,7 +234,8 @@ class Hub:
         with self._explained(f"sending to {kind} {repo}"):
             to_send = [change.path for change in changes if change.status in ("new", "changed")]
             additions = [CommitOperationAdd(path, publication.folder / path) for path in to_send]
-            for batch in _batches(additions):
+            for start in range(0, len(additions), _BATCH_FILES):
+                batch = additions[start : start + _BATCH_FILES]
                 self._api.preupload_lfs_files(repo, batch, repo_type=kind, free_memory=False)
                 sent(sum(addition.upload_info.size for addition in batch))
             deletions = [CommitOperationDelete(c.path, is_folder=False) for c in changes if c.status == "deleted"]
@@ -244,7 +255,10 @@ class Hub:
         except hub_errors.OfflineModeIsEnabled as error:
             raise PublishError(f"{doing}: HF_HUB_OFFLINE is set, so nothing may be sent; unset it") from error
         except hub_errors.LocalTokenNotFoundError as error:
-            raise PublishError(f"{doing}: no token; run 'hf auth login' or set HF_TOKEN") from error
+            raise PublishError(
+                f"{doing}: no token for the Hub: run 'hf auth login' once or set HF_TOKEN, with a token that may "
+                "write; --dry-run needs none for what is public"
+            ) from error
         except hub_errors.HfHubHTTPError as error:
             status, said = error.response.status_code, " ".join((error.server_message or "").split())
             fault = f"the Hub has a fault ({status}); run the same command again later, it sends only what is missing"
@@ -261,12 +275,89 @@ class Hub:
             raise PublishError(f"{doing}: {lines or type(error).__name__}; run the same command again") from error
 
 
-def _batches(additions: list[CommitOperationAdd]) -> Iterator[list[CommitOperationAdd]]:
-    batch: list[CommitOperationAdd] = []
-    for addition in additions:
-        batch.append(addition)
-        if len(batch) == _BATCH_FILES or sum(queued.upload_info.size for queued in batch) >= _BATCH_BYTES:
-            yield batch
-            batch = []
-    if batch:
-        yield batch
+@contextmanager
+def staging_folder(chosen: Path | None, identity: str) -> Iterator[Path]:
+    """Yield the folder for staged files: a temporary folder, or ``files/`` in ``chosen``, kept for the next run.
+    ``identity`` says what is staged. Files that an earlier run left in ``chosen`` are kept for the same identity and
+    removed for another. Raises `PublishError` for a folder that holds anything else, ``OSError`` for a failed write."""
+    if chosen is None:
+        with tempfile.TemporaryDirectory(prefix="fpp-bench-publish-") as folder:
+            yield Path(folder)
+        return
+    mark, files = chosen / _IDENTITY, chosen / _FILES
+    # With the versions that the bytes of a Parquet file or a PNG depend on.
+    writers = f"{__version__} {pyarrow.__version__} {cv2.__version__}"
+    expected = sha256(f"{identity}\n{writers}".encode()).hexdigest()
+    if chosen.exists() and not chosen.is_dir():
+        raise PublishError(f"--staging {chosen}: is a file; give a folder")
+    chosen.mkdir(parents=True, exist_ok=True)
+    held = mark.read_text(encoding="ascii", errors="replace").strip() if mark.is_file() else None
+    if held is None and any(chosen.iterdir()):
+        raise PublishError(f"--staging {chosen}: holds files that this command did not put there; give a new folder")
+    if held != expected:
+        shutil.rmtree(files, ignore_errors=True)
+        write_atomically(mark, f"{expected}\n".encode())
+    files.mkdir(exist_ok=True)
+    for unfinished in files.rglob(".*.tmp"):  # of a run that was killed
+        unfinished.unlink()
+    yield files
+
+
+def dataset_licence(dataset: DatasetFolder, license_id: str | None) -> str:
+    """Licence identifier for the card: ``license_id``, or MIT for generated data. `PublishError` for other data."""
+    origin = dataset.manifest.origin
+    if license_id is None and origin != GENERATED:
+        raise PublishError(f"{dataset.path}: {origin} data; say under which --license it may be shared")
+    licence = license_id or "mit"
+    if not _LICENCE.fullmatch(licence):
+        raise PublishError(f"--license: expected an identifier like mit or cc-by-4.0, got {licence!r}")
+    return licence
+
+
+def card_head(dataset: DatasetFolder, licence: str) -> str:
+    """Front matter of the card, from which the Hub's viewer and ``load_dataset`` know configurations and files."""
+    rows = sum(len(samples) for samples in dataset.splits.values())
+    files: dict[str, list[str]] = {split: [] for split in dataset.splits}
+    for name, shard in data_shards(dataset).items():
+        files[shard.split].append(name)
+    head = {
+        "license": licence,
+        "pretty_name": NAME,
+        "task_categories": ["depth-estimation"],
+        "size_categories": ["n<1K" if rows < 1000 else "1K<n<10K" if rows < 10_000 else "10K<n<100K"],
+        "tags": ["fringe-projection-profilometry", "structured-light", "metrology", "fpp-ml-bench"],
+        # Files by name, not by pattern: a stray file can never join the data.
+        "configs": card_configs(dataset, dataset.fingerprint, files, preview=True),
+    }
+    return f"---\n{yaml_text(head)}---\n"
+
+
+def stage_dataset(
+    dataset: DatasetFolder,
+    repo: str,
+    folder: Path,
+    texts: Mapping[str, str],
+    threads: int = 1,
+    row_done: Callable[[int], None] = lambda rows: None,
+) -> Publication:
+    """Write all that is published of ``dataset``, and ``texts`` by file name, into ``folder``: same data, same bytes.
+    Parquet files that are already there are kept (see `staging_folder`). Raises `DatasetError` for a damaged dataset,
+    ``OSError`` when a file can't be written."""
+    for name, shard in data_shards(dataset).items():
+        if (folder / name).is_file():
+            row_done(shard.rows)
+        else:
+            write_shard(dataset, shard, folder / name, threads, row_done)
+    for mesh in (file for file in dataset.manifest.others if file.path.startswith(f"{MESH_FOLDER}/")):
+        source = dataset.path / mesh.path
+        if not source.is_file() or file_hash(source) != mesh.xxh3_128:
+            raise DatasetError(f"{source}: missing or damaged, it isn't published; build the dataset again")
+        (folder / MESH_FOLDER).mkdir(exist_ok=True)
+        shutil.copyfile(source, folder / mesh.path)
+    save_rig(dataset.rig, folder / RIG_FILE)
+    for name, text in texts.items():
+        write_atomically(folder / name, text.encode())
+    about = {"fingerprint": dataset.fingerprint, "size": list(dataset.size), "configs": list(dataset.configs)}
+    marked = mark_bytes("dataset", **about, splits=dataset.splits, content=dataset.content)
+    write_atomically(folder / MARK, marked)
+    return Publication("dataset", repo, folder, f"{NAME} dataset {dataset.fingerprint[:12]}", OWNED)

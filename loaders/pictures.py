@@ -1,15 +1,23 @@
-"""Pictures of a dataset: a sample with frames, depth and mask, and a contact sheet of all objects and views."""
+"""Pictures: a capture with what was decoded from it, a sample of a dataset with frames, depth, mask and mesh, and a
+contact sheet of all objects and views."""
 
-from collections.abc import Callable
+import io
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from textwrap import wrap
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.coding.code import Reason
+from fpp_ml_bench.constants import GREY_LEVELS
+from fpp_ml_bench.containers import png_bytes
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.files import write_files
+from fpp_ml_bench.loaders.storage.manifest import MESH_FOLDER
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.sequence import DIRECTIONS
 
@@ -17,38 +25,111 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _TILE_PX = 120
-_DPI = 110
 _GREY = "gray"
-_COLUMNS = 5
+_LETTERS, _ACROSS = 250, 5
+"""Letters in a line below a picture, and panels in a line."""
+_COLOURS = ("#3ca951", "#9498a0", "#22252b", "#ff725c", "#efb118", "#a463f2", "#ff8ab7", "#4269d0", "#ffffff")
+
 Panel = tuple[str, NDArray, str, float, float]
 """Title, image, colour map, and the values at its ends: lengths in mm, or grey levels."""
 
 
-def panel_figure(panels: list[Panel]) -> "Figure":
-    """A figure of panels, five in a line; a colour bar in mm where they are not grey levels."""
+def _draw(axes: Any, title: str, image: NDArray, colours: str, low: float, high: float) -> None:
+    """A panel; frames, of grey levels from 0 to 255, without a scale."""
+    frame = (colours, high) == (_GREY, GREY_LEVELS)
+    drawn = axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation=None if frame else "nearest")
+    if not frame:
+        axes.figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03).ax.tick_params(labelsize=7)
+    axes.set_title(title, fontsize=9)
+    axes.set_xticks([])
+    axes.set_yticks([])
+
+
+def panel_figure(panels: Sequence[Panel], further: int = 0) -> "Figure":
+    """A figure of panels, five in a line, with room for ``further`` ones."""
     from matplotlib.figure import Figure
 
-    rows = -(-len(panels) // _COLUMNS)
-    figure = Figure(figsize=(3.4 * _COLUMNS, 3.7 * rows), dpi=_DPI, layout="constrained")
-    for number, (title, image, colours, low, high) in enumerate(panels):
-        axes = figure.add_subplot(rows, _COLUMNS, number + 1)
-        nearest = None if colours == _GREY else "nearest"
-        drawn = axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation=nearest)
-        if colours != _GREY:
-            bar = figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03)
-            bar.set_label("mm", fontsize=8)
-            bar.ax.tick_params(labelsize=7)
-        axes.set_title(title, fontsize=9)
-        axes.set_xticks([])
-        axes.set_yticks([])
+    rows = -(-(len(panels) + further) // _ACROSS)
+    figure = Figure(figsize=(3.4 * _ACROSS, 3.7 * rows), dpi=110, layout="constrained")
+    for number, panel in enumerate(panels, 1):
+        _draw(figure.add_subplot(rows, _ACROSS, number), *panel)
     return figure
 
 
+def _png(figure: "Figure") -> bytes:
+    content = io.BytesIO()
+    figure.savefig(content, format="png")
+    return content.getvalue()
+
+
+def capture_picture(
+    title: str,
+    grey: NDArray,
+    depth_mm: NDArray[np.float32],
+    sigma_mm: NDArray[np.float32],
+    modulation: NDArray,
+    reason: NDArray[np.uint8],
+    findings: Sequence[object] = (),
+) -> bytes:
+    """PNG of maps (H, W): a frame in grey levels, depth and standard uncertainty in mm (0 = none), modulation in grey
+    levels, and `Reason` codes; the ``findings`` stand below it."""
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+
+    lines = [line for finding in findings for line in wrap(str(finding), _LETTERS)]
+    figure = Figure(figsize=(17, 3.9 + 0.17 * len(lines)), dpi=100, layout="constrained")
+    if lines:
+        figure.supxlabel("\n".join(lines), fontsize=8, x=0.01, ha="left", color="#b00020")
+    figure.suptitle(title, fontsize=11)
+    found = depth_mm > 0
+    low, high = np.quantile(depth_mm[found], (0.005, 0.995)) if found.any() else (0.0, 1.0)
+    top = float(np.quantile(sigma_mm[found], 0.95)) if found.any() else 1.0
+    *maps, pixels = figure.subplots(1, 5)
+    panels: tuple[Panel, ...] = (
+        ("mean of the frames, grey levels", grey, _GREY, 0.0, max(float(np.quantile(grey, 0.999)), 1.0)),
+        ("depth, mm", np.where(found, depth_mm, np.nan), "viridis", low, high),
+        ("standard uncertainty by noise, mm", np.where(found, sigma_mm, np.nan), "magma", 0.0, top),
+        ("modulation, grey levels", modulation, _GREY, 0.0, float(max(np.nanmax(modulation, initial=1.0), 1.0))),
+    )
+    for axes, panel in zip(maps, panels, strict=True):
+        _draw(axes, *panel)
+    pixels.imshow(reason, cmap=ListedColormap(_COLOURS), vmin=0, vmax=len(_COLOURS) - 1, interpolation="nearest")
+    pixels.set_title("pixels", fontsize=9)
+    pixels.set_xticks([])
+    pixels.set_yticks([])
+    shares = np.bincount(reason.ravel(), minlength=len(_COLOURS)) / reason.size
+    handles = [
+        Patch(
+            facecolor=_COLOURS[code],
+            edgecolor="0.6",
+            label=f"{code.name.lower().replace('_', ' ')} {100 * shares[code]:.1f}%",
+        )
+        for code in Reason
+        if shares[code] > 0
+    ]
+    pixels.legend(handles=handles, fontsize=7, loc="upper left", bbox_to_anchor=(0.0, -0.02), ncols=2, frameon=False)
+    return _png(figure)
+
+
 def sample_picture(dataset: DatasetFolder, sample: str, path: Path) -> None:
-    """Write a sample as PNG: frames of each kind, depth, exact depth, their difference, mask."""
-    figure = panel_figure(_panels(dataset, sample))
+    """Write a sample as PNG: frames of each kind, depth, exact depth, their difference, mask, mesh. Raises
+    `DatasetError` for a place that can't be written, `MeshError` for a damaged mesh."""
+    from fpp_ml_bench.loaders.render.mesh_files import read_mesh
+
+    panels = _panels(dataset, sample)
+    mesh = dataset.path / MESH_FOLDER / f"{dataset.measured(sample)['object']}.ply"
+    figure = panel_figure(panels, further=int(mesh.is_file()))
     figure.suptitle(f"{sample} ({dataset.split_of_sample(sample)})")
-    _save(figure.savefig, path)
+    if mesh.is_file():
+        vertices_m, faces, _ = read_mesh(mesh)
+        rows, place = -(-(len(panels) + 1) // _ACROSS), len(panels) + 1
+        solid: Any = figure.add_subplot(rows, _ACROSS, place, projection="3d")
+        solid.plot_trisurf(*vertices_m.T, triangles=faces, color="0.9", linewidth=0, antialiased=False)
+        solid.set_aspect("equal")
+        solid.set_axis_off()
+        solid.set_title("ground-truth mesh", fontsize=9)
+    write_files(path.parent, {path.name: _png(figure)}, DatasetError)
 
 
 def _panels(dataset: DatasetFolder, sample: str) -> list[Panel]:
@@ -57,7 +138,7 @@ def _panels(dataset: DatasetFolder, sample: str) -> list[Panel]:
     codes = [index for direction in DIRECTIONS for index in tuple(sequence.gray(direction))[-3:][:1]]
     firsts = (*sequence.config("single_shot"), *sequence.sinusoids("vertical")[:1])
     frames = [i for i in dict.fromkeys((*firsts, *codes, sequence.white)) if i in stored]
-    panels: list[Panel] = [(sequence.frames[i].title, dataset.frame(sample, i), _GREY, 0, 255) for i in frames]
+    panels: list[Panel] = [(sequence.frames[i].title, dataset.frame(sample, i), _GREY, 0, GREY_LEVELS) for i in frames]
     depth_mm = dataset.depth_mm(sample)
     inside = object_mask(depth_mm)
     low, high = float(depth_mm[inside].min()), float(depth_mm.max())
@@ -68,19 +149,11 @@ def _panels(dataset: DatasetFolder, sample: str) -> list[Panel]:
         error_mm = depth_mm - exact_mm
         limit = float(np.quantile(np.abs(error_mm[inside]), 0.99))
         title = f"decoded - exact, MAE {np.abs(error_mm[inside]).mean(dtype=np.float64):.3f} mm"
-        panels.append(("exact depth", np.where(object_mask(exact_mm), exact_mm, np.nan), "viridis", low, high))
+        panels.append(("exact depth, mm", np.where(object_mask(exact_mm), exact_mm, np.nan), "viridis", low, high))
         panels.append((title, np.where(inside, error_mm, np.nan), "coolwarm", -limit, limit))
     title = f"object mask, {100 * inside.mean():.1f}% of the image"
-    panels.append((title, inside.astype(np.uint8) * 255, _GREY, 0, 255))
+    panels.append((title, inside * GREY_LEVELS, _GREY, 0, GREY_LEVELS))
     return panels
-
-
-def _save(save: Callable[..., None], path: Path) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save(path)
-    except OSError as error:
-        raise DatasetError(f"{path}: can't be written ({error.strerror or error})") from error
 
 
 def contact_sheet(dataset: DatasetFolder, split: str, path: Path) -> None:
@@ -91,21 +164,18 @@ def contact_sheet(dataset: DatasetFolder, split: str, path: Path) -> None:
     white, (single,) = dataset.sequence.white, dataset.sequence.config("single_shot")
     index = white if white in dataset.manifest.stored_frames and white is not None else single
     height, width = dataset.size
-    tile_px = tuple(max(1, _TILE_PX * side // max(width, height)) for side in (width, height))
-    label_px, columns = 18, 2
-    line_px = tile_px[1] + label_px
-    lines = -(-len(views) // columns)
-    column_px = max(map(len, views.values())) * tile_px[0]
-    sheet = np.full((lines * line_px, columns * column_px + 8), 255, dtype=np.uint8)
-    for number, (name, samples) in enumerate(views.items()):
-        top, left = (number // columns) * line_px, (number % columns) * (column_px + 8)
-        for view_number, sample in enumerate(samples):
-            tile = cv2.resize(dataset.frame(sample, index), tile_px, interpolation=cv2.INTER_AREA)
-            column = left + view_number * tile_px[0]
-            sheet[top + label_px : top + line_px, column : column + tile_px[0]] = cv2.convertScaleAbs(tile, alpha=1.4)
+    tile_width, tile_height = (max(1, _TILE_PX * side // max(width, height)) for side in (width, height))
+    label_px, gap_px = 18, 8
+    block_size = label_px + tile_height, max(map(len, views.values())) * tile_width + gap_px
+    blocks = []
+    for name, samples in views.items():
+        block = np.full(block_size, 255, dtype=np.uint8)
+        for number, sample in enumerate(samples):
+            tile = cv2.resize(dataset.frame(sample, index), (tile_width, tile_height), interpolation=cv2.INTER_AREA)
+            block[label_px:, number * tile_width :][:, :tile_width] = cv2.convertScaleAbs(tile, alpha=1.4)
         title = f"{name} ({dataset.split_of_sample(samples[0])})"
-        cv2.putText(sheet, title, (left + 4, top + 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, 0, 1, cv2.LINE_AA)
-    encoded, png = cv2.imencode(".png", sheet)
-    if not encoded:
-        raise DatasetError(f"{path}: the picture could not be encoded")
-    _save(lambda target: target.write_bytes(png.tobytes()) and None, path)
+        cv2.putText(block, title, (4, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, 0, 1, cv2.LINE_AA)
+        blocks.append(block)
+    blocks += [np.full(block_size, 255, dtype=np.uint8)] * (len(blocks) % 2)
+    sheet = np.vstack([np.hstack(line) for line in zip(blocks[::2], blocks[1::2], strict=True)])
+    write_files(path.parent, {path.name: png_bytes(sheet[:, :-gap_px])}, DatasetError)

@@ -116,7 +116,7 @@ def available_configs(sequence: AnySequence, stored: str) -> tuple[str, ...]:
     """Configurations that can be read from a dataset storing ``stored``."""
     available = set(stored_frames(sequence, stored))
     frames = {config: sequence.config(config) for config in CONFIGS}
-    return tuple(config for config in CONFIGS if frames[config] and available.issuperset(frames[config]))
+    return tuple(config for config, needed in frames.items() if needed and available.issuperset(needed))
 
 
 def row_columns(sequence: AnySequence, frames: tuple[int, ...], exact: bool) -> list[str]:

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
-from fpp_ml_bench.constants import CONFIGS, GREY_LEVELS
+from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.depth import NORMALISATIONS, Normalisation, RangeRule, depth_range_mm, normalise, object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -53,7 +53,7 @@ class FringeDepthDataset(Dataset[FringeDepth]):
         range_rule: RangeRule = "valid",
     ) -> None:
         self.source = DatasetFolder(folder)
-        if config not in CONFIGS or config not in self.source.configs:
+        if config not in self.source.configs:
             raise DatasetError(f"{folder}: no configuration {config!r}; there are {', '.join(self.source.configs)}")
         if normalisation not in NORMALISATIONS:
             raise DatasetError(f"unknown normalisation {normalisation!r}; there are {', '.join(NORMALISATIONS)}")

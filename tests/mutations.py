@@ -29,7 +29,7 @@ from fpp_ml_bench.evaluation.submission.description import read_submission
 from fpp_ml_bench.leaderboard.row_file import row_of, write_row
 from fpp_ml_bench.leaderboard.rows import read_entry
 from fpp_ml_bench.loaders.captures.images import read_splits
-from fpp_ml_bench.loaders.published.importing import import_tree, plan_import
+from fpp_ml_bench.loaders.published.importing import import_rows, plan_import
 from fpp_ml_bench.loaders.render.light import load_light
 from fpp_ml_bench.loaders.render.meshes import read_mesh_list
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -299,4 +299,4 @@ def tree_outcome(tree: Path, work: Path, seed: int) -> str:
         file.unlink()
     if kind == 5:
         file.symlink_to(chance.choice(("/dev/zero", "nowhere", str(file.parent))))
-    return outcome(lambda: import_tree(work / "out", plan_import(copy), 1), copy)
+    return outcome(lambda: import_rows(work / "out", plan_import(copy), 1), copy)

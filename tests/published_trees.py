@@ -10,7 +10,7 @@ import numpy as np
 import scipy.io
 
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.loaders.published.importing import import_tree, plan_import
+from fpp_ml_bench.loaders.published.importing import import_rows, plan_import
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 SIZE = (24, 24)
@@ -89,7 +89,7 @@ def make_tree(root, variants=("raw",), info=None, splits=SPLITS, size=SIZE):
 
 
 def imported(tree, out, workers=1, **settings):
-    import_tree(out, plan_import(tree, **settings), workers)
+    import_rows(out, plan_import(tree, **settings), workers)
     return DatasetFolder(out)
 
 

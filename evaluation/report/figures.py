@@ -55,8 +55,8 @@ def sample_panels(
     drawn_mm = np.where(inside | predicted, error_mm, np.nan)
     return [
         ("Fringe", fringe, "gray", 0, 255),
-        ("Truth", np.where(inside, target_mm, np.nan), "viridis", low, high),
-        ("Prediction", np.where(predicted, prediction_mm, np.nan), "viridis", low, high),
+        ("Truth, mm", np.where(inside, target_mm, np.nan), "viridis", low, high),
+        ("Prediction, mm", np.where(predicted, prediction_mm, np.nan), "viridis", low, high),
         (f"Absolute error, to {millimetres(clip)} mm", np.abs(drawn_mm), "magma", 0.0, clip),
         (f"Signed error, to {millimetres(clip)} mm", drawn_mm, "coolwarm", -clip, clip),
     ]

@@ -73,7 +73,7 @@ BENCH = Program(
                 "read a published tree, or a scanner's captures, into the same dataset format",
             ),
             "info": ("dataset:info", "describe a dataset: sizes, splits, rig, ground-truth uncertainty"),
-            "show": ("dataset:show_sample", "one sample as a picture: frames, depth, error, mask"),
+            "show": ("dataset:show_sample", "one sample as a picture: frames, depth, error, mask, mesh"),
         },
         "score": {
             "predict": ("predict:predict", "run a method over a split and write predictions that fpp-eval scores"),

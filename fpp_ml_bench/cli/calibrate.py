@@ -14,8 +14,8 @@ from fpp_ml_bench.constants import LARGEST_SIDE_PX, MM_PER_M
 from fpp_ml_bench.errors import CalibrationError, RigError
 from fpp_ml_bench.examination.findings import Examination
 from fpp_ml_bench.files import write_atomically
-from fpp_ml_bench.loaders.captures.board_poses import board_poses as read_board_poses
-from fpp_ml_bench.loaders.captures.board_poses import calibrated_rig, pose_folders
+from fpp_ml_bench.loaders.captures.decoding import board_poses as read_board_poses
+from fpp_ml_bench.loaders.captures.decoding import calibrated_rig, pose_folders
 from fpp_ml_bench.loaders.published.importing import plan_import, tree_views
 from fpp_ml_bench.loaders.render.boards.captures import photograph_board
 from fpp_ml_bench.loaders.render.boards.poses import BOARD_POSES, PAPER_BOARD, board_poses, fitting_board
@@ -190,7 +190,7 @@ def _virtual(settings: CalibrateSettings, folder: Path) -> None:
 def _from_depth(settings: CalibrateSettings, tree: Path) -> None:
     known_rig = None if settings.camera is None else load_rig(settings.camera)
     reader = plan_import(tree, known_rig, settings.frame_order).reader
-    with progress_bar("reading", len(reader.tree.by_name), "views") as advance:
+    with progress_bar("reading", len(reader.samples), "views") as advance:
         views = tree_views(reader, settings.workers or usable_cores(), advance)
     rig, fit = fit_projector(
         views, reader.rig, settings.projector, pitch_px=settings.pitch, focal_px=settings.focal, lens=settings.lens_term

@@ -145,7 +145,7 @@ def show_sample(
     split: str = option("all", "split that --sheet shows (default: all)", "SPLIT"),
     out: Path | None = option(None, "picture to write (default: SAMPLE.png or sheet.png)", "FILE.png"),
 ) -> None:
-    """One sample as a picture (frames, depth, error, mask), or a contact sheet of every object and view."""
+    """One sample as a picture (frames, depth, error, mask, mesh), or a contact sheet of every object and view."""
     if sheet == (sample is not None):
         raise DatasetError("expected either a SAMPLE or --sheet; `fpp-bench info DATASET --json -` lists the samples")
     picture = out or Path("sheet.png" if sheet else f"{sample}.png")

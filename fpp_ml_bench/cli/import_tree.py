@@ -12,16 +12,16 @@ from fpp_ml_bench.cli.console import gigabytes, progress_bar, show
 from fpp_ml_bench.cli.options import AT_LEAST_ONE, command, given
 from fpp_ml_bench.coding.code import Limits, Reason
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.loaders.captures.decoding import capture_notes, import_captures, plan_captures
+from fpp_ml_bench.loaders.captures.decoding import capture_notes, plan_captures
 from fpp_ml_bench.loaders.captures.images import read_splits
 from fpp_ml_bench.loaders.published.importing import (
     AGREEING_MM,
     depth_difference_mm,
     import_notes,
+    import_rows,
     plan_import,
     tree_views,
 )
-from fpp_ml_bench.loaders.published.importing import import_tree as import_published
 from fpp_ml_bench.loaders.storage.manifest import Manifest
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.rig_file import load_rig
@@ -118,10 +118,10 @@ def _import_captures(settings: ImportSettings) -> None:
     plan = plan_captures(
         settings.tree, load_rig(settings.rig), splits, limits, settings.bits, settings.colour, settings.anyway
     )
-    count, images = len(plan.reader.captures), len(plan.reader.rig.sequence)
+    count, images = len(plan.reader.samples), len(plan.reader.rig.sequence)
     started = perf_counter()
     with progress_bar("importing", count, "samples") as advance:
-        manifest = import_captures(settings.out, plan, settings.workers or usable_cores(), advance)
+        manifest = import_rows(settings.out, plan, settings.workers or usable_cores(), advance)
     _print_captures(manifest)
     _print_end(settings.out, manifest, images, perf_counter() - started, capture_notes(manifest))
 
@@ -156,16 +156,16 @@ def _import_tree(settings: ImportSettings) -> None:
     rig = None if settings.rig is None else load_rig(settings.rig)
     plan = plan_import(settings.tree, rig, settings.frame_order)
     if settings.fit_rig:
-        with progress_bar("reading", len(plan.reader.tree.by_name), "views") as advance:
+        with progress_bar("reading", len(plan.reader.samples), "views") as advance:
             views = tree_views(plan.reader, settings.workers or usable_cores(), advance)
         rig, fit = fit_projector(views, plan.reader.rig)
         print_fit(rig, fit)
         plan = plan_import(settings.tree, rig, settings.frame_order)
-    sample_count = len(plan.reader.tree.by_name)
+    sample_count = len(plan.reader.samples)
     images = len(plan.assembly.manifest.stored_frames)
     started = perf_counter()
     with progress_bar("importing", sample_count, "samples") as advance:
-        manifest = import_published(settings.out, plan, settings.workers or usable_cores(), advance)
+        manifest = import_rows(settings.out, plan, settings.workers or usable_cores(), advance)
     _print_end(settings.out, manifest, images, perf_counter() - started, import_notes(manifest))
     if rig is None:
         _warn_of_other_rig(settings.tree, depth_difference_mm(plan.reader))

@@ -11,7 +11,6 @@ from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import publish as board_publish
 from fpp_ml_bench.loaders import hub as hub_client
-from fpp_ml_bench.loaders import hub_dataset
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.options import REQUIRED, argument, option
@@ -78,14 +77,14 @@ def publish_dataset(
     Raises FppBenchError for files that can't be published and for errors of the Hub or the network."""
     hub = hub_client.Hub()
     opened = DatasetFolder(dataset)
-    licence = hub_dataset.dataset_licence(opened, license)
+    licence = hub_client.dataset_licence(opened, license)
     remote = _remote(target, hub, "dataset")
     texts = board_publish.dataset_texts(opened, target.repo, licence)
     rows = sum(len(samples) for samples in opened.splits.values())
-    with hub_dataset.staging_folder(staging, opened.fingerprint) as folder:
+    with hub_client.staging_folder(staging, opened.fingerprint) as folder:
         try:
             with progress_bar("preparing", rows, "samples") as advance:
-                stage = hub_dataset.stage_dataset
+                stage = hub_client.stage_dataset
                 publication = stage(opened, target.repo, folder, texts, usable_cores(), advance)
         except OSError as error:
             raise PublishError(

@@ -1,26 +1,30 @@
-"""A capture to depth: decoding with everything a user wants to know about it, and a dataset of a scanner's captures.
+"""A capture to depth: decoding with everything a user wants to know about it, a dataset of a scanner's captures, and
+captures of a calibration board, a folder of frames for each pose, to the points that a calibration needs.
 
-Each is decoded by the scanner's rig into the ground truth ``depth``, through the same crash-safe assembly as a build.
-What the rig can't decode is background there.
+In a dataset each capture is decoded by the scanner's rig into the ground truth ``depth``, through the same crash-safe
+assembly as a build. What the rig can't decode is background there.
 """
 
 import io
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.calibration.boards import Board
+from fpp_ml_bench.calibration.projector_points import Pose, measure_pose
+from fpp_ml_bench.calibration.response import Levels, Response, fit_response, levels_of
+from fpp_ml_bench.calibration.result import Calibration
 from fpp_ml_bench.coding.code import MIN_MODULATION, Limits, Reason
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.decoding.decode import Decoded, Directions, check_limits, decode_stack
 from fpp_ml_bench.decoding.triangulation import ASSUMED_NOISE_GREY, depth_sigma_mm, noise_of_frames
-from fpp_ml_bench.errors import CaptureError, DecodeError
+from fpp_ml_bench.errors import CalibrationError, CaptureError, DecodeError
 from fpp_ml_bench.examination.examine import examine
 from fpp_ml_bench.examination.findings import Examination, RefusedCapture
-from fpp_ml_bench.files import file_content
+from fpp_ml_bench.files import file_content, visible
 from fpp_ml_bench.loaders.captures.images import (
     Capture,
     CapturedFrames,
@@ -30,13 +34,13 @@ from fpp_ml_bench.loaders.captures.images import (
     read_frames,
     split_captures,
 )
-from fpp_ml_bench.loaders.published.importing import ImportPlan, RowReader, import_plan, run_import
+from fpp_ml_bench.loaders.published.importing import ImportPlan, RowReader, import_plan
 from fpp_ml_bench.loaders.sample import Row
-from fpp_ml_bench.loaders.storage.assembly import Progress
 from fpp_ml_bench.loaders.storage.manifest import CAPTURED, Manifest
 from fpp_ml_bench.loaders.storage.shards import ShardPlan, plan_rows
-from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.sequence import Direction
+from fpp_ml_bench.optics.rig import Rig, rotation_matrix
+from fpp_ml_bench.optics.rig_file import load_projection
+from fpp_ml_bench.optics.sequence import AXES, Direction
 
 CLIPPED_SHARE = 0.02
 """A frame in which more of the lit pixels than this are at full scale is named."""
@@ -54,6 +58,9 @@ CAUSES = {
     "scanner's",
 }
 """Why nothing is decoded, by the reason of most pixels."""
+FEWEST_POSES = 3
+RANGE_MARGIN = 0.1
+"""A calibrated rig's working range is that of the boards' points, widened by this share of their distance."""
 
 
 @dataclass(frozen=True)
@@ -87,21 +94,18 @@ def decode_capture(
     measured where there are four steps and more, else `ASSUMED_NOISE_GREY`. The frames are examined first: raises
     `RefusedCapture` where a finding makes the depth untrustworthy, unless ``anyway``; `CaptureError` for images of
     another size than the rig's, `DecodeError` where nothing can be decoded."""
-    frames, names = capture.frames, [file.name for file in capture.files]
-    examination = examine_capture(capture, rig, direction, mask=mask, min_modulation=min_modulation, anyway=anyway)
-    limits = Limits(min_modulation=min_modulation)
-    decoded = decode_stack(frames, rig, direction, mask=mask, limits=limits, details=True, threads=threads)
+    frames, limits = capture.frames, Limits(min_modulation=min_modulation)
+    decoded, examination = _examined_and_decoded(capture, rig, limits, anyway, direction, mask, threads)
     modulation = np.nanmax([measured.modulation for measured in decoded.details.values()], axis=0)
     measured_grey = noise_of_frames(list(frames), rig) if noise_grey is None else None
     noise = noise_grey if noise_grey is not None else measured_grey or ASSUMED_NOISE_GREY
     notes = [capture.note] if capture.note else []
     if noise_grey is None and measured_grey is None:
         notes.append(f"three steps can't tell their noise; {noise:g} grey level assumed, --noise sets it")
-    notes += _clipped(frames, names, modulation >= min_modulation)
+    notes += _clipped(capture, modulation >= min_modulation)
     if not decoded.depth_mm.any():
-        cause = main_reason(decoded)
-        name = cause.name.lower().replace("_", " ")
-        raise DecodeError(f"no pixel could be decoded; of most pixels: {name}; probably {CAUSES[cause]}")
+        cause = _main_reason(decoded)
+        raise DecodeError(f"no pixel could be decoded; of most pixels: {_words(cause)}; probably {CAUSES[cause]}")
     sigma_mm = depth_sigma_mm(decoded, rig, noise, systematic_rad=examination.systematic_rad)
     grey = frames.mean(axis=0, dtype=np.float64).astype(np.float32)
     return DecodedCapture(
@@ -109,47 +113,54 @@ def decode_capture(
     )
 
 
-def examine_capture(
+def _examined_and_decoded(
     capture: CapturedFrames,
     rig: Rig,
+    limits: Limits,
+    anyway: bool,
     direction: Directions = "both",
-    *,
     mask: NDArray[np.bool_] | None = None,
-    min_modulation: float = MIN_MODULATION,
-    anyway: bool = True,
-) -> Examination:
-    """What the frames of a capture say about themselves (`fpp_ml_bench.examination`), before they are decoded. Raises
+    threads: int = 1,
+    calibrated: bool = True,
+) -> tuple[Decoded, Examination]:
+    """The capture decoded, after what its frames say about themselves (`fpp_ml_bench.examination`). Raises
     `CaptureError` for images of another size than the rig's, `RigError` for a direction that it does not code, and
     unless ``anyway`` `RefusedCapture` where a finding makes the depth untrustworthy."""
     height, width = capture.frames.shape[1:]
+    folder = capture.files[0].parent
     if (height, width) != (rig.camera.height, rig.camera.width):
         raise CaptureError(
-            f"{capture.files[0].parent}: frames of {width} x {height} px, and the rig has a camera of "
+            f"{folder}: frames of {width} x {height} px, and the rig has a camera of "
             f"{rig.camera.width} x {rig.camera.height} px; give the rig that took them"
         )
     directions: tuple[Direction, ...] = rig.directions if direction == "both" else (direction,)
-    limits = Limits(min_modulation=min_modulation)
     check_limits(limits)
-    names = [file.name for file in capture.files]
-    examination = examine(capture.frames, rig, names, directions=directions, mask=mask, limits=limits)
+    examination = examine(
+        capture.frames, rig, capture.names, directions=directions, mask=mask, limits=limits, calibrated=calibrated
+    )
     if examination.refused and not anyway:
-        raise RefusedCapture(str(capture.files[0].parent), examination)
-    return examination
+        raise RefusedCapture(str(folder), examination)
+    decoded = decode_stack(capture.frames, rig, direction, mask=mask, limits=limits, details=True, threads=threads)
+    return decoded, examination
 
 
-def main_reason(decoded: Decoded) -> Reason:
+def _main_reason(decoded: Decoded) -> Reason:
     """The reason of most pixels without depth."""
     return max(CAUSES, key=lambda reason: decoded.counts[reason.name.lower()])
 
 
-def _clipped(frames: NDArray, names: Sequence[str], lit: NDArray[np.bool_]) -> list[str]:
-    shares = [float((frame[lit] >= GREY_LEVELS).mean()) if lit.any() else 0.0 for frame in frames]
-    high = [(name, share) for name, share in zip(names, shares, strict=True) if share > CLIPPED_SHARE]
-    if not high:
-        return []
-    listed = ", ".join(f"{name} ({100 * share:.0f}%)" for name, share in high[:4])
+def _words(reason: Reason) -> str:
+    return reason.name.lower().replace("_", " ")
+
+
+def _clipped(capture: CapturedFrames, lit: NDArray[np.bool_]) -> list[str]:
+    shares = {
+        name: float((frame[lit] >= GREY_LEVELS).mean()) if lit.any() else 0.0
+        for name, frame in zip(capture.names, capture.frames, strict=True)
+    }
+    high = [f"{name} ({100 * share:.0f}%)" for name, share in shares.items() if share > CLIPPED_SHARE]
     more = f" and {len(high) - 4} more" if len(high) > 4 else ""
-    return [f"saturated on lit pixels: {listed}{more}; expose less"]
+    return [f"saturated on lit pixels: {', '.join(high[:4])}{more}; expose less"] if high else []
 
 
 def read_mask(file: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
@@ -177,68 +188,46 @@ def read_mask(file: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:
 class CaptureReader(RowReader):
     """Reads and decodes captures."""
 
-    captures: Mapping[str, Capture]
-    rig: Rig
     limits: Limits
     bits: int | None
     colour: str | None
     anyway: bool = False
 
-    @property
-    def samples(self) -> Mapping[str, Capture]:
-        return self.captures
+    def refusal(self, problems: list[str]) -> CaptureError:
+        return CaptureError("\n  ".join(problems))
 
     def read(self, capture: Capture) -> Row:
         """The capture's row: frames of 8 bits, and depth from the frames as they were captured. Raises `CaptureError`
         for frames that can't be read, that are of another size than the rig's camera, that the examination refuses
         (unless ``anyway``), and that give almost no depth."""
         captured = read_frames(capture.files, bits=self.bits, colour=self.colour)
-        least = self.limits.min_modulation
-        examination = examine_capture(captured, self.rig, min_modulation=least, anyway=self.anyway)
         try:
-            decoded = decode_stack(captured.frames, self.rig, limits=self.limits, details=True)
+            decoded, examination = _examined_and_decoded(captured, self.rig, self.limits, self.anyway)
         except DecodeError as error:
             raise CaptureError(f"{capture.folder}: {error}") from error
-        measured = _measured(decoded, captured) | {"findings": [str(finding) for finding in examination.findings]}
-        if measured["decoded_share"] < LEAST_DECODED_SHARE:
-            reason = main_reason(decoded)
-            share = decoded.counts[reason.name.lower()] / decoded.reason.size
+        good, rounded = decoded.reason == Reason.DECODED, captured.frames.dtype != np.uint8
+        decoded_share = float(good.mean())
+        shares = {name: count / good.size for name, count in decoded.counts.items() if count and name != "decoded"}
+        if decoded_share < LEAST_DECODED_SHARE:
+            reason = _main_reason(decoded)
+            share = shares.get(reason.name.lower(), 0.0)
             raise CaptureError(
-                f"{capture.folder}: only {100 * measured['decoded_share']:.2f}% of the pixels can be decoded, expected "
+                f"{capture.folder}: only {100 * decoded_share:.2f}% of the pixels can be decoded, expected "
                 f"at least {100 * LEAST_DECODED_SHARE:g}%; {100 * share:.0f}% are refused as "
-                f"{reason.name.lower().replace('_', ' ')}: probably {CAUSES[reason]}"
+                f"{_words(reason)}: probably {CAUSES[reason]}"
             )
-        frames = {index: _eight_bits(frame) for index, frame in enumerate(captured.frames)}
-        names = capture.sample, capture.object, capture.view
-        return Row(*names, frames, decoded.depth_mm, None, measured)
-
-
-def _eight_bits(frame: NDArray[Any]) -> NDArray[np.uint8]:
-    return frame if frame.dtype == np.uint8 else np.rint(frame).astype(np.uint8)
-
-
-def _measured(decoded: Decoded, captured: CapturedFrames) -> dict[str, Any]:
-    """Measurements for the manifest: share of the pixels with a depth, their median modulation in grey levels (of the
-    weaker direction), the share refused for each reason, and how the frames' levels were read."""
-    good = decoded.reason == Reason.DECODED
-    weakest = np.minimum.reduce([measured.modulation for measured in decoded.details.values()])
-    counts = {name: count for name, count in decoded.counts.items() if count and name != "decoded"}
-    return {
-        "decoded_share": float(good.mean()),
-        "median_modulation": float(np.median(weakest[good])) if good.any() else 0.0,
-        "refused_share": {name: count / good.size for name, count in counts.items()},
-        "full_scale": captured.full_scale,
-        "rounded": captured.frames.dtype != np.uint8,
-        "note": captured.note,
-    }
-
-
-def _views(captures: list[Capture]) -> dict[str, list[str]]:
-    """Views of each object."""
-    views: dict[str, list[str]] = {}
-    for capture in captures:
-        views.setdefault(capture.object, []).append(capture.view)
-    return views
+        weakest = np.minimum.reduce([measured.modulation for measured in decoded.details.values()])
+        measured = {
+            "decoded_share": decoded_share,
+            "median_modulation": float(np.median(weakest[good])),
+            "refused_share": shares,
+            "full_scale": captured.full_scale,
+            "rounded": rounded,
+            "note": captured.note,
+            "findings": [str(finding) for finding in examination.findings],
+        }
+        frames = {i: np.rint(frame).astype(np.uint8) if rounded else frame for i, frame in enumerate(captured.frames)}
+        return Row(capture.sample, capture.object, capture.view, frames, decoded.depth_mm, None, measured)
 
 
 def plan_captures(
@@ -269,17 +258,15 @@ def plan_captures(
         **asdict(limits),
         "bits": bits,
         "colour": colour,
-        "objects": {split: _views(chosen) for split, chosen in by_split.items()},
+        "objects": {
+            split: {
+                name: [c.view for c in chosen if c.object == name] for name in dict.fromkeys(c.object for c in chosen)
+            }
+            for split, chosen in by_split.items()
+        },
     }
     reader = CaptureReader({capture.sample: capture for capture in captures}, rig, limits, bits, colour, anyway)
     return import_plan(reader, plans, CAPTURED, settings, "all")
-
-
-def import_captures(
-    folder: Path, plan: ImportPlan[CaptureReader], workers: int, progress: Progress = lambda rows: None
-) -> Manifest:
-    """Write the planned dataset into ``folder`` as `run_import`; the `CaptureError` lists every wrong capture."""
-    return run_import(folder, plan, workers, progress, lambda problems: CaptureError("\n  ".join(problems)))
 
 
 def capture_notes(manifest: Manifest) -> list[str]:
@@ -297,3 +284,85 @@ def capture_notes(manifest: Manifest) -> list[str]:
         notes.append(f"white was taken as different levels ({listed}); give the camera's --bits to read all alike")
     notes += [f"{row['sample']}: {finding}" for row in rows for finding in row["findings"]]
     return notes
+
+
+def pose_folders(captures: Path) -> list[Path]:
+    """The folders of the poses below ``captures``, by name. Raises `CalibrationError` for fewer than three."""
+    if not captures.is_dir():
+        raise CalibrationError(f"{captures}: no such folder; expected one that holds a folder of frames for each pose")
+    folders = [path for path in visible(captures, CalibrationError) if path.is_dir()]
+    if len(folders) < FEWEST_POSES:
+        raise CalibrationError(
+            f"{captures}: expected folders of at least {FEWEST_POSES} poses of the board, found {len(folders)}"
+        )
+    return folders
+
+
+def board_poses(
+    captures: Path,
+    board: Board,
+    sequence: Path,
+    bits: int | None = None,
+    colour: str | None = None,
+    progress: Callable[[int], None] = lambda poses: None,
+    anyway: bool = False,
+    examined: Callable[[str, Examination], None] = lambda name, examination: None,
+) -> tuple[list[Pose], Rig, Response | None]:
+    """The board's points in every pose folder of ``captures``, in camera and projector px, a rig with the sequence of
+    the rig file ``sequence`` that stands in for the one sought (`optics.load_projection`), and the response of
+    projector and camera where the captures tell it. ``bits`` and ``colour`` as in `read_frames`. The
+    frames of every pose are examined; ``anyway`` takes those that are refused, too, and ``examined`` is called with a
+    pose's name and what was found. Raises FppBenchError naming the
+    pose or file."""
+    rig = load_projection(sequence)
+    if len(rig.directions) < 2:
+        coded = " and ".join(rig.directions) or "crossed fringes"
+        raise CalibrationError(
+            f"{sequence}: codes {coded} only; a calibration needs the projector's columns and rows, so "
+            "project both directions on the board"
+        )
+    poses: list[Pose] = []
+    levels: list[Levels] = []
+    seen: dict[int, tuple[Path, int]] = {}
+    for folder in pose_folders(captures):
+        capture = read_frames(folder, count=len(rig.sequence), bits=bits, colour=colour)
+        frames = capture.frames
+        height, width = frames.shape[1:]
+        if not poses:
+            rig = load_projection(sequence, (width, height))
+        elif poses[0].size != (width, height):
+            expected = f"{poses[0].size[0]} x {poses[0].size[1]} px as in {poses[0].name}"
+            raise CalibrationError(f"{folder}: images of {width} x {height} px, expected {expected}")
+        for index, frame in enumerate(frames):
+            other, of_other = seen.setdefault(hash(frame.tobytes()), (folder, index))
+            if other != folder and np.ptp(frame):
+                raise CalibrationError(
+                    f"{folder}: image {index} is that of {other.name} (image {of_other}), byte for byte: two poses "
+                    "can't share an image; put this pose's own frames there, or remove it"
+                )
+        decoded, examination = _examined_and_decoded(capture, rig, Limits(), anyway, calibrated=False)
+        examined(folder.name, examination)
+        white = rig.sequence.white
+        lit = frames.mean(axis=0, dtype=np.float64) if white is None else frames[white]
+        u_px, v_px = (decoded.details[direction].coordinate_px for direction in AXES)
+        poses.append(measure_pose(folder.name, np.clip(np.rint(lit), 0, 255).astype(np.uint8), u_px, v_px, board))
+        measured = levels_of(list(frames), (u_px, v_px), poses[-1], rig)
+        levels += [] if measured is None else [measured]
+        progress(1)
+    return poses, rig, fit_response(levels)
+
+
+def calibrated_rig(found: Calibration, stand_in: Rig, range_mm: tuple[float, float] | None = None) -> Rig:
+    """The rig of a calibration, with the sequence of ``stand_in``; its working range is ``range_mm``, or that of the
+    boards' points and a margin."""
+    depths = [
+        found.board_mm @ rotation_matrix(pose.rotation_vector)[2] + pose.translation_mm[2] for pose in found.poses
+    ]
+    near, far = range_mm or (float(np.min(depths)) * (1 - RANGE_MARGIN), float(np.max(depths)) * (1 + RANGE_MARGIN))
+    return replace(
+        stand_in,
+        camera=found.camera.pinhole(),
+        projector=found.projector.pinhole(),
+        rotation=found.rotation,
+        translation_m=found.translation_m,
+    ).with_range((near, far))

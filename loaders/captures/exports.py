@@ -8,8 +8,8 @@ import io
 import json
 import re
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
-from textwrap import wrap
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +22,7 @@ from fpp_ml_bench.examination.findings import Examination
 from fpp_ml_bench.files import write_atomically, write_files
 from fpp_ml_bench.loaders.captures.decoding import DecodedCapture
 from fpp_ml_bench.loaders.captures.images import CapturedFrames
+from fpp_ml_bench.loaders.pictures import capture_picture
 from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.optics.rig import Rig
 
@@ -109,7 +110,7 @@ def pixel_normals(depth_mm: ArrayLike, camera: Pinhole, step_mm: float | None = 
     normals = np.cross(tangents[0], tangents[1])
     towards = (normals * rays).sum(axis=-1) < 0
     normals = np.where(towards[..., None], normals, -rays)
-    length = np.sqrt((normals * normals).sum(axis=-1, keepdims=True))
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
     return np.where(depth[..., None] > 0, normals / np.where(length > 0, length, 1.0), 0.0)
 
 
@@ -120,22 +121,19 @@ def triangles(depth_mm: ArrayLike, camera: Pinhole, step_mm: float | None = None
     `export_capture`."""
     rays, depth = _rays_and_depth(depth_mm, camera)
     index = np.arange(depth.size).reshape(depth.shape)
-    sides = (_FIRST, _RIGHT), (_FIRST, _BELOW), (_RIGHT, _ACROSS), (_BELOW, _ACROSS)
-    top, left, right, bottom = (_joined(rays, depth, one, other, step_mm) for one, other in sides)
-    falling, rising = (
-        _joined(rays, depth, one, other, step_mm) for one, other in ((_FIRST, _ACROSS), (_RIGHT, _BELOW))
-    )
-    along_falling = falling & left & bottom, falling & right & top
-    along_rising = rising & left & top, rising & right & bottom
-    more = along_falling[0].astype(int) + along_falling[1] - along_rising[0] - along_rising[1]
+
+    def whole(*corners: Part) -> tuple[NDArray[np.bool_], tuple[Part, ...]]:
+        """Where three corners belong to one surface, pair by pair."""
+        pairs = [_joined(rays, depth, one, other, step_mm) for one, other in combinations(corners, 2)]
+        return np.logical_and.reduce(pairs), corners
+
+    falling = whole(_FIRST, _BELOW, _ACROSS), whole(_FIRST, _ACROSS, _RIGHT)
+    rising = whole(_FIRST, _BELOW, _RIGHT), whole(_RIGHT, _BELOW, _ACROSS)
+    more = sum(there.astype(int) for there, _ in falling) - sum(there.astype(int) for there, _ in rising)
     flatter = np.abs(depth[_FIRST] - depth[_ACROSS]) <= np.abs(depth[_RIGHT] - depth[_BELOW])
     chosen = (more > 0) | ((more == 0) & flatter)
-    parts = (
-        (chosen & along_falling[0], (_FIRST, _BELOW, _ACROSS)),
-        (chosen & along_falling[1], (_FIRST, _ACROSS, _RIGHT)),
-        (~chosen & along_rising[0], (_FIRST, _BELOW, _RIGHT)),
-        (~chosen & along_rising[1], (_RIGHT, _BELOW, _ACROSS)),
-    )
+    parts = [(there & chosen, corners) for there, corners in falling]
+    parts += [(there & ~chosen, corners) for there, corners in rising]
     return np.concatenate([np.stack([index[corner][there] for corner in corners], -1) for there, corners in parts])
 
 
@@ -170,8 +168,8 @@ def _joined(
     """Whether the pixels at ``one`` and ``other`` have a depth and belong to the same surface."""
     if step_mm is not None and not 0 < step_mm < np.inf:
         raise CaptureError(f"step_mm: expected a positive number of mm, got {step_mm!r}; leave it out for the default")
-    near, far, difference = depth[one], depth[other], rays[one] - rays[other]
-    apart = (near + far) / 2 * np.sqrt(difference[..., 0] ** 2 + difference[..., 1] ** 2)
+    near, far = depth[one], depth[other]
+    apart = (near + far) / 2 * np.linalg.norm(rays[one] - rays[other], axis=-1)
     return (near > 0) & (far > 0) & (np.abs(near - far) <= (STEEPEST * apart if step_mm is None else step_mm))
 
 
@@ -221,26 +219,24 @@ def _ply(
     return trimesh.exchange.ply.export_ply(solid, vertex_normal=True)
 
 
-def check_outputs(folder: Path) -> None:
-    """Raise `CaptureError` for a folder that holds files which no decoding writes, or a file in its place."""
+def check_outputs(folder: Path) -> list[Path]:
+    """What an earlier decoding left in ``folder``. Raises `CaptureError` for a folder that holds files which no
+    decoding writes, or a file in its place."""
     if folder.exists() and not folder.is_dir():
         raise CaptureError(f"{folder}: expected a folder for the results, found a file; give another name")
-    if not folder.is_dir():
-        return
-    others = sorted(p.name for p in folder.iterdir() if p.is_dir() or not _WRITTEN.fullmatch(p.name))
+    paths = sorted(folder.iterdir()) if folder.is_dir() else []
+    others = [path.name for path in paths if path.is_dir() or not _WRITTEN.fullmatch(path.name)]
     if others:
         listed = ", ".join(others[:4]) + (f" and {len(others) - 4} more" if len(others) > 4 else "")
         raise CaptureError(f"{folder}: holds files that no decoding writes: {listed}; give a new folder")
+    return paths
 
 
 def clear_outputs(folder: Path) -> None:
     """Remove what an earlier decoding left in ``folder``, also one that was killed; its report first, without which the
     rest is no result. Raises `CaptureError` as `check_outputs`, and where a file can't be removed."""
-    check_outputs(folder)
-    if not folder.is_dir():
-        return
     try:
-        for path in sorted(folder.iterdir(), key=lambda path: path.name != REPORT):
+        for path in sorted(check_outputs(folder), key=lambda path: path.name != REPORT):
             path.unlink()
     except OSError as error:
         raise CaptureError(f"{error.filename}: can't be removed ({error.strerror}); give a new folder") from error
@@ -254,12 +250,17 @@ def write_capture(
     clear_outputs(folder)
     decoded, found = result.decoded, result.decoded.depth_mm > 0
     export_capture(folder, decoded.depth_mm, rig.camera, result.grey, forms)
-    for name, values in (("sigma_mm", result.sigma_mm), ("modulation", result.modulation), ("reason", decoded.reason)):
-        write_atomically(folder / f"{name}.npy", _npy(values))
     title = f"{capture.files[0].parent.name}: {100 * found.mean():.1f}% of the pixels with depth"
-    maps = result.grey, decoded.depth_mm, result.sigma_mm, result.modulation, decoded.reason
-    findings = [str(finding) for finding in result.examination.findings]
-    write_atomically(folder / "picture.png", capture_picture(title, *maps, findings))
+    sigma_mm, modulation, reason = result.sigma_mm, result.modulation, decoded.reason
+    contents = {
+        "sigma_mm.npy": _npy(sigma_mm),
+        "modulation.npy": _npy(modulation),
+        "reason.npy": _npy(reason),
+        "picture.png": capture_picture(
+            title, result.grey, decoded.depth_mm, sigma_mm, modulation, reason, result.examination.findings
+        ),
+    }
+    write_files(folder, contents, CaptureError)
     content = {
         "pixels": decoded.counts,
         "noise_grey": result.noise_grey,
@@ -283,75 +284,9 @@ def _write_report(
 ) -> None:
     report = {
         "rig": rig.to_dict(),
-        "frames": [file.name for file in capture.files],
+        "frames": capture.names,
         "full_scale": capture.full_scale,
         "examination": examination.to_dict(),
         **content,
     }
     write_atomically(folder / REPORT, (json.dumps(report, indent=1) + "\n").encode())
-
-
-_REASONS = {
-    Reason.DECODED: "decoded",
-    Reason.NO_RAY: "no ray",
-    Reason.LOW_MODULATION: "low modulation",
-    Reason.SATURATED: "saturated",
-    Reason.INCONSISTENT_ORDER: "order not clear",
-    Reason.OUTSIDE_PATTERN: "outside the pattern",
-    Reason.DIRECTIONS_DISAGREE: "directions disagree",
-    Reason.OUTSIDE_RANGE: "outside the range",
-    Reason.NOT_ASKED: "not asked",
-}
-_COLUMNS = 250
-_COLOURS = ("#3ca951", "#9498a0", "#22252b", "#ff725c", "#efb118", "#a463f2", "#ff8ab7", "#4269d0", "#ffffff")
-
-
-def capture_picture(
-    title: str,
-    grey: NDArray,
-    depth_mm: NDArray[np.float32],
-    sigma_mm: NDArray[np.float32],
-    modulation: NDArray,
-    reason: NDArray[np.uint8],
-    findings: Sequence[str] = (),
-) -> bytes:
-    """PNG of maps (H, W): a frame in grey levels, depth and standard uncertainty in mm (0 = none), modulation in grey
-    levels, and `Reason` codes; the ``findings`` stand below it."""
-    from matplotlib.colors import ListedColormap
-    from matplotlib.figure import Figure
-    from matplotlib.patches import Patch
-
-    lines = [line for finding in findings for line in wrap(finding, _COLUMNS)]
-    figure = Figure(figsize=(17, 3.9 + 0.17 * len(lines)), dpi=100, layout="constrained")
-    if lines:
-        figure.supxlabel("\n".join(lines), fontsize=8, x=0.01, ha="left", color="#b00020")
-    figure.suptitle(title, fontsize=11)
-    found = depth_mm > 0
-    low, high = np.quantile(depth_mm[found], (0.005, 0.995)) if found.any() else (0.0, 1.0)
-    top = np.quantile(sigma_mm[found], 0.95) if found.any() else 1.0
-    panels = (
-        ("mean of the frames, grey levels", grey, "gray", 0.0, max(float(np.quantile(grey, 0.999)), 1.0)),
-        ("depth, mm", np.where(found, depth_mm, np.nan), "viridis", low, high),
-        ("standard uncertainty by noise, mm", np.where(found, sigma_mm, np.nan), "magma", 0.0, top),
-        ("modulation, grey levels", modulation, "gray", 0.0, float(max(np.nanmax(modulation, initial=1.0), 1.0))),
-    )
-    axes = figure.subplots(1, 5)
-    for plot, (name, image, colours, bottom, most) in zip(axes, panels, strict=False):
-        drawn = plot.imshow(image, cmap=colours, vmin=bottom, vmax=most, interpolation="nearest")
-        figure.colorbar(drawn, ax=plot, fraction=0.046, pad=0.02).ax.tick_params(labelsize=7)
-        plot.set_title(name, fontsize=9)
-    axes[4].imshow(reason, cmap=ListedColormap(_COLOURS), vmin=0, vmax=len(_COLOURS) - 1, interpolation="nearest")
-    axes[4].set_title("pixels", fontsize=9)
-    shares = np.bincount(reason.ravel(), minlength=len(_COLOURS)) / reason.size
-    handles = [
-        Patch(facecolor=_COLOURS[code], edgecolor="0.6", label=f"{name} {100 * shares[code]:.1f}%")
-        for code, name in _REASONS.items()
-        if shares[code] > 0
-    ]
-    axes[4].legend(handles=handles, fontsize=7, loc="upper left", bbox_to_anchor=(0.0, -0.02), ncols=2, frameon=False)
-    for plot in axes:
-        plot.set_xticks([])
-        plot.set_yticks([])
-    content = io.BytesIO()
-    figure.savefig(content, format="png")
-    return content.getvalue()

@@ -2,8 +2,9 @@
 captures in folders, ``{object}/{view}/`` or ``{object}/``, with the split that each object belongs to."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -15,18 +16,14 @@ from pydantic import Field
 
 from fpp_ml_bench.constants import GREY_LEVELS, OBJECT_NAME, SPLITS, VIEW_NAME, sample_name
 from fpp_ml_bench.containers import LARGEST_BYTES, StoredImage, parse_image
-from fpp_ml_bench.errors import BuildError, CaptureError, PredictionError
+from fpp_ml_bench.errors import BuildError, CaptureError, LayoutError, PredictionError
 from fpp_ml_bench.files import file_content, read_yaml, visible
 from fpp_ml_bench.schema import StrictModel, Text, validate
 
-COLOURS = {
-    "luminance": (0.299, 0.587, 0.114),
-    "red": (1.0, 0.0, 0.0),
-    "green": (0.0, 1.0, 0.0),
-    "blue": (0.0, 0.0, 1.0),
-    "mean": (1 / 3, 1 / 3, 1 / 3),
-}
-"""Weights of red, green and blue; luminance as in Rec. 601 and OpenCV's conversion to grey."""
+_CHANNELS = "red", "green", "blue"
+_LUMINANCE, _MEAN = (0.299, 0.587, 0.114), (1 / 3, 1 / 3, 1 / 3)
+"""Weights of the channels; luminance as in Rec. 601 and OpenCV's conversion to grey."""
+COLOURS = "luminance", *_CHANNELS, "mean"
 SUFFIXES = (".png", ".bmp", ".tif", ".tiff")
 _OTHER_IMAGES = (".jpg", ".jpeg", ".jpe", ".jp2", ".webp", ".gif", ".pgm", ".ppm", ".exr", ".hdr", ".raw", ".dng")
 _MODES = ("L", "LA", "I", "I;16", "I;16L", "I;16B", "RGB", "RGBA", "P", "PA")
@@ -48,6 +45,10 @@ class CapturedFrames:
     files: tuple[Path, ...]
     full_scale: int = GREY_LEVELS
     note: str = ""
+
+    @property
+    def names(self) -> list[str]:
+        return [file.name for file in self.files]
 
 
 class _Image(NamedTuple):
@@ -92,8 +93,7 @@ def read_frames(
             )
     used = int(np.bitwise_or.reduce([image.used for image in images]))
     full_scale, note = _full_scale(used, first_image.bits, bits, files[0].parent)
-    weighted = any(image.levels.dtype == np.float32 for image in images)
-    if full_scale == GREY_LEVELS and first_image.bits == 8 and not weighted:
+    if all(image.levels.dtype == np.uint8 for image in images):
         return CapturedFrames(np.stack([image.levels for image in images]), tuple(files))
     frames = np.empty((len(images), *first_image.levels.shape), np.float32)
     for index, image in enumerate(images):
@@ -105,7 +105,7 @@ def check_options(bits: int | None, colour: str | None) -> None:
     """Raise `CaptureError` for options that `read_frames` does not take."""
     if colour is not None and colour not in COLOURS:
         raise CaptureError(f"colour: expected {', '.join(COLOURS)}, got {colour!r}")
-    if bits is not None and (isinstance(bits, bool) or not isinstance(bits, int) or not 8 <= bits <= 16):
+    if bits is not None and (type(bits) is not int or not 8 <= bits <= 16):
         raise CaptureError(f"bits: expected a whole number from 8 to 16, got {bits!r}")
 
 
@@ -132,9 +132,10 @@ def frame_files(source: str | Path | Sequence[str | Path]) -> list[Path]:
             raise CaptureError(f"{source}: no file matches this pattern; check it and the folder's name")
     else:
         raise CaptureError(f"{path}: expected a folder, an image or a pattern such as scan/*.png, found nothing there")
-    files.sort(key=lambda file: (natural_key(str(file.with_suffix(""))), str(file)))
+    keys = {file: natural_key(str(file.with_suffix(""))) for file in files}
+    files.sort(key=lambda file: (keys[file], str(file)))
     for file, following in pairwise(files):
-        if natural_key(str(file.with_suffix(""))) == natural_key(str(following.with_suffix(""))):
+        if keys[file] == keys[following]:
             raise CaptureError(
                 f"{file}: {following.name} has the same name or number, so the frames have no order; remove one of "
                 "them, or give a pattern or a list of files"
@@ -192,17 +193,17 @@ def _read(file: Path, colour: str | None) -> _Image:
         image = parse_image(content)
     except PredictionError as error:
         raise CaptureError(f"{file}: {error}; {CAPTURE_AGAIN}") from None
-    if problem := _problem(image):
+    levels = np.atleast_3d(image.levels)
+    alpha = levels.shape[2] in (2, 4)
+    if problem := _problem(image, levels[..., -1] if alpha else None):
         raise CaptureError(f"{file}: {problem}")
-    levels = np.rot90(image.levels, _QUARTER_TURNS.get(image.orientation, 0))
+    levels = np.rot90(levels[..., :-1] if alpha else levels, _QUARTER_TURNS.get(image.orientation, 0))
     if image.orientation in _MIRRORED:
         levels = np.fliplr(levels)
-    if levels.ndim == 3 and levels.shape[2] in (2, 4):
-        levels = levels[..., 0] if levels.shape[2] == 2 else levels[..., :3]
     return _Image(_grey(levels, colour, file), image.bits, int(np.bitwise_or.reduce(levels, axis=None)))
 
 
-def _problem(image: StoredImage) -> str | None:
+def _problem(image: StoredImage, alpha: NDArray[Any] | None) -> str | None:
     """Why an image is no frame, and what to do."""
     if image.lossy:
         lossy = "is compressed with loss (JPEG), and its blocks distort the phase"
@@ -214,7 +215,6 @@ def _problem(image: StoredImage) -> str | None:
         return f"expected grey levels or RGB of 8 to 16 bits, found {kind}"
     if image.bits > 8 and image.white_is_0:
         return "the TIFF stores white as 0 (photometric 0); write it with black as 0"
-    alpha = image.levels[..., -1] if image.levels.ndim == 3 and image.levels.shape[2] in (2, 4) else None
     if image.transparent or (alpha is not None and (alpha < (1 << image.bits) - 1).any()):
         return "has transparent pixels; write it without an alpha channel"
     return None
@@ -222,17 +222,15 @@ def _problem(image: StoredImage) -> str | None:
 
 def _grey(levels: NDArray[Any], colour: str | None, file: Path) -> NDArray[Any]:
     """(H, W): the channel, where all are equal, or what ``colour`` says."""
-    if levels.ndim == 2:
-        return levels
-    red, green, blue = np.moveaxis(levels, -1, 0)
-    if np.array_equal(red, green) and np.array_equal(green, blue):
-        return np.ascontiguousarray(red)
+    if (levels == levels[..., :1]).all():
+        return np.ascontiguousarray(levels[..., 0])
     if colour is None:
         raise CaptureError(f"{file}: the colour channels differ; say which to take by colour ({', '.join(COLOURS)})")
-    if colour in ("red", "green", "blue"):
-        return np.ascontiguousarray(levels[..., ("red", "green", "blue").index(colour)])
-    weights = COLOURS[colour]
-    return (weights[0] * red + weights[1] * green + weights[2] * blue).astype(np.float32)
+    if colour in _CHANNELS:
+        return np.ascontiguousarray(levels[..., _CHANNELS.index(colour)])
+    red, green, blue = np.moveaxis(levels, -1, 0)
+    of_red, of_green, of_blue = _LUMINANCE if colour == "luminance" else _MEAN
+    return (of_red * red + of_green * green + of_blue * blue).astype(np.float32)
 
 
 SINGLE_VIEW = "single"
@@ -302,10 +300,17 @@ def find_captures(root: Path, frames: int) -> list[Capture]:
         problems.append(f"{root}: holds frames itself; move the frames of each object into a folder of its name")
     captures: list[Capture] = []
     for folder in _folders(root):
-        if not OBJECT_NAME.fullmatch(folder.name):
-            problems.append(f"{folder}: expected an object name of letters, digits, - and _; rename the folder")
-            continue
-        captures += _of_object(folder, frames, problems)
+        views = _folders(folder)
+        with listed(problems):
+            if not OBJECT_NAME.fullmatch(folder.name):
+                raise CaptureError(f"{folder}: expected an object name of letters, digits, - and _; rename the folder")
+            if views and _images(folder):
+                raise CaptureError(
+                    f"{folder}: holds frames and folders; give a folder of frames for each view, or frames alone"
+                )
+            for view in views or [folder]:
+                with listed(problems):
+                    captures.append(_capture(folder.name, view, view.name if views else SINGLE_VIEW, frames))
     if not captures and not problems:
         problems.append(f"{root}: holds no folder of an object; expected {root / 'OBJECT' / 'VIEW'} with the frames")
     if problems:
@@ -313,31 +318,28 @@ def find_captures(root: Path, frames: int) -> list[Capture]:
     return captures
 
 
-def _of_object(folder: Path, frames: int, problems: list[str]) -> Iterable[Capture]:
-    views = _folders(folder)
-    if views and _images(folder):
-        problems.append(f"{folder}: holds frames and folders; give a folder of frames for each view, or frames alone")
-        return
-    for view in views or [folder]:
-        name = view.name if views else SINGLE_VIEW
-        if not VIEW_NAME.fullmatch(name):
-            suggested = f", such as {name.replace('_', '-')}" if "_" in name else ""
-            problems.append(
-                f"{view}: expected a view name of letters, digits and - (no _){suggested}; rename the folder"
-            )
-            continue
-        try:
-            files = frame_files(view)
-        except CaptureError as error:
-            problems.append(str(error))
-            continue
-        if len(files) != frames:
-            problems.append(
-                f"{view}: expected the {frames} frames of the rig's sequence, found {len(files)} ({files[0].name} to "
-                f"{files[-1].name}); capture what is missing, or give the rig that took them"
-            )
-            continue
-        yield Capture(folder.name, name, view, tuple(files))
+def _capture(name: str, folder: Path, view: str, frames: int) -> Capture:
+    if not VIEW_NAME.fullmatch(view):
+        suggested = f", such as {view.replace('_', '-')}" if "_" in view else ""
+        raise CaptureError(
+            f"{folder}: expected a view name of letters, digits and - (no _){suggested}; rename the folder"
+        )
+    files = frame_files(folder)
+    if len(files) != frames:
+        raise CaptureError(
+            f"{folder}: expected the {frames} frames of the rig's sequence, found {len(files)} ({files[0].name} to "
+            f"{files[-1].name}); capture what is missing, or give the rig that took them"
+        )
+    return Capture(name, view, folder, tuple(files))
+
+
+@contextmanager
+def listed(problems: list[str]) -> Iterator[None]:
+    """Add a `LayoutError` or `CaptureError` inside the block to ``problems``."""
+    try:
+        yield
+    except (LayoutError, CaptureError) as error:
+        problems.append(str(error))
 
 
 def _folders(folder: Path) -> list[Path]:

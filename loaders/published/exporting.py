@@ -99,23 +99,19 @@ def exporting(out: Path) -> Iterator[Path]:
         raise BuildError(f"{out}: is not empty; give a new folder, an export never adds to a folder or overwrites it")
     staging = target.with_name(f".{target.name}.export")
     with exclusive(staging / LOCK_FILE, out, "exporting there"):
+        content = staging / "files"
         try:
-            for remains in staging.iterdir():
-                if remains.is_dir() and not remains.is_symlink():
-                    shutil.rmtree(remains)
-                elif remains.name != LOCK_FILE:
-                    remains.unlink()
-            yield staging
-            (staging / LOCK_FILE).unlink()
-            staging.replace(target)
-        except BaseException as error:
-            shutil.rmtree(staging, ignore_errors=True)
-            if not isinstance(error, OSError):
-                raise
+            shutil.rmtree(content, ignore_errors=True)
+            content.mkdir()
+            yield content
+            content.replace(target)
+        except OSError as error:
             raise BuildError(
                 f"{out}: can't be written ({error.strerror or error}); nothing was left there. Free some "
                 "space or choose another disk"
             ) from error
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
 
 
 def chosen_splits(dataset: DatasetFolder, split: str) -> list[str]:
@@ -139,13 +135,13 @@ def export(
         raise BuildError(f"export: expected some of {', '.join(FORMS)}, got {', '.join(forms) or 'none'}")
     if out.resolve() == dataset.path.resolve() or dataset.path.resolve() in out.resolve().parents:
         raise BuildError(f"{out}: lies in the dataset itself; give another folder")
-    views = {row["view"] for split in splits for row in dataset.manifest.samples[split]}
-    if "mat" in forms and not (isinstance(dataset.sequence, Sequence) and views <= set(VIEWS)):
+    rows = [row for split in splits for row in dataset.manifest.samples[split]]
+    if "mat" in forms and not (isinstance(dataset.sequence, Sequence) and {row["view"] for row in rows} <= set(VIEWS)):
         raise DatasetError(
             f"{dataset.path}: the published layout holds views {', '.join(VIEWS)} and the paper's kind of frames, and "
             "this dataset has others; export it as parquet"
         )
-    meshes = _meshes(dataset, splits) if "meshes" in forms else []
+    meshes = _meshes(dataset, [row["object"] for row in rows]) if "meshes" in forms else []
     with exporting(out) as staging:
         for form in forms:
             folder = staging / form if len(forms) > 1 else staging
@@ -161,10 +157,9 @@ def export(
                 export_patterns(dataset.rig, folder)
 
 
-def _meshes(dataset: DatasetFolder, splits: list[str]) -> list[Path]:
-    rows = (row for split in splits for row in dataset.manifest.samples[split])
+def _meshes(dataset: DatasetFolder, objects: list[str]) -> list[Path]:
     listed = {dataset.path / file.path for file in dataset.manifest.others}
-    paths = [dataset.path / MESH_FOLDER / f"{name}.ply" for name in dict.fromkeys(row["object"] for row in rows)]
+    paths = [dataset.path / MESH_FOLDER / f"{name}.ply" for name in dict.fromkeys(objects)]
     for path in paths:
         if path not in listed or not path.is_file():
             imported = dataset.manifest.origin != GENERATED

@@ -4,9 +4,7 @@ depths say about the rig, whose pitch and projector are not published."""
 
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -17,8 +15,9 @@ from fpp_ml_bench import __version__
 from fpp_ml_bench.calibration.projection import MOST_PX, DepthView, view_from_frames
 from fpp_ml_bench.containers import from_file, parse_image, parse_matrix
 from fpp_ml_bench.decoding.decode import decode_stack
-from fpp_ml_bench.depth import Normalisation, denormalise, normalise, object_mask
+from fpp_ml_bench.depth import Normalisation, denormalise, object_mask
 from fpp_ml_bench.errors import CaptureError, DecodeError, LayoutError, PredictionError, RigError
+from fpp_ml_bench.loaders.captures.images import listed
 from fpp_ml_bench.loaders.published import tree as published_tree
 from fpp_ml_bench.loaders.published.order import AUTO, FrameOrder, check_order, find_order, parse_order
 from fpp_ml_bench.loaders.published.tree import VARIABLES, VARIANT_FOLDERS, PublishedSample, PublishedTree
@@ -57,11 +56,10 @@ def _grey_levels(content: bytes) -> NDArray[np.uint8]:
     image = parse_image(content)
     if image.transparent:
         raise PredictionError("has transparent colours; expected plain grey levels")
-    if image.levels.ndim == 2:
-        return image.levels
-    if (image.levels != image.levels[..., :1]).any():
+    levels = np.atleast_3d(image.levels)
+    if (levels != levels[..., :1]).any():
         raise PredictionError("an RGB image whose channels differ; expected grey levels")
-    return np.ascontiguousarray(image.levels[..., 0])
+    return np.ascontiguousarray(levels[..., 0])
 
 
 def read_matrix(path: Path, variable: str) -> NDArray:
@@ -78,24 +76,13 @@ def read_scalar(path: Path, variable: str) -> float:
     return float(matrix[0, 0])
 
 
-@contextmanager
-def _listed(problems: list[str]) -> Iterator[None]:
-    """Add a `LayoutError` inside the block to ``problems``."""
-    try:
-        yield
-    except LayoutError as error:
-        problems.append(str(error))
-
-
+@dataclass(frozen=True)
 class RowReader:
-    """Picklable source of an import's rows: reads and checks one sample after the other."""
+    """Picklable source of an import's rows: reads and checks one sample after the other. ``samples``: what `read`
+    takes, by sample; each has its ``files``."""
 
+    samples: Mapping[str, Any]
     rig: Rig
-
-    @property
-    def samples(self) -> Mapping[str, Any]:
-        """What `read` takes, by sample; each has its ``files``."""
-        raise NotImplementedError
 
     def read(self, sample: Any) -> Row:
         """The row of one of ``samples``. Raises `LayoutError` or `CaptureError` for a wrong file."""
@@ -105,13 +92,9 @@ class RowReader:
         for name, _, _ in plan.samples:
             yield self.read(self.samples[name])
 
-    def problem(self, sample: Any) -> str | None:
-        """What is wrong with a sample; None where it can be read."""
-        try:
-            self.read(sample)
-        except (LayoutError, CaptureError) as error:
-            return str(error)
-        return None
+    def refusal(self, problems: list[str]) -> Exception:
+        """The error that lists the problems of all samples."""
+        raise NotImplementedError
 
 
 Reader = TypeVar("Reader", bound=RowReader)
@@ -134,20 +117,25 @@ def import_plan(
     return ImportPlan(reader, Assembly(plans, reader, manifest))
 
 
-def run_import(
-    folder: Path, plan: ImportPlan, workers: int, progress: Progress, refusal: Callable[[list[str]], Exception]
-) -> Manifest:
+def import_rows(folder: Path, plan: ImportPlan, workers: int, progress: Progress = lambda rows: None) -> Manifest:
     """Write the planned dataset into ``folder``, or go on with one that was interrupted. When a sample can't be read,
-    all others are tried too, and ``refusal`` of all problems is raised. Raises `BuildError` as a build does, and when a
-    file changed after ``folder`` was finished."""
+    all others are tried too, and the reader's refusal of all problems is raised, a `LayoutError` or `CaptureError`.
+    Raises `BuildError` as a build does, and when a file changed after ``folder`` was finished."""
     reader = plan.reader
+
+    def problems_of(sample: Any) -> list[str]:
+        problems: list[str] = []
+        with listed(problems):
+            reader.read(sample)
+        return problems
+
     forget_outdated(folder, plan.assembly.plans, lambda name: reader.samples[name].files)
     try:
         return assemble(folder, plan.assembly, workers, progress)
     except (LayoutError, CaptureError) as error:
         with ThreadPoolExecutor(_CHECK_THREADS) as pool:
-            problems = [problem for problem in pool.map(reader.problem, reader.samples.values()) if problem]
-        raise refusal(problems or [str(error)]) from error
+            problems = [line for found in pool.map(problems_of, reader.samples.values()) for line in found]
+        raise reader.refusal(problems or [str(error)]) from error
 
 
 @dataclass(frozen=True)
@@ -155,44 +143,36 @@ class SampleReader(RowReader):
     """Reads the samples of ``tree``. ``order`` None: raw frames are only checked, not read as frames of a sequence."""
 
     tree: PublishedTree
-    rig: Rig
     order: FrameOrder | None
 
-    @property
-    def samples(self) -> Mapping[str, PublishedSample]:
-        return self.tree.by_name
+    def refusal(self, problems: list[str]) -> LayoutError:
+        return published_tree.layout_error(self.tree.root, problems)
 
     def read(self, sample: PublishedSample) -> Row:
         """The sample's row, depth float32 mm, 0 = background. Raises `LayoutError` with a line for each wrong file."""
         problems: list[str] = []
-        fringe, *copies = self._images(sample.fringes, problems)
-        if fringe is not None:
-            problems += [
-                f"{path}: expected the same image as {sample.fringes[0]}, got another image"
-                for path, image in zip(sample.fringes[1:], copies, strict=True)
-                if image is not None and not np.array_equal(image, fringe)
-            ]
+        images: dict[Path, NDArray[np.uint8]] = {}
+        for path in (*sample.fringes, *sample.frames):
+            with listed(problems):
+                images[path] = read_grey_png(path)
+        first, *copies = sample.fringes
+        problems += [
+            f"{path}: expected the same image as {first}, got another image"
+            for path in copies
+            if {first, path} <= images.keys() and not np.array_equal(images[path], images[first])
+        ]
         depth_mm = self._depth_mm(sample, problems)
-        files = self._images(sample.frames, problems)
-        frames = {} if fringe is None else {SINGLE_SHOT_FRAME: fringe}
-        present = [image for image in files if image is not None]
-        if files and len(present) == len(files):
-            if fringe is not None and not np.array_equal(present[0], fringe):
-                problems.append(f"{sample.frames[0]}: differs from the single-shot input {sample.fringes[0]}")
-            if self.order is not None:
-                problems += self._misfits(sample, present, self.order)
-                ordered = self.order.frames(self.rig.paper_sequence)
-                frames = {frame.index: image for frame, image in zip(ordered, present, strict=True)}
+        frames = {SINGLE_SHOT_FRAME: images[first]} if first in images else {}
+        if self.order is not None and images.keys() >= {first, *sample.frames}:
+            files = [images[path] for path in sample.frames]
+            if not np.array_equal(files[0], images[first]):
+                problems.append(f"{sample.frames[0]}: differs from the single-shot input {first}")
+            problems += self._misfits(sample, files, self.order)
+            ordered = self.order.frames(self.rig.paper_sequence)
+            frames = {frame.index: image for frame, image in zip(ordered, files, strict=True)}
         if problems or depth_mm is None:
             raise LayoutError("\n".join(problems))
         return Row(sample.sample, sample.object, sample.view, frames, depth_mm, None)
-
-    def _images(self, paths: tuple[Path, ...], problems: list[str]) -> list[NDArray[np.uint8] | None]:
-        images: list[NDArray[np.uint8] | None] = [None] * len(paths)
-        for number, path in enumerate(paths):
-            with _listed(problems):
-                images[number] = read_grey_png(path)
-        return images
 
     def _misfits(self, sample: PublishedSample, files: list[NDArray[np.uint8]], order: FrameOrder) -> list[str]:
         misfits = check_order(files, order, self.rig)
@@ -206,53 +186,45 @@ class SampleReader(RowReader):
 
     def _depth_mm(self, sample: PublishedSample, problems: list[str]) -> NDArray[np.float32] | None:
         """Depth from the first variant; the other variants and the depth range must agree with it."""
-        maps: list[tuple[Normalisation, Path, NDArray[np.float64]]] = []
-        limits = self._range_mm(sample, problems)
-        for variant, path in zip(self.tree.variants, sample.depths, strict=True):
-            if variant == "individual" and limits is None:
-                continue
-            with _listed(problems):
-                values = read_matrix(path, VARIABLES[variant])
-                maps.append((variant, path, self._to_mm(path, values, variant, limits or (0.0, 0.0))))
-        if not maps or maps[0][1] != sample.depths[0]:
+        limits: tuple[float, float] | None = None
+        if sample.info is not None:
+            with listed(problems):
+                limits = _range_mm(sample.info)
+        files = dict(zip(self.tree.variants, sample.depths, strict=True))
+        maps: dict[Normalisation, NDArray[np.float64]] = {}
+        for variant, path in files.items():
+            if limits is not None or variant != "individual":
+                with listed(problems):
+                    maps[variant] = self._to_mm(path, variant, limits or (0.0, 0.0))
+        first, *others = files
+        if first not in maps:
             return None
-        depth_mm = maps[0][2].astype(np.float32)
-        for variant, path, variant_mm in maps[1:]:
-            difference_mm = _disagreement_mm(variant_mm, depth_mm, variant)
+        depth_mm = maps[first].astype(np.float32)
+        for variant in others:
+            difference_mm = _disagreement_mm(maps[variant], depth_mm, variant) if variant in maps else 0.0
             if difference_mm > AGREEMENT_MM:
                 problems.append(
-                    f"{path}: differs from {sample.depths[0]} by up to {difference_mm:.3f} mm; expected at "
+                    f"{files[variant]}: differs from {files[first]} by up to {difference_mm:.3f} mm; expected at "
                     f"most {AGREEMENT_MM} mm"
                 )
-        if limits is not None and self.tree.variants[0] != "individual":
+        if limits is not None and first != "individual":
             inside = depth_mm[object_mask(depth_mm)]
             actual = float(inside.min()), float(inside.max())
-            if max(abs(a - b) for a, b in zip(actual, limits, strict=True)) > AGREEMENT_MM:
+            if np.abs(np.subtract(actual, limits)).max() > AGREEMENT_MM:
                 problems.append(
-                    f"{sample.info}: gives {limits[0]:.3f} to {limits[1]:.3f} mm, but {sample.depths[0]} has "
+                    f"{sample.info}: gives {limits[0]:.3f} to {limits[1]:.3f} mm, but {files[first]} has "
                     f"{actual[0]:.3f} to {actual[1]:.3f} mm"
                 )
         return depth_mm
 
-    def _range_mm(self, sample: PublishedSample, problems: list[str]) -> tuple[float, float] | None:
-        with _listed(problems):
-            if sample.info is not None:
-                low, high = (read_scalar(sample.info, name) for name in published_tree.INFO_VARIABLES)
-                if 0 < low <= high:
-                    return low, high
-                problems.append(f"{sample.info}: expected 0 < depth_min <= depth_max, got {low} and {high}")
-        return None
-
-    def _to_mm(
-        self, path: Path, values: NDArray, variant: Normalisation, limits: tuple[float, float]
-    ) -> NDArray[np.float64]:
+    def _to_mm(self, path: Path, variant: Normalisation, limits: tuple[float, float]) -> NDArray[np.float64]:
+        values = read_matrix(path, VARIABLES[variant])
         height, width = self.tree.size
         if values.shape != (height, width):
             raise LayoutError(f"{path}: expected {height} x {width} like the images, got {values.shape}")
-        if not np.isfinite(values).all():
-            raise LayoutError(f"{path}: {np.count_nonzero(~np.isfinite(values))} pixels are NaN or infinite")
-        if (values < 0).any():
-            raise LayoutError(f"{path}: {np.count_nonzero(values < 0)} pixels are negative; background is 0")
+        for wrong, are in ((~np.isfinite(values), "NaN or infinite"), (values < 0, "negative; background is 0")):
+            if wrong.any():
+                raise LayoutError(f"{path}: {np.count_nonzero(wrong)} pixels are {are}")
         inside = object_mask(values)
         if not inside.any():
             raise LayoutError(f"{path}: no pixel is above 0, so there is no object")
@@ -270,13 +242,18 @@ class SampleReader(RowReader):
         return depth_mm
 
 
+def _range_mm(info: Path) -> tuple[float, float]:
+    low, high = (read_scalar(info, name) for name in published_tree.INFO_VARIABLES)
+    if not 0 < low <= high:
+        raise LayoutError(f"{info}: expected 0 < depth_min <= depth_max, got {low} and {high}")
+    return low, high
+
+
 def _disagreement_mm(variant_mm: NDArray[np.float64], depth_mm: NDArray[np.float32], variant: Normalisation) -> float:
     expected = depth_mm.astype(np.float64)
     if variant == "individual":
         # By the paper's rule, pixels at the sample's least depth are 0 in this variant.
-        inside = expected[object_mask(expected)]
-        share = normalise(expected, "individual", float(inside.min()), float(inside.max()))
-        expected = np.where(object_mask(share), expected, 0.0)
+        expected[expected == expected[object_mask(expected)].min()] = 0.0
     return float(np.abs(variant_mm - expected).max())
 
 
@@ -293,12 +270,10 @@ def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> 
     elif order is None:
         order = _order_of(tree, rig_used)
     stored = "all" if tree.has_frames else "single_shot"
-    plans = []
-    for split, samples in tree.samples.items():
-        objects: dict[str, list[tuple[str, str, str]]] = {}
-        for s in samples:
-            objects.setdefault(s.object, []).append((s.sample, s.object, s.view))
-        plans += plan_shards(split, objects)
+    by_split: dict[str, dict[str, list[tuple[str, str, str]]]] = {}
+    for s in tree.samples:
+        by_split.setdefault(s.split, {}).setdefault(s.object, []).append((s.sample, s.object, s.view))
+    plans = [plan for split, objects in by_split.items() for plan in plan_shards(split, objects)]
     settings = {
         "layout": "published",
         "depth_from": VARIANT_FOLDERS[tree.variants[0]],
@@ -306,17 +281,10 @@ def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> 
         "frame_order": order.name if order else None,
         "rig_assumed": rig is None,
         "ignored": list(tree.ignored),
-        "objects": {split: list(dict.fromkeys(s.object for s in samples)) for split, samples in tree.samples.items()},
+        "objects": {split: list(objects) for split, objects in by_split.items()},
     }
-    reader = SampleReader(tree, rig_used, order)
+    reader = SampleReader({s.sample: s for s in tree.samples}, rig_used, tree, order)
     return import_plan(reader, plans, IMPORTED, settings, stored)
-
-
-def import_tree(
-    folder: Path, plan: ImportPlan[SampleReader], workers: int, progress: Progress = lambda rows: None
-) -> Manifest:
-    """Write the planned import into ``folder`` as `run_import`; the `LayoutError` lists every wrong file."""
-    return run_import(folder, plan, workers, progress, partial(published_tree.layout_error, plan.reader.tree.root))
 
 
 def import_notes(manifest: Manifest) -> list[str]:
@@ -362,7 +330,7 @@ def _rig_for(tree: PublishedTree, rig: Rig | None) -> Rig:
 def _order_of(tree: PublishedTree, rig: Rig) -> FrameOrder:
     """Frame order of the first readable raw scan that fits a named order; tries a few, as the first may be broken."""
     refusals = []
-    for sample in list(tree.by_name.values())[:_MOST_SCANS_TRIED]:
+    for sample in tree.samples[:_MOST_SCANS_TRIED]:
         try:
             files = [read_grey_png(path) for path in sample.frames]
         except LayoutError as error:
@@ -398,7 +366,7 @@ def tree_views(
 
     def view(sample: PublishedSample) -> DepthView:
         row = reader.read(sample)
-        measured = view_from_frames(sample.sample, _frames(row, reader.rig), row.depth_mm, reader.rig, most_px)
+        measured = view_from_frames(sample.sample, _frames(row), row.depth_mm, reader.rig, most_px)
         progress(1)
         return measured
 
@@ -413,7 +381,7 @@ def depth_difference_mm(reader: SampleReader) -> float | None:
         return None
     row = reader.read(next(iter(reader.samples.values())))
     try:
-        decoded_mm = decode_stack(_frames(row, reader.rig), reader.rig, mask=object_mask(row.depth_mm)).depth_mm
+        decoded_mm = decode_stack(_frames(row), reader.rig, mask=object_mask(row.depth_mm)).depth_mm
     except DecodeError:
         return float("inf")
     both = object_mask(decoded_mm) & object_mask(row.depth_mm)
@@ -422,5 +390,5 @@ def depth_difference_mm(reader: SampleReader) -> float | None:
     return float(np.median(np.abs(decoded_mm[both].astype(np.float64) - row.depth_mm[both])))
 
 
-def _frames(row: Row, rig: Rig) -> list[np.ndarray]:
-    return [row.frames[index] for index in range(len(rig.sequence))]
+def _frames(row: Row) -> list[NDArray[np.uint8]]:
+    return [row.frames[index] for index in sorted(row.frames)]

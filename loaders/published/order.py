@@ -8,11 +8,13 @@ sinusoids. The check uses a few image rows and columns and takes a few ms per fo
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations, compress, product
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.coding.gray_code import gray_to_binary
 from fpp_ml_bench.coding.phase_shift import phase_weights, weighted_sums
 from fpp_ml_bench.errors import LayoutError
 from fpp_ml_bench.optics.rig import Rig
@@ -20,8 +22,6 @@ from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction, Frame, Sequence
 
 AUTO = "auto"
 _Run = tuple[str, Direction]
-_Lit = list[NDArray[np.bool_]]
-"""Which pixels of `_Lines.parts` the projector reaches: (lines, W) and (lines, H)."""
 _SH: _Run = "sinusoid", "horizontal"
 _SV: _Run = "sinusoid", "vertical"
 _GH: _Run = "gray", "horizontal"
@@ -64,17 +64,17 @@ class FrameOrder:
 
     def frames(self, sequence: Sequence) -> tuple[Frame, ...]:
         """The frames in file order."""
-        frames: list[Frame] = []
+        order: list[int] = []
         for kind, direction in LAYOUTS[self.layout]:
             indices = list(sequence.sinusoids(direction) if kind == "sinusoid" else sequence.gray(direction))
             if kind == "sinusoid" and BACKWARD_STEPS in self.modifiers:
-                indices = [indices[-n % len(indices)] for n in range(len(indices))]
+                indices[1:] = indices[:0:-1]
             if kind == "gray" and LEAST_BIT_FIRST in self.modifiers:
                 indices.reverse()
-            frames += [sequence.frames[i] for i in indices]
+            order += indices
         ends = [sequence.black, sequence.white]
-        frames += [sequence.frames[i] for i in (reversed(ends) if WHITE_FIRST in self.modifiers else ends)]
-        return tuple(frames)
+        order += reversed(ends) if WHITE_FIRST in self.modifiers else ends
+        return tuple(sequence.frames[i] for i in order)
 
 
 def parse_order(name: str) -> FrameOrder | None:
@@ -99,94 +99,90 @@ def all_orders() -> Iterator[FrameOrder]:
 
 def find_order(files: list[NDArray[np.uint8]], rig: Rig) -> FrameOrder | None:
     """The named order that the images of a raw scan fit, or None."""
-    measured = _Lines(files)
-    sequence = rig.paper_sequence
-    return next((order for order in all_orders() if not _misfits(measured, order.frames(sequence), rig)), None)
+    lines = _Lines(files)
+    return next((order for order in all_orders() if not _misfits(lines, order, rig)), None)
 
 
 def check_order(files: list[NDArray[np.uint8]], order: FrameOrder, rig: Rig) -> list[str]:
     """Contradictions between ``order`` and the images of a raw scan, uint8 (H, W) in file order; empty if they fit."""
-    return _misfits(_Lines(files), order.frames(rig.paper_sequence), rig)
+    return _misfits(_Lines(files), order, rig)
 
 
 class _Lines:
-    """A raw scan on some image rows and columns: ``parts`` along x (F, lines, W) and along y (F, lines, H), float32."""
+    """A raw scan on some image rows and columns: ``parts`` along x (F, lines, W) and along y (F, lines, H), float32;
+    which of their pixels the projector reaches, ``lit``, by the darkest and the brightest image."""
 
     def __init__(self, files: list[NDArray[np.uint8]]) -> None:
-        height, width = files[0].shape
-        rows = np.unique(np.linspace(0, height - 1, _LINES).astype(int))
-        columns = np.unique(np.linspace(0, width - 1, _LINES).astype(int))
+        rows, columns = (np.unique(np.linspace(0, side - 1, _LINES).astype(int)) for side in files[0].shape)
         along_x, along_y = [image[rows] for image in files], [image[:, columns].T for image in files]
         self.parts = tuple(np.stack(lines).astype(np.float32) for lines in (along_x, along_y))
         self.mean = np.array([float(image.mean(dtype=np.float64)) for image in files])
+        self.darkest, self.brightest = int(self.mean.argmin()), int(self.mean.argmax())
+        self.lit = [part[self.brightest] - part[self.darkest] >= _LEAST_CONTRAST for part in self.parts]
+
+    @cached_property
+    def middle(self) -> NDArray[np.float64]:
+        """Share of each image's lit pixels in the middle half between black and white; (F,)."""
+        grey = np.concatenate([part[:, lit] for part, lit in zip(self.parts, self.lit, strict=True)], axis=1)
+        share = (grey - grey[self.darkest]) / (grey[self.brightest] - grey[self.darkest])
+        return ((share > _MIDDLE[0]) & (share < _MIDDLE[1])).mean(axis=1)
 
 
-def _misfits(lines: _Lines, frames: tuple[Frame, ...], rig: Rig) -> list[str]:
-    """Contradictions between the files and ``frames``. Cheap checks come first; the others run only if those pass."""
+def _misfits(lines: _Lines, order: FrameOrder, rig: Rig) -> list[str]:
+    """Contradictions between the files and ``order``. Cheap checks come first; the others run only if those pass."""
+    sequence = rig.paper_sequence
+    frames = order.frames(sequence)
     file_of_frame = {frame.index: number for number, frame in enumerate(frames)}
-    black, white = file_of_frame[rig.paper_sequence.black], file_of_frame[rig.paper_sequence.white]
-    darkest, brightest = int(lines.mean.argmin()), int(lines.mean.argmax())
+    black, white = file_of_frame[sequence.black], file_of_frame[sequence.white]
+    darkest, brightest = lines.darkest, lines.brightest
     # A code with more bits than its cells need has a first frame that is black all over, too.
     if max(lines.mean[black] - lines.mean[darkest], lines.mean[brightest] - lines.mean[white]) > _SAME_MEAN:
         return [
             f"A_{darkest}.png is the darkest and A_{brightest}.png the brightest image; expected black in "
             f"A_{black}.png and white in A_{white}.png"
         ]
-    lit = [part[white] - part[black] >= _LEAST_CONTRAST for part in lines.parts]
-    if min(float(part.mean()) for part in lit) < _LEAST_LIT:
+    if min(float(lit.mean()) for lit in lines.lit) < _LEAST_LIT:
         return [f"A_{white}.png is hardly brighter than A_{black}.png: too little contrast to check an order"]
-    problems = _two_valued(lines, frames, lit, black, white)
+    problems = []
+    for number, frame in enumerate(frames):
+        if frame.kind == "gray" and lines.middle[number] > _MOST_MIDDLE_OF_GRAY:
+            problems.append(f"A_{number}.png: expected a Gray code frame with two grey levels, got many levels between")
+        if frame.kind == "sinusoid" and lines.middle[number] < _LEAST_MIDDLE_OF_SINUSOID:
+            problems.append(f"A_{number}.png: expected a sinusoid, got an image of two grey levels")
     if not problems:
         for direction in DIRECTIONS:
-            sinusoids, codes = rig.paper_sequence.sinusoids(direction), rig.paper_sequence.gray(direction)
-            problems += _sinusoids(lines, [file_of_frame[i] for i in sinusoids], lit, direction, rig)
-            limit = [(part[black] + part[white]) / 2 for part in lines.parts]
-            problems += _codes(lines, [file_of_frame[i] for i in codes], lit, direction, rig, limit)
-    return problems
-
-
-def _two_valued(lines: _Lines, frames: tuple[Frame, ...], lit: _Lit, black: int, white: int) -> list[str]:
-    problems = []
-    parts = [part[:, part_lit] for part, part_lit in zip(lines.parts, lit, strict=True)]
-    grey = np.concatenate(parts, axis=1)
-    share = (grey - grey[black]) / (grey[white] - grey[black])
-    middle = ((share > _MIDDLE[0]) & (share < _MIDDLE[1])).mean(axis=1)
-    for number, frame in enumerate(frames):
-        if frame.kind == "gray" and middle[number] > _MOST_MIDDLE_OF_GRAY:
-            problems.append(f"A_{number}.png: expected a Gray code frame with two grey levels, got many levels between")
-        if frame.kind == "sinusoid" and middle[number] < _LEAST_MIDDLE_OF_SINUSOID:
-            problems.append(f"A_{number}.png: expected a sinusoid, got an image of two grey levels")
+            expected = _expected_gradient(direction, rig)
+            sinusoids, codes = sequence.sinusoids(direction), sequence.gray(direction)
+            problems += _sinusoids(lines, [file_of_frame[i] for i in sinusoids], direction, expected)
+            problems += _codes(lines, [file_of_frame[i] for i in codes], direction, int(np.abs(expected).argmax()))
     return problems
 
 
 def _expected_gradient(direction: Direction, rig: Rig) -> NDArray[np.float64]:
     """Change of the projector coordinate (px) over half an image pixel in x and in y, on the background plane; (2,)."""
     camera = rig.camera
-    centre = np.array([(camera.width - 1) / 2, (camera.height - 1) / 2])
-    coordinates_px = []
-    for offset in ((0.0, 0.0), (0.5, 0.0), (0.0, 0.5)):
-        x, y = camera.normalised(*(centre + offset))
-        point = np.array([float(np.asarray(x)), float(np.asarray(y)), 1.0]) * rig.background
-        coordinates_px.append(float(rig.project(point)[0 if direction == "vertical" else 1]))
-    return np.array([coordinates_px[1] - coordinates_px[0], coordinates_px[2] - coordinates_px[0]])
+    x, y = camera.normalised(camera.width / 2 - np.array([0.5, 0, 0.5]), camera.height / 2 - np.array([0.5, 0.5, 0]))
+    points = np.stack([x, y, np.ones_like(x)], axis=-1) * rig.background
+    coordinate_px = rig.project(points)[0 if direction == "vertical" else 1]
+    return coordinate_px[1:] - coordinate_px[0]
 
 
-def _sinusoids(lines: _Lines, numbers: list[int], lit: _Lit, direction: Direction, rig: Rig) -> list[str]:
+def _sinusoids(lines: _Lines, numbers: list[int], direction: Direction, expected: NDArray[np.float64]) -> list[str]:
     steps = len(numbers)
     shifts = 2 * np.pi * np.arange(steps) / steps
     weights = phase_weights(shifts)
-    residuals, real, imaginary, gradients = [], [], [], []
-    for part, part_lit in zip(lines.parts, lit, strict=True):
+    residuals, waves, gradients = [], [], []
+    for part, lit in zip(lines.parts, lines.lit, strict=True):
         stack = part[numbers]
         mean, cosine, sine = weighted_sums(stack, weights)
         wave = cosine - 1j * sine
         turn = np.angle(wave[:, 1:] * wave[:, :-1].conj())
-        gradients.append(float(np.median(turn[part_lit[:, 1:] & part_lit[:, :-1]])))
-        residuals.append((stack - mean)[:, part_lit])
-        real.append(wave.real[part_lit])
-        imaginary.append(wave.imag[part_lit])
+        gradients.append(float(np.median(turn[lit[:, 1:] & lit[:, :-1]])))
+        residuals.append((stack - mean)[:, lit])
+        waves.append(wave[lit])
     # I_n - A = Re(wave) cos(delta_n) - Im(wave) sin(delta_n), solved for delta_n over all pixels.
-    model = np.stack([np.concatenate(real), -np.concatenate(imaginary)], axis=1)
+    wave = np.concatenate(waves).conj()
+    model = np.stack([wave.real, wave.imag], axis=1)
     solved = np.linalg.lstsq(model, np.concatenate(residuals, axis=1).T, rcond=None)[0]
     foreign = np.flatnonzero(np.hypot(*solved) < _LEAST_SHARE)
     if foreign.size:
@@ -202,7 +198,6 @@ def _sinusoids(lines: _Lines, numbers: list[int], lit: _Lit, direction: Directio
         f"the image has {np.degrees(measured_shifts[n]) % 360:.0f}"
         for n in np.flatnonzero(np.abs(errors) > np.pi / steps / 2)
     ]
-    expected = _expected_gradient(direction, rig)
     axis = int(np.abs(expected).argmax())
     files = f"A_{min(numbers)}.png to A_{max(numbers)}.png"
     if np.abs(gradients).argmax() != axis:
@@ -212,49 +207,39 @@ def _sinusoids(lines: _Lines, numbers: list[int], lit: _Lit, direction: Directio
     return problems
 
 
-def _codes(
-    lines: _Lines, numbers: list[int], lit: _Lit, direction: Direction, rig: Rig, limit: list[NDArray[np.float32]]
-) -> list[str]:
-    axis = int(np.abs(_expected_gradient(direction, rig)).argmax())
-    codes = [part[numbers] > middle for part, middle in zip(lines.parts, limit, strict=True)]
-    pairs = [part_lit[:, 1:] & part_lit[:, :-1] for part_lit in lit]
-    # Changes of each bit per image line: (bits,) along x and along y.
-    edges = [
-        ((code[:, :, 1:] != code[:, :, :-1]) & pair).sum(axis=(1, 2)) / code.shape[1]
-        for code, pair in zip(codes, pairs, strict=True)
-    ]
-    along, across = edges[axis], edges[1 - axis]
+def _codes(lines: _Lines, numbers: list[int], direction: Direction, axis: int) -> list[str]:
+    parts, edges = [], []
+    for part, lit in zip(lines.parts, lines.lit, strict=True):
+        code = part[numbers] > (part[lines.darkest] + part[lines.brightest]) / 2
+        pairs = lit[:, 1:] & lit[:, :-1]
+        parts.append((part[numbers], code, pairs))
+        # Changes of each bit per image line: (bits,) along x and along y.
+        edges.append(((code[:, :, 1:] != code[:, :, :-1]) & pairs).sum(axis=(1, 2)) / code.shape[1])
+    (grey, code, pairs), along, across = parts[axis], edges[axis], edges[1 - axis]
     problems = [
         f"A_{numbers[i]}.png: expected {direction} Gray bit {i}, varying along image {'xy'[axis]}; it does not"
         for i in np.flatnonzero((across > along) & (across > _LEAST_EDGES_A_LINE))
     ]
-    grey = lines.parts[axis][numbers]
+    exchanges = list(combinations(range(len(numbers)), 2))
     problems += [
         f"A_{numbers[i]}.png and A_{numbers[j]}.png: the same image, expected two Gray bits"
-        for i, j in combinations(range(len(numbers)), 2)
+        for i, j in exchanges
         if along[i] > _LEAST_EDGES_A_LINE and np.array_equal(grey[i], grey[j])
     ]
     if problems:
         return problems
+    straight = np.arange(len(numbers))
+    values = 1 << straight[::-1]
+
+    def jumps(order: NDArray[np.intp]) -> int:
+        """How irregular the code is along the lines, with its bits in ``order``."""
+        cells = gray_to_binary(np.tensordot(values, code[order], 1))
+        return int(np.abs(np.diff(cells, axis=-1))[pairs].sum())
+
+    as_is = jumps(straight)
     return [
         f"A_{numbers[i]}.png and A_{numbers[j]}.png: expected {direction} Gray bits {i} and {j}, most significant "
         "first; the code is more regular with the two exchanged"
-        for i, j in _exchanged_bits(codes[axis], pairs[axis])
+        for i, j in exchanges
+        if jumps(np.where(straight == i, j, np.where(straight == j, i, straight))) < as_is
     ]
-
-
-def _exchanged_bits(code: NDArray[np.bool_], pairs: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Pairs of bits that give a more regular code along the lines when exchanged; ``code`` bool (bits, lines, L)."""
-
-    def jumps(order: list[int]) -> int:
-        cells, bit = np.zeros(code.shape[1:], dtype=np.int32), np.zeros(code.shape[1:], dtype=np.bool_)
-        for number in order:
-            bit ^= code[number]
-            cells += cells
-            cells += bit
-        return int(np.abs(np.diff(cells, axis=-1))[pairs].sum())
-
-    straight = list(range(len(code)))
-    as_is = jumps(straight)
-    exchanged = {(i, j): [{i: j, j: i}.get(k, k) for k in straight] for i, j in combinations(straight, 2)}
-    return [pair for pair, order in exchanged.items() if jumps(order) < as_is]

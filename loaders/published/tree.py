@@ -5,7 +5,6 @@ Only directory entries and PNG headers are read here; contents are checked when 
 from collections import Counter
 from collections.abc import Collection
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 from fpp_ml_bench.constants import OBJECT_NAME, OBJECTS, PUBLISHED_SPLIT_FOLDERS, VIEWS, sample_name, split_sample_name
@@ -42,9 +41,6 @@ NOT_STORED = (WRAPPED_PHASE, UNWRAPPED_PHASE, HEIGHTS)
 
 LISTED_PROBLEMS = 50
 _KINDS = {FRINGE: ".png", DEPTH: ".mat"}
-FilesBySplit = dict[str, dict[str, Path]]
-"""The files of each split by stem (sample name); keys are this package's split names."""
-
 
 _COLOURS = {PNG_GREY: "grey", PNG_RGB: "RGB", 3: "palette", 4: "grey + alpha", 6: "RGB + alpha"}
 
@@ -92,23 +88,19 @@ class PublishedSample:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        return (*self.fringes, *self.depths, *([self.info] if self.info else []), *self.frames)
+        return (*self.fringes, *self.depths, *filter(None, [self.info]), *self.frames)
 
 
 @dataclass(frozen=True)
 class PublishedTree:
-    """A tree with a valid layout: image size (H, W), variants present, samples per split in row order."""
+    """A tree with a valid layout: image size (H, W), variants present, samples split by split in row order."""
 
     root: Path
     size: tuple[int, int]
     variants: tuple[Normalisation, ...]
-    samples: dict[str, list[PublishedSample]]
+    samples: list[PublishedSample]
     has_frames: bool
     ignored: tuple[str, ...]
-
-    @cached_property
-    def by_name(self) -> dict[str, PublishedSample]:
-        return {sample.sample: sample for samples in self.samples.values() for sample in samples}
 
 
 def _locate(root: Path) -> tuple[Path, Path | None]:
@@ -137,187 +129,143 @@ def _locate(root: Path) -> tuple[Path, Path | None]:
 def scan_tree(root: Path, frames: int) -> PublishedTree:
     """Scan the tree at ``root``, whose raw scans have ``frames`` files. Raises `LayoutError` listing all problems.
     ``root`` holds ``training_datasets/`` and maybe ``fpp_synthetic_dataset/``, or is ``training_datasets`` itself."""
-    training, scans_folder = _locate(root)
-    scan = _Scan(training)
+    training, scans = _locate(root)
+    scan, frame_files = _Scan(), [frame_file(index) for index in range(frames)]
     variants = tuple(name for name, folder in VARIANT_FOLDERS.items() if (training / folder).is_dir())
-    files = [scan.variant(training / VARIANT_FOLDERS[name]) for name in variants]
-    scan.same_stems(variants, [part[FRINGE] for part in files])
-    info = scan.info(files[0][DEPTH], needed=variants == ("individual",))
-    scans = scan.raw_scans(scans_folder, files[0][FRINGE], frames) if scans_folder else {}
-    samples = {split: scan.samples(split, files, info, scans) for split in PUBLISHED_SPLIT_FOLDERS}
-    samples = {split: part for split, part in samples.items() if part}
-    everything = [sample for part in samples.values() for sample in part]
-    scan.objects(everything)
+    folders = [training / VARIANT_FOLDERS[name] for name in variants]
+    names = PUBLISHED_SPLIT_FOLDERS.values()
+    present = {name for folder in folders for name in scan.known(folder, names, f"the folders {', '.join(names)}")}
+    info = training / INFO if (training / INFO).is_dir() else None
+    if info:
+        scan.known(info, present, f"the folders {', '.join(sorted(present))}")
+    elif variants == ("individual",):
+        reason = "normalised depth can't be converted to mm without it"
+        scan.problems.append(f"{training / INFO}: the folder is missing; {reason}")
+    samples: list[PublishedSample] = []
+    for split, name in PUBLISHED_SPLIT_FOLDERS.items():
+        parts = [folder / name for folder in folders]
+        ranges = info / name / DEPTH if info else None
+        for stem in sorted(scan.stems(parts, ranges) if name in present else (), key=_place):
+            fringes, depths = (tuple(part / kind / f"{stem}{_KINDS[kind]}" for part in parts) for kind in _KINDS)
+            label, limits = split_sample_name(stem), ranges / f"{stem}.mat" if ranges else None
+            raw = [scans.joinpath(*label, name) for name in frame_files] if scans else ()
+            samples.append(PublishedSample(stem, *label, split, fringes, depths, limits, tuple(raw)))
+    scan.objects(samples)
+    if scans:
+        scan.raw_scans(scans, {sample.sample for sample in samples}, frame_files)
     if not samples and not scan.problems:
-        scan.problems.append(f"{training / VARIANT_FOLDERS[variants[0]]}: holds no sample")
-    size = scan.size(everything)
+        scan.problems.append(f"{folders[0]}: holds no sample")
+    images = [path for sample in samples for path in (*sample.fringes, *sample.frames)]
+    size = scan.size([path for path in images if path.exists() or path.is_symlink()])
     if scan.problems:
         raise layout_error(root, scan.problems)
     ignored = [name for name in BACKGROUND_REMOVED_FOLDERS.values() if (training / name).is_dir()]
-    if scans_folder:
-        computed = (name for name in NOT_STORED if next(scans_folder.glob(f"*/*/{name}"), None))
-        ignored += [f"{RAW_SCANS}/*/*/{name}" for name in computed]
-    return PublishedTree(root, size, variants, samples, scans_folder is not None, tuple(ignored))
+    if scans:
+        ignored += [f"{RAW_SCANS}/*/*/{name}" for name in NOT_STORED if next(scans.glob(f"*/*/{name}"), None)]
+    return PublishedTree(root, size, variants, samples, scans is not None, tuple(ignored))
+
+
+def _place(stem: str) -> tuple[int, str, int]:
+    """Sort key of a sample: the benchmark's objects in their order, then all other objects by name; by view."""
+    name, view = split_sample_name(stem)
+    return OBJECTS.index(name) if name in OBJECTS else len(OBJECTS), name, VIEWS.index(view)
 
 
 class _Scan:
     """Lists files folder by folder, and collects ``problems``, a line each."""
 
-    def __init__(self, training: Path) -> None:
-        self.training = training
+    def __init__(self) -> None:
         self.problems: list[str] = []
 
     def _foreign(self, entry: Path, expected: str) -> None:
         self.problems.append(f"{entry}: does not belong here; expected {expected}")
 
-    def _folders(self, folder: Path, names: Collection[str], listed: str) -> list[Path]:
-        """Folders called ``names`` in a folder; reports everything else in it."""
-        folders = []
-        for entry in visible(folder, LayoutError):
-            if entry.name in names and entry.is_dir():
-                folders.append(entry)
-            else:
-                self._foreign(entry, f"the folders {listed}")
-        return folders
+    def _entries(self, folder: Path) -> list[Path]:
+        if folder.is_dir():
+            return visible(folder, LayoutError)
+        self.problems.append(f"{folder}: the folder is missing")
+        return []
 
-    def _files(self, folder: Path, suffix: str) -> dict[str, Path]:
-        if not folder.is_dir():
-            self.problems.append(f"{folder}: the folder is missing")
-            return {}
-        files = {}
-        for entry in visible(folder, LayoutError):
+    def known(self, folder: Path, names: Collection[str], expected: str) -> dict[str, Path]:
+        """Entries called ``names`` in a folder; reports everything else in it."""
+        entries = {entry.name: entry for entry in self._entries(folder)}
+        for name in sorted(entries.keys() - names):
+            self._foreign(entries.pop(name), expected)
+        return entries
+
+    def stems(self, parts: list[Path], ranges: Path | None) -> set[str]:
+        """Samples of which the folders ``parts`` of a split hold a fringe or a depth; reports what is not there for
+        each of them, and depth ranges in the folder ``ranges`` that belong to none."""
+        listed: dict[Path, set[str]] = {}
+        for part in parts:
+            self.known(part, _KINDS, f"the folders {' and '.join(_KINDS)}")
+            listed |= {part / kind: self._named(part / kind) for kind in _KINDS}
+        stems = set[str]().union(*listed.values())
+        if ranges:
+            listed[ranges] = self._named(ranges)
+            extra = sorted(listed[ranges] - stems)
+            self.problems += [f"{ranges / stem}.mat: belongs to no sample of this split" for stem in extra]
+        for folder, present in listed.items():
+            for stem in sorted(stems - present):
+                other = next(place for place, there in listed.items() if stem in there)
+                found = f"{other / stem}{_KINDS[other.name]}"
+                self.problems.append(f"{folder / stem}{_KINDS[folder.name]}: is missing; {found} is there")
+        return stems
+
+    def _named(self, folder: Path) -> set[str]:
+        """Samples with a file in a folder of fringes or depths."""
+        suffix, stems = _KINDS[folder.name], set()
+        for entry in self._entries(folder):
             name, _, view = entry.stem.rpartition("_")
             if entry.suffix != suffix or not entry.is_file():
                 self._foreign(entry, f"files ending in {suffix}")
             elif not OBJECT_NAME.fullmatch(name) or view not in VIEWS:
                 self.problems.append(f"{entry}: expected a name like power_drill_A60{suffix}, views {', '.join(VIEWS)}")
             else:
-                files[entry.stem] = entry
-        return files
+                stems.add(entry.stem)
+        return stems
 
-    def variant(self, folder: Path) -> dict[str, FilesBySplit]:
-        """Fringes and depths of a variant; reports every file without its counterpart."""
-        files: dict[str, FilesBySplit] = {kind: {} for kind in _KINDS}
-        splits = {published: split for split, published in PUBLISHED_SPLIT_FOLDERS.items()}
-        for entry in self._folders(folder, splits, ", ".join(splits)):
-            self._folders(entry, _KINDS, " and ".join(_KINDS))
-            for kind, suffix in _KINDS.items():
-                files[kind][splits[entry.name]] = self._files(entry / kind, suffix)
-        for split in files[FRINGE]:
-            for kind, other in ((DEPTH, FRINGE), (FRINGE, DEPTH)):
-                present = files[other][split]
-                target = folder / PUBLISHED_SPLIT_FOLDERS[split] / kind
-                self.problems += [
-                    f"{target / (stem + _KINDS[kind])}: is missing, {present[stem]} has no {kind}"
-                    for stem in sorted(present.keys() - files[kind][split].keys())
-                ]
-        return files
-
-    def same_stems(self, variants: tuple[Normalisation, ...], fringes: list[FilesBySplit]) -> None:
-        """Report samples of the first variant that another variant lacks in the same split, and the reverse."""
-        for name, others in zip(variants[1:], fringes[1:], strict=True):
-            for split, published in PUBLISHED_SPLIT_FOLDERS.items():
-                first, here = fringes[0].get(split, {}).keys(), others.get(split, {}).keys()
-                for lacking, holding, stems in ((name, variants[0], first - here), (variants[0], name, here - first)):
-                    folder = self.training / VARIANT_FOLDERS[lacking] / published / FRINGE
-                    self.problems += [
-                        f"{folder / (stem + '.png')}: is missing; {VARIANT_FOLDERS[holding]} has it in {published}"
-                        for stem in sorted(stems)
-                    ]
-
-    def info(self, depths: FilesBySplit, needed: bool) -> FilesBySplit:
-        """Files of the depth ranges, one for each depth; reports the absence of what is ``needed``."""
-        folder = self.training / INFO
-        if not folder.is_dir():
-            if needed:
-                reason = "normalised depth can't be converted to mm without it"
-                self.problems.append(f"{folder}: the folder is missing; {reason}")
-            return {}
-        files: FilesBySplit = {}
-        split_folders = sorted(PUBLISHED_SPLIT_FOLDERS[split] for split in depths)
-        self._folders(folder, split_folders, ", ".join(split_folders))
-        for split, expected in depths.items():
-            part = folder / PUBLISHED_SPLIT_FOLDERS[split] / DEPTH
-            found = files[split] = self._files(part, ".mat")
-            if part.is_dir():
-                missing, extra = sorted(expected.keys() - found.keys()), sorted(found.keys() - expected.keys())
-                self.problems += [f"{part / (stem + '.mat')}: is missing" for stem in missing]
-                self.problems += [f"{found[stem]}: belongs to no sample of this split" for stem in extra]
-        return files
-
-    def raw_scans(self, root: Path, fringes: FilesBySplit, frames: int) -> dict[str, tuple[Path, ...]]:
-        """Frames of each sample in file order, of which there must be ``frames``."""
-        stems_with_depth = {stem for split in fringes.values() for stem in split}
-        names = [frame_file(index) for index in range(frames)]
-        scans: dict[str, tuple[Path, ...]] = {}
+    def raw_scans(self, root: Path, samples: set[str], names: list[str]) -> None:
+        """Report what is not a raw scan of frames ``names`` for each of the ``samples``."""
+        scans: dict[str, Path] = {}
         for folder in visible(root, LayoutError):
             if not folder.is_dir():
                 self._foreign(folder, "one folder per object")
                 continue
-            for view in self._folders(folder, VIEWS, ", ".join(VIEWS)):
-                stem = sample_name(folder.name, view.name)
-                if stem not in stems_with_depth:
-                    self.problems.append(f"{view}: a raw scan without depth; {TRAINING} has no sample {stem}")
-                    continue
-                present = {entry.name: entry for entry in visible(view, LayoutError)}
-                self.problems += [f"{view / name}: is missing" for name in names if name not in present]
-                for name in sorted(set(present) - set(names) - set(NOT_STORED)):
-                    self._foreign(present[name], f"{names[0]} to {names[-1]}, {', '.join(NOT_STORED)}")
-                scans[stem] = tuple(present[name] for name in names if name in present)
-        self.problems += [
-            f"{root.joinpath(*split_sample_name(stem))}: the raw scan is missing"
-            for stem in sorted(stems_with_depth - set(scans))
-        ]
-        return scans
-
-    def samples(
-        self, split: str, files: list[dict[str, FilesBySplit]], info: FilesBySplit, scans: dict[str, tuple[Path, ...]]
-    ) -> list[PublishedSample]:
-        """Samples of a split: the benchmark's objects in their order, then all other objects by name."""
-        samples = []
-        for stem in files[0][FRINGE].get(split, {}):
-            fringes, depths = (
-                tuple(part[kind][split][stem] for part in files if stem in part[kind].get(split, {}))
-                for kind in (FRINGE, DEPTH)
-            )
-            label = split_sample_name(stem)
-            more = info.get(split, {}).get(stem), scans.get(stem, ())
-            samples.append(PublishedSample(stem, *label, split, fringes, depths, *more))
-
-        def place(sample: PublishedSample) -> tuple[int, str, int]:
-            known = OBJECTS.index(sample.object) if sample.object in OBJECTS else len(OBJECTS)
-            return known, sample.object, VIEWS.index(sample.view)
-
-        return sorted(samples, key=place)
+            views = self.known(folder, VIEWS, f"the folders {', '.join(VIEWS)}")
+            scans |= {sample_name(folder.name, name): view for name, view in views.items()}
+        for stem, view in scans.items():
+            if stem not in samples:
+                self.problems.append(f"{view}: a raw scan without depth; {TRAINING} has no sample {stem}")
+                continue
+            present = self.known(view, {*names, *NOT_STORED}, f"{names[0]} to {names[-1]}, {', '.join(NOT_STORED)}")
+            self.problems += [f"{view / name}: is missing" for name in names if name not in present]
+        missing = (root.joinpath(*split_sample_name(stem)) for stem in sorted(samples - scans.keys()))
+        self.problems += [f"{view}: the raw scan is missing" for view in missing]
 
     def objects(self, samples: list[PublishedSample]) -> None:
         """Report objects that are in two splits or lack views."""
         first_files: dict[str, dict[str, Path]] = {}
-        views: dict[str, set[str]] = {}
-        for s in samples:
-            views.setdefault(s.object, set()).add(s.view)
-            first_files.setdefault(s.object, {}).setdefault(s.split, s.fringes[0])
+        for sample in samples:
+            first_files.setdefault(sample.object, {}).setdefault(sample.split, sample.fringes[0])
+        stems = {sample.sample for sample in samples}
         for name, by_split in first_files.items():
             first, *others = by_split.values()
             if others:
                 self.problems.append(f"{first}: object {name} is in two splits, see {', '.join(map(str, others))}")
-        for name, seen in views.items():
-            if missing := [sample_name(name, view) for view in VIEWS if view not in seen]:
-                folder = next(iter(first_files[name].values())).parent
-                self.problems.append(f"{folder}: object {name} lacks {', '.join(missing)}")
+            if missing := [stem for view in VIEWS if (stem := sample_name(name, view)) not in stems]:
+                self.problems.append(f"{first.parent}: object {name} lacks {', '.join(missing)}")
 
-    def size(self, samples: list[PublishedSample]) -> tuple[int, int]:
+    def size(self, paths: list[Path]) -> tuple[int, int]:
         """Image size of most PNG headers; reports every file of another size."""
         sizes: dict[Path, tuple[int, int]] = {}
-        for path in (path for sample in samples for path in (*sample.fringes, *sample.frames)):
+        for path in paths:
             try:
                 with opened(path, links=True) as (stream, _):
                     sizes[path] = png_size(stream.read(PNG_HEADER_BYTES))
             except PredictionError as error:
                 self.problems.append(f"{path}: {error}")
-        if not sizes:
-            return 0, 0
-        common = Counter(sizes.values()).most_common(1)[0][0]
+        common = Counter(sizes.values()).most_common(1)[0][0] if sizes else (0, 0)
         self.problems += [
             f"{path}: expected {common[1]} x {common[0]} px as most images here, got {size[1]} x {size[0]}"
             for path, size in sizes.items()

@@ -17,8 +17,9 @@ from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli import main_eval as evaluate
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.loaders.captures.decoding import CaptureReader, import_captures, plan_captures
+from fpp_ml_bench.loaders.captures.decoding import CaptureReader, plan_captures
 from fpp_ml_bench.loaders.captures.images import Splits
+from fpp_ml_bench.loaders.published.importing import import_rows
 from fpp_ml_bench.loaders.render.meshes import solid_mesh
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.view import Studio
@@ -196,7 +197,7 @@ def test_any_sequence_and_limits(tmp_path, sequence, used):
 def test_an_interrupted_import_goes_on_and_gives_the_same_bytes(scanned, monkeypatch):
     monkeypatch.setattr("fpp_ml_bench.loaders.storage.shards.ROWS_PER_SHARD", 1)
     plan = plan_captures(scanned / "scans", RIG)
-    import_captures(scanned / "whole", plan, 1)
+    import_rows(scanned / "whole", plan, 1)
     read, done = CaptureReader.read, []
 
     def stop_at_third(self, taken):
@@ -207,21 +208,21 @@ def test_an_interrupted_import_goes_on_and_gives_the_same_bytes(scanned, monkeyp
 
     monkeypatch.setattr(CaptureReader, "read", stop_at_third)
     with pytest.raises(KeyboardInterrupt):
-        import_captures(scanned / "set", plan, 1)
+        import_rows(scanned / "set", plan, 1)
     # A frame of a finished shard changes: that shard is read again, the other is not.
     frame = scanned / "scans" / "bolt" / "frame_0.png"
     frame.write_bytes(frame.read_bytes())
     steps = []
-    import_captures(scanned / "set", plan, 1, steps.append)
+    import_rows(scanned / "set", plan, 1, steps.append)
     assert done[3:] == ["bolt_single", "gear_wheel_front"] and steps == [1, 1, 1]
     assert file_bytes(scanned / "set") == file_bytes(scanned / "whole")
     assert not (scanned / "set" / ".build").exists()
     with pytest.raises(BuildError, match="other settings: objects"):
         given = Splits(train=["bolt"], test=["gear_wheel"])
-        import_captures(scanned / "set", plan_captures(scanned / "scans", RIG, given), 1)
+        import_rows(scanned / "set", plan_captures(scanned / "scans", RIG, given), 1)
     frame.write_bytes(frame.read_bytes())
     with pytest.raises(BuildError, match=r"holds a finished import, and .*frame_0\.png changed"):
-        import_captures(scanned / "set", plan, 1)
+        import_rows(scanned / "set", plan, 1)
 
 
 def test_shards_hold_few_large_images():
