@@ -299,6 +299,14 @@ def test_show_writes_a_picture_of_the_sample(tiny, tmp_path, capsys):
     assert pictures[0].shape != pictures[1].shape or (pictures[0] != pictures[1]).mean() > 0.02
 
 
+def test_show_with_a_damaged_mesh_names_it(tiny, tmp_path, capsys):
+    folder = tmp_path / "copy"
+    shutil.copytree(tiny, folder)
+    (folder / "meshes" / "cork.ply").write_bytes(b"ply\nhalf")
+    assert call("show", folder, "cork_A0", "--out", tmp_path / "x.png") == 2
+    assert "cork.ply" in capsys.readouterr().err
+
+
 def test_show_by_default_writes_into_the_current_folder(tiny, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert call("show", tiny, "cork_A0") == 0
