@@ -85,7 +85,7 @@ def test_panels_show_the_errors_they_claim():
     prediction[0, 0] = 1799
     fringe = rng.integers(0, 255, target.shape).astype(np.uint8)
     panels = {title.partition(",")[0]: panel for title, *panel in sample_panels(fringe, target, prediction)}
-    assert list(panels) == ["Fringe", "Truth, mm", "Prediction, mm", "Absolute error", "Signed error"]
+    assert list(panels) == ["Fringe", "Truth", "Prediction", "Absolute error", "Signed error"]
     difference = prediction.astype(float) - target
     clip = np.percentile(np.abs(difference[10:30, 10:30]), CLIP_PERCENTILE)
     assert panels["Absolute error"][1:] == ["magma", 0.0, pytest.approx(clip, rel=1e-6)]
@@ -93,7 +93,7 @@ def test_panels_show_the_errors_they_claim():
     visible = (target > 0) | (prediction > 0)  # a pixel predicted in the background is visible too
     for title, expected in (("Absolute error", np.abs(difference)), ("Signed error", difference)):
         np.testing.assert_array_equal(panels[title][0], np.where(visible, expected, np.nan))
-    np.testing.assert_array_equal(panels["Truth, mm"][0] > 0, target > 0)
+    np.testing.assert_array_equal(panels["Truth"][0] > 0, target > 0)
     np.testing.assert_array_equal(panels["Fringe"][0], fringe)
 
 

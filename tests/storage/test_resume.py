@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
+import yaml
 from conftest import TINY_OBJECTS, TINY_SIZE, file_bytes, tiny_settings
 from disks import small_disk
 
@@ -27,6 +28,8 @@ from fpp_ml_bench.loaders.storage.verification import verify
 
 ROOT = Path(__file__).resolve().parent.parent
 COMMAND = [sys.executable, "-c", "import sys; from fpp_ml_bench.cli import main; sys.exit(main())"]
+DIRECT = named_light("paper").changed("bounces", interreflection=False, ambient_occlusion=False)
+"""Light without bounces, which is quick to compute."""
 SMALL = {"objects": ("cork",), "stored": "single_shot"}
 
 
@@ -106,13 +109,22 @@ def stopped(tmp_path_factory):
 
 
 @pytest.fixture
+def direct_light(tmp_path):
+    """`DIRECT` as a file for the command."""
+    file = tmp_path / "direct.yaml"
+    file.write_text(yaml.safe_dump(DIRECT.model_dump(mode="json")))
+    return str(file)
+
+
+@pytest.fixture
 def half_built(stopped, tmp_path):
     """A copy of `stopped`."""
     return Path(shutil.copytree(stopped, tmp_path / "half"))
 
 
 def half_settings(**changes):
-    return tiny_settings(**{"objects": ("cork", "mug"), "stored": "single_shot", **changes})
+    """Of two objects and one frame, in `DIRECT` light."""
+    return tiny_settings(**{"objects": ("cork", "mug"), "stored": "single_shot", "light": DIRECT, **changes})
 
 
 @pytest.fixture(scope="module")
@@ -250,7 +262,7 @@ def test_half_a_dataset_of_another_version_is_not_finished(half_built, monkeypat
         build(half_built, half_settings(), workers=1)
 
 
-def test_finished_folder_is_left_alone_unless_a_shard_is_gone(half_built, uninterrupted, capsys):
+def test_finished_folder_is_left_alone_unless_a_shard_is_gone(half_built, direct_light, capsys):
     build(half_built, half_settings(), workers=1)
     stamps = {path: path.stat().st_mtime_ns for path in half_built.rglob("*") if path.is_file()}
     arguments = [
@@ -263,6 +275,8 @@ def test_finished_folder_is_left_alone_unless_a_shard_is_gone(half_built, uninte
         "mug,cork",
         "--config",
         "single_shot",
+        "--light",
+        direct_light,
     ]
     assert main(arguments) == 0
     assert "complete already" in capsys.readouterr().out
@@ -385,7 +399,7 @@ def test_disk_that_fills_up_during_the_build(full_disk, uninterrupted, monkeypat
     assert file_bytes(folder) == uninterrupted
 
 
-def test_files_that_can_not_grow(tmp_path, uninterrupted):
+def test_files_that_can_not_grow(tmp_path, direct_light, uninterrupted):
     """The same through a limit on file sizes (EFBIG), which needs no privileges, and the real command."""
     folder = tmp_path / "set"
     arguments = [
@@ -399,6 +413,8 @@ def test_files_that_can_not_grow(tmp_path, uninterrupted):
         "cork,mug",
         "--config",
         "single_shot",
+        "--light",
+        direct_light,
         "--workers",
         "1",
     ]
