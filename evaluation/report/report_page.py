@@ -90,7 +90,7 @@ def _panels(result: Result, dataset: DatasetFolder, folder: Path) -> Iterator[tu
 def _terminal_text(result: Result) -> str:
     """What `fpp-eval` prints of a result, as plain text."""
     stream = io.StringIO()
-    Console(file=stream, width=160, color_system=None, highlight=False).print(result_table(result))
+    Console(file=stream, width=130, color_system=None, highlight=False).print(result_table(result))
     return stream.getvalue()
 
 
