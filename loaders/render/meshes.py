@@ -3,6 +3,7 @@
 import math
 from collections import Counter
 from dataclasses import fields
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +19,20 @@ from fpp_ml_bench.loaders.render.scene import SolidMesh, UserMesh
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
 _NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyz0123456789_")
+_KEPT = 4
+"""The benchmark's objects that a process keeps, and with them their surfels (`Lighting`, about 15 MB each): drawing and
+tracing one takes about a second."""
 
 
 def solid_mesh(name: str, user_meshes: tuple[UserMesh, ...] = ()) -> SolidMesh:
-    """Mesh ``name`` ready for the scene: metres, z up, about its turning axis."""
+    """Mesh ``name`` ready for the scene: metres, z up, about its turning axis. The same for the same name, as long as
+    it is kept."""
     user = {mesh.name: mesh for mesh in user_meshes}
-    if name in user:
-        return load_user_mesh(user[name])
+    return load_user_mesh(user[name]) if name in user else _drawn(name)
+
+
+@lru_cache(maxsize=_KEPT)
+def _drawn(name: str) -> SolidMesh:
     mesh = object_mesh(name)
     return SolidMesh(name, np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int32))
 
