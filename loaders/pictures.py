@@ -49,10 +49,10 @@ def panel_figure(panels: Sequence[Panel], further: int = 0) -> "Figure":
     """A figure of panels, five in a line, with room for ``further`` ones."""
     from matplotlib.figure import Figure
 
-    rows = -(-(len(panels) + further) // _ACROSS)
-    figure = Figure(figsize=(3.4 * _ACROSS, 3.7 * rows), dpi=110, layout="constrained")
+    grid = -(-(len(panels) + further) // _ACROSS), _ACROSS
+    figure = Figure(figsize=(3.4 * _ACROSS, 3.7 * grid[0]), dpi=110, layout="constrained")
     for number, panel in enumerate(panels, 1):
-        _draw(figure.add_subplot(rows, _ACROSS, number), *panel)
+        _draw(figure.add_subplot(*grid, number), *panel)
     return figure
 
 
@@ -123,8 +123,9 @@ def sample_picture(dataset: DatasetFolder, sample: str, path: Path) -> None:
     figure.suptitle(f"{sample} ({dataset.split_of_sample(sample)})")
     if mesh.is_file():
         vertices_m, faces, _ = read_mesh(mesh)
-        rows, place = -(-(len(panels) + 1) // _ACROSS), len(panels) + 1
-        solid: Any = figure.add_subplot(rows, _ACROSS, place, projection="3d")
+        first: Any = figure.axes[0]
+        grid = first.get_subplotspec().get_gridspec()
+        solid: Any = figure.add_subplot(grid[len(panels) // _ACROSS, len(panels) % _ACROSS], projection="3d")
         solid.plot_trisurf(*vertices_m.T, triangles=faces, color="0.9", linewidth=0, antialiased=False)
         solid.set_aspect("equal")
         solid.set_axis_off()

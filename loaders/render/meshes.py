@@ -20,7 +20,7 @@ from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
 _NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyz0123456789_")
 _KEPT = 4
-"""The benchmark's objects that a process keeps, and with them their surfels (`Lighting`, about 15 MB each): drawing and
+"""The benchmark's objects that a process keeps, and with them their surfels (`Lighting`, about 10 MB each): drawing and
 tracing one takes about a second."""
 
 
