@@ -184,7 +184,7 @@ def decode(
 
 
 def after_motion(points: NDArray[np.float64], target: NDArray[np.float64]) -> tuple[float, float]:
-    """Median distance of points (n, 3) from ``target`` after the best rigid motion, outliers aside, and the ratio of
+    """Median distance of points (n, 3) from ``target`` after the best rigid motion, without outliers, and the ratio of
     their sizes."""
     kept = np.ones(len(points), dtype=bool)
     for _ in range(8):

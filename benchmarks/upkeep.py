@@ -45,7 +45,7 @@ from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.leaderboard import columns
 from fpp_ml_bench.leaderboard.columns import NOT_CHECKED, Column, device, error
 from fpp_ml_bench.leaderboard.groups import Group, more_than_trivial
-from fpp_ml_bench.leaderboard.names import assumption, short_names, told
+from fpp_ml_bench.leaderboard.names import assumption, given_truth, short_names
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.row_file import row_json, write_row
 from fpp_ml_bench.leaderboard.rows import VOUCHED, Entry, read_entry, vouching_line
@@ -90,7 +90,7 @@ METHODS = {
     "constant-range-training": "constant --at range-training",
     "nearest": "nearest",
 }
-"""File name of a row: method and options. The trivial methods that are told the range are scored by the rules of the
+"""File name of a row: method and options. The trivial methods that are given the range are scored by the rules of the
 paper's networks. The middle of the working range is the standoff, so it is no row of its own."""
 CROSSED = {"crossed": "crossed", "crossed-03": "crossed --frames 3", "crossed-net": "crossed-net"}
 """The same for datasets with crossed fringes. The trivial methods see no code, so theirs would be the same rows."""
@@ -208,12 +208,12 @@ _COLUMNS = (
 
 
 def readme_block(groups: Sequence[Group]) -> str:
-    """What is between README's markers: the best `SHOWN` rows of each group that is not `GroupKey.aside`, and the
-    paper's architectures."""
+    """What is between README's markers: the best `SHOWN` rows of each group without `GroupKey.special_data`, and
+    the paper's architectures."""
     if not groups:
         return f"No row yet. {_MADE_BY}\n"
-    others = list(dict.fromkeys(group.key.aside for group in groups if group.key.aside))
-    groups, lines = [group for group in groups if not group.key.aside], []
+    others = list(dict.fromkeys(group.key.special_data for group in groups if group.key.special_data))
+    groups, lines = [group for group in groups if not group.key.special_data], []
     for group in more_than_trivial(groups):
         machines = sorted({device(row.entry) for row in group.rows if row.entry.time_measured})
         timed = f"; measured on {', '.join(machines)}" if machines else ""
@@ -231,7 +231,7 @@ def readme_block(groups: Sequence[Group]) -> str:
         [
             row.label,
             *(f"{row.errors_mm[key]:.2f}" if key in row.errors_mm else "-" for key in keys),
-            f"{table.source}, told {told(row.track)}",
+            f"{table.source}, given {given_truth(row.track)}",
         ]
         for table in (*chosen_tables("architecture"), *chosen_tables("oracle_order"))
         for row in table.rows

@@ -15,13 +15,14 @@ from fpp_ml_bench.leaderboard.rows import Entry
 NOT_CHECKED = "*"
 NOT_MEASURED = "not measured"
 RANK_NOTE = (
-    "Rank: the best and the worst that the tests allow. Two rows are told apart by a sign-flip test of their paired "
+    "Rank: the best and the worst that the tests allow. Two rows are distinguished by a sign-flip test of their paired "
     "object means at 5%, by Holm's correction over all pairs of the table. Best: 1 + the rows that it is behind; "
     "worst: all ranked rows without those behind it."
 )
 RATIO_NOTE = (
     "x trivial: object MAE over that of the best method that looks at nothing, or only for the nearest training image, "
-    "and is told no more than the track's methods. Of depth range: object MAE over the depth range of each sample."
+    "and is given no more of the ground truth than the track's methods. "
+    "Of depth range: object MAE over the depth range of each sample."
 )
 TRUST_NOTE = (
     "(4): no rank, for nobody vouches for the row; 1 + the ranked rows with a smaller error. "

@@ -13,7 +13,7 @@ from fpp_ml_bench.evaluation.metrics import HEADLINE, WIDE, with_column
 from fpp_ml_bench.evaluation.metrics import RANK_KEY as _MAIN
 from fpp_ml_bench.leaderboard.columns import device, uncertainty
 from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, TEST, UNSEEN, Group, Ranked
-from fpp_ml_bench.leaderboard.names import learned_from, told
+from fpp_ml_bench.leaderboard.names import given_truth, learned_from
 from fpp_ml_bench.leaderboard.tables import ReportedTable
 
 _FORMULA = re.compile(r"[^\w=+@-]*[=+@-]")
@@ -104,7 +104,7 @@ def _cells(group: Group, row: Ranked) -> dict[str, object]:
         "within_stated_95": covered,
         "ause_mae_mm": ause_mm,
         "learned_from": learned_from(about),
-        "told": told(key.track),
+        "given_truth": given_truth(key.track),
         "provenance": row.provenance,
         "source": entry.path.name,
     }

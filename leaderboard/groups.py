@@ -81,7 +81,7 @@ class GroupKey:
         return self.split == "test" and self.data == _title(TEST)
 
     @property
-    def aside(self) -> str:
+    def special_data(self) -> str:
         """What sets a benchmark apart from those that are shown first, in words: another light or a small image, as
         ``workshop``, ``224 px``; empty for the others."""
         benchmark = self.benchmark
@@ -244,7 +244,7 @@ def behind(errors: NDArray[np.float64]) -> NDArray[np.bool_]:
         part = slice(start, start + _AT_ONCE)
         low[part], high[part] = sign_flip_bounds(errors[second[part]] - errors[first[part]])
     apart, left = np.zeros(len(first), bool), len(first)
-    while left:  # Holm's procedure: with each pair that is told apart, fewer are left, and the next may have a larger p
+    while left:  # Holm's procedure: with each pair that differs, fewer are left, and the next may have a larger p
         for pair in np.flatnonzero((left * low <= SIGNIFICANT) & (left * high > SIGNIFICANT)):
             low[pair] = high[pair] = sign_flip_p(errors[second[pair]] - errors[first[pair]])
         apart = left * high <= SIGNIFICANT
@@ -317,8 +317,8 @@ def more_than_trivial(groups: Sequence[Group]) -> list[Group]:
 
 def with_ratios(groups: Sequence[Group]) -> list[Group]:
     """``groups`` whose rows have their ``ratio``: object MAE over the smallest that a trivial row by the same rules has
-    on the row's objects. Trivial rows need at most one frame, so they count in all classes; a row that is told
-    something of the ground truth counts in the tracks that are told no less."""
+    on the row's objects. Trivial rows need at most one frame, so they count in all classes; a row that is given
+    something of the ground truth counts in the tracks that are given no less."""
     trivial: dict[tuple[object, ...], list[tuple[set[str], dict[str, float]]]] = {}
     for group in groups:
         for row in filter(is_trivial, group.rows):
@@ -331,7 +331,7 @@ def with_ratios(groups: Sequence[Group]) -> list[Group]:
 
 
 def _given(key: GroupKey) -> set[str]:
-    """What of the ground truth the track's methods are told, in the words of `Track`."""
+    """What of the ground truth the track's methods are given, in the words of `Track`."""
     return set(key.track.removeprefix("oracle ").split(" + ")) - {"metric"}
 
 

@@ -1,4 +1,4 @@
-"""Words about a table's rows: short names, what a method assumes of the scene, what it was told of the scored samples,
+"""Words about a table's rows: short names, what a method assumes of the scene, what it was given of the scored samples,
 and what it learned from. Rows of this package's methods get their short names from the method's settings; every other
 submission keeps its own name, cut at a word."""
 
@@ -54,16 +54,16 @@ def _from_settings(submission: Submission) -> str | None:
     return None
 
 
-_TOLD_OF = {"range": "depth range", "mask": "object mask", "order": "fringe order"}
+_TRUTH_NAMES = {"range": "depth range", "mask": "object mask", "order": "fringe order"}
 
 
-def told(track: str) -> str:
-    """What the methods of a track are told about the very samples that they are scored on; empty for ``metric``.
+def given_truth(track: str) -> str:
+    """The ground truth of the scored samples that the methods of a track are given; empty for ``metric``.
 
-    >>> told("oracle range + order")
+    >>> given_truth("oracle range + order")
     "the test sample's depth range and fringe order"
     """
-    things = [_TOLD_OF[word] for word in track.removeprefix("oracle ").split(" + ") if word in _TOLD_OF]
+    things = [_TRUTH_NAMES[word] for word in track.removeprefix("oracle ").split(" + ") if word in _TRUTH_NAMES]
     if not things:
         return ""
     return "the test sample's " + " and ".join(filter(None, (", ".join(things[:-1]), things[-1])))
@@ -81,10 +81,10 @@ def assumption(row: Row) -> str:
 
 
 def assumption_sentences(row: Row) -> str:
-    """For the row's own page: what the method assumes, and what it was told of the samples that it is scored on."""
-    given = told(row.track)
+    """For the row's own page: what the method assumes, and what it was given of the samples that it is scored on."""
+    given = given_truth(row.track)
     assumed = _assumption(row)
-    return " ".join([*([assumed.sentence] if assumed else []), *([f"Told {given}."] if given else [])])
+    return " ".join([*([assumed.sentence] if assumed else []), *([f"Given {given}."] if given else [])])
 
 
 def learned_from(row: Row) -> str:

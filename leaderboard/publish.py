@@ -20,7 +20,7 @@ from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.evaluation.protocol import Track
 from fpp_ml_bench.evaluation.report.html import millimetres, percent
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.leaderboard.names import told
+from fpp_ml_bench.leaderboard.names import given_truth
 from fpp_ml_bench.leaderboard.page.page import INDEX, SUBMISSIONS, write_page
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.row_file import Row
@@ -107,7 +107,7 @@ def task_of(row: Row, name: str) -> Task:
     if task is None:
         raise PublishError(
             f"{name}: the Hub's benchmark has no task for the {row.track} track (the method was given "
-            f"{told(row.track)}); publish a result of a method that finds the object and the fringe order itself"
+            f"{given_truth(row.track)}); publish a result of a method that finds the object and the fringe order itself"
         )
     return task
 

@@ -136,7 +136,7 @@ def _weights_sha256(recipe: Recipe, folders: Folders, opened: DatasetFolder) -> 
 class Ordering:
     """The paper reports a smaller object MAE for ``better`` than for ``worse``, by ``paper_gap_mm``; here the mean over
     samples of worse minus better is ``gap_mm``, its 95% interval over ``objects`` objects ``interval_mm`` (None with
-    fewer than two). ``same_track`` is False where the two rows were told different things about the test samples."""
+    fewer than two). ``same_track`` is False where the rows were given different ground truth of the samples."""
 
     better: str
     worse: str
@@ -384,6 +384,6 @@ def _orderings(judged: Sequence[Ordering]) -> list[str]:
     parts += [*TextTable.of("", rows, (0, 1, 5)).markdown(), ""]
     parts += ["Differences sample by sample; intervals by bootstrap over objects."]
     if not all(ordering.same_track for ordering in judged):
-        told = "one of the two was given the test sample's range, which is part of the difference."
-        parts += ["", f"\\{_TRACKS_DIFFER} of different tracks: {told}"]
+        difference = "one of the two was given the test sample's range, which is part of the difference."
+        parts += ["", f"\\{_TRACKS_DIFFER} of different tracks: {difference}"]
     return parts

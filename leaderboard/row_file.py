@@ -221,7 +221,7 @@ def view_means(objects: Iterable[ObjectMeans], key: str) -> Iterator[tuple[str, 
 
 
 def name_key(name: str) -> str:
-    """What two names share that look the same: compatible forms, letter case and spaces aside."""
+    """What two names share that look the same: compatible forms, ignoring letter case and spaces."""
     return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
 
 

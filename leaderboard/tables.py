@@ -16,7 +16,7 @@ from fpp_ml_bench.evaluation.report.html import interval_text, millimetres
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.columns import METHOD, NOTE, ONLY_IN_FILES, Column, columns
 from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, Group, Pair, Ranked
-from fpp_ml_bench.leaderboard.names import told
+from fpp_ml_bench.leaderboard.names import given_truth
 from fpp_ml_bench.leaderboard.rows import BY_ITS_AUTHORS, BY_THE_PAPER
 from fpp_ml_bench.paper import paper_rows
 from fpp_ml_bench.tables import Table
@@ -69,9 +69,13 @@ class ReportedTable:
 
     @property
     def note(self) -> str:
-        """Below the table: who measured, on what, and what the methods of its tracks were told."""
+        """Below the table: who measured, on what, and what the methods of its tracks were given."""
         depths = [PAPER_DEPTHS] if self.source == BY_THE_PAPER else []
-        given = [f"{track}: told {told(track)}." for track in sorted({row.track for row in self.rows}) if told(track)]
+        given = [
+            f"{track}: given {given_truth(track)}."
+            for track in sorted({row.track for row in self.rows})
+            if given_truth(track)
+        ]
         source = f"{self.source[0].upper()}{self.source[1:]}"
         said = [f"{source}. Other data, not ranked with the rows above.", *depths, *given]
         if self.figure is not None:
@@ -168,7 +172,7 @@ def pair_row(pair: Pair) -> dict[str, str]:
         "p": f"{pair.p:.2g}",
         "p, Holm": f"{pair.p_holm:.2g}",
         "Objects": str(pair.objects),
-        "Verdict": "second is behind" if pair.behind else "not told apart",
+        "Verdict": "second is behind" if pair.behind else "no difference shown",
     }
 
 

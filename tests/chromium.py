@@ -160,7 +160,7 @@ class Browser:
         return complaints
 
     def requests(self) -> list[str]:
-        """Addresses that were asked for since the page was opened, data: addresses aside."""
+        """Addresses that were asked for since the page was opened, without data: addresses."""
         self.run("1")
         urls = [
             event["params"]["request"]["url"]

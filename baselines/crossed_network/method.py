@@ -1,4 +1,4 @@
-"""crossed-net as a method of ``fpp-bench predict``: one crossed frame, metric depth, nothing told."""
+"""crossed-net as a method of ``fpp-bench predict``: one crossed frame, metric depth, no ground truth given."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -20,7 +20,7 @@ from fpp_ml_bench.baselines.phase_network.odds import (
     threshold_at,
 )
 from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask
-from fpp_ml_bench.baselines.phase_route.orders import nearest_inside, of_choice
+from fpp_ml_bench.baselines.phase_route.orders import chosen_values, nearest_inside
 from fpp_ml_bench.baselines.phase_route.resampling import Periods
 from fpp_ml_bench.optics.rig import Rig
 
@@ -90,14 +90,14 @@ class CrossedNetRoute:
         psi = scene.nearness * joint
         candidates = np.stack([psi + scene.step_rad[0], psi, psi + scene.step_rad[1]])
         choice = least_energy_order(answers.logits, candidates, perhaps, self.route.stride, JUMP_RAD)
-        nearness = scene.nearness + (of_choice(offers, choice) + answers.correction_rad) / joint
+        nearness = scene.nearness + (chosen_values(offers, choice) + answers.correction_rad) / joint
         known = scene.share > LEAST_SHARE
         if not known[inside].all():  # beyond the reach of any window: as the nearest pixel within it
             nearness = nearness[nearest_inside(known)]
         chances = probabilities(answers.logits)
-        wrong = np.clip(1 - of_choice(chances, choice), LEAST_CHANCE, 1)
+        wrong = np.clip(1 - chosen_values(chances, choice), LEAST_CHANCE, 1)
         np.put_along_axis(chances, choice[None], -1, axis=0)
-        rival = (scene.nearness + of_choice(offers, chances.argmax(axis=0)) / joint).astype(np.float32)
+        rival = (scene.nearness + chosen_values(offers, chances.argmax(axis=0)) / joint).astype(np.float32)
         fit = replace(seen.fit, nearness=nearness.astype(np.float32), uncertainty_rad=answers.sigma_rad)
         seen.watch.done("order")
         return self.route.conclude(replace(seen, fit=fit, inside=inside, rival=rival), wrong.astype(np.float32))

@@ -27,7 +27,7 @@ from fpp_ml_bench.baselines.phase_network.windows import (
     wrong_place,
 )
 from fpp_ml_bench.baselines.phase_route.calibration_layer import Mask
-from fpp_ml_bench.baselines.phase_route.orders import of_choice
+from fpp_ml_bench.baselines.phase_route.orders import chosen_values
 from fpp_ml_bench.baselines.training.views import View
 from fpp_ml_bench.depth import depth_edges
 from fpp_ml_bench.optics.named_rigs import crossed_rig
@@ -145,7 +145,7 @@ class CrossedTask(CandidateTask):
         scene, target = sample.scene.single(), sample.target
         part = self.route.carriers.at(scene.crop)
         joint = part.joint_gain
-        change = of_choice(offers_rad(scene), answers.logits.argmax(axis=0)) + answers.correction_rad
+        change = chosen_values(offers_rad(scene), answers.logits.argmax(axis=0)) + answers.correction_rad
         found_mm, true_mm = (
             part.depth_mm(scene.nearness + rad / joint)[target] for rad in (change, sample.missing_rad)
         )

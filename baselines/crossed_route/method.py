@@ -1,4 +1,4 @@
-"""The crossed route as a method of ``fpp-bench predict``: one frame or three, nothing learned, nothing told."""
+"""The crossed route as a method of ``fpp-bench predict``: one frame or three, nothing learned, no truth given."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.crossed_route.carriers import Carriers
 from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, Image, Mask, wrapped
 from fpp_ml_bench.baselines.phase_route.labels import LARGE, least_energy
-from fpp_ml_bench.baselines.phase_route.orders import links_between, of_choice
+from fpp_ml_bench.baselines.phase_route.orders import chosen_values, links_between
 
 PHASE_SIGMA_RAD = 0.35  # of a carrier's phase in a window, edges and texture included
 MOST_SIGMAS = 2.83
@@ -81,7 +81,7 @@ def chosen(
     joint_rad = (found.nearness * carriers.joint_gain).astype(np.float32)
     unary = np.where(inside, cost, np.float32(0))
     index, margin = least_energy(unary, joint_rad, *(links or links_between(inside)), JUMP_RAD)
-    evidence = np.minimum(_without(cost, index).min(axis=0) - of_choice(cost, index), most)
+    evidence = np.minimum(_without(cost, index).min(axis=0) - chosen_values(cost, index), most)
     return index, margin, evidence.astype(np.float32)
 
 
@@ -89,7 +89,7 @@ def rival(found: Candidates, index: NDArray[np.int32]) -> Image:
     """Nearness of the best candidate but the chosen one, (h', w'); the chosen one's own where there is no other."""
     cost = _without(np.where(found.exists, found.misfit_rad, LARGE), index)
     best = np.where(cost.min(axis=0) < LARGE, cost.argmin(axis=0), index)
-    return of_choice(found.nearness, best)  # type: ignore[no-any-return]
+    return chosen_values(found.nearness, best)  # type: ignore[no-any-return]
 
 
 def neighbours(found: Candidates, index: NDArray[np.int32]) -> Candidates:
@@ -98,10 +98,12 @@ def neighbours(found: Candidates, index: NDArray[np.int32]) -> Candidates:
     places = [np.clip(index + step, 0, count - 1) for step in (-1, 0, 1)]
     inside = [(index > 0), np.ones(index.shape, bool), (index < count - 1)]
     nearness, misfit_rad = (
-        np.stack([of_choice(maps, place) for place in places]) for maps in (found.nearness, found.misfit_rad)
+        np.stack([chosen_values(maps, place) for place in places]) for maps in (found.nearness, found.misfit_rad)
     )
     pairs = zip(places, inside, strict=True)
-    return Candidates(nearness, misfit_rad, np.stack([of_choice(found.exists, place) & one for place, one in pairs]))
+    return Candidates(
+        nearness, misfit_rad, np.stack([chosen_values(found.exists, place) & one for place, one in pairs])
+    )
 
 
 def _without(cost: Image, index: NDArray[np.int32]) -> Image:

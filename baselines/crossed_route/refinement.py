@@ -27,7 +27,7 @@ class Fit:
     """``nearness`` float32 (h, w); ``brightness`` g, grey levels (a white pattern's is twice as much); ``misfit_grey``:
     frame minus fit; ``slope``: change of the fringes over their brightness by the joint phase; ``weight``: share of the
     window that lies on the object; ``uncertainty_rad``: standard uncertainty of the joint phase from noise and misfit,
-    order aside."""
+    apart from the order."""
 
     nearness: NDArray[np.float32]
     brightness: Image

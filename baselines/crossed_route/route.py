@@ -23,7 +23,7 @@ from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask, wr
 from fpp_ml_bench.baselines.phase_route.local_fit import Window
 from fpp_ml_bench.baselines.phase_route.object_mask import Background, Crop, modulated_region, object_region, unlit
 from fpp_ml_bench.baselines.phase_route.observation import Watch
-from fpp_ml_bench.baselines.phase_route.orders import nearest_inside, of_choice, repeated, stride_of
+from fpp_ml_bench.baselines.phase_route.orders import chosen_values, nearest_inside, repeated, stride_of
 from fpp_ml_bench.baselines.phase_route.resampling import Periods, Resampling
 from fpp_ml_bench.coding.code import MIN_MODULATION
 from fpp_ml_bench.coding.crossed import Crossed
@@ -126,7 +126,7 @@ class CrossedRoute:
 
         nearest = nearest_inside(points)
         phase_rad = self.demodulator.phases_at(seen, carriers)
-        start = _lifted(carriers, phase_rad, spread(of_choice(found.nearness, index)))
+        start = _lifted(carriers, phase_rad, spread(chosen_values(found.nearness, index)))
         light = grey - np.float32(background.ambient_grey)
         fit = refined(carriers, light, inside, start, contrast, background.noise_grey)
         watch.done("fit")

@@ -25,7 +25,7 @@ from fpp_ml_bench.baselines.phase_route.labels import LARGE
 from fpp_ml_bench.baselines.phase_route.local_fit import Window
 from fpp_ml_bench.baselines.phase_route.object_mask import FLOOR_NOISE_GREY, Background, modulated_region
 from fpp_ml_bench.baselines.phase_route.observation import Watch
-from fpp_ml_bench.baselines.phase_route.orders import jump_links, links_between, nearest_inside, of_choice, repeated
+from fpp_ml_bench.baselines.phase_route.orders import chosen_values, jump_links, links_between, nearest_inside, repeated
 from fpp_ml_bench.baselines.phase_route.several_frames import differs, first_mask, lit_object
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.coding.phase_shift import wrapped_phase
@@ -140,7 +140,7 @@ class ThreeFrameRoute(CrossedRoute):
         )
         beside = neighbours(found, index)
         watch.done("order")
-        nearness = of_choice(found.nearness, index)
+        nearness = chosen_values(found.nearness, index)
         fit = self._fit(carriers, light, inside, nearness, modulations[self.moved], contrast)
         watch.done("fit")
         clipped = np.any([grey[crop] >= GREY_LEVELS for grey in greys], axis=0) & inside
@@ -180,7 +180,7 @@ class ThreeFrameRoute(CrossedRoute):
         expected = np.cos(carriers.infinity_rad[still] + carriers.gain[still] * found.nearness)
         left = light / bright - 1 - np.float32(contrast[still]) * expected
         likely = np.where(found.exists, found.misfit_rad, LARGE).argmin(axis=0)
-        indirect = local_median(of_choice(left, likely), inside, INDIRECT_PERIODS * self.carriers.period_px)
+        indirect = local_median(chosen_values(left, likely), inside, INDIRECT_PERIODS * self.carriers.period_px)
         left -= np.minimum(indirect, np.float32(MOST_INDIRECT))
         sigma = np.hypot(np.float32(LIGHT_SIGMA), np.float32(LIGHT_NOISE * background.noise_grey) / bright)
         cost: Image = np.minimum((left / sigma) ** 2 / 2, np.float32(MOST_LIGHT)).astype(np.float32)

@@ -161,9 +161,9 @@ def _prepare(out: Path) -> None:
 
 
 def _context(subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, command: str) -> dict[str, Any]:
-    told = ("name", "title", "sha256", "units", "normalisation", "frames_used", "direction")
+    subject_keys = ("name", "title", "sha256", "units", "normalisation", "frames_used", "direction")
     return {
-        "subject": {**{key: getattr(subject, key) for key in told}, "layers": subject.layer_names},
+        "subject": {**{key: getattr(subject, key) for key in subject_keys}, "layers": subject.layer_names},
         "dataset": {
             "name": dataset.path.resolve().name,
             "fingerprint": dataset.fingerprint,

@@ -160,7 +160,7 @@ class HeadReport(NamedTuple):
 
 @dataclass(frozen=True)
 class RangeHeads:
-    """Metric depth from an individually normalised network that is not told the sample's depth range.
+    """Metric depth from an individually normalised network that is not given the sample's depth range.
 
     Such a network puts out v in [0, 1], and mm are v (D_max - D_min) + D_min. The *metric twin* of its row (own
     definition) replaces the range of the test sample, which only the ground truth knows, by either

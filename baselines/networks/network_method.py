@@ -1,4 +1,4 @@
-"""A trained network as a method of the benchmark: of the metric track, or told the sample's depth range (oracle)."""
+"""A trained network as a method of the benchmark: of the metric track, or given the sample's depth range (oracle)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 DepthRange = Literal["oracle", "predicted", "mean"]
 DEPTH_RANGES: tuple[DepthRange, ...] = get_args(DepthRange)
 _SHORT_RANGES = {"oracle": "", "mean": "mean range", "predicted": "pred. range", None: ""}
-"""By the setting ``depth_range``. That the range was told is the group's track."""
+"""By the setting ``depth_range``. That the range was given is the group's track."""
 _SHORT_OPTIONS = {
     "input standardised": "standardised",
     "guided by phase": "guided",

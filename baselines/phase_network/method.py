@@ -231,8 +231,10 @@ class PhaseNetMethod(LearnedRoute):
         more = "" if config.name == f"phase-net-{learned}-albedo" else f" ({config.name})"
         # With a range under a period, most pixels have one order in it, whatever the network says.
         self.by_range = rig.periods_in_range(direction) < 1
-        told = "order by range; mask" if self.by_range else "order, mask"
-        self.title = f"Phase route, one {direction} fringe, {learned} albedo; {told} and correction learned{more}"
+        learned_parts = "order by range; mask" if self.by_range else "order, mask"
+        self.title = (
+            f"Phase route, one {direction} fringe, {learned} albedo; {learned_parts} and correction learned{more}"
+        )
         self.settings = {
             "direction": direction,
             "albedo": learned,

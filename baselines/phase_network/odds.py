@@ -14,7 +14,7 @@ from fpp_ml_bench.baselines.phase_network.network import PhaseNet
 from fpp_ml_bench.baselines.phase_route.calibration_layer import Image, Mask
 from fpp_ml_bench.baselines.phase_route.confidence import MARGIN_SCALE
 from fpp_ml_bench.baselines.phase_route.labels import LARGE, least_energy
-from fpp_ml_bench.baselines.phase_route.orders import links_between, nearest_inside, of_choice, repeated
+from fpp_ml_bench.baselines.phase_route.orders import chosen_values, links_between, nearest_inside, repeated
 from fpp_ml_bench.baselines.training.records import Panel, draw_curves
 
 GRAPH = 3.0  # weight of smoothness between neighbours in the labelling of the orders, in which depth may jump
@@ -89,7 +89,7 @@ def least_energy_order(
     link_x, link_y = (link * np.float32(GRAPH * stride) for link in links_between(points))
     cost = np.where(points, np.minimum(cost, LARGE), 0).astype(np.float32)
     choice, _ = least_energy(cost, phases, link_x, link_y, jump_rad)
-    chosen_rad = of_choice(phases, choice)
+    chosen_rad = chosen_values(phases, choice)
     chosen_rad = chosen_rad[nearest_inside(points)]
     apart = np.abs(phases_rad - repeated(chosen_rad, stride, inside.shape))
     return np.where(chances > 0, apart, np.inf).argmin(axis=0)

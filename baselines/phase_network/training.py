@@ -32,7 +32,7 @@ from fpp_ml_bench.baselines.phase_network.windows import (
 )
 from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, Image, Mask
 from fpp_ml_bench.baselines.phase_route.observation import Settings
-from fpp_ml_bench.baselines.phase_route.orders import of_choice, repeated
+from fpp_ml_bench.baselines.phase_route.orders import chosen_values, repeated
 from fpp_ml_bench.baselines.training.views import View
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import depth_edges, object_mask
@@ -243,7 +243,7 @@ class PhaseTask(CandidateTask):
         missing, target = turn(missing) * np.float32(geometry.rotation.sign), turn(target)
         steps = np.rint(missing / TAU).astype(np.int64)
         place = np.clip(steps, -1, 1) + 1
-        possible = target & (np.abs(steps) <= 1) & of_choice(exists, place)
+        possible = target & (np.abs(steps) <= 1) & chosen_values(exists, place)
         order, correction = np.where(possible, place, IGNORED), (missing - TAU * steps).astype(np.float32)
         window = padded(size, x, exists, order, correction, possible, target, turn(~void & (not moved)))
         return _mirrored(window) if random.random() < vary.mirror else window

@@ -389,10 +389,11 @@ class CandidateTask(Task):
         ]
         threshold = chosen_threshold(masks, self.thresholds, self.image_px, self.tolerance_mm)
         with_leads = ([one.with_lead(lead) for one in answers] for lead in self.leads)
-        wrong = [self.scores_of(led, validation)["wrong_percent"] for led in with_leads]
+        wrong = [self.scores_of(shifted, validation)["wrong_percent"] for shifted in with_leads]
         lead = self.leads[int(np.argmin(wrong))]
-        led = [one.with_lead(lead) for one in answers]
-        return led, {"threshold": threshold, "lead": lead, "validation": self.scores_of(led, validation, threshold)}
+        shifted = [one.with_lead(lead) for one in answers]
+        validated = self.scores_of(shifted, validation, threshold)
+        return shifted, {"threshold": threshold, "lead": lead, "validation": validated}
 
     def chosen(self, answered: Any, validation: list[Any], out: Path) -> dict[str, Any]:
         _, fields = answered

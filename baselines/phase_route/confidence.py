@@ -32,7 +32,7 @@ THIN_PERIODS = 0.5
 def fit_uncertainty_rad(
     capture: Capture, fit: FringeFit, inside: Mask, slopes: tuple[Image, Image], window: Window
 ) -> Image:
-    """Expected error of the phase of a local fit to the first frame, in rad, float32 (h, w); order aside."""
+    """Expected error of the phase of a local fit to the first frame, in rad, float32 (h, w), apart from the order."""
     background = capture.background
     bright = np.maximum(fit.brightness, 0.5)
     fringe = np.cos(fit.phase_rad) if fit.contrast == 1 else np.float32(fit.contrast) * np.cos(fit.phase_rad)

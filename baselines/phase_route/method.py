@@ -265,8 +265,8 @@ def levels_of(steps: int) -> tuple[int, ...]:
 class FewestFrames(Method):
     """The phase route with as many frames of one direction as ``error_mm`` takes, scene by scene: 1, 2 and 3 fringes a
     third of a period apart, then 6, then 18; the Gray code may be added from 3 on. Frames that were not captured are
-    never read. Further options are those of `PhaseMethod`, ``frames`` aside. Raises `PredictionError` for an error that
-    is no positive number of mm, and as `PhaseMethod`."""
+    never read. Further options are those of `PhaseMethod`, except ``frames``. Raises `PredictionError` for an error
+    that is no positive number of mm, and as `PhaseMethod`."""
 
     reports = True
 

@@ -109,8 +109,8 @@ class Capture:
 class Observation(Capture):
     """Everything measured in a capture before the orders are chosen, maps (h, w). ``inside``: object; ``fit``: phase,
     not wrapped, and brightness; ``phase_rad`` float32, the fit's phase in [-pi, pi]; ``slopes``: change of the residual
-    phase in rad a px along x and y; ``uncertainty_rad`` float32: of the phase, order aside; ``clipped_share`` float32:
-    of the window's weight, what is saturated; ``candidates``: the orders that the working range allows."""
+    phase in rad a px along x and y; ``uncertainty_rad`` float32: of the phase, without the order; ``clipped_share``
+    float32: of the window's weight, what is saturated; ``candidates``: the orders that the working range allows."""
 
     inside: Mask
     fit: FringeFit

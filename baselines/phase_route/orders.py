@@ -67,7 +67,7 @@ def links_between(inside: Mask) -> tuple[Image, Image]:
     return link_x, link_y
 
 
-def of_choice(values: NDArray, choice: NDArray) -> NDArray:
+def chosen_values(values: NDArray, choice: NDArray) -> NDArray:
     """``values`` (K, h, w) of the candidate chosen at each pixel, (h, w)."""
     return np.take_along_axis(values, choice[None].astype(np.intp), axis=0)[0]
 
@@ -178,7 +178,7 @@ def _evidence(proof: Image, choice: NDArray[np.int32], question: Question) -> Im
         return np.full(choice.shape, 2.0, np.float32)
     rivals = proof.copy()
     np.put_along_axis(rivals, choice[None].astype(np.intp), np.inf, axis=0)
-    gap = ((rivals.min(axis=0) - of_choice(proof, choice)) * question.inside).astype(np.float32)
+    gap = ((rivals.min(axis=0) - chosen_values(proof, choice)) * question.inside).astype(np.float32)
     side = 2 * max(1, round(EVIDENCE_PERIODS * question.period_px / question.stride / 2)) + 1
     maps = (gap, question.inside.astype(np.float32))
     mean_gap, share = (cv2.blur(values, (side, side), borderType=cv2.BORDER_CONSTANT) for values in maps)

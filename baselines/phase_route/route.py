@@ -139,7 +139,7 @@ class PhaseRoute:
         question = orders.question_of(observation)
         observation.watch.done("candidates")
         choice, margin = self.chooser(question, self.rig, self.settings)
-        chosen_rad = orders.of_choice(question.residual_rad, choice)
+        chosen_rad = orders.chosen_values(question.residual_rad, choice)
         return orders.spread_over_pixels(observation, chosen_rad, margin, question.inside)
 
     def conclude(

@@ -40,7 +40,7 @@ class Job:
 
 def variants(recipe: Recipe) -> tuple[DepthRange, ...]:
     """The rows that a training gives, by the depth range that turns its output into mm (see `NetworkMethod`). Under
-    individual normalisation it is told the test sample's range, as in the paper; its metric twins are not. With the
+    individual normalisation it is given the test sample's range, as in the paper; its metric twins are not. With the
     background removed the object's mask is given anyway, and there are no twins."""
     if recipe.normalisation != "individual":
         return (None,)

@@ -62,15 +62,15 @@ class Point(StrictModel):
     ``seconds`` a view, the median, and a view of a batch of up to `BATCH`; ``working_memory_mib`` that one prediction
     adds at its peak. ``object_mae_mm`` is the leaderboard's error, where an object pixel without a depth counts with
     its whole depth, and ``missing_share`` the share of such pixels, both means over the views. ``pixel_seconds``: on a
-    scene at each of the run's ``pixels``. ``aside``: why it is on no front. ``failed``: why it, or its time at other
-    sizes, could not be measured."""
+    scene at each of the run's ``pixels``. ``off_front_reason``: why it is on no front. ``failed``: why it,
+    or its time at other sizes, could not be measured."""
 
     method: Text
     options: dict[Text, Scalar]
     source_sha256: Text | None = None
     title: Text | None = None
     software: dict[Text, Text] | None = None
-    aside: Text | None = None
+    off_front_reason: Text | None = None
     frames: Count = 0
     seconds: Positive | None = None
     batch_seconds: Positive | None = None
@@ -108,8 +108,12 @@ class Tradeoff(StrictModel):
 
     def front(self, cost: Cost) -> list[Point]:
         """The points that no other beats in both ``cost`` and object MAE, the cheapest first. Of those that have both,
-        above 0, and are not `Point.aside`."""
-        points = [point for point in self.points if not point.aside and point.object_mae_mm and getattr(point, cost)]
+        above 0, and are not `Point.off_front_reason`."""
+        points = [
+            point
+            for point in self.points
+            if not point.off_front_reason and point.object_mae_mm and getattr(point, cost)
+        ]
         return [points[i] for i in pareto_front([(getattr(p, cost), p.object_mae_mm or 0) for p in points])]
 
 
@@ -286,9 +290,9 @@ def measured(plan: Plan, point: Point) -> Point:
     figures = point.model_dump(include={"method", "options", "source_sha256"})
     try:
         method = plan.load(point, plan.opened)
-        told = ["depth range"] * method.uses_ground_truth_range + ["object mask"] * method.uses_ground_truth_mask
-        if told or find(point.method).method.trivial:
-            figures["aside"] = f"told the view's {' and '.join(told)}" if told else "trivial"
+        given = ["depth range"] * method.uses_ground_truth_range + ["object mask"] * method.uses_ground_truth_mask
+        if given or find(point.method).method.trivial:
+            figures["off_front_reason"] = f"given the view's {' and '.join(given)}" if given else "trivial"
         figures |= _figures(plan, method)
         pixel_seconds = []
         for rig, frames in zip(plan.rigs, plan.scenes, strict=True):

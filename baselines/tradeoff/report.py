@@ -32,7 +32,7 @@ def point_rows(run: Tradeoff) -> list[list[str]]:
     return [
         [
             printable(point.label),
-            ", ".join(name for name, front in fronts.items() if point in front) or point.aside or "",
+            ", ".join(name for name, front in fronts.items() if point in front) or point.off_front_reason or "",
             millimetres(point.object_mae_mm),
             percent(point.missing_share),
             _ms(point.seconds),
@@ -120,7 +120,7 @@ def scatter(run: Tradeoff, cost: Cost) -> Scatter | None:
                     len(marks) + 1,
                     printable(point.label),
                     f"C{methods.index(point.method) % 10}",
-                    hollow=bool(point.aside),
+                    hollow=bool(point.off_front_reason),
                     title=f"{point.title}: {point.object_mae_mm:.3g} mm, {_ms(point.seconds)} ms",
                 )
             )
@@ -136,7 +136,7 @@ def draw_tradeoff(run: Tradeoff) -> Figure | None:
     figure.subplots_adjust(0.04, 0.1, 0.99, 0.9, 0.12)
     for number, picture in enumerate(pictures, start=1):
         picture.draw(figure.add_subplot(1, len(pictures), number))
-    figure.suptitle(f"{tables(run)[0][0]}\ndashed: the front; hollow: told something of the view, or trivial")
+    figure.suptitle(f"{tables(run)[0][0]}\ndashed: the front; hollow: given ground truth of the view, or trivial")
     return figure
 
 

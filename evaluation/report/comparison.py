@@ -46,7 +46,7 @@ class Difference(StrictModel):
         return ends(self.interval_mm)
 
     @property
-    def told_apart(self) -> bool:
+    def distinguishable(self) -> bool:
         """Whether 0 is outside the interval."""
         return self.interval is not None and not self.interval[0] <= 0 <= self.interval[1]
 
@@ -145,14 +145,15 @@ def sentence(first: str, second: str, difference: Difference) -> str:
     p = 1.0 if difference.sign_flip_p is None else difference.sign_flip_p
     between = f"{interval_text(difference.interval)} mm over {difference.objects} objects; sign-flip test p = {p:.3g}"
     few_objects = f" {warning}" if (warning := caution(difference.objects)) else ""
-    if difference.told_apart and p > SIGNIFICANT:
+    if difference.distinguishable and p > SIGNIFICANT:
         level = f"{100 * SIGNIFICANT:.0f}%"
         reach = f": {difference.objects} objects never reach {level}" if difference.objects < FEWEST_OBJECTS else ""
         few_objects = f" The test does not confirm it at {level}{reach}.{few_objects}"
-    if difference.told_apart:
+    if difference.distinguishable:
         by = f"by {size} on average (95% interval {between})"
         return f"{second} has a {word} object MAE than {first}, {by}, {views}.{few_objects}"
     return (
-        f"The object MAE of {second} and {first} can't be told apart: {second} is {size} {word} on average ({views}), "
+        f"The object MAE of {second} and {first} can't be distinguished: "
+        f"{second} is {size} {word} on average ({views}), "
         f"but the 95% interval holds 0 ({between}).{few_objects}"
     )

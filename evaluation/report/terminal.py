@@ -138,7 +138,7 @@ def comparison_table(compared: Comparison) -> Group:
             interval_text(row.interval, ".."),
             p,
             *map(str, counts),
-            style="bold" if row.told_apart and (row.sign_flip_p or 1.0) <= SIGNIFICANT else None,
+            style="bold" if row.distinguishable and (row.sign_flip_p or 1.0) <= SIGNIFICANT else None,
         )
     title = Text(
         f"\nfirst:  {printable(compared.first)}\nsecond: {printable(compared.second)}\n"

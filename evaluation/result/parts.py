@@ -254,8 +254,8 @@ class RelianceParts(StrictModel):
     change_other_pitch: Annotated[NonNegative | None, "changes with fringes of another pitch"]
     answered_no_fringe_inside: Annotated[Share | None, "share answered without fringes inside"]
     answered_no_fringe_outside: Annotated[Share | None, "share answered without fringes outside"]
-    order_free_follows_phase: Annotated[Share | None, "follows the phase, whole periods aside"]
-    order_free_change_outline: Annotated[NonNegative | None, "changes with another outline, whole periods aside"]
+    order_free_follows_phase: Annotated[Share | None, "follows the phase, without whole periods"]
+    order_free_change_outline: Annotated[NonNegative | None, "changes with another outline, without whole periods"]
 
 
 PART_TITLES: dict[str, str] = {name: field.metadata[0] for name, field in RelianceParts.model_fields.items()}

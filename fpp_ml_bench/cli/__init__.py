@@ -287,8 +287,8 @@ def run_program(program: Program, argv: Sequence[str] | None = None) -> int:
     first = words[0] if words else "--help"
     if first in program.commands:
         if first in (*ONE_THREAD, "diagnose"):  # before the command's module loads NumPy
-            told = re.search(r"--threads[ =](\d+)", " ".join(words))
-            limit_threads(int(told[1]) if told else 1 if first in ONE_THREAD else usable_cores())
+            threads = re.search(r"--threads[ =](\d+)", " ".join(words))
+            limit_threads(int(threads[1]) if threads else 1 if first in ONE_THREAD else usable_cores())
         name = f"{program.name} {first}"
         return _guarded(name, partial(_parsed_and_run, partial(program.command, first), name, words[1:]))
     # A folder of predictions has any name; one that is not there and almost that of a command is a slip.

@@ -120,8 +120,8 @@ fpp-bench build --out data/pen --objects pen --explain             what was left
 def build(settings: BuildCommandSettings) -> None:
     """Generate the benchmark: virtual rig, objects, six views each, decoded and exact ground truth."""
     settings.check()
-    asked, workers = settings_of(settings), settings.processes
-    assembly = assembly_of(asked)
+    build_settings, workers = settings_of(settings), settings.processes
+    assembly = assembly_of(build_settings)
     rows = sum(len(plan.samples) for plan in assembly.plans)
     frames = len(assembly.manifest.stored_frames)
     out, steps = settings.out, list[int]()
@@ -132,7 +132,7 @@ def build(settings: BuildCommandSettings) -> None:
             steps.append(finished)
             advance(finished)
 
-        manifest = build_dataset(out, asked, workers, count, settings.cluster)
+        manifest = build_dataset(out, build_settings, workers, count, settings.cluster)
     seconds = perf_counter() - started
     # The first step is what an interrupted run had left: it took no time now.
     made = sum(steps[1:]) * frames
@@ -145,4 +145,4 @@ def build(settings: BuildCommandSettings) -> None:
     say_benchmark(manifest)
     if isinstance(out, Path):
         print(f"next: fpp-bench info {out}")
-    settings.say(lambda: explain_build(manifest, asked))
+    settings.say(lambda: explain_build(manifest, build_settings))

@@ -207,8 +207,8 @@ def export(
     """Write a dataset as Parquet, as the published .mat tree, or its meshes and patterns.
 
     Raises FppBenchError for an unusable dataset, form or folder."""
-    asked = {"parquet": parquet, "mat": mat, "meshes": meshes, "patterns": patterns}
-    forms = [form for form in FORMS if asked[form]]
+    wanted = {"parquet": parquet, "mat": mat, "meshes": meshes, "patterns": patterns}
+    forms = [form for form in FORMS if wanted[form]]
     if not forms:
         raise BuildError("nothing to export: give at least one of --parquet, --mat, --meshes, --patterns")
     opened = DatasetFolder(dataset)

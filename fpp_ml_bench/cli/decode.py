@@ -71,14 +71,14 @@ def decode(
     with progress_bar("decoding", 4, "steps") as advance:
         capture = read_frames(frames, count=len(rig.sequence), bits=bits, colour=colour)
         advance(1)
-        asked = None if mask is None else read_mask(mask, capture.frames.shape[1:])
+        object_mask = None if mask is None else read_mask(mask, capture.frames.shape[1:])
         least = {} if min_modulation is None else {"min_modulation": min_modulation}
         try:
             result = decode_capture(
                 capture,
                 rig,
                 direction,
-                mask=asked,
+                mask=object_mask,
                 noise_grey=noise,
                 threads=threads,
                 anyway=anyway,

@@ -168,7 +168,7 @@ def _reliance_table(title: str, reliance: "Reliance") -> Table:
     interval = "" if low is None or high is None else f" ({low:.2f} to {high:.2f})"
     table.add_row("phase reliance, 0 to 1", f"{reliance.score:.3f}{interval}")
     if reliance.order_free_score is not None:
-        table.add_row("  whole periods aside", f"{reliance.order_free_score:.3f}")
+        table.add_row("  without whole periods", f"{reliance.order_free_score:.3f}")
     for key, words in PART_TITLES.items():
         value = getattr(reliance.parts, key)
         if value is not None:

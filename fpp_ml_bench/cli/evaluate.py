@@ -116,13 +116,13 @@ def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[D
     from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE, read_plain
     from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
-    shown, told, content = printable(str(folder), 500), Path(), {}
+    shown, predicted_from, content = printable(str(folder), 500), Path(), {}
     if not folder.is_dir():
         raise PredictionError(f"expected a folder of predictions, found none at {shown}")
     give = f"give the dataset: fpp-eval {shown} DATASET"
     try:  # by hand: pydantic, which takes long to import, checks the file while the first samples are scored
         predicted = read_plain(folder).get("predicted") or {}
-        told, content = Path(predicted["dataset"]), dict(predicted["content"])
+        predicted_from, content = Path(predicted["dataset"]), dict(predicted["content"])
         split = split or str(predicted["split"])
         if not content:
             raise ValueError("no content to compare")
@@ -136,7 +136,7 @@ def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[D
     if place is not None:
         return DatasetFolder(place), split or "test"
     try:
-        dataset = DatasetFolder(told)
+        dataset = DatasetFolder(predicted_from)
     except DatasetError as error:
         raise DatasetError(f"{error}. {shown} was predicted from there; if the data was moved, {give}") from None
     changed = next((name for name, digest in content.items() if dataset.content.get(name) != digest), None)

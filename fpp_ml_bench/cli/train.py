@@ -165,8 +165,8 @@ def reproduce_tables(
 
     again = command_line(preset=preset, only_missing=True)
     options = (dataset, only_missing, minutes, anyway)
-    asked = ReproduceSettings(tables, folders, again, reproduced, *options, report, row=row)
-    outcome = run_reproduce(asked)
+    reproduce_settings = ReproduceSettings(tables, folders, again, reproduced, *options, report, row=row)
+    outcome = run_reproduce(reproduce_settings)
     for name, path in zip(tables, outcome.tables, strict=True):
         lines = reproduced.table_lines(name, outcome.jobs, folders, outcome.opened)
         show(

@@ -20,7 +20,7 @@ from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.leaderboard import columns, tables
 from fpp_ml_bench.leaderboard.data_files import table_csv, table_json
 from fpp_ml_bench.leaderboard.groups import Group, Ranked, more_than_trivial, scenes_of
-from fpp_ml_bench.leaderboard.names import assumption, assumption_sentences, learned_from, told
+from fpp_ml_bench.leaderboard.names import assumption, assumption_sentences, given_truth, learned_from
 from fpp_ml_bench.leaderboard.page.sections import CLASS_COLOURS, blocks, tradeoff_section
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
 from fpp_ml_bench.leaderboard.row_file import Row
@@ -75,7 +75,7 @@ def page_files(
         columns=columns,
         range_key=RANGE_KEY,
         errors=[(m.key, f"{m.column}, mm" if m.unit == "mm" else m.column) for m in with_column(0) if not m.role],
-        told=told,
+        given_truth=given_truth,
         assumption=assumption,
         search=_search,
         slug=lambda entry: slugs[id(entry)],

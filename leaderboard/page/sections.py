@@ -26,7 +26,7 @@ _SHADES = 6
 
 def blocks(groups: Sequence[Group], slugs: Mapping[int, str]) -> list[dict[str, Any]]:
     """What the template needs of each dataset: its title and a ``short`` one, whether it is ``main`` (the first, or
-    not `GroupKey.aside`), the pictures of all its rows, and its tables."""
+    not `GroupKey.special_data`), the pictures of all its rows, and its tables."""
     datasets: list[dict[str, Any]] = []
     for data, members in groupby(groups, key=lambda group: group.key.data_title):
         of_data = list(members)
@@ -38,8 +38,8 @@ def blocks(groups: Sequence[Group], slugs: Mapping[int, str]) -> list[dict[str, 
                 "numbered": numbered if len(rows) <= MOST_LABELLED else [],
                 "id": f"data-{hashlib.sha256(data.encode()).hexdigest()[:8]}",
                 "title": data,
-                "short": key.aside or name,
-                "main": not datasets or not key.aside,
+                "short": key.special_data or name,
+                "main": not datasets or not key.special_data,
                 "figures": overview_figures(of_data, slugs),
                 "targets": sorted({group.key.against for group in of_data}),
                 "sections": [_section(group, _link(group, of_data)) for group in of_data],
@@ -138,8 +138,8 @@ _MOST_NAMES, MOST_LABELLED = 24, 100
 
 def overview(groups: Sequence[Group], cost: str, slugs: Mapping[int, str]) -> Scatter | None:
     """The rows of ``groups`` that have a place on log axes: a known cost, of `COSTS`, and an error above 0; None
-    without any. On the front are rows that were told nothing and are not trivial. ``slugs``: the name of a row's page
-    by id of its entry."""
+    without any. On the front are rows that were given no ground truth and are not trivial. ``slugs``: the name of a
+    row's page by id of its entry."""
     rows = [(group, row) for group in groups for row in group.rows]
     marks, can_lead = [], []
     for number, (group, row) in enumerate(rows, start=1):

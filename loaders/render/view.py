@@ -82,10 +82,10 @@ class Studio:
         if not depth_mm.any():
             counts = decode_stack(self._frames, self.settings.stated_rig, mask=object_mask(exact_mm)).counts
             counts["not_asked"] = 0
-            told = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts.items() if count)
+            reasons = ", ".join(f"{name.replace('_', ' ')} {count}" for name, count in counts.items() if count)
             raise BuildError(
                 f"sample {sample_name(mesh.name, view)!r}: none of its {len(scene.hits.pixels)} object pixels can be "
-                f"decoded ({told}); check the rig's pose and code, and how bright --light is"
+                f"decoded ({reasons}); check the rig's pose and code, and how bright --light is"
             )
         flags, cover = self.flags(scene)
         measured = {"distance_mm": scene.distance_m * MM_PER_M, "shadow_rays": shadow_rays}

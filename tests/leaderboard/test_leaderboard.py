@@ -121,7 +121,7 @@ def test_new_user_is_told_what_to_do(capsys):
     out = board(capsys)
     assert "No results here yet" in out and "fpp-eval predictions data/mini --split test" in out
     assert "Reported by others on other data (not measured here)" in out and "TransUNet" in out
-    assert "oracle range: told the test sample's depth range." in out
+    assert "oracle range: given the test sample's depth range." in out
 
 
 PAPER = {

@@ -79,10 +79,10 @@ def test_shipped_rows_are_of_a_benchmark(shipped):
         assert group.key.benchmark is not None
 
 
-def test_what_stands_aside(shipped):
+def test_the_data_that_is_not_shown_first(shipped):
     """Lights that nothing is trained in, and small images: on the page in one line, in README not at all."""
-    aside = {group.key.benchmark.name: group.key.aside for group in rank(shipped)}
-    assert aside == {
+    special = {group.key.benchmark.name: group.key.special_data for group in rank(shipped)}
+    assert special == {
         "fpp-bench-full": "",
         "fpp-bench-full-224": "224 px",
         "fpp-bench-workshop": "workshop",
@@ -219,7 +219,7 @@ def test_metric_phase_rows_say_what_they_assume(shipped):
                 assert ("one albedo for all surfaces and a lit background" in assumption_sentences(about)) == one
             else:
                 assert assumption(about) == ""
-            assert ("Told the test sample's" in assumption_sentences(about)) == (about.track != "metric")
+            assert ("Given the test sample's" in assumption_sentences(about)) == (about.track != "metric")
     (group,) = (group for group in rank(shipped) if any(row.entry.path.stem == "phase-vertical" for row in group.rows))
     pages = page_files([group], [])
     own = [text.decode() for file, text in pages.items() if file.startswith("submissions/")]
@@ -232,5 +232,5 @@ def test_metric_phase_rows_say_what_they_assume(shipped):
 
 def test_the_papers_errors_are_shown_apart(shipped):
     block = readme_block(rank(shipped))
-    line = "| UNet | 14.54 | 17.88 | 3.31 | reported by the paper, told the test sample&#39;s depth range |"
+    line = "| UNet | 14.54 | 17.88 | 3.31 | reported by the paper, given the test sample&#39;s depth range |"
     assert block.index("Reported by others on other data") < block.index(line)

@@ -22,7 +22,7 @@ from fpp_ml_bench.evaluation.submission.description import LearnedFrom, Submissi
 from fpp_ml_bench.leaderboard.columns import columns, uncertainty
 from fpp_ml_bench.leaderboard.data_files import table_json
 from fpp_ml_bench.leaderboard.groups import behind, pairs
-from fpp_ml_bench.leaderboard.names import learned_from, told
+from fpp_ml_bench.leaderboard.names import given_truth, learned_from
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.leaderboard.row_file import RowUncertainty, _uncertainty, write_row
 
@@ -315,7 +315,10 @@ def test_a_submission_may_say_that_it_was_given_the_order(base):
         7: "oracle range + mask + order",
     }
     assert set(tracks.values()) == set(get_args(Track))
-    assert told(tracks[7]) == "the test sample's depth range, object mask and fringe order" and told("metric") == ""
+    assert (
+        given_truth(tracks[7]) == "the test sample's depth range, object mask and fringe order"
+        and given_truth("metric") == ""
+    )
 
 
 def test_rows_of_others_say_where_they_are_from(capsys, tmp_path, monkeypatch):
@@ -325,4 +328,4 @@ def test_rows_of_others_say_where_they_are_from(capsys, tmp_path, monkeypatch):
     printed = " ".join(capsys.readouterr().out.split())
     assert "PhiCalNet, 1 frame" in printed and "4.46" in printed and "1.16" in printed
     assert "Reported by its authors (arXiv 2607.11928)" in printed
-    assert "oracle order: told the test sample's fringe order." in printed
+    assert "oracle order: given the test sample's fringe order." in printed

@@ -240,7 +240,7 @@ def test_a_given_mask_is_never_ranked_with_honest_rows(dataset, tmp_path, capsys
     assert all(len(group.rows) == 1 for group in groups)
     assert main(["leaderboard", *map(str, paths), "--page", str(tmp_path / "page")]) == 0
     page = unescape((tmp_path / "page" / "index.html").read_text())
-    assert "oracle mask track" in page and "told the test sample's depth range and object mask" in page
+    assert "oracle mask track" in page and "given the test sample's depth range and object mask" in page
     with pytest.raises(PublishError, match="no task for the oracle mask track"):
         task_of(groups[1].rows[0].entry.row, "masked.json")
 

@@ -202,7 +202,7 @@ def test_the_shipped_page_has_all_rows_and_the_papers_errors_apart(shipped_page)
     assert all(is_trivial(row) for group in groups if group not in shown for row in group.rows)
     index = shipped_page.read_text(encoding="utf-8")
     paper = index[index.index('<section id="reported">') :]
-    assert "14.54" in paper and "told the test sample" in paper and "Other data, not ranked" in paper
+    assert "14.54" in paper and "given the test sample" in paper and "Other data, not ranked" in paper
     above = index[: index.index('<section id="reported">')]
     assert not re.search(r"(?<![\d.])14\.54", above)  # 214.54 is a place in a picture
 

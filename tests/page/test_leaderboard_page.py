@@ -90,7 +90,7 @@ def test_groups_stay_apart_and_the_papers_rows_too(files):
     index = pages(files)["index.html"].decode()
     metric, oracle = re.findall(r'<section id="[a-z0-9-]+" class="board">.*?</section>', index, flags=re.DOTALL)
     assert "Was told" in oracle and "Was told" not in metric and "Fast and rough" not in oracle
-    assert "were told the test sample's depth range" in html.unescape(oracle)
+    assert "were given the test sample's depth range" in html.unescape(oracle)
     assert "TransUNet" not in metric + oracle and "TransUNet" in index
     assert "reported by the paper" in index
 

@@ -169,11 +169,11 @@ def test_what_cant_be_measured_says_why_and_has_no_numbers(small, tmp_path, answ
 def test_told_and_trivial_methods_are_on_no_front(small, tmp_path, answers, monkeypatch):
     monkeypatch.setattr(Answer, "uses_ground_truth_mask", True)
     run = measure.tradeoff(plan_of(small, tmp_path / "told", "bad"))
-    assert run.points[0].aside == "told the view's object mask" == point_rows(run)[0][1]
+    assert run.points[0].off_front_reason == "given the view's object mask" == point_rows(run)[0][1]
     monkeypatch.setattr(Answer, "uses_ground_truth_mask", False)
     answers.trivial = True
     run = measure.tradeoff(plan_of(small, tmp_path / "trivial", "bad"))
-    assert run.points[0].aside == "trivial" and all(run.front(cost) == [] for cost in COST_KEYS)
+    assert run.points[0].off_front_reason == "trivial" and all(run.front(cost) == [] for cost in COST_KEYS)
 
 
 def test_views_are_spread_and_differ_between_objects(small):
