@@ -96,8 +96,7 @@ _ENTRIES = (
         "Object MAE, share of its depth range",
         "ratio",
         lambda s: share(s.object.mae_mm, s.range_mm),
-        "object MAE over (D_max - D_min), the range of the sample's object pixels that are scored; may exceed 1; none "
-        "for a flat object. The paper's 18% is such a share",
+        "object MAE over (D_max - D_min) of the object pixels that are scored; may exceed 1; none for a flat object",
         33,
         training=True,
         role="range",
@@ -156,7 +155,7 @@ _ENTRIES = (
         "Object, median error",
         "mm",
         "spread.median_mm",
-        "median of |e|, with linear interpolation",
+        "median of |e|, linear interpolation",
         15,
     ),
     _object(
@@ -164,7 +163,7 @@ _ENTRIES = (
         "Object, 95th percentile",
         "mm",
         "spread.p95_mm",
-        "95th percentile of |e|, with linear interpolation",
+        "95th percentile of |e|, linear interpolation",
         16,
     ),
     _object("object_max_mm", "Object, largest error", "mm", "spread.largest_mm", "largest |e|", 17),
@@ -174,7 +173,7 @@ _ENTRIES = (
             f"Object within {limit} mm",
             "share",
             partial(_within, number),
-            f"share of pixels with |e| of at most {limit} mm",
+            f"share of pixels with |e| <= {limit} mm",
             18 + number,
             better="higher",
         )
@@ -208,8 +207,7 @@ _ENTRIES = (
         "Object MAE without one offset",
         "mm",
         "spread.shift_free_mm",
-        "MAE after the median of e has been subtracted: the error without a constant offset. Not the mean, which a few "
-        "missing pixels move by metres",
+        "MAE after the median of e is subtracted: the error without a constant offset",
         24,
         cancels=True,
         helped_by_missing=True,
@@ -255,7 +253,7 @@ _ENTRIES = (
         "Object where predicted, MAE",
         "mm",
         "valid.mae_mm",
-        "MAE over the measured pixels; read it beside their share",
+        "MAE over the measured pixels",
         10,
         helped_by_missing=True,
         training=True,
@@ -274,7 +272,7 @@ _ENTRIES = (
         "Object not predicted",
         "share",
         lambda s: share(s.object.pixels - s.valid.pixels, s.object.pixels),
-        "share of pixels predicted 0 or less; all other scores of the object count them with their full error",
+        "share of pixels predicted 0 or less",
         13,
         column="Missing",
         column_from=WIDE,
@@ -339,8 +337,7 @@ _ENTRIES = (
         "Unlit, MAE",
         "mm",
         "unlit.mae_mm",
-        "MAE over the unlit set, missing pixels included. There is no phase to read: what is right here is inferred "
-        "from the rest",
+        "MAE over the unlit set, missing pixels included",
         29,
         over="unlit",
     ),
@@ -425,8 +422,7 @@ _STATED = (
             f"Pixels with a sigma in their {percent}% interval",
             "share",
             methodcaller("within", percent),
-            "of the object pixels that state one, the share with |e| <= z s, z the quantile of a central Gaussian "
-            f"interval that holds {percent}%",
+            f"share of these with |e| <= z s, z of the central Gaussian interval of {percent}%",
             0,
             better="neither",
             terminal=f"In {percent}%\ninterval",
@@ -438,7 +434,7 @@ _STATED = (
         "Mean sigma",
         "mm",
         "sigma_mean_mm",
-        "sharpness: mean of s over these pixels",
+        "mean of s over these",
         0,
         terminal="Sigma\nmean",
     ),
@@ -447,7 +443,7 @@ _STATED = (
         "Median sigma",
         "mm",
         "sigma_median_mm",
-        "sharpness: median of s over these pixels",
+        "median of s over these",
         0,
         terminal="Sigma\nmedian",
     ),
@@ -456,8 +452,7 @@ _STATED = (
         "Negative log-likelihood, nats",
         "nats",
         "nll",
-        "mean over these pixels of ln s' + ln(2 pi) / 2 + min(|e| / s', 10)^2 / 2 in nats, with s' = max(s, 0.01 mm): "
-        "the Gaussian negative log-likelihood, robust against a single wrong order and against s near 0",
+        "mean over these of ln s' + ln(2 pi) / 2 + min(|e| / s', 10)^2 / 2, with s' = max(s, 0.01 mm)",
         0,
         terminal="NLL",
     ),
@@ -467,9 +462,8 @@ _STATED = (
             f"AUSE, {error.upper()}",
             "mm",
             methodcaller("area_mm", f"{error}_mm"),
-            f"sparsification (Ilg et al., ECCV 2018), over all object pixels: the {error.upper()} of the rest after "
-            "the share 0, 0.05, ... 0.95 of least sure pixels has been left out, minus that after the same share of "
-            "largest errors; mean of the 20 differences, in mm, not divided by the error",
+            f"{error.upper()} of the object without the share x of least sure pixels, minus that without the share x "
+            "of largest errors; mean over x = 0, 0.05, ... 0.95",
             0,
             cancels=True,
             terminal="AUSE\nMAE" if error == "mae" else "",
@@ -513,6 +507,7 @@ def sort_keys() -> tuple[str, ...]:
 
 
 def protocol_table(metrics: Iterable[Metric]) -> list[str]:
-    """Lines of the table in PROTOCOL.md."""
-    rows = [(f"`{m.key}`", m.unit, m.better, m.rule.replace("|", "\\|")) for m in listed(metrics)]
-    return ["| key | unit | better | rule |", "|---|---|---|---|", *(f"| {' | '.join(row)} |" for row in rows)]
+    """Lines of the table in PROTOCOL.md. Units are in the keys; a direction is named where it is not "lower"."""
+    other = {"lower": "", "higher": " (higher is better)", "nearer 0": " (nearer 0 is better)", "neither": " (neither)"}
+    rows = (f"| `{m.key}` | {m.rule}{other[m.better]} |".replace("|e|", "\\|e\\|") for m in listed(metrics))
+    return ["| key | rule |", "|---|---|", *rows]
