@@ -87,7 +87,7 @@ class OwnViews:
     unions: int | None = option(
         None, "images that join several objects, made from each sample (default: as the shipped weights)", "N"
     )
-    lights: int | None = option(None, "lights that are drawn (default: as the shipped weights)", "N")
+    lights: int | None = option(None, "lights that are drawn at random (default: as the shipped weights)", "N")
     rate: float | None = option(None, "largest learning rate (default: as the shipped weights)", "R")
 
 
@@ -97,7 +97,7 @@ class Method(ABC):
     name: what it is called on the command line and in submissions. purpose: what it does, one line of ``--help``.
     Options: a frozen dataclass, whose fields made with `fpp_ml_bench.options.option` are options of every command that
     takes a method. Training: the same for ``fpp-bench train``, None where there is nothing to train. trivial: whether
-    it looks at nothing, or only for the nearest training image, so that it says what other errors are worth.
+    it gives a constant or the depth of the nearest training image, with which other errors are compared.
     scenes_rig: which of `NAMED_RIGS` photographs the scenes that are rendered for it, as of ``fpp-bench robustness``.
     title: name of the submission, with the settings that matter.
     frames_used: frames that must be captured, ascending. settings: everything needed to run it again.

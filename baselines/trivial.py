@@ -1,5 +1,5 @@
-"""Predictors that look at nothing, or only for the nearest training image: what a method's error is worth is how far it
-is from theirs."""
+"""Trivial methods: a constant depth, and the depth of the training sample with the nearest image. Other methods' errors
+are compared with theirs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -33,8 +33,8 @@ class ConstantOptions:
 
     at: str | float = option(
         STANDOFF,
-        "standoff, middle (of the working range), training-mean, or mm; range-middle or range-training: a share of the "
-        "sample's depth range, which it is given",
+        "standoff, middle (of the working range), training-mean, or a depth in mm; range-middle or range-training: the "
+        "middle of the sample's depth range, or its best share on the training split; the range is then given",
         "DEPTH",
     )
 
@@ -45,7 +45,7 @@ class ConstantMethod(Method):
     network of the oracle range track is: normalised depth. Raises PredictionError for anything else."""
 
     name = "constant"
-    purpose = "looks at nothing"
+    purpose = "the same depth at every pixel"
     Options = ConstantOptions
     trivial = True
     packages = ("numpy",)

@@ -5,6 +5,7 @@ table and the tables of docs/robustness.md. Every step is a command of the packa
     python benchmarks/upkeep.py measured leaderboard/rows/phase-horizontal.json reliance phase data/full
     python benchmarks/upkeep.py readme [--check]
     python benchmarks/upkeep.py robustness results
+    python benchmarks/upkeep.py commands [--check]
 
 rows: predict, time, score on the test split, and write a row file and its line in ``leaderboard/vouched.txt`` for each
 method. At 960 px rows are scored against the exact depth, which is the same whatever is projected, and at 224 px
@@ -20,19 +21,24 @@ readme: write the block between README's markers from the rows; with ``--check``
 robustness: the tables and curves of every whole result that holds a block of ``test`` or ``unseen`` (`Robustness`), the
 least error first. The leaderboard's rows hold it in brief, without the severities. The tables go between the markers
 ``<!-- SET:begin -->`` and ``<!-- SET:end -->`` of the page, and the curves of ``test`` beside it.
+
+commands: write docs/commands.md from the commands themselves; with ``--check`` only say whether it is up to date.
 """
 
 import argparse
+import re
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 from fpp_ml_bench.baselines.phase_route.method import ONE_ALBEDO
 from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corruptions
 from fpp_ml_bench.baselines.robustness.report import Measured, draw_curves
+from fpp_ml_bench.cli import BENCH, EVAL, Program
 from fpp_ml_bench.cli import main as fpp_bench
 from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.constants import FULL_SIZE
@@ -61,6 +67,7 @@ from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 ROOT = Path(__file__).resolve().parent.parent
 ROWS, README, ROBUSTNESS = ROOT / "leaderboard" / "rows", ROOT / "README.md", ROOT / "docs" / "robustness.md"
+COMMANDS = ROOT / "docs" / "commands.md"
 REFUSED, OUTDATED = 2, 1
 
 METHODS = {
@@ -301,6 +308,42 @@ def curves(rows: Sequence[Row]) -> bytes:
     return draw_curves(measured)
 
 
+EXAMPLES = 2
+"""Of each command that docs/commands.md shows; the command's help has them all."""
+_COMMANDS_HEAD = """\
+# Commands
+
+For readers who look for a command. `COMMAND --help` lists all options and examples. Exit status:
+0 done, 1 a check failed, 2 bad input or failed, 130 stopped (143 by SIGTERM), 141 nobody reads the output. This page is
+made by `python benchmarks/upkeep.py commands`.
+"""
+
+
+def commands_page() -> str:
+    """docs/commands.md: each command's usage, sentence and first `EXAMPLES`, by program and group."""
+    parts = [_COMMANDS_HEAD]
+    for program in (BENCH, EVAL):
+        for group, commands in program.groups.items():
+            parts.append(f"## {program.name}: {group}\n" if len(program.groups) > 1 else f"## {program.name}\n")
+            for name in commands:
+                parts += _command_parts(f"{program.name} {name}", program.command(name))
+    return "\n".join(parts)
+
+
+def _command_parts(name: str, command: Any) -> Iterator[str]:
+    if isinstance(command, Program):
+        for inner in command.commands:
+            yield from _command_parts(f"{name} {inner}", command.command(inner))
+        return
+    usage = command.usage(command.context_class(command, info_name=name))
+    sentence = " ".join(command.help.split("\n\n")[0].split())
+    lines = command.examples.splitlines()
+    own = [line for line in lines if line.startswith(f"{name} ") or line == name] or lines
+    examples = [re.sub(r" {2,}", "  # ", line, count=1) for line in own[:EXAMPLES]]
+    yield f"**`{name} {usage}`**: {sentence}\n"
+    yield "\n".join(["```bash", *examples, "```", ""])
+
+
 def parser() -> argparse.ArgumentParser:
     """Of the words after the script's name."""
     summary = __doc__.split("\n\n", 1)[0]
@@ -319,6 +362,9 @@ def parser() -> argparse.ArgumentParser:
     add("words", nargs=argparse.REMAINDER, help="words of fpp-bench, without --into")
     add = jobs.add_parser("readme", help="write README's table").add_argument
     add("page", type=Path, nargs="?", default=README, help="Markdown with the markers")
+    add("--check", action="store_true", help="write nothing; exit status 1 where it is not up to date")
+    add = jobs.add_parser("commands", help="write docs/commands.md").add_argument
+    add("page", type=Path, nargs="?", default=COMMANDS, help="Markdown file")
     add("--check", action="store_true", help="write nothing; exit status 1 where it is not up to date")
     add = jobs.add_parser("robustness", help="write the tables of docs/robustness.md").add_argument
     add("results", type=Path, nargs="+", help="result files, or folders of them")
@@ -340,18 +386,24 @@ def make_rows(args: argparse.Namespace) -> None:
 
 def write_readme(page: Path, groups: Sequence[Group], check: bool) -> int:
     """Write the block of ``groups``; with ``check`` only say whether it is there, by the exit status."""
-    text = filled(page, {"leaderboard": readme_block(groups)}).encode()
-    same = text == page.read_bytes()
+    text = filled(page, {"leaderboard": readme_block(groups)})
+    return write_made(page, text, check, "the ranking", "the rows", "readme")
+
+
+def write_made(page: Path, text: str, check: bool, what: str, source: str, job: str) -> int:
+    """Write ``text``, which ``job`` made of ``source``; with ``check`` only say whether the page has it, by the exit
+    status."""
+    same = page.is_file() and text.encode() == page.read_bytes()
     if check and not same:
         print(
-            f"{page}: the ranking is not up to date with the rows; don't edit it by hand, run: "
-            "python benchmarks/upkeep.py readme",
+            f"{page}: {what} is not up to date with {source}; don't edit it by hand, run: "
+            f"python benchmarks/upkeep.py {job}",
             file=sys.stderr,
         )
         return OUTDATED
     if not same:
-        write_atomically(page, text)
-    print(f"{page}: {'the ranking is up to date with the rows' if same else 'written'}")
+        write_atomically(page, text.encode())
+    print(f"{page}: {f'{what} is up to date with {source}' if same else 'written'}")
     return 0
 
 
@@ -370,6 +422,8 @@ def main(words: Sequence[str] | None = None) -> int:
     try:
         if args.job == "readme":
             return write_readme(args.page, rank(read_entries(shipped_rows())), args.check)
+        if args.job == "commands":
+            return write_made(args.page, commands_page(), args.check, "the page", "the commands", "commands")
         if args.job == "measured":
             write_measured(args.row, args.words)
         elif args.job == "rows":

@@ -6,10 +6,11 @@ gets a `fpp_ml_bench.evaluation.score.SampleScores`: prediction, target and mask
 and the statistics that the built-in metrics share.
 """
 
+import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import count
+from itertools import count, groupby
 from operator import attrgetter, methodcaller
 from typing import Any, Literal
 
@@ -84,7 +85,7 @@ _ENTRIES = (
         "Object MAE",
         "mm",
         "object.mae_mm",
-        "mean of |e| over the object",
+        "MAE over the object",
         2,
         role="rank",
         over="object",
@@ -106,7 +107,7 @@ _ENTRIES = (
         "Object RMSE",
         "mm",
         "object.rmse_mm",
-        "root mean square of e over the object",
+        "RMSE over the object",
         3,
         over="object",
         column="Object RMSE",
@@ -117,7 +118,7 @@ _ENTRIES = (
         "Overall MAE",
         "mm",
         "overall.mae_mm",
-        "mean of |e| over object and background",
+        "MAE over object and background",
         0,
         column="Overall MAE",
     ),
@@ -126,7 +127,7 @@ _ENTRIES = (
         "Overall RMSE",
         "mm",
         "overall.rmse_mm",
-        "root mean square of e over object and background",
+        "RMSE over object and background",
         1,
     ),
     _headline(
@@ -134,7 +135,7 @@ _ENTRIES = (
         "Background MAE",
         "mm",
         "background.mae_mm",
-        "mean of |e| over the background",
+        "MAE over the background",
         4,
         over="background",
         column="Backgr. MAE",
@@ -146,7 +147,7 @@ _ENTRIES = (
         "Background RMSE",
         "mm",
         "background.rmse_mm",
-        "root mean square of e over the background",
+        "RMSE over the background",
         5,
         over="background",
     ),
@@ -506,8 +507,18 @@ def sort_keys() -> tuple[str, ...]:
     return (*keys, "seconds_per_sample", "frames_used")
 
 
+_VARIED = re.compile(r"MAE|RMSE|\d+(?= mm|%)")
+"""What the rules of neighbouring entries may differ in and still share a line."""
+
+
 def protocol_table(metrics: Iterable[Metric]) -> list[str]:
-    """Lines of the table in PROTOCOL.md. Units are in the keys; a direction is named where it is not "lower"."""
+    """Lines of the table in PROTOCOL.md; neighbours of the same rule share a line. Units are in the keys. A direction
+    is named where it is not "lower"."""
     other = {"lower": "", "higher": " (higher is better)", "nearer 0": " (nearer 0 is better)", "neither": " (neither)"}
-    rows = (f"| `{m.key}` | {m.rule}{other[m.better]} |".replace("|e|", "\\|e\\|") for m in listed(metrics))
-    return ["| key | rule |", "|---|---|", *rows]
+    lines = ["| key | rule |", "|---|---|"]
+    for (rule, better), entries in groupby(listed(metrics), lambda m: (_VARIED.sub("{}", m.rule), m.better)):
+        alike = list(entries)
+        values = zip(*(_VARIED.findall(metric.rule) for metric in alike), strict=True)
+        said = rule.format(*(", ".join(dict.fromkeys(options)) for options in values)).replace("|", "\\|")
+        lines.append(f"| {', '.join(f'`{metric.key}`' for metric in alike)} | {said}{other[better]} |")
+    return lines

@@ -15,18 +15,18 @@ from fpp_ml_bench.leaderboard.rows import Entry
 NOT_CHECKED = "*"
 NOT_MEASURED = "not measured"
 RANK_NOTE = (
-    "Rank: the best and the worst that the tests allow. Two rows are distinguished by a sign-flip test of their paired "
-    "object means at 5%, by Holm's correction over all pairs of the table. Best: 1 + the rows that it is behind; "
-    "worst: all ranked rows without those behind it."
+    "Rank: a range, because not every two rows can be told apart. A row is behind another where a sign-flip test of "
+    "their paired object means says so at 5%, by Holm's correction over all pairs of the table. First number: 1 + the "
+    "rows that it is behind. Last number: all ranked rows without those that are behind it."
 )
 RATIO_NOTE = (
-    "x trivial: object MAE over that of the best method that looks at nothing, or only for the nearest training image, "
-    "and is given no more of the ground truth than the track's methods. "
-    "Of depth range: object MAE over the depth range of each sample."
+    "x trivial: object MAE divided by that of the best trivial method (a constant depth, or the depth of the training "
+    "sample with the nearest image) that is given no more ground truth than the methods of the table. "
+    "Of depth range: object MAE divided by the depth range of each sample."
 )
 TRUST_NOTE = (
-    "(4): no rank, for nobody vouches for the row; 1 + the ranked rows with a smaller error. "
-    f"{NOT_CHECKED} time, phase reliance and robustness as their author reports them, not measured here."
+    "(4): a place without a rank, 1 + the ranked rows with a smaller error; the maintainers don't vouch for this row. "
+    f"{NOT_CHECKED} time, phase reliance and robustness as the author reports them, not measured here."
 )
 NOTE = (
     f"Errors in mm, mean over samples; 95% interval from a bootstrap over objects. {RANK_NOTE} {TRUST_NOTE} "

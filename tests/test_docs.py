@@ -15,15 +15,16 @@ from fpp_ml_bench.cli.options import flags_of
 
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = sorted(
-    {*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md"), ROOT / "evaluation/PROTOCOL.md"} - {ROOT / "CHANGELOG.md"}
+    {*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), ROOT / "evaluation/PROTOCOL.md"} - {ROOT / "CHANGELOG.md"}
 )
-TO_BE_WRITTEN = {"leaderboard/rows/my-method.json", "leaderboard/rows/my-method-unseen.json"}
-OF_OTHER_PROGRAMS = {"--all-files", "--dist", "--cpu", "--num_machines", "--num_processes"}
-"""Of pre-commit, pytest and accelerate."""
+of_each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+TO_BE_WRITTEN = {"leaderboard/rows/my-method.json", "leaderboard/rows/mine.json"}
+OF_OTHER_PROGRAMS = {"--all-files", "--dist", "--cpu", "--index-url", "--num_machines", "--num_processes", "--shm-size"}
+"""Of pre-commit, pytest, pip, accelerate and Docker."""
 TOP = "fpp_ml_bench|loaders|evaluation|baselines|leaderboard|tests|benchmarks|docs"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@of_each_page
 def test_named_files_and_modules_are_there(page):
     text = page.read_text(encoding="utf-8")
     for name in set(re.findall(rf"(?<![\w/.-])((?:{TOP})/[\w/.-]*[\w/])", text)) - TO_BE_WRITTEN:
@@ -84,7 +85,7 @@ def _commands(text):
                 yield words[:end]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@of_each_page
 def test_the_commands_of_a_page_are_accepted_by_their_parsers(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("mine.py").write_text("from fpp_ml_bench import Method\nclass Mine(Method):\n    name = 'mine'\n")
@@ -109,7 +110,7 @@ def test_commands_are_found_in_the_pages():
         command.make_context("x", rest)
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@of_each_page
 def test_options_named_in_the_text_of_a_page_exist(page):
     """Options beside their command are options of this command; those alone are options of some command or script."""
     text = FENCED.sub("", page.read_text(encoding="utf-8"))

@@ -43,7 +43,7 @@ PERIOD_TOLERANCE = 1.4
 resampled to theirs."""
 
 
-WEIGHTS = "weights: a file, such as training writes (default: those that come with the package)"
+WEIGHTS = "weights file of fpp-bench train (default: the weights that come with the package)"
 """Help of an option that all learned methods have."""
 ALBEDOS = ("one", "any")
 
@@ -124,8 +124,8 @@ class PhaseNetOptions:
     min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
     albedo: str | None = option(
         None,
-        "one, where all surfaces have the background's albedo, so that brightness tells the order, or any, where the "
-        "order is ambiguous unless range and shape tell it (default: one)",
+        "one: all surfaces have the background's albedo, and brightness tells the order; any: brightness is not used, "
+        "and the order is ambiguous unless range and shape tell it (default: one)",
         choices=ALBEDOS,
     )
     threads: int = 1
@@ -138,7 +138,7 @@ class PhaseNetTraining(OwnViews):
     """Training of phase-net; ``start``: weights to start from."""
 
     albedo: str | None = option(
-        None, "one, with brightness as a cue for the order, or any, without (default: one)", choices=ALBEDOS
+        None, "one: brightness is a cue for the order; any: it is not (default: one)", choices=ALBEDOS
     )
     start: Path | None = option(None, "weights to start from (default: none)", "FILE")
 

@@ -81,17 +81,17 @@ BENCH = Program(
             "leaderboard": ("leaderboard:rank", "rank result files: error and run time side by side"),
         },
         "understand": {
-            "diagnose": ("diagnose:diagnose", "probe a model: does it read fringes or shapes; an HTML report"),
+            "diagnose": ("diagnose:diagnose", "probe a model: does it read fringes or shapes? An HTML report"),
             "reliance": (
                 "diagnose:reliance",
-                "measure phase reliance: does a prediction follow the fringes or the outline",
+                "measure phase reliance: does the depth follow the fringes or the outline?",
             ),
             "robustness": (
                 "robustness:robust",
-                "disturb the scene, axis by axis: light, camera, surface, calibration, motion",
+                "error where light, camera, surface, calibration or motion disturb the scene",
             ),
-            "tradeoff": ("tradeoff:measure", "error against run time and captures, and how each cost grows"),
-            "stability": ("stability:check", "stiff and extreme cases against higher precision and theory"),
+            "tradeoff": ("tradeoff:measure", "error against run time, frames and memory, and how the time grows"),
+            "stability": ("stability:check", "check extreme cases against higher precision and theory"),
         },
         "learn": {
             "train": ("train:train", "train a recipe, shipped or yours, into a weights file"),
@@ -105,7 +105,10 @@ BENCH = Program(
                 "patterns:patterns",
                 "write the images to project, for any sequence; find two carriers for crossed fringes",
             ),
-            "calibrate": ("calibrate:calibrate", "find the rig that took captures, from frames and their depth"),
+            "calibrate": (
+                "calibrate:calibrate",
+                "find the rig that took captures, from poses of a board or from frames with depth",
+            ),
             "decode": ("decode:decode", "decode captured frames: depth, point cloud, uncertainty, reasons"),
             "fuse": (
                 "fuse:fuse",
@@ -135,10 +138,10 @@ EVAL = Program(
             "init": ("evaluate:init", "write a submission.yaml to fill in"),
             "check": ("evaluate:check", "check a submission before it is scored, without ground truth"),
             "compare": ("evaluate:compare", "compare two results of the same samples"),
-            "verify": ("evaluate:verify", "score the predictions again: is this result what they give"),
+            "verify": ("evaluate:verify", "score the predictions again, and compare with a result or row"),
             "conformal": (
                 "evaluate:conformal",
-                "scale a stated uncertainty so that its intervals hold what they say",
+                "scale a stated uncertainty so that its intervals hold the stated share of errors",
             ),
             "schema": ("evaluate:schema", "print the JSON Schema of result.json or submission.yaml"),
         }

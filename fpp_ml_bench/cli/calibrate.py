@@ -60,14 +60,16 @@ class BoardSettings:
     sequence: Path | None = option(None, "rig file with the projector's size and the sequence", "FILE")
     lens: str = option(
         AUTO,
-        "none, radial-1, radial-2, radial-3+tangential, rational, or two of them, CAMERA,PROJECTOR; auto (default): of "
-        f"{', '.join(AUTO_MODELS)} the one that predicts poses left out best",
+        "none, radial-1, radial-2, radial-3+tangential, rational, or two of them, CAMERA,PROJECTOR; auto (default): "
+        f"the model of {', '.join(AUTO_MODELS)} with the least error at poses that are left out of the fit",
         "MODEL",
     )
     square_pixels: bool = option(False, "fx = fy, of both devices")
     centred: bool = option(False, "the camera's principal point is the image's centre")
     estimate_board: bool = option(False, "estimate the board's points too: no print is perfect")
-    baseline: float | None = option(None, "distance of camera and projector, where the spacing is not known", "MM")
+    baseline: float | None = option(
+        None, "distance of camera and projector, where the spacing of the board is not known", "MM"
+    )
     working_range: tuple[float, float] | None = option(
         None, "working range in mm (default: the boards', and 10%)", "NEAR,FAR", parse=WORKING_RANGE
     )

@@ -36,7 +36,7 @@ def info(
     dataset: Path = argument("dataset folder", "DATASET"),
     json: Path | None = option(None, "write all of it as JSON; - is standard output, without the table", "FILE"),
 ) -> None:
-    """What a dataset holds: sizes, configurations, splits, rig, and how exact its ground truth is."""
+    """Print what a dataset holds: sizes, configurations, splits, rig, and how exact its ground truth is."""
     opened = DatasetFolder(dataset)
     benchmark = benchmark_of(opened.content)
     statistics = split_statistics(opened.manifest)
@@ -170,7 +170,7 @@ def verify(
     *,
     dataset: Path = argument("dataset folder", "DATASET"),
 ) -> int | None:
-    """Prove a dataset intact: checksums, files, labels, split leaks, duplicated images; and name its benchmark."""
+    """Check that a dataset is intact: checksums, files, labels, split leaks, duplicated images; name its benchmark."""
     manifest = read_manifest(dataset)
     files = manifest.files
     with progress_bar("verifying", len(files), "files") as advance:

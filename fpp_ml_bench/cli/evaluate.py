@@ -231,7 +231,7 @@ def compare(
     second: Path = argument("a result of another method on the same data, split, target and track", "B.json"),
     json: Path | None = option(None, "write the comparison here, each sample's included; - is standard output", "FILE"),
 ) -> None:
-    """Compare two results of the same samples: paired differences, their 95% intervals, and a plain sentence.
+    """Compare two results of the same samples: paired differences, their 95% intervals, and a sentence on them.
 
     Raises SubmissionError for results that can't be compared."""
     from fpp_ml_bench.cli.console import show
@@ -305,7 +305,7 @@ def conformal(
     ),
     coverage: float = option(
         0.68,
-        "what the interval of +- sigma x its Gaussian quantile shall hold (default: 0.68); n calibration objects "
+        "share of pixels that the Gaussian interval of this share shall hold (default: 0.68); n calibration objects "
         "support at most n / (n + 1)",
         "SHARE",
     ),

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from contextlib import redirect_stdout, suppress
 from dataclasses import MISSING, Field, dataclass
 from functools import partial
-from inspect import signature
+from inspect import getdoc, signature
 from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -139,7 +139,7 @@ class Pool:
     cluster: str | None = option(
         None,
         "all CPUs of a Ray cluster instead: ray://HOST:10001, or HOST:6379 on one of its nodes; they must share the "
-        "output folder, or write to a URL (docs/scale.md)",
+        "output folder, or write to a URL (docs/data.md)",
         "ADDRESS",
     )
 
@@ -253,7 +253,7 @@ class Command(click.Command):
                 group = self.groups[name] = parameter.annotation
                 params += [parameter_of(entry, heading=heading_of(group, entry.name)) for entry in options_of(group)]
         look = {"terminal_width": HELP_WIDTH, "help_option_names": ["-h", "--help"]}
-        super().__init__(function.__name__, look, params=params, help=function.__doc__)
+        super().__init__(function.__name__, look, params=params, help=getdoc(function))
 
     def values(self, ctx: click.Context) -> dict[str, Any]:
         """The function's arguments by what the command line gives."""

@@ -135,7 +135,7 @@ class PatternSettings(DesignSettings):
     )
     design: bool = option(
         False,
-        "write no images: find two carriers for crossed fringes whose phases agree at the true depth alone, and say "
+        "write no images: find two carriers for crossed fringes whose phases agree only at the true depth, and say "
         "what they cost",
     )
 
@@ -154,13 +154,13 @@ fpp-bench patterns rig.yaml --design --out crossed.yaml --picture design.png    
 fpp-bench patterns rig.yaml --design --pitches 12-30 --angles 0,45,90            these periods and angles only
 fpp-bench patterns paper --design --pair 18,18 --pair 18,14 --pair 24,13,0,45    beside pairs of yours (px, deg)
 
-Rival: another depth in the working range at which both phases nearly are what they are at the true one; its
-distance is what errors of the phases must cross half of. Finer fringes have less depth noise and more rivals.
+Rival: another depth in the working range at which both phases are nearly those of the true depth. Phase errors of
+more than half of this distance choose the rival. Finer fringes have less depth noise and more rivals.
 """
 )
 def patterns(settings: PatternSettings) -> None:
     """Write the images that a rig's projector shows, in order, and a manifest of what each of them is. Or find two
-    carriers for crossed fringes whose phases agree at the true depth alone, and say what they cost.
+    carriers for crossed fringes whose phases agree only at the true depth, and say what they cost.
 
     Raises FppBenchError for an unusable rig file or folder."""
     if settings.design:

@@ -2,7 +2,7 @@
 
 The noise of a pixel is a pure function of (dataset seed, object, view, frame, pixel): a 32-bit hash of the pixel number
 under two keys of the frame, and from its bits the sum of two entries of a table of 4,096 normal quantiles, which is
-normal, reaches 5.2 sigma and has 16 million levels (docs/generating.md). So any subset of pixels can be exposed alone.
+normal, reaches 5.2 sigma and has 16 million levels (docs/results/generating.md). So any pixels can be exposed alone.
 Noise follows EMVA 1288: a variance of read noise, and one of shot noise that is the number of electrons.
 """
 

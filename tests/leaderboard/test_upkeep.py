@@ -12,7 +12,7 @@ from board_rows import some_rows
 from scored_dataset import make_dataset
 from upkeep import SHOWN, readme_block
 
-from fpp_ml_bench.cli import BENCH
+from fpp_ml_bench.cli import BENCH, EVAL
 from fpp_ml_bench.cli.robustness import Scenes
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result.parts import Robustness, SeverityScores
@@ -138,6 +138,18 @@ def test_a_row_stays_vouched_for_when_more_of_it_is_measured(files, tmp_path, mo
     assert ran == [["reliance", "phase", "data/full", "--direction", "vertical", "--into", str(row)]]
     after = sha256(row.read_bytes()).hexdigest()
     assert after != before and (tmp_path / "vouched.txt").read_text() == f"{after} | measured\n"
+
+
+def test_the_page_of_commands_is_made_of_them(tmp_path, capsys):
+    assert upkeep.main(["commands", "--check"]) == 0, "run: python benchmarks/upkeep.py commands"
+    page = tmp_path / "commands.md"
+    assert upkeep.main(["commands", str(page), "--check"]) == 1 and not page.exists()
+    assert "run: python benchmarks/upkeep.py commands" in capsys.readouterr().err
+    assert upkeep.main(["commands", str(page)]) == 0
+    text = page.read_text()
+    for program in (BENCH, EVAL):
+        assert all(f"**`{program.name} {name} " in text for name in program.commands)
+    assert "fpp-eval predictions --json result.json\n" in text and "# plain load_dataset opens" in text
 
 
 def test_the_tables_of_robustness_stand_between_their_markers(tmp_path):
