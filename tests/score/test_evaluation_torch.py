@@ -8,9 +8,9 @@ import torch.multiprocessing as spawning
 from scored_dataset import disk_depth
 
 from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation import DepthScores
 from fpp_ml_bench.evaluation.result.model import over_samples
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
-from fpp_ml_bench.evaluation import DepthScores
 from fpp_ml_bench.evaluation.score.torch_metric import KEYS
 
 SIZE, SAMPLES = (40, 48), 11
