@@ -205,7 +205,7 @@ def test_comparison_is_paired_and_says_so(make, capsys, tmp_path):
     assert rows == [y["object_mae_mm"] - x["object_mae_mm"] for x, y in zip(first_rows, second_rows, strict=True)]
     main_difference = comparison.differences["object_mae_mm"]
     assert main_difference.mean_mm == pytest.approx(np.mean(rows)) and main_difference.lower == 4
-    assert main_difference.told_apart
+    assert main_difference.distinguishable
     assert comparison.sentence.startswith("Two has a lower object MAE than One, by 0.8")
     assert "lower in 4 of 4 samples" in comparison.sentence
     assert main_difference.sign_flip_p == 0.5
@@ -225,8 +225,8 @@ def test_a_comparison_with_0_in_its_interval(make, dataset, tmp_path):
         np.save(folder / f"{sample}.npy", depth + np.float32(1.0 if number < 2 else -0.5))
     write_result(evaluate(folder, dataset), tmp_path / "two.json")
     comparison = compare(read_result(first), read_result(tmp_path / "two.json"))
-    assert not comparison.differences["object_mae_mm"].told_apart
-    assert "can't be told apart" in comparison.sentence and "holds 0" in comparison.sentence
+    assert not comparison.differences["object_mae_mm"].distinguishable
+    assert "can't be distinguished" in comparison.sentence and "holds 0" in comparison.sentence
     assert "the same object MAE in all 4 samples" in compare(read_result(first), read_result(first)).sentence
 
 
