@@ -14,7 +14,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import FULL_SIZE, MM_PER_M, VIEW_DEGREES, VIEWS
@@ -23,6 +22,7 @@ from fpp_ml_bench.evaluation.protocol import TARGETS
 from fpp_ml_bench.evaluation.score.check import check_folder, scored_pair
 from fpp_ml_bench.evaluation.submission.prediction_files import read_sigma, reader_for
 from fpp_ml_bench.files import printable, write_files
+from fpp_ml_bench.loaders.render.mesh_files import ply_bytes
 from fpp_ml_bench.loaders.render.scene import turned, unturned
 from fpp_ml_bench.loaders.sample import DEPTH_EXACT
 from fpp_ml_bench.loaders.storage.manifest import GENERATED
@@ -259,10 +259,7 @@ def fuse_split(
 
 def write_object(out: Path, fused: FusedObject) -> list[Path]:
     """Write ``{object}.ply``, the object's cloud. Raises PredictionError for a folder that can't be written."""
-    # A mesh without faces: trimesh can't write a PointCloud without points.
-    cloud = trimesh.Trimesh(fused.cloud_m, np.zeros((0, 3), np.int64), process=False, validate=False)
-    content = trimesh.exchange.ply.export_ply(cloud, vertex_normal=False)
-    return write_files(out, {f"{fused.name}.ply": content}, PredictionError)
+    return write_files(out, {f"{fused.name}.ply": ply_bytes(fused.cloud_m)}, PredictionError)
 
 
 def write_counts(

@@ -17,6 +17,7 @@ from fpp_ml_bench.containers import png_bytes
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import write_files
+from fpp_ml_bench.loaders.sample import DEPTH, DEPTH_EXACT
 from fpp_ml_bench.loaders.storage.manifest import MESH_FOLDER
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.sequence import DIRECTIONS
@@ -146,7 +147,7 @@ def _panels(dataset: DatasetFolder, sample: str) -> list[Panel]:
     title = f"depth, {low:.0f}-{high:.0f} mm"
     panels.append((title, np.where(inside, depth_mm, np.nan), "viridis", low, high))
     if dataset.has_exact:
-        exact_mm = dataset.depth_mm(sample, "depth_exact")
+        exact_mm = dataset.depth_mm(sample, DEPTH_EXACT)
         error_mm = depth_mm - exact_mm
         limit = float(np.quantile(np.abs(error_mm[inside]), 0.99))
         title = f"decoded - exact, MAE {np.abs(error_mm[inside]).mean(dtype=np.float64):.3f} mm"
@@ -157,13 +158,28 @@ def _panels(dataset: DatasetFolder, sample: str) -> list[Panel]:
     return panels
 
 
+def _grey_frame(dataset: DatasetFolder) -> int:
+    """The white frame where it is stored, else the first one of a single shot."""
+    white, (single, *_) = dataset.sequence.white, dataset.sequence.config("single_shot")
+    return white if white in dataset.manifest.stored_frames and white is not None else single
+
+
+def sample_cloud(dataset: DatasetFolder, sample: str, folder: Path, name: str) -> list[Path]:
+    """Write a sample's exact depth, or the decoded one where no exact depth is stored, as ``name.ply`` and
+    ``name.html``; returns their paths. Raises `CaptureError` as `write_cloud`."""
+    from fpp_ml_bench.loaders.cloud import write_cloud
+
+    kind, column = ("exact", DEPTH_EXACT) if dataset.has_exact else ("decoded", DEPTH)
+    depth_mm, grey = dataset.depth_mm(sample, column), dataset.frame(sample, _grey_frame(dataset))
+    return write_cloud(folder, name, f"{sample}: {kind} depth", dataset.rig, depth_mm, grey)
+
+
 def contact_sheet(dataset: DatasetFolder, split: str, path: Path) -> None:
     """Write all objects (two per line) in all their views as a PNG, in white light if that frame is stored."""
     views: dict[str, list[str]] = {}
     for sample in dataset.samples(split):
         views.setdefault(dataset.measured(sample)["object"], []).append(sample)
-    white, (single,) = dataset.sequence.white, dataset.sequence.config("single_shot")
-    index = white if white in dataset.manifest.stored_frames and white is not None else single
+    index = _grey_frame(dataset)
     height, width = dataset.size
     tile_width, tile_height = (max(1, _TILE_PX * side // max(width, height)) for side in (width, height))
     label_px, gap_px = 18, 8

@@ -135,12 +135,14 @@ _ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
 @command("""\
 fpp-bench show data/mini power_drill_A60                 writes power_drill_A60.png
 fpp-bench show data/mini mug_A0 --out pictures/mug.png
+fpp-bench show data/mini mug_A0 --cloud                  also mug_A0.ply, and mug_A0.html to turn it in a browser
 fpp-bench show data/full --sheet --out sheet.png         all 50 objects x 6 views
 """)
 def show_sample(
     *,
     dataset: Path = argument("dataset folder", "DATASET"),
     sample: str | None = argument("sample such as power_drill_A60", "SAMPLE", None),
+    cloud: bool = option(False, "also write the points: SAMPLE.ply, and SAMPLE.html to turn in a browser"),
     sheet: bool = option(False, "all objects and views on one sheet instead"),
     split: str = option("all", "split that --sheet shows (default: all)", "SPLIT"),
     out: Path | None = option(None, "picture to write (default: SAMPLE.png or sheet.png)", "FILE.png"),
@@ -148,11 +150,13 @@ def show_sample(
     """One sample as a picture (frames, depth, error, mask, mesh), or a contact sheet of every object and view."""
     if sheet == (sample is not None):
         raise DatasetError("expected either a SAMPLE or --sheet; `fpp-bench info DATASET --json -` lists the samples")
+    if sheet and cloud:
+        raise DatasetError("--cloud: expected a SAMPLE, whose points it writes, not --sheet; leave one of them out")
     picture = out or Path("sheet.png" if sheet else f"{sample}.png")
     if picture.suffix.lower() != ".png":
         raise DatasetError(f"--out {out}: expected a file ending in .png")
     opened = DatasetFolder(dataset)
-    from fpp_ml_bench.loaders.pictures import contact_sheet, sample_picture
+    from fpp_ml_bench.loaders.pictures import contact_sheet, sample_cloud, sample_picture
 
     if sample is None:
         contact_sheet(opened, split, picture)
@@ -160,6 +164,9 @@ def show_sample(
         opened.split_of_sample(sample)
         sample_picture(opened, sample, picture)
     print(picture)
+    if sample is not None and cloud:
+        for path in sample_cloud(opened, sample, picture.parent, picture.stem):
+            print(path)
 
 
 @command("""\

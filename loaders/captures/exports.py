@@ -75,14 +75,12 @@ def export_capture(
     if not depth.any():
         raise CaptureError("depth_mm: no pixel has a depth, so there is nothing to write; check the capture's light")
     shade = None if grey is None else _checked(grey, camera, "grey", GREY_LEVELS)
-    normals = pixel_normals(depth, camera, step_mm) if {"ply", "mesh"} & set(forms) else np.zeros((0, 0, 3))
-    no_faces = np.zeros((0, 3), np.int64)
     written = {
         "npy": lambda: ("depth.npy", _npy(depth)),
         "mat": lambda: ("depth.mat", matrix_bytes({"depthMap": depth})),
         "png": lambda: _png(depth),
-        "ply": lambda: ("points.ply", _ply(depth, camera, normals, shade, no_faces)),
-        "mesh": lambda: ("mesh.ply", _ply(depth, camera, normals, shade, triangles(depth, camera, step_mm))),
+        "ply": lambda: ("points.ply", depth_ply(depth, camera, shade, step_mm)),
+        "mesh": lambda: ("mesh.ply", depth_ply(depth, camera, shade, step_mm, joined=True)),
     }
     return write_files(Path(folder), dict(written[form]() for form in forms), CaptureError)
 
@@ -194,29 +192,35 @@ def _png(depth: NDArray[np.float32]) -> tuple[str, bytes]:
     return f"depth_{unit:g}mm.png", buffer.getvalue()
 
 
-def _ply(
-    depth: NDArray[np.float32],
-    camera: Pinhole,
-    normals: NDArray[np.float64],
-    grey: NDArray[np.float64] | None,
-    faces: NDArray[np.int64],
-) -> bytes:
-    """The points with depth and the triangles between them."""
-    import trimesh
-
-    rays, z = _rays_and_depth(depth, camera)
-    there = z > 0
+def camera_points(depth_mm: ArrayLike, camera: Pinhole) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """The points (N, 3) of a depth map (H, W), 0 = none, in mm in the camera's frame, and their pixels, bool (H, W).
+    Raises `CaptureError` for a map without any point, or as `export_capture`."""
+    rays, depth = _rays_and_depth(depth_mm, camera)
+    there = depth > 0
     if not there.any():
-        raise CaptureError("depth_mm: the camera's lens has no ray where there is depth; check its calibration")
+        raise CaptureError(
+            "depth_mm: no pixel with depth has a ray through the camera's lens, so there is no point to write; check "
+            "the depth and the calibration"
+        )
+    return (rays * depth[..., None])[there], there
+
+
+def depth_ply(
+    depth_mm: ArrayLike,
+    camera: Pinhole,
+    grey: ArrayLike | None = None,
+    step_mm: float | None = None,
+    joined: bool = False,
+) -> bytes:
+    """PLY of `camera_points` with their normals and ``grey`` (H, W), grey levels of 0 to 255, ``joined`` by `triangles`
+    or not. Raises `CaptureError` as they do."""
+    from fpp_ml_bench.loaders.render.mesh_files import ply_bytes
+
+    points, there = camera_points(depth_mm, camera)
+    shade = None if grey is None else _checked(grey, camera, "grey", GREY_LEVELS)[there]
     place = np.cumsum(there.ravel()) - 1
-    points = (rays * z[..., None])[there]
-    solid = trimesh.Trimesh(points, place[faces], vertex_normals=normals[there], process=False, validate=False)
-    if grey is not None:
-        solid.vertex_attributes["intensity"] = grey[there].astype(np.float32)
-        shade = np.rint(grey[there]).astype(np.uint8)
-        colours = np.stack([shade, shade, shade, np.full_like(shade, 255)], axis=-1)
-        solid.visual = trimesh.visual.ColorVisuals(solid, vertex_colors=colours)
-    return trimesh.exchange.ply.export_ply(solid, vertex_normal=True)
+    faces = place[triangles(depth_mm, camera, step_mm)] if joined else None
+    return ply_bytes(points, faces, pixel_normals(depth_mm, camera, step_mm)[there], shade)
 
 
 def check_outputs(folder: Path) -> list[Path]:

@@ -1,4 +1,5 @@
-"""Reading users' mesh files (OBJ, PLY, STL, GLB) with what they name beside them: materials and textures."""
+"""Reading users' mesh files (OBJ, PLY, STL, GLB) with what they name beside them: materials and textures. Writing
+meshes and point clouds as PLY."""
 
 import base64
 import io
@@ -63,6 +64,25 @@ class _Beside(trimesh.resolvers.FilePathResolver):
         if suffix != ".bin":
             self.problems += _image_problems(content, printable(name))
         return content
+
+
+def ply_bytes(
+    points: NDArray[np.floating],
+    faces: NDArray[np.integer] | None = None,
+    normals: NDArray[np.floating] | None = None,
+    grey: NDArray[np.floating | np.integer] | None = None,
+) -> bytes:
+    """A binary PLY file: ``points`` (N, 3), triangles ``faces`` (M, 3) as indices of points, unit ``normals`` (N, 3),
+    and ``grey`` (N,), grey levels of 0 to 255, as intensity and colour."""
+    # A mesh without faces: trimesh can't write a PointCloud without points.
+    triangles = np.zeros((0, 3), np.int64) if faces is None else faces
+    solid = trimesh.Trimesh(points, triangles, vertex_normals=normals, process=False, validate=False)
+    if grey is not None:
+        solid.vertex_attributes["intensity"] = grey.astype(np.float32)
+        shade = np.rint(grey).astype(np.uint8)
+        colours = np.stack([shade, shade, shade, np.full_like(shade, 255)], axis=-1)
+        solid.visual = trimesh.visual.ColorVisuals(solid, vertex_colors=colours)
+    return trimesh.exchange.ply.export_ply(solid, vertex_normal=normals is not None)
 
 
 def read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], Paint | None]:

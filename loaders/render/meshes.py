@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 
 from fpp_ml_bench.constants import OBJECT_NAME, OBJECTS, SPLITS, UNSEEN
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.files import is_file, printable, read_yaml, write_atomically
-from fpp_ml_bench.loaders.render.mesh_files import MESH_SUFFIXES, content_hash, read_mesh
+from fpp_ml_bench.loaders.render.mesh_files import MESH_SUFFIXES, content_hash, ply_bytes, read_mesh
 from fpp_ml_bench.loaders.render.objects import object_mesh
 from fpp_ml_bench.loaders.render.scene import SolidMesh, UserMesh
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
@@ -55,9 +54,8 @@ def load_user_mesh(description: UserMesh) -> SolidMesh:
 
 def write_ply(mesh: SolidMesh, path: Path) -> None:
     """Write a mesh as binary PLY in metres, object coordinates."""
-    solid = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, trimesh.exchange.ply.export_ply(solid, vertex_normal=False))
+    write_atomically(path, ply_bytes(mesh.vertices_m, mesh.faces))
 
 
 def read_mesh_list(path: Path) -> tuple[UserMesh, ...]:
