@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.coding.code import Reason
-from fpp_ml_bench.constants import GREY_LEVELS
+from fpp_ml_bench.constants import GREY_LEVELS, VIEWS
 from fpp_ml_bench.containers import png_bytes
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _TILE_PX = 120
+_BRIGHTER = 0.7
+"""The power of a sheet's grey levels: dark surfaces show, and bright ones keep their texture."""
 _GREY = "gray"
 _LETTERS, _ACROSS = 250, 5
 """Letters in a line below a picture, and panels in a line."""
@@ -174,25 +176,32 @@ def sample_cloud(dataset: DatasetFolder, sample: str, folder: Path, name: str) -
     return write_cloud(folder, name, f"{sample}: {kind} depth", dataset.rig, depth_mm, grey)
 
 
-def contact_sheet(dataset: DatasetFolder, split: str, path: Path) -> None:
-    """Write all objects (two per line) in all their views as a PNG, in white light if that frame is stored."""
+def contact_sheet(dataset: DatasetFolder, split: str, path: Path, most_views: int = len(VIEWS)) -> None:
+    """Write the objects of ``split`` as a PNG, each in its first ``most_views`` views, in white light if that frame is
+    stored. Grey levels are raised to the power `_BRIGHTER`. Raises `DatasetError` for no view, or a place that can't be
+    written."""
+    if most_views < 1:
+        raise DatasetError(f"--views {most_views}: expected 1 or more views of each object")
     views: dict[str, list[str]] = {}
     for sample in dataset.samples(split):
         views.setdefault(dataset.measured(sample)["object"], []).append(sample)
-    index = _grey_frame(dataset)
-    height, width = dataset.size
-    tile_width, tile_height = (max(1, _TILE_PX * side // max(width, height)) for side in (width, height))
+    index, (height, width) = _grey_frame(dataset), dataset.size
+    across = min(most_views, max(map(len, views.values())))
+    tile_px = _TILE_PX * (2 if across == 1 else 1)  # the label is as long as two tiles
+    tile_width, tile_height = (max(1, tile_px * side // max(width, height)) for side in (width, height))
     label_px, gap_px = 18, 8
-    block_size = label_px + tile_height, max(map(len, views.values())) * tile_width + gap_px
+    block_size = label_px + tile_height, across * tile_width + gap_px
+    brighter = np.rint(GREY_LEVELS * (np.arange(256) / GREY_LEVELS) ** _BRIGHTER).astype(np.uint8)
     blocks = []
     for name, samples in views.items():
         block = np.full(block_size, 255, dtype=np.uint8)
-        for number, sample in enumerate(samples):
+        for number, sample in enumerate(samples[:across]):
             tile = cv2.resize(dataset.frame(sample, index), (tile_width, tile_height), interpolation=cv2.INTER_AREA)
-            block[label_px:, number * tile_width :][:, :tile_width] = cv2.convertScaleAbs(tile, alpha=1.4)
+            block[label_px:, number * tile_width :][:, :tile_width] = brighter[tile]
         title = f"{name} ({dataset.split_of_sample(samples[0])})"
         cv2.putText(block, title, (4, 13), cv2.FONT_HERSHEY_SIMPLEX, 0.42, 0, 1, cv2.LINE_AA)
         blocks.append(block)
-    blocks += [np.full(block_size, 255, dtype=np.uint8)] * (len(blocks) % 2)
-    sheet = np.vstack([np.hstack(line) for line in zip(blocks[::2], blocks[1::2], strict=True)])
+    columns = min(len(blocks), 2 * len(VIEWS) * _TILE_PX // (across * tile_px))
+    blocks += [np.full(block_size, 255, dtype=np.uint8)] * (-len(blocks) % columns)
+    sheet = np.vstack([np.hstack(blocks[start : start + columns]) for start in range(0, len(blocks), columns)])
     write_files(path.parent, {path.name: png_bytes(sheet[:, :-gap_px])}, DatasetError)

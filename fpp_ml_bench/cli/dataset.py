@@ -8,7 +8,7 @@ from fpp_ml_bench.calibration.result import VolumeError, volume_error_mm
 from fpp_ml_bench.cli import CHECK_FAILED
 from fpp_ml_bench.cli.console import gigabytes, millimetres, progress_bar, say_benchmark, show
 from fpp_ml_bench.cli.options import SPLITS, command
-from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.constants import MM_PER_M, VIEWS
 from fpp_ml_bench.errors import BuildError, DatasetError
 from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.loaders.published.exporting import FORMS, SAMPLE_FORMS, chosen_splits
@@ -137,6 +137,7 @@ fpp-bench show data/mini power_drill_A60                 writes power_drill_A60.
 fpp-bench show data/mini mug_A0 --out pictures/mug.png
 fpp-bench show data/mini mug_A0 --cloud                  also mug_A0.ply, and mug_A0.html to turn it in a browser
 fpp-bench show data/full --sheet --out sheet.png         all 50 objects x 6 views
+fpp-bench show data/full --sheet --views 2               the first two views of each object
 """)
 def show_sample(
     *,
@@ -145,6 +146,7 @@ def show_sample(
     cloud: bool = option(False, "also write the points: SAMPLE.ply, and SAMPLE.html to turn in a browser"),
     sheet: bool = option(False, "all objects and views on one sheet instead"),
     split: str = option("all", "split that --sheet shows (default: all)", "SPLIT"),
+    views: int = option(len(VIEWS), "views of each object that --sheet shows, from the first (default: all)", "N"),
     out: Path | None = option(None, "picture to write (default: SAMPLE.png or sheet.png)", "FILE.png"),
 ) -> None:
     """One sample as a picture (frames, depth, error, mask, mesh), or a contact sheet of every object and view."""
@@ -159,7 +161,7 @@ def show_sample(
     from fpp_ml_bench.loaders.pictures import contact_sheet, sample_cloud, sample_picture
 
     if sample is None:
-        contact_sheet(opened, split, picture)
+        contact_sheet(opened, split, picture, views)
     else:
         opened.split_of_sample(sample)
         sample_picture(opened, sample, picture)

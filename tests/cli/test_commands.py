@@ -18,6 +18,7 @@ from conftest import TINY_SIZE
 from fpp_ml_bench.cli import BENCH, COMMANDS, EVAL, Program, main, main_eval
 from fpp_ml_bench.constants import VIEWS
 from fpp_ml_bench.loaders.sample import VOID
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 ROOT = Path(__file__).resolve().parents[2]
 HEAVY = ("numpy", "torch", "datasets", "pyarrow", "scipy", "cv2", "numba", "matplotlib", "pydantic", "yaml", "trimesh")
@@ -171,6 +172,8 @@ def test_examples_in_the_help_are_accepted_by_their_parsers(tmp_path, monkeypatc
         (["show", "TINY", "mug_A0", "--out", "x.jpg"], "ending in .png"),
         (["show", "TINY", "mug_A0", "--out", "FILE/x.png"], "can't be written"),
         (["show", "TINY", "--sheet", "--split", "val", "--out", "x.png"], "no split 'val'"),
+        (["show", "TINY", "--sheet", "--views", "0", "--out", "x.png"], "--views 0: expected 1 or more"),
+        (["show", "TINY", "--sheet", "--cloud", "--out", "x.png"], "--cloud: expected a SAMPLE"),
         (["show", "OUT", "mug_A0", "--out", "x.png"], "no such folder"),
         (["predict", "magic", "TINY", "--out", "OUT"], "there are classical"),
         (["predict", "classical", "TINY"], "--out"),
@@ -297,6 +300,19 @@ def test_show_writes_a_picture_of_the_sample(tiny, tmp_path, capsys):
         assert ((colour < 3) & (picture[..., 0] > 20) & (picture[..., 0] < 235)).mean() > 0.05  # frames are grey
         assert (picture == 255).all(axis=2).mean() < 0.8
     assert pictures[0].shape != pictures[1].shape or (pictures[0] != pictures[1]).mean() > 0.02
+
+
+def test_show_draws_fewer_views_larger_or_more_objects_in_a_line(tiny, tmp_path):
+    sizes = {}
+    for views in (1, 2, 6, 99):
+        assert call("show", tiny, "--sheet", "--views", views, "--out", tmp_path / f"{views}.png") == 0
+        sizes[views] = cv2.imread(str(tmp_path / f"{views}.png"), cv2.IMREAD_GRAYSCALE).shape
+    stored = len({row["object"] for rows in DatasetFolder(tiny).manifest.samples.values() for row in rows})
+    across = min(stored, 6)
+    lines = -(-stored // across)
+    assert sizes[1] == (lines * (18 + 240), across * 248 - 8)
+    assert sizes[2] == (lines * (18 + 120), across * 248 - 8)
+    assert sizes[6] == sizes[99] and sizes[6][0] == -(-stored // 2) * (18 + 120)
 
 
 def test_show_with_a_damaged_mesh_names_it(tiny, tmp_path, capsys):
