@@ -45,6 +45,7 @@ from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.patterns import pattern_profiles
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.portable import gaussian_weights
+from fpp_ml_bench.style import ERROR_COLOURS, FRAME_COLOURS, figure, figure_png, styled
 
 SCENES = ("plane", "sphere", "open_book", "bowl", "cleaning_bucket", "magazine_stack")
 GLOSSY = ("plane", "sphere")
@@ -349,29 +350,25 @@ def compare(mi: Any, name: str, args: argparse.Namespace, folder: Path) -> list[
     return rows
 
 
+@styled
 def picture(name: str, own: Images, other: Images, inside: NDArray, file: Path) -> None:
     """Our image of white light, Mitsuba's, and ten times their difference inside the object."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
     rows, columns = np.nonzero(other.white)
     box = np.s_[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1]
     most = other.white[inside].max()
-    figure, axes = plt.subplots(1, 3, figsize=(9, 3.2), layout="constrained")
+    drawn = figure(9, 3.2, dpi=60)
+    axes = drawn.subplots(1, 3)
     for axis, image, title in (
         (axes[0], own.white, f"{name}: ours"),
         (axes[1], other.white, "Mitsuba 3"),
         (axes[2], 10 * np.where(inside, own.white - other.white, 0.0), "difference x 10"),
     ):
-        low, colours = (-most, "RdBu_r") if axis is axes[2] else (0, "gray")
+        low, colours = (-most, ERROR_COLOURS) if axis is axes[2] else (0, FRAME_COLOURS)
         axis.imshow(image[box], vmin=low, vmax=most, cmap=colours)
-        axis.set_title(title, fontsize=9)
+        axis.set_title(title)
         axis.axis("off")
     file.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(file, dpi=60)
-    plt.close(figure)
+    file.write_bytes(figure_png(drawn))
 
 
 def table(rows: list[Row]) -> str:

@@ -14,6 +14,7 @@ from fpp_ml_bench.errors import CaptureError
 from fpp_ml_bench.files import printable, write_files
 from fpp_ml_bench.loaders.captures.exports import camera_points, depth_ply
 from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.style import DEPTH_COLOURS
 
 MOST_POINTS = 150_000
 """Drawn by the page: a phone turns so many smoothly, and the file stays below 1.5 MB."""
@@ -42,7 +43,7 @@ def cloud_html(title: str, points_mm: NDArray[np.floating], grey: NDArray[np.uin
     first = points.min(axis=0)
     step_mm = float(np.ptp(points, axis=0).max()) / _STEPS or 1.0
     ends = np.quantile(points, _ENDS, axis=0)
-    colours = colormaps["viridis"](np.arange(256), bytes=True)[:, :3]
+    colours = colormaps[DEPTH_COLOURS](np.arange(256), bytes=True)[:, :3]
     data = {
         "places": _text(np.rint((points - first) / step_mm).astype("<u2")),
         "greys": _text(shown),

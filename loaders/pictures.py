@@ -1,7 +1,6 @@
 """Pictures: a capture with what was decoded from it, a sample of a dataset with frames, depth, mask and mesh, and a
 contact sheet of all objects and views."""
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from textwrap import wrap
@@ -21,6 +20,7 @@ from fpp_ml_bench.loaders.sample import DEPTH, DEPTH_EXACT
 from fpp_ml_bench.loaders.storage.manifest import MESH_FOLDER
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.sequence import DIRECTIONS
+from fpp_ml_bench.style import DEPTH_COLOURS, ERROR_COLOURS, FRAME_COLOURS, SIGMA_COLOURS, figure, figure_png, styled
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 _TILE_PX = 120
 _BRIGHTER = 0.7
 """The power of a sheet's grey levels: dark surfaces show, and bright ones keep their texture."""
-_GREY = "gray"
 _LETTERS, _ACROSS = 250, 5
 """Letters in a line below a picture, and panels in a line."""
 _COLOURS = ("#3ca951", "#9498a0", "#22252b", "#ff725c", "#efb118", "#a463f2", "#ff8ab7", "#4269d0", "#ffffff")
@@ -39,7 +38,7 @@ Panel = tuple[str, NDArray, str, float, float]
 
 def _draw(axes: Any, title: str, image: NDArray, colours: str, low: float, high: float) -> None:
     """A panel; frames, of grey levels from 0 to 255, without a scale."""
-    frame = (colours, high) == (_GREY, GREY_LEVELS)
+    frame = (colours, high) == (FRAME_COLOURS, GREY_LEVELS)
     drawn = axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation=None if frame else "nearest")
     if not frame:
         axes.figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03).ax.tick_params(labelsize=7)
@@ -48,23 +47,17 @@ def _draw(axes: Any, title: str, image: NDArray, colours: str, low: float, high:
     axes.set_yticks([])
 
 
+@styled
 def panel_figure(panels: Sequence[Panel], further: int = 0) -> "Figure":
     """A figure of panels, five in a line, with room for ``further`` ones."""
-    from matplotlib.figure import Figure
-
     grid = -(-(len(panels) + further) // _ACROSS), _ACROSS
-    figure = Figure(figsize=(3.4 * _ACROSS, 3.7 * grid[0]), dpi=110, layout="constrained")
+    drawn = figure(3.4 * _ACROSS, 3.7 * grid[0])
     for number, panel in enumerate(panels, 1):
-        _draw(figure.add_subplot(*grid, number), *panel)
-    return figure
+        _draw(drawn.add_subplot(*grid, number), *panel)
+    return drawn
 
 
-def _png(figure: "Figure") -> bytes:
-    content = io.BytesIO()
-    figure.savefig(content, format="png")
-    return content.getvalue()
-
-
+@styled
 def capture_picture(
     title: str,
     grey: NDArray,
@@ -77,23 +70,28 @@ def capture_picture(
     """PNG of maps (H, W): a frame in grey levels, depth and standard uncertainty in mm (0 = none), modulation in grey
     levels, and `Reason` codes; the ``findings`` stand below it."""
     from matplotlib.colors import ListedColormap
-    from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
     lines = [line for finding in findings for line in wrap(str(finding), _LETTERS)]
-    figure = Figure(figsize=(17, 3.9 + 0.17 * len(lines)), dpi=100, layout="constrained")
+    drawn = figure(17, 3.9 + 0.17 * len(lines))
     if lines:
-        figure.supxlabel("\n".join(lines), fontsize=8, x=0.01, ha="left", color="#b00020")
-    figure.suptitle(title, fontsize=11)
+        drawn.supxlabel("\n".join(lines), fontsize=8, x=0.01, ha="left", color="#b00020")
+    drawn.suptitle(title)
     found = depth_mm > 0
     low, high = np.quantile(depth_mm[found], (0.005, 0.995)) if found.any() else (0.0, 1.0)
     top = float(np.quantile(sigma_mm[found], 0.95)) if found.any() else 1.0
-    *maps, pixels = figure.subplots(1, 5)
+    *maps, pixels = drawn.subplots(1, 5)
     panels: tuple[Panel, ...] = (
-        ("mean of the frames, grey levels", grey, _GREY, 0.0, max(float(np.quantile(grey, 0.999)), 1.0)),
-        ("depth, mm", np.where(found, depth_mm, np.nan), "viridis", low, high),
-        ("standard uncertainty by noise, mm", np.where(found, sigma_mm, np.nan), "magma", 0.0, top),
-        ("modulation, grey levels", modulation, _GREY, 0.0, float(max(np.nanmax(modulation, initial=1.0), 1.0))),
+        ("mean of the frames, grey levels", grey, FRAME_COLOURS, 0.0, max(float(np.quantile(grey, 0.999)), 1.0)),
+        ("depth, mm", np.where(found, depth_mm, np.nan), DEPTH_COLOURS, low, high),
+        ("standard uncertainty by noise, mm", np.where(found, sigma_mm, np.nan), SIGMA_COLOURS, 0.0, top),
+        (
+            "modulation, grey levels",
+            modulation,
+            FRAME_COLOURS,
+            0.0,
+            float(max(np.nanmax(modulation, initial=1.0), 1.0)),
+        ),
     )
     for axes, panel in zip(maps, panels, strict=True):
         _draw(axes, *panel)
@@ -111,10 +109,11 @@ def capture_picture(
         for code in Reason
         if shares[code] > 0
     ]
-    pixels.legend(handles=handles, fontsize=7, loc="upper left", bbox_to_anchor=(0.0, -0.02), ncols=2, frameon=False)
-    return _png(figure)
+    pixels.legend(handles=handles, fontsize=7, loc="upper left", bbox_to_anchor=(0.0, -0.02), ncols=2)
+    return figure_png(drawn)
 
 
+@styled
 def sample_picture(dataset: DatasetFolder, sample: str, path: Path) -> None:
     """Write a sample as PNG: frames of each kind, depth, exact depth, their difference, mask, mesh. Raises
     `DatasetError` for a place that can't be written, `MeshError` for a damaged mesh."""
@@ -122,18 +121,18 @@ def sample_picture(dataset: DatasetFolder, sample: str, path: Path) -> None:
 
     panels = _panels(dataset, sample)
     mesh = dataset.path / MESH_FOLDER / f"{dataset.measured(sample)['object']}.ply"
-    figure = panel_figure(panels, further=int(mesh.is_file()))
-    figure.suptitle(f"{sample} ({dataset.split_of_sample(sample)})")
+    drawn = panel_figure(panels, further=int(mesh.is_file()))
+    drawn.suptitle(f"{sample} ({dataset.split_of_sample(sample)})")
     if mesh.is_file():
         vertices_m, faces, _ = read_mesh(mesh)
-        first: Any = figure.axes[0]
+        first: Any = drawn.axes[0]
         grid = first.get_subplotspec().get_gridspec()
-        solid: Any = figure.add_subplot(grid[len(panels) // _ACROSS, len(panels) % _ACROSS], projection="3d")
+        solid: Any = drawn.add_subplot(grid[len(panels) // _ACROSS, len(panels) % _ACROSS], projection="3d")
         solid.plot_trisurf(*vertices_m.T, triangles=faces, color="0.9", linewidth=0, antialiased=False)
         solid.set_aspect("equal")
         solid.set_axis_off()
         solid.set_title("ground-truth mesh", fontsize=9)
-    write_files(path.parent, {path.name: _png(figure)}, DatasetError)
+    write_files(path.parent, {path.name: figure_png(drawn)}, DatasetError)
 
 
 def _panels(dataset: DatasetFolder, sample: str) -> list[Panel]:
@@ -142,21 +141,23 @@ def _panels(dataset: DatasetFolder, sample: str) -> list[Panel]:
     codes = [index for direction in DIRECTIONS for index in tuple(sequence.gray(direction))[-3:][:1]]
     firsts = (*sequence.config("single_shot"), *sequence.sinusoids("vertical")[:1])
     frames = [i for i in dict.fromkeys((*firsts, *codes, sequence.white)) if i in stored]
-    panels: list[Panel] = [(sequence.frames[i].title, dataset.frame(sample, i), _GREY, 0, GREY_LEVELS) for i in frames]
+    panels: list[Panel] = [
+        (sequence.frames[i].title, dataset.frame(sample, i), FRAME_COLOURS, 0, GREY_LEVELS) for i in frames
+    ]
     depth_mm = dataset.depth_mm(sample)
     inside = object_mask(depth_mm)
     low, high = float(depth_mm[inside].min()), float(depth_mm.max())
     title = f"depth, {low:.0f}-{high:.0f} mm"
-    panels.append((title, np.where(inside, depth_mm, np.nan), "viridis", low, high))
+    panels.append((title, np.where(inside, depth_mm, np.nan), DEPTH_COLOURS, low, high))
     if dataset.has_exact:
         exact_mm = dataset.depth_mm(sample, DEPTH_EXACT)
         error_mm = depth_mm - exact_mm
         limit = float(np.quantile(np.abs(error_mm[inside]), 0.99))
         title = f"decoded - exact, MAE {np.abs(error_mm[inside]).mean(dtype=np.float64):.3f} mm"
-        panels.append(("exact depth, mm", np.where(object_mask(exact_mm), exact_mm, np.nan), "viridis", low, high))
-        panels.append((title, np.where(inside, error_mm, np.nan), "coolwarm", -limit, limit))
+        panels.append(("exact depth, mm", np.where(object_mask(exact_mm), exact_mm, np.nan), DEPTH_COLOURS, low, high))
+        panels.append((title, np.where(inside, error_mm, np.nan), ERROR_COLOURS, -limit, limit))
     title = f"object mask, {100 * inside.mean():.1f}% of the image"
-    panels.append((title, inside * GREY_LEVELS, _GREY, 0, GREY_LEVELS))
+    panels.append((title, inside * GREY_LEVELS, FRAME_COLOURS, 0, GREY_LEVELS))
     return panels
 
 

@@ -37,6 +37,7 @@ from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.result.parts import PART_TITLES, RELIANCE_VERSION, Reliance, RelianceParts
 from fpp_ml_bench.evaluation.score.uncertainty import caution, object_interval
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.style import ERROR_COLOURS
 
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.diagnostics.subjects import Subject
@@ -305,7 +306,7 @@ def _draw_scenes(predictor: ScenePredictor, scenes: Counterfactuals) -> Figure:
     largest = float(np.nanmax(np.abs(changes[0])))
     rows = {"captured": [Picture(frame) for frame in frames]}
     for name, maps in zip(("expected change", "actual change"), changes, strict=True):
-        rows[name] = [Picture(one, "coolwarm", -largest, largest) for one in maps]
+        rows[name] = [Picture(one, ERROR_COLOURS, -largest, largest) for one in maps]
     unit = "mm" if predictor.in_mm else "of the range"
     title = (
         f"{original.sample}: one thing changed at a time; {scenes.direction} phase; blue to red: -{largest:.3g} to "

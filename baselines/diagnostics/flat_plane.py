@@ -25,16 +25,17 @@ from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.paper import paper_rows
+from fpp_ml_bench.style import DEPTH_COLOURS
 
 TILTS_DEG = ((0.0, 0.0), (20.0, 0.0), (0.0, 20.0))
 DISTANCES_M = (1.6, 1.8, 2.0)
 OUTLINES, QUICK_OUTLINES = 5, 2
-FRAME, RECTANGLE, SILHOUETTE = "fills the frame", "rectangle", "silhouette"
-KINDS = FRAME, RECTANGLE, SILHOUETTE
+FRAME_COLOURS, RECTANGLE, SILHOUETTE = "fills the frame", "rectangle", "silhouette"
+KINDS = FRAME_COLOURS, RECTANGLE, SILHOUETTE
 """Kinds of outlines; a silhouette is named by its sample."""
 GROWING = {f"{RECTANGLE}, side {side:g}": side for side in (0.3, 0.45, 0.5, 0.6, 0.7, 0.8, 0.9, 0.96, 1.0)}
 """Sides, as shares of the image's, of rectangles that face the camera at the paper's distance."""
-SIDES = {FRAME: 1.0, RECTANGLE: 0.5, **GROWING}
+SIDES = {FRAME_COLOURS: 1.0, RECTANGLE: 0.5, **GROWING}
 STREAM = (0, "plane", "")
 PAPER = paper_rows()["probes"]["flat_plane"]
 PAPER_DISTANCE_M = PAPER["distance_m"]
@@ -236,7 +237,9 @@ def draw(shown: Mapping[str, PlanePrediction], normalised: bool) -> Figure:
     ]
     rows = {
         "fringes": [Picture(one.frame) for one in planes],
-        f"prediction,\n{low:g} to {high:g}\n{unit}": [Picture(one.prediction, "viridis", low, high) for one in planes],
+        f"prediction,\n{low:g} to {high:g}\n{unit}": [
+            Picture(one.prediction, DEPTH_COLOURS, low, high) for one in planes
+        ],
     }
     alt = "Fringes on planes in three outlines, and the predictions"
     return Figure("Flat planes at 1.8 m", alt, gallery(rows, columns, 2.4))

@@ -33,6 +33,7 @@ from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.paper import AVERAGE, paper_layers
+from fpp_ml_bench.style import HEAT_COLOURS
 
 Image = NDArray[np.float32]
 Mean = dict[str, Any]
@@ -226,6 +227,6 @@ def _draw_heatmaps(subject: Subject, dataset: DatasetFolder, samples: Sequence[s
         heat = heatmaps(network, subject.layers_of(network), subject.input_batch([frames]))
         maps = frames[subject.frames_used[0]], *references(subject, dataset, sample).values()
         rows[sample] = [Picture(np.asarray(image)) for image in maps]
-        rows[sample] += [Picture(values[0], "inferno") for values in heat.values()]
+        rows[sample] += [Picture(values[0], HEAT_COLOURS) for values in heat.values()]
     title, alt = "Heatmaps, each scaled to its own largest value", "Input, edges, fringes and Grad-CAM by layer"
     return Figure(title, alt, probe.gallery(rows, ("input", EDGES, FRINGES, *subject.layer_names)))

@@ -10,10 +10,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import import_module
-from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 from fpp_ml_bench.errors import DiagnosisError
+from fpp_ml_bench.style import FRAME_COLOURS, GRID, figure, figure_png, styled
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -171,7 +171,6 @@ COLOURS = {
     "ink": "#191c20",
 }
 """Colours of the targets, edges and depth as in the paper's figure; of the raw input, of random weights, of text."""
-_GRID = "#dfe1e5"
 _GAP = 4  # px between two pictures
 
 
@@ -202,7 +201,7 @@ class Picture:
     """A map (H, W) from ``low`` to ``high`` (default: its largest value) in matplotlib's ``colours``; NaN is white."""
 
     image: NDArray
-    colours: str = "gray"
+    colours: str = FRAME_COLOURS
     low: float = 0.0
     high: float | None = None
 
@@ -217,10 +216,12 @@ class Picture:
         return np.where(np.isnan(values)[..., None], 1.0, colormaps[self.colours](share)[..., :3])
 
 
+@styled
 def chart(panels: Sequence[Panel], columns: int, panel_size: tuple[float, float] = (5.0, 3.4)) -> bytes:
     """``panels`` in rows of ``columns``, of so many inches each, and one legend of all their lines; PNG."""
     rows = max(-(-len(panels) // columns), 1)
-    figure, axes_of = _figure(rows, columns, panel_size[0] * columns, panel_size[1] * rows)
+    drawn = figure(panel_size[0] * columns, panel_size[1] * rows)
+    axes_of = drawn.subplots(rows, columns, squeeze=False)
     handles: dict[str, Any] = {}
     for axes in axes_of.flat[len(panels) :]:
         axes.axis("off")
@@ -233,13 +234,14 @@ def chart(panels: Sequence[Panel], columns: int, panel_size: tuple[float, float]
                 if ends is not None:
                     axes.plot([x] * len(ends), ends, color=line.colour, linewidth=0.8)
         axes.set(**panel.axes)
-        axes.set_title(panel.title, fontsize=10, loc="left")
-        axes.tick_params(labelsize=8, axis="x", rotation=40)
-        axes.grid(axis="y", color=_GRID)
-    figure.legend(handles.values(), handles, fontsize=8, ncols=max(1, columns - 1), loc="outside lower center")
-    return _png(figure)
+        axes.set_title(panel.title, loc="left")
+        axes.tick_params(axis="x", rotation=40)
+        axes.grid(axis="y", color=GRID)
+    drawn.legend(handles.values(), handles, ncols=max(1, columns - 1), loc="outside lower center")
+    return figure_png(drawn, reduced=True)
 
 
+@styled
 def gallery(rows: Mapping[str, Sequence[Picture]], columns: Sequence[str], picture_inches: float = 1.1) -> bytes:
     """Pictures in named rows and columns, so many inches wide each; PNG."""
     import numpy as np
@@ -253,31 +255,12 @@ def gallery(rows: Mapping[str, Sequence[Picture]], columns: Sequence[str], pictu
             part = picture.rgb()
             sheet[down * height :, across * width :][: part.shape[0], : part.shape[1]] = part
     size = picture_inches * len(columns), picture_inches * len(rows) * height / width
-    figure, ((axes,),) = _figure(1, 1, size[0] + 1.2, size[1] + 0.6)
+    drawn = figure(size[0] + 1.2, size[1] + 0.6)
+    axes = drawn.subplots()
     axes.imshow(sheet, interpolation="nearest")
     axes.xaxis.tick_top()
     axes.set_xticks(width * (np.arange(len(columns)) + 0.5), columns)
     axes.set_yticks(height * (np.arange(len(rows)) + 0.5), list(rows))
     axes.tick_params(length=0, labelsize=7)
     axes.spines[:].set_visible(False)
-    return _png(figure)
-
-
-def _figure(rows: int, columns: int, width: float, height: float) -> tuple[Any, Any]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns, squeeze=False)
-
-
-def _png(figure: Any) -> bytes:
-    """With 256 colours, a third of the size; the bytes are reproducible."""
-    from PIL import Image
-
-    drawn, reduced = BytesIO(), BytesIO()
-    figure.savefig(drawn, format="png", dpi=130, facecolor="white", bbox_inches="tight", metadata={"Software": None})
-    image = Image.open(drawn).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-    image.save(reduced, format="png", optimize=True)
-    return reduced.getvalue()
+    return figure_png(drawn, reduced=True)

@@ -33,6 +33,7 @@ from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Direction
+from fpp_ml_bench.style import DEPTH_COLOURS
 
 DISTANCES_M = (0.3, 1.0, 1.8, 3.0, 5.0, 10.0)
 SHOWN_M = 1.8  # in the summary
@@ -191,7 +192,7 @@ def _draw_twins(twins: Twins) -> Figure:
         f"{name},\n{np.not_equal(*pair).sum()} pixels differ": list(map(Picture, pair)) for name, pair in pairs.items()
     }
     rows[f"depth,\n{low:.0f} to {high:.0f} mm"] = [
-        Picture(np.where(inside, depth, np.nan), "viridis", low, high) for depth in twins.depths_mm
+        Picture(np.where(inside, depth, np.nan), DEPTH_COLOURS, low, high) for depth in twins.depths_mm
     ]
     alt = "Two depths a period apart and their identical fringes"
     return Figure("Two scenes, one frame", alt, gallery(rows, ("scene A", "scene B"), 2.2))

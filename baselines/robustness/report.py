@@ -12,20 +12,9 @@ from fpp_ml_bench.baselines.robustness.axes import CLEAN, corruptions, severity_
 from fpp_ml_bench.baselines.robustness.run import read_axis
 from fpp_ml_bench.evaluation.report.html import data_uri, page, render
 from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.style import LINE_COLOURS
 
 PAGE, CURVES = "index.html", "curves.png"
-_COLOURS = (
-    "#4269d0",
-    "#efb118",
-    "#ff725c",
-    "#3ca951",
-    "#a463f2",
-    "#97bbf5",
-    "#9c6b4e",
-    "#6cc5b0",
-    "#ff8ab7",
-    "#9498a0",
-)
 _DASHES = ("-", "--", ":")
 
 
@@ -86,9 +75,9 @@ def draw_curves(measured: Sequence[Measured]) -> bytes:
             points = {0: one.means.get(CLEAN, {}).get(0, {}), **one.means[name]}
             label = one.setup["title"] + (", unseen" if one.setup["set"] == "unseen" else "")
             label += " (quick)" if one.setup["quick"] else ""
-            style = "o" + _DASHES[number // len(_COLOURS) % len(_DASHES)]
+            style = "o" + _DASHES[number // len(LINE_COLOURS) % len(_DASHES)]
             errors = [scores.get("mae_mm") for scores in points.values()]
-            lines.append(Line(label, list(points), errors, _COLOURS[number % len(_COLOURS)], style))
+            lines.append(Line(label, list(points), errors, LINE_COLOURS[number % len(LINE_COLOURS)], style))
         if lines:
             lines.append(Line("charge for no answer", range(6), [corruptions().unanswered_mm] * 6, "0.6", ":"))
             ticks = {"xticks": range(6), "xticklabels": ["clean", *(f"{value:g}" for value in axis.severities)]}

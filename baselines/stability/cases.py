@@ -7,7 +7,6 @@ times the unit round-off, or the propagation of noise and quantisation. The boun
 case states, never from the measured error.
 """
 
-import io
 import json
 import math
 import re
@@ -28,6 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from fpp_ml_bench.errors import FppBenchError, StabilityError
 from fpp_ml_bench.evaluation.result.file import environment, write_file, write_json
 from fpp_ml_bench.machine import numba_enabled
+from fpp_ml_bench.style import figure, figure_png, styled
 
 Expects = Literal["number", "refusal", "either"]
 Run = Callable[..., "Outcome"]
@@ -318,10 +318,10 @@ def _level(row: Row) -> int:
     return len(LEVELS) - 1 - (row.verdict is Verdict.FLAGGED)
 
 
+@styled
 def heat_map(rows: Sequence[Row]) -> bytes:
     """The heat map as PNG: a line for each family, a square for each case."""
     from matplotlib.colors import ListedColormap
-    from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
     families = {
@@ -331,8 +331,8 @@ def heat_map(rows: Sequence[Row]) -> bytes:
     for line, levels in zip(squares, families.values(), strict=True):
         line[: len(levels)] = levels
     height, width = squares.shape
-    figure = Figure((_SQUARE_IN * width + 4, _SQUARE_IN * height + 1), layout="constrained")
-    axes = figure.subplots()
+    drawn = figure(_SQUARE_IN * width + 4, _SQUARE_IN * height + 1)
+    axes = drawn.subplots()
     colours = ListedColormap([*LEVELS.values()])
     axes.pcolormesh(squares, cmap=colours, vmin=-0.5, vmax=len(LEVELS) - 0.5, edgecolors="white", linewidth=1.5)
     axes.set_yticks(np.arange(height) + 0.5, map(": ".join, families), fontsize=7)
@@ -342,10 +342,8 @@ def heat_map(rows: Sequence[Row]) -> bytes:
     axes.tick_params(length=0)
     axes.spines[:].set_visible(False)
     key = [Patch(color=colour, label=meaning) for meaning, colour in LEVELS.items()]
-    figure.legend(handles=key, ncols=3, fontsize=7, frameon=False, loc="outside upper center")
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=95, bbox_inches="tight", metadata={"Software": None})
-    return stream.getvalue()
+    drawn.legend(handles=key, ncols=3, loc="outside upper center")
+    return figure_png(drawn, reduced=True)
 
 
 def write_report(rows: Sequence[Row], folder: Path) -> list[Path]:

@@ -18,11 +18,12 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from matplotlib.transforms import Bbox
 
 from fpp_ml_bench.evaluation.report.html import escaped
+from fpp_ml_bench.style import GRID, INK, SOFT
 
 COLOURS = {
-    "ink": "#191c20",
-    "soft": "#59616b",
-    "line": "#dfe1e5",
+    "ink": INK,
+    "soft": SOFT,
+    "line": GRID,
     "panel": "#ffffff",
     "front": "#b84a00",
     "measured": "#0b6b50",

@@ -1,11 +1,10 @@
 """A trade-off as tables and pictures: the points with their fronts, and how costs grow."""
 
 from collections.abc import Iterator
-from io import BytesIO
 from pathlib import Path
 
-import matplotlib
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from rich.text import Text
 
 from fpp_ml_bench.baselines.tradeoff.drawing import Mark, Scatter
@@ -13,6 +12,7 @@ from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, TRADEOFF_FILE, Co
 from fpp_ml_bench.evaluation.report.html import millimetres, percent
 from fpp_ml_bench.evaluation.result.file import write_file
 from fpp_ml_bench.files import printable
+from fpp_ml_bench.style import LINE_COLOURS, figure, figure_png, styled
 from fpp_ml_bench.tables import Table
 
 COSTS: dict[Cost, tuple[str, float, str]] = {
@@ -24,6 +24,7 @@ COSTS: dict[Cost, tuple[str, float, str]] = {
 POINTS = ("Method", "Front of", "Object MAE, mm", "Not measured", "ms per view", "Frames", "Memory, MiB")
 GROWTH = ("Method", "ms at each size", "Power of pixels", "Power of frames", "ms per view in a batch")
 TEXT_COLUMNS = 2
+_KEY_COLUMNS = 5
 
 
 def point_rows(run: Tradeoff) -> list[list[str]]:
@@ -108,7 +109,8 @@ def markdown(run: Tradeoff) -> str:
 
 def scatter(run: Tradeoff, cost: Cost) -> Scatter | None:
     """Object MAE against ``cost`` of every point that has both, a colour for each method, hollow where it is on no
-    front by rule. Named as far as there is room, the front first. None where no point has both."""
+    front by rule. Numbered in the order of the points as far as there is room, the front first. None where no point has
+    both."""
     front, methods = run.front(cost), list(dict.fromkeys(point.method for point in run.points))
     marks: list[Mark] = []
     for point in [*front, *(point for point in run.points if point not in front)]:
@@ -117,27 +119,44 @@ def scatter(run: Tradeoff, cost: Cost) -> Scatter | None:
                 Mark(
                     COSTS[cost][1] * x,
                     point.object_mae_mm,
-                    len(marks) + 1,
+                    run.points.index(point) + 1,
                     printable(point.label),
-                    f"C{methods.index(point.method) % 10}",
+                    LINE_COLOURS[methods.index(point.method) % len(LINE_COLOURS)],
                     hollow=bool(point.off_front_reason),
                     title=f"{point.title}: {point.object_mae_mm:.3g} mm, {_ms(point.seconds)} ms",
                 )
             )
-    return Scatter(marks, marks[: len(front)], COSTS[cost][2], marks, numbers=False) if marks else None
+    return Scatter(marks, marks[: len(front)], COSTS[cost][2], marks, names=False) if marks else None
 
 
+@styled
 def draw_tradeoff(run: Tradeoff) -> Figure | None:
-    """A panel for each cost on log axes, with its front; None where no point can be drawn."""
+    """A panel for each cost on log axes, with its front, and a key of the numbers; None where no point can be drawn."""
     pictures = [picture for cost in COST_KEYS if (picture := scatter(run, cost))]
     if not pictures:
         return None
-    figure = Figure(figsize=(18, 6), dpi=110)
-    figure.subplots_adjust(0.04, 0.1, 0.99, 0.9, 0.12)
+    lines = -(-len(run.points) // _KEY_COLUMNS)
+    height_in = 5.8 + 0.2 * lines
+    drawn = figure(14, height_in, layout=None)
+    drawn.subplots_adjust(0.045, (0.6 + 0.2 * lines) / height_in, 0.99, 1 - 0.6 / height_in, 0.15)
     for number, picture in enumerate(pictures, start=1):
-        picture.draw(figure.add_subplot(1, len(pictures), number))
-    figure.suptitle(f"{tables(run)[0][0]}\ndashed: the front; hollow: given ground truth of the view, or trivial")
-    return figure
+        picture.draw(drawn.add_subplot(1, len(pictures), number))
+    marks = {mark.number: mark for picture in pictures for mark in picture.marks}
+    key = [
+        Line2D(
+            [],
+            [],
+            marker="o",
+            ls="",
+            color=mark.colour,
+            mfc="white" if mark.hollow else None,
+            label=f"{n}  {mark.name}",
+        )
+        for n, mark in sorted(marks.items())
+    ]
+    drawn.legend(handles=key, ncols=_KEY_COLUMNS, loc="lower center", handletextpad=0.2)
+    drawn.suptitle(f"{tables(run)[0][0]}\ndashed: the front; hollow: given ground truth of the view, or trivial")
+    return drawn
 
 
 def write_report(run: Tradeoff, out: Path) -> list[Path]:
@@ -145,12 +164,9 @@ def write_report(run: Tradeoff, out: Path) -> list[Path]:
     can't be written."""
     written = [out / TRADEOFF_FILE, out / "tradeoff.md"]
     write_file(markdown(run).encode("utf-8"), written[1])
-    with matplotlib.rc_context({"font.size": 8, "figure.titlesize": 9}):
-        if figure := draw_tradeoff(run):
-            image = BytesIO()
-            figure.savefig(image)
-            written.append(out / "tradeoff.png")
-            write_file(image.getvalue(), written[-1])
+    if drawn := draw_tradeoff(run):
+        written.append(out / "tradeoff.png")
+        write_file(figure_png(drawn, reduced=True), written[-1])
     return written
 
 

@@ -7,7 +7,6 @@ import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +19,7 @@ from torch.optim import Optimizer
 
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.files import opened, strict_json, write_atomically
+from fpp_ml_bench.style import figure, figure_png, styled
 
 LOG_FILE, CURVE_FILE = "log.jsonl", "curve.png"
 _FORMAT = "fpp-ml-bench training 1"
@@ -103,25 +103,22 @@ class Panel:
         return cls(title, x, lines, log)
 
 
+@styled
 def draw_curves(path: Path, title: str, panels: Sequence[Panel]) -> None:
     """Write the ``panels`` side by side as the picture ``path``."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
 
-    figure = Figure(figsize=(10, 3.2), layout="constrained", dpi=110)
-    for axes, panel in zip(figure.subplots(1, len(panels)), panels, strict=True):
+    drawn = figure(10, 3.2)
+    for axes, panel in zip(drawn.subplots(1, len(panels)), panels, strict=True):
         for label, (x, y) in panel.lines.items():
             axes.plot(x, y, "o" if len(x) == 1 else "-", label=label)
         axes.set(title=panel.title, xlabel=panel.x_label, **({"yscale": "log"} if panel.log else {"ylim": (0, None)}))
-        axes.grid(alpha=0.3)
+        axes.grid()
         axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         if not all(label.startswith("_") for label in panel.lines):
-            axes.legend(frameon=False)
-    figure.suptitle(title, fontsize=10)
-    picture = BytesIO()
-    FigureCanvasAgg(figure).print_png(picture)
-    write_atomically(path, picture.getvalue())
+            axes.legend()
+    drawn.suptitle(title)
+    write_atomically(path, figure_png(drawn))
 
 
 class Display:

@@ -1,6 +1,5 @@
 """Pictures of a report: a figure of the errors and of a stated uncertainty, and the panels of a sample."""
 
-import io
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,10 +11,10 @@ from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.evaluation.report.html import data_uri, millimetres
 from fpp_ml_bench.evaluation.result.parts import Uncertainty
 from fpp_ml_bench.loaders.pictures import Panel
+from fpp_ml_bench.style import DEPTH_COLOURS, ERROR_COLOURS, FRAME_COLOURS, SIGMA_COLOURS, figure, figure_png, styled
 
-_DPI = 100
 
-
+@styled
 def errors_figure(errors_mm: Sequence[float], block: Uncertainty | None) -> str:
     """PNG as a data URI: the object MAE in mm of every sample, ascending, and of a stated uncertainty how much of the
     object lies within the interval that should hold a share of it, and the error of the rest when the least sure pixels
@@ -29,14 +28,14 @@ def errors_figure(errors_mm: Sequence[float], block: Uncertainty | None) -> str:
     if block is not None and (curves := block.sparsification) is not None:
         lines = {"best order": curves.best_mae_mm, "by sigma": curves.mae_mm}
         plots.append(("share of object pixels left out", "MAE of the rest, mm", curves.left_out, lines))
-    figure = Figure(figsize=(4.4 * len(plots), 3.4), layout="constrained")
-    for axes, (across, up, places, lines) in zip(figure.subplots(1, len(plots), squeeze=False)[0], plots, strict=True):
+    drawn = figure(4.4 * len(plots), 3.4)
+    for axes, (across, up, places, lines) in zip(drawn.subplots(1, len(plots), squeeze=False)[0], plots, strict=True):
         for number, (title, values) in enumerate(lines.items()):
             axes.plot(places, values, "--" if number == 0 and title else ".-", label=title)
         axes.set(xlabel=across, ylabel=up)
         if len(lines) > 1:
-            axes.legend(frameon=False)
-    return figure_uri(figure)
+            axes.legend()
+    return figure_uri(drawn)
 
 
 CLIP_PERCENTILE = 95
@@ -54,16 +53,14 @@ def sample_panels(
     clip = float(np.percentile(np.abs(error_mm[inside if inside.any() else ...]), CLIP_PERCENTILE))
     drawn_mm = np.where(inside | predicted, error_mm, np.nan)
     return [
-        ("Fringe", fringe, "gray", 0, 255),
-        ("Truth, mm", np.where(inside, target_mm, np.nan), "viridis", low, high),
-        ("Prediction, mm", np.where(predicted, prediction_mm, np.nan), "viridis", low, high),
-        (f"Absolute error, to {millimetres(clip)} mm", np.abs(drawn_mm), "magma", 0.0, clip),
-        (f"Signed error, to {millimetres(clip)} mm", drawn_mm, "coolwarm", -clip, clip),
+        ("Fringe", fringe, FRAME_COLOURS, 0, 255),
+        ("Truth, mm", np.where(inside, target_mm, np.nan), DEPTH_COLOURS, low, high),
+        ("Prediction, mm", np.where(predicted, prediction_mm, np.nan), DEPTH_COLOURS, low, high),
+        (f"Absolute error, to {millimetres(clip)} mm", np.abs(drawn_mm), SIGMA_COLOURS, 0.0, clip),
+        (f"Signed error, to {millimetres(clip)} mm", drawn_mm, ERROR_COLOURS, -clip, clip),
     ]
 
 
-def figure_uri(figure: Figure) -> str:
+def figure_uri(drawn: Figure) -> str:
     """A figure as PNG, as a data URI."""
-    content = io.BytesIO()
-    figure.savefig(content, format="png", dpi=_DPI)
-    return data_uri(content.getvalue())
+    return data_uri(figure_png(drawn))

@@ -2,7 +2,6 @@
 residuals as a picture; and how far a rig's depth is from another's over the working volume."""
 
 from dataclasses import dataclass, field
-from io import BytesIO
 from typing import TYPE_CHECKING, NamedTuple
 
 import cv2
@@ -15,6 +14,7 @@ from fpp_ml_bench.errors import CalibrationError
 from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import AXES
+from fpp_ml_bench.style import DEPTH_COLOURS, figure, figure_png, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -167,17 +167,16 @@ class Calibration:
         return tuple(pose.name for pose, named in zip(self.poses, bad, strict=True) if named)
 
 
+@styled
 def draw_residuals(calibration: Calibration) -> bytes:
     """PNG of a calibration: for camera and projector the residuals by pose and the points in the image, and the RMS of
     each pose."""
     from matplotlib import colormaps
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
 
     poses = calibration.poses
-    colours = colormaps["turbo"](np.linspace(0.05, 0.95, len(poses)))
-    figure = Figure(figsize=(13, 8), layout="constrained", dpi=90)
-    plots = figure.subplots(2, 3)
+    colours = colormaps[DEPTH_COLOURS](np.linspace(0.05, 0.95, len(poses)))
+    drawn = figure(13, 8)
+    plots = drawn.subplots(2, 3)
     for row, (name, device) in enumerate((("camera", calibration.camera), ("projector", calibration.projector))):
         scatter, cover = plots[row, 0], plots[row, 1]
         for pose, colour in zip(poses, colours, strict=True):
@@ -200,10 +199,8 @@ def draw_residuals(calibration: Calibration) -> bytes:
     _bars(plots[0, 2], calibration)
     plots[1, 2].axis("off")
     handles, labels = plots[0, 0].get_legend_handles_labels()
-    plots[1, 2].legend(handles, labels, loc="upper left", ncols=1 + len(poses) // 20, fontsize=8, markerscale=3)
-    picture = BytesIO()
-    FigureCanvasAgg(figure).print_png(picture)
-    return picture.getvalue()
+    plots[1, 2].legend(handles, labels, loc="upper left", ncols=1 + len(poses) // 20, markerscale=3)
+    return figure_png(drawn)
 
 
 def _bars(axes: "Axes", calibration: Calibration) -> None:
@@ -220,7 +217,7 @@ def _bars(axes: "Axes", calibration: Calibration) -> None:
     marks = [pose.name + (" (!)" if pose.name in calibration.spoilers else "") for pose in poses]
     axes.set_xticks(place, marks, rotation=90 if len(poses) > 6 else 20, fontsize=7)
     axes.set(title="RMS by pose, (!) fits the others badly", ylabel="px")
-    axes.legend(fontsize=8)
+    axes.legend()
 
 
 class VolumeError(NamedTuple):

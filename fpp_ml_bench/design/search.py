@@ -4,7 +4,6 @@ a picture of it: the lines on the torus, the rival distance over depth and over 
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -23,6 +22,7 @@ from fpp_ml_bench.design.rivals import (
 )
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.style import figure, figure_png, styled
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -252,15 +252,13 @@ def _front(clearance: NDArray[np.float64], noise: NDArray[np.float64]) -> list[i
     return front
 
 
+@styled
 def draw_design(rig: Rig, proposed: Candidate, other: Candidate, assumed: Assumptions) -> bytes:
     """PNG of the ``proposed`` pair beside an ``other`` one on ``rig``: both lines on the torus, the distance of the
     nearest rival over depth, and that distance for all pairs of periods at the proposed angles."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     lines = EpipolarLines.of(rig)
-    figure = Figure(figsize=(11, 10), layout="constrained", dpi=90)
-    plots = figure.subplots(2, 2)
+    drawn = figure(11, 10)
+    plots = drawn.subplots(2, 2)
     for axes, candidate in zip(plots[0], (other, proposed), strict=True):
         _draw_torus(axes, lines, candidate)
     for candidate in (other, proposed):
@@ -272,9 +270,7 @@ def draw_design(rig: Rig, proposed: Candidate, other: Candidate, assumed: Assump
     )
     plots[1, 0].legend()
     _draw_map(plots[1, 1], rig, lines, proposed, assumed)
-    picture = BytesIO()
-    FigureCanvasAgg(figure).print_png(picture)
-    return picture.getvalue()
+    return figure_png(drawn)
 
 
 def _title(crossed: Crossed) -> str:
@@ -307,7 +303,7 @@ def _draw_torus(axes: "Axes", lines: EpipolarLines, candidate: Candidate) -> Non
         ylabel="phase of carrier 2, turns",
         aspect="equal",
     )
-    axes.legend(loc="best", fontsize=8)
+    axes.legend(loc="best")
 
 
 def _wrapped(turns: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
