@@ -39,6 +39,10 @@
 
   const places = new Uint16Array(bytes(cloud.places).buffer); // little-endian, as every browser's machine is
   const count = places.length / 3;
+  // The box that the view shows, in the steps of the positions.
+  const [least, most] = cloud.ends_mm.map((end) => end.map((mm, axis) => (mm - cloud.first_mm[axis]) / cloud.step_mm));
+  const middle = least.map((low, axis) => (low + most[axis]) / 2);
+  const radius = Math.max(1, Math.hypot(...least.map((low, axis) => most[axis] - low)) / 2);
   const attribute = (name, values, size, type, normalised) => {
     gl.bindBuffer(gl.ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ARRAY_BUFFER, values, gl.STATIC_DRAW);
@@ -60,12 +64,7 @@
   gl.enable(gl.DEPTH_TEST);
   gl.clearColor(0.082, 0.094, 0.11, 1);
 
-  const [low, high] = [0, 1, 2].reduce(([least, most], axis) => {
-    let [a, b] = [65535, 0];
-    for (let i = axis; i < places.length; i += 3) [a, b] = [Math.min(a, places[i]), Math.max(b, places[i])];
-    return [[...least, a], [...most, b]];
-  }, [[], []]);
-  const spacing = Math.sqrt(((high[0] - low[0] || 1) * (high[1] - low[1] || 1)) / count) / cloud.radius;
+  const spacing = Math.sqrt(((most[0] - least[0] || 1) * (most[1] - least[1] || 1)) / count) / radius;
   let yaw, pitch, zoom, byDepth = false, waiting = false;
 
   const draw = () => {
@@ -76,10 +75,10 @@
     const [cy, sy, cx, sx] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
     gl.viewport(0, 0, width, height);
     gl.uniformMatrix3fv(uniform("turn"), false, [cy, sx * sy, -cx * sy, 0, cx, sx, sy, -sx * cy, cx * cy]);
-    gl.uniform3fv(uniform("middle"), cloud.middle);
+    gl.uniform3fv(uniform("middle"), middle);
     gl.uniform2f(uniform("window"), (0.95 * side) / width, (0.95 * side) / height);
-    gl.uniform2fv(uniform("ends"), byDepth ? cloud.ends : [0, 0]);
-    gl.uniform1f(uniform("radius"), cloud.radius);
+    gl.uniform2fv(uniform("ends"), byDepth ? [least[2], most[2]] : [0, 0]);
+    gl.uniform1f(uniform("radius"), radius);
     gl.uniform1f(uniform("zoom"), zoom);
     gl.uniform1f(uniform("dot"), 0.5 * 0.95 * side * spacing * 1.1);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, 256, 1, 0, gl.RGB, gl.UNSIGNED_BYTE, byDepth ? table : greys);

@@ -50,27 +50,16 @@ def cloud_html(title: str, points_mm: NDArray[np.floating], grey: NDArray[np.uin
         "colours": _text(colours),
         "first_mm": first.tolist(),
         "step_mm": step_mm,
+        "ends_mm": ends.tolist(),
         "white": max(float(np.quantile(shown, _ENDS[1])), 1.0),
-        "middle": ((ends.mean(axis=0) - first) / step_mm).tolist(),
-        "radius": max(float(np.linalg.norm(np.ptp(ends, axis=0))) / 2 / step_mm, 1.0),
-        "ends": ((ends[:, 2] - first[2]) / step_mm).tolist(),
     }
     here = Path(__file__).parent
     template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True).from_string(
         (here / "cloud.html").read_text(encoding="utf-8")
     )
-    values = {
-        "title": printable(title),
-        "count": count,
-        "shown": len(points),
-        "every": every,
-        "size_mm": np.ptp(ends, axis=0),
-        "ends_mm": ends[:, 2],
-        "rounded_mm": step_mm / 2,
-        "data": data,
-        "script": (here / "cloud.js").read_text(encoding="utf-8"),
-    }
-    return template.render(values).encode()
+    script = (here / "cloud.js").read_text(encoding="utf-8")
+    values = {"title": printable(title), "count": count, "shown": len(points), "every": every}
+    return template.render(values, data=data, script=script).encode()
 
 
 def _text(values: NDArray) -> str:

@@ -19,6 +19,7 @@ from fpp_ml_bench.files import write_files
 from fpp_ml_bench.loaders.sample import DEPTH, DEPTH_EXACT
 from fpp_ml_bench.loaders.storage.manifest import MESH_FOLDER
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import DIRECTIONS
 from fpp_ml_bench.style import DEPTH_COLOURS, ERROR_COLOURS, FRAME_COLOURS, SIGMA_COLOURS, figure, figure_png, styled
 
@@ -32,6 +33,9 @@ _LETTERS, _ACROSS = 250, 5
 """Letters in a line below a picture, and panels in a line."""
 _COLOURS = ("#3ca951", "#9498a0", "#22252b", "#ff725c", "#efb118", "#a463f2", "#ff8ab7", "#4269d0", "#ffffff")
 
+_TURN = np.array([[0.82, 0.11, -0.56], [0.0, 0.98, 0.2], [0.57, -0.16, 0.81]])
+"""Rows: where x, y and z go when points are turned by 35 degrees about y, then by 11 about x; camera coordinates."""
+
 Panel = tuple[str, NDArray, str, float, float]
 """Title, image, colour map, and the values at its ends: lengths in mm, or grey levels."""
 
@@ -42,9 +46,7 @@ def _draw(axes: Any, title: str, image: NDArray, colours: str, low: float, high:
     drawn = axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation=None if frame else "nearest")
     if not frame:
         axes.figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03).ax.tick_params(labelsize=7)
-    axes.set_title(title, fontsize=9)
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(title=title, xticks=[], yticks=[])
 
 
 @styled
@@ -96,9 +98,7 @@ def capture_picture(
     for axes, panel in zip(maps, panels, strict=True):
         _draw(axes, *panel)
     pixels.imshow(reason, cmap=ListedColormap(_COLOURS), vmin=0, vmax=len(_COLOURS) - 1, interpolation="nearest")
-    pixels.set_title("pixels", fontsize=9)
-    pixels.set_xticks([])
-    pixels.set_yticks([])
+    pixels.set(title="pixels", xticks=[], yticks=[])
     shares = np.bincount(reason.ravel(), minlength=len(_COLOURS)) / reason.size
     handles = [
         Patch(
@@ -129,9 +129,8 @@ def sample_picture(dataset: DatasetFolder, sample: str, path: Path) -> None:
         grid = first.get_subplotspec().get_gridspec()
         solid: Any = drawn.add_subplot(grid[len(panels) // _ACROSS, len(panels) % _ACROSS], projection="3d")
         solid.plot_trisurf(*vertices_m.T, triangles=faces, color="0.9", linewidth=0, antialiased=False)
-        solid.set_aspect("equal")
+        solid.set(title="ground-truth mesh", aspect="equal")
         solid.set_axis_off()
-        solid.set_title("ground-truth mesh", fontsize=9)
     write_files(path.parent, {path.name: figure_png(drawn)}, DatasetError)
 
 
@@ -165,6 +164,53 @@ def _grey_frame(dataset: DatasetFolder) -> int:
     """The white frame where it is stored, else the first one of a single shot."""
     white, (single, *_) = dataset.sequence.white, dataset.sequence.config("single_shot")
     return white if white in dataset.manifest.stored_frames and white is not None else single
+
+
+@styled
+def front_picture(
+    frame: NDArray[np.uint8], depth_mm: NDArray[np.floating], exact_mm: NDArray[np.floating], rig: Rig, title: str
+) -> bytes:
+    """PNG of what a method makes of one frame, all maps (H, W) of the camera's size: the frame, its depth in mm, 0 =
+    none, the error against the exact depth in mm, and the points of the depth, turned and shaded. All are cut to the
+    object. ``exact_mm`` is 0 off the object and where a score leaves a pixel out (`DatasetFolder.void`). The object MAE
+    is then that of the score, in which the error of a pixel without an answer is its whole depth. Raises `CaptureError`
+    for a depth map without any point, or with values that are negative or not finite."""
+    from matplotlib import colormaps
+    from matplotlib.colors import LightSource
+
+    from fpp_ml_bench.loaders.captures.exports import camera_points
+
+    points_mm, there = camera_points(depth_mm, rig.camera)
+    inside = object_mask(exact_mm)
+    left, top, width, height = cv2.boundingRect((inside if inside.any() else there).astype(np.uint8))
+    margin = max(width, height) // 12
+    cut = np.s_[max(top - margin, 0) : top + height + margin, max(left - margin, 0) : left + width + margin]
+    low, high = (float(end) for end in np.quantile(points_mm[:, 2], (0.01, 0.99)))
+    error_mm = np.where(inside, depth_mm - exact_mm.astype(np.float64), np.nan)
+    mae_mm, answered_mm = np.abs(error_mm[inside]).mean() if inside.any() else np.nan, error_mm[inside & there]
+    clip_mm = float(np.quantile(np.abs(answered_mm), 0.95)) if answered_mm.any() else 1.0
+    title_of_error = f"its error, mm, object MAE {mae_mm:.2f} mm\n(colours end at {clip_mm:.2g} mm)"
+    white = max(float(np.quantile(frame[cut], 0.998)), 1.0)
+    drawn = figure(12.5, 3.5)
+    drawn.suptitle(title, parse_math=False)
+    *maps, solid = drawn.subplots(1, 4)
+    _draw(
+        maps[0], "one frame, brightened", np.clip(frame / white, 0, 1)[cut] * GREY_LEVELS, FRAME_COLOURS, 0, GREY_LEVELS
+    )
+    _draw(maps[1], "its depth, mm", np.where(there, depth_mm, np.nan)[cut], DEPTH_COLOURS, low, high)
+    _draw(maps[2], title_of_error, np.where(there, error_mm, np.nan)[cut], ERROR_COLOURS, -clip_mm, clip_mm)
+    # Shaded by the slopes of a smoothed depth: those between single pixels show noise alone.
+    smooth_mm = cv2.GaussianBlur(np.where(there, depth_mm, np.median(points_mm[:, 2])), (0, 0), depth_mm.shape[1] / 320)
+    pixel_mm = high / rig.camera.fx
+    shade = 0.4 + 0.6 * LightSource(315, 40).hillshade(-smooth_mm, dx=pixel_mm, dy=pixel_mm)[there]
+    x, y, z = (points_mm - np.median(points_mm, axis=0)).dot(_TURN).T
+    order = np.argsort(-z)
+    order = order[np.abs(points_mm[order, 2] - low) <= 2 * (high - low)]  # wrong points would shrink the others
+    colours = colormaps[DEPTH_COLOURS]((points_mm[:, 2] - low) / (high - low or 1.0))[:, :3] * shade[:, None]
+    solid.scatter(x[order], -y[order], s=2.5, c=colours[order], marker="s", linewidths=0)
+    solid.set(title="its points, turned and shaded", aspect="equal")
+    solid.set_axis_off()
+    return figure_png(drawn)
 
 
 def sample_cloud(dataset: DatasetFolder, sample: str, folder: Path, name: str) -> list[Path]:

@@ -150,7 +150,7 @@ def draw_tradeoff(run: Tradeoff) -> Figure | None:
             ls="",
             color=mark.colour,
             mfc="white" if mark.hollow else None,
-            label=f"{n}  {mark.name}",
+            label=f"{n}  {mark.name}".replace("$", r"\$"),
         )
         for n, mark in sorted(marks.items())
     ]

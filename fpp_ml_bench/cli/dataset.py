@@ -167,8 +167,7 @@ def show_sample(
         sample_picture(opened, sample, picture)
     print(picture)
     if sample is not None and cloud:
-        for path in sample_cloud(opened, sample, picture.parent, picture.stem):
-            print(path)
+        print(*sample_cloud(opened, sample, picture.parent, picture.stem), sep="\n")
 
 
 @command("""\
