@@ -185,10 +185,12 @@ class FusedObject:
     counts: Counts
 
 
-def prediction_maps(predictions: str | Path, dataset: DatasetFolder, split: str) -> tuple[str, Maps]:
+def prediction_maps(
+    predictions: str | Path, dataset: DatasetFolder, split: str, target: str = DEPTH_EXACT
+) -> tuple[str, Maps]:
     """The name of a method and its maps of ``split``: of a folder of predictions, which is checked as a whole first, or
-    the dataset's own where ``predictions`` is the text ``depth`` or ``depth_exact``. Raises PredictionError for
-    predictions that could not be scored."""
+    the dataset's own where ``predictions`` is the text ``depth`` or ``depth_exact``. Normalised predictions get the
+    range of the column ``target``. Raises PredictionError for predictions that could not be scored."""
     if isinstance(predictions, str) and predictions in TARGETS:
         column = predictions
         return f"{column} of {printable(dataset.path.name)}", lambda sample: (dataset.depth_mm(sample, column), None)
@@ -202,8 +204,8 @@ def prediction_maps(predictions: str | Path, dataset: DatasetFolder, split: str)
     reader = reader_for(checked.form, folder, checked.samples, dataset.size, described.png_mm_per_level)
 
     def read(sample: str) -> tuple[Map, Map | None]:
-        target_mm = dataset.target_mm(sample, DEPTH_EXACT)
-        left_out = dataset.left_out(sample, described.range_rule, DEPTH_EXACT)
+        target_mm = dataset.target_mm(sample, target)
+        left_out = dataset.left_out(sample, described.range_rule, target)
         depth_mm, _ = scored_pair(reader.read(sample)[0], target_mm, described.units, "standard", sample, left_out)
         sigma_mm = read_sigma(folder, sample, dataset.size) if checked.sigmas else None
         return np.array(depth_mm), sigma_mm

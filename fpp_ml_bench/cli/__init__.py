@@ -67,6 +67,7 @@ BENCH = Program(
     "FPP-ML-Bench: build, load, predict, score and rank single-shot fringe projection profilometry.",
     {
         "start": {
+            "demo": ("demo:demo", "the whole benchmark in small: two objects, three methods, one table; a minute"),
             "build": ("build:build", "generate the benchmark: virtual rig, 50 objects, 6 views, 52 frames"),
             "import": (
                 "import_tree:import_tree",
@@ -158,7 +159,7 @@ fpp-eval schema
     default="score",
 )
 COMMANDS = BENCH.commands
-ONE_THREAD = "predict", "time", "reliance", "robustness", "tradeoff"
+ONE_THREAD = "demo", "predict", "time", "reliance", "robustness", "tradeoff"
 """Commands that compute with one thread unless ``--threads`` says otherwise; `diagnose` with one for each core."""
 
 _STREAMS = "stdout", "stderr"

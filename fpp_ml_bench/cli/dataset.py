@@ -4,6 +4,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from fpp_ml_bench.baselines.views import prediction_maps
 from fpp_ml_bench.calibration.result import VolumeError, volume_error_mm
 from fpp_ml_bench.cli import CHECK_FAILED
 from fpp_ml_bench.cli.console import gigabytes, millimetres, progress_bar, say_benchmark, show
@@ -11,9 +14,14 @@ from fpp_ml_bench.cli.options import SPLITS, command
 from fpp_ml_bench.constants import MM_PER_M, VIEWS
 from fpp_ml_bench.errors import BuildError, DatasetError
 from fpp_ml_bench.evaluation.result.file import write_json
+from fpp_ml_bench.evaluation.submission.description import read_submission
+from fpp_ml_bench.files import printable, write_files
+from fpp_ml_bench.loaders.cloud import write_cloud
+from fpp_ml_bench.loaders.pictures import contact_sheet, front_picture, sample_cloud, sample_picture
 from fpp_ml_bench.loaders.published.exporting import FORMS, SAMPLE_FORMS, chosen_splits
 from fpp_ml_bench.loaders.published.exporting import export as export_published
 from fpp_ml_bench.loaders.render.scene import PHOTOGRAPHED_BY
+from fpp_ml_bench.loaders.sample import DEPTH, DEPTH_EXACT
 from fpp_ml_bench.loaders.storage.benchmark import benchmark_of, benchmark_sentence
 from fpp_ml_bench.loaders.storage.card import split_statistics, whole_statistics
 from fpp_ml_bench.loaders.storage.manifest import Manifest, read_manifest
@@ -136,6 +144,7 @@ _ROWS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
 fpp-bench show data/mini power_drill_A60                 writes power_drill_A60.png
 fpp-bench show data/mini mug_A0 --out pictures/mug.png
 fpp-bench show data/mini mug_A0 --cloud                  also mug_A0.ply, and mug_A0.html to turn it in a browser
+fpp-bench show data/mini power_drill_A60 --predictions predictions --cloud    what a method made of it
 fpp-bench show data/full --sheet --out sheet.png         all 50 objects x 6 views
 fpp-bench show data/full --sheet --views 2               the first two views of each object
 """)
@@ -144,30 +153,57 @@ def show_sample(
     dataset: Path = argument("dataset folder", "DATASET"),
     sample: str | None = argument("sample such as power_drill_A60", "SAMPLE", None),
     cloud: bool = option(False, "also write the points: SAMPLE.ply, and SAMPLE.html to turn in a browser"),
+    predictions: Path | None = option(
+        None, "show the prediction in this folder, its error and its points instead", "DIR"
+    ),
     sheet: bool = option(False, "all objects and views on one sheet instead"),
     split: str = option("all", "split that --sheet shows (default: all)", "SPLIT"),
     views: int = option(len(VIEWS), "views of each object that --sheet shows, from the first (default: all)", "N"),
     out: Path | None = option(None, "picture to write (default: SAMPLE.png or sheet.png)", "FILE.png"),
 ) -> None:
-    """One sample as a picture (frames, depth, error, mask, mesh), or a contact sheet of every object and view."""
+    """Draw one sample (frames, depth, error, mask, mesh), a prediction of it, or a contact sheet of all objects."""
     if sheet == (sample is not None):
         raise DatasetError("expected either a SAMPLE or --sheet; `fpp-bench info DATASET --json -` lists the samples")
-    if sheet and cloud:
-        raise DatasetError("--cloud: expected a SAMPLE, whose points it writes, not --sheet; leave one of them out")
+    for flag, value in (("--cloud", cloud), ("--predictions", predictions)):
+        if sheet and value:
+            raise DatasetError(f"{flag}: expected a SAMPLE, which it shows, not --sheet; leave one of them out")
     picture = out or Path("sheet.png" if sheet else f"{sample}.png")
     if picture.suffix.lower() != ".png":
         raise DatasetError(f"--out {out}: expected a file ending in .png")
     opened = DatasetFolder(dataset)
-    from fpp_ml_bench.loaders.pictures import contact_sheet, sample_cloud, sample_picture
-
+    written = [picture]
     if sample is None:
         contact_sheet(opened, split, picture, views)
+    elif predictions is not None:
+        written = _prediction_picture(opened, sample, predictions, picture, cloud)
     else:
         opened.split_of_sample(sample)
         sample_picture(opened, sample, picture)
-    print(picture)
-    if sample is not None and cloud:
-        print(*sample_cloud(opened, sample, picture.parent, picture.stem), sep="\n")
+        written += sample_cloud(opened, sample, picture.parent, picture.stem) if cloud else []
+    print(*written, sep="\n")
+
+
+def _prediction_picture(opened: DatasetFolder, sample: str, folder: Path, picture: Path, cloud: bool) -> list[Path]:
+    """Draw the prediction of ``sample`` in ``folder`` to ``picture``, with ``cloud`` its points too; the files. Raises
+    PredictionError for predictions that could not be scored."""
+    split = opened.split_of_sample(sample)
+    target = DEPTH_EXACT if opened.has_exact else DEPTH
+    name, maps = prediction_maps(folder, opened, split, target)
+    submission, (depth_mm, _) = read_submission(folder), maps(sample)
+    content = {} if submission.predicted is None else submission.predicted.content
+    if changed := next((key for key, digest in content.items() if opened.content.get(key) != digest), None):
+        raise DatasetError(
+            f"{opened.path}: is not what {folder} was predicted from, {printable(changed)} is another; give "
+            "that dataset"
+        )
+    target_mm = np.where(opened.void(sample, target), 0, opened.target_mm(sample, target))
+    title = f"{sample}: {name}, {opened.size[1]} x {opened.size[0]} px"
+    frame = opened.frame(sample, next(iter(submission.frames_used), 0))
+    drawn = front_picture(frame, depth_mm, target_mm, opened.rig, title)
+    written = write_files(picture.parent, {picture.name: drawn}, DatasetError)
+    if cloud:
+        written += write_cloud(picture.parent, picture.stem, title, opened.rig, depth_mm, frame)
+    return written
 
 
 @command("""\

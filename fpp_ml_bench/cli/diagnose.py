@@ -147,6 +147,7 @@ def reliance(
     with progress_bar(f"reliance of {chosen.name}", len(scene_set.samples), "samples") as advance:
         # Called before each sample, so the first call is for none.
         measured, _ = measure_reliance(method, scene_set, sha256, lambda done, total, sample: advance(min(done, 1)))
+        advance(1)
     if json is not None:
         write_json(measured.model_dump(mode="json"), json)
     if entry is not None:

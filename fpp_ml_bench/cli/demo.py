@@ -1,0 +1,117 @@
+"""``fpp-bench demo``: the whole benchmark in small, by its own public commands."""
+
+import shlex
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import redirect_stdout
+from functools import partial
+from io import StringIO
+from pathlib import Path
+from time import perf_counter
+from typing import NamedTuple
+
+from fpp_ml_bench import __version__
+from fpp_ml_bench.cli import BENCH, EVAL, OK, run_program
+from fpp_ml_bench.cli.console import show
+from fpp_ml_bench.cli.options import command
+from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.metrics import RANK_KEY
+from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE
+from fpp_ml_bench.leaderboard.rows import Entry, read_entry
+from fpp_ml_bench.options import option
+from fpp_ml_bench.tables import Table
+
+OBJECTS = "power_drill,wooden_boards"
+"""The two test objects of the preset ``mini``."""
+SAMPLE = "power_drill_A60"
+METHODS = {"classical": "mini", "phase": "mini", "crossed": "mini-crossed"}
+"""Each method of the demo, and the dataset that it is run on."""
+NOTES = """\
+Object MAE: mean error on the object's pixels, against the exact depth. Overall MAE: the same over all pixels.
+Time: median of one depth map on one thread of this machine. Frames: images that are captured for a depth map.
+Phase reliance: 1, the depth follows the phase of the fringes and nothing else; 0, it does not follow it.
+phase assumes one albedo and a lit background; crossed and classical don't. Two objects are too few for a ranking."""
+
+
+class Step(NamedTuple):
+    """A public command as ``words``; ``kept`` says whether what it writes is there from an earlier run."""
+
+    words: list[str]
+    kept: Callable[[], bool] = lambda: False
+
+
+def steps_in(out: Path) -> Iterator[Step]:
+    """The commands of the demo, in their order, with everything they write below ``out``."""
+    for name in dict.fromkeys(METHODS.values()):
+        rig = ["--rig", "crossed"] if name == "mini-crossed" else []
+        build = ["fpp-bench", "build", "--out", str(out / name), "--preset", "mini", "--objects", OBJECTS, *rig]
+        yield Step(build)  # of a finished dataset it only says so
+    for method, name in METHODS.items():
+        data, predictions, result = str(out / name), out / method, out / f"{method}.json"
+        predict = ["fpp-bench", "predict", method, data, "--out", str(predictions)]
+        yield Step(predict, (predictions / SUBMISSION_FILE).is_file)
+        yield Step(["fpp-eval", str(predictions), "--target", "depth_exact", "--json", str(result)], result.is_file)
+        reliance = ["fpp-bench", "reliance", method, data, "--views", "1", "--into", str(result)]
+        yield Step(reliance, partial(_has_reliance, result))
+    results = [str(out / f"{method}.json") for method in METHODS]
+    yield Step(["fpp-bench", "leaderboard", *results, "--page", str(out / "page")])
+    show_it = ["fpp-bench", "show", str(out / "mini-crossed"), SAMPLE, "--predictions", str(out / "crossed")]
+    yield Step([*show_it, "--cloud", "--out", str(out / f"{SAMPLE}.png")])
+
+
+def _has_reliance(result: Path) -> bool:
+    return result.is_file() and _entry(result).row.reliance is not None
+
+
+def _entry(result: Path) -> Entry:
+    """The result of a step. Raises `SubmissionError` for one that another version of this package made."""
+    entry = read_entry(result)
+    made_by = entry.row.submission.software.get("fpp_ml_bench")
+    if made_by != __version__:
+        raise SubmissionError(f"{result}: made by version {made_by}, this is {__version__}; give a new folder by --out")
+    return entry
+
+
+@command(
+    """\
+fpp-bench demo
+fpp-bench demo --out /tmp/demo
+"""
+)
+def demo(*, out: Path = option(Path("demo"), "folder for all that it writes (default: demo)", "DIR")) -> int:
+    """Run the whole benchmark in small: build, predict, score, measure what was read, and show it in one table.
+
+    It takes about a minute on two cores. It runs public commands and prints them; a run that was stopped continues."""
+    started, steps = perf_counter(), list(steps_in(out))
+    for number, (words, kept) in enumerate(steps, 1):
+        line = shlex.join(words)
+        print(f"[{number}/{len(steps)}] {'kept: ' if kept() else ''}{line}", file=sys.stderr, flush=True)
+        if kept():
+            continue
+        with redirect_stdout(StringIO()):
+            status = run_program({"fpp-bench": BENCH, "fpp-eval": EVAL}[words[0]], words[1:])
+        if status != OK:
+            print(f"fpp-bench demo: stopped at step {number}; the same command continues there", file=sys.stderr)
+            return status
+    show(_table([_entry(out / f"{method}.json") for method in METHODS]))
+    written = {"page": out / "page/index.html", "picture": out / f"{SAMPLE}.png", "points": out / f"{SAMPLE}.html"}
+    print(NOTES, *("", "Written, to look at:"), sep="\n")
+    for what, path in written.items():
+        print(f"  {what:8}{path}")
+    print("\nThe same by hand:", *(f"  {shlex.join(words)}" for words, _ in steps), sep="\n")
+    print(f"\n{perf_counter() - started:.0f} s. Next: a method of yours, your predictions, your rig (README.md).")
+    return OK
+
+
+def _table(entries: list[Entry]) -> Table:
+    numbers = "Frames", "Object MAE, mm", "Overall MAE, mm", "Time, ms", "Phase reliance"
+    data = entries[0].row.dataset
+    title = f"{data.samples} views of {OBJECTS.replace(',', ' and ')}, {data.size[1]} x {data.size[0]} px"
+    table = Table("Method", numbers=numbers, title=title)
+    for entry in entries:
+        row = entry.row
+        values = (entry.value(RANK_KEY), 2), (row.metrics.overall_mae_mm, 2), (entry.latency_ms, 0)
+        reliance = None if row.reliance is None else row.reliance.score
+        cells = ("-" if value is None else f"{value:.{digits}f}" for value, digits in (*values, (reliance, 2)))
+        table.add_row(row.submission.method, str(entry.frames), *cells)
+    return table
