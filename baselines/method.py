@@ -97,7 +97,7 @@ class Method(ABC):
     name: what it is called on the command line and in submissions. purpose: what it does, one line of ``--help``.
     Options: a frozen dataclass, whose fields made with `fpp_ml_bench.options.option` are options of every command that
     takes a method. Training: the same for ``fpp-bench train``, None where there is nothing to train. trivial: whether
-    it gives a constant or the depth of the nearest training image, with which other errors are compared.
+    it ignores the image (a constant) or only looks up the nearest training image: a reference for other errors.
     scenes_rig: which of `NAMED_RIGS` photographs the scenes that are rendered for it, as of ``fpp-bench robustness``.
     title: name of the submission, with the settings that matter.
     frames_used: frames that must be captured, ascending. settings: everything needed to run it again.

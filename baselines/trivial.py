@@ -1,5 +1,5 @@
-"""Trivial methods: a constant depth, and the depth of the training sample with the nearest image. Other methods' errors
-are compared with theirs."""
+"""Trivial methods: a constant depth, and the depth of the nearest training image. Their errors are the reference that
+tells what another method's error is worth."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

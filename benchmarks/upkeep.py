@@ -1,5 +1,5 @@
 """Upkeep of what the repository shows of the leaderboard: its rows, the list of those that are vouched for, README's
-table and the tables of docs/robustness.md. Every step is a command of the package, printed before it runs.
+table and the tables of docs/results/robustness.md. Every step is a command of the package, printed before it runs.
 
     python benchmarks/upkeep.py rows data/full --work rows-work          every row of that dataset
     python benchmarks/upkeep.py measured leaderboard/rows/phase-horizontal.json reliance phase data/full
@@ -66,7 +66,7 @@ from fpp_ml_bench.leaderboard.tables import (
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 ROOT = Path(__file__).resolve().parent.parent
-ROWS, README, ROBUSTNESS = ROOT / "leaderboard" / "rows", ROOT / "README.md", ROOT / "docs" / "robustness.md"
+ROWS, README, ROBUSTNESS = ROOT / "leaderboard" / "rows", ROOT / "README.md", ROOT / "docs/results/robustness.md"
 COMMANDS = ROOT / "docs" / "commands.md"
 REFUSED, OUTDATED = 2, 1
 
@@ -188,8 +188,8 @@ _MADE_BY = "Made by `python benchmarks/upkeep.py readme` from the files in `lead
 _NOTE = (
     f"{_MADE_BY} Errors in mm. {columns.RANK_NOTE} {columns.TRUST_NOTE} Intervals: bootstrap over objects. "
     f"{columns.RATIO_NOTE} Time: median latency of one image. Phase reliance: 1 follows the fringe's phase and nothing "
-    "else, 0 does not follow it (docs/reliance.md). Disturbed: object MAE over all axes and severities of disturbed "
-    "scenes, with 150 mm for a pixel without an answer (docs/robustness.md)."
+    "else, 0 does not follow it (docs/diagnosis.md). Disturbed: object MAE over all axes and severities of disturbed "
+    "scenes, with 150 mm for a pixel without an answer (docs/results/robustness.md)."
 ).replace(NOT_CHECKED, f"\\{NOT_CHECKED}")
 _ERRORS = (
     Column("Object MAE, mm", partial(error, "object_mae_mm")),
@@ -374,7 +374,7 @@ def parser() -> argparse.ArgumentParser:
     add = jobs.add_parser("commands", help="write docs/commands.md").add_argument
     add("page", type=Path, nargs="?", default=COMMANDS, help="Markdown file")
     add("--check", action="store_true", help="write nothing; exit status 1 where it is not up to date")
-    add = jobs.add_parser("robustness", help="write the tables of docs/robustness.md").add_argument
+    add = jobs.add_parser("robustness", help="write the tables of docs/results/robustness.md").add_argument
     add("results", type=Path, nargs="+", help="result files, or folders of them")
     add("--page", type=Path, default=ROBUSTNESS, help="Markdown with the markers")
     return words
@@ -420,9 +420,9 @@ def write_robustness(args: argparse.Namespace) -> None:
     results = list(map(read_result, expand(args.results)))
     rows = {name: of_set(name, results) for name in SETS}
     blocks = {name: robustness_tables(rows[name]) for name in SETS}
-    blocks["test"] += f"\n![Error against severity for each axis, a line for each of five methods](pictures/{CURVES})\n"
+    blocks["test"] += f"\n![Error against severity for each axis, a line for each of five methods](../pictures/{CURVES})\n"
     write_atomically(args.page, filled(args.page, blocks).encode())
-    write_atomically(args.page.parent / "pictures" / CURVES, curves(rows["test"]))
+    write_atomically(args.page.parent.parent / "pictures" / CURVES, curves(rows["test"]))
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -55,7 +55,7 @@ def option(
 def argument(
     help: str, metavar: str, default: Any = REQUIRED, choices: Collection[str] = (), many: bool = False
 ) -> Any:
-    """A dataclass field that is an argument of the command line, told by its place; else as `option`."""
+    """A dataclass field that is an argument of the command line, given by its position; else as `option`."""
     description = Description(help, metavar, tuple(choices), many=many, positional=True)
     return field(default=default, metadata={_KEY: description})
 

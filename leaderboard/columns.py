@@ -15,18 +15,19 @@ from fpp_ml_bench.leaderboard.rows import Entry
 NOT_CHECKED = "*"
 NOT_MEASURED = "not measured"
 RANK_NOTE = (
-    "Rank: a range, because not every two rows can be told apart. A row is behind another where a sign-flip test of "
-    "their paired object means says so at 5%, by Holm's correction over all pairs of the table. First number: 1 + the "
-    "rows that it is behind. Last number: all ranked rows without those that are behind it."
+    "Rank: a range, because not every pair of rows differs significantly. Each pair is compared by a sign-flip test of "
+    "the paired object means, at 5% with Holm's correction over all pairs of the table. Best rank: 1 + the number of "
+    "rows that are significantly better; worst rank: the number of ranked rows minus those significantly worse."
 )
 RATIO_NOTE = (
-    "x trivial: object MAE divided by that of the best trivial method (a constant depth, or the depth of the training "
-    "sample with the nearest image) that is given no more ground truth than the methods of the table. "
+    "x trivial: object MAE divided by that of the best trivial method (a constant depth, or the depth of the nearest "
+    "training image) that is given no more ground truth than the methods of the track. "
     "Of depth range: object MAE divided by the depth range of each sample."
 )
 TRUST_NOTE = (
-    "(4): a place without a rank, 1 + the ranked rows with a smaller error; the maintainers don't vouch for this row. "
-    f"{NOT_CHECKED} time, phase reliance and robustness as the author reports them, not measured here."
+    "(4): not ranked, because the maintainers do not vouch for the row; 1 + the number of ranked rows with a smaller "
+    "error. "
+    f"{NOT_CHECKED} time, phase reliance and robustness as their author reports them, not measured here."
 )
 NOTE = (
     f"Errors in mm, mean over samples; 95% interval from a bootstrap over objects. {RANK_NOTE} {TRUST_NOTE} "

@@ -1,1 +1,2 @@
-"""crossed-net: what one crossed frame leaves open, learned; the depth itself is computed (docs/crossed.md)."""
+"""crossed-net: a network decides what one crossed frame leaves open; the depth itself is computed
+(docs/phase_and_order.md)."""

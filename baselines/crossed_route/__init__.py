@@ -1,1 +1,1 @@
-"""Absolute depth from a frame with two crossed fringes, measured; nothing learned (docs/crossed.md)."""
+"""Absolute depth from one frame with two crossed fringes; nothing is learned (docs/phase_and_order.md)."""

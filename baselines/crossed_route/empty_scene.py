@@ -1,7 +1,7 @@
-"""The background plane in a crossed frame: where both phases are the plane's, and what grey levels it gives.
+"""The background plane in a crossed frame: the pixels where both phases are the plane's, and their grey levels.
 
-The plane's phases are calibrated, its lamp is not: its light, the contrast of the fringes and the curve of projector
-and camera are fitted to the pixels that show the plane. So no absolute grey level is needed.
+The plane's phases are known from the rig, the light is not: the lamp's brightness, the contrast of the fringes, and the
+response of projector and camera are fitted to the pixels that show the plane. So no absolute grey level is needed.
 """
 
 import cv2

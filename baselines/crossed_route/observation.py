@@ -1,4 +1,4 @@
-"""What the crossed route is asked for, and what it answers."""
+"""Data of the crossed route: its settings, what it has measured, and its result."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -52,9 +52,9 @@ class CrossedObservation:
     """A frame measured around its object, maps (h, w) of the part ``carriers.crop`` of an image of ``shape`` (H, W):
     ``grey`` float32; ``inside``: object; ``fit``; ``phase_rad`` and ``modulation`` float32 (2, h, w): wrapped phases
     and grey levels of the first windows; ``contrast``: modulation over mean of each carrier, in this image; ``margin``:
-    by how much more the rival order's energy costs, and ``evidence``: the rival's misfit less the chosen one's, in half
-    squared sigmas; ``rival``: nearness of the rival; ``candidates`` (3, h, w): a turn further, the chosen order, and a
-    turn nearer; ``clipped_share``: of the window, saturated."""
+    energy of the rival order minus that of the chosen one; ``evidence``: the same difference for the cost of the phase
+    misfit alone (a misfit of s standard deviations costs s^2 / 2); ``rival``: nearness of the rival; ``candidates`` (3,
+    h, w): a turn further, the chosen order, and a turn nearer; ``clipped_share``: of the window, saturated."""
 
     carriers: Carriers
     shape: tuple[int, ...]

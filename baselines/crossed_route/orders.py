@@ -1,8 +1,9 @@
 """The nearness at every grid point: the turn at which both phases agree, by least energy over pairs of neighbours.
 
-The carrier with the larger gain proposes: each of its orders in the working range is a candidate, whose nearness is
-the best for both phases. Its cost is the distance, in rad, at which both phases miss it. A single point is wrong where
-noise or a depth edge reaches the nearest rival; the energy lets neighbours decide (`phase_route.least_energy`).
+Each order of the carrier with the larger gain that lies in the working range is a candidate. Its nearness is the one
+that fits both phases best, and its cost grows with the remaining distance from both phases, in rad. A single point is
+wrong where noise or a depth edge makes a rival fit better; there the energy lets its neighbours decide
+(`phase_route.least_energy`).
 """
 
 from dataclasses import dataclass
@@ -70,9 +71,9 @@ def chosen(
     more_cost: Image | None = None,
 ) -> tuple[NDArray[np.int32], Image, Image]:
     """Index of the candidate of least energy, int32 (h', w'), the margin of the energy (0 for a tie), and the evidence:
-    the cost of the best rival less its own, in half squared sigmas; ``trust`` (h', w'): weight of a point's evidence,
-    0 to 1; ``links`` along x and y: weight of the smoothness between neighbours (default: 1 on the object);
-    ``more_cost`` (K, h', w'): of the candidates, beside that of their misfit, in half squared sigmas."""
+    cost of the best rival minus cost of the chosen candidate. A misfit of s standard deviations costs s^2 / 2.
+    ``trust`` (h', w'): weight of a point's evidence, 0 to 1; ``links`` along x and y: weight of the smoothness between
+    neighbours (default: 1 on the object); ``more_cost`` (K, h', w'): added to the misfit's cost of each candidate."""
     most = np.float32(MOST_SIGMAS**2 / 2)
     cost = np.minimum((found.misfit_rad / np.float32(PHASE_SIGMA_RAD)) ** 2 / 2, most)
     if more_cost is not None:

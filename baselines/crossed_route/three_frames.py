@@ -1,10 +1,10 @@
 """Three crossed frames that shift one carrier and keep the other still: depth from each pixel's own phase.
 
 The shifted carrier's phase is the three-step least squares of `fpp_ml_bench.coding`, pixel by pixel, so that nothing
-mixes two surfaces at an edge. In the mean of the frames that carrier cancels and the other one is left, which only
-chooses the order: by its phase in a window, and by the light of each pixel itself, since the first carrier's modulation
-says how bright the pixel is. A phase of three frames has the noise of the camera. It is averaged over pairs of pixels
-that lie opposite each other, where noise explains that all three lie on one plane; no other pixel takes part.
+mixes two surfaces at an edge. In the mean of the frames that carrier cancels, and the other one is left. It is used for
+the order alone, in two ways: by its phase in a window, and by the grey level of each single pixel, whose brightness is
+known from the first carrier's modulation. A phase of three frames has the noise of the camera. It is averaged over
+pairs of pixels on opposite sides, but only pairs that lie on one plane with the pixel within the noise.
 """
 
 from collections.abc import Sequence
@@ -172,9 +172,10 @@ class ThreeFrameRoute(CrossedRoute):
         inside: Mask,
         background: Background,
     ) -> Image:
-        """Cost of every candidate (K, h, w) in half squared sigmas: how far the still carrier is at its depth from what
-        ``light``, the mean of the frames less ambient light, shows over the brightness that the own ``modulation``
-        tells. Light from other surfaces is what the candidates of least misfit leave, in the median around a pixel."""
+        """Cost of every candidate (K, h, w); a deviation of s standard deviations costs s^2 / 2. The deviation is
+        that of the measured cosine of the still carrier from the cosine expected at the candidate's depth. The measured
+        one follows from ``light`` (mean of the frames minus ambient light) and the brightness, which ``modulation``
+        gives. Light from other surfaces is the local median of what the candidates of least misfit leave."""
         still = 1 - self.moved
         bright = np.maximum(modulation / np.float32(contrast[self.moved]), np.float32(LEAST_BRIGHT))
         expected = np.cos(carriers.infinity_rad[still] + carriers.gain[still] * found.nearness)

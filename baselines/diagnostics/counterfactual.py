@@ -3,7 +3,7 @@
 Each test object is rendered again with a single property changed, so that the correct change of depth is known, and is
 compared with the change of the prediction. A sample's score is the product of `follows`, over moves of the phase within
 the object, and of 1 - `relative_change` under other outlines over the same phase, at least 0. The method's score is the
-mean over samples, with a bootstrap over objects. docs/reliance.md defines and explains it: units, missing predictions,
+mean over samples, with a bootstrap over objects. docs/diagnosis.md defines and explains it: units, missing predictions,
 and *order-free* values, which allow errors of whole periods.
 """
 

@@ -1,4 +1,4 @@
-"""The paper's two theorems (Section 4.2), checked numerically (docs/reliance.md); the subject is not used.
+"""The paper's two theorems (Section 4.2), checked numerically (docs/phase_and_order.md); the subject is not used.
 
 *A single fringe does not determine depth*: surfaces a whole period apart on every ray give the same frame of that
 direction, noise included, if at each pixel the brighter one gets a lower albedo (in direct light from a projector in

@@ -1,8 +1,9 @@
 """Input of the network: maps of one image that mean the same for any rig, fringe direction and distance.
 
-The measured route gives every pixel a wrapped phase and a *base order*. The network gets that and its two neighbours:
-how bright the pixel would be with each against how bright it is, and whether the depth lies in the working range. No
-map holds a distance. Maps are rotated so that phase grows downwards and with nearness, whatever the fringe direction.
+The phase route gives every pixel a wrapped phase and a *base order*. For the base order and the orders before and after
+it, the network gets the expected brightness compared with the measured one, and whether the depth lies in the working
+range. No map holds a distance. Maps are rotated so that phase grows downwards and with nearness, whatever the fringe
+direction.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,5 +1,5 @@
-"""The network: a small U-Net on 2 x 2 blocks of pixels; order, object or not, and a phase correction a pixel. And the
-files of networks inside a route, of whatever family: written in half precision, read and checked."""
+"""The network: a small U-Net on 2 x 2 blocks of pixels. For each pixel it gives the order, object or background, and a
+phase correction. Also the weights files of all networks inside a route: written in half precision, read and checked."""
 
 from collections.abc import Callable
 from copy import deepcopy

@@ -1,5 +1,5 @@
-"""What a `PhaseNet` answers for an image, its order by least energy, and how likely that order is wrong: as it is
-stated, calibrated on validation views."""
+"""The output of a `PhaseNet` for an image, the order of least energy, and the stated probability that this order is
+wrong, which is calibrated on validation views."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,9 +1,9 @@
-"""Training phase-net: the measured route's scene of each view with the true phase, windows varied as other scenes would
-vary them, and what is chosen on validation views. ``out`` also holds reliability.png.
+"""Training phase-net: the measurement of the phase route for each view beside the true phase, the augmentation of
+windows, and the choice of constants on validation views. ``out`` also holds reliability.png.
 
-Whole objects are moved to another distance, with the light that the calibrated lamp would give and the measured route's
-errors as they were. Wrong base orders are made up in patches and whole windows, because the training objects have few.
-Columns are mirrored, as with a projector on the other side. Brightness varies a little.
+Whole objects are moved to another distance, with the brightness that the calibrated lamp would give there and unchanged
+phase errors. Wrong base orders are simulated in patches and whole windows, because they are rare on training objects.
+Columns are mirrored, as with a projector on the other side. Brightness is varied a little.
 """
 
 from collections.abc import Iterable, Mapping

@@ -1,6 +1,6 @@
-"""Training a network on windows of rendered views; no dataset is needed: what phase-net, crossed-net and classical-net
-have in common. Views in drawn lights are rendered, measured, and cut into windows; a moving average of the weights is
-kept; mask and order are chosen on validation views.
+"""What the trainings of phase-net, crossed-net and classical-net have in common: windows of rendered views; no dataset
+is needed. Views in drawn lights are rendered, measured, and cut into windows; a moving average of the weights is kept;
+mask and order are chosen on validation views.
 
 ``out`` holds ``views/``, the files of the engine and, at the end, the weights instead of the checkpoint. A stopped
 training continues at every stage.
@@ -139,7 +139,7 @@ class StepRecipe(ABC):
         """What the network learns from views of ``rig``."""
 
     def usual_rig(self) -> Rig:
-        """For which it trains unless told otherwise."""
+        """The rig for which it trains by default."""
         return paper_rig()
 
     def rate_at(self, step: int) -> float:

@@ -1,7 +1,7 @@
 """The fixed calibration layer: wrapped phase and fringe order to depth, in closed form, for any rig.
 
-With ``a = R (x, y, 1)`` the projector sees a pixel's ray at ``(Z a_i + t_i) / (Z a_2 + t_2)``, and far out at
-``a_i / a_2``. The residual phase is the absolute phase minus that of the point at infinity,
+With ``a = R (x, y, 1)`` the projector sees the pixel's point at ``(Z a_i + t_i) / (Z a_2 + t_2)``, and
+the point at infinity at ``a_i / a_2``. The residual phase is the absolute phase minus that of the point at infinity,
 ``psi = (2 pi f_p / P) (t_i - t_2 a_i / a_2) / (Z a_2 + t_2)``, for the paper's rig ``-2 pi f_p C / (P Z)``. It varies
 as slowly as 1 / Z does, and gives depth back without subtracting large numbers, so that float32 is enough.
 """

@@ -1,8 +1,8 @@
 """The expected error of each pixel in mm, and the reasons not to trust a pixel.
 
-The error adds noise and misfit of the local fit (its rms misfit over brightness is a phase error, which the calibration
-layer's slope turns into depth), the rim (there the fit extrapolates instead of averaging), and the order (its margin
-gives the probability of being a period off, whose error in mm is known).
+The expected error has three parts. Phase: noise and misfit of the local fit (rms misfit divided by brightness is a
+phase error, and the slope of the calibration layer turns it into mm). Rim: there the fit extrapolates instead of
+averaging. Order: its margin gives the probability of a wrong order, whose error in mm is known.
 """
 
 import cv2
@@ -22,7 +22,7 @@ LEAST_MARGIN = 0.1
 MARGIN_SCALE = 0.04  # margin by which the odds of two orders grow e-fold
 MISFIT_SHARE, UNKNOWN_MISFIT_SHARE = 0.3, 0.75
 """Phase error of a local fit as a share of its relative misfit: on the benchmark's objects, and where no known
-background shows, so that light and surface may be any (a real skull, `docs/phase_route.md`)."""
+background shows, so that light and surface may be any (a real skull, `docs/results/phase_route.md`)."""
 SATURATED_SHARE = 0.02
 SLOWEST, FASTEST = 0.35, 2.2
 """Fringe frequency in the image, as a multiple of that of a plane square to the axis, that a window resolves."""

@@ -1,8 +1,8 @@
-"""Orders that the working range settles: without brightness, a whole smooth surface has to lie in the range.
+"""Fringe orders from the working range alone, without brightness: the whole of a smooth surface must lie in the range.
 
-A pixel alone often has several orders in the range. All pixels of a smooth surface shift by the same number of periods,
-so an order is settled where every other one would put a part of its surface out of the range. Where another one keeps
-the surface within it, nothing tells the two apart, and the order is ambiguous.
+A single pixel often has several orders in the range. Over a smooth surface, all pixels share one error of the order. So
+an order is settled if every other order would put a part of the surface outside the range. If another order keeps the
+whole surface inside, the two can't be distinguished, and the order is ambiguous.
 """
 
 import cv2

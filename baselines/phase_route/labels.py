@@ -1,9 +1,9 @@
 """The candidate order of each pixel by sequential tree-reweighted message passing (Kolmogorov 2006, "TRW-S").
 
-Plain belief propagation keeps the result of its first sweep where smoothness is strong and brightness weak. Written
-twice, for the same numbers: compiled in `label_kernels`, and here in NumPy. A node depends on its left and upper
-neighbours (backwards: right and lower), so all nodes of an anti-diagonal can be computed at once: row d of a sheared
-map holds the nodes (i, d - i), at index i.
+Plain belief propagation does not improve on its first sweep where smoothness is strong and brightness weak. There are
+two implementations with the same results: compiled code in `label_kernels`, and NumPy here. A node depends on its left
+and upper neighbours (backwards: right and lower), so all nodes of an anti-diagonal can be computed at once: row d of a
+sheared map holds the nodes (i, d - i), at index i.
 """
 
 import numpy as np

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 ORDER_SHARE = (0.16, 0.10, 0.05)
 """Actual error from wrong orders as a share of the expected one, with 1, 2, and 3 or more frames, over training views
-(14 of each direction; measured again on version 1 of the benchmark: 0.06, 0.10 and 0.05, docs/frames.md).
+(14 of each direction; measured again on version 1 of the benchmark: 0.06, 0.10 and 0.05, docs/results/frames.md).
 The margin of an order overestimates the probability that it is wrong; these factors correct that."""
 
 

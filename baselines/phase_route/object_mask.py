@@ -1,8 +1,9 @@
 """The object mask: pixels whose grey level the empty scene does not explain; where none is known, modulated pixels.
 
-Twice a period the object's fringe is as bright as the plane's would be, and a single pixel there does not show which it
-is. Inside the object closing by a quarter of a period fills these stripes. At the silhouette two predictions compete,
-the empty scene's, and that of the object's own fringe, extrapolated from the local fit beside it: the nearer wins.
+Twice a period the object's fringe is as bright as the plane's would be, so a single pixel there can't be assigned to
+either. Inside the object, morphological closing by a quarter of a period fills these stripes. At the silhouette, a
+pixel is assigned to the better of two predictions of its grey level: that of the empty scene, and that of the object's
+fringe, extrapolated from the local fit beside it.
 """
 
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What the phase route is asked for, what it has measured before it chooses the fringe orders, and what it answers."""
+"""Data of the phase route: its settings, what it has measured before the fringe orders are chosen, and its result."""
 
 from dataclasses import dataclass
 from enum import IntEnum

@@ -1,4 +1,4 @@
-"""The choice of each pixel's fringe order, without learning: by brightness and smoothness (docs/phase_route.md).
+"""The choice of each pixel's fringe order, without learning: by brightness and smoothness (docs/phase_and_order.md).
 
 The phase fixes how fast 1/Z changes along the surface, the order fixes Z itself: together they give distance and normal
 of every candidate, and so the brightness of a matte surface there. That assumes the same albedo for plane and objects,

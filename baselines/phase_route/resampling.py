@@ -1,8 +1,8 @@
-"""Images whose fringe period is far from the one that a method was made for: resampled before, and the answer after.
+"""Images with a fringe period far from the one that a method was made for: resampled, and the result sampled back.
 
 Windows, steps of the grid of orders and filters of a network have a size in pixels of the fringe. So an image with a
-period of 116 px is measured at 22.6 px, and a network that learnt from 22.6 px gets an image of 6 px enlarged. Nothing
-is lost of a longer period: a local fit averages over a quarter of it anyway, and the image is shrunk by averaging.
+period of 116 px is measured at 22.6 px, and a network that learnt from 22.6 px gets an image of 6 px enlarged. A
+longer period loses nothing: a local fit averages over a quarter of it anyway, and the image is shrunk by averaging.
 """
 
 from collections.abc import Callable

@@ -1,9 +1,9 @@
 """Which frames to capture, and phase and object mask from two or more of one direction.
 
-From three frames on the phase is the N-step least squares of `fpp_ml_bench.decoding`, pixel by pixel, so nothing mixes
-two surfaces at a depth edge, and object pixels are those whose frames the empty scene does not explain. Two frames
-leave one unknown too many, but a fringe goes down to black: its mean is its modulation plus ambient light. With
-that constraint a window of a few px (`Settings.pair_window`) is enough.
+With three or more frames, the phase is the N-step least squares of `fpp_ml_bench.decoding`, pixel by pixel, so that two
+surfaces are never mixed at a depth edge. Object pixels are those whose frames the empty scene does not explain. Two
+frames have one equation too few, but a projected fringe goes down to black: its mean is its modulation plus ambient
+light. With that constraint a window of a few px (`Settings.pair_window`) is enough.
 """
 
 from collections.abc import Iterable, Iterator, Sequence

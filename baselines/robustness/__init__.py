@@ -1,2 +1,2 @@
-"""FPP-C: what breaks a method, axis by axis. Scenes are disturbed in the image formation, and the answers scored, with
-a fixed charge for silence."""
+"""FPP-C: which disturbance breaks a method, axis by axis. A disturbance changes one stage of the image formation. A
+pixel without an answer is charged a fixed error."""

@@ -1,5 +1,6 @@
-"""FPP-C's rules: what disturbs a scene, each one stage of the image formation at five severities (``axes.yaml``), and
-what a prediction of it is worth: errors with a fixed charge for silence, and honesty about them.
+"""The rules of FPP-C: the axes, each of which changes one stage of the image formation at five severities
+(``axes.yaml``), and the scores: errors with a fixed charge for a pixel without an answer, and how honest the stated
+uncertainty is.
 
 Scored are the object pixels of the undisturbed scene that are not void, against its exact depth. A pixel without an
 answer is charged half an order, so that "I don't know" is better than a wrong order and worse than a right one.

@@ -1,5 +1,5 @@
-"""Measuring a method axis by axis: predictions of disturbed views in processes, a file for each finished axis; and what
-they make together: means by severity, the mean over all of them, and its interval."""
+"""Measures a method axis by axis: predicts disturbed views in several processes, writes a file for each finished axis,
+and summarises them: means by severity, the mean over all of them, and its interval."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence

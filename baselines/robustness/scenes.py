@@ -1,4 +1,4 @@
-"""The disturbed views of a set: only the frames that a method uses, rendered when they are asked for, and kept.
+"""The disturbed views of a set: only the frames that a method uses, rendered on demand and cached.
 
 The cache is a folder for each condition with a file for each frame; a file depends on nothing but the condition and the
 view, so methods share it. The folders that were used longest ago go where it would grow beyond its limit.

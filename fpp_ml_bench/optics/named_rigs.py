@@ -12,7 +12,7 @@ CROSSED = Crossed((18.0, 18.0), (144.6, 54.6), shifts_deg=FIRST_SHIFTED_DEG)
 """The crossed rig's frames. The first carrier is turned 16 degrees from across the epipolar lines, where its phase
 changes fastest with depth, and the second is square to it: it changes 2 / 7 as much, so that rivals are 1.7 rad
 away but for the ends of the range, and the background 0.9 rad and more. 18 px survive a defocus that leaves
-nothing of finer fringes (docs/crossed.md)."""
+nothing of finer fringes (docs/results/crossed.md)."""
 
 
 def paper_rig(size: int = FULL_SIZE) -> Rig:

@@ -54,8 +54,8 @@ CAUSES = {
     Reason.INCONSISTENT_ORDER: "the sequence (order, steps, sign, pitches, Gray code) is not what was projected",
     Reason.OUTSIDE_PATTERN: "the sequence (order, sign, pitches) or the projector's size is not what was projected",
     Reason.DIRECTIONS_DISAGREE: "the rig's pose is not this scanner's, or the directions are swapped",
-    Reason.OUTSIDE_RANGE: "working_range_mm does not hold the object (--range), or the rig's pose or unit is not this "
-    "scanner's",
+    Reason.OUTSIDE_RANGE: "working_range_mm does not hold the object (--working-range), or the rig's pose or unit is "
+    "not this scanner's",
 }
 """Why nothing is decoded, by the reason of most pixels."""
 FEWEST_POSES = 3
@@ -66,7 +66,7 @@ RANGE_MARGIN = 0.1
 @dataclass(frozen=True)
 class DecodedCapture:
     """A decoded capture: maps (H, W) of standard uncertainty by noise in mm (0 = no depth), modulation and mean of the
-    frames in grey levels; the noise of a frame, and whether the frames told it; ``notes`` are sentences;
+    frames in grey levels; the noise of a frame, and whether it was estimated from the frames; ``notes`` are sentences;
     ``examination``: what the frames say about themselves."""
 
     decoded: Decoded

@@ -183,7 +183,7 @@ class DatasetFolder:
 
     def left_out(self, sample: str, rule: RangeRule, column: str = DEPTH) -> NDArray[np.bool_] | None:
         """Pixels that the depth range by ``rule`` leaves out of ``column``, bool (H, W), None for none: the void ones;
-        and of the exact depth what has no decoded one, because methods are told the range of ``depth``."""
+        and of the exact depth what has no decoded one, because methods are given the range of ``depth``."""
         if rule == "valid":
             return self.void(sample)
         return ~object_mask(self.depth_mm(sample)) if column == DEPTH_EXACT else None

@@ -1,4 +1,4 @@
-"""The predictors that look at nothing, or only for the nearest training image."""
+"""The trivial methods: a constant depth, and the depth of the nearest training image."""
 
 from dataclasses import replace
 
