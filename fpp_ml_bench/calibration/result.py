@@ -200,7 +200,7 @@ def draw_residuals(calibration: Calibration) -> bytes:
     plots[1, 2].axis("off")
     handles, labels = plots[0, 0].get_legend_handles_labels()
     plots[1, 2].legend(handles, labels, loc="upper left", ncols=1 + len(poses) // 20, markerscale=3)
-    return figure_png(drawn)
+    return figure_png(drawn, reduced=True)
 
 
 def _bars(axes: "Axes", calibration: Calibration) -> None:

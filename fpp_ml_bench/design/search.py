@@ -270,7 +270,7 @@ def draw_design(rig: Rig, proposed: Candidate, other: Candidate, assumed: Assump
     )
     plots[1, 0].legend()
     _draw_map(plots[1, 1], rig, lines, proposed, assumed)
-    return figure_png(drawn)
+    return figure_png(drawn, reduced=True)
 
 
 def _title(crossed: Crossed) -> str:
@@ -292,7 +292,7 @@ def _draw_torus(axes: "Axes", lines: EpipolarLines, candidate: Candidate) -> Non
             "x",
             ms=11,
             mew=3,
-            color="C3",
+            color="C1",
             label="background",
         )
     axes.set(
