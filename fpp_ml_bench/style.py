@@ -21,7 +21,7 @@ LINE_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9"
 INK, SOFT, GRID = "#191c20", "#59616b", "#dfe1e5"
 """Colours of text, of what explains it, and of grids."""
 DPI = 120
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "axes.edgecolor": SOFT,
     "axes.titlesize": 10,
     "figure.titlesize": 11,
@@ -36,7 +36,8 @@ _STYLE = {
     "ytick.labelsize": 8,
 }
 
-Arguments, Drawn = ParamSpec("Arguments"), TypeVar("Drawn")
+Arguments = ParamSpec("Arguments")
+Drawn = TypeVar("Drawn")
 
 
 def styled(draw: Callable[Arguments, Drawn]) -> Callable[Arguments, Drawn]:
@@ -44,9 +45,10 @@ def styled(draw: Callable[Arguments, Drawn]) -> Callable[Arguments, Drawn]:
 
     @wraps(draw)
     def in_style(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Drawn:
-        import matplotlib
+        from matplotlib import rc_context
+        from matplotlib.rcsetup import cycler
 
-        with matplotlib.rc_context(_STYLE | {"axes.prop_cycle": matplotlib.cycler(color=LINE_COLOURS)}):
+        with rc_context(_STYLE | {"axes.prop_cycle": cycler(color=LINE_COLOURS)}):
             return draw(*args, **kwargs)
 
     return in_style
