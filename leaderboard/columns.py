@@ -15,19 +15,18 @@ from fpp_ml_bench.leaderboard.rows import Entry
 NOT_CHECKED = "*"
 NOT_MEASURED = "not measured"
 RANK_NOTE = (
-    "Rank: a range, because not every pair of rows differs significantly. Each pair is compared by a sign-flip test of "
-    "the paired object means, at 5% with Holm's correction over all pairs of the table. Best rank: 1 + the number of "
-    "rows that are significantly better; worst rank: the number of ranked rows minus those significantly worse."
+    "Rank range: ranks that the paired tests can't exclude. A sign-flip test compares each pair of rows object by "
+    "object; two rows differ where p is at most 5% after Holm's correction over all pairs of the table. The first rank "
+    "is 1 + the number of better rows, the last is the number of ranked rows minus that of the worse rows."
 )
 RATIO_NOTE = (
-    "x trivial: object MAE divided by that of the best trivial method (a constant depth, or the depth of the nearest "
-    "training image) that is given no more ground truth than the methods of the track. "
-    "Of depth range: object MAE divided by the depth range of each sample."
+    "x trivial: object MAE divided by that of the best trivial method (a constant depth, or the depth of the most "
+    "similar training image) that is given no more of the ground truth than the methods of the table. "
+    "Of depth range: object MAE divided by the depth range of each sample's object."
 )
 TRUST_NOTE = (
-    "(4): not ranked, because the maintainers do not vouch for the row; 1 + the number of ranked rows with a smaller "
-    "error. "
-    f"{NOT_CHECKED} time, phase reliance and robustness as their author reports them, not measured here."
+    "(4): not ranked, because no maintainer vouches for the row; 1 + the number of ranked rows with a smaller error. "
+    f"{NOT_CHECKED}: time, phase reliance or robustness as the row's author reports it, not measured here."
 )
 NOTE = (
     f"Errors in mm, mean over samples; 95% interval from a bootstrap over objects. {RANK_NOTE} {TRUST_NOTE} "

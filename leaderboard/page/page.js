@@ -4,6 +4,7 @@
   const all = (selector, within = document) => [...within.querySelectorAll(selector)];
   const form = document.getElementById("filters");
   const selects = form ? all("select", form) : [];
+  const columns = document.getElementById("columns");
   const tables = all("table.ranking");
   const state = new URLSearchParams();
 
@@ -69,9 +70,14 @@
     all("[data-of]").forEach((row) => { row.hidden = !shown.has(row.dataset.of); });
     const message = shown.size === count ? "" : shown.size + " of " + count + " rows shown";
     document.getElementById("shown").textContent = message;
-    const entries = { q: search, hide: refused.join(",") };
+    const entries = { q: search, hide: refused.join(","), columns: columns.checked ? "all" : "" };
     for (const select of selects) entries[select.name] = select.value;
     for (const [key, value] of Object.entries(entries)) value ? state.set(key, value) : state.delete(key);
+  }
+
+  // On a phone, all columns are the list behind each row.
+  function showAll() {
+    all("details.rest").forEach((rest) => { rest.open = columns.checked; });
   }
 
   function restore() {
@@ -88,17 +94,38 @@
       select.value = state.get(select.name) || "";
       if (select.selectedIndex < 0) select.value = "";
     }
+    columns.checked = state.get("columns") === "all";
+    showAll();
     const hidden = (state.get("hide") || "").split(",");
     all("input[name=provenance]", form).forEach((box) => { box.checked = !hidden.includes(box.value); });
     filter();
   }
 
   if (form) {
-    form.hidden = false;
+    const box = document.getElementById("filter-box");
+    box.hidden = false;
+    box.open = matchMedia("(min-width: 52rem)").matches || location.hash.includes("=");
     const changed = () => { filter(); remember(); };
     form.addEventListener("input", changed);
+    columns.addEventListener("input", showAll);
     form.addEventListener("submit", (event) => event.preventDefault());
-    form.addEventListener("reset", () => setTimeout(changed));
+    form.addEventListener("reset", () => setTimeout(() => { showAll(); changed(); }));
+  }
+
+  // A number that is cut reads as another, so a cell shows nothing while the table's edge or its sticky columns cut it.
+  function hideCut(box) {
+    const heads = all("thead th", box);
+    const stays = heads.map((head) => getComputedStyle(head).position === "sticky");
+    const places = heads.map((head) => head.getBoundingClientRect());
+    const frame = box.getBoundingClientRect();
+    const left = Math.max(frame.left, ...places.filter((_, column) => stays[column]).map((place) => place.right));
+    const cut = places.map((place, column) => !stays[column] && (place.left < left - 1 || place.right > frame.right + 1));
+    all("tr", box).forEach((row) => [...row.cells].forEach((cell, column) => cell.classList.toggle("cut", cut[column])));
+  }
+  const resized = new ResizeObserver((changes) => changes.forEach(({ target }) => hideCut(target.closest(".scroll"))));
+  for (const box of all(".scroll:has(thead)")) {
+    box.addEventListener("scroll", () => hideCut(box));
+    all("table", box).concat(box).forEach((part) => resized.observe(part));
   }
 
   // Highlight a row's mark under the mouse, and a mark's row.

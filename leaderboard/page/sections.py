@@ -16,10 +16,10 @@ from fpp_ml_bench.evaluation.report.html import interval_text, signed
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import columns
 from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, Group, Ranked, is_trivial
+from fpp_ml_bench.leaderboard.page.cells import LogScale, cells, machines
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
 from fpp_ml_bench.loaders.storage.benchmark import benchmark_before
 
-_SPARSE = (*columns.PARTS, columns.RATIO, columns.RANGE, *columns.UNCERTAINTY)
 _TRADEOFF_PICTURE = 430, 380
 _SHADES = 6
 
@@ -30,7 +30,8 @@ def blocks(groups: Sequence[Group], slugs: Mapping[int, str]) -> list[dict[str, 
     datasets: list[dict[str, Any]] = []
     for data, members in groupby(groups, key=lambda group: group.key.data_title):
         of_data = list(members)
-        key, rows = of_data[0].key, [row for group in of_data for row in group.rows]
+        key, drawn_groups = of_data[0].key, of_one_target(of_data)
+        rows = [row for group in drawn_groups for row in group.rows]
         name = key.benchmark.name if key.benchmark is not None else data.split(", ")[0]
         numbered = [(n, row.short_name, slugs[id(row.entry)]) for n, row in enumerate(rows, start=1)]
         datasets.append(
@@ -40,12 +41,19 @@ def blocks(groups: Sequence[Group], slugs: Mapping[int, str]) -> list[dict[str, 
                 "title": data,
                 "short": key.special_data or name,
                 "main": not datasets or not key.special_data,
-                "figures": overview_figures(of_data, slugs),
-                "targets": sorted({group.key.against for group in of_data}),
+                "figures": overview_figures(drawn_groups, slugs),
+                "against": drawn_groups[0].key.against,
+                "left_out": len({group.key.against for group in of_data}) > 1,
                 "sections": [_section(group, _link(group, of_data)) for group in of_data],
             }
         )
     return datasets
+
+
+def of_one_target(groups: Sequence[Group]) -> list[Group]:
+    """The groups whose errors a picture may join: those against exact depth, all where there is none."""
+    exact = [group for group in groups if group.key.target == "depth_exact"]
+    return exact or list(groups)
 
 
 def anchor(group: Group) -> str:
@@ -67,26 +75,29 @@ def _section(group: Group, link: str) -> dict[str, Any]:
     """What the template needs of a group: its heading, its rows' intervals, objects and pairs."""
     key = group.key
     mode = "" if key.mode == "standard" else f", mode {key.mode}"
-    machines = sorted({columns.device(r.entry) for r in group.rows if r.entry.latency_ms is not None})
     per_object = [row.object_means(DEFAULT_SORT) for row in group.rows[:MOST_PAIRED]]
     objects = sorted({name for errors in per_object for name in errors})
+    scale = LogScale.of(group.rows)
     logs = [math.log(error) for errors in per_object for error in errors.values() if error]
     low, high = min(logs, default=0.0), max(logs, default=0.0)
-    ends = [(row.value(DEFAULT_SORT), *(row.interval(DEFAULT_SORT) or ())) for row in group.rows]
-    cells = [[(errors.get(name), _shade(errors.get(name), low, high)) for name in objects] for errors in per_object]
+    object_cells = [
+        [(errors.get(name), _shade(errors.get(name), low, high)) for name in objects] for errors in per_object
+    ]
     return {
         "group": group,
         "id": anchor(group),
         "link": link,
-        "machines": machines,
+        "machines": [f"({mark}) {name}" if mark else name for name, mark in machines(group.rows).items()],
+        "cells": [cells(row, group.rows) for row in group.rows],
+        "scale": scale,
+        "clipped": any((row.interval(DEFAULT_SORT) or (scale.low,))[0] < scale.low for row in group.rows),
         "objects": objects,
-        "object_cells": cells,
+        "object_cells": object_cells,
         "title": f"{key.frames[0].upper()}{key.frames[1:]}, {key.track} track, against {key.against}{mode}",
         "ranked": len(group.ranked),
         "most_paired": MOST_PAIRED,
         "matrix": _matrix(group) if group.pairs else [],
-        "with": [column.title for column in _SPARSE if column.shown_for(group.rows)],
-        "highest": max((end or 0.0 for row_ends in ends for end in row_ends), default=0.0),
+        "joins_unseen": columns.PARTS[1].shown_for(group.rows),
     }
 
 

@@ -71,7 +71,7 @@ def test_a_table_is_of_scenes_whatever_was_projected(files):
     (group,) = rank([first, replace(first, row=first.row.model_copy(update=changes))])
     assert [CODE.text(row) for row in group.rows] == ["crossed", "phase shift"]
     index = page_files([group], [])["index.html"].decode()
-    assert '<td class="text" data-v="crossed">crossed</td>' in index and "| crossed |" in readme_block([group])
+    assert '<td class="text more" data-v="crossed">crossed</td>' in index and "| crossed |" in readme_block([group])
 
 
 def test_shipped_rows_are_of_a_benchmark(shipped):
