@@ -75,10 +75,23 @@
     for (const [key, value] of Object.entries(entries)) value ? state.set(key, value) : state.delete(key);
   }
 
-  // On a phone, all columns are the list behind each row.
+  // On a phone, what has no column there is a list behind the row, and all columns are all lists.
   function showAll() {
     all("details.rest").forEach((rest) => { rest.open = columns.checked; });
   }
+  all("details.rest").forEach((rest) => {
+    rest.hidden = false;
+    rest.addEventListener("toggle", () => {
+      const heads = rest.closest("table").tHead.rows[0].cells;
+      const parts = [...rest.closest("tr").cells].filter((cell) => cell.matches(".first, .more")).flatMap((cell) => {
+        const [title, value] = ["dt", "dd"].map((name) => document.createElement(name));
+        title.textContent = heads[cell.cellIndex].firstChild.textContent;
+        value.append(...cell.cloneNode(true).childNodes);
+        return [title, value];
+      });
+      rest.querySelector("dl").replaceChildren(...parts);
+    });
+  });
 
   function restore() {
     const hash = location.hash.slice(1);

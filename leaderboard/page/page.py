@@ -11,7 +11,7 @@ from typing import Any
 
 from fpp_ml_bench.baselines.tradeoff.measure import Tradeoff
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
+from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS, RANGE_KEY, with_column
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
 from fpp_ml_bench.evaluation.report.html import interval_text, page, render, score_text
 from fpp_ml_bench.evaluation.result.parts import PART_TITLES
@@ -21,7 +21,6 @@ from fpp_ml_bench.leaderboard import columns, tables
 from fpp_ml_bench.leaderboard.data_files import table_csv, table_json
 from fpp_ml_bench.leaderboard.groups import Group, Ranked, more_than_trivial, scenes_of
 from fpp_ml_bench.leaderboard.names import assumption, assumption_sentences, given_truth, learned_from
-from fpp_ml_bench.leaderboard.page.cells import SELF_REPORTED_TIME, milliseconds
 from fpp_ml_bench.leaderboard.page.sections import CLASS_COLOURS, blocks, tradeoff_section
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
 from fpp_ml_bench.leaderboard.row_file import Row
@@ -69,12 +68,14 @@ def page_files(
         "learned": ("Learned from", sorted({learned_from(row.entry.row) or NOT_SAID for _, row in rows})),
     }
     present = {row.provenance for _, row in rows}
+    others = [metric for metric in with_column(0) if not metric.role and metric.key != "overall_mae_mm"]
     body = render(
         _PACKAGE,
         "index.html",
         **shared,
         columns=columns,
-        self_reported_time=SELF_REPORTED_TIME,
+        range_key=RANGE_KEY,
+        errors=[(m.key, f"{m.column}, mm" if m.unit == "mm" else m.column) for m in others],
         given_truth=given_truth,
         assumption=assumption,
         search=_search,
@@ -132,6 +133,13 @@ def _score_cells(row: Row) -> list[tuple[str, str, str]]:
             title = key.removesuffix("_mm").replace("_", " ")
             cells.append((title, score_text(key, value), interval_text(row.intervals.of(key))))
     return cells
+
+
+def milliseconds(value: float | None) -> str:
+    """A time in ms to three significant digits, a dash when unknown."""
+    if value is None:
+        return "-"
+    return f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def slug(entry: Entry) -> str:

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from itertools import groupby
+from string import ascii_lowercase
 from typing import Any
 
 from fpp_ml_bench.baselines.tradeoff.drawing import Mark, Scatter
@@ -16,10 +17,11 @@ from fpp_ml_bench.evaluation.report.html import interval_text, signed
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import columns
 from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, Group, Ranked, is_trivial
-from fpp_ml_bench.leaderboard.page.cells import LogScale, cells, machines
+from fpp_ml_bench.leaderboard.page.scale import LogScale
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
 from fpp_ml_bench.loaders.storage.benchmark import benchmark_before
 
+_SPARSE = (*columns.PARTS, columns.RATIO, columns.RANGE, *columns.UNCERTAINTY, columns.LEARNED)
 _TRADEOFF_PICTURE = 430, 380
 _SHADES = 6
 
@@ -77,6 +79,8 @@ def _section(group: Group, link: str) -> dict[str, Any]:
     mode = "" if key.mode == "standard" else f", mode {key.mode}"
     per_object = [row.object_means(DEFAULT_SORT) for row in group.rows[:MOST_PAIRED]]
     objects = sorted({name for errors in per_object for name in errors})
+    machines = sorted({columns.device(row.entry) for row in group.rows if row.entry.latency_ms is not None})
+    letters = [ascii_lowercase[number % 26] * (1 + number // 26) for number in range(len(machines))]
     scale = LogScale.of(group.rows)
     logs = [math.log(error) for errors in per_object for error in errors.values() if error]
     low, high = min(logs, default=0.0), max(logs, default=0.0)
@@ -87,8 +91,7 @@ def _section(group: Group, link: str) -> dict[str, Any]:
         "group": group,
         "id": anchor(group),
         "link": link,
-        "machines": [f"({mark}) {name}" if mark else name for name, mark in machines(group.rows).items()],
-        "cells": [cells(row, group.rows) for row in group.rows],
+        "machines": dict(zip(machines, letters if len(machines) > 1 else [""], strict=False)),
         "scale": scale,
         "clipped": any((row.interval(DEFAULT_SORT) or (scale.low,))[0] < scale.low for row in group.rows),
         "objects": objects,
@@ -97,7 +100,7 @@ def _section(group: Group, link: str) -> dict[str, Any]:
         "ranked": len(group.ranked),
         "most_paired": MOST_PAIRED,
         "matrix": _matrix(group) if group.pairs else [],
-        "joins_unseen": columns.PARTS[1].shown_for(group.rows),
+        "with": [column.title for column in _SPARSE if column.shown_for(group.rows)],
     }
 
 

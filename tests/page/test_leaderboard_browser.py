@@ -12,9 +12,9 @@ from scored_dataset import make_dataset
 
 from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, shipped_tradeoff
 from fpp_ml_bench.cli import main
+from fpp_ml_bench.evaluation.submission.description import LearnedFrom
 from fpp_ml_bench.leaderboard import rows
 from fpp_ml_bench.leaderboard.groups import is_trivial, more_than_trivial
-from fpp_ml_bench.leaderboard.page import page as page_module
 from fpp_ml_bench.leaderboard.page.page import write_page
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.tables import chosen_tables
@@ -130,6 +130,7 @@ def test_a_key_opens_what_a_phone_has_no_room_for(browser, page):
     assert browser.run(terms) == []
     tab_to(browser, "e.matches('.rest > summary')")
     browser.key("Enter", "\r")
+    browser.run("new Promise(done => setTimeout(done, 50))")
     shown = browser.run(terms)
     assert {"95% interval, mm", "Overall MAE, mm", "Time, ms", "Frames", "Code", "Provenance"} <= set(shown)
     assert browser.run("document.documentElement.scrollWidth") <= 390
@@ -335,15 +336,15 @@ def ranked_page(tmp_path_factory):
     file = write_result_file(work / "base.json", make_dataset(work / "tiny"), 1.0, timing=timing(3.0))
     (base,), full, unseen = read_entries([file]), {"test/depth": "f" * 32}, {"test/depth": "e" * 32}
     entries = []
+    learned = LearnedFrom(data="generated"), LearnedFrom(data="train-split", versions=["a benchmark"]), None
     for number, name in enumerate(("first", "second", "third")):
         for objects, data in ((5, full), (20, unseen)):
             errors = {f"{objects} {n}": float((1 + n) * (1 + number)) for n in range(objects)}
-            entry = entry_with_errors(base, errors, name, data, method="constant" if number == 2 else name)
+            about = {"method": "constant" if number == 2 else name, "learned_from": learned[number]}
+            entry = entry_with_errors(base, errors, name, data, **about)
             entries.append(replace(entry, path=work / f"{name}-{objects}.json"))
     with pytest.MonkeyPatch.context() as patch:
         named_benchmarks(patch, full=full, unseen=unseen)
-        learned = {"first": "generated", "second": "train-split"}
-        patch.setattr(page_module, "learned_from", lambda row: learned.get(row.submission.name, ""))
         write_page(rank(entries), chosen_tables(None), work / "page")
     return work / "page" / "index.html"
 
