@@ -35,7 +35,6 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from fpp_ml_bench.baselines.phase_route.method import ONE_ALBEDO
 from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corruptions
 from fpp_ml_bench.baselines.robustness.report import Measured, draw_curves
 from fpp_ml_bench.cli import BENCH, EVAL, Program
@@ -43,6 +42,8 @@ from fpp_ml_bench.cli import main as fpp_bench
 from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import FppBenchError, SubmissionError
+from fpp_ml_bench.evaluation.metrics import RANK_KEY
+from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
 from fpp_ml_bench.evaluation.report.html import percent
 from fpp_ml_bench.evaluation.result.file import read_result
 from fpp_ml_bench.evaluation.result.model import Result
@@ -50,19 +51,13 @@ from fpp_ml_bench.evaluation.result.parts import Robustness
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.leaderboard import columns
 from fpp_ml_bench.leaderboard.columns import NOT_CHECKED, Column, device, error
-from fpp_ml_bench.leaderboard.groups import Group, more_than_trivial
-from fpp_ml_bench.leaderboard.names import assumption, given_truth, short_names
+from fpp_ml_bench.leaderboard.groups import Group, Ranked, is_trivial
+from fpp_ml_bench.leaderboard.names import assumption, short_names
+from fpp_ml_bench.leaderboard.page.sections import of_one_target
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.row_file import row_json, write_row
 from fpp_ml_bench.leaderboard.rows import VOUCHED, Entry, read_entry, vouching_line
-from fpp_ml_bench.leaderboard.tables import (
-    PAPER_DEPTHS,
-    REPORTED_HEADING,
-    chosen_tables,
-    markdown_rows,
-    markdown_text,
-    ranking_table,
-)
+from fpp_ml_bench.leaderboard.tables import markdown_rows, markdown_text, ranking_table
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -183,70 +178,58 @@ def filled(path: Path, blocks: Mapping[str, str]) -> str:
 
 
 SHOWN = 5
-"""Rows of a group that README shows; the page shows them all."""
+"""Methods of one frame that README shows; the page shows them all."""
 _MADE_BY = "Made by `python benchmarks/upkeep.py readme` from the files in `leaderboard/rows/`."
-_NOTE = (
-    f"{_MADE_BY} Errors in mm. {columns.RANK_NOTE} {columns.TRUST_NOTE} Intervals: bootstrap over objects. "
-    f"{columns.RATIO_NOTE} Time: median latency of one image. Phase reliance: 1 follows the fringe's phase and nothing "
-    "else, 0 does not follow it (docs/diagnosis.md). Disturbed: object MAE over all axes and severities of disturbed "
-    "scenes, with 150 mm for a pixel without an answer (docs/results/robustness.md)."
-).replace(NOT_CHECKED, f"\\{NOT_CHECKED}")
-_ERRORS = (
-    Column("Object MAE, mm", partial(error, "object_mae_mm")),
-    Column("Object RMSE", partial(error, "object_rmse_mm")),
-    Column("Overall MAE", partial(error, "overall_mae_mm")),
-)
 _COLUMNS = (
-    columns.RANK,
     columns.METHOD,
-    columns.CODE,
-    _ERRORS[0],
-    Column("95% interval", partial(columns.interval, between=" - ")),
-    *columns.PARTS,
-    columns.RATIO,
-    columns.RANGE,
-    *_ERRORS[1:],
+    Column("Assumes", lambda row: assumption(row.entry.row) or "-", right=False),
+    Column(
+        "Object MAE, mm (95% interval)",
+        lambda row: f"{error(RANK_KEY, row)} ({columns.interval(row, between=' to ')})",
+    ),
+    Column("Overall MAE, mm", partial(error, "overall_mae_mm")),
     Column("Time, ms", columns.milliseconds_text),
     columns.FRAMES,
     columns.RELIANCE,
     columns.ROBUSTNESS,
-    columns.PROVENANCE,
 )
 
 
+def readme_rows(groups: Sequence[Group]) -> list[tuple[Group, Ranked]]:
+    """What README shows of the first dataset's metric track, against exact depth where a row is: the `SHOWN` methods of
+    one frame with the least object MAE, without trivial ones, and the best classical method with its full sequence.
+    Where rows of a group are vouched for, only those count."""
+    first = [group for group in groups if group.key.data_title == groups[0].key.data_title]
+    shown = []
+    for frames, count in ((FRAMES_CLASSES[0], SHOWN), (FRAMES_CLASSES[-1], 1)):
+        of_class = [group for group in first if group.key.frames == frames and group.key.track == "metric"]
+        for group in of_one_target(of_class)[:1]:
+            rows = [row for row in group.rows if row.value(RANK_KEY) is not None and not is_trivial(row)]
+            rows = [row for row in rows if row.entry.vouched] or rows
+            if frames == FRAMES_CLASSES[-1]:
+                rows = [row for row in rows if row.entry.row.submission.method == "classical"]
+            best = sorted(rows, key=lambda row: (row.value(RANK_KEY), row.short_name))
+            shown += [(group, row) for row in best[:count]]
+    return shown
+
+
 def readme_block(groups: Sequence[Group]) -> str:
-    """What is between README's markers: the best `SHOWN` rows of each group without `GroupKey.special_data`, and
-    the paper's architectures."""
-    if not groups:
+    """What is between README's markers: a table of `readme_rows`, and a line that says how to read it."""
+    if not (shown := readme_rows(groups) if groups else []):
         return f"No row yet. {_MADE_BY}\n"
-    others = list(dict.fromkeys(group.key.special_data for group in groups if group.key.special_data))
-    groups, lines = [group for group in groups if not group.key.special_data], []
-    for group in more_than_trivial(groups):
-        machines = sorted({device(row.entry) for row in group.rows if row.entry.time_measured})
-        timed = f"; measured on {', '.join(machines)}" if machines else ""
-        lines += [f"**{markdown_text(group.title + timed)}**", ""]
-        lines += [*ranking_table("", _COLUMNS, group.rows[:SHOWN]).markdown(), ""]
-        more = len(group.rows) - SHOWN
-        lines += [f"… and {more} more on the page", ""] if more > 0 else []
-    shown = [row.entry.row for group in groups for row in group.rows]
-    assuming = sorted({row.submission.method for row in shown if assumption(row)})
-    notes = [_NOTE] + ([f"{' and '.join(assuming)} assume {ONE_ALBEDO.words}."] if assuming else [])
-    notes += [f"Rows of other data ({'; '.join(others)}) are on the page."] if others else []
-    notes += dict.fromkeys(markdown_text(note) for group in groups for note in group.notes)
-    keys, titles = ("object_mae_mm", "object_rmse_mm", "overall_mae_mm"), [column.title for column in _ERRORS]
-    reported = [
-        [
-            row.label,
-            *(f"{row.errors_mm[key]:.2f}" if key in row.errors_mm else "-" for key in keys),
-            f"{table.source}, given {given_truth(row.track)}",
-        ]
-        for table in (*chosen_tables("architecture"), *chosen_tables("oracle_order"))
-        for row in table.rows
+    (group, first), rows = shown[0], [row for _, row in shown]
+    machines = sorted({device(row.entry) for row in rows if row.entry.latency_ms is not None})
+    notes = [
+        f"{group.key.data_title}: {group.parts}, {sum(part.samples for part in first.objects)} samples of "
+        f"{len(first.objects)} objects, against {group.key.against}.",
+        "Assumes: what must be true of the scene beside the rig's calibration.",
+        f"Time: median latency of one image on {' or '.join(machines) or 'an unknown machine'}.",
+        "Phase reliance: 1 if the depth follows the fringe's phase and nothing else, 0 if it does not follow it.",
+        "Disturbed: object MAE over disturbed scenes.",
     ]
-    rows = [list(map(markdown_text, cells)) for cells in reported]
-    lines += [f"**{REPORTED_HEADING}, not ranked with the rows above**", ""]
-    lines += [*markdown_rows(["Method", *titles, "Note"], (False, True, True, True, False), rows), ""]
-    return "\n".join([*lines, " ".join([PAPER_DEPTHS, *notes])]) + "\n"
+    reported = [f"{NOT_CHECKED}: reported by the row's author."] if any(not r.entry.all_checked for r in rows) else []
+    text = " ".join(map(markdown_text, notes + reported))
+    return "\n".join([*ranking_table("", _COLUMNS, rows).markdown(), "", f"{text} {_MADE_BY}"]) + "\n"
 
 
 CURVES = "robustness_curves.png"

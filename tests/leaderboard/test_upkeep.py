@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 import upkeep
-from board_rows import some_rows
+from board_rows import timing, write_result_file
 from scored_dataset import make_dataset
 from upkeep import SHOWN, readme_block
 
@@ -24,8 +24,20 @@ BEGIN, END = "<!-- leaderboard:begin -->", "<!-- leaderboard:end -->"
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory):
+    """Results of one frame, one of which was told the range, two of a full sequence, and one of few frames."""
     work = tmp_path_factory.mktemp("rows")
-    return some_rows(work / "rows", make_dataset(work / "tiny"))
+    dataset, made = make_dataset(work / "tiny"), []
+    for name, offset_mm, about in (
+        ("Fast and rough", 4.0, {"frames_used": [0], "timing": timing(2.0)}),
+        ("Slow and fine", 0.5, {"frames_used": [0], "timing": timing(50.0)}),
+        ("Beaten", 8.0, {"frames_used": [0], "seconds_per_sample": 0.08, "seconds_source": "self-reported"}),
+        ("Was told", 0.1, {"frames_used": [0], "uses_ground_truth_range": True}),
+        ("Classical, best", 0.2, {"frames_used": [*range(50)], "method": "classical"}),
+        ("Classical, worse", 0.3, {"frames_used": [*range(50)], "method": "classical"}),
+        ("Few", 0.1, {"frames_used": [0, 1]}),
+    ):
+        made.append(write_result_file(work / f"{name}.json", dataset, offset_mm, 0.1, name=name, **about))
+    return made
 
 
 @pytest.fixture
@@ -43,8 +55,8 @@ def test_readme_block_is_made_and_stays(readme, files, capsys):
     assert block(readme, files) == 0
     text = readme.read_text()
     assert text.startswith(f"# Title\n\n{BEGIN}\n\n") and text.endswith(f"\n{END}\n\nMore.\n")
-    lines = [line.split(" | ")[0][2:] for line in text.splitlines() if re.search(r"\| \d+ \|.* \| local file", line)]
-    assert lines == ["Slow and fine", "Fast and rough", "Beaten", "Was told"]
+    names = [line.split(" | ")[0][2:] for line in text.splitlines() if line.startswith("| ")][2:]
+    assert names == ["Slow and fine", "Fast and rough", "Beaten", "Classical, best"]
     assert block(readme, files[::-1]) == 0 and readme.read_text() == text
     assert block(readme, files, check=True) == 0
     assert "is up to date with the rows" in capsys.readouterr().out
@@ -67,13 +79,31 @@ def test_readme_shows_the_best_of_a_group(extra, files):
         )
         for number in range(count)
     ]
-    text = readme_block(rank([*named, read_entry(files[3])]))
+    text = readme_block(rank([*named, *map(read_entry, files[3:])]))
     # All share one error, so names decide.
     assert [n for n in range(count) if f"Method {n:02}" in text] == list(range(5))
-    assert [line for line in text.splitlines() if "more on the page" in line] == (
-        [f"… and {extra} more on the page"] if extra else []
-    )
-    assert "Was told" in text
+    assert "Classical, best" in text and not re.search("Was told|Classical, worse|Few", text)
+
+
+def test_readme_of_the_shipped_rows_is_one_short_table():
+    groups = rank(read_entries(sorted(SHIPPED_ROWS.glob("*.json"))))
+    text = readme_block(groups)
+    rows = [line.strip("| ").split(" | ") for line in text.splitlines() if line.startswith("| ")]
+    assert rows[0] == [
+        "Method",
+        "Assumes",
+        "Object MAE, mm (95% interval)",
+        "Overall MAE, mm",
+        "Time, ms",
+        "Frames",
+        "Phase reliance",
+        "Disturbed, mm",
+    ]
+    frames, errors = [int(row[5]) for row in rows[2:]], [float(row[2].split()[0]) for row in rows[2:]]
+    assert frames[:-1] == [1] * SHOWN and frames[-1] > 36 and errors[:-1] == sorted(errors[:-1])
+    assert rows[2][2] == "2.948 (2.177 to 3.880)" and rows[4][1] == "one albedo, a lit background"
+    assert "150 samples of 25 objects" in text and len(text.encode()) < 2048
+    assert readme_block([]).startswith("No row yet.")
 
 
 def test_a_hand_edited_block_fails_the_check_and_is_left_alone(readme, files, capsys):
