@@ -218,7 +218,7 @@ def readme_block(groups: Sequence[Group]) -> str:
     if not (shown := readme_rows(groups) if groups else []):
         return f"No row yet. {_MADE_BY}\n"
     (group, first), rows = shown[0], [row for _, row in shown]
-    machines = sorted({device(row.entry) for row in rows if row.entry.latency_ms is not None})
+    machines = sorted({markdown_text(device(row.entry)) for row in rows if row.entry.latency_ms is not None})
     notes = [
         f"{group.key.data_title}: {group.parts}, {sum(part.samples for part in first.objects)} samples of "
         f"{len(first.objects)} objects, against {group.key.against}.",
@@ -227,8 +227,8 @@ def readme_block(groups: Sequence[Group]) -> str:
         "Phase reliance: 1 if the depth follows the fringe's phase and nothing else, 0 if it does not follow it.",
         "Disturbed: object MAE over disturbed scenes.",
     ]
-    reported = [f"{NOT_CHECKED}: reported by the row's author."] if any(not r.entry.all_checked for r in rows) else []
-    text = " ".join(map(markdown_text, notes + reported))
+    reported = [f"\\{NOT_CHECKED}: reported by the row's author."] if any(not r.entry.all_checked for r in rows) else []
+    text = " ".join(notes + reported)
     return "\n".join([*ranking_table("", _COLUMNS, rows).markdown(), "", f"{text} {_MADE_BY}"]) + "\n"
 
 
