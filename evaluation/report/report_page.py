@@ -1,9 +1,13 @@
 """The report of a result: a figure of the errors, the scores, and samples from best to worst on an HTML page."""
 
 import io
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 
 from fpp_ml_bench.errors import DatasetError, PredictionError
@@ -14,7 +18,7 @@ from fpp_ml_bench.evaluation.report.terminal import result_table
 from fpp_ml_bench.evaluation.result.file import write_file
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import SampleResult
-from fpp_ml_bench.evaluation.score.check import scored_pair
+from fpp_ml_bench.evaluation.score.check import Depth, scored_pair
 from fpp_ml_bench.evaluation.submission.prediction_files import list_folder, reader_for
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.pictures import panel_figure
@@ -35,7 +39,7 @@ def write_report(result: Result, dataset: DatasetFolder, predictions_folder: str
         __package__,
         "report.html",
         result=result,
-        samples=_panels(result, dataset, Path(predictions_folder)),
+        samples=sample_maps(result, dataset, Path(predictions_folder), chosen_samples(result.per_sample)),
         figure=errors_figure(errors, result.uncertainty) if errors else None,
         scores=_terminal_text(result),
         table=_sample_rows(result),
@@ -60,8 +64,28 @@ def _by_object_error(row: SampleResult) -> tuple[float, str]:
     return row.object_mae_mm or 0.0, row.sample
 
 
-def _panels(result: Result, dataset: DatasetFolder, folder: Path) -> Iterator[tuple[str, SampleResult, str]]:
-    """The place, the row and the picture of each chosen sample, the best first; one sample's pixels at a time."""
+@dataclass(frozen=True)
+class SampleMaps:
+    """A scored sample: its ``place`` by error in words and its scores; the ``fringe`` image, and what was scored as
+    truth and as prediction, (H, W) in mm, 0 = background."""
+
+    place: str
+    row: SampleResult
+    fringe: NDArray[np.uint8]
+    target_mm: Depth
+    prediction_mm: Depth
+
+    @cached_property
+    def picture(self) -> str:
+        """Its five panels as a data URI."""
+        return figure_uri(panel_figure(sample_panels(self.fringe, self.target_mm, self.prediction_mm)))
+
+
+def sample_maps(
+    result: Result, dataset: DatasetFolder, folder: Path, chosen: Sequence[tuple[str, SampleResult]]
+) -> Iterator[SampleMaps]:
+    """The maps of the ``chosen`` samples, each a place and a row; one sample's pixels at a time. Raises as
+    `write_report` does."""
     if not result.dataset.content.items() <= dataset.content.items():
         raise DatasetError(f"{dataset.path}: is not what was scored; give {printable(result.dataset.identity)}")
     submission, samples = result.submission, [row.sample for row in result.per_sample]
@@ -69,7 +93,7 @@ def _panels(result: Result, dataset: DatasetFolder, folder: Path) -> Iterator[tu
     reader = reader_for(form, folder, samples, dataset.size, submission.png_mm_per_level)
     # The first frame that the method used; frame 0 where it used none or that frame is not stored here.
     used = [index for index in sorted(submission.frames_used) if index < len(dataset.sequence)]
-    for place, row in chosen_samples(result.per_sample):
+    for place, row in chosen:
         try:
             values, digest = reader.read(row.sample)
         except PredictionError as error:
@@ -84,7 +108,8 @@ def _panels(result: Result, dataset: DatasetFolder, folder: Path) -> Iterator[tu
             fringe = dataset.frame(row.sample, used[0] if used else 0)
         except DatasetError:
             fringe = dataset.frame(row.sample, 0)
-        yield place, row, figure_uri(panel_figure(sample_panels(fringe, target, prediction_mm)))
+        # The reader fills the same memory with the next sample.
+        yield SampleMaps(place, row, fringe, target, np.array(prediction_mm))
 
 
 def _terminal_text(result: Result) -> str:

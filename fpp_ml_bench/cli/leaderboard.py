@@ -4,12 +4,14 @@ from pathlib import Path
 
 from fpp_ml_bench.baselines.tradeoff.measure import read_tradeoff, shipped_tradeoff
 from fpp_ml_bench.cli.console import show
+from fpp_ml_bench.cli.evaluate import scored_data
 from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import METRICS, RANK_KEY, sort_keys
 from fpp_ml_bench.evaluation.result.file import write_file
 from fpp_ml_bench.leaderboard.data_files import table_csv, table_json
 from fpp_ml_bench.leaderboard.page.page import write_page
+from fpp_ml_bench.leaderboard.page.samples import predicted_samples
 from fpp_ml_bench.leaderboard.ranking import discover, expand, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.ranking import rank as rank_files
 from fpp_ml_bench.leaderboard.row_file import write_row
@@ -31,6 +33,7 @@ fpp-bench leaderboard --pairs --paper none
 fpp-bench leaderboard --csv leaderboard.csv
 fpp-bench leaderboard --paper loss
 fpp-bench leaderboard --page page
+fpp-bench leaderboard result.json --page page --predictions predictions
 fpp-bench leaderboard result.json --row leaderboard/rows/mine.json
 """
 )
@@ -71,6 +74,14 @@ def rank(
         "FILE",
         flag="--tradeoff",
     ),
+    predictions: tuple[Path, ...] = option(
+        (),
+        "with --page: a folder of predictions that a named result was scored from; the row's own page then shows the "
+        "median and the worst sample, and a point cloud; repeatable",
+        "FOLDER",
+        parse=Path,
+        many=True,
+    ),
     row_file: Path | None = option(
         None,
         "make a row file for the leaderboard of the given result, and print what a maintainer adds to "
@@ -82,6 +93,8 @@ def rank(
     """Rank result files: error and run time side by side, as a table and a static page.
 
     Raises SubmissionError naming a file that is not valid."""
+    if predictions and out is None:
+        raise SubmissionError("--predictions adds pictures to a page; give it with --page DIR")
     if measured is not None and out is None:
         raise SubmissionError("--tradeoff adds settings to a page; give it with --page DIR")
     if out is not None and sort != RANK_KEY:
@@ -106,7 +119,8 @@ def rank(
     if out is not None:
         shipped = None if results else shipped_tradeoff()
         settings = shipped if measured is None else read_tradeoff(measured)
-        written = write_page(groups, papers, out, settings)
+        sources = [(folder, scored_data(folder, None, None)[0]) for folder in predictions]
+        written = write_page(groups, papers, out, settings, predicted_samples(entries, sources))
         print(f"{out}: {len(written)} files; open {written[0]}")
         return
     not_shown = len(papers) if results and paper is None else 0

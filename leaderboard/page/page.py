@@ -5,8 +5,9 @@ The page works from disk and from any web server and loads no other file. The sa
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from fpp_ml_bench.baselines.tradeoff.measure import Tradeoff
@@ -21,25 +22,30 @@ from fpp_ml_bench.leaderboard import columns, tables
 from fpp_ml_bench.leaderboard.data_files import table_csv, table_json
 from fpp_ml_bench.leaderboard.groups import Group, Ranked, more_than_trivial, scenes_of
 from fpp_ml_bench.leaderboard.names import assumption, assumption_sentences, given_truth, learned_from
+from fpp_ml_bench.leaderboard.page.samples import Samples
 from fpp_ml_bench.leaderboard.page.sections import CLASS_COLOURS, blocks, tradeoff_section
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
 from fpp_ml_bench.leaderboard.row_file import Row
 from fpp_ml_bench.leaderboard.rows import MEANING, Entry
 from fpp_ml_bench.leaderboard.tables import ReportedTable
 
-INDEX, DATA, TABLE, SUBMISSIONS = "index.html", "data.json", "data.csv", "submissions"
+INDEX, DATA, TABLE, SUBMISSIONS, CLOUD = "index.html", "data.json", "data.csv", "submissions", "-cloud.html"
 _HERE, _PACKAGE = Path(__file__).resolve().parent, "fpp_ml_bench.leaderboard.page"
-_OWN_PAGES = re.compile(r"[a-z0-9-]+-[0-9a-f]{12}\.html")
+_OWN_PAGES = re.compile(r"[a-z0-9-]+-[0-9a-f]{12}(-cloud)?\.html")
 NOT_SAID = "not said"
 
 
 def write_page(
-    groups: Sequence[Group], papers: Sequence[ReportedTable], out: Path, tradeoff: Tradeoff | None = None
+    groups: Sequence[Group],
+    papers: Sequence[ReportedTable],
+    out: Path,
+    tradeoff: Tradeoff | None = None,
+    samples: Mapping[str, Samples] = MappingProxyType({}),
 ) -> list[Path]:
     """Write the page of ``groups`` (ranked by `DEFAULT_SORT`), the paper's tables and a trade-off into folder ``out``;
-    returns the files. Removes pages of submissions that are no longer ranked, and nothing else. SubmissionError where a
-    file can't be written."""
-    files = page_files(groups, papers, tradeoff)
+    returns the files. ``samples``: what `predicted_samples` found for rows. Removes pages of submissions that are no
+    longer ranked, and nothing else. SubmissionError where a file can't be written."""
+    files = page_files(groups, papers, tradeoff, samples)
     try:
         (out / SUBMISSIONS).mkdir(parents=True, exist_ok=True)
         for name, content in files.items():
@@ -53,7 +59,10 @@ def write_page(
 
 
 def page_files(
-    groups: Sequence[Group], papers: Sequence[ReportedTable], run: Tradeoff | None = None
+    groups: Sequence[Group],
+    papers: Sequence[ReportedTable],
+    run: Tradeoff | None = None,
+    samples: Mapping[str, Samples] = MappingProxyType({}),
 ) -> dict[str, bytes]:
     """Relative name -> content of every file of the page. Tables of trivial rows alone are in the data files only."""
     data = {DATA: table_json(groups, papers, DEFAULT_SORT), TABLE: table_csv(groups)}
@@ -91,13 +100,15 @@ def page_files(
     )
     about = "Ranking of single-shot fringe projection profilometry: depth error with intervals, run time and captures."
     index = page("FPP-ML-Bench leaderboard", body, style, script, about)
-    files = {INDEX: index, **data}
-    for group in groups:
-        for row in group.rows:
-            body = render(_PACKAGE, "submission.html", **shared, **_submission(group, row))
-            name = f"{SUBMISSIONS}/{slugs[id(row.entry)]}.html"
-            files[name] = page(f"{row.entry.name}: FPP-ML-Bench", body, style)
-    return {name: text.encode("utf-8") for name, text in files.items()}
+    files = {name: text.encode("utf-8") for name, text in {INDEX: index, **data}.items()}
+    for group, row in rows:
+        own, name = samples.get(row.entry.row.predictions_sha256), slugs[id(row.entry)]
+        body = render(_PACKAGE, "submission.html", **shared, **_submission(group, row), samples=own, slug=name)
+        text = page(f"{row.entry.name}: FPP-ML-Bench", body, style)
+        files[f"{SUBMISSIONS}/{name}.html"] = text.encode("utf-8")
+        if own is not None and own.cloud is not None:
+            files[f"{SUBMISSIONS}/{name}{CLOUD}"] = own.cloud
+    return files
 
 
 def _submission(group: Group, row: Ranked) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from fpp_ml_bench.leaderboard.groups import Ranked
 
 _CLIP, _MARGIN = 10, 1.05
 """An interval is drawn down to this part of its mean, and the scale goes on beyond its ends by this factor."""
-_STEPS = (1.0,), (1.0, 3.0), (1.0, 2.0, 5.0)
+_STEPS = (1,), (1, 3), (1, 2, 5), tuple(range(1, 10))
 
 
 @dataclass(frozen=True)

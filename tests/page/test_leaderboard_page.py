@@ -1,13 +1,17 @@
 """The static page as files: the same bytes, no way out of it, and nothing that a submission's text could do."""
 
 import html
+import json
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
-from board_rows import some_rows, timing, write_result_file
+import scored_dataset
+from board_rows import named_benchmarks, some_rows, timing, write_result_file
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from matplotlib.transforms import Bbox
@@ -18,10 +22,16 @@ from fpp_ml_bench.baselines.tradeoff.measure import pareto_front
 from fpp_ml_bench.cli import leaderboard as leaderboard_command
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.report.html import escaped, page
+from fpp_ml_bench.evaluation.report.report_page import write_report
+from fpp_ml_bench.evaluation.result.file import parse_result, write_result
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.leaderboard.page.page import page_files, slug
+from fpp_ml_bench.leaderboard.page.samples import predicted_samples
+from fpp_ml_bench.leaderboard.page.scale import LogScale
 from fpp_ml_bench.leaderboard.page.sections import overview
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries
 from fpp_ml_bench.leaderboard.tables import chosen_tables
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
 
 @pytest.fixture(scope="module")
@@ -186,8 +196,6 @@ def test_a_name_is_only_a_name(name, dataset, tmp_path, files):
     ],
 )
 def test_dangerous_text_is_refused_by_every_output(name, message, files, tmp_path, capsys):
-    import json
-
     content = json.loads(files[0].read_text())
     content["submission"]["name"] = name
     bad = tmp_path / "bad.json"
@@ -295,3 +303,97 @@ def test_unwritable_page_is_an_error(files, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert main(["leaderboard", str(files[0]), "--page", str(tmp_path / "file")]) == 2
     assert "can't be written" in capsys.readouterr().err
+
+
+@pytest.fixture
+def predicted(tmp_path, monkeypatch):
+    """A dataset with a camera of its size, predictions that say what they are of, and their result."""
+    monkeypatch.setattr(scored_dataset, "paper_rig", lambda _: paper_rig(48))
+    dataset = make_dataset(tmp_path / "data", (48, 48))
+    source = {"dataset": str(dataset.path), "split": "test", "content": dict(dataset.content)}
+    result = write_result_file(tmp_path / "mine.json", dataset, 2.0, 1.0, predicted=source)
+    return dataset, tmp_path / "mine-predictions", result
+
+
+def test_a_rows_page_shows_its_predictions(predicted, files, tmp_path):
+    dataset, folder, result = predicted
+    out = tmp_path / "page"
+    command = ["leaderboard", str(result), str(files[0]), "--page", str(out)]
+    assert main([*command, "--predictions", str(folder)]) == 0
+    mine = {path.name: path.read_text() for path in (out / "submissions").glob("a-method-*")}
+    (name,) = (name for name in mine if not name.endswith("-cloud.html"))
+    cloud = name.replace(".html", "-cloud.html")
+    assert set(mine) == {name, cloud} and f'href="{cloud}"' in mine[name]
+    assert "A method: " in mine[cloud] and "points in mm" in mine[cloud]
+    report = write_report(parse_result(json.loads(result.read_text()), result), dataset, folder, tmp_path / "report")
+    pictures = re.findall(r'<img [^>]*src="(data:image/png;base64,[^"]+)"', mine[name])
+    assert len(set(pictures)) == 2 and all(picture in report.read_text() for picture in pictures)
+    assert "Median: " in mine[name] and "Worst: " in mine[name] and "Signed error: blue is too near" in mine[name]
+    assert main(command) == 0  # without predictions, there are no pictures and no cloud
+    (left,) = (out / "submissions").glob("a-method-*")
+    assert "<img" not in left.read_text()
+
+
+def test_predictions_that_no_result_is_of_are_refused(predicted, files, tmp_path, capsys):
+    dataset, folder, result = predicted
+    page_of = ["--page", str(tmp_path / "page"), "--predictions", str(folder)]
+    row = tmp_path / "row.json"
+    assert main(["leaderboard", str(result), "--row", str(row)]) == 0
+    for given_file, why in ((files[0], "is not what was scored"), (row, "row files name no samples")):
+        assert main(["leaderboard", str(given_file), *page_of]) == 2
+        message = capsys.readouterr().err
+        assert why in message and f"{folder}: no given result was scored from it" in message
+    for sample in dataset.samples("test"):
+        np.save(folder / f"{sample}.npy", dataset.depth_mm(sample))
+    assert main(["leaderboard", str(result), *page_of]) == 2
+    assert "is not the file that was scored" in capsys.readouterr().err
+    assert main(["leaderboard", str(result), "--predictions", str(folder)]) == 2
+    assert "give it with --page DIR" in capsys.readouterr().err and not (tmp_path / "page").exists()
+
+
+def test_predictions_without_a_depth_have_no_cloud(predicted, tmp_path):
+    dataset, folder, _ = predicted
+    for sample in dataset.samples("test"):
+        np.save(folder / f"{sample}.npy", np.zeros(dataset.size, np.float32))
+    write_result(evaluate(folder, dataset), tmp_path / "none.json")
+    entries = read_entries([tmp_path / "none.json"])
+    (samples,) = predicted_samples(entries, [(folder, dataset)]).values()
+    assert samples.cloud is None and len(samples.shown) == 2
+    files = page_files(rank(entries), [], samples={entries[0].row.predictions_sha256: samples})
+    assert not any(name.endswith("-cloud.html") for name in files)
+
+
+@given(st.lists(st.floats(1e-6, 1e6), min_size=1, max_size=8))
+@settings(max_examples=100, deadline=None)
+def test_a_scale_holds_every_mean(means):
+    rows = [SimpleNamespace(value=lambda key, m=m: m, interval=lambda key, m=m: (0.0, 1.5 * m)) for m in means]
+    scale = LogScale.of(rows)
+    assert all(scale.low < mean / 9 and 1.5 * mean < scale.high for mean in means)
+    places = [scale.share(mean) for mean in sorted(means)]
+    assert places == sorted(places) and scale.share(0.0) == 0.0 and scale.share(1e12) == 1.0
+    ticks = [float(label) for _, label in scale.ticks]
+    assert len(ticks) >= 2 and ticks == sorted(ticks)
+
+
+def test_an_interval_that_reaches_zero_is_clipped_where_it_shows(files):
+    (entry,) = read_entries(files[:1])
+    intervals = entry.row.intervals.model_copy(update={"object_mae_mm": [0.0, 9.0]})
+    reaching = replace(entry, row=entry.row.model_copy(update={"intervals": intervals}))
+    for shown, expected in ((entry, False), (reaching, True)):
+        index = page_files(rank([shown]), [])["index.html"].decode()
+        assert ('<path class="beyond"' in index) is expected and ("an arrow marks those" in index) is expected
+    assert "on one logarithmic scale" in index
+
+
+def test_a_picture_is_of_one_target(dataset, tmp_path, monkeypatch):
+    """Errors against exact and against decoded depth are in tables of their own; a picture holds one of them."""
+    made = [
+        write_result_file(tmp_path / f"{target}.json", dataset, 2.0, name=target, target=target, timing=timing(3.0))
+        for target in ("depth", "depth_exact")
+    ]
+    entries = read_entries(made)
+    named_benchmarks(monkeypatch, full=dataset.content, unseen={})
+    index = page_files(rank(entries), [])["index.html"].decode()
+    assert "All points are errors against exact depth; the rows against other ground truth" in index
+    assert index.count("<b>Error against run time.</b>") == 1 and index.count('class="board"') == 2
+    assert len(set(re.findall(r'class="point[^>]*data-row="([^"]+)"', index))) == 1
