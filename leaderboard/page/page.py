@@ -102,7 +102,7 @@ def page_files(
     index = page("FPP-ML-Bench leaderboard", body, style, script, about)
     files = {name: text.encode("utf-8") for name, text in {INDEX: index, **data}.items()}
     for group, row in rows:
-        own, name = samples.get(row.entry.row.predictions_sha256), slugs[id(row.entry)]
+        own, name = samples.get(row.entry.row.result_sha256), slugs[id(row.entry)]
         body = render(_PACKAGE, "submission.html", **shared, **_submission(group, row), samples=own, slug=name)
         text = page(f"{row.entry.name}: FPP-ML-Bench", body, style)
         files[f"{SUBMISSIONS}/{name}.html"] = text.encode("utf-8")

@@ -28,31 +28,36 @@ class Samples:
 
 
 def predicted_samples(entries: Sequence[Entry], folders: Sequence[tuple[Path, DatasetFolder]]) -> dict[str, Samples]:
-    """The samples of every folder of predictions, each with its dataset, by `Row.predictions_sha256` of the entry that
-    was scored from it. Row files name no samples, so only results have them. Raises SubmissionError for a folder that
+    """The samples of every folder of predictions, each with its dataset, by `Row.result_sha256` of the entries that
+    were scored from it. Row files name no samples, so only results have them. Raises SubmissionError for a folder that
     no result was scored from, and says why."""
-    results = [scored for entry in entries if isinstance(scored := read_scored(entry.path), Result)]
-    hashes = [entry.row.predictions_sha256 for entry in entries if not entry.is_row_file]
-    found = {}
+    results = [entry for entry in entries if folders and not entry.is_row_file]
+    scored = {entry.row.result_sha256: read_scored(entry.path) for entry in results}
+    found: dict[str, Samples] = {}
     for folder, dataset in folders:
         why: FppBenchError | str = "row files name no samples; give the result of fpp-eval"
-        for digest, result in zip(hashes, results, strict=True):
+        of_folder = {}
+        for digest, result in scored.items():
             try:
-                found[digest] = _samples(result, folder, dataset)
-                break
+                if isinstance(result, Result):
+                    of_folder[digest] = _samples(result, folder, dataset)
             except (DatasetError, PredictionError) as error:
                 why = error
-        else:
+        if not of_folder:
             raise SubmissionError(f"{printable(str(folder), 500)}: no given result was scored from it ({why})")
+        found |= of_folder
     return found
 
 
 def _samples(result: Result, folder: Path, dataset: DatasetFolder) -> Samples:
     chosen = chosen_samples(result.per_sample)
     shown = list(sample_maps(result, dataset, folder, [c for c in chosen if c[0] in PLACES] or chosen[:1]))
+    if not shown or result.mode != "standard":  # no sample has an object; depths of another mode may lack an offset
+        return Samples(shown, None)
     try:
         points_mm, there = camera_points(shown[0].prediction_mm, dataset.rig.camera)
-    except (CaptureError, IndexError):  # no sample has an object, nothing was predicted, or with no camera of this size
+    except CaptureError:
         return Samples(shown, None)
-    title = f"{result.submission.name}: {shown[0].row.sample}"
-    return Samples(shown, cloud_html(title, points_mm, shown[0].fringe[there]) if result.mode == "standard" else None)
+    return Samples(
+        shown, cloud_html(f"{result.submission.name}: {shown[0].row.sample}", points_mm, shown[0].fringe[there])
+    )

@@ -16,6 +16,7 @@ from fpp_ml_bench.evaluation.submission.description import LearnedFrom
 from fpp_ml_bench.leaderboard import rows
 from fpp_ml_bench.leaderboard.groups import is_trivial, more_than_trivial
 from fpp_ml_bench.leaderboard.page.page import write_page
+from fpp_ml_bench.leaderboard.page.samples import predicted_samples
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.tables import chosen_tables
 
@@ -349,12 +350,38 @@ def ranked_page(tmp_path_factory):
     return work / "page" / "index.html"
 
 
-def test_axe_finds_nothing(browser, axe, page, ranked_page):
+@pytest.fixture(scope="module")
+def page_with_samples(tmp_path_factory):
+    """The own page of a row with the pictures of its predictions."""
+    work = tmp_path_factory.mktemp("samples")
+    dataset = make_dataset(work / "tiny")
+    entries = read_entries([write_result_file(work / "mine.json", dataset, 1.0, 0.5)])
+    samples = predicted_samples(entries, [(work / "mine-predictions", dataset)])
+    write_page(rank(entries), [], work / "page", None, samples)
+    return next((work / "page" / "submissions").glob("*.html"))
+
+
+@pytest.mark.parametrize("width", [390, 900, 1440])
+def test_pictures_of_predictions_are_shown_whole(browser, page_with_samples, width):
+    browser.open(page_with_samples, width)
+    assert browser.run("[...document.querySelectorAll('img.panels')].map(image => image.naturalWidth > 1000)") == [
+        True,
+        True,
+    ]
+    assert browser.run("document.documentElement.scrollWidth") <= width and browser.complaints() == []
+
+
+def test_axe_finds_nothing(browser, axe, page, ranked_page, page_with_samples):
     (broken := ranked_page.with_name("broken.html")).write_text("<!doctype html><html><body><input></body></html>")
     browser.open(broken)
     assert findings(browser, axe)  # or the check could not fail
     own_page = next((ranked_page.parent / "submissions").glob("*.html"))
-    for path, width, dark in ((page, 1440, False), (ranked_page, 375, True), (own_page, 768, False)):
+    for path, width, dark in (
+        (page, 1440, False),
+        (ranked_page, 375, True),
+        (own_page, 768, False),
+        (page_with_samples, 900, True),
+    ):
         browser.open(path, width, 900, dark)
         assert findings(browser, axe) == []
 

@@ -359,7 +359,7 @@ def test_predictions_without_a_depth_have_no_cloud(predicted, tmp_path):
     entries = read_entries([tmp_path / "none.json"])
     (samples,) = predicted_samples(entries, [(folder, dataset)]).values()
     assert samples.cloud is None and len(samples.shown) == 2
-    files = page_files(rank(entries), [], samples={entries[0].row.predictions_sha256: samples})
+    files = page_files(rank(entries), [], samples={entries[0].row.result_sha256: samples})
     assert not any(name.endswith("-cloud.html") for name in files)
 
 
