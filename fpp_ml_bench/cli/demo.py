@@ -54,7 +54,8 @@ def steps_in(out: Path) -> Iterator[Step]:
         reliance = ["fpp-bench", "reliance", method, data, "--views", "1", "--into", str(result)]
         yield Step(reliance, partial(_has_reliance, result))
     results = [str(out / f"{method}.json") for method in METHODS]
-    yield Step(["fpp-bench", "leaderboard", *results, "--page", str(out / "page")])
+    pictured = [word for method in METHODS for word in ("--predictions", str(out / method))]
+    yield Step(["fpp-bench", "leaderboard", *results, "--page", str(out / "page"), *pictured])
     show_it = ["fpp-bench", "show", str(out / "mini-crossed"), SAMPLE, "--predictions", str(out / "crossed")]
     yield Step([*show_it, "--cloud", "--out", str(out / f"{SAMPLE}.png")])
 

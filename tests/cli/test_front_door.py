@@ -1,14 +1,22 @@
-"""``fpp-bench demo``: one table of computed numbers, resumed where it stopped, made of public commands."""
+"""What a newcomer meets first: ``fpp-bench demo``, and every command and block of code in README."""
 
 import json
+import re
 import shlex
+from pathlib import Path
 
+import cv2
 import pytest
+import yaml
 
 from fpp_ml_bench.cli import main, main_eval
 from fpp_ml_bench.cli.demo import METHODS, SAMPLE, steps_in
 from fpp_ml_bench.constants import PRESETS
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.named_rigs import paper_rig
 
+ROOT = Path(__file__).resolve().parents[2]
+PROGRAMS = {"fpp-bench": main, "fpp-eval": main_eval}
 
 @pytest.fixture(scope="module")
 def small():
@@ -28,6 +36,11 @@ def out(small, tmp_path_factory):
     return folder
 
 
+def run(line):
+    program, *words = shlex.split(line, comments=True)
+    assert PROGRAMS[program](words) == 0, line
+
+
 def _stopped_at_crossed(folder):
     from fpp_ml_bench.cli.predict import predict_split
 
@@ -37,6 +50,11 @@ def _stopped_at_crossed(folder):
         return predict_split(opened, method, *rest)
 
     return predict
+
+
+@pytest.fixture
+def published_hub(tmp_path_factory, monkeypatch):
+    """A Hub on the loopback interface with a dataset of the published layout."""
 
 
 def test_a_stopped_demo_goes_on_and_prints_what_was_computed(out, capsys):
@@ -56,8 +74,7 @@ def test_a_stopped_demo_goes_on_and_prints_what_was_computed(out, capsys):
     commands = [line.strip() for line in printed.splitlines() if line.startswith("  fpp-")]
     assert commands == [shlex.join(step.words) for step in steps_in(out)]
     for line in commands[-2:]:  # that of the picture, and that of the page: they run by hand, too
-        program, *words = shlex.split(line)
-        assert {"fpp-bench": main, "fpp-eval": main_eval}[program](words) == 0
+        run(line)
 
 
 def test_predictions_are_shown_beside_the_frames_that_they_were_made_of(out, tmp_path, capsys):
@@ -78,3 +95,39 @@ def test_a_command_that_fails_stops_the_demo(tmp_path, capsys):
     (tmp_path / "demo").write_text("a file")
     assert main(["demo", "--out", str(tmp_path / "demo")]) == 2
     assert "stopped at step 1; the same command continues there" in capsys.readouterr().err
+
+
+def captures_in(folder):
+    """What README's lines on an own rig start from: a sequence, poses of a board, a capture, captures of an object."""
+    sequence = {"steps": 3, "bits_horizontal": 7, "bits_vertical": 7}
+    (folder / "true.yaml").write_text(yaml.safe_dump({**paper_rig(240).to_dict(), "sequence": sequence}))
+    run("fpp-bench calibrate --virtual poses --true-rig true.yaml --poses 5 --lens none --out found.yaml")
+    (folder / "poses" / "rig.yaml").rename(folder / "projector.yaml")
+    run("fpp-bench build --out lab --rig true.yaml --objects power_drill --workers 1")
+    lab = DatasetFolder(folder / "lab")
+    for sample, capture in (("power_drill_A0", "scan"), ("power_drill_A0", "scans/drill/front")):
+        (folder / capture).mkdir(parents=True)
+        for number in range(len(lab.sequence)):
+            cv2.imwrite(str(folder / capture / f"{number:02}.png"), lab.frame(sample, number))
+
+
+def test_every_command_and_block_of_readme_runs(out, published_hub, tmp_path, monkeypatch, capsys):
+    """But for its two lines of installation, which CI runs as they are."""
+    monkeypatch.chdir(tmp_path)
+    Path("demo").symlink_to(out)
+    captures_in(tmp_path)
+    monkeypatch.setitem(PRESETS, "mini", (("mug", "cork", "power_drill"), 200))
+    blocks = re.findall(r"^```(bash|python)\n(.*?)^```$", (ROOT / "README.md").read_text(), re.DOTALL | re.MULTILINE)
+    ran = []
+    for language, text in blocks:
+        if text.startswith("# mine.py"):
+            Path("mine.py").write_text(text)
+        elif language == "python":
+            exec(compile(text, "README.md", "exec"), {})
+        elif "pip install" not in text:
+            for line in text.splitlines():
+                run(line)
+                ran.append(line)
+    assert len(blocks) - 2 >= 9 and len(ran) >= 13
+    assert {"mine.png", "mine.html", "result.json", "rig.yaml"} <= {path.name for path in tmp_path.iterdir()}
+    assert list(DatasetFolder("data/own").splits) and list(DatasetFolder("data/published").splits)
