@@ -3,6 +3,8 @@
 import json
 import re
 import shlex
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import cv2
@@ -18,6 +20,7 @@ from fpp_ml_bench.optics.named_rigs import paper_rig
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAMS = {"fpp-bench": main, "fpp-eval": main_eval}
 
+
 @pytest.fixture(scope="module")
 def small():
     """The demo's preset with images of 200 px, so that the test takes seconds."""
@@ -27,13 +30,22 @@ def small():
 
 
 @pytest.fixture(scope="module")
-def out(small, tmp_path_factory):
-    """A demo that was stopped while its last method predicted, and then run again."""
+def demo(small, tmp_path_factory):
+    """A demo that was stopped while its last method predicted, and then run again: its folder, a result of before the
+    second run, and what that run printed on standard output and error."""
     folder = tmp_path_factory.mktemp("demo") / "demo"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fpp_ml_bench.cli.predict.predict_split", _stopped_at_crossed(folder))
         assert main(["demo", "--out", str(folder)]) == 130
-    return folder
+    earlier = (folder / "phase.json").read_bytes()
+    with redirect_stdout(StringIO()) as printed, redirect_stderr(StringIO()) as steps:
+        assert main(["demo", "--out", str(folder)]) == 0
+    return folder, earlier, printed.getvalue(), steps.getvalue()
+
+
+@pytest.fixture(scope="module")
+def out(demo):
+    return demo[0]
 
 
 def run(line):
@@ -57,10 +69,8 @@ def published_hub(tmp_path_factory, monkeypatch):
     """A Hub on the loopback interface with a dataset of the published layout."""
 
 
-def test_a_stopped_demo_goes_on_and_prints_what_was_computed(out, capsys):
-    earlier = (out / "phase.json").read_bytes()
-    assert main(["demo", "--out", str(out)]) == 0
-    printed, steps = capsys.readouterr()
+def test_a_stopped_demo_goes_on_and_prints_what_was_computed(demo):
+    out, earlier, printed, steps = demo
     assert (out / "phase.json").read_bytes() == earlier and "kept: fpp-bench reliance phase" in steps
     for method in METHODS:
         result = json.loads((out / f"{method}.json").read_text())
