@@ -132,6 +132,8 @@ def split_of(name: str) -> str:
 OBJECT_NAME, VIEW_NAME = re.compile(r"\w[\w-]{0,99}"), re.compile(r"[^\W_]([^\W_]|-){0,99}")
 SAMPLE_NAME = re.compile(f"{OBJECT_NAME.pattern}_{VIEW_NAME.pattern}")
 """Names that a dataset may have; they become names of files."""
+REPOSITORY_NAME = re.compile(r"(?!.*(--|\.\.|\.git$))\w[\w.-]{0,95}/\w[\w.-]{0,95}(?<![.-])", re.ASCII)
+"""OWNER/NAME of a repository of the Hugging Face Hub."""
 
 
 def sample_name(name: str, view: str) -> str:

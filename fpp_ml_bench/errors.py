@@ -81,7 +81,7 @@ class PoolError(FppBenchError):
 
 
 class RemoteError(FppBenchError):
-    """A URL that can't be read or written."""
+    """A URL, or a dataset of the Hugging Face Hub, that can't be read or written."""
 
 
 class PublishError(FppBenchError):

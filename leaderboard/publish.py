@@ -26,9 +26,10 @@ from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped
 from fpp_ml_bench.leaderboard.row_file import Row
 from fpp_ml_bench.leaderboard.rows import Entry, read_entry
 from fpp_ml_bench.leaderboard.tables import chosen_tables, markdown_text
-from fpp_ml_bench.loaders.hub import MARK, NAME, Publication, card_head, mark_bytes, yaml_text
+from fpp_ml_bench.loaders.hub import MARK, NAME, PICTURE, Publication, card_head, mark_bytes, yaml_text
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
-from fpp_ml_bench.loaders.storage.parquet import PREVIEW
+from fpp_ml_bench.loaders.storage.card import card_end
+from fpp_ml_bench.loaders.storage.parquet import published_features
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 FRAMEWORK = "fpp-ml-bench"
@@ -39,6 +40,8 @@ _SCORE_DIGITS = 6
 CARD_FILE, EVAL_FILE, RESULT_FOLDER = "README.md", "eval.yaml", ".eval_results"
 _BODY = """\
 # FPP-ML-Bench: single-shot fringe projection profilometry
+
+![Above: the first frame of some objects. Below: their depth, near yellow, far blue, background black.]({picture})
 
 {rows} samples of {height} x {width} px ({origin} data): what a structured-light camera sees of an object under
 projected fringes, and the depth of every pixel. No object is in two splits.
@@ -53,13 +56,6 @@ import datasets
 rows = datasets.load_dataset("{repo}", "{config}", split="{split}").with_format("numpy")
 ```
 
-| column | content |
-| --- | --- |
-| `frame_NN` | captured frame, 8-bit grey PNG; `frame_00` is the single-shot input |
-| `depth` | float32 (H, W), mm, 0 = background: decoded from the captured frames |{exact}
-| `{preview}` | small picture of `depth`, scaled to the object's own range: for looking, not for training |
-| `depth_min`, `depth_max` | range of `depth` on the object, mm; using them is the *oracle range* track |
-
 Configurations: {configs}.
 Each reads only its own columns. `meshes/` holds the objects (PLY, metres) where they are known, `rig.yaml` the camera,
 the projector and the sequence.
@@ -70,7 +66,8 @@ Single-shot and multi-frame methods, and methods that are given the depth range 
 `eval.yaml`.
 
 Fingerprint of the dataset: `{fingerprint}`. Written by fpp-ml-bench {package}.
-"""
+
+{end}"""
 
 
 @dataclass(frozen=True)
@@ -127,12 +124,6 @@ def dataset_texts(dataset: DatasetFolder, repo: str, licence: str) -> dict[str, 
         samples = dataset.manifest.samples[split]
         objects = dict.fromkeys(sample["object"] for sample in samples)
         splits.append(f"| {split} | {len(samples)} | {', '.join(markdown_text(name) for name in objects)} |")
-    exact = ""
-    if dataset.has_exact:
-        exact = "\n| `depth_exact` | the same, exact, from the ray cast that made the frames |"
-        exact += "\n| `flags` | uint8 (H, W), bits: 1 unlit, 2 mixed surfaces, 4 saturated, 8 strong interreflection, "
-        exact += "16 weak |"
-        exact += "\n| `cover` | uint8 (H, W): share of the pixel, in 255ths, that the central ray's surface covers |"
     body = _BODY.format(
         rows=sum(len(samples) for samples in dataset.splits.values()),
         height=dataset.size[0],
@@ -142,8 +133,8 @@ def dataset_texts(dataset: DatasetFolder, repo: str, licence: str) -> dict[str, 
         splits="\n".join(splits),
         config=dataset.configs[-1],
         split=list(dataset.splits)[-1],
-        exact=exact,
-        preview=PREVIEW,
+        picture=PICTURE,
+        end=card_end(dataset.manifest, published_features(dataset)),
         configs=", ".join(f"`{config}`" for config in dataset.configs),
         score=SCORE_TEXT,
         fingerprint=dataset.fingerprint,
@@ -183,14 +174,14 @@ def stage_results(
     repo: str,
     folder: Path,
     scored_on: str,
-    revision: str,
+    revision: str | None,
     content: object,
     source_url: str | None = None,
 ) -> Publication:
     """Write a file for each result into ``folder``; it replaces an earlier result of the same task. Only numbers and
     fixed words of a result are published, no text that its author wrote. A result scored on other data than ``content``
     (`DatasetFolder.content`, by the repository's mark) is refused, as is a result of another split or target, or
-    without an object score (`PublishError`)."""
+    without an object score (`PublishError`). ``revision`` None: the data can't be compared (a dry run)."""
     if source_url is not None and (urlsplit(source_url).scheme != "https" or not urlsplit(source_url).netloc):
         raise PublishError(f"--source-url: expected an https address, got {printable(source_url, 120)!r}")
     named: dict[str, Path] = {}
@@ -199,7 +190,8 @@ def stage_results(
         entry, file = read_entry(path), printable(str(path), 300)
         row = entry.row
         held = content if isinstance(content, dict) else {}
-        if other := [name for name, digest in row.dataset.content.items() if held.get(name) != digest]:
+        other = [name for name, digest in row.dataset.content.items() if held.get(name) != digest]
+        if other and revision is not None:
             raise PublishError(
                 f"{file}: was scored on other data than {scored_on} holds ({other[0]} is "
                 f"{row.dataset.content[other[0]]}, there {printable(held.get(other[0]), 40)}); score the predictions "

@@ -28,11 +28,12 @@ from huggingface_hub.utils import disable_progress_bars
 from huggingface_hub.utils.sha import git_hash
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.errors import DatasetError, PublishError
+from fpp_ml_bench.constants import REPOSITORY_NAME
+from fpp_ml_bench.errors import DatasetError, PublishError, RemoteError
 from fpp_ml_bench.files import file_hash, printable, read_json, write_atomically
-from fpp_ml_bench.loaders.storage.card import RIG_FILE
+from fpp_ml_bench.loaders.storage.card import RIG_FILE, dataset_info
 from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER
-from fpp_ml_bench.loaders.storage.parquet import card_configs, data_shards, write_shard
+from fpp_ml_bench.loaders.storage.parquet import card_configs, data_shards, overview, published_features, write_shard
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.rig_file import save_rig
 
@@ -43,7 +44,6 @@ MARK = "fpp-bench.json"
 """File that marks a repository as published by this command, and says what it holds: the next run may replace it."""
 _BATCH_FILES = 8
 """Files are sent before the commit so many at a time, for the progress bar."""
-_REPO = re.compile(r"(?!.*(--|\.\.))\w[\w.-]{0,95}/\w[\w.-]{0,95}(?<![.-])", re.ASCII)
 _ANSWERS = {
     401: "the Hub does not accept the token (401); run 'hf auth login' again or set another HF_TOKEN",
     403: "the token may not do that (403); it needs write access to this owner and repository",
@@ -56,9 +56,14 @@ _ANSWERS = {
 
 
 NAME = "FPP-ML-Bench"
+PICTURE = "overview.png"
 OWNED = ("data/", f"{MESH_FOLDER}/")
 _LICENCE = re.compile(r"[a-z0-9][a-z0-9.-]{0,39}")
 _IDENTITY, _FILES = "staged.sha256", "files"
+
+
+class Unreachable(PublishError, RemoteError):
+    """Nothing could be asked of the Hub: no network, or HF_HUB_OFFLINE."""
 
 
 @dataclass(frozen=True)
@@ -76,11 +81,13 @@ class Publication:
 
 @dataclass(frozen=True)
 class Remote:
-    """The current state of a repository: ``commit`` is None where it does not exist, or this token may not see it."""
+    """The current state of a repository: ``commit`` is None where it does not exist, or this token may not see it, or
+    the Hub was not ``asked``."""
 
     commit: str | None
     private: bool = False
     files: Mapping[str, RepoFile] = field(default_factory=dict)
+    asked: bool = True
 
     @property
     def exists(self) -> bool:
@@ -155,7 +162,7 @@ def check_replaceable(publication: Publication, remote: Remote, adopt: bool) -> 
 
 def check_repo_name(repo: str) -> str:
     """``repo`` itself when it is an OWNER/NAME that the Hub can have, else `PublishError`."""
-    if not _REPO.fullmatch(repo) or repo.endswith(".git"):
+    if not REPOSITORY_NAME.fullmatch(repo):
         raise PublishError(
             f"expected a repository as OWNER/NAME (letters, digits, '-', '_', '.'), got {printable(repo, 80)!r}"
         )
@@ -163,14 +170,20 @@ def check_repo_name(repo: str) -> str:
 
 
 class Hub:
-    """A connection to the Hub. Its constructor uses no network."""
+    """A connection to the Hub. Its constructor uses no network. Errors are `PublishError`, or, where nothing is to be
+    sent, `RemoteError`."""
 
-    def __init__(self) -> None:
-        disable_progress_bars()  # ours shows all files together
+    def __init__(self, sending: bool = True) -> None:
+        if sending:
+            disable_progress_bars()  # ours shows all files together
+        self._error = PublishError if sending else RemoteError
+        self._participle, self._continues = (
+            ("sent", "it sends only what is missing") if sending else ("downloaded", "it continues where it stopped")
+        )
         self._api = HfApi(library_name="fpp-ml-bench", library_version=__version__)
         self.endpoint: str = self._api.endpoint
         if not self.endpoint.startswith(("https://", "http://")):
-            raise PublishError(f"HF_ENDPOINT: expected a URL like https://huggingface.co, got {self.endpoint!r}")
+            raise self._error(f"HF_ENDPOINT: expected a URL like https://huggingface.co, got {self.endpoint!r}")
 
     def url(self, kind: Kind, repo: str) -> str:
         return f"{self.endpoint}/{REPO_TYPES_URL_PREFIXES.get(kind, '')}{repo}"
@@ -197,8 +210,35 @@ class Hub:
                 if error.response.status_code == 401 and get_token():
                     raise
                 return Remote(None)
-            tree = self._api.list_repo_tree(repo, repo_type=kind, recursive=True, revision=info.sha)
-            files = {entry.path: entry for entry in tree if isinstance(entry, RepoFile)}
+            return self._remote(kind, repo, info)
+
+    def contents(self, repo: str, revision: str | None) -> Remote:
+        """Commit and files of a dataset at a branch, tag or commit, by default on its main branch. `RemoteError` where
+        there is none."""
+        with self._explained(f"reading dataset {repo}"):
+            try:
+                info = self._api.repo_info(repo, repo_type="dataset", revision=revision)
+            except hub_errors.RevisionNotFoundError as error:
+                raise self._error(f"{repo}: has no branch, tag or commit {printable(revision, 60)!r}") from error
+            except hub_errors.RepositoryNotFoundError as error:
+                if isinstance(error, hub_errors.GatedRepoError) or (error.response.status_code == 401 and get_token()):
+                    raise
+                raise self._error(
+                    f"{repo}: no such folder here, and no such dataset on {self.endpoint}, or it is private; check the "
+                    "name, or run 'hf auth login' with a token that may read it"
+                ) from error
+            return self._remote("dataset", repo, info)
+
+    def download(self, repo: str, commit: str, patterns: list[str]) -> Path:
+        """Download files of a dataset whose names match ``patterns`` into the client's cache, but for those that are
+        there; returns the folder of the commit in the cache."""
+        with self._explained(f"downloading dataset {repo}"):
+            folder = self._api.snapshot_download(repo, repo_type="dataset", revision=commit, allow_patterns=patterns)
+        return Path(folder)
+
+    def _remote(self, kind: Kind, repo: str, info: Any) -> Remote:
+        tree = self._api.list_repo_tree(repo, repo_type=kind, recursive=True, revision=info.sha)
+        files = {entry.path: entry for entry in tree if isinstance(entry, RepoFile)}
         return Remote(info.sha or "", bool(info.private), files)
 
     def mark(self, kind: Kind, repo: str, remote: Remote) -> dict[str, Any]:
@@ -253,26 +293,33 @@ class Hub:
         try:
             yield
         except hub_errors.OfflineModeIsEnabled as error:
-            raise PublishError(f"{doing}: HF_HUB_OFFLINE is set, so nothing may be sent; unset it") from error
+            reason = f"HF_HUB_OFFLINE is set, so nothing may be {self._participle}; unset it"
+            raise Unreachable(f"{doing}: {reason}") from error
         except hub_errors.LocalTokenNotFoundError as error:
             raise PublishError(
                 f"{doing}: no token for the Hub: run 'hf auth login' once or set HF_TOKEN, with a token that may "
                 "write; --dry-run needs none for what is public"
             ) from error
+        except hub_errors.GatedRepoError as error:
+            raise self._error(
+                f"{doing}: its owner gives it only to those who accept the conditions on its page on {self.endpoint}; "
+                "accept them there, then run 'hf auth login' once or set HF_TOKEN"
+            ) from error
         except hub_errors.HfHubHTTPError as error:
             status, said = error.response.status_code, " ".join((error.server_message or "").split())
-            fault = f"the Hub has a fault ({status}); run the same command again later, it sends only what is missing"
+            fault = f"the Hub has a fault ({status}); run the same command again later, {self._continues}"
             answer = _ANSWERS.get(status, f"the Hub refused ({status})") if status < 500 else fault
-            raise PublishError(f"{doing}: {answer}{f'. The Hub says: {printable(said)}' if said else ''}") from error
-        except hub_errors.HTTPError as error:
-            raise PublishError(
-                f"{doing}: {self.endpoint} can't be reached ({printable(str(error)) or type(error).__name__}); check "
-                "the network and HF_ENDPOINT, then run the same command again: it sends only what is missing"
+            raise self._error(f"{doing}: {answer}{f'. The Hub says: {printable(said)}' if said else ''}") from error
+        except (hub_errors.HTTPError, hub_errors.LocalEntryNotFoundError) as error:
+            cause = error if isinstance(error, hub_errors.HTTPError) else error.__cause__ or error
+            raise Unreachable(
+                f"{doing}: {self.endpoint} can't be reached ({printable(str(cause)) or type(cause).__name__}); check "
+                f"the network and HF_ENDPOINT, then run the same command again: {self._continues}"
             ) from error
         except (ValueError, RuntimeError, OSError) as error:
             # The client's refusals of an answer or a card (ValueError), and its transfer library (RuntimeError).
             lines = " ".join(printable(line) for line in str(error).splitlines())
-            raise PublishError(f"{doing}: {lines or type(error).__name__}; run the same command again") from error
+            raise self._error(f"{doing}: {lines or type(error).__name__}; run the same command again") from error
 
 
 @contextmanager
@@ -316,8 +363,9 @@ def dataset_licence(dataset: DatasetFolder, license_id: str | None) -> str:
 
 def card_head(dataset: DatasetFolder, licence: str) -> str:
     """Front matter of the card, from which the Hub's viewer and ``load_dataset`` know configurations and files."""
-    rows = sum(len(samples) for samples in dataset.splits.values())
     files: dict[str, list[str]] = {split: [] for split in dataset.splits}
+    counts = {split: len(samples) for split, samples in dataset.splits.items()}
+    rows = sum(counts.values())
     for name, shard in data_shards(dataset).items():
         files[shard.split].append(name)
     head = {
@@ -328,6 +376,10 @@ def card_head(dataset: DatasetFolder, licence: str) -> str:
         "tags": ["fringe-projection-profilometry", "structured-light", "metrology", "fpp-ml-bench"],
         # Files by name, not by pattern: a stray file can never join the data.
         "configs": card_configs(dataset, dataset.fingerprint, files, preview=True),
+        "dataset_info": [
+            dataset_info(config, published_features(dataset, config), dataset.size, counts)
+            for config in dataset.configs
+        ],
     }
     return f"---\n{yaml_text(head)}---\n"
 
@@ -355,6 +407,7 @@ def stage_dataset(
         (folder / MESH_FOLDER).mkdir(exist_ok=True)
         shutil.copyfile(source, folder / mesh.path)
     save_rig(dataset.rig, folder / RIG_FILE)
+    write_atomically(folder / PICTURE, overview(dataset))
     for name, text in texts.items():
         write_atomically(folder / name, text.encode())
     about = {"fingerprint": dataset.fingerprint, "size": list(dataset.size), "configs": list(dataset.configs)}

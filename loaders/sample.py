@@ -33,6 +33,22 @@ LABELS = ("sample", "object", "view", "split")
 DEPTH, DEPTH_EXACT, FLAGS, COVER = "depth", "depth_exact", "flags", "cover"
 DEPTHS, PIXEL_MAPS = (DEPTH, DEPTH_EXACT), (FLAGS, COVER)
 RANGE = ("depth_min", "depth_max")
+PREVIEW = "depth_preview"
+MEANINGS = {
+    "sample": ("", "object and view"),
+    "object": ("", "the object; no object is in two splits"),
+    "view": ("", "the view of the object, such as its angle on the turntable: `A60` is 60 degrees"),
+    "split": ("", "train, validation or test"),
+    "frame": ("grey level", "camera image under one projected pattern"),
+    PREVIEW: ("", "picture of `depth`, scaled to the range of the object: for looking, not for training"),
+    DEPTH: ("mm", "depth along the camera's axis, decoded from the frames; 0 = background, or not decoded"),
+    DEPTH_EXACT: ("mm", "the same without error, from the ray cast that made the frames; 0 = background"),
+    FLAGS: ("bits", "1 unlit, 2 mixed surfaces (1 and 2: no score), 4 saturated, 8 interreflection, 16 weakly lit"),
+    COVER: ("1/255", "share of the pixel that the surface at its centre covers"),
+    "depth_min": ("mm", "least depth on the object; methods that are given it are ranked apart"),
+    "depth_max": ("mm", "largest depth on the object; as `depth_min`"),
+}
+"""Unit and meaning of each column; ``frame`` stands for all frames."""
 SINGLE_SHOT_FRAME = 0
 """The single-shot input of the paper's sequence."""
 HASH_DIGITS = 32

@@ -1,8 +1,8 @@
 """A Hugging Face Hub on the loopback interface, standard library only: enough of it for the real client.
 
 Repositories live in memory. Whose name they carry decides what goes wrong: ``forbidden/...`` may not be written (403),
-``broken/...`` fails with 500, ``cut/...`` fails once, at its first commit, and to ``raced/...`` somebody else commits
-while files are sent. The only tokens are `TOKENS`.
+``broken/...`` fails with 500, ``cut/...`` fails once, at its first commit, to ``raced/...`` somebody else commits
+while files are sent, and files of ``gated/...`` may not be read (403). The only tokens are `TOKENS`.
 """
 
 import base64
@@ -33,6 +33,14 @@ class Repo:
     sdk: str | None = None
     files: dict[str, bytes] = field(default_factory=lambda: {".gitattributes": b"*.parquet filter=lfs\n"})
     commits: list[str] = field(default_factory=lambda: [hashlib.sha1(b"initial").hexdigest()])
+    tags: dict[str, tuple[str, dict[str, bytes]]] = field(default_factory=dict)
+    """Commit and files of each tag; ``files`` are those of the main branch."""
+
+    def at(self, revision: str) -> tuple[str, dict[str, bytes]] | None:
+        """Commit and files of a branch, tag or commit."""
+        known = {commit: (commit, files) for commit, files in self.tags.values()} | self.tags
+        now = self.commits[-1], self.files
+        return known.get(revision, now if revision in ("main", self.commits[-1]) else None)
 
 
 class HubServer(ThreadingHTTPServer):
@@ -46,6 +54,10 @@ class HubServer(ThreadingHTTPServer):
         self.large: dict[str, bytes] = {}
         self.requests: list[tuple[str, str]] = []
         self.cut: set[str] = set()
+        self.faults: set[str] = set()
+        """Files of which the next download fails, with 500."""
+        self.halves: set[str] = set()
+        """Files of which the next download ends in the middle."""
         threading.Thread(target=self.serve_forever, daemon=True).start()
 
     @property
@@ -108,7 +120,7 @@ class _Handler(BaseHTTPRequestHandler):
             return self._api(repo, match, body) if repo else None
         if match := _RESOLVE.fullmatch(path):
             repo = self._repo(match[1] or "models", match[2], token)
-            return self._resolve(repo, match[4]) if repo else None
+            return self._resolve(repo, match[2], match[3], match[4]) if repo else None
         return self._refuse(404, f"no such address: {path}")
 
     do_GET = do_HEAD = do_POST = do_PUT = _handle
@@ -143,7 +155,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer(200, {"transfer": "basic", "objects": objects})
 
     def _api(self, repo: Repo, match: re.Match[str], body: bytes) -> None:
-        kind, name, action, _, _ = match.groups()
+        kind, name, action, revision, _ = match.groups()
         if action == "preupload":
             if name.startswith("raced/"):
                 repo.commits.append(hashlib.sha1(b"somebody else").hexdigest())
@@ -159,10 +171,13 @@ class _Handler(BaseHTTPRequestHandler):
             return self._answer(200, {"files": files})
         if action == "commit":
             return self._commit(repo, kind, name, body)
+        if (there := repo.at(revision or "main")) is None:
+            return self._refuse(404, f"Invalid rev id: {revision}", "RevisionNotFound")
+        commit, files = there
         if action == "tree":
-            return self._answer(200, [self._entry(path, repo.files[path]) for path in sorted(repo.files)])
-        siblings = [{"rfilename": path} for path in sorted(repo.files)]
-        about = {"id": name, "sha": repo.commits[-1], "private": repo.private, "siblings": siblings, "tags": []}
+            return self._answer(200, [self._entry(path, files[path]) for path in sorted(files)])
+        siblings = [{"rfilename": path} for path in sorted(files)]
+        about = {"id": name, "sha": commit, "private": repo.private, "siblings": siblings, "tags": []}
         return self._answer(200, about)
 
     def _entry(self, path: str, content: bytes) -> dict[str, Any]:
@@ -193,14 +208,24 @@ class _Handler(BaseHTTPRequestHandler):
         url = f"{self.server.endpoint}/{kind}/{name}/commit/{repo.commits[-1]}"
         return self._answer(200, {"success": True, "commitOid": repo.commits[-1], "commitUrl": url, "hookOutput": ""})
 
-    def _resolve(self, repo: Repo, path: str) -> None:
-        if path not in repo.files:
+    def _resolve(self, repo: Repo, name: str, revision: str, path: str) -> None:
+        if name.startswith("gated/"):
+            return self._refuse(403, "Access to this dataset is restricted", "GatedRepo")
+        commit, files = repo.at(revision) or ("", {})
+        if path not in files:
             return self._refuse(404, f"{path} does not exist", "EntryNotFound")
-        content = repo.files[path]
+        content = files[path]
+        if self.command == "GET" and path in self.server.faults:
+            self.server.faults.remove(path)
+            return self._refuse(500, "Internal Error")
         etag = self._entry(path, content).get("lfs", {}).get("oid") or git_sha1(content)
-        about = {"ETag": f'"{etag}"', "X_Repo_Commit": repo.commits[-1], "Accept_Ranges": "bytes"}
+        about = {"ETag": f'"{etag}"', "X_Repo_Commit": commit, "Accept_Ranges": "bytes"}
         if byte_range := re.fullmatch(r"bytes=(\d+)-(\d*)", self.headers.get("Range") or ""):
             first, last = int(byte_range[1]), min(int(byte_range[2] or len(content)), len(content) - 1)
             about["Content_Range"] = f"bytes {first}-{last}/{len(content)}"
             return self._answer(206, content[first : last + 1], **about)
+        if self.command == "GET" and path in self.server.halves:
+            self.server.halves.remove(path)
+            self.close_connection = True
+            return self._answer(200, content[: len(content) // 2], **about, Content_Length=str(len(content)))
         return self._answer(200, content, **about)

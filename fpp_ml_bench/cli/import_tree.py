@@ -1,6 +1,7 @@
 """``fpp-bench import``: a published tree, or a scanner's captures, into the dataset format."""
 
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
@@ -11,17 +12,21 @@ from fpp_ml_bench.cli.calibrate import print_fit
 from fpp_ml_bench.cli.console import gigabytes, progress_bar, show
 from fpp_ml_bench.cli.options import AT_LEAST_ONE, command, given
 from fpp_ml_bench.coding.code import Limits, Reason
+from fpp_ml_bench.constants import REPOSITORY_NAME
 from fpp_ml_bench.errors import BuildError
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.captures.decoding import capture_notes, plan_captures
 from fpp_ml_bench.loaders.captures.images import read_splits
 from fpp_ml_bench.loaders.published.importing import (
     AGREEING_MM,
+    Source,
     depth_difference_mm,
     import_notes,
     import_rows,
     plan_import,
     tree_views,
 )
+from fpp_ml_bench.loaders.published.tree import INFO
 from fpp_ml_bench.loaders.storage.manifest import Manifest
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.rig_file import load_rig
@@ -56,10 +61,21 @@ class CaptureSettings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImportSettings(CaptureSettings):
+class HubSettings:
+    """What is fetched of a dataset on the Hub."""
+
+    HEADING = "a dataset of the Hugging Face Hub"
+    revision: str | None = option(None, "branch, tag or commit (default: its main branch)", "REV")
+    raw_scans: bool = option(False, "fetch the raw scans, too; --fit-rig and --frame-order imply it")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportSettings(HubSettings, CaptureSettings):
     """Settings of `import_tree`."""
 
-    tree: Path = argument("folder that holds training_datasets/, or captures", "TREE")
+    tree: Path = argument(
+        "folder that holds training_datasets/, or captures; or OWNER/NAME on the Hugging Face Hub", "TREE"
+    )
     out: Path = option(REQUIRED, "new folder, or the folder of an interrupted import", "DIR")
     workers: int | None = option(None, "processes (default: one per processor)", "N", parse=AT_LEAST_ONE)
     captures: bool = option(False, "TREE holds captures, which --rig decodes into the ground truth")
@@ -72,7 +88,8 @@ class ImportSettings(CaptureSettings):
 
 @command(
     """\
-fpp-bench import fpp-ml-bench --out data/published
+fpp-bench import aharoon/fpp-ml-bench --out data/published  fetch the published dataset and import it
+fpp-bench import fpp-ml-bench --out data/published          import a copy of it in a folder
 fpp-bench import fpp-ml-bench --out data/published --frame-order paper
 fpp-bench import my-scans --out data/mine --rig my-rig.yaml
 fpp-bench import my-scans --out data/mine --fit-rig         find the rig from frames and depth, as calibrate does
@@ -82,6 +99,10 @@ TREE holds training_datasets/ (training_data_depth_raw, or the global or individ
 raw scans, fpp_synthetic_dataset/. The tree's split is used. If files break the layout, they are all listed and
 nothing is imported. Frame orders: paper, vertical-first, by-direction, by-direction-vertical-first, with any of
 +white-first, +backward-steps, +least-bit-first; the order is checked on the images.
+
+Where there is no folder TREE, OWNER/NAME is a dataset of the Hub with the same layout. What will be downloaded is
+printed first: the depth variant that is read and, with --raw-scans, the frames of the raw scans, into the cache of
+huggingface_hub (HF_HOME). Run a stopped command again, and it continues.
 
 With --captures, TREE holds a folder for each object, with a folder of frames for each view, or with the frames
 of a single view: as many images as the rig's sequence has, in the order of their names. The rig decodes them
@@ -93,12 +114,17 @@ def import_tree(settings: ImportSettings) -> None:
     format as a build.
 
     Prints a summary. Raises FppBenchError for an unusable tree, captures, rig or folder."""
+    from_hub = REPOSITORY_NAME.fullmatch(str(settings.tree)) and not settings.tree.exists() and not settings.captures
+    if (of_hub := given(settings, HubSettings)) and not from_hub:
+        raise BuildError(
+            f"{of_hub[0]} belongs to a dataset of the Hub, given as OWNER/NAME; {settings.tree} is a folder"
+        )
     if settings.rig is not None and settings.fit_rig:
         raise BuildError("--rig and --fit-rig: the first gives the rig that the second finds; give one of them")
     if settings.captures:
         _import_captures(settings)
     else:
-        _import_tree(settings)
+        _import_tree(settings, bool(from_hub))
 
 
 def _import_captures(settings: ImportSettings) -> None:
@@ -150,17 +176,42 @@ def _print_end(out: Path, manifest: "Manifest", images: int, seconds: float, not
     print(f"next: fpp-bench info {out}")
 
 
-def _import_tree(settings: ImportSettings) -> None:
+def _fetch(settings: ImportSettings) -> tuple[Path, Source]:
+    """Download what the import needs of a dataset of the Hub: the folder of its tree, and where it is from."""
+    from fpp_ml_bench.loaders.hub import Hub  # imports huggingface_hub, for which no other import waits
+    from fpp_ml_bench.loaders.published.fetching import fetch_tree, plan_download
+
+    hub = Hub(sending=False)
+    raw_scans = settings.raw_scans or settings.fit_rig or settings.frame_order != "auto"
+    download = plan_download(hub, str(settings.tree), settings.revision, raw_scans)
+    source, revision = download.source, "" if settings.revision is None else f" ({printable(settings.revision, 60)})"
+    print(f"{hub.url('dataset', source.repository)} at commit {source.commit}{revision}")
+    print(f"  needed: {', '.join((*source.folders, INFO))}: {_amount(download.sizes)}")
+    print(f"  to download: {_amount(download.missing)}, into {download.cache} (HF_HOME)")
+    if download.raw_scans:
+        print(f"  not needed: images of raw scans, {_amount(download.raw_scans)}; --raw-scans fetches them, too")
+    sys.stdout.flush()  # into a file or pipe, too, it is said before the download
+    return fetch_tree(hub, download, settings.out), source
+
+
+def _amount(sizes: Mapping[str, int]) -> str:
+    return f"{len(sizes):,} files, {gigabytes(sum(sizes.values()))}"
+
+
+def _import_tree(settings: ImportSettings, from_hub: bool) -> None:
     if of_captures := given(settings, CaptureSettings):
         raise BuildError(f"{of_captures[0]} belongs to captures without depth; give --captures too")
     rig = None if settings.rig is None else load_rig(settings.rig)
-    plan = plan_import(settings.tree, rig, settings.frame_order)
+    if not from_hub and REPOSITORY_NAME.fullmatch(str(settings.tree)) and settings.tree.is_dir():
+        print(f"{settings.tree}: reading this folder, not a dataset of that name on the Hugging Face Hub")
+    tree, source = _fetch(settings) if from_hub else (settings.tree, None)
+    plan = plan_import(tree, rig, settings.frame_order, source)
     if settings.fit_rig:
         with progress_bar("reading", len(plan.reader.samples), "views") as advance:
             views = tree_views(plan.reader, settings.workers or usable_cores(), advance)
         rig, fit = fit_projector(views, plan.reader.rig)
         print_fit(rig, fit)
-        plan = plan_import(settings.tree, rig, settings.frame_order)
+        plan = plan_import(tree, rig, settings.frame_order, source)
     sample_count = len(plan.reader.samples)
     images = len(plan.assembly.manifest.stored_frames)
     started = perf_counter()
@@ -168,7 +219,7 @@ def _import_tree(settings: ImportSettings) -> None:
         manifest = import_rows(settings.out, plan, settings.workers or usable_cores(), advance)
     _print_end(settings.out, manifest, images, perf_counter() - started, import_notes(manifest))
     if rig is None:
-        _warn_of_other_rig(settings.tree, depth_difference_mm(plan.reader))
+        _warn_of_other_rig(tree, depth_difference_mm(plan.reader))
 
 
 def _warn_of_other_rig(tree: Path, difference_mm: float | None) -> None:

@@ -44,7 +44,7 @@ class Repository:
 
     private = adopt = False
     repo: str = option(REQUIRED, "repository on the Hub", "OWNER/NAME", parse=hub_client.check_repo_name)
-    dry_run: bool = option(False, "print what would change and send nothing")
+    dry_run: bool = option(False, "print what would change and send nothing; works without a network, too")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -139,19 +139,30 @@ def publish_results(
     """Publish results as .eval_results/*.yaml of a model's repository."""
     hub = hub_client.Hub()
     remote = _remote(target, hub, "model")
-    dataset = hub.state("dataset", dataset_repo)
-    content = hub.mark("dataset", dataset_repo, dataset).get("content")
-    scored_on = dataset_repo, dataset.commit or "", content, source_url
+    dataset = _state(target, hub, "dataset", dataset_repo)
+    content = hub.mark("dataset", dataset_repo, dataset).get("content") if dataset.asked else None
+    scored_on = dataset_repo, dataset.commit, content, source_url
     with TemporaryDirectory(prefix="fpp-bench-publish-") as folder:
         publication = board_publish.stage_results(results, target.repo, Path(folder), *scored_on)
         _carry_out(target, hub, publication, remote)
 
 
+def _state(target: Repository, hub: hub_client.Hub, kind: hub_client.Kind, repo: str) -> hub_client.Remote:
+    """The current state of ``repo``; for a dry run that can't ask the Hub, that of one with no files, and a note."""
+    try:
+        return hub.state(kind, repo)
+    except hub_client.Unreachable as error:
+        if not target.dry_run:
+            raise
+        print(f"Nothing was asked of the Hub: {error}")
+        return hub_client.Remote(None, asked=False)
+
+
 def _remote(target: Repository, hub: hub_client.Hub, kind: hub_client.Kind) -> hub_client.Remote:
     """The current state of the repository, after checking that token, owner and visibility allow the run."""
     names = set() if target.dry_run else hub.check_token()
-    remote = hub.state(kind, target.repo)
-    if not remote.exists and kind == "model":
+    remote = _state(target, hub, kind, target.repo)
+    if not remote.exists and kind == "model" and remote.asked:
         raise PublishError(
             f"{target.repo}: no such model on {hub.endpoint}, or this token may not see it; make it first"
         )
@@ -170,7 +181,8 @@ def _carry_out(
     planned = hub_client.changes(publication, remote)
     visibility = "private" if (remote.private if remote.exists else target.private) else "public"
     url = hub.url(publication.kind, publication.repo)
-    print(f"{publication.kind} {url} ({'' if remote.exists else 'new, '}{visibility})")
+    state = f"{'' if remote.exists else 'new, '}{visibility}" if remote.asked else "the Hub was not asked"
+    print(f"{publication.kind} {url} ({state})")
     for change in planned:
         size = gigabytes(change.bytes)
         print(f"  {_SIGNS[change.status]} {change.status:<9}  {size:>9}  {printable(change.path, 300)}")
@@ -180,6 +192,8 @@ def _carry_out(
     nothing = all(change.status == "unchanged" for change in planned)
     if nothing or target.dry_run:
         print("Nothing to send: the Hub has all files." if nothing else "Dry run: nothing was sent.")
+        if not remote.asked:
+            print("The Hub was not asked which files it has, so all files are listed as new.")
         return
     with progress_bar("sending", sum(bytes_of["new"] + bytes_of["changed"]), "bytes") as advance:
         print(f"Published: {hub.send(publication, planned, remote, target.private, advance)}")

@@ -139,6 +139,16 @@ def import_rows(folder: Path, plan: ImportPlan, workers: int, progress: Progress
 
 
 @dataclass(frozen=True)
+class Source:
+    """Where a tree was downloaded from: the dataset ``repository`` of the Hugging Face Hub at ``commit``. ``folders``
+    are those of its variants and raw scans that were asked for; a cache may hold parts of others."""
+
+    repository: str
+    commit: str
+    folders: tuple[str, ...]
+
+
+@dataclass(frozen=True)
 class SampleReader(RowReader):
     """Reads the samples of ``tree``. ``order`` None: raw frames are only checked, not read as frames of a sequence."""
 
@@ -257,13 +267,16 @@ def _disagreement_mm(variant_mm: NDArray[np.float64], depth_mm: NDArray[np.float
     return float(np.abs(variant_mm - expected).max())
 
 
-def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> ImportPlan[SampleReader]:
+def plan_import(
+    root: Path, rig: Rig | None = None, frame_order: str = AUTO, source: Source | None = None
+) -> ImportPlan[SampleReader]:
     """Scan the tree at ``root`` and determine how it is read. ``rig``: the rig that took the images; None assumes the
     paper's rig, scaled to the image size. ``frame_order``: see `FrameOrder`; ``auto`` determines it from the first
-    sample's images, and checks all others against it. Raises `LayoutError` listing all files that break the layout,
-    `RigError` for a rig of another image size."""
+    sample's images, and checks all others against it. ``source``: where the tree was downloaded from. Raises
+    `LayoutError` listing all files that break the layout, `RigError` for a rig of another image size."""
     order = parse_order(frame_order)
-    tree = published_tree.scan_tree(root, len((rig or paper_rig()).sequence))
+    frames = len((rig or paper_rig()).sequence)
+    tree = published_tree.scan_tree(root, frames, None if source is None else source.folders)
     rig_used = _rig_for(tree, rig)
     if not tree.has_frames:
         order = None
@@ -282,6 +295,7 @@ def plan_import(root: Path, rig: Rig | None = None, frame_order: str = AUTO) -> 
         "rig_assumed": rig is None,
         "ignored": list(tree.ignored),
         "objects": {split: list(objects) for split, objects in by_split.items()},
+        **({} if source is None else {"repository": source.repository, "commit": source.commit}),
     }
     reader = SampleReader({s.sample: s for s in tree.samples}, rig_used, tree, order)
     return import_plan(reader, plans, IMPORTED, settings, stored)
@@ -291,6 +305,8 @@ def import_notes(manifest: Manifest) -> list[str]:
     """Notes about a finished import for the user, one sentence each."""
     settings = manifest.settings
     notes = [f"depth taken from {settings['depth_from']}"]
+    if "repository" in settings:
+        notes[0] += f" of dataset {settings['repository']} at commit {settings['commit']}"
     if settings["depth_checked_against"]:
         notes[0] += f", checked against {', '.join(settings['depth_checked_against'])}"
     if settings["depth_from"] == VARIANT_FOLDERS["individual"]:

@@ -106,7 +106,10 @@ class PublishedTree:
 def _locate(root: Path) -> tuple[Path, Path | None]:
     """Folders of the training data and of the raw scans."""
     if not root.is_dir():
-        raise LayoutError(f"{root}: no such folder; give the folder that holds {TRAINING}/")
+        raise LayoutError(
+            f"{root}: no such folder; give the folder that holds {TRAINING}/, or OWNER/NAME of a dataset on the "
+            "Hugging Face Hub"
+        )
     scans = root / RAW_SCANS if (root / RAW_SCANS).is_dir() else None
     training = root / TRAINING if (root / TRAINING).is_dir() else root
     if any((training / folder).is_dir() for folder in VARIANT_FOLDERS.values()):
@@ -126,12 +129,15 @@ def _locate(root: Path) -> tuple[Path, Path | None]:
     )
 
 
-def scan_tree(root: Path, frames: int) -> PublishedTree:
+def scan_tree(root: Path, frames: int, only: Collection[str] | None = None) -> PublishedTree:
     """Scan the tree at ``root``, whose raw scans have ``frames`` files. Raises `LayoutError` listing all problems.
-    ``root`` holds ``training_datasets/`` and maybe ``fpp_synthetic_dataset/``, or is ``training_datasets`` itself."""
+    ``root`` holds ``training_datasets/`` and maybe ``fpp_synthetic_dataset/``, or is ``training_datasets`` itself. Of
+    the folders of variants and raw scans, those that ``only`` names are read; None: all."""
     training, scans = _locate(root)
+    scans = scans if only is None or RAW_SCANS in only else None
     scan, frame_files = _Scan(), [frame_file(index) for index in range(frames)]
-    variants = tuple(name for name, folder in VARIANT_FOLDERS.items() if (training / folder).is_dir())
+    read = {name: folder for name, folder in VARIANT_FOLDERS.items() if only is None or folder in only}
+    variants = tuple(name for name, folder in read.items() if (training / folder).is_dir())
     folders = [training / VARIANT_FOLDERS[name] for name in variants]
     names = PUBLISHED_SPLIT_FOLDERS.values()
     present = {name for folder in folders for name in scan.known(folder, names, f"the folders {', '.join(names)}")}

@@ -3,6 +3,7 @@
 ``datasets.load_from_disk(FOLDER)`` follows ``dataset_dict.json`` and the split folders' ``state.json``, in place."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,20 @@ import numpy as np
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.files import write_atomically
-from fpp_ml_bench.loaders.sample import DATA_GROUP, available_configs, features, group_columns, stored_groups
-from fpp_ml_bench.loaders.storage.manifest import CAPTURED, Manifest
+from fpp_ml_bench.loaders.sample import (
+    DATA_GROUP,
+    DEPTHS,
+    LABELS,
+    MEANINGS,
+    PREVIEW,
+    RANGE,
+    available_configs,
+    features,
+    group_columns,
+    row_columns,
+    stored_groups,
+)
+from fpp_ml_bench.loaders.storage.manifest import CAPTURED, GENERATED, Manifest
 from fpp_ml_bench.optics.rig_file import rig_from_dict, save_rig
 
 RIG_FILE = "rig.yaml"
@@ -50,6 +63,55 @@ import datasets                                   # frame {first} and depth
 ```
 
 `fpp-bench info` says what is in it, `fpp-bench verify` proves it intact. Made by fpp-ml-bench {package}.
+
+{end}"""
+_LIMITS = {
+    GENERATED: """\
+- The images are rendered. Objects with names of the paper's objects are procedural models that stand in for them, not
+  scans of them, so scores on this dataset can't be compared with scores on the published `aharoon/fpp-ml-bench`.
+- Light `{light}`. In light `paper` all objects have one matte grey material and cast no shadows, as in the paper.
+- There is no table and no ground plane: objects are in front of a distant wall, which counts as background.
+- All images are of one rig, and depths are within {near:g} to {far:g} mm.
+""",
+    CAPTURED: """\
+- `depth` is decoded from the captured frames with the rig in `rig.yaml`, and has the errors of both.
+- All images are of one rig, whose working range is {near:g} to {far:g} mm.
+""",
+}
+_IMPORTED_LIMITS = """\
+- `depth` is that of the imported files{source}; there is no exact depth, and no flags of unlit or mixed pixels.
+- The files do not name their rig: `rig.yaml` is {rig}.
+- Scores on this dataset can't be compared with scores on datasets that `fpp-bench build` makes.
+"""
+_END = """\
+## Columns
+
+| column | dtype | unit | meaning |
+| --- | --- | --- | --- |
+{columns}
+
+## Limitations
+
+{limits}
+## Citation
+
+```bibtex
+@inproceedings{{haroon2026fppml,
+  author    = {{Anush Lakshman S. and Adam Haroon and Beiwen Li}},
+  title     = {{Comprehensive machine learning benchmarking for fringe projection profilometry with photorealistic
+               synthetic data}},
+  booktitle = {{Photonic Instrumentation Engineering XIII}},
+  volume    = {{13904}},
+  pages     = {{1390402}},
+  publisher = {{SPIE}},
+  year      = {{2026}},
+  doi       = {{10.1117/12.3082257}}
+}}
+@misc{{haroon_shortcuts,
+  author = {{Adam Haroon and Anush Lakshman and Cody Fleming and Beiwen Li}},
+  title  = {{Diagnosing Shape-Prior Shortcuts in Long-Range Single-Shot Fringe Projection Profilometry}}
+}}
+```
 """
 
 
@@ -61,6 +123,50 @@ def card_head(manifest: Manifest) -> str:
 def data_version(fingerprint: str) -> str:
     """Version for a card; it changes with the data, because ``datasets`` looks up its cached copies by version."""
     return f"1.0.{int(fingerprint[:7], 16)}"
+
+
+def card_end(manifest: Manifest, described: Mapping[str, Mapping[str, Any]]) -> str:
+    """End of every card: the columns by their `features`, all frames in one line; limitations and citation."""
+    frames, rows = [name for name in described if name.startswith("frame_")], []
+    for name in (name for name in described if name not in frames[1:]):
+        feature, many = described[name], name in frames and len(frames) > 1
+        unit, meaning = MEANINGS["frame" if name in frames else name]
+        dtype = "image, 8-bit grey" if feature["_type"] == "Image" else feature["dtype"]
+        shape = f" {tuple(feature['shape'])}" if "shape" in feature else ""
+        rows.append(f"| `{name}`{f' ... `{frames[-1]}`' if many else ''} | {dtype}{shape} | {unit} | {meaning} |")
+    settings, (near, far) = manifest.settings, rig_from_dict(manifest.rig).working_range_mm
+    source = ""
+    if "repository" in settings:
+        url = f"https://huggingface.co/datasets/{settings['repository']}"
+        source = f", from {url} at commit `{settings['commit']}`"
+    limits = _LIMITS.get(manifest.origin, _IMPORTED_LIMITS).format(
+        light=settings.get("light", {}).get("name", "paper"),
+        near=near,
+        far=far,
+        source=source,
+        rig="assumed to be that of the paper" if settings.get("rig_assumed") else "the one given at the import",
+    )
+    return _END.format(columns="\n".join(rows), limits=limits)
+
+
+def dataset_info(
+    config: str, described: Mapping[str, Mapping[str, Any]], size: tuple[int, int], rows: Mapping[str, int]
+) -> dict[str, Any]:
+    """What the front matter says of a configuration: columns by their `features`, and ``rows`` of each split with the
+    size of their decoded images. ``size`` is (H, W)."""
+    columns, bytes_per_pixel = [], 0
+    for name, feature in described.items():
+        if feature["_type"] == "Array2D":
+            dtype: Any = {"array2_d": {"shape": feature["shape"], "dtype": feature["dtype"]}}
+        else:
+            dtype = feature.get("dtype", "image")
+        columns.append({"name": name, "dtype": dtype})
+        if name not in (*LABELS, *RANGE, PREVIEW):
+            bytes_per_pixel += 4 if name in DEPTHS else 1
+    row_bytes = size[0] * size[1] * bytes_per_pixel
+    splits = [{"name": name, "num_bytes": row_bytes * count, "num_examples": count} for name, count in rows.items()]
+    total = sum(split["num_bytes"] for split in splits)
+    return {"config_name": config, "features": columns, "splits": splits, "dataset_size": total}
 
 
 def write_card(folder: Path, manifest: Manifest) -> list[str]:
@@ -104,6 +210,7 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
         config=available_configs(sequence, manifest.stored)[-1],
         package=__version__,
         first=frames[0],
+        end=card_end(manifest, features(row_columns(sequence, manifest.stored_frames, manifest.exact), manifest.size)),
     )
     write_atomically(folder / "README.md", text.encode())
     return ["README.md", RIG_FILE, *contents]

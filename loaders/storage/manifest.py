@@ -10,7 +10,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin
 
-from fpp_ml_bench.constants import OBJECT_NAME, SAMPLE_NAME, SCHEMA_VERSION, SPLITS, VIEW_NAME
+from fpp_ml_bench.constants import OBJECT_NAME, REPOSITORY_NAME, SAMPLE_NAME, SCHEMA_VERSION, SPLITS, VIEW_NAME
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import file_hash, path_problem, printable, read_json, text_problem, write_atomically
 from fpp_ml_bench.loaders.sample import available_configs, stored_frames, stored_groups
@@ -24,6 +24,8 @@ GENERATED = "generated"
 """`Manifest.origin` of a dataset that the builder made."""
 CAPTURED = "captured"
 """That of a dataset decoded from a scanner's captures; objects have any views."""
+_LOCAL = "data"
+"""Folder of the datasets in all examples: data/mini that is not there is no repository of an owner called data."""
 LARGEST_PX = 16384
 """Largest side of an image."""
 Kind = TypeVar("Kind")
@@ -112,6 +114,11 @@ def read_manifest(folder: Path) -> Manifest:
     """Manifest of a dataset folder. Raises `DatasetError` for a folder that is none, is unfinished or is damaged."""
     path = folder / MANIFEST
     if not folder.is_dir():
+        if REPOSITORY_NAME.fullmatch(str(folder)) and folder.parts[0] != _LOCAL and not folder.parent.is_dir():
+            raise DatasetError(
+                f"{folder}: is no dataset folder; to fetch the published dataset: fpp-bench import {folder} "
+                "--out data/published"
+            )
         raise DatasetError(f"{folder}: no such folder; build one with: fpp-bench build --out {folder} --preset mini")
     if not path.is_file():
         if (folder / WORK_FOLDER).is_dir():

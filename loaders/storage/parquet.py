@@ -22,20 +22,21 @@ import pyarrow.parquet as pq
 import yaml
 from numpy.typing import NDArray
 
+from fpp_ml_bench.containers import png_bytes
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders import sample as layout
-from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTHS, LABELS, PIXEL_MAPS, RANGE, config_columns
-from fpp_ml_bench.loaders.storage.card import card_head, data_version
+from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTHS, LABELS, PIXEL_MAPS, PREVIEW, RANGE, config_columns
+from fpp_ml_bench.loaders.storage.card import card_end, card_head, data_version
 from fpp_ml_bench.loaders.storage.manifest import ShardFile
 from fpp_ml_bench.loaders.storage.shards import arrow_schema
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
-PREVIEW = "depth_preview"
 PREVIEW_PX = 240
 """Longest side of a preview."""
 _NEAREST, _FARTHEST = 255, 64
+_SHOWN = 4
 _GROUP_BYTES, _VIEWER_GROUP_BYTES = 1 << 28, 200_000_000
 """Raw bytes of a row group; the Hub's viewer reads whole groups and refuses those above 286 MiB."""
 _MOST_ROWS_PER_GROUP = 24
@@ -55,7 +56,8 @@ train = datasets.load_dataset("THIS FOLDER", "{config}", split="{split}")
 ```
 
 Configurations: {names}. A configuration reads only its own columns.
-"""
+
+{end}"""
 
 
 def columns(dataset: DatasetFolder, config: str | None = None) -> list[str]:
@@ -212,13 +214,18 @@ def _stored_columns(dataset: DatasetFolder, parts: list[ShardFile]) -> dict[str,
     return stored
 
 
+def published_features(dataset: DatasetFolder, config: str | None = None) -> dict[str, dict[str, Any]]:
+    """The `columns` of a configuration as published, as `sample.features`; frames and preview are images."""
+    names = columns(dataset, config)
+    pictures = {name: {"_type": "Image"} for name in names if name == PREVIEW or name.startswith("frame_")}
+    return {**layout.features(names, dataset.size), **pictures}
+
+
 def _viewer_schema(dataset: DatasetFolder, names: list[str], pictures: list[str]) -> pa.Schema:
-    arrays = [name for name in names if name not in pictures]
-    schema = arrow_schema(arrays, dataset.size)
-    described = layout.features(arrays, dataset.size) | {name: {"_type": "Image"} for name in pictures}
+    schema = arrow_schema([name for name in names if name not in pictures], dataset.size)
     image = pa.struct({"bytes": pa.binary(), "path": pa.string()})
     fields = [pa.field(name, image) if name in pictures else schema.field(name) for name in names]
-    content = {"info": {"features": {name: described[name] for name in names}}}
+    content = {"info": {"features": published_features(dataset)}}
     return pa.schema(fields, metadata={b"huggingface": json.dumps(content).encode()})
 
 
@@ -246,6 +253,21 @@ def preview(depth_mm: NDArray[np.float32]) -> NDArray[np.uint8]:
     return np.where(inside, np.rint(_NEAREST - share * (_NEAREST - _FARTHEST)), 0).astype(np.uint8)
 
 
+def overview(dataset: DatasetFolder) -> bytes:
+    """PNG of the first views of up to `_SHOWN` objects: the first frame above the depth, near yellow and far blue."""
+    first_views = {row["object"]: row["sample"] for rows in dataset.manifest.samples.values() for row in reversed(rows)}
+    panels = []
+    for sample in list(first_views.values())[-_SHOWN:]:
+        shades = preview(dataset.depth_mm(sample))
+        frame = np.asarray(dataset.frame(sample, dataset.sequence.config("single_shot")[0]))
+        small = cv2.resize(frame, shades.shape[::-1], interpolation=cv2.INTER_AREA)
+        share = np.clip((shades.astype(float) - _FARTHEST) / (_NEAREST - _FARTHEST), 0, 1)
+        depth = cv2.applyColorMap(np.rint(255 * share).astype(np.uint8), cv2.COLORMAP_CIVIDIS)
+        depth[shades == 0] = 0
+        panels.append(np.vstack([cv2.cvtColor(small, cv2.COLOR_GRAY2BGR), depth]))
+    return png_bytes(np.hstack(panels))
+
+
 def _card(dataset: DatasetFolder, splits: list[str]) -> str:
     manifest = dataset.manifest
     # Exports of the same dataset with different splits must not share a cache entry.
@@ -261,4 +283,5 @@ def _card(dataset: DatasetFolder, splits: list[str]) -> str:
         config=dataset.configs[0],
         split=splits[0],
         names=", ".join(f"`{config}`" for config in dataset.configs),
+        end=card_end(manifest, layout.features(_all_columns(dataset), dataset.size)),
     )

@@ -2,16 +2,21 @@
 
 import json
 import re
+import socket
 import subprocess
 import sys
 
+import cv2
 import numpy as np
 import pytest
 import yaml
+from datasets import Array2D, Features, Image
 from hub_server import Repo
+from huggingface_hub import constants
 from publishing import DATA, ODD_OBJECT, ROOT, SIZE, listed, make_all_frames, running_hub
 from scored_dataset import make_dataset
 
+from fpp_ml_bench.cli import main
 from fpp_ml_bench.loaders.sample import config_columns
 
 
@@ -48,7 +53,7 @@ def published(client, dataset):
 def test_a_dry_run_says_everything_and_changes_nothing(published):
     output, writes, repos = published["dry"]
     assert listed(output) == dict.fromkeys(
-        [*DATA, "README.md", "eval.yaml", "fpp-bench.json", "meshes/bowl.ply", "rig.yaml"], "new"
+        [*DATA, "README.md", "eval.yaml", "fpp-bench.json", "meshes/bowl.ply", "overview.png", "rig.yaml"], "new"
     )
     assert "(new, public)" in output
     assert "Dry run: nothing was sent." in output
@@ -62,7 +67,7 @@ def test_the_real_run_does_what_the_dry_run_said(published, client):
     assert set(repo.files) == {*listed(output), ".gitattributes"}
     assert len(repo.commits) == 2  # the Hub's own, and one that makes everything visible at once
     assert not repo.private
-    assert sum(method == "PUT" for method, _ in writes) == 4  # three Parquet files and a mesh
+    assert sum(method == "PUT" for method, _ in writes) == 5  # three Parquet files, a mesh and the picture
 
 
 def test_a_second_run_sends_nothing(published):
@@ -136,6 +141,50 @@ def test_a_name_with_markup_is_shown_as_it_is(published, client):
     }
 
 
+def test_the_card_describes_columns_and_splits(published, client, dataset):
+    files = client.server.repos["datasets", "alice/fpp"].files
+    head, body = files["README.md"].decode().split("---\n", 2)[1:]
+    for info in yaml.safe_load(head)["dataset_info"]:
+        names = config_columns(dataset.sequence, info["config_name"], exact=True)
+        assert {column["name"] for column in info["features"]} == {*names, "depth_preview"}
+        assert {split["name"]: split["num_examples"] for split in info["splits"]} == {
+            split: len(samples) for split, samples in dataset.splits.items()
+        }
+        features = Features._from_yaml_list(info["features"])
+        assert features["depth"] == Array2D(SIZE, "float32") and isinstance(features[names[4]], Image)
+    height, width = SIZE
+    pixels = height * width * (1 + 4 + 4 + 1 + 1)  # frame 0, two depths, flags, cover
+    single = next(info for info in yaml.safe_load(head)["dataset_info"] if info["config_name"] == "single_shot")
+    assert single["splits"][-1]["num_bytes"] == 2 * pixels
+    for name in ("sample", "depth", "depth_exact", "flags", "cover", "depth_min", "depth_preview"):
+        assert f"| `{name}` |" in body
+    assert "| `frame_00` ... `frame_51` | image, 8-bit grey | grey level |" in body
+    assert "## Limitations" in body and "10.1117/12.3082257" in body
+    picture = cv2.imdecode(np.frombuffer(files["overview.png"], np.uint8), cv2.IMREAD_COLOR)
+    assert picture.shape == (2 * height, 4 * width, 3) and "](overview.png)" in body
+    assert len(np.unique(picture[height:].reshape(-1, 3), axis=0)) > 2  # the depths
+
+
+@pytest.mark.parametrize("offline", [True, False])
+@pytest.mark.parametrize("what", ["dataset", "leaderboard"])
+def test_a_dry_run_works_without_a_network(small, monkeypatch, capsys, tmp_path, offline, what):
+    def refuse(*args):
+        raise OSError("no network in this test")
+
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", offline)
+    call = ["publish", what, *([str(small.path)] if what == "dataset" else []), "--repo", "alice/never"]
+    assert main([*call, "--dry-run"]) == 0
+    output = capsys.readouterr().out
+    expected = {*DATA, "README.md", "overview.png"} if what == "dataset" else {"README.md", "index.html"}
+    assert expected <= listed(output).keys() and set(listed(output).values()) == {"new"}
+    reason = "HF_HUB_OFFLINE is set" if offline else "can't be reached"
+    assert re.search(rf"Nothing was asked of the Hub: .*{reason}", output) and "Dry run: nothing was sent." in output
+    monkeypatch.setenv("HF_TOKEN", "hf_good")
+    assert main(call) == 2
+    assert reason in capsys.readouterr().err
+
+
 def test_the_benchmark_is_registered(published, client):
     evaluation = yaml.safe_load(client.server.repos["datasets", "alice/fpp"].files["eval.yaml"])
     assert evaluation["evaluation_framework"] == "fpp-ml-bench"
@@ -174,7 +223,7 @@ def test_a_run_that_was_cut_off_sends_only_what_is_missing(client, small):
     assert first[0] == 2 and "the Hub has a fault (500)" in first[2]
     assert second[0] == 0, second[2]
     writes = client.server.writes()
-    assert sum(method == "PUT" for method, _ in writes) == 3  # each large file once, over both runs
+    assert sum(method == "PUT" for method, _ in writes) == 4  # each large file once, over both runs
     assert sum("/commit/" in path for _, path in writes) == 2
     assert len(client.server.repos["datasets", "cut/fpp"].commits) == 2
 
