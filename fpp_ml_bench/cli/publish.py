@@ -141,6 +141,8 @@ def publish_results(
     remote = _remote(target, hub, "model")
     dataset = _state(target, hub, "dataset", dataset_repo)
     content = hub.mark("dataset", dataset_repo, dataset).get("content") if dataset.asked else None
+    if not dataset.asked:
+        print(f"The results were not compared with the content of {dataset_repo}.")
     scored_on = dataset_repo, dataset.commit, content, source_url
     with TemporaryDirectory(prefix="fpp-bench-publish-") as folder:
         publication = board_publish.stage_results(results, target.repo, Path(folder), *scored_on)

@@ -154,7 +154,8 @@ def dataset_info(
 ) -> dict[str, Any]:
     """What the front matter says of a configuration: columns by their `features`, and ``rows`` of each split with the
     size of their decoded images. ``size`` is (H, W)."""
-    columns, bytes_per_pixel = [], 0
+    columns: list[dict[str, Any]] = []
+    bytes_per_pixel = 0
     for name, feature in described.items():
         if feature["_type"] == "Array2D":
             dtype: Any = {"array2_d": {"shape": feature["shape"], "dtype": feature["dtype"]}}
@@ -165,7 +166,7 @@ def dataset_info(
             bytes_per_pixel += 4 if name in DEPTHS else 1
     row_bytes = size[0] * size[1] * bytes_per_pixel
     splits = [{"name": name, "num_bytes": row_bytes * count, "num_examples": count} for name, count in rows.items()]
-    total = sum(split["num_bytes"] for split in splits)
+    total = row_bytes * sum(rows.values())
     return {"config_name": config, "features": columns, "splits": splits, "dataset_size": total}
 
 

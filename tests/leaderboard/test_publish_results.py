@@ -75,6 +75,9 @@ def test_results_parse_back(client, scored):
             ".eval_results/single_shot_depth--alice--scored.yaml": "new",
         }
     )
+    ((status, alone, error),) = client.run([*call, "--dry-run"], HF_HUB_OFFLINE="1")
+    assert status == 0 and listed(alone) == listed(dry), error
+    assert "HF_HUB_OFFLINE is set" in alone and "not compared with the content of alice/scored" in alone
     repo = client.server.repos["models", "alice/unet"]
     assert repo.files["README.md"] == b"card" and repo.files[".eval_results/hle.yaml"] == b"[]"
     single = entry(client, "alice/unet", "single_shot_depth")
