@@ -2,12 +2,15 @@
 
 import io
 import zlib
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
 import h5py
 import numpy as np
 import scipy.io
+from hub_server import HubServer, Repo
+from huggingface_hub import constants
 
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.loaders.published.importing import import_rows, plan_import
@@ -23,6 +26,8 @@ FOLDERS = {
     "individual": "training_data_depth_individual_normalized",
 }
 TRAINING = Path("training_datasets")
+PUBLISHED = "aharoon/fpp-ml-bench"
+"""Name of the published dataset on the Hub."""
 
 
 def depth_of(stem, size=SIZE):
@@ -86,6 +91,29 @@ def make_tree(root, variants=("raw",), info=None, splits=SPLITS, size=SIZE):
                     root / TRAINING / f"info_depth_params/{split}/depth/{stem}.mat", depth_min=low, depth_max=high
                 )
     return root
+
+
+def files_of(tree):
+    """What a Hub repository with the tree holds: content by path."""
+    files = {path.relative_to(tree).as_posix(): path.read_bytes() for path in tree.rglob("*") if path.is_file()}
+    return {**files, "README.md": b"# A dataset\n", ".gitattributes": b""}
+
+
+@contextmanager
+def hub_of(tree, cache, monkeypatch):
+    """A Hub on the loopback interface whose one dataset is the tree, as `PUBLISHED`; this process's client talks to
+    it. The Hugging Face cache is the folder ``cache``."""
+    server = HubServer()
+    server.repos["datasets", PUBLISHED] = Repo(files=files_of(tree))
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
+    monkeypatch.setattr(constants, "ENDPOINT", server.endpoint)
+    template = server.endpoint + "/{repo_id}/resolve/{revision}/{filename}"
+    monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(cache))
+    monkeypatch.delenv("HF_TOKEN", raising=False)
+    yield server
+    server.shutdown()
+    server.server_close()
 
 
 def imported(tree, out, workers=1, **settings):

@@ -8,9 +8,10 @@ from collections import namedtuple
 
 import numpy as np
 import pytest
-from hub_server import HubServer, Repo
+from hub_server import Repo
 from huggingface_hub import constants
-from published_trees import FOLDERS, TRAINING, depth_path, imported, make_tree, write_mat
+from published_trees import FOLDERS, TRAINING, depth_path, files_of, hub_of, imported, make_tree, write_mat
+from published_trees import PUBLISHED as NAME
 from publishing import ROOT
 
 import fpp_ml_bench
@@ -20,7 +21,6 @@ from fpp_ml_bench.loaders.published import fetching
 from fpp_ml_bench.loaders.published.exporting import export
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
-NAME = "aharoon/fpp-ml-bench"
 RAW = f"{TRAINING}/{FOLDERS['raw']}"
 MAT = f"{RAW}/test/depth/power_drill_A60.mat"
 
@@ -37,11 +37,6 @@ def scanned(opened, tmp_path_factory):
     folder = tmp_path_factory.mktemp("scanned") / "tree"
     export(opened, folder, ["mat"], ["test"])
     return folder
-
-
-def files_of(tree):
-    files = {path.relative_to(tree).as_posix(): path.read_bytes() for path in tree.rglob("*") if path.is_file()}
-    return {**files, "README.md": b"# A dataset\n", ".gitattributes": b""}
 
 
 class Run:
@@ -66,18 +61,9 @@ class Run:
 
 @pytest.fixture
 def run(tree, tmp_path, monkeypatch, capfd):
-    server = HubServer()
-    server.repos["datasets", NAME] = Repo(files=files_of(tree))
-    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
-    monkeypatch.setattr(constants, "ENDPOINT", server.endpoint)
-    template = server.endpoint + "/{repo_id}/resolve/{revision}/{filename}"
-    monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
-    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
-    monkeypatch.delenv("HF_TOKEN", raising=False)
     monkeypatch.chdir(tmp_path)
-    yield Run(server, capfd)
-    server.shutdown()
-    server.server_close()
+    with hub_of(tree, tmp_path / "cache", monkeypatch) as server:
+        yield Run(server, capfd)
 
 
 def assert_same_data(dataset, expected):
