@@ -38,7 +38,7 @@ MEANINGS = {
     "sample": ("", "object and view"),
     "object": ("", "the object; no object is in two splits"),
     "view": ("", "the view of the object, such as its angle on the turntable: `A60` is 60 degrees"),
-    "split": ("", "train, validation or test"),
+    "split": ("", "the split that the sample is in"),
     "frame": ("grey level", "camera image under one projected pattern"),
     PREVIEW: ("", "picture of `depth`, scaled to the range of the object: for looking, not for training"),
     DEPTH: ("mm", "depth along the camera's axis, decoded from the frames; 0 = background, or not decoded"),

@@ -88,8 +88,8 @@ class ImportSettings(HubSettings, CaptureSettings):
 
 @command(
     """\
-fpp-bench import aharoon/fpp-ml-bench --out data/published  fetch the published dataset and import it
-fpp-bench import fpp-ml-bench --out data/published          import a copy of it in a folder
+fpp-bench import aharoon/fpp-ml-bench --out data/published      fetch the published dataset and import it
+fpp-bench import fpp-ml-bench --out data/published              import a copy of it in a folder
 fpp-bench import fpp-ml-bench --out data/published --frame-order paper
 fpp-bench import my-scans --out data/mine --rig my-rig.yaml
 fpp-bench import my-scans --out data/mine --fit-rig         find the rig from frames and depth, as calibrate does
