@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hub_server import Repo
 from huggingface_hub import constants
+from huggingface_hub.utils import enable_progress_bars
 from published_trees import FOLDERS, TRAINING, depth_path, files_of, hub_of, imported, make_tree, write_mat
 from published_trees import PUBLISHED as NAME
 from publishing import ROOT
@@ -71,7 +72,8 @@ def assert_same_data(dataset, expected):
 
 
 def test_the_whole_run(run, tree, tmp_path, monkeypatch):
-    monkeypatch.setenv("TQDM_POSITION", "-1")  # the client's progress bars, also where there is no terminal
+    monkeypatch.setenv("TQDM_POSITION", "-1")  # the client's progress bars, also where there is no terminal,
+    enable_progress_bars()  # and after tests of publishing, which turns them off for its process
     commit = run.server.repos["datasets", NAME].commits[-1]
     status, printed, error = run(NAME, "--out", "data/published", "--workers", 1)
     assert status == 0, error
