@@ -2,7 +2,6 @@
 
 import json
 import os
-import re
 import shlex
 import shutil
 import subprocess
@@ -37,29 +36,38 @@ def call(*arguments, command=main):
 
 AT_ONCE = "", "fpp-eval"
 """Help that no heavy import precedes. That of a command may import what the command needs at once, but no torch."""
+HELPS = """
+import json, sys
+from contextlib import redirect_stdout
+from io import StringIO
+from fpp_ml_bench.cli import main, main_eval
+loaded = set()
+for name in sys.argv[1:]:
+    program, words = (main_eval, []) if name == "fpp-eval" else (main, [name] if name else [])
+    with redirect_stdout(StringIO()) as text:
+        status = program([*words, "--help"])
+    print(json.dumps([name, status, text.getvalue(), sorted(set(sys.modules) - loaded)]))
+    loaded = set(sys.modules)
+"""
+"""Prints the help of each name, one after the other in one process, and the modules that it was the first to import."""
 
 
-@pytest.mark.parametrize("name", [*COMMANDS, "", "fpp-eval"])
-def test_help_answers_without_importing_anything_heavy(name):
-    code = (
-        "import sys\n"
-        "from fpp_ml_bench.cli import main\n"
-        f"words, name = sys.argv[1:], {name!r}\n"
-        "if name == 'fpp-eval':\n"
-        "    from fpp_ml_bench.cli import main_eval as main\n"
-        "status = main([*([name] if name in words and name else []), '--help'])\n"
-        f"print('HEAVY', [m for m in {HEAVY!r} if m in sys.modules], status)\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code, name], cwd=ROOT, capture_output=True, text=True)
+@pytest.fixture(scope="module")
+def helps():
+    command = [sys.executable, "-c", HELPS, *AT_ONCE, *COMMANDS]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    heavy = done.stdout.rstrip().rpartition("HEAVY ")[2]
-    loaded = set(re.findall(r"[a-z]\w+", heavy))
-    assert heavy.endswith(" 0") and not loaded & (set(HEAVY) if name in AT_ONCE else {"torch", "datasets"})
-    assert "usage:" in done.stdout and "examples:" in done.stdout
-    if name and name != "fpp-eval":
-        assert f"usage: fpp-bench {name}" in done.stdout
-    for line in done.stdout.splitlines():
-        assert len(line) <= 125
+    return {name: rest for name, *rest in map(json.loads, done.stdout.splitlines())}
+
+
+@pytest.mark.parametrize("name", [*AT_ONCE, *COMMANDS])
+def test_help_answers_without_importing_anything_heavy(helps, name):
+    status, text, imported = helps[name]
+    assert status == 0 and not set(imported) & (set(HEAVY) if name in AT_ONCE else {"torch", "datasets"})
+    assert "usage:" in text and "examples:" in text
+    if name not in AT_ONCE:
+        assert f"usage: fpp-bench {name}" in text
+    assert max(map(len, text.splitlines())) <= 125
 
 
 def test_help_and_version_of_the_programs_import_no_command():
