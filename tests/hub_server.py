@@ -58,7 +58,7 @@ class HubServer(ThreadingHTTPServer):
         """Files of which the next download fails, with 500."""
         self.halves: set[str] = set()
         """Files of which the next download ends in the middle."""
-        threading.Thread(target=self.serve_forever, daemon=True).start()
+        threading.Thread(target=self.serve_forever, args=(0.01,), daemon=True).start()
 
     @property
     def endpoint(self) -> str:
