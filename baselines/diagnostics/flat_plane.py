@@ -30,12 +30,12 @@ from fpp_ml_bench.style import DEPTH_COLOURS
 TILTS_DEG = ((0.0, 0.0), (20.0, 0.0), (0.0, 20.0))
 DISTANCES_M = (1.6, 1.8, 2.0)
 OUTLINES, QUICK_OUTLINES = 5, 2
-FRAME_COLOURS, RECTANGLE, SILHOUETTE = "fills the frame", "rectangle", "silhouette"
-KINDS = FRAME_COLOURS, RECTANGLE, SILHOUETTE
+FRAME, RECTANGLE, SILHOUETTE = "fills the frame", "rectangle", "silhouette"
+KINDS = FRAME, RECTANGLE, SILHOUETTE
 """Kinds of outlines; a silhouette is named by its sample."""
 GROWING = {f"{RECTANGLE}, side {side:g}": side for side in (0.3, 0.45, 0.5, 0.6, 0.7, 0.8, 0.9, 0.96, 1.0)}
 """Sides, as shares of the image's, of rectangles that face the camera at the paper's distance."""
-SIDES = {FRAME_COLOURS: 1.0, RECTANGLE: 0.5, **GROWING}
+SIDES = {FRAME: 1.0, RECTANGLE: 0.5, **GROWING}
 STREAM = (0, "plane", "")
 PAPER = paper_rows()["probes"]["flat_plane"]
 PAPER_DISTANCE_M = PAPER["distance_m"]

@@ -75,7 +75,6 @@ class Scatter:
     across: str
     labelled: Sequence[Mark]
     names: bool = True
-    numbers: bool = True
 
     def draw(self, axes: Axes) -> list[Mark]:
         """Draw into ``axes``, whose place in the figure is fixed. Returns the marks that are shown by a number."""
@@ -123,7 +122,7 @@ class Scatter:
         numbered = []
         for mark in self.labelled:
             tries = [(mark.name, _NAME_GAP, lines)] if self.names else []
-            tries += [(str(mark.number), gap, more) for more in (lines, ()) for gap in _NUMBER_GAPS if self.numbers]
+            tries += [(str(mark.number), gap, more) for more in (lines, ()) for gap in _NUMBER_GAPS]
             for text, gap, more in tries:
                 half = ((_CHARACTER * len(text) / 2 + _PADDING) * size, _LINE * size / 2)
                 box = free_box(places[mark.number], half, (mark.radius + gap) * px, [*taken, *more], axes.bbox)

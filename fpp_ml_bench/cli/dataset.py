@@ -191,7 +191,7 @@ def _prediction_picture(opened: DatasetFolder, sample: str, folder: Path, pictur
     name, maps = prediction_maps(folder, opened, split, target)
     submission, (depth_mm, _) = read_submission(folder), maps(sample)
     content = {} if submission.predicted is None else submission.predicted.content
-    if changed := next((key for key, digest in content.items() if opened.content.get(key) != digest), None):
+    if changed := opened.changed_column(content):
         raise DatasetError(
             f"{opened.path}: is not what {folder} was predicted from, {printable(changed)} is another; give "
             "that dataset"

@@ -14,15 +14,16 @@ from fpp_ml_bench import __version__
 from fpp_ml_bench.cli import BENCH, EVAL, OK, run_program
 from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.cli.options import command
+from fpp_ml_bench.constants import MINI_OBJECTS, TEST_OBJECTS
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import RANK_KEY
 from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE
+from fpp_ml_bench.leaderboard.names import assumption
 from fpp_ml_bench.leaderboard.rows import Entry, read_entry
 from fpp_ml_bench.options import option
 from fpp_ml_bench.tables import Table
 
-OBJECTS = "power_drill,wooden_boards"
-"""The two test objects of the preset ``mini``."""
+OBJECTS = tuple(name for name in MINI_OBJECTS if name in TEST_OBJECTS)
 SAMPLE = "power_drill_A60"
 METHODS = {"classical": "mini", "phase": "mini", "crossed": "mini-crossed"}
 """Each method of the demo, and the dataset that it is run on."""
@@ -30,7 +31,7 @@ NOTES = """\
 Object MAE: mean error on the object's pixels, against the exact depth. Overall MAE: the same over all pixels.
 Time: median of one depth map on one thread of this machine. Frames: images that are captured for a depth map.
 Phase reliance: 1, the depth follows the phase of the fringes and nothing else; 0, it does not follow it.
-phase assumes one albedo and a lit background; crossed and classical don't. Two objects are too few for a ranking."""
+Two objects are too few for a ranking."""
 
 
 class Step(NamedTuple):
@@ -44,7 +45,17 @@ def steps_in(out: Path) -> Iterator[Step]:
     """The commands of the demo, in their order, with everything they write below ``out``."""
     for name in dict.fromkeys(METHODS.values()):
         rig = ["--rig", "crossed"] if name == "mini-crossed" else []
-        build = ["fpp-bench", "build", "--out", str(out / name), "--preset", "mini", "--objects", OBJECTS, *rig]
+        build = [
+            "fpp-bench",
+            "build",
+            "--out",
+            str(out / name),
+            "--preset",
+            "mini",
+            "--objects",
+            ",".join(OBJECTS),
+            *rig,
+        ]
         yield Step(build)  # of a finished dataset it only says so
     for method, name in METHODS.items():
         data, predictions, result = str(out / name), out / method, out / f"{method}.json"
@@ -94,9 +105,11 @@ def demo(*, out: Path = option(Path("demo"), "folder for all that it writes (def
         if status != OK:
             print(f"fpp-bench demo: stopped at step {number}; the same command continues there", file=sys.stderr)
             return status
-    show(_table([_entry(out / f"{method}.json") for method in METHODS]))
+    entries = [_entry(out / f"{method}.json") for method in METHODS]
+    show(_table(entries))
     written = {"page": out / "page/index.html", "picture": out / f"{SAMPLE}.png", "points": out / f"{SAMPLE}.html"}
-    print(NOTES, *("", "Written, to look at:"), sep="\n")
+    assumed = [f"{name}: {assumption(entry.row) or 'nothing'}" for name, entry in zip(METHODS, entries, strict=True)]
+    print(NOTES, f"Assumed of the scene. {'; '.join(assumed)}.", "", "Written, to look at:", sep="\n")
     for what, path in written.items():
         print(f"  {what:8}{path}")
     print("\nThe same by hand:", *(f"  {shlex.join(words)}" for words, _ in steps), sep="\n")
@@ -107,7 +120,7 @@ def demo(*, out: Path = option(Path("demo"), "folder for all that it writes (def
 def _table(entries: list[Entry]) -> Table:
     numbers = "Frames", "Object MAE, mm", "Overall MAE, mm", "Time, ms", "Phase reliance"
     data = entries[0].row.dataset
-    title = f"{data.samples} views of {OBJECTS.replace(',', ' and ')}, {data.size[1]} x {data.size[0]} px"
+    title = f"{data.samples} views of {' and '.join(OBJECTS)}, {data.size[1]} x {data.size[0]} px"
     table = Table("Method", numbers=numbers, title=title)
     for entry in entries:
         row = entry.row

@@ -87,6 +87,10 @@ class DatasetFolder:
         """``split/column`` -> hash of its decoded values, by the manifest; `fpp-bench verify` reads the images."""
         return self.manifest.content
 
+    def changed_column(self, content: Mapping[str, str]) -> str | None:
+        """The first ``split/column`` of ``content`` whose hash differs from the dataset's; None where all agree."""
+        return next((name for name, digest in content.items() if self.content.get(name) != digest), None)
+
     def content_hash(self, split: str, column: str, hashes: Mapping[str, str]) -> tuple[str, str]:
         """``split/column``, and the hash of its images, of which ``hashes`` are those of the samples (`image_hash`).
         Raises `DatasetError` where the manifest has another: the files were changed after it was written."""

@@ -27,8 +27,7 @@ from fpp_ml_bench.evaluation.result.file import parse_result, write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.leaderboard.page.page import page_files, slug
 from fpp_ml_bench.leaderboard.page.samples import predicted_samples
-from fpp_ml_bench.leaderboard.page.scale import LogScale
-from fpp_ml_bench.leaderboard.page.sections import overview
+from fpp_ml_bench.leaderboard.page.sections import LogScale, overview
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries
 from fpp_ml_bench.leaderboard.tables import chosen_tables
 from fpp_ml_bench.optics.named_rigs import paper_rig
