@@ -189,7 +189,7 @@ def front_picture(
     error_mm = np.where(inside, depth_mm - exact_mm.astype(np.float64), np.nan)
     mae_mm, answered_mm = np.abs(error_mm[inside]).mean() if inside.any() else np.nan, error_mm[inside & there]
     clip_mm = float(np.quantile(np.abs(answered_mm), 0.95)) if answered_mm.any() else 1.0
-    title_of_error = f"its error, mm, object MAE {mae_mm:.2f} mm\n(colours end at {clip_mm:.2g} mm)"
+    title_of_error = f"its error, mm, object MAE {mae_mm:.2f} mm\n(colours end at {float(f'{clip_mm:.2g}'):g} mm)"
     white = max(float(np.quantile(frame[cut], 0.998)), 1.0)
     drawn = figure(12.5, 3.5)
     drawn.suptitle(title, parse_math=False)
