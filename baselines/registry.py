@@ -29,11 +29,11 @@ FILE_MARK = ".py:"
 """What tells ``mine.py:Mine`` from a name."""
 BUILT_IN = (
     "classical:ClassicalMethod",
-    "classical_network.method:ClassicalNetMethod",
-    "phase_route.method:PhaseMethod",
-    "phase_network.method:PhaseNetMethod",
-    "crossed_route.method:CrossedMethod",
-    "crossed_network.method:CrossedNetMethod",
+    "learned.classical_method:ClassicalNetMethod",
+    "phase.method:PhaseMethod",
+    "learned.method:PhaseNetMethod",
+    "phase.crossed_method:CrossedMethod",
+    "learned.crossed_method:CrossedNetMethod",
     "trivial:ConstantMethod",
     "trivial:NearestMethod",
 )

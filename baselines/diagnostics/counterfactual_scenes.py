@@ -23,7 +23,7 @@ from fpp_ml_bench.baselines.diagnostics.scene_renderer import (
     Surface,
     layer_of,
 )
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError

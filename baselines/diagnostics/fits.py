@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fpp_ml_bench.baselines.diagnostics.subjects import checked_output
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import normalise, object_mask
 from fpp_ml_bench.errors import DiagnosisError

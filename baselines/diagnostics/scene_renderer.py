@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.depth import object_mask

@@ -27,7 +27,7 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
 )
 from fpp_ml_bench.baselines.diagnostics.scene_renderer import SceneRenderer, Surface, constant, moved
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
-from fpp_ml_bench.baselines.phase_route.calibration_layer import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders.storage.store import DatasetFolder

@@ -12,7 +12,7 @@ from torch.func import functional_call
 from fpp_ml_bench.baselines.networks.base import RECENTRED_FROM, InstanceNorm, in_full_precision, torch_threads
 from fpp_ml_bench.baselines.networks.model import NETWORKS as NAMES
 from fpp_ml_bench.baselines.networks.model import build
-from fpp_ml_bench.baselines.phase_route.calibration_layer import CalibrationLayer
+from fpp_ml_bench.baselines.phase.calibration_layer import CalibrationLayer
 from fpp_ml_bench.baselines.stability.cases import U32, U64, Group, Outcome, gamma, worst, wrong
 from fpp_ml_bench.baselines.stability.scores import exact_scores
 from fpp_ml_bench.baselines.training.losses import EPSILON, loss_function

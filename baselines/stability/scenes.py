@@ -8,8 +8,8 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from fpp_ml_bench.baselines.crossed_route.observation import CrossedReason
-from fpp_ml_bench.baselines.crossed_route.route import CrossedRoute
+from fpp_ml_bench.baselines.phase.crossed_observation import CrossedReason
+from fpp_ml_bench.baselines.phase.crossed_route import CrossedRoute
 from fpp_ml_bench.baselines.stability.cases import U64, Floats, Group, Outcome, worst, wrong
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.decoding.blocks import projected

@@ -87,7 +87,7 @@ class ModelConfig:
 class NetConfig:
     """What a phase network is, how its answers are used, and what it was trained on. ``options``: arguments of
     `PhaseNet`; ``threshold``: logit from which on a pixel is object; ``lead``: what is added to the logit of the base
-    order, ``temperature``, ``offset`` and ``doubted`` as of `phase_network.Odds`, all chosen on validation views;
+    order, ``temperature``, ``offset`` and ``doubted`` as of `learned.Odds`, all chosen on validation views;
     ``period_px``: image px per fringe period of the training images, by direction; ``steps`` trained; the others as in
     `ModelConfig`."""
 

@@ -20,11 +20,11 @@ from disks import small_disk
 from scored_dataset import make_dataset
 
 from fpp_ml_bench import pool
-from fpp_ml_bench.baselines.classical_network.training import FilterRecipe
-from fpp_ml_bench.baselines.crossed_network.training import CrossedRecipe
 from fpp_ml_bench.baselines.diagnostics.diagnosis import diagnose
-from fpp_ml_bench.baselines.phase_network.training import Recipe
-from fpp_ml_bench.baselines.phase_network.window_training import train_net
+from fpp_ml_bench.baselines.learned.classical_training import FilterRecipe
+from fpp_ml_bench.baselines.learned.crossed_training import CrossedRecipe
+from fpp_ml_bench.baselines.learned.training import Recipe
+from fpp_ml_bench.baselines.learned.window_training import train_net
 from fpp_ml_bench.baselines.training.engine import CHECKPOINT, alone_in
 from fpp_ml_bench.baselines.training.records import save_checkpoint
 from fpp_ml_bench.cli import main, main_eval, run_command

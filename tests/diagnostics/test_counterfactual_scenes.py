@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from conftest import tiny_settings
 
-from fpp_ml_bench.baselines.crossed_route.carriers import Carriers
 from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import (
     LARGEST_SHIFT_RAD,
     chosen_samples,
@@ -23,6 +22,7 @@ from fpp_ml_bench.baselines.diagnostics.scene_renderer import (
     normals_of_depth,
     plane,
 )
+from fpp_ml_bench.baselines.phase.carriers import Carriers
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.render.light import named_light

@@ -8,7 +8,7 @@ import pytest
 from scored_dataset import name_benchmarks
 from tiny_network import config_of, tiny_network
 
-from fpp_ml_bench.baselines.phase_network.network import PhaseNet, load_net, save_net
+from fpp_ml_bench.baselines.learned.network import PhaseNet, load_net, save_net
 from fpp_ml_bench.baselines.training import weights as training_data
 from fpp_ml_bench.baselines.training.depth_training import model_config
 from fpp_ml_bench.baselines.training.recipe import load_recipe

@@ -1,0 +1,473 @@
+"""What the trainings of phase-net, crossed-net and classical-net have in common: windows of rendered views; no dataset
+is needed. Views in drawn lights are rendered, measured, and cut into windows; a moving average of the weights is kept;
+mask and order are chosen on validation views.
+
+``out`` holds ``views/``, the files of the engine and, at the end, the weights instead of the checkpoint. A stopped
+training continues at every stage.
+"""
+
+import hashlib
+import json
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from time import perf_counter
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+
+from fpp_ml_bench.baselines.learned.inputs import CHANNELS
+from fpp_ml_bench.baselines.learned.network import PhaseNet, load_net, read_net, save_net
+from fpp_ml_bench.baselines.learned.odds import Answers
+from fpp_ml_bench.baselines.learned.windows import IGNORED, chosen_threshold, mean_scores
+from fpp_ml_bench.baselines.phase.calibration_layer import Mask
+from fpp_ml_bench.baselines.training.engine import CHECKPOINT, Training, alone_in, claim_folder, reproducible
+from fpp_ml_bench.baselines.training.records import Panel, Record
+from fpp_ml_bench.baselines.training.views import View, fingerprint_of, groups_of, measured_views
+from fpp_ml_bench.baselines.training.weights import PHASE_NETWORKS, Family, NetConfig, TrainingBenchmark
+from fpp_ml_bench.errors import RecipeError, TrainingError
+from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.optics.rig import Rig
+
+VIEWS = "views"
+SMALL_RAD = 0.05  # error of the phase below which its loss is quadratic
+IMPOSSIBLE = -1e4  # logit of an order that puts its pixel out of the working range: finite, for gradients to stay so
+LARGEST_GRADIENT = 50.0
+
+Batch = dict[str, Tensor]  # the fields of a window with a leading axis B
+
+
+def mean_over(values: Tensor, where: Tensor) -> Tensor:
+    """Mean of ``values`` over the pixels ``where``; 0 without one."""
+    return (values * where).sum() / where.sum().clamp(min=1)
+
+
+def mask_loss(logit: Tensor, target: Tensor, valid: Tensor) -> Tensor:
+    """Binary cross-entropy of the object's ``logit`` over ``valid`` pixels."""
+    by_pixel = functional.binary_cross_entropy_with_logits(logit, target.float(), reduction="none")
+    return mean_over(by_pixel, valid)
+
+
+def scale_loss(error: Tensor, scale: Tensor, where: Tensor) -> Tensor:
+    """Negative log-likelihood of an absolute ``error`` under a Laplace distribution of ``scale``, a logarithm."""
+    return mean_over(error * torch.exp(-scale) + scale, where)
+
+
+def batch_of(windows: Sequence[Any]) -> Batch:
+    fields = windows[0].__dataclass_fields__
+    batch = {name: torch.from_numpy(np.stack([getattr(window, name) for window in windows])) for name in fields}
+    batch["x"] = batch["x"].contiguous(memory_format=torch.channels_last)
+    return batch
+
+
+@dataclass(frozen=True)
+class StepRecipe(ABC):
+    """``steps`` of ``batch`` windows of ``window`` px; AdamW at ``rate``, after ``warm_up`` steps falling as a cosine;
+    ``averaged``: decay of the moving average of the weights, which is what the weights file holds; ``lights`` that are
+    drawn, ``views_a_light`` of training objects in each, and ``unions`` for every view (see `training.groups_of`). A
+    subclass says which network learns what. Raises `RecipeError` for values that train nothing."""
+
+    name: str = ""
+    steps: int = 5000
+    batch: int = 6
+    window: int = 160
+    rate: float = 3e-3
+    warm_up: int = 100
+    decay: float = 1e-4
+    averaged: float = 0.995
+    seed: int = 42
+    validate_every: int = 500
+    lights: int = 30
+    views_a_light: int = 8
+    unions: int = 1
+
+    title: ClassVar[str]
+    """Of the weights."""
+    family: ClassVar[Family] = PHASE_NETWORKS
+    makes: ClassVar[type[nn.Module]] = PhaseNet
+    """The network's class."""
+    main_loss: ClassVar[str]
+    """Which is shown while it trains."""
+    scores: ClassVar[dict[str, dict[str, str]]]
+    """What its curve shows beside the losses: titles, and scores with their labels."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "window", "validate_every"):
+            if not getattr(self, name) >= 1:
+                raise RecipeError(f"{name} {getattr(self, name)!r}: expected 1 or more")
+        if not self.rate > 0 or not 0 <= self.averaged < 1:
+            raise RecipeError(f"expected rate above 0 and averaged 0 to below 1, got {self.rate} and {self.averaged}")
+        if not (self.lights >= 0 and 1 <= self.views_a_light <= 40 and 0 <= self.unions <= 100):
+            raise RecipeError(
+                f"lights {self.lights!r}, views_a_light {self.views_a_light!r}, unions {self.unions!r}: expected 0 and "
+                "more, 1 to 40, 0 to 100"
+            )
+
+    @property
+    def drawn(self) -> tuple[int, ...]:
+        """Arguments of `training.groups_of`."""
+        return self.lights, self.views_a_light, self.seed
+
+    @property
+    def weights_name(self) -> str:
+        """Of the file, and of the weights that come with the package."""
+        return self.name
+
+    @property
+    def weights(self) -> dict[str, float]:
+        """Of the losses, by name: the fields ``weight_*``."""
+        return {name.removeprefix("weight_"): value for name, value in vars(self).items() if name.startswith("weight_")}
+
+    @abstractmethod
+    def network(self) -> nn.Module:
+        """The network, untrained."""
+
+    @abstractmethod
+    def losses(self, network: nn.Module, batch: "Batch") -> dict[str, Tensor]:
+        """Of ``network`` on a batch, by the names of `weights`."""
+
+    @abstractmethod
+    def task(self, rig: Rig) -> "Task":
+        """What the network learns from views of ``rig``."""
+
+    def usual_rig(self) -> Rig:
+        """The rig for which it trains by default."""
+        return paper_rig()
+
+    def rate_at(self, step: int) -> float:
+        """Learning rate of step 0, 1, ..."""
+        if step < self.warm_up:
+            return self.rate * (step + 1) / self.warm_up
+        progress = (step - self.warm_up) / max(1, self.steps - self.warm_up)
+        return self.rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0))))
+
+    def to_dict(self) -> dict[str, Any]:
+        return json.loads(json.dumps(asdict(self)))
+
+    @property
+    def digest(self) -> str:
+        return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
+
+
+@dataclass(frozen=True)
+class WindowRecipe(StepRecipe):
+    """Of a `PhaseNet`: ``widths`` to ``bound_rad`` make the network; ``weight_*``: of the losses, ``weight_scale`` that
+    of the stated uncertainty."""
+
+    name: str = "phase-net"
+    widths: tuple[int, ...] = (24, 32, 48, 64)
+    fine: int = 14
+    squeezed: int = 20
+    order_widths: tuple[int, ...] = (32, 48, 64)
+    bound_rad: float = math.pi / 2
+    weight_order: float = 2.0
+    weight_mask: float = 0.5
+    weight_phase: float = 10.0
+    weight_scale: float = 0.1
+
+    main_loss: ClassVar[str] = "phase"
+    scores: ClassVar[dict[str, dict[str, str]]] = {
+        "validation MAE, mm": {"object_mae_mm": "object", "right_mae_mm": "right order"},
+        "validation, % of object pixels": {"wrong_percent": "wrong order", "missed_percent": "missed"},
+    }
+
+    @property
+    def channels(self) -> int:
+        """Input maps of the network."""
+        return len(CHANNELS)
+
+    def network(self) -> PhaseNet:
+        return PhaseNet(self.widths, self.fine, self.squeezed, self.order_widths, self.bound_rad, self.channels)
+
+    def losses(self, network: nn.Module, batch: "Batch") -> dict[str, Tensor]:
+        """``order``: cross-entropy over the candidates; ``mask``: binary cross-entropy; ``phase``: smooth L1 in rad;
+        ``scale``: negative log-likelihood of its phase error under a Laplace distribution."""
+        order, inside, correction, scale = network(batch["x"])
+        logits = torch.where(batch["exists"], order, torch.tensor(IMPOSSIBLE))
+        fitted = batch["fitted"]
+        by_order = functional.cross_entropy(logits, batch["order"], ignore_index=IGNORED, reduction="sum")
+        target_rad = batch["correction_rad"].clamp(-self.bound_rad, self.bound_rad)
+        by_phase = functional.smooth_l1_loss(correction, target_rad, beta=SMALL_RAD, reduction="none")
+        error = (correction.detach() - batch["correction_rad"]).abs()
+        return {
+            "order": by_order / fitted.sum().clamp(min=1),
+            "mask": mask_loss(inside, batch["target"], batch["mask_valid"]),
+            "phase": mean_over(by_phase, fitted),
+            "scale": scale_loss(error, scale, fitted),
+        }
+
+
+class WindowTraining(Training):
+    """Training in intervals between two validations, on the processor. ``draw`` gives a random window, a dataclass of
+    arrays with the network's input ``x``; ``validate``: scores of a network, those of ``recipe.scores`` among them, or
+    nothing. ``start``: the network whose weights it starts from (None: random ones). ``print_line`` is given a line for
+    every new record. Raises `TrainingError` where ``start`` is another network than the recipe's, and for a checkpoint
+    of another recipe."""
+
+    largest_gradient = LARGEST_GRADIENT
+
+    def __init__(
+        self,
+        recipe: StepRecipe,
+        draw: Callable[[np.random.Generator], Any],
+        validate: Callable[[Any], dict[str, float]],
+        out: Path,
+        start: PhaseNet | None = None,
+        print_line: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        super().__init__(out, {"recipe": recipe.digest}, recipe.seed, cpu=True)
+        self.recipe, self.draw, self.validate, self.print_line = recipe, draw, validate, print_line
+        self.name = self.title = recipe.name
+        network = recipe.network()
+        network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        if start is not None:
+            if start.options != network.options:
+                raise TrainingError(f"weights to start from: expected {network.options}, got {start.options}")
+            network.load_state_dict(start.state_dict())
+        self.averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(recipe.averaged), use_buffers=True)
+        self.bare = {"network": network, "averaged": self.averaged}
+        optimizer = torch.optim.AdamW(network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
+        prepared, prepared_optimizer = self.accelerator.prepare(network, optimizer)
+        self.modules, self.optimizers, self.objective = {"network": prepared}, {"network": prepared_optimizer}, self
+        self.resume()
+
+    def steps(self, batch: Batch) -> Iterator[tuple[str, Tensor, dict[str, Tensor]]]:
+        """As of `training.Objective`: the weighted losses; the average is updated after every step."""
+        parts = self.recipe.losses(self.modules["network"], batch)
+        total = torch.stack([weight * parts[name] for name, weight in self.recipe.weights.items()]).sum()
+        yield "network", total, {name: value.detach() for name, value in parts.items()}
+        self.averaged.update_parameters(self.modules["network"])
+
+    @property
+    def network(self) -> Any:
+        """The averaged network, to be used."""
+        return self.averaged.module.eval()
+
+    @property
+    def steps_done(self) -> int:
+        return self.history[-1]["step"] if self.history else 0
+
+    @property
+    def _next_validation(self) -> int:
+        every = self.recipe.validate_every
+        return min((self.steps_done // every + 1) * every, self.recipe.steps)
+
+    @property
+    def total_steps(self) -> int:
+        return self.recipe.steps
+
+    @property
+    def over(self) -> bool:
+        return self.steps_done >= self.recipe.steps
+
+    def rate(self, number: int) -> float:
+        return self.recipe.rate_at(self.steps_done + number)
+
+    def batches(self) -> Iterator[Batch]:
+        """The batches up to the next validation: each is a function of seed and step alone, made one step ahead."""
+        first, last, recipe = self.steps_done, self._next_validation, self.recipe
+
+        def make(step: int) -> Batch:
+            random = np.random.default_rng([recipe.seed, step])
+            return batch_of([self.draw(random) for _ in range(recipe.batch)])
+
+        with ThreadPoolExecutor(1) as pool:
+            coming = pool.submit(make, first)
+            for step in range(first, last):
+                batch = coming.result()
+                if step + 1 < last:
+                    coming = pool.submit(make, step + 1)
+                yield batch
+
+    def diverged(self, name: str, value: float, number: int, label: None) -> str:
+        return f"the loss is {value} at step {self.steps_done + number + 1}; lower the rate and start again"
+
+    def validated(self, losses: dict[str, float], began: float) -> Record:
+        seconds, steps = perf_counter() - began, self._next_validation
+        record: Record = {"step": steps, "rate": self.recipe.rate_at(steps - 1), "seconds": seconds}
+        record |= {f"loss_{name}": value for name, value in losses.items()}
+        return record | self.validate(self.network)
+
+    def recorded(self, record: Record) -> None:
+        self.print_line("  ".join(f"{key} {value:.4g}" for key, value in record.items()))
+
+    def progress(self) -> str:
+        shown = self.recipe.main_loss
+        return f"step {self.steps_done}/{self.recipe.steps}  {shown} {self.history[-1][f'loss_{shown}']:.4g}"
+
+    def panels(self) -> list[Panel]:
+        def panel(title: str, labels: dict[str, str], log: bool = False) -> Panel:
+            return Panel.of(title, self.history, "step", labels, log)
+
+        shown = {f"loss_{name}": name for name in self.recipe.weights if name != "scale"}  # a log-likelihood
+        scores = [panel(title, labels) for title, labels in self.recipe.scores.items()]
+        return [panel("training losses", shown, log=True), *scores]
+
+
+class Task(ABC):
+    """What a network learns from rendered views of a rig: samples of the views, windows of the samples, and what
+    is chosen on validation samples. ``frames``: those it takes; of the validation samples every ``scored_share``-th is
+    scored during training."""
+
+    frames: tuple[int, ...]
+    scored_share: ClassVar[int] = 3
+
+    @abstractmethod
+    def samples(self, views: Iterable[View]) -> list[Any]:
+        """The samples of views; a view that can't be used has none."""
+
+    @abstractmethod
+    def draw(self, samples: list[Any], random: np.random.Generator) -> Any:
+        """A random window, see `WindowTraining`."""
+
+    @abstractmethod
+    def scores(self, network: Any, samples: list[Any]) -> dict[str, float]:
+        """Mean scores of a network."""
+
+    @abstractmethod
+    def answered(self, network: Any, samples: list[Any], validation: list[Any]) -> Any:
+        """The trained network's answers for the validation samples, computed reproducibly, and what follows."""
+
+    @abstractmethod
+    def chosen(self, answered: Any, validation: list[Any], out: Path) -> dict[str, Any]:
+        """From `answered`, the fields of `training.NetConfig` that are chosen on validation samples, and their scores;
+        pictures of that go to ``out``."""
+
+
+class CandidateTask(Task):
+    """That of a `PhaseNet`. ``thresholds`` of the mask's logit and ``leads`` of the base order are tried on the
+    validation samples, thresholds also on every ``chosen_share``-th training sample; sums of errors ``tolerance_mm``
+    from the least count as equal."""
+
+    thresholds: ClassVar[tuple[float, ...]]
+    leads: ClassVar[tuple[float, ...]]
+    tolerance_mm: ClassVar[float] = 0.0
+    chosen_share: ClassVar[int | None] = None
+
+    def __init__(self, rig: Rig) -> None:
+        self.image_px = rig.camera.width * rig.camera.height
+
+    @abstractmethod
+    def answers(self, network: PhaseNet, sample: Any) -> Answers:
+        """The network's answers for a sample."""
+
+    @abstractmethod
+    def decided(self, answers: Answers, scene: Any, threshold: float) -> Mask:
+        """A scene's object pixels."""
+
+    @abstractmethod
+    def score(self, answers: Answers, sample: Any, inside: Mask) -> dict[str, float | None]:
+        """`candidate_scores` of a sample whose pixels ``inside`` are object; each pixel's likeliest order is taken."""
+
+    def scores_of(self, answers: Iterable[Answers], samples: list[Any], threshold: float = 0.0) -> dict[str, float]:
+        """Means of each `score` over the samples that have it."""
+        scores = []
+        for one, sample in zip(answers, samples, strict=True):
+            inside = self.decided(one, sample.scene.single(), threshold)
+            scores.append(self.score(one, sample, inside))
+        return mean_scores(scores)
+
+    def scores(self, network: PhaseNet, samples: list[Any]) -> dict[str, float]:
+        return self.scores_of((self.answers(network, sample) for sample in samples), samples)
+
+    def answered(self, network: PhaseNet, samples: list[Any], validation: list[Any]) -> Any:
+        """The answers with the lead that was chosen, by which the fewest orders are wrong; threshold, lead, scores."""
+        answers = [self.answers(network, sample) for sample in validation]
+        further = samples[:: self.chosen_share] if self.chosen_share else []
+        masked = answers + [self.answers(network, sample) for sample in further]
+        masks = [
+            (sample, partial(self.decided, one, sample.scene.single()))
+            for one, sample in zip(masked, validation + further, strict=True)
+        ]
+        threshold = chosen_threshold(masks, self.thresholds, self.image_px, self.tolerance_mm)
+        with_leads = ([one.with_lead(lead) for one in answers] for lead in self.leads)
+        wrong = [self.scores_of(shifted, validation)["wrong_percent"] for shifted in with_leads]
+        lead = self.leads[int(np.argmin(wrong))]
+        shifted = [one.with_lead(lead) for one in answers]
+        validated = self.scores_of(shifted, validation, threshold)
+        return shifted, {"threshold": threshold, "lead": lead, "validation": validated}
+
+    def chosen(self, answered: Any, validation: list[Any], out: Path) -> dict[str, Any]:
+        _, fields = answered
+        return dict(fields)
+
+
+@dataclass(frozen=True)
+class Trained:
+    """The weights file (None for a training that stopped because its minutes were over), validation scores, and the
+    mask threshold that was chosen there."""
+
+    weights: Path | None
+    steps: int
+    threshold: float
+    validation: dict[str, float]
+
+
+def train_net(
+    recipe: StepRecipe,
+    out: Path,
+    *,
+    rig: Rig | None = None,
+    start: Path | None = None,
+    minutes: float | None = None,
+    workers: int = 1,
+    show: bool = False,
+    print_line: Callable[[str], None] = lambda line: None,
+) -> Trained:
+    """Train for ``rig`` (default: that of the recipe), starting from the weights in ``start`` or from random ones; the
+    same call resumes a training that was stopped. ``show``: progress on stderr; ``print_line`` is given a line for
+    every validation. Raises `TrainingError` for a folder of another recipe or rig."""
+    started, rig = perf_counter(), rig or recipe.usual_rig()
+    groups = groups_of(*recipe.drawn)
+    first = None if start is None else load_net(start, folded=False)
+    described = recipe.to_dict() | {"rig": rig.to_dict()}
+    described |= {} if first is None else {"start_sha256": first.sha256}
+    fingerprint = fingerprint_of(described, groups)
+    with alone_in(out):
+        claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
+        weights = out / f"{recipe.weights_name}.safetensors"
+        if weights.exists():
+            config = read_net(weights, recipe.makes, recipe.family)[0]
+            scores = {key: float(value or 0) for key, value in config.validation.items()}
+            return Trained(weights, config.steps, config.threshold, scores)
+        task = recipe.task(rig)
+        samples, validation = measured_views(
+            groups, rig, task.frames, out / VIEWS, task.samples, recipe.unions, recipe.seed, workers, show
+        )
+        scored = validation[:: task.scored_share]
+        with reproducible(cpu=True):
+            ongoing = WindowTraining(
+                recipe,
+                partial(task.draw, samples),
+                lambda network: task.scores(network, scored),
+                out,
+                None if first is None else first.network,
+                print_line,
+            )
+            ongoing.run(started, minutes, show)
+            if not ongoing.over:
+                return Trained(None, ongoing.steps_done, 0.0, {})
+            network = ongoing.network
+            answered = task.answered(network, samples, validation)
+        fields = task.chosen(answered, validation, out)
+        config = NetConfig(
+            name=recipe.weights_name,
+            title=recipe.title,
+            options=network.options,
+            dataset_fingerprint=fingerprint,
+            benchmark=TrainingBenchmark(f"{recipe.name} views", 1),
+            steps=recipe.steps,
+            recipe=described,
+            **fields,
+        )
+        save_net(weights, network, config, recipe.family)
+        (out / CHECKPOINT).unlink(missing_ok=True)
+        return Trained(weights, recipe.steps, config.threshold, dict(fields["validation"]))

@@ -1,0 +1,322 @@
+"""The phase route as methods of ``fpp-bench predict``: with given frames, or with the fewest that a scene needs.
+
+The fewest are decided while capturing, without ground truth. Capture one fringe and measure: the measurement gives its
+expected error, from its phase and from its order. While that error is too large, capture the frames that reduce it
+(more fringes for the phase, the Gray code for the order) and measure again. No captured frame is wasted.
+"""
+
+import operator
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method
+from fpp_ml_bench.baselines.phase.observation import PIXELWISE, Measurement, Prior, Reason, Settings
+from fpp_ml_bench.baselines.phase.route import PhaseRoute
+from fpp_ml_bench.baselines.phase.several_frames import steps_of
+from fpp_ml_bench.coding.phase_shift import PhaseShift
+from fpp_ml_bench.decoding.decode import decode_stack
+from fpp_ml_bench.errors import DecodeError, PredictionError
+from fpp_ml_bench.loaders.captures.decoding import read_mask
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import DIRECTIONS, PAPER_SEQUENCE, Direction
+from fpp_ml_bench.options import option
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.evaluation.submission.description import Submission
+
+ORDER_SHARE = (0.16, 0.10, 0.05)
+"""Actual error from wrong orders as a share of the expected one, with 1, 2, and 3 or more frames, over training views
+(14 of each direction; measured again on version 1 of the benchmark: 0.06, 0.10 and 0.05, docs/results/frames.md).
+The margin of an order overestimates the probability that it is wrong; these factors correct that."""
+
+
+MIN_CONFIDENCE = "mask pixels of less confidence, 0 to 1 (default: 0, dense)"
+DIRECTION = "direction of the fringes (default: horizontal)"
+WHITE_GREY = (
+    "for images without a lit background: grey level of a white pattern on a surface that faces the projector at the "
+    "near end of the working range"
+)
+AMBIENT_GREY = (
+    "for images without a lit background: grey level of a surface in ambient light alone (default: the image's darkest)"
+)
+MASK = "object mask: an image of the frames' size, above 0 on the object in every sample (default: found in each image)"
+"""Help of options that several routes have."""
+LIT_BACKGROUND = Assumption(
+    "a lit background", "Assumes a lit background; not one albedo, so that little tells the fringe order."
+)
+ONE_ALBEDO = Assumption(
+    "one albedo, a lit background",
+    "Assumes one albedo for all surfaces and a lit background, which shows how strong the lamp is: the brightness of "
+    "the fringe image decides the fringe order.",
+)
+
+
+@dataclass(frozen=True)
+class PhaseOptions(Settings):
+    """Options of `PhaseMethod`: those of `Settings`, an object ``mask`` (a file of `captures.read_mask`), and
+    ``error_mm``, which makes it `FewestFrames`."""
+
+    direction: Direction = option("horizontal", DIRECTION, choices=DIRECTIONS)
+    frames: int = option(1, "fringes of that direction, 1 to 18; no Gray code (default: 1)", "N")
+    error_mm: float | None = option(
+        None,
+        "instead of --frames: for each scene the fewest frames whose expected error is at most this, starting with a "
+        "single fringe; may need the Gray code",
+        "MM",
+    )
+    prior: Prior = option(
+        "none",
+        "standoff: assume that objects are near the rig's standoff, true of fixed placement (default: none)",
+        choices=get_args(Prior),
+    )
+    shading: bool = option(True, "choose the fringe order without brightness", flag="--no-shading")
+    min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
+    white_grey: float | None = option(None, WHITE_GREY, "GREY")
+    ambient_grey: float | None = option(None, AMBIENT_GREY, "GREY")
+    mask: str | Path | None = option(None, MASK, "FILE")
+
+
+class RouteMethod(Method):
+    """A method that measures every map of a sample at once: ``measure`` (frames) gives a measurement with ``depth_mm``
+    and ``sigma_mm``."""
+
+    measure: Callable[[Frames], Any]
+
+    def images(self, frames: Frames) -> list[NDArray[np.uint8]]:
+        """The captured frames of `frames_used`; raises `DecodeError` for one that is missing."""
+        images = []
+        for index in self.frames_used:
+            image = frames[index] if index < len(frames) else None
+            if image is None:
+                used = f"frames {self.frames_used}" if len(self.frames_used) > 1 else "that frame"
+                raise DecodeError(f"frame {index} is missing: {self.name} needs {used}")
+            images.append(image)
+        return images
+
+    def predict(self, frames: Frames) -> NDArray[np.float32]:
+        """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""
+        return self.measure(frames).depth_mm  # type: ignore[no-any-return]
+
+    def answer(self, frames: Frames) -> Answer:
+        measurement = self.measure(frames)
+        return Answer(measurement.depth_mm, measurement.sigma_mm)
+
+
+class PhaseMethod(RouteMethod):
+    """Depth from one or more sinusoids of one direction; options are those of `Settings`. ``mask``: a file
+    (`captures.read_mask`) that says where the object is in every sample, instead of the route's own mask. Raises
+    `PredictionError` for an unknown option or an invalid value, `CaptureError` for a mask that can't be used."""
+
+    name = "phase"
+    purpose = "one fringe or a few, nothing learned"
+    Options = PhaseOptions
+
+    @classmethod
+    def for_rig(cls, rig: Rig, **options: Any) -> Method:
+        """`FewestFrames` where ``error_mm`` is given."""
+        if options.get("error_mm") is not None and "frames" in options:
+            raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
+        options = fringe_options(cls.name, rig, options)
+        return cls(rig, **options) if options.get("error_mm") is None else FewestFrames(rig, **options)
+
+    def __init__(self, rig: Rig, **options: Any) -> None:
+        given = self.checked_options(options)
+        settings = Settings(**{entry.name: getattr(given, entry.name) for entry in fields(Settings)})
+        mask = given.mask
+        self.rig, self.options, self.route = rig, settings, PhaseRoute(rig, settings)
+        sinusoids = rig.sequence.sinusoids(settings.direction)
+        self.frames_used = tuple(sinusoids[step] for step in self.route.steps)
+        frames = len(self.frames_used)
+        count = f"one {settings.direction} fringe" if frames == 1 else f"{frames} {settings.direction} fringes"
+        cues = ["range"] + ["shading"] * settings.shading + ["standoff"] * (settings.prior == "standoff")
+        self.title = f"Phase route, {count}, order by {' + '.join(cues)}, nothing learned"
+        shape = rig.camera.height, rig.camera.width
+        self.mask = None if mask is None else read_mask(Path(mask), shape)
+        self.settings = asdict(settings) | ({} if mask is None else {"mask": Path(mask).name})
+
+    @classmethod
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+        if not rig.fringe_directions:
+            return []
+        few = [{"frames": 1}, {"frames": 3}] if rig.sequence.steps >= PIXELWISE else [{"frames": 1}]
+        return [*few, {"error_mm": 3.0}] if rig.sequence == PAPER_SEQUENCE else few
+
+    @classmethod
+    def short_name(cls, submission: "Submission") -> str | None:
+        if not submission.name.startswith("Phase route, "):
+            return None
+        settings = submission.settings
+        direction = direction_of(submission)
+        if "error_mm" in settings:
+            name = f"Phase, fewest {direction}, {float(settings['error_mm'] or 0):g} mm"
+        else:
+            name = f"Phase, {operator.index(settings['frames'])} {direction}"  # type: ignore[arg-type]
+        standoff = settings.get("prior") == "standoff"
+        if not settings["shading"]:
+            return f"{name}, standoff alone" if standoff else f"{name}, no shading"
+        return f"{name}, standoff" if standoff else name
+
+    @classmethod
+    def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
+        return ONE_ALBEDO if settings.get("shading") is True else None
+
+    def measure(self, frames: Frames) -> Measurement:
+        """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
+        return self.route.measure(self.images(frames), self.mask)
+
+    def crop(self, frames: Frames) -> tuple[slice, slice]:
+        return self.route.resampling.captured_crop(self.route.observe(self.images(frames), self.mask).crop)
+
+
+@dataclass(frozen=True)
+class Look:
+    """Expected error with ``frames`` frames captured, means over object pixels in mm: ``phase_mm`` from the phase and
+    ``order_mm`` from the order; ``gray``: whether the Gray code is among the frames."""
+
+    frames: int
+    gray: bool
+    phase_mm: float
+    order_mm: float
+
+    @classmethod
+    def of(cls, measurement: Measurement, count: int) -> "Look":
+        # A pixel without a depth because its order is ambiguous is what more frames are for.
+        on_object = (measurement.depth_mm > 0) | (measurement.reason == Reason.AMBIGUOUS)
+        if not on_object.any():
+            return cls(count, False, 0.0, 0.0)
+        order_mm = float(measurement.order_doubt_mm[on_object].mean(dtype=np.float64))
+        error_mm = float(measurement.expected_error_mm[on_object].mean(dtype=np.float64))
+        return cls(count, False, error_mm - order_mm, order_mm * ORDER_SHARE[min(count, len(ORDER_SHARE)) - 1])
+
+    @property
+    def expected_mm(self) -> float:
+        return self.phase_mm + self.order_mm
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """``depth_mm`` float32 (H, W) of the last look, its ``frames_used`` (indices, ascending), and all ``looks``."""
+
+    depth_mm: NDArray[np.float32]
+    frames_used: tuple[int, ...]
+    looks: tuple[Look, ...]
+
+    def report(self) -> dict[str, Any]:
+        """JSON of one sample: number of frames, their indices, and the expected error at each look."""
+        looks = [
+            {
+                "frames": look.frames,
+                "gray_code": look.gray,
+                "expected_error_mm": round(look.expected_mm, 4),
+                "by_phase_mm": round(look.phase_mm, 4),
+                "by_order_mm": round(look.order_mm, 4),
+            }
+            for look in self.looks
+        ]
+        last = {name: looks[-1][name] for name in ("frames", "expected_error_mm")}
+        return last | {"frames_used": list(self.frames_used), "looks": looks}
+
+
+def fringe_options(name: str, rig: Rig, options: dict[str, Any]) -> dict[str, Any]:
+    """``options`` of a method called ``name`` that computes with the fringes of one direction, by default the rig's
+    only one. Raises `PredictionError` for fringes that it would take for others."""
+    ways = rig.fringe_directions
+    if len(ways) == 1:
+        options = {"direction": ways[0], **options}
+    direction = options.get("direction", "horizontal")
+    if direction not in ways or not isinstance(code := rig.code(direction), PhaseShift):
+        return options  # refused by the method
+    shifts = code.fringes[code.finest].shifts_deg
+    if code.origin_px != 0 or shifts[0] != 0:
+        raise PredictionError(
+            f"{name}: needs fringes with a crest on pixel 0 of the projector, and in this rig the first {direction} "
+            f"frame is shifted (origin_px {code.origin_px:g}, {shifts[0]:g} degrees); decode all frames instead"
+        )
+    if options.get("error_mm") is not None and not code.is_plain:
+        raise PredictionError(
+            f"{name}: error_mm needs fringes of one period with Gray code in half periods, and this rig has "
+            f"{code.title}; say how many frames instead"
+        )
+    return options
+
+
+def direction_of(submission: "Submission") -> str:
+    """The setting ``direction`` of a submission. Raises ValueError or KeyError for settings of no fringe route."""
+    return DIRECTIONS[DIRECTIONS.index(submission.settings["direction"])]  # type: ignore[arg-type]
+
+
+def levels_of(steps: int) -> tuple[int, ...]:
+    """Numbers of fringes to capture in turn, each containing the fringes before: 1, 2, 3 and more where ``steps`` is a
+    multiple of three, else 1 and then all."""
+    if steps % PIXELWISE:
+        return (1, steps)
+    levels = [1, 2, PIXELWISE]
+    for fringes in (6, steps):
+        if fringes > levels[-1] and set(steps_of(steps, levels[-1])) <= set(steps_of(steps, fringes)):
+            levels.append(fringes)
+    return tuple(levels)
+
+
+class FewestFrames(Method):
+    """The phase route with as many frames of one direction as ``error_mm`` takes, scene by scene: 1, 2 and 3 fringes a
+    third of a period apart, then 6, then 18; the Gray code may be added from 3 on. Frames that were not captured are
+    never read. Further options are those of `PhaseMethod`, except ``frames``. Raises `PredictionError` for an error
+    that is no positive number of mm, and as `PhaseMethod`."""
+
+    reports = True
+
+    def __init__(self, rig: Rig, error_mm: float, **options: Any) -> None:
+        self.name = PhaseMethod.name
+        if isinstance(error_mm, bool) or not isinstance(error_mm, int | float) or not 0 < error_mm < np.inf:
+            raise PredictionError(f"error_mm {error_mm!r}: expected the largest error to accept, in mm, above 0")
+        if "frames" in options:
+            raise PredictionError("frames and error_mm: give one of them; error_mm chooses the frames itself")
+        self.rig, self.error_mm = rig, float(error_mm)
+        self.methods = {n: PhaseMethod(rig, **options, frames=n) for n in levels_of(rig.sequence.steps)}
+        self.options = self.methods[1].options
+        self.gray = tuple(rig.sequence.gray(self.options.direction))
+        fringes = {index for method in self.methods.values() for index in method.frames_used}
+        self.frames_used = tuple(sorted(fringes | set(self.gray)))  # all that a scene may need; most need few of them
+        self.title = f"Phase route, fewest {self.options.direction} fringes for {error_mm:g} mm, nothing learned"
+        settings = self.methods[1].settings
+        self.settings = {"error_mm": self.error_mm} | {key: settings[key] for key in settings if key != "frames"}
+
+    def choose(self, frames: Frames) -> FrameChoice:
+        """Measure and capture more frames until the expected error is at most ``error_mm`` or no frame is left."""
+        looks: list[Look] = []
+        gray = False
+        for count, method in self.methods.items():
+            measurement = method.measure(frames)
+            depth_mm, used, look = measurement.depth_mm, method.frames_used, Look.of(measurement, count)
+            if not gray:
+                looks.append(look)
+                # The Gray code helps the order only: it is captured once the phase is good enough, or when no fringe
+                # is left.
+                phase_done = look.phase_mm <= self.error_mm or count == max(self.methods)
+                gray = look.expected_mm > self.error_mm and count >= PIXELWISE and phase_done
+            if gray:
+                depth_mm = decode_stack(frames, self.rig, direction=self.options.direction, steps=count).depth_mm
+                used = tuple(sorted({*used, *self.gray}))
+                looks.append(replace(look, frames=len(used), gray=True, order_mm=0.0))
+            if looks[-1].expected_mm <= self.error_mm:
+                break
+        return FrameChoice(depth_mm, used, tuple(looks))
+
+    def answer(self, frames: Frames) -> Answer:
+        """Depth as `predict`, and the sample's report (see `FrameChoice.report`)."""
+        choice = self.choose(frames)
+        return Answer(choice.depth_mm, report=choice.report())
+
+    def predict(self, frames: Frames) -> NDArray[np.float32]:
+        """Depth float32 (H, W) in mm, 0 = background."""
+        return self.choose(frames).depth_mm
+
+    def summary(self, reports: Sequence[Mapping[str, Any]]) -> dict[str, float]:
+        """Summary of a split's reports for the submission's settings: mean and largest number of frames a sample."""
+        counts = [int(report["frames"]) for report in reports]
+        return {"frames_mean": round(float(np.mean(counts)), 3), "frames_most": max(counts)}

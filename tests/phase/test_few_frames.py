@@ -1,0 +1,252 @@
+"""Two and more frames of one direction, and the choice of how many a scene needs."""
+
+import json
+from functools import cache
+from itertools import pairwise
+from pathlib import Path
+from typing import ClassVar
+
+import numpy as np
+import pytest
+from flat_planes import PAPER, USERS_WORD
+from synthetic import make
+
+from fpp_ml_bench.baselines.method import Answer, Method
+from fpp_ml_bench.baselines.phase.local_fit import FringeFit, Window, fringe_fit
+from fpp_ml_bench.baselines.phase.method import FewestFrames, PhaseMethod, levels_of
+from fpp_ml_bench.baselines.phase.several_frames import steps_of
+from fpp_ml_bench.baselines.registry import load_method
+from fpp_ml_bench.baselines.run import predict_split
+from fpp_ml_bench.decoding.triangulation import depth_noise_mm
+from fpp_ml_bench.errors import DecodeError, PredictionError
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.evaluation.submission.description import read_submission
+from fpp_ml_bench.evaluation.submission.prediction_files import REPORTS_FILE
+from fpp_ml_bench.loaders.render.illumination import light_surface
+from fpp_ml_bench.loaders.render.sensor import Exposure, camera_noise
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.named_rigs import paper_rig
+
+SIZE = 480
+RIG = paper_rig(SIZE)
+HALF = SIZE // 2
+OBJECT = (slice(110, 370), slice(130, 350))
+
+
+@cache
+def made(frames: int, direction: str = "horizontal", **options: object) -> PhaseMethod:
+    return PhaseMethod(RIG, direction=direction, frames=frames, **options)
+
+
+@cache
+def plane(distance_m: float, direction: str = "horizontal", noise: float = 1.0) -> list[np.ndarray | None]:
+    """All fringes and Gray frames of one direction on a plane that fills the frame."""
+    x, y = RIG.camera.rays()
+    points = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3) * distance_m
+    light = PAPER.changed("camera", **camera_noise(noise))
+    exposure = Exposure.of(RIG, light)
+    lit = light_surface(points, np.broadcast_to([0.0, 0.0, -1.0], points.shape), RIG, light, exposure.pattern)
+    indices = [*RIG.sequence.sinusoids(direction), *RIG.sequence.gray(direction)]  # type: ignore[arg-type]
+    pixels = np.arange(x.size, dtype=np.uint32)
+    images = exposure.expose(indices, lit, pixels, (7, "plane", 0))
+    frames: list[np.ndarray | None] = [None] * len(RIG.sequence)
+    for index, image in zip(indices, images, strict=True):
+        frames[index] = image.reshape(x.shape)
+    return frames
+
+
+def scene(left_m: float, right_m: float) -> list[np.ndarray | None]:
+    """A block before the calibrated plane, its left and right half at two distances."""
+    frames: list[np.ndarray | None] = []
+    for back, left, right in zip(plane(RIG.background_m), plane(left_m), plane(right_m), strict=True):
+        if back is None or left is None or right is None:
+            frames.append(None)
+            continue
+        image, both = back.copy(), np.where(np.arange(SIZE) < HALF, left, right)
+        image[OBJECT] = both[OBJECT]
+        frames.append(image)
+    return frames
+
+
+def exact_mm(left_m: float, right_m: float) -> np.ndarray:
+    depth = np.zeros((SIZE, SIZE))
+    depth[OBJECT] = np.broadcast_to(np.where(np.arange(SIZE) < HALF, left_m, right_m) * 1000, depth.shape)[OBJECT]
+    return depth
+
+
+def test_steps_are_spread_and_complete_each_other() -> None:
+    assert [steps_of(18, n) for n in (1, 2, 3, 4, 6)] == [
+        (0,),
+        (0, 6),
+        (0, 6, 12),
+        (0, 5, 9, 14),
+        (0, 3, 6, 9, 12, 15),
+    ]
+    assert steps_of(18, 18) == tuple(range(18))
+    for steps, expected in ((18, (1, 2, 3, 6, 18)), (12, (1, 2, 3, 6, 12)), (9, (1, 2, 3, 6, 9)), (4, (1, 4))):
+        levels = levels_of(steps)
+        assert levels == expected
+        for few, more in pairwise(levels):
+            assert set(steps_of(steps, few)) <= set(steps_of(steps, more))
+    for wrong in (0, 19, 2.5, True, "3"):
+        with pytest.raises(PredictionError, match="1 to the 18"):
+            steps_of(18, wrong)  # type: ignore[arg-type]
+
+
+def test_two_frames_solve_the_tied_fringe() -> None:
+    y, x = np.mgrid[:60, :60]
+    phase = (0.3 * y + 0.4 * np.sin(x / 15)).astype(np.float32)
+    bright = (40 + 0.1 * x).astype(np.float32)
+    shifts = (0.0, 2 * np.pi / 3)
+    greys = [(6 + bright * (1 + np.cos(phase + shift))).astype(np.float32) for shift in shifts]
+    start = phase + np.float32(0.35) * np.cos(x / 9).astype(np.float32)
+
+    def fitted(frames: int) -> FringeFit:
+        carrier = start
+        for _ in range(3):
+            fit = fringe_fit(greys[:frames], np.ones(phase.shape, bool), carrier, 6.0, Window(1.5), shifts[:frames])
+            carrier = fit.phase_rad
+        return fit
+
+    fit = fitted(2)
+    inner = (slice(6, -6), slice(6, -6))
+    assert np.abs(fit.phase_rad - phase)[inner].max() < 0.08  # where both are dark; a hundredth elsewhere
+    assert np.abs(fit.phase_rad - phase)[inner].mean() < 0.01
+    assert np.abs(fit.brightness - bright)[inner].mean() < 0.2
+    assert np.abs(fitted(1).phase_rad - phase)[inner].mean() > 0.1  # a window this small needs the second frame
+
+
+@pytest.mark.parametrize("direction", ["horizontal", "vertical"])
+@pytest.mark.parametrize("frames", [3, 4, 18])
+def test_noise_of_a_plane_is_the_closed_form(frames: int, direction: str) -> None:
+    measurement = made(frames, direction, **USERS_WORD).measure(plane(1.8, direction))
+    middle = (slice(150, 330), slice(150, 330))
+    error = (measurement.depth_mm - 1800)[middle].astype(np.float64)
+    expected = depth_noise_mm(RIG, 1800.0, direction, frames, float(measurement.modulation_grey[middle].mean()), 1.0)
+    # Rounding adds a twelfth of a squared level to the noise; unequal steps weigh noise a little unevenly.
+    assert 0.9 < error.std() / expected < 1.15
+    assert abs(error.mean()) < 3 * expected / 180 + 0.05
+    assert (measurement.expected_error_mm - measurement.order_doubt_mm)[middle].mean() == pytest.approx(
+        np.abs(error).mean(), rel=0.25
+    )
+
+
+@pytest.mark.parametrize("distance_m", [1.55, 1.8, 2.05])
+@pytest.mark.parametrize("frames", [2, 3])
+def test_a_plane_is_at_its_distance_without_gray_code(frames: int, distance_m: float) -> None:
+    measurement = made(frames, **USERS_WORD).measure(plane(distance_m))
+    lit = measurement.modulation_grey > 5
+    assert lit.mean() > 0.7
+    assert np.abs(measurement.depth_mm - distance_m * 1000)[lit].mean() < 1.5
+
+
+def test_a_depth_edge_blurs_one_frame_and_no_more() -> None:
+    left_m, right_m = 1.80, 1.72
+    frames, truth = scene(left_m, right_m), exact_mm(left_m, right_m)
+    band = (slice(120, 360), slice(HALF - 4, HALF + 4))
+    off = {}
+    for count in (1, 2, 3):
+        measurement = made(count).measure(frames)
+        off[count] = np.abs(measurement.depth_mm - truth)[band].mean()
+        on_object = measurement.depth_mm > 0
+        assert (on_object != (truth > 0)).mean() < 0.004
+    assert off[3] < 1.5
+    assert off[2] < 0.5 * off[1]
+    assert off[1] > 5 * off[3]
+
+
+def test_frames_are_added_until_the_stated_error_is_expected() -> None:
+    frames, truth = scene(1.8, 1.72), exact_mm(1.8, 1.72)
+    looks = FewestFrames(RIG, 1e-3).choose(frames).looks
+    assert [(look.frames, look.gray) for look in looks] == [
+        (1, False),
+        (2, False),
+        (3, False),
+        (6, False),
+        (18, False),
+        (25, True),
+    ]
+    # Two frames still average over a small window, which a plane rewards; from three on noise falls as the root.
+    assert looks[0].expected_mm > 2 * looks[1].expected_mm
+    assert looks[2].expected_mm == pytest.approx(looks[4].expected_mm * 6**0.5, rel=0.2)
+    for place in (0, 1):
+        error_mm = 1.001 * looks[place].expected_mm
+        chosen = FewestFrames(RIG, error_mm).choose(frames)
+        assert chosen.looks == looks[: len(chosen.looks)]
+        assert chosen.looks[-1].expected_mm <= error_mm
+        assert all(look.expected_mm > error_mm for look in chosen.looks[:-1])
+        assert len(chosen.frames_used) == chosen.looks[-1].frames
+        assert np.abs(chosen.depth_mm - truth)[truth > 0].mean() < 2.0
+        assert chosen.report()["frames"] == len(chosen.frames_used)
+
+
+def test_doubt_about_the_order_asks_for_the_gray_code() -> None:
+    frames, truth = scene(1.8, 1.8), exact_mm(1.8, 1.8)
+    chosen = FewestFrames(RIG, 2.0, shading=False).choose(frames)  # nothing but the range: two orders are as good
+    assert chosen.looks[-1].gray and chosen.looks[-1].frames == 3 + RIG.sequence.bits("horizontal")
+    assert not any(look.gray for look in chosen.looks[:-1])
+    assert chosen.looks[-2].order_mm > 2.0
+    assert np.abs(chosen.depth_mm - truth)[truth > 0].mean() < 2.0
+
+
+def test_frames_not_asked_for_are_never_looked_at() -> None:
+    frames = scene(1.8, 1.8)
+    chosen = FewestFrames(RIG, 1.2).choose(frames)
+    only = [frame if index in chosen.frames_used else None for index, frame in enumerate(frames)]
+    assert np.array_equal(FewestFrames(RIG, 1.2).choose(only).depth_mm, chosen.depth_mm)
+    missing = list(only)
+    missing[chosen.frames_used[-1]] = None
+    with pytest.raises(DecodeError, match=f"frame {chosen.frames_used[-1]} is missing"):
+        FewestFrames(RIG, 1.2).predict(missing)
+
+
+def test_an_empty_scene_needs_one_frame() -> None:
+    chosen = FewestFrames(RIG, 0.1).choose(plane(RIG.background_m))
+    assert chosen.looks[-1].frames == 1
+    assert not chosen.depth_mm.any()
+
+
+def test_methods_say_what_they_need_and_refuse_what_they_cannot() -> None:
+    assert load_method("phase", RIG, frames=3, direction="vertical").frames_used == (18, 24, 30)
+    few = load_method("phase", RIG, error_mm=3.0)
+    assert few.frames_used == (*range(18), *range(36, 43)) and "3 mm" in few.title
+    assert few.settings["error_mm"] == 3.0 and "frames" not in few.settings
+    for wrong in (0, -1.0, float("nan"), float("inf"), True, "3"):
+        with pytest.raises(PredictionError, match="error_mm"):
+            load_method("phase", RIG, error_mm=wrong)
+    with pytest.raises(PredictionError, match="give one"):
+        load_method("phase", RIG, error_mm=3.0, frames=2)
+    with pytest.raises(PredictionError, match="frames 19"):
+        load_method("phase", RIG, frames=19)
+    with pytest.raises(DecodeError, match="frame 6 is missing"):
+        made(3).measure([image if i != 6 else None for i, image in enumerate(plane(1.8))])
+    with pytest.raises(DecodeError, match="expected 3 fringes"):
+        made(3).route.measure(plane(1.8)[0])
+
+
+class Reporting(Method):
+    """A method that says how many frames each sample took."""
+
+    name, title, frames_used, reports = "counting", "Counting", (0,), True
+    settings: ClassVar = {"error_mm": 3.0}
+
+    def predict(self, frames):  # type: ignore[no-untyped-def]
+        return np.where(frames[0] > 128, 1800, 0).astype(np.float32)
+
+    def answer(self, frames):  # type: ignore[no-untyped-def]
+        return Answer(self.predict(frames), report={"frames": int(frames[0][0, 0]) % 3 + 1})
+
+    def summary(self, reports):  # type: ignore[no-untyped-def]
+        return {"frames_mean": sum(report["frames"] for report in reports) / len(reports)}
+
+
+def test_reports_lie_beside_the_predictions(tmp_path: Path) -> None:
+    dataset = make(tmp_path / "data", views=("A0", "A60"))
+    opened = DatasetFolder(dataset)
+    out = tmp_path / "out"
+    predict_split(opened, Reporting(opened.rig), "test", out)
+    reports = json.loads((out / REPORTS_FILE).read_text())
+    assert list(reports) == opened.samples("test")
+    mean = np.mean([report["frames"] for report in reports.values()])
+    assert read_submission(out).settings == {"error_mm": 3.0, "frames_mean": mean}
+    assert len(evaluate(out, opened, "test").per_sample) == 2
