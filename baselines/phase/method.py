@@ -6,24 +6,27 @@ expected error, from its phase and from its order. While that error is too large
 """
 
 import operator
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method
-from fpp_ml_bench.baselines.phase.observation import PIXELWISE, Measurement, Prior, Reason, Settings
-from fpp_ml_bench.baselines.phase.route import PhaseRoute
-from fpp_ml_bench.baselines.phase.several_frames import steps_of
+from fpp_ml_bench.baselines.phase.depth import FringeMeasurement, Reason
+from fpp_ml_bench.baselines.phase.observe import CROSSED_FRAMES, MIN_CONFIDENCE, PIXELWISE, Settings, steps_of
+from fpp_ml_bench.baselines.phase.order import TERMS, terms_of
+from fpp_ml_bench.baselines.phase.route import CrossedRoute, PhaseRoute
+from fpp_ml_bench.coding.crossed import crossed_from_pair
 from fpp_ml_bench.coding.phase_shift import PhaseShift
-from fpp_ml_bench.decoding.decode import decode_stack
+from fpp_ml_bench.decoding.decode import decode_stack, grey_levels
 from fpp_ml_bench.errors import DecodeError, PredictionError
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.captures.decoding import read_mask
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.sequence import DIRECTIONS, PAPER_SEQUENCE, Direction
+from fpp_ml_bench.optics.sequence import DIRECTIONS, PAPER_SEQUENCE
 from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
@@ -35,25 +38,11 @@ ORDER_SHARE = (0.16, 0.10, 0.05)
 The margin of an order overestimates the probability that it is wrong; these factors correct that."""
 
 
-MIN_CONFIDENCE = "mask pixels of less confidence, 0 to 1 (default: 0, dense)"
-DIRECTION = "direction of the fringes (default: horizontal)"
-WHITE_GREY = (
-    "for images without a lit background: grey level of a white pattern on a surface that faces the projector at the "
-    "near end of the working range"
-)
-AMBIENT_GREY = (
-    "for images without a lit background: grey level of a surface in ambient light alone (default: the image's darkest)"
-)
-MASK = "object mask: an image of the frames' size, above 0 on the object in every sample (default: found in each image)"
-"""Help of options that several routes have."""
 LIT_BACKGROUND = Assumption(
     "a lit background", "Assumes a lit background; not one albedo, so that little tells the fringe order."
 )
-ONE_ALBEDO = Assumption(
-    "one albedo, a lit background",
-    "Assumes one albedo for all surfaces and a lit background, which shows how strong the lamp is: the brightness of "
-    "the fringe image decides the fringe order.",
-)
+ONE_ALBEDO = Assumption("one albedo, a lit background", TERMS["shading"].assumes)
+MASK = "object mask: an image of the frames' size, above 0 on the object in every sample (default: found in each image)"
 
 
 @dataclass(frozen=True)
@@ -61,31 +50,37 @@ class PhaseOptions(Settings):
     """Options of `PhaseMethod`: those of `Settings`, an object ``mask`` (a file of `captures.read_mask`), and
     ``error_mm``, which makes it `FewestFrames`."""
 
-    direction: Direction = option("horizontal", DIRECTION, choices=DIRECTIONS)
-    frames: int = option(1, "fringes of that direction, 1 to 18; no Gray code (default: 1)", "N")
     error_mm: float | None = option(
         None,
         "instead of --frames: for each scene the fewest frames whose expected error is at most this, starting with a "
         "single fringe; may need the Gray code",
         "MM",
     )
-    prior: Prior = option(
-        "none",
-        "standoff: assume that objects are near the rig's standoff, true of fixed placement (default: none)",
-        choices=get_args(Prior),
-    )
-    shading: bool = option(True, "choose the fringe order without brightness", flag="--no-shading")
+    mask: str | Path | None = option(None, MASK, "FILE")
+
+
+@dataclass(frozen=True)
+class CrossedOptions:
+    """Options of `CrossedMethod`."""
+
+    frames: int = option(1, "crossed frames, 1 or 3 (default: 1)", "N")
     min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
-    white_grey: float | None = option(None, WHITE_GREY, "GREY")
-    ambient_grey: float | None = option(None, AMBIENT_GREY, "GREY")
     mask: str | Path | None = option(None, MASK, "FILE")
 
 
 class RouteMethod(Method):
-    """A method that measures every map of a sample at once: ``measure`` (frames) gives a measurement with ``depth_mm``
-    and ``sigma_mm``."""
+    """A method that measures every map of a sample at once by its `route`."""
 
-    measure: Callable[[Frames], Any]
+    route: Any
+    mask: NDArray[np.bool_] | None = None
+
+    def use_mask(self, mask: str | Path | None) -> dict[str, str]:
+        """Take the object mask of every sample from a file (`captures.read_mask`), if there is one; what it adds to the
+        settings."""
+        if mask is None:
+            return {}
+        self.mask = read_mask(Path(mask), (self.rig.camera.height, self.rig.camera.width))
+        return {"mask": Path(mask).name}
 
     def images(self, frames: Frames) -> list[NDArray[np.uint8]]:
         """The captured frames of `frames_used`; raises `DecodeError` for one that is missing."""
@@ -98,6 +93,10 @@ class RouteMethod(Method):
             images.append(image)
         return images
 
+    def measure(self, frames: Frames) -> Any:
+        """All maps of a captured sequence (`Measurement`); frames that are not in `frames_used` may be None."""
+        return self.route.measure(self.images(frames), self.mask)
+
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""
         return self.measure(frames).depth_mm  # type: ignore[no-any-return]
@@ -105,6 +104,10 @@ class RouteMethod(Method):
     def answer(self, frames: Frames) -> Answer:
         measurement = self.measure(frames)
         return Answer(measurement.depth_mm, measurement.sigma_mm)
+
+    def crop(self, frames: Frames) -> tuple[slice, slice]:
+        seen = self.route.observe(self.images(frames), self.mask)
+        return self.route.resampling.captured_crop(seen.crop)  # type: ignore[no-any-return]
 
 
 class PhaseMethod(RouteMethod):
@@ -127,17 +130,14 @@ class PhaseMethod(RouteMethod):
     def __init__(self, rig: Rig, **options: Any) -> None:
         given = self.checked_options(options)
         settings = Settings(**{entry.name: getattr(given, entry.name) for entry in fields(Settings)})
-        mask = given.mask
         self.rig, self.options, self.route = rig, settings, PhaseRoute(rig, settings)
         sinusoids = rig.sequence.sinusoids(settings.direction)
         self.frames_used = tuple(sinusoids[step] for step in self.route.steps)
         frames = len(self.frames_used)
         count = f"one {settings.direction} fringe" if frames == 1 else f"{frames} {settings.direction} fringes"
-        cues = ["range"] + ["shading"] * settings.shading + ["standoff"] * (settings.prior == "standoff")
-        self.title = f"Phase route, {count}, order by {' + '.join(cues)}, nothing learned"
-        shape = rig.camera.height, rig.camera.width
-        self.mask = None if mask is None else read_mask(Path(mask), shape)
-        self.settings = asdict(settings) | ({} if mask is None else {"mask": Path(mask).name})
+        cues = " + ".join(["range", *terms_of(settings)])
+        self.title = f"Phase route, {count}, order by {cues}, nothing learned"
+        self.settings = asdict(settings) | self.use_mask(given.mask)
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
@@ -165,12 +165,125 @@ class PhaseMethod(RouteMethod):
     def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
         return ONE_ALBEDO if settings.get("shading") is True else None
 
-    def measure(self, frames: Frames) -> Measurement:
-        """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
-        return self.route.measure(self.images(frames), self.mask)
 
-    def crop(self, frames: Frames) -> tuple[slice, slice]:
-        return self.route.resampling.captured_crop(self.route.observe(self.images(frames), self.mask).crop)
+def frames_of(rig: Rig, name: str) -> tuple[int, ...]:
+    """The frames that make one crossed frame: the rig's first crossed one, or the first sinusoid of both directions,
+    whose mean is one. Raises `PredictionError` for a rig without either, in the words of the method ``name``."""
+    if crossed := rig.sequence.crossed_frames:
+        return crossed[:1]
+    if rig.fringe_directions == DIRECTIONS:
+        return tuple(sorted(rig.sequence.sinusoids(direction)[0] for direction in DIRECTIONS))
+    listed = " and ".join(rig.fringe_directions) or "no"
+    raise PredictionError(
+        f"{name}: needs a crossed frame, or one fringe of each direction to make it from; this rig projects {listed} "
+        "fringes. fpp-bench patterns --design proposes crossed fringes for a rig"
+    )
+
+
+def crossed_image(images: Sequence[NDArray]) -> NDArray[np.uint8]:
+    """The crossed frame of the images of `frames_of`."""
+    grey = [grey_levels(image) for image in images]
+    return grey[0] if len(grey) == 1 else crossed_from_pair(grey[0], grey[1])
+
+
+def has_crossed_fringes(rig: Rig) -> bool:
+    """Whether `frames_of` finds a crossed frame."""
+    return bool(rig.sequence.crossed_frames) or rig.fringe_directions == DIRECTIONS
+
+
+def shifted_carrier(rig: Rig, name: str) -> int:
+    """The carrier that the rig's first three crossed frames shift. Raises `PredictionError`, in the words of the method
+    ``name``, for a rig without such frames."""
+    family = rig.crossed
+    shifts = np.zeros((0, 2)) if family is None else np.asarray(family.shifts_deg[:CROSSED_FRAMES], np.float64)
+    if len(shifts) == CROSSED_FRAMES:
+        different = [len(set(np.mod(column, 360))) for column in shifts.T]
+        if sorted(different) == [1, CROSSED_FRAMES]:
+            return different.index(CROSSED_FRAMES)
+    found = "none" if family is None else f"{len(family)} with shifts_deg {[list(pair) for pair in family.shifts_deg]}"
+    raise PredictionError(
+        f"{name} --frames {CROSSED_FRAMES}: needs three crossed frames that shift one carrier and keep the other "
+        f"still; this rig has {found}. Build with --rig crossed, or give the rig such shifts_deg (docs/own_rig.md)"
+    )
+
+
+class CrossedMethod(RouteMethod):
+    """Depth from one crossed frame; where the rig has none, from the mean of the first fringe of both directions, which
+    is one. With ``frames`` 3: from three that shift one carrier. ``mask``: a file
+    (`captures.read_mask`) that says where the object is in every sample. Raises `PredictionError` for a rig without
+    such frames and for an invalid option, `CaptureError` for a mask that can't be used."""
+
+    name = "crossed"
+    purpose = "one frame with two fringe directions, or three, nothing learned"
+    Options = CrossedOptions
+    scenes_rig = "crossed"
+
+    def __init__(self, rig: Rig, **options: Any) -> None:
+        given = self.checked_options(options)
+        self.rig, frames, moved = rig, given.frames, None
+        if frames == CROSSED_FRAMES:
+            self.frames_used, moved = rig.sequence.crossed_frames[:CROSSED_FRAMES], shifted_carrier(rig, self.name)
+            count = "three frames"
+        elif frames == 1:
+            self.frames_used = frames_of(rig, self.name)
+            count = "one frame" if len(self.frames_used) == 1 else "one frame, the mean of two"
+        else:
+            raise PredictionError(f"{self.name} --frames {frames}: expected 1 or {CROSSED_FRAMES} crossed frames")
+        self.route = CrossedRoute(rig, Settings(min_confidence=given.min_confidence), moved=moved)
+        pitches = " and ".join(f"{pitch:g}" for pitch in self.route.family.pitches_px)
+        self.title = f"Crossed fringes of {pitches} px, {count}, nothing learned"
+        self.settings = {"min_confidence": given.min_confidence} | self.use_mask(given.mask)
+        self.settings |= {} if frames == 1 else {"frames": frames}
+
+    @classmethod
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+        if not has_crossed_fringes(rig):
+            return []
+        return [{}, {"frames": CROSSED_FRAMES}] if len(rig.sequence.crossed_frames) >= CROSSED_FRAMES else [{}]
+
+    @classmethod
+    def short_name(cls, submission: "Submission") -> str | None:
+        return crossed_name(submission, "Crossed fringes ")
+
+    def images(self, frames: Frames) -> list[NDArray[np.uint8]]:
+        images = super().images(frames)
+        return images if self.route.moved is not None else [crossed_image(images)]
+
+
+def crossed_name(submission: "Submission", begins: str) -> str | None:
+    """A short name for a submission of crossed fringes whose name ``begins`` so; None for another."""
+    if not submission.name.startswith(begins):
+        return None
+    frames = {1: "1 frame", 2: "mean of 2"}.get(len(submission.frames_used), f"{len(submission.frames_used)} frames")
+    return f"{printable(submission.settings.get('weights', 'Crossed'))}, {frames}"
+
+
+def fringe_options(name: str, rig: Rig, options: dict[str, Any]) -> dict[str, Any]:
+    """``options`` of a method called ``name`` that computes with the fringes of one direction, by default the rig's
+    only one. Raises `PredictionError` for fringes that it would take for others."""
+    ways = rig.fringe_directions
+    if len(ways) == 1:
+        options = {"direction": ways[0], **options}
+    direction = options.get("direction", "horizontal")
+    if direction not in ways or not isinstance(code := rig.code(direction), PhaseShift):
+        return options  # refused by the method
+    shifts = code.fringes[code.finest].shifts_deg
+    if code.origin_px != 0 or shifts[0] != 0:
+        raise PredictionError(
+            f"{name}: needs fringes with a crest on pixel 0 of the projector, and in this rig the first {direction} "
+            f"frame is shifted (origin_px {code.origin_px:g}, {shifts[0]:g} degrees); decode all frames instead"
+        )
+    if options.get("error_mm") is not None and not code.is_plain:
+        raise PredictionError(
+            f"{name}: error_mm needs fringes of one period with Gray code in half periods, and this rig has "
+            f"{code.title}; say how many frames instead"
+        )
+    return options
+
+
+def direction_of(submission: "Submission") -> str:
+    """The setting ``direction`` of a submission. Raises ValueError or KeyError for settings of no fringe route."""
+    return DIRECTIONS[DIRECTIONS.index(submission.settings["direction"])]  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -184,7 +297,7 @@ class Look:
     order_mm: float
 
     @classmethod
-    def of(cls, measurement: Measurement, count: int) -> "Look":
+    def of(cls, measurement: FringeMeasurement, count: int) -> "Look":
         # A pixel without a depth because its order is ambiguous is what more frames are for.
         on_object = (measurement.depth_mm > 0) | (measurement.reason == Reason.AMBIGUOUS)
         if not on_object.any():
@@ -220,34 +333,6 @@ class FrameChoice:
         ]
         last = {name: looks[-1][name] for name in ("frames", "expected_error_mm")}
         return last | {"frames_used": list(self.frames_used), "looks": looks}
-
-
-def fringe_options(name: str, rig: Rig, options: dict[str, Any]) -> dict[str, Any]:
-    """``options`` of a method called ``name`` that computes with the fringes of one direction, by default the rig's
-    only one. Raises `PredictionError` for fringes that it would take for others."""
-    ways = rig.fringe_directions
-    if len(ways) == 1:
-        options = {"direction": ways[0], **options}
-    direction = options.get("direction", "horizontal")
-    if direction not in ways or not isinstance(code := rig.code(direction), PhaseShift):
-        return options  # refused by the method
-    shifts = code.fringes[code.finest].shifts_deg
-    if code.origin_px != 0 or shifts[0] != 0:
-        raise PredictionError(
-            f"{name}: needs fringes with a crest on pixel 0 of the projector, and in this rig the first {direction} "
-            f"frame is shifted (origin_px {code.origin_px:g}, {shifts[0]:g} degrees); decode all frames instead"
-        )
-    if options.get("error_mm") is not None and not code.is_plain:
-        raise PredictionError(
-            f"{name}: error_mm needs fringes of one period with Gray code in half periods, and this rig has "
-            f"{code.title}; say how many frames instead"
-        )
-    return options
-
-
-def direction_of(submission: "Submission") -> str:
-    """The setting ``direction`` of a submission. Raises ValueError or KeyError for settings of no fringe route."""
-    return DIRECTIONS[DIRECTIONS.index(submission.settings["direction"])]  # type: ignore[arg-type]
 
 
 def levels_of(steps: int) -> tuple[int, ...]:
