@@ -17,11 +17,10 @@ from fpp_ml_bench.baselines.learned.odds import (
 )
 from fpp_ml_bench.baselines.phase.calibration_layer import Carriers, Image, Mask
 from fpp_ml_bench.baselines.phase.candidates import chosen_values
-from fpp_ml_bench.baselines.phase.depth import Fitted, Measurement
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Fitted, Measurement
 from fpp_ml_bench.baselines.phase.observe import Settings
 from fpp_ml_bench.baselines.phase.order import JUMP_RAD
 from fpp_ml_bench.baselines.phase.resampling import Periods, nearest_inside
-from fpp_ml_bench.baselines.phase.route import CrossedRoute
 from fpp_ml_bench.optics.rig import Rig
 
 DENIED = 6.0  # a pixel of the measured mask stays object unless its logit is this far below the threshold
@@ -78,7 +77,6 @@ class CrossedNetRoute:
             return self.route.conclude(seen)
         scene = Scene.of(seen)
         answers = network_answers(self.network, scene, self.route.carriers, self.lead)
-        seen.watch.done("network")
         return self.conclude(seen, scene, answers)
 
     def conclude(self, seen: Fitted, scene: Scene, answers: Answers) -> Measurement:
@@ -99,5 +97,4 @@ class CrossedNetRoute:
         np.put_along_axis(chances, choice[None], -1, axis=0)
         rival = (scene.nearness + chosen_values(offers, chances.argmax(axis=0)) / joint).astype(np.float32)
         fit = replace(seen.fit, nearness=nearness.astype(np.float32), uncertainty_rad=answers.sigma_rad)
-        seen.watch.done("order")
         return self.route.conclude(replace(seen, fit=fit, inside=inside, rival=rival), wrong.astype(np.float32))

@@ -27,7 +27,7 @@ from fpp_ml_bench.baselines.learned.windows import (
 )
 from fpp_ml_bench.baselines.phase.calibration_layer import Mask
 from fpp_ml_bench.baselines.phase.candidates import chosen_values
-from fpp_ml_bench.baselines.phase.route import CrossedRoute
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute
 from fpp_ml_bench.baselines.training.views import View
 from fpp_ml_bench.depth import depth_edges
 from fpp_ml_bench.optics.named_rigs import crossed_rig

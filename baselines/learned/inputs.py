@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer, Crop, Image, Mask, wrapped
 from fpp_ml_bench.baselines.phase.candidates import irradiance
+from fpp_ml_bench.baselines.phase.depth import PhaseRoute
 from fpp_ml_bench.baselines.phase.observe import Observation, Settings
 from fpp_ml_bench.baselines.phase.order import LEAST_BRIGHTNESS
 from fpp_ml_bench.baselines.phase.resampling import Periods, grid_of, repeated
-from fpp_ml_bench.baselines.phase.route import PhaseRoute
 from fpp_ml_bench.optics.rig import Rig
 
 STEPS = (-1, 0, 1)  # the candidates: a period further than the base order, the base order, a period nearer

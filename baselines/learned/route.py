@@ -76,12 +76,10 @@ class NetworkRoute:
         geometry, route = self.geometry, self.geometry.route
         seen = route.observe(image)
         base, margin = route.choose(seen)
-        seen.watch.done("order")
         if not (seen.background.calibrated and seen.inside.any()):
             return route.conclude(seen, base, margin)
         scene = Scene.of(seen, base, geometry.shading)
         answers = network_answers(self.network, scene, geometry, self.lead)
-        seen.watch.done("network")
         inside = decided_mask(answers, scene, self.threshold)
         choice = decided_order(answers, scene, inside, geometry)
         moved = seen.phase_rad + answers.correction_rad

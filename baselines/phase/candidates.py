@@ -75,19 +75,18 @@ def fringe_candidates(seen: Observation) -> FringeCandidates:
     grid, where = grid_of(seen.stride), grid_of(seen.stride, seen.crop)
     layer, orders = seen.layer.at(grid), seen.candidates
     count = np.maximum(orders.count[grid], 1)
-    steps = range(int(count.max(initial=1)))
-    phase = [layer.residual_phase(seen.phase_rad[grid], orders.first[grid] + k).astype(np.float32) for k in steps]
-    slopes = seen.slopes[0][grid], seen.slopes[1][grid]
+    steps = np.arange(count.max(initial=1))[:, None, None]
+    phase = layer.residual_phase(seen.phase_rad[grid], orders.first[grid] + steps).astype(np.float32)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        light = np.stack([irradiance(layer, candidate, slopes, seen.rig, where) for candidate in phase])
-        depth = np.stack([layer.depth_of_residual_mm(candidate) for candidate in phase]).astype(np.float32)
+        light = irradiance(layer, phase, (seen.slopes[0][grid], seen.slopes[1][grid]), seen.rig, where)
+        depth = layer.depth_of_residual_mm(phase).astype(np.float32)
     # NaN where the lamp's strength is unknown: then brightness tells nothing, and no evidence separates orders.
     brightness = seen.fit.brightness[grid] / np.float32(seen.background.strength / 2)
     lit = np.nan_to_num(np.clip(brightness * seen.rig.standoff_m**2, 0.02, 1), nan=1.0)
     trust = np.clip((seen.fit.weight[grid] - 0.4) / 0.5, 0.05, 1) * lit**2
-    exists, inside = np.stack([k < count for k in steps]), seen.inside[grid]
+    inside, trust = seen.inside[grid], trust.astype(np.float32)
     links = _links(seen, inside, phase[0], seen.fit.brightness[grid])
-    return FringeCandidates(np.stack(phase), exists, trust.astype(np.float32), inside, links, depth, light, brightness)
+    return FringeCandidates(phase, steps < count, trust, inside, links, depth, light, brightness)
 
 
 def crossed_candidates(seen: CrossedObservation) -> CrossedCandidates:
@@ -102,26 +101,25 @@ def crossed_candidates(seen: CrossedObservation) -> CrossedCandidates:
     proposing, other, joint = residual[main], residual[1 - main], carriers.joint_gain
     ratio = gain[1 - main] / gain[main]
     first = np.ceil((low - proposing) / TAU)
-    nearness, misfits, exists = [], [], []
-    for turn in range(int(np.ceil(float((high - low).max()) / TAU)) + 1):
-        psi = proposing + TAU * (first + turn)
-        beside = wrapped(other - psi * ratio)
-        if moved is None:  # the point of the line nearest to the measured pair, and its distance
-            nearness.append((gain[main] * psi + gain[1 - main] * (psi * ratio + beside)) / joint**2)
-            misfits.append(np.abs(beside * gain[main]) / joint)
-        else:
-            nearness.append(psi / gain[main])
-            misfits.append(np.abs(beside))
-        exists.append(psi <= high)
-    furthest_first = slice(None, None, 1 if float(np.median(gain[main])) > 0 else -1)
-    q, misfit, exist = (np.stack(values)[furthest_first] for values in (nearness, misfits, exists))
-    q, inside = q.astype(np.float32), seen.inside[grid_of(seen.stride)]
+    turns = np.arange(int(np.ceil(float((high - low).max()) / TAU)) + 1)
+    if float(np.median(gain[main])) < 0:  # the furthest first
+        turns = turns[::-1]
+    psi = proposing + TAU * (first + turns[:, None, None])
+    beside = wrapped(other - psi * ratio)
+    if moved is None:  # the point of the line nearest to the measured pair, and its distance
+        nearness = (gain[main] * psi + gain[1 - main] * (psi * ratio + beside)) / joint**2
+        misfit = np.abs(beside * gain[main]) / joint
+    else:
+        nearness, misfit = psi / gain[main], np.abs(beside)
+    q, misfit, inside = nearness.astype(np.float32), misfit.astype(np.float32), seen.inside[grid_of(seen.stride)]
     # Of a window both carriers must be seen; beside a pixel's own phase, the window of the other one.
     modulation = seen.modulation[:, *grid_of(seen.stride)]
     weakest = modulation.min(axis=0) if moved is None else modulation[1 - moved]
     trust = np.clip(weakest / np.float32(WELL_LIT * noise_grey), LEAST_TRUST, 1)
     links = _links(seen, inside, residual[main], modulation[main])
-    return CrossedCandidates((q * joint).astype(np.float32), exist, trust, inside, links, q, misfit.astype(np.float32))
+    return CrossedCandidates(
+        (q * joint).astype(np.float32), psi <= high, trust, inside, links, q, misfit.astype(np.float32)
+    )
 
 
 def _links(seen: Capture, inside: Mask, residual_rad: Image, brightness: Image) -> tuple[Image, Image]:

@@ -1,4 +1,4 @@
-"""Last stop: depth, its uncertainty, and the reasons not to trust a pixel.
+"""Last stop: depth, its uncertainty, and the reasons not to trust a pixel; and the routes, which make all four stops.
 
 One carrier: wrapped phase and order give the depth in closed form. Its expected error has three parts. Phase: noise and
 misfit of the local fit (rms misfit divided by brightness is a phase error, and the slope of the calibration layer turns
@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Image, Mask, Orders, wrapped
+from fpp_ml_bench.baselines.phase.candidates import crossed_candidates, fringe_candidates
 from fpp_ml_bench.baselines.phase.local_fit import (
     CURVED,
     LARGEST_STEP_RAD,
@@ -37,15 +38,17 @@ from fpp_ml_bench.baselines.phase.observe import (
     CROSSED_FRAMES,
     Capture,
     CrossedObservation,
+    Frames,
     Observation,
     OneCarrier,
     Settings,
     TwoCarriers,
 )
-from fpp_ml_bench.baselines.phase.order import CrossedOrder
+from fpp_ml_bench.baselines.phase.order import CrossedOrder, crossed_order, fringe_order, margin_by_range
 from fpp_ml_bench.coding.code import MIN_MODULATION
 from fpp_ml_bench.coding.phase_shift import phase_weights
 from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.errors import DecodeError
 
 HALF_CONFIDENCE_MM = 5.0  # expected error of a pixel whose confidence is a half
 SATURATED_SHARE = 0.02
@@ -110,7 +113,7 @@ class Measurement:
     ``sigma_mm`` float32: standard uncertainty, 0 where there is no depth; ``order_doubt_mm``: the part of the expected
     error that comes from the order; ``confidence`` float32, 0 to 1, by the expected error, 0 beyond the range;
     ``modulation_grey`` float32: half of a white pattern's grey level; ``reason`` uint8, a `Reason`, given whether the
-    pixel was masked or not; ``background_share``: of the image that shows the plane; ``seconds`` per stage."""
+    pixel was masked or not; ``background_share``: of the image that shows the plane."""
 
     depth_mm: Image
     sigma_mm: Image
@@ -119,7 +122,6 @@ class Measurement:
     modulation_grey: Image
     reason: NDArray[np.uint8]
     background_share: float
-    seconds: dict[str, float]
 
     @property
     def counts(self) -> dict[str, int]:
@@ -163,56 +165,6 @@ class Fitted(CrossedObservation, CrossedOrder):
     clipped_share: Image
 
 
-def fringe_depth(
-    model: OneCarrier, seen: Observation, order: NDArray[np.int32], margin: NDArray, least_margin: float
-) -> FringeMeasurement:
-    """The measurement that follows from an ``order`` of every pixel; see `PhaseRoute.conclude`."""
-    inside, layer, settings = seen.inside, seen.layer, model.settings
-    depth_mm = np.where(inside, layer.depth_mm(seen.phase_rad, order), 0.0)
-    depth_mm[~seen.rig.in_range(depth_mm)] = 0.0
-    ahead = layer.forward * (np.maximum(depth_mm, seen.rig.working_range_mm[0]) / MM_PER_M) + layer.back_m
-    mm_per_rad = np.abs(ahead**2 / (layer.gain * layer.forward)) * MM_PER_M * inside
-    uncertainty_rad = (
-        _uncertainty_rad(seen, model.windows[-1]) if seen.uncertainty_rad is None else seen.uncertainty_rad
-    )
-    wrong_chance = 1 / (1 + np.exp(np.clip(margin / MARGIN_SCALE, 0, 50)))
-    error_mm = (mm_per_rad * (uncertainty_rad + TAU * wrong_chance)).astype(np.float32)
-    # The carrier of a plane square to the axis advances by one period every period_px; slopes come on top.
-    axis = 0 if settings.direction == "vertical" else 1
-    along = np.abs(TAU / seen.period_px + seen.slopes[axis]) * seen.period_px / TAU
-    frequency = np.hypot(along, np.abs(seen.slopes[1 - axis]) * seen.period_px / TAU)
-    widest = disk(THIN_PERIODS / 2 * seen.period_px)
-    reasons = {
-        Reason.THIN: cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_OPEN, widest) == 0,
-        Reason.TOO_STEEP: (frequency < SLOWEST) | (frequency > FASTEST),
-        Reason.AMBIGUOUS: margin < LEAST_MARGIN,
-    }
-    guessed = margin < least_margin
-    if not seen.background.calibrated:
-        guessed |= margin == 0
-    maps = _judged(
-        seen,
-        settings,
-        depth_mm,
-        error_mm,
-        _clipped_share(seen, model.windows[1], seen.fit.weight),
-        seen.fit.brightness,
-        reasons,
-        guessed,
-    )
-    orders = Orders(*(_pasted(seen, part, np.int32) for part in (seen.candidates.first, seen.candidates.count)))
-    maps["sigma_mm"] *= np.float32(np.sqrt(np.pi / 2))  # of a normal error of that expected size
-    measured = FringeMeasurement(
-        **maps,
-        order_doubt_mm=_pasted(seen, mm_per_rad * TAU * wrong_chance),
-        wrapped_phase_rad=_pasted(seen, seen.phase_rad, np.float32, np.nan),
-        order=_pasted(seen, order, np.int32),
-        candidates=orders,
-        expected_error_mm=_pasted(seen, error_mm),
-    )
-    return _restored_fringe(model, measured) if model.resampling.needed else measured
-
-
 def _uncertainty_rad(seen: Observation, window: Window) -> Image:
     """Expected absolute error of the phase of each pixel in rad, float32 (h, w), apart from the order."""
     fit, background = seen.fit, seen.background
@@ -244,19 +196,6 @@ def _noise_and_rest(seen: Capture, power: NDArray, window: Window, weight: NDArr
     # A window of sigma s averages 4 pi s^2 pixels of white noise; what is not noise does not average.
     noise = seen.background.noise_grey**2
     return noise / (2 * np.pi * window.sigma_px**2 * np.maximum(weight, 0.05)), np.maximum(power - noise, 0)
-
-
-def fitted(seen: CrossedObservation, order: CrossedOrder) -> Fitted:
-    """The nearness of every pixel of crossed fringes, which the order begins."""
-    if seen.moved is None:
-        fit = _window_fit(seen, order.candidates.nearness[1])
-        if not seen.given and not seen.background.shown:
-            seen = replace(seen, inside=seen.inside & (fit.brightness > MIN_MODULATION))
-        clipped_share = _clipped_share(seen, Window(WINDOW_PERIODS * seen.period_px), fit.weight)
-    else:
-        fit, clipped_share = _own_fit(seen, order.candidates.nearness[1], seen.moved), seen.saturated.astype(np.float32)
-    known = {entry.name: getattr(seen, entry.name) for entry in fields(seen)}
-    return Fitted(**known, **vars(order), fit=fit, clipped_share=clipped_share)
 
 
 def _window_fit(seen: CrossedObservation, nearness: NDArray) -> NearnessFit:
@@ -295,36 +234,6 @@ def _own_fit(seen: CrossedObservation, nearness: Image, moved: int) -> NearnessF
     weight = Window(WINDOW_PERIODS * seen.period_px).moment(seen.inside.astype(np.float32))
     maps = (nearness, brightness, misfit, weight, uncertainty)
     return NearnessFit(*(np.asarray(values, np.float32) for values in maps))
-
-
-def crossed_depth(model: TwoCarriers, seen: Fitted, wrong_chance: Image | None = None) -> Measurement:
-    """The measurement that follows from a fit; see `CrossedRoute.conclude`."""
-    carriers, fit = seen.carriers, seen.fit
-    depth_mm = carriers.depth_mm(fit.nearness)
-    # A fit may leave the range that its order was chosen in.
-    depth_mm = np.where(seen.inside & seen.rig.in_range(depth_mm), depth_mm, 0.0)
-    if wrong_chance is None:
-        odds = seen.evidence / EVIDENCE_SCALE + seen.margin / ENERGY_SCALE - EVEN_ODDS
-        wrong_chance = (1 / (1 + np.exp(np.clip(odds, -50, 50)))).astype(np.float32)
-    bright = np.maximum(fit.brightness, 0.5)
-    pairs = zip(seen.modulation, carriers.weights, strict=True)
-    weakest = np.minimum(*(modulation / (weight * bright) for modulation, weight in pairs))
-    lost = weakest < LOST_SHARE * max(seen.contrast) / max(carriers.weights)
-    wrong_chance = np.where(lost, np.maximum(wrong_chance, LOST_CHANCE), wrong_chance)
-    mm_per_rad = carriers.mm_per_rad(np.maximum(depth_mm, 1.0))
-    doubt_rad = reaching(np.abs(seen.rival - fit.nearness) * carriers.joint_gain, wrong_chance)
-    sigma_mm = mm_per_rad * np.hypot(fit.uncertainty_rad, doubt_rad)
-    window = Window(WINDOW_PERIODS * seen.period_px)
-    misfit = window.moment((fit.misfit_grey**2 * seen.inside).astype(np.float32)) / np.maximum(fit.weight, 1e-3)
-    texture = (np.sqrt(misfit) > TEXTURE_SHARE * bright) | (seen.candidates.misfit_rad[1] > TEXTURE_RAD)
-    reasons = {
-        Reason.ONE_DIRECTION: lost,
-        Reason.TEXTURE: texture,
-        Reason.AMBIGUOUS: wrong_chance > AMBIGUOUS_CHANCE,
-    }
-    maps = _judged(seen, model.settings, depth_mm, sigma_mm, seen.clipped_share, fit.brightness, reasons)
-    measured = Measurement(**maps, order_doubt_mm=_pasted(seen, mm_per_rad * doubt_rad))
-    return _restored_crossed(model, measured) if model.resampling.needed else measured
 
 
 def reaching(apart_rad: NDArray, wrong_chance: Image) -> NDArray:
@@ -372,7 +281,6 @@ def _judged(
     codes = [np.uint8(reason) for reason in by_reason]
     reason = np.select(list(by_reason.values()), codes, np.uint8(Reason.MEASURED))
     kept = found & ~guessed if least == 0 else found & ~guessed & (confidence >= least)
-    seen.watch.done("depth")
     return {
         "depth_mm": _pasted(seen, np.where(kept, depth_mm, 0)),
         "sigma_mm": _pasted(seen, np.where(kept, error_mm, 0)),
@@ -380,7 +288,6 @@ def _judged(
         "modulation_grey": _pasted(seen, brightness),
         "reason": _pasted(seen, reason, np.uint8, Reason.BACKGROUND),
         "background_share": seen.background.share,
-        "seconds": seen.watch.seconds,
     }
 
 
@@ -421,29 +328,22 @@ def _restored_fringe(model: OneCarrier, measured: FringeMeasurement) -> FringeMe
     inside = np.isfinite(measured.wrapped_phase_rad)
     psi = np.where(inside, model.layer.residual_phase(measured.wrapped_phase_rad, measured.order), 0.0)
     on_object, phases, nearest = model.resampling.restored(psi, inside)
-    part = model.captured_layer.at(on_object)
-    absolute = phases[on_object] + part.infinity_rad + TAU * part.infinity_order
+    layer = model.captured_layer
+    absolute = np.where(on_object, phases, np.nan) + layer.infinity_rad + TAU * layer.infinity_order
     order = np.rint(absolute / TAU)
     phase = (absolute - TAU * order).astype(np.float32)
-    allowed = part.orders_in_range(phase, model.range_mm)
     with np.errstate(divide="ignore", invalid="ignore"):
-        depth_mm = part.depth_of_residual_mm(phases[on_object])
-
-    def whole(values: NDArray, dtype: type = np.int32, outside: float = 0) -> NDArray:
-        image: NDArray = np.full(on_object.shape, outside, dtype=dtype)
-        image[on_object] = values
-        return image
-
+        depth_mm = layer.depth_of_residual_mm(phases)
     return _restored(
         model,
         measured,
         inside,
-        whole(depth_mm, np.float64),
+        depth_mm,
         on_object,
         nearest,
-        wrapped_phase_rad=whole(phase, np.float32, np.nan),
-        order=whole(order),
-        candidates=Orders(whole(allowed.first), whole(allowed.count)),
+        wrapped_phase_rad=phase,
+        order=np.nan_to_num(order).astype(np.int32),
+        candidates=layer.orders_in_range(phase, model.range_mm),
         expected_error_mm=np.where(on_object, nearest(measured.expected_error_mm), np.float32(0)),
     )
 
@@ -457,3 +357,128 @@ def _restored_crossed(model: TwoCarriers, measured: Measurement) -> Measurement:
     on_object, psi, nearest = model.resampling.restored((nearness * unit).astype(np.float64), known)
     depth_mm = model.captured_carriers.depth_mm(psi / unit)
     return _restored(model, measured, known, depth_mm, on_object, nearest)
+
+
+class PhaseRoute(OneCarrier):
+    """The route of fringes of one direction: observe, candidates, order, depth. Of resampled images `rig`, `layer`,
+    `period_px` and observations are those of the resampled ones; images, masks and measurements have the captured
+    size."""
+
+    def measure(self, image: Frames, mask: Mask | None = None) -> FringeMeasurement:
+        """Depth and the maps behind it; arguments and errors as of `observe`."""
+        seen = self.observe(image, mask)
+        return self.conclude(seen, *self.choose(seen))
+
+    def choose(self, seen: Observation) -> tuple[NDArray[np.int32], Image]:
+        """The order of every pixel of the observation's crop (h, w), and its margin, without learning."""
+        return fringe_order(seen, fringe_candidates(seen), self.settings)
+
+    def conclude(
+        self, seen: Observation, order: NDArray[np.int32], margin: NDArray, least_margin: float = -np.inf
+    ) -> FringeMeasurement:
+        """The measurement that follows from an ``order`` int32 for each pixel of the observation's crop (h, w), however
+        it was chosen; ``margin`` (h, w): how clearly that order won, 0 for a tie, 1 or more for a clear choice. A pixel
+        of less than ``least_margin`` has no depth, as always a tie in light that nothing calibrates. Raises
+        `DecodeError` for shapes that are not the crop's."""
+        if np.shape(order) != seen.inside.shape or np.shape(margin) != seen.inside.shape:
+            raise DecodeError(
+                f"expected an order and a margin for each of the {seen.inside.shape} pixels (h, w) around the object, "
+                f"got {np.shape(order)} and {np.shape(margin)}"
+            )
+        guessed = margin < least_margin
+        if not seen.background.calibrated:  # no evidence about the order, whatever the choice preferred
+            margin = margin_by_range(seen, order)
+            guessed = (margin == 0) | (margin < least_margin)
+        inside, layer, settings = seen.inside, seen.layer, self.settings
+        depth_mm = np.where(inside, layer.depth_mm(seen.phase_rad, order), 0.0)
+        depth_mm[~seen.rig.in_range(depth_mm)] = 0.0
+        ahead = layer.forward * (np.maximum(depth_mm, seen.rig.working_range_mm[0]) / MM_PER_M) + layer.back_m
+        mm_per_rad = np.abs(ahead**2 / (layer.gain * layer.forward)) * MM_PER_M
+        uncertainty_rad = seen.uncertainty_rad
+        if uncertainty_rad is None:
+            uncertainty_rad = _uncertainty_rad(seen, self.windows[-1])
+        wrong_chance = 1 / (1 + np.exp(np.clip(margin / MARGIN_SCALE, 0, 50)))
+        error_mm = (mm_per_rad * (uncertainty_rad + TAU * wrong_chance)).astype(np.float32)
+        # The carrier of a plane square to the axis advances by one period every period_px; slopes come on top.
+        axis = 0 if settings.direction == "vertical" else 1
+        along = np.abs(TAU / seen.period_px + seen.slopes[axis]) * seen.period_px / TAU
+        frequency = np.hypot(along, np.abs(seen.slopes[1 - axis]) * seen.period_px / TAU)
+        widest = disk(THIN_PERIODS / 2 * seen.period_px)
+        reasons = {
+            Reason.THIN: cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_OPEN, widest) == 0,
+            Reason.TOO_STEEP: (frequency < SLOWEST) | (frequency > FASTEST),
+            Reason.AMBIGUOUS: margin < LEAST_MARGIN,
+        }
+        maps = _judged(
+            seen,
+            settings,
+            depth_mm,
+            error_mm,
+            _clipped_share(seen, self.windows[1], seen.fit.weight),
+            seen.fit.brightness,
+            reasons,
+            guessed,
+        )
+        orders = Orders(*(_pasted(seen, part, np.int32) for part in (seen.candidates.first, seen.candidates.count)))
+        maps["sigma_mm"] *= np.float32(np.sqrt(np.pi / 2))  # of a normal error of that expected size
+        measured = FringeMeasurement(
+            **maps,
+            order_doubt_mm=_pasted(seen, mm_per_rad * TAU * wrong_chance),
+            wrapped_phase_rad=_pasted(seen, seen.phase_rad, np.float32, np.nan),
+            order=_pasted(seen, order, np.int32),
+            candidates=orders,
+            expected_error_mm=_pasted(seen, error_mm),
+        )
+        return _restored_fringe(self, measured) if self.resampling.needed else measured
+
+
+class CrossedRoute(TwoCarriers):
+    """The route of fringes of two directions in one frame, or in three; sizes as of `PhaseRoute`."""
+
+    def measure(self, image: Frames, mask: Mask | None = None) -> Measurement:
+        """Depth and the maps behind it; arguments and errors as of `observe`."""
+        return self.conclude(self.fitted(self.observe(image, mask)))
+
+    def fitted(self, seen: CrossedObservation) -> Fitted:
+        """The order of every pixel, and the nearness that follows."""
+        order = crossed_order(seen, crossed_candidates(seen), self.settings)
+        if seen.moved is None:
+            fit = _window_fit(seen, order.candidates.nearness[1])
+            if not seen.given and not seen.background.shown:
+                seen = replace(seen, inside=seen.inside & (fit.brightness > MIN_MODULATION))
+            clipped_share = _clipped_share(seen, Window(WINDOW_PERIODS * seen.period_px), fit.weight)
+        else:
+            fit = _own_fit(seen, order.candidates.nearness[1], seen.moved)
+            clipped_share = seen.saturated.astype(np.float32)
+        known = {entry.name: getattr(seen, entry.name) for entry in fields(seen)}
+        return Fitted(**known, **vars(order), fit=fit, clipped_share=clipped_share)
+
+    def conclude(self, seen: Fitted, wrong_chance: Image | None = None) -> Measurement:
+        """The measurement that follows from a fit. ``wrong_chance`` (h, w): probability of a wrong order, by default
+        from evidence and margin."""
+        carriers, fit = seen.carriers, seen.fit
+        depth_mm = carriers.depth_mm(fit.nearness)
+        # A fit may leave the range that its order was chosen in.
+        depth_mm = np.where(seen.inside & seen.rig.in_range(depth_mm), depth_mm, 0.0)
+        if wrong_chance is None:
+            odds = seen.evidence / EVIDENCE_SCALE + seen.margin / ENERGY_SCALE - EVEN_ODDS
+            wrong_chance = (1 / (1 + np.exp(np.clip(odds, -50, 50)))).astype(np.float32)
+        bright = np.maximum(fit.brightness, 0.5)
+        pairs = zip(seen.modulation, carriers.weights, strict=True)
+        weakest = np.minimum(*(modulation / (weight * bright) for modulation, weight in pairs))
+        lost = weakest < LOST_SHARE * max(seen.contrast) / max(carriers.weights)
+        wrong_chance = np.where(lost, np.maximum(wrong_chance, LOST_CHANCE), wrong_chance)
+        mm_per_rad = carriers.mm_per_rad(np.maximum(depth_mm, 1.0))
+        doubt_rad = reaching(np.abs(seen.rival - fit.nearness) * carriers.joint_gain, wrong_chance)
+        sigma_mm = mm_per_rad * np.hypot(fit.uncertainty_rad, doubt_rad)
+        window = Window(WINDOW_PERIODS * seen.period_px)
+        misfit = window.moment((fit.misfit_grey**2 * seen.inside).astype(np.float32)) / np.maximum(fit.weight, 1e-3)
+        texture = (np.sqrt(misfit) > TEXTURE_SHARE * bright) | (seen.candidates.misfit_rad[1] > TEXTURE_RAD)
+        reasons = {
+            Reason.ONE_DIRECTION: lost,
+            Reason.TEXTURE: texture,
+            Reason.AMBIGUOUS: wrong_chance > AMBIGUOUS_CHANCE,
+        }
+        maps = _judged(seen, self.settings, depth_mm, sigma_mm, seen.clipped_share, fit.brightness, reasons)
+        measured = Measurement(**maps, order_doubt_mm=_pasted(seen, mm_per_rad * doubt_rad))
+        return _restored_crossed(self, measured) if self.resampling.needed else measured

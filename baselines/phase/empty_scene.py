@@ -119,7 +119,7 @@ class EmptyScene:
         terms = np.stack([np.ones_like(sampled)] + [term[row, column] for term in self._terms], axis=1)
         solution = np.linalg.lstsq(terms, sampled, rcond=None)[0]
         misfit = sampled - terms @ solution
-        noise = max(MAD_TO_SIGMA * float(np.median(np.abs(misfit))), FLOOR_NOISE_GREY)
+        noise = _noise_of(misfit)
         ambient_grey, *weights = solution
         residual = grey - np.float32(ambient_grey)
         for weight, term in zip(weights, self._terms, strict=True):
@@ -176,6 +176,11 @@ def image_noise_grey(image: NDArray) -> float:
     return MAD_TO_SIGMA * float(np.median(np.abs(mask))) / 6.0
 
 
+def _noise_of(misfit_grey: NDArray) -> float:
+    """Standard deviation of noise in grey levels from misfits of which some are none."""
+    return max(MAD_TO_SIGMA * float(np.median(np.abs(misfit_grey))), FLOOR_NOISE_GREY)
+
+
 def plane_irradiance(rig: Rig, depth_m: float) -> NDArray[np.float64]:
     """Irradiance of a plane square to the camera's axis at ``depth_m``: cosine over distance squared, 1/m^2, (H, W)."""
     x, y = rig.camera.rays()
@@ -194,29 +199,18 @@ class CrossedEmptyScene:
     """The plane of a rig in the light of a carrier pair; computed once, then fitted to every image."""
 
     def __init__(self, carriers: Carriers, stride: int) -> None:
-        rig = carriers.rig
-        self.known = rig.background_m is not None
-        shape = rig.camera.height, rig.camera.width
-        self._coarse = slice(None, None, stride), slice(None, None, stride)
-        self._stride = stride
-        if rig.background_m is None:
-            return
-        phases = carriers.phases(carriers.nearness(rig.background_m * MM_PER_M))
-        self._phases = wrapped(phases[:, *self._coarse])
+        rig, self._stride = carriers.rig, stride
+        # Without a known background nothing is predicted, and no image shows it.
+        depth_m = np.nan if rig.background_m is None else rig.background_m
+        phases = carriers.phases(carriers.nearness(depth_m * MM_PER_M))
+        self._phases = wrapped(phases[:, ::stride, ::stride])
         x, y = (axis.astype(np.float32) for axis in rig.camera.rays())
-        fall_off = plane_irradiance(rig, rig.background_m).astype(np.float32)
+        fall_off = plane_irradiance(rig, depth_m).astype(np.float32)
         fall_off /= np.float32(np.median(fall_off))
-        lamp = [fall_off * term for term in _quadratic(x, y)]
         first, second = (np.float32(w) * np.cos(phase) for w, phase in zip(carriers.weights, phases, strict=True))
-        self._terms = [
-            term.astype(np.float32)
-            for term in (
-                *(part * (1 + first + second) for part in lamp),
-                fall_off * first,
-                fall_off * second,
-                np.ones(shape),
-            )
-        ]
+        terms = [fall_off * term * (1 + first + second) for term in _quadratic(x, y)]
+        terms += [fall_off * first, fall_off * second, np.ones_like(x)]
+        self._terms = [term.astype(np.float32) for term in terms]
         self._margin = 2 * max(1, round(MARGIN_PERIODS * carriers.period_px / stride)) + 1
 
     def __call__(self, grey: Image, seen: Demodulated) -> Background:
@@ -226,7 +220,7 @@ class CrossedEmptyScene:
         smooth = cv2.blur(grey, (3, 3))[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX]
         dark = float(np.percentile(smooth, DARK_PERCENTILE))
         noise = max(image_noise_grey(grey), FLOOR_NOISE_GREY)
-        plane_points = self._plane(seen, noise) if self.known else np.zeros(seen.mean_grey.shape, bool)
+        plane_points = self._plane(seen, noise)
         share = float(plane_points.mean())
         if share < LEAST_SHARE:
             return Background(dark, np.nan, max(noise, DEFAULT_NOISE_GREY), np.zeros_like(grey), 0.0, ())
@@ -238,7 +232,7 @@ class CrossedEmptyScene:
         curve = np.stack([light**power for power in CURVE_POWERS] + [np.ones_like(light)], axis=1)
         scale = np.abs(curve).max(axis=0)
         fitted, bend = _robust(curve / scale, samples)
-        noise = max(MAD_TO_SIGMA * float(np.median(np.abs(samples - fitted))), FLOOR_NOISE_GREY)
+        noise = _noise_of(samples - fitted)
         # Horner's rule on whole images, in single precision: 1e-5 of a grey level is enough here.
         first = sum((np.float32(w) * term for w, term in zip(weights, self._terms, strict=True)), np.float32(0))
         bend = (bend / scale).astype(np.float32)
@@ -262,5 +256,5 @@ def _robust(terms: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[ND
         solution = np.linalg.lstsq(terms[keep], values[keep], rcond=None)[0]
         fitted = terms @ solution
         misfit = np.abs(values - fitted)
-        keep = misfit < OUTLIER_SIGMAS * max(MAD_TO_SIGMA * float(np.median(misfit[keep])), FLOOR_NOISE_GREY)
+        keep = misfit < OUTLIER_SIGMAS * _noise_of(misfit[keep])
     return fitted, solution

@@ -214,7 +214,6 @@ class Demodulated:
 
     amplitude: NDArray[np.complex64]
     mean_grey: Image
-    stride: int
 
     @property
     def phase_rad(self) -> Image:
@@ -287,7 +286,7 @@ class Demodulator:
         answers = []
         for bins, response, ramp in self._filters:
             answers.append(fft.ifft2(spectrum[bins] * response)[:rows, :columns] * ramp)
-        return Demodulated(np.stack(answers[:2]), np.ascontiguousarray(answers[2].real), self.stride)
+        return Demodulated(np.stack(answers[:2]), np.ascontiguousarray(answers[2].real))
 
 
 def window_kernels(step_rad: NDArray[np.float64], sigma_px: float) -> list[NDArray[np.complex128]]:
@@ -323,24 +322,22 @@ def same_plane_mean(psi: Image, sigma: Image, inside: Mask) -> tuple[Image, Imag
     opposite each other, up to `REACH_PX` away, that differ from it and from a plane through it by no more than noise;
     and the mean's uncertainty. Opposite pixels have the mean of their plane at the pixel, so a slope adds nothing."""
     reach, limit = REACH_PX, np.float32(SAME_PLANE_SIGMAS**2)
-    psis, variances = np.pad(psi, reach), np.pad(sigma * sigma, reach)
-    known = np.pad(inside, reach)
     height, width = psi.shape
-    own = variances[reach:-reach, reach:-reach]
+    maps = np.pad(np.stack([psi, sigma * sigma, inside]).astype(np.float32), ((0, 0), (reach, reach), (reach, reach)))
+
+    def beside(down: int, right: int) -> NDArray[np.float32]:
+        return maps[:, reach + down : reach + down + height, reach + right : reach + right + width]
+
+    own = beside(0, 0)[1]
     total, weights = psi / own, 1 / own
-
-    def beside(values: NDArray, down: int, right: int) -> NDArray:
-        return values[reach + down : reach + down + height, reach + right : reach + right + width]
-
     half = [(0, right) for right in range(1, reach + 1)]
     half += [(down, right) for down in range(1, reach + 1) for right in range(-reach, reach + 1)]
     for down, right in half:
-        both = [
-            tuple(beside(maps, *place) for maps in (psis, variances, known))
-            for place in ((down, right), (-down, -right))
-        ]
-        (first, first_variance, first_known), (second, second_variance, second_known) = both
-        alike = first_known & second_known
+        (first, first_variance, first_known), (second, second_variance, second_known) = (
+            beside(down, right),
+            beside(-down, -right),
+        )
+        alike = (first_known > 0) & (second_known > 0)
         alike &= (first - psi) ** 2 < limit * (first_variance + own)
         alike &= (second - psi) ** 2 < limit * (second_variance + own)
         variance = first_variance + second_variance

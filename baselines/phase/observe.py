@@ -11,7 +11,6 @@ other still, which is left in their mean, where the shifted one cancels.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from time import perf_counter
 from typing import Literal, get_args
 
 import cv2
@@ -144,19 +143,6 @@ class Settings:
             raise PredictionError(f"ambient_grey {self.ambient_grey!r}: expected 0 to {GREY_LEVELS} grey levels")
 
 
-class Watch:
-    """Seconds of each stop since the last."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._since = perf_counter()
-
-    def done(self, stage: str) -> None:
-        now = perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._since
-        self._since = now
-
-
 @dataclass(frozen=True)
 class Capture:
     """Frames measured around the object: maps (h, w) of the part ``crop`` of images of ``shape`` (H, W). ``greys``:
@@ -174,7 +160,6 @@ class Capture:
     background: Background
     inside: Mask
     given: bool
-    watch: Watch
 
     @property
     def pixelwise(self) -> bool:
@@ -287,10 +272,8 @@ class OneCarrier(MeasurementModel):
         self.shifts_rad = tuple(shifts_rad[step] for step in self.steps)
         frames = len(self.steps), f"fringes, those of steps {self.steps}"
         super().__init__(rig, settings, rig.image_px_per_period(settings.direction), periods, frames)
-        self.captured_layer = self.layer = CalibrationLayer.of(rig, settings.direction)
         rig = self.rig
-        if self.resampling.needed:
-            self.layer = CalibrationLayer.of(rig, settings.direction)
+        self.layer = CalibrationLayer.of(rig, settings.direction)
         (near, far), periods_in_range = rig.working_range_mm, rig.periods_in_range(settings.direction)
         most_slack_mm = MOST_SLACK_PERIODS * (far - near) / periods_in_range if periods_in_range > 0 else np.inf
         self.settings = replace(settings, slack_mm=min(settings.slack_mm, most_slack_mm))
@@ -301,12 +284,16 @@ class OneCarrier(MeasurementModel):
         if settings.frames == 2:
             self.windows += [Window(settings.pair_window * self.period_px)] * PAIR_ROUNDS
 
+    @cached_property
+    def captured_layer(self) -> CalibrationLayer:
+        """The calibration layer of the captured images."""
+        return CalibrationLayer.of(self.resampling.captured, self.settings.direction)
+
     def observe(self, image: Frames, mask: Mask | None = None) -> Observation:
         """Mask and phase of captured fringes: one, uint8 (H, W), or the frames of ``steps``. ``mask`` bool (H, W)
         replaces the object mask that is found. Raises `DecodeError` for another number, dtype or shape."""
-        images, watch = self.images(image), Watch()
+        images = self.images(image)
         background = self._scene.fit(images[0])
-        watch.done("background")
         if mask is not None:
             region = self.resampling.mask(mask)
         elif background.shown:
@@ -316,7 +303,6 @@ class OneCarrier(MeasurementModel):
             _, modulation = carrier_fit(first, np.ones(first.shape, bool), self._carrier, self.windows[0])
             region = modulated_region(first, modulation, background, self.period_px)
         crop = crop_around(region, int(np.ceil(MARGIN_PERIODS * self.period_px)))
-        watch.done("mask")
         greys = tuple(frame[crop].astype(np.float32) for frame in images)
         background = replace(background, residual=background.residual[crop])
         layer, inside, mean_grey = self.layer.at(crop), region[crop], None
@@ -329,11 +315,10 @@ class OneCarrier(MeasurementModel):
             # The share of a window on the object is what the use of slopes needs.
             fit = FringeFit(phase, modulation, self.windows[1].moment(inside.astype(np.float32)))
         else:
-            inside, fit = self._local_fits(greys, background, crop, inside, mask is not None, watch)
+            inside, fit = self._local_fits(greys, background, crop, inside, mask is not None)
         phase = wrapped(fit.phase_rad).astype(np.float32)
         residual = wrapped(phase - layer.infinity_rad).astype(np.float32)
         slopes = phase_slopes(residual, inside, self.settings.slope_window * self.period_px)
-        watch.done("phase")
         return Observation(
             rig=self.rig,
             period_px=self.period_px,
@@ -345,7 +330,6 @@ class OneCarrier(MeasurementModel):
             background=background,
             inside=inside,
             given=mask is not None,
-            watch=watch,
             layer=layer,
             shifts_rad=self.shifts_rad,
             fit=fit,
@@ -360,7 +344,7 @@ class OneCarrier(MeasurementModel):
         return [grey - self._scene.predicted(background, shift, crop) for grey, shift in pairs]
 
     def _local_fits(
-        self, greys: Sequence[Image], background: Background, crop: Crop, region: Mask, given: bool, watch: Watch
+        self, greys: Sequence[Image], background: Background, crop: Crop, region: Mask, given: bool
     ) -> tuple[Mask, FringeFit]:
         """Object mask and local fits of one or two frames, each window starting from the phase of the last; ``region``:
         where the first frame differs, or the ``given`` mask."""
@@ -372,7 +356,6 @@ class OneCarrier(MeasurementModel):
                 differing = first_mask(different, period_px)
                 region = differing if background.shown else region & differing
             inside = region & ~dark
-            watch.done("mask")
         carrier = self._carrier[crop]
         phase, _ = carrier_fit(grey, inside, carrier, self.windows[0])
         for window in self.windows[1:]:
@@ -392,7 +375,6 @@ class OneCarrier(MeasurementModel):
             for _ in range(FREE_ROUNDS):
                 fit = fringe_fit(greys, inside, phase, *light)
                 phase = fit.phase_rad
-        watch.done("phase")
         if given:
             return inside, fit
         if len(greys) == 1:
@@ -400,7 +382,6 @@ class OneCarrier(MeasurementModel):
             predicted = (background.ambient_grey + fit.light).astype(np.float32)
             inside = refined(inside, background, predicted, grey, FRINGE_NOISE * bright, RING_PERIODS * period_px)
         inside = inside & ~dark & (fit.brightness > (DARKEST_GREY if background.shown else MIN_MODULATION))
-        watch.done("mask")
         return inside, fit
 
 
@@ -451,7 +432,7 @@ class TwoCarriers(MeasurementModel):
         """Mask and both phases of one crossed frame, uint8 (H, W) or float32 grey levels of the same range, or of
         three. ``mask`` bool (H, W) replaces the object mask that is found. Raises `DecodeError` for another number,
         dtype or shape."""
-        greys, watch, moved = [grey.astype(np.float32) for grey in self.images(image)], Watch(), self.moved
+        greys, moved = [grey.astype(np.float32) for grey in self.images(image)], self.moved
         grey, period_px, stride = greys[0], self.period_px, self.stride
         if moved is not None:
             fitted = wrapped_phase(greys, self.shifts_rad, np.float32)
@@ -459,11 +440,9 @@ class TwoCarriers(MeasurementModel):
             # `Carriers` has the phases of the first frame.
             own_phase = wrapped(own_phase + np.float32(self.shifts_rad[0]))
         seen = self.demodulator(grey)
-        watch.done("phase")
         pairs = zip(self._scenes, greys, strict=True)
         planes = [scene(frame, seen if frame is grey else self.demodulator(frame)) for scene, frame in pairs]
         background = planes[0]
-        watch.done("background")
         if mask is not None:
             region = self.resampling.mask(mask)
         elif not all(plane.shown for plane in planes):
@@ -481,7 +460,6 @@ class TwoCarriers(MeasurementModel):
         background, inside = replace(background, residual=background.residual[crop]), region[crop]
         if mask is None and moved is None:
             inside = inside & ~unlit(grey[crop], background, period_px)
-        watch.done("mask")
         grid = tuple(slice(part.start // stride, -(-part.stop // stride)) for part in crop)
         carriers = self.carriers.at(crop)
         points, mean_grey = inside[::stride, ::stride], seen.mean_grey[grid] - background.ambient_grey
@@ -503,7 +481,6 @@ class TwoCarriers(MeasurementModel):
             background=background,
             inside=inside,
             given=mask is not None,
-            watch=watch,
             carriers=carriers,
             moved=moved,
             grey=grey[crop],
@@ -521,10 +498,8 @@ class TwoCarriers(MeasurementModel):
         if not inner.any():
             return self.carriers.weights
         shares = np.median(modulation[:, inner] / mean_grey[inner], axis=1)
-        first, second = (
-            float(np.clip(share, LEAST_CONTRAST, weight))
-            for share, weight in zip(shares, self.carriers.weights, strict=True)
-        )
+        least, most = np.float32(LEAST_CONTRAST), np.asarray(self.carriers.weights, np.float32)
+        first, second = np.clip(shares, least, most).tolist()
         return first, second
 
 

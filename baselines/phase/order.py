@@ -17,7 +17,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Image, Mask
-from fpp_ml_bench.baselines.phase.candidates import Candidates, CrossedCandidates, FringeCandidates, chosen_values
+from fpp_ml_bench.baselines.phase.candidates import (
+    Candidates,
+    CrossedCandidates,
+    FringeCandidates,
+    chosen_values,
+    links_between,
+)
 from fpp_ml_bench.baselines.phase.object_mask import disk
 from fpp_ml_bench.baselines.phase.observe import CrossedObservation, Observation, Settings
 from fpp_ml_bench.baselines.phase.resampling import nearest_inside
@@ -207,14 +213,14 @@ def crossed_order(seen: CrossedObservation, offered: CrossedCandidates, settings
     misfit = _rivals(np.where(offered.exists, offered.misfit_rad, LARGE), index, LARGE)
     rival = chosen_values(offered.nearness, np.where(misfit.min(axis=0) < LARGE, misfit.argmin(axis=0), index))
     count = len(offered.nearness)
-    places = [index - 1, index, index + 1]
-    maps = [
-        np.stack([chosen_values(values, np.clip(place, 0, count - 1)) for place in places])
+    place = index + np.array([-1, 0, 1])[:, None, None]
+    nearness, misfit, exists = (
+        seen.spread(np.take_along_axis(values, np.clip(place, 0, count - 1), axis=0))
         for values in (offered.nearness, offered.misfit_rad, offered.exists)
-    ]
-    maps[2] &= np.stack([(place >= 0) & (place < count) for place in places])
+    )
+    exists &= seen.spread((place >= 0) & (place < count))
     return CrossedOrder(
-        Turns(*(seen.spread(values) for values in maps)),
+        Turns(nearness, misfit, exists),
         seen.spread(margin / np.float32(smoothness)),
         seen.spread(np.float32(evidence_weight) * evidence),
         seen.spread(rival),
@@ -268,10 +274,7 @@ def _in_range(seen: Observation, order: NDArray[np.int32]) -> Mask:
 def _slopes(residual_rad: Image, inside: Mask) -> tuple[Image, Image]:
     """Larger of the two one-sided changes a px along x and y, between object pixels."""
     slopes = []
-    for axis in (1, 0):
-        pair = np.delete(inside, 0, axis) & np.delete(inside, -1, axis)
-        change = np.abs(np.diff(residual_rad, axis=axis)) * pair
-        ends = [(1, 0), (0, 1)]
-        padded = [np.pad(change, [end if along == axis else (0, 0) for along in (0, 1)]) for end in ends]
-        slopes.append(np.maximum(*padded))
+    for axis, link in zip((1, 0), links_between(inside), strict=True):
+        change = np.abs(np.diff(residual_rad, axis=axis)) * link
+        slopes.append(np.maximum(*(np.insert(change, place, 0, axis) for place in (0, change.shape[axis]))))
     return slopes[0], slopes[1]

@@ -8,8 +8,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from fpp_ml_bench.baselines.phase.depth import Reason
-from fpp_ml_bench.baselines.phase.route import CrossedRoute
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Reason
 from fpp_ml_bench.baselines.stability.cases import U64, Floats, Group, Outcome, worst, wrong
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.decoding.blocks import projected

@@ -16,7 +16,7 @@ from fpp_ml_bench.baselines.learned.network import load_net
 from fpp_ml_bench.baselines.learned.odds import Answers, threshold_at
 from fpp_ml_bench.baselines.learned.window_training import train_net
 from fpp_ml_bench.baselines.learned.windows import IGNORED
-from fpp_ml_bench.baselines.phase.route import CrossedRoute
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.training.views import Group, View, read_views, render_views, with_unions
 from fpp_ml_bench.cli import main

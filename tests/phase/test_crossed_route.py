@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from skimage.filters import gabor_kernel
 
 from fpp_ml_bench.baselines.phase.calibration_layer import Carriers, wrapped
-from fpp_ml_bench.baselines.phase.depth import Reason, reaching
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Reason, reaching
 from fpp_ml_bench.baselines.phase.local_fit import CURVED, DEMODULATION_PERIODS, Demodulator, window_kernels
-from fpp_ml_bench.baselines.phase.route import CrossedRoute
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.coding.crossed import Crossed, crossed_from_pair
 from fpp_ml_bench.errors import DecodeError, PredictionError

@@ -9,11 +9,10 @@ from crossed_scenes import FAMILY, NO_PLANE, RIG, frame, slab
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from fpp_ml_bench.baselines.phase.depth import Measurement
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Measurement
 from fpp_ml_bench.baselines.phase.local_fit import phase_noise_grey, same_plane_mean
 from fpp_ml_bench.baselines.phase.object_mask import continued
 from fpp_ml_bench.baselines.phase.order import local_median
-from fpp_ml_bench.baselines.phase.route import CrossedRoute
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.errors import DecodeError, PredictionError
