@@ -7,7 +7,7 @@ expected error, from its phase and from its order. While that error is too large
 
 import operator
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -121,8 +121,6 @@ class PhaseMethod(RouteMethod):
     @classmethod
     def for_rig(cls, rig: Rig, **options: Any) -> Method:
         """`FewestFrames` where ``error_mm`` is given."""
-        if options.get("error_mm") is not None and "frames" in options:
-            raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
         options = fringe_options(cls.name, rig, options)
         return cls(rig, **options) if options.get("error_mm") is None else FewestFrames(rig, **options)
 
@@ -287,27 +285,27 @@ def direction_of(submission: "Submission") -> str:
 
 @dataclass(frozen=True)
 class Look:
-    """Expected error with ``frames`` frames captured, means over object pixels in mm: ``phase_mm`` from the phase and
-    ``order_mm`` from the order; ``gray``: whether the Gray code is among the frames."""
+    """Expected error with ``frames`` frames captured, means over object pixels in mm: from the phase and from the
+    order; ``gray_code``: whether the Gray code is among the frames."""
 
     frames: int
-    gray: bool
-    phase_mm: float
-    order_mm: float
+    gray_code: bool
+    expected_error_mm: float
+    by_phase_mm: float
+    by_order_mm: float
 
     @classmethod
     def of(cls, measurement: FringeMeasurement, count: int) -> "Look":
         # A pixel without a depth because its order is ambiguous is what more frames are for.
         on_object = (measurement.depth_mm > 0) | (measurement.reason == Reason.AMBIGUOUS)
         if not on_object.any():
-            return cls(count, False, 0.0, 0.0)
-        order_mm = float(measurement.order_doubt_mm[on_object].mean(dtype=np.float64))
-        error_mm = float(measurement.expected_error_mm[on_object].mean(dtype=np.float64))
-        return cls(count, False, error_mm - order_mm, order_mm * ORDER_SHARE[min(count, len(ORDER_SHARE)) - 1])
-
-    @property
-    def expected_mm(self) -> float:
-        return self.phase_mm + self.order_mm
+            return cls(count, False, 0.0, 0.0, 0.0)
+        error_mm, order_mm = (
+            float(values[on_object].mean(dtype=np.float64))
+            for values in (measurement.expected_error_mm, measurement.order_doubt_mm)
+        )
+        by_phase_mm, by_order_mm = error_mm - order_mm, order_mm * ORDER_SHARE[min(count, len(ORDER_SHARE)) - 1]
+        return cls(count, False, by_phase_mm + by_order_mm, by_phase_mm, by_order_mm)
 
 
 @dataclass(frozen=True)
@@ -320,16 +318,9 @@ class FrameChoice:
 
     def report(self) -> dict[str, Any]:
         """JSON of one sample: number of frames, their indices, and the expected error at each look."""
-        looks = [
-            {
-                "frames": look.frames,
-                "gray_code": look.gray,
-                "expected_error_mm": round(look.expected_mm, 4),
-                "by_phase_mm": round(look.phase_mm, 4),
-                "by_order_mm": round(look.order_mm, 4),
-            }
-            for look in self.looks
-        ]
+        looks = [asdict(look) for look in self.looks]
+        for look in looks:
+            look |= {key: round(value, 4) for key, value in look.items() if key.endswith("_mm")}
         last = {name: looks[-1][name] for name in ("frames", "expected_error_mm")}
         return last | {"frames_used": list(self.frames_used), "looks": looks}
 
@@ -359,7 +350,7 @@ class FewestFrames(Method):
         if isinstance(error_mm, bool) or not isinstance(error_mm, int | float) or not 0 < error_mm < np.inf:
             raise PredictionError(f"error_mm {error_mm!r}: expected the largest error to accept, in mm, above 0")
         if "frames" in options:
-            raise PredictionError("frames and error_mm: give one of them; error_mm chooses the frames itself")
+            raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
         self.rig, self.error_mm = rig, float(error_mm)
         self.methods = {n: PhaseMethod(rig, **options, frames=n) for n in levels_of(rig.sequence.steps)}
         self.options = self.methods[1].options
@@ -381,13 +372,13 @@ class FewestFrames(Method):
                 looks.append(look)
                 # The Gray code helps the order only: it is captured once the phase is good enough, or when no fringe
                 # is left.
-                phase_done = look.phase_mm <= self.error_mm or count == max(self.methods)
-                gray = look.expected_mm > self.error_mm and count >= PIXELWISE and phase_done
+                phase_done = look.by_phase_mm <= self.error_mm or count == max(self.methods)
+                gray = look.expected_error_mm > self.error_mm and count >= PIXELWISE and phase_done
             if gray:
                 depth_mm = decode_stack(frames, self.rig, direction=self.options.direction, steps=count).depth_mm
                 used = tuple(sorted({*used, *self.gray}))
-                looks.append(replace(look, frames=len(used), gray=True, order_mm=0.0))
-            if looks[-1].expected_mm <= self.error_mm:
+                looks.append(Look(len(used), True, look.by_phase_mm, look.by_phase_mm, 0.0))
+            if looks[-1].expected_error_mm <= self.error_mm:
                 break
         return FrameChoice(depth_mm, used, tuple(looks))
 
