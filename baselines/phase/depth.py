@@ -310,16 +310,15 @@ def _restored(
     own = cv2.resize(own, found.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
     reason = np.where(on_object, nearest(measured.reason), own)
     reason[beyond & ((reason == Reason.MEASURED) | (reason > Reason.OUT_OF_RANGE))] = Reason.OUT_OF_RANGE
-    where = {"sigma_mm": found, "confidence": on_object & in_range, "order_doubt_mm": on_object}
-    where |= {"modulation_grey": on_object}
-    kept = {name: np.where(mask, nearest(getattr(measured, name)), np.float32(0)) for name, mask in where.items()}
-    return replace(
-        measured,
-        depth_mm=np.where(found, depth_mm, 0).astype(np.float32),
-        reason=reason.astype(np.uint8),
-        **kept,
-        **maps,
-    )
+    for name, where in (
+        ("sigma_mm", found),
+        ("confidence", on_object & in_range),
+        ("order_doubt_mm", on_object),
+        ("modulation_grey", on_object),
+    ):
+        maps[name] = np.where(where, nearest(getattr(measured, name)), np.float32(0))
+    maps["depth_mm"] = np.where(found, depth_mm, 0).astype(np.float32)
+    return replace(measured, reason=reason.astype(np.uint8), **maps)
 
 
 def _restored_fringe(model: OneCarrier, measured: FringeMeasurement) -> FringeMeasurement:

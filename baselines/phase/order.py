@@ -170,7 +170,7 @@ def _evidence(proof: Image, choice: NDArray[np.int32], seen: Observation, inside
     return mean_gap / np.maximum(share, 1e-3)  # type: ignore[return-value]  # cv2 keeps float32
 
 
-def _rivals(cost: Image, choice: NDArray[np.int32], ruled_out: float) -> Image:
+def _rivals(cost: Image, choice: NDArray[np.int32], ruled_out: float | np.float32) -> Image:
     """``cost`` (K, h, w) with the chosen candidate ruled out."""
     rivals = cost.copy()
     np.put_along_axis(rivals, choice[None].astype(np.intp), ruled_out, axis=0)
