@@ -219,19 +219,9 @@ class Carriers:
         return replace(self, crop=where, infinity_rad=maps[0], gain=maps[1], forward=maps[2])
 
     @property
-    def weights(self) -> tuple[float, float]:
-        """Modulation over mean of each carrier, as projected."""
-        return self.family.weights[0], self.family.weights[1]
-
-    @property
-    def periods_px(self) -> NDArray[np.float64]:
-        """Image px a period of each carrier, on a plane at the standoff, float64 (2,)."""
-        return TAU / np.linalg.norm(self.step_rad, axis=1)
-
-    @property
     def period_px(self) -> float:
-        """The longer of `periods_px`: windows have a size in it."""
-        return float(self.periods_px.max())
+        """Image px a period of the longer carrier, on a plane at the standoff: windows have a size in it."""
+        return float((TAU / np.linalg.norm(self.step_rad, axis=1)).max())
 
     @cached_property
     def joint_gain(self) -> Image:

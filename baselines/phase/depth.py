@@ -27,6 +27,7 @@ from fpp_ml_bench.baselines.phase.candidates import crossed_candidates, fringe_c
 from fpp_ml_bench.baselines.phase.local_fit import (
     CURVED,
     LARGEST_STEP_RAD,
+    FringeFit,
     Window,
     fringes,
     phase_noise_grey,
@@ -159,10 +160,9 @@ class NearnessFit:
 
 @dataclass(frozen=True)
 class Fitted(CrossedObservation, CrossedOrder):
-    """Crossed fringes with their order and the ``fit`` of the nearness; ``clipped_share``: of the window, saturated."""
+    """Crossed fringes with their order and the ``fit`` of the nearness."""
 
     fit: NearnessFit
-    clipped_share: Image
 
 
 def _uncertainty_rad(seen: Observation, window: Window) -> Image:
@@ -243,11 +243,6 @@ def reaching(apart_rad: NDArray, wrong_chance: Image) -> NDArray:
     return np.where(wrong_chance < LEAST_WRONG, 0.0, apart_rad / sigmas)
 
 
-def _clipped_share(seen: Capture, window: Window, weight: Image) -> Image:
-    """Share of the window's weight on the object that is saturated in any of the frames, float32 (h, w)."""
-    return (window.moment(seen.saturated.astype(np.float32)) / np.maximum(weight, 1e-3)).astype(np.float32)
-
-
 def _pasted(seen: Capture, part: NDArray, dtype: type = np.float32, outside: float = 0) -> NDArray:
     """A map (h, w) of the crop as one of the image (H, W), ``outside`` where there is no object."""
     whole: NDArray = np.full(seen.shape, outside, dtype=dtype)
@@ -260,20 +255,24 @@ def _judged(
     settings: Settings,
     depth_mm: NDArray,
     error_mm: NDArray,
-    clipped_share: Image,
-    brightness: Image,
+    fit: FringeFit | NearnessFit,
+    window: Window | None,
     reasons: Mapping[Reason, Mask],
     guessed: Mask | bool = False,
 ) -> dict[str, Any]:
     """What every measurement states of a depth (h, w), 0 beyond the object and the range, whose expected size of the
-    error is ``error_mm``: confidence, reason, and what is left of depth and error where pixels are masked. ``reasons``:
-    those of the model's own; ``guessed``: pixels without a depth, since their order is a guess."""
+    error is ``error_mm``: confidence, reason, and what is left of depth and error where pixels are masked. ``window``:
+    what a pixel was measured in, None for itself alone; ``reasons``: those of the model's own; ``guessed``: pixels
+    without a depth, since their order is a guess."""
+    clipped = seen.saturated.astype(np.float32)
+    if window is not None:
+        clipped = window.moment(clipped) / np.maximum(fit.weight, 1e-3)
     found, least = depth_mm > 0, settings.min_confidence
     confidence = np.where(found, 1 / (1 + error_mm / HALF_CONFIDENCE_MM), 0)
     by_reason = {
         Reason.BACKGROUND: ~seen.inside,
-        Reason.LOW_MODULATION: brightness < MIN_MODULATION,
-        Reason.SATURATED: clipped_share > SATURATED_SHARE,
+        Reason.LOW_MODULATION: fit.brightness < MIN_MODULATION,
+        Reason.SATURATED: clipped > SATURATED_SHARE,
         Reason.OUT_OF_RANGE: ~found,
         **reasons,
         Reason.UNSURE: confidence < least,
@@ -285,7 +284,7 @@ def _judged(
         "depth_mm": _pasted(seen, np.where(kept, depth_mm, 0)),
         "sigma_mm": _pasted(seen, np.where(kept, error_mm, 0)),
         "confidence": _pasted(seen, confidence),
-        "modulation_grey": _pasted(seen, brightness),
+        "modulation_grey": _pasted(seen, fit.brightness),
         "reason": _pasted(seen, reason, np.uint8, Reason.BACKGROUND),
         "background_share": seen.background.share,
     }
@@ -408,16 +407,7 @@ class PhaseRoute(OneCarrier):
             Reason.TOO_STEEP: (frequency < SLOWEST) | (frequency > FASTEST),
             Reason.AMBIGUOUS: margin < LEAST_MARGIN,
         }
-        maps = _judged(
-            seen,
-            settings,
-            depth_mm,
-            error_mm,
-            _clipped_share(seen, self.windows[1], seen.fit.weight),
-            seen.fit.brightness,
-            reasons,
-            guessed,
-        )
+        maps = _judged(seen, settings, depth_mm, error_mm, seen.fit, self.windows[1], reasons, guessed)
         orders = Orders(*(_pasted(seen, part, np.int32) for part in (seen.candidates.first, seen.candidates.count)))
         maps["sigma_mm"] *= np.float32(np.sqrt(np.pi / 2))  # of a normal error of that expected size
         measured = FringeMeasurement(
@@ -441,16 +431,12 @@ class CrossedRoute(TwoCarriers):
     def fitted(self, seen: CrossedObservation) -> Fitted:
         """The order of every pixel, and the nearness that follows."""
         order = crossed_order(seen, crossed_candidates(seen), self.settings)
-        if seen.moved is None:
-            fit = _window_fit(seen, order.candidates.nearness[1])
-            if not seen.given and not seen.background.shown:
-                seen = replace(seen, inside=seen.inside & (fit.brightness > MIN_MODULATION))
-            clipped_share = _clipped_share(seen, Window(WINDOW_PERIODS * seen.period_px), fit.weight)
-        else:
-            fit = _own_fit(seen, order.candidates.nearness[1], seen.moved)
-            clipped_share = seen.saturated.astype(np.float32)
+        nearness = order.candidates.nearness[1]
+        fit = _window_fit(seen, nearness) if seen.moved is None else _own_fit(seen, nearness, seen.moved)
+        if seen.moved is None and not seen.given and not seen.background.shown:
+            seen = replace(seen, inside=seen.inside & (fit.brightness > MIN_MODULATION))
         known = {entry.name: getattr(seen, entry.name) for entry in fields(seen)}
-        return Fitted(**known, **vars(order), fit=fit, clipped_share=clipped_share)
+        return Fitted(**known, **vars(order), fit=fit)
 
     def conclude(self, seen: Fitted, wrong_chance: Image | None = None) -> Measurement:
         """The measurement that follows from a fit. ``wrong_chance`` (h, w): probability of a wrong order, by default
@@ -463,9 +449,9 @@ class CrossedRoute(TwoCarriers):
             odds = seen.evidence / EVIDENCE_SCALE + seen.margin / ENERGY_SCALE - EVEN_ODDS
             wrong_chance = (1 / (1 + np.exp(np.clip(odds, -50, 50)))).astype(np.float32)
         bright = np.maximum(fit.brightness, 0.5)
-        pairs = zip(seen.modulation, carriers.weights, strict=True)
+        pairs = zip(seen.modulation, carriers.family.weights, strict=True)
         weakest = np.minimum(*(modulation / (weight * bright) for modulation, weight in pairs))
-        lost = weakest < LOST_SHARE * max(seen.contrast) / max(carriers.weights)
+        lost = weakest < LOST_SHARE * max(seen.contrast) / max(carriers.family.weights)
         wrong_chance = np.where(lost, np.maximum(wrong_chance, LOST_CHANCE), wrong_chance)
         mm_per_rad = carriers.mm_per_rad(np.maximum(depth_mm, 1.0))
         doubt_rad = reaching(np.abs(seen.rival - fit.nearness) * carriers.joint_gain, wrong_chance)
@@ -478,6 +464,8 @@ class CrossedRoute(TwoCarriers):
             Reason.TEXTURE: texture,
             Reason.AMBIGUOUS: wrong_chance > AMBIGUOUS_CHANCE,
         }
-        maps = _judged(seen, self.settings, depth_mm, sigma_mm, seen.clipped_share, fit.brightness, reasons)
+        maps = _judged(
+            seen, self.settings, depth_mm, sigma_mm, fit, None if seen.moved is not None else window, reasons
+        )
         measured = Measurement(**maps, order_doubt_mm=_pasted(seen, mm_per_rad * doubt_rad))
         return _restored_crossed(self, measured) if self.resampling.needed else measured

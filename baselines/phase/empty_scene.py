@@ -207,7 +207,9 @@ class CrossedEmptyScene:
         x, y = (axis.astype(np.float32) for axis in rig.camera.rays())
         fall_off = plane_irradiance(rig, depth_m).astype(np.float32)
         fall_off /= np.float32(np.median(fall_off))
-        first, second = (np.float32(w) * np.cos(phase) for w, phase in zip(carriers.weights, phases, strict=True))
+        first, second = (
+            np.float32(w) * np.cos(phase) for w, phase in zip(carriers.family.weights, phases, strict=True)
+        )
         terms = [fall_off * term * (1 + first + second) for term in _quadratic(x, y)]
         terms += [fall_off * first, fall_off * second, np.ones_like(x)]
         self._terms = [term.astype(np.float32) for term in terms]

@@ -496,9 +496,9 @@ class TwoCarriers(MeasurementModel):
         inner = cv2.erode(points.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0  # type: ignore[call-overload]
         inner &= mean_grey > MIN_MODULATION
         if not inner.any():
-            return self.carriers.weights
+            return self.carriers.family.weights
         shares = np.median(modulation[:, inner] / mean_grey[inner], axis=1)
-        least, most = np.float32(LEAST_CONTRAST), np.asarray(self.carriers.weights, np.float32)
+        least, most = np.float32(LEAST_CONTRAST), np.asarray(self.carriers.family.weights, np.float32)
         first, second = np.clip(shares, least, most).tolist()
         return first, second
 

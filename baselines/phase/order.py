@@ -7,7 +7,7 @@ order, so that an order is settled if every other order would put a part of the 
 order keeps the whole surface inside, the two can't be distinguished, and the order is ambiguous.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -25,7 +25,7 @@ from fpp_ml_bench.baselines.phase.candidates import (
     links_between,
 )
 from fpp_ml_bench.baselines.phase.object_mask import disk
-from fpp_ml_bench.baselines.phase.observe import CrossedObservation, Observation, Settings
+from fpp_ml_bench.baselines.phase.observe import Capture, CrossedObservation, Observation, Settings
 from fpp_ml_bench.baselines.phase.resampling import nearest_inside
 from fpp_ml_bench.constants import MM_PER_M
 
@@ -134,6 +134,14 @@ def terms_of(settings: Settings) -> list[str]:
     return ["shading"] * settings.shading + ["standoff"] * (settings.prior == "standoff")
 
 
+def cost_of(names: Sequence[str], seen: Capture, offered: Candidates, settings: Settings) -> Image:
+    """Cost (K, h, w) of every candidate by the terms ``names``."""
+    cost = np.zeros_like(offered.phase_rad)
+    for name in names:
+        cost += TERMS[name].cost(seen, offered, settings)
+    return cost
+
+
 def solved(offered: Candidates, cost: Image, smoothness: float, jump_rad: float) -> tuple[NDArray[np.int32], Image]:
     """Index of the candidate of least energy, int32 (h, w), and the margin of the energy (0 for a tie)."""
     from fpp_ml_bench.baselines.phase.labels import least_energy  # compiled when it is imported
@@ -145,9 +153,7 @@ def solved(offered: Candidates, cost: Image, smoothness: float, jump_rad: float)
 
 def fringe_order(seen: Observation, offered: FringeCandidates, settings: Settings) -> tuple[NDArray[np.int32], Image]:
     """Order of every pixel, int32 (h, w), and how clearly it won, float32: 0 for a tie, 1 or more for certain."""
-    cost = np.zeros_like(offered.phase_rad)
-    for name in terms_of(settings):
-        cost += TERMS[name].cost(seen, offered, settings)
+    cost = cost_of(terms_of(settings), seen, offered, settings)
     index, margin = solved(offered, cost * seen.stride**2, 1.0, settings.jump_rad)
     largest = max(settings.shading_cost * settings.shading_limit * settings.shading, settings.prior_cost)
     proof = cost / np.float32(largest)
@@ -201,11 +207,10 @@ class CrossedOrder:
 
 def crossed_order(seen: CrossedObservation, offered: CrossedCandidates, settings: Settings) -> CrossedOrder:
     """The order of every pixel of crossed fringes."""
-    cost = agreement_cost(seen, offered, settings)
-    smoothness = evidence_weight = 1.0
+    terms, smoothness, evidence_weight = ["agreement"], 1.0, 1.0
     if seen.moved is not None:
-        cost = cost + pixel_light_cost(seen, offered, settings)
-        smoothness, evidence_weight = SMOOTHNESS, EVIDENCE_WEIGHT
+        terms, smoothness, evidence_weight = ["agreement", "pixel light"], SMOOTHNESS, EVIDENCE_WEIGHT
+    cost = cost_of(terms, seen, offered, settings)
     cost = np.where(offered.exists, cost * offered.trust, LARGE).astype(np.float32)
     index, margin = solved(offered, cost, smoothness, JUMP_RAD)
     evidence = _rivals(cost, index, LARGE).min(axis=0) - chosen_values(cost, index)
