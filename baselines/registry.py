@@ -32,7 +32,7 @@ BUILT_IN = (
     "learned.classical_method:ClassicalNetMethod",
     "phase.method:PhaseMethod",
     "learned.method:PhaseNetMethod",
-    "phase.crossed_method:CrossedMethod",
+    "phase.method:CrossedMethod",
     "learned.crossed_method:CrossedNetMethod",
     "trivial:ConstantMethod",
     "trivial:NearestMethod",

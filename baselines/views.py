@@ -6,7 +6,7 @@ coordinates are metres, z up, as in the dataset's meshes.
 """
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cached_property
@@ -162,27 +162,19 @@ def cell_means(points_m: Points, weights: Values, cell_mm: float = CELL_MM) -> P
     return np.column_stack([np.bincount(cell, weights * axis) / total for axis in points_m.T])
 
 
-def fuse(views: Sequence[PlacedView], kept: Sequence[Flags] | None = None, cell_mm: float = CELL_MM) -> Points:
-    """One cloud (k, 3) in object coordinates, metres: `cell_means` of all views' points by their `point_weights`;
-    with ``kept``, bool (n,) for each view, of these points only."""
-    chosen = [np.ones(view.pixels.size, dtype=bool) for view in views] if kept is None else kept
-    points = np.concatenate([view.points_m[keep] for view, keep in zip(views, chosen, strict=True)])
-    weights = [weight[keep] for weight, keep in zip(point_weights(views), chosen, strict=True)]
-    return cell_means(points, np.concatenate(weights), cell_mm)
-
-
 Counts = dict[str, float | None]
 
 
-@dataclass(frozen=True, eq=False)
-class FusedObject:
-    """An object's ``cloud_m`` (k, 3): that of its views without contradicted pixels, object coordinates in metres.
-    ``counts``: ``cloud_points``; ``answered_px`` of all views, which have a depth; ``contradicted_px`` of these, and
-    their share (``contradicted_share``, None without a depth)."""
-
-    name: str
-    cloud_m: Points
-    counts: Counts
+def fused(views: Sequence[PlacedView], cell_mm: float = CELL_MM) -> tuple[Points, Counts]:
+    """One cloud (k, 3) of an object in object coordinates, metres: `cell_means` of its views' points by their
+    `point_weights`, without the contradicted ones. And counts: ``cloud_points``; ``answered_px`` of all views, which
+    have a depth; ``contradicted_px`` of these, and their share (``contradicted_share``, None without a depth)."""
+    wrong = np.concatenate(contradicted(views))
+    points = np.concatenate([view.points_m for view in views])
+    cloud_m = cell_means(points[~wrong], np.concatenate(point_weights(views))[~wrong], cell_mm)
+    answered, contradictions = wrong.size, int(wrong.sum())
+    counts: Counts = {"cloud_points": len(cloud_m), "answered_px": answered, "contradicted_px": contradictions}
+    return cloud_m, counts | {"contradicted_share": contradictions / answered if answered else None}
 
 
 def prediction_maps(
@@ -234,47 +226,42 @@ def views_by_object(dataset: DatasetFolder, split: str, only: str | None = None)
 
 
 def fuse_split(
-    predictions: str | Path, dataset: DatasetFolder, split: str, only: str | None = None, cell_mm: float = CELL_MM
-) -> tuple[str, Iterator[FusedObject]]:
-    """The method's name, and the objects of ``split`` put together one after another (``only``: a single one). Raises
-    what `prediction_maps` and `views_by_object` raise."""
+    predictions: str | Path,
+    dataset: DatasetFolder,
+    split: str,
+    out: Path,
+    only: str | None = None,
+    cell_mm: float = CELL_MM,
+) -> tuple[str, int, Iterator[tuple[str, Counts]]]:
+    """The method's name, the number of objects, and the objects of ``split`` (``only``: a single one) one after another
+    with their counts, as they are put together and written: ``{object}.ply``, the object's cloud, and at last
+    `FUSION_FILE`, the counts of all objects, and by which rules. Raises what `prediction_maps` and `views_by_object`
+    raise, and PredictionError for a folder that can't be written."""
     if not 0 < cell_mm < 1000:
         raise PredictionError(f"--cell-mm {cell_mm:g}: expected the edge of a cell in mm, above 0 and below 1000")
     chosen = views_by_object(dataset, split, only)
     name, maps = prediction_maps(predictions, dataset, split)
 
-    def fused() -> Iterator[FusedObject]:
+    def written() -> Iterator[tuple[str, Counts]]:
+        objects: dict[str, Counts] = {}
         for obj, samples in chosen.items():
             views = []
             for sample in samples:
                 depth_mm, sigma_mm = maps(sample)
                 views.append(PlacedView(depth_mm, dataset.rig.camera, *placement(dataset, sample), sigma_mm))
                 dataset.release(sample)
-            flags = contradicted(views)
-            cloud_m = fuse(views, [~flag for flag in flags], cell_mm)
-            answered, wrong = sum(flag.size for flag in flags), int(sum(flag.sum() for flag in flags))
-            counts: Counts = {"cloud_points": len(cloud_m), "answered_px": answered, "contradicted_px": wrong}
-            yield FusedObject(obj, cloud_m, counts | {"contradicted_share": wrong / answered if answered else None})
+            cloud_m, objects[obj] = fused(views, cell_mm)
+            write_files(out, {f"{obj}.ply": ply_bytes(cloud_m)}, PredictionError)
+            yield obj, objects[obj]
+        document = {
+            "method": name,
+            "dataset": dataset.fingerprint,
+            "split": split,
+            "cell_mm": cell_mm,
+            "tolerance_mm": TOLERANCE_MM,
+            "objects": objects,
+        }
+        content = (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
+        write_files(out, {FUSION_FILE: content}, PredictionError)
 
-    return name, fused()
-
-
-def write_object(out: Path, fused: FusedObject) -> list[Path]:
-    """Write ``{object}.ply``, the object's cloud. Raises PredictionError for a folder that can't be written."""
-    return write_files(out, {f"{fused.name}.ply": ply_bytes(fused.cloud_m)}, PredictionError)
-
-
-def write_counts(
-    out: Path, name: str, dataset: DatasetFolder, split: str, cell_mm: float, objects: Mapping[str, Counts]
-) -> list[Path]:
-    """Write `FUSION_FILE`: the counts of all objects, and by which rules. Errors as `write_object`."""
-    document = {
-        "method": name,
-        "dataset": dataset.fingerprint,
-        "split": split,
-        "cell_mm": cell_mm,
-        "tolerance_mm": TOLERANCE_MM,
-        "objects": dict(objects),
-    }
-    content = (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
-    return write_files(out, {FUSION_FILE: content}, PredictionError)
+    return name, len(chosen), written()

@@ -23,7 +23,7 @@ from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.learned.classical_method import ClassicalNetMethod
 from fpp_ml_bench.baselines.learned.crossed_method import CrossedNetMethod
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.baselines.phase.crossed_route import CrossedRoute
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute
 from fpp_ml_bench.baselines.phase.method import PhaseMethod
 from fpp_ml_bench.baselines.robustness.axes import corruptions
 from fpp_ml_bench.calibration.boards import Board

@@ -18,11 +18,9 @@ from fpp_ml_bench.baselines.learned.inputs import (
     CroppedMaps,
     from_the_sides,
 )
-from fpp_ml_bench.baselines.phase.calibration_layer import Image, Mask, wrapped
-from fpp_ml_bench.baselines.phase.carriers import Carriers
-from fpp_ml_bench.baselines.phase.crossed_observation import CrossedObservation
-from fpp_ml_bench.baselines.phase.local_fit import phase_slopes
-from fpp_ml_bench.baselines.phase.refinement import fringes
+from fpp_ml_bench.baselines.phase.calibration_layer import Carriers, Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase.depth import Fitted
+from fpp_ml_bench.baselines.phase.local_fit import fringes, phase_slopes
 
 CHANNELS = (
     "light",
@@ -89,7 +87,7 @@ class Scene(CroppedMaps):
     strength: float
 
     @classmethod
-    def of(cls, seen: CrossedObservation) -> "Scene":
+    def of(cls, seen: Fitted) -> "Scene":
         """From an observation of the measured route."""
         fit, background, carriers = seen.fit, seen.background, seen.carriers
         lit = fit.brightness[seen.inside & (fit.brightness > 0)]

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.learned.method import WEIGHTS, LearnedRoute
 from fpp_ml_bench.baselines.method import Frames
-from fpp_ml_bench.baselines.phase.crossed_method import crossed_image, crossed_name, frames_of, has_crossed_fringes
-from fpp_ml_bench.baselines.phase.crossed_observation import Settings
-from fpp_ml_bench.baselines.phase.method import MIN_CONFIDENCE
+from fpp_ml_bench.baselines.phase.method import crossed_image, crossed_name, frames_of, has_crossed_fringes
+from fpp_ml_bench.baselines.phase.observe import MIN_CONFIDENCE, Settings
 from fpp_ml_bench.baselines.phase.resampling import Periods
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.optics.rig import Rig
@@ -81,7 +80,7 @@ class CrossedNetMethod(LearnedRoute):
         learned_px = config.period_px["crossed"]
         periods = Periods(learned_px / PERIOD_TOLERANCE, learned_px, learned_px * PERIOD_TOLERANCE)
         self.route = CrossedNetRoute(
-            rig, self.file.network, config.threshold, config.lead, Settings(min_confidence), periods
+            rig, self.file.network, config.threshold, config.lead, Settings(min_confidence=min_confidence), periods
         )
         made = "" if len(self.frames_used) == 1 else ", the mean of two"
         more = "" if config.name == DEFAULT else f" ({config.name})"

@@ -15,13 +15,12 @@ from fpp_ml_bench.baselines.learned.odds import (
     probabilities,
     threshold_at,
 )
-from fpp_ml_bench.baselines.phase.calibration_layer import Image, Mask
-from fpp_ml_bench.baselines.phase.carriers import Carriers
-from fpp_ml_bench.baselines.phase.crossed_observation import CrossedMeasurement, CrossedObservation, Settings
-from fpp_ml_bench.baselines.phase.crossed_orders import JUMP_RAD
-from fpp_ml_bench.baselines.phase.crossed_route import CrossedRoute
-from fpp_ml_bench.baselines.phase.orders import chosen_values, nearest_inside
-from fpp_ml_bench.baselines.phase.resampling import Periods
+from fpp_ml_bench.baselines.phase.calibration_layer import Carriers, Image, Mask
+from fpp_ml_bench.baselines.phase.candidates import chosen_values
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Fitted, Measurement
+from fpp_ml_bench.baselines.phase.observe import Settings
+from fpp_ml_bench.baselines.phase.order import JUMP_RAD
+from fpp_ml_bench.baselines.phase.resampling import Periods, nearest_inside
 from fpp_ml_bench.optics.rig import Rig
 
 DENIED = 6.0  # a pixel of the measured mask stays object unless its logit is this far below the threshold
@@ -71,17 +70,16 @@ class CrossedNetRoute:
         self.route = CrossedRoute(rig, settings, periods=periods)
         self.network, self.threshold, self.lead = network, threshold, lead
 
-    def measure(self, image: NDArray) -> CrossedMeasurement:
+    def measure(self, image: NDArray) -> Measurement:
         """Everything about one crossed frame (H, W). Raises `DecodeError` for another dtype or shape."""
-        seen = self.route.observe(image)
+        seen = self.route.fitted(self.route.observe(image))
         if not seen.inside.any():
             return self.route.conclude(seen)
         scene = Scene.of(seen)
         answers = network_answers(self.network, scene, self.route.carriers, self.lead)
-        seen.watch.done("network")
         return self.conclude(seen, scene, answers)
 
-    def conclude(self, seen: CrossedObservation, scene: Scene, answers: Answers) -> CrossedMeasurement:
+    def conclude(self, seen: Fitted, scene: Scene, answers: Answers) -> Measurement:
         """The measurement from the network's answers."""
         joint, offers = seen.carriers.joint_gain, offers_rad(scene)
         inside = decided_mask(answers, scene, self.threshold)
@@ -99,5 +97,4 @@ class CrossedNetRoute:
         np.put_along_axis(chances, choice[None], -1, axis=0)
         rival = (scene.nearness + chosen_values(offers, chances.argmax(axis=0)) / joint).astype(np.float32)
         fit = replace(seen.fit, nearness=nearness.astype(np.float32), uncertainty_rad=answers.sigma_rad)
-        seen.watch.done("order")
         return self.route.conclude(replace(seen, fit=fit, inside=inside, rival=rival), wrong.astype(np.float32))

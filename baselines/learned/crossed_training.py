@@ -26,8 +26,8 @@ from fpp_ml_bench.baselines.learned.windows import (
     wrong_place,
 )
 from fpp_ml_bench.baselines.phase.calibration_layer import Mask
-from fpp_ml_bench.baselines.phase.crossed_route import CrossedRoute
-from fpp_ml_bench.baselines.phase.orders import chosen_values
+from fpp_ml_bench.baselines.phase.candidates import chosen_values
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute
 from fpp_ml_bench.baselines.training.views import View
 from fpp_ml_bench.depth import depth_edges
 from fpp_ml_bench.optics.named_rigs import crossed_rig
@@ -47,7 +47,7 @@ class CrossedSample(Sample):
 
 def sample_of(view: View, route: CrossedRoute) -> CrossedSample:
     """The sample of a view; its void pixels are no target, and no background either."""
-    seen = route.observe(view.frames[0])
+    seen = route.fitted(route.observe(view.frames[0]))
     crop = seen.carriers.crop
     depth_mm, void = view.depth_mm[crop], view.void[crop]
     target = (depth_mm > 0) & ~void

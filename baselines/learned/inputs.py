@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer, Image, Mask, wrapped
-from fpp_ml_bench.baselines.phase.object_mask import Crop
-from fpp_ml_bench.baselines.phase.observation import Observation, Settings
-from fpp_ml_bench.baselines.phase.orders import LEAST_BRIGHTNESS, grid_of, irradiance, repeated
-from fpp_ml_bench.baselines.phase.resampling import Periods
-from fpp_ml_bench.baselines.phase.route import PhaseRoute
+from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer, Crop, Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase.candidates import irradiance
+from fpp_ml_bench.baselines.phase.depth import PhaseRoute
+from fpp_ml_bench.baselines.phase.observe import Observation, Settings
+from fpp_ml_bench.baselines.phase.order import LEAST_BRIGHTNESS
+from fpp_ml_bench.baselines.phase.resampling import Periods, grid_of, repeated
 from fpp_ml_bench.optics.rig import Rig
 
 STEPS = (-1, 0, 1)  # the candidates: a period further than the base order, the base order, a period nearer

@@ -10,18 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Assumption, Frames, Method, OwnViews
-from fpp_ml_bench.baselines.phase.method import (
-    AMBIENT_GREY,
-    DIRECTION,
-    LIT_BACKGROUND,
-    MIN_CONFIDENCE,
-    ONE_ALBEDO,
-    WHITE_GREY,
-    RouteMethod,
-    direction_of,
-    fringe_options,
-)
-from fpp_ml_bench.baselines.phase.observation import Settings
+from fpp_ml_bench.baselines.phase.method import LIT_BACKGROUND, ONE_ALBEDO, RouteMethod, direction_of, fringe_options
+from fpp_ml_bench.baselines.phase.observe import AMBIENT_GREY, DIRECTION, MIN_CONFIDENCE, WHITE_GREY, Settings
 from fpp_ml_bench.baselines.phase.resampling import Periods
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.files import printable

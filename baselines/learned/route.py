@@ -20,9 +20,9 @@ from fpp_ml_bench.baselines.learned.odds import (
     wrong_chance,
 )
 from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Mask, wrapped
-from fpp_ml_bench.baselines.phase.observation import Measurement, Settings
-from fpp_ml_bench.baselines.phase.orders import stride_of
-from fpp_ml_bench.baselines.phase.resampling import Periods
+from fpp_ml_bench.baselines.phase.depth import FringeMeasurement
+from fpp_ml_bench.baselines.phase.observe import Settings
+from fpp_ml_bench.baselines.phase.resampling import Periods, stride_of
 from fpp_ml_bench.optics.rig import Rig
 
 OPEN_MARGIN = 1e-6
@@ -71,17 +71,15 @@ class NetworkRoute:
         self.geometry = Geometry.of(rig, settings, periods)
         self.network, self.threshold, self.lead, self.odds = network, threshold, lead, odds or Odds()
 
-    def measure(self, image: NDArray[np.uint8]) -> Measurement:
+    def measure(self, image: NDArray[np.uint8]) -> FringeMeasurement:
         """Everything about one captured fringe uint8 (H, W). Raises `DecodeError` for another dtype or shape."""
         geometry, route = self.geometry, self.geometry.route
         seen = route.observe(image)
         base, margin = route.choose(seen)
-        seen.watch.done("order")
         if not (seen.background.calibrated and seen.inside.any()):
             return route.conclude(seen, base, margin)
         scene = Scene.of(seen, base, geometry.shading)
         answers = network_answers(self.network, scene, geometry, self.lead)
-        seen.watch.done("network")
         inside = decided_mask(answers, scene, self.threshold)
         choice = decided_order(answers, scene, inside, geometry)
         moved = seen.phase_rad + answers.correction_rad

@@ -31,8 +31,9 @@ from fpp_ml_bench.baselines.learned.windows import (
     wrong_place,
 )
 from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Image, Mask
-from fpp_ml_bench.baselines.phase.observation import Settings
-from fpp_ml_bench.baselines.phase.orders import chosen_values, repeated
+from fpp_ml_bench.baselines.phase.candidates import chosen_values
+from fpp_ml_bench.baselines.phase.observe import Settings
+from fpp_ml_bench.baselines.phase.resampling import repeated
 from fpp_ml_bench.baselines.training.views import View
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import depth_edges, object_mask

@@ -8,8 +8,7 @@ import numpy as np
 import trimesh
 from numpy.typing import ArrayLike
 
-from fpp_ml_bench.baselines.phase.crossed_observation import CrossedReason
-from fpp_ml_bench.baselines.phase.crossed_route import CrossedRoute
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Reason
 from fpp_ml_bench.baselines.stability.cases import U64, Floats, Group, Outcome, worst, wrong
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.decoding.blocks import projected
@@ -141,7 +140,7 @@ def plane_outcome(
     route = CrossedRoute(rig, family=measured_as or family)
     measured = route.measure(grey, mask)
     depth_mm, exact_mm = measured.depth_mm[MIDDLE], DEPTH_M * 1000
-    flagged = (depth_mm == 0) | (measured.reason[MIDDLE] != CrossedReason.MEASURED)
+    flagged = (depth_mm == 0) | (measured.reason[MIDDLE] != Reason.MEASURED)
     bound_mm = float(np.median(route.carriers.mm_per_rad(np.full(u.shape, exact_mm)))) * math.pi / 2
     return worst(depth_mm - exact_mm, bound_mm, flagged)
 

@@ -34,14 +34,12 @@ def fuse(
 
     Prints what was counted. Raises FppBenchError for unusable predictions or data."""
     opened = DatasetFolder(dataset)
-    name, objects = views.fuse_split(predictions, opened, split, only, cell_mm)
+    name, count, objects = views.fuse_split(predictions, opened, split, out, only, cell_mm)
     counts = {}
-    with progress_bar("fusing", len(views.views_by_object(opened, split, only)), "objects") as advance:
-        for fused in objects:
-            views.write_object(out, fused)
-            counts[fused.name] = fused.counts
+    with progress_bar("fusing", count, "objects") as advance:
+        for obj, row in objects:
+            counts[obj] = row
             advance(1)
-    views.write_counts(out, name, opened, split, cell_mm, counts)
     table = Table(
         "object", numbers=("points in the cloud", "pixels with a depth", "contradicted"), title=printable(name)
     )

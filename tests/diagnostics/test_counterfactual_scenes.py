@@ -22,7 +22,7 @@ from fpp_ml_bench.baselines.diagnostics.scene_renderer import (
     normals_of_depth,
     plane,
 )
-from fpp_ml_bench.baselines.phase.carriers import Carriers
+from fpp_ml_bench.baselines.phase.calibration_layer import Carriers
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.render.light import named_light

@@ -22,7 +22,7 @@ from fpp_ml_bench.baselines.learned.training import (
     sample_of,
 )
 from fpp_ml_bench.baselines.learned.window_training import WindowTraining, train_net
-from fpp_ml_bench.baselines.phase.observation import Settings
+from fpp_ml_bench.baselines.phase.observe import Settings
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.training.engine import CHECKPOINT, reproducible
 from fpp_ml_bench.baselines.training.views import Group, View, read_views
