@@ -361,8 +361,8 @@ def calibrated_rig(found: Calibration, stand_in: Rig, range_mm: tuple[float, flo
     near, far = range_mm or (float(np.min(depths)) * (1 - RANGE_MARGIN), float(np.max(depths)) * (1 + RANGE_MARGIN))
     return replace(
         stand_in,
-        camera=found.camera.pinhole(),
-        projector=found.projector.pinhole(),
+        camera=found.camera.pinhole,
+        projector=found.projector.pinhole,
         rotation=found.rotation,
         translation_m=found.translation_m,
     ).with_range((near, far))
