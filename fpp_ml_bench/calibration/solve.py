@@ -105,11 +105,11 @@ def calibrate(
     """Calibrate a rig from at least three poses of a flat board; sizes are (width, height) in px.
 
     ``lenses``: of camera and projector. No point is rejected. Camera and projector residuals are weighted by the
-    inverse of the variances that they show, the projector's with the own uncertainty of each point. ``estimate_board``: the board's points are estimated too, about
-    their nominal places (Strobl and Hirzinger, More accurate pinhole camera calibration with imperfect planar target,
-    ICCV Workshops 2011). ``baseline_mm``: lengths are scaled so that the baseline has this
-    length; without it the scale is that of the board's spacing. ``hold_out``: compute the held-out errors (a fit for
-    each pose; needs four).
+    inverse of the variances that they show, the projector's with the own uncertainty of each point. ``estimate_board``:
+    the board's points are estimated too, about their nominal places (Strobl and Hirzinger, More accurate pinhole camera
+    calibration with imperfect planar target, ICCV Workshops 2011). ``baseline_mm``: lengths are scaled so that the
+    baseline has this length; without it the scale is that of the board's spacing. ``hold_out``: compute the held-out
+    errors (a fit for each pose; needs four).
 
     Raises `CalibrationError` for too few or parallel poses, other image sizes, mirrored images, points outside the
     projector, and where the captures don't determine the rig; it names the pose."""
