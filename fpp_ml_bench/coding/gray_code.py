@@ -87,16 +87,6 @@ def decode_cells(
     return cells, trusted
 
 
-def absolute_phase(
-    phase: NDArray[np.float64], cells: NDArray[np.int32], centres_rad: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Absolute phase ``phi + 2 pi k`` with k nearest to the cell's centre, float64 rad (H, W), and whether the two
-    agree, bool (H, W): the cell exists and its centre, of `cell_centres_rad`, is within `INCONSISTENT_RAD`."""
-    centre = centres_rad[np.minimum(cells, len(centres_rad) - 1)]
-    absolute = phase + 2 * np.pi * np.floor((centre - phase) / (2 * np.pi) + 0.5)
-    return absolute, (cells < len(centres_rad)) & (np.abs(absolute - centre) <= INCONSISTENT_RAD)
-
-
 class DecodedCells(NamedTuple):
     """Cell ``number`` and the ``other`` that it would be with all ambiguous bits flipped (itself where none is), int32
     (n,) each. ``trusted`` bool (n,): no bit is ambiguous, or a single one that makes the other a neighbour."""

@@ -15,7 +15,6 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from types import ModuleType
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -36,8 +35,7 @@ from fpp_ml_bench.coding.code import (
 from fpp_ml_bench.coding.gray_code import GrayCells
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import DecodeError, RigError
-from fpp_ml_bench.machine import numba_enabled
-from fpp_ml_bench.portable import arctangent2, cosine_of_turns, sine_of_turns
+from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
 TAU = 2 * math.pi
 CLEAR_RATIO = 4.0
@@ -54,15 +52,6 @@ class Phase(NamedTuple):
     phase: NDArray[np.floating]
     modulation: NDArray[np.floating]
     mean: NDArray[np.floating]
-
-
-def compiled_kernels() -> ModuleType | None:
-    """The codes' compiled kernels, or None where NumPy is to be used."""
-    if not numba_enabled():
-        return None
-    from fpp_ml_bench.coding import kernels
-
-    return kernels
 
 
 def choose_steps(steps: int, count: int) -> tuple[int, ...]:
@@ -133,12 +122,10 @@ def weighted_sums(images: Iterable[NDArray], weights: NDArray[np.float64]) -> li
 
 def minus_atan2(sine: NDArray[np.float64], cosine: NDArray[np.float64]) -> NDArray[np.float64]:
     """``-atan2(sine, cosine)`` in [-pi, pi), float64 to 2 ulp, with the same bits on every processor."""
-    if kernels := compiled_kernels():
-        phase = np.empty(np.shape(sine))
-        kernels.minus_atan2_all(np.ravel(sine), np.ravel(cosine), phase.ravel())
-        return phase
-    phase = -arctangent2(sine, cosine)
-    phase[phase >= np.pi] = -np.pi
+    from fpp_ml_bench.coding import kernels  # imports numba, which takes longer than most commands
+
+    phase = np.empty(np.shape(sine))
+    kernels.minus_atan2_all(np.ravel(sine), np.ravel(cosine), phase.ravel())
     return phase
 
 
