@@ -22,6 +22,7 @@ from fpp_ml_bench.optics.pinhole import Maps, Pinhole, number, numbers, require
 from fpp_ml_bench.optics.sequence import (
     AXES,
     DIRECTIONS,
+    PAPER_PITCH_PX,
     PAPER_SEQUENCE,
     CodedSequence,
     Direction,
@@ -50,8 +51,8 @@ class Rig:
     projector: Pinhole
     rotation: Matrix3
     translation_m: tuple[float, float, float]
-    pitch_horizontal_px: float | None = 18.0
-    pitch_vertical_px: float | None = 18.0
+    pitch_horizontal_px: float | None = PAPER_PITCH_PX
+    pitch_vertical_px: float | None = PAPER_PITCH_PX
     sequence: Sequence | CodedSequence = PAPER_SEQUENCE
     working_range_mm: tuple[float, float] = WORKING_RANGE_MM
     standoff_m: float = STANDOFF_M
