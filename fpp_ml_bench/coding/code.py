@@ -167,11 +167,11 @@ class Code(ABC):
         """The entries of a rig file; `code_from_dict` gives an equal code back."""
 
 
-def entry(entries: Mapping[str, Any], key: str, default: Any = None) -> Any:
-    """An entry of a rig file; raises `RigError` where it is missing and has no ``default``."""
-    if key not in entries and default is None:
+def entry(entries: Mapping[str, Any], key: str) -> Any:
+    """An entry of a rig file; raises `RigError` where it is missing."""
+    if key not in entries:
         raise RigError(f"{key}: missing")
-    return entries.get(key, default)
+    return entries[key]
 
 
 def check_keys(entries: Mapping[str, Any], keys: tuple[str, ...]) -> None:

@@ -277,7 +277,7 @@ class PhaseShift(Code):
             first += steps
         finest = self.finest
         if self.gray is not None:
-            cells = self.gray.decode(levels[first:], means[finest], modulations[finest], limits.ambiguous_fraction)
+            cells = self.gray.cells_of(levels[first:], means[finest], modulations[finest], limits.ambiguous_fraction)
             near = self.gray.centre_px(cells.number, length_px)
             away = near - self.origin_px
             order = np.floor(away / self.pitch_px - phases[finest] + 0.5)

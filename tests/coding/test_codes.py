@@ -71,7 +71,7 @@ def test_a_code_gives_its_own_pixels_back(name):
     assert (found.reason == Reason.DECODED).mean() > (0.9 if name == "whole-period cells" else 0.99)
     good = found.reason == 0
     # 8-bit patterns are rounded to half a grey level of 127.5; a cell knows its pixels to half its width.
-    bound = code.cells.cell_px / 2 if isinstance(code, GrayOnly) else 0.05
+    bound = code.cell_px / 2 if isinstance(code, GrayOnly) else 0.05
     assert np.abs(found.coordinate_px - pixels)[good].max() <= bound
     assert len(code.shown) == len(code.profiles(LENGTH))
     assert code.step_px == (bound if isinstance(code, GrayOnly) else 0)
