@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding.code import SMALLEST_PITCH_PX, check_keys, entry, real
+from fpp_ml_bench.coding.code import SMALLEST_PITCH_PX, check_keys, numbers, require
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
@@ -65,15 +65,13 @@ class Crossed:
     def from_entries(cls, entries: Mapping[str, Any]) -> Crossed:
         """The family of a rig file's entries; `RigError` naming the key."""
         check_keys(entries, _KEYS)
-        given: dict[str, Any] = {"pitches_px": _pair(entry(entries, "pitches_px"), "pitches_px")}
-        for key in ("angles_deg", "weights"):
-            if key in entries:
-                given[key] = _pair(entries[key], key)
+        require("pitches_px" in entries, "pitches_px: missing")
+        given: dict[str, Any] = {key: numbers(entries[key], 2, key) for key in entries if key != "shifts_deg"}
         if "shifts_deg" in entries:
             shifts = entries["shifts_deg"]
-            if not isinstance(shifts, list):
-                raise RigError(f"shifts_deg: expected a list with a pair of degrees for each frame, got {shifts!r}")
-            given["shifts_deg"] = tuple(_pair(pair, f"shifts_deg[{n}]") for n, pair in enumerate(shifts))
+            pairs = f"shifts_deg: expected a list with a pair of degrees for each frame, got {shifts!r}"
+            require(isinstance(shifts, list), pairs)
+            given["shifts_deg"] = tuple(numbers(pair, 2, f"shifts_deg[{n}]") for n, pair in enumerate(shifts))
         return cls(**given)
 
     @classmethod
@@ -131,13 +129,6 @@ class Crossed:
             )
         )
         return np.rint(half + half * (first + second)).astype(np.uint8)
-
-
-def _pair(values: object, key: str) -> Pair:
-    if not isinstance(values, list) or len(values) != 2:
-        raise RigError(f"{key}: expected a list of two numbers, one for each carrier, got {values!r}")
-    first, second = (real(value, f"{key}[{i}]") for i, value in enumerate(values))
-    return first, second
 
 
 def crossed_from_pair(first_horizontal: NDArray[np.uint8], first_vertical: NDArray[np.uint8]) -> NDArray[np.uint8]:

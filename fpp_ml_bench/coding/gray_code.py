@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.coding.code import AMBIGUOUS_FRACTION, Code, Coordinates, Limits, Shown, check_keys, real, whole
+from fpp_ml_bench.coding.code import AMBIGUOUS_FRACTION, Code, Coordinates, Limits, Shown, check_keys, number, whole
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import RigError
 
@@ -121,10 +121,10 @@ class GrayCells:
                 f"gray: expected a mapping with some of cell_px, bits, inverse, origin_px, least_first; got {entries!r}"
             )
         check_keys(entries, ("cell_px", "bits", "inverse", "origin_px", "least_first"))
-        size = real(entries.get("cell_px", cell_px), "cell_px")
+        size = number(entries.get("cell_px", cell_px), "cell_px")
         if not size >= 1:
             raise RigError(f"cell_px: expected 1 px and more, got {size:g}")
-        origin_px, least_first = real(entries.get("origin_px", 0.0), "origin_px"), entries.get("least_first", False)
+        origin_px, least_first = number(entries.get("origin_px", 0.0), "origin_px"), entries.get("least_first", False)
         if not isinstance(least_first, bool):
             raise RigError(f"least_first: expected true or false, got {least_first!r}")
         bits = whole(entries.get("bits", bits_needed(length_px - origin_px, 2 * size)), "bits", 1, 15)

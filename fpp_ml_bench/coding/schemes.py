@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.coding.code import SMALLEST_PITCH_PX, Code, Coordinates, Limits, Shown, check_keys, real
+from fpp_ml_bench.coding.code import SMALLEST_PITCH_PX, Code, Coordinates, Limits, Shown, check_keys, numbers
 from fpp_ml_bench.coding.gray_code import GrayOnly
 from fpp_ml_bench.coding.phase_shift import PhaseShift
 from fpp_ml_bench.constants import GREY_LEVELS
@@ -33,7 +33,7 @@ class Composite(Code):
         pitches = entries.get("pitches_px")
         if not isinstance(pitches, list) or len(pitches) < 2:
             raise RigError(f"pitches_px: expected a list of two periods and more, got {pitches!r}")
-        return cls(tuple(real(pitch, f"pitches_px[{i}]") for i, pitch in enumerate(pitches)))
+        return cls(numbers(pitches, len(pitches), "pitches_px"))
 
     def to_dict(self) -> dict[str, Any]:
         return {"scheme": self.scheme, "pitches_px": list(self.pitches_px)}

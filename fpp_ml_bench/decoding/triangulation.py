@@ -149,34 +149,26 @@ def depth_noise_mm(
         raise DecodeError(f"direction: expected horizontal, vertical or both, got {direction!r}")
     if steps < 3:
         raise DecodeError(f"steps: expected at least 3, got {steps}")
-    z = np.asarray(depth_mm, dtype=np.float64) / MM_PER_M
-    normalised: Maps = rays if rays is not None else (np.zeros(()), np.zeros(()))
-    forward = rotated_ray(normalised, rig, 2)
+    along: Maps = rays if rays is not None else (np.zeros(()), np.zeros(()))
     precision: NDArray[np.float64] | float = 0.0
     with np.errstate(divide="ignore", invalid="ignore"):
         sigma_phase = np.sqrt(2.0 / steps) * np.asarray(noise) / np.asarray(modulation)
         for name in DIRECTIONS if direction == "both" else (direction,):
-            slope = _slope_px_per_m(rig, name, normalised, forward, z)
+            slope = coordinate_slope_px_per_mm(rig, depth_mm, name, along)  # type: ignore[arg-type]
             sigma_px = rig.pitch(name) * sigma_phase / (2 * np.pi)  # type: ignore[arg-type]
             precision = precision + (slope / sigma_px) ** 2
-        return MM_PER_M / np.sqrt(precision)
+        return 1.0 / np.sqrt(precision)
 
 
 def coordinate_slope_px_per_mm(rig: Rig, depth_mm: ArrayLike, direction: Direction, rays: Maps) -> NDArray[np.float64]:
     """Projector px by which the coordinate of ``direction`` changes for a mm of depth, at normalised ``rays`` (x, y);
     float64. The projector's distortion is ignored, as in `depth_noise_mm`."""
+    axis, forward = AXES.index(direction), rotated_ray(rays, rig, 2)
     with np.errstate(divide="ignore", invalid="ignore"):
         z_m = np.asarray(depth_mm, dtype=np.float64) / MM_PER_M
-        return _slope_px_per_m(rig, direction, rays, rotated_ray(rays, rig, 2), z_m) / MM_PER_M
-
-
-def _slope_px_per_m(
-    rig: Rig, direction: Direction, rays: Maps, forward: NDArray, z_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    axis = AXES.index(direction)
-    slope = rig.projector.focal[axis] * (rotated_ray(rays, rig, axis) * rig.t[2] - rig.t[axis] * forward)
-    quotient: NDArray[np.float64] = slope / (forward * z_m + rig.t[2]) ** 2
-    return quotient
+        slope = rig.projector.focal[axis] * (rotated_ray(rays, rig, axis) * rig.t[2] - rig.t[axis] * forward)
+        px_per_mm: NDArray[np.float64] = slope / (forward * z_m + rig.t[2]) ** 2 / MM_PER_M
+        return px_per_mm
 
 
 def depth_sigma_mm(

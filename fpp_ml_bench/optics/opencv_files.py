@@ -16,11 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.coding.code import require
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.containers import Answer, guarded, limit_memory
 from fpp_ml_bench.errors import PredictionError, RigError
 from fpp_ml_bench.files import file_content, printable, strict_json, strict_yaml, write_atomically
-from fpp_ml_bench.optics.pinhole import Pinhole, require
+from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.optics.rig import Matrix3
 
 UNITS = {"mm": MM_PER_M, "m": 1.0}

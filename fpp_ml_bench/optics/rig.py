@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.coding.code import SMALLEST_PITCH_PX, Code
+from fpp_ml_bench.coding.code import SMALLEST_PITCH_PX, Code, number, numbers, require
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.coding.gray_code import bits_needed, cell_count
 from fpp_ml_bench.coding.phase_shift import PhaseShift
 from fpp_ml_bench.constants import BACKGROUND_M, MM_PER_M, STANDOFF_M, WORKING_RANGE_MM
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.optics.pinhole import Maps, Pinhole, number, numbers, require
+from fpp_ml_bench.optics.pinhole import Maps, Pinhole
 from fpp_ml_bench.optics.sequence import (
     AXES,
     DIRECTIONS,

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding.code import Code, Kind
+from fpp_ml_bench.coding.code import Code, Kind, whole
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.coding.gray_code import GrayCells
 from fpp_ml_bench.coding.phase_shift import Fringes, PhaseShift, equal_shifts
@@ -172,11 +172,8 @@ class Sequence(AnySequence):
     bits_vertical: int = 7
 
     def __post_init__(self) -> None:
-        if self.steps < 3:
-            raise ValueError(f"a phase needs at least 3 steps, got steps={self.steps}")
-        across, down = self.bits_horizontal, self.bits_vertical
-        if not (1 <= across <= 15 and 1 <= down <= 15):
-            raise ValueError(f"Gray bits must be 1 to 15 per direction, got {across} horizontal and {down} vertical")
+        for name, least, most in (("steps", 3, 1000), ("bits_horizontal", 1, 15), ("bits_vertical", 1, 15)):
+            whole(getattr(self, name), f"sequence.{name}", least, most)
 
     @property
     def directions(self) -> tuple[Direction, ...]:
@@ -313,13 +310,7 @@ def sequence_from_dict(entries: object, lengths_px: Mapping[Direction, int]) -> 
             f"sequence: {', '.join(problems)}; expected exactly {', '.join(paper)}, or a code for each direction under "
             f"{' and '.join(DIRECTIONS)}"
         )
-    for key in paper:
-        if isinstance(entries[key], bool) or not isinstance(entries[key], int):
-            raise RigError(f"sequence.{key}: expected a whole number, got {entries[key]!r}")
-    try:
-        return Sequence(**entries)
-    except ValueError as error:
-        raise RigError(f"sequence: {error}") from error
+    return Sequence(**entries)
 
 
 PAPER_SEQUENCE = Sequence()
