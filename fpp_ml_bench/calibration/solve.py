@@ -155,27 +155,22 @@ def _start(
         seen = [[pose.corners_px, pose.projector.points_px][device] for pose in poses]
         kept = [np.isfinite(pixels).all(1) for pixels in seen]
         objects = [points[keep] for keep in kept]
-        images = [pixels[keep].astype(np.float32)[:, None] for pixels, keep in zip(seen, kept, strict=True)]
+        # OpenCV refuses a start whose principal point is outside the image, where a projector's may well be: the image
+        # gets a margin of its own size all round.
+        images = [(pixels[keep] + size).astype(np.float32)[:, None] for pixels, keep in zip(seen, kept, strict=True)]
+        with_margin = tuple(3 * length for length in size)
         simple = Lens("radial-1" if lens.model != "none" else "none", True, lens.centred)
         try:
-            _, matrix, distortion, turns, _ = cv2.calibrateCamera(objects, images, size, None, None, flags=simple.flags)
+            _, matrix, distortion, turns, _ = cv2.calibrateCamera(
+                objects, images, with_margin, None, None, flags=simple.flags
+            )
             if device == 0:
                 check_start(poses, turns)
-            # OpenCV refuses a start whose principal point is outside the image, where a projector's may well be: the
-            # image gets a margin of its own size all round.
-            margin = np.array(size, dtype=np.float32)
-            matrix, distortion = np.array(matrix, dtype=np.float64), np.ravel(distortion).astype(np.float64)
-            matrix[:2, 2] += np.array(size)
+            guess = np.asarray(matrix, dtype=np.float64), np.resize(np.asarray(distortion, dtype=np.float64), 5)
+            flags = lens.flags + cv2.CALIB_USE_INTRINSIC_GUESS
             error, matrix, distortion, turns, shifts = cv2.calibrateCamera(
-                objects,
-                [image + margin for image in images],
-                tuple(3 * length for length in size),
-                matrix,
-                np.resize(distortion, 5),
-                flags=lens.flags + cv2.CALIB_USE_INTRINSIC_GUESS,
+                objects, images, with_margin, *guess, flags=flags
             )
-            matrix = np.array(matrix, dtype=np.float64)
-            matrix[:2, 2] -= np.array(size)
         except cv2.error as problem:
             raise CalibrationError(
                 f"OpenCV can't calibrate the {'projector' if device else 'camera'} from these poses ({problem.err}): "
@@ -184,7 +179,7 @@ def _start(
         distortion = np.resize(np.ravel(distortion), lens.coefficients)
         if not (np.isfinite(matrix).all() and np.isfinite(distortion).all()):
             raise CalibrationError("the poses don't determine the intrinsics: show the board from other directions")
-        intrinsics.append(np.concatenate([matrix[[0, 1, 0, 1], [0, 1, 2, 2]], distortion]))
+        intrinsics.append(np.concatenate([np.diag(matrix)[:2], matrix[:2, 2] - size, distortion]))
         rms.append(float(error))
         views.append((turns, shifts))
     first, second = (Rotation.from_rotvec(np.reshape(vectors, (-1, 3))) for vectors, _ in views)

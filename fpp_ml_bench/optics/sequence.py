@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.coding.code import Code, Kind, whole
-from fpp_ml_bench.coding.crossed import Crossed
-from fpp_ml_bench.coding.gray_code import GrayCells
+from fpp_ml_bench.coding.crossed import Composite, Crossed
+from fpp_ml_bench.coding.gray_code import GrayCells, GrayOnly
 from fpp_ml_bench.coding.phase_shift import Fringes, PhaseShift, equal_shifts
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.errors import RigError
@@ -272,10 +272,27 @@ class CodedSequence(AnySequence):
         return {"order": list(self.order), **crossed, **codes}
 
 
+SCHEMES: dict[str, type[Code]] = {scheme.scheme: scheme for scheme in (PhaseShift, GrayOnly, Composite)}
+
+
+def code_from_dict(entries: Mapping[str, Any], length_px: int, where: str) -> Code:
+    """The code that a rig file's entry describes, on a pattern ``length_px`` long. Raises `RigError` naming the key."""
+    if not isinstance(entries, Mapping):
+        raise RigError(f"{where}: expected a mapping with the key scheme, got {entries!r}")
+    scheme = entries.get("scheme")
+    if not isinstance(scheme, str) or scheme not in SCHEMES:
+        raise RigError(f"{where}.scheme: expected {', '.join(SCHEMES)}, got {scheme!r}")
+    rest = {key: value for key, value in entries.items() if key != "scheme"}
+    try:
+        code: Code = SCHEMES[scheme].from_entries(rest, length_px)
+        code.check(length_px)
+    except RigError as error:
+        raise RigError(f"{where}.{error}") from error
+    return code
+
+
 def sequence_from_dict(entries: object, lengths_px: Mapping[Direction, int]) -> Sequence | CodedSequence:
     """The sequence that a rig file describes, on patterns of ``lengths_px``. Raises `RigError` naming the key."""
-    from fpp_ml_bench.coding.schemes import code_from_dict
-
     if not isinstance(entries, Mapping):
         raise RigError(f"sequence: expected a mapping, got {entries!r}")
     paper = ("steps", "bits_horizontal", "bits_vertical")

@@ -10,13 +10,12 @@ import pytest
 from fpp_ml_bench.coding.code import Limits, Reason
 from fpp_ml_bench.coding.gray_code import GrayCells, GrayOnly
 from fpp_ml_bench.coding.phase_shift import PhaseShift
-from fpp_ml_bench.coding.schemes import SCHEMES, code_from_dict
 from fpp_ml_bench.errors import DecodeError, RigError
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.patterns import pattern_image
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.rig_file import load_rig, rig_from_dict, save_rig
-from fpp_ml_bench.optics.sequence import CodedSequence
+from fpp_ml_bench.optics.sequence import SCHEMES, CodedSequence, code_from_dict
 
 LENGTH = 912
 LIMITS = Limits()
