@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.calibration.boards import Board
-from fpp_ml_bench.calibration.projector_points import Pose, measure_pose
-from fpp_ml_bench.calibration.response import Levels, Response, fit_response, levels_of
+from fpp_ml_bench.calibration.projector_points import Levels, Pose, Response, fit_response, levels_of, measure_pose
 from fpp_ml_bench.calibration.result import Calibration
 from fpp_ml_bench.coding.code import MIN_MODULATION, Limits, Reason
 from fpp_ml_bench.constants import GREY_LEVELS
@@ -361,8 +360,8 @@ def calibrated_rig(found: Calibration, stand_in: Rig, range_mm: tuple[float, flo
     near, far = range_mm or (float(np.min(depths)) * (1 - RANGE_MARGIN), float(np.max(depths)) * (1 + RANGE_MARGIN))
     return replace(
         stand_in,
-        camera=found.camera.pinhole(),
-        projector=found.projector.pinhole(),
+        camera=found.camera.pinhole,
+        projector=found.projector.pinhole,
         rotation=found.rotation,
         translation_m=found.translation_m,
     ).with_range((near, far))

@@ -100,7 +100,7 @@ class PatternLight:
         count = len(self.table)
         taken, given, like = [], [], []  # per mode: the weight of each frame in it, in each frame, a frame of its kind
         sets = sequence.equal_steps()
-        for _, indices, turns in sets:
+        for indices, turns in sets:
             frames = list(indices)
             cosine, sine = cosine_of_turns(turns), sine_of_turns(turns)
             for weights, scale in ((np.ones(len(frames)), 1.0), (cosine, 2.0), (sine, 2.0)):
@@ -108,7 +108,7 @@ class PatternLight:
                 given.append(np.zeros(count))
                 taken[-1][frames], given[-1][frames] = scale / len(frames) * weights, weights
                 like.append(frames[0])
-        sinusoids = {index for _, indices, _ in sets for index in indices}
+        sinusoids = {index for indices, _ in sets for index in indices}
         for frame in (frame for frame in range(count) if frame not in sinusoids and frame != sequence.black):
             taken.append(np.eye(count)[frame])
             given.append(np.eye(count)[frame])
