@@ -19,7 +19,6 @@ from typing import Any, Literal
 
 import cv2
 import pyarrow
-import yaml
 from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, get_token
 from huggingface_hub import errors as hub_errors
 from huggingface_hub.constants import REPO_TYPES_URL_PREFIXES
@@ -31,7 +30,8 @@ from fpp_ml_bench import __version__
 from fpp_ml_bench.constants import REPOSITORY_NAME
 from fpp_ml_bench.errors import DatasetError, PublishError, RemoteError
 from fpp_ml_bench.files import file_hash, printable, read_json, write_atomically
-from fpp_ml_bench.loaders.storage.card import RIG_FILE, dataset_info
+from fpp_ml_bench.loaders.sample import DEPTHS, LABELS, PREVIEW, RANGE
+from fpp_ml_bench.loaders.storage.card import NAME, RIG_FILE, front_matter
 from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER
 from fpp_ml_bench.loaders.storage.parquet import card_configs, data_shards, overview, published_features, write_shard
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -55,7 +55,6 @@ _ANSWERS = {
 }
 
 
-NAME = "FPP-ML-Bench"
 PICTURE = "overview.png"
 OWNED = ("data/", f"{MESH_FOLDER}/")
 _LICENCE = re.compile(r"[a-z0-9][a-z0-9.-]{0,39}")
@@ -101,11 +100,6 @@ class Change:
     status: Status
     path: str
     bytes: int
-
-
-def yaml_text(content: Any, allow_unicode: bool = False) -> str:
-    """YAML as the Hub's files have it: in the order given, lines of at most 110 characters."""
-    return str(yaml.safe_dump(content, sort_keys=False, width=110, allow_unicode=allow_unicode))
 
 
 def mark_bytes(publishes: str, **about: Any) -> bytes:
@@ -363,25 +357,26 @@ def dataset_licence(dataset: DatasetFolder, license_id: str | None) -> str:
 
 def card_head(dataset: DatasetFolder, licence: str) -> str:
     """Front matter of the card, from which the Hub's viewer and ``load_dataset`` know configurations and files."""
+    from datasets import DatasetInfo, Features  # takes a second to import
+    from datasets.splits import SplitDict, SplitInfo
+
     files: dict[str, list[str]] = {split: [] for split in dataset.splits}
-    counts = {split: len(samples) for split, samples in dataset.splits.items()}
-    rows = sum(counts.values())
     for name, shard in data_shards(dataset).items():
-        files[shard.split].append(name)
-    head = {
-        "license": licence,
-        "pretty_name": NAME,
-        "task_categories": ["depth-estimation"],
-        "size_categories": ["n<1K" if rows < 1000 else "1K<n<10K" if rows < 10_000 else "10K<n<100K"],
-        "tags": ["fringe-projection-profilometry", "structured-light", "metrology", "fpp-ml-bench"],
-        # Files by name, not by pattern: a stray file can never join the data.
-        "configs": card_configs(dataset, dataset.fingerprint, files, preview=True),
-        "dataset_info": [
-            dataset_info(config, published_features(dataset, config), dataset.size, counts)
-            for config in dataset.configs
-        ],
-    }
-    return f"---\n{yaml_text(head)}---\n"
+        files[shard.split].append(name)  # by name, not by pattern: a stray file can never join the data
+    infos = []
+    for config in dataset.configs:
+        described = published_features(dataset, config)
+        levels = sum(4 if name in DEPTHS else 1 for name in described if name not in (*LABELS, *RANGE, PREVIEW))
+        row_bytes = dataset.size[0] * dataset.size[1] * levels
+        splits = [SplitInfo(name, row_bytes * len(samples), len(samples)) for name, samples in dataset.splits.items()]
+        info = DatasetInfo(
+            features=Features.from_dict(described),
+            splits=SplitDict({split.name: split for split in splits}),
+            dataset_size=sum(split.num_bytes for split in splits),
+        )
+        infos.append({"config_name": config, **info._to_yaml_dict()})
+    configs = card_configs(dataset, dataset.fingerprint, files, preview=True)
+    return front_matter(dataset.manifest, configs, licence, ["fpp-ml-bench"], dataset_info=infos)
 
 
 def stage_dataset(
@@ -399,7 +394,7 @@ def stage_dataset(
         if (folder / name).is_file():
             row_done(shard.rows)
         else:
-            write_shard(dataset, shard, folder / name, threads, row_done)
+            write_shard(dataset, shard, folder / name, row_done, threads)
     for mesh in (file for file in dataset.manifest.others if file.path.startswith(f"{MESH_FOLDER}/")):
         source = dataset.path / mesh.path
         if not source.is_file() or file_hash(source) != mesh.xxh3_128:

@@ -146,13 +146,6 @@ def config_columns(sequence: AnySequence, config: str, exact: bool) -> list[str]
     return row_columns(sequence, sequence.config(config), exact)
 
 
-def group_columns(sequence: AnySequence, group: str, frames: tuple[int, ...], exact: bool) -> list[str]:
-    """Column names of a group's files, in order."""
-    if group == DATA_GROUP:
-        return row_columns(sequence, frames, exact)
-    return [sequence.frames[i].column for i in frames]
-
-
 def features(columns: list[str], size: tuple[int, int]) -> dict[str, dict[str, Any]]:
     """The columns as ``datasets.Features`` writes them in JSON; ``size`` is (H, W)."""
     described: dict[str, dict[str, Any]] = {}

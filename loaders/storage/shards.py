@@ -4,7 +4,7 @@ import json
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,7 @@ from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders import sample as layout
 from fpp_ml_bench.loaders.sample import COVER, DATA_GROUP, DEPTH, DEPTH_EXACT, DEPTHS, FLAGS, LABELS, RANGE, Row
-from fpp_ml_bench.loaders.storage.manifest import ShardFile
-from fpp_ml_bench.optics.sequence import AnySequence
+from fpp_ml_bench.loaders.storage.manifest import WORK_FOLDER, Manifest, OtherFile, ShardFile
 
 
 class HashedFile:
@@ -68,8 +67,16 @@ OBJECTS_PER_SHARD = 4
 """Four objects are 24 rows: with batches of that size, batch boundaries no longer slow down reading (measured)."""
 ROWS_PER_SHARD, SHARD_PX = 24, 1 << 26
 """A shard's frame and depth map of every row are in memory until it is written: 0.3 GB for so many pixels."""
-Receipt = tuple[list[ShardFile], list[dict[str, Any]]]
-"""Files of a written shard, and per row its labels and measurements, and ``hashes`` of its images by column."""
+
+
+@dataclass(frozen=True)
+class Receipt:
+    """What is written of a shard: its files, per row the labels and measurements and the ``hashes`` of its images by
+    column, and the meshes of its objects."""
+
+    files: list[ShardFile]
+    rows: list[dict[str, Any]]
+    meshes: list[OtherFile] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -138,32 +145,29 @@ def arrow_schema(columns: list[str], size: tuple[int, int]) -> pa.Schema:
 
 
 class ShardWriter:
-    """Writes shards of one dataset, one after the other. Pixels are copied once, into buffers that all shards reuse.
-    ``sequence``, ``stored``, ``exact`` and ``size`` (H, W) are the dataset's, as in its `Manifest`; unfinished files
-    lie in ``scratch``."""
+    """Writes shards of the dataset that ``manifest`` describes, one after the other. Pixels are copied once, into
+    buffers that all shards reuse."""
 
-    def __init__(
-        self, folder: Path, scratch: Path, sequence: AnySequence, stored: str, exact: bool, size: tuple[int, int]
-    ) -> None:
-        self._folder, self._scratch, self._sequence, self._size = folder, scratch, sequence, size
-        self._groups = layout.stored_groups(sequence, stored)
-        self._schemas = {
-            group: arrow_schema(layout.group_columns(sequence, group, frames, exact), size)
-            for group, frames in self._groups.items()
-        }
+    def __init__(self, manifest: Manifest) -> None:
+        self._manifest, self._size = manifest, manifest.size
+        self._schemas = {group: arrow_schema(manifest.columns(group), manifest.size) for group in manifest.groups}
         self._images = [name for name in self._schemas[DATA_GROUP].names if name not in (*LABELS, *RANGE)]
         # Mapping 200 MB of new pages for every shard takes longer than filling them.
         self._buffers: dict[str, NDArray] = {}
 
-    def write(self, plan: ShardPlan, rows: Iterable[Row], row_done: Callable[[], None] = lambda: None) -> Receipt:
-        """Write the rows of ``plan``, which come in its order, and call ``row_done`` after each. Raises `BuildError`
-        when the disk is full or can't be written; no unfinished file is left."""
-        temporary = {group: self._scratch / f"{plan.name}.{os.getpid()}.{group}.tmp" for group in self._groups}
+    def write(
+        self, folder: Path, plan: ShardPlan, rows: Iterable[Row], row_done: Callable[[], None] = lambda: None
+    ) -> Receipt:
+        """Write the rows of ``plan``, which come in its order, into the dataset's folder, and call ``row_done`` after
+        each. Raises `BuildError` when the disk is full or can't be written; no unfinished file is left."""
+        scratch = folder / WORK_FOLDER
+        temporary = {group: scratch / f"{plan.name}.{os.getpid()}.{group}.tmp" for group in self._schemas}
         try:
+            scratch.mkdir(parents=True, exist_ok=True)
             described, sinks = self._write_streams(plan, rows, temporary, row_done)
             files = []
             for group, path in temporary.items():
-                target = self._folder / plan.path(group)
+                target = folder / plan.path(group)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 path.replace(target)
                 place = (plan.path(group), plan.split, group, plan.first_row, len(plan.samples))
@@ -171,13 +175,13 @@ class ShardWriter:
         except (OSError, pa.ArrowException) as error:
             number = getattr(error, "errno", None)
             reason = os.strerror(number) if number else error
-            where = self._folder / plan.path(DATA_GROUP)
+            where = folder / plan.path(DATA_GROUP)
             advice = "free some space or choose another disk, then run the same command again: it resumes"
             raise BuildError(f"{where}: can't be written ({reason}); {advice}") from error
         finally:
             for path in temporary.values():
                 path.unlink(missing_ok=True)
-        return files, described
+        return Receipt(files, described)
 
     def _write_streams(
         self, plan: ShardPlan, rows: Iterable[Row], paths: dict[str, Path], row_done: Callable[[], None]
@@ -201,8 +205,8 @@ class ShardWriter:
                     values.append(value)
                 # The data group is one batch of all rows. All frames but the first are written at once, one row per
                 # batch, and not held in memory.
-                for group, frames in self._groups.items():
-                    images: dict[str, Any] = {self._sequence.frames[i].column: row.frames[i] for i in frames}
+                for group, frames in self._manifest.groups.items():
+                    images: dict[str, Any] = {self._manifest.sequence.frames[i].column: row.frames[i] for i in frames}
                     if group == DATA_GROUP:
                         images |= {DEPTH: row.depth_mm, DEPTH_EXACT: row.depth_exact_mm}
                         images |= {FLAGS: row.flags, COVER: row.cover}

@@ -29,7 +29,6 @@ from fpp_ml_bench.loaders.sample import (
     Flag,
     config_columns,
     exact_void,
-    stored_groups,
     void_pixels,
 )
 from fpp_ml_bench.loaders.storage.manifest import MANIFEST, ShardFile, read_manifest
@@ -112,14 +111,14 @@ class DatasetFolder:
         """The rig whose camera took the images."""
         return rig_from_dict(self.manifest.rig)
 
-    @cached_property
+    @property
     def sequence(self) -> AnySequence:
         return self.manifest.sequence
 
     @property
     def configs(self) -> tuple[str, ...]:
         """Configurations whose frames are stored here."""
-        return layout.available_configs(self.sequence, self.manifest.stored)
+        return self.manifest.configs
 
     @property
     def has_exact(self) -> bool:
@@ -200,7 +199,7 @@ class DatasetFolder:
 
     def frame(self, sample: str, index: int) -> NDArray[np.uint8]:
         """One captured frame, uint8 (H, W). Raises `DatasetError` when the dataset does not store it."""
-        for group, frames in stored_groups(self.sequence, self.manifest.stored).items():
+        for group, frames in self.manifest.groups.items():
             if index in frames:
                 return self._image(sample, group, self.sequence.frames[index].column)
         raise DatasetError(
@@ -330,7 +329,7 @@ def _joined_split(dataset: DatasetFolder, config: str, split: str) -> "Dataset":
 
     columns = config_columns(dataset.sequence, config, dataset.has_exact)
     tables = []
-    for group in stored_groups(dataset.sequence, dataset.manifest.stored):
+    for group in dataset.manifest.groups:
         shards = [s for s in dataset.manifest.shards if s.split == split and s.group == group]
         files = [MemoryMappedTable.from_file(str(dataset.path / shard.path)) for shard in shards]
         names = [name for name in files[0].column_names if name in columns]

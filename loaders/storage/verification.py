@@ -23,9 +23,7 @@ from fpp_ml_bench.loaders.sample import (
     PIXEL_MAPS,
     RANGE,
     Flag,
-    group_columns,
     image_hash,
-    stored_groups,
 )
 from fpp_ml_bench.loaders.storage.manifest import CAPTURED, GENERATED, MANIFEST, WORK_FOLDER, Manifest, ShardFile
 from fpp_ml_bench.loaders.storage.shards import arrow_schema
@@ -101,10 +99,9 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: ImageHashes
     path = opened.path / shard.path
     manifest = opened.manifest
     rows = manifest.samples.get(shard.split, [])[shard.first_row : shard.first_row + shard.rows]
-    frames = stored_groups(opened.sequence, manifest.stored).get(shard.group)
-    if frames is None or len(rows) != shard.rows:
-        return [f"{path}: the manifest has no such rows or columns"]
-    expected = group_columns(opened.sequence, shard.group, frames, manifest.exact)
+    if len(rows) != shard.rows:
+        return [f"{path}: the manifest has no such rows"]
+    expected = manifest.columns(shard.group)
     batches = opened.record_batches(shard)
     right = batches and _types(batches[0].schema) == _types(arrow_schema(expected, manifest.size))
     if not right or sum(len(b) for b in batches) != shard.rows:
@@ -155,7 +152,7 @@ def _coverage_findings(manifest: Manifest) -> list[str]:
     """Rows that no file holds, or more than one: every group's files must follow on from each other."""
     findings = []
     for split, rows in manifest.samples.items():
-        for group in stored_groups(manifest.sequence, manifest.stored):
+        for group in manifest.groups:
             files = [shard for shard in manifest.shards if (shard.split, shard.group) == (split, group)]
             ends = list(accumulate((shard.rows for shard in files), initial=0))
             if ends[-1] != len(rows) or ends[:-1] != [shard.first_row for shard in files]:
