@@ -194,34 +194,24 @@ class Hub:
             owners = ", ".join(printable(name, 60) for name in sorted(names))
             raise PublishError(f"{repo}: does not exist, and this token may make repositories of {owners} only")
 
-    def state(self, kind: Kind, repo: str) -> Remote:
-        """A repository's commit, visibility and files; a `Remote` without a commit where no repository is visible."""
+    def state(self, kind: Kind, repo: str, revision: str | None = None) -> Remote:
+        """A repository's commit, visibility and files at a branch, tag or commit, by default on its main branch; a
+        `Remote` without a commit where no repository is visible."""
         with self._explained(f"reading {kind} {repo}"):
             try:
-                info = self._api.repo_info(repo, repo_type=kind)
+                info = self._api.repo_info(repo, repo_type=kind, revision=revision)
+            except hub_errors.RevisionNotFoundError as error:
+                raise self._error(f"{repo}: has no branch, tag or commit {printable(revision, 60)!r}") from error
+            except hub_errors.GatedRepoError:
+                raise
             except hub_errors.RepositoryNotFoundError as error:
                 # Without a token the Hub answers 401, not 404, for a repository that is private or missing.
                 if error.response.status_code == 401 and get_token():
                     raise
                 return Remote(None)
-            return self._remote(kind, repo, info)
-
-    def contents(self, repo: str, revision: str | None) -> Remote:
-        """Commit and files of a dataset at a branch, tag or commit, by default on its main branch. `RemoteError` where
-        there is none."""
-        with self._explained(f"reading dataset {repo}"):
-            try:
-                info = self._api.repo_info(repo, repo_type="dataset", revision=revision)
-            except hub_errors.RevisionNotFoundError as error:
-                raise self._error(f"{repo}: has no branch, tag or commit {printable(revision, 60)!r}") from error
-            except hub_errors.RepositoryNotFoundError as error:
-                if isinstance(error, hub_errors.GatedRepoError) or (error.response.status_code == 401 and get_token()):
-                    raise
-                raise self._error(
-                    f"{repo}: no such folder here, and no such dataset on {self.endpoint}, or it is private; check the "
-                    "name, or run 'hf auth login' with a token that may read it"
-                ) from error
-            return self._remote("dataset", repo, info)
+            tree = self._api.list_repo_tree(repo, repo_type=kind, recursive=True, revision=info.sha)
+            files = {entry.path: entry for entry in tree if isinstance(entry, RepoFile)}
+            return Remote(info.sha or "", bool(info.private), files)
 
     def download(self, repo: str, commit: str, patterns: list[str]) -> Path:
         """Download files of a dataset whose names match ``patterns`` into the client's cache, but for those that are
@@ -229,11 +219,6 @@ class Hub:
         with self._explained(f"downloading dataset {repo}"):
             folder = self._api.snapshot_download(repo, repo_type="dataset", revision=commit, allow_patterns=patterns)
         return Path(folder)
-
-    def _remote(self, kind: Kind, repo: str, info: Any) -> Remote:
-        tree = self._api.list_repo_tree(repo, repo_type=kind, recursive=True, revision=info.sha)
-        files = {entry.path: entry for entry in tree if isinstance(entry, RepoFile)}
-        return Remote(info.sha or "", bool(info.private), files)
 
     def mark(self, kind: Kind, repo: str, remote: Remote) -> dict[str, Any]:
         """Content of `MARK` in a repository; `PublishError` where the file is missing or damaged."""

@@ -1,7 +1,6 @@
 """A dataset of the published layout on the Hugging Face Hub: the files of it that an import reads, and downloading them
 into the cache of ``huggingface_hub``, where a download that was stopped continues."""
 
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +8,8 @@ from huggingface_hub import constants, try_to_load_from_cache
 from huggingface_hub.utils import filter_repo_objects
 
 from fpp_ml_bench.constants import FULL_SIZE
-from fpp_ml_bench.errors import BuildError, LayoutError
+from fpp_ml_bench.errors import LayoutError, RemoteError
+from fpp_ml_bench.files import check_space
 from fpp_ml_bench.loaders.hub import MARK, Hub
 from fpp_ml_bench.loaders.published.importing import Source
 from fpp_ml_bench.loaders.published.tree import FRINGE, INFO, RAW_SCANS, TRAINING, VARIANT_FOLDERS
@@ -35,8 +35,13 @@ class Download:
 def plan_download(hub: Hub, repository: str, revision: str | None = None, raw_scans: bool = False) -> Download:
     """What an import of ``repository`` at ``revision`` (branch, tag or commit; None: its main branch) downloads: the
     depth variant that it reads, the depth ranges and, with ``raw_scans``, the frames of the raw scans. Raises
-    `RemoteError` as `Hub.contents`, `LayoutError` for a repository without the published layout or raw scans."""
-    remote = hub.contents(repository, revision)
+    `RemoteError` as `Hub.state`, `LayoutError` for a repository without the published layout or raw scans."""
+    remote = hub.state("dataset", repository, revision)
+    if not remote.exists:
+        raise RemoteError(
+            f"{repository}: no such folder here, and no such dataset on {hub.endpoint}, or it is private; check the "
+            "name, or run 'hf auth login' with a token that may read it"
+        )
 
     def matching(*patterns: str) -> dict[str, int]:
         names = filter_repo_objects(remote.files, allow_patterns=list(patterns))
@@ -67,25 +72,10 @@ def fetch_tree(hub: Hub, download: Download, out: Path) -> Path:
     Raises `BuildError` where a disk has no space for the download and the dataset to be written to ``out``,
     `RemoteError` as `Hub.download`."""
     if download.missing:
-        _check_space(download, out)
+        # The import is estimated for images of the paper's size.
+        frames = len(PAPER_SEQUENCE) if RAW_SCANS in download.source.folders else 1
+        samples = sum(f"/{FRINGE}/" in name for name in download.sizes)
+        imported, downloaded = samples * FULL_SIZE**2 * (frames + _DEPTH_BYTES), sum(download.missing.values())
+        cure = " for the download (HF_HOME) or the dataset (--out)"
+        check_space({download.cache: downloaded, out: imported}, "download and import need", cure)
     return hub.download(download.source.repository, download.source.commit, list(download.patterns))
-
-
-def _check_space(download: Download, out: Path) -> None:
-    """Raise `BuildError` for a disk that is too small. The import is estimated for images of the paper's size."""
-    frames = len(PAPER_SEQUENCE) if RAW_SCANS in download.source.folders else 1
-    samples = sum(f"/{FRINGE}/" in name for name in download.sizes)
-    imported, downloaded = samples * FULL_SIZE**2 * (frames + _DEPTH_BYTES), sum(download.missing.values())
-    cache, target = (
-        next(parent for parent in (folder, *folder.parents) if parent.exists())
-        for folder in (download.cache.absolute(), out.absolute())
-    )
-    same = cache.stat().st_dev == target.stat().st_dev
-    for disk, needed in ((cache, downloaded + same * imported), (target, imported)):
-        free = shutil.disk_usage(disk).free
-        if needed > free:
-            raise BuildError(
-                f"{disk}: the disk has {free / 1e9:.2f} GB free, and download and import need about "
-                f"{needed / 1e9:.2f} GB there; free some space, or choose another disk for the download (HF_HOME) or "
-                "the dataset (--out)"
-            )

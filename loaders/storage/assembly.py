@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.files import cause_of, exclusive, file_hash, read_json, write_atomically
+from fpp_ml_bench.files import cause_of, check_space, exclusive, file_hash, read_json, write_atomically
 from fpp_ml_bench.loaders.sample import Row, column_hash
 from fpp_ml_bench.loaders.storage.card import write_card
 from fpp_ml_bench.loaders.storage.manifest import (
@@ -138,7 +138,10 @@ def assemble(
                     written[name] = None
             missing = [plan for plan in assembly.plans if written[plan.name] is None]
             if isinstance(place, Path):
-                _check_space(place, assembly.manifest.row_bytes * sum(len(plan.samples) for plan in missing))
+                needed = assembly.manifest.row_bytes * sum(len(plan.samples) for plan in missing)
+                check_space(
+                    {place: needed + _RESERVE_BYTES}, "the dataset needs", ", a smaller --size or fewer --objects"
+                )
             progress(sum(len(plan.samples) for plan in assembly.plans if written[plan.name] is not None))
             _write_shards(ShardWork(assembly, place), missing, written, workers, cluster, progress)
             return _finish(place, folder, assembly, [receipt for receipt in written.values() if receipt is not None])
@@ -305,12 +308,3 @@ def planned_receipt(file: Path, plan: ShardPlan) -> Receipt | None:
     labels = tuple((row["sample"], row["object"], row["view"]) for row in receipt.rows)
     named = all(file.path == plan.path(file.group) and file.split == plan.split for file in receipt.files)
     return receipt if labels == plan.samples and named else None
-
-
-def _check_space(folder: Path, needed: int) -> None:
-    free = shutil.disk_usage(folder).free
-    if needed + _RESERVE_BYTES > free:
-        raise BuildError(
-            f"{folder}: needs {needed / 1e9:.2f} GB more and the disk has {free / 1e9:.2f} GB free; free some space, "
-            "choose another disk, a smaller --size or fewer --objects"
-        )

@@ -175,7 +175,7 @@ def _stored_columns(dataset: DatasetFolder, parts: list[ShardFile]) -> dict[str,
     """Columns of shard files, memory-mapped from disk: what is written has the same bits."""
     stored = {}
     for part in parts:
-        batches = dataset.record_batches(part)
+        batches = dataset.mapped(part).batches
         for name in batches[0].schema.names:
             # An Array2D extension where `datasets` has been imported; the lists it stores are the same.
             arrays = (batch.column(name) for batch in batches)

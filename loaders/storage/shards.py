@@ -10,58 +10,14 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import xxhash
 from numpy.typing import NDArray
 
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import BuildError
+from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders import sample as layout
 from fpp_ml_bench.loaders.sample import COVER, DATA_GROUP, DEPTH, DEPTH_EXACT, DEPTHS, FLAGS, LABELS, RANGE, Row
 from fpp_ml_bench.loaders.storage.manifest import WORK_FOLDER, Manifest, OtherFile, ShardFile
-
-
-class HashedFile:
-    """A new file for sequential writing, in the form that ``pyarrow.PythonFile`` takes. After `close`, ``size`` bytes
-    with hash ``xxh3_128`` are on the disk, and no longer in the cache, where gigabytes of shards would push out
-    everything else. Raises ``OSError`` where the disk can't be written."""
-
-    def __init__(self, path: Path) -> None:
-        self._hash = xxhash.xxh3_128()
-        self._file = path.open("wb", buffering=0)
-        self.size = 0
-
-    def write(self, data: object) -> int:
-        """Append ``data`` (any bytes-like object); returns its length."""
-        view = memoryview(data).cast("B")  # type: ignore[arg-type]
-        self._hash.update(view)
-        self.size += len(view)
-        rest = view
-        while len(rest):
-            rest = rest[self._file.write(rest) :]
-        return len(view)
-
-    def flush(self) -> None:
-        """Does nothing, but pyarrow calls it."""
-
-    @property
-    def closed(self) -> bool:
-        return self._file.closed
-
-    def close(self) -> None:
-        """Wait until everything is on the disk."""
-        if self.closed:
-            return
-        try:
-            os.fdatasync(self._file.fileno())
-            os.posix_fadvise(self._file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-        finally:
-            self._file.close()
-
-    @property
-    def xxh3_128(self) -> str:
-        """Hash of everything written."""
-        return self._hash.hexdigest()
-
 
 OBJECTS_PER_SHARD = 4
 """Four objects are 24 rows: with batches of that size, batch boundaries no longer slow down reading (measured)."""
@@ -164,14 +120,15 @@ class ShardWriter:
         temporary = {group: scratch / f"{plan.name}.{os.getpid()}.{group}.tmp" for group in self._schemas}
         try:
             scratch.mkdir(parents=True, exist_ok=True)
-            described, sinks = self._write_streams(plan, rows, temporary, row_done)
+            described = self._write_streams(plan, rows, temporary, row_done)
             files = []
             for group, path in temporary.items():
+                size, digest = _settled(path)
                 target = folder / plan.path(group)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 path.replace(target)
                 place = (plan.path(group), plan.split, group, plan.first_row, len(plan.samples))
-                files.append(ShardFile(*place, bytes=sinks[group].size, xxh3_128=sinks[group].xxh3_128))
+                files.append(ShardFile(*place, size, digest))
         except (OSError, pa.ArrowException) as error:
             number = getattr(error, "errno", None)
             reason = os.strerror(number) if number else error
@@ -185,13 +142,12 @@ class ShardWriter:
 
     def _write_streams(
         self, plan: ShardPlan, rows: Iterable[Row], paths: dict[str, Path], row_done: Callable[[], None]
-    ) -> tuple[list[dict[str, Any]], dict[str, HashedFile]]:
+    ) -> list[dict[str, Any]]:
         with ExitStack() as files:
-            sinks, writers = {}, {}
+            writers = {}
             for group, path in paths.items():
-                sinks[group] = HashedFile(path)
-                files.callback(sinks[group].close)
-                writers[group] = pa.ipc.new_stream(pa.PythonFile(sinks[group], mode="w"), self._schemas[group])
+                sink = files.enter_context(path.open("wb"))
+                writers[group] = pa.ipc.new_stream(pa.PythonFile(sink, mode="w"), self._schemas[group])
             described = []
             data: dict[str, list[Any]] = {name: [] for name in (*LABELS, *RANGE)}
             for number, row in enumerate(_in_order(plan, rows)):
@@ -225,7 +181,7 @@ class ShardWriter:
             writers[DATA_GROUP].write_batch(_record_batch(columns, schema))
             for writer in writers.values():
                 writer.close()
-        return described, sinks
+        return described
 
     def _buffer(self, column: str, rows: int) -> NDArray:
         if column not in self._buffers or len(self._buffers[column]) < rows:
@@ -238,6 +194,16 @@ class ShardWriter:
             received = "nothing" if image is None else f"{image.dtype} {image.shape}"
             raise BuildError(f"column {column}: expected {_dtype(column)} {self._size}, got {received}")
         return image
+
+
+def _settled(path: Path) -> tuple[int, str]:
+    """Bytes and hash of a file just written. It is on the disk then, and no longer in the cache, where gigabytes of
+    shards would push out everything else."""
+    with path.open("rb") as file:
+        os.fdatasync(file.fileno())
+        digest = file_hash(path)
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        return file.seek(0, os.SEEK_END), digest
 
 
 def _dtype(column: str) -> np.dtype:

@@ -55,10 +55,7 @@ class DatasetFolder:
         """With ``check`` off, the folder opens even if some of its files are missing or cut."""
         self.path = Path(path)
         self.manifest = read_manifest(self.path)
-        self._batches: dict[str, list[pa.RecordBatch]] = {}
-        self._images: dict[tuple[str, str], list[NDArray]] = {}
-        self._maps: dict[str, mmap.mmap] = {}
-        self._look_s: dict[str, float] = {}
+        self._mapped: dict[str, MappedShard] = {}
         for shard in self.manifest.shards if check else ():
             file = self.path / shard.path
             size = file.stat().st_size if file.is_file() else None
@@ -68,10 +65,7 @@ class DatasetFolder:
 
     def forget(self, shard: ShardFile) -> None:
         """Close the memory maps of a file."""
-        self._batches.pop(shard.path, None)
-        self._maps.pop(shard.path, None)
-        for key in [key for key in self._images if key[0] == shard.path]:
-            del self._images[key]
+        self._mapped.pop(shard.path, None)
 
     def __reduce__(self) -> tuple[type["DatasetFolder"], tuple[Path]]:
         return DatasetFolder, (self.path,)
@@ -216,12 +210,9 @@ class DatasetFolder:
         a split, it keeps the memory from growing with the number of samples."""
         split, row = self._find(sample)
         for shard in self.manifest.shards:
-            mapped_file = self._maps.get(shard.path)
-            if mapped_file is None or shard.split != split or not 0 <= row - shard.first_row < shard.rows:
+            if shard.path not in self._mapped or shard.split != split or not 0 <= row - shard.first_row < shard.rows:
                 continue
-            for column in self.record_batches(shard)[0].schema.names:
-                if (shard.path, column) in self._images:
-                    release_pages(self._row_of(shard, column, row), mapped_file)
+            self._mapped[shard.path].release(row - shard.first_row)
             if row - shard.first_row == shard.rows - 1:
                 self.forget(shard)  # pages between its images stay mapped as long as the file is
 
@@ -229,51 +220,61 @@ class DatasetFolder:
         split, row = self._find(sample)
         for shard in self.manifest.shards:
             if shard.split == split and shard.group == group and 0 <= row - shard.first_row < shard.rows:
-                return self._row_of(shard, column, row)
+                return self.mapped(shard).image(column, row - shard.first_row)
         raise DatasetError(f"{self.path}: no file holds row {row} of {group} in {split}; run: fpp-bench verify")
 
-    def _row_of(self, shard: ShardFile, column: str, row: int) -> NDArray:
-        """Image of row ``row`` of the split, from the file that holds it."""
-        row -= shard.first_row
-        for images in self.column_images(shard, column):
+    def mapped(self, shard: ShardFile) -> "MappedShard":
+        """A file of the dataset, memory-mapped."""
+        if shard.path not in self._mapped:
+            self._mapped[shard.path] = MappedShard(self.path / shard.path, self.size)
+        return self._mapped[shard.path]
+
+
+class MappedShard:
+    """An Arrow file, memory-mapped: its record ``batches``, and their columns as images of ``size`` (H, W). Raises
+    `DatasetError` naming the file where it can't be read."""
+
+    def __init__(self, path: Path, size: tuple[int, int]) -> None:
+        import pyarrow as pa
+
+        self.path, self._size = path, size
+        self._images: dict[str, list[NDArray]] = {}
+        self._look_s = 0.0
+        try:
+            with path.open("rb") as file:
+                self._file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            self.batches: list[pa.RecordBatch] = list(pa.ipc.open_stream(pa.py_buffer(self._file)))
+        except (pa.ArrowException, OSError, ValueError) as error:
+            raise DatasetError(f"{path}: can't be read as Arrow ({error}); run: fpp-bench verify") from error
+
+    def images(self, column: str) -> list[NDArray]:
+        """A column as images: a read-only view (rows, H, W) per record batch."""
+        if column not in self._images:
+            try:
+                self._images[column] = [self._views(batch.column(column)) for batch in self.batches]
+            except (ValueError, KeyError, AttributeError) as error:
+                expected = f"does not hold images of {self._size[0]} x {self._size[1]} px ({error})"
+                raise DatasetError(f"{self.path}: column {column} {expected}; run: fpp-bench verify") from error
+        if (now_s := monotonic()) > self._look_s:
+            self._look_s = now_s + LOOK_EVERY_S
+            if (size := self._file.size()) < len(self._file):
+                # Reading pages that the file no longer has would end the process (SIGBUS).
+                cut = f"was cut to {size} of {len(self._file)} bytes while it was read"
+                raise DatasetError(f"{self.path}: {cut}; build or copy the dataset again")
+        return self._images[column]
+
+    def image(self, column: str, row: int) -> NDArray:
+        """The image of a row of the file."""
+        for images in self.images(column):
             if row < len(images):
                 return images[row]
             row -= len(images)
-        raise DatasetError(f"{self.path / shard.path}: fewer rows than its manifest says; run: fpp-bench verify")
+        raise DatasetError(f"{self.path}: fewer rows than its manifest says; run: fpp-bench verify")
 
-    def record_batches(self, shard: ShardFile) -> "list[pa.RecordBatch]":
-        """Record batches of a file, memory-mapped."""
-        if shard.path not in self._batches:
-            import pyarrow as pa
-
-            path = self.path / shard.path
-            try:
-                with path.open("rb") as file:
-                    mapped_file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-                self._batches[shard.path] = list(pa.ipc.open_stream(pa.py_buffer(mapped_file)))
-                self._maps[shard.path] = mapped_file
-            except (pa.ArrowException, OSError, ValueError) as error:
-                raise DatasetError(f"{path}: can't be read as Arrow ({error}); run: fpp-bench verify") from error
-        return self._batches[shard.path]
-
-    def column_images(self, shard: ShardFile, column: str) -> list[NDArray]:
-        """A column of a file as images: a read-only view (rows, H, W) per record batch."""
-        key = shard.path, column
-        if key not in self._images:
-            try:
-                self._images[key] = [self._views(batch.column(column)) for batch in self.record_batches(shard)]
-            except (ValueError, KeyError, AttributeError) as error:
-                expected = f"does not hold images of {self.size[0]} x {self.size[1]} px ({error})"
-                where = f"{self.path / shard.path}: column {column}"
-                raise DatasetError(f"{where} {expected}; run: fpp-bench verify") from error
-        if (now_s := monotonic()) > self._look_s.get(shard.path, 0.0):
-            self._look_s[shard.path] = now_s + LOOK_EVERY_S
-            mapped_file = self._maps.get(shard.path)
-            if mapped_file is not None and (size := mapped_file.size()) < len(mapped_file):
-                # Reading pages that the file no longer has would end the process (SIGBUS).
-                cut = f"was cut to {size} of {len(mapped_file)} bytes while it was read"
-                raise DatasetError(f"{self.path / shard.path}: {cut}; build or copy the dataset again")
-        return self._images[key]
+    def release(self, row: int) -> None:
+        """Release the memory of the images of a row that were read."""
+        for column in self._images:
+            release_pages(self.image(column, row), self._file)
 
     def _views(self, column: "pa.Array") -> NDArray:
         storage = getattr(column, "storage", column)  # an Array2D extension where `datasets` has been imported
@@ -281,7 +282,7 @@ class DatasetFolder:
         dtype = np.dtype(np.uint8 if flat.type.bit_width == 8 else np.float32)
         # Not flat.to_numpy(): that imports pandas where it is installed, which takes longer than scoring a test split.
         pixels = np.frombuffer(flat.buffers()[1], dtype, len(flat), flat.offset * dtype.itemsize)
-        return pixels.reshape(len(storage), *self.size)
+        return pixels.reshape(len(storage), *self._size)
 
 
 FAULT_AROUND_BYTES = 1 << 16

@@ -102,7 +102,8 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: ImageHashes
     if len(rows) != shard.rows:
         return [f"{path}: the manifest has no such rows"]
     expected = manifest.columns(shard.group)
-    batches = opened.record_batches(shard)
+    mapped = opened.mapped(shard)
+    batches = mapped.batches
     right = batches and _types(batches[0].schema) == _types(arrow_schema(expected, manifest.size))
     if not right or sum(len(b) for b in batches) != shard.rows:
         return [f"{path}: its rows or columns are not those the manifest says"]
@@ -110,7 +111,7 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: ImageHashes
     for column in expected:
         if column in (*LABELS, *RANGE):
             continue
-        images = (image for batch in opened.column_images(shard, column) for image in batch)
+        images = (image for batch in mapped.images(column) for image in batch)
         for row, image in zip(rows, images, strict=True):
             if column in DEPTHS:
                 findings += _depth_findings(f"{path}: sample {row['sample']!r}, column {column}", column, row, image)
