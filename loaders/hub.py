@@ -1,5 +1,7 @@
-"""A folder of staged files on the Hugging Face Hub: what publishing would change, and sending it; and staging a
-dataset: Parquet that the Hub's viewer shows, meshes, rig, and the head of the card.
+"""Datasets on the Hugging Face Hub. A folder of staged files: what publishing would change, and sending it. Staging a
+dataset: Parquet that the Hub's viewer shows, meshes, rig, and the head of the card. And of a dataset of the published
+layout the files that an import reads, and downloading them into the cache of ``huggingface_hub``, where a download that
+was stopped continues.
 
 Files are compared by the hashes that the Hub stores (SHA-256 of a large file, git's hash of a small one), so a dry run
 can tell what would change. Every error of the client becomes a `PublishError` that says what to do; the client reads
@@ -19,23 +21,32 @@ from typing import Any, Literal
 
 import cv2
 import pyarrow
-from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, get_token
+from huggingface_hub import (
+    CommitOperationAdd,
+    CommitOperationDelete,
+    HfApi,
+    constants,
+    get_token,
+    try_to_load_from_cache,
+)
 from huggingface_hub import errors as hub_errors
-from huggingface_hub.constants import REPO_TYPES_URL_PREFIXES
 from huggingface_hub.hf_api import RepoFile
-from huggingface_hub.utils import disable_progress_bars
+from huggingface_hub.utils import disable_progress_bars, filter_repo_objects
 from huggingface_hub.utils.sha import git_hash
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.constants import REPOSITORY_NAME
-from fpp_ml_bench.errors import DatasetError, PublishError, RemoteError
-from fpp_ml_bench.files import file_hash, printable, read_json, write_atomically
+from fpp_ml_bench.constants import FULL_SIZE, REPOSITORY_NAME
+from fpp_ml_bench.errors import DatasetError, LayoutError, PublishError, RemoteError
+from fpp_ml_bench.files import check_space, printable, read_json, write_atomically
+from fpp_ml_bench.loaders.published.importing import Source
+from fpp_ml_bench.loaders.published.tree import FRINGE, INFO, RAW_SCANS, TRAINING, VARIANT_FOLDERS
 from fpp_ml_bench.loaders.sample import DEPTHS, LABELS, PREVIEW, RANGE
 from fpp_ml_bench.loaders.storage.card import NAME, RIG_FILE, front_matter
-from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER
+from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER, damage_of
 from fpp_ml_bench.loaders.storage.parquet import card_configs, data_shards, overview, published_features, write_shard
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.rig_file import save_rig
+from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
 Kind = Literal["dataset", "space", "model"]
 Status = Literal["new", "changed", "unchanged", "deleted"]
@@ -59,6 +70,8 @@ PICTURE = "overview.png"
 OWNED = ("data/", f"{MESH_FOLDER}/")
 _LICENCE = re.compile(r"[a-z0-9][a-z0-9.-]{0,39}")
 _IDENTITY, _FILES = "staged.sha256", "files"
+_SCAN_FRAMES = f"{RAW_SCANS}/*/A_*.png"
+_DEPTH_BYTES = 4
 
 
 class Unreachable(PublishError, RemoteError):
@@ -180,7 +193,7 @@ class Hub:
             raise self._error(f"HF_ENDPOINT: expected a URL like https://huggingface.co, got {self.endpoint!r}")
 
     def url(self, kind: Kind, repo: str) -> str:
-        return f"{self.endpoint}/{REPO_TYPES_URL_PREFIXES.get(kind, '')}{repo}"
+        return f"{self.endpoint}/{constants.REPO_TYPES_URL_PREFIXES.get(kind, '')}{repo}"
 
     def check_token(self) -> set[str]:
         """Names that the token may publish under: its user and their organisations. `PublishError` without a token."""
@@ -381,11 +394,10 @@ def stage_dataset(
         else:
             write_shard(dataset, shard, folder / name, row_done, threads)
     for mesh in (file for file in dataset.manifest.others if file.path.startswith(f"{MESH_FOLDER}/")):
-        source = dataset.path / mesh.path
-        if not source.is_file() or file_hash(source) != mesh.xxh3_128:
-            raise DatasetError(f"{source}: missing or damaged, it isn't published; build the dataset again")
+        if damage := damage_of(dataset.path, mesh):
+            raise DatasetError(damage)
         (folder / MESH_FOLDER).mkdir(exist_ok=True)
-        shutil.copyfile(source, folder / mesh.path)
+        shutil.copyfile(dataset.path / mesh.path, folder / mesh.path)
     save_rig(dataset.rig, folder / RIG_FILE)
     write_atomically(folder / PICTURE, overview(dataset))
     for name, text in texts.items():
@@ -394,3 +406,65 @@ def stage_dataset(
     marked = mark_bytes("dataset", **about, splits=dataset.splits, content=dataset.content)
     write_atomically(folder / MARK, marked)
     return Publication("dataset", repo, folder, f"{NAME} dataset {dataset.fingerprint[:12]}", OWNED)
+
+
+@dataclass(frozen=True)
+class Download:
+    """What an import downloads from ``source``: ``sizes`` in bytes by name of file, those matched by ``patterns``.
+    ``missing`` are those of them that ``cache`` does not hold, ``raw_scans`` the images that are left out."""
+
+    source: Source
+    patterns: tuple[str, ...]
+    sizes: dict[str, int]
+    missing: dict[str, int]
+    raw_scans: dict[str, int]
+    cache: Path
+
+
+def plan_download(hub: Hub, repository: str, revision: str | None = None, raw_scans: bool = False) -> Download:
+    """What an import of ``repository`` at ``revision`` (branch, tag or commit; None: its main branch) downloads: the
+    depth variant that it reads, the depth ranges and, with ``raw_scans``, the frames of the raw scans. Raises
+    `RemoteError` as `Hub.state`, `LayoutError` for a repository without the published layout or raw scans."""
+    remote = hub.state("dataset", repository, revision)
+    if not remote.exists:
+        raise RemoteError(
+            f"{repository}: no such folder here, and no such dataset on {hub.endpoint}, or it is private; check the "
+            "name, or run 'hf auth login' with a token that may read it"
+        )
+
+    def matching(*patterns: str) -> dict[str, int]:
+        names = filter_repo_objects(remote.files, allow_patterns=list(patterns))
+        return {name: remote.files[name].size for name in names}
+
+    variant = next((name for name in VARIANT_FOLDERS.values() if matching(f"{TRAINING}/{name}/*")), None)
+    scans = matching(_SCAN_FRAMES)
+    if variant is None:
+        hint = f"expected {TRAINING}/ with one of {', '.join(VARIANT_FOLDERS.values())}"
+        if MARK in remote.files:
+            hint = f'it holds Parquet files, which datasets.load_dataset("{repository}") opens'
+        raise LayoutError(f"{repository}: this dataset does not have the published layout; {hint}")
+    if raw_scans and not scans:
+        raise LayoutError(f"{repository}: has no raw scans ({RAW_SCANS}/), only the single-shot images and their depth")
+    patterns = (f"{TRAINING}/{variant}/*", f"{TRAINING}/{INFO}/*", *([_SCAN_FRAMES] if raw_scans else []))
+    sizes, commit = matching(*patterns), remote.commit or ""
+    missing = {
+        name: size
+        for name, size in sizes.items()
+        if not isinstance(try_to_load_from_cache(repository, name, revision=commit, repo_type="dataset"), str)
+    }
+    source = Source(repository, commit, (variant, *([RAW_SCANS] if raw_scans else [])))
+    return Download(source, patterns, sizes, missing, {} if raw_scans else scans, Path(constants.HF_HUB_CACHE))
+
+
+def fetch_tree(hub: Hub, download: Download, out: Path) -> Path:
+    """Download what is missing, with the client's own progress bars; returns the folder of the tree in the cache.
+    Raises `BuildError` where a disk has no space for the download and the dataset to be written to ``out``,
+    `RemoteError` as `Hub.download`."""
+    if download.missing:
+        # The import is estimated for images of the paper's size.
+        frames = len(PAPER_SEQUENCE) if RAW_SCANS in download.source.folders else 1
+        samples = sum(f"/{FRINGE}/" in name for name in download.sizes)
+        imported, downloaded = samples * FULL_SIZE**2 * (frames + _DEPTH_BYTES), sum(download.missing.values())
+        cure = " for the download (HF_HOME) or the dataset (--out)"
+        check_space({download.cache: downloaded, out: imported}, "download and import need", cure)
+    return hub.download(download.source.repository, download.source.commit, list(download.patterns))

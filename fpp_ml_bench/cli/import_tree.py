@@ -144,7 +144,7 @@ def _import_captures(settings: ImportSettings) -> None:
     plan = plan_captures(
         settings.tree, load_rig(settings.rig), splits, limits, settings.bits, settings.colour, settings.anyway
     )
-    count, images = len(plan.reader.samples), len(plan.reader.rig.sequence)
+    count, images = len(plan.rows.samples), len(plan.rows.rig.sequence)
     started = perf_counter()
     with progress_bar("importing", count, "samples") as advance:
         manifest = import_rows(settings.out, plan, settings.workers or usable_cores(), advance)
@@ -178,8 +178,7 @@ def _print_end(out: Path, manifest: "Manifest", images: int, seconds: float, not
 
 def _fetch(settings: ImportSettings) -> tuple[Path, Source]:
     """Download what the import needs of a dataset of the Hub: the folder of its tree, and where it is from."""
-    from fpp_ml_bench.loaders.hub import Hub  # imports huggingface_hub, for which no other import waits
-    from fpp_ml_bench.loaders.published.fetching import fetch_tree, plan_download
+    from fpp_ml_bench.loaders.hub import Hub, fetch_tree, plan_download  # imports huggingface_hub, which others don't
 
     hub = Hub(sending=False)
     raw_scans = settings.raw_scans or settings.fit_rig or settings.frame_order != "auto"
@@ -207,19 +206,19 @@ def _import_tree(settings: ImportSettings, from_hub: bool) -> None:
     tree, source = _fetch(settings) if from_hub else (settings.tree, None)
     plan = plan_import(tree, rig, settings.frame_order, source)
     if settings.fit_rig:
-        with progress_bar("reading", len(plan.reader.samples), "views") as advance:
-            views = tree_views(plan.reader, settings.workers or usable_cores(), advance)
-        rig, fit = fit_projector(views, plan.reader.rig)
+        with progress_bar("reading", len(plan.rows.samples), "views") as advance:
+            views = tree_views(plan.rows, settings.workers or usable_cores(), advance)
+        rig, fit = fit_projector(views, plan.rows.rig)
         print_fit(rig, fit)
         plan = plan_import(tree, rig, settings.frame_order, source)
-    sample_count = len(plan.reader.samples)
-    images = len(plan.assembly.manifest.stored_frames)
+    sample_count = len(plan.rows.samples)
+    images = len(plan.manifest.stored_frames)
     started = perf_counter()
     with progress_bar("importing", sample_count, "samples") as advance:
         manifest = import_rows(settings.out, plan, settings.workers or usable_cores(), advance)
     _print_end(settings.out, manifest, images, perf_counter() - started, import_notes(manifest))
     if rig is None:
-        _warn_of_other_rig(tree, depth_difference_mm(plan.reader))
+        _warn_of_other_rig(tree, depth_difference_mm(plan.rows))
 
 
 def _warn_of_other_rig(tree: Path, difference_mm: float | None) -> None:

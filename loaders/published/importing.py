@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,28 +100,23 @@ class RowReader:
 Reader = TypeVar("Reader", bound=RowReader)
 
 
-class ImportPlan(NamedTuple, Generic[Reader]):
-    """An import that is ready to start: the reader of the samples found, and the dataset to assemble."""
-
-    reader: Reader
-    assembly: Assembly
-
-
 def import_plan(
     reader: Reader, plans: list[ShardPlan], origin: str, settings: dict[str, Any], stored: str
-) -> ImportPlan[Reader]:
-    """The plan of a dataset of ``reader``'s rows, with ``stored`` frames of its rig."""
+) -> Assembly[Reader]:
+    """What there is to do for a dataset of ``reader``'s rows, with ``stored`` frames of its rig."""
     camera, generator = reader.rig.camera, {"name": "fpp-ml-bench", "version": __version__}
     size = camera.height, camera.width
     manifest = Manifest(origin, generator, settings, reader.rig.to_dict(), size, stored, exact=False)
-    return ImportPlan(reader, Assembly(plans, reader, manifest))
+    return Assembly(plans, reader, manifest)
 
 
-def import_rows(folder: Path, plan: ImportPlan, workers: int, progress: Progress = lambda rows: None) -> Manifest:
+def import_rows(
+    folder: Path, plan: Assembly[RowReader], workers: int, progress: Progress = lambda rows: None
+) -> Manifest:
     """Write the planned dataset into ``folder``, or go on with one that was interrupted. When a sample can't be read,
     all others are tried too, and the reader's refusal of all problems is raised, a `LayoutError` or `CaptureError`.
     Raises `BuildError` as a build does, and when a file changed after ``folder`` was finished."""
-    reader = plan.reader
+    reader = plan.rows
 
     def problems_of(sample: Any) -> list[str]:
         problems: list[str] = []
@@ -129,9 +124,9 @@ def import_rows(folder: Path, plan: ImportPlan, workers: int, progress: Progress
             reader.read(sample)
         return problems
 
-    forget_outdated(folder, plan.assembly.plans, lambda name: reader.samples[name].files)
+    forget_outdated(folder, plan.plans, lambda name: reader.samples[name].files)
     try:
-        return assemble(folder, plan.assembly, workers, progress)
+        return assemble(folder, plan, workers, progress)
     except (LayoutError, CaptureError) as error:
         with ThreadPoolExecutor(_CHECK_THREADS) as pool:
             problems = [line for found in pool.map(problems_of, reader.samples.values()) for line in found]
@@ -269,7 +264,7 @@ def _disagreement_mm(variant_mm: NDArray[np.float64], depth_mm: NDArray[np.float
 
 def plan_import(
     root: Path, rig: Rig | None = None, frame_order: str = AUTO, source: Source | None = None
-) -> ImportPlan[SampleReader]:
+) -> Assembly[SampleReader]:
     """Scan the tree at ``root`` and determine how it is read. ``rig``: the rig that took the images; None assumes the
     paper's rig, scaled to the image size. ``frame_order``: see `FrameOrder`; ``auto`` determines it from the first
     sample's images, and checks all others against it. ``source``: where the tree was downloaded from. Raises

@@ -171,7 +171,9 @@ def scan_tree(root: Path, frames: int, only: Collection[str] | None = None) -> P
         files |= raw_files
     missing = sorted(expected - files)
     problems += [
-        f"{folder}: the folder is missing" for folder in dict.fromkeys(p.parent for p in missing) if not folder.is_dir()
+        f"{folder}: the {'raw scan' if scans in folder.parents else 'folder'} is missing"
+        for folder in dict.fromkeys(path.parent for path in missing)
+        if not folder.is_dir()
     ]
     problems += [
         f"{path}: is missing, and other files of its sample are there" for path in missing if path.parent.is_dir()
@@ -205,8 +207,8 @@ def _files(
     for entry in visible(folder, LayoutError):
         fits = names.fullmatch(entry.name) if isinstance(names, re.Pattern) else entry.name in names
         if not fits or entry.is_dir() != bool(below):
-            kept = "" if entry.suffix in _KINDS.values() else "does not belong here; "
-            problems.append(f"{entry}: {kept}expected {layout}")
+            named = names is _SAMPLE_FILE and entry.suffix in _KINDS.values()
+            problems.append(f"{entry}: {'' if named else 'does not belong here; '}expected {layout}")
         elif below:
             files |= _files(entry, below, layout, problems)
         else:

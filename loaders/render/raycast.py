@@ -42,15 +42,11 @@ class PixelRays:
         self.x, self.y = np.ascontiguousarray(x), np.ascontiguousarray(y)
         self.columns, self.rows = _bounds(self.x, 0), _bounds(self.y, 1)
 
-    @classmethod
-    def of(cls, camera: Pinhole) -> "PixelRays":
+    @staticmethod
+    @lru_cache(maxsize=2)
+    def of(camera: Pinhole) -> "PixelRays":
         """The rays of a camera; those of the two latest cameras are kept."""
-        return _camera_rays(camera)
-
-
-@lru_cache(maxsize=2)
-def _camera_rays(camera: Pinhole) -> PixelRays:
-    return PixelRays(*camera.rays())
+        return PixelRays(*camera.rays())
 
 
 def _bounds(rays: NDArray[np.float64], axis: int) -> NDArray[np.float64]:

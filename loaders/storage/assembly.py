@@ -12,10 +12,10 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.files import cause_of, check_space, exclusive, file_hash, read_json, write_atomically
+from fpp_ml_bench.files import cause_of, check_space, exclusive, read_json, write_atomically
 from fpp_ml_bench.loaders.sample import Row, column_hash
 from fpp_ml_bench.loaders.storage.card import write_card
 from fpp_ml_bench.loaders.storage.manifest import (
@@ -25,6 +25,7 @@ from fpp_ml_bench.loaders.storage.manifest import (
     OtherFile,
     ShardFile,
     check_row,
+    damage_of,
     describe_file,
     read_manifest,
     strictly,
@@ -37,16 +38,17 @@ SETTINGS = "settings.json"
 RowSource = Callable[[ShardPlan, Path], Iterable[Row]]
 """Makes the rows of a shard, in order, and maybe meshes in the dataset folder. Picklable; a process calls one for all
 its shards, and may hold what they share in it."""
+Rows = TypeVar("Rows", bound=RowSource, covariant=True)
 Progress = Callable[[int], None]
 _RESERVE_BYTES = 1 << 26
 
 
 @dataclass(frozen=True)
-class Assembly:
+class Assembly(Generic[Rows]):
     """A dataset to be written: its shard plans, the source of their rows, and the manifest without rows."""
 
     plans: list[ShardPlan]
-    rows: RowSource
+    rows: Rows
     manifest: Manifest
     mesh_folder: str | None = None
     """Folder below the dataset folder into which ``rows`` writes a PLY of each object."""
@@ -98,7 +100,7 @@ class ShardWork:
             receipt = replace(receipt, meshes=meshes)
             write_atomically(folder / name, json.dumps(asdict(receipt)).encode())
             if isinstance(place, RemoteFolder):
-                for path in (*(file.path for file in (*receipt.files, *meshes)), name):
+                for path in (*(file.path for file in receipt.written), name):
                     place.put(folder / path, path)
         return receipt
 
@@ -128,13 +130,13 @@ def assemble(
             _check_settings(place, folder / WORK_FOLDER, assembly.manifest)
 
             def whole(file: ShardFile | OtherFile) -> bool:
-                if size_of(file.path) != file.bytes:
-                    return False
-                return isinstance(place, RemoteFolder) or file_hash(folder / file.path) == file.xxh3_128
+                if isinstance(place, RemoteFolder):
+                    return size_of(file.path) == file.bytes
+                return damage_of(folder, file) is None
 
             written = {plan.name: planned_receipt(folder / _receipt_name(plan), plan) for plan in assembly.plans}
             for name, receipt in written.items():
-                if receipt is not None and not all(map(whole, [*receipt.files, *receipt.meshes])):
+                if receipt is not None and not all(map(whole, receipt.written)):
                     written[name] = None
             missing = [plan for plan in assembly.plans if written[plan.name] is None]
             if isinstance(place, Path):

@@ -178,7 +178,7 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
         (folder / name).parent.mkdir(exist_ok=True)
         write_atomically(folder / name, json.dumps(content, indent=1).encode() + b"\n")
     save_rig(rig_from_dict(manifest.rig), folder / RIG_FILE)
-    files = {split: f"{split}/{DATA_GROUP}-*.arrow" for split in manifest.samples}
+    patterns = {split: f"{split}/{DATA_GROUP}-*.arrow" for split in manifest.samples}
     text = _FOLDER_TEXT.format(
         stored=manifest.stored,
         split=next(iter(manifest.samples)),
@@ -187,7 +187,7 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
         first=manifest.groups[DATA_GROUP][0],
     )
     rows = sum(len(rows) for rows in manifest.samples.values())
-    configs = [card_config("single_shot", manifest.fingerprint, files, default=True)]
+    configs = [card_config("single_shot", manifest.fingerprint, patterns, default=True)]
     write_atomically(folder / "README.md", card(manifest, configs, "", rows, text))
     return ["README.md", RIG_FILE, *contents]
 

@@ -232,6 +232,21 @@ def _check(manifest: Manifest) -> None:
             raise ValueError(f"content {printable(name)!r}: expected split/column and a hash of 32 hex digits")
 
 
+def damage_of(folder: Path, file: ShardFile | OtherFile, whole: bool = True) -> str | None:
+    """What is wrong with a file of the dataset, a sentence that names it, or None: it is missing, of another size, or
+    ``whole``, which reads it, of another content."""
+    path = folder / file.path
+    if not path.is_file():
+        problem = "is missing"
+    elif (size := path.stat().st_size) != file.bytes:
+        problem = f"has {size} bytes, expected {file.bytes}"
+    elif whole and file_hash(path) != file.xxh3_128:
+        problem = "its content has changed (checksum differs)"
+    else:
+        return None
+    return f"{path}: {problem}; copy or build the dataset again"
+
+
 def describe_file(folder: Path, path: Path) -> OtherFile:
     """Manifest entry of a file below the dataset folder."""
     return OtherFile(path.relative_to(folder).as_posix(), path.stat().st_size, file_hash(path))

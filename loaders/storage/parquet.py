@@ -25,11 +25,10 @@ from numpy.typing import NDArray
 from fpp_ml_bench.containers import png_bytes
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders import sample as layout
 from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTHS, LABELS, PIXEL_MAPS, PREVIEW, RANGE, config_columns
 from fpp_ml_bench.loaders.storage.card import card, card_config
-from fpp_ml_bench.loaders.storage.manifest import ShardFile
+from fpp_ml_bench.loaders.storage.manifest import ShardFile, damage_of
 from fpp_ml_bench.loaders.storage.shards import arrow_schema
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
@@ -112,8 +111,8 @@ def write_shard(
     longer has its checksum, ``OSError`` for a failed write."""
     parts = [part for part in dataset.manifest.shards if (part.split, part.first_row) == (shard.split, shard.first_row)]
     for part in parts:
-        if file_hash(dataset.path / part.path) != part.xxh3_128:
-            raise DatasetError(f"{dataset.path / part.path}: damaged, its checksum does not match; it isn't published")
+        if damage := damage_of(dataset.path, part):
+            raise DatasetError(damage)
     viewer = picture_threads is not None
     names = columns(dataset) if viewer else dataset.manifest.columns()
     pictures = [name for name in names if viewer and (name == PREVIEW or name.startswith("frame_"))]

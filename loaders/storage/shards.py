@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.depth import depth_range_mm, object_mask
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders import sample as layout
@@ -33,6 +33,10 @@ class Receipt:
     files: list[ShardFile]
     rows: list[dict[str, Any]]
     meshes: list[OtherFile] = field(default_factory=list)
+
+    @property
+    def written(self) -> tuple[ShardFile | OtherFile, ...]:
+        return (*self.files, *self.meshes)
 
 
 @dataclass(frozen=True)
@@ -151,7 +155,7 @@ class ShardWriter:
             described = []
             data: dict[str, list[Any]] = {name: [] for name in (*LABELS, *RANGE)}
             for number, row in enumerate(_in_order(plan, rows)):
-                low_mm, high_mm = depth_range_mm(row.depth_mm, row.sample)
+                low_mm, high_mm = checked_range_mm(row.depth_mm, row.sample)
                 labels = {"sample": row.sample, "object": row.object, "view": row.view}
                 object_px = int(np.count_nonzero(object_mask(row.depth_mm)))
                 measured = {"object_px": object_px, "depth_min_mm": low_mm, "depth_max_mm": high_mm, **row.measured}
@@ -241,13 +245,12 @@ def _image_column(images: NDArray, kind: pa.DataType) -> pa.Array:
     return pa.ListArray.from_arrays(pa.array(np.arange(rows + 1, dtype=np.int32) * height), inner)
 
 
-def depth_range_mm(depth_mm: NDArray[np.float32], sample: str) -> tuple[float, float]:
+def checked_range_mm(depth_mm: NDArray[np.float32], sample: str) -> tuple[float, float]:
     """Least and greatest depth above 0 of a sample (paper Section 3.3), mm. Raises `BuildError` for a map without
     object pixels, or with a depth that is negative or not finite."""
     if not (np.isfinite(depth_mm).all() and depth_mm.min() >= 0):
         raise BuildError(f"sample {sample!r}: its depth map has depths that are negative or not finite")
-    inside = depth_mm[object_mask(depth_mm)]
-    if inside.size == 0:
+    if not object_mask(depth_mm).any():
         expected = "expected an object in the working range"
         raise BuildError(f"sample {sample!r}: its depth map has no pixel above 0 mm; {expected}")
-    return float(inside.min()), float(inside.max())
+    return depth_range_mm(depth_mm)

@@ -31,7 +31,7 @@ from fpp_ml_bench.loaders.sample import (
     exact_void,
     void_pixels,
 )
-from fpp_ml_bench.loaders.storage.manifest import MANIFEST, ShardFile, read_manifest
+from fpp_ml_bench.loaders.storage.manifest import MANIFEST, ShardFile, damage_of, read_manifest
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.rig_file import rig_from_dict
 from fpp_ml_bench.optics.sequence import AnySequence
@@ -57,11 +57,8 @@ class DatasetFolder:
         self.manifest = read_manifest(self.path)
         self._mapped: dict[str, MappedShard] = {}
         for shard in self.manifest.shards if check else ():
-            file = self.path / shard.path
-            size = file.stat().st_size if file.is_file() else None
-            if size != shard.bytes:
-                found = "it is missing" if size is None else f"it has {size}"
-                raise DatasetError(f"{file}: expected {shard.bytes} bytes, {found}; build or copy the dataset again")
+            if damage := damage_of(self.path, shard, whole=False):
+                raise DatasetError(damage)
 
     def forget(self, shard: ShardFile) -> None:
         """Close the memory maps of a file."""
@@ -304,7 +301,38 @@ def release_pages(view: NDArray[Any], mapped_file: mmap.mmap) -> None:
 
 
 def load_dataset(folder: str | Path, config: str = "single_shot", split: str | None = None) -> "Dataset | DatasetDict":
-    """A built or imported dataset folder as ``datasets`` objects; see `fpp_ml_bench.load_dataset`."""
+    """Open a dataset folder as a ``datasets.Dataset`` on the memory-mapped shards.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Dataset written by ``fpp-bench build`` or ``fpp-bench import``.
+    config : {"single_shot", "crossed", "horizontal", "vertical", "sinusoidal", "all"}
+        Which frames: the first one, the crossed ones of a rig that has them, those of a direction, all sinusoids, or
+        the whole sequence.
+    split : {"train", "validation", "test"}, optional
+        None for all of them, as a ``DatasetDict``.
+
+    Returns
+    -------
+    datasets.Dataset or datasets.DatasetDict
+        Columns ``sample``, ``object``, ``view``, ``split``; a uint8 (H, W) column ``frame_NN`` for each frame;
+        ``depth`` and, for generated data, ``depth_exact`` (float32 (H, W), mm, 0 = background); ``depth_min`` and
+        ``depth_max`` (mm).
+
+    Raises
+    ------
+    DatasetError
+        For a folder that is no finished dataset, and for an unknown or unstored configuration or split.
+
+    Examples
+    --------
+    >>> import fpp_ml_bench as fpp
+    >>> test = fpp.load_dataset("data/mini", "single_shot", split="test")
+    >>> row = test.with_format("numpy")[0]
+    >>> row["frame_00"].shape == row["depth"].shape
+    True
+    """
     dataset = DatasetFolder(folder)
     if config not in CONFIGS:
         raise DatasetError(f"unknown configuration {config!r}; there are {', '.join(CONFIGS)}")

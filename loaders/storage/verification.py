@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import OBJECTS, UNSEEN, VIEWS, sample_name, split_of
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders.sample import (
     DATA_GROUP,
     DEPTH,
@@ -25,7 +24,15 @@ from fpp_ml_bench.loaders.sample import (
     Flag,
     image_hash,
 )
-from fpp_ml_bench.loaders.storage.manifest import CAPTURED, GENERATED, MANIFEST, WORK_FOLDER, Manifest, ShardFile
+from fpp_ml_bench.loaders.storage.manifest import (
+    CAPTURED,
+    GENERATED,
+    MANIFEST,
+    WORK_FOLDER,
+    Manifest,
+    ShardFile,
+    damage_of,
+)
 from fpp_ml_bench.loaders.storage.shards import arrow_schema
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
@@ -56,8 +63,7 @@ def verify(folder: Path, progress: Callable[[int], None] = lambda files: None) -
     findings = _foreign_files(folder, manifest)
     hashes = ImageHashes()
     for file in manifest.files:
-        damage = _file_damage(folder / file.path, file.bytes, file.xxh3_128)
-        if damage:
+        if damage := damage_of(folder, file):
             findings.append(damage)
         elif isinstance(file, ShardFile):
             # Straight after its checksum the file is still in the page cache, so looking inside costs no second read.
@@ -81,17 +87,6 @@ def _foreign_files(folder: Path, manifest: Manifest) -> list[str]:
         if relative.as_posix() not in listed and not path.name.startswith("cache-"):
             findings.append(f"{path}: is not part of this dataset; remove it")
     return findings
-
-
-def _file_damage(path: Path, size: int, expected_hash: str) -> str | None:
-    """What is wrong with one file, or None."""
-    if not path.is_file():
-        return f"{path}: is missing; copy or build the dataset again"
-    if path.stat().st_size != size:
-        return f"{path}: has {path.stat().st_size} bytes, expected {size}; copy or build the dataset again"
-    if file_hash(path) != expected_hash:
-        return f"{path}: its content has changed (checksum differs); copy or build the dataset again"
-    return None
 
 
 def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: ImageHashes) -> list[str]:
