@@ -298,7 +298,8 @@ def camera_rows() -> list[str]:
             own,
             np.full((1, pixels.size), grey, dtype=np.float32),
             pixels,
-            sensor.answer(stream_keys("fade", grey)[None]),
+            stream_keys("fade", grey)[None],
+            sensor,
         )
         # `fade` cuts off decimals where ours rounds: half a grey level of dark current makes the two one.
         image = np.full((1, 1, pixels.size, 1), grey / 255)

@@ -30,8 +30,7 @@ _CHUNK = 2048
 _MASK = (1 << TABLE_BITS) - 1
 
 
-@dataclass(frozen=True)
-class Noise:
+class Noise(NamedTuple):
     """Shot and read noise in grey levels: variance = ``read_variance`` + ``shot_per_grey`` x signal."""
 
     read_variance: float
@@ -77,6 +76,11 @@ def stream_keys(*name: object) -> NDArray[np.uint32]:
     return np.frombuffer(name_bytes(*name), dtype="<u4").astype(np.uint32)
 
 
+def frame_keys(stream: tuple[object, ...], frames: Sequence[int]) -> NDArray[np.uint32]:
+    """`stream_keys` of each of a view's k ``frames``; uint32 (k, 2)."""
+    return np.array([stream_keys(*stream, index) for index in frames], dtype=np.uint32).reshape(-1, 2)
+
+
 def hash_pixels(pixels: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDArray[np.uint32]:
     """32-bit hash of each pixel number: a keyed two-round multiply-xorshift, a bijection of the pixel number."""
     with np.errstate(over="ignore"):
@@ -97,27 +101,22 @@ def standard_normal(pixels: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDA
     return table[h & mask] + table[(h >> np.uint32(TABLE_BITS)) & mask]
 
 
-@dataclass(frozen=True)
-class Sensor:
-    """What turns the light of a pixel into a byte: black level in grey levels, noise, and the 8-bit grey level of each
-    code of the converter, uint8 (2^bits,)."""
+class Sensor(NamedTuple):
+    """What turns the light of a pixel into a byte: black level in grey levels, noise, the 8-bit grey level of each code
+    of the converter, uint8 (2^bits,), whether the two are the same, and the `normal_table`."""
 
-    black_grey: float
+    black_grey: np.float32
     noise: Noise
     grey_of_code: NDArray[np.uint8]
+    plain: bool
+    table: NDArray[np.float32]
 
     @classmethod
     def of(cls, camera: CameraLight) -> "Sensor":
         codes = np.arange(1 << camera.bits)
-        grey = GREY_LEVELS * respond(camera.response, codes / codes[-1])
-        return cls(camera.black_grey, Noise.of_camera(camera), np.rint(grey).astype(np.uint8))
-
-    def answer(self, keys: NDArray[np.uint32]) -> "SensorAnswer":
-        """What a frame of each noise stream of ``keys`` (k, 2) is made with."""
-        plain = np.array_equal(self.grey_of_code, np.arange(GREY_LEVELS + 1))
-        grey_of_code = np.empty(0, dtype=np.uint8) if plain else self.grey_of_code
-        variances = _FLOAT(self.noise.read_variance), _FLOAT(self.noise.shot_per_grey)
-        return SensorAnswer(normal_table(), keys, *variances, _FLOAT(self.black_grey), grey_of_code)
+        grey = np.rint(GREY_LEVELS * respond(camera.response, codes / codes[-1])).astype(np.uint8)
+        noise = Noise(*map(_FLOAT, Noise.of_camera(camera)))
+        return cls(_FLOAT(camera.black_grey), noise, grey, np.array_equal(grey, codes), normal_table())
 
 
 @dataclass(frozen=True)
@@ -148,7 +147,7 @@ class Exposure:
         ``frames``, written into ``out`` if given.
         """
         result = np.empty((len(frames), pixels.size), dtype=np.uint8) if out is None else out
-        expose_kernel(result, self._light(frames, lit, stream), pixels, self._answer(frames, stream))
+        expose_kernel(result, self._light(frames, lit, stream), pixels, frame_keys(stream, frames), self.sensor)
         return result
 
     def radiance(
@@ -167,21 +166,17 @@ class Exposure:
         out: NDArray[np.uint8],
     ) -> NDArray[np.uint8]:
         """The sensor's answer to ``radiance`` (k, n): fills ``out`` uint8 (k, n)."""
-        sense_kernel(out, radiance, pixels, self._answer(frames, stream))
+        sense_kernel(out, radiance, pixels, frame_keys(stream, frames), self.sensor)
         return out
 
     def _light(self, frames: Sequence[int], lit: LitPixels, stream: tuple[object, ...]) -> "PointLight":
         lamp = np.ones(len(frames), dtype=np.float32)
         if self.flicker:
-            keys = np.array([stream_keys(*stream, "lamp", index) for index in frames], dtype=np.uint32).reshape(-1, 2)
+            keys = frame_keys((*stream, "lamp"), frames)
             lamp += np.float32(self.flicker) * np.array([standard_normal(np.zeros(1, np.uint32), k)[0] for k in keys])
         bounced = np.empty((0, 0), dtype=np.float32) if lit.bounced is None else lit.bounced
         indices = np.array(frames, dtype=np.int64)
         return PointLight(indices, lamp, self.pattern, lit.place, lit.gain, lit.ambient, bounced)
-
-    def _answer(self, frames: Sequence[int], stream: tuple[object, ...]) -> "SensorAnswer":
-        keys = np.array([stream_keys(*stream, index) for index in frames], dtype=np.uint32).reshape(-1, 2)
-        return self.sensor.answer(keys)
 
 
 class PointLight(NamedTuple):
@@ -195,18 +190,6 @@ class PointLight(NamedTuple):
     gain: NDArray[np.float32]
     ambient: NDArray[np.float32]
     bounced: NDArray[np.float32]
-
-
-class SensorAnswer(NamedTuple):
-    """What `fill_bytes` needs: the ``normal`` table, ``keys`` uint32 (k, 2) of the noise streams, variances and black
-    level, and the grey level of each code, empty where both are the same."""
-
-    table: NDArray[np.float32]
-    keys: NDArray[np.uint32]
-    read_variance: np.float32
-    shot_per_grey: np.float32
-    black: np.float32
-    grey_of_code: NDArray[np.uint8]
 
 
 @njit
@@ -245,12 +228,11 @@ def average(signal, pixels, samples):  # type: ignore[no-untyped-def]
 
 
 @njit
-def fill_bytes(target, signal, numbers, hashes, normal, row, sensor):  # type: ignore[no-untyped-def]
-    """The answer of a `SensorAnswer` to ``signal`` in frame number ``row``: fills ``target`` uint8 (n,). ``numbers``:
-    pixel numbers times the first factor of the hash, uint32 (n,)."""
-    n, table, first, second = target.size, sensor.table, sensor.keys[row, 0], sensor.keys[row, 1]
-    read_variance, shot_per_grey, black = sensor.read_variance, sensor.shot_per_grey, sensor.black
-    grey_of_code = sensor.grey_of_code
+def fill_bytes(target, signal, numbers, hashes, normal, keys, sensor):  # type: ignore[no-untyped-def]
+    """The answer of a `Sensor` to ``signal`` under the ``keys`` (2,) of a noise stream: fills ``target`` uint8 (n,).
+    ``numbers``: pixel numbers times the first factor of the hash, uint32 (n,)."""
+    n, table, grey_of_code, first, second = target.size, sensor.table, sensor.grey_of_code, keys[0], keys[1]
+    read_variance, shot_per_grey, black = sensor.noise.read_variance, sensor.noise.shot_per_grey, sensor.black_grey
     for k in range(n):
         h = numbers[k] ^ first
         h ^= h >> np.uint32(16)
@@ -263,7 +245,7 @@ def fill_bytes(target, signal, numbers, hashes, normal, row, sensor):  # type: i
     for k in range(n):
         h = hashes[k]
         normal[k] = table[h & np.uint32(_MASK)] + table[(h >> np.uint32(TABLE_BITS)) & np.uint32(_MASK)]
-    if grey_of_code.size == 0:
+    if sensor.plain:
         for k in range(n):
             value = signal[k] + black + np.sqrt(read_variance + shot_per_grey * signal[k]) * normal[k] + np.float32(0.5)
             value = min(max(value, np.float32(0)), np.float32(255))
@@ -278,9 +260,9 @@ def fill_bytes(target, signal, numbers, hashes, normal, row, sensor):  # type: i
 
 
 @njit
-def expose_kernel(out, light, pixels, sensor):  # type: ignore[no-untyped-def]
-    """Expose k frames of a `PointLight` at n ``pixels`` uint32 (n,): row i of ``out`` uint8 (k, n) is its frame i, as a
-    `SensorAnswer` has it.
+def expose_kernel(out, light, pixels, keys, sensor):  # type: ignore[no-untyped-def]
+    """Expose k frames of a `PointLight` at n ``pixels`` uint32 (n,): row i of ``out`` uint8 (k, n) is its frame i, as
+    the `Sensor` has it under the ``keys`` uint32 (k, 2) of the noise streams.
 
     Pixels are processed in chunks, with all frames for each chunk, so that values common to the frames (a pixel's place
     in the pattern, its brightness) are read from memory once. Each stage is a separate loop, because the compiler turns
@@ -298,7 +280,7 @@ def expose_kernel(out, light, pixels, sensor):  # type: ignore[no-untyped-def]
         for row in range(light.frames.size):
             fill_signal(signal[: n * samples], row, light, start * samples)
             average(signal, n, samples)
-            fill_bytes(out[row, start : start + n], signal[:n], numbers, hashes, normal, row, sensor)
+            fill_bytes(out[row, start : start + n], signal[:n], numbers, hashes, normal, keys[row], sensor)
 
 
 @njit
@@ -316,8 +298,8 @@ def radiance_kernel(out, light):  # type: ignore[no-untyped-def]
 
 
 @njit
-def sense_kernel(out, radiance, pixels, sensor):  # type: ignore[no-untyped-def]
-    """A `SensorAnswer` to ``radiance`` float32 (k, n) at n pixels: fills ``out`` uint8 (k, n)."""
+def sense_kernel(out, radiance, pixels, keys, sensor):  # type: ignore[no-untyped-def]
+    """The answer of a `Sensor` to ``radiance`` float32 (k, n) at n pixels: fills ``out`` uint8 (k, n)."""
     numbers, hashes, normal = np.empty(_CHUNK, np.uint32), np.empty(_CHUNK, np.uint32), np.empty(_CHUNK, np.float32)
     for start in range(0, pixels.size, _CHUNK):
         n = min(start + _CHUNK, pixels.size) - start
@@ -325,4 +307,4 @@ def sense_kernel(out, radiance, pixels, sensor):  # type: ignore[no-untyped-def]
             numbers[k] = np.uint32(pixels[start + k] * np.uint32(0x9E3779B1))
         for row in range(out.shape[0]):
             answer = out[row, start : start + n]
-            fill_bytes(answer, radiance[row, start : start + n], numbers, hashes, normal, row, sensor)
+            fill_bytes(answer, radiance[row, start : start + n], numbers, hashes, normal, keys[row], sensor)
