@@ -193,16 +193,12 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
 
 
 def split_statistics(manifest: Manifest) -> list[dict[str, Any]]:
-    """Statistics of each split that has rows in the manifest: lengths in mm, shares from 0 to 1, None where a dataset
-    has no exact depth. ``gt_mae_mm`` and ``gt_rmse_mm`` are the uncertainty of the ground truth: decoded against exact
-    depth over all object pixels, averaged over samples like every score; ``gt_interior_*`` over those 3 px or more from
-    depth edges."""
-    return [_split(split, rows, manifest) for split, rows in manifest.samples.items()]
-
-
-def whole_statistics(manifest: Manifest) -> dict[str, Any]:
-    """Statistics of all rows together, as a split called ``all``."""
-    return _split("all", [row for rows in manifest.samples.values() for row in rows], manifest)
+    """Statistics of each split that has rows in the manifest, and last of all rows together, as a split called ``all``:
+    lengths in mm, shares from 0 to 1, None where a dataset has no exact depth. ``gt_mae_mm`` and ``gt_rmse_mm`` are the
+    uncertainty of the ground truth: decoded against exact depth over all object pixels, averaged over samples like
+    every score; ``gt_interior_*`` over those 3 px or more from depth edges."""
+    whole = [row for rows in manifest.samples.values() for row in rows]
+    return [_split(split, rows, manifest) for split, rows in (*manifest.samples.items(), ("all", whole))]
 
 
 def _split(split: str, rows: list[dict[str, Any]], manifest: Manifest) -> dict[str, Any]:
@@ -239,6 +235,6 @@ def ground_truth_summary(manifest: Manifest) -> list[str]:
         f"{s['split']}: ground truth within {s['gt_mae_mm']:.3f} mm MAE, {s['gt_rmse_mm']:.3f} mm RMSE of the exact "
         f"depth ({s['gt_interior_mae_mm']:.3f} mm 3 px or more from depth edges); {100 * s['undecoded_share']:.2f}% of "
         f"object pixels not decodable, {100 * s['void_share']:.2f}% void (unlit, or surfaces mixed in a pixel)"
-        for s in split_statistics(manifest)
+        for s in split_statistics(manifest)[:-1]
         if None not in (s["gt_mae_mm"], s["gt_interior_mae_mm"], s["undecoded_share"])
     ]

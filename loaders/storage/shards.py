@@ -153,7 +153,6 @@ class ShardWriter:
                 sink = files.enter_context(path.open("wb"))
                 writers[group] = pa.ipc.new_stream(pa.PythonFile(sink, mode="w"), self._schemas[group])
             described = []
-            data: dict[str, list[Any]] = {name: [] for name in (*LABELS, *RANGE)}
             for number, row in enumerate(_in_order(plan, rows)):
                 low_mm, high_mm = checked_range_mm(row.depth_mm, row.sample)
                 labels = {"sample": row.sample, "object": row.object, "view": row.view}
@@ -161,8 +160,6 @@ class ShardWriter:
                 measured = {"object_px": object_px, "depth_min_mm": low_mm, "depth_max_mm": high_mm, **row.measured}
                 hashes: dict[str, str] = {}
                 described.append({**labels, **measured, "hashes": hashes})
-                for values, value in zip(data.values(), (*labels.values(), plan.split, low_mm, high_mm), strict=True):
-                    values.append(value)
                 # The data group is one batch of all rows. All frames but the first are written at once, one row per
                 # batch, and not held in memory.
                 for group, frames in self._manifest.groups.items():
@@ -180,9 +177,12 @@ class ShardWriter:
                     for column, image in images.items():
                         self._buffer(column, len(plan.samples))[number] = image
                 row_done()
-            schema = self._schemas[DATA_GROUP]
-            columns = [data.get(name) or self._buffer(name, len(plan.samples)) for name in schema.names]
-            writers[DATA_GROUP].write_batch(_record_batch(columns, schema))
+            labelled = [layout.labels_of(row, plan.split) for row in described]
+            columns = [
+                self._buffer(name, len(plan.samples)) if name in self._images else [row[name] for row in labelled]
+                for name in self._schemas[DATA_GROUP].names
+            ]
+            writers[DATA_GROUP].write_batch(_record_batch(columns, self._schemas[DATA_GROUP]))
             for writer in writers.values():
                 writer.close()
         return described

@@ -23,6 +23,7 @@ from fpp_ml_bench.loaders.sample import (
     RANGE,
     Flag,
     image_hash,
+    labels_of,
 )
 from fpp_ml_bench.loaders.storage.manifest import (
     CAPTURED,
@@ -102,7 +103,12 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: ImageHashes
     right = batches and _types(batches[0].schema) == _types(arrow_schema(expected, manifest.size))
     if not right or sum(len(b) for b in batches) != shard.rows:
         return [f"{path}: its rows or columns are not those the manifest says"]
-    findings = _label_findings(path, shard, rows, batches) if shard.group == DATA_GROUP else []
+    findings = []
+    if shard.group == DATA_GROUP:
+        stored = [labels for batch in batches for labels in batch.select([*LABELS, *RANGE]).to_pylist()]
+        wanted = [labels_of(row, shard.split) for row in rows]
+        pairs = zip(wanted, stored, strict=True)
+        findings += [f"{path}: expected labels {row}, found {labels}" for row, labels in pairs if labels != row]
     for column in expected:
         if column in (*LABELS, *RANGE):
             continue
@@ -131,17 +137,6 @@ def _depth_findings(where: str, column: str, row: dict[str, Any], image: NDArray
     if column == DEPTH and (float(inside.min()), float(inside.max())) != (row["depth_min_mm"], row["depth_max_mm"]):
         return [f"{where}: depth_min and depth_max do not fit its depth"]
     return []
-
-
-def _label_findings(path: Path, shard: ShardFile, rows: list[dict], batches: list[pa.RecordBatch]) -> list[str]:
-    findings = []
-    stored = [record for batch in batches for record in batch.select([*LABELS, *RANGE]).to_pylist()]
-    for row, labels in zip(rows, stored, strict=True):
-        expected = {"sample": row["sample"], "object": row["object"], "view": row["view"], "split": shard.split}
-        expected.update(zip(RANGE, (row["depth_min_mm"], row["depth_max_mm"]), strict=True))
-        if labels != expected:
-            findings.append(f"{path}: expected labels {expected}, found {labels}")
-    return findings
 
 
 def _coverage_findings(manifest: Manifest) -> list[str]:

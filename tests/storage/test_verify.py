@@ -170,7 +170,7 @@ def test_other_columns_under_a_right_checksum(clean):
 )
 def test_depths_that_no_sample_may_have(tmp_path, monkeypatch, value, message):
     """The writer refuses them, but a dataset written by another program may contain them."""
-    monkeypatch.setattr(writing, "depth_range_mm", lambda depth, sample: (1500.0, 2100.0))
+    monkeypatch.setattr(writing, "checked_range_mm", lambda depth, sample: (1500.0, 2100.0))
     folder = make(tmp_path / "set", spoil=("mug_A60", value))
     findings = [finding for finding in verify(folder) if "mug_A60" in finding]
     assert len(findings) == 1 and message in findings[0] and "column depth" in findings[0]
