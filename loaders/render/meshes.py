@@ -40,7 +40,7 @@ def _drawn(name: str) -> SolidMesh:
 def load_user_mesh(description: UserMesh) -> SolidMesh:
     """Read, scale and pose a user's mesh: x scale, then turns about x, y and z, then centred, then shifted. Its
     colours and textures come along. Raises `MeshError` as `read_mesh` does."""
-    vertices, faces, paint = read_mesh(Path(description.path))
+    vertices, faces, paint, _ = read_mesh(Path(description.path))
     vertices_m = vertices * description.scale
     for axis, degrees in enumerate(description.rotation_deg):
         cosine, sine = cosine_of_turns(degrees / 360), sine_of_turns(degrees / 360)
