@@ -26,6 +26,15 @@ def object_mask(depth_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
     return depth_mm > 0
 
 
+def depth_problem(depth: NDArray[np.floating]) -> str | None:
+    """What is wrong with a depth map (H, W) of an object, a sentence, or None: depths that are not finite or below 0,
+    or none above 0."""
+    for wrong, are in ((~np.isfinite(depth), "NaN or infinite"), (depth < 0, "negative; background is 0")):
+        if wrong.any():
+            return f"{np.count_nonzero(wrong)} pixels are {are}"
+    return None if object_mask(depth).any() else "no pixel is above 0, so there is no object"
+
+
 def extremes(values: NDArray[np.floating]) -> tuple[float, float]:
     """The smallest and the largest value of a map (H, W) that is not empty, NaN if it holds any; read once, in blocks
     that stay in the cache."""

@@ -15,7 +15,7 @@ from fpp_ml_bench import __version__
 from fpp_ml_bench.calibration.projection import MOST_PX, DepthView, view_from_frames
 from fpp_ml_bench.containers import from_file, parse_image, parse_matrix
 from fpp_ml_bench.decoding.decode import decode_stack
-from fpp_ml_bench.depth import Normalisation, denormalise, object_mask
+from fpp_ml_bench.depth import Normalisation, denormalise, depth_problem, depth_range_mm, object_mask
 from fpp_ml_bench.errors import CaptureError, DecodeError, LayoutError, PredictionError, RigError
 from fpp_ml_bench.loaders.captures.images import listed
 from fpp_ml_bench.loaders.published import tree as published_tree
@@ -213,8 +213,7 @@ class SampleReader(RowReader):
                     f"most {AGREEMENT_MM} mm"
                 )
         if limits is not None and first != "individual":
-            inside = depth_mm[object_mask(depth_mm)]
-            actual = float(inside.min()), float(inside.max())
+            actual = depth_range_mm(depth_mm)
             if np.abs(np.subtract(actual, limits)).max() > AGREEMENT_MM:
                 problems.append(
                     f"{sample.info}: gives {limits[0]:.3f} to {limits[1]:.3f} mm, but {files[first]} has "
@@ -227,17 +226,13 @@ class SampleReader(RowReader):
         height, width = self.tree.size
         if values.shape != (height, width):
             raise LayoutError(f"{path}: expected {height} x {width} like the images, got {values.shape}")
-        for wrong, are in ((~np.isfinite(values), "NaN or infinite"), (values < 0, "negative; background is 0")):
-            if wrong.any():
-                raise LayoutError(f"{path}: {np.count_nonzero(wrong)} pixels are {are}")
-        inside = object_mask(values)
-        if not inside.any():
-            raise LayoutError(f"{path}: no pixel is above 0, so there is no object")
+        if problem := depth_problem(values):
+            raise LayoutError(f"{path}: {problem}")
         if variant == "individual" and values.max() > 1 + _ROUNDING:
             raise LayoutError(f"{path}: expected values in [0, 1], got up to {values.max():g}")
-        depth_mm = np.where(inside, denormalise(values, variant, *limits), 0.0)
+        depth_mm = np.where(object_mask(values), denormalise(values, variant, *limits), 0.0)
         near, far = self.rig.working_range_mm
-        low, high = float(depth_mm[inside].min()), float(depth_mm[inside].max())
+        low, high = depth_range_mm(depth_mm)
         if low < near / _UNIT_SLACK or high > far * _UNIT_SLACK:
             unit = "m" if variant == "global" else "mm"
             raise LayoutError(

@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from fpp_ml_bench.depth import depth_range_mm, object_mask
+from fpp_ml_bench.depth import depth_problem, depth_range_mm, object_mask
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders import sample as layout
@@ -248,9 +248,6 @@ def _image_column(images: NDArray, kind: pa.DataType) -> pa.Array:
 def checked_range_mm(depth_mm: NDArray[np.float32], sample: str) -> tuple[float, float]:
     """Least and greatest depth above 0 of a sample (paper Section 3.3), mm. Raises `BuildError` for a map without
     object pixels, or with a depth that is negative or not finite."""
-    if not (np.isfinite(depth_mm).all() and depth_mm.min() >= 0):
-        raise BuildError(f"sample {sample!r}: its depth map has depths that are negative or not finite")
-    if not object_mask(depth_mm).any():
-        expected = "expected an object in the working range"
-        raise BuildError(f"sample {sample!r}: its depth map has no pixel above 0 mm; {expected}")
+    if problem := depth_problem(depth_mm):
+        raise BuildError(f"sample {sample!r}: its depth map: {problem}")
     return depth_range_mm(depth_mm)

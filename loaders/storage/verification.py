@@ -4,14 +4,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import OBJECTS, UNSEEN, VIEWS, sample_name, split_of
-from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.depth import depth_problem, depth_range_mm
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders.sample import (
     DATA_GROUP,
@@ -114,10 +112,13 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: ImageHashes
             continue
         images = (image for batch in mapped.images(column) for image in batch)
         for row, image in zip(rows, images, strict=True):
-            if column in DEPTHS:
-                findings += _depth_findings(f"{path}: sample {row['sample']!r}, column {column}", column, row, image)
+            problem = depth_problem(image) if column in DEPTHS else None
+            if column == DEPTH and not problem and depth_range_mm(image) != (row["depth_min_mm"], row["depth_max_mm"]):
+                problem = "depth_min and depth_max do not fit its depth"
             if column == FLAGS and image.max() > sum(Flag):
-                findings.append(f"{path}: sample {row['sample']!r}, column {column}: unknown flags")
+                problem = "unknown flags"
+            if problem:
+                findings.append(f"{path}: sample {row['sample']!r}, column {column}: {problem}")
             hashes.add(shard.split, column, row["sample"], image)
     opened.forget(shard)
     return findings
@@ -126,17 +127,6 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: ImageHashes
 def _types(schema: pa.Schema) -> list[tuple[str, pa.DataType]]:
     """Columns and what they are stored as, whether or not `datasets` has registered its array extension."""
     return [(field.name, getattr(field.type, "storage_type", field.type)) for field in schema]
-
-
-def _depth_findings(where: str, column: str, row: dict[str, Any], image: NDArray[np.float32]) -> list[str]:
-    if not (np.isfinite(image).all() and image.min() >= 0):
-        return [f"{where}: depths that are not finite or negative"]
-    inside = image[object_mask(image)]
-    if inside.size == 0:
-        return [f"{where}: no depth above 0, so there is nothing to measure"]
-    if column == DEPTH and (float(inside.min()), float(inside.max())) != (row["depth_min_mm"], row["depth_max_mm"]):
-        return [f"{where}: depth_min and depth_max do not fit its depth"]
-    return []
 
 
 def _coverage_findings(manifest: Manifest) -> list[str]:

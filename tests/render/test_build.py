@@ -241,7 +241,7 @@ def write(tmp_path, rows):
 
 @pytest.mark.parametrize(
     ("value", "message"),
-    [(np.nan, "not finite"), (np.inf, "not finite"), (-1.0, "negative"), (0.0, "no pixel above 0")],
+    [(np.nan, "NaN or infinite"), (np.inf, "NaN or infinite"), (-1.0, "negative"), (0.0, "no pixel is above 0")],
 )
 def test_writer_takes_no_bad_depth(tmp_path, value, message):
     depth = np.full((8, 6), 1800 if value else 0, np.float32)

@@ -161,10 +161,10 @@ def test_other_columns_under_a_right_checksum(clean):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (np.nan, "not finite or negative"),
-        (np.inf, "not finite or negative"),
-        (-1.0, "not finite or negative"),
-        (0.0, "no depth above 0"),
+        (np.nan, "1 pixels are NaN or infinite"),
+        (np.inf, "1 pixels are NaN or infinite"),
+        (-1.0, "1 pixels are negative"),
+        (0.0, "no pixel is above 0"),
         (9000.0, "depth_min and depth_max do not fit"),
     ],
 )
