@@ -20,7 +20,7 @@ from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.submission.description import check_submission
 from fpp_ml_bench.evaluation.submission.prediction_files import REPORTS_FILE, SIGMA, SUBMISSION_FILE, UNFINISHED_FILE
 from fpp_ml_bench.files import LOCK_FILE, exclusive, write_atomically
-from fpp_ml_bench.loaders.sample import row_columns, stored_frames
+from fpp_ml_bench.loaders.sample import row_columns
 from fpp_ml_bench.loaders.storage.store import ALL_SPLITS, DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by, seconds_of, skipping
@@ -176,7 +176,7 @@ def explain_predict(opened: DatasetFolder, method: Method, split: str) -> Explan
     """The account of a run of ``method`` over ``split``. Takes as long as predicting some samples again."""
     samples = opened.samples(split)
     height, width = opened.size
-    unused = [i for i in stored_frames(opened.sequence, opened.manifest.stored) if i not in method.frames_used]
+    unused = [i for i in opened.manifest.stored_frames if i not in method.frames_used]
     sample = samples[len(samples) // 2]
     seconds = seconds_of(lambda: [frame.copy() for frame in opened.frames(sample, unused)]) if unused else None
     opened.release(sample)

@@ -124,7 +124,7 @@ def sample_picture(dataset: DatasetFolder, sample: str, path: Path) -> None:
     drawn = panel_figure(panels, further=int(mesh.is_file()))
     drawn.suptitle(f"{sample} ({dataset.split_of_sample(sample)})")
     if mesh.is_file():
-        vertices_m, faces, _ = read_mesh(mesh)
+        vertices_m, faces, *_ = read_mesh(mesh)
         first: Any = drawn.axes[0]
         grid = first.get_subplotspec().get_gridspec()
         solid: Any = drawn.add_subplot(grid[len(panels) // _ACROSS, len(panels) % _ACROSS], projection="3d")

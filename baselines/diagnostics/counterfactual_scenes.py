@@ -171,7 +171,7 @@ def _outline_changes(
     for name, cut in cuts.items():
         inside_cut = cut.ravel()[sample.surface.pixels]
         lit, place = sample.scene.lit, sample.scene.lit.place
-        place = replace(place, **{name: values[inside_cut] for name, values in vars(place).items() if values.size})
+        place = place._replace(**{key: values[inside_cut] for key, values in place._asdict().items() if values.size})
         lit = replace(lit, place=place, gain=lit.gain[inside_cut], ambient=lit.ambient[inside_cut])
         scene = replace(sample.scene, pixels=sample.scene.pixels[inside_cut], lit=lit, mask=sample.target & cut)
         yield Variant("outline", name, scene, sample.depth_mm * (inside & cut))

@@ -31,7 +31,7 @@ from fpp_ml_bench.evaluation.submission.prediction_files import (
     reader_for,
 )
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.sample import Flag, image_hash, stored_frames, void_pixels
+from fpp_ml_bench.loaders.sample import Flag, image_hash, void_pixels
 from fpp_ml_bench.loaders.storage.benchmark import benchmark_of
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
@@ -416,7 +416,7 @@ def explain_eval(dataset: DatasetFolder, split: str, target: str, edge_band_px: 
     for sample in samples:
         boxes[sample] = _box_px(object_mask(dataset.target_mm(sample, target)))
         dataset.release(sample)
-    frames, depths = len(stored_frames(dataset.sequence, dataset.manifest.stored)), 1 + dataset.has_exact
+    frames, depths = len(dataset.manifest.stored_frames), 1 + dataset.has_exact
     read = 1 + (target != "depth")
     median = sorted(samples, key=lambda sample: boxes[sample])[len(samples) // 2]
     depth_mm = dataset.target_mm(median, target)

@@ -191,7 +191,7 @@ def _virtual(settings: CalibrateSettings, folder: Path) -> None:
 
 def _from_depth(settings: CalibrateSettings, tree: Path) -> None:
     known_rig = None if settings.camera is None else load_rig(settings.camera)
-    reader = plan_import(tree, known_rig, settings.frame_order).reader
+    reader = plan_import(tree, known_rig, settings.frame_order).rows
     with progress_bar("reading", len(reader.samples), "views") as advance:
         views = tree_views(reader, settings.workers or usable_cores(), advance)
     rig, fit = fit_projector(

@@ -38,6 +38,13 @@ def gigabytes(count: float) -> str:
     return f"{count:.2f} GB"
 
 
+def contents(manifest: "Manifest") -> str:
+    """What a dataset holds, as text: samples of each split, images and bytes."""
+    parts = ", ".join(f"{split} {len(rows)}" for split, rows in manifest.samples.items())
+    images = len(manifest.stored_frames) * sum(map(len, manifest.samples.values()))
+    return f"{parts} samples, {images:,} images, {gigabytes(sum(file.bytes for file in manifest.files))}"
+
+
 def millimetres(value: float | None) -> str:
     """A length in mm as text for a table; a dash for None."""
     return "-" if value is None else f"{value:.3f}"

@@ -33,8 +33,9 @@ from fpp_ml_bench.loaders.captures.images import (
     read_frames,
     split_captures,
 )
-from fpp_ml_bench.loaders.published.importing import ImportPlan, RowReader, import_plan
+from fpp_ml_bench.loaders.published.importing import RowReader, import_plan
 from fpp_ml_bench.loaders.sample import Row
+from fpp_ml_bench.loaders.storage.assembly import Assembly
 from fpp_ml_bench.loaders.storage.manifest import CAPTURED, Manifest
 from fpp_ml_bench.loaders.storage.shards import ShardPlan, plan_rows
 from fpp_ml_bench.optics.rig import Rig, rotation_matrix
@@ -237,7 +238,7 @@ def plan_captures(
     bits: int | None = None,
     colour: str | None = None,
     anyway: bool = False,
-) -> ImportPlan[CaptureReader]:
+) -> Assembly[CaptureReader]:
     """Find the captures ``root/{object}/{view}/`` or ``root/{object}/``, each a folder of all frames of
     ``rig.sequence``. ``splits``: which objects are in which; None puts all into ``test``. ``limits``: of the decoder;
     ``bits`` and ``colour``: see `read_frames`; ``anyway``: captures that the examination refuses too.

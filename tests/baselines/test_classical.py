@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import yaml
 from conftest import TINY_SIZE
+from edges import edge_distance_px
 from flat_planes import DIRECT, RIG, plane_depth_m, plane_fringe
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
@@ -14,7 +15,7 @@ from fpp_ml_bench.baselines.registry import load_method, methods
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.decoding.triangulation import noise_by_light
-from fpp_ml_bench.depth import edge_distance_px, object_mask
+from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError, PredictionError
 from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.render.meshes import solid_mesh

@@ -249,7 +249,7 @@ def test_a_shard_that_is_cut_while_it_is_open_is_named(tmp_path, monkeypatch):
     os.truncate(opened.path / shard.path, 4096)
     with pytest.raises(DatasetError, match=rf"{shard.path}: was cut to 4096 of {shard.bytes} bytes while it was read"):
         opened.depth_mm(sample)
-    with pytest.raises(DatasetError, match=rf"{shard.path}: expected {shard.bytes} bytes"):
+    with pytest.raises(DatasetError, match=rf"{shard.path}: has 4096 bytes, expected {shard.bytes}"):
         DatasetFolder(opened.path)
 
 

@@ -5,11 +5,12 @@ import statistics
 
 import numpy as np
 import pytest
+from edges import edge_distance_px
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scored_dataset import disk_depth
 
-from fpp_ml_bench.depth import depth_edges, edge_distance_px, object_near_edge
+from fpp_ml_bench.depth import depth_edges, object_near_edge
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.metrics import METRICS
 from fpp_ml_bench.evaluation.result.model import over_samples, pooled
