@@ -73,10 +73,6 @@ def share(part: Any, whole: Any) -> Any:
     return part / whole if whole else None
 
 
-def _within(number: int, sample: Any) -> Any:
-    return sample.spread.within[number]
-
-
 _headline = partial(Metric, headline=True, training=True)
 _object = partial(Metric, over="object", training=True)
 _ENTRIES = (
@@ -155,7 +151,7 @@ _ENTRIES = (
         "object_median_mm",
         "Object, median error",
         "mm",
-        "spread.median_mm",
+        methodcaller("quantile", 0.5),
         "median of |e|, linear interpolation",
         15,
     ),
@@ -163,17 +159,17 @@ _ENTRIES = (
         "object_p95_mm",
         "Object, 95th percentile",
         "mm",
-        "spread.p95_mm",
+        methodcaller("quantile", 0.95),
         "95th percentile of |e|, linear interpolation",
         16,
     ),
-    _object("object_max_mm", "Object, largest error", "mm", "spread.largest_mm", "largest |e|", 17),
+    _object("object_max_mm", "Object, largest error", "mm", methodcaller("quantile", 1.0), "largest |e|", 17),
     *(
         _object(
             f"object_within_{limit}mm_share",
             f"Object within {limit} mm",
             "share",
-            partial(_within, number),
+            methodcaller("within", limit),
             f"share of pixels with |e| <= {limit} mm",
             18 + number,
             better="higher",
@@ -184,7 +180,7 @@ _ENTRIES = (
         "object_bias_mm",
         "Object, signed bias",
         "signed mm",
-        "spread.bias_mm",
+        "bias_mm",
         "mean of e",
         22,
         cancels=True,
@@ -195,7 +191,7 @@ _ENTRIES = (
         "object_valid_bias_mm",
         "Object where predicted, signed bias",
         "signed mm",
-        "spread.valid_bias_mm",
+        "valid_bias_mm",
         "mean of e over the measured pixels",
         23,
         cancels=True,
@@ -207,7 +203,7 @@ _ENTRIES = (
         "object_shift_free_mae_mm",
         "Object MAE without one offset",
         "mm",
-        "spread.shift_free_mm",
+        "shift_free_mae_mm",
         "MAE after the median of e is subtracted: the error without a constant offset",
         24,
         cancels=True,
@@ -272,7 +268,7 @@ _ENTRIES = (
         "object_missing_share",
         "Object not predicted",
         "share",
-        lambda s: share(s.object.pixels - s.valid.pixels, s.object.pixels),
+        lambda s: share(s.missing, s.object.pixels),
         "share of pixels predicted 0 or less",
         13,
         column="Missing",
