@@ -4,10 +4,10 @@ file is read, and overall is checked against object and background in every samp
 
 import math
 import statistics
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -41,6 +41,9 @@ from fpp_ml_bench.evaluation.score.uncertainty import intervals_over_objects
 from fpp_ml_bench.evaluation.submission.description import Submission
 from fpp_ml_bench.loaders.storage.benchmark import Counts, known_problem
 from fpp_ml_bench.schema import Count, SparseModel, StrictModel, Text
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.evaluation.score.evaluator import Scored
 
 AGREES = 1e-9
 """Relative difference up to which two computations of an average count as the same number."""
@@ -123,8 +126,8 @@ class Result(SparseModel):
         void = self.mode == "standard"
         for row in self.per_sample:
             _check_sample(row, height * width, {"void": void, "unlit": void and self.target == "depth_exact"})
-        derived = _derived(self.per_sample)
-        _check_same("", self.model_dump(include=set(derived)), derived)
+        follows = derived(self.per_sample)
+        _check_same("", self.model_dump(include=set(follows)), follows)
         return self
 
 
@@ -144,20 +147,16 @@ class ArrayScores(StrictModel):
     uncertainty: Uncertainty | None = None
 
 
-def array_scores(rows: list[dict[str, Any]], stated: Mapping[str, SigmaSample]) -> ArrayScores:
-    """`ArrayScores` from ``per_sample`` rows (keys of `SampleResult`) and the ``stated`` uncertainty of all or none."""
-    per_sample = [SampleResult(**row) for row in rows]
-    uncertainty = uncertainty_of(stated, {row.sample: row.object for row in per_sample}) if stated else None
-    return ArrayScores(per_sample=per_sample, uncertainty=uncertainty, **_derived(per_sample))
+def scores_of(scored: "Sequence[Scored]") -> dict[str, Any]:
+    """Every key of `ArrayScores` from ``scored`` samples, of which all state an uncertainty or none does."""
+    per_sample = [SampleResult(sample=sample.name, object=sample.object, **sample.row) for sample in scored]
+    stated = {sample.name: sample.stated for sample in scored if sample.stated is not None}
+    owners = {sample.name: sample.object for sample in scored}
+    uncertainty = uncertainty_of(stated, owners) if stated else None
+    return {"per_sample": per_sample, "uncertainty": uncertainty, **derived(per_sample)}
 
 
-def result_from_rows(rows: list[dict[str, Any]], **fields: Any) -> Result:
-    """A `Result` from ``per_sample`` rows (keys of `SampleResult`) and the remaining keys; averages are made here."""
-    per_sample, version = [SampleResult(**row) for row in rows], protocol.RESULT_SCHEMA_VERSION
-    return Result(schema_version=version, per_sample=per_sample, **_derived(per_sample), **fields)
-
-
-def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
+def derived(per_sample: list[SampleResult]) -> dict[str, Any]:
     """Every key of `Result` that follows from the per-sample scores."""
     rows = [{key: getattr(row, key) for key in METRICS} for row in per_sample]
     objects = [row.object for row in per_sample]
