@@ -6,9 +6,7 @@ keep ``vouched.txt``: a line for each row file that they measured themselves, or
 Nothing in a row says so, and nothing is signed: who can change the list can change the code.
 """
 
-import math
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import sha256
@@ -19,9 +17,9 @@ from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.result.file import parse_result, read_json, write_result
-from fpp_ml_bench.evaluation.result.model import Result
+from fpp_ml_bench.evaluation.result.model import Result, disagreements
 from fpp_ml_bench.evaluation.result.parts import Reliance, Robustness
-from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.evaluation.score.evaluator import difference_lines, evaluate
 from fpp_ml_bench.files import file_content, printable
 from fpp_ml_bench.leaderboard.row_file import (
     DIGITS,
@@ -199,29 +197,9 @@ def differences(row: Row, folder: Path, dataset: DatasetFolder) -> list[str]:
     raises."""
     scored = evaluate(folder, dataset, row.dataset.split, row.target, row.edge_band_px, row.mode)
     rows = row, Row.model_validate(row_content(scored, digits=None))
-    stored, computed = (dict(_leaves("", each.model_dump(mode="json", exclude=_NOT_COMPARED))) for each in rows)
-    return [
-        f"{name}: {printable(stored.get(name), 80)} in the row, {printable(computed.get(name), 80)} recomputed"
-        for name in dict.fromkeys((*stored, *computed))
-        if not _agree(stored.get(name), computed.get(name), row.metrics.object_mae_mm or 0.0)
-    ]
-
-
-def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Name and value of every number, text and null in ``value``."""
-    if isinstance(value, dict | list):
-        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _leaves(f"{name}.{key}" if name else str(key), inner)
-    else:
-        yield name, value
-
-
-def _agree(stored: Any, computed: Any, error_mm: float) -> bool:
-    if not isinstance(stored, float) or not isinstance(computed, float) or computed == 0:
-        return bool(stored == computed)
-    half_unit = 0.5 * 10.0 ** (math.floor(math.log10(abs(computed))) + 1 - DIGITS)
-    # A bias is a small difference of large numbers.
-    return abs(stored - computed) <= half_unit + 1e-9 * max(abs(computed), error_mm)
+    pair = (each.model_dump(mode="json", exclude=_NOT_COMPARED) for each in rows)
+    found = disagreements(*pair, cancelling=1e-9 * (row.metrics.object_mae_mm or 0.0), digits=DIGITS)
+    return difference_lines(found, "row")
 
 
 def not_checked(about: Row | Result) -> list[str]:

@@ -385,19 +385,21 @@ def differences(scored: Result, folder: Path, dataset: DatasetFolder) -> list[st
     block, again_block = (part.pop("uncertainty", None) for part in (stored, computed))
     found = list(disagreements(stored, computed))
     if rows.keys() != again_rows.keys():
-        return [*_lines(found), "per_sample: other samples than the split has"]
+        return [*difference_lines(found), "per_sample: other samples than the split has"]
     for sample, row in again_rows.items():
         differing = disagreements(rows[sample], row, cancelling=1e-9 * (row["object_mae_mm"] or 0.0))
         found += [(f"{sample}: {name}", *pair) for name, *pair in differing]
     if (block is None) != (again_block is None):
         said = ["there is none" if part is None else "there is one" for part in (block, again_block)]
-        return [*_lines(found), f"uncertainty: {said[0]} in the result, {said[1]} recomputed"]
-    return _lines([*found, *disagreements(block, again_block, "uncertainty", rounding=1e-12)])  # nll is near 0
+        return [*difference_lines(found), f"uncertainty: {said[0]} in the result, {said[1]} recomputed"]
+    found += disagreements(block, again_block, "uncertainty", rounding=1e-12)  # nll is near 0
+    return difference_lines(found)
 
 
-def _lines(found: Iterable[tuple[str, Any, Any]]) -> list[str]:
+def difference_lines(found: Iterable[tuple[str, Any, Any]], file: str = "result") -> list[str]:
+    """The `disagreements` of a ``file``, a line each."""
     return [
-        f"{name}: {_value_text(stored)} in the result, {_value_text(value)} "
+        f"{name}: {_value_text(stored)} in the {file}, {_value_text(value)} "
         + (f"in {SUBMISSION_FILE}" if name.startswith("submission.") else "recomputed")
         for name, stored, value in found
     ]
