@@ -4,12 +4,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+from fpp_ml_bench.baselines.method import Assumption
+from fpp_ml_bench.baselines.registry import methods
 from fpp_ml_bench.evaluation.metrics import METRICS, RANGE_KEY, RANK_KEY, WIDE, WIDEST, with_column
 from fpp_ml_bench.evaluation.report.html import millimetres, percent, score_text, seconds
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.leaderboard.groups import TEST, UNSEEN, Ranked
-from fpp_ml_bench.leaderboard.names import assumption, learned_from
-from fpp_ml_bench.leaderboard.row_file import processor
+from fpp_ml_bench.leaderboard.ranking import TEST, UNSEEN, Ranked
+from fpp_ml_bench.leaderboard.row_file import Row, processor
 from fpp_ml_bench.leaderboard.rows import Entry
 
 NOT_CHECKED = "*"
@@ -148,6 +149,45 @@ def device(entry: Entry) -> str:
     """What the time was taken on: the GPU where there is one, else the CPU and its cores; a dash when unknown."""
     hardware = entry.row.hardware
     return "-" if hardware is None else printable(hardware.gpu or processor(hardware), _DEVICE_WIDTH)
+
+
+_TRUTH_NAMES = {"range": "depth range", "mask": "object mask", "order": "fringe order"}
+
+
+def given_truth(track: str) -> str:
+    """The ground truth of the scored samples that the methods of a track are given; empty for ``metric``.
+
+    >>> given_truth("oracle range + order")
+    "the test sample's depth range and fringe order"
+    """
+    things = [_TRUTH_NAMES[word] for word in track.removeprefix("oracle ").split(" + ") if word in _TRUTH_NAMES]
+    if not things:
+        return ""
+    return "the test sample's " + " and ".join(filter(None, (", ".join(things[:-1]), things[-1])))
+
+
+def _assumption(row: Row) -> Assumption | None:
+    method = methods().get(row.submission.method)
+    return None if method is None else method.assumption(row.submission.settings)
+
+
+def assumption(row: Row) -> str:
+    """In a few words; empty where a method assumes nothing of the scene, or is not of this package."""
+    assumed = _assumption(row)
+    return "" if assumed is None else assumed.words
+
+
+def assumption_sentences(row: Row) -> str:
+    """For the row's own page: what the method assumes, and what it was given of the samples that it is scored on."""
+    given = given_truth(row.track)
+    assumed = _assumption(row)
+    return " ".join([*([assumed.sentence] if assumed else []), *([f"Given {given}."] if given else [])])
+
+
+def learned_from(row: Row) -> str:
+    """What data the method learned from, as its submission says; empty where it does not say."""
+    said = row.submission.learned_from
+    return "" if said is None else str(said.data)
 
 
 def _states_uncertainty(row: Ranked) -> bool:

@@ -13,10 +13,10 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE
 from fpp_ml_bench.evaluation.result.parts import Timing
 from fpp_ml_bench.leaderboard import columns, rows
-from fpp_ml_bench.leaderboard.data_files import table_csv
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.row_file import ObjectMeans, Row, interval_over, mean_over, row_json, write_row
 from fpp_ml_bench.leaderboard.rows import read_entry
+from fpp_ml_bench.leaderboard.tables import table_csv
 
 OBJECTS = [f"object {n}" for n in range(8)]
 HONEST = {"first": 1.0, "second": 2.0, "third": 3.0}
