@@ -26,9 +26,8 @@ from fpp_ml_bench.leaderboard.row_file import (
     ROW_SCHEMA_VERSION,
     Row,
     check_size,
+    in_brief,
     processor,
-    robustness_in_brief,
-    rounded,
     row_content,
     row_of,
     write_row,
@@ -234,22 +233,15 @@ def check_same_method(entry: Entry, method: Method) -> None:
             )
 
 
-def write_reliance(entry: Entry, reliance: Reliance) -> None:
-    """Put ``reliance`` into the file of ``entry``, replacing an earlier value; of a row, in four digits. Raises
-    SubmissionError for a block that contradicts the result (other weights, other units)."""
-    block = reliance.model_dump(mode="json")
-    _write(entry, "reliance", rounded(block, 4) if entry.is_row_file else block)
-
-
-def write_robustness(entry: Entry, robustness: Robustness) -> None:
-    """`write_reliance` of ``robustness``, beside that on another set; of a row, in brief."""
-    block = robustness_in_brief(robustness) if entry.is_row_file else robustness.model_dump(mode="json")
-    sets = read_json(entry.path).get("robustness", {})
-    _write(entry, "robustness", {**sets, robustness.set: block})
-
-
-def _write(entry: Entry, key: str, block: dict[str, Any]) -> None:
-    content = {**read_json(entry.path), key: block}
+def write_block(entry: Entry, block: Reliance | Robustness) -> None:
+    """Put a ``block`` into the file of ``entry``, replacing an earlier value, that of a robustness on the same set; of
+    a row, in brief. Raises SubmissionError for a block that contradicts the result (other weights, other units)."""
+    content = read_json(entry.path)
+    plain = in_brief(block) if entry.is_row_file else block.model_dump(mode="json")
+    if isinstance(block, Robustness):
+        content["robustness"] = {**content.get("robustness", {}), block.set: plain}
+    else:
+        content["reliance"] = plain
     if entry.is_row_file:
         write_row(validate(Row, content, entry.path, "leaderboard row"), entry.path)
     else:

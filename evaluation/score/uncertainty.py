@@ -50,10 +50,7 @@ def object_interval(values: Sequence[float | None], objects: Sequence[Hashable])
     totals = np.array([math.fsum(group) for group in sums.values()])
     counts = np.array([len(group) for group in sums.values()], dtype=np.float64)
     drawn = _draws(len(sums))
-    if (counts == counts[0]).all():
-        means = totals.take(drawn).mean(axis=1) / counts[0]
-    else:
-        means = totals.take(drawn).sum(axis=1) / counts.take(drawn).sum(axis=1)
+    means = totals.take(drawn).sum(axis=1) / counts.take(drawn).sum(axis=1)
     low, high = np.quantile(means, _levels(len(sums)))
     return float(low), float(high)
 
@@ -180,11 +177,9 @@ def holm(p_values: Sequence[float]) -> list[float]:
     >>> [round(p, 6) for p in holm([0.01, 0.04, 0.03])]
     [0.03, 0.06, 0.06]
     """
-    adjusted, largest = [0.0] * len(p_values), 0.0
-    for place, index in enumerate(sorted(range(len(p_values)), key=p_values.__getitem__)):
-        largest = max(largest, min(1.0, (len(p_values) - place) * p_values[index]))
-        adjusted[index] = largest
-    return adjusted
+    order = np.argsort(p_values)
+    adjusted = np.sort(p_values) * np.arange(len(order), 0, -1)
+    return np.minimum(np.maximum.accumulate(adjusted), 1.0)[np.argsort(order)].tolist()  # type: ignore[no-any-return]
 
 
 @dataclass(frozen=True)

@@ -169,8 +169,6 @@ HEADER_BYTES = 16384
 _PARSING = Lock()
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 _NO_HEADER = (ValueError, TypeError, SyntaxError, TokenError, KeyError, RecursionError, MemoryError, OverflowError)
-_Layout = tuple[np.dtype[Any], bool, int]
-"""Type, whether in Fortran order, and the offset of the first value."""
 
 
 def read_npy(path: Path, size: tuple[int, int], memory: local) -> MapAndHash:
@@ -182,11 +180,8 @@ def read_npy(path: Path, size: tuple[int, int], memory: local) -> MapAndHash:
         memory.buffer = bytearray(_largest_npy(size))
     view = memoryview(memory.buffer)
     with opened(path) as (stream, length):
-        filled = fill(stream, view[:length])
-        layout = _layout(bytes(view[: min(filled, HEADER_BYTES)]), length, size)
-        if filled != length:
-            raise PredictionError(f"ended early: expected {length} bytes, got {filled}; write it again")
-    return _array_in(memory.buffer, size, layout), hashlib.sha256(view[:length]).hexdigest()
+        content = view[: fill(stream, view[:length])]
+    return parse_npy(content, size, length), hashlib.sha256(content).hexdigest()
 
 
 def _largest_npy(size: tuple[int, int]) -> int:
@@ -211,25 +206,14 @@ def declared_size(path: Path) -> tuple[int, int] | None:
     return None
 
 
-def parse_npy(content: bytes, size: tuple[int, int]) -> NDArray[Any]:
-    """The array in the bytes of a .npy file; PredictionError as `read_npy`."""
-    return _array_in(content, size, _layout(content[:HEADER_BYTES], len(content), size))
-
-
-def _array_in(content: bytes | bytearray, size: tuple[int, int], layout: _Layout) -> NDArray[Any]:
-    """The (H, W) array in a whole file's bytes, a view."""
-    dtype, fortran, start = layout
-    flat = np.frombuffer(content, dtype=dtype, count=size[0] * size[1], offset=start)
-    return flat.reshape(size, order="F" if fortran else "C")
-
-
-def _layout(head: bytes, length: int, size: tuple[int, int]) -> _Layout:
-    """Of a .npy file of ``length`` bytes that begins with ``head``; refuses what is not a map of ``size``."""
-    if head[:4] == b"PK\x03\x04":
+def parse_npy(content: bytes | memoryview, size: tuple[int, int], length: int | None = None) -> NDArray[Any]:
+    """The array (H, W) in the bytes of a .npy file, a view; ``length``: that of the file where ``content`` may be its
+    beginning only. PredictionError as `read_npy`."""
+    if content[:4] == b"PK\x03\x04":
         raise PredictionError(
             "is a zip archive (np.savez?) under the name .npy; write it with np.save, or name it .npz"
         )
-    stream = io.BytesIO(head)
+    stream = io.BytesIO(content[:HEADER_BYTES])
     try:
         version = npy.read_magic(stream)
         if (read := _HEADERS.get(version)) is not None:
@@ -240,12 +224,15 @@ def _layout(head: bytes, length: int, size: tuple[int, int]) -> _Layout:
     if read is None:
         raise PredictionError(f"has .npy format version {version}; expected 1.0 or 2.0, write it with np.save")
     _check_array(dtype, shape, size)
-    start = stream.tell()
+    start, length = stream.tell(), len(content) if length is None else length
     expected = start + size[0] * size[1] * dtype.itemsize
     if length != expected:
         problem = "is truncated" if length < expected else "has foreign bytes after the array"
         raise PredictionError(f"{problem}: expected {expected} bytes, got {length}; write it again")
-    return dtype, fortran, start
+    if len(content) != length:
+        raise PredictionError(f"ended early: expected {length} bytes, got {len(content)}; write it again")
+    flat = np.frombuffer(content, dtype=dtype, count=size[0] * size[1], offset=start)
+    return flat.reshape(size, order="F" if fortran else "C")
 
 
 def _check_array(dtype: np.dtype[Any], shape: tuple[int, ...], size: tuple[int, int]) -> None:
