@@ -195,7 +195,7 @@ _COLUMNS = (
         lambda row: f"{error(RANK_KEY, row)} ({columns.interval(row, between=' to ')})",
     ),
     Column("Overall MAE, mm", partial(error, "overall_mae_mm")),
-    Column("Time, ms", columns.milliseconds_text),
+    Column("Time, ms", partial(columns.time_text, per_second=1000)),
     columns.FRAMES,
     columns.RELIANCE,
     columns.ROBUSTNESS,

@@ -27,12 +27,10 @@ from fpp_ml_bench.evaluation.score.uncertainty import FEWEST_OBJECTS, Interval, 
 from fpp_ml_bench.evaluation.submission.description import Submission
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import rows
-from fpp_ml_bench.leaderboard.row_file import ObjectMeans, Row, interval_over, mean_over, name_key
-from fpp_ml_bench.leaderboard.rows import LOCAL, MEANING, SELF_REPORTED, Entry, read_entry
-from fpp_ml_bench.loaders.storage.benchmark import BENCHMARKS, Benchmark, benchmark_of
+from fpp_ml_bench.leaderboard.row_file import ObjectMeans, interval_over, mean_over, name_key
+from fpp_ml_bench.leaderboard.rows import LOCAL, MEANING, SELF_REPORTED, TEST, UNSEEN, Entry, read_entry
+from fpp_ml_bench.loaders.storage.benchmark import BENCHMARKS, Benchmark
 
-TEST, UNSEEN = "fpp-bench-full", "fpp-bench-unseen"
-"""The benchmark whose test split, and the set of unseen objects that, make one row."""
 MOST_PAIRED = 40
 """Ranked rows up to which a table lists its pairs, 780 of them."""
 
@@ -54,9 +52,9 @@ class GroupKey:
     protocol_version: str
 
     @classmethod
-    def of(cls, row: Row) -> "GroupKey":
-        info, benchmark = row.dataset, scenes_of(row)
-        data = info.truth if benchmark is None else _title(TEST) if is_unseen(row) else benchmark.title
+    def of(cls, entry: Entry) -> "GroupKey":
+        row, info, benchmark = entry.row, entry.row.dataset, entry.row.dataset.known
+        data = info.truth if benchmark is None else _title(TEST) if entry.is_unseen else benchmark.title
         return cls(
             row.frames_class,
             row.track,
@@ -176,18 +174,7 @@ class Ranked:
 
     def on(self, benchmark: str) -> Entry | None:
         """The part of it on the objects of `TEST` or on those of `UNSEEN`, whatever its frames are."""
-        return next((part for part in self._parts if is_unseen(part.row) == (benchmark == UNSEEN)), None)
-
-
-def scenes_of(row: Row) -> Benchmark | None:
-    """The benchmark whose scenes a row is scored on, whatever was projected."""
-    return benchmark_of(row.dataset.content)
-
-
-def is_unseen(row: Row) -> bool:
-    """Whether a row is scored on the set of unseen objects."""
-    benchmark = scenes_of(row)
-    return benchmark is not None and benchmark.name == UNSEEN and row.dataset.split == "test"
+        return next((part for part in self._parts if part.is_unseen == (benchmark == UNSEEN)), None)
 
 
 def _title(name: str) -> str:
@@ -246,24 +233,25 @@ def with_ratios(groups: Sequence[Group]) -> list[Group]:
     """``groups`` whose rows have their ``ratio``: object MAE over the smallest that a trivial row by the same rules has
     on the row's objects. Trivial rows need at most one frame, so they count in all classes; a row that is given
     something of the ground truth counts in the tracks that are given no less."""
-    trivial: dict[tuple[object, ...], list[tuple[set[str], dict[str, float]]]] = {}
+    trivial: dict[GroupKey, list[tuple[set[str], dict[str, float]]]] = {}
     for group in groups:
         for row in filter(is_trivial, group.rows):
-            trivial.setdefault(_data(group.key), []).append((_given(group.key), row.object_means(RANK_KEY)))
+            trivial.setdefault(_alike(group.key), []).append((_given(group.key), row.object_means(RANK_KEY)))
     with_ratio = []
     for group in groups:
-        means = [own for given, own in trivial.get(_data(group.key), []) if given <= _given(group.key)]
+        means = [own for given, own in trivial.get(_alike(group.key), []) if given <= _given(group.key)]
         with_ratio.append(replace(group, rows=tuple(replace(row, ratio=_ratio(row, means)) for row in group.rows)))
     return with_ratio
+
+
+def _alike(key: GroupKey) -> GroupKey:
+    """What tables share whose rows are scored by the same rules on the same data."""
+    return replace(key, frames=FRAMES_CLASSES[0], track="metric")
 
 
 def _given(key: GroupKey) -> set[str]:
     """What of the ground truth the track's methods are given, in the words of `Track`."""
     return set(key.track.removeprefix("oracle ").split(" + ")) - {"metric"}
-
-
-def _data(key: GroupKey) -> tuple[object, ...]:
-    return key.data, key.size, key.split, key.target, key.mode, key.edge_band_px, key.protocol_version
 
 
 def _ratio(row: Ranked, trivial: Sequence[Mapping[str, float]]) -> float | None:
@@ -319,13 +307,13 @@ def rank(entries: Iterable[Entry], sort: str = DEFAULT_SORT) -> list[Group]:
         raise SubmissionError(f"expected a sort key out of {', '.join(sort_keys())}, got {printable(sort)!r}")
     members: dict[GroupKey, list[Entry]] = {}
     for entry in entries:
-        members.setdefault(GroupKey.of(entry.row), []).append(entry)
+        members.setdefault(GroupKey.of(entry), []).append(entry)
     return with_ratios([_group(key, members[key], sort) for key in sorted(members, key=lambda key: key.order)])
 
 
 def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
     # Vouched rows first: of two copies they stay, and what others contradict is theirs.
-    entries = sorted(entries, key=lambda e: (list(MEANING).index(e.provenance), is_unseen(e.row), e.name, e.path.name))
+    entries = sorted(entries, key=lambda e: (list(MEANING).index(e.provenance), e.is_unseen, e.name, e.path.name))
     entries, notes = _without_copies(entries)
     methods = _methods(entries)
     claims = [first.name for first, _ in methods if first.provenance == SELF_REPORTED]
@@ -362,7 +350,7 @@ def _without_copies(entries: Sequence[Entry]) -> tuple[list[Entry], list[str]]:
     kept: dict[tuple[bool, str], Entry] = {}
     notes = []
     for entry in entries:
-        first = kept.setdefault((is_unseen(entry.row), entry.row.predictions_sha256), entry)
+        first = kept.setdefault((entry.is_unseen, entry.row.predictions_sha256), entry)
         if first is not entry:
             copy, of = (f"{printable(e.name, 80)} ({printable(e.path.name, 80)})" for e in (entry, first))
             notes.append(f"Not shown, the same predictions as {of}: {copy}.")
@@ -374,13 +362,13 @@ def _methods(entries: Sequence[Entry]) -> list[tuple[Entry, Entry | None]]:
     contradict each other."""
     by_name: dict[str, tuple[Entry, Entry | None]] = {}
     by_data: dict[bool, Entry] = {}
-    for entry in sorted(entries, key=lambda entry: is_unseen(entry.row)):
+    for entry in sorted(entries, key=lambda entry: entry.is_unseen):
         key = name_key(entry.name)
         if key in by_name:
             test, unseen = by_name[key]
             _check_one_method(unseen or test, entry)
         by_name[key] = (by_name[key][0], entry) if key in by_name else (entry, None)
-        first = by_data.setdefault(is_unseen(entry.row), entry)
+        first = by_data.setdefault(entry.is_unseen, entry)
         if _counts(first) != _counts(entry):
             files = [printable(str(e.path), 500) for e in (entry, first)]
             raise SubmissionError(
@@ -400,7 +388,7 @@ def _check_one_method(first: Entry, second: Entry) -> None:
     both = f"{files[0]} and {files[1]} both hold {printable(first.name)!r}"
     if first.name != second.name:
         both += f" or what looks like it, {printable(second.name)!r},"
-    if is_unseen(first.row) == is_unseen(second.row):
+    if first.is_unseen == second.is_unseen:
         raise SubmissionError(f"{both} on the same data; leave one out, or give one another name")
     about_first, about_second = first.row.submission, second.row.submission
     weights = "weights_sha256"

@@ -8,7 +8,7 @@ Nothing in a row says so, and nothing is signed: who can change the list can cha
 
 import re
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -32,13 +32,14 @@ from fpp_ml_bench.leaderboard.row_file import (
     row_of,
     write_row,
 )
-from fpp_ml_bench.loaders.storage.benchmark import benchmark_of
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.schema import validate
 
 SHIPPED_ROWS = Path(__file__).resolve().parent / "rows"
 VOUCHED = Path(__file__).resolve().parent / "vouched.txt"
 _LARGEST_FILE_BYTES = 1 << 26
+TEST, UNSEEN = "fpp-bench-full", "fpp-bench-unseen"
+"""The benchmark whose test split, and the set of unseen objects that, make one row."""
 
 MEASURED_HERE, VERIFIED, SELF_REPORTED = "measured here", "verified", "self-reported"
 LOCAL = "local file"
@@ -87,6 +88,12 @@ class Entry:
     def frames(self) -> int:
         """Number of captured frames per depth map."""
         return len(self.row.submission.frames_used)
+
+    @cached_property
+    def is_unseen(self) -> bool:
+        """Whether it is scored on the set of unseen objects."""
+        benchmark = self.row.dataset.known
+        return benchmark is not None and benchmark.name == UNSEEN and self.row.dataset.split == "test"
 
     @property
     def vouched(self) -> bool:
@@ -141,7 +148,7 @@ def read_entry(path: Path) -> Entry:
             f"{file}: was scored by protocol {row.protocol_version}, this is {PROTOCOL_VERSION}; score the predictions "
             "again"
         )
-    benchmark = benchmark_of(row.dataset.content)
+    benchmark = row.dataset.known
     if benchmark is not None and row.metrics.object_mae_mm == 0:
         raise SubmissionError(
             f"{file}: every error is exactly 0, so the predictions are the ground truth of {benchmark.title} itself; "

@@ -31,8 +31,8 @@ from fpp_ml_bench.leaderboard.columns import (
     learned_from,
     uncertainty,
 )
-from fpp_ml_bench.leaderboard.ranking import MOST_PAIRED, TEST, UNSEEN, Group, Ranked
-from fpp_ml_bench.leaderboard.rows import BY_ITS_AUTHORS, BY_THE_PAPER
+from fpp_ml_bench.leaderboard.ranking import MOST_PAIRED, Group, Ranked
+from fpp_ml_bench.leaderboard.rows import BY_ITS_AUTHORS, BY_THE_PAPER, TEST, UNSEEN
 from fpp_ml_bench.paper import paper_rows
 from fpp_ml_bench.tables import Table
 

@@ -232,7 +232,7 @@ def test_blocks_that_predictions_dont_tell_are_marked(base, board):
     blocks = {"reliance": reliance(score=1.0, interval=[0.9, 1.0]), "robustness": {"test": robustness()}}
     (group,) = board(content_of(row.model_copy(update=blocks)))
     shown = {row.short_name: row for row in group.rows}["forged"]
-    cells = [columns.reliance(shown.entry), columns.robustness(shown.entry), columns.milliseconds_text(shown)]
+    cells = [columns.reliance(shown.entry), columns.robustness(shown.entry), columns.time_text(shown, 1000)]
     assert cells == ["1.00*", "31.0*", "0.01*"] and not shown.entry.time_measured
 
 
