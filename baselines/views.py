@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import FULL_SIZE, MM_PER_M, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation.protocol import TARGETS
-from fpp_ml_bench.evaluation.score.check import check_folder, scored_pair
-from fpp_ml_bench.evaluation.submission.prediction_files import read_sigma, reader_for
+from fpp_ml_bench.evaluation.score.check import Rules, check_folder
 from fpp_ml_bench.files import printable, write_files
 from fpp_ml_bench.loaders.render.mesh_files import ply_bytes
 from fpp_ml_bench.loaders.render.scene import turned, unturned
@@ -186,23 +185,17 @@ def prediction_maps(
     if isinstance(predictions, str) and predictions in TARGETS:
         column = predictions
         return f"{column} of {printable(dataset.path.name)}", lambda sample: (dataset.depth_mm(sample, column), None)
-    folder = Path(predictions)
-    checked = check_folder(folder, dataset, split)
-    if checked.problems or checked.description is None:
-        raise PredictionError(
-            f"{printable(str(folder), 500)} can't be used, {len(checked.problems)} problems:", checked.problems
-        )
-    described = checked.description
-    reader = reader_for(checked.form, folder, checked.samples, dataset.size, described.png_mm_per_level)
+    checked = check_folder(predictions, dataset, split)
+    described, listing = checked.sound(), checked.listing
+    read = listing.reader(dataset.size, described.png_mm_per_level)
+    rules = Rules(target, described.units, described.range_rule, "standard")
 
-    def read(sample: str) -> tuple[Map, Map | None]:
-        target_mm = dataset.target_mm(sample, target)
-        left_out = dataset.left_out(sample, described.range_rule, target)
-        depth_mm, _ = scored_pair(reader.read(sample)[0], target_mm, described.units, "standard", sample, left_out)
-        sigma_mm = read_sigma(folder, sample, dataset.size) if checked.sigmas else None
+    def maps(sample: str) -> tuple[Map, Map | None]:
+        depth_mm, _ = rules.pair(read(sample)[0], dataset, sample)
+        sigma_mm = listing.sigma_mm(sample, dataset.size) if listing.sigmas else None
         return np.array(depth_mm), sigma_mm
 
-    return described.name, read
+    return described.name, maps
 
 
 def views_by_object(dataset: DatasetFolder, split: str, only: str | None = None) -> dict[str, list[str]]:

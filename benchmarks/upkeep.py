@@ -50,11 +50,18 @@ from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import Robustness
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.leaderboard import columns
-from fpp_ml_bench.leaderboard.columns import NOT_CHECKED, Column, device, error
-from fpp_ml_bench.leaderboard.groups import Group, Ranked, is_trivial
-from fpp_ml_bench.leaderboard.names import assumption, short_names
+from fpp_ml_bench.leaderboard.columns import NOT_CHECKED, Column, assumption, device, error
 from fpp_ml_bench.leaderboard.page.sections import of_one_target
-from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
+from fpp_ml_bench.leaderboard.ranking import (
+    Group,
+    Ranked,
+    expand,
+    is_trivial,
+    rank,
+    read_entries,
+    shipped_rows,
+    short_names,
+)
 from fpp_ml_bench.leaderboard.row_file import row_json, write_row
 from fpp_ml_bench.leaderboard.rows import VOUCHED, Entry, read_entry, vouching_line
 from fpp_ml_bench.leaderboard.tables import markdown_rows, markdown_text, ranking_table
@@ -188,7 +195,7 @@ _COLUMNS = (
         lambda row: f"{error(RANK_KEY, row)} ({columns.interval(row, between=' to ')})",
     ),
     Column("Overall MAE, mm", partial(error, "overall_mae_mm")),
-    Column("Time, ms", columns.milliseconds_text),
+    Column("Time, ms", partial(columns.time_text, per_second=1000)),
     columns.FRAMES,
     columns.RELIANCE,
     columns.ROBUSTNESS,

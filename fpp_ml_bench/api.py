@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from fpp_ml_bench.baselines.method import Method
     from fpp_ml_bench.evaluation.score.evaluator import Maps
-    from fpp_ml_bench.leaderboard.groups import Group
+    from fpp_ml_bench.leaderboard.ranking import Group
     from fpp_ml_bench.optics.rig import Rig
 
 __all__ = ["compare", "decode", "evaluate", "load_dataset", "load_method", "open_dataset", "rank"]

@@ -20,7 +20,7 @@ from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.evaluation.protocol import Track
 from fpp_ml_bench.evaluation.report.html import millimetres, percent
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.leaderboard.names import given_truth
+from fpp_ml_bench.leaderboard.columns import given_truth
 from fpp_ml_bench.leaderboard.page.page import INDEX, SUBMISSIONS, write_page
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.row_file import Row

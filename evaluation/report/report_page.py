@@ -18,8 +18,8 @@ from fpp_ml_bench.evaluation.report.terminal import result_table
 from fpp_ml_bench.evaluation.result.file import write_file
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import SampleResult
-from fpp_ml_bench.evaluation.score.check import Depth, scored_pair
-from fpp_ml_bench.evaluation.submission.prediction_files import list_folder, reader_for
+from fpp_ml_bench.evaluation.score.check import Depth, Rules
+from fpp_ml_bench.evaluation.submission.prediction_files import list_folder
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.pictures import panel_figure
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -88,22 +88,21 @@ def sample_maps(
     `write_report` does."""
     if not result.dataset.content.items() <= dataset.content.items():
         raise DatasetError(f"{dataset.path}: is not what was scored; give {printable(result.dataset.identity)}")
-    submission, samples = result.submission, [row.sample for row in result.per_sample]
-    form = list_folder(folder, samples, result.dataset.split, {}).form
-    reader = reader_for(form, folder, samples, dataset.size, submission.png_mm_per_level)
+    submission = result.submission
+    rules = Rules(result.target, submission.units, submission.range_rule, result.mode)
+    listing = list_folder(folder, dataset, result.dataset.split)
+    read = listing.reader(dataset.size, submission.png_mm_per_level)
     # The first frame that the method used; frame 0 where it used none or that frame is not stored here.
     used = [index for index in sorted(submission.frames_used) if index < len(dataset.sequence)]
     for place, row in chosen:
         try:
-            values, digest = reader.read(row.sample)
+            values, digest = read(row.sample)
         except PredictionError as error:
-            raise PredictionError(f"{reader.named(row.sample)}: {error}") from None
+            raise PredictionError(f"{listing.named(row.sample)}: {error}") from None
         if digest != row.prediction_sha256:
-            named = reader.named(row.sample)
+            named = listing.named(row.sample)
             raise PredictionError(f"{named}: is not the file that was scored; score the folder again")
-        target_mm = dataset.target_mm(row.sample, result.target)
-        left_out = dataset.left_out(row.sample, submission.range_rule, result.target)
-        prediction_mm, target = scored_pair(values, target_mm, submission.units, result.mode, row.sample, left_out)
+        prediction_mm, target = rules.pair(values, dataset, row.sample)
         try:
             fringe = dataset.frame(row.sample, used[0] if used else 0)
         except DatasetError:

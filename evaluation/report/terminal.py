@@ -10,7 +10,7 @@ from string import Formatter
 from rich.console import Group
 from rich.text import Text
 
-from fpp_ml_bench.evaluation.metrics import METRICS, NOTES, UNCERTAINTY, Metric, listed
+from fpp_ml_bench.evaluation.metrics import METRICS, NOTES, UNCERTAINTY, Metric
 from fpp_ml_bench.evaluation.protocol import PIXEL_SETS
 from fpp_ml_bench.evaluation.report.comparison import Comparison
 from fpp_ml_bench.evaluation.report.html import interval_text, millimetres, score_text, seconds, signed
@@ -91,7 +91,7 @@ def _notes(result: Result) -> Text:
 def _uncertainty(result: Result) -> Table | None:
     if (block := result.uncertainty) is None:
         return None
-    shown = [metric for metric in listed(UNCERTAINTY.values()) if metric.terminal]
+    shown = [metric for metric in UNCERTAINTY.values() if metric.terminal]
     table = _table(
         "Stated uncertainty",
         numbers=[metric.terminal for metric in shown],

@@ -18,7 +18,7 @@ from fpp_ml_bench.constants import MINI_OBJECTS, TEST_OBJECTS
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import RANK_KEY
 from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE
-from fpp_ml_bench.leaderboard.names import assumption
+from fpp_ml_bench.leaderboard.columns import assumption
 from fpp_ml_bench.leaderboard.rows import Entry, read_entry
 from fpp_ml_bench.options import option
 from fpp_ml_bench.tables import Table

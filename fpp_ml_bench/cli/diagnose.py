@@ -19,7 +19,7 @@ from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings, OfMethods
 from fpp_ml_bench.cli.options import COUNT, command, command_line, names, value
 from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.evaluation.result.parts import PART_TITLES, Reliance
-from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_reliance
+from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_block
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.options import REQUIRED, argument, option
@@ -151,7 +151,7 @@ def reliance(
     if json is not None:
         write_json(measured.model_dump(mode="json"), json)
     if entry is not None:
-        write_reliance(entry, measured)
+        write_block(entry, measured)
     moved = [value for key, value in measured.parts if not key.startswith("answered")]
     if any(moved):
         show(_reliance_table(method.title, measured))

@@ -18,7 +18,7 @@ from fpp_ml_bench.cli.options import Pool, command, names
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.report.html import millimetres, percent
-from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_robustness
+from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_block
 from fpp_ml_bench.loaders.render.builder import assembly_of
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.storage.manifest import Manifest
@@ -87,7 +87,7 @@ def robust(
             )
         page = f"{out}/{write_page(below).name}"
     if entry is not None:
-        write_robustness(entry, robustness_block(setup, rows))
+        write_block(entry, robustness_block(setup, rows))
     show(_table(setup, rows))
     print(f"{page}: curves of all methods measured there")
 

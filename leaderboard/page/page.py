@@ -19,15 +19,13 @@ from fpp_ml_bench.evaluation.result.parts import PART_TITLES
 from fpp_ml_bench.evaluation.score.uncertainty import FEWEST_OBJECTS
 from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.leaderboard import columns, tables
-from fpp_ml_bench.leaderboard.data_files import table_csv, table_json
-from fpp_ml_bench.leaderboard.groups import Group, Ranked, more_than_trivial, scenes_of
-from fpp_ml_bench.leaderboard.names import assumption, assumption_sentences, given_truth, learned_from
+from fpp_ml_bench.leaderboard.columns import assumption, assumption_sentences, given_truth, learned_from
 from fpp_ml_bench.leaderboard.page.samples import Samples
 from fpp_ml_bench.leaderboard.page.sections import CLASS_COLOURS, blocks, tradeoff_section
-from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
+from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, Group, Ranked, more_than_trivial
 from fpp_ml_bench.leaderboard.row_file import Row
 from fpp_ml_bench.leaderboard.rows import MEANING, Entry
-from fpp_ml_bench.leaderboard.tables import ReportedTable
+from fpp_ml_bench.leaderboard.tables import ReportedTable, table_csv, table_json
 
 INDEX, DATA, TABLE, SUBMISSIONS, CLOUD = "index.html", "data.json", "data.csv", "submissions", "-cloud.html"
 _HERE, _PACKAGE = Path(__file__).resolve().parent, "fpp_ml_bench.leaderboard.page"
@@ -132,7 +130,7 @@ def _submission(group: Group, row: Ranked) -> dict[str, Any]:
 
 
 def _data_words(row: Row) -> str:
-    benchmark = scenes_of(row)
+    benchmark = row.dataset.known
     return f"{row.dataset.name if benchmark is None else benchmark.title}, {row.dataset.split} split"
 
 
