@@ -44,7 +44,6 @@ from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import FppBenchError, SubmissionError
 from fpp_ml_bench.evaluation.metrics import RANK_KEY
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
-from fpp_ml_bench.evaluation.report.html import percent
 from fpp_ml_bench.evaluation.result.file import read_result
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import Robustness
@@ -59,6 +58,7 @@ from fpp_ml_bench.leaderboard.row_file import row_json, write_row
 from fpp_ml_bench.leaderboard.rows import VOUCHED, Entry, read_entry, vouching_line
 from fpp_ml_bench.leaderboard.tables import markdown_rows, markdown_text, ranking_table
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.style import percent
 
 ROOT = Path(__file__).resolve().parent.parent
 ROWS, README, ROBUSTNESS = ROOT / "leaderboard" / "rows", ROOT / "README.md", ROOT / "docs/results/robustness.md"

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 from functools import partial
 
 from fpp_ml_bench.evaluation.metrics import METRICS, RANGE_KEY, RANK_KEY, WIDE, WIDEST, with_column
-from fpp_ml_bench.evaluation.report.html import millimetres, percent, score_text, seconds
+from fpp_ml_bench.evaluation.report.terminal import score_text
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.groups import TEST, UNSEEN, Ranked
 from fpp_ml_bench.leaderboard.names import assumption, learned_from
 from fpp_ml_bench.leaderboard.row_file import processor
 from fpp_ml_bench.leaderboard.rows import Entry
+from fpp_ml_bench.style import millimetres, percent, three_digits
 
 NOT_CHECKED = "*"
 NOT_MEASURED = "not measured"
@@ -113,7 +114,7 @@ def uncertainty(entry: Entry) -> tuple[float | None, float | None]:
 
 def _seconds(row: Ranked) -> str:
     value = row.entry.value("seconds_per_sample")
-    return seconds(value) + (NOT_CHECKED if value is not None and not row.entry.time_measured else "")
+    return three_digits(value) + (NOT_CHECKED if value is not None and not row.entry.time_measured else "")
 
 
 def milliseconds_text(row: Ranked) -> str:

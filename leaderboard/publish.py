@@ -18,7 +18,6 @@ from fpp_ml_bench.baselines.tradeoff.measure import shipped_tradeoff
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.evaluation.protocol import Track
-from fpp_ml_bench.evaluation.report.html import millimetres, percent
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.names import given_truth
 from fpp_ml_bench.leaderboard.page.page import INDEX, SUBMISSIONS, write_page
@@ -31,6 +30,7 @@ from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
 from fpp_ml_bench.loaders.storage.card import card_end
 from fpp_ml_bench.loaders.storage.parquet import published_features
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.style import millimetres, percent
 
 FRAMEWORK = "fpp-ml-bench"
 SPLIT, TARGET, MODE = "test", "depth", "standard"

@@ -19,7 +19,6 @@ from fpp_ml_bench.baselines.reproduce.scoring import MAIN_KEY, AllFrames, all_fr
 from fpp_ml_bench.baselines.reproduce.work import Outcome, ReproduceSettings, current_weights, file_sha256, state_of
 from fpp_ml_bench.baselines.training.recipe import Recipe, table_rows
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.report.html import percent
 from fpp_ml_bench.evaluation.result.file import write_file
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.score.uncertainty import object_interval
@@ -28,6 +27,7 @@ from fpp_ml_bench.leaderboard.row_file import Row, row_of, view_means, write_row
 from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEASURED_HERE, Entry, read_entry
 from fpp_ml_bench.leaderboard.tables import PAPER_DEPTHS, TextTable, markdown_text, paper_tables
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.style import percent
 
 _NOT_IN_THE_PAPER = {
     "pix2pixhd": "pix2pixHD",

@@ -12,13 +12,13 @@ from typing import Any
 
 from rich.text import Text
 
-from fpp_ml_bench.evaluation.report.html import interval_text, millimetres
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.columns import METHOD, NOTE, ONLY_IN_FILES, Column, columns
 from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, Group, Pair, Ranked
 from fpp_ml_bench.leaderboard.names import given_truth
 from fpp_ml_bench.leaderboard.rows import BY_ITS_AUTHORS, BY_THE_PAPER
 from fpp_ml_bench.paper import paper_rows
+from fpp_ml_bench.style import interval_text, millimetres
 from fpp_ml_bench.tables import Table
 
 NO_RESULTS = """\

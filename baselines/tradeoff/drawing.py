@@ -17,8 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from matplotlib.transforms import Bbox
 
-from fpp_ml_bench.evaluation.report.html import escaped
-from fpp_ml_bench.style import GRID, INK, SOFT
+from fpp_ml_bench.style import GRID, INK, SOFT, escaped
 
 COLOURS = {
     "ink": INK,

@@ -9,10 +9,9 @@ from rich.text import Text
 
 from fpp_ml_bench.baselines.tradeoff.drawing import Mark, Scatter
 from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, TRADEOFF_FILE, Cost, Point, Tradeoff, power
-from fpp_ml_bench.evaluation.report.html import millimetres, percent
 from fpp_ml_bench.evaluation.result.file import write_file
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.style import LINE_COLOURS, figure, figure_png, styled
+from fpp_ml_bench.style import LINE_COLOURS, figure, figure_png, millimetres, percent, styled
 from fpp_ml_bench.tables import Table
 
 COSTS: dict[Cost, tuple[str, float, str]] = {

@@ -15,12 +15,12 @@ from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, Tradeoff, pareto_
 from fpp_ml_bench.baselines.tradeoff.report import scatter, tables
 from fpp_ml_bench.evaluation.metrics import RANK_KEY
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
-from fpp_ml_bench.evaluation.report.html import interval_text, signed
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import columns
 from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, Group, Ranked, is_trivial
 from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
 from fpp_ml_bench.loaders.storage.benchmark import benchmark_before
+from fpp_ml_bench.style import interval_text, signed
 
 _SPARSE = (*columns.PARTS, columns.RATIO, columns.RANGE, *columns.UNCERTAINTY, columns.LEARNED)
 _TRADEOFF_PICTURE = 430, 380

@@ -15,8 +15,7 @@ from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.submission.description import LearnedFrom
 from fpp_ml_bench.leaderboard import rows
 from fpp_ml_bench.leaderboard.groups import is_trivial, more_than_trivial
-from fpp_ml_bench.leaderboard.page.page import write_page
-from fpp_ml_bench.leaderboard.page.samples import predicted_samples
+from fpp_ml_bench.leaderboard.page.page import predicted_samples, write_page
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.tables import chosen_tables
 

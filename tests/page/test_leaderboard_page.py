@@ -21,16 +21,15 @@ from fpp_ml_bench.baselines.tradeoff.drawing import Mark, Scatter, free_box
 from fpp_ml_bench.baselines.tradeoff.measure import pareto_front
 from fpp_ml_bench.cli import leaderboard as leaderboard_command
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.evaluation.report.html import escaped, page
 from fpp_ml_bench.evaluation.report.report_page import write_report
 from fpp_ml_bench.evaluation.result.file import parse_result, write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
-from fpp_ml_bench.leaderboard.page.page import page_files, slug
-from fpp_ml_bench.leaderboard.page.samples import predicted_samples
+from fpp_ml_bench.leaderboard.page.page import page_files, predicted_samples, slug
 from fpp_ml_bench.leaderboard.page.sections import LogScale, overview
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries
 from fpp_ml_bench.leaderboard.tables import chosen_tables
 from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.style import escaped, page
 
 
 @pytest.fixture(scope="module")
@@ -209,7 +208,7 @@ def test_dangerous_text_is_refused_by_every_output(name, message, files, tmp_pat
 def test_escaping_holds_without_the_checks_before_it():
     assert escaped("\x1b[31m<b>\u202e") == "\\x1b[31m&lt;b&gt;\\u202e"
     assert len(escaped("<" * 10_000_000)) < 1000
-    assert "<title>&lt;/title&gt;</title>" in page("</title>", "")
+    assert "<title>&lt;/title&gt;</title>" in page("fpp_ml_bench", "parts.html", "</title>").decode()
 
 
 def test_a_slug_is_a_file_name_of_its_own(files):
