@@ -13,7 +13,6 @@ from fpp_ml_bench.baselines.phase.crossed_observation import CrossedReason
 from fpp_ml_bench.baselines.phase.crossed_route import CrossedRoute
 from fpp_ml_bench.baselines.stability.cases import (
     U64,
-    Expects,
     Floats,
     Outcome,
     difference,
@@ -131,12 +130,11 @@ def rounding_px(rig: Rig) -> float:
     return rig.pitch("vertical") / (2 * np.pi) * worst_angle(rounding())
 
 
-def _decoded_phase(mean: float, modulation: float, noise_grey: float = 0.0) -> tuple[Floats, NDArray]:
+def _decoded_phase(mean: float, modulation: float) -> tuple[Floats, NDArray]:
     """Error of the absolute phase in rad, which includes slipped periods, of 20,000 pixels across the pattern; the
     flagged pixels."""
     rig, positions_px = coded_rig(), np.linspace(2.0, 909.0, 20_000)
     levels = direction_levels(rig, positions_px, mean=mean, modulation=modulation)
-    levels += noise_grey * np.random.default_rng(7).standard_normal(levels.shape)
     error_px, flagged = coordinate_error(rig, levels, positions_px)
     return error_px * 2 * np.pi / 18.0, flagged
 
@@ -166,32 +164,21 @@ def modulation_exact(modulation: float) -> Outcome:
     return worst(difference(wrapped_phase(frames).phase[0], exact), bound, condition=condition)
 
 
-def _by_modulation(modulation: float, **_: float) -> Expects:
-    if modulation == MIN_MODULATION:
-        return "either"
-    return "number" if modulation > MIN_MODULATION else "refusal"
-
-
 @family(
     "phase",
     "modulation, 8-bit frames",
     "rad",
     against="the phase that the frames were made from",
-    bound="asin(g / 2B), g = max (2/N) sum |sin|: half a grey level in every frame; with noise sqrt(2/N) "
-    "sigma / B, sigma^2 = 1 + 1/12, second order 2 sigma_phi^2, 4 standard errors; under 5 levels "
-    "refused",
-    noise_grey=(0.0, 1.0),
+    bound="asin(g / 2B), g = max (2/N) sum |sin|: half a grey level in every frame; under 5 levels refused",
     modulation=MODULATIONS,
-    expects=_by_modulation,
+    expects=lambda modulation: (
+        "either" if modulation == MIN_MODULATION else "number" if modulation > MIN_MODULATION else "refusal"
+    ),
 )
-def modulation_8bit(modulation: float, noise_grey: float) -> Outcome:
-    """absolute phase by the decoder, 8-bit frames, with noise its rms"""
-    error, flagged = _decoded_phase(MEAN, modulation, noise_grey)
-    if not noise_grey or flagged.all():
-        return worst(error, worst_angle(rounding(), modulation), flagged)
-    sigma, measured = math.sqrt(2 / 18 * (1 + 1 / 12)) / modulation, error[~flagged]
-    bound = sigma * (1 + 2 * sigma**2 + 4 / math.sqrt(2 * measured.size))
-    return Outcome(float(np.sqrt(np.mean(measured**2))), bound, float(flagged.mean()))
+def modulation_8bit(modulation: float) -> Outcome:
+    """absolute phase by the decoder, 8-bit frames"""
+    error, flagged = _decoded_phase(MEAN, modulation)
+    return worst(error, worst_angle(rounding(), modulation), flagged)
 
 
 @family(

@@ -1,5 +1,5 @@
 """Losses of zero residual, empty mask, half precisions and any magnitude; instance normalisation of nearly constant
-input; gradients; networks in single and half precision; the training metric."""
+input; networks in single and half precision; the training metric."""
 
 import math
 from collections.abc import Callable
@@ -12,14 +12,10 @@ from torch.func import functional_call
 from fpp_ml_bench.baselines.networks.base import RECENTRED_FROM, InstanceNorm, in_full_precision, torch_threads
 from fpp_ml_bench.baselines.networks.model import NETWORKS as NAMES
 from fpp_ml_bench.baselines.networks.model import build
-from fpp_ml_bench.baselines.phase.calibration_layer import CalibrationLayer
-from fpp_ml_bench.baselines.stability.cases import U32, U64, Outcome, family, gamma, worst, wrong
+from fpp_ml_bench.baselines.stability.cases import U32, Outcome, family, gamma, worst, wrong
 from fpp_ml_bench.baselines.stability.scores import exact_scores
 from fpp_ml_bench.baselines.training.losses import EPSILON, loss_function
-from fpp_ml_bench.baselines.training.tables import LOSSES
 from fpp_ml_bench.evaluation.score.torch_metric import DepthScores
-from fpp_ml_bench.optics.named_rigs import paper_rig
-from fpp_ml_bench.optics.sequence import DIRECTIONS
 
 ALPHA = 0.7
 SMALL = {
@@ -124,46 +120,6 @@ def instance_norm(offset: float, amplitude: float) -> Outcome:
     off = torch.minimum(torch.full_like(left, relative * offset), left)
     bound = 2 * (off / (off**2 + variance).sqrt() + relative * exact.abs() + relative)
     return worst((output.detach() - exact + 0 * gradient).numpy(), bound.numpy(), condition=offset)
-
-
-def directional(function: Callable[[Tensor], Tensor], x: Tensor, step: float = 1e-3) -> Outcome:
-    """Autograd's derivative along a random direction against Richardson's extrapolated difference quotient."""
-    seed = random(tuple(x.shape), 8)
-    seed = seed / seed.norm()
-    inner = x.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(function(inner), inner)
-    slope = float((gradient * seed).sum())
-    with torch.no_grad():
-        steps = step, 2 * step, 4 * step
-        one, two, four = (float(function(x + h * seed) - function(x - h * seed)) / (2 * h) for h in steps)
-        rounding = 64 * U64 * abs(float(function(x))) * math.sqrt(x.numel()) / step
-    first, second = (4 * one - two) / 3, (4 * two - four) / 3
-    return worst(slope - first, abs(first - second) + abs(one - two) * 1e-3 + rounding)
-
-
-@family(
-    "networks",
-    "gradient",
-    "1",
-    against="Richardson's extrapolated differences",
-    bound="difference of two extrapolations (the next order) + 64 u |f| sqrt(n) / h of rounding",
-    of=(*LOSSES, *DIRECTIONS, "instance norm", *NAMES),
-)
-@torch_threads(1)
-def gradient(of: str) -> Outcome:
-    """directional derivative of a loss, of the calibration layer's depth of a direction, of a layer, of a network, in
-    float64"""
-    if of in LOSSES:
-        target = _target()  # all errors are away from the kink of |.|
-        return directional(lambda x: _loss(of)(x, target), target + 0.1 + random(_SHAPE, 2, torch.rand))
-    if of in DIRECTIONS:
-        exact = CalibrationLayer.of(paper_rig(16), of)  # type: ignore[arg-type]
-        layer, total = exact.tensors(torch.float64), torch.from_numpy(exact.absolute_phase(1800.0))
-        order = torch.floor(total / (2 * math.pi) + 0.5)
-        return directional(lambda phase: layer.depth_mm(phase, order).sum(), total - 2 * math.pi * order)
-    network = InstanceNorm(1, affine=True).double() if of == "instance norm" else small_network(of)
-    seed = random(_IMAGE, 10)
-    return directional(lambda image: (network(image) * seed).sum(), random(_IMAGE, 9, torch.rand), step=1e-7)
 
 
 @family(
