@@ -7,11 +7,12 @@ from functools import partial
 from fpp_ml_bench.baselines.method import Assumption
 from fpp_ml_bench.baselines.registry import methods
 from fpp_ml_bench.evaluation.metrics import METRICS, RANGE_KEY, RANK_KEY, WIDE, WIDEST, with_column
-from fpp_ml_bench.evaluation.report.html import millimetres, percent, score_text
+from fpp_ml_bench.evaluation.report.terminal import score_text
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.ranking import Ranked
 from fpp_ml_bench.leaderboard.row_file import Row, processor
 from fpp_ml_bench.leaderboard.rows import TEST, UNSEEN, Entry
+from fpp_ml_bench.style import millimetres, percent
 
 NOT_CHECKED = "*"
 NOT_MEASURED = "not measured"

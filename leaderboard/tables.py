@@ -8,8 +8,8 @@ import io
 import json
 import re
 import unicodedata
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,7 @@ from typing import Any
 from rich.text import Text
 
 from fpp_ml_bench.evaluation.metrics import HEADLINE, RANK_KEY, WIDE, with_column
-from fpp_ml_bench.evaluation.report.html import interval_text, millimetres
 from fpp_ml_bench.evaluation.score.uncertainty import Pair
-from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.columns import (
     METHOD,
     NOTE,
@@ -34,7 +32,8 @@ from fpp_ml_bench.leaderboard.columns import (
 from fpp_ml_bench.leaderboard.ranking import MOST_PAIRED, Group, Ranked
 from fpp_ml_bench.leaderboard.rows import BY_ITS_AUTHORS, BY_THE_PAPER, TEST, UNSEEN
 from fpp_ml_bench.paper import paper_rows
-from fpp_ml_bench.tables import Table
+from fpp_ml_bench.style import interval_text, millimetres
+from fpp_ml_bench.tables import Table, markdown_text
 
 NO_RESULTS = """\
 No results here yet. Score predictions, and their row appears:
@@ -130,37 +129,7 @@ def chosen_tables(choice: str | None) -> list[ReportedTable]:
     return [tables[name] for name in several.get(choice, (str(choice),))]
 
 
-@dataclass(frozen=True)
-class TextTable:
-    """Rows of text under ``titles``, of which the columns numbered ``words`` are aligned to the left: the same table
-    for the terminal, for Markdown and for the page."""
-
-    title: str
-    titles: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    words: Collection[int] = (0, 1)
-
-    @classmethod
-    def of(cls, title: str, rows: Sequence[Mapping[str, str]], words: Collection[int] = (0, 1)) -> "TextTable":
-        """A table of ``rows`` of cells by the titles of their columns."""
-        return cls(title, tuple(rows[0]) if rows else (), [tuple(row.values()) for row in rows], words)
-
-    def markdown(self) -> list[str]:
-        """Lines of a Markdown table."""
-        right = [number not in self.words for number in range(len(self.titles))]
-        return markdown_rows(self.titles, right, [list(map(markdown_text, row)) for row in self.rows])
-
-    def rich(self, **look: Any) -> Table:
-        """The table in a terminal; text that was submitted is never markup."""
-        table = Table(title=Text(self.title), **{"elsewhere": "--markdown FILE", **look})
-        for number, title in enumerate(self.titles):
-            table.add_column(Text(title), justify="left" if number in self.words else "right")
-        for cells in self.rows:
-            table.add_row(*map(Text, cells))
-        return table
-
-
-def paper_table(paper: ReportedTable) -> TextTable:
+def paper_table(paper: ReportedTable) -> Table:
     """The rows of a table of others, errors with the two decimals of their tables."""
     titles = {
         f"{shown} {error.upper()}": f"{pixels}_{error}_mm"
@@ -176,7 +145,7 @@ def paper_table(paper: ReportedTable) -> TextTable:
         }
         for row in paper.rows
     ]
-    return TextTable.of(f"{paper.name}: {paper.title}, mm", rows)
+    return Table.of(f"{paper.name}: {paper.title}, mm", rows, elsewhere="--markdown FILE")
 
 
 def pair_row(pair: Pair) -> dict[str, str]:
@@ -193,12 +162,13 @@ def pair_row(pair: Pair) -> dict[str, str]:
     }
 
 
-def ranking_table(title: str, shown: Sequence[Column], rows: Sequence[Ranked]) -> TextTable:
-    """``rows`` of a ranking with the columns of ``shown`` that any of them has."""
+def ranking_table(title: str, shown: Sequence[Column], rows: Sequence[Ranked], **look: Any) -> Table:
+    """``rows`` of a ranking with the columns of ``shown`` that any of them has, whose titles take two lines in a
+    terminal, to leave more width for the names; ``look``: further settings of the `Table`."""
     shown = [column for column in shown if column.shown_for(rows)]
     words = [number for number, column in enumerate(shown) if not column.right]
-    cells = [[column.text(row) for column in shown] for row in rows]
-    return TextTable(title, [column.title for column in shown], cells, words)
+    cells = [{_two_lines(column.title): column.text(row) for column in shown} for row in rows]
+    return Table.of(title, cells, words, elsewhere="--markdown FILE", **look)
 
 
 def group_tables(groups: Sequence[Group], sort: str, with_pairs: bool = False) -> list[Table | Text]:
@@ -208,23 +178,21 @@ def group_tables(groups: Sequence[Group], sort: str, with_pairs: bool = False) -
     parts: list[Table | Text] = []
     for group in groups:
         shown = [column for column in columns(sort) if column.from_width < ONLY_IN_FILES]
-        ranking = ranking_table(group.title, shown, group.rows)
-        shown.reverse()  # of equal importance, the rightmost is left out first
-        first_out = [_two_lines(column.title) for column in sorted(shown, key=partial(_importance, sort))]
-        titles = [*map(_two_lines, ranking.titles)]
-        names = 1 + titles.index(METHOD.title)
-        parts += [replace(ranking, titles=titles).rich(names=names, first_out=first_out)]
+        names = 1 + [column.title for column in shown if column.shown_for(group.rows)].index(METHOD.title)
+        rightmost = shown[::-1]  # of equal importance, the rightmost is left out first
+        first_out = [_two_lines(column.title) for column in sorted(rightmost, key=partial(_importance, sort))]
+        parts += [ranking_table(group.title, shown, group.rows, names=names, first_out=first_out)]
         parts += [Text("".join(f"{note}\n" for note in group.notes))]
         if with_pairs and len(group.ranked) > MOST_PAIRED:
             parts.append(Text(f"The pairs of more than {MOST_PAIRED} ranked rows are not listed.\n"))
         elif with_pairs and group.pairs:
-            pairs = TextTable.of("Pairs of these rows", [*map(pair_row, group.pairs)])
-            parts.append(pairs.rich(names=2, first_out=PAIRS_FIRST_OUT, elsewhere="--json FILE"))
+            look = {"names": 2, "first_out": PAIRS_FIRST_OUT, "elsewhere": "--json FILE"}
+            parts.append(Table.of("Pairs of these rows", [*map(pair_row, group.pairs)], **look))
     return [*parts, Text(f"{NOTE}\n")]
 
 
 def _two_lines(title: str) -> str:
-    return title.replace(" ", "\n", 1)  # leaves more width for the names
+    return title.replace(" ", "\n", 1)
 
 
 def _importance(sort: str, column: Column) -> tuple[bool, int, int]:
@@ -237,22 +205,8 @@ def paper_rich_tables(papers: Sequence[ReportedTable]) -> list[Table | Text]:
     """The tables of others under their heading."""
     parts: list[Table | Text] = [Text(REPORTED_HEADING, style="bold")] if papers else []
     for paper in papers:
-        parts += [paper_table(paper).rich(), Text(f"{paper.note}\n")]
+        parts += [paper_table(paper), Text(f"{paper.note}\n")]
     return parts
-
-
-def markdown_text(text: str) -> str:
-    """``text`` as Markdown that shows exactly this text: punctuation that could be markup becomes a character entity.
-    Entities are never structure (CommonMark 6.2): no pipe ends a table cell, no tag, link, code or mention begins."""
-    safe = "".join(c if not c.isascii() or c.isalnum() or c in _PLAIN else f"&#{ord(c)};" for c in printable(text))
-    return re.sub(r"(?i)(www)\.", r"\1&#46;", safe)  # GitHub links bare www. names too
-
-
-def markdown_rows(titles: Sequence[str], right: Sequence[bool], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table; ``right`` says which columns are aligned to the right. Cells are Markdown already."""
-    rules = (" ---: " if to_right else " --- " for to_right in right)
-    lines = ["| " + " | ".join(titles) + " |", "|" + "|".join(rules) + "|"]
-    return lines + ["| " + " | ".join(cells) + " |" for cells in rows]
 
 
 def markdown(groups: Sequence[Group], papers: Sequence[ReportedTable], sort: str) -> str:
@@ -260,14 +214,14 @@ def markdown(groups: Sequence[Group], papers: Sequence[ReportedTable], sort: str
     lines: list[str] = []
     for group in groups:
         table = ranking_table(group.title, columns(sort), group.rows)
-        lines += [f"### {markdown_text(table.title)}", "", *table.markdown(), ""]
+        lines += [f"### {markdown_text(str(table.title))}", "", *table.markdown(), ""]
         for note in group.notes:
             lines += [markdown_text(note), ""]
     lines += [NOTE.replace("*", "\\*"), ""] if groups else []
     lines += [f"### {REPORTED_HEADING}", ""] if papers else []
     for paper in papers:
         table = paper_table(paper)
-        lines += [markdown_text(table.title), "", *table.markdown(), "", paper.note, ""]
+        lines += [markdown_text(str(table.title)), "", *table.markdown(), "", paper.note, ""]
     return "\n".join(lines).rstrip("\n") + "\n"
 
 

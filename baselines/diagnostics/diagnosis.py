@@ -25,12 +25,12 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
 )
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.evaluation.report.html import data_uri, page, render
 from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, read_json, write_atomically
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
 from fpp_ml_bench.options import did_you_mean
+from fpp_ml_bench.style import data_uri, page
 
 JSON_FILE, REPORT_FILE = "diagnose.json", "index.html"
 FORMAT_VERSION = 2
@@ -100,7 +100,7 @@ def diagnose(
         content = {"format": "fpp-ml-bench diagnosis", "version": FORMAT_VERSION, **context, "findings": findings}
         write_json(content, out / JSON_FILE)
         html = report_page(context, [(one.probe.question, one.finding) for one in results])
-        write_atomically(out / REPORT_FILE, html.encode("utf-8"))
+        write_atomically(out / REPORT_FILE, html)
         return results
 
 
@@ -177,19 +177,21 @@ def _context(subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, 
     }
 
 
-def report_page(context: Mapping[str, Any], findings: Sequence[tuple[str, Finding]]) -> str:
+def report_page(context: Mapping[str, Any], findings: Sequence[tuple[str, Finding]]) -> bytes:
     """The report: a section for each finding with its question; ``context`` is what ``diagnose.json`` says about
     subject, dataset, settings and machine."""
-    body = render(
+    name = context["subject"]["name"]
+    return page(
         "fpp_ml_bench.baselines.diagnostics",
         "diagnosis.html",
+        f"{name}: diagnosis",
+        _STYLE,
+        description=f"What {name} read",
         sections=findings,
         data_uri=data_uri,
         cells=lambda table: [[cell_text(cell) for cell in row] for row in table.rows],
         **context,
     )
-    name = context["subject"]["name"]
-    return page(f"{name}: diagnosis", body, _STYLE, description=f"What {name} read")
 
 
 def cell_text(cell: Cell) -> str:

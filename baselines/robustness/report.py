@@ -10,9 +10,8 @@ import numpy as np
 from fpp_ml_bench.baselines.diagnostics.probe import Line, Panel, chart
 from fpp_ml_bench.baselines.robustness.axes import CLEAN, corruptions, severity_means
 from fpp_ml_bench.baselines.robustness.run import read_axis
-from fpp_ml_bench.evaluation.report.html import data_uri, page, render
 from fpp_ml_bench.files import write_atomically
-from fpp_ml_bench.style import LINE_COLOURS
+from fpp_ml_bench.style import LINE_COLOURS, data_uri, page
 
 PAGE, CURVES = "index.html", "curves.png"
 _DASHES = ("-", "--", ":")
@@ -51,16 +50,17 @@ def write_page(out: Path) -> Path:
     measured = read_measured(out)
     curves = draw_curves(measured)
     write_atomically(out / CURVES, curves)
-    body = render(
+    content = page(
         "fpp_ml_bench.baselines.robustness",
         "robustness.html",
+        "Robustness: FPP-ML-Bench",
         methods=measured,
         axes=corruptions().axes,
         rules=corruptions(),
         curves=data_uri(curves),
         clean=CLEAN,
     )
-    write_atomically(out / PAGE, page("Robustness: FPP-ML-Bench", body).encode("utf-8"))
+    write_atomically(out / PAGE, content)
     return out / PAGE
 
 

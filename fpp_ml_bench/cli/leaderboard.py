@@ -9,8 +9,7 @@ from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import METRICS, RANK_KEY, sort_keys
 from fpp_ml_bench.evaluation.result.file import write_file
-from fpp_ml_bench.leaderboard.page.page import write_page
-from fpp_ml_bench.leaderboard.page.samples import predicted_samples
+from fpp_ml_bench.leaderboard.page.page import predicted_samples, write_page
 from fpp_ml_bench.leaderboard.ranking import discover, expand, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.ranking import rank as rank_files
 from fpp_ml_bench.leaderboard.row_file import write_row

@@ -17,7 +17,6 @@ from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
 from fpp_ml_bench.cli.options import Pool, command, names
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.report.html import millimetres, percent
 from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_block
 from fpp_ml_bench.loaders.render.builder import assembly_of
 from fpp_ml_bench.loaders.render.scene import BuildSettings
@@ -26,6 +25,7 @@ from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import AnySequence
 from fpp_ml_bench.options import REQUIRED, option
 from fpp_ml_bench.remote import RemoteFolder, place, working_copy
+from fpp_ml_bench.style import millimetres, percent
 from fpp_ml_bench.tables import Table
 
 

@@ -170,7 +170,7 @@ def reproduce_tables(
     for name, path in zip(tables, outcome.tables, strict=True):
         lines = reproduced.table_lines(name, outcome.jobs, folders, outcome.opened)
         show(
-            reproduced.text_table(name, lines, preset).rich(elsewhere="the page below"),
+            reproduced.line_table(name, lines, preset),
             reproduced.conclusion(name, lines),
         )
         print(f"Written: {path}")
