@@ -9,7 +9,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Reason
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute
+from fpp_ml_bench.baselines.phase.depth import Reason as DepthReason
 from fpp_ml_bench.baselines.stability.cases import (
     U64,
     Floats,
@@ -386,7 +387,7 @@ def plane_outcome(
     route = CrossedRoute(rig, family=measured_as or family)
     measured = route.measure(grey, mask)
     depth_mm, exact_mm = measured.depth_mm[MIDDLE], DEPTH_M * 1000
-    flagged = (depth_mm == 0) | (measured.reason[MIDDLE] != Reason.MEASURED)
+    flagged = (depth_mm == 0) | (measured.reason[MIDDLE] != DepthReason.MEASURED)
     bound_mm = float(np.median(route.carriers.mm_per_rad(np.full(u.shape, exact_mm)))) * math.pi / 2
     return worst(depth_mm - exact_mm, bound_mm, flagged)
 
