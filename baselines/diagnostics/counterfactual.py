@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -52,6 +53,7 @@ if TYPE_CHECKING:
     from fpp_ml_bench.baselines.diagnostics.subjects import Subject
     from fpp_ml_bench.baselines.method import Method
 
+MARGIN_PX = 6  # around the objects in the picture
 Map = NDArray[np.floating]
 
 
@@ -295,7 +297,9 @@ def summary(reliance: Reliance) -> str:
 def _draw_scenes(name: str, sample: Sample) -> Figure:
     """One column per scene: captured frame, expected change and actual change."""
     shown = [one for one in sample.variants if one.kind in ("phase", "outline", "projected") and one.amplitude_rad >= 0]
-    box = _box(np.logical_or.reduce([variant.scene.mask for variant in shown]))
+    seen = np.logical_or.reduce([variant.scene.mask for variant in shown])
+    left, top, width, height = cv2.boundingRect(seen.astype(np.uint8))
+    box = np.s_[max(top - MARGIN_PX, 0) : top + height + MARGIN_PX, max(left - MARGIN_PX, 0) : left + width + MARGIN_PX]
     method, columns = sample.method, []
     for variant in shown:
         scene, index = variant.scene, method.frames_used[0]
@@ -316,9 +320,3 @@ def _draw_scenes(name: str, sample: Sample) -> Figure:
     alt = f"Scenes of {name} with changed phase, outline or fringes, and the change of its prediction"
     titles = [f"{variant.kind}:\n{variant.name.replace(' ', chr(10), 1)}" for variant in shown]
     return Figure(title, alt, gallery(rows, titles, 1.3))
-
-
-def _box(mask: Mask, margin: int = 6) -> tuple[slice, ...]:
-    """The part of the image around ``mask``."""
-    seen = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    return tuple(slice(max(places[0] - margin, 0), places[-1] + margin + 1) for places in seen)

@@ -72,7 +72,8 @@ class FlatPlane(Probe):
         low, high = (float(np.mean(ends)) for ends in zip(*ranges, strict=True))
         masks = {outline: rectangle(renderer.shape, side) for outline, side in SIDES.items()} | silhouettes
         poses = [(outline, *pose) for outline in masks for pose in poses_of(outline, settings.quick)]
-        rows, shown = [], {}
+        rows: list[Row] = []
+        shown: dict[str, tuple[Row, NDArray, NDArray]] = {}
         for outline, tilt_deg, distance_m in poses:
             surface = plane(renderer.rig, distance_m, tilt_deg, masks[outline])
             lit, seen = renderer.light(surface), masks[outline].copy()
@@ -96,13 +97,13 @@ class FlatPlane(Probe):
             }
             rows.append(row)
             if (tilt_deg, distance_m) == FACING:
-                shown.setdefault(kind_of(outline), (row, frames[subject.frames_used[0]], prediction))
+                shown.setdefault(kind_of(outline), (row, np.asarray(frames[subject.frames_used[0]]), prediction))
             progress(len(rows), len(poses), f"{outline}, {distance_m:g} m")
         control = control_of(subject, dataset, renderer, list(silhouettes), limit)
         range_mm = [low, high] if normalised else None
-        values = {"planes": rows, "objects": control, "range_mm": range_mm, "collapse_below": limit}
+        content = {"planes": rows, "objects": control, "range_mm": range_mm, "collapse_below": limit}
         drawn = draw([shown[kind] for kind in KINDS], normalised)
-        return Finding(summary(rows, shown[RECTANGLE][0], control, normalised), values, table(rows, normalised), drawn)
+        return Finding(summary(rows, shown[RECTANGLE][0], control, normalised), content, table(rows, normalised), drawn)
 
 
 def kind_of(outline: str) -> str:

@@ -18,7 +18,6 @@ from captum.attr import LayerAttribution, LayerGradCam
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from fpp_ml_bench.baselines.diagnostics.linear import edge_map
 from fpp_ml_bench.baselines.diagnostics.probe import (
     Figure,
     Finding,
@@ -31,6 +30,7 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     mean_of,
     with_interval,
 )
+from fpp_ml_bench.baselines.diagnostics.scenes import edge_map
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DiagnosisError

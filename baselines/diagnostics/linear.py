@@ -9,11 +9,10 @@ layers"; the other choices are ours. Both learn from the network's batches as th
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import cache, lru_cache, partial
+from functools import cache, partial
 from itertools import product
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -31,16 +30,14 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     Table,
     chart,
 )
+from fpp_ml_bench.baselines.diagnostics.scenes import truth
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject, activations_of
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer
-from fpp_ml_bench.constants import MM_PER_M, split_sample_name
-from fpp_ml_bench.depth import normalise, object_mask
+from fpp_ml_bench.constants import split_sample_name
+from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.sequence import Direction
-from fpp_ml_bench.style import INK
+from fpp_ml_bench.style import INK, LINE_COLOURS
 
 SAMPLES, QUICK_SAMPLES = 120, 24  # training samples of the probes
 EPOCHS, QUICK_EPOCHS = 6, 4
@@ -64,22 +61,21 @@ class Target(NamedTuple):
     """What is read from a layer: its ``maps``, by the names in `truth`, and the mask ``where`` they are compared."""
 
     title: str
-    colour: str
     maps: tuple[str, ...]
     where: str = "object"
 
 
 Targets = Mapping[str, Target]
 LINEAR: Targets = {
-    "edges": Target("edges", "#2e8b57", ("edges",), "image"),
-    "depth": Target("depth, whole image", "#c0392b", ("depth",), "image"),
-    OBJECT_DEPTH: Target("depth, object", "#e08e79", ("depth",)),
-    "distance": Target("depth in mm, object", "#c0392b", ("depth_mm",)),
-    "phase": Target("wrapped phase", "#1b5bb8", ("sine", "cosine")),
-    "order": Target("fringe order", "#8a4b00", ("order",)),
+    "edges": Target("edges", ("edges",), "image"),
+    "depth": Target("depth, whole image", ("depth",), "image"),
+    OBJECT_DEPTH: Target("depth, object", ("depth",)),
+    "distance": Target("depth in mm, object", ("depth_mm",)),
+    "phase": Target("wrapped phase", ("sine", "cosine")),
+    "order": Target("fringe order", ("order",)),
 }
-"""Of the linear probes, each of which is fitted where it is compared; the phase is an angle and so has two maps. Edges
-and depth have the colours of the paper's figure."""
+"""Of the linear probes, each of which is fitted where it is compared; the phase is an angle and so has two maps."""
+COLOURS = {TRAINED: LINE_COLOURS[0], UNTRAINED: LINE_COLOURS[6]}
 FRINGE = ("phase", "order")  # of these, what needs fringes of a single direction
 SPATIAL: Targets = {name: LINEAR[name] for name in ("edges", "depth", OBJECT_DEPTH)}
 """Of the four-convolution probes, which are trained on the maps of the whole image."""
@@ -149,42 +145,6 @@ def _samples_with_object(dataset: DatasetFolder, split: str) -> list[str]:
     if not names:
         raise DiagnosisError(f"{dataset.path}: split {split} holds no object; probes need training and validation data")
     return names
-
-
-def truth(depth_mm: Image, rig: Rig, direction: Direction) -> dict[str, NDArray]:
-    """Ground truth of a depth map (H, W) in mm, 0 = background, seen by ``rig`` under fringes of ``direction``.
-    ``object``: its mask. ``edges``: `edge_map`, [0, 1]. ``depth``: normalised to the sample's own range, background 0
-    (the paper's target). ``depth_mm``. ``sine``, ``cosine``: of the wrapped phase, 0 outside the object. ``order``: the
-    fringe order minus that of a plane at the rig's standoff, 0 outside the object; the plane's order follows from the
-    pixel's position alone. All are float32. Raises ``ValueError`` for a map without an object."""
-    inside = object_mask(depth_mm)
-    standoff_mm = rig.standoff_m * MM_PER_M
-    # Of the background as if it were at the standoff.
-    phase = _layer(rig, direction).absolute_phase(np.where(inside, depth_mm, standoff_mm))
-    maps = {
-        "object": inside,
-        "edges": edge_map(depth_mm),
-        "depth": normalise(depth_mm, "individual", float(depth_mm[inside].min()), float(depth_mm[inside].max())),
-        "depth_mm": depth_mm,
-        "sine": np.where(inside, np.sin(phase), 0.0),
-        "cosine": np.where(inside, np.cos(phase), 0.0),
-        "order": np.floor(phase / TAU) - np.floor(_layer(rig, direction).absolute_phase(standoff_mm) / TAU),
-    }
-    return {name: np.array(values, dtype=np.float32) for name, values in maps.items()}
-
-
-def edge_map(depth_mm: NDArray) -> Image:
-    """Sobel gradient magnitude (3 x 3) of a depth map (H, W), float32, divided by its largest value, a scale that the
-    paper leaves open; 0 for a constant map."""
-    depth = np.asarray(depth_mm, dtype=np.float32)
-    across, down = (cv2.Sobel(depth, cv2.CV_32F, *order, ksize=3) for order in ((1, 0), (0, 1)))
-    strength = np.hypot(across, down)
-    return strength / (strength.max() or np.float32(1))  # type: ignore[no-any-return]
-
-
-@lru_cache(maxsize=2)
-def _layer(rig: Rig, direction: Direction) -> CalibrationLayer:
-    return CalibrationLayer.of(rig, direction)
 
 
 def at_size(features: Tensor, side: tuple[int, int]) -> Tensor:
@@ -367,9 +327,10 @@ class LinearProbes:
         return errors
 
 
-def grid_step(size: tuple[int, int]) -> int:
-    """Image px per grid step for images of ``size``: 4 up to 480 px, 8 at 960."""
-    return max(SHARE, -(-max(size) // LONGEST))
+def grid_of(size: tuple[int, int]) -> tuple[int, int]:
+    """Grid points (h, w) for images of ``size``: one for 4 x 4 px up to 480 px, for 8 x 8 px at 960."""
+    step = max(SHARE, -(-max(size) // LONGEST))
+    return max(1, size[0] // step), max(1, size[1] // step)
 
 
 class ConvolutionProbe(nn.Module):
@@ -417,8 +378,7 @@ class ConvolutionProbes(LinearProbes):
         self.probes: dict[tuple[Source, str, int], ConvolutionProbe] = {}
 
     def reduce(self, maps: Tensor, names: Sequence[str]) -> Tensor:
-        (height, width), step = self.subject.image_size, grid_step(self.subject.image_size)
-        return at_size(maps, (max(1, height // step), max(1, width // step)))
+        return at_size(maps, grid_of(self.subject.image_size))
 
     def masks(self, share: Tensor) -> tuple[Tensor, Tensor]:
         # Cells across the outline mix depth with background; of a tiny object those with the largest share count.
@@ -514,18 +474,20 @@ def summary(linear: Scores, spatial: Scores) -> str:
 def table(spatial: Scores) -> Table:
     """The paper's table, with its ratio of depth's MSE to edges', and the same probes as shares of variance."""
     trained = spatial[TRAINED]
-    groups = {layer: {layer: targets} for layer, targets in trained.items()}
-    groups |= {"average": trained, "average, random weights": spatial[UNTRAINED]}
-    groups |= {CONTROL_TITLES[name]: {name: targets} for name, targets in spatial[CONTROLS].items()}
-    rows: dict[str, dict[str, Any]] = {}
-    for name, layers in groups.items():
-        rows[name] = {f"mse {key}": mean_over(layers, key, "mse") for key in SPATIAL}
-        for key in SPATIAL:
-            interval = layers[name][key]["r2_interval"] if name in layers else None
-            rows[name][f"r2 {key}"] = {"r": mean_over(layers, key), "interval": interval}
+
+    def row(layers: Mapping[str, Mapping[str, Score]], layer: str | None = None) -> dict[str, Any]:
+        """Means over ``layers``, with the interval of a ``layer``."""
+        mse = {f"mse {key}": mean_over(layers, key, "mse") for key in SPATIAL}
+        intervals = {key: layers[layer][key]["r2_interval"] if layer else None for key in SPATIAL}
+        r2 = {f"r2 {key}": {"r": mean_over(layers, key), "interval": ends} for key, ends in intervals.items()}
+        return {**mse, **r2}
+
+    rows = {layer: row({layer: targets}, layer) for layer, targets in trained.items()}
+    rows |= {"average": row(trained), "average, random weights": row(spatial[UNTRAINED])}
+    rows |= {CONTROL_TITLES[name]: row({name: targets}) for name, targets in spatial[CONTROLS].items()}
     rows["predicting the mean"] = {f"mse {key}": mean_over(trained, key, "mse_of_mean") for key in SPATIAL}
-    for row in rows.values():
-        row["ratio"] = row["mse depth"] / row["mse edges"]
+    for numbers in rows.values():
+        numbers["ratio"] = numbers["mse depth"] / numbers["mse edges"]
     columns = {f"mse {key}": f"MSE, {target.title}" for key, target in SPATIAL.items()}
     columns |= {"ratio": "Ratio depth / edges"}
     columns |= {f"r2 {key}": f"R2, {target.title}" for key, target in SPATIAL.items()}
@@ -538,13 +500,13 @@ def figure(linear: Scores) -> Figure:
     panels, layers = [], list(linear[TRAINED])
     for target in linear[CONTROLS][INPUT]:
         lines = []
-        for label, source, colour, style, ends in (
-            ("trained", TRAINED, LINEAR[target].colour, "o-", "r2_interval"),
-            ("random weights", UNTRAINED, "#9aa3ad", "s--", "seeds"),
+        for label, network, style, ends in (
+            ("trained", TRAINED, "o-", "r2_interval"),
+            ("random weights", UNTRAINED, "s--", "seeds"),
         ):
-            scores = [linear[source][layer][target] for layer in layers]
+            scores = [linear[network][layer][target] for layer in layers]
             values, intervals = ([one[key] for one in scores] for key in ("r2", ends))
-            lines.append(Line(label, layers, values, colour, style, intervals))
+            lines.append(Line(label, layers, values, COLOURS[network], style, intervals))
         for (control, title), style in zip(CONTROL_TITLES.items(), (":", "-."), strict=True):
             level = [linear[CONTROLS][control][target]["r2"]] * len(layers)
             lines.append(Line(title, layers, level, INK, style))

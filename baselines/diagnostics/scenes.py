@@ -1,4 +1,5 @@
-"""Scenes that differ from a dataset's sample in a single property: its phase, its outline, or its fringes.
+"""What is true of a dataset's sample, and scenes that differ from it in a single property: its phase, its outline, or
+its fringes.
 
 Scenes are in direct light (`direct_light`): a changed scene is compared with its sample in the same light, never with
 the dataset's frames. Projector, brightness and sensor are the dataset's. An unchanged scene gives the frames of a
@@ -16,6 +17,7 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 from typing import Literal
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, shift
@@ -23,7 +25,7 @@ from scipy.ndimage import distance_transform_edt, shift
 from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.decoding.decode import decode_stack
-from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.depth import normalise, object_mask
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders.captures.exports import pixel_normals
 from fpp_ml_bench.loaders.render.illumination import LitPixels, light_surface
@@ -59,6 +61,36 @@ ONE_SURFACE_MM = 1e9  # all pixels of an object belong to one surface
 _STEP = 1e-6  # step of difference quotients in normalised ray coordinates: far below a pixel, far above rounding
 _GRAZING = 0.02
 """Smallest cosine between ray and normal at which the tangent plane is extrapolated to a neighbouring ray."""
+
+
+def truth(depth_mm: NDArray[np.float32], rig: Rig, direction: Direction) -> dict[str, NDArray]:
+    """Ground truth of a depth map (H, W) in mm, 0 = background, seen by ``rig`` under fringes of ``direction``.
+    ``object``: its mask. ``edges``: `edge_map`, [0, 1]. ``depth``: normalised to the sample's own range, background 0
+    (the paper's target). ``depth_mm``. ``sine``, ``cosine``: of the wrapped phase, 0 outside the object. ``order``: the
+    fringe order minus that of a plane at the rig's standoff, 0 outside the object; the plane's order follows from the
+    pixel's position alone. All are float32. Raises ``ValueError`` for a map without an object."""
+    inside, layer, standoff_mm = object_mask(depth_mm), CalibrationLayer.of(rig, direction), rig.standoff_m * MM_PER_M
+    # Of the background as if it were at the standoff.
+    phase = layer.absolute_phase(np.where(inside, depth_mm, standoff_mm))
+    maps = {
+        "object": inside,
+        "edges": edge_map(depth_mm),
+        "depth": normalise(depth_mm, "individual", float(depth_mm[inside].min()), float(depth_mm[inside].max())),
+        "depth_mm": depth_mm,
+        "sine": np.where(inside, np.sin(phase), 0.0),
+        "cosine": np.where(inside, np.cos(phase), 0.0),
+        "order": np.floor(phase / TAU) - np.floor(layer.absolute_phase(standoff_mm) / TAU),
+    }
+    return {name: np.array(values, dtype=np.float32) for name, values in maps.items()}
+
+
+def edge_map(depth_mm: NDArray) -> NDArray[np.float32]:
+    """Sobel gradient magnitude (3 x 3) of a depth map (H, W), float32, divided by its largest value, a scale that the
+    paper leaves open; 0 for a constant map."""
+    depth = np.asarray(depth_mm, dtype=np.float32)
+    across, down = (cv2.Sobel(depth, cv2.CV_32F, *order, ksize=3) for order in ((1, 0), (0, 1)))
+    strength: NDArray[np.float32] = np.hypot(across, down)
+    return strength / np.float32(strength.max() or 1)
 
 
 @dataclass(frozen=True)
@@ -301,23 +333,28 @@ def counterfactuals(
     return variants + [Variant("projected", name, replace(unchanged, projected=name)) for name in REPROJECTED]
 
 
-def fields(surface: Surface) -> dict[str, Field]:
-    """Shifts of at most 1 over the object's bounding box: constant, ramps across and down, a bump in the centre."""
-    middle = [(axis.min() + axis.max()) / 2 for axis in (surface.x, surface.y)]
-    half = [max((axis.max() - axis.min()) / 2, 1e-9) for axis in (surface.x, surface.y)]
-    return {
-        "constant": constant,
-        "ramp across": lambda x, y: (x - middle[0]) / half[0],
-        "ramp down": lambda x, y: (y - middle[1]) / half[1],
-        "bump": lambda x, y: np.exp(-2.0 * (((x - middle[0]) / half[0]) ** 2 + ((y - middle[1]) / half[1]) ** 2)),
-    }
+FIELDS: dict[str, Field] = {
+    "constant": constant,
+    "ramp across": lambda x, y: x,
+    "ramp down": lambda x, y: y,
+    "bump": lambda x, y: np.exp(-2.0 * (x**2 + y**2)),
+}
+"""Shifts of at most 1 over an object's bounding box, whose coordinates are -1 to 1."""
+
+
+def _over_box(field: Field, surface: Surface) -> Field:
+    """A field of `FIELDS` over the surface's bounding box."""
+    (left, right), (top, bottom) = ((axis.min(), axis.max()) for axis in (surface.x, surface.y))
+    across, down = max((right - left) / 2, 1e-9), max((bottom - top) / 2, 1e-9)
+    return lambda x, y: field((x - (left + right) / 2) / across, (y - (top + bottom) / 2) / down)
 
 
 def _moves(sample: Scene, renderer: SceneRenderer, direction: MovedPhase) -> Iterator[Variant]:
     surface, before = sample.surface, sample.lit
-    for name, field in fields(surface).items():
+    for name, field in FIELDS.items():
+        field = _over_box(field, surface)
         for sign in (1.0, -1.0):
-            amplitude = sign * _largest_shift_rad(surface, renderer, direction, field, sign)
+            amplitude = sign * _largest_shift_rad(surface, renderer.rig, direction, field, sign)
             if abs(amplitude) < SMALLEST_SHIFT_RAD:
                 continue
             moved_surface = moved(surface, renderer.rig, direction, field, amplitude)
@@ -332,18 +369,15 @@ def _moves(sample: Scene, renderer: SceneRenderer, direction: MovedPhase) -> Ite
                 yield Variant(kind, name, replace(sample, surface=moved_surface, lit=shown), amplitude)
 
 
-def _largest_shift_rad(
-    surface: Surface, renderer: SceneRenderer, direction: MovedPhase, field: Field, sign: float
-) -> float:
+def _largest_shift_rad(surface: Surface, rig: Rig, direction: MovedPhase, field: Field, sign: float) -> float:
     """The largest shift, up to `LARGEST_SHIFT_RAD`, that keeps every pixel within the working range."""
-    layer = layer_of(renderer.rig, direction, (surface.x, surface.y))
+    layer = layer_of(rig, direction, (surface.x, surface.y))
     phase = layer.absolute_phase(surface.depth_m * MM_PER_M)
-    ends = [layer.absolute_phase(end) - phase for end in renderer.rig.working_range_mm]
-    low, high = np.minimum(*ends), np.maximum(*ends)
-    shifts = sign * field(surface.x, surface.y)
     with np.errstate(divide="ignore", invalid="ignore"):
-        limits = np.where(shifts > 0, high / shifts, np.where(shifts < 0, low / shifts, np.inf))
-    return float(np.clip(limits.min(), 0.0, LARGEST_SHIFT_RAD))
+        ends = [
+            (layer.absolute_phase(end) - phase) / (sign * field(surface.x, surface.y)) for end in rig.working_range_mm
+        ]
+    return float(np.clip(np.nanmin(np.maximum(*ends)), 0.0, LARGEST_SHIFT_RAD))
 
 
 def _outline_changes(sample: Scene, renderer: SceneRenderer, outlines: Sequence[Mask]) -> Iterator[Variant]:

@@ -4,6 +4,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from copy import deepcopy
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial
@@ -114,7 +115,8 @@ class Subject:
 
     def input_batch(self, stacks: Sequence[Frames]) -> Tensor:
         """Input of ``network``, float32 (B, 1, H, W) in [0, 1]."""
-        return fringe_batch([frames[self.frames_used[0]] for frames in stacks], self.image_size, self.name)
+        images = [np.asarray(frames[self.frames_used[0]]) for frames in stacks]
+        return fringe_batch(images, self.image_size, self.name)
 
     def batches(
         self, dataset: DatasetFolder, samples: Sequence[str], size: int | None = None
@@ -275,8 +277,18 @@ def _subject_of_factory(
     show early."""
     if not 0 <= frame < len(dataset.sequence):
         raise DiagnosisError(f"frame {frame}: expected 0 to {len(dataset.sequence) - 1}, the frames of the sequence")
-    (path_text, _, attribute), network = name.rpartition(":"), _build_network(name, factory)
-    path, normalisation = Path(path_text), NORMALISATION_OF[units]
+    try:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)  # random weights are the same every time
+            network = factory()
+    except (Exception, SystemExit) as error:
+        raise DiagnosisError(
+            f"{name}: calling it without arguments failed: {type(error).__name__}: {printable(str(error), 400)}"
+        ) from error
+    if not isinstance(network, nn.Module):
+        raise DiagnosisError(f"{name}: expected it to return a torch module, got {type(network).__name__}")
+    network = network.eval().requires_grad_(False).cpu()
+    path, normalisation = Path(name.rpartition(":")[0]), NORMALISATION_OF[units]
     digest = hashlib.sha256(f"{units} {frame}".encode() + path.read_bytes())
     for key, value in network.state_dict().items():
         if isinstance(value, Tensor):
@@ -284,12 +296,12 @@ def _subject_of_factory(
             digest.update(key.encode() + values.numpy().tobytes())
 
     def predict(frames: Frames) -> Depth:
-        batch = fringe_batch([frames[frame]], dataset.size, path.stem)
-        return denormalise(network_output(network, batch, path.stem), normalisation, 0.0, 1.0).astype(np.float32)
+        output = network_output(network, user_subject.input_batch([frames]), path.stem)
+        return denormalise(output, normalisation, 0.0, 1.0).astype(np.float32)
 
     user_subject = Subject(
         name=path.stem,
-        title=f"{path.name}:{attribute}",
+        title=f"{path.name}:{name.rpartition(':')[2]}",
         sha256=digest.hexdigest(),
         units="normalised" if units == "normalised" else "mm",
         image_size=dataset.size,
@@ -299,7 +311,7 @@ def _subject_of_factory(
         normalisation=normalisation,
         network=network,
         layer_names=_select_layers(layers, network, name),
-        untrained=lambda seed: randomised(_build_network(name, factory), seed),
+        untrained=lambda seed: randomised(deepcopy(network), seed),
     )
     samples = dataset.samples("all")
     if not samples:
@@ -322,17 +334,3 @@ def randomised(network: nn.Module, seed: int) -> nn.Module:
                 order = torch.randperm(parameter.numel())
                 parameter.copy_(parameter.reshape(-1)[order].reshape(parameter.shape))
     return network
-
-
-def _build_network(name: str, factory: Any) -> nn.Module:
-    try:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)  # random weights are the same every time
-            network = factory()
-    except (Exception, SystemExit) as error:
-        raise DiagnosisError(
-            f"{name}: calling it without arguments failed: {type(error).__name__}: {printable(str(error), 400)}"
-        ) from error
-    if not isinstance(network, nn.Module):
-        raise DiagnosisError(f"{name}: expected it to return a torch module, got {type(network).__name__}")
-    return network.eval().requires_grad_(False).cpu()

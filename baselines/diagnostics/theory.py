@@ -57,7 +57,7 @@ class Theory(Probe):
         progress(0, 2, "two scenes, one frame")
         twins = twins_of(dataset, SceneRenderer.of(dataset))
         progress(1, 2, "one period, many distances")
-        laws = [
+        laws: list[dict[str, Any]] = [
             {
                 "error": name,
                 "distance_m": distance_m,
@@ -135,7 +135,7 @@ def twins_of(dataset: DatasetFolder, renderer: SceneRenderer, direction: Directi
             ]
             depths_mm = np.stack([scene.depth_mm for scene in scenes])
             frames, other_frames = (
-                np.stack([in_focus.frames(scene, [index])[index] for scene in scenes])  # type: ignore[arg-type]
+                np.stack([np.asarray(in_focus.frames(scene, [index])[index]) for scene in scenes])
                 for index in (frame, across)
             )
             return Twins(sample, direction, frame, across, depths_mm, frames, other_frames, paint)

@@ -37,7 +37,6 @@ PAGE, CURVES = "index.html", "curves.png"
 _DASHES = ("-", "--", ":")
 View = dict[str, Any]
 """A row of a view: sample, object, severity, seconds, and `SCORES`."""
-Progress = Callable[[str, int], None]
 Work = tuple[Method, Condition, FrameCache, tuple[str, ...]]
 """A method, the clean scene, rendered frames, and the views of each object."""
 
@@ -103,20 +102,20 @@ def measure(
     axes: Sequence[str] = (),
     workers: int = 1,
     cache: Path | None = None,
-    progress: Progress = lambda axis, views: None,
+    progress: Callable[[int], None] = lambda views: None,
     cluster: str | None = None,
     saved: Callable[[], None] = lambda: None,
 ) -> dict[str, list[View]]:
     """The rows of every view by axis, and a file ``out/AXIS.json`` for each axis as soon as it is finished; files that
     an earlier run of the same setup left are read instead. Views are predicted and scored by so many processes, or by
-    the Ray cluster at an address. ``progress`` is called with an axis and a number of views, ``saved`` after each file.
+    the Ray cluster at an address. ``progress`` is called with a number of views, ``saved`` after each file.
     Raises PredictionError for files of another setup, `BuildError` where another process is at it, `PoolError`."""
     with exclusive(out / LOCK_FILE, out, "measuring there"):
         files = {axis: out / f"{axis}.json" for axis in setup.axes(axes)}
         kept = {axis: read_axis(file, setup.key()) for axis, file in files.items()}
         rows = {axis: content["views"] for axis, content in kept.items() if content is not None}
-        for axis, found in rows.items():
-            progress(axis, len(found))
+        for found in rows.values():
+            progress(len(found))
         missing = [axis for axis in files if axis not in rows]
         frames = FrameCache(cache)
         work = setup.method, setup.conditions(CLEAN)[0], frames, setup.views
@@ -129,7 +128,7 @@ def measure(
                 rows[axis] = []
                 for views in mapped(_measure_object, *zip(*tasks, strict=True)):
                     rows[axis] += views
-                    progress(axis, len(views))
+                    progress(len(views))
                 content = {"setup": setup.key(), "axis": axis, "views": rows[axis]}
                 write_atomically(files[axis], (json.dumps(content, indent=1) + "\n").encode())
                 saved()

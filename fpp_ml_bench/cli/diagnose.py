@@ -1,12 +1,12 @@
 """What a model reads: ``fpp-bench diagnose`` probes it, ``fpp-bench reliance`` measures how far it follows the fringe's
 phase."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
-from rich import progress as bar
 from rich.console import Console
+from rich.progress import Progress
 from rich.text import Text
 
 from fpp_ml_bench.baselines import registry
@@ -17,7 +17,6 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     REPORT_FILE,
     Probe,
     ProbeSettings,
-    Progress,
     checked_names,
 )
 from fpp_ml_bench.baselines.diagnostics.probe import diagnose as run_diagnosis
@@ -93,16 +92,9 @@ def diagnose(
     subject = subject_of(model, opened, layers, units, frame, threads or usable_cores(), of_method)
     probing = ProbeSettings(samples, seeds, quick)
     again = command_line(threads=None)
-    columns = (
-        bar.TextColumn("{task.description}"),
-        bar.BarColumn(),
-        bar.TaskProgressColumn(),
-        bar.TimeElapsedColumn(),
-        bar.TimeRemainingColumn(),
-    )
-    with bar.Progress(*columns, console=Console(stderr=True)) as bars:
+    with Progress(console=Console(stderr=True)) as bars:
 
-        def progress(probe: "Probe") -> "Progress":
+        def progress(probe: Probe) -> Callable[[int, int, str], None]:
             task = bars.add_task(probe.title, total=None)
             return lambda done, total, activity: bars.update(
                 task, completed=done, total=total, description=f"{probe.title}: {activity}"
@@ -167,7 +159,7 @@ def reliance(
         )
 
 
-def _reliance_table(title: str, reliance: "Reliance") -> Table:
+def _reliance_table(title: str, reliance: Reliance) -> Table:
     heading = Text(f"{title}: {reliance.samples} samples of {reliance.objects} objects")
     table = Table("", numbers=("value",), title=heading)
     low, high = reliance.interval

@@ -80,9 +80,7 @@ def robust(
     with working_copy(out) as (below, save):
         folder = below / slug(setup)
         with progress_bar(f"{chosen.name}, {objects}", views, "views") as advance:
-            rows = measure_robustness(
-                setup, folder, axes, workers, cache, lambda axis, count: advance(count), pool.cluster, save
-            )
+            rows = measure_robustness(setup, folder, axes, workers, cache, advance, pool.cluster, save)
         page = f"{out}/{write_page(below).name}"
     if entry is not None:
         write_robustness(entry, robustness_block(setup, rows))

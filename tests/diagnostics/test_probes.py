@@ -23,11 +23,10 @@ from fpp_ml_bench.baselines.diagnostics.linear import (
     apply,
     at_pixels,
     at_size,
-    edge_map,
-    grid_step,
+    grid_of,
     score,
-    truth,
 )
+from fpp_ml_bench.baselines.diagnostics.scenes import edge_map, truth
 from fpp_ml_bench.baselines.diagnostics.subjects import activations_of
 from fpp_ml_bench.baselines.stability.cases import U32
 from fpp_ml_bench.coding.phase_shift import wrapped_phase
@@ -290,7 +289,7 @@ def test_a_layer_that_holds_the_mask_alone_is_the_silhouette_control(opened):
 
 def test_depth_on_the_object_is_compared_there_and_with_the_mean_there(opened):
     errors = spatial_errors(oracle(opened, ("depth",)), opened, 1)
-    side = tuple(length // grid_step(opened.size) for length in opened.size)
+    side = grid_of(opened.size)
 
     def within(name):
         depth_mm = opened.depth_mm(name)
