@@ -36,7 +36,7 @@ from pathlib import Path
 from typing import Any
 
 from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corruptions
-from fpp_ml_bench.baselines.robustness.report import Measured, draw_curves
+from fpp_ml_bench.baselines.robustness.run import Measured, draw_curves
 from fpp_ml_bench.cli import BENCH, EVAL, Program
 from fpp_ml_bench.cli import main as fpp_bench
 from fpp_ml_bench.cli import main_eval as fpp_eval

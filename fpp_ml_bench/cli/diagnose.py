@@ -1,18 +1,26 @@
 """What a model reads: ``fpp-bench diagnose`` probes it, ``fpp-bench reliance`` measures how far it follows the fringe's
 phase."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal
 
-from rich import progress as bar
 from rich.console import Console
+from rich.progress import Progress
 from rich.text import Text
 
 from fpp_ml_bench.baselines import registry
 from fpp_ml_bench.baselines.diagnostics.counterfactual import measure as measure_reliance
-from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import SceneSet
-from fpp_ml_bench.baselines.diagnostics.probe import PROBES, Probe, ProbeSettings, Progress
+from fpp_ml_bench.baselines.diagnostics.probe import (
+    JSON_FILE,
+    PROBES,
+    REPORT_FILE,
+    Probe,
+    ProbeSettings,
+    checked_names,
+)
+from fpp_ml_bench.baselines.diagnostics.probe import diagnose as run_diagnosis
+from fpp_ml_bench.baselines.diagnostics.scenes import chosen_samples
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings, OfMethods
@@ -75,8 +83,6 @@ def diagnose(
     """Diagnose a network or method with the paper's probes and further ones; writes an HTML report and a JSON file.
 
     Raises FppBenchError for what can't be diagnosed."""
-    from fpp_ml_bench.baselines.diagnostics.diagnosis import JSON_FILE, REPORT_FILE, checked_names
-    from fpp_ml_bench.baselines.diagnostics.diagnosis import diagnose as run_diagnosis
     from fpp_ml_bench.baselines.diagnostics.subjects import subject as subject_of
 
     probe_names = checked_names(probe)
@@ -86,16 +92,9 @@ def diagnose(
     subject = subject_of(model, opened, layers, units, frame, threads or usable_cores(), of_method)
     probing = ProbeSettings(samples, seeds, quick)
     again = command_line(threads=None)
-    columns = (
-        bar.TextColumn("{task.description}"),
-        bar.BarColumn(),
-        bar.TaskProgressColumn(),
-        bar.TimeElapsedColumn(),
-        bar.TimeRemainingColumn(),
-    )
-    with bar.Progress(*columns, console=Console(stderr=True)) as bars:
+    with Progress(console=Console(stderr=True)) as bars:
 
-        def progress(probe: "Probe") -> "Progress":
+        def progress(probe: Probe) -> Callable[[int, int, str], None]:
             task = bars.add_task(probe.title, total=None)
             return lambda done, total, activity: bars.update(
                 task, completed=done, total=total, description=f"{probe.title}: {activity}"
@@ -141,12 +140,10 @@ def reliance(
     entry = None if into is None else read_entry(into)
     if entry is not None:
         check_same_method(entry, method)
-    scene_set = SceneSet(opened, views)
-    found = method.settings.get("weights_sha256")
-    sha256 = found if isinstance(found, str) else None
-    with progress_bar(f"reliance of {chosen.name}", len(scene_set.samples), "samples") as advance:
+    samples = chosen_samples(opened, "test", views)
+    with progress_bar(f"reliance of {chosen.name}", len(samples), "samples") as advance:
         # Called before each sample, so the first call is for none.
-        measured, _ = measure_reliance(method, scene_set, sha256, lambda done, total, sample: advance(min(done, 1)))
+        measured, _ = measure_reliance(method, opened, samples, lambda done, total, sample: advance(min(done, 1)))
         advance(1)
     if json is not None:
         write_json(measured.model_dump(mode="json"), json)
@@ -162,7 +159,7 @@ def reliance(
         )
 
 
-def _reliance_table(title: str, reliance: "Reliance") -> Table:
+def _reliance_table(title: str, reliance: Reliance) -> Table:
     heading = Text(f"{title}: {reliance.samples} samples of {reliance.objects} objects")
     table = Table("", numbers=("value",), title=heading)
     low, high = reliance.interval

@@ -51,10 +51,10 @@ def predict(
     samples = len(opened.samples(split))
     bar = progress_bar(f"{chosen.name}, {split}", samples, "samples")
     with working_copy(out) as (folder, _), bar as advance:
-        finished = predict_split(opened, method, split, folder, advance)
+        seconds = predict_split(opened, method, split, folder, advance)
     print(
-        f"{out}: {finished.samples} predictions by {method.title}; {len(method.frames_used)} frames and "
-        f"{finished.seconds_per_sample:.3f} s a sample (median)"
+        f"{out}: {samples} predictions by {method.title}; {len(method.frames_used)} frames and "
+        f"{seconds:.3f} s a sample (median)"
     )
     how = f"{_scoring(method, opened)} --json result.json"
     if isinstance(out, Path):

@@ -20,7 +20,7 @@ from disks import small_disk
 from scored_dataset import make_dataset
 
 from fpp_ml_bench import pool
-from fpp_ml_bench.baselines.diagnostics.diagnosis import diagnose
+from fpp_ml_bench.baselines.diagnostics.probe import diagnose
 from fpp_ml_bench.baselines.learned.classical_training import FilterRecipe
 from fpp_ml_bench.baselines.learned.crossed_training import CrossedRecipe
 from fpp_ml_bench.baselines.learned.training import Recipe

@@ -12,9 +12,9 @@ from mutations import ODD, sealed_manifest, sources, tree_outcome
 from published_trees import make_tree
 from synthetic import assembly, make
 
+from fpp_ml_bench.baselines.run import UNFINISHED_FILE, UnfinishedRun
 from fpp_ml_bench.baselines.training import weights as weights_files
 from fpp_ml_bench.baselines.training.weights import DEPTH_NETWORKS
-from fpp_ml_bench.baselines.unfinished import UNFINISHED_FILE, Finished, UnfinishedRun
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import DatasetError, FppBenchError, LayoutError, RemoteError, RigError, SubmissionError
 from fpp_ml_bench.evaluation.result.file import read_result
@@ -443,7 +443,7 @@ def test_damaged_lines_of_a_stopped_run_do_not_count(tmp_path):
         '{"sample": "b", "seconds": NaN,',
     )
     (tmp_path / UNFINISHED_FILE).write_text("\n".join([json.dumps(run), *bad, json.dumps(good)]) + "\n")
-    assert UnfinishedRun(tmp_path, run).finished == {"a": Finished(0.5, {})}
+    assert UnfinishedRun(tmp_path, run).finished == {"a": (0.5, {})}
 
 
 def test_a_missing_file_is_named(tmp_path):
