@@ -10,7 +10,7 @@
 """
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import MISSING, Field, dataclass, field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from difflib import get_close_matches
 from typing import Any
 
@@ -60,9 +60,9 @@ def argument(
     return field(default=default, metadata={_KEY: description})
 
 
-def options_of(settings: type | None) -> "list[Field[Any]]":
+def options_of(settings: Any) -> "list[Field[Any]]":
     """The fields of a dataclass that are options of the command line, in order; its other fields are for code alone."""
-    return [entry for entry in (fields(settings) if settings else ()) if _KEY in entry.metadata]
+    return [entry for entry in (fields(settings) if is_dataclass(settings) else ()) if _KEY in entry.metadata]
 
 
 def described(entry: "Field[Any]") -> Description:

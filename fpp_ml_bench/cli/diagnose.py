@@ -1,9 +1,10 @@
 """What a model reads: ``fpp-bench diagnose`` probes it, ``fpp-bench reliance`` measures how far it follows the fringe's
 phase."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from rich import progress as bar
 from rich.console import Console
@@ -15,7 +16,7 @@ from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import SceneSet
 from fpp_ml_bench.baselines.diagnostics.probe import PROBES, Probe, ProbeSettings, Progress
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.cli.console import progress_bar, show
-from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings, OfMethods
+from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
 from fpp_ml_bench.cli.options import COUNT, command, command_line, names, value
 from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.evaluation.result.parts import PART_TITLES, Reliance
@@ -29,8 +30,8 @@ from fpp_ml_bench.tables import Table
 class DiagnoseCommand(MethodCommand):
     """A command whose options are also those of the methods without a network that is probed layer by layer."""
 
-    def methods(self, words: Sequence[str]) -> list[type[Method]]:
-        return list(registry.methods().values())
+    def methods(self, words: Sequence[str]) -> dict[str, type[Method]]:
+        return registry.methods()
 
 
 @command(
@@ -70,7 +71,7 @@ def diagnose(
         None, "layers to probe, comma separated (default: the model's own)", "A,B", parse=names
     ),
     threads: int | None = option(None, "threads (default: every core)", "N", parse=COUNT),
-    options: OfMethods,
+    options: dict[str, Any],
 ) -> None:
     """Diagnose a network or method with the paper's probes and further ones; writes an HTML report and a JSON file.
 
@@ -81,11 +82,9 @@ def diagnose(
 
     probe_names = checked_names(probe)
     opened = DatasetFolder(dataset)
-    method = registry.methods().get(model, registry.network_method())
-    of_method = options.of(method, model)
-    subject = subject_of(model, opened, layers, units, frame, threads or usable_cores(), of_method)
+    subject = subject_of(model, opened, layers, units, frame, threads or usable_cores(), options)
     probing = ProbeSettings(samples, seeds, quick)
-    again = command_line(threads=None)
+    again = re.sub(r" --threads[ =]\S+", "", command_line())
     columns = (
         bar.TextColumn("{task.description}"),
         bar.BarColumn(),

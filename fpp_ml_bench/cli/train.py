@@ -4,6 +4,7 @@ directions, trained and scored here."""
 import sys
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from fpp_ml_bench.baselines import registry
 from fpp_ml_bench.baselines.reproduce.plan import Folders, planned, variants
@@ -11,7 +12,7 @@ from fpp_ml_bench.baselines.training.recipe import load_recipe, table_rows
 from fpp_ml_bench.baselines.training.tables import PRESETS, TABLES
 from fpp_ml_bench.cli import CHECK_FAILED, OK
 from fpp_ml_bench.cli.console import show
-from fpp_ml_bench.cli.methods import MethodCommand, OfMethods
+from fpp_ml_bench.cli.methods import MethodCommand
 from fpp_ml_bench.cli.options import MINUTES, command, command_line
 from fpp_ml_bench.errors import RecipeError, TrainingError
 from fpp_ml_bench.files import printable
@@ -52,7 +53,7 @@ def train(
     minutes: float | None = option(
         None, "stop before an epoch that would not finish in time, everything saved", "M", parse=MINUTES
     ),
-    options: OfMethods,
+    options: dict[str, Any],
 ) -> int:
     """Train one recipe, a shipped one or a YAML file of yours, into a weights file that predict takes.
 
@@ -71,9 +72,8 @@ def train(
         import cv2
 
         cv2.setNumThreads(1)
-        finished = method.train(method.Training(**options.of(method, recipe, "Training")), out, minutes)
+        finished = method.train(method.Training(**options), out, minutes)
         return OK if finished else CHECK_FAILED
-    options.of(registry.network_method(), recipe, "Training")
     if not Path(recipe).exists() and nearest(recipe, methods):
         raise RecipeError(f"no recipe {recipe!r}; {did_you_mean(recipe, methods)}")
     if dataset is None:
@@ -163,7 +163,10 @@ def reproduce_tables(
     def report(line: str) -> None:  # with the time, where the engine's progress is too
         print(f"{datetime.now():%H:%M:%S} {line}", file=sys.stderr, flush=True)
 
-    again = command_line(preset=preset, only_missing=True)
+    typed = command_line()
+    again = " ".join(
+        [typed, *(words for words in (f"--preset {preset}", "--only-missing") if words.split()[0] not in typed)]
+    )
     options = (dataset, only_missing, minutes, anyway)
     reproduce_settings = ReproduceSettings(tables, folders, again, reproduced, *options, report, row=row)
     outcome = run_reproduce(reproduce_settings)
