@@ -6,9 +6,8 @@ coordinates are metres, z up, as in the dataset's meshes.
 """
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 
@@ -28,6 +27,7 @@ from fpp_ml_bench.loaders.sample import DEPTH_EXACT
 from fpp_ml_bench.loaders.storage.manifest import GENERATED
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.pinhole import Pinhole
+from fpp_ml_bench.options import did_you_mean
 
 FUSION_FILE = "fusion.json"
 CELL_MM = 2.0
@@ -162,27 +162,7 @@ def cell_means(points_m: Points, weights: Values, cell_mm: float = CELL_MM) -> P
     return np.column_stack([np.bincount(cell, weights * axis) / total for axis in points_m.T])
 
 
-def fuse(views: Sequence[PlacedView], kept: Sequence[Flags] | None = None, cell_mm: float = CELL_MM) -> Points:
-    """One cloud (k, 3) in object coordinates, metres: `cell_means` of all views' points by their `point_weights`;
-    with ``kept``, bool (n,) for each view, of these points only."""
-    chosen = [np.ones(view.pixels.size, dtype=bool) for view in views] if kept is None else kept
-    points = np.concatenate([view.points_m[keep] for view, keep in zip(views, chosen, strict=True)])
-    weights = [weight[keep] for weight, keep in zip(point_weights(views), chosen, strict=True)]
-    return cell_means(points, np.concatenate(weights), cell_mm)
-
-
 Counts = dict[str, float | None]
-
-
-@dataclass(frozen=True, eq=False)
-class FusedObject:
-    """An object's ``cloud_m`` (k, 3): that of its views without contradicted pixels, object coordinates in metres.
-    ``counts``: ``cloud_points``; ``answered_px`` of all views, which have a depth; ``contradicted_px`` of these, and
-    their share (``contradicted_share``, None without a depth)."""
-
-    name: str
-    cloud_m: Points
-    counts: Counts
 
 
 def prediction_maps(
@@ -216,12 +196,9 @@ def prediction_maps(
 def views_by_object(dataset: DatasetFolder, split: str, only: str | None = None) -> dict[str, list[str]]:
     """The samples of each object of ``split``, or of the object ``only``, whose placement is known. Raises
     `DatasetError` for another object, for one with a single view, and for data without placement."""
-    views: dict[str, list[str]] = {}
-    for sample in dataset.samples(split):
-        views.setdefault(dataset.measured(sample)["object"], []).append(sample)
+    views = dataset.samples_by_object(split)
     if only is not None and only not in views:
-        near = ", ".join(get_close_matches(only, views, n=3)) or f"there are {', '.join(views)}"
-        raise DatasetError(f"{dataset.path}: no object {only!r} in split {split}; {near}")
+        raise DatasetError(f"{dataset.path}: no object {only!r} in split {split}; {did_you_mean(only, views)}")
     chosen = {name: samples for name, samples in views.items() if only in (None, name)}
     if not chosen:
         raise DatasetError(f"{dataset.path}: split {split} holds no sample; there is nothing to put together")
@@ -233,48 +210,45 @@ def views_by_object(dataset: DatasetFolder, split: str, only: str | None = None)
     return chosen
 
 
-def fuse_split(
-    predictions: str | Path, dataset: DatasetFolder, split: str, only: str | None = None, cell_mm: float = CELL_MM
-) -> tuple[str, Iterator[FusedObject]]:
-    """The method's name, and the objects of ``split`` put together one after another (``only``: a single one). Raises
-    what `prediction_maps` and `views_by_object` raise."""
-    if not 0 < cell_mm < 1000:
-        raise PredictionError(f"--cell-mm {cell_mm:g}: expected the edge of a cell in mm, above 0 and below 1000")
-    chosen = views_by_object(dataset, split, only)
+def fuse(
+    predictions: str | Path,
+    dataset: DatasetFolder,
+    split: str,
+    objects: Mapping[str, Sequence[str]],
+    out: Path,
+    cell_mm: float = CELL_MM,
+    progress: Callable[[int], None] = lambda objects: None,
+) -> tuple[str, dict[str, Counts]]:
+    """Put the views of each of ``objects`` of ``split`` (`views_by_object`) into one cloud without contradicted pixels,
+    `cell_means` of their points by `point_weights`. Writes ``{object}.ply``, object coordinates in metres, and
+    `FUSION_FILE` last: the counts of all objects, and by which rules.
+
+    Gives the method's name, and the counts of each object: ``cloud_points``; ``answered_px`` of all views, which have a
+    depth; ``contradicted_px`` of these, and their share (``contradicted_share``, None without a depth). Raises what
+    `prediction_maps` raises, and PredictionError for a folder that can't be written."""
     name, maps = prediction_maps(predictions, dataset, split)
-
-    def fused() -> Iterator[FusedObject]:
-        for obj, samples in chosen.items():
-            views = []
-            for sample in samples:
-                depth_mm, sigma_mm = maps(sample)
-                views.append(PlacedView(depth_mm, dataset.rig.camera, *placement(dataset, sample), sigma_mm))
-                dataset.release(sample)
-            flags = contradicted(views)
-            cloud_m = fuse(views, [~flag for flag in flags], cell_mm)
-            answered, wrong = sum(flag.size for flag in flags), int(sum(flag.sum() for flag in flags))
-            counts: Counts = {"cloud_points": len(cloud_m), "answered_px": answered, "contradicted_px": wrong}
-            yield FusedObject(obj, cloud_m, counts | {"contradicted_share": wrong / answered if answered else None})
-
-    return name, fused()
-
-
-def write_object(out: Path, fused: FusedObject) -> list[Path]:
-    """Write ``{object}.ply``, the object's cloud. Raises PredictionError for a folder that can't be written."""
-    return write_files(out, {f"{fused.name}.ply": ply_bytes(fused.cloud_m)}, PredictionError)
-
-
-def write_counts(
-    out: Path, name: str, dataset: DatasetFolder, split: str, cell_mm: float, objects: Mapping[str, Counts]
-) -> list[Path]:
-    """Write `FUSION_FILE`: the counts of all objects, and by which rules. Errors as `write_object`."""
+    counts: dict[str, Counts] = {}
+    for obj, samples in objects.items():
+        views = []
+        for sample in samples:
+            depth_mm, sigma_mm = maps(sample)
+            views.append(PlacedView(depth_mm, dataset.rig.camera, *placement(dataset, sample), sigma_mm))
+            dataset.release(sample)
+        wrong = np.concatenate(contradicted(views))
+        points_m, weights = (np.concatenate(part) for part in ([v.points_m for v in views], point_weights(views)))
+        cloud_m = cell_means(points_m[~wrong], weights[~wrong], cell_mm)
+        write_files(out, {f"{obj}.ply": ply_bytes(cloud_m)}, PredictionError)
+        counts[obj] = {"cloud_points": len(cloud_m), "answered_px": wrong.size, "contradicted_px": int(wrong.sum())}
+        counts[obj]["contradicted_share"] = float(wrong.mean()) if wrong.size else None
+        progress(1)
     document = {
         "method": name,
         "dataset": dataset.fingerprint,
         "split": split,
         "cell_mm": cell_mm,
         "tolerance_mm": TOLERANCE_MM,
-        "objects": dict(objects),
+        "objects": counts,
     }
     content = (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
-    return write_files(out, {FUSION_FILE: content}, PredictionError)
+    write_files(out, {FUSION_FILE: content}, PredictionError)
+    return name, counts

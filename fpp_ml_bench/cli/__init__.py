@@ -111,7 +111,7 @@ BENCH = Program(
             ),
             "decode": ("decode:decode", "decode captured frames: depth, point cloud, uncertainty, reasons"),
             "fuse": (
-                "fuse:fuse",
+                "decode:fuse",
                 "put an object's views into one point cloud, and find the pixels that other views contradict",
             ),
         },

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin
 
 import click
 
-from fpp_ml_bench.errors import FppBenchError, PoolError
+from fpp_ml_bench.errors import PoolError
 from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.options import described, did_you_mean, flag_of, option, options_of
@@ -61,6 +61,16 @@ def number_pair(text: str) -> tuple[float, float]:
     """Two numbers with a comma between them."""
     first, second = (float(part) for part in text.split(","))
     return first, second
+
+
+def new_file(text: str) -> Path:
+    """A file that may be written: no folder, and in one that is there."""
+    path = Path(text)
+    if path.is_dir():
+        raise ValueError("expected a file to write, found a folder")
+    if not path.absolute().parent.is_dir():
+        raise ValueError(f"the folder {path.parent} does not exist; make it first")
+    return path
 
 
 def whole(least: int, most: int, unit: str = "") -> Any:
@@ -157,15 +167,9 @@ class Explain:
 
     HEADING = "skipped work"
     explain: bool = option(False, "print which work was left out and what that saved (takes a moment)")
-    explain_json: Path | None = option(None, "write the same as JSON into FILE; implies --explain", "FILE")
-
-    def check(self) -> None:
-        """Raises `FppBenchError`, before any work, for a JSON file that can't be written."""
-        path = self.explain_json
-        if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
-            raise FppBenchError(
-                f"--explain-json {path}: expected a file in an existing folder; create the folder first"
-            )
+    explain_json: Path | None = option(
+        None, "write the same as JSON into FILE; implies --explain", "FILE", parse=new_file
+    )
 
     def say(self, account: Callable[[], "Explanation"]) -> None:
         """Print the account as a table with the rules for the seconds below, and write it as JSON, if asked for."""
