@@ -88,7 +88,7 @@ def train(
         print(f"{out}: stopped after {trained.epochs} epochs, everything saved; run the same command to resume")
         return CHECK_FAILED
     weights = trained.weights
-    if resolved.normalisation == "individual" and not resolved.background_removed:
+    if "predicted" in variants(resolved):
         weights = out / "model.safetensors"
         save_with_heads(trained.weights, dataset, weights)
     print(f"{weights}: {resolved.title}, epoch {trained.best_epoch} of {trained.epochs}, {trained.seconds:.0f} s")
@@ -163,13 +163,12 @@ def reproduce_tables(
     def report(line: str) -> None:  # with the time, where the engine's progress is too
         print(f"{datetime.now():%H:%M:%S} {line}", file=sys.stderr, flush=True)
 
-    typed = command_line()
-    again = " ".join(
-        [typed, *(words for words in (f"--preset {preset}", "--only-missing") if words.split()[0] not in typed)]
+    again = command_line()
+    for words in (f"--preset {preset}", "--only-missing"):
+        again += "" if words.split()[0] in again else f" {words}"
+    outcome = run_reproduce(
+        ReproduceSettings(tables, folders, again, reproduced, dataset, only_missing, minutes, anyway, report, row)
     )
-    options = (dataset, only_missing, minutes, anyway)
-    reproduce_settings = ReproduceSettings(tables, folders, again, reproduced, *options, report, row=row)
-    outcome = run_reproduce(reproduce_settings)
     for name, path in zip(tables, outcome.tables, strict=True):
         lines = reproduced.table_lines(name, outcome.jobs, folders, outcome.opened)
         show(
