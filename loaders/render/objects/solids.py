@@ -6,7 +6,8 @@ where the camera stands at the first view. *Drawn* solids (scissors, lettering) 
 viewer sees them, z towards the viewer, and :func:`facing` stands them up. Source: own.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import pairwise
 from typing import TypeAlias
 
@@ -21,6 +22,8 @@ Points: TypeAlias = Sequence[Sequence[float]] | np.ndarray
 Level = tuple[float, float, float, float]
 """Height, size along y, size along x, and power of a superellipse."""
 
+DRAWINGS: dict[str, Callable[[], Solid]] = {}
+"""What makes each object, by its name, as it stands in the scene, in mm."""
 GRID_MM = 2.0**-14
 """Solids are put on this grid before they are joined or cut, so that booleans decide alike on every processor."""
 SEGMENTS = 120  # round a turned part: chord error 0.05 mm at a radius of 150 mm, a fifteenth of a pixel at 1.8 m
@@ -62,6 +65,29 @@ def facing(solid: Solid) -> Solid:
 def laid(solid: Solid) -> Solid:
     """An upright solid laid into the drawing frame, its front towards the viewer: the inverse of :func:`facing`."""
     return solid.rotate((0, 0, 90)).rotate((-90, 0, 0))
+
+
+def upright(
+    enlarged: float, *turns: Point3, stood: Callable[[Solid], Solid] = lambda solid: solid
+) -> Callable[[Callable[[], Solid]], Callable[[], Solid]]:
+    """Make an object of a function that draws an upright solid at its real size: it stands in the scene turned by
+    degrees about x, then y, then z, by one of ``turns`` after the other, and ``enlarged``."""
+
+    def add(draw: Callable[[], Solid]) -> Callable[[], Solid]:
+        def placed() -> Solid:
+            solid = stood(draw())
+            for turn in turns:
+                solid = solid.rotate(turn)
+            return solid.scale((enlarged,) * 3)
+
+        DRAWINGS[draw.__name__] = placed
+        return placed
+
+    return add
+
+
+drawn = partial(upright, stood=facing)
+"""The same of a function that draws a solid as the viewer sees it (`facing`)."""
 
 
 def embossed(body: Solid, section: Section, relief: float) -> Solid:

@@ -11,7 +11,7 @@ from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
     curve,
     cut,
     disc,
-    facing,
+    drawn,
     laid,
     lathe,
     loft,
@@ -30,6 +30,7 @@ from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
 )
 
 
+@drawn(1.8, (3, 0, 3))
 def hammer() -> Solid:
     """Claw hammer, 330 mm long: turned face, cheek, forked claw, waisted grip with a bulged end."""
     handle = laid(
@@ -66,9 +67,10 @@ def hammer() -> Solid:
     fork = place(plate(wedge, 90), (-40, 285, 0), (90, 0, 180))
     claw = cut(skin(np.array(rings)), fork)
     grooves = [place(ring(19, 2.0).scale((0.95, 0.8, 1)), (0, y, 0), (-90, 0, 0)) for y in (34, 48, 62, 76, 90)]
-    return place(facing(union(cut(handle, *grooves), face, cheek, claw)), turn=(3, 0, 3))
+    return union(cut(handle, *grooves), face, cheek, claw)
 
 
+@drawn(2.6, (3, 0, 2))
 def scissors() -> Solid:
     """Household scissors, 205 mm long, a little open: two pointed blades, pivot screw, a round and a long bow."""
     blade = polygon([(-4, -20), (9, -20), (10, 10), (7, 70), (1.5, 108), (0, 108), (-6, 20)], 0.6)
@@ -82,9 +84,10 @@ def scissors() -> Solid:
         halves.append(half.translate((0, 0, 1.8)) if side > 0 else half.mirror((1, 0, 0)).translate((0, 0, -1.8)))
     slot = block(12, 1.4, 2, 0, (0, 0, 7.6)).rotate((0, 0, 35))
     pivot = union(rod((0, 0, -6.5), (0, 0, 6.5), 6), cut(rod((0, 0, 5), (0, 0, 7.6), 5), slot))
-    return place(facing(union(*halves, pivot)), turn=(3, 0, 2))
+    return union(*halves, pivot)
 
 
+@drawn(2.15, (0, 0, 2))
 def large_clamp() -> Solid:
     """Spring clamp, 200 mm long: two jaws with pads crossing at a coiled spring, handles with sleeves."""
     arm = stroke(curve([(18, -24), (0, 2), (-24, 30), (-34, 54), (-28, 76), (-14, 90)]), 22)
@@ -98,9 +101,10 @@ def large_clamp() -> Solid:
     coil = [ring(12.5, 2.8, z) for z in (-16.4, -13.4, 13.4, 16.4)]
     legs = [tube(curve([(s * 11, -4, 14), (s * 22, -26, 14), (s * 31, -46, 12)]), 2.8, up=(0, 0, 1)) for s in (-1, 1)]
     both = union(half, pad, half.mirror((1, 0, 0)), pad.mirror((1, 0, 0)), pin, *ears, *coil, *legs)
-    return place(facing(both), turn=(0, 0, 2))
+    return both
 
 
+@drawn(2.0, (0, 3, 3))
 def clamp() -> Solid:
     """C-clamp, 150 mm tall: ribbed frame, threaded screw with swivel pad and sliding bar."""
     frame = stroke([(40, 62), (-34, 66), (-46, 54), (-46, -40), (-34, -52), (40, -48)], 20)
@@ -114,9 +118,10 @@ def clamp() -> Solid:
     bar = union(rod((2, -112, 8), (78, -112, -8), 4.2), ball(6.4, (2, -112, 8)), ball(6.4, (78, -112, -8)))
     head = ball(10.5, (40, -112, 0))
     parts = union(plate(frame, 12), plate(rib, 20), anvil, screw, pad, boss, bar, head, *thread)
-    return place(facing(parts), turn=(0, 3, 3))
+    return parts
 
 
+@drawn(2.5, (2, 0, 2))
 def boxcutter() -> Solid:
     """Snap-off knife, 190 mm with its blade out: score lines, slider in its slot, ribbed grip, end clip."""
     handle = polygon([(-15, -86), (15, -86), (16, -60), (13, -10), (14, 40), (10, 62), (-10, 62), (-14, 40)], 3)
@@ -130,7 +135,7 @@ def boxcutter() -> Solid:
     backs = [place(solid, (0, 0, 0), (0, 180, 0)).mirror((1, 0, 0)) for solid in scores]
     ribs = [block(35, 2.6, 9, 1, (0, y, 0)) for y in range(-58, -20, 7)]
     grips = [place(rod((0, 0, -20), (0, 0, 20), 5), (17, y, 0)) for y in (-44, -30, -16)]
-    return place(facing(union(cut(union(body, *ribs), *grips), slider, cut(blade, *scores, *backs))), turn=(2, 0, 2))
+    return union(cut(union(body, *ribs), *grips), slider, cut(blade, *scores, *backs))
 
 
 def _handle(profile: list[Point2], flatten: float = 1.0) -> Solid:
@@ -140,6 +145,7 @@ def _handle(profile: list[Point2], flatten: float = 1.0) -> Solid:
     return turned.rotate((90, 0, 0)).scale((1, 1, flatten))
 
 
+@drawn(2.35, (3, 0, 3))
 def paint_brush() -> Solid:
     """Artist's flat brush, 230 mm: long turned handle, crimped ferrule, bristles coming to a rounded edge."""
     handle = _handle([(11.5, 0), (14.0, 22), (13.0, 44), (8.0, 90), (6.4, 130), (5.2, 155), (4.0, 162)])
@@ -150,9 +156,10 @@ def paint_brush() -> Solid:
     spots = [(x, s) for x in range(-15, 16, 5) for s in (-1, 1)]
     furrows = [place(block(0.9, 40, 2, 0), (x, 66, s * 5.6), (s * 4, 0, -0.12 * x)) for x, s in spots]
     tuft = cut(laid(union(ferrule, bristles)), *furrows)
-    return place(facing(union(handle, tuft, *crimps)), turn=(3, 0, 3))
+    return union(handle, tuft, *crimps)
 
 
+@drawn(2.1, (4, -2, 4))
 def paint_brush_large() -> Solid:
     """Wall brush, 100 mm wide: thick bristles, nailed ferrule, beaver-tail handle with a hanging hole."""
     ferrule = block(100, 42, 22, 2.5, (0, 20, 0))
@@ -167,9 +174,10 @@ def paint_brush_large() -> Solid:
     tuft = laid(loft([(38, 97, 20, 7), (60, 100, 22, 6), (92, 102, 16, 6), (104, 100, 6, 6)], smooth=5))
     spots = [(x, s) for x in range(-45, 46, 6) for s in (-1, 1)]
     furrows = [place(block(1.2, 62, 4, 0), (x, 76, s * 11.4), (s * 4, 0, 0)) for x, s in spots]
-    return place(facing(union(ferrule, *bands, *nails, handle, cut(tuft, *furrows))), turn=(4, -2, 4))
+    return union(ferrule, *bands, *nails, handle, cut(tuft, *furrows))
 
 
+@drawn(2.15, (2, 0, 2))
 def pallet_knife() -> Solid:
     """Trowel-shaped palette knife, 215 mm: leaf blade on a cranked neck, turned handle with a brass collar."""
     right = curve([(0, 120), (10, 106), (19, 76), (21, 54), (13, 36), (0, 30)])
@@ -178,9 +186,10 @@ def pallet_knife() -> Solid:
     neck = tube(curve([(0, -6, 0), (0, 8, 1), (0, 20, 9), (0, 32, 16), (0, 46, 17)]), 3.6, flatten=0.8, up=(1, 0, 0))
     collar = place(lathe([(8, 0), (9, 3), (8, 9), (6, 11)], segments=48), (0, -11, 0), (-90, 0, 0))
     handle = _handle([(8.5, 8), (11.0, 26), (11.5, 50), (9.0, 76), (10.5, 94), (7.0, 104)])
-    return place(facing(union(plate(leaf, 2.6).translate((0, 0, 17)), neck, collar, handle)), turn=(2, 0, 2))
+    return union(plate(leaf, 2.6).translate((0, 0, 17)), neck, collar, handle)
 
 
+@drawn(1.95, (2, 1, 2))
 def pallet_knife_large() -> Solid:
     """Long palette knife, 290 mm: straight round-ended blade, bolster, riveted flat handle."""
     right = curve([(12, 20), (17, 90), (18, 150), (14, 166), (0, 174)])
@@ -192,12 +201,13 @@ def pallet_knife_large() -> Solid:
     grip = polygon([*left, *right[1:]])
     handle = union(plate(grip, 15), plate(grip.offset(-3.5), 20))
     rivets = [rod((0, y, -11), (0, y, 11), 3.6) for y in (-20, -56, -92)]
-    return place(facing(union(plate(blade, 3.0), bolster, handle, *rivets)), turn=(2, 1, 2))
+    return union(plate(blade, 3.0), bolster, handle, *rivets)
 
 
 _TO_LEFT = (0, -90, 0)  # turns a lathe so that its top points to the viewer's left
 
 
+@drawn(1.72, (0, 0, 1))
 def power_drill() -> Solid:
     """Cordless drill, 230 x 215 mm: motor housing with vents, clutch ring, chuck and bit, grip, trigger, battery."""
     housing = lathe([(24, 0), *curve([(26, 4), (28, 30), (28, 70), (26.5, 92), (25, 107)])], 1)
@@ -223,9 +233,10 @@ def power_drill() -> Solid:
     badge = plate(rectangle(38, 11, 4, (-14, 82)), 60)
     switch = rod((8, 58, -24), (8, 58, 24), 5)
     parts = union(body, clutch, *knurls, cut(chuck, *flutes), bit, trigger, shoe, battery, latch, badge, switch)
-    return place(facing(parts), turn=(0, 0, 1))
+    return parts
 
 
+@drawn(1.45, (0, 0, 1))
 def spraygun() -> Solid:
     """Gravity-feed spray gun, 250 mm tall: cup on top, air cap with horns, hooked body, trigger, grip and hose end."""
     body = place(lathe([(15, 0), (17, 4), (17, 60), (15, 84), (17, 88), (17, 96)], 1), (34, 60, 0), _TO_LEFT)
@@ -253,4 +264,4 @@ def spraygun() -> Solid:
         union(*(rod((x, y, 0), (end_x, end_y, 0), radius) for x, y, end_x, end_y, radius in ends))
         for ends in (knob_ends, inlet_ends)
     )
-    return place(facing(union(body, cap, grip, hook, trigger, pivot, stem, cup, knobs, inlet, *rows)), turn=(0, 0, 1))
+    return union(body, cap, grip, hook, trigger, pivot, stem, cup, knobs, inlet, *rows)
