@@ -61,7 +61,7 @@ def mustard_bottle() -> Solid:
     closure = lathe([(23, 152), (23, 163), *curve([(21, 165), (14, 169), (8, 176), (5.5, 184), (4.2, 192)])])
     grips = [ring(23, 0.8, z) for z in (155, 158, 161)]
     panel = embossed(body, rectangle(72, 84, 14, (0, 66)), 0.8)
-    words = text_section("MUSTARD", 62).translate((0, 80)) + rectangle(46, 3, 0, (0, 58)) + rectangle(34, 3, 0, (0, 50))
+    words = text_section("MUSTARD", 62, (0, 80)) + rectangle(46, 3, 0, (0, 58)) + rectangle(34, 3, 0, (0, 50))
     return union(body, closure, panel, embossed(body, words, 2.2), *grips)
 
 
@@ -86,7 +86,7 @@ def bleach_cleanser() -> Solid:
     )
     neck = rod((0, 0, 205), (0, 0, 222), 16)
     cap = union(ribbed_cap(20, 22).translate((0, 0, 216)), rod((0, 0, 236), (0, 0, 250), 11, 8))
-    words = text_section("BLEACH", 74).translate((0, 70))
+    words = text_section("BLEACH", 74, (0, 70))
     for width, height in ((76, 50), (60, 40), (66, 30)):
         words = words + rectangle(width, 2.6, 0, (0, height))
     return union(body, neck, cap, embossed(body, words, 1.5))
@@ -114,7 +114,7 @@ def container_bottle() -> Solid:
     thinner = [place(block(40, 60, 120, 18), (s * 56, -0.0 + 62, 190), (0, s * -6, 0)) for s in (-1, 1)]
     cap = union(ribbed_cap(31, 26, 44).translate((0, 0, 258)), ring(31, 2.2, 259))
     panel = embossed(body, rectangle(118, 96, 12, (-4, 78)), 1.0)
-    marks = text_section("LITRE", 84).translate((-4, 100)) + rectangle(90, 7, 3, (-4, 70))
+    marks = text_section("LITRE", 84, (-4, 100)) + rectangle(90, 7, 3, (-4, 70))
     marks = marks + rectangle(60, 7, 3, (-19, 48))
     for step in range(7):
         marks = marks + rectangle(14 if step % 2 else 9, 2.6, 0, (66, 40 + 18.0 * step))
@@ -239,7 +239,7 @@ def potted_meat_can() -> Solid:
     lid = loft([(79.5, 92, 45, outline), (84, 92, 45, outline)])
     body = loft([(height, *size, outline) for height, size in levels])
     label = embossed(body, rectangle(84, 60, 3, (0, 41)), 0.6)
-    words = text_section("MEAT", 68).translate((0, 50)) + text_section("POTTED", 56).translate((0, 26))
+    words = text_section("MEAT", 68, (0, 50)) + text_section("POTTED", 56, (0, 26))
     tab = place(_pull_tab(1.1), (0, 12, 78.5), (0, 0, 90))
     return union(cut(body, lid), label, embossed(body, words, 1.8), tab)
 
@@ -326,7 +326,7 @@ def _tube(length: float, width: float, cap_radius: float, cap_height: float, cri
 def paint_container_tube_small() -> Solid:
     """Stubby watercolour tube, 21 x 84 mm."""
     body = _tube(62, 20.5, 7.0, 10, 6)
-    words = embossed(body, text_section("RED", 13).translate((0, 48)), 0.5)
+    words = embossed(body, text_section("RED", 13, (0, 48)), 0.5)
     return union(body, words)
 
 
@@ -335,7 +335,7 @@ def paint_container_tube() -> Solid:
     """Oil-paint tube, 30 x 130 mm, rolled up a little at its end."""
     body = _tube(106, 30, 7.5, 13, 8)
     roll = rod((-3.2, -15.6, 126), (-3.2, 15.6, 126), 4.6)
-    words = text_section("OIL", 19).translate((0, 72)) + stroke(_BRUSH_MARK, 9).scale((0.5, 0.6)).translate((0, 50))
+    words = text_section("OIL", 19, (0, 72)) + stroke(_BRUSH_MARK, 9).scale((0.5, 0.6)).translate((0, 50))
     return union(body, roll, embossed(body, words, 0.7))
 
 
@@ -345,7 +345,7 @@ def paint_container_tube_large() -> Solid:
     body = _tube(156, 52, 19, 26, 9)
     dent = place(ball(26), (-32, 8, 140))
     hinge = block(6, 12, 8, 1, (18, 0, 24))
-    words = text_section("ACRYL", 36).translate((0, 64)) + rectangle(32, 3, 0, (0, 82)) + rectangle(24, 3, 0, (0, 90))
+    words = text_section("ACRYL", 36, (0, 64)) + rectangle(32, 3, 0, (0, 82)) + rectangle(24, 3, 0, (0, 90))
     return union(cut(union(body, embossed(body, words, 1.0)), dent), hinge)
 
 

@@ -7,7 +7,7 @@ viewer sees them, z towards the viewer, and :func:`facing` stands them up. Sourc
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, reduce
 from itertools import pairwise
 from typing import TypeAlias
 
@@ -74,14 +74,8 @@ def upright(
     degrees about x, then y, then z, by one of ``turns`` after the other, and ``enlarged``."""
 
     def add(draw: Callable[[], Solid]) -> Callable[[], Solid]:
-        def placed() -> Solid:
-            solid = stood(draw())
-            for turn in turns:
-                solid = solid.rotate(turn)
-            return solid.scale((enlarged,) * 3)
-
-        DRAWINGS[draw.__name__] = placed
-        return placed
+        DRAWINGS[draw.__name__] = lambda: reduce(Solid.rotate, turns, stood(draw())).scale((enlarged,) * 3)
+        return draw
 
     return add
 
@@ -215,6 +209,17 @@ def curve(points: Points, per_span: int = 10) -> np.ndarray:
     return np.concatenate([*spans, control[-1:]])
 
 
+def symmetric(half: Points) -> list[np.ndarray]:
+    """Outline through ``half`` (N, 2), which starts or ends on x = 0, and its mirror image: a `curve` through each."""
+    mirrored = np.asarray(half, dtype=np.float64)[::-1] * (-1.0, 1.0)
+    return [*curve(half), *curve(mirrored)[1:]]
+
+
+def cushioned(section: Section, thickness: float, inset: float, middle: float) -> Solid:
+    """The section as a plate that is ``middle`` mm thick where it is ``inset`` mm from its edge."""
+    return union(plate(section, thickness), plate(section.offset(-inset), middle))
+
+
 def skin(rings: np.ndarray, closed: bool = False) -> Solid:
     """Solid under rings of points (N, K, 3), each joined to the next; ``closed`` joins the last to the first. Ends that
     are not closed are capped by a fan about the mean of their ring, so end rings should be star-shaped."""
@@ -322,8 +327,8 @@ _GLYPHS = {
 _ROWS, _ADVANCE = 7, 6
 
 
-def text_section(text: str, width: float) -> Section:
-    """The text as a flat section, ``width`` mm wide, centred at the origin; cells overlap a little where they meet."""
+def text_section(text: str, width: float, at: Point2 = (0, 0)) -> Section:
+    """The text as a flat section, ``width`` mm wide, centred at ``at``; cells overlap a little where they meet."""
     runs = []
     for place, letter in enumerate(text):
         for row, digit in enumerate(_GLYPHS[letter]):
@@ -334,7 +339,7 @@ def text_section(text: str, width: float) -> Section:
     section = CrossSection.batch_boolean(runs, OpType.Add)
     cells_wide = len(text) * _ADVANCE - 1
     scale = width / cells_wide
-    return section.translate((-cells_wide / 2, -_ROWS / 2)).scale((scale, scale))
+    return section.translate((-cells_wide / 2, -_ROWS / 2)).scale((scale, scale)).translate(at)
 
 
 def text_plate(text: str, width: float, relief: float) -> Solid:

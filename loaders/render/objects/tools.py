@@ -9,6 +9,7 @@ from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
     ball,
     block,
     curve,
+    cushioned,
     cut,
     disc,
     drawn,
@@ -25,6 +26,7 @@ from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
     softened,
     stroke,
     superellipse,
+    symmetric,
     tube,
     union,
 )
@@ -165,11 +167,8 @@ def paint_brush_large() -> Solid:
     ferrule = block(100, 42, 22, 2.5, (0, 20, 0))
     bands = [block(102, 4, 24, 1.5, (0, y, 0)) for y in (4, 36)]
     nails = [rod((x, 20, -12.2), (x, 20, 12.2), 2.2) for x in (-40, -20, 0, 20, 40)]
-    outline = [
-        *curve([(-48, 2), (-44, -14), (-22, -30), (-14, -52), (-15, -84), (-20, -112), (-15, -134), (0, -142)]),
-        *curve([(0, -142), (15, -134), (20, -112), (15, -84), (14, -52), (22, -30), (44, -14), (48, 2)])[1:],
-    ]
-    handle = union(plate(polygon(outline), 14), plate(polygon(outline).offset(-5), 19))
+    half = [(-48, 2), (-44, -14), (-22, -30), (-14, -52), (-15, -84), (-20, -112), (-15, -134), (0, -142)]
+    handle = cushioned(polygon(symmetric(half)), 14, 5, 19)
     handle = cut(handle, rod((0, -126, -20), (0, -126, 20), 6))
     tuft = laid(loft([(38, 97, 20, 7), (60, 100, 22, 6), (92, 102, 16, 6), (104, 100, 6, 6)], smooth=5))
     spots = [(x, s) for x in range(-45, 46, 6) for s in (-1, 1)]
@@ -180,9 +179,7 @@ def paint_brush_large() -> Solid:
 @drawn(2.15, (2, 0, 2))
 def pallet_knife() -> Solid:
     """Trowel-shaped palette knife, 215 mm: leaf blade on a cranked neck, turned handle with a brass collar."""
-    right = curve([(0, 120), (10, 106), (19, 76), (21, 54), (13, 36), (0, 30)])
-    left = curve([(0, 30), (-13, 36), (-21, 54), (-19, 76), (-10, 106), (0, 120)])
-    leaf = polygon([*right, *left[1:]], 0.5)
+    leaf = polygon(symmetric([(0, 120), (10, 106), (19, 76), (21, 54), (13, 36), (0, 30)]), 0.5)
     neck = tube(curve([(0, -6, 0), (0, 8, 1), (0, 20, 9), (0, 32, 16), (0, 46, 17)]), 3.6, flatten=0.8, up=(1, 0, 0))
     collar = place(lathe([(8, 0), (9, 3), (8, 9), (6, 11)], segments=48), (0, -11, 0), (-90, 0, 0))
     handle = _handle([(8.5, 8), (11.0, 26), (11.5, 50), (9.0, 76), (10.5, 94), (7.0, 104)])
@@ -192,14 +189,10 @@ def pallet_knife() -> Solid:
 @drawn(1.95, (2, 1, 2))
 def pallet_knife_large() -> Solid:
     """Long palette knife, 290 mm: straight round-ended blade, bolster, riveted flat handle."""
-    right = curve([(12, 20), (17, 90), (18, 150), (14, 166), (0, 174)])
-    left = curve([(0, 174), (-14, 166), (-18, 150), (-17, 90), (-12, 20)])
-    blade = polygon([*right, *left[1:], (-9, 0), (9, 0)])
+    blade = polygon([*symmetric([(12, 20), (17, 90), (18, 150), (14, 166), (0, 174)]), (-9, 0), (9, 0)])
     bolster = block(26, 16, 15, 3, (0, 4, 0))
-    left = curve([(-12, 4), (-15, -30), (-12, -62), (-16, -98), (-10, -116), (0, -120)])
-    right = curve([(0, -120), (10, -116), (16, -98), (12, -62), (15, -30), (12, 4)])
-    grip = polygon([*left, *right[1:]])
-    handle = union(plate(grip, 15), plate(grip.offset(-3.5), 20))
+    half = [(-12, 4), (-15, -30), (-12, -62), (-16, -98), (-10, -116), (0, -120)]
+    handle = cushioned(polygon(symmetric(half)), 15, 3.5, 20)
     rivets = [rod((0, y, -11), (0, y, 11), 3.6) for y in (-20, -56, -92)]
     return union(plate(blade, 3.0), bolster, handle, *rivets)
 
@@ -221,8 +214,7 @@ def power_drill() -> Solid:
     bit = union(*(rod((x, 78, 0), (end, 78, 0), radius, tip) for x, end, radius, tip in bit_parts))
     front = curve([(2, 70), (2, 40), (10, 0), (18, -34), (20, -50)])
     back = curve([(66, -50), (62, -20), (58, 20), (60, 50), (62, 84)])
-    grip_outline = polygon([*front, *back], 4)
-    grip = union(plate(grip_outline, 30), plate(grip_outline.offset(-4), 40))
+    grip = cushioned(polygon([*front, *back], 4), 30, 4, 40)
     trigger = union(plate(polygon([(4, 50), (-8, 44), (-8, 32), (0, 20), (12, 16), (10, 50)], 2), 16))
     shoe = plate(polygon([(-8, -46), (74, -46), (80, -62), (-16, -62)], 3), 34)
     battery = block(104, 42, 36, 6, (30, -81, 0))
@@ -247,8 +239,7 @@ def spraygun() -> Solid:
     )
     front = curve([(4, 56), (6, 30), (16, -6), (24, -40), (28, -66)])
     back = curve([(58, -66), (54, -36), (46, -4), (42, 30), (56, 52), (60, 66), (48, 74)])
-    grip_outline = polygon([*front, *back], 3)
-    grip = union(plate(grip_outline, 18), plate(grip_outline.offset(-4), 25))
+    grip = cushioned(polygon([*front, *back], 3), 18, 4, 25)
     hook = plate(stroke([(-18, 66), (-26, 84), (-38, 86)], 8), 8)
     trigger = plate(stroke(curve([(-34, 66), (-26, 34), (-14, 10), (-12, -12), (-24, -30)]), 9), 13)
     pivot = rod((-33, 64, -21), (-33, 64, 21), 6)
