@@ -20,6 +20,7 @@ from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
     place,
     plate,
     polygon,
+    post,
     rectangle,
     ring,
     rod,
@@ -37,7 +38,7 @@ from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
 def ribbed_cap(radius: float, height: float, ribs: int = 36) -> Solid:
     """Screw cap standing on z = 0 with vertical grips."""
     feet = [(radius * c, radius * s) for c, s in around(ribs)]
-    grips = [rod((x, y, 1.5), (x, y, height - 2.5), 0.07 * radius) for x, y in feet]
+    grips = [post(1.5, height - 2.5, 0.07 * radius, at=(x, y)) for x, y in feet]
     return union(lathe([(radius, 0), (radius, height - 2), (radius - 2, height)]), *grips)
 
 
@@ -84,8 +85,8 @@ def bleach_cleanser() -> Solid:
         ],
         smooth=8,
     )
-    neck = rod((0, 0, 205), (0, 0, 222), 16)
-    cap = union(ribbed_cap(20, 22).translate((0, 0, 216)), rod((0, 0, 236), (0, 0, 250), 11, 8))
+    neck = post(205, 222, 16)
+    cap = union(ribbed_cap(20, 22).translate((0, 0, 216)), post(236, 250, 11, 8))
     words = text_section("BLEACH", 74, (0, 70))
     for width, height in ((76, 50), (60, 40), (66, 30)):
         words = words + rectangle(width, 2.6, 0, (0, height))
@@ -178,7 +179,7 @@ def cork() -> Solid:
         side = angle + 0.09 * (0.6 + 1.9 * ((k * 0.7320508) % 1.0))
         ends = [(radius * float(np.cos(a)), radius * float(np.sin(a)), at) for a, at in ((angle, z), (side, z + 0.4))]
         pits.append(rod(ends[0], ends[1], 0.4, 0.75, rounded=True))
-    holes = [rod((x, y, 40), (x, y, 44), 0.9) for x, y in ((4, 3), (-6, 2), (1, -7), (-3, -3), (9, -4))]
+    holes = [post(40, 44, 0.9, at=(x, y)) for x, y in ((4, 3), (-6, 2), (1, -7), (-3, -3), (9, -4))]
     split = block(10, 0.8, 14, 0, (-14, 4, 36))
     return cut(body, *pits, *holes, split)
 
@@ -190,24 +191,24 @@ def _rimmed(radius: float, height: float, ribs: tuple[float, ...] = ()) -> Solid
     for z in ribs:
         wall += [(radius, z - 1.8), (radius + 0.9, z - 0.6), (radius + 0.9, z + 0.6), (radius, z + 1.8)]
     wall += [(radius, height - 3.6), (rim, height - 2.6), (rim, height - 0.8), (rim - 1, height)]
-    sunk_lid = rod((0, 0, height - 3), (0, 0, height + 1), radius - 1.2)
+    sunk_lid = post(height - 3, height + 1, radius - 1.2)
     return cut(lathe(wall), sunk_lid)
 
 
 def _pull_tab(scale: float = 1.0) -> Solid:
     """Ring-pull lying on z = 0, its rivet at the origin and its ring towards -x."""
     tab = (rectangle(22, 15, 7.4, (-9, 0)) - softened(rectangle(10, 9, 4.4, (-13, 0)), 1)).scale((scale, scale))
-    return union(plate(tab, 1.6).translate((0, 0, 1.2)), rod((0, 0, -1), (0, 0, 2.6), 3.0 * scale))
+    return union(plate(tab, 1.6).translate((0, 0, 1.2)), post(-1, 2.6, 3.0 * scale))
 
 
 @upright(1.32)
 def master_chef_can() -> Solid:
     """Coffee can, 102 x 139 mm, with an overhanging plastic lid and its name on a label that does not quite close."""
     body = _rimmed(50, 132)
-    lid = cut(lathe([(52.5, 126), (53, 127), (53, 137), (51.5, 139)]), rod((0, 0, 137), (0, 0, 141), 46))
+    lid = cut(lathe([(52.5, 126), (53, 127), (53, 137), (51.5, 139)]), post(137, 141, 46))
     label = wrapped(rectangle(292, 112), 50, 65, 0.6)
     name = union(*lettered(50.6, 1.0, ("MASTER", 76, 92), ("CHEF", 58, 70)), wrapped(disc(17), 50.6, 36, 1.0))
-    grips = [rod((53 * c, 53 * s, 127.5), (53 * c, 53 * s, 136.5), 0.9) for c, s in around(60)]
+    grips = [post(127.5, 136.5, 0.9, at=(53 * c, 53 * s)) for c, s in around(60)]
     return union(body, lid, label, name, *grips)
 
 
@@ -265,7 +266,7 @@ def paint_container_bottle() -> Solid:
     """Craft-paint bottle, 44 x 118 mm, with a flip-top cap and a daub of paint on its label."""
     body = lathe([(19, 0), (21.5, 2), (22, 6), (22, 72), *curve([(21.5, 78), (17, 86), (12, 90), (11, 94)])])
     top = lathe([(12.4, 103), (12.6, 112), (11, 115)])
-    cap = union(ribbed_cap(13, 13, 28).translate((0, 0, 91)), top, rod((0, 0, 114), (0, 0, 119), 4, 3))
+    cap = union(ribbed_cap(13, 13, 28).translate((0, 0, 91)), top, post(114, 119, 4, 3))
     notch = block(5, 11, 4, 1, (-13.6, 0, 104))
     label = wrapped(rectangle(112, 52), 22, 38, 0.35)
     daub = wrapped(stroke(_BRUSH_MARK, 12).scale((0.66, 0.8)), 22.4, 28, 0.9)
@@ -356,7 +357,7 @@ def paint_thinner() -> Solid:
     levels = ((0, wall), (2, seam_size), (6, seam_size), (7, wall), (193, wall), (194, seam_size), (199, seam_size))
     body = union(loft([(height, *size, 9) for height, size in (*levels, (200, wall))]))
     top = loft([(196, 157, 92, 9), (203, 157, 92, 9)])
-    spout = union(rod((0, 50, 190), (0, 50, 216), 19), ribbed_cap(22, 20, 36).translate((0, 50, 202)))
+    spout = union(post(190, 216, 19, at=(0, 50)), ribbed_cap(22, 20, 36).translate((0, 50, 202)))
     bow = [(16, 196), (12, 224), (-14, 238), (-48, 234), (-64, 214), (-66, 196)]
     strap = tube(curve([(0, y, z) for y, z in bow]), 9, flatten=0.28, up=(0, 0.3, 1))
     words = union(

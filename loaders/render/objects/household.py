@@ -17,6 +17,7 @@ from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
     place,
     plate,
     polygon,
+    post,
     rectangle,
     ring,
     rod,
@@ -48,7 +49,7 @@ def mug() -> Solid:
     ear = curve([(0, -38, 76), (0, -52, 79), (0, -66, 68), (0, -69, 50), (0, -62, 32), (0, -50, 22), (0, -37, 19)])
     handle = tube(ear, 5.2, flatten=1.35, up=(1, 0, 0))
     badge = wrapped(stroke([(-16, 8), (-8, 18), (0, 10), (8, 18), (16, 8), (0, -14), (-16, 8)], 3.4), 41, 46, 1.2)
-    solid = cut(union(body, handle), rod((0, 0, 4.5), (0, 0, 88), 37.3))
+    solid = cut(union(body, handle), post(4.5, 88, 37.3))
     return union(solid, badge, ring(39.5, 1.7, 91.5))
 
 
@@ -94,7 +95,7 @@ def cleaning_bucket() -> Solid:
     grip = rod((-118, -46, 312), (-118, 46, 312), 11)
     words = wrapped(text_section("CLEAN", 150), 120, 130, 2.0)
     rivets = [ball(4.5, (0, s * 147, 236)) for s in (-1, 1)]
-    solid = cut(union(body, *bands, *ears), rod((0, 0, 8), (0, 0, 252), 97.5, 134.2))
+    solid = cut(union(body, *bands, *ears), post(8, 252, 97.5, 134.2))
     return union(solid, bail, grip, words, *rivets)
 
 
@@ -116,7 +117,7 @@ def _candle(radius: float, height: float) -> Solid:
         angle = 1.11 + 1.31 * k + 0.03 * height
         x, y = (radius - 0.4) * float(np.cos(angle)), (radius - 0.4) * float(np.sin(angle))
         runs.append(rod((x, y, height - 4), (x, y, height - 16 - 9 * ((k * 3) % 4)), 2.6, 3.4, rounded=True))
-    wick = rod((0, 0, height - 8), (0, 0, height + 10), 1.6)
+    wick = post(height - 8, height + 10, 1.6)
     flame = ((0.6, 4), (4.5, 8), (6.6, 15), (4.6, 25), (0.6, 38))
     flame_side = curve([(radius, height + above) for radius, above in flame], 6)
     return union(body, *runs, wick, lathe(flame_side, segments=SMALL_SEGMENTS))
@@ -126,13 +127,13 @@ def _candle(radius: float, height: float) -> Solid:
 def duct_tape() -> Solid:
     """Roll of tape, 128 x 50 mm, on a cardboard core, its end lifted; stood on edge with the hole to the viewer."""
     turns = lathe([(64, 0), (64, 50)], 0.6)
-    core = cut(rod((0, 0, -0.6), (0, 0, 50.6), 41), rod((0, 0, -2), (0, 0, 53), 38))
+    core = cut(post(-0.6, 50.6, 41), post(-2, 53, 38))
     rings = [(r, z) for r in range(45, 63, 4) for z in (-0.7, 49.1)]
-    windings = [cut(rod((0, 0, z), (0, 0, z + 1.6), r + 0.8), rod((0, 0, -3), (0, 0, 55), r)) for r, z in rings]
+    windings = [cut(post(z, z + 1.6, r + 0.8), post(-3, 55, r)) for r, z in rings]
     bent = np.linspace(-1.4, 0.15, 24)
     reach = 64.0 + 30 * np.clip(bent + 0.5, 0, 1) ** 2
     end = stroke(np.stack([reach * np.cos(bent), reach * np.sin(bent)], axis=1), 1.4).extrude(50)
-    roll = union(cut(union(turns, end), rod((0, 0, -2), (0, 0, 53), 40)), core, *windings)
+    roll = union(cut(union(turns, end), post(-2, 53, 40)), core, *windings)
     return roll.translate((0, 0, -25))
 
 
@@ -175,7 +176,7 @@ def marker() -> Solid:
     """Felt marker, 18 x 132 mm, its cap off at the writing end: stepped barrel, chisel tip, end plug."""
     side = [(7.6, 0), (8.6, 1), (8.6, 3), (9, 4), (9, 84), (8.4, 86), (8.4, 94), (5.6, 100), (5.2, 116), (3.4, 120)]
     barrel = lathe(side)
-    tip = cut(rod((0, 0, 118), (0, 0, 131), 2.9, 2.7), place(block(12, 12, 10), (-4, 0, 131), (0, 40, 0)))
+    tip = cut(post(118, 131, 2.9, 2.7), place(block(12, 12, 10), (-4, 0, 131), (0, 40, 0)))
     label = wrapped(rectangle(52, 64), 9, 44, 0.3)
     words = wrapped(text_section("MARKER", 54).rotate(90), 9.2, 44, 0.6)
     grooves = [ring(9, 0.45, z) for z in (7, 9, 11, 80)]
@@ -365,7 +366,7 @@ def open_book() -> Solid:
     lines = ((182, 60), *((164 - 11 * k, 98 - 7 * (k % 3)) for k in range(11)), (43, 50))
     drawn = [(z, inked ^ rectangle(width, 60, 0, (28 + width / 2, 0))) for z, width in lines]
     text = [line.extrude(3.4).translate((0, 0, z)).rotate((0, 0, spread)) for z, line in drawn]
-    spine = rod((0, -1.5, -5), (0, -1.5, 210), 4)
+    spine = post(-5, 210, 4, at=(0, -1.5))
     left = union(pages.extrude(205), cover).rotate((0, 0, spread)).mirror((1, 0, 0))
     printed = [line.mirror((1, 0, 0)) for line in text]
     ribbon = stroke([(0, 14), (9, 22), (13, 26)], 1.6).extrude(150).translate((0, 0, -22))

@@ -180,6 +180,11 @@ def rod(start: Point3, end: Point3, radius: float, end_radius: float | None = No
     return place(Manifold.cylinder(length, radius, last, segments_for(max(radius, last))), start, (0, polar, azimuth))
 
 
+def post(low: float, high: float, radius: float, end_radius: float | None = None, at: Point2 = (0, 0)) -> Solid:
+    """A `rod` along z, from height ``low`` to ``high``."""
+    return rod((*at, low), (*at, high), radius, end_radius)
+
+
 def block(width: float, depth: float, height: float, soften: float = 0.0, at: Point3 = (0, 0, 0)) -> Solid:
     """Box of size x, y, z centred at ``at``, edges and corners rounded to ``soften``."""
     if soften <= 0:

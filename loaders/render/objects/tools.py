@@ -19,6 +19,7 @@ from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
     place,
     plate,
     polygon,
+    post,
     rectangle,
     ring,
     rod,
@@ -85,7 +86,7 @@ def scissors() -> Solid:
         half = union(plate(blade, 3.2), plate(shank, 8), ring_bow).rotate((0, 0, 9))
         halves.append(half.translate((0, 0, 1.8)) if side > 0 else half.mirror((1, 0, 0)).translate((0, 0, -1.8)))
     slot = block(12, 1.4, 2, 0, (0, 0, 7.6)).rotate((0, 0, 35))
-    pivot = union(rod((0, 0, -6.5), (0, 0, 6.5), 6), cut(rod((0, 0, 5), (0, 0, 7.6), 5), slot))
+    pivot = union(post(-6.5, 6.5, 6), cut(post(5, 7.6, 5), slot))
     return union(*halves, pivot)
 
 
@@ -97,9 +98,9 @@ def large_clamp() -> Solid:
     sleeve = stroke(curve([(31, -46), (40, -67), (48, -100)]), 34)
     slot = plate(stroke([(20, -28), (29, -46)], 7), 60)
     half = cut(union(plate(softened(arm + lever, 2), 20), plate(softened(sleeve, 1), 28)), slot)
-    pad = union(place(block(10, 38, 30, 3), (-6.5, 90, 0), (0, 0, 3)), rod((-12, 90, -17), (-12, 90, 17), 6))
+    pad = union(place(block(10, 38, 30, 3), (-6.5, 90, 0), (0, 0, 3)), post(-17, 17, 6, at=(-12, 90)))
     ears = [plate(disc(19), 6).translate((0, 0, z)) for z in (-12, 12)]
-    pin = rod((0, 0, -20), (0, 0, 20), 7)
+    pin = post(-20, 20, 7)
     coil = [ring(12.5, 2.8, z) for z in (-16.4, -13.4, 13.4, 16.4)]
     legs = [tube(curve([(s * 11, -4, 14), (s * 22, -26, 14), (s * 31, -46, 12)]), 2.8, up=(0, 0, 1)) for s in (-1, 1)]
     both = union(half, pad, half.mirror((1, 0, 0)), pad.mirror((1, 0, 0)), pin, *ears, *coil, *legs)
@@ -136,7 +137,7 @@ def boxcutter() -> Solid:
     scores = [place(block(26, 1.2, 3, 0), (0, y, 1.6), (0, 0, -35)) for y in (66, 77, 88, 99)]
     backs = [place(solid, (0, 0, 0), (0, 180, 0)).mirror((1, 0, 0)) for solid in scores]
     ribs = [block(35, 2.6, 9, 1, (0, y, 0)) for y in range(-58, -20, 7)]
-    grips = [place(rod((0, 0, -20), (0, 0, 20), 5), (17, y, 0)) for y in (-44, -30, -16)]
+    grips = [place(post(-20, 20, 5), (17, y, 0)) for y in (-44, -30, -16)]
     return union(cut(union(body, *ribs), *grips), slider, cut(blade, *scores, *backs))
 
 
@@ -166,10 +167,10 @@ def paint_brush_large() -> Solid:
     """Wall brush, 100 mm wide: thick bristles, nailed ferrule, beaver-tail handle with a hanging hole."""
     ferrule = block(100, 42, 22, 2.5, (0, 20, 0))
     bands = [block(102, 4, 24, 1.5, (0, y, 0)) for y in (4, 36)]
-    nails = [rod((x, 20, -12.2), (x, 20, 12.2), 2.2) for x in (-40, -20, 0, 20, 40)]
+    nails = [post(-12.2, 12.2, 2.2, at=(x, 20)) for x in (-40, -20, 0, 20, 40)]
     half = [(-48, 2), (-44, -14), (-22, -30), (-14, -52), (-15, -84), (-20, -112), (-15, -134), (0, -142)]
     handle = cushioned(polygon(symmetric(half)), 14, 5, 19)
-    handle = cut(handle, rod((0, -126, -20), (0, -126, 20), 6))
+    handle = cut(handle, post(-20, 20, 6, at=(0, -126)))
     tuft = laid(loft([(38, 97, 20, 7), (60, 100, 22, 6), (92, 102, 16, 6), (104, 100, 6, 6)], smooth=5))
     spots = [(x, s) for x in range(-45, 46, 6) for s in (-1, 1)]
     furrows = [place(block(1.2, 62, 4, 0), (x, 76, s * 11.4), (s * 4, 0, 0)) for x, s in spots]
@@ -193,7 +194,7 @@ def pallet_knife_large() -> Solid:
     bolster = block(26, 16, 15, 3, (0, 4, 0))
     half = [(-12, 4), (-15, -30), (-12, -62), (-16, -98), (-10, -116), (0, -120)]
     handle = cushioned(polygon(symmetric(half)), 15, 3.5, 20)
-    rivets = [rod((0, y, -11), (0, y, 11), 3.6) for y in (-20, -56, -92)]
+    rivets = [post(-11, 11, 3.6, at=(0, y)) for y in (-20, -56, -92)]
     return union(plate(blade, 3.0), bolster, handle, *rivets)
 
 
@@ -223,7 +224,7 @@ def power_drill() -> Solid:
     cap = place(lathe([(27, 0), (27, 6), (20, 12)], 1.5), (60, 78, 0), (0, 90, 0))
     body = cut(union(housing, cap, grip), *(v - block(200, 200, 56, 0, (0, 84, 0)) for v in vents))
     badge = plate(rectangle(38, 11, 4, (-14, 82)), 60)
-    switch = rod((8, 58, -24), (8, 58, 24), 5)
+    switch = post(-24, 24, 5, at=(8, 58))
     parts = union(body, clutch, *knurls, cut(chuck, *flutes), bit, trigger, shoe, battery, latch, badge, switch)
     return parts
 
@@ -242,8 +243,8 @@ def spraygun() -> Solid:
     grip = cushioned(polygon([*front, *back], 3), 18, 4, 25)
     hook = plate(stroke([(-18, 66), (-26, 84), (-38, 86)], 8), 8)
     trigger = plate(stroke(curve([(-34, 66), (-26, 34), (-14, 10), (-12, -12), (-24, -30)]), 9), 13)
-    pivot = rod((-33, 64, -21), (-33, 64, 21), 6)
-    nut = place(rod((0, 0, 0), (0, 0, 10), 15), (-34, 100, 0), (-90, 0, 0))
+    pivot = post(-21, 21, 6, at=(-33, 64))
+    nut = place(post(0, 10, 15), (-34, 100, 0), (-90, 0, 0))
     stem = union(rod((-22, 60, 0), (-34, 102, 0), 10), nut)
     cup = lathe([(8, 0), *curve([(16, 2), (30, 14), (39, 34), (41, 60), (41, 92)])])
     lid = lathe([(43, 88), (43.5, 90), (43.5, 100), (30, 106), (8, 107), (8, 113), (5, 114)])

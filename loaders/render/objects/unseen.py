@@ -22,6 +22,7 @@ from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
     place,
     plate,
     polygon,
+    post,
     rectangle,
     rod,
     skin,
@@ -70,7 +71,7 @@ def hinged_leaves() -> Solid:
         place(block(12, width, 330, 2, (0, side * width / 2, 0)), turn=(0, 0, side * 55))
         for side, width in ((1, 250), (-1, 210))
     ]
-    return union(*leaves, rod((0, 0, -165), (0, 0, 165), 11))
+    return union(*leaves, post(-165, 165, 11))
 
 
 @upright(1.0, (6, -4, 0))
@@ -122,9 +123,9 @@ def gear() -> Solid:
     """A gear of 18 teeth with a hub, six lightening holes and a keyway, 390 mm across."""
     tooth = polygon([(150, -22), (174, -18), (194, -9), (194, 9), (174, 18), (150, 22)])
     wheel = CrossSection.batch_boolean([disc(160), *(tooth.rotate(20 * k) for k in range(18))], _ADD)
-    body = cut(plate(wheel, 56), *(rod((98 * x, 98 * y, -40), (98 * x, 98 * y, 40), 30) for x, y in around(6)))
+    body = cut(plate(wheel, 56), *(post(-40, 40, 30, at=(98 * x, 98 * y)) for x, y in around(6)))
     hub = lathe([(62, -46), (62, 40), (54, 48)], 1)
-    bore = union(rod((0, 0, -80), (0, 0, 80), 26), block(16, 66, 160, 0, (0, 0, 0)))
+    bore = union(post(-80, 80, 26), block(16, 66, 160, 0, (0, 0, 0)))
     return cut(union(body, hub), bore)
 
 
