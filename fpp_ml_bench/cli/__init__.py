@@ -168,27 +168,14 @@ Exit status: 0 done, 1 a check failed, 2 bad input or failed, 130 stopped (143 b
 """
 
 
-def run_command(command: Any, prog: str, argv: Sequence[str]) -> int:
-    """Parse ``argv`` and run the command. An error of this package, an unreadable file, a full disk, Ctrl-C or SIGTERM
-    becomes a message and a status; where nobody reads the output any more, there is a status alone."""
-    return _guarded(prog, partial(_parsed_and_run, lambda: command, prog, argv))
-
-
-def _parsed_and_run(load: Callable[[], Any], prog: str, argv: Sequence[str]) -> int:
-    command = load()
-    if isinstance(command, Program):
-        return run_program(command, argv)
-    with command.make_context(prog, list(argv)) as ctx:
-        status: int = command.invoke(ctx)
-        return status
-
-
-def _guarded(prog: str, action: Callable[[], int]) -> int:
+def run_command(load: Callable[[], Any], prog: str, argv: Sequence[str]) -> int:
+    """Import a command, parse ``argv`` and run it. An error of this package, an unreadable file, a full disk, Ctrl-C or
+    SIGTERM becomes a message and a status; where nobody reads the output any more, there is a status alone."""
     for name in _STREAMS:
         if getattr(sys, name) is None:  # closed by the caller: its number must not become that of a data file
             setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115
     try:
-        status = _status_of(prog, action)
+        status = _status_of(prog, load, argv)
     except SystemExit as stop:  # of rich where its output is closed
         if not isinstance(stop.__context__, BrokenPipeError):
             raise
@@ -204,11 +191,16 @@ def _guarded(prog: str, action: Callable[[], int]) -> int:
     return status
 
 
-def _status_of(prog: str, action: Callable[[], int]) -> int:
+def _status_of(prog: str, load: Callable[[], Any], argv: Sequence[str]) -> int:
     try:
         with _terminable():
-            return action()
-    except click.exceptions.Exit as leaving:  # of --help
+            command = load()
+            if isinstance(command, Program):
+                return run_program(command, argv)
+            with command.make_context(prog, list(argv)) as ctx:
+                status: int = command.invoke(ctx)
+                return status
+    except click.exceptions.Exit as leaving:  # of --help and --version
         return leaving.exit_code
     except click.UsageError as error:
         return _refused(error.ctx.command_path if error.ctx else prog, problem_of(error))
@@ -274,16 +266,6 @@ def _say(text: str) -> None:
         print(text, file=sys.stderr)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point of ``fpp-bench``."""
-    return run_program(BENCH, argv)
-
-
-def main_eval(argv: Sequence[str] | None = None) -> int:
-    """Entry point of ``fpp-eval``."""
-    return run_program(EVAL, argv)
-
-
 def run_program(program: Program, argv: Sequence[str] | None = None) -> int:
     """Run the command that the first word of ``argv`` (default: the process's) names, or the default one."""
     words = list(sys.argv[1:] if argv is None else argv)
@@ -298,12 +280,12 @@ def run_program(program: Program, argv: Sequence[str] | None = None) -> int:
     elif program.default and first not in ("", "--help", "-h", "--version") and not slip:
         command = program.default
     else:
-        return _guarded(name, partial(_without_command, program, first))
-    return _guarded(name, partial(_parsed_and_run, partial(program.command, command), name, words))
+        return run_command(partial(_without_command, program, first), name, words)
+    return run_command(partial(program.command, command), name, words)
 
 
-def _without_command(program: Program, first: str) -> int:
-    """Help, version, or what is wrong with the command's name."""
+def _without_command(program: Program, first: str) -> None:
+    """Help, version, or what is wrong with the command's name, raised as click's exception."""
     if first == "--version":
         print(f"fpp-ml-bench {__version__}")
     elif first in ("", "--help", "-h"):
@@ -312,7 +294,7 @@ def _without_command(program: Program, first: str) -> int:
         raise click.UsageError(f"unknown option {first!r} before a command; see {program.name} --help")
     else:
         raise click.UsageError(f"unknown command {first!r}; {did_you_mean(first, program.commands)}")
-    return OK if first else BAD_INPUT
+    raise click.exceptions.Exit(OK if first else BAD_INPUT)
 
 
 def help_of(program: Program) -> str:
@@ -328,3 +310,9 @@ def help_of(program: Program) -> str:
         sections |= command.sections(ctx)
     text = help_text(usages, program.purpose, sections, program.examples)
     return f"{text}\n{_MEANINGS.format(name=program.name)}"
+
+
+main = partial(run_program, BENCH)
+"""Entry point of ``fpp-bench``."""
+main_eval = partial(run_program, EVAL)
+"""Entry point of ``fpp-eval``."""

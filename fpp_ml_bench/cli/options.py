@@ -13,7 +13,7 @@ from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from textwrap import indent
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args, get_origin
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 import click
 
@@ -31,7 +31,6 @@ STANDARD_OUTPUT = "-"
 OPTIONS = "options"
 """Heading of the options of a settings class that has no ``HEADING`` of its own."""
 
-T = TypeVar("T")
 Row = tuple[str, str]
 """A line of the help: a term, and what it means."""
 
@@ -39,11 +38,11 @@ Row = tuple[str, str]
 # ---- how the text of an option becomes its value
 
 
-def value(expected: str, parse: Callable[[str], T], sound: Callable[[T], bool] = lambda result: True) -> Any:
+def value(expected: str, parse: Callable[[str], Any], sound: Callable[[Any], bool] = lambda result: True) -> Any:
     """``parse`` of an option: text that ``parse`` makes a ``sound`` value of, without ValueError; else it says what was
     ``expected``."""
 
-    def parsed(text: str) -> T:
+    def parsed(text: str) -> Any:
         with suppress(ValueError):
             if sound(result := parse(text)):
                 return result
@@ -200,17 +199,16 @@ def command_line() -> str:
 
 def parameter_of(entry: "Field[Any]", heading: str = OPTIONS) -> Any:
     """The click.Option or click.Argument that a field is, listed in the help below ``heading``."""
-    about, required = described(entry), entry.default is MISSING
+    about, required, words = described(entry), entry.default is MISSING, [flag_of(entry), entry.name]
     told: dict[str, Any] = {"help": about.help} if required else {"help": about.help, "default": entry.default}
-    valued = {"type": _Value(parser_of(entry)), "required": required, "metavar": about.metavar}
-    words = [flag_of(entry), entry.name]
+    shown = about.metavar or "|".join(choices_of(entry))
+    valued = {"type": _Value(parser_of(entry)), "required": required, "metavar": shown, **told}
     if about.positional:
-        made: Any = click.Argument([entry.name], nargs=-1 if about.many else 1, **valued, **told)
+        made: Any = click.Argument([entry.name], nargs=-1 if about.many else 1, **valued)
     elif _kinds(entry) == {"bool"}:
         made = click.Option(words, is_flag=True, flag_value=not entry.default, **told)
     else:
-        valued["metavar"] = about.metavar or "|".join(choices_of(entry))
-        made = click.Option(words, multiple=about.many, **valued, **told)
+        made = click.Option(words, multiple=about.many, **valued)
     made.heading = "arguments" if about.positional else heading
     return made
 

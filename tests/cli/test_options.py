@@ -50,7 +50,7 @@ def shoot(
 
 
 def shot(capsys, words):
-    status = run_command(shoot, "fpp-bench shoot", words.split())
+    status = run_command(lambda: shoot, "fpp-bench shoot", words.split())
     captured = capsys.readouterr()
     return status, captured.out if status == 0 else captured.err
 
