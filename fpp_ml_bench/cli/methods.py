@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import Field, dataclass, field
+from dataclasses import Field, dataclass, field, fields
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -38,7 +38,7 @@ class MethodSettings:
     def load(self, dataset: "Photographed", warn: bool = True) -> Method:
         """The method for the rig of ``dataset``. Unless told not to, warns on standard error about weights that were
         trained on another version of the dataset's benchmark. Raises FppBenchError for an unknown method."""
-        known = registry.find(self.name).method.Options.__dataclass_fields__
+        known = [entry.name for entry in fields(registry.find(self.name).method.Options)]
         threads = {"threads": self.threads} if "threads" in known else {}
         method = registry.load_method(self.name, dataset, **self.options, **threads)
         config = method.weights_config

@@ -214,10 +214,10 @@ def curve(points: Points, per_span: int = 10) -> np.ndarray:
     return np.concatenate([*spans, control[-1:]])
 
 
-def symmetric(half: Points) -> list[np.ndarray]:
+def symmetric(half: Points) -> np.ndarray:
     """Outline through ``half`` (N, 2), which starts or ends on x = 0, and its mirror image: a `curve` through each."""
     mirrored = np.asarray(half, dtype=np.float64)[::-1] * (-1.0, 1.0)
-    return [*curve(half), *curve(mirrored)[1:]]
+    return np.concatenate([curve(half), curve(mirrored)[1:]])
 
 
 def cushioned(section: Section, thickness: float, inset: float, middle: float) -> Solid:
