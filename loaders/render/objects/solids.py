@@ -13,6 +13,7 @@ from typing import TypeAlias
 
 import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold, Mesh64, OpType
+from numpy.typing import ArrayLike
 
 Solid: TypeAlias = Manifold
 Section: TypeAlias = CrossSection
@@ -200,18 +201,18 @@ def curve(points: Points, per_span: int = 10) -> np.ndarray:
     control = np.asarray(points, dtype=np.float64)
     padded = np.concatenate([2 * control[:1] - control[1:2], control, 2 * control[-1:] - control[-2:-1]])
     knots = np.concatenate([[0.0], np.cumsum(np.sqrt(np.linalg.norm(np.diff(padded, axis=0), axis=1)))])
-    spans = []
-    for i in range(1, len(padded) - 2):
-        t = np.linspace(knots[i], knots[i + 1], per_span, endpoint=False)[:, None]
-        t0, t1, t2, t3 = knots[i - 1 : i + 3]
-        p0, p1, p2, p3 = padded[i - 1 : i + 3]
-        a1 = ((t1 - t) * p0 + (t - t0) * p1) / (t1 - t0)
-        a2 = ((t2 - t) * p1 + (t - t1) * p2) / (t2 - t1)
-        a3 = ((t3 - t) * p2 + (t - t2) * p3) / (t3 - t2)
-        b1 = ((t2 - t) * a1 + (t - t0) * a2) / (t2 - t0)
-        b2 = ((t3 - t) * a2 + (t - t1) * a3) / (t3 - t1)
-        spans.append(((t2 - t) * b1 + (t - t1) * b2) / (t2 - t1))
-    return np.concatenate([*spans, control[-1:]])
+    t = np.linspace(knots[1:-2], knots[2:-1], per_span, endpoint=False, axis=1)[..., None]
+    count = len(control) - 1
+
+    def between(first: np.ndarray, second: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        return ((high - t) * first + (t - low) * second) / (high - low)
+
+    t0, t1, t2, t3 = (knots[k : k + count, None, None] for k in range(4))
+    p0, p1, p2, p3 = (padded[k : k + count, None] for k in range(4))
+    middle = between(p1, p2, t1, t2)
+    before = between(between(p0, p1, t0, t1), middle, t0, t2)
+    behind = between(middle, between(p2, p3, t2, t3), t1, t3)
+    return np.concatenate([between(before, behind, t1, t2).reshape(-1, control.shape[1]), control[-1:]])
 
 
 def symmetric(half: Points) -> np.ndarray:
@@ -281,10 +282,15 @@ def loft(levels: Points, smooth: int = 0, sides: int = 120) -> Solid:
 
 
 def tube(
-    path: Points, radius: float, flatten: float = 1.0, up: Point3 = (0, 0, 1), closed: bool = False, sides: int = 32
+    path: Points,
+    radius: ArrayLike,
+    flatten: float = 1.0,
+    up: Point3 = (0, 0, 1),
+    closed: bool = False,
+    sides: int = 32,
 ) -> Solid:
-    """Round (or, with ``flatten`` other than 1, oval) bar along a path (N, 3). ``up`` fixes how an oval section lies:
-    its radius towards ``up`` is ``flatten`` times the one across."""
+    """Round (or, with ``flatten`` other than 1, oval) bar along a path (N, 3), of one ``radius`` or of one at each
+    point (N,). ``up`` fixes how an oval section lies: its radius towards ``up`` is ``flatten`` times the one across."""
     points = np.asarray(path, dtype=np.float64)
     if closed:
         tangents = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
@@ -297,7 +303,8 @@ def tube(
     angle = angles(sides)[None, :, None]
     ring_across = np.cos(angle) * across[:, None, :]
     ring_above = flatten * np.sin(angle) * above[:, None, :]
-    return skin(points[:, None, :] + float(radius) * (ring_across + ring_above), closed)
+    reach = np.asarray(radius, dtype=np.float64).reshape(-1, 1, 1)
+    return skin(points[:, None, :] + reach * (ring_across + ring_above), closed)
 
 
 _GLYPHS = {

@@ -243,14 +243,7 @@ def spiral_shell() -> Solid:
     share = np.linspace(0, 1, 150)
     turn, growth = 2 * np.pi * 2.5 * share, 0.16 * 6.25**share
     path = np.column_stack([190 * growth * np.cos(turn), 190 * growth * np.sin(turn), 330 * (1 - growth)])
-    tangents = np.gradient(path, axis=0)
-    tangents /= np.sqrt((tangents**2).sum(axis=1, keepdims=True))
-    across = np.cross([0, 0, 1], tangents)
-    across /= np.sqrt((across**2).sum(axis=1, keepdims=True))
-    above = np.cross(tangents, across)
-    turn = angles(48)[None, :, None]
-    reach = (84 * growth)[:, None, None]
-    return skin(path[:, None] + reach * (np.cos(turn) * across[:, None] + np.sin(turn) * above[:, None]))
+    return tube(path, 84 * growth, sides=48)
 
 
 @drawn(1.0, (5, 7, 4))
