@@ -92,7 +92,7 @@ def placement(dataset: DatasetFolder, sample: str) -> tuple[float, float]:
     return VIEW_DEGREES[VIEWS.index(view)], distance_mm / MM_PER_M
 
 
-def contradicted(views: Sequence[PlacedView], tolerance_mm: float = TOLERANCE_MM) -> list[Flags]:
+def contradicted(views: Sequence[PlacedView]) -> list[Flags]:
     """For each view its contradicted ``pixels``, bool (n,), without ground truth. One view contradicts nothing.
 
     Each point is looked for in every other view. A view supports the point if it answers about the same depth there. It
@@ -111,8 +111,8 @@ def contradicted(views: Sequence[PlacedView], tolerance_mm: float = TOLERANCE_MM
             inside = (u > -0.5) & (u < other.camera.width - 0.5) & (v > -0.5) & (v < other.camera.height - 0.5)
             column, row = (np.rint(axis[inside]).astype(np.intp) for axis in (u, v))
             near, far, depth = nearest[row, column], farthest[row, column], z[inside]
-            supported[inside] |= (depth >= near - tolerance_mm) & (depth <= far + tolerance_mm)
-            seen_through[inside] |= depth < near - tolerance_mm
+            supported[inside] |= (depth >= near - TOLERANCE_MM) & (depth <= far + TOLERANCE_MM)
+            seen_through[inside] |= depth < near - TOLERANCE_MM
         flags.append(seen_through & ~supported)
     return flags
 
