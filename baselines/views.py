@@ -6,7 +6,7 @@ coordinates are metres, z up, as in the dataset's meshes.
 """
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -165,6 +165,18 @@ def cell_means(points_m: Points, weights: Values, cell_mm: float = CELL_MM) -> P
 Counts = dict[str, float | None]
 
 
+def fused(views: Sequence[PlacedView], cell_mm: float = CELL_MM) -> tuple[Points, Counts]:
+    """One cloud (k, 3) of an object in object coordinates, metres: `cell_means` of its views' points by their
+    `point_weights`, without the contradicted ones. And counts: ``cloud_points``; ``answered_px`` of all views, which
+    have a depth; ``contradicted_px`` of these, and their share (``contradicted_share``, None without a depth)."""
+    wrong = np.concatenate(contradicted(views))
+    points = np.concatenate([view.points_m for view in views])
+    cloud_m = cell_means(points[~wrong], np.concatenate(point_weights(views))[~wrong], cell_mm)
+    answered, contradictions = wrong.size, int(wrong.sum())
+    counts: Counts = {"cloud_points": len(cloud_m), "answered_px": answered, "contradicted_px": contradictions}
+    return cloud_m, counts | {"contradicted_share": contradictions / answered if answered else None}
+
+
 def prediction_maps(
     predictions: str | Path, dataset: DatasetFolder, split: str, target: str = DEPTH_EXACT
 ) -> tuple[str, Maps]:
@@ -210,45 +222,43 @@ def views_by_object(dataset: DatasetFolder, split: str, only: str | None = None)
     return chosen
 
 
-def fuse(
+def fuse_split(
     predictions: str | Path,
     dataset: DatasetFolder,
     split: str,
-    objects: Mapping[str, Sequence[str]],
     out: Path,
+    only: str | None = None,
     cell_mm: float = CELL_MM,
-    progress: Callable[[int], None] = lambda objects: None,
-) -> tuple[str, dict[str, Counts]]:
-    """Put the views of each of ``objects`` of ``split`` (`views_by_object`) into one cloud without contradicted pixels,
-    `cell_means` of their points by `point_weights`. Writes ``{object}.ply``, object coordinates in metres, and
-    `FUSION_FILE` last: the counts of all objects, and by which rules.
-
-    Gives the method's name, and the counts of each object: ``cloud_points``; ``answered_px`` of all views, which have a
-    depth; ``contradicted_px`` of these, and their share (``contradicted_share``, None without a depth). Raises what
-    `prediction_maps` raises, and PredictionError for a folder that can't be written."""
+) -> tuple[str, int, Iterator[tuple[str, Counts]]]:
+    """The method's name, the number of objects, and the objects of ``split`` (``only``: a single one) one after another
+    with their counts, as they are put together and written: ``{object}.ply``, the object's cloud, and at last
+    `FUSION_FILE`, the counts of all objects, and by which rules. Raises what `prediction_maps` and `views_by_object`
+    raise, and PredictionError for a folder that can't be written."""
+    if not 0 < cell_mm < 1000:
+        raise PredictionError(f"--cell-mm {cell_mm:g}: expected the edge of a cell in mm, above 0 and below 1000")
+    chosen = views_by_object(dataset, split, only)
     name, maps = prediction_maps(predictions, dataset, split)
-    counts: dict[str, Counts] = {}
-    for obj, samples in objects.items():
-        views = []
-        for sample in samples:
-            depth_mm, sigma_mm = maps(sample)
-            views.append(PlacedView(depth_mm, dataset.rig.camera, *placement(dataset, sample), sigma_mm))
-            dataset.release(sample)
-        wrong = np.concatenate(contradicted(views))
-        points_m, weights = (np.concatenate(part) for part in ([v.points_m for v in views], point_weights(views)))
-        cloud_m = cell_means(points_m[~wrong], weights[~wrong], cell_mm)
-        write_files(out, {f"{obj}.ply": ply_bytes(cloud_m)}, PredictionError)
-        counts[obj] = {"cloud_points": len(cloud_m), "answered_px": wrong.size, "contradicted_px": int(wrong.sum())}
-        counts[obj]["contradicted_share"] = float(wrong.mean()) if wrong.size else None
-        progress(1)
-    document = {
-        "method": name,
-        "dataset": dataset.fingerprint,
-        "split": split,
-        "cell_mm": cell_mm,
-        "tolerance_mm": TOLERANCE_MM,
-        "objects": counts,
-    }
-    content = (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
-    write_files(out, {FUSION_FILE: content}, PredictionError)
-    return name, counts
+
+    def written() -> Iterator[tuple[str, Counts]]:
+        objects: dict[str, Counts] = {}
+        for obj, samples in chosen.items():
+            views = []
+            for sample in samples:
+                depth_mm, sigma_mm = maps(sample)
+                views.append(PlacedView(depth_mm, dataset.rig.camera, *placement(dataset, sample), sigma_mm))
+                dataset.release(sample)
+            cloud_m, objects[obj] = fused(views, cell_mm)
+            write_files(out, {f"{obj}.ply": ply_bytes(cloud_m)}, PredictionError)
+            yield obj, objects[obj]
+        document = {
+            "method": name,
+            "dataset": dataset.fingerprint,
+            "split": split,
+            "cell_mm": cell_mm,
+            "tolerance_mm": TOLERANCE_MM,
+            "objects": objects,
+        }
+        content = (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
+        write_files(out, {FUSION_FILE: content}, PredictionError)
+
+    return name, len(chosen), written()

@@ -135,30 +135,25 @@ def fuse(
     dataset: Path = argument("folder of a generated dataset", "DATASET"),
     split: str = option("test", "split of PREDICTIONS (default: test)", choices=SPLITS),
     only: str | None = option(None, "only this object (default: all of the split)", "NAME", flag="--object"),
-    cell_mm: float = option(
-        views.CELL_MM,
-        "edge of the cells in which points are averaged (default: 2)",
-        "MM",
-        parse=value("the edge of a cell in mm, above 0 and below 1000", float, lambda edge: 0 < edge < 1000),
-    ),
+    cell_mm: float = option(views.CELL_MM, "edge of the cells in which points are averaged (default: 2)", "MM"),
     out: Path = option(REQUIRED, "folder for {object}.ply (metres, object coordinates) and fusion.json", "DIR"),
 ) -> None:
     """Put the views of each object into one point cloud by their known placement, and compare them with each other.
 
     Prints what was counted. Raises FppBenchError for unusable predictions or data."""
     opened = DatasetFolder(dataset)
-    objects = views.views_by_object(opened, split, only)
-    with progress_bar("fusing", len(objects), "objects") as advance:
-        name, counts = views.fuse(predictions, opened, split, objects, out, cell_mm, advance)
+    name, count, objects = views.fuse_split(predictions, opened, split, out, only, cell_mm)
     table = Table(
         "object", numbers=("points in the cloud", "pixels with a depth", "contradicted"), title=printable(name)
     )
     total = np.zeros(3, int)
-    for obj, row in counts.items():
-        numbers = np.array([row[key] for key in ("cloud_points", "answered_px", "contradicted_px")], int)
-        total += numbers
-        points, answered, wrong = numbers
-        table.add_row(obj, f"{points:,}", f"{answered:,}", f"{wrong:,} ({_percent(wrong, answered)})")
+    with progress_bar("fusing", count, "objects") as advance:
+        for obj, counts in objects:
+            numbers = np.array([counts[key] for key in ("cloud_points", "answered_px", "contradicted_px")], int)
+            total += numbers
+            points, answered, wrong = numbers
+            table.add_row(obj, f"{points:,}", f"{answered:,}", f"{wrong:,} ({_percent(wrong, answered)})")
+            advance(1)
     show(table)
     _, answered, wrong = total
     print(f"other views contradict {wrong:,} of {answered:,} pixels with a depth ({_percent(wrong, answered)})")
