@@ -1,6 +1,7 @@
 """``fpp-bench train``: one recipe, one weights file; and ``fpp-bench reproduce``: the paper's tables and its further
 directions, trained and scored here."""
 
+import re
 import sys
 from datetime import datetime
 from pathlib import Path
@@ -164,8 +165,10 @@ def reproduce_tables(
         print(f"{datetime.now():%H:%M:%S} {line}", file=sys.stderr, flush=True)
 
     again = command_line()
-    for words in (f"--preset {preset}", "--only-missing"):
-        again += "" if words.split()[0] in again else f" {words}"
+    if "--preset" not in again:
+        again = re.sub(r"(?= --)|$", f" --preset {preset}", again, count=1)
+    if not only_missing:
+        again = re.sub(r"--preset[ =]\S+", r"\g<0> --only-missing", again, count=1)
     outcome = run_reproduce(
         ReproduceSettings(tables, folders, again, reproduced, dataset, only_missing, minutes, anyway, report, row)
     )
