@@ -8,7 +8,6 @@ coordinates are metres, z up, as in the dataset's meshes.
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 
@@ -27,6 +26,7 @@ from fpp_ml_bench.loaders.sample import DEPTH_EXACT
 from fpp_ml_bench.loaders.storage.manifest import GENERATED
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.pinhole import Pinhole
+from fpp_ml_bench.options import did_you_mean
 
 FUSION_FILE = "fusion.json"
 CELL_MM = 2.0
@@ -91,7 +91,7 @@ def placement(dataset: DatasetFolder, sample: str) -> tuple[float, float]:
     return VIEW_DEGREES[VIEWS.index(view)], distance_mm / MM_PER_M
 
 
-def contradicted(views: Sequence[PlacedView], tolerance_mm: float = TOLERANCE_MM) -> list[Flags]:
+def contradicted(views: Sequence[PlacedView]) -> list[Flags]:
     """For each view its contradicted ``pixels``, bool (n,), without ground truth. One view contradicts nothing.
 
     Each point is looked for in every other view. A view supports the point if it answers about the same depth there. It
@@ -110,8 +110,8 @@ def contradicted(views: Sequence[PlacedView], tolerance_mm: float = TOLERANCE_MM
             inside = (u > -0.5) & (u < other.camera.width - 0.5) & (v > -0.5) & (v < other.camera.height - 0.5)
             column, row = (np.rint(axis[inside]).astype(np.intp) for axis in (u, v))
             near, far, depth = nearest[row, column], farthest[row, column], z[inside]
-            supported[inside] |= (depth >= near - tolerance_mm) & (depth <= far + tolerance_mm)
-            seen_through[inside] |= depth < near - tolerance_mm
+            supported[inside] |= (depth >= near - TOLERANCE_MM) & (depth <= far + TOLERANCE_MM)
+            seen_through[inside] |= depth < near - TOLERANCE_MM
         flags.append(seen_through & ~supported)
     return flags
 
@@ -201,12 +201,9 @@ def prediction_maps(
 def views_by_object(dataset: DatasetFolder, split: str, only: str | None = None) -> dict[str, list[str]]:
     """The samples of each object of ``split``, or of the object ``only``, whose placement is known. Raises
     `DatasetError` for another object, for one with a single view, and for data without placement."""
-    views: dict[str, list[str]] = {}
-    for sample in dataset.samples(split):
-        views.setdefault(dataset.measured(sample)["object"], []).append(sample)
+    views = dataset.samples_by_object(split)
     if only is not None and only not in views:
-        near = ", ".join(get_close_matches(only, views, n=3)) or f"there are {', '.join(views)}"
-        raise DatasetError(f"{dataset.path}: no object {only!r} in split {split}; {near}")
+        raise DatasetError(f"{dataset.path}: no object {only!r} in split {split}; {did_you_mean(only, views)}")
     chosen = {name: samples for name, samples in views.items() if only in (None, name)}
     if not chosen:
         raise DatasetError(f"{dataset.path}: split {split} holds no sample; there is nothing to put together")

@@ -229,9 +229,7 @@ def contact_sheet(dataset: DatasetFolder, split: str, path: Path, most_views: in
     written."""
     if most_views < 1:
         raise DatasetError(f"--views {most_views}: expected 1 or more views of each object")
-    views: dict[str, list[str]] = {}
-    for sample in dataset.samples(split):
-        views.setdefault(dataset.measured(sample)["object"], []).append(sample)
+    views = dataset.samples_by_object(split)
     index, (height, width) = _grey_frame(dataset), dataset.size
     across = min(most_views, max(map(len, views.values())))
     tile_px = _TILE_PX * (2 if across == 1 else 1)  # the label is as long as two tiles

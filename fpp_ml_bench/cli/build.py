@@ -119,7 +119,6 @@ fpp-bench build --out data/pen --objects pen --explain             what was left
 )
 def build(settings: BuildCommandSettings) -> None:
     """Generate the benchmark: virtual rig, objects, six views each, decoded and exact ground truth."""
-    settings.check()
     build_settings, workers = settings_of(settings), settings.processes
     assembly = assembly_of(build_settings)
     rows = sum(len(plan.samples) for plan in assembly.plans)

@@ -1,9 +1,10 @@
 """What a model reads: ``fpp-bench diagnose`` probes it, ``fpp-bench reliance`` measures how far it follows the fringe's
 phase."""
 
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.progress import Progress
@@ -23,7 +24,7 @@ from fpp_ml_bench.baselines.diagnostics.probe import diagnose as run_diagnosis
 from fpp_ml_bench.baselines.diagnostics.scenes import chosen_samples
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.cli.console import progress_bar, show
-from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings, OfMethods
+from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
 from fpp_ml_bench.cli.options import COUNT, command, command_line, names, value
 from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.evaluation.result.parts import PART_TITLES, Reliance
@@ -37,8 +38,8 @@ from fpp_ml_bench.tables import Table
 class DiagnoseCommand(MethodCommand):
     """A command whose options are also those of the methods without a network that is probed layer by layer."""
 
-    def methods(self, words: Sequence[str]) -> list[type[Method]]:
-        return list(registry.methods().values())
+    def methods(self, words: Sequence[str]) -> dict[str, type[Method]]:
+        return registry.methods()
 
 
 @command(
@@ -78,7 +79,7 @@ def diagnose(
         None, "layers to probe, comma separated (default: the model's own)", "A,B", parse=names
     ),
     threads: int | None = option(None, "threads (default: every core)", "N", parse=COUNT),
-    options: OfMethods,
+    options: dict[str, Any],
 ) -> None:
     """Diagnose a network or method with the paper's probes and further ones; writes an HTML report and a JSON file.
 
@@ -87,11 +88,9 @@ def diagnose(
 
     probe_names = checked_names(probe)
     opened = DatasetFolder(dataset)
-    method = registry.methods().get(model, registry.network_method())
-    of_method = options.of(method, model)
-    subject = subject_of(model, opened, layers, units, frame, threads or usable_cores(), of_method)
+    subject = subject_of(model, opened, layers, units, frame, threads or usable_cores(), options)
     probing = ProbeSettings(samples, seeds, quick)
-    again = command_line(threads=None)
+    again = re.sub(r" --threads[ =]\S+", "", command_line())
     with Progress(console=Console(stderr=True)) as bars:
 
         def progress(probe: Probe) -> Callable[[int, int, str], None]:

@@ -72,7 +72,6 @@ def score_folder(
     from fpp_ml_bench.loaders.storage.benchmark import benchmark_sentence
 
     prepare_process()
-    account.check()
     _check_outputs(json, page, predictions)
     opened, split = scored_data(predictions, dataset, split)
     scored = evaluate_folder(

@@ -142,6 +142,13 @@ class DatasetFolder:
         split, row = self._find(sample)
         return self.manifest.samples[split][row]
 
+    def samples_by_object(self, split: str) -> dict[str, list[str]]:
+        """The samples of each object of ``split``, in the order of `samples`."""
+        views: dict[str, list[str]] = {}
+        for sample in self.samples(split):
+            views.setdefault(self.measured(sample)["object"], []).append(sample)
+        return views
+
     def _find(self, sample: str) -> tuple[str, int]:
         if sample not in self._position:
             raise DatasetError(f"{self.path}: no sample {sample!r}; {did_you_mean(sample, self._position)}")

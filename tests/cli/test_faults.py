@@ -355,7 +355,7 @@ def test_sigterm_ends_a_command_as_ctrl_c_does(capsys, tmp_path):
             write_atomically(tmp_path / "saved", b"x")
 
     before = signal.getsignal(signal.SIGTERM)
-    assert run_command(run, "fpp-bench x", []) == 143
+    assert run_command(lambda: run, "fpp-bench x", []) == 143
     assert capsys.readouterr().err == "fpp-bench x: stopped\n"
     assert (tmp_path / "saved").exists() and signal.getsignal(signal.SIGTERM) == before
 
@@ -367,7 +367,7 @@ def test_sigterm_during_an_import_is_not_swallowed(tmp_path):
         "from fpp_ml_bench.cli import run_command\n"
         "from fpp_ml_bench.cli.options import command\n"
         "@command('')\ndef stopped():\n    import swallows\n"
-        "run_command(stopped, 'x', [])"
+        "run_command(lambda: stopped, 'x', [])"
     )
     done = _python(code, tmp_path)
     assert (done.returncode, done.stderr) == (-signal.SIGTERM, "")
