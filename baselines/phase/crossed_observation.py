@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.phase.calibration_layer import Image, Mask
 from fpp_ml_bench.baselines.phase.carriers import Carriers
 from fpp_ml_bench.baselines.phase.crossed_orders import Candidates
-from fpp_ml_bench.baselines.phase.object_mask import Background
+from fpp_ml_bench.baselines.phase.object_mask import Background, Crop
 from fpp_ml_bench.baselines.phase.observation import Watch
 from fpp_ml_bench.baselines.phase.refinement import Fit
 from fpp_ml_bench.errors import PredictionError
@@ -71,6 +71,10 @@ class CrossedObservation:
     candidates: Candidates
     clipped_share: Image
     watch: Watch
+
+    @property
+    def crop(self) -> Crop:
+        return self.carriers.crop
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from fpp_ml_bench.baselines.phase.calibration_layer import CalibrationLayer
 from fpp_ml_bench.baselines.stability.cases import U32, U64, Group, Outcome, gamma, worst, wrong
 from fpp_ml_bench.baselines.stability.scores import exact_scores
 from fpp_ml_bench.baselines.training.losses import EPSILON, loss_function
-from fpp_ml_bench.baselines.training.tables import LOSSES
+from fpp_ml_bench.baselines.training.recipe import LOSSES
 from fpp_ml_bench.evaluation.score.torch_metric import DepthScores
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.sequence import DIRECTIONS
