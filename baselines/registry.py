@@ -29,11 +29,11 @@ FILE_MARK = ".py:"
 """What tells ``mine.py:Mine`` from a name."""
 BUILT_IN = (
     "classical:ClassicalMethod",
-    "learned.classical_method:ClassicalNetMethod",
+    "learned.method:ClassicalNetMethod",
     "phase.method:PhaseMethod",
     "learned.method:PhaseNetMethod",
     "phase.method:CrossedMethod",
-    "learned.crossed_method:CrossedNetMethod",
+    "learned.method:CrossedNetMethod",
     "trivial:ConstantMethod",
     "trivial:NearestMethod",
 )
@@ -75,7 +75,7 @@ def find(name: str | Path) -> Found:
         return Found(known[text], {})
     if text in (unusable := _installed()[1]):
         raise PredictionError(unusable[text])
-    from fpp_ml_bench.baselines.training.tables import TABLES
+    from fpp_ml_bench.baselines.training.recipe import TABLES
     from fpp_ml_bench.baselines.training.weights import shipped_names, weights_path
 
     try:

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.learned.classical_method import ClassicalNetMethod
-from fpp_ml_bench.baselines.learned.crossed_method import CrossedNetMethod
+from fpp_ml_bench.baselines.learned.method import ClassicalNetMethod, CrossedNetMethod
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.phase.depth import CrossedRoute
 from fpp_ml_bench.baselines.phase.method import PhaseMethod

@@ -86,8 +86,7 @@ class Ours:
             module.train()
 
     def batches(self) -> Iterable[Any]:
-        self.engine.sampler.epoch += 1
-        return self.engine.loader
+        return self.engine.batches()
 
     def step(self, batch: FringeDepth) -> torch.Tensor:
         return self.engine.step(batch)["loss"]

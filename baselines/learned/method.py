@@ -1,18 +1,33 @@
-"""The learned route as a method of ``fpp-bench predict``: one captured fringe, metric depth, no range given."""
+"""The learned methods of ``fpp-bench predict``: phase-net and crossed-net measure depth in one captured frame, without
+a range given; classical-net averages and fills what the decoder finds."""
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.method import Assumption, Frames, Method, OwnViews
-from fpp_ml_bench.baselines.phase.method import LIT_BACKGROUND, ONE_ALBEDO, RouteMethod, direction_of, fringe_options
+from fpp_ml_bench.baselines.classical import DIRECTIONS as CODED_DIRECTIONS
+from fpp_ml_bench.baselines.classical import ClassicalMethod
+from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method, OwnViews
+from fpp_ml_bench.baselines.phase.method import (
+    LIT_BACKGROUND,
+    ONE_ALBEDO,
+    RouteMethod,
+    crossed_image,
+    crossed_name,
+    direction_of,
+    frames_of,
+    fringe_options,
+    has_crossed_fringes,
+)
 from fpp_ml_bench.baselines.phase.observe import AMBIENT_GREY, DIRECTION, MIN_CONFIDENCE, WHITE_GREY, Settings
 from fpp_ml_bench.baselines.phase.resampling import Periods
+from fpp_ml_bench.coding.phase_shift import PhaseShift
+from fpp_ml_bench.decoding.decode import Directions
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.machine import usable_cores
@@ -21,18 +36,13 @@ from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
 from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
-    from torch import nn
-
-    from fpp_ml_bench.baselines.learned.network import NetFile
-    from fpp_ml_bench.baselines.learned.window_training import StepRecipe
-    from fpp_ml_bench.baselines.training.weights import NetConfig
+    from fpp_ml_bench.baselines.learned.training import StepRecipe
+    from fpp_ml_bench.baselines.training.weights import Family, NetConfig, WeightsFile
     from fpp_ml_bench.evaluation.submission.description import Submission
 
-PERIOD_TOLERANCE = 1.4
-"""Factor by which an image's fringe period in px may differ from that of the training images; beyond, the image is
-resampled to theirs."""
-
-
+STEPS = 3
+"""Phase steps of classical-net where a rig's code leaves the choice and no others are asked for: noise is what it takes
+away."""
 WEIGHTS = "weights file of fpp-bench train (default: the weights that come with the package)"
 """Help of an option that all learned methods have."""
 ALBEDOS = ("one", "any")
@@ -52,7 +62,7 @@ class LearnedMethod(Method):
 
     @classmethod
     def train(cls, training: Any, out: Path, minutes: float | None = None) -> bool:
-        from fpp_ml_bench.baselines.learned.window_training import train_net
+        from fpp_ml_bench.baselines.learned.training import train_net
 
         given = {key: value for key, value in vars(training).items() if value is not None}
         start = given.pop("start", None)
@@ -69,10 +79,22 @@ class LearnedMethod(Method):
         print(f"next: fpp-bench predict {cls.name} DATASET --weights {trained.weights} --out predictions")
         return True
 
-    def use(self, config: "NetConfig", network: "nn.Module", sha256: str) -> dict[str, Any]:
-        """Note whose weights these are; what they add to the submission's settings."""
-        self.weights_config, self.parameters = config, sum(parameter.numel() for parameter in network.parameters())
-        return {"weights": config.name, "weights_sha256": sha256, "mask_threshold": config.threshold}
+    def use(self, weights: "str | Path | WeightsFile", family: "Family | None" = None) -> None:
+        """Take its network from weights that come with the package, or a file; of `PHASE_NETWORKS`, ready to predict,
+        or of another ``family``."""
+        from fpp_ml_bench.baselines.learned.network import SHIPPED, load_net
+        from fpp_ml_bench.baselines.training.weights import PHASE_NETWORKS, WeightsFile, shipped_names
+
+        given = isinstance(weights, WeightsFile)
+        self.file = weights if given else load_net(weights, family is None, family or PHASE_NETWORKS)
+        self.weights_config = config = self.file.config
+        self.parameters = sum(parameter.numel() for parameter in self.file.network.parameters())
+        self.more = "" if config.name in shipped_names(SHIPPED) else f" ({config.name})"
+        self.weights_settings = {
+            "weights": config.name,
+            "weights_sha256": self.file.sha256,
+            "mask_threshold": config.threshold,
+        }
 
     @property
     def learned_from(self) -> dict[str, Any]:
@@ -82,14 +104,27 @@ class LearnedMethod(Method):
 
 
 class LearnedRoute(LearnedMethod, RouteMethod):
-    """A learned method that measures every map of a sample with `route`, and its network in ``threads``."""
+    """A learned method that measures every map of a sample with `route`, and its network in ``threads``. Images whose
+    fringe period in px differs by more than ``period_tolerance`` from that of the training images are resampled to
+    theirs."""
 
     route: Any
     threads: int
+    period_tolerance: float
 
     @abstractmethod
     def image(self, frames: Frames) -> NDArray[np.uint8]:
         """The image (H, W) that is measured, of a captured sequence."""
+
+    def learned_periods(self, fringes: str) -> Periods:
+        """Raises `PredictionError` for ``fringes`` that the weights did not learn from."""
+        learned_px = self.weights_config.period_px.get(fringes)
+        if learned_px is None:
+            raise PredictionError(
+                f"{self.file.path}: learned from {', '.join(self.weights_config.period_px)} fringes only, not from "
+                f"{fringes} ones; use other weights, or a measured route (phase, crossed)"
+            )
+        return Periods(learned_px / self.period_tolerance, learned_px, learned_px * self.period_tolerance)
 
     def measure(self, frames: Frames) -> Any:
         """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
@@ -98,11 +133,9 @@ class LearnedRoute(LearnedMethod, RouteMethod):
         with torch_threads(self.threads):
             return self.route.measure(self.image(frames))
 
-
-def _shipped(albedo: str) -> str:
-    if albedo not in ALBEDOS:
-        raise PredictionError(f"albedo {albedo!r}: expected one or any")
-    return f"phase-net-{albedo}-albedo"
+    def crop(self, frames: Frames) -> tuple[slice, slice]:
+        route = self.route.route
+        return route.resampling.captured_crop(route.observe(self.image(frames)).crop)
 
 
 @dataclass(frozen=True)
@@ -110,7 +143,7 @@ class PhaseNetOptions:
     """Options of `PhaseNetMethod`; ``weights``: also a file that was read."""
 
     direction: Direction = option("horizontal", DIRECTION, choices=DIRECTIONS)
-    weights: "str | Path | NetFile | None" = option(None, WEIGHTS, "FILE")
+    weights: "str | Path | WeightsFile | None" = option(None, WEIGHTS, "FILE")
     min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
     albedo: str | None = option(
         None,
@@ -141,6 +174,7 @@ class PhaseNetMethod(LearnedRoute):
     for weights that can't be used, and `PredictionError` for an invalid option."""
 
     name = "phase-net"
+    period_tolerance = 1.4
     purpose = "one fringe; order, mask and correction learned"
     Options = PhaseNetOptions
     Training = PhaseNetTraining
@@ -151,9 +185,9 @@ class PhaseNetMethod(LearnedRoute):
 
     @classmethod
     def recipe(cls, **given: Any) -> "StepRecipe":
-        from fpp_ml_bench.baselines.learned.training import Recipe
+        from fpp_ml_bench.baselines.learned.recipes import PhaseRecipe
 
-        return Recipe(**given)
+        return PhaseRecipe(**given)
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
@@ -174,76 +208,180 @@ class PhaseNetMethod(LearnedRoute):
         return ONE_ALBEDO if shading is True else LIT_BACKGROUND if shading is False else None
 
     def __init__(self, rig: Rig, **options: Any) -> None:
-        from fpp_ml_bench.baselines.learned.network import NetFile, load_net
         from fpp_ml_bench.baselines.learned.odds import Odds
-        from fpp_ml_bench.baselines.learned.route import NetworkRoute
+        from fpp_ml_bench.baselines.learned.routes import PhaseNetRoute
 
         given = self.checked_options(options)
-        direction, weights, albedo, threads = given.direction, given.weights, given.albedo, given.threads
-        min_confidence, white_grey, ambient_grey = given.min_confidence, given.white_grey, given.ambient_grey
-        self.file = weights if isinstance(weights, NetFile) else load_net(weights or _shipped(albedo or "one"))
-        learned = self.file.config.recipe.get("albedo")
-        if learned not in ("one", "any") or not self.file.network.uncertain:
+        if given.albedo not in (None, *ALBEDOS):
+            raise PredictionError(f"albedo {given.albedo!r}: expected one or any")
+        self.use(given.weights or f"phase-net-{given.albedo or 'one'}-albedo")
+        config = self.weights_config
+        learned = config.recipe.get("albedo")
+        if learned not in ALBEDOS:
             raise PredictionError(
                 f"{self.file.path}: expected weights that this version's fpp-bench train phase-net wrote"
             )
-        if albedo not in (None, learned):
-            raise PredictionError(f"{self.file.path}: learned {learned} albedo, not {albedo}; leave --albedo out")
-        shading = learned == "one"
-        self.options = Settings(
-            direction=direction,
-            min_confidence=min_confidence,
-            shading=shading,
-            white_grey=white_grey,
-            ambient_grey=ambient_grey,
-        )
-        self.rig, self.threads = rig, threads
-        trained_period_px = self.file.config.period_px.get(direction)
-        if trained_period_px is None:
-            raise PredictionError(
-                f"{self.file.path}: learned from {', '.join(self.file.config.period_px)} fringes only, not from "
-                f"{direction} ones; use other weights, or the measured route (phase)"
-            )
-        bounds = trained_period_px / PERIOD_TOLERANCE, trained_period_px * PERIOD_TOLERANCE
-        periods = Periods(bounds[0], trained_period_px, bounds[1])
-        config = self.file.config
-        odds = Odds(config.temperature, config.offset, config.doubted)
-        self.route = NetworkRoute(
-            rig,
-            self.options,
-            self.file.network,
-            config.threshold,
-            config.lead,
-            odds,
-            periods,
-        )
-        self.frames_used = (rig.sequence.sinusoids(direction)[0],)
-        more = "" if config.name == f"phase-net-{learned}-albedo" else f" ({config.name})"
+        if given.albedo not in (None, learned):
+            raise PredictionError(f"{self.file.path}: learned {learned} albedo, not {given.albedo}; leave --albedo out")
+        own = {entry.name: getattr(given, entry.name) for entry in fields(Settings) if hasattr(given, entry.name)}
+        self.options, self.rig, self.threads = Settings(**own, shading=learned == "one"), rig, given.threads
+        odds, periods = Odds(config.temperature, config.offset, config.doubted), self.learned_periods(given.direction)
+        self.route = PhaseNetRoute(rig, self.options, self.file.network, config.threshold, config.lead, odds, periods)
+        self.frames_used = (rig.sequence.sinusoids(given.direction)[0],)
         # With a range under a period, most pixels have one order in it, whatever the network says.
-        self.by_range = rig.periods_in_range(direction) < 1
+        self.by_range = rig.periods_in_range(given.direction) < 1
         learned_parts = "order by range; mask" if self.by_range else "order, mask"
         self.title = (
-            f"Phase route, one {direction} fringe, {learned} albedo; {learned_parts} and correction learned{more}"
+            f"Phase route, one {given.direction} fringe, {learned} albedo; {learned_parts} and correction learned"
+            f"{self.more}"
         )
         self.settings = {
-            "direction": direction,
+            **vars(given),
+            **self.weights_settings,
             "albedo": learned,
-            "shading": shading,
+            "shading": self.options.shading,
             "order_by_range": self.by_range,
-            "min_confidence": min_confidence,
-            **self.use(config, self.file.network, self.file.sha256),
             "order_lead": config.lead,
-            "temperature": config.temperature,
-            "offset": config.offset,
-            "doubted": config.doubted,
-            "threads": threads,
-            "white_grey": white_grey,
-            "ambient_grey": ambient_grey,
+            **vars(odds),
         }
 
     def image(self, frames: Frames) -> NDArray[np.uint8]:
         return self.images(frames)[0]
 
-    def crop(self, frames: Frames) -> tuple[slice, slice]:
-        route = self.route.geometry.route
-        return route.resampling.captured_crop(route.observe(self.image(frames)).crop)
+
+@dataclass(frozen=True)
+class CrossedNetOptions:
+    """Options of `CrossedNetMethod`; ``weights``: also a file that was read."""
+
+    weights: "str | Path | WeightsFile" = option("crossed-net", WEIGHTS, "FILE")
+    min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
+    threads: int = 1
+
+
+class CrossedNetMethod(LearnedRoute):
+    """Depth from one crossed frame by the weights ``weights`` (a shipped name or a file), or from the mean of the first
+    fringe of both directions where the rig has no crossed frame. ``min_confidence``: pixels below it are masked. Raises
+    `WeightsError` for weights that can't be used, and `PredictionError` for a rig whose fringes they did not learn."""
+
+    name = "crossed-net"
+    period_tolerance = 2.2
+    purpose = "one crossed frame, with order, mask and correction learned"
+    Options = CrossedNetOptions
+    scenes_rig = "crossed"
+
+    @classmethod
+    def recipe(cls, **given: Any) -> "StepRecipe":
+        from fpp_ml_bench.baselines.learned.recipes import CrossedRecipe
+
+        return CrossedRecipe(**given)
+
+    @classmethod
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+        return [{}] if has_crossed_fringes(rig) else []
+
+    @classmethod
+    def short_name(cls, submission: "Submission") -> str | None:
+        return crossed_name(submission, "Crossed fringes, ")
+
+    def __init__(self, rig: Rig, **options: Any) -> None:
+        from fpp_ml_bench.baselines.learned.routes import CrossedNetRoute
+
+        given = self.checked_options(options)
+        self.use(given.weights)
+        config, periods = self.weights_config, self.learned_periods("crossed")
+        self.rig, self.threads, self.frames_used = rig, given.threads, frames_of(rig, self.name)
+        self.route = CrossedNetRoute(
+            rig,
+            self.file.network,
+            config.threshold,
+            config.lead,
+            Settings(min_confidence=given.min_confidence),
+            periods,
+        )
+        made = "" if len(self.frames_used) == 1 else ", the mean of two"
+        self.title = f"Crossed fringes, one frame{made}; order, mask and correction learned{self.more}"
+        self.settings = {**vars(given), **self.weights_settings, "order_lead": config.lead}
+
+    def image(self, frames: Frames) -> NDArray[np.uint8]:
+        return crossed_image(self.images(frames))
+
+
+@dataclass(frozen=True)
+class ClassicalNetOptions:
+    """Options of `ClassicalNetMethod`."""
+
+    direction: Directions | None = option(
+        None, "fringes to use (default: those that the weights learned)", choices=CODED_DIRECTIONS
+    )
+    steps: int | None = option(None, "phase steps a direction, 3 to 18, with Gray code (default: 3)", "N")
+    weights: str | Path = option("classical-net", WEIGHTS, "FILE")
+    threads: int = 1
+
+
+class ClassicalNetMethod(LearnedMethod):
+    """`ClassicalMethod` of one ``direction`` (default: the one it learned) and ``steps`` (default: 3). The weights
+    ``weights`` (a shipped name or a file) average its depth over neighbours, by at most three stated standard
+    uncertainties, and fill it where it has none. Raises `WeightsError` for weights that can't be used, and
+    `PredictionError` for a code whose uncertainty is not known."""
+
+    name = "classical-net"
+    purpose = "classical frames; noise and missed pixels learned"
+    Options = ClassicalNetOptions
+
+    @classmethod
+    def recipe(cls, **given: Any) -> "StepRecipe":
+        from fpp_ml_bench.baselines.learned.filter_recipe import FilterRecipe
+
+        return FilterRecipe(**given)
+
+    @classmethod
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+        return [{}] if all(isinstance(rig.code(way), PhaseShift) for way in rig.directions[:1]) else []
+
+    @classmethod
+    def short_name(cls, submission: "Submission") -> str | None:
+        classical = ClassicalMethod.short_name(submission)
+        if classical is None:
+            return None
+        return printable(submission.settings["weights"]) + classical.removeprefix("Classical")
+
+    def __init__(self, rig: Rig, **options: Any) -> None:
+        from fpp_ml_bench.baselines.training.weights import FILTER_NETWORKS
+
+        given = self.checked_options(options)
+        steps = given.steps
+        self.use(given.weights, FILTER_NETWORKS)
+        self.network = self.file.network.folded()
+        learned = str(self.weights_config.recipe.get("direction", "vertical"))
+        way: Any = given.direction or (learned if learned in rig.directions else rig.directions[0])
+        codes = [rig.code(one) for one in (rig.directions if way == "both" else (way,))]
+        fringes = [code for code in codes if isinstance(code, PhaseShift)]
+        if len(fringes) < len(codes):
+            raise PredictionError(
+                f"{self.name}: needs the uncertainty of every pixel, which {codes[0].title} does not give; use "
+                f"{ClassicalMethod.name}"
+            )
+        if steps is None and all(code.is_plain for code in fringes):
+            steps = STEPS
+        self.classical = ClassicalMethod(rig, direction=way, steps=steps, threads=given.threads)
+        self.rig, self.threads, self.frames_used = rig, given.threads, self.classical.frames_used
+        self.title = f"{self.classical.title}; noise and missed pixels learned{self.more}"
+        self.settings = {**self.classical.settings, **self.weights_settings}
+
+    def predict(self, frames: Frames) -> NDArray[np.float32]:
+        return self.answer(frames).depth
+
+    def answer(self, frames: Frames) -> Answer:
+        """Depth, and the standard uncertainty that the network expects."""
+        from fpp_ml_bench.baselines.learned.routes import DepthScene, decided, filtered, written
+        from fpp_ml_bench.baselines.networks.base import torch_threads
+
+        decoded, modulation = self.classical.measure(frames)
+        scene = None if decoded.sigma_mm is None else DepthScene.of(decoded.depth, decoded.sigma_mm, modulation)
+        if scene is None:
+            return decoded
+        with torch_threads(self.threads):
+            answer = filtered(self.network, scene)
+        inside = decided(answer, scene, self.weights_config.threshold)
+        inside &= self.rig.in_range(answer.depth_mm + np.float32(scene.middle_mm))
+        return Answer(*written(answer, scene, inside, decoded.depth.shape))

@@ -1,29 +1,22 @@
-"""The network: a small U-Net on 2 x 2 blocks of pixels. For each pixel it gives the order, object or background, and a
-phase correction. Also the weights files of all networks inside a route: written in half precision, read and checked."""
+"""The networks inside a route, a small U-Net with heads each: of a phase (order, mask, correction, scale), and of a
+decoded depth (neighbours' weights, mask, scale). Also their weights, by name."""
 
-from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Self
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from fpp_ml_bench.baselines.learned.inputs import CHANNELS, SIDES, STEPS
-from fpp_ml_bench.baselines.training.weights import (
-    PHASE_NETWORKS,
-    Family,
-    NetConfig,
-    read_file,
-    weights_path,
-    write_file,
-)
-from fpp_ml_bench.errors import NetworkError, WeightsError
-from fpp_ml_bench.files import printable
+from fpp_ml_bench.baselines.learned.inputs import PHASE_CHANNELS, SIDES, STEPS
+from fpp_ml_bench.baselines.training.weights import PHASE_NETWORKS, Family, WeightsFile, open_weights, weights_path
+from fpp_ml_bench.errors import NetworkError
 
 BLOCK = 2  # pixels along the side of a block that the first layer takes as one
 COARSE = 4  # pixels along a block that the order's branch averages
@@ -58,15 +51,47 @@ class UNet(nn.Module):
         return deep
 
 
-def fold(body: UNet) -> None:
-    """Fold the normalisation of ``body`` into its convolutions, for inference: less to compute."""
-    for block in (*body.encoder, *body.decoder):
-        for number in (0, 3):
-            block[number] = fuse_conv_bn_eval(block[number], block[number + 1])
-            block[number + 1] = nn.Identity()
+class Refiner(nn.Module):
+    """A network inside a route: `UNet` bodies with heads, built again by ``options``. The first input is (B, C, h, w),
+    h and w multiples of ``stride``."""
+
+    options: dict[str, Any]
+    stride: int
+
+    def check(self, x: Tensor) -> None:
+        if x.shape[-2] % self.stride or x.shape[-1] % self.stride:
+            raise NetworkError(f"height and width: expected multiples of {self.stride}, got {tuple(x.shape[-2:])}")
+
+    def folded(self) -> Self:
+        """The same network for inference, with the normalisation folded into the convolutions: less to compute."""
+        network = deepcopy(self).eval()
+        for body in network.modules():
+            for block in (*body.encoder, *body.decoder) if isinstance(body, UNet) else ():
+                for number in (0, 3):
+                    block[number] = fuse_conv_bn_eval(block[number], block[number + 1])
+                    block[number + 1] = nn.Identity()
+        return network.to(memory_format=torch.channels_last)  # type: ignore[no-any-return,call-overload]
+
+    def outputs(self, *maps: NDArray) -> list[NDArray]:
+        """Its outputs (..., h, w) for one image's ``maps`` (..., h, w) of any size."""
+        height, width = maps[0].shape[-2:]
+        pad = [(0, -height % self.stride), (0, -width % self.stride)]
+        batch = [torch.from_numpy(np.pad(part, [(0, 0)] * (part.ndim - 2) + pad))[None] for part in maps]
+        batch[0] = batch[0].contiguous(memory_format=torch.channels_last)
+        with torch.inference_mode():
+            return [out[0, ..., :height, :width].numpy() for out in self(*batch)]
 
 
-class PhaseNet(nn.Module):
+def _first_answers(layer: nn.Conv2d, biases: list[int], value: float) -> nn.Conv2d:
+    """``layer`` with small weights and biases of 0, but ``value`` for the answers ``biases``."""
+    nn.init.normal_(layer.weight, std=0.05)
+    bias = torch.zeros(layer.out_channels)
+    bias[biases] = value
+    layer.bias = nn.Parameter(bias)
+    return layer
+
+
+class PhaseNet(Refiner):
     """(B, C, H, W) -> order logits (B, 3, H, W), mask logits (B, H, W), phase correction in rad (B, H, W), and the
     logarithm of the scale in rad of the phase error that is left (B, H, W). The correction is a weighted average of the
     corrections that a pixel's surroundings propose (`inputs.SIDES`) and of none, with weights from the network, plus a
@@ -84,7 +109,7 @@ class PhaseNet(nn.Module):
         squeezed: int = 20,
         order_widths: tuple[int, ...] = (32, 48, 64),
         bound_rad: float = 1.5708,
-        channels: int = len(CHANNELS),
+        channels: int = len(PHASE_CHANNELS),
         uncertain: bool = True,
     ) -> None:
         super().__init__()
@@ -96,7 +121,7 @@ class PhaseNet(nn.Module):
             )
         if not uncertain:
             raise NetworkError("expected a network that states its uncertainty, uncertain true; train it again")
-        self.options: dict[str, Any] = {
+        self.options = {
             "widths": list(widths),
             "fine": fine,
             "squeezed": squeezed,
@@ -115,21 +140,10 @@ class PhaseNet(nn.Module):
         self.trust = nn.Parameter(torch.tensor(TRUST))
         self.order_body = UNet(channels, order_widths)
         self.order_answer = nn.Conv2d(order_widths[0], len(STEPS), 1)
-        nn.init.normal_(self.answer.weight, std=0.05)
-        bias = torch.zeros(self.answer.out_channels)
-        bias[[1, 5]] = FIRST_BIAS
-        self.answer.bias = nn.Parameter(bias)
-
-    def folded(self) -> "PhaseNet":
-        """The same network for inference, with the normalisation folded into the convolutions."""
-        network = deepcopy(self).eval()
-        for body in (network.body, network.order_body):
-            fold(body)
-        return network.to(memory_format=torch.channels_last)  # type: ignore[no-any-return,call-overload]
+        _first_answers(self.answer, [1, 5], FIRST_BIAS)
 
     def forward(self, x: Tensor) -> tuple[Tensor, ...]:
-        if x.shape[-2] % self.stride or x.shape[-1] % self.stride:
-            raise NetworkError(f"height and width: expected multiples of {self.stride}, got {tuple(x.shape[-2:])}")
+        self.check(x)
         squeezed = self.squeeze(x)
         deep = self.body(functional.pixel_unshuffle(squeezed, BLOCK))
         pixels = functional.pixel_shuffle(self.spread(deep), BLOCK)
@@ -147,55 +161,55 @@ class PhaseNet(nn.Module):
         return order, answers[:, 3], bounded, answers[:, -1].clamp(*LOG_SCALES)
 
 
+REACH = 2  # px to the farthest neighbour along an axis
+NEIGHBOURS = (2 * REACH + 1) ** 2
+OWN_BIAS = 3.0  # start value of the bias of the pixel itself
+ABSENT = -1e4  # logit of a neighbour without a depth: finite, for gradients to stay so
+BOUND_SIGMAS = 3.0  # largest change of a depth, in its own standard uncertainties
+LOG_UNITS = -4.0, 3.0  # the same of a scale in median sigmas
+
+
+class DepthFilter(Refiner):
+    """Depth as a weighted average of the depths around it (a kernel-predicting network, Bako et al. 2017): it can't
+    give a depth that no neighbour has. Takes ``x`` (B, C, h, w), and (B, h, w) each ``depth_mm``, ``sigma_mm`` and
+    ``found`` of a `DepthScene`. Gives (B, h, w) each the depth in mm, changed by at most `BOUND_SIGMAS` where one was
+    found; the logit of a pixel to be object; the logarithm of the scale of the error that is left, in median sigmas of
+    the scene; and whether a neighbour has a depth. h and w must be multiples of ``stride``."""
+
+    def __init__(self, channels: int, widths: tuple[int, ...] = (16, 24, 32)) -> None:
+        super().__init__()
+        widths = tuple(widths)
+        if not widths or min((*widths, channels)) < 1:
+            raise NetworkError(f"expected positive widths and channels; got widths {widths}, channels {channels}")
+        self.options = {"channels": channels, "widths": list(widths)}
+        self.stride = 2 ** (len(widths) - 1)
+        self.body = UNet(channels, widths)
+        self.answer = _first_answers(nn.Conv2d(widths[0], NEIGHBOURS + 2, 1), [NEIGHBOURS // 2], OWN_BIAS)
+
+    def forward(self, x: Tensor, depth_mm: Tensor, sigma_mm: Tensor, found: Tensor) -> tuple[Tensor, ...]:
+        self.check(x)
+        answers = self.answer(self.body(x))
+        depths, present = _around(depth_mm), _around(found.to(x.dtype)) > 0
+        logits = torch.where(present, answers[:, :NEIGHBOURS], torch.tensor(ABSENT))
+        average = (torch.softmax(logits, dim=1) * depths).sum(dim=1)
+        most = BOUND_SIGMAS * sigma_mm
+        bounded = depth_mm + torch.maximum(torch.minimum(average - depth_mm, most), -most)
+        depth = torch.where(found, bounded, average)
+        return depth, answers[:, NEIGHBOURS], answers[:, NEIGHBOURS + 1].clamp(*LOG_UNITS), present.any(dim=1)
+
+
+def _around(maps: Tensor) -> Tensor:
+    """Values (B, `NEIGHBOURS`, h, w) of every pixel's neighbours in maps (B, h, w), 0 outside the image."""
+    batch, height, width = maps.shape
+    return functional.unfold(maps[:, None], 2 * REACH + 1, padding=REACH).view(batch, NEIGHBOURS, height, width)
+
+
 SHIPPED = Path(__file__).resolve().parent / "weights"  # folder of the weights that come with the package
 DEFAULT = "phase-net-one-albedo"
 
 
-@dataclass(frozen=True)
-class NetFile:
-    """A checked file and the network in it, ready to run."""
-
-    path: Path
-    config: NetConfig
-    network: PhaseNet
-    sha256: str
-
-
-def save_net(path: Path, network: nn.Module, config: NetConfig, family: Family = PHASE_NETWORKS) -> str:
-    """Write ``network`` to ``path`` in half precision, complete or not at all; the file's SHA-256. `WeightsError` for
-    tensors that are not finite in half precision, and for a path that can't be written."""
-    tensors = {}
-    for name, tensor in network.state_dict().items():
-        tensors[name] = tensor.detach().cpu().half() if tensor.is_floating_point() else tensor
-        if not bool(tensors[name].isfinite().all()):
-            raise WeightsError(f"{path}: {name} is not finite in half precision; the training diverged")
-    return write_file(path, family, config, tensors)
-
-
-Network = TypeVar("Network", bound=nn.Module)
-
-
-def read_net(
-    path: Path, build: Callable[..., Network], family: Family = PHASE_NETWORKS
-) -> tuple[NetConfig, Network, str]:
-    """Configuration, network, float32, and SHA-256 of a file of ``family`` whose options ``build`` takes.
-    `WeightsError` for a file that is absent, damaged, of another kind or version, or whose tensors do not fit its
-    configuration."""
-    shown = printable(str(path), 500)
-    config, tensors, digest = read_file(path, family)
-    try:
-        network = build(**config.options)
-        network.load_state_dict({name: t.float() if t.is_floating_point() else t for name, t in tensors.items()})
-    except (NetworkError, TypeError, ValueError, RuntimeError) as error:
-        raise WeightsError(f"{shown}: its tensors are not those of its network: {printable(str(error), 300)}") from None
-    if not all(bool(torch.isfinite(t).all()) for t in network.state_dict().values()):
-        raise WeightsError(f"{shown}: holds values that are not finite; copy or train it again")
-    return config, network, digest
-
-
-def load_net(name_or_path: str | Path = DEFAULT, folded: bool = True, shipped: Path = SHIPPED) -> NetFile:
-    """Weights in the folder ``shipped`` or of a file, float32; ``folded``: for inference alone (`PhaseNet.folded`),
-    False to train on. Raises what `read_net` raises."""
-    path = weights_path(name_or_path, shipped)
-    config, network, digest = read_net(path, PhaseNet)
-    return NetFile(path, config, network.folded() if folded else network, digest)
+def load_net(name_or_path: str | Path = DEFAULT, folded: bool = True, family: Family = PHASE_NETWORKS) -> WeightsFile:
+    """Weights of a learned method that come with the package, or of a file; ``folded``: for inference alone
+    (`PhaseNet.folded`), False to train on. Raises what `open_weights` raises."""
+    file = open_weights(weights_path(name_or_path, SHIPPED), family)
+    return replace(file, network=file.network.folded()) if folded else file

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
+from fpp_ml_bench.baselines.learned.inputs import Candidates
 from fpp_ml_bench.baselines.learned.network import PhaseNet
 from fpp_ml_bench.baselines.phase.calibration_layer import Image, Mask
 from fpp_ml_bench.baselines.phase.candidates import chosen_values, links_between
@@ -51,11 +51,11 @@ def threshold_at(strength: float, threshold: float) -> float:
     return threshold + SPREAD * float(np.clip(2 * place - 1, -1, 1))
 
 
-def decided_object(answers: Answers, inside: Mask, strength: float, threshold: float, denied: float) -> Mask:
-    """Object pixels (h, w): those whose logit is above the `threshold_at` the scene's ``strength``, and those of the
-    measured route's mask ``inside`` whose logit is at most ``denied`` below it."""
-    logit, threshold = answers.object_logit, threshold_at(strength, threshold)
-    return (logit > threshold) | (inside & (logit > threshold - denied))
+def decided_mask(answers: Answers, scene: Candidates, threshold: float) -> Mask:
+    """Object pixels (h, w) of those that are usable: their logit is above the `threshold_at` the scene's strength, or
+    they are of the measured route's mask and their logit is at most ``denied`` below it."""
+    logit, threshold = answers.object_logit, threshold_at(scene.strength, threshold)
+    return ((logit > threshold) | (scene.inside & (logit > threshold - scene.denied))) & scene.usable
 
 
 def probabilities(logits: Image) -> Image:
@@ -67,11 +67,7 @@ def probabilities(logits: Image) -> Image:
 def answers_of_maps(network: PhaseNet, x: Image, exists: Mask) -> Answers:
     """The answers of a network that states its uncertainty, for its input ``x`` (C, h, w); ``exists`` bool (3, h, w):
     the candidates that there are, at least one a pixel."""
-    _, height, width = x.shape
-    padded = np.pad(x, ((0, 0), (0, -height % network.stride), (0, -width % network.stride)))
-    with torch.inference_mode():
-        batch = torch.from_numpy(padded)[None].contiguous(memory_format=torch.channels_last)
-        order, inside, correction, scale = (out[0, ..., :height, :width].numpy() for out in network(batch))
+    order, inside, correction, scale = network.outputs(x)
     logits = np.where(exists, order, np.float32(-np.inf))
     return Answers(logits, inside, correction, np.float32(SCALE_TO_SIGMA) * np.exp(scale))
 

@@ -1,294 +1,509 @@
-"""Training phase-net: the measurement of the phase route for each view beside the true phase, the augmentation of
-windows, and the choice of constants on validation views. ``out`` also holds reliability.png.
+"""What the trainings of phase-net, crossed-net and classical-net have in common: windows of rendered views; no dataset
+is needed. Views in drawn lights are rendered, measured, and cut into windows; a moving average of the weights is kept;
+mask and order are chosen on validation views.
 
-Whole objects are moved to another distance, with the brightness that the calibrated lamp would give there and unchanged
-phase errors. Wrong base orders are simulated in patches and whole windows, because they are rare on training objects.
-Columns are mirrored, as with a projector on the other side. Brightness is varied a little.
+``out`` holds ``views/``, the files of the engine and, at the end, the weights instead of the checkpoint. A stopped
+training continues at every stage.
 """
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+import hashlib
+import json
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from time import perf_counter
+from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from fpp_ml_bench.baselines.learned import inputs
-from fpp_ml_bench.baselines.learned.inputs import FIRST_MISFIT, FIRST_SIDE, SIDES, STEPS, Geometry, Scene
-from fpp_ml_bench.baselines.learned.network import PhaseNet
-from fpp_ml_bench.baselines.learned.odds import Answers, Judged, chosen_odds, confident_shares, draw_reliability
-from fpp_ml_bench.baselines.learned.route import decided_mask, decided_order, network_answers
-from fpp_ml_bench.baselines.learned.window_training import CandidateTask, WindowRecipe
+from fpp_ml_bench.baselines.learned.inputs import PHASE_CHANNELS
+from fpp_ml_bench.baselines.learned.network import PhaseNet, load_net
+from fpp_ml_bench.baselines.learned.odds import Answers, decided_mask
+from fpp_ml_bench.baselines.learned.scenes import (
+    View,
+    fingerprint_of,
+    groups_of,
+    read_views,
+    render_views,
+    with_unions,
+)
 from fpp_ml_bench.baselines.learned.windows import (
     IGNORED,
     Sample,
     Window,
-    candidate_scores,
-    edge_points,
-    padded,
-    place_of,
-    wrong_place,
+    chosen_threshold,
+    mean_scores,
+    view_scores,
 )
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Image, Mask
-from fpp_ml_bench.baselines.phase.candidates import chosen_values
-from fpp_ml_bench.baselines.phase.observe import Settings
-from fpp_ml_bench.baselines.phase.resampling import repeated
-from fpp_ml_bench.baselines.training.views import View
-from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.depth import depth_edges, object_mask
-from fpp_ml_bench.errors import RecipeError
+from fpp_ml_bench.baselines.phase.calibration_layer import Image, Mask
+from fpp_ml_bench.baselines.training.engine import CHECKPOINT, Training, alone_in, claim_folder, reproducible
+from fpp_ml_bench.baselines.training.records import Display, Panel, Record
+from fpp_ml_bench.baselines.training.weights import (
+    PHASE_NETWORKS,
+    Family,
+    NetConfig,
+    TrainingBenchmark,
+    open_weights,
+    save_weights,
+)
+from fpp_ml_bench.errors import RecipeError, TrainingError
+from fpp_ml_bench.optics.named_rigs import NAMED_RIGS
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
 
-Albedo = Literal["one", "any"]
-RELIABILITY = "reliability.png"
-JUDGED_PX = 3  # the stated chances are calibrated on every so many-th pixel
-_MIRRORED = inputs.CHANNELS.index("slope across")
-_PARTNERS = [SIDES.index((row, -column)) for row, column in SIDES]
-_SWAPPED = [FIRST_SIDE + n for n in _PARTNERS] + [FIRST_MISFIT] + [FIRST_MISFIT + 1 + n for n in _PARTNERS]
+VIEWS = "views"
+SMALL_RAD = 0.05  # error of the phase below which its loss is quadratic
+IMPOSSIBLE = -1e4  # logit of an order that puts its pixel out of the working range: finite, for gradients to stay so
+LARGEST_GRADIENT = 50.0
 
-Geometries = Mapping[Direction, Geometry]
+Batch = dict[str, Tensor]  # the fields of a window with a leading axis B
+
+
+def mean_over(values: Tensor, where: Tensor) -> Tensor:
+    """Mean of ``values`` over the pixels ``where``; 0 without one."""
+    return (values * where).sum() / where.sum().clamp(min=1)
+
+
+def mask_loss(logit: Tensor, target: Tensor, valid: Tensor) -> Tensor:
+    """Binary cross-entropy of the object's ``logit`` over ``valid`` pixels."""
+    by_pixel = functional.binary_cross_entropy_with_logits(logit, target.float(), reduction="none")
+    return mean_over(by_pixel, valid)
+
+
+def scale_loss(error: Tensor, scale: Tensor, where: Tensor) -> Tensor:
+    """Negative log-likelihood of an absolute ``error`` under a Laplace distribution of ``scale``, a logarithm."""
+    return mean_over(error * torch.exp(-scale) + scale, where)
+
+
+def batch_of(windows: Sequence[Window]) -> Batch:
+    batch = {name: torch.from_numpy(np.stack([window[name] for window in windows])) for name in windows[0]}
+    batch["x"] = batch["x"].contiguous(memory_format=torch.channels_last)
+    return batch
 
 
 @dataclass(frozen=True)
-class Variation:
-    """How often (0 to 1) and how much windows are varied; with 0 throughout they stay as captured. ``shift``: how often
-    objects are moved to any distance of the working range; ``shift_blind``: the same for a network without brightness,
-    so that it does not learn where they mostly stand."""
+class StepRecipe(ABC):
+    """``steps`` of ``batch`` windows of ``window`` px; AdamW at ``rate``, after ``warm_up`` steps falling as a cosine;
+    ``averaged``: decay of the moving average of the weights, which is what the weights file holds; ``lights`` that are
+    drawn, ``views_a_light`` of training objects in each, ``unions`` for every view, ``textured_every``-th of the lights
+    with albedo maps and gloss, and ``validation_lights`` for validation objects (see `groups_of`). A subclass says
+    which network learns what. Raises `RecipeError` for values that train nothing."""
 
-    near_edge: float = 0.7
-    shift: float = 0.5
-    shift_blind: float = 0.8
-    brightness: float = 0.04
-    wrong_window: float = 0.15
-    wrong_patch: float = 0.3
-    mirror: float = 0.5
+    name: str = ""
+    steps: int = 5000
+    batch: int = 6
+    window: int = 160
+    rate: float = 3e-3
+    warm_up: int = 100
+    decay: float = 1e-4
+    averaged: float = 0.995
+    seed: int = 42
+    validate_every: int = 500
+    lights: int = 30
+    views_a_light: int = 8
+    unions: int = 1
+    textured_every: int = 1
+    validation_lights: int = 0
 
-
-@dataclass(frozen=True)
-class Recipe(WindowRecipe):
-    """``albedo``: "one", with brightness as a cue for the order, or "any", without; ``directions``: the fringes it
-    learns from, one frame each; every ``textured_every``-th of the drawn lights has albedo maps and gloss;
-    ``validation_lights``: drawn ones for validation objects; ``vary``: how its windows are varied."""
-
-    steps: int = 9000
-    validate_every: int = 250
-    albedo: Albedo = "one"
-    directions: tuple[Direction, ...] = DIRECTIONS
-    textured_every: int = 3
-    validation_lights: int = 6
-    vary: Variation = field(default_factory=Variation)
+    title: ClassVar[str]
+    """Of the weights."""
+    family: ClassVar[Family] = PHASE_NETWORKS
+    main_loss: ClassVar[str]
+    """Which is shown while it trains."""
+    scores: ClassVar[dict[str, dict[str, str]]]
+    """What its curve shows beside the losses: titles, and scores with their labels."""
+    rig: ClassVar[str] = "paper"
+    """Which of `NAMED_RIGS` it trains for by default."""
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.albedo not in get_args(Albedo):
-            raise RecipeError(f"albedo {self.albedo!r}: expected {' or '.join(get_args(Albedo))}")
-        if not self.directions or any(direction not in DIRECTIONS for direction in self.directions):
-            raise RecipeError(f"directions {self.directions}: expected some of {', '.join(DIRECTIONS)}")
-        if not (self.textured_every >= 1 and self.validation_lights >= 0):
-            raise RecipeError(
-                f"textured_every {self.textured_every!r}, validation_lights {self.validation_lights!r}: expected 1 and "
-                "more, 0 and more"
-            )
-
-    @property
-    def title(self) -> str:  # type: ignore[override]
-        return f"Fringe order, mask and bounded phase correction, {self.albedo} albedo"
-
-    @property
-    def drawn(self) -> tuple[int, ...]:
-        return *super().drawn, self.textured_every, self.validation_lights
+        for name in ("steps", "batch", "window", "validate_every"):
+            if not getattr(self, name) >= 1:
+                raise RecipeError(f"{name} {getattr(self, name)!r}: expected 1 or more")
+        if not self.rate > 0 or not 0 <= self.averaged < 1:
+            raise RecipeError(f"expected rate above 0 and averaged 0 to below 1, got {self.rate} and {self.averaged}")
+        drawn = {"lights": (0, 10000), "views_a_light": (1, 40), "unions": (0, 100)}
+        for name, (least, most) in (drawn | {"textured_every": (1, 10000), "validation_lights": (0, 10000)}).items():
+            if not least <= getattr(self, name) <= most:
+                raise RecipeError(f"{name} {getattr(self, name)!r}: expected {least} to {most}")
 
     @property
     def weights_name(self) -> str:
-        return f"{self.name}-{self.albedo}-albedo"
+        """Of the file, and of the weights that come with the package."""
+        return self.name
 
-    def task(self, rig: Rig) -> "PhaseTask":
-        return PhaseTask(self, rig)
+    @property
+    def weights(self) -> dict[str, float]:
+        """Of the losses, by name: the fields ``weight_*``."""
+        return {name.removeprefix("weight_"): value for name, value in vars(self).items() if name.startswith("weight_")}
+
+    @abstractmethod
+    def network(self) -> nn.Module:
+        """The network, untrained."""
+
+    @abstractmethod
+    def losses(self, network: nn.Module, batch: "Batch") -> dict[str, Tensor]:
+        """Of ``network`` on a batch, by the names of `weights`."""
+
+    @abstractmethod
+    def task(self, rig: Rig) -> "Task":
+        """What the network learns from views of ``rig``."""
+
+    def rate_at(self, step: int) -> float:
+        """Learning rate of step 0, 1, ..."""
+        if step < self.warm_up:
+            return self.rate * (step + 1) / self.warm_up
+        progress = (step - self.warm_up) / max(1, self.steps - self.warm_up)
+        return self.rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0))))
+
+    def to_dict(self) -> dict[str, Any]:
+        return json.loads(json.dumps(asdict(self)))
+
+    @property
+    def digest(self) -> str:
+        return hashlib.sha256(json.dumps(self.to_dict(), sort_keys=True).encode()).hexdigest()
 
 
 @dataclass(frozen=True)
-class PhaseSample(Sample):
-    """Of an image of the light ``group``. ``missing_rad`` float16 (h, w): true absolute phase minus that of the base
-    order, 0 outside the object."""
+class WindowRecipe(StepRecipe):
+    """Of a `PhaseNet`: ``widths`` to ``bound_rad`` make the network; ``weight_*``: of the losses, ``weight_scale`` that
+    of the stated uncertainty."""
 
-    group: str
-    direction: Direction
-    missing_rad: NDArray[np.float16]
+    name: str = "phase-net"
+    widths: tuple[int, ...] = (24, 32, 48, 64)
+    fine: int = 14
+    squeezed: int = 20
+    order_widths: tuple[int, ...] = (32, 48, 64)
+    bound_rad: float = math.pi / 2
+    weight_order: float = 2.0
+    weight_mask: float = 0.5
+    weight_phase: float = 10.0
+    weight_scale: float = 0.1
 
+    inputs: ClassVar[tuple[str, ...]] = PHASE_CHANNELS
+    main_loss: ClassVar[str] = "phase"
+    scores: ClassVar[dict[str, dict[str, str]]] = {
+        "validation MAE, mm": {"object_mae_mm": "object", "right_mae_mm": "right order"},
+        "validation, % of object pixels": {"wrong_percent": "wrong order", "missed_percent": "missed"},
+    }
 
-def sample_of(view: View, image: NDArray[np.uint8], geometry: Geometry) -> PhaseSample | None:
-    """Sample of an image uint8 (H, W) of a view, whose void pixels count nowhere, in half precision; None where nothing
-    calibrates its brightness, or no object is seen."""
-    observation = geometry.route.observe(image)
-    if not observation.background.calibrated or not observation.inside.any():
-        return None
-    order, _ = geometry.route.choose(observation)
-    scene = Scene.of(observation, order, geometry.shading)
-    depth_mm, void = view.depth_mm[observation.crop], view.void[observation.crop]
-    target = object_mask(depth_mm) & ~void
-    if not target.any():
-        return None
-    true_phase = observation.layer.absolute_phase(np.where(target, depth_mm, 1000.0))
-    missing = np.where(target, true_phase - observation.phase_rad - TAU * order, 0.0)
-    direction, half = geometry.route.settings.direction, np.nan_to_num(missing).astype(np.float16)
-    edges = edge_points(depth_edges(depth_mm))
-    own = view.name, scene.single(np.float16), target, void, edges
-    return PhaseSample(*own, view.group, direction, half)
+    def network(self) -> PhaseNet:
+        return PhaseNet(self.widths, self.fine, self.squeezed, self.order_widths, self.bound_rad, len(self.inputs))
 
-
-def _moved(
-    scene: Scene, missing: Image, target: Mask, geometry: Geometry, vary: Variation, random: np.random.Generator
-) -> Scene:
-    """The object at another distance within the working range."""
-    near, far = geometry.rig.working_range_mm
-    layer = geometry.layer.at(scene.crop)
-    true_rad = (layer.residual_phase(scene.phase_rad, scene.order) + missing).astype(np.float32)
-    middle = float(np.median(true_rad[target]))
-    gain, forward = float(np.median(layer.gain)), float(np.median(layer.forward))
-    depth_m = random.uniform(near, far) / MM_PER_M
-    delta = np.float32(gain / (forward * depth_m + layer.back_m) - middle)
-    with np.errstate(all="ignore"):
-        before, after = np.maximum(inputs.coarse_irradiance(scene, geometry, (true_rad, true_rad + delta)), 1e-3)
-        ratio = np.clip(np.nan_to_num(after / before, nan=1.0), 0.4, 2.5)
-    ratio = repeated(ratio, inputs.STEP_PX, scene.light.shape).astype(np.float32)
-    ratio = np.where(target, ratio * np.float32(np.exp(random.normal(0, vary.brightness))), np.float32(1))
-    true_phase = scene.phase_rad + missing
-    light = ratio * (scene.light + scene.bright * (np.cos(true_phase + delta) - np.cos(true_phase)))
-    phase = scene.phase_rad + delta
-    carry = np.rint(phase / TAU)
-    return replace(
-        scene,
-        light=np.where(target, light, scene.light),
-        bright=(scene.bright * ratio).astype(np.float32),
-        phase_rad=(phase - TAU * carry).astype(np.float32),
-        order=scene.order + carry.astype(np.int32),
-        middle_rad=scene.middle_rad + float(delta),
-    )
-
-
-def _wrong(
-    scene: Scene, missing: Image, geometry: Geometry, vary: Variation, random: np.random.Generator
-) -> tuple[Scene, Image]:
-    """Wrong base orders, where the working range allows them."""
-    where, whole = wrong_place(scene.light.shape, vary.wrong_window, vary.wrong_patch, random)
-    if where is None:
-        return scene, missing
-    step = int(random.choice((-1, 1)))
-    if not where.any():
-        return scene, missing
-    with np.errstate(all="ignore"):
-        depth_mm = geometry.layer.at(scene.crop).depth_mm(scene.phase_rad, scene.order + where * np.int32(step))
-        off = np.where(geometry.in_range(depth_mm), where * step, 0).astype(np.int32)
-    changed = replace(scene, order=scene.order + off, middle_rad=scene.middle_rad + TAU * step * whole)
-    return changed, missing - np.float32(TAU) * off
-
-
-def _mirrored(window: Window) -> Window:
-    flipped = {name: getattr(window, name)[..., ::-1].copy() for name in Window.__dataclass_fields__}
-    flipped["x"][_MIRRORED] *= -1
-    flipped["x"][FIRST_SIDE:] = flipped["x"][_SWAPPED]
-    return Window(**flipped)
-
-
-class PhaseTask(CandidateTask):
-    """What phase-net learns: one fringe of each direction of its recipe."""
-
-    scored_share = 5
-    thresholds = tuple(float(value) for value in np.arange(-5, 3.01, 0.5))
-    leads = tuple(float(value) for value in range(8))
-    tolerance_mm = 0.1
-
-    def __init__(self, recipe: Recipe, rig: Rig) -> None:
-        super().__init__(rig)
-        self.recipe = recipe
-        self.geometries: Geometries = {
-            direction: Geometry.of(rig, Settings(direction=direction, shading=recipe.albedo == "one"))
-            for direction in recipe.directions
-        }
-        self.frames = tuple(rig.sequence.sinusoids(direction)[0] for direction in recipe.directions)
-
-    def samples(self, views: Iterable[View]) -> list[PhaseSample]:
-        """Samples of ``views``, whose frames are the first fringes of the recipe's directions, in their order; of a
-        union for one direction alone, in turn. A view whose light the background does not calibrate is left out, since
-        the network is not used on it."""
-        samples: list[PhaseSample] = []
-        unions = 0
-        for view in views:
-            pairs = list(zip(self.geometries.values(), view.frames, strict=True))
-            if view.united:
-                pairs = [pairs[unions % len(pairs)]]
-                unions += 1
-            found = (sample_of(view, frame, geometry) for geometry, frame in pairs)
-            samples += [sample for sample in found if sample is not None]
-        return samples
-
-    def draw(self, samples: list[PhaseSample], random: np.random.Generator) -> Window:
-        """A random window of one of ``samples``, varied."""
-        size, vary = self.recipe.window, self.recipe.vary
-        sample = samples[random.integers(len(samples))]
-        geometry = self.geometries[sample.direction]
-        rows, columns = place_of(sample.edges, sample.target.shape, size, random.random() < vary.near_edge, random)
-        scene, missing = (
-            sample.scene.window(rows, columns).single(),
-            sample.missing_rad[rows, columns].astype(np.float32),
-        )
-        target, void = sample.target[rows, columns], sample.void[rows, columns]
-        moved = random.random() < (vary.shift if geometry.shading else vary.shift_blind) and target.any()
-        if moved:
-            scene = _moved(scene, missing, target, geometry, vary, random)
-        scene, missing = _wrong(scene, missing, geometry, vary, random)
-        x, exists = inputs.channels(scene, geometry)
-        turn = geometry.rotation.turn
-        missing, target = turn(missing) * np.float32(geometry.rotation.sign), turn(target)
-        steps = np.rint(missing / TAU).astype(np.int64)
-        place = np.clip(steps, -1, 1) + 1
-        possible = target & (np.abs(steps) <= 1) & chosen_values(exists, place)
-        order, correction = np.where(possible, place, IGNORED), (missing - TAU * steps).astype(np.float32)
-        window = padded(size, x, exists, order, correction, possible, target, turn(~void & (not moved)))
-        return _mirrored(window) if random.random() < vary.mirror else window
-
-    def answers(self, network: PhaseNet, sample: PhaseSample) -> Answers:
-        return network_answers(network, sample.scene.single(), self.geometries[sample.direction])
-
-    def decided(self, answers: Answers, scene: Scene, threshold: float) -> Mask:
-        return decided_mask(answers, scene, threshold)
-
-    def score(self, answers: Answers, sample: PhaseSample, inside: Mask) -> dict[str, float | None]:
-        scene, target = sample.scene.single(), sample.target
-        layer = self.geometries[sample.direction].layer.at(scene.crop)
-        change = TAU * np.array(STEPS, np.int32)[answers.logits.argmax(axis=0)] + answers.correction_rad
-        base = layer.residual_phase(scene.phase_rad, scene.order)
-        true_mm, found_mm = (layer.depth_of_residual_mm(base + rad)[target] for rad in (sample.missing_rad, change))
-        error = (change - sample.missing_rad)[target]
-        return candidate_scores(found_mm, true_mm, error, answers.sigma_rad[target], inside, sample, np.pi)
-
-    def judged(self, answers: Answers, sample: PhaseSample, threshold: float) -> Judged:
-        """Every `JUDGED_PX`-th object pixel of a sample, with the order that the method would choose."""
-        scene = sample.scene.single()
-        inside = decided_mask(answers, scene, threshold)
-        choice = decided_order(answers, scene, inside, self.geometries[sample.direction])
-        change = TAU * np.array(STEPS, np.int32)[choice] + answers.correction_rad
-        wrong = np.abs(change - sample.missing_rad) > np.pi
-        places = np.nonzero((sample.target & inside)[::JUDGED_PX, ::JUDGED_PX])
-        row, column = (JUDGED_PX * place for place in places)
-        return Judged(sample.group, answers.logits[:, row, column], choice[row, column], wrong[row, column])
-
-    def answered(self, network: PhaseNet, samples: list[PhaseSample], validation: list[PhaseSample]) -> Any:
-        answers, fields = super().answered(network, samples, validation)
-        pairs = zip(answers, validation, strict=True)
-        return [self.judged(one, sample, fields["threshold"]) for one, sample in pairs], fields
-
-    def chosen(self, answered: Any, validation: list[PhaseSample], out: Path) -> dict[str, Any]:
-        """Also the odds of a wrong order, of which a picture is drawn."""
-        seen, fields = answered
-        odds = chosen_odds(seen)
-        draw_reliability(out / RELIABILITY, seen, odds)
-        confident = 100 * max(confident_shares(seen, odds).values())
+    def losses(self, network: nn.Module, batch: "Batch") -> dict[str, Tensor]:
+        """``order``: cross-entropy over the candidates; ``mask``: binary cross-entropy; ``phase``: smooth L1 in rad;
+        ``scale``: negative log-likelihood of its phase error under a Laplace distribution."""
+        order, inside, correction, scale = network(batch["x"])
+        logits = torch.where(batch["exists"], order, torch.tensor(IMPOSSIBLE))
+        fitted = batch["fitted"]
+        by_order = functional.cross_entropy(logits, batch["order"], ignore_index=IGNORED, reduction="sum")
+        target_rad = batch["correction_rad"].clamp(-self.bound_rad, self.bound_rad)
+        by_phase = functional.smooth_l1_loss(correction, target_rad, beta=SMALL_RAD, reduction="none")
+        error = (correction.detach() - batch["correction_rad"]).abs()
         return {
-            **fields,
-            **vars(odds),
-            "validation": fields["validation"] | {"confident_percent": confident},
-            "period_px": {direction: g.route.period_px for direction, g in self.geometries.items()},
+            "order": by_order / fitted.sum().clamp(min=1),
+            "mask": mask_loss(inside, batch["target"], batch["mask_valid"]),
+            "phase": mean_over(by_phase, fitted),
+            "scale": scale_loss(error, scale, fitted),
         }
+
+
+class WindowTraining(Training):
+    """Training in intervals between two validations, on the processor. ``draw`` gives a random window; ``validate``:
+    scores of a network, those of ``recipe.scores`` among them, or nothing. ``start``: the network whose weights it
+    starts from (None: random ones). ``print_line`` is given a line for every new record. Raises `TrainingError` where
+    ``start`` is another network than the recipe's, and for a checkpoint of another recipe."""
+
+    largest_gradient = LARGEST_GRADIENT
+
+    def __init__(
+        self,
+        recipe: StepRecipe,
+        draw: Callable[[np.random.Generator], Window],
+        validate: Callable[[Any], dict[str, float]],
+        out: Path,
+        start: PhaseNet | None = None,
+        print_line: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        super().__init__(out, {"recipe": recipe.digest}, recipe.seed, cpu=True)
+        self.recipe, self.draw, self.validate, self.print_line = recipe, draw, validate, print_line
+        self.name = self.title = recipe.name
+        network = recipe.network()
+        network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        if start is not None:
+            if start.options != network.options:
+                raise TrainingError(f"weights to start from: expected {network.options}, got {start.options}")
+            network.load_state_dict(start.state_dict())
+        self.averaged = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(recipe.averaged), use_buffers=True)
+        self.bare = {"network": network, "averaged": self.averaged}
+        optimizer = torch.optim.AdamW(network.parameters(), lr=recipe.rate, weight_decay=recipe.decay)
+        prepared, prepared_optimizer = self.accelerator.prepare(network, optimizer)
+        self.modules, self.optimizers, self.objective = {"network": prepared}, {"network": prepared_optimizer}, self
+        self.resume()
+
+    def steps(self, batch: Batch) -> Iterator[tuple[str, Tensor, dict[str, Tensor]]]:
+        """As of `training.Objective`: the weighted losses; the average is updated after every step."""
+        parts = self.recipe.losses(self.modules["network"], batch)
+        total = torch.stack([weight * parts[name] for name, weight in self.recipe.weights.items()]).sum()
+        yield "network", total, {name: value.detach() for name, value in parts.items()}
+        self.averaged.update_parameters(self.modules["network"])
+
+    @property
+    def network(self) -> Any:
+        """The averaged network, to be used."""
+        return self.averaged.module.eval()
+
+    @property
+    def interval_steps(self) -> int:
+        return self.recipe.validate_every
+
+    @property
+    def total_steps(self) -> int:
+        return self.recipe.steps
+
+    @property
+    def _next_validation(self) -> int:
+        return min(self.steps_done + self.interval_steps, self.total_steps)
+
+    def rate(self, number: int) -> float:
+        return self.recipe.rate_at(self.steps_done + number)
+
+    def batches(self) -> Iterator[Batch]:
+        """The batches up to the next validation: each is a function of seed and step alone, made one step ahead."""
+        first, last, recipe = self.steps_done, self._next_validation, self.recipe
+
+        def make(step: int) -> Batch:
+            random = np.random.default_rng([recipe.seed, step])
+            return batch_of([self.draw(random) for _ in range(recipe.batch)])
+
+        with ThreadPoolExecutor(1) as pool:
+            coming = pool.submit(make, first)
+            for step in range(first, last):
+                batch = coming.result()
+                if step + 1 < last:
+                    coming = pool.submit(make, step + 1)
+                yield batch
+
+    def diverged(self, name: str, value: float, number: int) -> str:
+        return f"the loss is {value} at step {self.steps_done + number + 1}; lower the rate and start again"
+
+    def validated(self, losses: dict[str, float], began: float) -> Record:
+        seconds, steps = perf_counter() - began, self._next_validation
+        record: Record = {"step": steps, "rate": self.recipe.rate_at(steps - 1), "seconds": seconds}
+        record |= {f"loss_{name}": value for name, value in losses.items()}
+        record |= self.validate(self.network)
+        self.print_line("  ".join(f"{key} {value:.4g}" for key, value in record.items()))
+        return record
+
+    def progress(self) -> str:
+        shown = self.recipe.main_loss
+        return f"step {self.steps_done}/{self.recipe.steps}  {shown} {self.history[-1][f'loss_{shown}']:.4g}"
+
+    def panels(self) -> list[Panel]:
+        def panel(title: str, labels: dict[str, str], log: bool = False) -> Panel:
+            return Panel.of(title, self.history, "step", labels, log)
+
+        shown = {f"loss_{name}": name for name in self.recipe.weights if name != "scale"}  # a log-likelihood
+        scores = [panel(title, labels) for title, labels in self.recipe.scores.items()]
+        return [panel("training losses", shown, log=True), *scores]
+
+
+class Task(ABC):
+    """What a network learns from rendered views of a rig: samples of the views, windows of the samples, and what
+    is chosen on validation samples. ``frames``: those it takes; of the validation samples every ``scored_share``-th is
+    scored during training."""
+
+    recipe: Any
+    frames: tuple[int, ...]
+    scored_share: ClassVar[int] = 3
+
+    @abstractmethod
+    def samples(self, views: Iterable[View]) -> list[Sample]:
+        """The samples of views; a view that can't be used has none."""
+
+    @abstractmethod
+    def draw(self, samples: list[Sample], random: np.random.Generator) -> Window:
+        """A random window of one of ``samples``, varied."""
+
+    @abstractmethod
+    def scores(self, network: Any, samples: list[Sample]) -> dict[str, float]:
+        """Mean scores of a network."""
+
+    @abstractmethod
+    def chosen(self, network: Any, samples: list[Sample], validation: list[Sample], out: Path) -> dict[str, Any]:
+        """The fields of `training.NetConfig` that are chosen on the validation samples for the trained network, and its
+        scores there; pictures of that go to ``out``."""
+
+
+class CandidateTask(Task):
+    """That of a `PhaseNet`. ``thresholds`` of the mask's logit and ``leads`` of the base order are tried on the
+    validation samples, thresholds also on every ``chosen_share``-th training sample; sums of errors ``tolerance_mm``
+    from the least count as equal. An order is wrong where the phase is more than ``wrong_rad`` off."""
+
+    thresholds: ClassVar[tuple[float, ...]]
+    leads: ClassVar[tuple[float, ...]]
+    tolerance_mm: ClassVar[float] = 0.0
+    chosen_share: ClassVar[int | None] = None
+    wrong_rad: ClassVar[float]
+
+    def __init__(self, recipe: "WindowRecipe", rig: Rig) -> None:
+        self.recipe, self.image_px = recipe, rig.camera.width * rig.camera.height
+
+    @abstractmethod
+    def varied(self, sample: Sample, scene: Any, missing: Image, random: np.random.Generator, *truth: Mask) -> Window:
+        """The training example of a window's ``scene``, varied; ``missing`` and ``truth``, target and void, of the
+        sample there."""
+
+    @abstractmethod
+    def answers(self, network: PhaseNet, sample: Sample) -> Answers:
+        """The network's answers for a sample."""
+
+    @abstractmethod
+    def changes_rad(self, answers: Answers, sample: Sample) -> Image:
+        """By how much the answers change the phase of a sample's scene: each pixel's likeliest order is taken."""
+
+    @abstractmethod
+    def depth_mm(self, sample: Sample, change_rad: Image) -> Image:
+        """Depth with the phase of a sample's scene changed."""
+
+    def draw(self, samples: list[Sample], random: np.random.Generator) -> Window:
+        sample = samples[random.integers(len(samples))]
+        size = self.recipe.window
+        where = sample.place(size, self.recipe.vary.near_edge, random)
+        scene, missing = sample.scene.window(*where).single(), sample.missing[where].astype(np.float32)
+        return self.varied(sample, scene, missing, random, sample.target[where], sample.void[where])
+
+    def score(self, answers: Answers, sample: Sample, inside: Mask) -> dict[str, float | None]:
+        """`view_scores` of a sample whose pixels ``inside`` are object. ``right_mae_mm``: MAE of detected pixels with
+        the right order; ``wrong_percent`` of the object's pixels; ``within_percent``: errors of the phase within the
+        stated standard uncertainty, 68 of a normal distribution. Where no order is right, it and ``right_mae_mm`` are
+        None."""
+        target, change = sample.target, self.changes_rad(answers, sample)
+        found, true = (self.depth_mm(sample, rad) for rad in (change, sample.missing))
+        apart = np.abs(change - sample.missing)
+        wrong = apart > self.wrong_rad
+        right = target & inside & ~wrong
+        error = np.minimum(np.abs(np.nan_to_num(found) - true), true)[right]
+        return view_scores(sample, inside, found, true) | {
+            "right_mae_mm": float(error.mean(dtype=np.float64)) if right.any() else None,
+            "wrong_percent": 100 * float(wrong[target].mean()),
+            "within_percent": 100 * float((apart < answers.sigma_rad)[right].mean()) if right.any() else None,
+        }
+
+    def scores_of(self, answers: Iterable[Answers], samples: list[Sample], threshold: float = 0.0) -> dict[str, float]:
+        """Means of each `score` over the samples that have it."""
+        return mean_scores(
+            self.score(one, sample, decided_mask(one, sample.scene.single(), threshold))
+            for one, sample in zip(answers, samples, strict=True)
+        )
+
+    def scores(self, network: PhaseNet, samples: list[Sample]) -> dict[str, float]:
+        return self.scores_of((self.answers(network, sample) for sample in samples), samples)
+
+    def chosen(self, network: PhaseNet, samples: list[Sample], validation: list[Sample], out: Path) -> dict[str, Any]:
+        """Threshold, and the lead by which the fewest orders are wrong."""
+        answers = [self.answers(network, sample) for sample in validation]
+        further = samples[:: self.chosen_share] if self.chosen_share else []
+        masked = answers + [self.answers(network, sample) for sample in further]
+        masks = [
+            (sample, partial(decided_mask, one, sample.scene.single()))
+            for one, sample in zip(masked, validation + further, strict=True)
+        ]
+        threshold = chosen_threshold(masks, self.thresholds, self.image_px, self.tolerance_mm)
+        with_leads = ([one.with_lead(lead) for one in answers] for lead in self.leads)
+        wrong = [self.scores_of(shifted, validation)["wrong_percent"] for shifted in with_leads]
+        lead = self.leads[int(np.argmin(wrong))]
+        shifted = [one.with_lead(lead) for one in answers]
+        validated = self.scores_of(shifted, validation, threshold)
+        fields = {"threshold": threshold, "lead": lead, "validation": validated}
+        self.calibrated(fields, shifted, validation, out)
+        return fields
+
+    @abstractmethod
+    def calibrated(self, fields: dict[str, Any], answers: list[Answers], validation: list[Sample], out: Path) -> None:
+        """Add the other ``fields``, from the ``answers`` with the lead that was chosen."""
+
+
+@dataclass(frozen=True)
+class Trained:
+    """The weights file (None for a training that stopped because its minutes were over), validation scores, and the
+    mask threshold that was chosen there."""
+
+    weights: Path | None
+    steps: int
+    threshold: float
+    validation: dict[str, float]
+
+
+def train_net(
+    recipe: StepRecipe,
+    out: Path,
+    *,
+    rig: Rig | None = None,
+    start: Path | None = None,
+    minutes: float | None = None,
+    workers: int = 1,
+    show: bool = False,
+    print_line: Callable[[str], None] = lambda line: None,
+) -> Trained:
+    """Train for ``rig`` (default: that of the recipe), starting from the weights in ``start`` or from random ones; the
+    same call resumes a training that was stopped. ``show``: progress on stderr; ``print_line`` is given a line for
+    every validation. Raises `TrainingError` for a folder of another recipe or rig."""
+    started, rig = perf_counter(), rig or NAMED_RIGS[recipe.rig]()
+    groups = groups_of(
+        recipe.lights, recipe.views_a_light, recipe.seed, recipe.textured_every, recipe.validation_lights
+    )
+    first = None if start is None else load_net(start, folded=False)
+    described = recipe.to_dict() | {"rig": rig.to_dict()}
+    described |= {} if first is None else {"start_sha256": first.sha256}
+    fingerprint = fingerprint_of(described, groups)
+    with alone_in(out):
+        claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
+        weights = out / f"{recipe.weights_name}.safetensors"
+        if weights.exists():
+            config = open_weights(weights, recipe.family).config
+            scores = {key: float(value or 0) for key, value in config.validation.items()}
+            return Trained(weights, config.steps, config.threshold, scores)
+        task = recipe.task(rig)
+        render_views(groups, rig, task.frames, out / VIEWS, workers, show)
+        with Display("measuring views", sum(len(group.views) for group in groups), show) as display:
+
+            def measured(split: str, unions: int) -> list[Sample]:
+                views = display.followed(read_views(out / VIEWS, groups, split))
+                return task.samples(with_unions(views, unions, recipe.seed))
+
+            samples, validation = measured("train", recipe.unions), measured("validation", 0)
+        scored = validation[:: task.scored_share]
+        with reproducible(cpu=True):
+            ongoing = WindowTraining(
+                recipe,
+                partial(task.draw, samples),
+                lambda network: task.scores(network, scored),
+                out,
+                None if first is None else first.network,
+                print_line,
+            )
+            ongoing.run(started, minutes, show)
+            if not ongoing.over:
+                return Trained(None, ongoing.steps_done, 0.0, {})
+            network = ongoing.network
+            fields = task.chosen(network, samples, validation, out)
+        config = NetConfig(
+            name=recipe.weights_name,
+            title=recipe.title,
+            options=network.options,
+            dataset_fingerprint=fingerprint,
+            benchmark=TrainingBenchmark(f"{recipe.name} views", 1),
+            steps=recipe.steps,
+            recipe=described,
+            **fields,
+        )
+        save_weights(weights, network, config, family=recipe.family)
+        (out / CHECKPOINT).unlink(missing_ok=True)
+        return Trained(weights, recipe.steps, config.threshold, dict(fields["validation"]))

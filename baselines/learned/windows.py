@@ -1,5 +1,5 @@
-"""Windows of training samples, and how a network is judged on whole views: what phase-net, crossed-net and
-classical-net have in common."""
+"""Windows of measured views, and how a network is judged on whole views: what phase-net, crossed-net and classical-net
+have in common."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.baselines.learned.inputs import SIDE_CHANNELS, SIDES
+from fpp_ml_bench.baselines.learned.scenes import View
 from fpp_ml_bench.baselines.phase.calibration_layer import Image, Mask
+from fpp_ml_bench.depth import depth_edges
+from fpp_ml_bench.optics.sequence import Direction
 
 IGNORED = -100
 """Class of a pixel that is left out of the order's loss: background, or none of the three candidates is right."""
@@ -17,54 +21,56 @@ EDGE_POINTS = 2000  # pixels of interest that a sample holds, as centres of trai
 TYPICAL_MM = 1800.0
 """Depth error that a missed or invented pixel counts with."""
 
+Window = dict[str, NDArray]
+"""One training example, maps (..., n, n) by name: ``x`` (C, n, n) float32, the network's input, and what its losses
+compare with. Of a `PhaseNet`: ``exists`` bool (3, n, n): candidates; ``order`` int64, 0 to 2 or `IGNORED`;
+``correction_rad`` and ``fitted``: error of the phase beside the order, and where it counts; ``target``: object;
+``mask_valid``: where the mask's loss counts, not on void pixels, nor for an object that moved."""
+CANDIDATE_MAPS = "exists", "order", "correction_rad", "fitted", "target", "mask_valid"
+
 
 @dataclass(frozen=True)
 class Sample:
-    """A measured view: its ``scene``, the maps that a network is given, and the truth, (h, w) each: ``target``: object
-    pixels that are not ``void``, which are neither object nor background; ``edges`` int32 (n, 2): rows and columns of
-    interest, beside depth edges and silhouettes."""
+    """A measured view in the light ``group``: its ``scene``, the maps that a network is given, and the truth, (h, w)
+    each: ``target``: object pixels that are not ``void``, which are neither object nor background; ``missing``: what
+    the true phase or depth has beyond the scene's, 0 outside the object; ``edges`` int32 (n, 2): rows and columns of
+    interest, beside depth edges and silhouettes. ``direction`` of its fringes, where a network learns both."""
 
     name: str
+    group: str
     scene: Any
     target: Mask
     void: Mask
+    missing: NDArray
     edges: NDArray[np.int32]
+    direction: Direction = "horizontal"
 
+    @classmethod
+    def of(
+        cls,
+        view: View,
+        scene: Any,
+        missing: NDArray,
+        interesting: Mask | bool = False,
+        direction: Direction = "horizontal",
+    ) -> "Sample":
+        """Of a ``view`` that is cut to the crop of ``scene``; ``interesting``: further pixels of interest."""
+        # Always the same points of a view.
+        places = np.argwhere(depth_edges(view.depth_mm) | interesting).astype(np.int32)
+        edges = places[np.random.default_rng(0).permutation(len(places))[:EDGE_POINTS]]
+        return cls(view.name, view.group, scene, view.target, view.void, missing, edges, direction)
 
-@dataclass(frozen=True)
-class Window:
-    """One training example: ``x`` (C, n, n) float32, ``exists`` (3, n, n); ``order`` int64 (n, n), 0 to 2 or `IGNORED`;
-    ``correction_rad`` and ``fitted`` (n, n): error of the phase beside the order, and where it counts; ``target`` bool
-    (n, n): object; ``mask_valid``: where the mask's loss counts, not on void pixels, nor for an object that moved."""
-
-    x: Image
-    exists: Mask
-    order: NDArray[np.int64]
-    correction_rad: Image
-    fitted: Mask
-    target: Mask
-    mask_valid: Mask
-
-
-def edge_points(interesting: Mask) -> NDArray[np.int32]:
-    """Rows and columns int32 (n, 2) of at most `EDGE_POINTS` of the ``interesting`` pixels, always the same."""
-    places = np.argwhere(interesting).astype(np.int32)
-    return places[np.random.default_rng(0).permutation(len(places))[:EDGE_POINTS]]
-
-
-def place_of(
-    edges: NDArray[np.int32], shape: tuple[int, ...], size: int, near_edge: bool, random: np.random.Generator
-) -> tuple[slice, slice]:
-    """Rows and columns of a random window of ``size`` px in an image of ``shape``, or of one near a point of ``edges``
-    (n, 2)."""
-    height, width = shape
-    if near_edge and len(edges):
-        row, column = edges[random.integers(len(edges))] + random.integers(-size // 3, size // 3 + 1, 2)
-    else:
-        row, column = random.integers(height), random.integers(width)
-    top = int(np.clip(row - size // 2, 0, max(height - size, 0)))
-    left = int(np.clip(column - size // 2, 0, max(width - size, 0)))
-    return slice(top, min(top + size, height)), slice(left, min(left + size, width))
+    def place(self, size: int, near_edge: float, random: np.random.Generator) -> tuple[slice, slice]:
+        """Rows and columns of a random window of ``size`` px, as often as ``near_edge`` says near a point of
+        interest."""
+        height, width = self.target.shape
+        if random.random() < near_edge and len(self.edges):
+            row, column = self.edges[random.integers(len(self.edges))] + random.integers(-size // 3, size // 3 + 1, 2)
+        else:
+            row, column = random.integers(height), random.integers(width)
+        top = int(np.clip(row - size // 2, 0, max(height - size, 0)))
+        left = int(np.clip(column - size // 2, 0, max(width - size, 0)))
+        return slice(top, min(top + size, height)), slice(left, min(left + size, width))
 
 
 def wrong_place(
@@ -82,45 +88,48 @@ def wrong_place(
     return noise > random.uniform(0.5, 1.5), False
 
 
-def padded(size: int, x: Image, exists: Mask, *maps: NDArray) -> Window:
-    """A `Window` of ``size`` px of its fields in their order, which may be smaller; what is added counts nowhere."""
-    height, width = x.shape[-2:]
+def padded(size: int, window: Window) -> Window:
+    """A window of ``size`` px of one that may be smaller; what is added counts nowhere."""
+    height, width = window["x"].shape[-2:]
     pad = ((0, size - height), (0, size - width))
-    order, *others = maps
-    return Window(
-        np.pad(x, ((0, 0), *pad)),
-        np.pad(exists, ((0, 0), *pad), constant_values=True),
-        np.pad(order, pad, constant_values=IGNORED).astype(np.int64),
-        *(np.pad(values, pad) for values in others),
-    )
-
-
-def candidate_scores(
-    found_mm: NDArray,
-    true_mm: NDArray,
-    error_rad: NDArray,
-    sigma_rad: NDArray,
-    inside: Mask,
-    truth: Sample,
-    wrong_rad: float,
-) -> dict[str, float | None]:
-    """Scores of a view from its depth, true depth, error of the phase and its stated uncertainty at the pixels of
-    ``truth.target``, (n,) each, and its mask ``inside`` (h, w). ``object_mae_mm`` counts a missed pixel with its whole
-    depth; ``right_mae_mm``: MAE of pixels with the right order, whose phase is less than ``wrong_rad`` off;
-    ``wrong_percent`` and ``missed_percent``: shares of the object's pixels; ``invented_kpx``: background pixels with a
-    depth, in thousands; ``within_percent``: errors of the phase within the stated standard uncertainty, 68 of a normal
-    distribution. Where no order is right, it and ``right_mae_mm`` are None."""
-    detected, apart = inside[truth.target], np.abs(error_rad)
-    error = np.minimum(np.abs(np.nan_to_num(found_mm) - true_mm), true_mm)
-    error, wrong = np.where(detected, error, true_mm), apart > wrong_rad
-    right = detected & ~wrong
+    added = {"exists": True, "order": IGNORED}
     return {
-        "object_mae_mm": float(error.mean()),
-        "right_mae_mm": float(error[right].mean()) if right.any() else None,
-        "wrong_percent": 100 * float(wrong.mean()),
+        name: np.pad(maps, ((0, 0),) * (maps.ndim - 2) + pad, constant_values=added.get(name, 0))
+        for name, maps in window.items()
+    }
+
+
+def symmetric(window: Window, channels: Sequence[str], turn: int) -> Window:
+    """The window of a `PhaseNet`, whose input has ``channels``, in one of the 8 orientations of a square: bit 0 of
+    ``turn`` flips rows, bit 1 columns, bit 2 swaps them. What points somewhere is turned with it."""
+    window = window | {"x": window["x"].copy()}
+    slopes = [channels.index("slope down"), channels.index("slope right")]
+    places = list(SIDES)
+    for axis, slope in enumerate(slopes):
+        if turn & (1 << axis):
+            window = {name: np.flip(maps, axis - 2) for name, maps in window.items()}
+            window["x"][slope] *= -1
+            places = [(-row, column) if slope == slopes[0] else (row, -column) for row, column in places]
+    if turn & 4:
+        window = {name: maps.swapaxes(-1, -2) for name, maps in window.items()}
+        window["x"][slopes] = window["x"][slopes[::-1]]
+        places = [(column, row) for row, column in places]
+    x, first, count = window["x"], len(channels) - len(SIDE_CHANNELS), len(SIDES)
+    order = np.array([places.index(side) for side in SIDES])
+    x[first:] = x[[*(first + order), first + count, *(first + count + 1 + order)]]
+    return {name: np.ascontiguousarray(maps) for name, maps in window.items()}
+
+
+def view_scores(sample: Sample, inside: Mask, found_mm: NDArray, true_mm: NDArray) -> dict[str, float]:
+    """Scores of a view from its mask ``inside``, the depth found there and the true one, (h, w) each. ``object_mae_mm``
+    counts a missed pixel with its whole depth; ``missed_percent``: share of the object's pixels; ``invented_kpx``:
+    background pixels with a depth, in thousands."""
+    detected, true = inside[sample.target], true_mm[sample.target]
+    error = np.minimum(np.abs(np.nan_to_num(found_mm[sample.target]) - true), true)
+    return {
+        "object_mae_mm": float(np.where(detected, error, true).mean(dtype=np.float64)),
         "missed_percent": 100 * float((~detected).mean()),
-        "within_percent": 100 * float((apart < sigma_rad)[right].mean()) if right.any() else None,
-        "invented_kpx": float((inside & ~truth.target & ~truth.void).sum()) / 1000,
+        "invented_kpx": float((inside & ~sample.target & ~sample.void).sum()) / 1000,
     }
 
 

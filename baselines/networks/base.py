@@ -96,11 +96,6 @@ def rate(network: str, option: str, value: object) -> float:
     return float(value)
 
 
-def parameter_count(module: nn.Module) -> int:
-    """Trainable numbers in ``module``."""
-    return sum(p.numel() for p in module.parameters() if p.requires_grad)
-
-
 def trains_channels_last(module: nn.Module) -> bool:
     """Whether ``module`` may be trained in channels-last layout on a CPU: not with a 1 x 1 convolution that has a
     stride, for whose weights' gradient oneDNN writes past a buffer's end (github.com/uxlfoundation/oneDNN/issues/6035).
@@ -280,9 +275,6 @@ class DropPath(nn.Module):
             return x
         keep_rate = 1.0 - self.rate
         return x * x.new_empty((x.shape[0],) + (1,) * (x.dim() - 1)).bernoulli_(keep_rate).div_(keep_rate)
-
-    def extra_repr(self) -> str:
-        return f"rate={self.rate:.3f}"
 
 
 class TransformerLayer(nn.Module):

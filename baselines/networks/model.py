@@ -4,12 +4,12 @@ import importlib.util
 import inspect
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -107,14 +107,11 @@ def represent(network: nn.Module, fringe: Tensor, name: str) -> Tensor:
     return output
 
 
+@dataclass(frozen=True)
 class Probe:
     """Outputs of two layers of a network for the last batch: see `probed`."""
 
-    def __init__(self) -> None:
-        self.outputs: dict[str, Tensor] = {}
-
-    def record(self, name: str, module: nn.Module, inputs: object, output: Tensor) -> None:
-        self.outputs[name] = output
+    outputs: dict[str, Tensor]
 
     def pooled(self) -> Tensor:
         """Mean and spread over the pixels of each bottleneck channel, float64 (B, 2 C), on the CPU."""
@@ -132,10 +129,15 @@ class Probe:
 @contextmanager
 def probed(network: FringeNetwork) -> Iterator[Probe]:
     """Record the outputs of the bottleneck and the last decoder layer for every batch inside this block."""
-    probe, layers = Probe(), {"bottleneck": "bottleneck", "last": network.last_layer}
-    handles = [network.probe_layers[at].register_forward_hook(partial(probe.record, n)) for n, at in layers.items()]
+    outputs: dict[str, Tensor] = {}
+
+    def recorded(name: str) -> Callable[[nn.Module, object, Tensor], None]:
+        return lambda module, inputs, output: outputs.update({name: output})
+
+    layers = {"bottleneck": "bottleneck", "last": network.last_layer}
+    handles = [network.probe_layers[at].register_forward_hook(recorded(name)) for name, at in layers.items()]
     try:
-        yield probe
+        yield Probe(outputs)
     finally:
         for handle in handles:
             handle.remove()
@@ -143,19 +145,6 @@ def probed(network: FringeNetwork) -> Iterator[Probe]:
 
 Twin = Literal["mean", "predicted"]
 TWINS: tuple[Twin, ...] = get_args(Twin)
-
-
-class HeadReport(NamedTuple):
-    """How the heads do on the validation split, on which ridge strength and thresholds were chosen. Range errors are
-    means over its pairs of (|error of D_min| + |error of D_max|) / 2 in mm; ``mask_iou`` is that of predicted and true
-    object, all pixels pooled, at the threshold of ``predicted``."""
-
-    mean_range_error_mm: float
-    predicted_range_error_mm: float
-    mask_iou: float
-    mean_overall_mae_mm: float
-    predicted_overall_mae_mm: float
-    ridge_strength: float
 
 
 @dataclass(frozen=True)
@@ -175,7 +164,7 @@ class RangeHeads:
     Ranges and limits in mm, float64; ``F`` pooled and ``C`` per-pixel features.
     mean_range_mm (2,): D_min, D_max. range_weight (F, 2), range_bias (2,): to (D_min, span). mask_weight (C,),
     mask_bias (): the logit of being object. mask_threshold (2,): least logit of an object pixel, for each of `TWINS`.
-    limits_mm (2,): what depth is held within. report (6,): a `HeadReport`.
+    limits_mm (2,): what depth is held within.
     """
 
     mean_range_mm: Tensor
@@ -185,7 +174,6 @@ class RangeHeads:
     mask_bias: Tensor
     mask_threshold: Tensor
     limits_mm: Tensor
-    report: Tensor
 
     def depth_range_mm(self, probe: Probe, twin: Twin) -> Tensor:
         """D_min and span of the probed batch, float64 (B, 2); a span is never below 0."""
@@ -220,6 +208,7 @@ def heads_from_tensors(tensors: Mapping[str, Tensor], name: str) -> RangeHeads |
     """The heads stored with the weights ``name``; None without any. `WeightsError` for what can't be heads."""
     if not tensors:
         return None
+    tensors = {key: tensor for key, tensor in tensors.items() if key != "report"}  # of older files
     fields = RangeHeads.__dataclass_fields__
     if odd := [*sorted(set(fields) - set(tensors)), *sorted(set(tensors) - set(fields))]:
         raise WeightsError(f"{name}: expected the range heads {', '.join(fields)}, differs in {odd[0]}; fit them again")
@@ -233,7 +222,6 @@ def heads_from_tensors(tensors: Mapping[str, Tensor], name: str) -> RangeHeads |
         "mask_bias": (),
         "mask_threshold": (2,),
         "limits_mm": (2,),
-        "report": (len(HeadReport._fields),),
     }
     for key, shape in shapes.items():
         if tuple(tensors[key].shape) != shape or tensors[key].dtype != torch.float64:
@@ -300,13 +288,10 @@ def load(name_or_path: str | Path, device: str | None = None) -> Model:
     ``cpu``, ``cuda``, ...; None takes a CUDA device where there is one. `WeightsError` for an unknown name, a damaged
     or foreign file, or a device that does not exist."""
     weights = open_weights(weights_path(name_or_path))
-    with torch.device("meta"):
-        network = build(weights.config.network, **weights.config.options)
-    network.load_state_dict(weights.tensors, assign=True)
     heads, torch_device = heads_from_tensors(weights.heads, str(weights.path)), _device(device)
     # Channels last: never slower here, and up to 1.7 times faster on a CPU (UNet, width 8, 224 px).
-    network = network.eval().requires_grad_(False).to(torch_device)
-    network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    network = weights.network.requires_grad_(False).to(torch_device)
+    network = network.to(memory_format=torch.channels_last)
     return Model(network, weights.config, heads, torch_device, weights.sha256)
 
 
@@ -348,11 +333,11 @@ def export_onnx(model: Any, path: str | Path, size: int | tuple[int, int]) -> Pa
         # A file that appears under its name only when whole.
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=".onnx-") as folder:
             unfinished = Path(folder) / target.name
-            with _exportable(network), warnings.catch_warnings():
+            with warnings.catch_warnings():
                 # The size rule is checked once, here, and is meant to be a constant of the file.
                 warnings.simplefilter("ignore")
                 torch.onnx.export(
-                    network,
+                    deepcopy(network).eval().float(),
                     (example,),
                     str(unfinished),
                     dynamo=False,
@@ -365,17 +350,3 @@ def export_onnx(model: Any, path: str | Path, size: int | tuple[int, int]) -> Pa
     except OSError as error:
         raise FppBenchError(f"can't write {target}: {error.strerror or error}") from error
     return target
-
-
-@contextmanager
-def _exportable(network: nn.Module) -> Iterator[None]:
-    """Evaluation mode in float32 for a while; the mode and type found are put back."""
-    dtype = next(network.parameters()).dtype
-    modes = {module: module.training for module in network.modules()}
-    network.eval().float()
-    try:
-        yield
-    finally:
-        network.to(dtype)
-        for module, training in modes.items():
-            module.training = training

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Frames, Method, Photographed, Setting
-from fpp_ml_bench.baselines.training.recipe import Loss, load_recipe
-from fpp_ml_bench.baselines.training.tables import NETWORK_TITLES, PRESETS
+from fpp_ml_bench.baselines.training.recipe import NETWORK_TITLES, PRESETS, Loss, load_recipe
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.errors import PredictionError, RecipeError, WeightsError
 from fpp_ml_bench.optics.rig import Rig

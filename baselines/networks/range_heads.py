@@ -1,6 +1,7 @@
 """Fitting the range heads (`RangeHeads`) to a frozen network: closed forms, a few seconds."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from fpp_ml_bench.baselines.networks.base import FringeNetwork
-from fpp_ml_bench.baselines.networks.model import TWINS, HeadReport, Probe, RangeHeads, load, probed, represent
+from fpp_ml_bench.baselines.networks.model import TWINS, Probe, RangeHeads, load, probed, represent
 from fpp_ml_bench.baselines.training.weights import ModelConfig, save_weights
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import WeightsError
@@ -26,6 +27,7 @@ RIDGE_STRENGTHS = tuple(10.0 ** (power / 2) for power in range(-8, 9))
 """Candidates, per training pair, on features of unit spread."""
 MASK_DECAY = 1e-6
 LOGIT_LIMIT, LOGIT_STEP = 20.0, 0.05
+LOGIT_BINS = round(2 * LOGIT_LIMIT / LOGIT_STEP)
 Values = NDArray[np.float64]
 _SEED = 42
 _PIXELS_AT_ONCE = 4 * 224 * 224
@@ -50,11 +52,10 @@ def fit_heads(
     network.eval()
     try:
         with torch.no_grad(), probed(network) as probe:
-            runs = {
-                split: _Pairs(network, probe, config, dataset_folder, split, cap, progress)
-                for split, cap in (("train", TRAIN_PAIRS), ("validation", VALIDATION_PAIRS))
-            }
-            return vars(_fit(runs["train"], runs["validation"]))
+            run = partial(_run, network, probe, config.name, progress)
+            train = _chosen_pairs(config, dataset_folder, "train", TRAIN_PAIRS)
+            validation = _chosen_pairs(config, dataset_folder, "validation", VALIDATION_PAIRS)
+            return vars(_fit(probe, config.image_size, partial(run, *train), partial(run, *validation)))
     finally:
         network.train(was_training)
 
@@ -66,60 +67,55 @@ def save_with_heads(weights: str | Path, dataset_folder: str | Path, target: str
     save_weights(target, model.network, model.config, fit_heads(model.network, model.config, dataset_folder))
 
 
-class _Pairs:
-    """The chosen pairs of one split; each `run` sends them through the network batch by batch."""
-
-    def __init__(
-        self,
-        network: FringeNetwork,
-        probe: Probe,
-        config: ModelConfig,
-        folder: str | Path,
-        split: str,
-        cap: int,
-        progress: Callable[[int], None],
-    ) -> None:
-        self.data = FringeDepthDataset(
-            folder, split, config.data_config, "individual", config.background_removed, config.range_rule
+def _chosen_pairs(
+    config: ModelConfig, folder: str | Path, split: str, cap: int
+) -> tuple[FringeDepthDataset, list[int]]:
+    """A split, and ``cap`` of its pairs at most, evenly over those with an object: others have no depth range."""
+    data = FringeDepthDataset(
+        folder, split, config.data_config, "individual", config.background_removed, config.range_rule
+    )
+    source = data.source
+    if source.size != config.image_size or source.fingerprint != config.dataset_fingerprint:
+        raise WeightsError(
+            f"{config.name}: was trained on dataset {config.dataset_fingerprint[:12]} of {config.image_size} px, "
+            f"{folder} is {source.fingerprint[:12]} of {source.size} px; fit them on its training data"
         )
-        source = self.data.source
-        if source.size != config.image_size or source.fingerprint != config.dataset_fingerprint:
-            raise WeightsError(
-                f"{config.name}: was trained on dataset {config.dataset_fingerprint[:12]} of {config.image_size} px, "
-                f"{folder} is {source.fingerprint[:12]} of {source.size} px; fit them on its training data"
-            )
-        # A sample without an object has no depth range.
-        usable = [
-            index
-            for index in range(len(self.data))
-            if source.measured(self.data.samples[self.data.pair(index)[0]])["depth_max_mm"] > 0
-        ]
-        if not usable:
-            raise WeightsError(f"{folder}: split {split} holds no object, so there is no range to learn")
-        places = np.linspace(0, len(usable) - 1, min(cap, len(usable))).round().astype(int)
-        self.order = [usable[place] for place in places]
-        self.network, self.probe, self.name, self.progress = network, probe, config.name, progress
-        self.device, self.size = next(network.parameters()).device, source.size
-        self.batch = max(1, min(4, _PIXELS_AT_ONCE // (self.size[0] * self.size[1])))
-
-    def run(self) -> Iterator[tuple[Tensor, NDArray[np.float32], Values]]:
-        """Network output (B, 1, H, W), depth in mm (B, H, W), and D_min and span (B, 2)."""
-        for batch in self.data.batches(self.batch, self.order):
-            values = represent(self.network, batch.fringe.to(self.device), self.name)
-            depth = [self.data.source.depth_mm(self.data.samples[int(row)]) for row in batch.row]
-            edges = batch.depth_range_mm.double().numpy()
-            span = np.stack([edges[:, 0], edges[:, 1] - edges[:, 0]], axis=1)
-            yield values, np.stack(depth), span
-            self.progress(len(depth))
+    highest_mm = [source.measured(sample)["depth_max_mm"] for sample in data.samples]
+    usable = [index for index in range(len(data)) if highest_mm[data.pair(index)[0]] > 0]
+    if not usable:
+        raise WeightsError(f"{folder}: split {split} holds no object, so there is no range to learn")
+    places = np.linspace(0, len(usable) - 1, min(cap, len(usable))).round().astype(int)
+    return data, [usable[place] for place in places]
 
 
-def _fit(train: _Pairs, validation: _Pairs) -> RangeHeads:
+def _run(
+    network: FringeNetwork,
+    probe: Probe,
+    name: str,
+    progress: Callable[[int], None],
+    data: FringeDepthDataset,
+    order: list[int],
+) -> Iterator[tuple[Tensor, NDArray[np.float32], Values]]:
+    """Network output (B, 1, H, W), depth in mm (B, H, W), and D_min and span (B, 2), batch by batch."""
+    device, (height, width) = next(network.parameters()).device, data.source.size
+    for batch in data.batches(max(1, min(4, _PIXELS_AT_ONCE // (height * width))), order):
+        values = represent(network, batch.fringe.to(device), name)
+        depth = [data.source.depth_mm(data.samples[int(row)]) for row in batch.row]
+        edges = batch.depth_range_mm.double().numpy()
+        yield values, np.stack(depth), np.stack([edges[:, 0], edges[:, 1] - edges[:, 0]], axis=1)
+        progress(len(depth))
+
+
+Run = Callable[[], Iterator[tuple[Tensor, NDArray[np.float32], Values]]]
+
+
+def _fit(probe: Probe, size: tuple[int, int], train: Run, validation: Run) -> RangeHeads:
     pooled, ranges, features, costs, labels = [], [], [], [], []
     rng = np.random.default_rng(_SEED)
-    for _, depth_mm, range_mm in train.run():
-        pooled.append(train.probe.pooled().numpy())
+    for _, depth_mm, range_mm in train():
+        pooled.append(probe.pooled().numpy())
         ranges.append(range_mm)
-        layer = train.probe.pixels(train.size).flatten(2)
+        layer = probe.pixels(size).flatten(2)
         for number, depth in enumerate(depth_mm):
             for label in (True, False):
                 label_pixels = np.flatnonzero(object_mask(depth) == label)
@@ -138,10 +134,9 @@ def _fit(train: _Pairs, validation: _Pairs) -> RangeHeads:
     mask_weight, mask_bias = _logistic(
         torch.cat(features), torch.from_numpy(np.concatenate(labels)), torch.from_numpy(np.concatenate(costs)).double()
     )
-    validation_features = [(validation.probe.pooled().numpy(), range_mm) for _, _, range_mm in validation.run()]
+    validation_features = [(probe.pooled().numpy(), range_mm) for _, _, range_mm in validation()]
     validation_pooled, validation_ranges = (np.concatenate(part) for part in zip(*validation_features, strict=True))
-    fitted = _ridge(np.concatenate(pooled), train_ranges, validation_pooled, validation_ranges)
-    strength, weight, bias, error_mm = fitted
+    weight, bias = _ridge(np.concatenate(pooled), train_ranges, validation_pooled, validation_ranges)
     mean = np.array([lows.mean(), highs.mean()])
     heads = RangeHeads(
         mean_range_mm=torch.from_numpy(mean),
@@ -151,20 +146,14 @@ def _fit(train: _Pairs, validation: _Pairs) -> RangeHeads:
         mask_bias=mask_bias,
         mask_threshold=torch.zeros(2, dtype=torch.float64),
         limits_mm=torch.tensor([lows.min() - margin, highs.max() + margin], dtype=torch.float64),
-        report=torch.zeros(6, dtype=torch.float64),
     )
-    tallies = {twin: _Tally() for twin in TWINS}
-    for values, depth_mm, _ in validation.run():
-        logits = heads.logits(validation.probe, validation.size).cpu().numpy()[:, 0]
-        for twin, tally in tallies.items():
-            depth = heads.unmasked_mm(values, heads.depth_range_mm(validation.probe, twin))
-            tally.add(logits, depth.cpu().numpy()[:, 0], depth_mm)
-    best = {twin: tally.best() for twin, tally in tallies.items()}
-    heads.mask_threshold.copy_(torch.tensor([best[twin][0] for twin in TWINS], dtype=torch.float64))
-    mean_error_mm = _range_error_mm(np.array([[mean[0], mean[1] - mean[0]]]), validation_ranges)
-    (_, mean_mae_mm, _), (_, mae_mm, iou) = best["mean"], best["predicted"]
-    report = HeadReport(mean_error_mm, error_mm, iou, mean_mae_mm, mae_mm, strength)
-    heads.report.copy_(torch.tensor(report, dtype=torch.float64))
+    gains = {twin: np.zeros(LOGIT_BINS) for twin in TWINS}
+    for values, depth_mm, _ in validation():
+        logits = heads.logits(probe, size).cpu().numpy()[:, 0]
+        for twin, gain in gains.items():
+            depth = heads.unmasked_mm(values, heads.depth_range_mm(probe, twin))
+            gain += _gains(logits, depth.cpu().numpy()[:, 0], depth_mm)
+    heads.mask_threshold.copy_(torch.tensor([_best_threshold(gains[twin]) for twin in TWINS], dtype=torch.float64))
     return heads
 
 
@@ -176,8 +165,8 @@ def _range_error_mm(predicted: NDArray[np.float64], ranges: NDArray[np.float64])
 
 def _ridge(
     pooled: Values, ranges: Values, validation_pooled: Values, validation_ranges: Values
-) -> tuple[float, Values, Values, float]:
-    """Strength of least `_range_error_mm` on validation's (N, F) and (N, 2), weight (F, 2), bias (2,), the error."""
+) -> tuple[Values, Values]:
+    """Weight (F, 2) and bias (2,) of the strength of least `_range_error_mm` on validation's (N, F) and (N, 2)."""
     centre, spread = pooled.mean(axis=0), pooled.std(axis=0)
     scale = np.where(spread > 0, spread, 1.0)
     target = ranges.mean(axis=0)
@@ -190,9 +179,9 @@ def _ridge(
         bias = target - centre @ weight
         predicted = validation_pooled @ weight + bias
         predicted[:, 1] = np.maximum(predicted[:, 1], 0.0)
-        candidates.append((_range_error_mm(predicted, validation_ranges), strength, weight, bias))
-    error_mm, strength, weight, bias = min(candidates, key=lambda candidate: candidate[0])
-    return strength, weight, bias, error_mm
+        candidates.append((_range_error_mm(predicted, validation_ranges), weight, bias))
+    _, weight, bias = min(candidates, key=lambda candidate: candidate[0])
+    return weight, bias
 
 
 def _logistic(features: Tensor, labels: Tensor, costs: Tensor) -> tuple[Tensor, Tensor]:
@@ -221,32 +210,18 @@ def _logistic(features: Tensor, labels: Tensor, costs: Tensor) -> tuple[Tensor, 
     return weight, parameters.detach()[-1] - centre @ weight
 
 
-class _Tally:
-    """Change of the absolute error by every threshold on the logit, summed in bins of `LOGIT_STEP`."""
+def _gains(logits: NDArray, depth_mm: NDArray, target_mm: NDArray) -> Values:
+    """Change of the absolute error by pixels (B, H, W) that count as object, summed in bins of `LOGIT_STEP` of their
+    logit; ``depth_mm``: what they get as object, ``target_mm``: true depth."""
+    bins = np.floor((logits.astype(np.float64) + LOGIT_LIMIT) / LOGIT_STEP).clip(0, LOGIT_BINS - 1).astype(int)
+    true = target_mm.astype(np.float64)
+    gain = np.abs(depth_mm.astype(np.float64) - true) - true
+    return np.bincount(bins.ravel(), gain.ravel(), LOGIT_BINS)
 
-    def __init__(self) -> None:
-        self.bins = round(2 * LOGIT_LIMIT / LOGIT_STEP)
-        self.gain, self.inside, self.outside = (np.zeros(self.bins) for _ in range(3))
-        self.without = 0.0
 
-    def add(self, logits: NDArray, depth_mm: NDArray, target_mm: NDArray) -> None:
-        """Pixels (B, H, W): logit, depth that they get as object, true depth."""
-        bins = np.floor((logits.astype(np.float64) + LOGIT_LIMIT) / LOGIT_STEP).clip(0, self.bins - 1).astype(int)
-        bins, true = bins.ravel(), target_mm.astype(np.float64).ravel()
-        object_pixels = object_mask(target_mm).ravel()
-        gain = np.abs(depth_mm.astype(np.float64).ravel() - true) - true
-        self.gain += np.bincount(bins, gain, self.bins)
-        self.inside += np.bincount(bins[object_pixels], minlength=self.bins)
-        self.outside += np.bincount(bins[~object_pixels], minlength=self.bins)
-        self.without += float(true.sum())
-
-    def best(self) -> tuple[float, float, float]:
-        """Least logit of an object pixel, the overall MAE in mm that this gives, and the mask's intersection over
-        union. Between thresholds that do equally well, the middle one."""
-        above = np.append(np.cumsum(self.gain[::-1])[::-1], 0.0)
-        equal = np.flatnonzero(above == above.min())
-        run = equal[: np.flatnonzero(np.diff(equal, append=-1) != 1)[0] + 1]
-        best_bin = int(run[len(run) // 2])
-        inside, hit, false = self.inside.sum(), self.inside[best_bin:].sum(), self.outside[best_bin:].sum()
-        mae_mm = float((self.without + above[best_bin]) / (inside + self.outside.sum()))
-        return best_bin * LOGIT_STEP - LOGIT_LIMIT, mae_mm, float(hit / (inside + false))
+def _best_threshold(gain: Values) -> float:
+    """Least logit of an object pixel with the least error. Between thresholds that do equally well, the middle one."""
+    above = np.append(np.cumsum(gain[::-1])[::-1], 0.0)
+    equal = np.flatnonzero(above == above.min())
+    run = equal[: np.flatnonzero(np.diff(equal, append=-1) != 1)[0] + 1]
+    return int(run[len(run) // 2]) * LOGIT_STEP - LOGIT_LIMIT

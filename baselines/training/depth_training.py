@@ -10,7 +10,7 @@ that never stopped.
 
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -23,7 +23,6 @@ from accelerate import PartialState
 from accelerate.utils import gather_object, set_seed
 from torch import Tensor, nn
 from torch.optim import RMSprop
-from torch.utils.data import DataLoader, Dataset, Sampler
 
 from fpp_ml_bench.baselines.networks.base import trains_channels_last
 from fpp_ml_bench.baselines.networks.model import build as build_network
@@ -32,9 +31,8 @@ from fpp_ml_bench.baselines.networks.unet import re_projection_loss
 from fpp_ml_bench.baselines.phase.calibration_layer import CalibrationLayer
 from fpp_ml_bench.baselines.training.engine import DIVERGED, Training, alone_in, claim_folder, reproducible
 from fpp_ml_bench.baselines.training.losses import Adversarial, AdversarialSettings, Regression
-from fpp_ml_bench.baselines.training.recipe import Linear, Plateau, Recipe
+from fpp_ml_bench.baselines.training.recipe import GAN, Linear, Plateau, Recipe
 from fpp_ml_bench.baselines.training.records import CURVE_FILE, LOG_FILE, Panel, Record
-from fpp_ml_bench.baselines.training.tables import GAN
 from fpp_ml_bench.baselines.training.weights import ModelConfig, save_weights, training_benchmark
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import Normalisation
@@ -63,15 +61,26 @@ _RELATIVE = 1e-9
 
 @dataclass(frozen=True)
 class TrainingRun:
-    """Files and epochs of a training; ``finished`` is False when its minutes ran out: call `train` again to resume."""
+    """Epochs of the training in the folder ``out``, and its files; ``finished`` is False when its minutes ran out: call
+    `train` again to resume."""
 
-    weights: Path
+    out: Path
     epochs: int
     best_epoch: int
     seconds: float
-    finished: bool
-    log: Path
-    curve: Path
+    finished: bool = True
+
+    @property
+    def weights(self) -> Path:
+        return self.out / WEIGHTS
+
+    @property
+    def log(self) -> Path:
+        return self.out / LOG_FILE
+
+    @property
+    def curve(self) -> Path:
+        return self.out / CURVE_FILE
 
 
 def train(
@@ -92,12 +101,13 @@ def train(
         with reproducible(recipe.precision):
             training = DepthTraining(recipe, data, validation, out)
             seconds = training.run(started, minutes, show)
-            epochs, best = training.epoch, training.best["epoch"] if training.history else 0
-            if training.over and training.accelerator.is_main_process:
-                summary = {"epochs": epochs, "best_epoch": best, "seconds": seconds}
+            best = training.best["epoch"] if training.history else 0
+            run = TrainingRun(out, training.epoch, best, seconds, training.over)
+            if run.finished and training.accelerator.is_main_process:
+                summary = {key: vars(run)[key] for key in ("epochs", "best_epoch", "seconds")}
                 write_atomically(out / DONE, json.dumps(summary).encode())
             training.accelerator.wait_for_everyone()
-            return _run(out, epochs, best, seconds, training.over)
+            return run
 
 
 def finished_run(out: Path) -> TrainingRun | None:
@@ -108,13 +118,9 @@ def finished_run(out: Path) -> TrainingRun | None:
     cure = "is damaged; delete it, and the training resumes from its checkpoint"
     summary = read_json(path, TrainingError, f"it {cure}")
     try:
-        return _run(out, summary["epochs"], summary["best_epoch"], summary["seconds"], True)
-    except (KeyError, TypeError):
+        return TrainingRun(out, **summary)
+    except TypeError:
         raise TrainingError(f"{path}: {cure}") from None
-
-
-def _run(out: Path, epochs: int, best: int, seconds: float, finished: bool) -> TrainingRun:
-    return TrainingRun(out / WEIGHTS, epochs, best, seconds, finished, out / LOG_FILE, out / CURVE_FILE)
 
 
 def epoch_order(pairs: int, drawn: int | None, seed: int, epoch: int) -> list[int]:
@@ -138,41 +144,6 @@ def spread(pairs: int, drawn: int | None) -> list[int]:
     return [int((place + place * _GOLDEN % 1) * pairs / drawn) for place in range(drawn)]
 
 
-class BatchRead(Dataset[FringeDepth]):
-    """`FringeDepthDataset` read a batch at a time, as torch's loader asks of what offers ``__getitems__``."""
-
-    def __init__(self, source: FringeDepthDataset) -> None:
-        self.source = source
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def __getitem__(self, index: int) -> FringeDepth:
-        return self.source[index]
-
-    def __getitems__(self, indices: list[int]) -> FringeDepth:
-        return self.source.read(indices)
-
-
-class EpochSampler(Sampler[int]):
-    """`epoch_order` as a sampler; set ``epoch`` before each pass."""
-
-    def __init__(self, pairs: int, drawn: int | None, seed: int) -> None:
-        self.pairs, self.drawn, self.seed, self.epoch = pairs, drawn, seed, 0
-
-    def __len__(self) -> int:
-        return min(self.drawn or self.pairs, self.pairs)
-
-    def __iter__(self) -> Iterator[int]:
-        return iter(epoch_order(self.pairs, self.drawn, self.seed, self.epoch))
-
-
-def training_loader(source: FringeDepthDataset, sampler: EpochSampler, batch: int, pin: bool) -> DataLoader:
-    """Batches in the sampler's order, read in this process (that takes less time than a step), as `BatchRead` gives
-    them: there is nothing to collate."""
-    return DataLoader(BatchRead(source), batch_size=batch, sampler=sampler, collate_fn=lambda b: b, pin_memory=pin)
-
-
 def open_data(recipe: Recipe, dataset: Path) -> tuple[FringeDepthDataset, FringeDepthDataset]:
     """Training and validation pairs. TrainingError for another image size than the recipe's, or an empty split."""
     datasets = []
@@ -191,47 +162,25 @@ def open_data(recipe: Recipe, dataset: Path) -> tuple[FringeDepthDataset, Fringe
     return datasets[0], datasets[1]
 
 
-class Schedule:
-    """``rate`` of the coming epoch, of all optimisers; a plateau as torch's ``ReduceLROnPlateau`` counts it."""
-
-    def __init__(self, rule: Plateau | Linear, rate: float) -> None:
-        self.rule, self.first, self.rate = rule, rate, rate
-        self.epochs, self.bad, self.best = 0, 0, math.inf
-
-    @property
-    def finished(self) -> bool:
-        """The rate is at its minimum (plateau), or all epochs are over (linear)."""
-        if isinstance(self.rule, Linear):
-            return self.epochs >= self.rule.constant + self.rule.decay
-        return self.rate <= self.rule.minimum * (1 + _RELATIVE)
-
-    def step(self, validation_loss: float) -> None:
-        """An epoch with this validation loss has ended."""
-        rule = self.rule
-        self.epochs += 1
-        if isinstance(rule, Linear):
-            left = rule.constant + rule.decay - self.epochs
-            self.rate = self.first * min(1.0, max(0, left) / rule.decay)
-        elif validation_loss < self.best * (1 - LEAST_GAIN):
-            self.best, self.bad = validation_loss, 0
-        elif self.bad < rule.patience:
-            self.bad += 1
+def rate_after(rule: Plateau | Linear, rate: float, losses: Sequence[float]) -> float:
+    """Learning rate of the epoch after those with these validation ``losses``, from the first ``rate``; a plateau as
+    torch's ``ReduceLROnPlateau`` counts it."""
+    if isinstance(rule, Linear):
+        return rate * min(1.0, max(0, rule.constant + rule.decay - len(losses)) / rule.decay)
+    best, bad = math.inf, 0
+    for loss in losses:
+        if loss < best * (1 - LEAST_GAIN):
+            best, bad = loss, 0
+        elif bad < rule.patience:
+            bad += 1
         else:
-            self.rate, self.bad = max(self.rate * rule.factor, rule.minimum), 0
+            rate, bad = max(rate * rule.factor, rule.minimum), 0
+    return rate
 
-    def state(self) -> dict[str, Any]:
-        if isinstance(self.rule, Linear):
-            return {"epochs": self.epochs}
-        best = self.best if math.isfinite(self.best) else None
-        return {"epochs": self.epochs, "rate": self.rate, "bad": self.bad, "best": best}
 
-    def restore(self, state: Mapping[str, Any]) -> None:
-        if isinstance(self.rule, Linear):
-            for _ in range(state["epochs"]):
-                self.step(0.0)
-            return
-        self.epochs, self.rate, self.bad = state["epochs"], state["rate"], state["bad"]
-        self.best = math.inf if state["best"] is None else state["best"]
+def at_minimum(rule: Plateau | Linear, rate: float) -> bool:
+    """Whether a training ends at ``rate``: that of a plateau is at its minimum, or a linear one at 0."""
+    return rate <= getattr(rule, "minimum", 0.0) * (1 + _RELATIVE)
 
 
 class DepthTraining(Training):
@@ -265,10 +214,6 @@ class DepthTraining(Training):
             name: RMSprop(module.parameters(), rule.learning_rate, alpha=rule.alpha, weight_decay=rule.weight_decay)
             for name, module in modules.items()
         }
-        self.schedule = Schedule(recipe.schedule, rule.learning_rate)
-        self.sampler = EpochSampler(len(data), recipe.pairs_per_epoch, recipe.seed)
-        loader = training_loader(data, self.sampler, recipe.batch, pin=on_gpu)
-        self.loader: DataLoader = self.accelerator.prepare(loader)
         for name, module in modules.items():
             prepared = self.accelerator.prepare(module, self.optimizers[name])
             self.objective.modules[name], self.optimizers[name] = prepared
@@ -303,32 +248,50 @@ class DepthTraining(Training):
         return min(self.history, key=lambda record: record["validation_loss"])
 
     @property
-    def over(self) -> bool:
-        return self.epoch >= self.recipe.max_epochs or (self.epoch > 0 and self.schedule.finished)
+    def learning_rate(self) -> float:
+        losses = [record["validation_loss"] for record in self.history]
+        return rate_after(self.recipe.schedule, self.recipe.optimizer.learning_rate, losses)
 
     @property
-    def steps_done(self) -> int:
-        return self.epoch * len(self.loader)
+    def over(self) -> bool:
+        return super().over or (self.epoch > 0 and at_minimum(self.recipe.schedule, self.learning_rate))
+
+    @property
+    def interval_steps(self) -> int:
+        return len(self._indices())
 
     @property
     def total_steps(self) -> int:
-        return self.epochs * max(1, len(self.loader))
+        return self.epochs * self.interval_steps
 
-    def batches(self) -> Iterable[FringeDepth]:
+    def _indices(self) -> list[list[int]]:
+        """The pairs of each batch of this process in the coming epoch; all processes have as many batches."""
+        size, processes = self.recipe.batch, self.accelerator.num_processes
+        order = epoch_order(len(self.data), self.recipe.pairs_per_epoch, self.recipe.seed, self.epoch)
+        if processes > 1:
+            order = np.resize(order, -(-len(order) // (size * processes)) * size * processes).tolist()
+        batches = [order[start : start + size] for start in range(0, len(order), size)]
+        return batches[self.accelerator.process_index :: processes]
+
+    def batches(self) -> Iterator[FringeDepth]:
         # What is drawn within an epoch (DropPath) depends on the epoch alone: a resumed training draws the same.
         set_seed((self.recipe.seed + 1_000_003 * (self.epoch + 1) + self.accelerator.process_index) % 2**32)
-        self.sampler.epoch = self.epoch
-        return self.loader
+        torch.empty((), dtype=torch.int64).random_()  # as a DataLoader draws: published weights come out again
+        for indices in self._indices():
+            yield self._on_device(self.data.read(indices))
+
+    def _on_device(self, read: FringeDepth) -> FringeDepth:
+        device = self.accelerator.device
+        if device.type == "cuda":
+            read = FringeDepth(*(tensor.pin_memory() for tensor in read))
+        return FringeDepth(*(tensor.to(device, non_blocking=True) for tensor in read))
 
     def rate(self, number: int) -> float:
-        return self.schedule.rate
+        return self.learning_rate
 
-    def label(self, batch: FringeDepth) -> Tensor:
-        return batch.row
-
-    def diverged(self, name: str, value: float, number: int, label: Tensor) -> str:
+    def diverged(self, name: str, value: float, number: int) -> str:
         fault = f"is {DIVERGED:g} times the first one" if math.isfinite(value) else "is not finite"
-        samples = sorted({self.data.samples[row] for row in label.tolist()})
+        samples = sorted({self.data.samples[self.data.pair(index)[0]] for index in self._indices()[number]})
         return (
             f"training diverged: {name} {fault} ({value:.4g}) in epoch {self.epoch + 1}, batch {number + 1}, samples "
             f"{', '.join(samples)}. The last good state is kept ({self.epoch} epochs); lower the learning rate, or "
@@ -344,14 +307,19 @@ class DepthTraining(Training):
                 f"good state is kept ({self.epoch} epochs); lower the learning rate"
             )
         training_loss = losses.pop("loss")
-        return {
+        record = {
             "epoch": self.epoch + 1,
-            "learning_rate": self.schedule.rate,
+            "learning_rate": self.learning_rate,
             "training_loss": training_loss,
             **scores,
             **losses,
             "seconds": round(perf_counter() - began, 3),
         }
+        if all(loss < before["validation_loss"] for before in self.history) and self.accelerator.is_main_process:
+            network, data = self.bare["network"], self.data
+            config = model_config(self.recipe, network, data.source, record["epoch"], scores)
+            save_weights(self.out / WEIGHTS, network, replace(config, range_rule=data.range_rule))
+        return record
 
     def _validate(self) -> dict[str, float | None]:
         """``validation_loss`` and the scores in `LOGGED` of the network (not distributed, not compiled): means over the
@@ -366,7 +334,7 @@ class DepthTraining(Training):
             metric.to(accelerator.device)
         losses: list[float] = []
         for read in self.validation.batches(self.recipe.batch, indices):
-            batch = FringeDepth(*(tensor.to(accelerator.device) for tensor in read))
+            batch = self._on_device(read)
             with torch.inference_mode(), accelerator.autocast():
                 prediction = network(batch.fringe).float()
                 losses += self.objective.validation_losses(prediction, batch).double().cpu().tolist()
@@ -383,21 +351,6 @@ class DepthTraining(Training):
         means = {key: float(mean) for key, mean in metric.compute().items() if key in LOGGED}
         scores = {key: None if math.isnan(means[key]) else means[key] for key in LOGGED}
         return {"validation_loss": sum(losses) / len(losses) if losses else None, **scores}
-
-    def recorded(self, record: Record) -> None:
-        """Set the rate of the next epoch, keep the best weights."""
-        self.schedule.step(record["validation_loss"])
-        if self.best is record and self.accelerator.is_main_process:
-            scores = {key: value for key, value in record.items() if key.endswith("_mm") or key == "validation_loss"}
-            network, data = self.bare["network"], self.data.source
-            config = model_config(self.recipe, network, data, record["epoch"], scores)
-            save_weights(self.out / WEIGHTS, network, replace(config, range_rule=self.data.range_rule))
-
-    def state(self) -> dict[str, Any]:
-        return {"schedule": self.schedule.state()}
-
-    def restore(self, state: Mapping[str, Any]) -> None:
-        self.schedule.restore(state["schedule"])
 
     def progress(self) -> str:
         record = self.history[-1]

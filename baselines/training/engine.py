@@ -8,7 +8,7 @@ type and number of threads the same recipe and data give the same bits on the CP
 import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from time import perf_counter
@@ -23,7 +23,6 @@ from torch.optim import Optimizer
 
 from fpp_ml_bench.baselines.networks.base import tiny_floats_are_zero
 from fpp_ml_bench.baselines.training import records
-from fpp_ml_bench.baselines.training.losses import Objective
 from fpp_ml_bench.baselines.training.records import Display, Panel, Record
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.files import LOCK_FILE, cause_of, exclusive, read_json, write_atomically
@@ -43,7 +42,7 @@ class Training(ABC):
 
     name: str
     title: str
-    objective: Objective
+    objective: Any
     optimizers: dict[str, Optimizer]
     bare: dict[str, nn.Module]
     largest_gradient: float | None = None
@@ -60,18 +59,23 @@ class Training(ABC):
 
     @property
     @abstractmethod
-    def over(self) -> bool:
-        """Whether it has come to its end."""
+    def interval_steps(self) -> int:
+        """Steps of an interval; the last may have fewer."""
 
     @property
     @abstractmethod
     def total_steps(self) -> int:
-        """Steps at most, for the progress bar."""
+        """Steps at most."""
 
     @property
-    @abstractmethod
     def steps_done(self) -> int:
         """Steps of all intervals so far."""
+        return min(len(self.history) * self.interval_steps, self.total_steps)
+
+    @property
+    def over(self) -> bool:
+        """Whether it has come to its end."""
+        return self.steps_done >= self.total_steps
 
     @abstractmethod
     def batches(self) -> Iterable[Any]:
@@ -83,25 +87,11 @@ class Training(ABC):
 
     @abstractmethod
     def validated(self, losses: dict[str, float], began: float) -> Record:
-        """The record of an interval that began at ``began`` and had these mean ``losses``; has ``seconds``."""
+        """The record of an interval that began at ``began`` and had these mean ``losses``; has ``seconds``. It is not
+        in `history` yet."""
 
     @abstractmethod
-    def recorded(self, record: Record) -> None:
-        """Do what follows from the newest record, before everything is saved."""
-
-    def state(self) -> dict[str, Any]:
-        """What a checkpoint holds besides modules, optimisers, history and first loss; `restore` takes it back."""
-        return {}
-
-    def restore(self, state: Mapping[str, Any]) -> None:  # noqa: B027  nothing to do is right
-        """Continue from `state`."""
-
-    def label(self, batch: Any) -> Any:
-        """By what `diverged` names a batch."""
-        return None
-
-    @abstractmethod
-    def diverged(self, name: str, value: float, number: int, label: Any) -> str:
+    def diverged(self, name: str, value: float, number: int) -> str:
         """Words on a loss that is not finite, or far above the first one, at step ``number`` of the interval."""
 
     @abstractmethod
@@ -125,9 +115,7 @@ class Training(ABC):
                 if not broadcast_object_list([last_interval_s == 0 or in_time])[0]:
                     break
                 began = perf_counter()
-                record = self.validated(self._train_interval(display), began)
-                self.history.append(record)
-                self.recorded(record)
+                self.history.append(self.validated(self._train_interval(display), began))
                 if self.accelerator.is_main_process:
                     self._save()
                     records.write_log(self.out, self.history)
@@ -167,7 +155,6 @@ class Training(ABC):
                 records.restore_optimizer(optimizer, tensors, f"optimizer.{name}")
             self.history, self.first_loss, self.before = state["history"], state["first_loss"], state["seconds"]
             self.resumed_at = len(self.history)
-            self.restore(state)
         if len(set(gather_object([len(self.history)]))) > 1:
             words = "processes found different checkpoints; give a folder that all machines share"
             raise TrainingError(f"{self.out}: {words}")
@@ -177,13 +164,13 @@ class Training(ABC):
         batches, count = self.batches(), 0
         for module in self.objective.modules.values():
             module.train()
-        unchecked: list[tuple[int, Any, dict[str, Tensor]]] = []
+        unchecked: list[tuple[int, dict[str, Tensor]]] = []
         sums: dict[str, float] = {}
         for batch in batches:
             for optimizer in self.optimizers.values():
                 for group in optimizer.param_groups:
                     group["lr"] = self.rate(count)
-            unchecked.append((count, self.label(batch), self.step(batch)))
+            unchecked.append((count, self.step(batch)))
             count += 1
             if len(unchecked) == CHECK_EVERY:
                 self._check_losses(unchecked, sums)
@@ -191,15 +178,15 @@ class Training(ABC):
         self._check_losses(unchecked, sums)
         return {name: value / count for name, value in sums.items()}
 
-    def _check_losses(self, unchecked: list[tuple[int, Any, dict[str, Tensor]]], sums: dict[str, float]) -> None:
+    def _check_losses(self, unchecked: list[tuple[int, dict[str, Tensor]]], sums: dict[str, float]) -> None:
         """Add the losses of the last steps to ``sums``; raise for a loss that is not finite or has diverged."""
-        for number, label, logged in unchecked:
+        for number, logged in unchecked:
             for name, value in logged.items():
                 loss = float(value)
                 if name == "loss" and self.first_loss is None and math.isfinite(loss):
                     self.first_loss = max(loss, 1e-6)
                 if not math.isfinite(loss) or (name == "loss" and loss > self.limit):
-                    raise TrainingError(f"{self.out}: {self.diverged(name, loss, number, label)}")
+                    raise TrainingError(f"{self.out}: {self.diverged(name, loss, number)}")
                 sums[name] = sums.get(name, 0.0) + loss
         unchecked.clear()
 
@@ -216,7 +203,7 @@ class Training(ABC):
             tensors |= records.optimizer_tensors(optimizer, f"optimizer.{name}")
         seconds = self.before + sum(record["seconds"] for record in self.history[self.resumed_at :])
         state = {"history": self.history, "first_loss": self.first_loss, "seconds": seconds}
-        records.save_checkpoint(self.out / CHECKPOINT, tensors, {**self.identity, **state, **self.state()})
+        records.save_checkpoint(self.out / CHECKPOINT, tensors, {**self.identity, **state})
 
 
 def alone_in(out: Path) -> AbstractContextManager[None]:

@@ -14,18 +14,15 @@ With p the prediction, t the target, both in the training representation, and e 
 - Half precisions are computed in float32 (2,100 mm squared is beyond float16), float64 in float64.
 """
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
 
-from fpp_ml_bench.baselines.training.tables import check_loss
-from fpp_ml_bench.errors import RecipeError
+from fpp_ml_bench.baselines.training.recipe import check_loss
 from fpp_ml_bench.loaders.training import FringeDepth
 
 EPSILON = 1e-8
@@ -128,19 +125,11 @@ def _wide(values: Tensor) -> Tensor:
 
 
 Step = tuple[str, Tensor, dict[str, Tensor]]
-"""Module to update, its loss (0-d, with gradient), and what to log (0-d, detached; no name occurs twice a batch)."""
+"""Module to update, its loss (0-d, with gradient), and what to log (0-d, detached; no name occurs twice a batch).
 
-
-class Objective(Protocol):
-    """What is minimised: it owns its networks and gives the engine the losses, one by one. Every call goes through
-    ``modules``: the engine may put wrapped networks (several processes, mixed precision, compiled) there. The weights
-    file holds ``modules["network"]``. An objective of depth also has ``validation_losses(prediction, batch)``, (B,), of
-    which rate schedule and choice of weights see the mean."""
-
-    modules: dict[str, nn.Module]
-
-    def steps(self, batch: Any) -> Iterator[Step]:
-        """The updates of one batch. The engine takes each one before it asks for the next."""
+An objective owns its networks and gives the engine such steps of a batch, one by one; each is taken before the next is
+asked for. Every call goes through its ``modules``: the engine may put wrapped networks (several processes, mixed
+precision, compiled) there. The weights file holds ``modules["network"]``."""
 
 
 class Regression:
@@ -175,7 +164,7 @@ class Regression:
 class AdversarialSettings:
     """Weights of the generator's terms; the defaults are those of the authors' pix2pixHD. ``l1`` and ``gradient_l1``
     weigh differences in [-1, 1], ``scale_invariant_log`` logarithms of depths in [0, 1], ``hybrid_l1`` that loss with
-    ``alpha`` in [0, 1]. Raises `RecipeError` for a weight that is negative or not finite."""
+    ``alpha`` in [0, 1]."""
 
     adversarial: float = 1.0
     feature_matching: float = 10.0
@@ -190,11 +179,6 @@ class AdversarialSettings:
         """The defaults for None. Else Isola et al.'s objective with the hybrid L1 in the place of their L1, of weight
         100 for differences in [-1, 1], so 200 here; and the feature matching of pix2pixHD, which it is adapted from."""
         return cls() if alpha is None else cls(1.0, 10.0, 0.0, 0.0, 0.0, 200.0, alpha)
-
-    def __post_init__(self) -> None:
-        for name, weight in asdict(self).items():
-            if isinstance(weight, bool) or not isinstance(weight, (int, float)) or not 0 <= weight < math.inf:
-                raise RecipeError(f"loss gan: weight {name}: expected a number from 0 up, got {weight!r}")
 
 
 class Adversarial:

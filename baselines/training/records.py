@@ -3,28 +3,29 @@
 The checkpoint is a safetensors file, never a pickle, of networks, optimisers, schedule and history.
 """
 
-import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+from pydantic import TypeAdapter
 from rich import progress as bar
 from rich.console import Console
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from fpp_ml_bench.errors import TrainingError
-from fpp_ml_bench.files import opened, strict_json, write_atomically
+from fpp_ml_bench.baselines.training.weights import Family, file_bytes, read_file
+from fpp_ml_bench.errors import TrainingError, WeightsError
+from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.style import figure, figure_png, styled
 
 LOG_FILE, CURVE_FILE = "log.jsonl", "curve.png"
-_FORMAT = "fpp-ml-bench training 1"
+Item = TypeVar("Item")
 State = dict[str, Tensor]
 Record = dict[str, Any]
+CHECKPOINTS = Family("fpp-ml-bench training", TypeAdapter(Record), "RECIPE", nn.Module)
 
 
 def optimizer_tensors(optimizer: Optimizer, prefix: str) -> State:
@@ -44,37 +45,28 @@ def restore_optimizer(optimizer: Optimizer, tensors: State, prefix: str) -> None
     optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
 
 
-def save_checkpoint(path: Path, tensors: State, state: dict[str, Any]) -> None:
+def save_checkpoint(path: Path, tensors: State, state: Record) -> None:
     """Write ``tensors`` and the JSON mapping ``state``, sealed with a digest of both."""
-    contiguous = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
-    text = json.dumps(state, allow_nan=False)
-    write_atomically(path, save(contiguous, {"format": _FORMAT, "state": text, "sha256": _seal(contiguous, text)}))
+    write_atomically(path, file_bytes(CHECKPOINTS, {**state, "sha256": _seal(tensors, state)}, tensors))
 
 
-def read_checkpoint(path: Path) -> tuple[State, dict[str, Any]]:
+def read_checkpoint(path: Path) -> tuple[State, Record]:
     """What `save_checkpoint` wrote. TrainingError for a file that is cut off, changed or something else."""
-    cure = f"; delete {path} to train again from the start"
+    cure = f"delete {path} to train again from the start"
     try:
-        with opened(path, links=True), safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  it is no mapping
-    except (SafetensorError, OSError, ValueError) as why:
-        raise TrainingError(f"{path}: expected a checkpoint of this package, it can't be read ({why}){cure}") from None
-    if metadata.get("format") != _FORMAT:
-        raise TrainingError(f"{path}: expected {_FORMAT!r}, got {metadata.get('format')!r}{cure}")
-    if metadata.get("sha256") != _seal(tensors, metadata.get("state", "")):
-        raise TrainingError(f"{path}: its content does not match its own checksum, it was damaged{cure}")
-    try:
-        return tensors, strict_json(metadata["state"])
-    except (ValueError, KeyError) as why:
-        raise TrainingError(f"{path}: its state is no valid JSON ({why}){cure}") from None
+        state, tensors, _ = read_file(path, CHECKPOINTS)
+    except WeightsError as error:
+        raise TrainingError(f"{error}; {cure}") from None
+    if state.pop("sha256", None) != _seal(tensors, state):
+        raise TrainingError(f"{path}: its content does not match its own checksum, it was damaged; {cure}")
+    return tensors, state
 
 
-def _seal(tensors: State, text: str) -> str:
-    digest = hashlib.sha256(text.encode())
+def _seal(tensors: State, state: Record) -> str:
+    digest = sha256(json.dumps(state, sort_keys=True, allow_nan=False).encode())
     for name in sorted(tensors):
         digest.update(name.encode())
-        digest.update(tensors[name].numpy().reshape(-1).view("uint8").data)
+        digest.update(tensors[name].detach().cpu().contiguous().numpy().reshape(-1).view("uint8").data)
     return digest.hexdigest()
 
 
@@ -147,6 +139,12 @@ class Display:
     def advance(self, steps: int = 1) -> None:
         """So many more steps are done."""
         self.progress.advance(self.task, steps)
+
+    def followed(self, items: Iterable[Item]) -> Iterator[Item]:
+        """``items``, each a step that is done when the next is asked for."""
+        for item in items:
+            yield item
+            self.advance()
 
     def update(self, steps_done: int, state: str) -> None:
         """All steps so far, now or by an earlier call, and words on where they led."""

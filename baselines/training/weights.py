@@ -6,8 +6,9 @@ Pickles are never opened: that can run code. The same tensors and configuration 
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -53,134 +54,141 @@ class TrainingBenchmark:
         return f"{self.name} version {self.version}"
 
 
-@checked_dataclass(frozen=True, config=_STRICT)
-class ModelConfig:
+@checked_dataclass(frozen=True, config=_STRICT, kw_only=True)
+class TrainedConfig:
     """What a trained network is, and what it was trained on. ``ValueError`` for a wrong type or unknown value.
 
-    ``network`` and ``options`` are what ``networks.build`` takes; ``normalisation`` is what it puts out, ``image_size``
-    (H, W) in px the only size it is meant for. ``data_config`` names the frames it was trained on,
-    ``background_removed`` says that its input is 0 outside the object, ``range_rule`` by which depth range it was
-    normalised (``object`` in older files). ``benchmark`` is None for a dataset of the
-    user's own, and in older files; ``recipe`` the resolved recipe, ``validation`` the scores of these weights."""
+    ``options``: arguments that build it again; ``benchmark`` is None for a dataset of the user's own, and in older
+    files; ``recipe``: the resolved recipe; ``validation``: the scores of these weights."""
 
     name: Text
     title: Text
-    network: Text
     options: dict[Text, Any]
-    normalisation: Normalisation
-    image_size: tuple[Pixels, Pixels]
     dataset_fingerprint: Fingerprint
     benchmark: TrainingBenchmark | None = None
+    recipe: dict[Text, Any] = field(default_factory=dict)
+    validation: dict[Text, Scalar] = field(default_factory=dict)
+
+
+@checked_dataclass(frozen=True, config=_STRICT, kw_only=True)
+class ModelConfig(TrainedConfig):
+    """A network from image to depth. ``network`` and ``options`` are what ``networks.build`` takes; ``normalisation``
+    is what it puts out, ``image_size`` (H, W) in px the only size it is meant for. ``data_config`` names the frames it
+    was trained on, ``background_removed`` says that its input is 0 outside the object, ``range_rule`` by which depth
+    range it was normalised (``object`` in older files)."""
+
+    network: Text
+    normalisation: Normalisation
+    image_size: tuple[Pixels, Pixels]
     data_config: Text = "single_shot"
     background_removed: bool = False
     range_rule: RangeRule = "object"
-    recipe: dict[Text, Any] = field(default_factory=dict)
     epoch: Count = 0
-    validation: dict[Text, Scalar] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.data_config not in CONFIGS:
             raise ValueError(f"unknown data_config {self.data_config!r}; there are {', '.join(CONFIGS)}")
 
 
-@checked_dataclass(frozen=True, config=_STRICT)
-class NetConfig:
-    """What a phase network is, how its answers are used, and what it was trained on. ``options``: arguments of
-    `PhaseNet`; ``threshold``: logit from which on a pixel is object; ``lead``: what is added to the logit of the base
-    order, ``temperature``, ``offset`` and ``doubted`` as of `learned.Odds`, all chosen on validation views;
-    ``period_px``: image px per fringe period of the training images, by direction; ``steps`` trained; the others as in
-    `ModelConfig`."""
+@checked_dataclass(frozen=True, config=_STRICT, kw_only=True)
+class NetConfig(TrainedConfig):
+    """The network of a learned method, and how its answers are used. ``threshold``: logit from which on a pixel is
+    object; ``lead``: what is added to the logit of the base order; ``temperature``, ``offset`` and ``doubted`` as of
+    `learned.Odds`, all chosen on validation views; ``period_px``: image px per fringe period of the training images, by
+    direction; ``steps`` trained."""
 
-    name: Text
-    title: Text
-    options: dict[Text, Any]
     threshold: Finite
     period_px: dict[Text, Finite]
-    dataset_fingerprint: Fingerprint
-    benchmark: TrainingBenchmark | None = None
     lead: Finite = 0.0
     temperature: Finite = 1.0
     offset: Finite = 0.0
     doubted: Finite = 1.0
     steps: Count = 0
-    recipe: dict[Text, Any] = field(default_factory=dict)
-    validation: dict[Text, Scalar] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
 class Family:
-    """A kind of networks: ``format`` and configuration of their files, and words on other files."""
+    """A kind of networks: ``format`` and configuration of their files, the ``recipe`` that ``fpp-bench train`` is given
+    for them, and what builds the network of a configuration. ``half``: that files hold half precision."""
 
     format: str
     config: TypeAdapter[Any]
-    kind: str
-    file: str
-    cure: str
+    recipe: str
+    build: Callable[[Any], Any]
+    half: bool = True
 
 
-DEPTH_NETWORKS = Family(
-    "fpp-ml-bench",
-    TypeAdapter(ModelConfig),
-    "a weights file",
-    f"{SUFFIX} file",
-    "a safetensors file of something else holds no configuration to rebuild the network from",
-)
+def _depth_network(config: ModelConfig) -> "nn.Module":
+    from fpp_ml_bench.baselines.networks.model import build  # imports this module
+
+    network = build(config.network, **config.options)
+    network.check_size(*config.image_size)
+    return network
+
+
+def _refiner(kind: str, config: NetConfig) -> "nn.Module":
+    from fpp_ml_bench.baselines.learned import network  # imports this module
+
+    return getattr(network, kind)(**config.options)  # type: ignore[no-any-return]
+
+
+DEPTH_NETWORKS = Family("fpp-ml-bench", TypeAdapter(ModelConfig), "RECIPE", _depth_network, half=False)
 FILTER_NETWORKS = Family(
-    "fpp-ml-bench classical-net",
-    TypeAdapter(NetConfig),
-    "classical-net weights",
-    "classical-net weights",
-    "give a file that fpp-bench train classical-net wrote",
+    "fpp-ml-bench classical-net", TypeAdapter(NetConfig), "classical-net", partial(_refiner, "DepthFilter")
 )
-PHASE_NETWORKS = Family(
-    "fpp-ml-bench phase-net",
-    TypeAdapter(NetConfig),
-    "phase-net weights",
-    "phase-net weights",
-    "give a file that fpp-bench train phase-net wrote",
-)
+PHASE_NETWORKS = Family("fpp-ml-bench phase-net", TypeAdapter(NetConfig), "phase-net", partial(_refiner, "PhaseNet"))
 
 
 @dataclass(frozen=True)
 class WeightsFile:
-    """A checked file: ``tensors`` are the network's, ``heads`` the range heads' without their prefix (may be empty)."""
+    """A checked file: its ``network`` in float32, in eval mode, and the range heads' tensors without their prefix (may
+    be empty)."""
 
     path: Path
-    config: ModelConfig
-    tensors: "dict[str, Tensor]"
+    config: Any
+    network: Any
     heads: "dict[str, Tensor]"
     sha256: str
 
 
 def save_weights(
-    path: str | Path, network: "nn.Module", config: ModelConfig, heads: "Mapping[str, Tensor] | None" = None
-) -> None:
-    """Write ``network`` (its ``state_dict``) and ``heads`` to ``path``, complete or not at all. Raises `WeightsError`
-    for tensors that are not finite, that do not fit the network that ``config`` builds, and for a path that can't be
-    written."""
+    path: str | Path,
+    network: "nn.Module",
+    config: TrainedConfig,
+    heads: "Mapping[str, Tensor] | None" = None,
+    family: Family = DEPTH_NETWORKS,
+) -> str:
+    """Write ``network`` (its ``state_dict``) and ``heads`` to ``path``, complete or not at all; the file's SHA-256.
+    Raises `WeightsError` for tensors that are not finite, that do not fit the network that ``config`` builds, and for a
+    path that can't be written."""
     path = Path(path)
     if path.suffix != SUFFIX:
         raise _fault(path, f": expected a name that ends in {SUFFIX}; weights are saved as nothing else")
-    tensors = network.state_dict()
-    clash = next((name for name in tensors if name.startswith(HEAD_PREFIX)), None)
-    if clash is not None:
-        raise _fault(path, f": the network's {clash!r} starts with {HEAD_PREFIX!r}, kept for range heads")
-    _check_tensors(path, config, tensors)
-    head_tensors = {HEAD_PREFIX + name: tensor for name, tensor in (heads or {}).items()}
-    _check_finite(path, head_tensors)
-    write_file(path, DEPTH_NETWORKS, config, {**tensors, **head_tensors})
+    _built(path, config, network.state_dict(), family)
+    tensors = {**network.state_dict(), **{HEAD_PREFIX + name: tensor for name, tensor in (heads or {}).items()}}
+    if family.half:
+        tensors = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in tensors.items()}
+    _check_finite(path, tensors)
+    data = file_bytes(family, config, tensors)
+    try:
+        write_atomically(path, data)
+    except OSError as error:
+        raise _fault(path, f" can't be written: {error.strerror}; give a folder that exists") from None
+    return sha256(data).hexdigest()
 
 
-def open_weights(path: str | Path) -> WeightsFile:
-    """Everything in the weights file of a depth network, checked. `WeightsError` as `read_file`, and for tensors that
-    are not finite or that do not fit the network that the configuration builds."""
+def open_weights(path: str | Path, family: Family = DEPTH_NETWORKS) -> WeightsFile:
+    """Everything in a weights file of ``family``, checked. `WeightsError` as `read_file`, and for tensors that are not
+    finite or that do not fit the network that the configuration builds."""
     path = Path(path)
-    config, tensors, digest = read_file(path, DEPTH_NETWORKS)
-    head_tensors = {name: tensors.pop(name) for name in list(tensors) if name.startswith(HEAD_PREFIX)}
-    _check_tensors(path, config, tensors)
-    _check_finite(path, head_tensors)
-    heads = {name.removeprefix(HEAD_PREFIX): tensor for name, tensor in head_tensors.items()}
-    return WeightsFile(path, config, tensors, heads, digest)
+    config, tensors, digest = read_file(path, family)
+    _check_finite(path, tensors)
+    heads = {name.removeprefix(HEAD_PREFIX): tensors.pop(name) for name in [*tensors] if name.startswith(HEAD_PREFIX)}
+    if family.half:
+        tensors = {name: tensor.float() if tensor.is_floating_point() else tensor for name, tensor in tensors.items()}
+    network = _built(path, config, tensors, family)
+    network.load_state_dict(tensors, assign=True)
+    return WeightsFile(path, config, network.eval(), heads, digest)
 
 
 def shipped_names(folder: Path | None = None) -> list[str]:
@@ -210,14 +218,14 @@ def training_benchmark(content: Mapping[str, str]) -> TrainingBenchmark | None:
     return None if benchmark is None else TrainingBenchmark(benchmark.name, benchmark.version)
 
 
-def trained_on(config: "ModelConfig | NetConfig") -> TrainingBenchmark | None:
+def trained_on(config: TrainedConfig) -> TrainingBenchmark | None:
     """The benchmark that weights were trained on, None where it is none. Version 1 of a benchmark, which had the same
     images and depths, counts as today's."""
     same = benchmark_before(config.dataset_fingerprint)
     return config.benchmark if same is None else TrainingBenchmark(same.name, same.version)
 
 
-def training_data_warning(config: "ModelConfig | NetConfig", manifest: Manifest) -> str | None:
+def training_data_warning(config: TrainedConfig, manifest: Manifest) -> str | None:
     """A sentence where weights are used on another version of the benchmark that they were trained on, or where nothing
     is known about their training data; else None. Only for a named benchmark, or a dataset built with its settings: on
     imported data, a dataset with settings of its own and another benchmark the user chose so."""
@@ -235,18 +243,20 @@ def training_data_warning(config: "ModelConfig | NetConfig", manifest: Manifest)
     )
 
 
-def write_file(path: Path, family: Family, config: ModelConfig | NetConfig, tensors: "Mapping[str, Tensor]") -> str:
-    """Write ``tensors`` and ``config``, complete or not at all; the file's SHA-256. `WeightsError` where it can't."""
+def file_bytes(family: Family, config: Any, tensors: "Mapping[str, Tensor]") -> bytes:
+    """A file of ``family``: always the same bytes for the same ``tensors`` and ``config``."""
     from safetensors.torch import save
 
     plain = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in tensors.items()}
     text = family.config.dump_json(config).decode("utf-8")
-    data = _ordered_header(save(plain, {"format": family.format, "version": VERSION, "config": text}))
-    try:
-        write_atomically(path, data)
-    except OSError as error:
-        raise _fault(path, f" can't be written: {error.strerror}; give a folder that exists") from None
-    return sha256(data).hexdigest()
+    data = save(plain, {"format": family.format, "version": VERSION, "config": text})
+    # safetensors writes the metadata's keys in an order that changes from run to run.
+    length = int.from_bytes(data[:8], "little")
+    header = json.loads(data[8 : 8 + length].decode("utf-8"))
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    encoded = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode("utf-8")
+    encoded += b" " * (-len(encoded) % 8)  # tensors start aligned
+    return len(encoded).to_bytes(8, "little") + encoded + data[8 + length :]
 
 
 def read_file(path: Path, family: Family) -> "tuple[Any, dict[str, Tensor], str]":
@@ -258,7 +268,7 @@ def read_file(path: Path, family: Family) -> "tuple[Any, dict[str, Tensor], str]
 
     if not path.is_file():
         actual = "a folder" if path.is_dir() else "no file" if path.exists() else "nothing"
-        raise _fault(path, f": expected {family.kind} (*{SUFFIX}), found {actual} there")
+        raise _fault(path, f": expected weights of {family.format} (*{SUFFIX}), found {actual} there")
     data = file_content(path, LARGEST_BYTES, WeightsError, "give a weights file")
     metadata = _metadata(path, data, family)
     try:
@@ -290,32 +300,30 @@ def _metadata(path: Path, data: bytes, family: Family) -> dict[str, Any]:
         if not isinstance(metadata, dict):
             raise ValueError("its metadata is no mapping")
     except (ValueError, AttributeError) as error:
-        words = f": damaged or no {family.file} ({printable(str(error), 200)}); copy or train it again"
+        words = f": damaged or no {SUFFIX} file ({printable(str(error), 200)}); copy or train it again"
         raise _fault(path, words) from None
     form, version = (printable(str(metadata.get(key)), 60) for key in ("format", "version"))
     if metadata.get("format") != family.format:
-        raise _fault(path, f": expected weights of {family.format}, got format {form!r}: {family.cure}")
+        cure = f"give what fpp-bench train {family.recipe} wrote"
+        raise _fault(path, f": expected weights of {family.format}, got format {form!r}; {cure}")
     if metadata.get("version") != VERSION:
         cure = "read it with the version of fpp-ml-bench that wrote it, or train again"
         raise _fault(path, f": expected version {VERSION}, got {version!r}; {cure}")
     return metadata
 
 
-def _check_tensors(path: Path, config: ModelConfig, tensors: "Mapping[str, Tensor]") -> None:
-    """Refuse tensors that are not exactly those of the network that ``config`` builds, or that are not finite."""
+def _built(path: Path, config: Any, tensors: "Mapping[str, Tensor]", family: Family) -> "nn.Module":
+    """The network that ``config`` makes, without memory. Refuses tensors that are not exactly its own."""
     import torch
-
-    from fpp_ml_bench.baselines.networks.model import build  # imports this module
 
     try:
         with torch.device("meta"):
-            network = build(config.network, **config.options)
-        network.check_size(*config.image_size)
+            network = family.build(config)
         expected = network.state_dict()
     except (FppBenchError, TypeError, ValueError, RuntimeError) as error:
         raise _fault(path, f": its configuration makes no network: {printable(str(error), 300)}") from None
     options = ", ".join(f"{key}={value}" for key, value in config.options.items()) or "its defaults"
-    built = f"{config.network} with {printable(options, 200)}"
+    built = f"{getattr(config, 'network', family.recipe)} with {printable(options, 200)}"
     for name in tensors:
         if name not in expected:
             raise _fault(path, f": tensor {printable(name, 100)} is none of {built}")
@@ -325,7 +333,7 @@ def _check_tensors(path: Path, config: ModelConfig, tensors: "Mapping[str, Tenso
         wanted, actual = (f"{str(t.dtype).removeprefix('torch.')} {tuple(t.shape)}" for t in (tensor, tensors[name]))
         if actual != wanted:
             raise _fault(path, f": tensor {name}: expected {wanted} for {built}, got {actual}")
-    _check_finite(path, tensors)
+    return network
 
 
 def _check_finite(path: Path, tensors: "Mapping[str, Tensor]") -> None:
@@ -333,16 +341,6 @@ def _check_finite(path: Path, tensors: "Mapping[str, Tensor]") -> None:
         if tensor.is_floating_point() and not bool(tensor.isfinite().all()):
             words = "holds values that are not finite; the training diverged or the file is damaged"
             raise _fault(path, f": tensor {printable(name, 100)} {words}")
-
-
-def _ordered_header(data: bytes) -> bytes:
-    """The same file with its metadata keys sorted: safetensors writes them in an order that changes from run to run."""
-    length = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8 : 8 + length].decode("utf-8"))
-    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
-    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode("utf-8")
-    text += b" " * (-len(text) % 8)  # tensors start aligned
-    return len(text).to_bytes(8, "little") + text + data[8 + length :]
 
 
 def _fault(path: Path, words: str) -> WeightsError:

@@ -9,8 +9,7 @@ from typing import Any
 
 from fpp_ml_bench.baselines import registry
 from fpp_ml_bench.baselines.reproduce.plan import Folders, planned, variants
-from fpp_ml_bench.baselines.training.recipe import load_recipe, table_rows
-from fpp_ml_bench.baselines.training.tables import PRESETS, TABLES
+from fpp_ml_bench.baselines.training.recipe import PRESETS, TABLES, load_recipe, table_rows
 from fpp_ml_bench.cli import CHECK_FAILED, OK
 from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.cli.methods import MethodCommand

@@ -21,10 +21,9 @@ from scored_dataset import make_dataset
 
 from fpp_ml_bench import pool
 from fpp_ml_bench.baselines.diagnostics.probe import diagnose
-from fpp_ml_bench.baselines.learned.classical_training import FilterRecipe
-from fpp_ml_bench.baselines.learned.crossed_training import CrossedRecipe
-from fpp_ml_bench.baselines.learned.training import Recipe
-from fpp_ml_bench.baselines.learned.window_training import train_net
+from fpp_ml_bench.baselines.learned.filter_recipe import FilterRecipe
+from fpp_ml_bench.baselines.learned.recipes import CrossedRecipe, PhaseRecipe
+from fpp_ml_bench.baselines.learned.training import train_net
 from fpp_ml_bench.baselines.training.engine import CHECKPOINT, alone_in
 from fpp_ml_bench.baselines.training.records import save_checkpoint
 from fpp_ml_bench.cli import main, main_eval, run_command
@@ -73,7 +72,7 @@ def test_what_a_killed_run_left_locks_nothing_and_the_evaluator_says_what_it_is(
 def test_of_two_that_train_in_a_folder_one_is_told(tmp_path):
     out = tmp_path / "run"
     with alone_in(out):
-        for recipe in (Recipe(), CrossedRecipe(), FilterRecipe()):
+        for recipe in (PhaseRecipe(), CrossedRecipe(), FilterRecipe()):
             with pytest.raises(TrainingError, match=r"another process is training in this folder; wait for it"):
                 train_net(recipe, out)
     assert list(out.iterdir()) == []

@@ -10,22 +10,28 @@ import torch
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.learned import window_training
-from fpp_ml_bench.baselines.learned.classical_method import ClassicalNetMethod
-from fpp_ml_bench.baselines.learned.classical_network import BOUND_SIGMAS, REACH, DepthFilter
-from fpp_ml_bench.baselines.learned.classical_route import Filtered, decided, filtered
-from fpp_ml_bench.baselines.learned.classical_scene import CHANNELS, DepthScene, channels
-from fpp_ml_bench.baselines.learned.classical_training import (
+from fpp_ml_bench.baselines.learned import training
+from fpp_ml_bench.baselines.learned.filter_recipe import (
     THRESHOLDS,
-    DepthSample,
     FilterRecipe,
     chosen_threshold,
-    sample_of,
+    depth_sample,
     score,
 )
-from fpp_ml_bench.baselines.learned.window_training import train_net
+from fpp_ml_bench.baselines.learned.method import ClassicalNetMethod
+from fpp_ml_bench.baselines.learned.network import BOUND_SIGMAS, REACH, DepthFilter
+from fpp_ml_bench.baselines.learned.routes import (
+    DEPTH_CHANNELS,
+    DepthScene,
+    Filtered,
+    decided,
+    depth_channels,
+    filtered,
+)
+from fpp_ml_bench.baselines.learned.scenes import Group, View, read_views, render_views
+from fpp_ml_bench.baselines.learned.training import train_net
+from fpp_ml_bench.baselines.learned.windows import Sample
 from fpp_ml_bench.baselines.registry import load_method
-from fpp_ml_bench.baselines.training.views import Group, View, read_views, render_views
 from fpp_ml_bench.baselines.training.weights import SHIPPED
 from fpp_ml_bench.errors import NetworkError, TrainingError, WeightsError
 from fpp_ml_bench.loaders.render.light import named_light
@@ -52,8 +58,8 @@ def views(tmp_path_factory: pytest.TempPathFactory) -> Views:
 
 
 @pytest.fixture(scope="module")
-def samples(views: Views) -> list[DepthSample]:
-    found = [sample_of(view, method()) for view in views]
+def samples(views: Views) -> list[Sample]:
+    found = [depth_sample(view, method()) for view in views]
     assert all(found)
     return found  # type: ignore[return-value]
 
@@ -68,13 +74,13 @@ def frames_of(view: View) -> list:
 def wild(seed: int = 0) -> DepthFilter:
     """A network that was not trained, with weights far from their first values."""
     torch.manual_seed(seed)
-    network = DepthFilter(len(CHANNELS), (4, 6)).eval()
+    network = DepthFilter(len(DEPTH_CHANNELS), (4, 6)).eval()
     torch.nn.init.normal_(network.answer.weight, std=3.0)
     return network
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_no_depth_that_no_neighbour_has(samples: list[DepthSample], seed: int) -> None:
+def test_no_depth_that_no_neighbour_has(samples: list[Sample], seed: int) -> None:
     scene = samples[0].scene
     holes = replace(scene, found=scene.found & (np.random.default_rng(seed).random(scene.found.shape) > 0.2))
     scene = replace(holes, depth_mm=holes.depth_mm * holes.found, sigma_mm=holes.sigma_mm * holes.found)
@@ -90,10 +96,10 @@ def test_no_depth_that_no_neighbour_has(samples: list[DepthSample], seed: int) -
     assert not (decided(answer, scene, -np.inf) & ~answer.near & ~scene.found).any()
 
 
-def test_what_the_network_sees_has_no_distance_unit_or_direction(samples: list[DepthSample]) -> None:
+def test_what_the_network_sees_has_no_distance_unit_or_direction(samples: list[Sample]) -> None:
     scene = samples[0].scene
-    seen = channels(scene)
-    assert seen.shape == (len(CHANNELS), *scene.found.shape) and np.isfinite(seen).all()
+    seen = depth_channels(scene)
+    assert seen.shape == (len(DEPTH_CHANNELS), *scene.found.shape) and np.isfinite(seen).all()
     twice = replace(
         scene,
         depth_mm=2 * scene.depth_mm,
@@ -102,28 +108,34 @@ def test_what_the_network_sees_has_no_distance_unit_or_direction(samples: list[D
         unit_mm=2 * scene.unit_mm,
         bright=scene.bright / 4,
     )
-    np.testing.assert_allclose(channels(twice), seen, atol=2e-3)
-    np.testing.assert_allclose(channels(scene.with_maps(np.rot90)), np.rot90(seen, axes=(-2, -1)), atol=2e-3)
+    np.testing.assert_allclose(depth_channels(twice), seen, atol=2e-3)
+    np.testing.assert_allclose(
+        depth_channels(scene.with_maps(lambda name, maps: np.ascontiguousarray(np.rot90(maps)))),
+        np.rot90(seen, axes=(-2, -1)),
+        atol=2e-3,
+    )
 
 
-def test_a_sample_holds_the_exact_depth(views: Views, samples: list[DepthSample]) -> None:
+def test_a_sample_holds_the_exact_depth(views: Views, samples: list[Sample]) -> None:
     view, sample = views[0], samples[0]
-    exact = sample.exact_mm + sample.scene.middle_mm
+    exact = sample.missing + sample.scene.middle_mm
     np.testing.assert_allclose(exact[sample.target], view.depth_mm[sample.scene.crop][sample.target], atol=2e-3)
-    error = (sample.scene.depth_mm - sample.exact_mm)[sample.target & sample.scene.found]
+    error = (sample.scene.depth_mm - sample.missing)[sample.target & sample.scene.found]
     assert 0.05 < np.median(np.abs(error)) < 2
     random, task = np.random.default_rng(1), FilterRecipe(window=96).task(paper_rig(SIZE))
     for _ in range(8):
         window = task.draw(samples, random)
-        assert window.x.shape == (len(CHANNELS), 96, 96) and window.depth_mm.shape == window.valid.shape == (96, 96)
-        assert (window.x[0] == window.found).all() and not (window.target & ~window.valid).any()
+        assert window["x"].shape == (len(DEPTH_CHANNELS), 96, 96) and window["depth_mm"].shape == window[
+            "valid"
+        ].shape == (96, 96)
+        assert (window["x"][0] == window["found"]).all() and not (window["target"] & ~window["valid"]).any()
     blank = replace(view, frames=np.zeros_like(view.frames))
-    assert sample_of(blank, method()) is None
+    assert depth_sample(blank, method()) is None
 
 
-def test_the_threshold_lets_no_view_lose(samples: list[DepthSample]) -> None:
-    def filling(sample: DepthSample, logits: np.ndarray) -> Filtered:
-        zeros = np.zeros_like(sample.exact_mm)
+def test_the_threshold_lets_no_view_lose(samples: list[Sample]) -> None:
+    def filling(sample: Sample, logits: np.ndarray) -> Filtered:
+        zeros = np.zeros_like(sample.missing)
         return Filtered(zeros, zeros, logits.astype(np.float32), np.ones_like(sample.target))
 
     right = [filling(one, np.where(one.target, 2.5, -2.5)) for one in samples]
@@ -135,7 +147,7 @@ def test_the_threshold_lets_no_view_lose(samples: list[DepthSample]) -> None:
 
 
 def test_training_resumes_to_the_same_weights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(window_training, "groups_of", lambda *args: GROUPS)
+    monkeypatch.setattr(training, "groups_of", lambda *args: GROUPS)
     recipe = FilterRecipe(steps=4, batch=2, window=64, widths=(4, 6), validate_every=2, lights=0)
     rig = paper_rig(SIZE)
     whole = train_net(recipe, tmp_path / "whole", rig=rig)
@@ -164,18 +176,18 @@ def test_the_shipped_weights_take_noise_away_on_every_view(views: Views) -> None
         np.testing.assert_array_equal(filter_method.predict(frames_of(view)), answer.depth)
 
 
-def test_scores_count_a_missed_pixel_with_its_whole_depth(samples: list[DepthSample]) -> None:
+def test_scores_count_a_missed_pixel_with_its_whole_depth(samples: list[Sample]) -> None:
     sample = samples[0]
     exact = Filtered(
-        sample.exact_mm,
-        np.ones_like(sample.exact_mm),
-        np.full(sample.exact_mm.shape, -9.0, np.float32),
+        sample.missing,
+        np.ones_like(sample.missing),
+        np.full(sample.missing.shape, -9.0, np.float32),
         np.ones_like(sample.target),
     )
     found = replace(sample.scene, found=sample.scene.found & (np.arange(sample.target.shape[1]) % 2 == 0))
     scores = score(exact, replace(sample, scene=found), 0.0)
     missed = sample.target & ~found.found
-    whole = (sample.exact_mm + found.middle_mm)[missed].sum(dtype=np.float64) / sample.target.sum()
+    whole = (sample.missing + found.middle_mm)[missed].sum(dtype=np.float64) / sample.target.sum()
     assert scores["object_mae_mm"] == pytest.approx(whole, rel=1e-5)
     assert scores["missed_percent"] == pytest.approx(100 * missed.sum() / sample.target.sum())
 

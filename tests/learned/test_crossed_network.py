@@ -7,18 +7,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fpp_ml_bench.baselines.learned import crossed_inputs as inputs
-from fpp_ml_bench.baselines.learned import window_training
-from fpp_ml_bench.baselines.learned.crossed_method import CrossedNetMethod
-from fpp_ml_bench.baselines.learned.crossed_route import CrossedNetRoute, decided_mask, stated_rad
-from fpp_ml_bench.baselines.learned.crossed_training import CrossedRecipe, CrossedSample, Variation, sample_of
+from fpp_ml_bench.baselines.learned import training
+from fpp_ml_bench.baselines.learned.inputs import CROSSED_CHANNELS, CrossedScene, crossed_channels
+from fpp_ml_bench.baselines.learned.method import CrossedNetMethod
 from fpp_ml_bench.baselines.learned.network import load_net
-from fpp_ml_bench.baselines.learned.odds import Answers, threshold_at
-from fpp_ml_bench.baselines.learned.window_training import train_net
-from fpp_ml_bench.baselines.learned.windows import IGNORED
+from fpp_ml_bench.baselines.learned.odds import Answers, decided_mask, threshold_at
+from fpp_ml_bench.baselines.learned.recipes import CrossedRecipe, CrossedVariation, crossed_sample
+from fpp_ml_bench.baselines.learned.routes import CrossedNetRoute, stated_rad
+from fpp_ml_bench.baselines.learned.scenes import Group, View, read_views, render_views, with_unions
+from fpp_ml_bench.baselines.learned.training import train_net
+from fpp_ml_bench.baselines.learned.windows import IGNORED, Sample, symmetric
 from fpp_ml_bench.baselines.phase.depth import CrossedRoute
 from fpp_ml_bench.baselines.registry import load_method
-from fpp_ml_bench.baselines.training.views import Group, View, read_views, render_views, with_unions
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import PredictionError, TrainingError, WeightsError
 from fpp_ml_bench.loaders.render.light import named_light
@@ -29,7 +29,7 @@ GROUPS = [
     Group("paper", named_light("paper"), (("wood_block", "A0"), ("duct_tape", "A60"))),
     Group("validation-paper", named_light("paper"), (("mug", "A0"),), "validation"),
 ]
-STILL = Variation(near_edge=0.5, wrong_window=0, wrong_patch=0, no_plane=0)
+STILL = CrossedVariation(near_edge=0.5, wrong_window=0, wrong_patch=0, no_plane=0)
 
 
 @cache
@@ -45,22 +45,22 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def samples(folder: Path) -> list[CrossedSample]:
+def samples(folder: Path) -> list[Sample]:
     learned = with_unions(read_views(folder, GROUPS, "train"), unions=1, seed=1)
-    return [sample_of(view, route()) for view in learned]
+    return [crossed_sample(view, route()) for view in learned]
 
 
-def test_the_truth_of_a_sample_is_the_exact_depth(samples: list[CrossedSample], folder: Path) -> None:
+def test_the_truth_of_a_sample_is_the_exact_depth(samples: list[Sample], folder: Path) -> None:
     sample, view = samples[0], next(read_views(folder, GROUPS, "train"))
     part = route().carriers.at(sample.scene.crop)
-    truth = sample.scene.nearness + sample.missing_rad.astype(np.float32) / part.joint_gain
+    truth = sample.scene.nearness + sample.missing.astype(np.float32) / part.joint_gain
     exact = view.depth_mm[sample.scene.crop]
-    near = sample.target & (np.abs(sample.missing_rad) < 2)  # half precision: 1e-3 of 2 rad
+    near = sample.target & (np.abs(sample.missing) < 2)  # half precision: 1e-3 of 2 rad
     assert near.sum() > 500
     assert np.abs(part.depth_mm(truth) - exact)[near].max() < 0.1
 
 
-def test_a_union_shows_the_nearer_object(samples: list[CrossedSample]) -> None:
+def test_a_union_shows_the_nearer_object(samples: list[Sample]) -> None:
     names = [sample.name for sample in samples]
     assert names[:2] == ["wood_block_A0", "duct_tape_A60"] and all("+" in name for name in names[2:])
     # All that both objects show, but for what the nearer hides and pixels that mix them.
@@ -68,36 +68,40 @@ def test_a_union_shows_the_nearer_object(samples: list[CrossedSample]) -> None:
 
 
 @pytest.mark.parametrize("turn", range(8))
-def test_windows_mean_the_same_in_every_orientation(samples: list[CrossedSample], turn: int) -> None:
+def test_windows_mean_the_same_in_every_orientation(samples: list[Sample], turn: int) -> None:
     # Turning the picture and measuring is turning what was measured: sides and slopes point to the turned places.
     scene = samples[0].scene.single()
     size = min(scene.light.shape)
     scene = scene.window(slice(0, size), slice(0, size))
-    x, _ = inputs.channels(scene, route().carriers)
-    (psi,), turned = inputs.symmetric([scene.nearness * route().carriers.at(scene.crop).joint_gain], x, turn)
-    inside = turned[inputs.CHANNELS.index("measured mask")] > 0
+    x, _ = crossed_channels(scene, route().carriers)
+    psi = scene.nearness * route().carriers.at(scene.crop).joint_gain
+    window = symmetric({"x": x, "psi": psi}, CROSSED_CHANNELS, turn)
+    psi, turned = window["psi"], window["x"]
+    inside = turned[CROSSED_CHANNELS.index("measured mask")] > 0
     along = np.gradient(psi, axis=0)[inside], np.gradient(psi, axis=1)[inside]
-    for channel, slope in zip((inputs.DOWN, inputs.RIGHT), along, strict=True):
+    for way, slope in zip(("down", "right"), along, strict=True):
+        channel = CROSSED_CHANNELS.index(f"slope {way}")
         assert np.corrcoef(turned[channel][inside], np.clip(slope, -0.3, 0.3))[0, 1] > 0.4
-    back = turned
     for bit in (4, 2, 1):
-        (), back = inputs.symmetric([], back, turn & bit)
-    assert np.array_equal(back, x)
+        window = symmetric(window, CROSSED_CHANNELS, turn & bit)
+    assert np.array_equal(window["x"], x)
 
 
-def test_labels_say_which_candidate_and_how_far(samples: list[CrossedSample]) -> None:
+def test_labels_say_which_candidate_and_how_far(samples: list[Sample]) -> None:
     rng = np.random.default_rng(5)
     for vary in (STILL, replace(STILL, wrong_window=1.0)):
         seen, task = [], CrossedRecipe(window=64, vary=vary).task(crossed_rig(SIZE))
         for _ in range(12):
             window = task.draw(samples, rng)
-            assert np.isfinite(window.x).all() and window.x.shape == (len(inputs.CHANNELS), 64, 64)
-            labelled = window.order != IGNORED
-            assert np.array_equal(labelled, window.fitted)
-            assert (np.abs(window.correction_rad[labelled]) < 2.3).all()
-            assert np.take_along_axis(window.exists, np.where(labelled, window.order, 1)[None], 0)[0][labelled].all()
-            assert not (window.target & ~window.mask_valid).any()
-            seen += [window.order[labelled]]
+            assert np.isfinite(window["x"]).all() and window["x"].shape == (len(CROSSED_CHANNELS), 64, 64)
+            labelled = window["order"] != IGNORED
+            assert np.array_equal(labelled, window["fitted"])
+            assert (np.abs(window["correction_rad"][labelled]) < 2.3).all()
+            assert np.take_along_axis(window["exists"], np.where(labelled, window["order"], 1)[None], 0)[0][
+                labelled
+            ].all()
+            assert not (window["target"] & ~window["mask_valid"]).any()
+            seen += [window["order"][labelled]]
         base = (np.concatenate(seen) == 1).mean()
         assert base > 0.9 if vary is STILL else base < 0.9
 
@@ -105,7 +109,7 @@ def test_labels_say_which_candidate_and_how_far(samples: list[CrossedSample]) ->
 def test_a_training_in_small_is_resumed_and_predicts(
     tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(window_training, "groups_of", lambda *args: GROUPS)
+    monkeypatch.setattr(training, "groups_of", lambda *args: GROUPS)
     recipe = CrossedRecipe(
         steps=2, validate_every=1, batch=1, window=64, widths=(4, 4), order_widths=(4, 4), fine=4, squeezed=4
     )
@@ -125,7 +129,7 @@ def test_a_training_in_small_is_resumed_and_predicts(
     answer = method.answer(frames)
     assert answer.depth.dtype == np.float32 and np.isfinite(answer.depth).all()
     assert np.array_equal(answer.sigma_mm > 0, answer.depth > 0)
-    assert load_net(trained.weights).network.options["channels"] == len(inputs.CHANNELS)
+    assert load_net(trained.weights).network.options["channels"] == len(CROSSED_CHANNELS)
 
 
 def test_depths_lie_on_measured_candidates_whatever_the_network_says(folder: Path) -> None:
@@ -133,7 +137,7 @@ def test_depths_lie_on_measured_candidates_whatever_the_network_says(folder: Pat
     learned = CrossedNetRoute(crossed_rig(SIZE), recipe.network().eval(), threshold=0.0, lead=0.0)
     view = next(read_views(folder, GROUPS, "train"))
     seen = learned.route.fitted(learned.route.observe(view.frames[0]))
-    scene = inputs.Scene.of(seen)
+    scene = CrossedScene.of(seen)
     shape = scene.light.shape
     rng = np.random.default_rng(0)
     logits = np.where(scene.exists, rng.normal(size=(3, *shape)), -np.inf)
@@ -142,7 +146,7 @@ def test_depths_lie_on_measured_candidates_whatever_the_network_says(folder: Pat
     answers = Answers(logits, np.full(shape, 9.0), correction, np.full(shape, 0.1))
     measured = learned.conclude(seen, scene, answers)
     part = seen.carriers
-    known = (scene.share > inputs.LEAST_SHARE) & (measured.depth_mm[part.crop] > 0)
+    known = scene.known & (measured.depth_mm[part.crop] > 0)
     psi = part.nearness(np.where(known, measured.depth_mm[part.crop], 1000.0)) * part.joint_gain
     offers = scene.nearness * part.joint_gain + np.stack([scene.step_rad[0], np.zeros(shape), scene.step_rad[1]])
     apart = np.abs(psi - correction - offers).min(axis=0)
@@ -176,12 +180,12 @@ def test_what_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> 
         np.zeros((SIZE, SIZE), np.float32),
         np.zeros((SIZE, SIZE), bool),
     )
-    assert not sample_of(view, route()).target.any()
+    assert not crossed_sample(view, route()).target.any()
     with pytest.raises(TrainingError, match=r"delete it"):
         next(read_views(tmp_path, GROUPS, "train"))
 
 
-def test_the_mask_asks_for_less_in_a_weak_frame(samples: list[CrossedSample]) -> None:
+def test_the_mask_asks_for_less_in_a_weak_frame(samples: list[Sample]) -> None:
     scene = samples[0].scene.single()
     assert scene.strength > 25  # the light paper
     limits = [threshold_at(strength, -0.5) for strength in (0.0, 5.0, 20.0, 40.0, 200.0)]

@@ -7,10 +7,10 @@ import pytest
 import torch
 from flat_planes import FIRST, OTHER_RIG, RIG, USERS_WORD, photograph, plane_depth_m, plane_fringe
 
-from fpp_ml_bench.baselines.learned.inputs import CHANNELS
+from fpp_ml_bench.baselines.learned.inputs import PHASE_CHANNELS
 from fpp_ml_bench.baselines.learned.method import PhaseNetMethod
 from fpp_ml_bench.baselines.learned.network import PhaseNet, load_net
-from fpp_ml_bench.baselines.learned.route import NetworkRoute
+from fpp_ml_bench.baselines.learned.routes import PhaseNetRoute
 from fpp_ml_bench.baselines.phase.calibration_layer import TAU
 from fpp_ml_bench.baselines.phase.depth import Reason
 from fpp_ml_bench.baselines.phase.observe import Settings
@@ -42,7 +42,7 @@ def test_random_weights_stay_on_the_candidates(direction: str) -> None:
     one candidate, its order is that one."""
     bound = 0.5
     settings = Settings(direction=direction)
-    network_route = NetworkRoute(RIG, settings, wild(bound), threshold=-1e9)
+    network_route = PhaseNetRoute(RIG, settings, wild(bound), threshold=-1e9)
     image = photograph("cork", "A60").frames[FIRST[direction]]
     measurement, measured = network_route.measure(image), network_route.geometry.route
     observation = measured.observe(image)
@@ -67,7 +67,7 @@ def test_a_range_under_one_period_settles_the_order(direction: str) -> None:
     short = replace(RIG, working_range_mm=(1685.0, 1915.0))
     assert short.periods_in_range(direction) < 1  # type: ignore[arg-type]
     image = photograph("cork", "A60").frames[FIRST[direction]]
-    route = NetworkRoute(short, Settings(direction=direction), wild(0.5), threshold=-1e9)  # type: ignore[arg-type]
+    route = PhaseNetRoute(short, Settings(direction=direction), wild(0.5), threshold=-1e9)  # type: ignore[arg-type]
     measurement, observation = route.measure(image), route.geometry.route.observe(image)
     crop, candidates = observation.crop, observation.candidates
     one = (candidates.count == 1) & (measurement.depth_mm[crop] > 0)
@@ -108,7 +108,7 @@ def test_brighter_or_darker_frames_have_the_same_depth() -> None:
 
 def test_an_empty_scene_has_no_depth() -> None:
     empty = plane_fringe(RIG, 0, plane_depth_m(RIG, RIG.background_m))
-    assert not NetworkRoute(RIG, Settings(), wild(0.5), threshold=-1e9).measure(empty).depth_mm.any()
+    assert not PhaseNetRoute(RIG, Settings(), wild(0.5), threshold=-1e9).measure(empty).depth_mm.any()
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
@@ -119,7 +119,7 @@ def test_a_plane_that_fills_the_frame(distance_m: float, direction: str) -> None
     rig, file = part_of(paper_rig(960), 240), load_net()
     told = Settings(direction, **USERS_WORD)  # type: ignore[arg-type]
     image = plane_fringe(rig, FIRST[direction], plane_depth_m(rig, distance_m))
-    measurement = NetworkRoute(rig, told, file.network, file.config.threshold, lead=file.config.lead).measure(image)
+    measurement = PhaseNetRoute(rig, told, file.network, file.config.threshold, lead=file.config.lead).measure(image)
     assert (measurement.depth_mm > 0).mean() > 0.98
     assert np.abs(measurement.depth_mm - 1000 * distance_m)[measurement.depth_mm > 0].mean() < 2.0
 
@@ -128,7 +128,7 @@ def test_a_plane_that_fills_the_frame(distance_m: float, direction: str) -> None
 def test_beyond_the_end_of_the_range_there_is_no_depth(translation_m: tuple[float, float, float]) -> None:
     """Whatever the network's correction, at the range's end and where the projector is on the camera's axis."""
     rig = replace(part_of(paper_rig(960), 240), translation_m=translation_m)
-    network_route = NetworkRoute(rig, Settings(**USERS_WORD), wild(0.5), threshold=-1e9)  # type: ignore[arg-type]
+    network_route = PhaseNetRoute(rig, Settings(**USERS_WORD), wild(0.5), threshold=-1e9)  # type: ignore[arg-type]
     measurement = network_route.measure(plane_fringe(rig, 0, plane_depth_m(rig, 2.095, (0.06, 0.0)), (0.06, 0.0)))
     depth_mm, outside = measurement.depth_mm, measurement.reason == Reason.OUT_OF_RANGE
     assert outside.mean() > 0.05 and not depth_mm[outside].any()
@@ -218,7 +218,7 @@ def test_refusals_name_what_came() -> None:
     with pytest.raises(PredictionError, match="learned one albedo"):
         PhaseNetMethod(RIG, weights=load_net(), albedo="any")
     with pytest.raises(NetworkError, match="multiples of 16"):
-        PhaseNet().forward(torch.zeros(1, len(CHANNELS), 40, 32))
+        PhaseNet().forward(torch.zeros(1, len(PHASE_CHANNELS), 40, 32))
     with pytest.raises(NetworkError, match="bound_rad"):
         PhaseNet(bound_rad=4.0)
     with pytest.raises(NetworkError, match="states its uncertainty"):

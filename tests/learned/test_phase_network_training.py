@@ -11,22 +11,17 @@ import pytest
 import torch
 from flat_planes import DIRECT, USERS_WORD, plane_depth_m, plane_fringe
 
-from fpp_ml_bench.baselines.learned import window_training
-from fpp_ml_bench.baselines.learned.inputs import CHANNELS, Geometry, Rotation
-from fpp_ml_bench.baselines.learned.network import PhaseNet, load_net, save_net
-from fpp_ml_bench.baselines.learned.training import (
-    PhaseSample,
-    PhaseTask,
-    Recipe,
-    Variation,
-    sample_of,
-)
-from fpp_ml_bench.baselines.learned.window_training import WindowTraining, train_net
+from fpp_ml_bench.baselines.learned import training
+from fpp_ml_bench.baselines.learned.inputs import PHASE_CHANNELS, Geometry, Rotation
+from fpp_ml_bench.baselines.learned.network import PhaseNet, load_net
+from fpp_ml_bench.baselines.learned.recipes import PhaseRecipe, PhaseTask, Variation, phase_sample
+from fpp_ml_bench.baselines.learned.scenes import Group, View, read_views
+from fpp_ml_bench.baselines.learned.training import WindowTraining, train_net
+from fpp_ml_bench.baselines.learned.windows import Sample
 from fpp_ml_bench.baselines.phase.observe import Settings
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.training.engine import CHECKPOINT, reproducible
-from fpp_ml_bench.baselines.training.views import Group, View, read_views
-from fpp_ml_bench.baselines.training.weights import SHIPPED, NetConfig
+from fpp_ml_bench.baselines.training.weights import PHASE_NETWORKS, SHIPPED, NetConfig, save_weights
 from fpp_ml_bench.errors import RecipeError, TrainingError, WeightsError
 from fpp_ml_bench.loaders.render.light import named_light
 from fpp_ml_bench.optics.named_rigs import paper_rig
@@ -34,7 +29,7 @@ from fpp_ml_bench.optics.named_rigs import paper_rig
 RIG = paper_rig(240)
 AS_CAPTURED = Variation(near_edge=0, shift=0, wrong_window=0, wrong_patch=0, mirror=0, brightness=0)
 OPTIONS = {"widths": [4, 6], "fine": 4, "squeezed": 6, "order_widths": [4, 6], "bound_rad": 1.0, "uncertain": True}
-SMALL = Recipe(
+SMALL = PhaseRecipe(
     steps=4,
     batch=2,
     window=48,
@@ -62,14 +57,14 @@ def geometry(direction: str = "horizontal") -> Geometry:
     return Geometry.of(RIG, Settings(direction=direction, **USERS_WORD))  # type: ignore[arg-type]
 
 
-def plane(distance_m: float, direction: str = "horizontal") -> PhaseSample:
+def plane(distance_m: float, direction: str = "horizontal") -> Sample:
     """A tilted plane that fills the frame; one ray a pixel, since the fringe is to be as deep as it is bright."""
     tilt = (0.1, -0.1)
     depth_m = plane_depth_m(RIG, distance_m, tilt)
     image = plane_fringe(RIG, 0 if direction == "horizontal" else 18, depth_m, tilt, noise=0.3, light=DIRECT)
     depth_mm, nothing = (1000 * depth_m).astype(np.float32), np.zeros(depth_m.shape, bool)
     view = View("plane_A0", "plane", "paper", image[None], depth_mm, nothing)
-    sample = sample_of(view, image, geometry(direction))
+    sample = phase_sample(view, image, geometry(direction))
     assert sample is not None
     return sample
 
@@ -94,16 +89,22 @@ def test_an_object_that_is_moved_looks_as_if_it_stood_there(direction: str) -> N
     moved, random = replace(AS_CAPTURED, shift=1.0), [ToTheMiddle(np.random.PCG64(1)) for _ in range(2)]
     moved_window = task(240, moved, direction).draw([plane(1.7, direction)], random[0])
     captured_window = task(240, AS_CAPTURED, direction).draw([plane(1.8, direction)], random[1])
-    lit = moved_window.fitted & captured_window.fitted & (moved_window.x[CHANNELS.index("window share")] > 0.9)
-    lit &= moved_window.x[CHANNELS.index("brightness")] > -0.5  # the projector's field ends before the camera's
+    lit = (
+        moved_window["fitted"]
+        & captured_window["fitted"]
+        & (moved_window["x"][PHASE_CHANNELS.index("window share")] > 0.9)
+    )
+    lit &= (
+        moved_window["x"][PHASE_CHANNELS.index("brightness")] > -0.5
+    )  # the projector's field ends before the camera's
     assert lit.mean() > 0.5
-    for name, tolerance in (("brightness", 0.03), ("base: brightness misfit", 0.05), ("slope along", 0.02)):
-        channel = CHANNELS.index(name)
-        assert np.abs(np.median(moved_window.x[channel][lit] - captured_window.x[channel][lit])) < tolerance, name
+    for name, tolerance in (("brightness", 0.03), ("base: brightness misfit", 0.05), ("slope down", 0.02)):
+        channel = PHASE_CHANNELS.index(name)
+        assert np.abs(np.median(moved_window["x"][channel][lit] - captured_window["x"][channel][lit])) < tolerance, name
     # Fringe and phase part by what an object keeps and a frame-filling plane does not: its place in the image.
-    assert np.abs(moved_window.x[CHANNELS.index("fit misfit")][lit]).mean() < 0.03
-    assert (moved_window.order[lit] == 1).mean() > 0.99
-    assert np.abs(moved_window.correction_rad[lit]).mean() < 0.05
+    assert np.abs(moved_window["x"][PHASE_CHANNELS.index("fit misfit")][lit]).mean() < 0.03
+    assert (moved_window["order"][lit] == 1).mean() > 0.99
+    assert np.abs(moved_window["correction_rad"][lit]).mean() < 0.05
 
 
 def test_wrong_first_orders_are_labelled_as_such() -> None:
@@ -112,12 +113,12 @@ def test_wrong_first_orders_are_labelled_as_such() -> None:
     orders = []
     for seed in range(4):
         window = task(96, vary).draw(samples, np.random.default_rng(seed))
-        assert np.take_along_axis(window.exists, np.maximum(window.order, 0)[None], 0)[0][window.fitted].all()
-        orders += [window.order[window.fitted]]
+        assert np.take_along_axis(window["exists"], np.maximum(window["order"], 0)[None], 0)[0][window["fitted"]].all()
+        orders += [window["order"][window["fitted"]]]
     labels = np.unique(np.concatenate(orders))
     assert {0, 2} & set(labels.tolist())
     captured = task(96).draw(samples, np.random.default_rng(0))
-    assert (captured.order[captured.fitted] == 1).mean() > 0.95
+    assert (captured["order"][captured["fitted"]] == 1).mean() > 0.95
 
 
 def test_turning_for_the_network_and_back() -> None:
@@ -135,7 +136,7 @@ def test_stopping_and_going_on_gives_the_same_weights(tmp_path: Path) -> None:
     def scores(network: PhaseNet) -> dict[str, float]:
         return small.scores(network, samples[:1])
 
-    def trained(name: str, recipe: Recipe = SMALL, minutes: float | None = None) -> WindowTraining:
+    def trained(name: str, recipe: PhaseRecipe = SMALL, minutes: float | None = None) -> WindowTraining:
         (tmp_path / name).mkdir(exist_ok=True)
         with reproducible(cpu=True):
             training = WindowTraining(recipe, partial(small.draw, samples), scores, tmp_path / name)
@@ -171,17 +172,21 @@ def test_recipes_that_train_nothing_are_refused() -> None:
     assert SMALL.rate_at(0) > SMALL.rate_at(3) > 0
 
 
+def save_net(path: Path, network: PhaseNet, config: NetConfig) -> str:
+    return save_weights(path, network, config, family=PHASE_NETWORKS)
+
+
 def test_weights_come_back_as_they_were(tmp_path: Path) -> None:
     torch.manual_seed(0)
     network = PhaseNet(**OPTIONS)
     torch.nn.init.normal_(network.answer.weight)
-    network(torch.rand(2, len(CHANNELS), 24, 24))  # the normalisation has seen something
+    network(torch.rand(2, len(PHASE_CHANNELS), 24, 24))  # the normalisation has seen something
     path = tmp_path / "small.safetensors"
     digest = save_net(path, network, CONFIG)
     assert save_net(tmp_path / "again.safetensors", network, CONFIG) == digest
     file = load_net(path)
     assert (file.sha256, file.config) == (digest, CONFIG)
-    x = torch.rand(1, len(CHANNELS), 24, 24)
+    x = torch.rand(1, len(PHASE_CHANNELS), 24, 24)
     with torch.inference_mode():
         for answer, loaded in zip(network.eval()(x), file.network(x), strict=True):
             # Every weight is rounded to half precision, by 2**-12 of it at most; float32 rounding is far below that.
@@ -197,14 +202,18 @@ def test_weights_that_are_none_are_refused(tmp_path: Path) -> None:
     cut, junk, wider = tmp_path / "cut.safetensors", tmp_path / "junk.safetensors", tmp_path / "wider.safetensors"
     cut.write_bytes(data[:-100])
     junk.write_bytes(b"not weights at all")
-    save_net(wider, PhaseNet(**OPTIONS), replace(CONFIG, options=OPTIONS | {"widths": [4, 8]}))
+    wide = PhaseNet(**OPTIONS | {"widths": [4, 8]})
+    save_net(wider, wide, replace(CONFIG, options=wide.options))
+    wider.write_bytes(wider.read_bytes().replace(rb"\"widths\":[4,8]", rb"\"widths\":[4,6]"))
+    with pytest.raises(WeightsError, match=r"tensor .*: expected float32"):
+        save_net(tmp_path / "not.safetensors", PhaseNet(**OPTIONS), replace(CONFIG, options=wide.options))
     unet = next(SHIPPED.glob("*.safetensors"))
     for file, message in (
         (tmp_path / "none.safetensors", "found nothing"),
         (cut, "damaged"),
         (junk, "cut off|damaged"),
         (unet, "expected weights of fpp-ml-bench phase-net"),
-        (wider, "not those of its network"),
+        (wider, "tensor .*: expected float32"),
     ):
         with pytest.raises(WeightsError, match=message):
             load_net(file)
@@ -226,7 +235,7 @@ def test_a_training_in_small_is_resumed_and_predicts(tmp_path: Path, monkeypatch
         Group("paper", named_light("paper"), (("wood_block", "A0"), ("duct_tape", "A60"))),
         Group("validation-paper", named_light("paper"), (("mug", "A0"),), "validation"),
     ]
-    monkeypatch.setattr(window_training, "groups_of", lambda *args: groups)
+    monkeypatch.setattr(training, "groups_of", lambda *args: groups)
     out, recipe = tmp_path / "run", replace(SMALL, steps=2, validate_every=1, batch=1, albedo="any")
     first = train_net(recipe, out, rig=rig, minutes=1e-9)
     assert first.weights is None and first.steps == 1

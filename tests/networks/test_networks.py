@@ -9,7 +9,6 @@ import torch
 from tiny_network import SMALL, one_thread, rounding_error  # noqa: F401
 from torch import nn
 
-from fpp_ml_bench.baselines.networks.base import parameter_count
 from fpp_ml_bench.baselines.networks.model import NETWORKS, build, discriminator
 from fpp_ml_bench.errors import NetworkError
 
@@ -45,6 +44,10 @@ STRIDES = {"unet": 16, "transunet": 16, "resunet": 8, "hformer": 32, "pix2pix": 
 @pytest.fixture(autouse=True)
 def _seed():
     torch.manual_seed(0)
+
+
+def parameter_count(module):
+    return sum(parameter.numel() for parameter in module.parameters())
 
 
 @pytest.mark.parametrize("name", NETWORKS)

@@ -11,8 +11,7 @@ from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.baselines.reproduce import plan
 from fpp_ml_bench.baselines.reproduce.plan import Folders, default_folder, open_dataset, planned, variants
-from fpp_ml_bench.baselines.training.recipe import load_recipe
-from fpp_ml_bench.baselines.training.tables import PRESETS, TABLES
+from fpp_ml_bench.baselines.training.recipe import PRESETS, TABLES, load_recipe
 from fpp_ml_bench.cli import train as command
 from fpp_ml_bench.errors import DatasetError, RecipeError
 from fpp_ml_bench.evaluation.report.comparison import compare

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from fpp_ml_bench.baselines.training.losses import EPSILON, loss_function, sample_losses
-from fpp_ml_bench.baselines.training.tables import LOSSES
+from fpp_ml_bench.baselines.training.recipe import LOSSES
 from fpp_ml_bench.errors import RecipeError
 
 ALL = [(name, alpha) for name in LOSSES for alpha in ((0.0, 0.3, 0.7, 1.0) if name.startswith("hybrid") else (None,))]

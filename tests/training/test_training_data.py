@@ -8,11 +8,12 @@ import pytest
 from scored_dataset import name_benchmarks
 from tiny_network import config_of, tiny_network
 
-from fpp_ml_bench.baselines.learned.network import PhaseNet, load_net, save_net
+from fpp_ml_bench.baselines.learned.network import PhaseNet, load_net
 from fpp_ml_bench.baselines.training import weights as training_data
 from fpp_ml_bench.baselines.training.depth_training import model_config
 from fpp_ml_bench.baselines.training.recipe import load_recipe
 from fpp_ml_bench.baselines.training.weights import (
+    PHASE_NETWORKS,
     SHIPPED,
     NetConfig,
     TrainingBenchmark,
@@ -62,7 +63,12 @@ def test_a_new_weights_file_names_its_benchmark(benchmarks, opened, tmp_path):
         path = tmp_path / "net.safetensors"
         save_weights(path, network, config)
         assert open_weights(path).config.benchmark == expected
-        save_net(path, PhaseNet(**NET_OPTIONS), phase_net_config(benchmark=training_benchmark(data.content)))
+        save_weights(
+            path,
+            PhaseNet(**NET_OPTIONS),
+            phase_net_config(benchmark=training_benchmark(data.content)),
+            family=PHASE_NETWORKS,
+        )
         assert load_net(path).config.benchmark == expected
 
 
@@ -72,7 +78,9 @@ def test_a_file_without_the_entry_is_read(tmp_path):
     assert named == {TrainingBenchmark("fpp-bench-full-224", 1)}
     assert load_net().config.benchmark == TrainingBenchmark("phase-net views", 1)
     path = tmp_path / "net.safetensors"
-    save_net(path, PhaseNet(**NET_OPTIONS), phase_net_config(benchmark=TrainingBenchmark("tiny", 1)))
+    save_weights(
+        path, PhaseNet(**NET_OPTIONS), phase_net_config(benchmark=TrainingBenchmark("tiny", 1)), family=PHASE_NETWORKS
+    )
     data = path.read_bytes()
     length = int.from_bytes(data[:8], "little")
     header = json.loads(data[8 : 8 + length])
@@ -133,7 +141,7 @@ def test_the_commands_warn_once_and_go_on(benchmarks, opened, tiny, tmp_path, ca
     if method == "phase-net":
         period_px = opened.rig.image_px_per_period("horizontal")
         config = phase_net_config(period_px={"horizontal": period_px}, dataset_fingerprint=OLD)
-        save_net(tmp_path / "net.safetensors", PhaseNet(**NET_OPTIONS), config)
+        save_weights(tmp_path / "net.safetensors", PhaseNet(**NET_OPTIONS), config, family=PHASE_NETWORKS)
         options += ["--weights", tmp_path / "net.safetensors"]
     assert main([str(argument) for argument in (command, method, tiny, *options)]) == 0
     warnings = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]

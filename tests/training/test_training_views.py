@@ -3,7 +3,7 @@
 import numpy as np
 from flat_planes import plane_depth_m, plane_fringe
 
-from fpp_ml_bench.baselines.training.views import View, companions, drawn_light, groups_of, united, with_unions
+from fpp_ml_bench.baselines.learned.scenes import View, companions, drawn_light, groups_of, united, with_unions
 from fpp_ml_bench.optics.named_rigs import paper_rig
 
 RIG = paper_rig(240)
@@ -63,7 +63,13 @@ def test_a_union_is_what_the_rig_captures_of_both() -> None:
         for depth, tilt in zip(depths, tilts, strict=True)
     ]
     images[1][-1, 0] = 0  # a shadow on the plane stays
-    image, depth_mm = united(images, [1000 * depth_m for depth_m in depths])
+    nothing = np.zeros(rows.shape, bool)
+    both = [
+        View(name, name, "x", image[None], (1000 * depth_m).astype(np.float32), nothing)
+        for name, image, depth_m in zip("ab", images, depths, strict=True)
+    ]
+    union = united(both)
+    (image,), depth_mm = union.frames, union.depth_mm
     first = (depths[0] > 0) & ((depths[1] == 0) | (depths[0] <= depths[1]))
     second = (depths[1] > 0) & ~first
     assert (first & (depths[1] > 0)).mean() > 0.05 and (second & (depths[0] > 0)).mean() > 0.05

@@ -47,7 +47,7 @@ def config_with(path, **changes):
 
 def test_what_goes_in_comes_out(saved, network):
     file = open_weights(saved)
-    config, tensors, heads = file.config, file.tensors, file.heads
+    config, tensors, heads = file.config, file.network.state_dict(), file.heads
     assert config == config_of(network) and config.image_size == (32, 48) and config.recipe["loss"]["alpha"] == 0.7
     assert tensors.keys() == network.state_dict().keys()
     for name, tensor in network.state_dict().items():

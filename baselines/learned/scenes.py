@@ -1,4 +1,4 @@
-"""The views that phase-net and crossed-net learn from: objects in lights that are drawn at random, rendered and kept.
+"""The views that the learned methods learn from: objects in lights that are drawn at random, rendered and kept.
 
 A light is drawn stage by stage of the image formation: exposure, noise, ambient light, response, defocus, blur, albedo
 maps, gloss, shadows. Each serves several views, so that some of them can be united into one image: the nearest surface
@@ -8,13 +8,14 @@ one another. The validation views are the validation objects in two lights of th
 """
 
 import json
-import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from hashlib import sha256
+from io import BytesIO
+from itertools import groupby
 from math import exp, log
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.training.records import Display
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M, OBJECTS, VIEWS, split_of
 from fpp_ml_bench.errors import TrainingError
+from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.render.light import Light, named_light
 from fpp_ml_bench.loaders.render.meshes import solid_mesh
 from fpp_ml_bench.loaders.render.scene import BuildSettings
@@ -30,7 +32,6 @@ from fpp_ml_bench.loaders.sample import VOID
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.pool import mapping
 
-Measured = TypeVar("Measured")
 VALIDATION_LIGHTS = ("paper", "workshop")
 DRAWN_VALIDATION_VIEWS = 3  # of validation objects in each light that is drawn for them
 SHADOW_GREY = 6.0
@@ -61,6 +62,28 @@ class View:
     depth_mm: NDArray[np.float32]
     void: NDArray[np.bool_]
     united: bool = False
+
+    @property
+    def target(self) -> NDArray[np.bool_]:
+        """Object pixels that are not void."""
+        return (self.depth_mm > 0) & ~self.void
+
+    def part(self, crop: tuple[slice, slice]) -> "View":
+        """The view cut to ``crop``."""
+        frames = self.frames[:, *crop]
+        return replace(self, frames=frames, depth_mm=self.depth_mm[crop], void=self.void[crop])
+
+
+def photographed(
+    studio: Studio, name: str, view: str, frames: tuple[int, ...]
+) -> tuple[NDArray[np.uint8], NDArray[np.float32], NDArray[np.uint8]]:
+    """An object in a view as a ``studio`` sees it, with the rig, light and seed of its settings: ``frames`` (indices in
+    the rig's sequence) uint8 (n, H, W), exact depth in mm float32 (H, W), 0 = background, and the pixels' `Flag`."""
+    scene = studio.trace(solid_mesh(name), view)
+    studio.expose(scene, frames)
+    depth_mm = np.zeros((studio.rig.camera.height, studio.rig.camera.width), np.float32)
+    depth_mm.ravel()[scene.hits.pixels] = scene.hits.depth_m * MM_PER_M
+    return np.stack([studio.frame(frame) for frame in frames]), depth_mm, studio.flags(scene)[0]
 
 
 def drawn_light(random: np.random.Generator) -> Light:
@@ -155,49 +178,28 @@ def fingerprint_of(recipe: dict[str, Any], groups: list[Group]) -> str:
 
 
 def render_views(
-    groups: list[Group],
-    rig: Rig,
-    frames: tuple[int, ...],
-    folder: Path,
-    workers: int,
-    progress: Callable[[int], None] = lambda views: None,
+    groups: list[Group], rig: Rig, frames: tuple[int, ...], folder: Path, workers: int, show: bool = False
 ) -> None:
-    """Render what ``folder`` does not hold yet of ``frames`` (indices in the rig's sequence), a file a view. Raises
-    `TrainingError` for a folder that can't be written."""
+    """Render what ``folder`` does not hold yet of ``frames`` (indices in the rig's sequence), a file a view. ``show``:
+    progress on stderr. Raises OSError where ``folder`` can't be written."""
     missing = [group for group in groups if not all(_file(folder, group, *view).exists() for view in group.views)]
-    progress(sum(len(group.views) for group in groups) - sum(len(group.views) for group in missing))
-    if not missing:
-        return
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise TrainingError(f"{folder}: can't be written ({error.strerror})") from error
-    with mapping((rig, frames, folder), workers) as mapped:
-        for count in mapped(_render_group, missing):
-            progress(count)
+    with Display("rendering views", sum(len(group.views) for group in missing), show) as display:
+        if missing:
+            folder.mkdir(parents=True, exist_ok=True)
+            with mapping((rig, frames, folder), workers) as mapped:
+                for count in mapped(_render_group, missing):
+                    display.advance(count)
 
 
 def _render_group(work: tuple[Rig, tuple[int, ...], Path], group: Group) -> int:
     rig, frames, folder = work
     objects = tuple(sorted({name for name, _ in group.views}))
     studio = Studio(BuildSettings(rig=rig, objects=objects, light=group.light))
-    shape = rig.camera.height, rig.camera.width
     for name, view in group.views:
-        scene = studio.trace(solid_mesh(name), view)
-        studio.expose(scene, frames)
-        depth_mm = np.zeros(shape, np.float32)
-        depth_mm.ravel()[scene.hits.pixels] = scene.hits.depth_m * MM_PER_M
-        void = (studio.flags(scene)[0] & VOID) != 0
-        file = _file(folder, group, name, view)
-        temporary = file.with_name(f".{file.name}.{os.getpid()}.tmp")
-        try:
-            with temporary.open("wb") as stream:
-                images = np.stack([studio.frame(frame) for frame in frames])
-                np.savez_compressed(stream, frames=images, depth_mm=depth_mm, void=void)
-            temporary.replace(file)
-        except OSError as error:
-            temporary.unlink(missing_ok=True)
-            raise TrainingError(f"{file}: can't be written ({error.strerror}); free some space") from error
+        images, depth_mm, flags = photographed(studio, name, view, frames)
+        content = BytesIO()
+        np.savez_compressed(content, frames=images, depth_mm=depth_mm, void=(flags & VOID) != 0)
+        write_atomically(_file(folder, group, name, view), content.getvalue(), sync=False)
     return len(group.views)
 
 
@@ -215,84 +217,46 @@ def read_views(folder: Path, groups: list[Group], split: str) -> Iterator[View]:
             yield View(f"{name}_{view}", name, group.name, *maps)
 
 
-def measured_views(
-    groups: list[Group],
-    rig: Rig,
-    frames: tuple[int, ...],
-    folder: Path,
-    measure: Callable[[Iterable[View]], list[Measured]],
-    unions: int,
-    seed: int,
-    workers: int,
-    show: bool,
-) -> tuple[list[Measured], list[Measured]]:
-    """What ``measure`` makes of the training views, with ``unions`` for each, and of the validation views; those that
-    ``folder`` lacks are rendered first. ``show``: progress on stderr. Raises `TrainingError` as `render_views` and
-    `read_views`."""
-    views = sum(len(group.views) for group in groups)
-    with Display("rendering views", views, show) as display:
-        render_views(groups, rig, frames, folder, workers, display.advance)
-    learnt = sum(len(group.views) for group in groups if group.split == "train")
-    with Display("measuring views", views + learnt * unions, show) as display:
-        learned = with_unions(read_views(folder, groups, "train"), unions, seed, display.advance)
-        kept = with_unions(read_views(folder, groups, "validation"), 0, 0, display.advance)
-        return measure(learned), measure(kept)
-
-
 def _file(folder: Path, group: Group, name: str, view: str) -> Path:
     return folder / f"{group.name}-{name}-{view}.npz"
 
 
-def with_unions(
-    views: Iterable[View], unions: int, seed: int, progress: Callable[[int], None] = lambda n: None
-) -> Iterator[View]:
+def with_unions(views: Iterable[View], unions: int, seed: int) -> Iterator[View]:
     """``views``, group after group, each followed by ``unions`` for each of its views with others of the group."""
-    group: list[View] = []
     made = 0
-
-    def united_views() -> Iterator[View]:
-        objects = {view.name: view.object_name for view in group}
-        by_name = {view.name: view for view in group}
+    for _, members in groupby(views, lambda view: view.group):
+        group = []
+        for view in members:
+            group.append(view)
+            yield view
+        objects, by_name = {view.name: view.object_name for view in group}, {view.name: view for view in group}
         for number, view in enumerate(group):
             for copy in range(unions):
                 random = np.random.default_rng([seed, made, number, copy])
-                members = [view, *(by_name[name] for name in companions(objects, view.name, random))]
-                if len(members) > 1:
-                    yield _union(members)
-                progress(1)
-
-    for view in views:
-        if group and view.group != group[-1].group:
-            yield from united_views()
-            made += len(group)
-            group.clear()
-        group.append(view)
-        yield view
-        progress(1)
-    yield from united_views()
+                others = [by_name[name] for name in companions(objects, view.name, random)]
+                if others:
+                    yield united([view, *others])
+        made += len(group)
 
 
-def _union(members: list[View]) -> View:
-    frames, depth_mm = united([view.frames for view in members], [view.depth_mm for view in members])
-    ranges = np.stack([np.where(view.depth_mm > 0, view.depth_mm, np.inf) for view in members])
-    void = np.take_along_axis(np.stack([view.void for view in members]), ranges.argmin(axis=0)[None], axis=0)[0]
-    first = members[0]
-    return View("+".join(view.name for view in members), first.object_name, first.group, frames, depth_mm, void, True)
-
-
-def united(
-    images: Sequence[NDArray[np.uint8]], depths_mm: Sequence[NDArray[np.floating]]
-) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-    """Images uint8 (..., H, W) and depth in mm float32 (H, W), 0 = background, of all objects together. The nearest
-    surface counts; without one, the first image's background, or another image's where it is in shadow."""
-    ranges, stacked = np.stack([np.where(depth > 0, depth, np.inf) for depth in depths_mm]), np.stack(images)
-    nearest = ranges.argmin(axis=0)
-    depth = np.take_along_axis(ranges, nearest[None], axis=0)[0]
-    place = np.broadcast_to(nearest, stacked.shape[1:])
-    image, darkest = np.take_along_axis(stacked, place[None], axis=0)[0], stacked.min(axis=0)
+def united(views: list[View]) -> View:
+    """All objects of ``views`` together. The nearest surface counts; without one, the first image's background, or
+    another image's where it is in shadow."""
+    ranges = np.stack([np.where(view.depth_mm > 0, view.depth_mm, np.inf) for view in views])
+    nearest = ranges.argmin(axis=0)[None]
+    depth, void = (np.take_along_axis(maps, nearest, axis=0)[0] for maps in (ranges, np.stack([v.void for v in views])))
+    stacked = np.stack([view.frames for view in views])
+    frames, darkest = np.take_along_axis(stacked, nearest[:, None], axis=0)[0], stacked.min(axis=0)
     empty = np.isinf(depth)
-    shadow = empty & (darkest.astype(np.float32) + SHADOW_GREY < image)
-    return np.where(shadow, darkest, image), np.where(empty, 0.0, depth).astype(np.float32)
+    shadow = empty & (darkest.astype(np.float32) + SHADOW_GREY < frames)
+    return replace(
+        views[0],
+        name="+".join(view.name for view in views),
+        frames=np.where(shadow, darkest, frames),
+        depth_mm=np.where(empty, 0.0, depth).astype(np.float32),
+        void=void,
+        united=True,
+    )
 
 
 def companions(objects: Mapping[str, str], view: str, random: np.random.Generator) -> list[str]:

@@ -13,10 +13,17 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.learned.classical_network import DepthFilter
-from fpp_ml_bench.baselines.learned.classical_route import Filtered, decided, filtered
-from fpp_ml_bench.baselines.learned.classical_scene import CHANNELS, DepthScene, channels
-from fpp_ml_bench.baselines.learned.window_training import (
+from fpp_ml_bench.baselines.learned.network import DepthFilter
+from fpp_ml_bench.baselines.learned.routes import (
+    DEPTH_CHANNELS,
+    DepthScene,
+    Filtered,
+    decided,
+    depth_channels,
+    filtered,
+)
+from fpp_ml_bench.baselines.learned.scenes import View
+from fpp_ml_bench.baselines.learned.training import (
     Batch,
     StepRecipe,
     Task,
@@ -24,11 +31,8 @@ from fpp_ml_bench.baselines.learned.window_training import (
     mean_over,
     scale_loss,
 )
-from fpp_ml_bench.baselines.learned.windows import Sample, edge_points, mean_scores, place_of
-from fpp_ml_bench.baselines.phase.calibration_layer import Image, Mask
-from fpp_ml_bench.baselines.training.views import View
+from fpp_ml_bench.baselines.learned.windows import Sample, Window, mean_scores, view_scores
 from fpp_ml_bench.baselines.training.weights import FILTER_NETWORKS, Family
-from fpp_ml_bench.depth import depth_edges
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Direction
 
@@ -41,30 +45,9 @@ STRIDES, STRIDE_SHARES = (1, 2, 4), (0.6, 0.25, 0.15)
 """Every so many-th pixel of a view makes a window, and how often: a coarser camera sees steeper, more bent surfaces."""
 
 
-@dataclass(frozen=True)
-class DepthSample(Sample):
-    """``exact_mm`` (h, w): exact depth less the scene's ``middle_mm``; pixels without a depth are of interest too."""
-
-    exact_mm: Image
-
-
-@dataclass(frozen=True)
-class Window:
-    """One training example, maps (n, n) of a `DepthSample`; ``x`` (C, n, n); ``valid``: neither void nor padding;
-    ``unit_mm``: median sigma of the scene, the unit of the errors."""
-
-    x: Image
-    depth_mm: Image
-    sigma_mm: Image
-    found: Mask
-    exact_mm: Image
-    target: Mask
-    valid: Mask
-    unit_mm: NDArray[np.float32]
-
-
-def sample_of(view: View, method: ClassicalMethod) -> DepthSample | None:
-    """The sample of a view, decoded by ``method``; None where nothing was decoded."""
+def depth_sample(view: View, method: ClassicalMethod) -> Sample | None:
+    """The sample of a view, decoded by ``method``; None where nothing was decoded. What is missing: exact depth less
+    the scene's ``middle_mm``. Pixels without a depth are of interest too."""
     frames: list[NDArray[np.uint8] | None] = [None] * len(method.rig.sequence)
     for index, frame in zip(method.frames_used, view.frames, strict=True):
         frames[index] = frame
@@ -72,11 +55,9 @@ def sample_of(view: View, method: ClassicalMethod) -> DepthSample | None:
     scene = None if answer.sigma_mm is None else DepthScene.of(answer.depth, answer.sigma_mm, modulation)
     if scene is None:
         return None
-    depth_mm, void = view.depth_mm[scene.crop], view.void[scene.crop]
-    target = (depth_mm > 0) & ~void
-    exact = np.where(target, depth_mm - np.float32(scene.middle_mm), 0).astype(np.float32)
-    edges = edge_points(depth_edges(depth_mm) | (target & ~scene.found))
-    return DepthSample(view.name, scene, target, void, edges, exact)
+    part = view.part(scene.crop)
+    exact = np.where(part.target, part.depth_mm - np.float32(scene.middle_mm), 0).astype(np.float32)
+    return Sample.of(part, scene, exact, part.target & ~scene.found)
 
 
 @dataclass(frozen=True)
@@ -99,7 +80,6 @@ class FilterRecipe(StepRecipe):
 
     title: ClassVar[str] = "Weights of neighbouring depths, and which missing pixels are object"
     family: ClassVar[Family] = FILTER_NETWORKS
-    makes: ClassVar[type[nn.Module]] = DepthFilter
     main_loss: ClassVar[str] = "depth"
     scores: ClassVar[dict[str, dict[str, str]]] = {
         "validation MAE, mm": {"object_mae_mm": "filtered", "input_mae_mm": "decoded"},
@@ -107,7 +87,7 @@ class FilterRecipe(StepRecipe):
     }
 
     def network(self) -> DepthFilter:
-        return DepthFilter(len(CHANNELS), self.widths)
+        return DepthFilter(len(DEPTH_CHANNELS), self.widths)
 
     def losses(self, network: nn.Module, batch: Batch) -> dict[str, Tensor]:
         """``depth``: smooth L1 in the scene's median sigma; ``mask``: binary cross-entropy of pixels without a depth;
@@ -134,71 +114,66 @@ class FilterTask(Task):
         self.recipe, self.method = recipe, ClassicalMethod(rig, direction=recipe.direction, steps=recipe.phase_steps)
         self.frames = self.method.frames_used
 
-    def samples(self, views: Iterable[View]) -> list[DepthSample]:
-        return [sample for view in views if (sample := sample_of(view, self.method)) is not None]
+    def samples(self, views: Iterable[View]) -> list[Sample]:
+        return [sample for view in views if (sample := depth_sample(view, self.method)) is not None]
 
-    def draw(self, samples: list[DepthSample], random: np.random.Generator) -> Window:
-        """A random window of one of ``samples``, of one of `STRIDES`, in one of 8 orientations."""
-        size, near_edge = self.recipe.window, self.recipe.near_edge
-        sample = samples[random.integers(len(samples))]
+    def draw(self, samples: list[Sample], random: np.random.Generator) -> Window:
+        """A random window of one of ``samples``, of one of `STRIDES`, in one of 8 orientations: the maps of its scene
+        that the network takes; ``exact_mm``, ``target``, and ``valid``: neither void nor padding; ``unit_mm``: median
+        sigma of the scene, the unit of the errors."""
+        size, sample = self.recipe.window, samples[random.integers(len(samples))]
         orientation, every = int(random.integers(ORIENTATIONS)), int(random.choice(STRIDES, p=STRIDE_SHARES))
-        rows, columns = place_of(sample.edges, sample.target.shape, size * every, random.random() < near_edge, random)
+        rows, columns = sample.place(size * every, self.recipe.near_edge, random)
 
-        def cut(maps: NDArray) -> NDArray:
+        def cut(name: str, maps: NDArray) -> NDArray:
             part = np.rot90(maps[rows, columns][::every, ::every], orientation % 4)
             part = part[:, ::-1] if orientation >= 4 else part
             return np.pad(part, [(0, size - length) for length in part.shape])
 
         scene = sample.scene.with_maps(cut)
-        return Window(
-            channels(scene),
-            scene.depth_mm,
-            scene.sigma_mm,
-            scene.found,
-            cut(sample.exact_mm),
-            cut(sample.target),
-            cut(~sample.void),
-            np.asarray(scene.unit_mm, dtype=np.float32),
-        )
+        truth = {"exact_mm": sample.missing, "target": sample.target, "valid": ~sample.void}
+        return {
+            "x": depth_channels(scene),
+            **{name: getattr(scene, name) for name in ("depth_mm", "sigma_mm", "found")},
+            **{name: cut(name, maps) for name, maps in truth.items()},
+            "unit_mm": np.asarray(scene.unit_mm, dtype=np.float32),
+        }
 
-    def scores(self, network: DepthFilter, samples: list[DepthSample]) -> dict[str, float]:
+    def scores(self, network: DepthFilter, samples: list[Sample]) -> dict[str, float]:
         return mean_scores(score(filtered(network, sample.scene), sample, 0.0) for sample in samples)
 
-    def answered(
-        self, network: DepthFilter, samples: list[DepthSample], validation: list[DepthSample]
-    ) -> list[Filtered]:
-        return [filtered(network.folded(), sample.scene) for sample in validation]
-
-    def chosen(self, answered: list[Filtered], validation: list[DepthSample], out: Path) -> dict[str, Any]:
-        threshold = chosen_threshold(answered, validation)
-        pairs = zip(answered, validation, strict=True)
+    def chosen(
+        self, network: DepthFilter, samples: list[Sample], validation: list[Sample], out: Path
+    ) -> dict[str, Any]:
+        folded = network.folded()
+        answers = [filtered(folded, sample.scene) for sample in validation]
+        threshold = chosen_threshold(answers, validation)
+        pairs = zip(answers, validation, strict=True)
         means = mean_scores(score(answer, sample, threshold) for answer, sample in pairs)
         return {"threshold": threshold, "period_px": {}, "validation": means}
 
 
-def score(answer: Filtered, sample: DepthSample, threshold: float) -> dict[str, float | None]:
-    """Of a view: MAE of object pixels in mm, filtered and as decoded, where a missed one counts with its whole depth;
-    the shares that are missed; background pixels that were given a depth, in thousands; and the share of errors within
-    the stated standard uncertainty."""
+def score(answer: Filtered, sample: Sample, threshold: float) -> dict[str, float | None]:
+    """`view_scores` of a view, filtered and, as ``input_*``, as decoded; ``invented_kpx`` counts what the filter added.
+    ``within_percent``: share of errors within the stated standard uncertainty."""
     scene, target = sample.scene, sample.target
     if not target.any():
         return {}
-    inside = decided(answer, scene, threshold)
-    whole = sample.exact_mm + np.float32(scene.middle_mm)
-    error = np.where(inside, np.abs(answer.depth_mm - sample.exact_mm), whole)[target]
-    before = np.where(scene.found, np.abs(scene.depth_mm - sample.exact_mm), whole)[target]
-    within = np.abs(answer.depth_mm - sample.exact_mm) < answer.sigma_mm
+    inside, middle = decided(answer, scene, threshold), np.float32(scene.middle_mm)
+    exact = sample.missing + middle
+    after = view_scores(sample, inside, answer.depth_mm + middle, exact)
+    before = view_scores(sample, scene.found, scene.depth_mm + middle, exact)
+    within = (np.abs(answer.depth_mm - sample.missing) < answer.sigma_mm)[target & inside]
     return {
-        "object_mae_mm": float(error.mean(dtype=np.float64)),
-        "input_mae_mm": float(before.mean(dtype=np.float64)),
-        "missed_percent": 100 * float((~inside)[target].mean()),
-        "input_missed_percent": 100 * float((~scene.found)[target].mean()),
-        "invented_kpx": float((inside & ~scene.found & ~target & ~sample.void).sum()) / 1000,
-        "within_percent": 100 * float(within[target & inside].mean()) if (target & inside).any() else None,
+        **after,
+        "input_mae_mm": before["object_mae_mm"],
+        "input_missed_percent": before["missed_percent"],
+        "invented_kpx": after["invented_kpx"] - before["invented_kpx"],
+        "within_percent": 100 * float(within.mean()) if within.size else None,
     }
 
 
-def chosen_threshold(answers: Sequence[Filtered], samples: Sequence[DepthSample]) -> float:
+def chosen_threshold(answers: Sequence[Filtered], samples: Sequence[Sample]) -> float:
     """The lowest of `THRESHOLDS` at which no validation view loses: what filling saves on the object is at least what
     it adds on the background, each pixel counted with its whole depth."""
     for threshold in THRESHOLDS:
@@ -207,6 +182,6 @@ def chosen_threshold(answers: Sequence[Filtered], samples: Sequence[DepthSample]
     return THRESHOLDS[-1]
 
 
-def _gain_px(answer: Filtered, sample: DepthSample, threshold: float) -> int:
+def _gain_px(answer: Filtered, sample: Sample, threshold: float) -> int:
     new = decided(answer, sample.scene, threshold) & ~sample.scene.found
     return int((new & sample.target).sum()) - int((new & ~sample.target & ~sample.void).sum())
