@@ -24,8 +24,8 @@ REQUIRED: Any = MISSING
 
 @dataclass(frozen=True)
 class Description:
-    """What the command line says of an option: ``help``, ``metavar`` of its value, the ``choices`` that there are (those
-    of a field annotated ``Literal`` are known), and ``flag``, its spelling where that is not made of the field's name.
+    """What the command line says of an option: ``help``, ``metavar`` of its value, the ``choices`` that there are (a
+    ``Literal`` annotation says them itself), and ``flag``, its spelling where that is not made of the field's name.
     ``parse`` makes a value of its text where the field's type does not say how; it raises ValueError with what it
     expected. ``many``: may be given again, the field is a tuple. ``positional``: an argument without a flag."""
 

@@ -91,7 +91,6 @@ def time(
         (),
         "put it into this submission.yaml or result file of the same method; may be given again",
         "FILE",
-        parse=Path,
         many=True,
     ),
 ) -> None:

@@ -90,7 +90,7 @@ def cleaning_bucket() -> Solid:
     bands = [ring(137.5, 4, 248), ring(135.2, 2.5, 232), ring(104, 2.5, 18), ring(105.5, 2.0, 28)]
     ears = [rod((0, s * 130, 236), (0, s * 146, 236), 13, 10) for s in (-1, 1)]
     angle = np.linspace(0, np.pi, 41)
-    bow = np.stack([-118 * np.sin(angle), 146 * np.cos(angle), 236 + 78 * np.sin(angle)], axis=1)
+    bow = np.column_stack([-118 * np.sin(angle), 146 * np.cos(angle), 236 + 78 * np.sin(angle)])
     bail = tube(bow, 3.6, up=(1, 0, 1))
     grip = rod((-118, -46, 312), (-118, 46, 312), 11)
     words = wrapped(text_section("CLEAN", 150), 120, 130, 2.0)
@@ -132,7 +132,7 @@ def duct_tape() -> Solid:
     windings = [cut(post(z, z + 1.6, r + 0.8), post(-3, 55, r)) for r, z in rings]
     bent = np.linspace(-1.4, 0.15, 24)
     reach = 64.0 + 30 * np.clip(bent + 0.5, 0, 1) ** 2
-    end = stroke(np.stack([reach * np.cos(bent), reach * np.sin(bent)], axis=1), 1.4).extrude(50)
+    end = stroke(np.column_stack([reach * np.cos(bent), reach * np.sin(bent)]), 1.4).extrude(50)
     roll = union(cut(union(turns, end), post(-2, 53, 40)), core, *windings)
     return roll.translate((0, 0, -25))
 
@@ -142,7 +142,7 @@ def banana() -> Solid:
     """Banana, about 190 mm along its bend: five blunt edges, a stalk and a dark tip."""
     bend = np.linspace(np.radians(-38), np.radians(46), 61)
     radius = 112.0
-    path = np.stack([np.zeros_like(bend), radius * np.sin(bend), -radius * np.cos(bend)], axis=1)
+    path = np.column_stack([np.zeros_like(bend), radius * np.sin(bend), -radius * np.cos(bend)])
     along = np.linspace(0, 1, len(bend))
     knots = curve(
         [
@@ -229,7 +229,7 @@ def eyeglasses() -> Solid:
     rim = superellipse(56, 46, 2.6, 96)
     parts: list[Solid] = []
     for side in (-1, 1):
-        loop = np.stack([rim[:, 0] + side * 35, rim[:, 1], 0 * rim[:, 0]], axis=1)
+        loop = np.column_stack([rim[:, 0] + side * 35, rim[:, 1], 0 * rim[:, 0]])
         temple = [(66, 9, -2), (68, 9, -28), (68, 8, -72), (67, 1, -96), (66, -18, -112)]
         arm = [(8.5, 1, 0), (8, -2, -4), (9.5, -7, -7)]
         parts += [

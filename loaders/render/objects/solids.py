@@ -235,14 +235,14 @@ def skin(rings: np.ndarray, closed: bool = False) -> Solid:
     there = np.roll(index, -1, axis=0) if closed else index[1:]
     a, b = here.ravel(), np.roll(here, -1, axis=1).ravel()
     c, d = np.roll(there, -1, axis=1).ravel(), there.ravel()
-    faces = [np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)]
+    faces = [np.column_stack([a, b, c]), np.column_stack([a, c, d])]
     points = [rings.reshape(-1, 3)]
     if not closed:
         points.append(np.stack([rings[0].mean(axis=0), rings[-1].mean(axis=0)]))
         first, last = index[0], index[-1]
         centre = np.full(sides, count * sides)
-        faces.append(np.stack([np.roll(first, -1), first, centre], axis=1))
-        faces.append(np.stack([last, np.roll(last, -1), centre + 1], axis=1))
+        faces.append(np.column_stack([np.roll(first, -1), first, centre]))
+        faces.append(np.column_stack([last, np.roll(last, -1), centre + 1]))
     vertices, triangles = np.concatenate(points), np.concatenate(faces)
     corners = vertices[triangles]
     if np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() < 0:
@@ -265,7 +265,7 @@ def superellipse(width: float, depth: float, power: float = 2.0, sides: int = 12
     cosine, sine = np.cos(angles(sides)), np.sin(angles(sides))
     x = np.sign(cosine) * np.abs(cosine) ** (2 / power)
     y = np.sign(sine) * np.abs(sine) ** (2 / power)
-    return np.stack([x * width / 2, y * depth / 2], axis=1)
+    return np.column_stack([x * width / 2, y * depth / 2])
 
 
 def loft(levels: Points, smooth: int = 0, sides: int = 120) -> Solid:
@@ -367,7 +367,7 @@ def wrapped(section: Section, radius: float, height: float, relief: float, turn:
     def bend(points: np.ndarray) -> np.ndarray:
         angle = points[:, 0] / radius
         reach = radius + points[:, 2]
-        return np.stack([-reach * np.cos(angle), -reach * np.sin(angle), points[:, 1] + height], axis=1)
+        return np.column_stack([-reach * np.cos(angle), -reach * np.sin(angle), points[:, 1] + height])
 
     return flat.warp_batch(bend).rotate((0, 0, turn))
 

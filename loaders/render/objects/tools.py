@@ -65,7 +65,7 @@ def hammer() -> Solid:
         normal = np.array([-tangent[1], tangent[0]]) / np.linalg.norm(tangent)
         section = superellipse(2 * thick[k], 2 * claw_wide[k], 4, 48)
         x, y = (point[k] + normal[k] * section[:, 0] for k in (0, 1))
-        rings.append(np.stack([x, y, section[:, 1]], axis=1))
+        rings.append(np.column_stack([x, y, section[:, 1]]))
     wedge = polygon([(0, 2.5), (0, -2.5), (70, -7), (70, 7)])
     fork = place(plate(wedge, 90), (-40, 285, 0), (90, 0, 180))
     claw = cut(skin(np.array(rings)), fork)
@@ -81,7 +81,7 @@ def scissors() -> Solid:
     halves = []
     for side, reach in ((1, 25.0), (-1, 36.0)):
         bow = np.linspace(0, 2 * np.pi, 72, endpoint=False)
-        loop = np.stack([18.5 * np.cos(bow) + 13, reach * np.sin(bow) - 50 - reach, 0 * bow], axis=1)
+        loop = np.column_stack([18.5 * np.cos(bow) + 13, reach * np.sin(bow) - 50 - reach, 0 * bow])
         ring_bow = tube(loop, 5.2, flatten=1.25, closed=True, sides=24)
         half = union(plate(blade, 3.2), plate(shank, 8), ring_bow).rotate((0, 0, 9))
         halves.append(half.translate((0, 0, 1.8)) if side > 0 else half.mirror((1, 0, 0)).translate((0, 0, -1.8)))
