@@ -173,6 +173,8 @@ class Capture:
 
     def spread(self, values: NDArray) -> NDArray:
         """Maps of the grid (..., h', w') at all pixels, each that of its grid point or of the nearest one inside."""
+        if self.pixelwise and self.stride == 1:
+            return values
         return repeated(values[..., *self._nearest], self.stride, (*values.shape[:-2], *self.inside.shape))
 
     @cached_property
@@ -220,9 +222,6 @@ class CrossedObservation(Capture):
     def light(self) -> Image:
         """Grey levels less ambient light."""
         return self.grey - np.float32(self.background.ambient_grey)
-
-    def spread(self, values: NDArray) -> NDArray:
-        return super().spread(values) if self.moved is None else values
 
 
 class MeasurementModel:
@@ -420,7 +419,7 @@ class TwoCarriers(MeasurementModel):
                 f"by {span:.2g} rad, too little for a depth; shift the other carrier"
             )
         for pair in shifted[1:]:
-            carriers = Carriers.of(self.rig, Crossed(**vars(self.family) | {"shifts_deg": (pair,)}))
+            carriers = Carriers.of(self.rig, replace(self.family, shifts_deg=(pair,)))
             self._scenes.append(CrossedEmptyScene(carriers, self.stride))
 
     @cached_property
