@@ -254,8 +254,8 @@ class MeasurementModel:
         for image in images:
             if image.dtype not in (np.uint8, np.float32) or image.shape != (camera.height, camera.width):
                 raise DecodeError(
-                    f"expected frames of uint8 grey levels, shape (H, W) = {(camera.height, camera.width)} of the rig's "
-                    f"camera, got {image.dtype} {image.shape}; use rig.scaled(width) for a resized image"
+                    f"expected frames of uint8 grey levels, shape (H, W) = {(camera.height, camera.width)} of the "
+                    f"rig's camera, got {image.dtype} {image.shape}; use rig.scaled(width) for a resized image"
                 )
         return [self.resampling.image(image) for image in images]
 
