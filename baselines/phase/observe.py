@@ -305,12 +305,17 @@ class OneCarrier(MeasurementModel):
         greys = tuple(frame[crop].astype(np.float32) for frame in images)
         background = replace(background, residual=background.residual[crop])
         layer, inside, mean_grey = self.layer.at(crop), region[crop], None
+        if len(greys) > 1 and mask is None:
+            planes = [self._scene.predicted(background, shift, crop) for shift in self.shifts_rad]
+            misfits = [grey - plane for grey, plane in zip(greys, planes, strict=True)]
+            different = differs(misfits, background.noise_grey)
+            region = first_mask(different, self.period_px)
+            inside = region if background.shown else inside & region
         if len(greys) >= PIXELWISE:
             fitted = wrapped_phase(greys, self.shifts_rad, np.float32)
             phase, modulation, mean_grey = (np.asarray(values, np.float32) for values in fitted)
             if mask is None:
-                different = differs(self._plane_misfits(greys, background, crop), background.noise_grey)
-                inside = lit_object(different, modulation, background, self.shifts_rad, self.period_px)
+                inside = lit_object(different, region, modulation, background, self.shifts_rad, self.period_px)
             # The share of a window on the object is what the use of slopes needs.
             fit = FringeFit(phase, modulation, self.windows[1].moment(inside.astype(np.float32)))
         else:
@@ -337,23 +342,14 @@ class OneCarrier(MeasurementModel):
             mean_grey=mean_grey,
         )
 
-    def _plane_misfits(self, greys: Sequence[Image], background: Background, crop: Crop) -> list[Image]:
-        """Each frame (h, w) less what the empty scene gives there, grey levels."""
-        pairs = zip(greys, self.shifts_rad, strict=True)
-        return [grey - self._scene.predicted(background, shift, crop) for grey, shift in pairs]
-
     def _local_fits(
         self, greys: Sequence[Image], background: Background, crop: Crop, region: Mask, given: bool
     ) -> tuple[Mask, FringeFit]:
         """Object mask and local fits of one or two frames, each window starting from the phase of the last; ``region``:
-        where the first frame differs, or the ``given`` mask."""
+        where frames differ from the empty scene, or the ``given`` mask."""
         period_px, inside, grey = self.period_px, region, greys[0]
         if not given:
             dark = unlit(np.maximum.reduce(greys), background, period_px)
-            if len(greys) > 1:
-                different = differs(self._plane_misfits(greys, background, crop), background.noise_grey)
-                differing = first_mask(different, period_px)
-                region = differing if background.shown else region & differing
             inside = region & ~dark
         carrier = self._carrier[crop]
         phase, _ = carrier_fit(grey, inside, carrier, self.windows[0])
@@ -452,9 +448,10 @@ class TwoCarriers(MeasurementModel):
             region = object_region(background, period_px)
         else:
             different = differs([plane.residual for plane in planes], background.noise_grey)
-            region = lit_object(different, own_modulation, background, self.shifts_rad, period_px)
+            closed = first_mask(different, period_px)
+            region = lit_object(different, closed, own_modulation, background, self.shifts_rad, period_px)
             residual = wrapped(own_phase - self.carriers.infinity_rad[moved])
-            region = continued(region, first_mask(different, period_px), different, residual)
+            region = continued(region, closed, different, residual)
         crop = crop_around(region, int(np.ceil(MARGIN_PERIODS * period_px)), stride)
         background, inside = replace(background, residual=background.residual[crop]), region[crop]
         if mask is None and moved is None:
