@@ -104,7 +104,8 @@ class Settings:
     more. ``slack_mm`` widens the range in which orders are chosen, for noise at its ends: a depth
     beyond them is left out, and no other order is taken to be within. ``white_grey`` and ``ambient_grey``, if given,
     calibrate brightness (see `EmptyScene`); without them it is taken from the lit background, and where the image
-    shows none, range and continuity settle the order, or it is ambiguous and has no depth (see `continuity`).
+    shows none, range and continuity settle the order, or it is ambiguous and has no depth (`order.margin_by_range`).
+    Of these, crossed fringes use ``min_confidence`` and ``slack_mm`` alone.
     """
 
     direction: Direction = option("horizontal", DIRECTION, choices=DIRECTIONS)
