@@ -127,21 +127,21 @@ class ClassicalMethod(Method):
         gray = len(submission.frames_used) - steps * (2 if direction == "both" else 1)
         return f"Classical {steps}, {direction}, {f'{gray} Gray' if gray else 'no Gray'}"
 
-    def decode(self, frames: Frames, reasons: bool = True, details: bool = False) -> Decoded:
-        """`decode_stack` of a captured sequence; frames that are not in `frames_used` may be None."""
+    def decode(self, frames: Frames, details: bool = False) -> Decoded:
+        """`decode_stack` of a captured sequence, without reasons; frames that are not in `frames_used` may be None."""
         return decode_stack(
             frames,
             self.rig,
             direction=self.direction,
             steps=self.steps,
             threads=self.threads,
-            reasons=reasons,
+            reasons=False,
             fewest=self.fewest,
             details=details,
         )
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
-        return self.decode(frames, reasons=False).depth_mm
+        return self.decode(frames).depth_mm
 
     def answer(self, frames: Frames) -> Answer:
         """Depth, and its standard uncertainty by the noise of the frames; none for a code that has none by pixel."""
@@ -149,7 +149,7 @@ class ClassicalMethod(Method):
 
     def measure(self, frames: Frames) -> tuple[Answer, NDArray[np.float32]]:
         """`answer`, and the modulation in grey levels (H, W), the larger of both directions; 0 where there is none."""
-        decoded = self.decode(frames, reasons=False, details=True)
+        decoded = self.decode(frames, details=True)
         measured = np.stack([measured.modulation for measured in decoded.details.values()]).max(axis=0)
         modulation = np.nan_to_num(measured).astype(np.float32)
         if not all(isinstance(self.rig.code(way), PhaseShift) for way in decoded.details):

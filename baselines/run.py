@@ -256,7 +256,7 @@ def explain_predict(opened: DatasetFolder, method: Method, split: str) -> Explan
     if isinstance(method, ClassicalMethod) and method.direction == "both":
         for frames in stacks:
             with skipping(True):
-                second_px = method.decode(frames, reasons=False).second_px
+                second_px = method.decode(frames).second_px
             saved_s += saved_by(lambda: method.predict(frames), 1, 1) or 0.0  # noqa: B023  called at once
             done, left_out = done + second_px, left_out + height * width - second_px
         pixels = round(left_out * scale)

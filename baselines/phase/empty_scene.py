@@ -117,9 +117,8 @@ class EmptyScene:
         row, column = (SAMPLE_STEP_PX * place for place in places)
         sampled = grey[row, column].astype(np.float64)
         terms = np.stack([np.ones_like(sampled)] + [term[row, column] for term in self._terms], axis=1)
-        solution = np.linalg.lstsq(terms, sampled, rcond=None)[0]
-        misfit = sampled - terms @ solution
-        noise = _noise_of(misfit)
+        fitted, solution = _least_squares(terms, sampled, rounds=1)
+        noise = _noise_of(sampled - fitted)
         ambient_grey, *weights = solution
         residual = grey - np.float32(ambient_grey)
         for weight, term in zip(weights, self._terms, strict=True):
@@ -230,10 +229,10 @@ class CrossedEmptyScene:
         row, column = self._stride * places[:: max(1, len(places) // SAMPLES)].T
         samples = grey[row, column].astype(np.float64)
         terms = np.stack([term[row, column] for term in self._terms], axis=1).astype(np.float64)
-        light, weights = _robust(terms, samples)
+        light, weights = _least_squares(terms, samples)
         curve = np.stack([light**power for power in CURVE_POWERS] + [np.ones_like(light)], axis=1)
         scale = np.abs(curve).max(axis=0)
-        fitted, bend = _robust(curve / scale, samples)
+        fitted, bend = _least_squares(curve / scale, samples)
         noise = _noise_of(samples - fitted)
         # Horner's rule on whole images, in single precision: 1e-5 of a grey level is enough here.
         first = sum((np.float32(w) * term for w, term in zip(weights, self._terms, strict=True)), np.float32(0))
@@ -249,12 +248,14 @@ class CrossedEmptyScene:
         return cv2.erode(same, np.ones((self._margin, self._margin), np.uint8), borderValue=1) > 0  # type: ignore[call-overload,no-any-return]
 
 
-def _robust(terms: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-    """Least squares without outliers: the fitted values and the solution."""
+def _least_squares(
+    terms: NDArray[np.float64], values: NDArray[np.float64], rounds: int = ROUNDS
+) -> tuple[NDArray, NDArray]:
+    """Least squares, in more than one of the ``rounds`` without outliers: the fitted values and the solution."""
     keep = np.ones(len(values), bool)
     fitted: NDArray = values
     solution: NDArray = values
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         solution = np.linalg.lstsq(terms[keep], values[keep], rcond=None)[0]
         fitted = terms @ solution
         misfit = np.abs(values - fitted)

@@ -17,7 +17,7 @@ ROUNDS = 10
 
 
 def least_energy(
-    unary: Image, phase_rad: Image, link_x: Image, link_y: Image, limit_rad: float, rounds: int = ROUNDS
+    unary: Image, phase_rad: Image, link_x: Image, link_y: Image, limit_rad: float
 ) -> tuple[NDArray[np.int32], Image]:
     """Index of the chosen candidate, int32 (H, W), and its margin to the second best, float32 (at most `LARGE`).
     ``unary`` (K, H, W): costs of K candidates; ``phase_rad`` (K, H, W): residual phase of each; ``link_x`` (H, W - 1)
@@ -29,7 +29,7 @@ def least_energy(
     links = np.ascontiguousarray(link_x, np.float32), np.ascontiguousarray(link_y, np.float32)
     field = (costs, phases, *links, np.float32(limit_rad))
     messages = np.zeros((height, width, 4, count), np.float32)
-    iterate(field, rounds, messages)
+    iterate(field, ROUNDS, messages)
     choice, margin = np.zeros((height, width), np.int32), np.zeros((height, width), np.float32)
     decide(field, messages, choice, margin)
     return choice, np.minimum(margin, LARGE)

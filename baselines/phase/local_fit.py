@@ -50,7 +50,7 @@ class Window:
         weight = np.exp(-0.5 * t * t)
         weight /= weight.sum()
         self.sigma_px = sigma_px
-        self._kernels = [(weight * t**power).astype(np.float64) for power in range(2 * max(map(max, CURVED)) + 1)]
+        self._kernels = [(weight * t**power).astype(np.float64) for power in range(5)]
 
     def moment(self, image: Image, along_x: int = 0, along_y: int = 0) -> Image:
         """Sum of ``image`` (H, W) under the window times x^along_x y^along_y, in window sigmas; 0 beyond the image. In
@@ -126,7 +126,7 @@ def tied_fit(
     views: Iterable[tuple[NDArray, NDArray, NDArray]],
     inside: Mask,
     window: Window,
-    terms: Sequence[tuple[int, int]] = PLANE,
+    terms: Sequence[tuple[int, int]],
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Fit of ``light = g raised + s slope`` around each pixel of one or several ``views``, each light (grey levels
     less ambient light), and light over brightness with its change by the phase, (h, w). Brightness g, the polynomial of

@@ -308,23 +308,6 @@ class Look:
         return cls(count, False, by_phase_mm + by_order_mm, by_phase_mm, by_order_mm)
 
 
-@dataclass(frozen=True)
-class FrameChoice:
-    """``depth_mm`` float32 (H, W) of the last look, its ``frames_used`` (indices, ascending), and all ``looks``."""
-
-    depth_mm: NDArray[np.float32]
-    frames_used: tuple[int, ...]
-    looks: tuple[Look, ...]
-
-    def report(self) -> dict[str, Any]:
-        """JSON of one sample: number of frames, their indices, and the expected error at each look."""
-        looks = [asdict(look) for look in self.looks]
-        for look in looks:
-            look |= {key: round(value, 4) for key, value in look.items() if key.endswith("_mm")}
-        last = {name: looks[-1][name] for name in ("frames", "expected_error_mm")}
-        return last | {"frames_used": list(self.frames_used), "looks": looks}
-
-
 def levels_of(steps: int) -> tuple[int, ...]:
     """Numbers of fringes to capture in turn, each containing the fringes before: 1, 2, 3 and more where ``steps`` is a
     multiple of three, else 1 and then all."""
@@ -361,8 +344,10 @@ class FewestFrames(Method):
         settings = self.methods[1].settings
         self.settings = {"error_mm": self.error_mm} | {key: settings[key] for key in settings if key != "frames"}
 
-    def choose(self, frames: Frames) -> FrameChoice:
-        """Measure and capture more frames until the expected error is at most ``error_mm`` or no frame is left."""
+    def answer(self, frames: Frames) -> Answer:
+        """Measure and capture more frames until the expected error is at most ``error_mm`` or no frame is left. The
+        depth of the last look, and the sample's report: number of frames, their indices, and the expected error at each
+        look."""
         looks: list[Look] = []
         gray = False
         for count, method in self.methods.items():
@@ -380,16 +365,16 @@ class FewestFrames(Method):
                 looks.append(Look(len(used), True, look.by_phase_mm, look.by_phase_mm, 0.0))
             if looks[-1].expected_error_mm <= self.error_mm:
                 break
-        return FrameChoice(depth_mm, used, tuple(looks))
-
-    def answer(self, frames: Frames) -> Answer:
-        """Depth as `predict`, and the sample's report (see `FrameChoice.report`)."""
-        choice = self.choose(frames)
-        return Answer(choice.depth_mm, report=choice.report())
+        rows = [
+            {key: round(value, 4) if key.endswith("_mm") else value for key, value in asdict(look).items()}
+            for look in looks
+        ]
+        last = {name: rows[-1][name] for name in ("frames", "expected_error_mm")}
+        return Answer(depth_mm, report=last | {"frames_used": list(used), "looks": rows})
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in mm, 0 = background."""
-        return self.choose(frames).depth_mm
+        return self.answer(frames).depth
 
     def summary(self, reports: Sequence[Mapping[str, Any]]) -> dict[str, float]:
         """Summary of a split's reports for the submission's settings: mean and largest number of frames a sample."""

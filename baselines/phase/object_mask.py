@@ -151,16 +151,21 @@ def first_mask(different: Mask, period_px: float) -> Mask:
 
 
 def lit_object(
-    different: Mask, modulation: Image, background: Background, shifts_rad: Sequence[float], period_px: float
+    different: Mask,
+    region: Mask,
+    modulation: Image,
+    background: Background,
+    shifts_rad: Sequence[float],
+    period_px: float,
 ) -> Mask:
-    """Object pixels (h, w): those that are ``different`` (`differs`) and modulated by more than noise. Pixels that only
-    closing has added must be as bright as the object around them, otherwise they are the plane beside a corner."""
+    """Object pixels (h, w): those of ``region`` (`first_mask`) that are ``different`` (`differs`) and modulated by more
+    than noise. Pixels that only closing has added must be as bright as the object around them, otherwise they are the
+    plane beside a corner."""
     _, cosine, sine = phase_weights(shifts_rad)
     sigma = background.noise_grey * np.sqrt(max(cosine @ cosine, sine @ sine))
     least_grey = min(max(DARKEST_GREY, DARK_SIGMAS * float(sigma)), MIN_MODULATION)
     if not background.shown:  # nothing else tells the object
         least_grey = MIN_MODULATION
-    region = first_mask(different, period_px)
     certain = region & different & (modulation > least_grey)
     side = 2 * round(PIXELWISE_CLOSING_PERIODS * period_px) + 1
     weight = cv2.blur(certain.astype(np.float32), (side, side))

@@ -104,7 +104,8 @@ class Settings:
     more. ``slack_mm`` widens the range in which orders are chosen, for noise at its ends: a depth
     beyond them is left out, and no other order is taken to be within. ``white_grey`` and ``ambient_grey``, if given,
     calibrate brightness (see `EmptyScene`); without them it is taken from the lit background, and where the image
-    shows none, range and continuity settle the order, or it is ambiguous and has no depth (see `continuity`).
+    shows none, range and continuity settle the order, or it is ambiguous and has no depth (`order.margin_by_range`).
+    Of these, crossed fringes use ``min_confidence`` and ``slack_mm`` alone.
     """
 
     direction: Direction = option("horizontal", DIRECTION, choices=DIRECTIONS)
@@ -173,6 +174,8 @@ class Capture:
 
     def spread(self, values: NDArray) -> NDArray:
         """Maps of the grid (..., h', w') at all pixels, each that of its grid point or of the nearest one inside."""
+        if self.pixelwise and self.stride == 1:
+            return values
         return repeated(values[..., *self._nearest], self.stride, (*values.shape[:-2], *self.inside.shape))
 
     @cached_property
@@ -221,9 +224,6 @@ class CrossedObservation(Capture):
         """Grey levels less ambient light."""
         return self.grey - np.float32(self.background.ambient_grey)
 
-    def spread(self, values: NDArray) -> NDArray:
-        return super().spread(values) if self.moved is None else values
-
 
 class MeasurementModel:
     """What a rig photographs, and how phase is measured in it. Images whose fringe period ``seen_px`` is beyond
@@ -255,7 +255,7 @@ class MeasurementModel:
         for image in images:
             if image.dtype not in (np.uint8, np.float32) or image.shape != (camera.height, camera.width):
                 raise DecodeError(
-                    f"expected {kind} of uint8 grey levels, shape (H, W) = {(camera.height, camera.width)} of the "
+                    f"expected frames of uint8 grey levels, shape (H, W) = {(camera.height, camera.width)} of the "
                     f"rig's camera, got {image.dtype} {image.shape}; use rig.scaled(width) for a resized image"
                 )
         return [self.resampling.image(image) for image in images]
@@ -306,12 +306,17 @@ class OneCarrier(MeasurementModel):
         greys = tuple(frame[crop].astype(np.float32) for frame in images)
         background = replace(background, residual=background.residual[crop])
         layer, inside, mean_grey = self.layer.at(crop), region[crop], None
+        if len(greys) > 1 and mask is None:
+            planes = [self._scene.predicted(background, shift, crop) for shift in self.shifts_rad]
+            misfits = [grey - plane for grey, plane in zip(greys, planes, strict=True)]
+            different = differs(misfits, background.noise_grey)
+            region = first_mask(different, self.period_px)
+            inside = region if background.shown else inside & region
         if len(greys) >= PIXELWISE:
             fitted = wrapped_phase(greys, self.shifts_rad, np.float32)
             phase, modulation, mean_grey = (np.asarray(values, np.float32) for values in fitted)
             if mask is None:
-                different = differs(self._plane_misfits(greys, background, crop), background.noise_grey)
-                inside = lit_object(different, modulation, background, self.shifts_rad, self.period_px)
+                inside = lit_object(different, region, modulation, background, self.shifts_rad, self.period_px)
             # The share of a window on the object is what the use of slopes needs.
             fit = FringeFit(phase, modulation, self.windows[1].moment(inside.astype(np.float32)))
         else:
@@ -338,23 +343,14 @@ class OneCarrier(MeasurementModel):
             mean_grey=mean_grey,
         )
 
-    def _plane_misfits(self, greys: Sequence[Image], background: Background, crop: Crop) -> list[Image]:
-        """Each frame (h, w) less what the empty scene gives there, grey levels."""
-        pairs = zip(greys, self.shifts_rad, strict=True)
-        return [grey - self._scene.predicted(background, shift, crop) for grey, shift in pairs]
-
     def _local_fits(
         self, greys: Sequence[Image], background: Background, crop: Crop, region: Mask, given: bool
     ) -> tuple[Mask, FringeFit]:
         """Object mask and local fits of one or two frames, each window starting from the phase of the last; ``region``:
-        where the first frame differs, or the ``given`` mask."""
+        where frames differ from the empty scene, or the ``given`` mask."""
         period_px, inside, grey = self.period_px, region, greys[0]
         if not given:
             dark = unlit(np.maximum.reduce(greys), background, period_px)
-            if len(greys) > 1:
-                different = differs(self._plane_misfits(greys, background, crop), background.noise_grey)
-                differing = first_mask(different, period_px)
-                region = differing if background.shown else region & differing
             inside = region & ~dark
         carrier = self._carrier[crop]
         phase, _ = carrier_fit(grey, inside, carrier, self.windows[0])
@@ -420,7 +416,7 @@ class TwoCarriers(MeasurementModel):
                 f"by {span:.2g} rad, too little for a depth; shift the other carrier"
             )
         for pair in shifted[1:]:
-            carriers = Carriers.of(self.rig, Crossed(**vars(self.family) | {"shifts_deg": (pair,)}))
+            carriers = Carriers.of(self.rig, replace(self.family, shifts_deg=(pair,)))
             self._scenes.append(CrossedEmptyScene(carriers, self.stride))
 
     @cached_property
@@ -453,9 +449,10 @@ class TwoCarriers(MeasurementModel):
             region = object_region(background, period_px)
         else:
             different = differs([plane.residual for plane in planes], background.noise_grey)
-            region = lit_object(different, own_modulation, background, self.shifts_rad, period_px)
+            closed = first_mask(different, period_px)
+            region = lit_object(different, closed, own_modulation, background, self.shifts_rad, period_px)
             residual = wrapped(own_phase - self.carriers.infinity_rad[moved])
-            region = continued(region, first_mask(different, period_px), different, residual)
+            region = continued(region, closed, different, residual)
         crop = crop_around(region, int(np.ceil(MARGIN_PERIODS * period_px)), stride)
         background, inside = replace(background, residual=background.residual[crop]), region[crop]
         if mask is None and moved is None:

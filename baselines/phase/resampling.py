@@ -73,17 +73,9 @@ class Resampling:
         if periods.shortest <= seen_px <= periods.longest:
             return cls(rig, rig)
         width, height = (max(1, round(length * periods.best / seen_px)) for length in (camera.width, camera.height))
-        across, down = width / camera.width, height / camera.height
-        # Pixel areas scale, not centres; rounding to whole pixels makes the two scales a little different.
-        resized = replace(
-            camera,
-            width=width,
-            height=height,
-            fx=camera.fx * across,
-            fy=camera.fy * down,
-            cx=(camera.cx + 0.5) * across - 0.5,
-            cy=(camera.cy + 0.5) * down - 0.5,
-        )
+        # Rounding to whole pixels makes the scales of width and height a little different.
+        down = height / camera.height
+        resized = replace(camera.scaled(width), height=height, fy=camera.fy * down, cy=(camera.cy + 0.5) * down - 0.5)
         return cls(rig, replace(rig, camera=resized))
 
     @property
@@ -110,16 +102,12 @@ class Resampling:
 
     def captured_crop(self, crop: Crop) -> Crop:
         """The part of the captured image that ``crop`` of the resampled one shows."""
-        if not self.needed:
-            return crop
-        lengths = (
-            (self.captured.camera.height, self.rig.camera.height),
-            (self.captured.camera.width, self.rig.camera.width),
+        whole, part = self.captured.camera, self.rig.camera
+        rows, columns = (
+            slice(place.start * full // less, -(-place.stop * full // less))
+            for place, full, less in zip(crop, (whole.height, whole.width), (part.height, part.width), strict=True)
         )
-        ends = [
-            (s.start * full // less, -(-s.stop * full // less)) for s, (full, less) in zip(crop, lengths, strict=True)
-        ]
-        return slice(*ends[0]), slice(*ends[1])
+        return rows, columns
 
     def restored(
         self, psi: NDArray[np.float64], inside: Mask

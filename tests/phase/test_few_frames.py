@@ -4,7 +4,7 @@ import json
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -72,6 +72,11 @@ def exact_mm(left_m: float, right_m: float) -> np.ndarray:
     depth = np.zeros((SIZE, SIZE))
     depth[OBJECT] = np.broadcast_to(np.where(np.arange(SIZE) < HALF, left_m, right_m) * 1000, depth.shape)[OBJECT]
     return depth
+
+
+def looks_of(answer: Answer) -> list[dict[str, Any]]:
+    """The expected error at each number of frames."""
+    return answer.report["looks"]  # type: ignore[no-any-return]
 
 
 def test_steps_are_spread_and_complete_each_other() -> None:
@@ -157,8 +162,8 @@ def test_a_depth_edge_blurs_one_frame_and_no_more() -> None:
 
 def test_frames_are_added_until_the_stated_error_is_expected() -> None:
     frames, truth = scene(1.8, 1.72), exact_mm(1.8, 1.72)
-    looks = FewestFrames(RIG, 1e-3).choose(frames).looks
-    assert [(look.frames, look.gray_code) for look in looks] == [
+    looks = looks_of(FewestFrames(RIG, 1e-3).answer(frames))
+    assert [(look["frames"], look["gray_code"]) for look in looks] == [
         (1, False),
         (2, False),
         (3, False),
@@ -166,44 +171,47 @@ def test_frames_are_added_until_the_stated_error_is_expected() -> None:
         (18, False),
         (25, True),
     ]
+    expected_mm = [look["expected_error_mm"] for look in looks]
     # Two frames still average over a small window, which a plane rewards; from three on noise falls as the root.
-    assert looks[0].expected_error_mm > 2 * looks[1].expected_error_mm
-    assert looks[2].expected_error_mm == pytest.approx(looks[4].expected_error_mm * 6**0.5, rel=0.2)
+    assert expected_mm[0] > 2 * expected_mm[1]
+    assert expected_mm[2] == pytest.approx(expected_mm[4] * 6**0.5, rel=0.2)
     for place in (0, 1):
-        error_mm = 1.001 * looks[place].expected_error_mm
-        chosen = FewestFrames(RIG, error_mm).choose(frames)
-        assert chosen.looks == looks[: len(chosen.looks)]
-        assert chosen.looks[-1].expected_error_mm <= error_mm
-        assert all(look.expected_error_mm > error_mm for look in chosen.looks[:-1])
-        assert len(chosen.frames_used) == chosen.looks[-1].frames
-        assert np.abs(chosen.depth_mm - truth)[truth > 0].mean() < 2.0
-        assert chosen.report()["frames"] == len(chosen.frames_used)
+        error_mm = 1.001 * expected_mm[place]
+        chosen = FewestFrames(RIG, error_mm).answer(frames)
+        assert looks_of(chosen) == looks[: len(looks_of(chosen))]
+        *before, last = looks_of(chosen)
+        assert last["expected_error_mm"] <= error_mm
+        assert all(look["expected_error_mm"] > error_mm for look in before)
+        assert len(chosen.report["frames_used"]) == last["frames"] == chosen.report["frames"]
+        assert np.abs(chosen.depth - truth)[truth > 0].mean() < 2.0
 
 
 def test_doubt_about_the_order_asks_for_the_gray_code() -> None:
     frames, truth = scene(1.8, 1.8), exact_mm(1.8, 1.8)
-    chosen = FewestFrames(RIG, 2.0, shading=False).choose(frames)  # nothing but the range: two orders are as good
-    assert chosen.looks[-1].gray_code and chosen.looks[-1].frames == 3 + RIG.sequence.bits("horizontal")
-    assert not any(look.gray_code for look in chosen.looks[:-1])
-    assert chosen.looks[-2].by_order_mm > 2.0
-    assert np.abs(chosen.depth_mm - truth)[truth > 0].mean() < 2.0
+    chosen = FewestFrames(RIG, 2.0, shading=False).answer(frames)  # nothing but the range: two orders are as good
+    *before, last = looks_of(chosen)
+    assert last["gray_code"] and last["frames"] == 3 + RIG.sequence.bits("horizontal")
+    assert not any(look["gray_code"] for look in before)
+    assert before[-1]["by_order_mm"] > 2.0
+    assert np.abs(chosen.depth - truth)[truth > 0].mean() < 2.0
 
 
 def test_frames_not_asked_for_are_never_looked_at() -> None:
     frames = scene(1.8, 1.8)
-    chosen = FewestFrames(RIG, 1.2).choose(frames)
-    only = [frame if index in chosen.frames_used else None for index, frame in enumerate(frames)]
-    assert np.array_equal(FewestFrames(RIG, 1.2).choose(only).depth_mm, chosen.depth_mm)
+    chosen = FewestFrames(RIG, 1.2).answer(frames)
+    used = chosen.report["frames_used"]
+    only = [frame if index in used else None for index, frame in enumerate(frames)]
+    assert np.array_equal(FewestFrames(RIG, 1.2).predict(only), chosen.depth)
     missing = list(only)
-    missing[chosen.frames_used[-1]] = None
-    with pytest.raises(DecodeError, match=f"frame {chosen.frames_used[-1]} is missing"):
+    missing[used[-1]] = None
+    with pytest.raises(DecodeError, match=f"frame {used[-1]} is missing"):
         FewestFrames(RIG, 1.2).predict(missing)
 
 
 def test_an_empty_scene_needs_one_frame() -> None:
-    chosen = FewestFrames(RIG, 0.1).choose(plane(RIG.background_m))
-    assert chosen.looks[-1].frames == 1
-    assert not chosen.depth_mm.any()
+    chosen = FewestFrames(RIG, 0.1).answer(plane(RIG.background_m))
+    assert chosen.report["frames"] == 1
+    assert not chosen.depth.any()
 
 
 def test_methods_say_what_they_need_and_refuse_what_they_cannot() -> None:
