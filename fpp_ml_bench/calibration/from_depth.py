@@ -219,7 +219,7 @@ def _rig_of(found: Projector, rig: Rig, size: tuple[int, int], depths_mm: NDArra
         return replace(
             rig,
             projector=Pinhole(*size, focal, focal * aspect, c_u, c_v, (found.values["k1"], 0.0, 0.0, 0.0, 0.0)),
-            rotation=tuple(map(tuple, rotation_matrix(turn).tolist())),
+            rotation=tuple(map(tuple, rotation_matrix(tuple(turn)).tolist())),
             translation_m=(x, y, z),
             pitch_vertical_px=found.values["pitch_u"],
             pitch_horizontal_px=found.values["pitch_v"],

@@ -209,7 +209,9 @@ def _decomposed(matrix: NDArray[np.float64], kept: NDArray[np.bool_]) -> Project
             f"under {MOST_SKEW}); check the camera, the frame order, and that the depth belongs to these frames"
         )
     translation = -rotation @ (place[:3] / place[3])
-    return Projection(cv2.Rodrigues(rotation)[0][:, 0], translation[:, 0], np.diag(upper)[:2], upper[:2, 2], kept)
+    return Projection(
+        cv2.Rodrigues(rotation)[0][:, 0].astype(np.float64), translation[:, 0], np.diag(upper)[:2], upper[:2, 2], kept
+    )
 
 
 class Measured(NamedTuple):
@@ -222,21 +224,20 @@ class Measured(NamedTuple):
     bands: NDArray[np.intp]
 
     def only(self, kept: NDArray[np.bool_]) -> "Measured":
-        return Measured(*(values[..., kept] for values in self))
+        return Measured(self.points_m[:, kept], self.periods[:, kept], self.weights[:, kept], self.bands[kept])
 
 
 def measured_in(views: list[DepthView], most_px: int) -> Measured:
     """What ``views`` measure, thinned evenly to about ``most_px`` pixels."""
     step = max(1, -(-sum(len(view.depth_mm) for view in views) // most_px))
-    points, periods, strength, bands = [], [], [], []
-    for number, view in enumerate(views):
-        count = len(view.depth_mm[::step])
-        bands.append(number * _BANDS + np.arange(count) * _BANDS // max(count, 1))
-        for listed, values in ((points, view.points_m), (periods, view.periods), (strength, view.modulation)):
-            listed.append(values[:, ::step])
-    weights = np.concatenate(strength, axis=1)
-    weights /= np.median(weights, axis=1, keepdims=True)  # the noise of a phase goes as 1 / modulation
-    return Measured(np.concatenate(points, axis=1), np.concatenate(periods, axis=1), weights, np.concatenate(bands))
+    counts = [len(view.depth_mm[::step]) for view in views]
+    bands = [number * _BANDS + np.arange(count) * _BANDS // max(count, 1) for number, count in enumerate(counts)]
+    points, periods, weights = (
+        np.concatenate([getattr(view, name)[:, ::step] for view in views], axis=1)
+        for name in ("points_m", "periods", "modulation")
+    )
+    weights = weights / np.median(weights, axis=1, keepdims=True)  # the noise of a phase goes as 1 / modulation
+    return Measured(points, periods, weights, np.concatenate(bands))
 
 
 class Projector(NamedTuple):

@@ -225,7 +225,8 @@ def _result(
     devices = []
     for part, lens, size in zip((bundle.camera, bundle.projector), bundle.lenses, sizes, strict=True):
         fx, fy, cx, cy, *terms = x[part].tolist()
-        devices.append(Device(lens, Pinhole(*size, fx, fy, cx, cy, tuple(terms)), tuple(sigma[part].tolist())))
+        pinhole = Pinhole(size[0], size[1], fx, fy, cx, cy, tuple(terms))
+        devices.append(Device(lens, pinhole, tuple(sigma[part].tolist())))
     turn, shift = x[bundle.stereo][:3], x[bundle.stereo][3:]
     of_shift = root[bundle.stereo][3:]
     scale, factor = f"from the board's spacing of {board.spacing_mm:g} mm", 1.0
@@ -242,7 +243,8 @@ def _result(
         residuals = bundle.residuals(x, index)
         fitted.append(FittedPose(pose.name, turned, moved, held_out[index], bundle.targets[index], residuals))
     return Calibration(
-        *devices,
+        devices[0],
+        devices[1],
         tuple(map(tuple, cv2.Rodrigues(turn)[0].tolist())),
         tuple((factor * shift).tolist()),
         tuple(sigma[bundle.stereo][:3].tolist()),

@@ -167,11 +167,18 @@ class Code(ABC):
         """The entries of a rig file; `code_from_dict` gives an equal code back."""
 
 
-def check_keys(entries: Mapping[str, Any], keys: tuple[str, ...]) -> None:
-    """Raise `RigError` for an entry that is none of ``keys``."""
-    unknown = [str(key) for key in entries if key not in keys]
-    if unknown:
-        raise RigError(f"{unknown[0]}: unknown key; expected some of {', '.join(keys)}")
+def mapping(value: object, keys: Iterable[str], name: str = "", optional: Iterable[str] = ()) -> dict[str, Any]:
+    """``value`` as a mapping that has all ``keys``, and beside them ``optional`` ones at most; raises `RigError` naming
+    the key below ``name``."""
+    keys, optional = tuple(keys), tuple(optional)
+    expected = " and optionally ".join(", ".join(listed) for listed in (keys, optional) if listed)
+    if not isinstance(value, Mapping):
+        raise RigError(f"{name}: expected a mapping with the keys {expected}, got {value!r}".removeprefix(": "))
+    below = f"{name}." if name else ""
+    problems = [f"{below}{key}: unknown key" for key in value if key not in (*keys, *optional)]
+    problems += [f"{below}{key}: missing" for key in keys if key not in value]
+    require(not problems, f"{', '.join(problems)}; expected {expected}")
+    return dict(value)
 
 
 def whole(value: object, name: str, least: int, most: int) -> int:

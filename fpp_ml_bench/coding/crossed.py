@@ -25,7 +25,7 @@ from fpp_ml_bench.coding.code import (
     Coordinates,
     Limits,
     Shown,
-    check_keys,
+    mapping,
     numbers,
     require,
 )
@@ -40,7 +40,6 @@ Pair = tuple[float, float]
 LEAST_ANGLE_DEG = 5.0
 """Between the two carriers. Spectra of a window must be apart, and nearly parallel carriers are apart by their periods
 alone."""
-_KEYS = ("pitches_px", "angles_deg", "weights", "shifts_deg")
 
 
 @dataclass(frozen=True)
@@ -75,9 +74,7 @@ class Crossed:
 
     @classmethod
     def from_entries(cls, entries: Mapping[str, Any]) -> Crossed:
-        """The family of a rig file's entries; `RigError` naming the key."""
-        check_keys(entries, _KEYS)
-        require("pitches_px" in entries, "pitches_px: missing")
+        """The family of a rig file's entries, whose keys are the fields; `RigError` naming the key."""
         given: dict[str, Any] = {key: numbers(entries[key], 2, key) for key in entries if key != "shifts_deg"}
         if "shifts_deg" in entries:
             shifts = entries["shifts_deg"]
@@ -164,8 +161,7 @@ class Composite(Code):
 
     @classmethod
     def from_entries(cls, entries: Mapping[str, Any], length_px: int) -> Composite:
-        check_keys(entries, ("pitches_px",))
-        pitches = entries.get("pitches_px")
+        pitches = mapping(entries, ("pitches_px",))["pitches_px"]
         if not isinstance(pitches, list) or len(pitches) < 2:
             raise RigError(f"pitches_px: expected a list of two periods and more, got {pitches!r}")
         return cls(numbers(pitches, len(pitches), "pitches_px"))

@@ -7,14 +7,13 @@ the order can be wrong by 1; a median filter hides such errors but moves depth e
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.coding.code import AMBIGUOUS_FRACTION, Code, Coordinates, Limits, Shown, check_keys, number, whole
+from fpp_ml_bench.coding.code import AMBIGUOUS_FRACTION, Code, Coordinates, Limits, Shown, mapping, number, whole
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import RigError
 
@@ -116,11 +115,7 @@ class GrayCells:
     def from_entries(cls, entries: Any, length_px: int, cell_px: float = 1.0) -> Self:
         """From a rig file's mapping, whose keys are the fields; ``cell_px`` by default as given here, ``bits`` as many
         as the pattern needs. Raises `RigError`."""
-        if not isinstance(entries, Mapping):
-            raise RigError(
-                f"gray: expected a mapping with some of cell_px, bits, inverse, origin_px, least_first; got {entries!r}"
-            )
-        check_keys(entries, ("cell_px", "bits", "inverse", "origin_px", "least_first"))
+        mapping(entries, (), "", ("cell_px", "bits", "inverse", "origin_px", "least_first"))
         size = number(entries.get("cell_px", cell_px), "cell_px")
         if not size >= 1:
             raise RigError(f"cell_px: expected 1 px and more, got {size:g}")

@@ -27,7 +27,7 @@ from fpp_ml_bench.coding.code import (
     Coordinates,
     Limits,
     Shown,
-    check_keys,
+    mapping,
     number,
     numbers,
     require,
@@ -163,7 +163,7 @@ class PhaseShift(Code):
 
     @classmethod
     def from_entries(cls, entries: Mapping[str, Any], length_px: int) -> "PhaseShift":
-        check_keys(entries, _KEYS)
+        mapping(entries, (), "", _KEYS)
         pitches = entries.get("pitches_px", [entries["pitch_px"]] if "pitch_px" in entries else None)
         if not isinstance(pitches, list) or not pitches or ("pitch_px" in entries and "pitches_px" in entries):
             raise RigError("pitches_px: expected a list of periods in projector px (or pitch_px: a single one)")
@@ -190,6 +190,7 @@ class PhaseShift(Code):
         fringes = tuple(Fringes(pitch, listed) for pitch, listed in zip(periods, angles, strict=True))
         gray = entries.get("gray")
         finest = min(periods)
+        require(gray is None or isinstance(gray, Mapping), f"gray: expected a mapping of Gray cells, got {gray!r}")
         cells = None if gray is None else GrayCells.from_entries(gray, length_px, finest / 2)
         return cls(fringes, number(entries.get("origin_px", 0.0), "origin_px"), cells)
 

@@ -46,6 +46,7 @@ class CodePlan:
 class DirectionPlan(CodePlan):
     """The plan of the paper's kind of code, which has compiled kernels, with some of its steps."""
 
+    code: PhaseShift
     sinusoids: tuple[int, ...] = ()
     weights: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 0)))
     centres_rad: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
@@ -116,16 +117,16 @@ def projected(rays: Maps, depth_m: float, rig: Rig) -> Maps:
 def decode_direction(grey: NDArray, plan: DirectionPlan, limits: Limits) -> Coordinates:
     """Projector coordinate of a block from its grey levels, uint8 or float32 (rows of the plan, n)."""
     if grey.dtype != np.uint8:
-        code = plan.code if plan.gray else replace(plan.code, gray=None)  # type: ignore[call-arg]
+        code = plan.code if plan.gray else replace(plan.code, gray=None)
         return code.decode(grey, plan.length_px, limits)
     from fpp_ml_bench.coding import kernels
 
     count = grey.shape[1]
     results = np.empty(count), np.empty(count), np.empty(count), np.empty(count, dtype=np.uint8)
     thresholds = float(limits.min_modulation), float(plan.max_clipped_steps), float(limits.ambiguous_fraction)
-    code = len(plan.gray), plan.centres_rad, plan.pitch_px, float(plan.length_px)
+    cells = len(plan.gray), plan.centres_rad, plan.pitch_px, float(plan.length_px)
     reasons = tuple(float(reason) for reason in STAGE_REASONS)
-    kernels.decode_block(grey, plan.weights, code, (*thresholds, INCONSISTENT_RAD), reasons, results)
+    kernels.decode_block(grey, plan.weights, cells, (*thresholds, INCONSISTENT_RAD), reasons, results)
     return Coordinates(*results)
 
 

@@ -125,8 +125,10 @@ def depth_from_both(
     if device.is_distorted:
         straight, pixels = device.normalised(u, v), ((1.0, 0.0), (1.0, 0.0))
     result = DepthFromBoth(np.empty(u.shape), np.empty(u.shape))
-    flat = [(first.ravel(), second.ravel()) for first, second in ((x, y), straight, weights, result)]
-    kernels.depth_from_both(*flat[:2], pixels, flat[2], geometry(rig), flat[3])
+    rays, straight, by_weight, filled = (
+        (first.ravel(), second.ravel()) for first, second in ((x, y), straight, weights, result)
+    )
+    kernels.depth_from_both(rays, straight, pixels, by_weight, geometry(rig), filled)
     return result
 
 

@@ -34,15 +34,14 @@ A distortion has 5, 8, 12 or 14 coefficients (`fpp_ml_bench.optics.pinhole`).
 """
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
 
-from fpp_ml_bench.coding.code import numbers, require
+from fpp_ml_bench.coding.code import mapping, numbers, require
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.files import read_json, read_yaml, write_atomically
@@ -60,29 +59,18 @@ CALIBRATED_PX, MOST_SHARE = 0.1, 0.05
 this may be, at the far end of the range, where the rig measures best: no more than a twentieth."""
 
 
-def _mapping(value: object, keys: Iterable[str], name: str, optional: Iterable[str] = ()) -> dict[str, Any]:
-    prefix, expected = f"{name}: " if name else "", ", ".join(keys)
-    if not isinstance(value, Mapping):
-        raise RigError(f"{prefix}expected a mapping with the keys {expected}, got {value!r}")
-    problems = [f"unknown key {key}" for key in value if key not in (*keys, *optional)]
-    problems += [f"missing key {key}" for key in keys if key not in value]
-    possible = f", and optionally {', '.join(optional)}" if optional else ""
-    require(not problems, f"{prefix}{', '.join(problems)}; expected exactly {expected}{possible}")
-    return dict(value)
-
-
 def rig_from_dict(data: object) -> Rig:
     """The rig that a mapping in the form of this module's docstring describes. Raises `RigError` naming the key for
     anything unknown, missing, of the wrong type, or impossible as a rig."""
     sequence = data.get("sequence") if isinstance(data, Mapping) else None
     coded = isinstance(sequence, Mapping) and any(key in sequence for key in CODED_KEYS)
     keys = tuple(key for key in _RIG_KEYS if not (coded and key == "pitch_px"))
-    entries = _mapping(data, keys, "", _OPTIONAL_RIG_KEYS)
+    entries = mapping(data, keys, "", _OPTIONAL_RIG_KEYS)
     if not coded:
-        pitch = _mapping(entries.pop("pitch_px"), DIRECTIONS, "pitch_px")
+        pitch = mapping(entries.pop("pitch_px"), DIRECTIONS, "pitch_px")
         entries |= {f"pitch_{direction}_px": pitch[direction] for direction in DIRECTIONS}
     for device in ("camera", "projector"):
-        values = _mapping(entries[device], [entry.name for entry in fields(Pinhole)], device)
+        values = mapping(entries[device], [entry.name for entry in fields(Pinhole)], device)
         if isinstance(lens := values["distortion"], list | tuple) and len(lens) == 4:
             raise RigError(f"{device}.distortion: expected at least 5 numbers, got 4; write k3 too, as 0")
         try:
@@ -199,10 +187,8 @@ def _with_calibration(data: object, folder: Path) -> object:
     given = named if isinstance(named, Mapping) else {"file": named}
     twice = [key for key in ("camera", "projector", "rotation", "translation_m") if key in entries]
     require(not twice, f"calibration: {', '.join(twice)} given besides; a rig has one calibration")
-    keys = ("file", "unit", "camera_size", "projector_size")
-    unknown = [str(key) for key in given if key not in keys]
-    require(not unknown, f"calibration: unknown key {', '.join(unknown)}; expected some of {', '.join(keys)}")
-    file = given.get("file")
+    given = mapping(given, ("file",), "calibration", ("unit", "camera_size", "projector_size"))
+    file = given["file"]
     require(isinstance(file, str), f"calibration.file: expected the name of a file, got {file!r}")
     sizes: dict[str, tuple[int, int]] = {}
     for key in ("camera_size", "projector_size"):

@@ -9,14 +9,14 @@ fringes, or all of them.
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cached_property, lru_cache
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding.code import Code, Kind, whole
+from fpp_ml_bench.coding.code import Code, Kind, mapping, whole
 from fpp_ml_bench.coding.crossed import Composite, Crossed
 from fpp_ml_bench.coding.gray_code import GrayCells, GrayOnly
 from fpp_ml_bench.coding.phase_shift import Fringes, PhaseShift, equal_shifts
@@ -297,9 +297,7 @@ def sequence_from_dict(entries: object, lengths_px: Mapping[Direction, int]) -> 
         raise RigError(f"sequence: expected a mapping, got {entries!r}")
     paper = ("steps", "bits_horizontal", "bits_vertical")
     if any(key in entries for key in CODED_KEYS):
-        unknown = [key for key in entries if key not in CODED_KEYS]
-        if unknown:
-            raise RigError(f"sequence: unknown key {unknown[0]}; expected {', '.join(CODED_KEYS)}")
+        mapping(entries, (), "sequence", CODED_KEYS)
         codes = {
             direction: code_from_dict(entries[direction], lengths_px[direction], f"sequence.{direction}")
             for direction in DIRECTIONS
@@ -307,12 +305,10 @@ def sequence_from_dict(entries: object, lengths_px: Mapping[Direction, int]) -> 
         }
         crossed = None
         if "crossed" in entries:
-            if not isinstance(entries["crossed"], Mapping):
-                raise RigError(
-                    f"sequence.crossed: expected a mapping with the key pitches_px, got {entries['crossed']!r}"
-                )
+            pitches, *others = (entry.name for entry in fields(Crossed))
+            family = mapping(entries["crossed"], (pitches,), "sequence.crossed", others)
             try:
-                crossed = Crossed.from_entries(entries["crossed"])
+                crossed = Crossed.from_entries(family)
                 crossed.check(lengths_px["vertical"], lengths_px["horizontal"])
             except RigError as error:
                 raise RigError(f"sequence.crossed.{error}") from error
@@ -320,13 +316,10 @@ def sequence_from_dict(entries: object, lengths_px: Mapping[Direction, int]) -> 
         if not isinstance(order, list) or not all(isinstance(name, str) for name in order):
             raise RigError(f"sequence.order: expected a list of names, got {order!r}")
         return CodedSequence(codes.get("horizontal"), codes.get("vertical"), tuple(order), crossed)
-    problems = [f"unknown key {key}" for key in entries if key not in paper]
-    problems += [f"missing key {key}" for key in paper if key not in entries]
-    if problems:
-        raise RigError(
-            f"sequence: {', '.join(problems)}; expected exactly {', '.join(paper)}, or a code for each direction under "
-            f"{' and '.join(DIRECTIONS)}"
-        )
+    try:
+        mapping(entries, paper, "sequence")
+    except RigError as error:
+        raise RigError(f"{error}, or a code for each direction under {' and '.join(DIRECTIONS)}") from error
     return Sequence(**entries)
 
 

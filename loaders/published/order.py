@@ -72,7 +72,7 @@ class FrameOrder:
             if kind == "gray" and LEAST_BIT_FIRST in self.modifiers:
                 indices.reverse()
             order += indices
-        ends = [sequence.black, sequence.white]
+        ends = [frame.index for frame in sequence if frame.direction is None]
         order += reversed(ends) if WHITE_FIRST in self.modifiers else ends
         return tuple(sequence.frames[i] for i in order)
 
@@ -133,7 +133,7 @@ def _misfits(lines: _Lines, order: FrameOrder, rig: Rig) -> list[str]:
     sequence = rig.paper_sequence
     frames = order.frames(sequence)
     file_of_frame = {frame.index: number for number, frame in enumerate(frames)}
-    black, white = file_of_frame[sequence.black], file_of_frame[sequence.white]
+    black, white = (file_of_frame[frame.index] for frame in sequence if frame.direction is None)
     darkest, brightest = lines.darkest, lines.brightest
     # A code with more bits than its cells need has a first frame that is black all over, too.
     if max(lines.mean[black] - lines.mean[darkest], lines.mean[brightest] - lines.mean[white]) > _SAME_MEAN:

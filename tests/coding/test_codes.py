@@ -240,7 +240,7 @@ def test_single_frames_are_described_and_made_but_not_decoded_pixel_by_pixel():
         ({"vertical": CODES["unit cue"], "order": ["vertical", "vertical"]}, "at most once"),
         ({"vertical": CODES["unit cue"], "order": "vertical"}, "expected a list of names"),
         ({"vertical": CODES["unit cue"], "order": ["horizontal"]}, "expected each of vertical, black, white"),
-        ({"vertical": CODES["unit cue"], "diagonal": {}}, "unknown key diagonal"),
+        ({"vertical": CODES["unit cue"], "diagonal": {}}, "diagonal: unknown key"),
         ({"vertical": CODES["unit cue"], "order": ["crossed"]}, "expected each of vertical, black, white"),
         ({"vertical": {"scheme": "composite", "pitches_px": [18]}}, "two periods and more"),
         ({"vertical": {"scheme": "composite", "pitches_px": [18, 2]}}, "4 px and more"),

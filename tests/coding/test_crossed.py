@@ -131,5 +131,5 @@ def test_an_order_that_does_not_fit_is_refused():
         rig_from_dict(rig_of(order=["black"], crossed=FAMILY))
     with pytest.raises(RigError, match="expected each of crossed, black, white at most once"):
         rig_from_dict(rig_of(order=["crossed", "vertical"], crossed=FAMILY))
-    with pytest.raises(RigError, match="crossed: expected a mapping with the key pitches_px"):
+    with pytest.raises(RigError, match="crossed: expected a mapping with the keys pitches_px"):
         rig_from_dict(rig_of(crossed=3))

@@ -246,7 +246,7 @@ def test_patterns_come_with_a_manifest(tmp_path, capsys):
         ("", "empty"),
         ("sequence: {}", "projector: expected a mapping"),
         ("projector: {width: 20}", "projector.height: missing"),
-        ("projector: {width: 20, height: 20}", "missing key pitch_px"),
+        ("projector: {width: 20, height: 20}", "pitch_px: missing"),
         (
             "projector: {width: 20, height: 20}\nsequence: {vertical: {scheme: gray, bits: 1}, order: [vertical]}",
             "need",
