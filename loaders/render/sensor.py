@@ -33,8 +33,8 @@ _MASK = (1 << TABLE_BITS) - 1
 class Noise(NamedTuple):
     """Shot and read noise in grey levels: variance = ``read_variance`` + ``shot_per_grey`` x signal."""
 
-    read_variance: float
-    shot_per_grey: float
+    read_variance: float | np.float32
+    shot_per_grey: float | np.float32
 
     @classmethod
     def of_camera(cls, camera: CameraLight) -> "Noise":
