@@ -403,11 +403,12 @@ def _check_complete(content: bytes, form: str, unpacked: int | None) -> None:
         raise PredictionError(f"the PNG unpacks to {more}{min(length, unpacked)} bytes, expected {unpacked}")
 
 
-def png_bytes(image: NDArray[np.uint8]) -> bytes:
-    """A grey image uint8 (H, W) as PNG."""
+def png_bytes(image: NDArray[np.uint8], *settings: int) -> bytes:
+    """An image uint8 (H, W) or (H, W, 3) as PNG; ``settings`` are further ones of ``cv2.imencode``."""
     import cv2
 
-    done, content = cv2.imencode(".png", np.ascontiguousarray(image), [cv2.IMWRITE_PNG_COMPRESSION, COMPRESSION_LEVEL])
+    level = cv2.IMWRITE_PNG_COMPRESSION, COMPRESSION_LEVEL
+    done, content = cv2.imencode(".png", np.ascontiguousarray(image), [*level, *settings])
     if not done:
         raise LayoutError(f"OpenCV could not encode an image of shape {image.shape} as PNG")
     return content.tobytes()

@@ -241,10 +241,13 @@ LOCK_FILE = ".lock"
 def exclusive(
     lock_file: Path, folder: Path, activity: str, error_type: type[FppBenchError] = BuildError
 ) -> Iterator[None]:
-    """Hold ``lock_file``, created with its folder if absent and removed at the end; ``error_type`` for ``folder`` if
-    another process has it. The operating system releases the lock when the process ends in any way."""
+    """Hold ``lock_file``, created with its folder if absent and removed at the end; ``error_type`` for a ``folder``
+    that is a file, can't be written or that another process has. The operating system releases the lock when the
+    process ends in any way."""
     import filelock
 
+    if folder.exists() and not folder.is_dir():
+        raise error_type(f"{folder}: is a file; give a folder")
     lock = filelock.FileLock(lock_file, timeout=0)
     try:
         lock_file.parent.mkdir(parents=True, exist_ok=True)

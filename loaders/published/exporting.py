@@ -92,8 +92,6 @@ def exporting(out: Path) -> Iterator[Path]:
     of an export that was killed are removed. Raises `BuildError` when ``out`` is not empty, is a file, is being written
     by another process, or the disk can't be written."""
     target = out.resolve()
-    if target.exists() and not target.is_dir():
-        raise BuildError(f"{out}: is a file; give a new folder")
     if target.is_dir() and any(target.iterdir()):
         raise BuildError(f"{out}: is not empty; give a new folder, an export never adds to a folder or overwrites it")
     staging = target.with_name(f".{target.name}.export")

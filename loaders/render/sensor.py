@@ -28,13 +28,15 @@ _FLOAT = np.float32
 _MID_GREY = 127.5
 _CHUNK = 2048
 _MASK = (1 << TABLE_BITS) - 1
+_FIRST_FACTOR = np.uint32(0x9E3779B1)
+"""Of the hash of a pixel number."""
 
 
 class Noise(NamedTuple):
     """Shot and read noise in grey levels: variance = ``read_variance`` + ``shot_per_grey`` x signal."""
 
-    read_variance: float
-    shot_per_grey: float
+    read_variance: float | np.float32
+    shot_per_grey: float | np.float32
 
     @classmethod
     def of_camera(cls, camera: CameraLight) -> "Noise":
@@ -83,15 +85,9 @@ def frame_keys(stream: tuple[object, ...], frames: Sequence[int]) -> NDArray[np.
 
 def hash_pixels(pixels: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDArray[np.uint32]:
     """32-bit hash of each pixel number: a keyed two-round multiply-xorshift, a bijection of the pixel number."""
-    with np.errstate(over="ignore"):
-        h = (pixels * np.uint32(0x9E3779B1)) ^ keys[0]
-        h ^= h >> np.uint32(16)
-        h *= np.uint32(0x7FEB352D)
-        h ^= h >> np.uint32(15)
-        h += keys[1]
-        h *= np.uint32(0x846CA68B)
-        h ^= h >> np.uint32(16)
-    return h
+    hashes = np.empty(pixels.size, dtype=np.uint32)
+    fill_hashes(hashes, pixels * _FIRST_FACTOR, keys)
+    return hashes
 
 
 def standard_normal(pixels: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDArray[np.float32]:
@@ -228,12 +224,10 @@ def average(signal, pixels, samples):  # type: ignore[no-untyped-def]
 
 
 @njit
-def fill_bytes(target, signal, numbers, hashes, normal, keys, sensor):  # type: ignore[no-untyped-def]
-    """The answer of a `Sensor` to ``signal`` under the ``keys`` (2,) of a noise stream: fills ``target`` uint8 (n,).
-    ``numbers``: pixel numbers times the first factor of the hash, uint32 (n,)."""
-    n, table, grey_of_code, first, second = target.size, sensor.table, sensor.grey_of_code, keys[0], keys[1]
-    read_variance, shot_per_grey, black = sensor.noise.read_variance, sensor.noise.shot_per_grey, sensor.black_grey
-    for k in range(n):
+def fill_hashes(hashes, numbers, keys):  # type: ignore[no-untyped-def]
+    """Hashes of pixel numbers, given times `_FIRST_FACTOR`: fills ``hashes`` uint32 (n,)."""
+    first, second = keys[0], keys[1]
+    for k in range(hashes.size):
         h = numbers[k] ^ first
         h ^= h >> np.uint32(16)
         h = np.uint32(h * np.uint32(0x7FEB352D))
@@ -242,6 +236,15 @@ def fill_bytes(target, signal, numbers, hashes, normal, keys, sensor):  # type: 
         h = np.uint32(h * np.uint32(0x846CA68B))
         h ^= h >> np.uint32(16)
         hashes[k] = h
+
+
+@njit
+def fill_bytes(target, signal, numbers, hashes, normal, keys, sensor):  # type: ignore[no-untyped-def]
+    """The answer of a `Sensor` to ``signal`` under the ``keys`` (2,) of a noise stream: fills ``target`` uint8 (n,).
+    ``numbers``: pixel numbers times `_FIRST_FACTOR`, uint32 (n,)."""
+    n, table, grey_of_code = target.size, sensor.table, sensor.grey_of_code
+    read_variance, shot_per_grey, black = sensor.noise.read_variance, sensor.noise.shot_per_grey, sensor.black_grey
+    fill_hashes(hashes[:n], numbers, keys)
     for k in range(n):
         h = hashes[k]
         normal[k] = table[h & np.uint32(_MASK)] + table[(h >> np.uint32(TABLE_BITS)) & np.uint32(_MASK)]
@@ -276,7 +279,7 @@ def expose_kernel(out, light, pixels, keys, sensor):  # type: ignore[no-untyped-
         n = min(start + step, pixels.size) - start
         number = pixels[start : start + n]
         for k in range(n):
-            numbers[k] = np.uint32(number[k] * np.uint32(0x9E3779B1))
+            numbers[k] = np.uint32(number[k] * _FIRST_FACTOR)
         for row in range(light.frames.size):
             fill_signal(signal[: n * samples], row, light, start * samples)
             average(signal, n, samples)
@@ -304,7 +307,7 @@ def sense_kernel(out, radiance, pixels, keys, sensor):  # type: ignore[no-untype
     for start in range(0, pixels.size, _CHUNK):
         n = min(start + _CHUNK, pixels.size) - start
         for k in range(n):
-            numbers[k] = np.uint32(pixels[start + k] * np.uint32(0x9E3779B1))
+            numbers[k] = np.uint32(pixels[start + k] * _FIRST_FACTOR)
         for row in range(out.shape[0]):
             answer = out[row, start : start + n]
             fill_bytes(answer, radiance[row, start : start + n], numbers, hashes, normal, keys[row], sensor)

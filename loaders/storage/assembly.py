@@ -180,8 +180,6 @@ def _writing(place: Path | RemoteFolder) -> Iterator[tuple[Path, Callable[[str],
                 place.remove(WORK_FOLDER)
         return
     work = place / WORK_FOLDER
-    if place.exists() and not place.is_dir():
-        raise BuildError(f"{place}: is a file; give a folder")
     if place.is_dir() and not (place / MANIFEST).exists() and not work.exists() and any(place.iterdir()):
         raise BuildError(f"{place}: holds other files and no dataset; give a new or empty folder")
     with exclusive(work / "lock", place, "writing this folder"):

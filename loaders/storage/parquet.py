@@ -202,11 +202,7 @@ def _png(dataset: DatasetFolder, sample: str, column: str) -> bytes:
     files are 22% smaller than at OpenCV's level 1, and decode 1.7 times as fast (measured)."""
     depth = column == PREVIEW
     image = preview(dataset.depth_mm(sample)) if depth else dataset.frame(sample, int(column.removeprefix("frame_")))
-    settings = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
-    done, content = cv2.imencode(".png", np.ascontiguousarray(image), settings)
-    if not done:
-        raise DatasetError(f"sample {sample!r}: OpenCV could not encode an image of shape {image.shape} as PNG")
-    return content.tobytes()
+    return png_bytes(image, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY)
 
 
 def preview(depth_mm: NDArray[np.float32]) -> NDArray[np.uint8]:
