@@ -69,10 +69,9 @@ def conformal_quantile(scores: Mapping[str, list[Scores]], coverage: float) -> f
     weights = np.concatenate(
         [np.full(view.size, 1 / (len(views) * view.size)) for views in objects.values() for view in views]
     )
-    order = np.argsort(values, kind="stable")
-    reached = np.cumsum(weights[order])
     # The weights of an object add up to 1 but for rounding.
-    return float(values[order][np.searchsorted(reached, coverage * (count + 1) - 1e-9).clip(max=values.size - 1)])
+    share = min((coverage * (count + 1) - 1e-9) / count, 1.0)
+    return float(np.quantile(values, share, weights=weights, method="inverted_cdf"))
 
 
 def calibrate(
