@@ -69,9 +69,10 @@ def conformal_quantile(scores: Mapping[str, list[Scores]], coverage: float) -> f
     weights = np.concatenate(
         [np.full(view.size, 1 / (len(views) * view.size)) for views in objects.values() for view in views]
     )
+    order = np.argsort(values, kind="stable")
+    reached = np.cumsum(weights[order])
     # The weights of an object add up to 1 but for rounding.
-    share = min((coverage * (count + 1) - 1e-9) / count, 1.0)
-    return float(np.quantile(values, share, weights=weights, method="inverted_cdf"))
+    return float(values[order][np.searchsorted(reached, coverage * (count + 1) - 1e-9).clip(max=values.size - 1)])
 
 
 def calibrate(
@@ -149,10 +150,8 @@ def write_calibrated(calibration: Calibration, folder: Path, dataset: DatasetFol
         )
     if out.exists():
         raise PredictionError(f"{out} is there already; give a new folder")
-    out.mkdir(parents=True)
-    for path in sorted(folder.iterdir()):
-        if not path.name.endswith(SIGMA) and path.name != SUBMISSION_FILE:
-            shutil.copyfile(path, out / path.name)
+    left_out = shutil.ignore_patterns(f"*{SIGMA}", SUBMISSION_FILE)
+    shutil.copytree(folder, out, ignore=left_out, copy_function=shutil.copyfile)
     for sample in checked.listing.present:
         sigma_mm = checked.listing.sigma_mm(sample, dataset.size).astype(np.float64) * calibration.factor
         np.save(out / f"{sample}{SIGMA}", sigma_mm.astype(np.float32))
