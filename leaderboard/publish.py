@@ -6,7 +6,6 @@ Own definition; 10 mm is the widest tolerance that this benchmark counts pixels 
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -71,21 +70,13 @@ Fingerprint of the dataset: `{fingerprint}`. Written by fpp-ml-bench {package}.
 {end}"""
 
 
-@dataclass(frozen=True)
-class Task:
-    """A ranking on the Hub: results of other tracks, or with more frames, have their own."""
-
-    id: str
-    single_shot: bool
-    track: Track
+TRACKS: tuple[Track, ...] = ("metric", "oracle range")
+"""Those that have tasks on the Hub; each has one for a frame and one for more."""
 
 
-TASKS = (
-    Task("single_shot_depth", True, "metric"),
-    Task("single_shot_depth_oracle_range", True, "oracle range"),
-    Task("multi_frame_depth", False, "metric"),
-    Task("multi_frame_depth_oracle_range", False, "oracle range"),
-)
+def task_id(single_shot: bool, track: Track) -> str:
+    """The name of a ranking on the Hub."""
+    return f"{'single_shot' if single_shot else 'multi_frame'}_depth{'' if track == TRACKS[0] else '_oracle_range'}"
 
 
 def score(object_mae_mm: float) -> float:
@@ -93,30 +84,28 @@ def score(object_mae_mm: float) -> float:
     return round(100.0 / (1.0 + object_mae_mm / SCORE_HALF_MM), _SCORE_DIGITS)
 
 
-def task_of(row: Row, name: str) -> Task:
+def task_of(row: Row, name: str) -> str:
     """The task that a result belongs to; `PublishError`, naming the file ``name``, where it belongs to none."""
     if (row.dataset.split, row.target, row.mode) != (SPLIT, TARGET, MODE):
         raise PublishError(
             f"{name}: the Hub's benchmark is scored on the {SPLIT} split against {TARGET} in {MODE} mode, this result "
             f"on {row.dataset.split} against {row.target} in {row.mode} mode; score the predictions so first"
         )
-    single = set(row.submission.frames_used) <= {SINGLE_SHOT_FRAME}
-    task = next((task for task in TASKS if (task.single_shot, task.track) == (single, row.track)), None)
-    if task is None:
+    if row.track not in TRACKS:
         raise PublishError(
             f"{name}: the Hub's benchmark has no task for the {row.track} track (the method was given "
             f"{given_truth(row.track)}); publish a result of a method that finds the object and the fringe order itself"
         )
-    return task
+    return task_id(set(row.submission.frames_used) <= {SINGLE_SHOT_FRAME}, row.track)
 
 
 def dataset_texts(dataset: DatasetFolder, repo: str, licence: str) -> dict[str, str]:
     """What a dataset's repository ``repo`` says beside its data: the card, and the registration of the tasks."""
     widest = max(dataset.configs, key=CONFIGS.index)
     tasks = [
-        {"id": task.id, "config": CONFIGS[0] if task.single_shot else widest, "split": SPLIT}
-        for task in TASKS
-        if task.single_shot or widest != CONFIGS[0]
+        {"id": task_id(single, track), "config": CONFIGS[0] if single else widest, "split": SPLIT}
+        for single in ([True] if widest == CONFIGS[0] else [True, False])
+        for track in TRACKS
     ]
     description = f"Depth from fringe images in structured light. {SCORE_TEXT[0].upper()}{SCORE_TEXT[1:]}."
     evaluation = {"name": NAME, "description": description, "evaluation_framework": FRAMEWORK, "tasks": tasks}
@@ -198,7 +187,7 @@ def stage_results(
                 f"{row.dataset.content[other[0]]}, there {printable(held.get(other[0]), 40)}); score the predictions "
                 "on that dataset, or publish this one"
             )
-        task = task_of(row, file).id
+        task = task_of(row, file)
         if task in named:
             raise PublishError(
                 f"{printable(str(named[task]), 300)} and {file} are both results of {task}; a model has one of "

@@ -114,7 +114,7 @@ class GroupKey:
         return "exact depth" if self.target == "depth_exact" else "decoded depth"
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class Ranked:
     """A row: a method on the test objects in ``entry`` and on the ``unseen`` ones, or ``entry`` alone. With the best
     and the worst rank that the tests allow, None where it is not ranked; a row beside the ranks has a ``place``, 1 +
@@ -139,16 +139,17 @@ class Ranked:
     @property
     def provenance(self) -> str:
         """The weakest of its parts' (a key of `MEANING`)."""
-        return max((part.provenance for part in self._parts), key=list(MEANING).index)
+        return max((part.provenance for part in self.entries), key=list(MEANING).index)
 
     @property
-    def _parts(self) -> list[Entry]:
+    def entries(self) -> list[Entry]:
+        """Its parts."""
         return [entry for entry in (self.entry, self.unseen) if entry is not None]
 
     @cached_property
     def objects(self) -> tuple[ObjectMeans, ...]:
         """The objects that it is scored on."""
-        return tuple(part for entry in self._parts for part in entry.row.per_object)
+        return tuple(part for entry in self.entries for part in entry.row.per_object)
 
     def value(self, key: str) -> float | None:
         """Mean of a sort key over all samples of the row; None for an empty pixel set or an unknown time. Of a row with
@@ -157,7 +158,7 @@ class Ranked:
             return self.entry.value(key)
         if key in HEADLINE:
             return mean_over(self.objects, key)
-        known = [(value, part.row.dataset.samples) for part in self._parts if (value := part.value(key)) is not None]
+        known = [(value, part.row.dataset.samples) for part in self.entries if (value := part.value(key)) is not None]
         return sum(value * samples for value, samples in known) / sum(n for _, n in known) if known else None
 
     def interval(self, key: str) -> Interval | None:
@@ -174,7 +175,7 @@ class Ranked:
 
     def on(self, benchmark: str) -> Entry | None:
         """The part of it on the objects of `TEST` or on those of `UNSEEN`, whatever its frames are."""
-        return next((part for part in self._parts if part.is_unseen == (benchmark == UNSEEN)), None)
+        return next((part for part in self.entries if part.is_unseen == (benchmark == UNSEEN)), None)
 
 
 def _title(name: str) -> str:
@@ -229,19 +230,18 @@ def more_than_trivial(groups: Sequence[Group]) -> list[Group]:
     return [group for group in groups if not all(map(is_trivial, group.rows))] or list(groups)
 
 
-def with_ratios(groups: Sequence[Group]) -> list[Group]:
-    """``groups`` whose rows have their ``ratio``: object MAE over the smallest that a trivial row by the same rules has
-    on the row's objects. Trivial rows need at most one frame, so they count in all classes; a row that is given
+def set_ratios(groups: Sequence[Group]) -> None:
+    """Give the rows of ``groups`` their ``ratio``: object MAE over the smallest that a trivial row by the same rules
+    has on the row's objects. Trivial rows need at most one frame, so they count in all classes; a row that is given
     something of the ground truth counts in the tracks that are given no less."""
     trivial: dict[GroupKey, list[tuple[set[str], dict[str, float]]]] = {}
     for group in groups:
         for row in filter(is_trivial, group.rows):
             trivial.setdefault(_alike(group.key), []).append((_given(group.key), row.object_means(RANK_KEY)))
-    with_ratio = []
     for group in groups:
         means = [own for given, own in trivial.get(_alike(group.key), []) if given <= _given(group.key)]
-        with_ratio.append(replace(group, rows=tuple(replace(row, ratio=_ratio(row, means)) for row in group.rows)))
-    return with_ratio
+        for row in group.rows:
+            row.ratio = _ratio(row, means)
 
 
 def _alike(key: GroupKey) -> GroupKey:
@@ -308,7 +308,9 @@ def rank(entries: Iterable[Entry], sort: str = DEFAULT_SORT) -> list[Group]:
     members: dict[GroupKey, list[Entry]] = {}
     for entry in entries:
         members.setdefault(GroupKey.of(entry), []).append(entry)
-    return with_ratios([_group(key, members[key], sort) for key in sorted(members, key=lambda key: key.order)])
+    groups = [_group(key, members[key], sort) for key in sorted(members, key=lambda key: key.order)]
+    set_ratios(groups)
+    return groups
 
 
 def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
@@ -324,7 +326,7 @@ def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
 
     def by_rank(row: Ranked) -> tuple[object, ...]:
         value = row.value(sort)
-        ranks = (row.best_rank, row.worst_rank) if row.best_rank is not None else (math.inf, 0)
+        ranks = row.best_rank or math.inf, row.worst_rank or 0
         return value is None, *ranks, 0.0 if value is None else turned(value), row.entry.name
 
     shown.sort(key=by_rank)
@@ -334,12 +336,11 @@ def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
         return Group(key, tuple(shown), sort, (why, *notes))
     objects = sorted(family[0].object_means(sort))
     errors = np.array([[row.object_means(sort)[name] for name in objects] for row in family])
-    ranges = dict(zip(map(id, family), rank_ranges(errors), strict=True))
+    for row, ranks in zip(family, rank_ranges(errors), strict=True):
+        row.best_rank, row.worst_rank = ranks
     values = sorted(row.value(sort) or 0.0 for row in family)
-    places = {id(row): 1 + bisect_left(values, row.value(sort) or 0.0) for row in complete}
-    for number, row in enumerate(shown):
-        best, worst = ranges.get(id(row), (None, None))
-        shown[number] = replace(row, best_rank=best, worst_rank=worst, place=places.get(id(row)))
+    for row in complete:
+        row.place = 1 + bisect_left(values, row.value(sort) or 0.0)
     if len(complete) < len(shown):
         notes.insert(0, "Rows without a result on the unseen objects have no rank.")
     return Group(key, tuple(sorted(shown, key=by_rank)), sort, tuple(notes))

@@ -203,8 +203,9 @@ def differences(row: Row, folder: Path, dataset: DatasetFolder) -> list[str]:
     raises."""
     scored = evaluate(folder, dataset, row.dataset.split, row.target, row.edge_band_px, row.mode)
     rows = row, Row.model_validate(row_content(scored, digits=None))
-    pair = (each.model_dump(mode="json", exclude=_NOT_COMPARED) for each in rows)
-    found = disagreements(*pair, cancelling=1e-9 * (row.metrics.object_mae_mm or 0.0), digits=DIGITS)
+    stored, computed = (each.model_dump(mode="json", exclude=_NOT_COMPARED) for each in rows)
+    cancelling = 1e-9 * (row.metrics.object_mae_mm or 0.0)
+    found = disagreements(stored, computed, cancelling=cancelling, digits=DIGITS)
     return difference_lines(found, "row")
 
 

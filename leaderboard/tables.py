@@ -30,7 +30,7 @@ from fpp_ml_bench.leaderboard.columns import (
     uncertainty,
 )
 from fpp_ml_bench.leaderboard.ranking import MOST_PAIRED, Group, Ranked
-from fpp_ml_bench.leaderboard.rows import BY_ITS_AUTHORS, BY_THE_PAPER, TEST, UNSEEN
+from fpp_ml_bench.leaderboard.rows import BY_ITS_AUTHORS, BY_THE_PAPER, TEST, UNSEEN, Entry
 from fpp_ml_bench.paper import paper_rows
 from fpp_ml_bench.style import interval_text, millimetres
 from fpp_ml_bench.tables import Table, markdown_text
@@ -107,13 +107,10 @@ def reported_tables() -> dict[str, ReportedTable]:
     tables = {}
     for content in (paper_rows(), others):
         for table in content["tables"]:
-            rows = []
-            for row in table["rows"]:
-                errors_mm = dict(zip(content["columns"], row["errors_mm"], strict=True))
-                rows.append(ReportedRow(**row | {"errors_mm": errors_mm}))
+            errors_mm = [dict(zip(content["columns"], row["errors_mm"], strict=True)) for row in table["rows"]]
+            rows = [ReportedRow(**row | {"errors_mm": mm}) for row, mm in zip(table["rows"], errors_mm, strict=True)]
             source = f"{BY_ITS_AUTHORS} ({table['source']})" if "source" in table else BY_THE_PAPER
-            name, title = table["name"], table["title"]
-            tables[name] = ReportedTable(name, title, tuple(rows), source, table.get("figure"))
+            tables[table["name"]] = ReportedTable(**table | {"rows": tuple(rows), "source": source})
     return tables
 
 
@@ -232,7 +229,7 @@ def table_json(groups: Sequence[Group], papers: Sequence[ReportedTable], sort: s
         {
             **asdict(group.key),
             "title": group.title,
-            "rows": [_json_row(group, row) for row in group.rows],
+            "rows": [{**_cells(group, row), "parts": list(map(_part, row.entries))} for row in group.rows],
             "pairs": list(map(asdict, group.pairs)) if len(group.ranked) <= MOST_PAIRED else None,
             "notes": group.notes,
         }
@@ -242,10 +239,8 @@ def table_json(groups: Sequence[Group], papers: Sequence[ReportedTable], sort: s
     return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
-def _json_row(group: Group, row: Ranked) -> dict[str, Any]:
-    files = [part for part in (row.entry, row.unseen) if part is not None]
-    parts = [{"source": part.path.name, **part.row.model_dump(mode="json")} for part in files]
-    return {**_cells(group, row), "parts": parts}
+def _part(entry: Entry) -> dict[str, Any]:
+    return {"source": entry.path.name, **entry.row.model_dump(mode="json")}
 
 
 def table_csv(groups: Sequence[Group]) -> str:

@@ -51,10 +51,8 @@ AGREES = 1e-9
 Scores = dict[str, float | None]
 
 
-class Result(SparseModel):
-    """Everything that `fpp-eval` computes. Deterministic but for ``created`` and the machine in ``environment``."""
-
-    SPARSE = ("reliance", "robustness", "uncertainty")
+class _Rules(StrictModel):
+    """What was scored, and by which rules."""
 
     schema_version: SchemaVersion
     protocol_version: Annotated[str, Field(pattern=r"^[0-9]{1,4}\.[0-9]{1,4}\.[0-9]{1,4}$")]
@@ -66,6 +64,11 @@ class Result(SparseModel):
     frames_class: FramesClass
     edge_band_px: Annotated[int, Field(ge=0, le=1000)]
     edge_jump_mm: Annotated[float, Field(gt=0)]
+
+
+class _Scores(StrictModel):
+    """The scores of a split, and what they were computed with."""
+
     metrics: Metrics
     intervals: parts.Intervals
     median: Metrics
@@ -76,6 +79,19 @@ class Result(SparseModel):
     per_sample: list[SampleResult] = Field(max_length=100_000)
     bootstrap: parts.Bootstrap
     seeds: dict[Text, Count]
+
+
+class ArrayScores(_Scores):
+    """The scores that a `Result` has, of arrays in memory: without a submission and a dataset, so it is not ranked."""
+
+    uncertainty: Uncertainty | None = None
+
+
+class Result(SparseModel, _Scores, _Rules):
+    """Everything that `fpp-eval` computes. Deterministic but for ``created`` and the machine in ``environment``."""
+
+    SPARSE = ("reliance", "robustness", "uncertainty")
+
     environment: parts.Environment
     reliance: Reliance | None = None
     robustness: dict[Literal["test", "unseen"], Robustness] | None = None
@@ -127,22 +143,6 @@ class Result(SparseModel):
         follows = derived(self.per_sample)
         _check_same("", self.model_dump(include=set(follows)), follows)
         return self
-
-
-class ArrayScores(StrictModel):
-    """The scores that a `Result` has, of arrays in memory: without a submission and a dataset, so it is not ranked."""
-
-    metrics: Metrics
-    intervals: parts.Intervals
-    median: Metrics
-    pooled: parts.Headline
-    samples_without_object: Count
-    samples_without_background: Count
-    per_object: list[parts.ObjectResult]
-    per_sample: list[SampleResult]
-    bootstrap: parts.Bootstrap
-    seeds: dict[Text, Count]
-    uncertainty: Uncertainty | None = None
 
 
 def scores_of(scored: "Sequence[Scored]") -> dict[str, Any]:

@@ -40,8 +40,8 @@ _TYPES: dict[str, Any] = {
 
 def _fields(metrics: Iterable[Metric]) -> dict[str, Any]:
     """A field for each metric, as the annotations of a model."""
-    types = {metric.key: (metric.optional, _TYPES[metric.unit]) for metric in metrics}
-    return {key: Annotated[kind, Field(default=None)] if optional else kind for key, (optional, kind) in types.items()}
+    types = ((metric, _TYPES[metric.unit]) for metric in metrics)
+    return {metric.key: Annotated[kind, Field(default=None)] if metric.optional else kind for metric, kind in types}
 
 
 class Scores(StrictModel):

@@ -34,8 +34,6 @@ if TYPE_CHECKING:
     from fpp_ml_bench.evaluation.submission.description import Submission
 
 Depth = NDArray[np.floating[Any]]
-MM_PER_UNIT = {"mm": 1.0, "m": 1000.0, "normalised": 1000.0}
-"""Upper bound in mm of one declared unit; for normalised depth, that no working range is above 1 m."""
 
 
 def declared_units(target_max: float, units: str | None) -> Units:
@@ -56,11 +54,6 @@ def in_mm(values: Any, units: Units) -> Any:
     return values.astype(np.float64) * MM_PER_M if units == "m" else values
 
 
-def not_in_mm(largest: float, reach_mm: float) -> bool:
-    """Whether depths up to ``largest`` can't be mm where there are depths up to ``reach_mm``, but metres or shares."""
-    return 0 < largest < min(protocol.METRES_BELOW, reach_mm / protocol.UNITS_APART)
-
-
 def value_problems(prediction: Depth, target_mm: Depth, reach_mm: float, units: Units) -> list[str]:
     """What is wrong with the values of a prediction (H, W) in ``units``; usually an empty list. ``reach_mm``: up to
     which depth there is something to measure, the far end of the rig's working range, or the largest target; 0 where
@@ -75,7 +68,7 @@ def value_problems(prediction: Depth, target_mm: Depth, reach_mm: float, units: 
             return problems
         prediction = np.where(np.isfinite(prediction), prediction, prediction.dtype.type(0))
         low, high = float(prediction.min()), float(prediction.max())
-    largest = protocol.LARGEST_MM / MM_PER_UNIT[units]
+    largest = protocol.LARGEST_MM / (1 if units == "mm" else MM_PER_M)  # no working range is above 1 m
     if max(high, -low) > largest:
         values = f"values up to {max(high, -low):.3g} {units} in magnitude"
         problems.append(f"holds {values}; the limit is {largest:g}; write 0 where nothing was measured")
@@ -91,7 +84,7 @@ def _unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, re
         return None
     reach = f"its largest value is {high:.4g}, and there are depths up to {reach_mm / MM_PER_M:.4g} m"
     if units == "mm":
-        if not_in_mm(high, reach_mm):
+        if 0 < high < min(protocol.METRES_BELOW, reach_mm / protocol.UNITS_APART):
             return (
                 f"looks like metres or normalised depth: {reach}; convert it to mm, or declare units: m or normalised"
             )
@@ -137,10 +130,8 @@ def scored_pair(
     and subtracting 1.7 m.
 
     Raises DatasetError where the target has no range to normalise by."""
-    if units == "mm":
-        return values, target_mm
-    if units == "m":
-        return values.astype(np.float64) * MM_PER_M, target_mm
+    if units != "normalised":
+        return in_mm(values, units), target_mm
     inside = object_mask(target_mm)
     if not inside.any():
         if mode == "standard" and not values.any():

@@ -150,10 +150,8 @@ def write_calibrated(calibration: Calibration, folder: Path, dataset: DatasetFol
         )
     if out.exists():
         raise PredictionError(f"{out} is there already; give a new folder")
-    out.mkdir(parents=True)
-    for path in sorted(folder.iterdir()):
-        if not path.name.endswith(SIGMA) and path.name != SUBMISSION_FILE:
-            shutil.copyfile(path, out / path.name)
+    left_out = shutil.ignore_patterns(f"*{SIGMA}", SUBMISSION_FILE)
+    shutil.copytree(folder, out, ignore=left_out, copy_function=shutil.copyfile)
     for sample in checked.listing.present:
         sigma_mm = checked.listing.sigma_mm(sample, dataset.size).astype(np.float64) * calibration.factor
         np.save(out / f"{sample}{SIGMA}", sigma_mm.astype(np.float32))

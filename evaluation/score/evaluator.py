@@ -84,7 +84,9 @@ def evaluate(
     rules = Rules(target, content.get("units", "mm"), cast(RangeRule, rule), cast(Mode, mode))
     outcomes: Iterable[Scored | list[str]] = ()
     if rules.units in get_args(Units):
-        read = listing.reader(dataset.size, float(level) if type(level) in (int, float) else None)
+        read = listing.reader(
+            dataset.size, level if isinstance(level, int | float) and 0 < level < protocol.LARGEST_MM else None
+        )
         outcomes = _scored(listing, read, dataset, rules, edge_band_px)
     if refusal is None:
         try:
@@ -115,12 +117,12 @@ def evaluate(
             hashes.setdefault((dataset.split_of_sample(sample.name), column), {})[sample.name] = digest
     content = dict(dataset.content_hash(*column, images) for column, images in hashes.items())
     benchmark = benchmark_of(content)
-    return Result(
-        schema_version=protocol.RESULT_SCHEMA_VERSION,
-        protocol_version=protocol.PROTOCOL_VERSION,
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
-        submission=description.model_copy(update={"predicted": None}),
-        dataset={
+    about: dict[str, Any] = {
+        "schema_version": protocol.RESULT_SCHEMA_VERSION,
+        "protocol_version": protocol.PROTOCOL_VERSION,
+        "created": datetime.now(UTC).isoformat(timespec="seconds"),
+        "submission": description.model_copy(update={"predicted": None}),
+        "dataset": {
             "name": printable(Path(dataset.path).resolve().name, 100).strip() or "dataset",
             "content": content,
             "code": code_of(dataset.sequence),
@@ -129,14 +131,14 @@ def evaluate(
             "size": list(dataset.size),
             "samples": len(scored),
         },
-        target=target,
-        mode=mode,
-        frames_class=frames_class(dataset.sequence, description.frames_used),
-        edge_band_px=edge_band_px,
-        edge_jump_mm=edge_jump_mm(dataset.size[1]),
-        environment=environment(),
-        **scores_of(scored),
-    )
+        "target": target,
+        "mode": mode,
+        "frames_class": frames_class(dataset.sequence, description.frames_used),
+        "edge_band_px": edge_band_px,
+        "edge_jump_mm": edge_jump_mm(dataset.size[1]),
+        "environment": environment(),
+    }
+    return Result(**about, **scores_of(scored))
 
 
 @dataclass(frozen=True)

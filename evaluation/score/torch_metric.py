@@ -58,8 +58,8 @@ class DepthScores(Metric):
         scored = np.ones(targets.shape, bool) if void is None else ~_checked_void(void, targets.shape)
         for predicted, truth, pixels in zip(predictions, targets, scored, strict=True):
             # What a void pixel holds, as NaN, does not matter.
-            maps = (np.where(pixels, depths, 0.0) for depths in (predicted, truth))
-            sample, _ = score_arrays(*maps, ~pixels, self.units, check_prediction_units=self.units is None)
+            shown, true = (np.where(pixels, depths, 0.0) for depths in (predicted, truth))
+            sample, _ = score_arrays(shown, true, ~pixels, self.units, check_prediction_units=self.units is None)
             for number, key in enumerate(KEYS):
                 if (score := METRICS[key].value(sample)) is not None:
                     self.sums[number] += score
