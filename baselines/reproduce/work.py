@@ -40,7 +40,7 @@ from fpp_ml_bench.baselines.training.engine import RECIPE
 from fpp_ml_bench.baselines.training.recipe import Recipe
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.depth import RangeRule
-from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError, WeightsError
+from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError, TrainingError, WeightsError
 from fpp_ml_bench.evaluation.metrics import HEADLINE
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION, Mode, Units
 from fpp_ml_bench.evaluation.result.file import write_json, write_result
@@ -110,6 +110,7 @@ def reproduce(settings: ReproduceSettings) -> Outcome:
     check_machine(wanted, folders, settings.anyway, settings.command)
     with exclusive(folders.runs / "lock", folders.runs, "reproducing into this folder"):
         opened = plan.open_dataset(settings.data, jobs, folders, settings.report)
+        check_same_dataset(opened, wanted, folders)
         outcome = Outcome(opened, jobs)
         try:
             _work(settings, outcome)
@@ -214,6 +215,18 @@ def check_run_folders(jobs: Sequence[Job], folders: Folders) -> None:
             raise TrainingError(
                 f"{path.parent}: holds a training of another recipe, {job.rows[0]} differs in {differs}; to keep both, "
                 f"mv {out} {out}-before, or give another --out"
+            )
+
+
+def check_same_dataset(opened: DatasetFolder, jobs: Sequence[Job], folders: Folders) -> None:
+    """Refuse a dataset other than that of the trainings that were begun: DatasetError names both."""
+    for job in jobs:
+        path = folders.training(job.recipe) / RECIPE
+        trained_on = str(_stored(path).get("fingerprint")) if path.is_file() else opened.fingerprint
+        if trained_on != opened.fingerprint:
+            raise DatasetError(
+                f"{opened.path}: has fingerprint {opened.fingerprint[:8]}, but the training in {path.parent} is of "
+                f"{trained_on[:8]}; give that dataset as DATASET, or another --out"
             )
 
 

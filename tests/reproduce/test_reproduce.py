@@ -250,6 +250,14 @@ def test_a_training_of_another_recipe_is_refused_before_any_work(run, trainer, t
     assert run(TABLE) == 2 and "can't be read" in capsys.readouterr().err
 
 
+def test_a_training_on_another_dataset_is_refused(run, trainer, unscored, tmp_path, capsys):
+    assert run(TABLE) == 0 and run(TABLE) == 0
+    path = tmp_path / "runs" / "cpu" / "unet-individual-rmse" / "recipe.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"fingerprint": 64 * "a"}))
+    assert run(TABLE) == 2
+    assert "is of aaaaaaaa; give that dataset as DATASET, or another --out" in capsys.readouterr().err
+
+
 def test_the_papers_preset_needs_a_gpu(run, trainer, unscored, monkeypatch, capsys):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert run(TABLE, "--preset", "paper", "--minutes", "10") == 2

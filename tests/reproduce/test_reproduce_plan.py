@@ -1,6 +1,5 @@
 """What `fpp-bench reproduce` plans to do, on which dataset, and how it judges the paper's orderings."""
 
-import json
 from dataclasses import replace
 from statistics import fmean
 from types import SimpleNamespace
@@ -110,20 +109,6 @@ def test_a_dataset_without_the_frames_is_refused(tmp_path, dataset):
         DatasetError, match="multi_frame/horizontal needs the frames of horizontal, stored are those of"
     ):
         open_dataset(dataset.path, planned(["multi_frame"], "cpu"), folders(tmp_path), print)
-
-
-def test_one_runs_folder_is_of_one_dataset(tmp_path, dataset):
-    jobs, run_folders = planned(["normalization"], "cpu"), folders(tmp_path)
-    first = open_dataset(dataset.path, jobs, run_folders, print)
-    assert open_dataset(dataset.path, jobs, run_folders, print).fingerprint == first.fingerprint
-    record = run_folders.runs / "dataset.json"
-    recorded = json.loads(record.read_text())
-    record.write_text(json.dumps({**recorded, "fingerprint": 64 * "a"}))
-    with pytest.raises(DatasetError, match=r"are of aaaaaaaa .*give that dataset as DATASET, or another --out"):
-        open_dataset(dataset.path, jobs, run_folders, print)
-    record.write_text("{")
-    with pytest.raises(DatasetError, match="damaged"):
-        open_dataset(dataset.path, jobs, run_folders, print)
 
 
 def line(label: str, paper_mae: float | None, errors: dict[str, float], entry: Entry | None = None) -> Line:
