@@ -274,7 +274,7 @@ def test_text_of_a_finding_can_only_be_text(tmp_path):
         "hardware": {"cpu": "c", "cores": 1},
     }
     table = Table("<u>", ("<u>",), (("<script>",), (0.123456,), (None,)))
-    page = diagnosis.report_page(context, [("<q>?", Finding("linear", "<t>", "<s>", table=table))])
+    page = diagnosis.report_page(context, [("<q>?", Finding("linear", "<t>", "<s>", table=table))]).decode()
     for tag in ("<b>x", "<script>", "<s>", "<t>", "<u>", "<q>", "fpp-bench <i>"):
         assert tag not in page
     assert "0.1235" in page
