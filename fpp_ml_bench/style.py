@@ -125,7 +125,7 @@ def data_uri(png: bytes) -> str:
 
 
 def page(
-    package: str, template: str, title: str, style: str = "", script: str = "", description: str = "", **values: object
+    package: str, template: str, title: str, style: str = "", script: str = "", description: str = "", **values: Any
 ) -> bytes:
     """A whole HTML page, whose body is ``templates/TEMPLATE`` of ``package`` by Jinja2 with ``values``, every one of
     them escaped. A template may include or import those of this package's own ``templates`` too. ``title`` and
@@ -135,7 +135,7 @@ def page(
 
     environment = _environment(package)
     style = Path(__file__).with_name("templates").joinpath("page.css").read_text(encoding="utf-8") + style
-    own = {"body": environment.get_template(template).render(values), "style": style, "script": script}
+    own = {"body": environment.get_template(template).render(title=title, **values), "style": style, "script": script}
     frame = environment.get_template("page.html")
     own = {name: Markup(text) for name, text in own.items()}
     return str(frame.render(title=title, description=description, **own)).encode("utf-8")

@@ -15,13 +15,21 @@ from pathlib import Path
 from typing import Literal
 
 from fpp_ml_bench.baselines.reproduce.plan import Folders, Job, variants
-from fpp_ml_bench.baselines.reproduce.scoring import MAIN_KEY, AllFrames, all_frames_that_hold
-from fpp_ml_bench.baselines.reproduce.work import Outcome, ReproduceSettings, current_weights, file_sha256, state_of
+from fpp_ml_bench.baselines.reproduce.work import (
+    MAIN_KEY,
+    AllFrames,
+    Outcome,
+    ReproduceSettings,
+    all_frames_that_hold,
+    current_weights,
+    file_sha256,
+    state_of,
+)
 from fpp_ml_bench.baselines.training.recipe import Recipe, table_rows
 from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.report.comparison import Difference, paired_difference
 from fpp_ml_bench.evaluation.result.file import write_file
 from fpp_ml_bench.evaluation.result.model import Result
-from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 from fpp_ml_bench.leaderboard.columns import device
 from fpp_ml_bench.leaderboard.row_file import Row, row_of, view_means, write_row
 from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEASURED_HERE, Entry, read_entry
@@ -135,23 +143,20 @@ def _weights_sha256(recipe: Recipe, folders: Folders, opened: DatasetFolder) -> 
 
 @dataclass(frozen=True)
 class Ordering:
-    """The paper reports a smaller object MAE for ``better`` than for ``worse``, by ``paper_gap_mm``; here the mean over
-    samples of worse minus better is ``gap_mm``, its 95% interval over ``objects`` objects ``interval_mm`` (None with
-    fewer than two). ``same_track`` is False where the rows were given different ground truth of the samples."""
+    """The paper reports a smaller object MAE for ``better`` than for ``worse``, by ``paper_gap_mm``; ``here``: worse
+    minus better. ``same_track`` is False where the rows were given different ground truth of the samples."""
 
     better: str
     worse: str
     paper_gap_mm: float
-    gap_mm: float
-    interval_mm: tuple[float, float] | None
+    here: Difference
     same_track: bool
-    objects: int
 
     @property
     def verdict(self) -> Literal["holds", "not decided", "reversed"]:
-        if self.interval_mm is None or self.interval_mm[0] <= 0 <= self.interval_mm[1]:
+        if not self.here.distinguishable:
             return "not decided"
-        return "holds" if self.interval_mm[0] > 0 else "reversed"
+        return "holds" if (self.here.mean_mm or 0) > 0 else "reversed"
 
 
 def orderings(lines: Sequence[Line]) -> list[Ordering]:
@@ -161,19 +166,15 @@ def orderings(lines: Sequence[Line]) -> list[Ordering]:
     ]
     judged = []
     for (better_mm, better), (worse_mm, worse) in combinations(sorted(compared, key=lambda c: c[0]), 2):
-        difference = _difference(worse, better)
-        if worse_mm == better_mm or difference is None:
-            continue
-        tracks = {line.entry.row.track for line in (better, worse) if line.entry is not None}
-        gap, interval, objects = difference
-        labels = better.label, worse.label
-        judged.append(Ordering(*labels, worse_mm - better_mm, gap, interval, len(tracks) == 1, objects))
+        here = _difference(worse, better)
+        if worse_mm > better_mm and here.samples:
+            tracks = {line.entry.row.track for line in (better, worse) if line.entry is not None}
+            judged.append(Ordering(better.label, worse.label, worse_mm - better_mm, here, len(tracks) == 1))
     return judged
 
 
-def _difference(line: Line, other: Line) -> tuple[float, tuple[float, float] | None, int] | None:
-    """Object MAE of ``line`` minus that of ``other``: mean over the samples of both, its 95% interval over objects, and
-    how many objects; None where no sample is in both."""
+def _difference(line: Line, other: Line) -> Difference:
+    """Object MAE of ``line`` minus that of ``other`` over the samples of both."""
     first, second = _errors(line), _errors(other)
     gaps = [
         (name, statistics.fmean(views) - statistics.fmean(second[name]))
@@ -181,10 +182,7 @@ def _difference(line: Line, other: Line) -> tuple[float, tuple[float, float] | N
         if name in second
         for _ in views
     ]
-    if not gaps:
-        return None
-    objects, differences = [name for name, _ in gaps], [gap for _, gap in gaps]
-    return statistics.fmean(differences), object_interval(differences, objects), len(set(objects))
+    return paired_difference([gap for _, gap in gaps], [name for name, _ in gaps])
 
 
 def _errors(line: Line) -> dict[str, list[float]]:
@@ -207,16 +205,16 @@ def conclusion(table: str, lines: Sequence[Line]) -> str:
         return orderings_sentence(orderings(lines))
     said = []
     for line in lines[1:]:
-        if (difference := _difference(line, lines[0])) is not None:
-            gap, interval, objects = difference
-            ends = "" if interval is None else f" (95% interval over {objects} objects {between(interval)})"
-            said.append(f"{line.label} {gap:+.2f} mm{ends}")
+        here = _difference(line, lines[0])
+        if here.samples:
+            ends = f" (95% interval over {here.objects} objects {_between(here)})" if here.interval else ""
+            said.append(f"{line.label} {here.mean_mm:+.2f} mm{ends}")
     return f"Object MAE against {lines[0].label}, sample by sample: {'; '.join(said)}." if said else ""
 
 
-def between(interval: tuple[float, float]) -> str:
-    """Both ends of an interval, with their signs."""
-    return " to ".join(f"{end:+.2f}" for end in interval)
+def _between(difference: Difference) -> str:
+    """Both ends of its interval, with their signs; a dash where there is none."""
+    return "-" if difference.interval is None else " to ".join(f"{end:+.2f}" for end in difference.interval)
 
 
 def orderings_sentence(judged: Sequence[Ordering]) -> str:
@@ -224,7 +222,7 @@ def orderings_sentence(judged: Sequence[Ordering]) -> str:
     if not judged:
         return "No two rows of the paper's have been measured here yet, so none of its orderings can be judged."
     count = Counter(ordering.verdict for ordering in judged)
-    objects = max(ordering.objects for ordering in judged)
+    objects = max(ordering.here.objects for ordering in judged)
     return (
         f"The paper's pairwise orderings by object MAE, {len(judged)} among the rows measured here: {count['holds']} "
         f"hold, {count['reversed']} reversed, {count['not decided']} not decided by {objects} objects (the 95% "
@@ -376,8 +374,8 @@ def _orderings(judged: Sequence[Ordering]) -> list[str]:
             "Better in the paper": ordering.better,
             "Worse in the paper": ordering.worse + ("" if ordering.same_track else f" {_TRACKS_DIFFER}"),
             f"Worse minus better, mm, {BY_THE_PAPER}": f"{ordering.paper_gap_mm:+.2f}",
-            f"Worse minus better, mm, {MEASURED_HERE}": f"{ordering.gap_mm:+.2f}",
-            "95% interval": "-" if ordering.interval_mm is None else between(ordering.interval_mm),
+            f"Worse minus better, mm, {MEASURED_HERE}": f"{ordering.here.mean_mm:+.2f}",
+            "95% interval": _between(ordering.here),
             "Here": ordering.verdict,
         }
         for ordering in judged

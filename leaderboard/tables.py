@@ -183,8 +183,9 @@ def group_tables(groups: Sequence[Group], sort: str, with_pairs: bool = False) -
         if with_pairs and len(group.ranked) > MOST_PAIRED:
             parts.append(Text(f"The pairs of more than {MOST_PAIRED} ranked rows are not listed.\n"))
         elif with_pairs and group.pairs:
-            look = {"names": 2, "first_out": PAIRS_FIRST_OUT, "elsewhere": "--json FILE"}
-            parts.append(Table.of("Pairs of these rows", [*map(pair_row, group.pairs)], **look))
+            rows = [*map(pair_row, group.pairs)]
+            pairs = Table.of("Pairs of these rows", rows, names=2, first_out=PAIRS_FIRST_OUT, elsewhere="--json FILE")
+            parts.append(pairs)
     return [*parts, Text(f"{NOTE}\n")]
 
 

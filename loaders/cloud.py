@@ -5,6 +5,7 @@ The page contains its points, style and script, and loads nothing: it works from
 
 from base64 import b64encode
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -54,7 +55,7 @@ def cloud_html(title: str, points_mm: NDArray[np.floating], grey: NDArray[np.uin
     }
     here, title = Path(__file__).parent / "templates", printable(title)
     style, script = ((here / name).read_text(encoding="utf-8") for name in ("cloud.css", "cloud.js"))
-    values = {"heading": title, "count": count, "shown": len(points), "every": every, "data": data}
+    values: dict[str, Any] = {"count": count, "shown": len(points), "every": every, "data": data}
     return page("fpp_ml_bench.loaders", "cloud.html", title, style, script, **values)
 
 

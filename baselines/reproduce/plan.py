@@ -3,7 +3,6 @@ which is built where it is missing and is the same for every row of a run. Rows 
 (``normalization/individual``, ``loss/rmse``, ``multi_frame/frame0``) are one training and one row of the leaderboard.
 """
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,6 @@ from typing import Literal
 from fpp_ml_bench.baselines.training.recipe import Recipe, load_recipe, table_rows
 from fpp_ml_bench.constants import FULL_SIZE, OBJECTS
 from fpp_ml_bench.errors import DatasetError, RecipeError
-from fpp_ml_bench.files import read_json, write_atomically
 from fpp_ml_bench.loaders.render.builder import build as build_dataset
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.storage.manifest import MANIFEST
@@ -104,8 +102,7 @@ def default_folder(preset: str, size: int) -> Path:
 def open_dataset(folder: Path | None, jobs: list[Job], folders: Folders, report: Report) -> DatasetFolder:
     """The dataset in ``folder`` (default: see `default_folder`), built there first where there is none: all 50 objects
     and 52 frames, which every table shares. Raises DatasetError for a dataset of another image size than the preset's,
-    without a frame that a row needs, or another dataset than the trainings in the runs folder; BuildError where it
-    can't be built."""
+    or without a frame that a row needs; BuildError where it can't be built."""
     sizes = {job.recipe.size: job.recipe.name for job in jobs}
     if len(sizes) != 1:
         raise RecipeError(f"expected one image size for all rows, got {sizes}; reproduce the tables one by one")
@@ -128,29 +125,4 @@ def open_dataset(folder: Path | None, jobs: list[Job], folders: Folders, report:
                 f"{folder}: {job.rows[0]} needs the frames of {job.recipe.frames}, stored are those of "
                 f"{', '.join(opened.configs)}; build it with all frames: {command}"
             )
-    _check_same_dataset(opened, folders)
     return opened
-
-
-def _check_same_dataset(opened: DatasetFolder, folders: Folders) -> None:
-    """Record the dataset in the runs folder; refuse a dataset other than the recorded one."""
-    record = folders.runs / "dataset.json"
-    content = {"fingerprint": opened.fingerprint, "size": list(opened.size), "folder": str(opened.path)}
-    try:
-        if not record.is_file():
-            folders.runs.mkdir(parents=True, exist_ok=True)
-            write_atomically(record, (json.dumps(content, indent=1) + "\n").encode("utf-8"))
-            return
-    except OSError as error:
-        raise DatasetError(f"{record}: {error.strerror or error}") from None
-    cure = "damaged; give another --out, or remove it if DATASET is the dataset that was used"
-    recorded = read_json(record, DatasetError, f"it is {cure}")
-    try:
-        fingerprint, folder = recorded["fingerprint"], recorded["folder"]
-    except (KeyError, TypeError):
-        raise DatasetError(f"{record}: {cure}") from None
-    if fingerprint != opened.fingerprint:
-        raise DatasetError(
-            f"{opened.path}: has fingerprint {opened.fingerprint[:8]}, but the trainings in {folders.runs} are of "
-            f"{str(fingerprint)[:8]} ({folder}); give that dataset as DATASET, or another --out"
-        )

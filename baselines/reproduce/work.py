@@ -1,38 +1,66 @@
 """Regenerating the paper's tables: train, predict, time, score, write rows and a Markdown table; skip what is done.
 
 No training is ever deleted: a finished training is used, a stopped one continued, one of another recipe refused.
+
+In the paper's multi-frame table (Section 5.4) scores are averages over all (view, frame) pairs of a condition's test
+set. Here each sample's score is the mean over its frames, and the headline the mean over samples: the same number, for
+every sample has the same frames, and the interval can then be taken over objects. The rules are the evaluator's own
+(`scored_pair`, `score_sample`).
 """
 
 import json
 import shlex
-from collections.abc import Sequence
+import shutil
+import statistics
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
 from textwrap import shorten
 from time import perf_counter
 from types import ModuleType
-from typing import Any
+from typing import Annotated, Any, Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
+from pydantic import Field
 
 from fpp_ml_bench.baselines.method import Setting
 from fpp_ml_bench.baselines.networks.base import torch_threads
 from fpp_ml_bench.baselines.networks.model import Model, load
 from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
 from fpp_ml_bench.baselines.networks.range_heads import save_with_heads
-from fpp_ml_bench.baselines.reproduce import plan, scoring
+from fpp_ml_bench.baselines.reproduce import plan
 from fpp_ml_bench.baselines.reproduce.plan import Folders, Job, Report, variants
+from fpp_ml_bench.baselines.run import predict_split
+from fpp_ml_bench.baselines.timing import time_method, write_timing
 from fpp_ml_bench.baselines.training.depth_training import DONE, SCORING, WEIGHTS, TrainingRun, train
 from fpp_ml_bench.baselines.training.engine import RECIPE
 from fpp_ml_bench.baselines.training.recipe import Recipe
-from fpp_ml_bench.errors import PredictionError, TrainingError, WeightsError
-from fpp_ml_bench.evaluation.result.file import write_json
+from fpp_ml_bench.constants import split_sample_name
+from fpp_ml_bench.depth import RangeRule
+from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError, TrainingError, WeightsError
+from fpp_ml_bench.evaluation.metrics import HEADLINE
+from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION, Mode, Units
+from fpp_ml_bench.evaluation.result.file import write_json, write_result
+from fpp_ml_bench.evaluation.result.model import Result
+from fpp_ml_bench.evaluation.result.parts import Headline, Intervals, Sha256
+from fpp_ml_bench.evaluation.score.check import scored_pair
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.evaluation.score.sample_scores import score_sample
+from fpp_ml_bench.evaluation.score.uncertainty import intervals_over_objects
+from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE
 from fpp_ml_bench.files import exclusive, read_json, write_atomically
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.schema import Count, StrictModel, Text, validate
 
 PAPER_PRESET = "paper"
 REASON_LENGTH = 400
+MAIN_KEY = "object_mae_mm"
+SPLIT, TARGET = "test", "depth"
+REPEATS = 20
+Scores = dict[str, float | None]
 
 
 @dataclass(frozen=True)
@@ -82,6 +110,7 @@ def reproduce(settings: ReproduceSettings) -> Outcome:
     check_machine(wanted, folders, settings.anyway, settings.command)
     with exclusive(folders.runs / "lock", folders.runs, "reproducing into this folder"):
         opened = plan.open_dataset(settings.data, jobs, folders, settings.report)
+        check_same_dataset(opened, wanted, folders)
         outcome = Outcome(opened, jobs)
         try:
             _work(settings, outcome)
@@ -133,7 +162,7 @@ def _score(job: Job, run: TrainingRun, settings: ReproduceSettings, opened: Data
         with torch_threads(torch.get_num_threads()):
             method = NetworkMethod(model, depth_range, remark=f"{recipe.preset} preset", about=about)
             settings.leaderboard.check_row_is_of(path, opened)
-            result = scoring.score_method(opened, method, path, folders)
+            result = score_method(opened, method, path, folders)
         settings.leaderboard.write_measured(result, path)
         settings.report(f"  {path.stem}: object MAE {_mm(result.metrics.object_mae_mm)}, {result.track} track")
 
@@ -141,15 +170,14 @@ def _score(job: Job, run: TrainingRun, settings: ReproduceSettings, opened: Data
 def _score_all_frames(recipe: Recipe, model: Model, settings: ReproduceSettings, opened: DatasetFolder) -> None:
     """All frames of the training's configuration, by the rule of the oracle range, as in the paper."""
     path = settings.folders.all_frames(recipe)
-    if settings.only_missing and scoring.all_frames_that_hold(path, opened.fingerprint, model.sha256) is not None:
+    if settings.only_missing and all_frames_that_hold(path, opened.fingerprint, model.sha256) is not None:
         return
-    frames, about = opened.sequence.config(recipe.frames), {"recipe": recipe.name, "weights_sha256": model.sha256}
-    scores = scoring.score_all_frames(
+    scores = score_all_frames(
         opened,
         lambda frame: model.predict_representation([frame])[0],
-        frames,
+        opened.sequence.config(recipe.frames),
         SCORING[recipe.normalisation],
-        about,
+        model.sha256,
         model.config.range_rule,
     )
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -187,6 +215,18 @@ def check_run_folders(jobs: Sequence[Job], folders: Folders) -> None:
             raise TrainingError(
                 f"{path.parent}: holds a training of another recipe, {job.rows[0]} differs in {differs}; to keep both, "
                 f"mv {out} {out}-before, or give another --out"
+            )
+
+
+def check_same_dataset(opened: DatasetFolder, jobs: Sequence[Job], folders: Folders) -> None:
+    """Refuse a dataset other than that of the trainings that were begun: DatasetError names both."""
+    for job in jobs:
+        path = folders.training(job.recipe) / RECIPE
+        trained_on = str(_stored(path).get("fingerprint")) if path.is_file() else opened.fingerprint
+        if trained_on != opened.fingerprint:
+            raise DatasetError(
+                f"{opened.path}: has fingerprint {opened.fingerprint[:8]}, but the training in {path.parent} is of "
+                f"{trained_on[:8]}; give that dataset as DATASET, or another --out"
             )
 
 
@@ -247,3 +287,108 @@ def _stored(path: Path) -> Any:
 def file_sha256(path: Path) -> str:
     """SHA-256 of a file's bytes, 64 hex digits."""
     return sha256(path.read_bytes()).hexdigest()
+
+
+def score_method(opened: DatasetFolder, method: NetworkMethod, row: Path, folders: Folders) -> Result:
+    """Predict the test split, time the method, score against the decoded depth (as in the paper). Files of an earlier
+    run are replaced at the end: an interrupted run leaves nothing that is taken for finished. Raises what predicting,
+    timing and scoring raise."""
+    name = row.stem
+    predictions, results = folders.runs / "predictions" / name, folders.runs / "results"
+    making = predictions.with_name(f"{name}.making")
+    shutil.rmtree(making, ignore_errors=True)
+    predict_split(opened, method, SPLIT, making)
+    write_timing(making / SUBMISSION_FILE, time_method(opened, method, SPLIT, repeats=REPEATS))
+    result = evaluate(making, opened, SPLIT, TARGET, mode=method.mode)
+    for folder in (folders.rows, results):
+        folder.mkdir(parents=True, exist_ok=True)
+    shutil.rmtree(predictions, ignore_errors=True)
+    making.rename(predictions)
+    write_result(result, results / f"{name}.json")
+    return result
+
+
+class SampleMean(StrictModel):
+    """Mean over frames for one sample."""
+
+    sample: Text
+    object: Text
+    metrics: Headline
+
+
+class AllFrames(StrictModel):
+    """The six errors over all ``pairs`` of ``frames`` and test samples, with what they were computed from."""
+
+    schema_version: Literal["2.0.0"] = "2.0.0"
+    protocol_version: Text = PROTOCOL_VERSION
+    fingerprint: Sha256
+    weights_sha256: Sha256
+    frames: list[Count]
+    pairs: Annotated[int, Field(gt=0)]
+    metrics: Headline
+    intervals: Intervals
+    per_sample: list[SampleMean]
+
+
+def score_all_frames(
+    opened: DatasetFolder,
+    predict: Callable[[NDArray[np.uint8]], NDArray[np.float32]],
+    frames: Sequence[int],
+    scoring: tuple[Units, Mode],
+    weights_sha256: str,
+    rule: RangeRule = "object",
+) -> AllFrames:
+    """Score ``predict`` (a frame (H, W) in, depth (H, W) in the units of ``scoring`` out, normalised by
+    ``rule``) on every test sample and frame; ``weights_sha256``: of the network. Raises PredictionError for a
+    prediction that is not finite, and what `scored_pair` raises."""
+    samples = opened.samples(SPLIT)
+    rows: list[Scores] = []
+    for sample in samples:
+        target_mm = opened.target_mm(sample)
+        void = opened.void(sample) if scoring[1] == "standard" else None
+        left_out = opened.left_out(sample, rule)
+        scores: list[Scores] = []
+        for frame in frames:
+            values = predict(opened.frame(sample, frame))
+            if not np.isfinite(values).all():
+                raise PredictionError(f"{sample}, frame {frame}: the network gave values that are not finite")
+            pair = scored_pair(values, target_mm, *scoring, sample, left_out)
+            scores.append(score_sample(*pair, void=void).metrics())
+        rows.append(_mean(scores))
+    objects = [split_sample_name(sample)[0] for sample in samples]
+    ends = intervals_over_objects(rows, objects, HEADLINE)
+    return AllFrames(
+        fingerprint=opened.fingerprint,
+        weights_sha256=weights_sha256,
+        frames=list(frames),
+        pairs=len(samples) * len(frames),
+        metrics=Headline(**_mean(rows)),
+        intervals=Intervals(**{key: list(interval or (None, None)) for key, interval in ends.items()}),
+        per_sample=[
+            SampleMean(sample=sample, object=name, metrics=Headline(**row))
+            for sample, name, row in zip(samples, objects, rows, strict=True)
+        ],
+    )
+
+
+def _mean(rows: Sequence[Scores]) -> Scores:
+    """Plain mean of each headline score over the rows that have it."""
+    values_by_key = {key: [value for row in rows if (value := row[key]) is not None] for key in HEADLINE}
+    return {key: statistics.fmean(values) if values else None for key, values in values_by_key.items()}
+
+
+def read_all_frames(path: Path) -> AllFrames:
+    """Read strictly; SubmissionError names the file and what is wrong with it."""
+    return validate(
+        AllFrames, read_json(path, SubmissionError, "run the command again"), path, "file of scores on all frames"
+    )
+
+
+def all_frames_that_hold(path: Path, fingerprint: str, weights_sha256: str) -> AllFrames | None:
+    """The scores in ``path`` if valid and of this dataset, these weights and the current protocol; else None."""
+    try:
+        scores = read_all_frames(path)
+    except SubmissionError:
+        return None
+    key = (fingerprint, weights_sha256, PROTOCOL_VERSION)
+    return scores if (scores.fingerprint, scores.weights_sha256, scores.protocol_version) == key else None

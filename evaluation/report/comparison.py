@@ -3,6 +3,7 @@ Samples that are hard for both methods cancel in the difference. A comparison ca
 own intervals overlap."""
 
 import statistics
+from collections.abc import Sequence
 from operator import attrgetter
 from typing import Annotated
 
@@ -75,7 +76,8 @@ def compare(first: Result, second: Result) -> Comparison:
         pairs = {key: (getattr(row, key), getattr(second_rows[row.sample], key)) for key in HEADLINE}
         differences = {key: None if None in pair else pair[1] - pair[0] for key, pair in pairs.items()}
         paired.append(PairedSample(sample=row.sample, object=row.object, differences=differences))
-    summaries = {key: _summary(paired, key) for key in HEADLINE}
+    owners = [row.object for row in paired]
+    summaries = {key: paired_difference([row.differences[key] for row in paired], owners) for key in HEADLINE}
     names = printable(first.submission.name), printable(second.submission.name)
     if names[0] == names[1]:
         names = f"{names[0]} (first)", f"{names[1]} (second)"
@@ -110,14 +112,15 @@ def _check_same_data(first: Result, second: Result) -> None:
         )
 
 
-def _summary(paired: list[PairedSample], key: str) -> Difference:
-    values = [row.differences[key] for row in paired]
+def paired_difference(values: Sequence[float | None], owners: Sequence[str]) -> Difference:
+    """The `Difference` of second minus first in mm, ``values`` by sample, None where a pixel set is empty; ``owners``:
+    the object of each sample."""
     differences = [value for value in values if value is not None]
-    interval = object_interval(values, [row.object for row in paired])
+    interval = object_interval(values, owners)
     by_object: dict[str, list[float]] = {}
-    for row, value in zip(paired, values, strict=True):
+    for name, value in zip(owners, values, strict=True):
         if value is not None:
-            by_object.setdefault(row.object, []).append(value)
+            by_object.setdefault(name, []).append(value)
     return Difference(
         mean_mm=statistics.fmean(differences) if differences else None,
         interval_mm=[None, None] if interval is None else list(interval),

@@ -88,7 +88,7 @@ def page_files(
     style = (_HERE / "page.css").read_text("utf-8")
     slugs = {id(row.entry): slug(row.entry) for group in groups for row in group.rows}
     rows = [(group, row) for group in groups for row in group.rows]
-    shared = {"meaning": MEANING, "learned_from": learned_from}
+    shared: dict[str, Any] = {"meaning": MEANING, "learned_from": learned_from}
     filters: dict[str, tuple[str, list[str]]] = {
         "class": ("Class", [name for name in FRAMES_CLASSES if any(group.key.frames == name for group in groups)]),
         "track": ("Track", sorted({group.key.track for group in groups})),

@@ -284,7 +284,7 @@ def test_text_of_a_finding_can_only_be_text(tmp_path):
     table = Table("<u>", ("<u>",), (("<script>",), (0.123456,), (None,)))
     counted = Counted()
     counted.title, counted.question = "<t>", "<q>?"
-    page = probe.report_page(context, [ProbeResult(counted, Finding("<s>", table=table), 1.0, False)])
+    page = probe.report_page(context, [ProbeResult(counted, Finding("<s>", table=table), 1.0, False)]).decode()
     for tag in ("<b>x", "<script>", "<s>", "<t>", "<u>", "<q>", "fpp-bench <i>"):
         assert tag not in page
     assert "0.1235" in page

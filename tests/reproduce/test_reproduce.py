@@ -11,8 +11,8 @@ import torch
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.networks.model import build
-from fpp_ml_bench.baselines.reproduce import plan, scoring, work
-from fpp_ml_bench.baselines.reproduce.scoring import (
+from fpp_ml_bench.baselines.reproduce import plan, work
+from fpp_ml_bench.baselines.reproduce.work import (
     SPLIT,
     all_frames_that_hold,
     read_all_frames,
@@ -34,7 +34,6 @@ from fpp_ml_bench.leaderboard.rows import read_entry
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 TABLE = "normalization"
-ABOUT = {"recipe": "r", "weights_sha256": 64 * "a"}
 NAMES = ("cpu-unet-raw-rmse", "cpu-unet-global-rmse", "cpu-unet-individual-rmse")
 TWINS = tuple(f"cpu-unet-individual-rmse-range-{source}" for source in ("predicted", "mean"))
 
@@ -59,11 +58,11 @@ def small(monkeypatch, opened, request):
         return recipe.model_copy(update={"size": opened.size[0], "width": 1})
 
     monkeypatch.setattr(plan, "load_recipe", tiny_recipe)
-    monkeypatch.setattr(scoring, "REPEATS", 2)
+    monkeypatch.setattr(work, "REPEATS", 2)
     for constant in ("TRAIN_PAIRS", "VALIDATION_PAIRS", "PIXELS"):
         monkeypatch.setattr(f"fpp_ml_bench.baselines.networks.range_heads.{constant}", 4)
     if "from_trainings" not in request.node.name:  # there the time is really measured
-        monkeypatch.setattr(scoring, "time_method", reused_timing)
+        monkeypatch.setattr(work, "time_method", reused_timing)
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
     yield
@@ -251,6 +250,14 @@ def test_a_training_of_another_recipe_is_refused_before_any_work(run, trainer, t
     assert run(TABLE) == 2 and "can't be read" in capsys.readouterr().err
 
 
+def test_a_training_on_another_dataset_is_refused(run, trainer, unscored, tmp_path, capsys):
+    assert run(TABLE) == 0 and run(TABLE) == 0
+    path = tmp_path / "runs" / "cpu" / "unet-individual-rmse" / "recipe.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"fingerprint": 64 * "a"}))
+    assert run(TABLE) == 2
+    assert "is of aaaaaaaa; give that dataset as DATASET, or another --out" in capsys.readouterr().err
+
+
 def test_the_papers_preset_needs_a_gpu(run, trainer, unscored, monkeypatch, capsys):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     assert run(TABLE, "--preset", "paper", "--minutes", "10") == 2
@@ -273,11 +280,9 @@ def test_every_frame_is_scored_for_the_multi_frame_table(run, trainer, tmp_path,
     result = read_result(below / "results" / "cpu-unet-individual-rmse-vertical.json")
     row = read_entry(below / "rows" / "cpu-unet-individual-rmse-vertical.json").row
     assert result.submission.frames_used == row.submission.frames_used == [18]
-    first = next(part.metrics for part in scores.per_frame if part.frame == 18)
     for key in ("object_mae_mm", "overall_rmse_mm", "background_mae_mm"):
-        assert getattr(first, key) == pytest.approx(getattr(result.metrics, key), rel=1e-9)
-        per_frame = [getattr(part.metrics, key) for part in scores.per_frame]
-        assert getattr(scores.metrics, key) == pytest.approx(np.mean(per_frame), rel=1e-9)
+        per_sample = [getattr(part.metrics, key) for part in scores.per_sample]
+        assert getattr(scores.metrics, key) == pytest.approx(np.mean(per_sample), rel=1e-9)
     table = (below / "multi_frame.md").read_text().split("## ")[0]
     lines = [line for line in table.splitlines() if line.startswith("| 18 vertical")]
     assert len(lines) == 2 and "its first frame only" in lines[1]
@@ -289,7 +294,7 @@ def test_all_frames_files_are_read_strictly(opened, tmp_path):
     def zeros(frame):
         return np.zeros(frame.shape, np.float32)
 
-    scores = score_all_frames(opened, zeros, [0, 3], ("mm", "standard"), ABOUT)
+    scores = score_all_frames(opened, zeros, [0, 3], ("mm", "standard"), 64 * "a")
     path = tmp_path / "all.json"
     write_json(scores.model_dump(mode="json"), path)
     assert read_all_frames(path) == scores == all_frames_that_hold(path, opened.fingerprint, 64 * "a")
@@ -300,7 +305,7 @@ def test_all_frames_files_are_read_strictly(opened, tmp_path):
         read_all_frames(path)
     assert all_frames_that_hold(path, opened.fingerprint, 64 * "a") is None
     with pytest.raises(PredictionError, match=r"frame 0.*not finite"):
-        score_all_frames(opened, lambda f: zeros(f) + np.nan, [0], ("mm", "standard"), ABOUT)
+        score_all_frames(opened, lambda f: zeros(f) + np.nan, [0], ("mm", "standard"), 64 * "a")
 
 
 def test_all_frames_of_one_frame_is_the_evaluators_score(opened, tmp_path):
@@ -315,7 +320,7 @@ def test_all_frames_of_one_frame_is_the_evaluators_score(opened, tmp_path):
     for sample, values in noise.items():
         np.save(folder / f"{sample}.npy", values)
     result = evaluate(folder, opened, mode="paper")
-    scores = score_all_frames(opened, lambda frame: next(waiting), [0], ("normalised", "paper"), ABOUT)
+    scores = score_all_frames(opened, lambda frame: next(waiting), [0], ("normalised", "paper"), 64 * "a")
     for key, value in scores.metrics:
         assert value == pytest.approx(getattr(result.metrics, key), rel=1e-12)
 
