@@ -187,10 +187,10 @@ class Sample:
             if turn is not None:
                 turns[key].append(turn)
         unit = rms_expected(changes["phase"])
-        follow, outline = follows(changes["phase"]), relative_change(changes["outline"], unit)
-        parts = {"score": sample_score(follow, outline), "order_free_score": None, "follows_phase": follow}
-        parts |= {"change_outline": outline}
-        parts |= {f"follows_{kind}": follows(changes[kind]) for kind in ("light", "both", "constant")}
+        parts: dict[str, float | None] = {"score": None, "order_free_score": None}
+        parts |= {f"follows_{kind}": follows(changes[kind]) for kind in ("phase", "light", "both", "constant")}
+        parts["change_outline"] = relative_change(changes["outline"], unit)
+        parts["score"] = sample_score(parts["follows_phase"], parts["change_outline"])
         for key in (name.replace(" ", "_") for name in REPROJECTED):
             (other,) = changes[key]
             kept = other.answered
@@ -229,16 +229,14 @@ def measure(
         raise DiagnosisError("no sample's phase can be moved within the working range, so there is no score")
     objects = [dataset.measured(name)["object"] for name in scored]
     interval = object_interval([parts["score"] for parts in scored.values()], objects)
-
-    def mean(key: str) -> float | None:
-        return mean_of(parts.get(key) for parts in scored.values())
-
+    keys = ("score", "order_free_score", *RelianceParts.model_fields)
+    means = {key: mean_of(parts.get(key) for parts in scored.values()) for key in keys}
     reliance = Reliance(
         version=RELIANCE_VERSION,
-        score=mean("score") or 0.0,
+        score=means.pop("score") or 0.0,
         interval=[None, None] if interval is None else [min(max(end, 0.0), 1.0) for end in interval],
-        order_free_score=mean("order_free_score"),
-        parts=RelianceParts(**{key: mean(key) for key in RelianceParts.model_fields}),
+        order_free_score=means.pop("order_free_score"),
+        parts=RelianceParts(**means),
         units="mm" if method.units == "mm" else "normalised",
         direction=direction_read(method.frames_used, dataset),
         samples=len(scored),

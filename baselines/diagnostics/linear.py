@@ -20,15 +20,15 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fpp_ml_bench.baselines.diagnostics.probe import (
+    LINE,
     Figure,
     Finding,
-    Line,
-    Panel,
     Probe,
     ProbeSettings,
     Progress,
     Table,
-    chart,
+    panels,
+    with_legend,
 )
 from fpp_ml_bench.baselines.diagnostics.scenes import truth
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject, activations_of
@@ -37,7 +37,7 @@ from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.style import INK, LINE_COLOURS
+from fpp_ml_bench.style import INK, LINE_COLOURS, styled
 
 SAMPLES, QUICK_SAMPLES = 120, 24  # training samples of the probes
 EPOCHS, QUICK_EPOCHS = 6, 4
@@ -75,7 +75,6 @@ LINEAR: Targets = {
     "order": Target("fringe order", ("order",)),
 }
 """Of the linear probes, each of which is fitted where it is compared; the phase is an angle and so has two maps."""
-COLOURS = {TRAINED: LINE_COLOURS[0], UNTRAINED: LINE_COLOURS[6]}
 FRINGE = ("phase", "order")  # of these, what needs fringes of a single direction
 SPATIAL: Targets = {name: LINEAR[name] for name in ("edges", "depth", OBJECT_DEPTH)}
 """Of the four-convolution probes, which are trained on the maps of the whole image."""
@@ -137,7 +136,7 @@ class LinearProbing(Probe):
             "epochs": epochs,
         }
         values = {"protocol": protocol, "four_convolutions": spatial, "linear": linear}
-        return Finding(summary(linear, spatial), values, table(spatial), figure(linear))
+        return Finding(summary(linear, spatial), values, table(spatial), draw(linear))
 
 
 def _samples_with_object(dataset: DatasetFolder, split: str) -> list[str]:
@@ -494,22 +493,24 @@ def table(spatial: Scores) -> Table:
     return Table.of("Four-convolution probes on the validation samples", "Layer", rows, columns)
 
 
-def figure(linear: Scores) -> Figure:
+@styled
+def draw(linear: Scores) -> Figure:
     """R2 of the linear probes by layer, a panel for each target: trained, with intervals, random weights with the range
     of seeds, and controls."""
-    panels, layers = [], list(linear[TRAINED])
-    for target in linear[CONTROLS][INPUT]:
-        lines = []
-        for label, network, style, ends in (
-            ("trained", TRAINED, "o-", "r2_interval"),
-            ("random weights", UNTRAINED, "s--", "seeds"),
+    targets, layers = list(linear[CONTROLS][INPUT]), list(linear[TRAINED])
+    drawn, panels_of = panels([LINEAR[target].title for target in targets], 3, 4.4, 3.0)
+    for axes, target in zip(panels_of, targets, strict=True):
+        for label, network, style, ends, colour in (
+            ("trained", TRAINED, "o-", "r2_interval", LINE_COLOURS[0]),
+            ("random weights", UNTRAINED, "s--", "seeds", LINE_COLOURS[6]),
         ):
             scores = [linear[network][layer][target] for layer in layers]
-            values, intervals = ([one[key] for one in scores] for key in ("r2", ends))
-            lines.append(Line(label, layers, values, COLOURS[network], style, intervals))
-        for (control, title), style in zip(CONTROL_TITLES.items(), (":", "-."), strict=True):
+            axes.plot(layers, [one["r2"] for one in scores], style, color=colour, label=label, **LINE)
+            for layer, one in zip(layers, scores, strict=True):
+                axes.plot([layer] * len(one[ends] or ()), one[ends] or (), color=colour, linewidth=0.8)
+        for (control, label), style in zip(CONTROL_TITLES.items(), (":", "-."), strict=True):
             level = [linear[CONTROLS][control][target]["r2"]] * len(layers)
-            lines.append(Line(title, layers, level, INK, style))
-        panels.append(Panel(LINEAR[target].title, lines, {"ylabel": "R2", "ylim": (-0.1, 1.02)}))
+            axes.plot(layers, level, style, color=INK, label=label, **LINE)
+        axes.set(ylabel="R2", ylim=(-0.1, 1.02))
     alt = "R2 of linear probes by layer, a panel for each target, with random weights and controls"
-    return Figure("Linear (1 x 1) probes by layer and target", alt, chart(panels, 3, (4.4, 3.0)))
+    return Figure("Linear (1 x 1) probes by layer and target", alt, with_legend(drawn, 2))

@@ -2,7 +2,7 @@
 
 A `Subject` is the model that is diagnosed, a `Probe` is one test of it, and a `Finding` is the probe's result;
 `diagnose` puts them on one page, which loads nothing, and into a JSON file. A probe gives rows for tables, and lines or
-pictures for figures; `chart` and `gallery` draw them in one style.
+pictures for figures; `panels` and `gallery` draw them in one style.
 """
 
 from __future__ import annotations
@@ -319,29 +319,8 @@ def report_page(context: Mapping[str, Any], results: Sequence[ProbeResult]) -> b
     )
 
 
+LINE = {"markersize": 4, "linewidth": 1.2}
 _GAP = 4  # px between two pictures
-
-
-@dataclass(frozen=True)
-class Line:
-    """Values ``y`` (n,) at ``x`` (n,), numbers or names; None is left out. ``ends``: the interval of each value.
-    ``style``: marker and line as for matplotlib's ``plot``."""
-
-    label: str
-    x: Sequence[Any] | NDArray
-    y: Sequence[float | None] | NDArray
-    colour: str
-    style: str = "o-"
-    ends: Sequence[Sequence[float] | None] = ()
-
-
-@dataclass(frozen=True)
-class Panel:
-    """Lines over one pair of axes; ``axes``: properties of matplotlib's ``Axes``, such as ``ylabel`` and ``ylim``."""
-
-    title: str
-    lines: Sequence[Line]
-    axes: Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -363,28 +342,24 @@ class Picture:
         return np.where(np.isnan(values)[..., None], 1.0, colormaps[self.colours](share)[..., :3])
 
 
-@styled
-def chart(panels: Sequence[Panel], columns: int, panel_size: tuple[float, float] = (5.0, 3.4)) -> bytes:
-    """``panels`` in rows of ``columns``, of so many inches each, and one legend of all their lines; PNG."""
-    rows = max(-(-len(panels) // columns), 1)
-    drawn = figure(panel_size[0] * columns, panel_size[1] * rows)
+def panels(titles: Sequence[str], columns: int, width_in: float, height_in: float) -> tuple[Any, list[Any]]:
+    """An empty figure with a panel for each title, in rows of ``columns``, of so many inches each; its panels."""
+    rows = max(-(-len(titles) // columns), 1)
+    drawn = figure(width_in * columns, height_in * rows)
     axes_of = drawn.subplots(rows, columns, squeeze=False)
-    handles: dict[str, Any] = {}
-    for axes in axes_of.flat[len(panels) :]:
+    for axes in axes_of.flat[len(titles) :]:
         axes.axis("off")
-    for panel, axes in zip(panels, axes_of.flat, strict=False):
-        for line in panel.lines:
-            values = [float("nan") if value is None else value for value in line.y]
-            (handle,) = axes.plot(line.x, values, line.style, color=line.colour, markersize=4, linewidth=1.2)
-            handles.setdefault(line.label, handle)
-            for x, ends in zip(line.x, line.ends, strict=False):
-                if ends is not None:
-                    axes.plot([x] * len(ends), ends, color=line.colour, linewidth=0.8)
-        axes.set(**panel.axes)
-        axes.set_title(panel.title, loc="left")
+    for axes, title in zip(axes_of.flat, titles, strict=False):
+        axes.set_title(title, loc="left")
         axes.tick_params(axis="x", rotation=40)
         axes.grid(axis="y", color=GRID)
-    drawn.legend(handles.values(), handles, ncols=max(1, columns - 1), loc="outside lower center")
+    return drawn, list(axes_of.flat[: len(titles)])
+
+
+def with_legend(drawn: Any, columns: int) -> bytes:
+    """A figure with one legend of the lines of all its panels; PNG."""
+    handles = {label: h for axes in drawn.axes for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    drawn.legend(handles.values(), handles, ncols=columns, loc="outside lower center")
     return figure_png(drawn, reduced=True)
 
 

@@ -170,11 +170,10 @@ class FrameCache:
         """The sequence of a view with the frames ``wanted``, uint8 (H, W) each, and None for the others. A moving
         object rests halfway through the frames, which are captured one after another."""
         studio = _studio(condition)
-        shape = studio.rig.camera.height, studio.rig.camera.width
         files = {index: self._file(condition, wanted, f"{sample_name(name, view)}-{index:02d}") for index in wanted}
         out: Frames = [None] * len(studio.rig.sequence)
         for index, file in files.items():
-            out[index] = _load(file, shape, np.dtype(np.uint8))
+            out[index] = _load(file)
         missing = tuple(index for index in wanted if out[index] is None)
         if missing and studio.light.motion_mm:
             middle = (len(wanted) - 1) / 2
@@ -189,9 +188,8 @@ class FrameCache:
     def truth(self, clean: Condition, name: str, view: str) -> Truth:
         """Exact depth and scored pixels of an undisturbed view."""
         studio = _studio(clean)
-        shape = studio.rig.camera.height, studio.rig.camera.width
         file = self._file(clean, (), f"{sample_name(name, view)}-truth")
-        kept = _load(file, (2, *shape), np.dtype(np.float32))
+        kept = _load(file)
         if kept is None:
             scene = studio.trace(_mesh(name), view)
             depth_mm = studio.exact_mm(scene)
@@ -226,18 +224,16 @@ def _studio(condition: Condition) -> Studio:
     return Studio(condition.settings)
 
 
-def _load(file: Path | None, shape: tuple[int, ...], dtype: np.dtype) -> NDArray | None:
+def _load(file: Path | None) -> NDArray | None:
     """The array of a file of the cache; None where there is none, or no whole one."""
     if file is None:
         return None
     try:
-        array = np.load(file, allow_pickle=False)
+        array: NDArray = np.load(file, allow_pickle=False)
+        os.utime(file.parent)
     except (OSError, ValueError, EOFError):
         return None
-    if array.shape != shape or array.dtype != dtype:
-        return None
-    os.utime(file.parent)
-    return array  # type: ignore[no-any-return]
+    return array
 
 
 def _save(file: Path | None, array: NDArray) -> None:

@@ -9,8 +9,10 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import numpy as np
+
 from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.diagnostics.probe import Line, Panel, chart, mean_of
+from fpp_ml_bench.baselines.diagnostics.probe import LINE, mean_of, panels, with_legend
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.robustness.axes import (
     CLEAN,
@@ -28,7 +30,7 @@ from fpp_ml_bench.evaluation.result.parts import Robustness, SeverityScores
 from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 from fpp_ml_bench.files import LOCK_FILE, exclusive, read_json, write_atomically
 from fpp_ml_bench.pool import mapping
-from fpp_ml_bench.style import LINE_COLOURS, data_uri, page
+from fpp_ml_bench.style import LINE_COLOURS, data_uri, page, styled
 
 QUICK_SEVERITIES = (1, 3, 5)
 SEVERITIES = (1, 2, 3, 4, 5)
@@ -258,11 +260,13 @@ def write_page(out: Path) -> Path:
     return out / PAGE
 
 
+@styled
 def draw_curves(measured: Sequence[Measured]) -> bytes:
     """A panel for each axis: mean error against severity, a line a method; PNG."""
-    panels = []
-    for name, axis in corruptions().axes.items():
-        lines = []
+    rules = corruptions()
+    axes = {name: axis for name, axis in rules.axes.items() if any(name in one.means for one in measured)}
+    drawn, panels_of = panels([f"{name}, {axis.unit}" for name, axis in axes.items()], 4, 3.3, 2.9)
+    for panel, (name, axis) in zip(panels_of, axes.items(), strict=True):
         for number, one in enumerate(measured):
             if name not in one.means:
                 continue
@@ -270,11 +274,11 @@ def draw_curves(measured: Sequence[Measured]) -> bytes:
             label = one.setup["title"] + (", unseen" if one.setup["set"] == "unseen" else "")
             label += " (quick)" if one.setup["quick"] else ""
             style = "o" + _DASHES[number // len(LINE_COLOURS) % len(_DASHES)]
-            errors = [scores.get("mae_mm") for scores in points.values()]
-            lines.append(Line(label, list(points), errors, LINE_COLOURS[number % len(LINE_COLOURS)], style))
-        if lines:
-            lines.append(Line("charge for no answer", range(6), [corruptions().unanswered_mm] * 6, "0.6", ":"))
-            ticks = {"xticks": range(6), "xticklabels": ["clean", *(f"{value:g}" for value in axis.severities)]}
-            scale = {"yscale": "log", "ylim": (0.1, 1000), "ylabel": "object MAE, mm"}
-            panels.append(Panel(f"{name}, {axis.unit}", lines, {**ticks, **scale}))
-    return chart(panels, 4, (3.3, 2.9))
+            errors = np.array([scores.get("mae_mm") for scores in points.values()], dtype=float)
+            colour = LINE_COLOURS[number % len(LINE_COLOURS)]
+            panel.plot(list(points), errors, style, color=colour, label=label, **LINE)
+        charge = [rules.unanswered_mm] * 6
+        panel.plot(range(6), charge, ":", color="0.6", label="charge for no answer", **LINE)
+        panel.set(xticks=range(6), xticklabels=["clean", *(f"{value:g}" for value in axis.severities)])
+        panel.set(yscale="log", ylim=(0.1, 1000), ylabel="object MAE, mm")
+    return with_legend(drawn, 3)
