@@ -8,7 +8,7 @@ shows its error.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from operator import index
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ from fpp_ml_bench.schema import validate
 if TYPE_CHECKING:
     from fpp_ml_bench.evaluation.submission.description import Submission
 
-DIRECTIONS = ("horizontal", "vertical", "both")
+DIRECTIONS: tuple[Directions, ...] = get_args(Directions)
 
 
 @dataclass(frozen=True)

@@ -216,6 +216,12 @@ class Method(ABC):
         return {"data": "train-split", "versions": [title]}
 
     @property
+    def weights_sha256(self) -> str | None:
+        """Hash of the weights file, of a method that has one."""
+        sha256 = self.settings.get("weights_sha256")
+        return sha256 if isinstance(sha256, str) else None
+
+    @property
     def software(self) -> dict[str, str]:
         """Versions of this package, Python and the packages that the method computes with."""
         versions = {package: version(package) for package in self.packages}

@@ -32,7 +32,7 @@ BUILT_IN = (
     "learned.method:ClassicalNetMethod",
     "phase.method:PhaseMethod",
     "learned.method:PhaseNetMethod",
-    "phase.crossed_method:CrossedMethod",
+    "phase.method:CrossedMethod",
     "learned.method:CrossedNetMethod",
     "trivial:ConstantMethod",
     "trivial:NearestMethod",
@@ -101,13 +101,7 @@ def load_method(name: str | Path, source: Photographed | Rig, **options: Any) ->
     """
     method, preset = find(name)
     make = method.for_rig if isinstance(source, Rig) else method.for_dataset
-    try:
-        return make(source, **preset, **options)  # type: ignore[arg-type]
-    except TypeError as error:
-        if inspect.isabstract(method):
-            missing = ", ".join(sorted(method.__abstractmethods__))
-            raise PredictionError(f"{name}: does not define {missing}, which a method needs") from error
-        raise
+    return make(source, **preset, **options)  # type: ignore[arg-type]
 
 
 def load_from_file(text: str) -> Any:
@@ -210,6 +204,9 @@ def _checked(method: Any, where: str) -> type[Method]:
     name = getattr(method, "name", None)
     if not isinstance(name, str) or not name or printable(name) != name or any(c in name for c in " /:\\"):
         raise PredictionError(f"{where}: its name is {name!r}; expected text without spaces, slashes and colons")
+    if inspect.isabstract(method):
+        missing = ", ".join(sorted(method.__abstractmethods__))
+        raise PredictionError(f"{where}: does not define {missing}, which a method needs")
     return method
 
 

@@ -1,9 +1,10 @@
 """Running a method over a split: one prediction a sample, timed, and a submission that says how it was made."""
 
 import json
+import os
 import statistics
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from io import BytesIO
 from pathlib import Path
 from time import perf_counter
@@ -14,35 +15,27 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.baselines.unfinished import Finished, UnfinishedRun
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.submission.description import check_submission
 from fpp_ml_bench.evaluation.submission.prediction_files import REPORTS_FILE, SIGMA, SUBMISSION_FILE, UNFINISHED_FILE
-from fpp_ml_bench.files import LOCK_FILE, exclusive, write_atomically
-from fpp_ml_bench.loaders.sample import row_columns, stored_frames
+from fpp_ml_bench.files import LOCK_FILE, exclusive, file_content, naming, printable, strict_json, write_atomically
+from fpp_ml_bench.loaders.sample import row_columns
 from fpp_ml_bench.loaders.storage.store import ALL_SPLITS, DatasetFolder
 from fpp_ml_bench.machine import describe_hardware
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by, seconds_of, skipping
 
 PREDICTION_SUFFIX = ".npy"
-
-
-@dataclass(frozen=True)
-class Run:
-    """Result of a run: samples written, median seconds a sample."""
-
-    samples: int
-    seconds_per_sample: float
+LARGEST_JOURNAL_BYTES = 1 << 28
 
 
 def predict_split(
     opened: DatasetFolder, method: Method, split: str, out: Path, progress: Callable[[int], None] = lambda samples: None
-) -> Run:
+) -> float:
     """Predict every sample of ``split`` into ``out``: ``{sample}.npy`` float32 (H, W) in mm or the method's own units,
     ``{sample}.sigma.npy`` of a method that states its uncertainty, and ``submission.yaml`` last. The reports of a
     method that ``reports`` are written beside, by sample, as `REPORTS_FILE`, and its summary of them into the
-    submission's settings.
+    submission's settings. Median seconds a sample.
 
     A sample's time is that of the method on frames in memory, after one run that is not counted; the submission gives
     the median over the split. A run that was stopped continues behind its last finished sample.
@@ -50,49 +43,114 @@ def predict_split(
     Raises `PredictionError` for an ``out`` that another process predicts into, or that holds anything but an unfinished
     run of the same method, settings, data and machine, and `DatasetError` when the dataset lacks a frame that the
     method needs."""
-    opened.samples(split)  # before a folder is made
+    samples = opened.samples(split)  # before a folder is made
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise PredictionError(f"{out}: can't be made a folder ({error.strerror})") from error
     with exclusive(out / LOCK_FILE, out, "predicting into this folder", PredictionError):
-        return _predict_split(opened, method, split, out, progress)
+        run = _prepare(out, opened, method, split)
+        warm = False
+        for sample in samples:
+            path = out / f"{sample}{PREDICTION_SUFFIX}"
+            if not run.holds(sample, path, opened.size):
+                frames = captured_frames(opened, method, sample)
+                if not warm:
+                    method.predict(frames)
+                    warm = True
+                started = perf_counter()
+                answer = method.answer(frames)
+                seconds = perf_counter() - started
+                _write_prediction(run, path, answer.depth, opened.size)
+                if answer.sigma_mm is not None:
+                    _write_prediction(run, out / f"{sample}{SIGMA}", answer.sigma_mm, opened.size)
+                run.add(sample, seconds, dict(answer.report) if method.reports else {})
+            progress(1)
+        finished = {sample: run.finished[sample] for sample in samples}
+        median = statistics.median(seconds for seconds, _ in finished.values())
+        summary: dict[str, Any] = {}
+        if method.reports:
+            reports = {sample: report for sample, (_, report) in finished.items()}
+            write_atomically(
+                out / REPORTS_FILE, (json.dumps(reports, indent=1, allow_nan=False) + "\n").encode("utf-8")
+            )
+            summary = method.summary(list(reports.values()))
+        timed = {"seconds_per_sample": float(f"{median:.6g}"), "seconds_source": "measured"}
+        described = {**_described(method), **_predicted(opened, method, split)}
+        described["settings"] |= summary
+        submission = check_submission(out, {**described, **timed})
+        write_atomically(out / SUBMISSION_FILE, submission.to_yaml().encode("utf-8"))
+        run.path.unlink(missing_ok=True)
+        return median
 
 
-def _predict_split(
-    opened: DatasetFolder, method: Method, split: str, out: Path, progress: Callable[[int], None]
-) -> Run:
-    samples = opened.samples(split)
-    run = _prepare(out, opened, method, split)
-    warm = False
-    for sample in samples:
-        path = out / f"{sample}{PREDICTION_SUFFIX}"
-        if not run.holds(sample, path, opened.size):
-            frames = captured_frames(opened, method, sample)
-            if not warm:
-                method.predict(frames)
-                warm = True
-            started = perf_counter()
-            answer = method.answer(frames)
-            seconds = perf_counter() - started
-            _write_prediction(run, path, answer.depth, opened.size)
-            if answer.sigma_mm is not None:
-                _write_prediction(run, out / f"{sample}{SIGMA}", answer.sigma_mm, opened.size)
-            run.add(sample, Finished(seconds, dict(answer.report) if method.reports else {}))
-        progress(1)
-    median = statistics.median(run.finished[sample].seconds for sample in samples)
-    summary: dict[str, Any] = {}
-    if method.reports:
-        reports = {sample: run.finished[sample].report for sample in samples}
-        write_atomically(out / REPORTS_FILE, (json.dumps(reports, indent=1, allow_nan=False) + "\n").encode("utf-8"))
-        summary = method.summary(list(reports.values()))
-    timed = {"seconds_per_sample": float(f"{median:.6g}"), "seconds_source": "measured"}
-    described = {**_described(method), **_predicted(opened, method, split)}
-    described["settings"] |= summary
-    submission = check_submission(out, {**described, **timed})
-    write_atomically(out / SUBMISSION_FILE, submission.to_yaml().encode("utf-8"))
-    run.remove()
-    return Run(len(samples), median)
+class UnfinishedRun:
+    """What a stopped run in ``folder`` left, and whether it is the run that ``run`` describes in plain values.
+    ``finished``: seconds and report by sample, of all calls so far.
+
+    ``unfinished.jsonl`` stands beside the predictions until all are there. Its first line says what run it is, each
+    further one is a finished sample, written when its files are. A last line that was cut off does not count."""
+
+    def __init__(self, folder: Path, run: Mapping[str, Any]) -> None:
+        """Raises PredictionError for a file that belongs to another run."""
+        self.path = folder / UNFINISHED_FILE
+        self.run = json.loads(json.dumps(run))
+        self.finished: dict[str, tuple[float, dict[str, Any]]] = {}
+        if not self.path.exists():
+            return
+        cure = "remove the folder, or give another one"
+        text = file_content(self.path, LARGEST_JOURNAL_BYTES, PredictionError, cure).decode("utf-8", "replace")
+        lines = [entry for line in text.splitlines() if isinstance(entry := _parsed(line), dict)]
+        if not text.startswith("{") or not lines:
+            self.path.unlink()  # stopped before the first line was whole
+            return
+        earlier = lines[0]
+        if differing := [key for key in {**earlier, **self.run} if earlier.get(key) != self.run.get(key)]:
+            key = differing[0]
+            values = [printable(json.dumps(run.get(key)), 150) for run in (earlier, self.run)]
+            raise PredictionError(
+                f"{folder}: holds an unfinished run that differs in {', '.join(differing)} ({key}: {values[0]} there, "
+                f"{values[1]} now); finish it with its own options, remove the folder, or give another one"
+            )
+        for entry in lines[1:]:
+            with suppress(KeyError, TypeError, ValueError):  # a damaged line: its sample is predicted again
+                self.finished[str(entry["sample"])] = float(entry["seconds"]), dict(entry["report"])
+        if not text.endswith("\n"):
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write("\n")  # what follows is a line of its own
+
+    def holds(self, sample: str, path: Path, size: tuple[int, int]) -> bool:
+        """Whether ``sample`` is finished and its file ``path`` is a whole map of ``size``."""
+        if sample not in self.finished:
+            return False
+        try:
+            return np.load(path, mmap_mode="r", allow_pickle=False).shape == size
+        except (OSError, ValueError, EOFError):
+            return False
+
+    def add(self, sample: str, seconds: float, report: dict[str, Any]) -> None:
+        """Note that the files of ``sample`` are there."""
+        self.finished[sample] = seconds, report
+        self._append({"sample": sample, "seconds": seconds, "report": report})
+
+    def begin(self) -> None:
+        """Note what run it is, before its first file: a folder with a prediction and no note is not taken over."""
+        if not self.path.exists():
+            self._append(self.run)
+
+    def _append(self, entry: dict[str, Any]) -> None:
+        with naming(self.path), self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(entry) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+
+
+def _parsed(line: str) -> Any:
+    """The line's JSON; None for one that was cut off."""
+    try:
+        return strict_json(line)
+    except ValueError:
+        return None
 
 
 def captured_frames(opened: DatasetFolder, method: Method, sample: str) -> list[NDArray[np.uint8] | None]:
@@ -176,7 +234,7 @@ def explain_predict(opened: DatasetFolder, method: Method, split: str) -> Explan
     """The account of a run of ``method`` over ``split``. Takes as long as predicting some samples again."""
     samples = opened.samples(split)
     height, width = opened.size
-    unused = [i for i in stored_frames(opened.sequence, opened.manifest.stored) if i not in method.frames_used]
+    unused = [i for i in opened.manifest.stored_frames if i not in method.frames_used]
     sample = samples[len(samples) // 2]
     seconds = seconds_of(lambda: [frame.copy() for frame in opened.frames(sample, unused)]) if unused else None
     opened.release(sample)

@@ -18,6 +18,7 @@ from fpp_ml_bench.baselines.method import Frames, Method
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.errors import DatasetError, SubmissionError
 from fpp_ml_bench.evaluation.result.file import read_result, write_file, write_result
+from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import HardwareInfo, Timing
 from fpp_ml_bench.evaluation.submission.description import Submission, read_submission
 from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE
@@ -129,7 +130,7 @@ def _status_mib(key: str) -> float:
 def check_target(path: Path, method: Method) -> None:
     """Refuse, before any work, a file that is no submission or result, or that describes another method. Raises
     SubmissionError, which says what differs."""
-    submission = read_result(path).submission if path.suffix == ".json" else _described(path)
+    submission, _ = _described(path)
     for key, in_file, timed in (
         ("method", submission.method, method.name),
         ("frames_used", sorted(submission.frames_used), list(method.frames_used)),
@@ -151,8 +152,7 @@ def write_timing(path: Path, timing: Timing) -> None:
         "hardware": content["hardware"],
         "timing": content,
     }
-    result = read_result(path) if path.suffix == ".json" else None
-    submission = _described(path) if result is None else result.submission
+    submission, result = _described(path)
     submission = Submission.model_validate({**submission.model_dump(mode="json"), **measured})
     if result is not None:
         write_result(result.model_copy(update={"submission": submission}), path)
@@ -160,7 +160,11 @@ def write_timing(path: Path, timing: Timing) -> None:
         write_file(submission.to_yaml().encode("utf-8"), path)
 
 
-def _described(path: Path) -> Submission:
+def _described(path: Path) -> tuple[Submission, Result | None]:
+    """The submission of a file, and the result that it is in."""
+    if path.suffix == ".json":
+        result = read_result(path)
+        return result.submission, result
     if path.name != SUBMISSION_FILE:
         raise SubmissionError(f"{printable(str(path), 500)}: expected a {SUBMISSION_FILE} or a result file (*.json)")
-    return read_submission(path.parent)
+    return read_submission(path.parent), None

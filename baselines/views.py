@@ -6,9 +6,8 @@ coordinates are metres, z up, as in the dataset's meshes.
 """
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import cached_property
 from pathlib import Path
 
@@ -19,8 +18,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import FULL_SIZE, MM_PER_M, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation.protocol import TARGETS
-from fpp_ml_bench.evaluation.score.check import check_folder, scored_pair
-from fpp_ml_bench.evaluation.submission.prediction_files import read_sigma, reader_for
+from fpp_ml_bench.evaluation.score.check import Rules, check_folder
 from fpp_ml_bench.files import printable, write_files
 from fpp_ml_bench.loaders.render.mesh_files import ply_bytes
 from fpp_ml_bench.loaders.render.scene import turned, unturned
@@ -28,6 +26,7 @@ from fpp_ml_bench.loaders.sample import DEPTH_EXACT
 from fpp_ml_bench.loaders.storage.manifest import GENERATED
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.pinhole import Pinhole
+from fpp_ml_bench.options import did_you_mean
 
 FUSION_FILE = "fusion.json"
 CELL_MM = 2.0
@@ -92,7 +91,7 @@ def placement(dataset: DatasetFolder, sample: str) -> tuple[float, float]:
     return VIEW_DEGREES[VIEWS.index(view)], distance_mm / MM_PER_M
 
 
-def contradicted(views: Sequence[PlacedView], tolerance_mm: float = TOLERANCE_MM) -> list[Flags]:
+def contradicted(views: Sequence[PlacedView]) -> list[Flags]:
     """For each view its contradicted ``pixels``, bool (n,), without ground truth. One view contradicts nothing.
 
     Each point is looked for in every other view. A view supports the point if it answers about the same depth there. It
@@ -111,8 +110,8 @@ def contradicted(views: Sequence[PlacedView], tolerance_mm: float = TOLERANCE_MM
             inside = (u > -0.5) & (u < other.camera.width - 0.5) & (v > -0.5) & (v < other.camera.height - 0.5)
             column, row = (np.rint(axis[inside]).astype(np.intp) for axis in (u, v))
             near, far, depth = nearest[row, column], farthest[row, column], z[inside]
-            supported[inside] |= (depth >= near - tolerance_mm) & (depth <= far + tolerance_mm)
-            seen_through[inside] |= depth < near - tolerance_mm
+            supported[inside] |= (depth >= near - TOLERANCE_MM) & (depth <= far + TOLERANCE_MM)
+            seen_through[inside] |= depth < near - TOLERANCE_MM
         flags.append(seen_through & ~supported)
     return flags
 
@@ -162,27 +161,19 @@ def cell_means(points_m: Points, weights: Values, cell_mm: float = CELL_MM) -> P
     return np.column_stack([np.bincount(cell, weights * axis) / total for axis in points_m.T])
 
 
-def fuse(views: Sequence[PlacedView], kept: Sequence[Flags] | None = None, cell_mm: float = CELL_MM) -> Points:
-    """One cloud (k, 3) in object coordinates, metres: `cell_means` of all views' points by their `point_weights`;
-    with ``kept``, bool (n,) for each view, of these points only."""
-    chosen = [np.ones(view.pixels.size, dtype=bool) for view in views] if kept is None else kept
-    points = np.concatenate([view.points_m[keep] for view, keep in zip(views, chosen, strict=True)])
-    weights = [weight[keep] for weight, keep in zip(point_weights(views), chosen, strict=True)]
-    return cell_means(points, np.concatenate(weights), cell_mm)
-
-
 Counts = dict[str, float | None]
 
 
-@dataclass(frozen=True, eq=False)
-class FusedObject:
-    """An object's ``cloud_m`` (k, 3): that of its views without contradicted pixels, object coordinates in metres.
-    ``counts``: ``cloud_points``; ``answered_px`` of all views, which have a depth; ``contradicted_px`` of these, and
-    their share (``contradicted_share``, None without a depth)."""
-
-    name: str
-    cloud_m: Points
-    counts: Counts
+def fused(views: Sequence[PlacedView], cell_mm: float = CELL_MM) -> tuple[Points, Counts]:
+    """One cloud (k, 3) of an object in object coordinates, metres: `cell_means` of its views' points by their
+    `point_weights`, without the contradicted ones. And counts: ``cloud_points``; ``answered_px`` of all views, which
+    have a depth; ``contradicted_px`` of these, and their share (``contradicted_share``, None without a depth)."""
+    wrong = np.concatenate(contradicted(views))
+    points = np.concatenate([view.points_m for view in views])
+    cloud_m = cell_means(points[~wrong], np.concatenate(point_weights(views))[~wrong], cell_mm)
+    answered, contradictions = wrong.size, int(wrong.sum())
+    counts: Counts = {"cloud_points": len(cloud_m), "answered_px": answered, "contradicted_px": contradictions}
+    return cloud_m, counts | {"contradicted_share": contradictions / answered if answered else None}
 
 
 def prediction_maps(
@@ -194,34 +185,25 @@ def prediction_maps(
     if isinstance(predictions, str) and predictions in TARGETS:
         column = predictions
         return f"{column} of {printable(dataset.path.name)}", lambda sample: (dataset.depth_mm(sample, column), None)
-    folder = Path(predictions)
-    checked = check_folder(folder, dataset, split)
-    if checked.problems or checked.description is None:
-        raise PredictionError(
-            f"{printable(str(folder), 500)} can't be used, {len(checked.problems)} problems:", checked.problems
-        )
-    described = checked.description
-    reader = reader_for(checked.form, folder, checked.samples, dataset.size, described.png_mm_per_level)
+    checked = check_folder(predictions, dataset, split)
+    described, listing = checked.sound(), checked.listing
+    read = listing.reader(dataset.size, described.png_mm_per_level)
+    rules = Rules(target, described.units, described.range_rule, "standard")
 
-    def read(sample: str) -> tuple[Map, Map | None]:
-        target_mm = dataset.target_mm(sample, target)
-        left_out = dataset.left_out(sample, described.range_rule, target)
-        depth_mm, _ = scored_pair(reader.read(sample)[0], target_mm, described.units, "standard", sample, left_out)
-        sigma_mm = read_sigma(folder, sample, dataset.size) if checked.sigmas else None
+    def maps(sample: str) -> tuple[Map, Map | None]:
+        depth_mm, _ = rules.pair(read(sample)[0], dataset, sample)
+        sigma_mm = listing.sigma_mm(sample, dataset.size) if listing.sigmas else None
         return np.array(depth_mm), sigma_mm
 
-    return described.name, read
+    return described.name, maps
 
 
 def views_by_object(dataset: DatasetFolder, split: str, only: str | None = None) -> dict[str, list[str]]:
     """The samples of each object of ``split``, or of the object ``only``, whose placement is known. Raises
     `DatasetError` for another object, for one with a single view, and for data without placement."""
-    views: dict[str, list[str]] = {}
-    for sample in dataset.samples(split):
-        views.setdefault(dataset.measured(sample)["object"], []).append(sample)
+    views = dataset.samples_by_object(split)
     if only is not None and only not in views:
-        near = ", ".join(get_close_matches(only, views, n=3)) or f"there are {', '.join(views)}"
-        raise DatasetError(f"{dataset.path}: no object {only!r} in split {split}; {near}")
+        raise DatasetError(f"{dataset.path}: no object {only!r} in split {split}; {did_you_mean(only, views)}")
     chosen = {name: samples for name, samples in views.items() if only in (None, name)}
     if not chosen:
         raise DatasetError(f"{dataset.path}: split {split} holds no sample; there is nothing to put together")
@@ -234,47 +216,42 @@ def views_by_object(dataset: DatasetFolder, split: str, only: str | None = None)
 
 
 def fuse_split(
-    predictions: str | Path, dataset: DatasetFolder, split: str, only: str | None = None, cell_mm: float = CELL_MM
-) -> tuple[str, Iterator[FusedObject]]:
-    """The method's name, and the objects of ``split`` put together one after another (``only``: a single one). Raises
-    what `prediction_maps` and `views_by_object` raise."""
+    predictions: str | Path,
+    dataset: DatasetFolder,
+    split: str,
+    out: Path,
+    only: str | None = None,
+    cell_mm: float = CELL_MM,
+) -> tuple[str, int, Iterator[tuple[str, Counts]]]:
+    """The method's name, the number of objects, and the objects of ``split`` (``only``: a single one) one after another
+    with their counts, as they are put together and written: ``{object}.ply``, the object's cloud, and at last
+    `FUSION_FILE`, the counts of all objects, and by which rules. Raises what `prediction_maps` and `views_by_object`
+    raise, and PredictionError for a folder that can't be written."""
     if not 0 < cell_mm < 1000:
         raise PredictionError(f"--cell-mm {cell_mm:g}: expected the edge of a cell in mm, above 0 and below 1000")
     chosen = views_by_object(dataset, split, only)
     name, maps = prediction_maps(predictions, dataset, split)
 
-    def fused() -> Iterator[FusedObject]:
+    def written() -> Iterator[tuple[str, Counts]]:
+        objects: dict[str, Counts] = {}
         for obj, samples in chosen.items():
             views = []
             for sample in samples:
                 depth_mm, sigma_mm = maps(sample)
                 views.append(PlacedView(depth_mm, dataset.rig.camera, *placement(dataset, sample), sigma_mm))
                 dataset.release(sample)
-            flags = contradicted(views)
-            cloud_m = fuse(views, [~flag for flag in flags], cell_mm)
-            answered, wrong = sum(flag.size for flag in flags), int(sum(flag.sum() for flag in flags))
-            counts: Counts = {"cloud_points": len(cloud_m), "answered_px": answered, "contradicted_px": wrong}
-            yield FusedObject(obj, cloud_m, counts | {"contradicted_share": wrong / answered if answered else None})
+            cloud_m, objects[obj] = fused(views, cell_mm)
+            write_files(out, {f"{obj}.ply": ply_bytes(cloud_m)}, PredictionError)
+            yield obj, objects[obj]
+        document = {
+            "method": name,
+            "dataset": dataset.fingerprint,
+            "split": split,
+            "cell_mm": cell_mm,
+            "tolerance_mm": TOLERANCE_MM,
+            "objects": objects,
+        }
+        content = (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
+        write_files(out, {FUSION_FILE: content}, PredictionError)
 
-    return name, fused()
-
-
-def write_object(out: Path, fused: FusedObject) -> list[Path]:
-    """Write ``{object}.ply``, the object's cloud. Raises PredictionError for a folder that can't be written."""
-    return write_files(out, {f"{fused.name}.ply": ply_bytes(fused.cloud_m)}, PredictionError)
-
-
-def write_counts(
-    out: Path, name: str, dataset: DatasetFolder, split: str, cell_mm: float, objects: Mapping[str, Counts]
-) -> list[Path]:
-    """Write `FUSION_FILE`: the counts of all objects, and by which rules. Errors as `write_object`."""
-    document = {
-        "method": name,
-        "dataset": dataset.fingerprint,
-        "split": split,
-        "cell_mm": cell_mm,
-        "tolerance_mm": TOLERANCE_MM,
-        "objects": dict(objects),
-    }
-    content = (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
-    return write_files(out, {FUSION_FILE: content}, PredictionError)
+    return name, len(chosen), written()

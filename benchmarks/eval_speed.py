@@ -36,7 +36,6 @@ from fpp_ml_bench.loaders.storage.assembly import Assembly
 from fpp_ml_bench.loaders.storage.manifest import Manifest
 from fpp_ml_bench.loaders.storage.shards import ShardWriter, plan_shards
 from fpp_ml_bench.optics.named_rigs import paper_rig
-from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
 COVER = 0.1
 COMMAND = Path(sys.executable).with_name("fpp-eval")
@@ -95,6 +94,7 @@ def prepare(data: Path, predictions: Path, targets: Path, size: int, samples: in
     for sample in names:
         objects.setdefault(sample[1], []).append(sample)
     plans, receipts = plan_shards("test", objects), []
+    manifest = Manifest("generated", {}, {}, paper_rig(960).to_dict(), (size, size), "single_shot", exact=False)
     for number, plan in enumerate(plans):
         rows: list[Row] = []
         for sample, name, view in plan.samples:
@@ -103,10 +103,8 @@ def prepare(data: Path, predictions: Path, targets: Path, size: int, samples: in
             np.save(predictions / f"{sample}.npy", (depth + noise).astype(np.float32))
             np.save(targets / f"{sample}.npy", depth)
             rows.append(Row(sample, name, view, {0: np.zeros(depth.shape, np.uint8)}, depth, None))
-        writer = ShardWriter(data, data / ".build", PAPER_SEQUENCE, "single_shot", False, (size, size))
-        receipts.append(writer.write(plan, rows))
+        receipts.append(ShardWriter(manifest).write(data, plan, rows))
     (data / ".build").rmdir()
-    manifest = Manifest("generated", {}, {}, paper_rig(960).to_dict(), (size, size), "single_shot", exact=False)
     Assembly(plans, lambda plan, folder: (), manifest).filled(receipts).write(data)
     (predictions / "submission.yaml").write_text(_DESCRIPTION)
 

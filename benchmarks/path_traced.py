@@ -37,7 +37,7 @@ from fpp_ml_bench.loaders.render.light import Light, named_light
 from fpp_ml_bench.loaders.render.meshes import solid_mesh as benchmark_mesh
 from fpp_ml_bench.loaders.render.pixels import blur_image
 from fpp_ml_bench.loaders.render.scene import BuildSettings, SolidMesh, place
-from fpp_ml_bench.loaders.render.sensor import Sensor, normal_table, sense_kernel, stream_keys
+from fpp_ml_bench.loaders.render.sensor import Sensor, sense_kernel, stream_keys
 from fpp_ml_bench.loaders.render.surfels import Surfels
 from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.sample import Flag
@@ -298,12 +298,8 @@ def camera_rows() -> list[str]:
             own,
             np.full((1, pixels.size), grey, dtype=np.float32),
             pixels,
-            normal_table(),
             stream_keys("fade", grey)[None],
-            np.float32(sensor.noise.read_variance),
-            np.float32(sensor.noise.shot_per_grey),
-            np.float32(0),
-            np.empty(0, dtype=np.uint8),
+            sensor,
         )
         # `fade` cuts off decimals where ours rounds: half a grey level of dark current makes the two one.
         image = np.full((1, 1, pixels.size, 1), grey / 255)

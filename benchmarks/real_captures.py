@@ -22,7 +22,7 @@ from PIL import Image
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.learned.method import ClassicalNetMethod, CrossedNetMethod
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.baselines.phase.crossed_route import CrossedRoute
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute
 from fpp_ml_bench.baselines.phase.method import PhaseMethod
 from fpp_ml_bench.baselines.robustness.axes import corruptions
 from fpp_ml_bench.calibration.boards import Board
@@ -114,18 +114,19 @@ def calibrate(folder: Path, theirs: "OpenCvCalibration", scratch: Path, out: Pat
     errors = theirs.camera_error_px, theirs.projector_error_px, theirs.stereo_error_px
     print(f"{'authors':<50}{errors[0]:6.3f}{'':9}{errors[1]:8.3f}{'':7}{errors[2]:8.3f}")
     own = (Lens("radial-1", True, True), Lens("radial-1", True))
+    radial, full = (Lens("radial-1"), Lens("radial-1")), (Lens(), Lens())
     results = []
     for title, lens, free in (
         ("their model, perfect board", own, False),
         ("their model, board estimated", own, True),
-        ("radial-1, board estimated", "radial-1", True),
-        ("radial-3+tangential, board estimated", "radial-3+tangential", True),
+        ("radial-1, board estimated", radial, True),
+        ("radial-3+tangential, board estimated", full, True),
     ):
         found = calibrate_rig(poses, board, *sizes, lens, estimate_board=free)
         alone = found.alone_rms_px
         print(
-            f"{title:<50}{found.camera_rms_px:6.3f} {alone[0]:6.3f}  {found.projector_rms_px:8.3f} {alone[1]:6.3f}"
-            f"{found.stereo_rms_px:8.3f}{found.held_out_rms_px:10.3f}"
+            f"{title:<50}{found.rms_px.camera:6.3f} {alone[0]:6.3f}  {found.rms_px.projector:8.3f} {alone[1]:6.3f}"
+            f"{found.rms_px.both:8.3f}{found.held_out_rms_px:10.3f}"
         )
         results.append(found)
     best = min(results, key=lambda found: found.held_out_rms_px)

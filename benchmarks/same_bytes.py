@@ -42,8 +42,7 @@ WAYS: dict[str, dict[str, str]] = {
 
 MESHES = """\
 import hashlib, sys
-from fpp_ml_bench.baselines.robustness.axes import corruptions
-from fpp_ml_bench.baselines.robustness.scenes import Condition, FrameCache
+from fpp_ml_bench.baselines.robustness.axes import Condition, FrameCache, corruptions
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.constants import OBJECTS, UNSEEN
 from fpp_ml_bench.loaders.render.meshes import solid_mesh

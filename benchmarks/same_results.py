@@ -49,6 +49,7 @@ SETS = {
     "vertical": f"--objects {THREE} --size 224 --frames vertical --no-skip",
     "own-mesh": "--mesh own.ply --size 224 --frames sinusoidal",
     "every-object": "--preset full --size 176 --frames single_shot",
+    "crossed": f"--objects {THREE} --size 480 --rig crossed",
 }
 RECIPES = {
     "normalization": "raw global individual",
@@ -107,6 +108,14 @@ METHODS = (
     "unet-individual-hybrid_l1_0.7 small",
     "unet-individual-hybrid_l1_0.7 small --range oracle",
     "unet-individual-hybrid_l1_0.7 varied",
+    "crossed crossed",
+    "crossed crossed --frames 3",
+    "crossed crossed --min-confidence 0.5 --split all",
+    "crossed mini",
+    "crossed-net crossed",
+    "crossed-net mini",
+    "classical-net mini",
+    "classical-net mini --direction horizontal --steps 6",
     "no-such-method mini",
 )
 

@@ -36,7 +36,7 @@ from pathlib import Path
 from typing import Any
 
 from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corruptions
-from fpp_ml_bench.baselines.robustness.report import Measured, draw_curves
+from fpp_ml_bench.baselines.robustness.run import Measured, draw_curves
 from fpp_ml_bench.cli import BENCH, EVAL, Program
 from fpp_ml_bench.cli import main as fpp_bench
 from fpp_ml_bench.cli import main_eval as fpp_eval
@@ -44,21 +44,29 @@ from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import FppBenchError, SubmissionError
 from fpp_ml_bench.evaluation.metrics import RANK_KEY
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
-from fpp_ml_bench.evaluation.report.html import percent
 from fpp_ml_bench.evaluation.result.file import read_result
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import Robustness
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.leaderboard import columns
-from fpp_ml_bench.leaderboard.columns import NOT_CHECKED, Column, device, error
-from fpp_ml_bench.leaderboard.groups import Group, Ranked, is_trivial
-from fpp_ml_bench.leaderboard.names import assumption, short_names
+from fpp_ml_bench.leaderboard.columns import NOT_CHECKED, Column, assumption, device, error
 from fpp_ml_bench.leaderboard.page.sections import of_one_target
-from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
+from fpp_ml_bench.leaderboard.ranking import (
+    Group,
+    Ranked,
+    expand,
+    is_trivial,
+    rank,
+    read_entries,
+    shipped_rows,
+    short_names,
+)
 from fpp_ml_bench.leaderboard.row_file import row_json, write_row
 from fpp_ml_bench.leaderboard.rows import VOUCHED, Entry, read_entry, vouching_line
-from fpp_ml_bench.leaderboard.tables import markdown_rows, markdown_text, ranking_table
+from fpp_ml_bench.leaderboard.tables import ranking_table
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.style import percent
+from fpp_ml_bench.tables import Table, markdown_text
 
 ROOT = Path(__file__).resolve().parent.parent
 ROWS, README, ROBUSTNESS = ROOT / "leaderboard" / "rows", ROOT / "README.md", ROOT / "docs/results/robustness.md"
@@ -188,7 +196,7 @@ _COLUMNS = (
         lambda row: f"{error(RANK_KEY, row)} ({columns.interval(row, between=' to ')})",
     ),
     Column("Overall MAE, mm", partial(error, "overall_mae_mm")),
-    Column("Time, ms", columns.milliseconds_text),
+    Column("Time, ms", partial(columns.time_text, per_second=1000)),
     columns.FRAMES,
     columns.RELIANCE,
     columns.ROBUSTNESS,
@@ -270,23 +278,21 @@ def of_set(name: SetName, results: Sequence[Result]) -> list[Row]:
 
 def robustness_tables(rows: Sequence[Row]) -> str:
     """Both tables in Markdown: means over all axes, then each axis by itself."""
-    overall, by_axis = [], []
     axes = [axis for axis in corruptions().axes if any(axis in block.axes for _, block in rows)]
+    overall, by_axis = Table(TITLES[0], numbers=TITLES[1:]), Table("method", numbers=axes)
     for name, block in rows:
         low, high = block.interval
         interval = "-" if low is None or high is None else f"{low:.1f} to {high:.1f}"
         ratio = "-" if block.ratio is None else f"{block.ratio:.1f}"
         numbers = [f"{block.mae_mm:.1f}", interval, f"{block.clean.mae_mm:.1f}", ratio]
-        overall.append([markdown_text(name), *numbers, *(percent(block.mean(key)) for key in SCORES)])
+        overall.add_row(name, *numbers, *(percent(block.mean(key)) for key in SCORES))
         means = []
         for axis in axes:
             errors = [scores.mae_mm for scores in block.axes.get(axis, [])]
             means.append(f"{sum(errors) / len(errors):.1f}, {errors[-1]:.1f}" if errors else "")
-        by_axis.append([markdown_text(name), *means])
-    lines = markdown_rows(TITLES, [False] + [True] * (len(TITLES) - 1), overall)
-    lines += ["", "By axis, mean over the five severities and the last one, mm:", ""]
-    lines += markdown_rows(("method", *axes), [False] + [True] * len(axes), by_axis)
-    return "\n".join(lines) + "\n"
+        by_axis.add_row(name, *means)
+    between = ["", "By axis, mean over the five severities and the last one, mm:", ""]
+    return "\n".join([*overall.markdown(), *between, *by_axis.markdown()]) + "\n"
 
 
 def curves(rows: Sequence[Row]) -> bytes:

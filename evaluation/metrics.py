@@ -8,9 +8,9 @@ and the statistics that the built-in metrics share.
 
 import re
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from itertools import count, groupby
+from itertools import groupby
 from operator import attrgetter, methodcaller
 from typing import Any, Literal
 
@@ -18,21 +18,17 @@ from fpp_ml_bench.evaluation.protocol import COVERED, WIDE_BAND_PX, WITHIN_MM
 
 Unit = Literal["mm", "signed mm", "share", "ratio", "nats"]
 """A ``share`` is from 0 to 1, a ``ratio`` may exceed 1; both are shown as per cent."""
-ALWAYS = 28
-"""So many places among the keys of a file are always there."""
 WIDE, WIDEST = 140, 170
-_rows = count()
 
 
 @dataclass(frozen=True)
 class Metric:
     """``of`` computes it for a sample, None where the sample has no pixel for it, or names a statistic that a sample
-    has; ``title`` and ``rule`` say what it is in reports and in PROTOCOL.md, which list the entries by ``row``, in the
-    order in which they are written.
+    has; ``title`` and ``rule`` say what it is in reports and in PROTOCOL.md. The order of the entries is that of the
+    keys in a file and of all tables.
 
-    ``place``: that of its key in a file. In the first `ALWAYS` places a score that no sample has is null, in the others
-    its key is left out. A new metric has no place: it comes last, and files from before stay readable. ``cancels``: a
-    small difference of large numbers, which two machines compute to 1e-9 of the error.
+    ``optional``: a file leaves its key out where no sample has it, so that files from before the entry stay readable;
+    else it is null. ``cancels``: a small difference of large numbers, which two machines compute to 1e-9 of the error.
 
     Roles: ``headline``: one of the paper's six numbers, which have intervals and ranks; ``role``: ``rank``, the
     leaderboard's order, and ``range``, which stands beside it; ``helped_by_missing``: a method improves it by answering
@@ -45,7 +41,7 @@ class Metric:
     unit: Unit
     of: Callable[[Any], Any] | str
     rule: str
-    place: int = 1000
+    optional: bool = True
     cancels: bool = False
     better: Literal["lower", "higher", "nearer 0", "neither"] = "lower"
     headline: bool = False
@@ -56,16 +52,10 @@ class Metric:
     column: str = ""
     column_from: int = 0
     terminal: str = ""
-    row: int = field(default_factory=lambda: next(_rows), compare=False)
 
     def value(self, sample: Any) -> Any:
         """The metric of a sample."""
         return attrgetter(self.of)(sample) if isinstance(self.of, str) else self.of(sample)
-
-    @property
-    def optional(self) -> bool:
-        """Whether a file leaves it out where no sample has it."""
-        return self.place >= ALWAYS
 
 
 def share(part: Any, whole: Any) -> Any:
@@ -73,131 +63,136 @@ def share(part: Any, whole: Any) -> Any:
     return part / whole if whole else None
 
 
-def _within(number: int, sample: Any) -> Any:
-    return sample.spread.within[number]
+def _mae(pixels: str, title: str, where: str, error: str = "mae", **about: Any) -> Metric:
+    """The MAE over a set of pixels, or another ``error`` that `ErrorStats` has."""
+    name, statistic = error.upper(), f"{pixels.removeprefix('object_')}.{error}_mm"
+    return Metric(f"{pixels}_{error}_mm", f"{title} {name}", "mm", statistic, f"{name} over {where}", **about)
 
 
-_headline = partial(Metric, headline=True, training=True)
-_object = partial(Metric, over="object", training=True)
+def _errors(pixels: str, title: str, where: str, mae: Any = None, rmse: Any = None, **about: Any) -> tuple[Metric, ...]:
+    """MAE and RMSE over a set of pixels; ``mae`` and ``rmse``: what only one of them has."""
+    both = {"mae": mae or {}, "rmse": rmse or {}}
+    return tuple(_mae(pixels, title, where, error, **about, **own) for error, own in both.items())
+
+
+_headline = partial(_errors, headline=True, training=True, optional=False)
+_always = partial(Metric, optional=False)
+_object = partial(_always, over="object", training=True)
 _ENTRIES = (
-    _headline(
-        "object_mae_mm",
-        "Object MAE",
-        "mm",
-        "object.mae_mm",
-        "MAE over the object",
-        2,
-        role="rank",
+    *_headline("overall", "Overall", "object and background", {"column": "Overall MAE"}),
+    *_headline(
+        "object",
+        "Object",
+        "the object",
+        {"role": "rank", "column": "Object MAE", "terminal": "Object\nMAE"},
+        {"column": "Object RMSE", "terminal": "Object\nRMSE"},
         over="object",
-        column="Object MAE",
-        terminal="Object\nMAE",
     ),
-    Metric(
-        "object_mae_range_share",
-        "Object MAE, share of its depth range",
-        "ratio",
-        lambda s: share(s.object.mae_mm, s.range_mm),
-        "object MAE over (D_max - D_min) of the object pixels that are scored; may exceed 1; none for a flat object",
-        33,
+    *_headline(
+        "background",
+        "Background",
+        "the background",
+        {"column": "Backgr. MAE", "column_from": WIDE, "terminal": "Background\nMAE"},
+        over="background",
+    ),
+    *_errors(
+        "object_interior",
+        "Object away from edges,",
+        "the object interior",
+        {"column": "Interior MAE", "column_from": WIDEST},
+        optional=False,
+    ),
+    *_errors(
+        "object_edge",
+        "Object along edges,",
+        "the object edge",
+        {"column": "Edge MAE", "column_from": WIDEST},
+        optional=False,
+    ),
+    _mae(
+        "object_valid",
+        "Object where predicted,",
+        "the measured pixels",
+        helped_by_missing=True,
         training=True,
-        role="range",
+        optional=False,
     ),
-    _headline(
-        "object_rmse_mm",
-        "Object RMSE",
-        "mm",
-        "object.rmse_mm",
-        "RMSE over the object",
-        3,
+    _mae(
+        "object_interior_valid",
+        "Object where predicted, away from edges,",
+        "the measured pixels of the interior",
+        helped_by_missing=True,
+        optional=False,
+    ),
+    _always(
+        "object_edge_share",
+        "Object along edges, share of pixels",
+        "share",
+        lambda s: share(s.edge.pixels, s.object.pixels),
+        "share of the object that is object edge",
+        better="neither",
         over="object",
-        column="Object RMSE",
-        terminal="Object\nRMSE",
+        terminal="Near\nedges",
     ),
-    _headline(
-        "overall_mae_mm",
-        "Overall MAE",
-        "mm",
-        "overall.mae_mm",
-        "MAE over object and background",
-        0,
-        column="Overall MAE",
-    ),
-    _headline(
-        "overall_rmse_mm",
-        "Overall RMSE",
-        "mm",
-        "overall.rmse_mm",
-        "RMSE over object and background",
-        1,
-    ),
-    _headline(
-        "background_mae_mm",
-        "Background MAE",
-        "mm",
-        "background.mae_mm",
-        "MAE over the background",
-        4,
-        over="background",
-        column="Backgr. MAE",
+    _object(
+        "object_missing_share",
+        "Object not predicted",
+        "share",
+        lambda s: share(s.missing, s.object.pixels),
+        "share of pixels predicted 0 or less",
+        column="Missing",
         column_from=WIDE,
-        terminal="Background\nMAE",
+        terminal="Not\nmeasured",
     ),
-    _headline(
-        "background_rmse_mm",
-        "Background RMSE",
-        "mm",
-        "background.rmse_mm",
-        "RMSE over the background",
-        5,
-        over="background",
+    _always(
+        "object_interior_missing_share",
+        "Object away from edges, not predicted",
+        "share",
+        lambda s: share(s.interior.pixels - s.interior_valid.pixels, s.interior.pixels),
+        "the same share of the interior",
     ),
     _object(
         "object_median_mm",
         "Object, median error",
         "mm",
-        "spread.median_mm",
+        methodcaller("quantile", 0.5),
         "median of |e|, linear interpolation",
-        15,
     ),
     _object(
         "object_p95_mm",
         "Object, 95th percentile",
         "mm",
-        "spread.p95_mm",
+        methodcaller("quantile", 0.95),
         "95th percentile of |e|, linear interpolation",
-        16,
     ),
-    _object("object_max_mm", "Object, largest error", "mm", "spread.largest_mm", "largest |e|", 17),
+    _object("object_max_mm", "Object, largest error", "mm", methodcaller("quantile", 1.0), "largest |e|"),
     *(
         _object(
             f"object_within_{limit}mm_share",
             f"Object within {limit} mm",
             "share",
-            partial(_within, number),
+            methodcaller("within", limit),
             f"share of pixels with |e| <= {limit} mm",
-            18 + number,
             better="higher",
         )
-        for number, limit in enumerate(WITHIN_MM)
+        for limit in WITHIN_MM
     ),
     _object(
         "object_bias_mm",
         "Object, signed bias",
         "signed mm",
-        "spread.bias_mm",
+        "bias_mm",
         "mean of e",
-        22,
         cancels=True,
         better="nearer 0",
         helped_by_missing=True,
     ),
-    Metric(
+    _always(
         "object_valid_bias_mm",
         "Object where predicted, signed bias",
         "signed mm",
-        "spread.valid_bias_mm",
+        "valid_bias_mm",
         "mean of e over the measured pixels",
-        23,
         cancels=True,
         better="nearer 0",
         helped_by_missing=True,
@@ -207,120 +202,24 @@ _ENTRIES = (
         "object_shift_free_mae_mm",
         "Object MAE without one offset",
         "mm",
-        "spread.shift_free_mm",
+        "shift_free_mae_mm",
         "MAE after the median of e is subtracted: the error without a constant offset",
-        24,
         cancels=True,
         helped_by_missing=True,
     ),
-    Metric(
-        "object_interior_mae_mm",
-        "Object away from edges, MAE",
-        "mm",
-        "interior.mae_mm",
-        "MAE over the object interior",
-        6,
-        column="Interior MAE",
-        column_from=WIDEST,
+    _mae("object_wide_band", f"Object within {WIDE_BAND_PX} px of edges,", "the object wide band", optional=False),
+    _mae(
+        "object_wide_interior",
+        f"Object {WIDE_BAND_PX} px or more from edges,",
+        "the object wide interior",
+        optional=False,
     ),
-    Metric(
-        "object_interior_rmse_mm",
-        "Object away from edges, RMSE",
-        "mm",
-        "interior.rmse_mm",
-        "RMSE over the object interior",
-        7,
-    ),
-    Metric(
-        "object_edge_mae_mm",
-        "Object along edges, MAE",
-        "mm",
-        "edge.mae_mm",
-        "MAE over the object edge",
-        8,
-        column="Edge MAE",
-        column_from=WIDEST,
-    ),
-    Metric(
-        "object_edge_rmse_mm",
-        "Object along edges, RMSE",
-        "mm",
-        "edge.rmse_mm",
-        "RMSE over the object edge",
-        9,
-    ),
-    Metric(
-        "object_valid_mae_mm",
-        "Object where predicted, MAE",
-        "mm",
-        "valid.mae_mm",
-        "MAE over the measured pixels",
-        10,
-        helped_by_missing=True,
-        training=True,
-    ),
-    Metric(
-        "object_interior_valid_mae_mm",
-        "Object where predicted, away from edges, MAE",
-        "mm",
-        "interior_valid.mae_mm",
-        "MAE over the measured pixels of the interior",
-        11,
-        helped_by_missing=True,
-    ),
-    _object(
-        "object_missing_share",
-        "Object not predicted",
-        "share",
-        lambda s: share(s.object.pixels - s.valid.pixels, s.object.pixels),
-        "share of pixels predicted 0 or less",
-        13,
-        column="Missing",
-        column_from=WIDE,
-        terminal="Not\nmeasured",
-    ),
-    Metric(
-        "object_interior_missing_share",
-        "Object away from edges, not predicted",
-        "share",
-        lambda s: share(s.interior.pixels - s.interior_valid.pixels, s.interior.pixels),
-        "the same share of the interior",
-        14,
-    ),
-    Metric(
-        "object_edge_share",
-        "Object along edges, share of pixels",
-        "share",
-        lambda s: share(s.edge.pixels, s.object.pixels),
-        "share of the object that is object edge",
-        12,
-        better="neither",
-        over="object",
-        terminal="Near\nedges",
-    ),
-    Metric(
-        "object_wide_band_mae_mm",
-        f"Object within {WIDE_BAND_PX} px of edges, MAE",
-        "mm",
-        "wide_band.mae_mm",
-        "MAE over the object wide band",
-        25,
-    ),
-    Metric(
-        "object_wide_interior_mae_mm",
-        f"Object {WIDE_BAND_PX} px or more from edges, MAE",
-        "mm",
-        "wide_interior.mae_mm",
-        "MAE over the object wide interior",
-        26,
-    ),
-    Metric(
+    _always(
         "object_wide_band_share",
         f"Object within {WIDE_BAND_PX} px of edges, share of pixels",
         "share",
         lambda s: share(s.wide_band.pixels, s.object.pixels),
         "share of the object that is wide band",
-        27,
         better="neither",
         over="object",
     ),
@@ -330,47 +229,29 @@ _ENTRIES = (
         "share",
         lambda s: None if s.void is None else s.void / (s.object.pixels + s.background.pixels + s.void),
         "void pixels over all pixels of the image",
-        28,
         better="neither",
     ),
-    Metric(
-        "unlit_mae_mm",
-        "Unlit, MAE",
-        "mm",
-        "unlit.mae_mm",
-        "MAE over the unlit set, missing pixels included",
-        29,
-        over="unlit",
-    ),
-    Metric(
-        "unlit_rmse_mm",
-        "Unlit, RMSE",
-        "mm",
-        "unlit.rmse_mm",
-        "RMSE over the unlit set, missing pixels included",
-        30,
-        over="unlit",
-    ),
-    Metric(
-        "unlit_valid_mae_mm",
-        "Unlit where predicted, MAE",
-        "mm",
-        "unlit_valid.mae_mm",
-        "MAE over the measured pixels of the unlit set",
-        31,
-        helped_by_missing=True,
-    ),
+    *_errors("unlit", "Unlit,", "the unlit set, missing pixels included", over="unlit"),
+    _mae("unlit_valid", "Unlit where predicted,", "the measured pixels of the unlit set", helped_by_missing=True),
     Metric(
         "unlit_missing_share",
         "Unlit, not predicted",
         "share",
         lambda s: share(s.unlit.pixels - s.unlit_valid.pixels, s.unlit.pixels),
         "share of the unlit set predicted 0 or less",
-        32,
         over="unlit",
     ),
+    Metric(
+        "object_mae_range_share",
+        "Object MAE, share of its depth range",
+        "ratio",
+        lambda s: share(s.object.mae_mm, s.range_mm),
+        "object MAE over (D_max - D_min) of the object pixels that are scored; may exceed 1; none for a flat object",
+        training=True,
+        role="range",
+    ),
 )
-METRICS = {metric.key: metric for metric in sorted(_ENTRIES, key=attrgetter("place"))}
+METRICS = {metric.key: metric for metric in _ENTRIES}
 """Every metric by its key, in the order of a file."""
 HEADLINE = tuple(key for key, metric in METRICS.items() if metric.headline)
 """The paper's six numbers (Section 5.3.2): MAE and RMSE over the full grid, the object and the background, in mm."""
@@ -406,17 +287,8 @@ NOTES = (
 """What the terminal says below its table; a line whose first score may be left out of a file is left out with it."""
 
 
-_sigma = partial(Metric, helped_by_missing=True)
+_sigma = partial(Metric, helped_by_missing=True, optional=False)
 _STATED = (
-    _sigma(
-        "unstated_share",
-        "Object without a sigma",
-        "share",
-        "unstated_share",
-        "share of object pixels that state none",
-        1,
-        terminal="Not\nstated",
-    ),
     *(
         _sigma(
             f"coverage_{percent}",
@@ -424,7 +296,6 @@ _STATED = (
             "share",
             methodcaller("within", percent),
             f"share of these with |e| <= z s, z of the central Gaussian interval of {percent}%",
-            0,
             better="neither",
             terminal=f"In {percent}%\ninterval",
         )
@@ -436,7 +307,6 @@ _STATED = (
         "mm",
         "sigma_mean_mm",
         "mean of s over these",
-        0,
         terminal="Sigma\nmean",
     ),
     _sigma(
@@ -445,7 +315,6 @@ _STATED = (
         "mm",
         "sigma_median_mm",
         "median of s over these",
-        0,
         terminal="Sigma\nmedian",
     ),
     _sigma(
@@ -454,7 +323,6 @@ _STATED = (
         "nats",
         "nll",
         "mean over these of ln s' + ln(2 pi) / 2 + min(|e| / s', 10)^2 / 2, with s' = max(s, 0.01 mm)",
-        0,
         terminal="NLL",
     ),
     *(
@@ -465,7 +333,6 @@ _STATED = (
             methodcaller("area_mm", f"{error}_mm"),
             f"{error.upper()} of the object without the share x of least sure pixels, minus that without the share x "
             "of largest errors; mean over x = 0, 0.05, ... 0.95",
-            0,
             cancels=True,
             terminal="AUSE\nMAE" if error == "mae" else "",
         )
@@ -478,27 +345,29 @@ _STATED = (
             "mm",
             methodcaller("sure_mm", f"{error}_mm"),
             f"{error.upper()} of the object without its 5% least sure pixels",
-            0,
             terminal="MAE of the\nsurest 95%" if error == "mae" else "",
         )
         for error in ("mae", "rmse")
     ),
+    _sigma(
+        "unstated_share",
+        "Object without a sigma",
+        "share",
+        "unstated_share",
+        "share of object pixels that state none",
+        terminal="Not\nstated",
+    ),
 )
-UNCERTAINTY = {metric.key: metric for metric in sorted(_STATED, key=attrgetter("place"))}
+UNCERTAINTY = {metric.key: metric for metric in _STATED}
 """Scores of a stated uncertainty (``{sample}.sigma.npy``), a block of their own in a result; ``of`` gets a
 `SigmaSample`."""
-
-
-def listed(metrics: Iterable[Metric]) -> list[Metric]:
-    """The entries in the order in which they are written, which is that of tables for people."""
-    return sorted(metrics, key=attrgetter("row"))
 
 
 def with_column(width: int) -> list[Metric]:
     """Those with a column in the leaderboard's tables where the terminal has ``width`` characters, the most important
     first."""
-    shown = (metric for metric in listed(METRICS.values()) if metric.column and metric.column_from <= width)
-    return sorted(shown, key=attrgetter("column_from"))
+    shown = (metric for metric in METRICS.values() if metric.column and metric.column_from <= width)
+    return sorted(shown, key=lambda metric: (metric.column_from, metric.role != "rank"))
 
 
 def sort_keys() -> tuple[str, ...]:
@@ -516,7 +385,7 @@ def protocol_table(metrics: Iterable[Metric]) -> list[str]:
     is named where it is not "lower"."""
     other = {"lower": "", "higher": " (higher is better)", "nearer 0": " (nearer 0 is better)", "neither": " (neither)"}
     lines = ["| key | rule |", "|---|---|"]
-    for (rule, better), entries in groupby(listed(metrics), lambda m: (_VARIED.sub("{}", m.rule), m.better)):
+    for (rule, better), entries in groupby(metrics, lambda m: (_VARIED.sub("{}", m.rule), m.better)):
         alike = list(entries)
         values = zip(*(_VARIED.findall(metric.rule) for metric in alike), strict=True)
         said = rule.format(*(", ".join(dict.fromkeys(options)) for options in values)).replace("|", "\\|")

@@ -23,14 +23,13 @@ Track = Literal[
     "oracle range + mask + order",
 ]
 """What a method was given of the ground truth of the scored samples; see PROTOCOL.md."""
-Mode = Literal["standard", "paper", "paper-individual"]
-"""By which rules; see PROTOCOL.md. ``paper-individual`` stands in results of protocol 1 only: ``paper`` for normalised
-depth."""
+Mode = Literal["standard", "paper"]
+"""By which rules; see PROTOCOL.md."""
 FramesClass = Literal["one frame", "few frames, no code", "full sequence"]
 """What a method captures: at most one frame; several but no Gray code; frames with Gray code."""
 Units = Literal["mm", "m", "normalised"]
 TARGETS: tuple[str, ...] = get_args(Target)
-MODES: tuple[Mode, ...] = ("standard", "paper")
+MODES: tuple[Mode, ...] = get_args(Mode)
 FRAMES_CLASSES: tuple[FramesClass, ...] = get_args(FramesClass)
 
 

@@ -23,56 +23,18 @@ from fpp_ml_bench.evaluation.report.comparison import compare as compare_results
 from fpp_ml_bench.evaluation.result.model import ArrayScores, Result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate as evaluate_folder
 from fpp_ml_bench.evaluation.score.evaluator import evaluate_arrays
-from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.loaders.storage.store import load_dataset as load_stored
+from fpp_ml_bench.loaders.storage.store import DatasetFolder, load_dataset
 
 if TYPE_CHECKING:
     import numpy as np
-    from datasets import Dataset, DatasetDict
     from numpy.typing import NDArray
 
     from fpp_ml_bench.baselines.method import Method
     from fpp_ml_bench.evaluation.score.evaluator import Maps
-    from fpp_ml_bench.leaderboard.groups import Group
+    from fpp_ml_bench.leaderboard.ranking import Group
     from fpp_ml_bench.optics.rig import Rig
 
 __all__ = ["compare", "decode", "evaluate", "load_dataset", "load_method", "open_dataset", "rank"]
-
-
-def load_dataset(folder: str | Path, config: str = "single_shot", split: str | None = None) -> "Dataset | DatasetDict":
-    """Open a dataset folder as a ``datasets.Dataset`` on the memory-mapped shards.
-
-    Parameters
-    ----------
-    folder : str or Path
-        Dataset written by ``fpp-bench build`` or ``fpp-bench import``.
-    config : {"single_shot", "crossed", "horizontal", "vertical", "sinusoidal", "all"}
-        Which frames: the first one, the crossed ones of a rig that has them, those of a direction, all sinusoids, or
-        the whole sequence.
-    split : {"train", "validation", "test"}, optional
-        None for all of them, as a ``DatasetDict``.
-
-    Returns
-    -------
-    datasets.Dataset or datasets.DatasetDict
-        Columns ``sample``, ``object``, ``view``, ``split``; a uint8 (H, W) column ``frame_NN`` for each frame;
-        ``depth`` and, for generated data, ``depth_exact`` (float32 (H, W), mm, 0 = background); ``depth_min`` and
-        ``depth_max`` (mm).
-
-    Raises
-    ------
-    DatasetError
-        For a folder that is no finished dataset, and for an unknown or unstored configuration or split.
-
-    Examples
-    --------
-    >>> import fpp_ml_bench as fpp
-    >>> test = fpp.load_dataset("data/mini", "single_shot", split="test")
-    >>> row = test.with_format("numpy")[0]
-    >>> row["frame_00"].shape == row["depth"].shape
-    True
-    """
-    return load_stored(folder, config, split=split)
 
 
 def open_dataset(folder: str | Path) -> "DatasetFolder":

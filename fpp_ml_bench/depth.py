@@ -26,6 +26,15 @@ def object_mask(depth_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
     return depth_mm > 0
 
 
+def depth_problem(depth: NDArray[np.floating]) -> str | None:
+    """What is wrong with a depth map (H, W) of an object, a sentence, or None: depths that are not finite or below 0,
+    or none above 0."""
+    for wrong, are in ((~np.isfinite(depth), "NaN or infinite"), (depth < 0, "negative; background is 0")):
+        if wrong.any():
+            return f"{np.count_nonzero(wrong)} pixels are {are}"
+    return None if object_mask(depth).any() else "no pixel is above 0, so there is no object"
+
+
 def extremes(values: NDArray[np.floating]) -> tuple[float, float]:
     """The smallest and the largest value of a map (H, W) that is not empty, NaN if it holds any; read once, in blocks
     that stay in the cache."""
@@ -55,21 +64,10 @@ def depth_edges(depth_mm: NDArray[np.floating], jump_mm: float | None = None) ->
     return edge
 
 
-def edge_distance_px(depth_mm: NDArray[np.floating], jump_mm: float | None = None) -> NDArray[np.float32]:
-    """Distance of each pixel to the nearest of `depth_edges`, float32 (H, W), in px; 0 for both pixels beside an
-    edge, inf in an image without edges."""
-    import cv2
-
-    edge = depth_edges(depth_mm, jump_mm)
-    if not edge.any():
-        return np.full(depth_mm.shape, np.inf, dtype=np.float32)
-    distance = cv2.distanceTransform((~edge).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    return np.asarray(distance, dtype=np.float32)
-
-
 def object_near_edge(depth_mm: NDArray[np.floating], band_px: int, jump_mm: float | None = None) -> NDArray[np.bool_]:
-    """Object pixels whose `edge_distance_px` is under ``band_px``, bool (H, W). By dilation, which for a narrow band is
-    several times faster than a distance transform, and needs no OpenCV (slower to import than ten samples to score)."""
+    """Object pixels nearer than ``band_px`` to one of `depth_edges`, bool (H, W). By dilation, which for a narrow band
+    is several times faster than a distance transform, and needs no OpenCV (slower to import than ten samples to
+    score)."""
     return object_near_edges(depth_mm, (band_px,), jump_mm)[0]
 
 

@@ -5,9 +5,11 @@ import errno
 import json
 import os
 import re
+import shutil
 import stat
 import sys
 import unicodedata
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import cache
@@ -212,6 +214,23 @@ def file_hash(path: Path) -> str:
                 digest.update(view[start : start + (1 << 24)])
             view.release()
     return digest.hexdigest()
+
+
+def check_space(needed: Mapping[Path, int], needing: str, cure: str) -> None:
+    """Raise `BuildError` for a disk that has less free space than all folders on it need, in bytes. ``needing``: what
+    needs them, and the verb."""
+    places, sizes = dict[int, Path](), Counter[int]()
+    for folder, size in needed.items():
+        there = next(parent for parent in (folder.absolute(), *folder.absolute().parents) if parent.exists())
+        sizes[there.stat().st_dev] += size
+        places.setdefault(there.stat().st_dev, there)
+    for device, size in sizes.items():
+        there = places[device]
+        if size > (free := shutil.disk_usage(there).free):
+            raise BuildError(
+                f"{there}: the disk has {free / 1e9:.2f} GB free, and {needing} about {size / 1e9:.2f} GB there; "
+                f"free some space, or choose another disk{cure}"
+            )
 
 
 LOCK_FILE = ".lock"

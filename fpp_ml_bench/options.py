@@ -10,7 +10,7 @@
 """
 
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import MISSING, Field, dataclass, field, fields
+from dataclasses import MISSING, Field, dataclass, field, fields, is_dataclass
 from difflib import get_close_matches
 from typing import Any
 
@@ -24,10 +24,10 @@ REQUIRED: Any = MISSING
 
 @dataclass(frozen=True)
 class Description:
-    """What the command line says of an option: ``help``, ``metavar`` of its value, the ``choices`` that there are, and
-    ``flag``, its spelling where that is not made of the field's name. ``parse`` makes a value of its text where the
-    field's type does not say how; it raises ValueError with what it expected. ``many``: may be given again, the field
-    is a tuple. ``positional``: an argument without a flag."""
+    """What the command line says of an option: ``help``, ``metavar`` of its value, the ``choices`` that there are (those
+    of a field annotated ``Literal`` are known), and ``flag``, its spelling where that is not made of the field's name.
+    ``parse`` makes a value of its text where the field's type does not say how; it raises ValueError with what it
+    expected. ``many``: may be given again, the field is a tuple. ``positional``: an argument without a flag."""
 
     help: str
     metavar: str | None = None
@@ -60,9 +60,9 @@ def argument(
     return field(default=default, metadata={_KEY: description})
 
 
-def options_of(settings: type | None) -> "list[Field[Any]]":
+def options_of(settings: Any) -> "list[Field[Any]]":
     """The fields of a dataclass that are options of the command line, in order; its other fields are for code alone."""
-    return [entry for entry in (fields(settings) if settings else ()) if _KEY in entry.metadata]
+    return [entry for entry in (fields(settings) if is_dataclass(settings) else ()) if _KEY in entry.metadata]
 
 
 def described(entry: "Field[Any]") -> Description:

@@ -15,23 +15,6 @@ _SINE = [(-1.0) ** k / math.factorial(2 * k + 1) for k in range(9)]
 _EXPONENTIAL = [1.0 / math.factorial(k) for k in range(15)]
 _LOGARITHM = [2.0 / (2 * k + 1) for k in range(12)]
 """Taylor coefficients; the first one left out is below 2^-56 of the result over the reduced range of each function."""
-ATAN_TOP = (
-    -6.485021904942025371773e1,
-    -1.228866684490136173410e2,
-    -7.500855792314704667340e1,
-    -1.615753718733365076637e1,
-    -8.750608600031904122785e-1,
-)
-ATAN_BOTTOM = (
-    1.945506571482613964425e2,
-    4.853903996359136964868e2,
-    4.328810604912902668951e2,
-    1.650270098316988542046e2,
-    2.485846490142306297962e1,
-    1.0,
-)
-"""Cephes (Moshier 1989): atan(t) = t + t z P(z) / Q(z) with z = t^2 on [0, tan(pi/8)], lowest coefficient first."""
-TAN_EIGHTH = math.sqrt(2.0) - 1.0
 _LN2 = 0.6931471805599453
 
 
@@ -66,22 +49,6 @@ def cosine_of_turns(turns: ArrayLike) -> NDArray[np.float64]:
 def sine_of_turns(turns: ArrayLike) -> NDArray[np.float64]:
     """sin(2 pi ``turns``), as `cosine_of_turns`."""
     return _cosine_and_sine(turns)[1]
-
-
-def arctangent2(y: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """atan2(``y``, ``x``) in [-pi, pi], float64, to 2 units in the last place; 0 where both are 0. The same operations
-    as in `fpp_ml_bench.decoding.kernels`, which is faster."""
-    ax, ay = np.abs(x), np.abs(y)
-    small, large = np.minimum(ax, ay), np.maximum(ax, ay)
-    upper = small > TAN_EIGHTH * large
-    top, bottom = np.where(upper, small - large, small), np.where(upper, small + large, large)
-    t = top / np.where(bottom > 0.0, bottom, 1.0)
-    z = t * t
-    angle = t + t * z * (_polynomial(z, ATAN_TOP) / _polynomial(z, ATAN_BOTTOM))
-    angle = np.where(upper, angle + math.pi / 4, angle)
-    angle = np.where(ay > ax, math.pi / 2 - angle, angle)
-    angle = np.where(x < 0.0, math.pi - angle, angle)
-    return np.where(y < 0.0, -angle, angle)
 
 
 def power(base: NDArray[np.float64], exponent: float) -> NDArray[np.float64]:

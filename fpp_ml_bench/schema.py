@@ -20,6 +20,11 @@ def _checked(value: str) -> str:
     return value
 
 
+def as_tuple(value: Any) -> Any:
+    """For a field that is a tuple, which files write as a list."""
+    return tuple(value) if isinstance(value, list) else value
+
+
 Text = Annotated[str, AfterValidator(_checked)]
 Scalar = Text | bool | int | float | None
 Positive = Annotated[float, Field(gt=0)]

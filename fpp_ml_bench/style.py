@@ -1,13 +1,22 @@
-"""How the pictures look: one style for all that matplotlib draws.
+"""How numbers, pictures and pages look: one style for all that matplotlib draws, one frame for all that browsers show.
 
 Lines have colours that colour-blind readers can tell apart (Okabe and Ito, 2008, with grey in place of yellow). Each
 quantity has its own colour map, in which equal steps of the quantity look equal.
+
+A page contains its style, script and pictures. Its Content-Security-Policy allows only the style and the script with
+the given hashes: the page sends no request, and an injected script can't run. Text from a submission stays text.
 """
 
+import hashlib
+import html
+from base64 import b64encode
 from collections.abc import Callable
-from functools import wraps
+from functools import cache, wraps
 from io import BytesIO
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
+
+from fpp_ml_bench.files import NAME_LIMIT, printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -72,3 +81,91 @@ def figure_png(drawn: "Figure", reduced: bool = False) -> bytes:
     image = Image.open(content).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     image.save(smaller, format="png", optimize=True)
     return smaller.getvalue()
+
+
+def millimetres(value: float | None) -> str:
+    """An error in mm to three decimals, in powers of ten where very small or large, a dash for an empty pixel set."""
+    if value is None:
+        return "-"
+    if value == 0:
+        return "0"
+    return f"{value:.3f}" if 5e-4 <= value < 1e6 else f"{value:.2e}"
+
+
+def percent(share: float | None) -> str:
+    """A share as per cent with one decimal, a dash where there is none."""
+    return "-" if share is None else f"{100 * share:.1f}%"
+
+
+def three_digits(value: float | None) -> str:
+    """A time or another amount to three significant digits, whole from 100 on, a dash when unknown."""
+    return "-" if value is None else f"{value:,.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def signed(value: float | None, plus: str = "+") -> str:
+    """A signed error in mm: `millimetres` with its sign, a dash where there is none."""
+    if value is None:
+        return "-"
+    return ("-" if value < 0 else plus if value > 0 else "") + millimetres(abs(value))
+
+
+def interval_text(ends: tuple[float, float] | None, between: str = " to ") -> str:
+    """The two ends of an interval in mm, a dash where there is none."""
+    return "-" if ends is None else between.join(signed(end, plus="") for end in ends)
+
+
+def escaped(value: object, limit: int = NAME_LIMIT) -> str:
+    """``value`` escaped as HTML text or attribute value, at most ``limit`` characters."""
+    return html.escape(printable(value, limit), quote=True)
+
+
+def data_uri(png: bytes) -> str:
+    """A PNG as a data URI, which an ``img`` shows without a request."""
+    return "data:image/png;base64," + b64encode(png).decode("ascii")
+
+
+def page(
+    package: str, template: str, title: str, style: str = "", script: str = "", description: str = "", **values: object
+) -> bytes:
+    """A whole HTML page, whose body is ``templates/TEMPLATE`` of ``package`` by Jinja2 with ``values``, every one of
+    them escaped. A template may include or import those of this package's own ``templates`` too. ``title`` and
+    ``description`` are text; ``style`` and ``script`` are our own. Filters: ``printable``, ``data_uri``, and the
+    numbers of this module."""
+    from markupsafe import Markup
+
+    environment = _environment(package)
+    style = Path(__file__).with_name("templates").joinpath("page.css").read_text(encoding="utf-8") + style
+    own = {"body": environment.get_template(template).render(values), "style": style, "script": script}
+    frame = environment.get_template("page.html")
+    own = {name: Markup(text) for name, text in own.items()}
+    return str(frame.render(title=title, description=description, **own)).encode("utf-8")
+
+
+@cache
+def _environment(package: str) -> Any:  # a jinja2.Environment
+    import jinja2  # plain `fpp-eval` writes no HTML
+
+    environment = jinja2.Environment(
+        loader=jinja2.ChoiceLoader([jinja2.PackageLoader(name) for name in (package, "fpp_ml_bench")]),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters |= {
+        "printable": printable,
+        "data_uri": data_uri,
+        "millimetres": millimetres,
+        "percent": percent,
+        "three_digits": three_digits,
+        "source": _source,
+    }
+    return environment
+
+
+def _source(text: str) -> str:
+    """The source of a Content-Security-Policy that allows exactly ``text``."""
+    from markupsafe import Markup
+
+    return Markup(f"'sha256-{b64encode(hashlib.sha256(text.encode('utf-8')).digest()).decode('ascii')}'")

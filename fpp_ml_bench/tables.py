@@ -1,16 +1,21 @@
-"""Tables of rows in the terminal. Names and numbers stay whole; where a table is too wide, columns are left out."""
+"""One table for the terminal, Markdown and HTML pages. In the terminal names and numbers stay whole; where a table is
+too wide, columns are left out."""
 
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
-from typing import Any
+from typing import Any, Self
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from fpp_ml_bench.files import printable
+
 _UNLIMITED = 1_000_000
+_PLAIN = frozenset(" -,+()/%=.")
 
 
 class Table(RichTable):
@@ -35,6 +40,33 @@ class Table(RichTable):
         for title in numbers:
             self.add_column(title, justify="right")
         self.names, self.first_out, self.elsewhere = names, first_out, elsewhere
+
+    @classmethod
+    def of(cls, title: str, rows: Sequence[Mapping[str, str]], words: Collection[int] = (0, 1), **look: Any) -> Self:
+        """A table of ``rows`` of cells by the titles of their columns, of which those numbered ``words`` are text. No
+        cell is markup."""
+        table = cls(title=Text(title), **look)
+        for number, name in enumerate(rows[0] if rows else ()):
+            table.add_column(Text(name), justify="left" if number in words else "right")
+        for row in rows:
+            table.add_row(*map(Text, row.values()))
+        return table
+
+    @property
+    def titles(self) -> list[str]:
+        """The titles of the columns."""
+        return [" ".join(str(column.header).split()) for column in self.columns]
+
+    @property
+    def texts(self) -> list[tuple[str, ...]]:
+        """The cells of each row."""
+        return list(zip(*(map(str, column.cells) for column in self.columns), strict=True))
+
+    def markdown(self) -> list[str]:
+        """Lines of a Markdown table, without its title."""
+        rules = (" ---: " if column.justify == "right" else " --- " for column in self.columns)
+        lines = ["| " + " | ".join(self.titles) + " |", "|" + "|".join(rules) + "|"]
+        return lines + ["| " + " | ".join(map(markdown_text, cells)) + " |" for cells in self.texts]
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         measured = [self._widths(console, options, number) for number in range(len(self.columns))]
@@ -76,3 +108,10 @@ class Table(RichTable):
         titles = [str(self.columns[number].header) for number in numbers]
         first = [numbers[titles.index(title)] for title in self.first_out if title in titles]
         return first + [number for number in numbers if number not in first]
+
+
+def markdown_text(text: str) -> str:
+    """``text`` as Markdown that shows exactly this text: punctuation that could be markup becomes a character entity.
+    Entities are never structure (CommonMark 6.2): no pipe ends a table cell, no tag, link, code or mention begins."""
+    safe = "".join(c if not c.isascii() or c.isalnum() or c in _PLAIN else f"&#{ord(c)};" for c in printable(text))
+    return re.sub(r"(?i)(www)\.", r"\1&#46;", safe)  # GitHub links bare www. names too

@@ -4,13 +4,15 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
+from fpp_ml_bench.baselines.method import Assumption
+from fpp_ml_bench.baselines.registry import methods
 from fpp_ml_bench.evaluation.metrics import METRICS, RANGE_KEY, RANK_KEY, WIDE, WIDEST, with_column
-from fpp_ml_bench.evaluation.report.html import millimetres, percent, score_text, seconds
+from fpp_ml_bench.evaluation.report.terminal import score_text
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.leaderboard.groups import TEST, UNSEEN, Ranked
-from fpp_ml_bench.leaderboard.names import assumption, learned_from
-from fpp_ml_bench.leaderboard.row_file import processor
-from fpp_ml_bench.leaderboard.rows import Entry
+from fpp_ml_bench.leaderboard.ranking import Ranked
+from fpp_ml_bench.leaderboard.row_file import Row, processor
+from fpp_ml_bench.leaderboard.rows import TEST, UNSEEN, Entry
+from fpp_ml_bench.style import millimetres, percent
 
 NOT_CHECKED = "*"
 NOT_MEASURED = "not measured"
@@ -73,7 +75,7 @@ def columns(sort: str) -> list[Column]:
         METHOD,
         CODE,
         *errors,
-        Column("s/sample", _seconds),
+        Column("s/sample", time_text),
         FRAMES,
         RELIANCE,
         ROBUSTNESS,
@@ -111,25 +113,28 @@ def uncertainty(entry: Entry) -> tuple[float | None, float | None]:
     return (None, None) if block is None else (block.within_95_share, block.ause_mae_mm)
 
 
-def _seconds(row: Ranked) -> str:
+def time_text(row: Ranked, per_second: float = 1.0) -> str:
+    """The time of an image in seconds, or in another unit, to three significant digits."""
     value = row.entry.value("seconds_per_sample")
-    return seconds(value) + (NOT_CHECKED if value is not None and not row.entry.time_measured else "")
-
-
-def milliseconds_text(row: Ranked) -> str:
-    ms = row.entry.latency_ms
-    return "-" if ms is None else f"{ms:.3g}{'' if row.entry.time_measured else NOT_CHECKED}"
+    mark = "" if row.entry.time_measured else NOT_CHECKED
+    return "-" if value is None else f"{per_second * value:.3g}{mark}"
 
 
 def reliance(entry: Entry) -> str:
     """The phase-reliance score with two decimals."""
-    measured = entry.row.reliance
-    return NOT_MEASURED if measured is None else f"{measured.score:.2f}{_mark(entry)}"
+    block = entry.row.reliance
+    return NOT_MEASURED if block is None else _measured(entry, block.score, 2)
 
 
-def _mark(entry: Entry) -> str:
-    """Behind what only its author measured."""
-    return "" if entry.all_checked else NOT_CHECKED
+def robustness(entry: Entry) -> str:
+    """Mean error over the disturbed scenes of the test set, mm with one decimal."""
+    block = (entry.row.robustness or {}).get("test")
+    return NOT_MEASURED if block is None else _measured(entry, block.mae_mm, 1)
+
+
+def _measured(entry: Entry, value: float, decimals: int) -> str:
+    """With a mark behind what only its author measured."""
+    return f"{value:.{decimals}f}{'' if entry.all_checked else NOT_CHECKED}"
 
 
 def reliance_interval(entry: Entry) -> str:
@@ -138,23 +143,57 @@ def reliance_interval(entry: Entry) -> str:
     return "" if low is None or high is None else f"{low:.2f} - {high:.2f}"
 
 
-def robustness(entry: Entry) -> str:
-    """Mean error over the disturbed scenes of the test set, mm with one decimal."""
-    measured = (entry.row.robustness or {}).get("test")
-    return NOT_MEASURED if measured is None else f"{measured.mae_mm:.1f}{_mark(entry)}"
-
-
 def device(entry: Entry) -> str:
     """What the time was taken on: the GPU where there is one, else the CPU and its cores; a dash when unknown."""
     hardware = entry.row.hardware
     return "-" if hardware is None else printable(hardware.gpu or processor(hardware), _DEVICE_WIDTH)
 
 
-def _states_uncertainty(row: Ranked) -> bool:
-    return uncertainty(row.entry) != (None, None)
+_TRUTH_NAMES = {"range": "depth range", "mask": "object mask", "order": "fringe order"}
 
 
-RANK = Column("Rank", lambda row: row.ranks, present=lambda row: row.best_rank is not None)
+def given_truth(track: str) -> str:
+    """The ground truth of the scored samples that the methods of a track are given; empty for ``metric``.
+
+    >>> given_truth("oracle range + order")
+    "the test sample's depth range and fringe order"
+    """
+    things = [_TRUTH_NAMES[word] for word in track.removeprefix("oracle ").split(" + ") if word in _TRUTH_NAMES]
+    if not things:
+        return ""
+    return "the test sample's " + " and ".join(filter(None, (", ".join(things[:-1]), things[-1])))
+
+
+def _assumption(row: Row) -> Assumption | None:
+    method = methods().get(row.submission.method)
+    return None if method is None else method.assumption(row.submission.settings)
+
+
+def assumption(row: Row) -> str:
+    """In a few words; empty where a method assumes nothing of the scene, or is not of this package."""
+    assumed = _assumption(row)
+    return "" if assumed is None else assumed.words
+
+
+def assumption_sentences(row: Row) -> str:
+    """For the row's own page: what the method assumes, and what it was given of the samples that it is scored on."""
+    given = given_truth(row.track)
+    assumed = _assumption(row)
+    return " ".join([*([assumed.sentence] if assumed else []), *([f"Given {given}."] if given else [])])
+
+
+def learned_from(row: Row) -> str:
+    """What data the method learned from, as its submission says; empty where it does not say."""
+    said = row.submission.learned_from
+    return "" if said is None else str(said.data)
+
+
+def _sparse(title: str, text: Callable[[Ranked], str], from_width: int = 0, right: bool = True) -> Column:
+    """A column of tables in which any row has more than a dash."""
+    return Column(title, text, right, from_width, lambda row: text(row) != "-")
+
+
+RANK = _sparse("Rank", lambda row: row.ranks)
 CODE = Column("Code", lambda row: printable(row.entry.row.dataset.code, _DEVICE_WIDTH), False, MIDDLE)
 METHOD = Column("Method", lambda row: printable(row.short_name), False)
 FRAMES = Column("Frames", lambda row: str(row.entry.frames))
@@ -163,19 +202,13 @@ PARTS = tuple(
     for title, part in (("On test", TEST), ("On unseen", UNSEEN))
 )
 """Both errors of a row that joins the two sets."""
-RANGE = Column("Of depth range", partial(error, RANGE_KEY), True, MIDDLE, lambda row: row.value(RANGE_KEY) is not None)
-RATIO = Column("x trivial", ratio, present=lambda row: row.ratio is not None)
-RELIANCE = Column("Phase reliance", lambda row: reliance(row.entry), True, WIDE)
-ROBUSTNESS = Column("Disturbed, mm", lambda row: robustness(row.entry), True, WIDEST)
+RANGE = _sparse("Of depth range", partial(error, RANGE_KEY), MIDDLE)
+RATIO = _sparse("x trivial", ratio)
+RELIANCE = Column("Phase reliance", lambda row: reliance(row.entry), from_width=WIDE)
+ROBUSTNESS = Column("Disturbed, mm", lambda row: robustness(row.entry), from_width=WIDEST)
 UNCERTAINTY = (
-    Column("In 95%", lambda row: percent(uncertainty(row.entry)[0]), True, WIDEST, _states_uncertainty),
-    Column("AUSE", lambda row: millimetres(uncertainty(row.entry)[1]), True, WIDEST, _states_uncertainty),
+    _sparse("In 95%", lambda row: percent(uncertainty(row.entry)[0]), WIDEST),
+    _sparse("AUSE", lambda row: millimetres(uncertainty(row.entry)[1]), WIDEST),
 )
-LEARNED = Column(
-    "Learned from",
-    lambda row: learned_from(row.entry.row) or "-",
-    False,
-    WIDEST,
-    lambda row: bool(learned_from(row.entry.row)),
-)
+LEARNED = _sparse("Learned from", lambda row: learned_from(row.entry.row) or "-", WIDEST, right=False)
 PROVENANCE = Column("Provenance", lambda row: row.provenance, False, MIDDLE)

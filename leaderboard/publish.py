@@ -18,19 +18,20 @@ from fpp_ml_bench.baselines.tradeoff.measure import shipped_tradeoff
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.evaluation.protocol import Track
-from fpp_ml_bench.evaluation.report.html import millimetres, percent
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.leaderboard.names import given_truth
+from fpp_ml_bench.leaderboard.columns import given_truth
 from fpp_ml_bench.leaderboard.page.page import INDEX, SUBMISSIONS, write_page
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.row_file import Row
 from fpp_ml_bench.leaderboard.rows import Entry, read_entry
-from fpp_ml_bench.leaderboard.tables import chosen_tables, markdown_text
-from fpp_ml_bench.loaders.hub import MARK, NAME, PICTURE, Publication, card_head, mark_bytes, yaml_text
+from fpp_ml_bench.leaderboard.tables import chosen_tables
+from fpp_ml_bench.loaders.hub import MARK, PICTURE, Publication, card_head, mark_bytes
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
-from fpp_ml_bench.loaders.storage.card import card_end
+from fpp_ml_bench.loaders.storage.card import NAME, card_end, yaml_text
 from fpp_ml_bench.loaders.storage.parquet import published_features
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.style import millimetres, percent
+from fpp_ml_bench.tables import markdown_text
 
 FRAMEWORK = "fpp-ml-bench"
 SPLIT, TARGET, MODE = "test", "depth", "standard"

@@ -1,24 +1,264 @@
-"""Row files into ranked groups. Rows on different data or by different rules are never ranked together, and only rows
-that the maintainers vouch for are ranked; in a table without any, those that are not on the leaderboard."""
+"""Row files into ranked tables. Rows on different data or by different rules are never ranked together, and only rows
+that the maintainers vouch for are ranked; in a table without any, those that are not on the leaderboard. The row of a
+method on the test objects and that on the unseen ones are shown as one.
+
+Two rows are compared by their paired differences over the objects: a sign-flip test of each pair, Holm's correction
+over all pairs of the table, and the ranks that follow. Rows of this package's methods get their short names from the
+method's settings; every other submission keeps its own name, cut at a word.
+"""
 
 import math
 import operator
 from bisect import bisect_left
-from collections.abc import Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
+from statistics import fmean
 
 import numpy as np
 
+from fpp_ml_bench.baselines.registry import methods, network_method
+from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS, RANK_KEY, sort_keys
-from fpp_ml_bench.evaluation.score.uncertainty import FEWEST_OBJECTS
+from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, FramesClass, Track
+from fpp_ml_bench.evaluation.score.uncertainty import FEWEST_OBJECTS, Interval, Pair, pairs, rank_ranges
+from fpp_ml_bench.evaluation.submission.description import Submission
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import rows
-from fpp_ml_bench.leaderboard.groups import UNSEEN, Group, GroupKey, Ranked, is_unseen, rank_ranges, with_ratios
-from fpp_ml_bench.leaderboard.names import short_names
-from fpp_ml_bench.leaderboard.row_file import name_key
-from fpp_ml_bench.leaderboard.rows import LOCAL, MEANING, SELF_REPORTED, Entry, read_entry
+from fpp_ml_bench.leaderboard.row_file import ObjectMeans, interval_over, mean_over, name_key
+from fpp_ml_bench.leaderboard.rows import LOCAL, MEANING, SELF_REPORTED, TEST, UNSEEN, Entry, read_entry
+from fpp_ml_bench.loaders.storage.benchmark import BENCHMARKS, Benchmark
+
+MOST_PAIRED = 40
+"""Ranked rows up to which a table lists its pairs, 780 of them."""
+
+
+@dataclass(frozen=True, order=True)
+class GroupKey:
+    """What two rows must share to be compared. ``data`` is the title of the benchmark whose scenes were scored, or for
+    other data their `DatasetInfo.truth`, whatever was projected; the unseen objects have that of the benchmark whose
+    test split they complete."""
+
+    frames: FramesClass
+    track: Track
+    mode: str
+    split: str
+    target: str
+    data: str
+    size: tuple[int, int]
+    edge_band_px: int
+    protocol_version: str
+
+    @classmethod
+    def of(cls, entry: Entry) -> "GroupKey":
+        row, info, benchmark = entry.row, entry.row.dataset, entry.row.dataset.known
+        data = info.truth if benchmark is None else _title(TEST) if entry.is_unseen else benchmark.title
+        return cls(
+            row.frames_class,
+            row.track,
+            row.mode,
+            info.split,
+            row.target,
+            data,
+            (info.size[0], info.size[1]),
+            row.edge_band_px,
+            row.protocol_version,
+        )
+
+    @property
+    def benchmark(self) -> Benchmark | None:
+        """Whose scenes these are; None for data without a name."""
+        return next((benchmark for benchmark in BENCHMARKS if benchmark.title == self.data), None)
+
+    @property
+    def takes_unseen(self) -> bool:
+        """Whether a row of this group has a part on the unseen objects beside that on the test objects."""
+        return self.split == "test" and self.data == _title(TEST)
+
+    @property
+    def special_data(self) -> str:
+        """What sets a benchmark apart from those that are shown first, in words: another light or a small image, as
+        ``workshop``, ``224 px``; empty for the others."""
+        benchmark = self.benchmark
+        if benchmark is None or (benchmark.light == "paper" and benchmark.size == FULL_SIZE):
+            return ""
+        words = [benchmark.light, f"{benchmark.size} px"]
+        return ", ".join(word for word, usual in zip(words, ("paper", f"{FULL_SIZE} px"), strict=True) if word != usual)
+
+    @property
+    def order(self) -> tuple[object, ...]:
+        """Sort key of the groups: named benchmarks as they are listed, then other data; the larger images first, then
+        the fewer frames, the metric track before the others."""
+        place = len(BENCHMARKS) if self.benchmark is None else BENCHMARKS.index(self.benchmark)
+        return (
+            self.benchmark is None,
+            -self.size[0] * self.size[1],
+            place,
+            self.data,
+            FRAMES_CLASSES.index(self.frames),
+            self.track != "metric",
+            self,
+        )
+
+    @property
+    def data_title(self) -> str:
+        """``fpp-bench-full version 2, 960 x 960 px``; other data by size and the first 8 digits of their hash."""
+        pixels = f"{self.size[1]} x {self.size[0]} px"
+        return f"{pixels}, data {self.data[:8]}" if self.benchmark is None else f"{self.data}, {pixels}"
+
+    @property
+    def against(self) -> str:
+        """The ground truth in words: exact depth or decoded depth."""
+        return "exact depth" if self.target == "depth_exact" else "decoded depth"
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A row: a method on the test objects in ``entry`` and on the ``unseen`` ones, or ``entry`` alone. With the best
+    and the worst rank that the tests allow, None where it is not ranked; a row beside the ranks has a ``place``, 1 +
+    the ranked rows with a smaller error. ``ratio``: its object MAE over that of the best trivial method on the same
+    objects, None without any."""
+
+    entry: Entry
+    short_name: str
+    unseen: Entry | None = None
+    best_rank: int | None = None
+    worst_rank: int | None = None
+    place: int | None = None
+    ratio: float | None = None
+
+    @property
+    def ranks(self) -> str:
+        """``1-4``, or the single number where both ranks agree; ``(4)`` beside the ranks; a dash without any."""
+        if self.best_rank is None:
+            return "-" if self.place is None else f"({self.place})"
+        return str(self.best_rank) if self.best_rank == self.worst_rank else f"{self.best_rank}-{self.worst_rank}"
+
+    @property
+    def provenance(self) -> str:
+        """The weakest of its parts' (a key of `MEANING`)."""
+        return max((part.provenance for part in self._parts), key=list(MEANING).index)
+
+    @property
+    def _parts(self) -> list[Entry]:
+        return [entry for entry in (self.entry, self.unseen) if entry is not None]
+
+    @cached_property
+    def objects(self) -> tuple[ObjectMeans, ...]:
+        """The objects that it is scored on."""
+        return tuple(part for entry in self._parts for part in entry.row.per_object)
+
+    def value(self, key: str) -> float | None:
+        """Mean of a sort key over all samples of the row; None for an empty pixel set or an unknown time. Of a row with
+        two parts, scores beside `HEADLINE` are weighted by the samples of each."""
+        if self.unseen is None or key in ("seconds_per_sample", "frames_used"):
+            return self.entry.value(key)
+        if key in HEADLINE:
+            return mean_over(self.objects, key)
+        known = [(value, part.row.dataset.samples) for part in self._parts if (value := part.value(key)) is not None]
+        return sum(value * samples for value, samples in known) / sum(n for _, n in known) if known else None
+
+    def interval(self, key: str) -> Interval | None:
+        """The 95% interval of ``key`` over all objects of the row; None where it has none."""
+        return self.entry.row.intervals.of(key) if self.unseen is None else self._joined.get(key)
+
+    @cached_property
+    def _joined(self) -> dict[str, Interval | None]:
+        return {key: interval_over(self.objects, key) for key in HEADLINE}
+
+    def object_means(self, key: str) -> dict[str, float]:
+        """Mean of a headline score over the views of each object that has one."""
+        return {part.object: value for part in self.objects if (value := getattr(part, key)) is not None}
+
+    def on(self, benchmark: str) -> Entry | None:
+        """The part of it on the objects of `TEST` or on those of `UNSEEN`, whatever its frames are."""
+        return next((part for part in self._parts if part.is_unseen == (benchmark == UNSEEN)), None)
+
+
+def _title(name: str) -> str:
+    return next(benchmark.title for benchmark in BENCHMARKS if benchmark.name == name)
+
+
+@dataclass(frozen=True)
+class Group:
+    """Rows that may be compared: by rank, then the best value first. ``notes`` say why rows have no rank, and which are
+    left out."""
+
+    key: GroupKey
+    rows: tuple[Ranked, ...]
+    sort: str
+    notes: tuple[str, ...] = ()
+
+    @property
+    def ranked(self) -> tuple[Ranked, ...]:
+        return tuple(row for row in self.rows if row.best_rank is not None)
+
+    @cached_property
+    def pairs(self) -> tuple[Pair, ...]:
+        """The tests of the ranked rows' pairs; none for a table of more than `MOST_PAIRED` of them."""
+        if len(self.ranked) > MOST_PAIRED:
+            return ()
+        return tuple(pairs({row.short_name: row.object_means(self.sort) for row in self.ranked}))
+
+    @property
+    def parts(self) -> str:
+        """The sets of samples that its rows are scored on, in words."""
+        split = f"{self.key.split} split"
+        names = [split] if any(row.on(TEST) for row in self.rows) else []
+        return " + ".join(names + ["unseen"] * any(row.on(UNSEEN) for row in self.rows))
+
+    @property
+    def title(self) -> str:
+        """The group's heading, the same in the terminal, in Markdown and on the page."""
+        key = self.key
+        mode = "" if key.mode == "standard" else f", mode {key.mode}"
+        return f"{key.data_title}: {key.frames}, {key.track} track, {self.parts}, against {key.against}{mode}"
+
+
+def is_trivial(row: Ranked) -> bool:
+    """Whether it is a row of a trivial method (`Method.trivial`) that was measured here; what others call their methods
+    does not count."""
+    method = methods().get(row.entry.row.submission.method)
+    return method is not None and method.trivial and row.entry.all_checked
+
+
+def more_than_trivial(groups: Sequence[Group]) -> list[Group]:
+    """The groups that hold more than trivial rows, whose errors the others' ratios show; all where none does."""
+    return [group for group in groups if not all(map(is_trivial, group.rows))] or list(groups)
+
+
+def with_ratios(groups: Sequence[Group]) -> list[Group]:
+    """``groups`` whose rows have their ``ratio``: object MAE over the smallest that a trivial row by the same rules has
+    on the row's objects. Trivial rows need at most one frame, so they count in all classes; a row that is given
+    something of the ground truth counts in the tracks that are given no less."""
+    trivial: dict[GroupKey, list[tuple[set[str], dict[str, float]]]] = {}
+    for group in groups:
+        for row in filter(is_trivial, group.rows):
+            trivial.setdefault(_alike(group.key), []).append((_given(group.key), row.object_means(RANK_KEY)))
+    with_ratio = []
+    for group in groups:
+        means = [own for given, own in trivial.get(_alike(group.key), []) if given <= _given(group.key)]
+        with_ratio.append(replace(group, rows=tuple(replace(row, ratio=_ratio(row, means)) for row in group.rows)))
+    return with_ratio
+
+
+def _alike(key: GroupKey) -> GroupKey:
+    """What tables share whose rows are scored by the same rules on the same data."""
+    return replace(key, frames=FRAMES_CLASSES[0], track="metric")
+
+
+def _given(key: GroupKey) -> set[str]:
+    """What of the ground truth the track's methods are given, in the words of `Track`."""
+    return set(key.track.removeprefix("oracle ").split(" + ")) - {"metric"}
+
+
+def _ratio(row: Ranked, trivial: Sequence[Mapping[str, float]]) -> float | None:
+    errors = row.object_means(RANK_KEY)
+    means = [fmean(means[name] for name in errors) for means in trivial if errors and means.keys() >= errors.keys()]
+    return fmean(errors.values()) / min(means) if means and min(means) > 0 else None
+
 
 DEFAULT_SORT = RANK_KEY
 
@@ -67,13 +307,13 @@ def rank(entries: Iterable[Entry], sort: str = DEFAULT_SORT) -> list[Group]:
         raise SubmissionError(f"expected a sort key out of {', '.join(sort_keys())}, got {printable(sort)!r}")
     members: dict[GroupKey, list[Entry]] = {}
     for entry in entries:
-        members.setdefault(GroupKey.of(entry.row), []).append(entry)
+        members.setdefault(GroupKey.of(entry), []).append(entry)
     return with_ratios([_group(key, members[key], sort) for key in sorted(members, key=lambda key: key.order)])
 
 
 def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
     # Vouched rows first: of two copies they stay, and what others contradict is theirs.
-    entries = sorted(entries, key=lambda e: (list(MEANING).index(e.provenance), is_unseen(e.row), e.name, e.path.name))
+    entries = sorted(entries, key=lambda e: (list(MEANING).index(e.provenance), e.is_unseen, e.name, e.path.name))
     entries, notes = _without_copies(entries)
     methods = _methods(entries)
     claims = [first.name for first, _ in methods if first.provenance == SELF_REPORTED]
@@ -110,7 +350,7 @@ def _without_copies(entries: Sequence[Entry]) -> tuple[list[Entry], list[str]]:
     kept: dict[tuple[bool, str], Entry] = {}
     notes = []
     for entry in entries:
-        first = kept.setdefault((is_unseen(entry.row), entry.row.predictions_sha256), entry)
+        first = kept.setdefault((entry.is_unseen, entry.row.predictions_sha256), entry)
         if first is not entry:
             copy, of = (f"{printable(e.name, 80)} ({printable(e.path.name, 80)})" for e in (entry, first))
             notes.append(f"Not shown, the same predictions as {of}: {copy}.")
@@ -122,13 +362,13 @@ def _methods(entries: Sequence[Entry]) -> list[tuple[Entry, Entry | None]]:
     contradict each other."""
     by_name: dict[str, tuple[Entry, Entry | None]] = {}
     by_data: dict[bool, Entry] = {}
-    for entry in sorted(entries, key=lambda entry: is_unseen(entry.row)):
+    for entry in sorted(entries, key=lambda entry: entry.is_unseen):
         key = name_key(entry.name)
         if key in by_name:
             test, unseen = by_name[key]
             _check_one_method(unseen or test, entry)
         by_name[key] = (by_name[key][0], entry) if key in by_name else (entry, None)
-        first = by_data.setdefault(is_unseen(entry.row), entry)
+        first = by_data.setdefault(entry.is_unseen, entry)
         if _counts(first) != _counts(entry):
             files = [printable(str(e.path), 500) for e in (entry, first)]
             raise SubmissionError(
@@ -148,7 +388,7 @@ def _check_one_method(first: Entry, second: Entry) -> None:
     both = f"{files[0]} and {files[1]} both hold {printable(first.name)!r}"
     if first.name != second.name:
         both += f" or what looks like it, {printable(second.name)!r},"
-    if is_unseen(first.row) == is_unseen(second.row):
+    if first.is_unseen == second.is_unseen:
         raise SubmissionError(f"{both} on the same data; leave one out, or give one another name")
     about_first, about_second = first.row.submission, second.row.submission
     weights = "weights_sha256"
@@ -186,3 +426,47 @@ def _no_ranks(
     if len(complete) > 1 and not family:
         return "No ranks: nobody vouches for a row here."
     return "" if len(family) > 1 else "No ranks: there are not two rows to compare."
+
+
+LONGEST_NAME = 36
+"""Characters of a short name."""
+
+
+def short_names(submissions: Sequence[Submission], own: Collection[str] = ()) -> list[str]:
+    """A short name for each of the ``submissions`` of a group, whose own names differ. The order changes no name. Where
+    two would look the same, the later by its own name has a number behind it. Those in ``own``, which only claim to be
+    this package's methods, keep their own names, behind all others."""
+    derived = {s.name: None if s.name in own else _from_settings(s) for s in submissions}
+    chosen: dict[str, str] = {}
+    taken: set[str] = set()
+    for name in sorted(derived, key=lambda name: (name in own, derived[name] is None, name)):
+        short, number = derived[name] or cut_at_word(printable(name)), 1
+        candidate = short
+        while name_key(candidate) in taken:
+            number += 1
+            suffix = f" ({number})"
+            candidate = cut_at_word(short, LONGEST_NAME - len(suffix)) + suffix
+        taken.add(name_key(candidate))
+        chosen[name] = candidate
+    return [chosen[submission.name] for submission in submissions]
+
+
+def cut_at_word(text: str, longest: int = LONGEST_NAME) -> str:
+    """``text``, or as many of its words as fit into ``longest`` characters with an ellipsis behind them."""
+    if len(text) <= longest:
+        return text
+    words = text[:longest].rpartition(" ")[0].rstrip(" ,;:-+(")
+    return (words or text[: longest - 1]) + "…"
+
+
+def _from_settings(submission: Submission) -> str | None:
+    """A name made of the method's settings; None for a submission that is not one of this package's methods."""
+    method = methods().get(submission.method, network_method())
+    for maker in (method, network_method()):
+        try:
+            name = maker.short_name(submission)
+        except (KeyError, TypeError, ValueError):  # settings that the package's methods do not write
+            return None
+        if name is not None:
+            return name if len(name) <= LONGEST_NAME else None
+    return None

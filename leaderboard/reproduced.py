@@ -19,15 +19,16 @@ from fpp_ml_bench.baselines.reproduce.scoring import MAIN_KEY, AllFrames, all_fr
 from fpp_ml_bench.baselines.reproduce.work import Outcome, ReproduceSettings, current_weights, file_sha256, state_of
 from fpp_ml_bench.baselines.training.recipe import Recipe, table_rows
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.report.html import percent
 from fpp_ml_bench.evaluation.result.file import write_file
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 from fpp_ml_bench.leaderboard.columns import device
 from fpp_ml_bench.leaderboard.row_file import Row, row_of, view_means, write_row
 from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEASURED_HERE, Entry, read_entry
-from fpp_ml_bench.leaderboard.tables import PAPER_DEPTHS, TextTable, markdown_text, paper_tables
+from fpp_ml_bench.leaderboard.tables import PAPER_DEPTHS, paper_tables
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.style import percent
+from fpp_ml_bench.tables import Table, markdown_text
 
 _NOT_IN_THE_PAPER = {
     "pix2pixhd": "pix2pixHD",
@@ -279,12 +280,12 @@ def _twin(line: Line, depth_range: str) -> str:
     return " / ".join([*errors, percent(entry.value("object_missing_share"))])
 
 
-def text_table(table: str, lines: Sequence[Line], preset: str) -> TextTable:
+def line_table(table: str, lines: Sequence[Line], preset: str) -> Table:
     """The lines as a table. One that the paper does not have has no empty columns."""
     title = _TITLES[table] if table in _TITLES else paper_tables()[table].title
     rows = [_cells(line, preset) for line in lines]
     shown = [name for name in rows[0] if table in paper_tables() or {row[name] for row in rows} != {"-"}]
-    return TextTable.of(title, [{name: row[name] for name in shown} for row in rows])
+    return Table.of(title, [{name: row[name] for name in shown} for row in rows], elsewhere="the page below")
 
 
 def write_table(table: str, settings: ReproduceSettings, outcome: Outcome) -> Path:
@@ -299,9 +300,9 @@ def write_table(table: str, settings: ReproduceSettings, outcome: Outcome) -> Pa
 
 def table_markdown(table: str, lines: Sequence[Line], preset: str, command: str, failed: dict[str, str]) -> str:
     """The page of a table as Markdown. ``command`` makes it again; ``failed`` maps a recipe's name to its error."""
-    shown = text_table(table, lines, preset)
+    shown = line_table(table, lines, preset)
     parts = [
-        f"# {markdown_text(shown.title)}",
+        f"# {markdown_text(str(shown.title))}",
         "",
         f"Made by `{command}`. Errors in mm, mean over samples.",
         *_about(lines, table in paper_tables()),
@@ -381,7 +382,7 @@ def _orderings(judged: Sequence[Ordering]) -> list[str]:
         }
         for ordering in judged
     ]
-    parts += [*TextTable.of("", rows, (0, 1, 5)).markdown(), ""]
+    parts += [*Table.of("", rows, (0, 1, 5)).markdown(), ""]
     parts += ["Differences sample by sample; intervals by bootstrap over objects."]
     if not all(ordering.same_track for ordering in judged):
         difference = "one of the two was given the test sample's range, which is part of the difference."

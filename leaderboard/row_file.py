@@ -260,9 +260,9 @@ def row_content(result: Result, digits: int | None = DIGITS) -> dict[str, Any]:
     if result.uncertainty is not None:
         content["uncertainty"] = rounded(_uncertainty(result.uncertainty), digits)
     if result.reliance is not None:
-        content["reliance"] = rounded(result.reliance.model_dump(mode="json"), 4)
+        content["reliance"] = in_brief(result.reliance)
     if result.robustness is not None:
-        content["robustness"] = {name: robustness_in_brief(block) for name, block in result.robustness.items()}
+        content["robustness"] = {name: in_brief(block) for name, block in result.robustness.items()}
     return content
 
 
@@ -289,11 +289,14 @@ def _uncertainty(block: Uncertainty) -> dict[str, float | None]:
     return {"within_95_share": fmean(covered) if covered else None, "ause_mae_mm": block.metrics.ause_mae_mm}
 
 
-def robustness_in_brief(block: Robustness) -> dict[str, Any]:
-    """The content of a `RowRobustness`."""
-    axes = {name: fmean(scores.mae_mm for scores in axis) for name, axis in block.axes.items()}
-    kept = block.model_dump(mode="json", include=set(RowRobustness.model_fields))
-    return rounded({**kept, "clean_mae_mm": block.clean.mae_mm, "axes": axes}, DIGITS)  # type: ignore[no-any-return]
+def in_brief(block: Reliance | Robustness) -> dict[str, Any]:
+    """What a row holds of a block: a reliance in four digits, of a robustness the content of a `RowRobustness`."""
+    content = block.model_dump(mode="json")
+    if isinstance(block, Robustness):
+        axes = {name: fmean(scores.mae_mm for scores in axis) for name, axis in block.axes.items()}
+        content |= {"clean_mae_mm": block.clean.mae_mm, "axes": axes}
+        content = {key: content[key] for key in RowRobustness.model_fields}
+    return rounded(content, DIGITS if isinstance(block, Robustness) else 4)  # type: ignore[no-any-return]
 
 
 def rounded(value: Any, digits: int | None) -> Any:

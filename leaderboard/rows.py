@@ -6,11 +6,9 @@ keep ``vouched.txt``: a line for each row file that they measured themselves, or
 Nothing in a row says so, and nothing is signed: who can change the list can change the code.
 """
 
-import math
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -19,29 +17,29 @@ from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.result.file import parse_result, read_json, write_result
-from fpp_ml_bench.evaluation.result.model import Result
+from fpp_ml_bench.evaluation.result.model import Result, disagreements
 from fpp_ml_bench.evaluation.result.parts import Reliance, Robustness
-from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.evaluation.score.evaluator import difference_lines, evaluate
 from fpp_ml_bench.files import file_content, printable
 from fpp_ml_bench.leaderboard.row_file import (
     DIGITS,
     ROW_SCHEMA_VERSION,
     Row,
     check_size,
+    in_brief,
     processor,
-    robustness_in_brief,
-    rounded,
     row_content,
     row_of,
     write_row,
 )
-from fpp_ml_bench.loaders.storage.benchmark import benchmark_of
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.schema import validate
 
 SHIPPED_ROWS = Path(__file__).resolve().parent / "rows"
 VOUCHED = Path(__file__).resolve().parent / "vouched.txt"
 _LARGEST_FILE_BYTES = 1 << 26
+TEST, UNSEEN = "fpp-bench-full", "fpp-bench-unseen"
+"""The benchmark whose test split, and the set of unseen objects that, make one row."""
 
 MEASURED_HERE, VERIFIED, SELF_REPORTED = "measured here", "verified", "self-reported"
 LOCAL = "local file"
@@ -90,6 +88,12 @@ class Entry:
     def frames(self) -> int:
         """Number of captured frames per depth map."""
         return len(self.row.submission.frames_used)
+
+    @cached_property
+    def is_unseen(self) -> bool:
+        """Whether it is scored on the set of unseen objects."""
+        benchmark = self.row.dataset.known
+        return benchmark is not None and benchmark.name == UNSEEN and self.row.dataset.split == "test"
 
     @property
     def vouched(self) -> bool:
@@ -144,7 +148,7 @@ def read_entry(path: Path) -> Entry:
             f"{file}: was scored by protocol {row.protocol_version}, this is {PROTOCOL_VERSION}; score the predictions "
             "again"
         )
-    benchmark = benchmark_of(row.dataset.content)
+    benchmark = row.dataset.known
     if benchmark is not None and row.metrics.object_mae_mm == 0:
         raise SubmissionError(
             f"{file}: every error is exactly 0, so the predictions are the ground truth of {benchmark.title} itself; "
@@ -199,29 +203,9 @@ def differences(row: Row, folder: Path, dataset: DatasetFolder) -> list[str]:
     raises."""
     scored = evaluate(folder, dataset, row.dataset.split, row.target, row.edge_band_px, row.mode)
     rows = row, Row.model_validate(row_content(scored, digits=None))
-    stored, computed = (dict(_leaves("", each.model_dump(mode="json", exclude=_NOT_COMPARED))) for each in rows)
-    return [
-        f"{name}: {printable(stored.get(name), 80)} in the row, {printable(computed.get(name), 80)} recomputed"
-        for name in dict.fromkeys((*stored, *computed))
-        if not _agree(stored.get(name), computed.get(name), row.metrics.object_mae_mm or 0.0)
-    ]
-
-
-def _leaves(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """Name and value of every number, text and null in ``value``."""
-    if isinstance(value, dict | list):
-        for key, inner in value.items() if isinstance(value, dict) else enumerate(value):
-            yield from _leaves(f"{name}.{key}" if name else str(key), inner)
-    else:
-        yield name, value
-
-
-def _agree(stored: Any, computed: Any, error_mm: float) -> bool:
-    if not isinstance(stored, float) or not isinstance(computed, float) or computed == 0:
-        return bool(stored == computed)
-    half_unit = 0.5 * 10.0 ** (math.floor(math.log10(abs(computed))) + 1 - DIGITS)
-    # A bias is a small difference of large numbers.
-    return abs(stored - computed) <= half_unit + 1e-9 * max(abs(computed), error_mm)
+    pair = (each.model_dump(mode="json", exclude=_NOT_COMPARED) for each in rows)
+    found = disagreements(*pair, cancelling=1e-9 * (row.metrics.object_mae_mm or 0.0), digits=DIGITS)
+    return difference_lines(found, "row")
 
 
 def not_checked(about: Row | Result) -> list[str]:
@@ -256,22 +240,15 @@ def check_same_method(entry: Entry, method: Method) -> None:
             )
 
 
-def write_reliance(entry: Entry, reliance: Reliance) -> None:
-    """Put ``reliance`` into the file of ``entry``, replacing an earlier value; of a row, in four digits. Raises
-    SubmissionError for a block that contradicts the result (other weights, other units)."""
-    block = reliance.model_dump(mode="json")
-    _write(entry, "reliance", rounded(block, 4) if entry.is_row_file else block)
-
-
-def write_robustness(entry: Entry, robustness: Robustness) -> None:
-    """`write_reliance` of ``robustness``, beside that on another set; of a row, in brief."""
-    block = robustness_in_brief(robustness) if entry.is_row_file else robustness.model_dump(mode="json")
-    sets = read_json(entry.path).get("robustness", {})
-    _write(entry, "robustness", {**sets, robustness.set: block})
-
-
-def _write(entry: Entry, key: str, block: dict[str, Any]) -> None:
-    content = {**read_json(entry.path), key: block}
+def write_block(entry: Entry, block: Reliance | Robustness) -> None:
+    """Put a ``block`` into the file of ``entry``, replacing an earlier value, that of a robustness on the same set; of
+    a row, in brief. Raises SubmissionError for a block that contradicts the result (other weights, other units)."""
+    content = read_json(entry.path)
+    plain = in_brief(block) if entry.is_row_file else block.model_dump(mode="json")
+    if isinstance(block, Robustness):
+        content["robustness"] = {**content.get("robustness", {}), block.set: plain}
+    else:
+        content["reliance"] = plain
     if entry.is_row_file:
         write_row(validate(Row, content, entry.path, "leaderboard row"), entry.path)
     else:

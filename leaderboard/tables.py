@@ -1,25 +1,39 @@
-"""The leaderboard as tables in the terminal and as Markdown; the same rows give the same bytes. And the tables that
-were typed in: the paper's own (`fpp_ml_bench.paper`), and those of other publications on its dataset, in
-``reported_rows.json``. This package did not measure their rows, and they are never ranked with measured ones."""
+"""The leaderboard as tables in the terminal, as Markdown, and as data: JSON with everything, a CSV with a line for each
+row; the same rows give the same bytes. And the tables that were typed in: the paper's own (`fpp_ml_bench.paper`), and
+those of other publications on its dataset, in ``reported_rows.json``. This package did not measure their rows, and they
+are never ranked with measured ones."""
 
+import csv
+import io
 import json
 import re
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+import unicodedata
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 from rich.text import Text
 
-from fpp_ml_bench.evaluation.report.html import interval_text, millimetres
-from fpp_ml_bench.files import printable
-from fpp_ml_bench.leaderboard.columns import METHOD, NOTE, ONLY_IN_FILES, Column, columns
-from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, Group, Pair, Ranked
-from fpp_ml_bench.leaderboard.names import given_truth
-from fpp_ml_bench.leaderboard.rows import BY_ITS_AUTHORS, BY_THE_PAPER
+from fpp_ml_bench.evaluation.metrics import HEADLINE, RANK_KEY, WIDE, with_column
+from fpp_ml_bench.evaluation.score.uncertainty import Pair
+from fpp_ml_bench.leaderboard.columns import (
+    METHOD,
+    NOTE,
+    ONLY_IN_FILES,
+    Column,
+    columns,
+    device,
+    given_truth,
+    learned_from,
+    uncertainty,
+)
+from fpp_ml_bench.leaderboard.ranking import MOST_PAIRED, Group, Ranked
+from fpp_ml_bench.leaderboard.rows import BY_ITS_AUTHORS, BY_THE_PAPER, TEST, UNSEEN
 from fpp_ml_bench.paper import paper_rows
-from fpp_ml_bench.tables import Table
+from fpp_ml_bench.style import interval_text, millimetres
+from fpp_ml_bench.tables import Table, markdown_text
 
 NO_RESULTS = """\
 No results here yet. Score predictions, and their row appears:
@@ -32,6 +46,8 @@ PAIRS_FIRST_OUT = ("Objects", "p", "95% interval", "p, Holm")
 LAST_OUT = ("Frames", "s/sample", "x trivial", "Object MAE")
 """In a narrow terminal, the columns of a ranking that are left out after all others of their width, in this order."""
 _PLAIN = frozenset(" -,+()/%=.")
+_FORMULA = re.compile(r"[^\w=+@-]*[=+@-]")
+"""A sign that begins a formula, before any letter or digit: behind spaces, quotes, a byte order mark."""
 
 
 REPORTED_HEADING = "Reported by others on other data (not measured here)"
@@ -113,37 +129,7 @@ def chosen_tables(choice: str | None) -> list[ReportedTable]:
     return [tables[name] for name in several.get(choice, (str(choice),))]
 
 
-@dataclass(frozen=True)
-class TextTable:
-    """Rows of text under ``titles``, of which the columns numbered ``words`` are aligned to the left: the same table
-    for the terminal, for Markdown and for the page."""
-
-    title: str
-    titles: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    words: Collection[int] = (0, 1)
-
-    @classmethod
-    def of(cls, title: str, rows: Sequence[Mapping[str, str]], words: Collection[int] = (0, 1)) -> "TextTable":
-        """A table of ``rows`` of cells by the titles of their columns."""
-        return cls(title, tuple(rows[0]) if rows else (), [tuple(row.values()) for row in rows], words)
-
-    def markdown(self) -> list[str]:
-        """Lines of a Markdown table."""
-        right = [number not in self.words for number in range(len(self.titles))]
-        return markdown_rows(self.titles, right, [list(map(markdown_text, row)) for row in self.rows])
-
-    def rich(self, **look: Any) -> Table:
-        """The table in a terminal; text that was submitted is never markup."""
-        table = Table(title=Text(self.title), **{"elsewhere": "--markdown FILE", **look})
-        for number, title in enumerate(self.titles):
-            table.add_column(Text(title), justify="left" if number in self.words else "right")
-        for cells in self.rows:
-            table.add_row(*map(Text, cells))
-        return table
-
-
-def paper_table(paper: ReportedTable) -> TextTable:
+def paper_table(paper: ReportedTable) -> Table:
     """The rows of a table of others, errors with the two decimals of their tables."""
     titles = {
         f"{shown} {error.upper()}": f"{pixels}_{error}_mm"
@@ -159,7 +145,7 @@ def paper_table(paper: ReportedTable) -> TextTable:
         }
         for row in paper.rows
     ]
-    return TextTable.of(f"{paper.name}: {paper.title}, mm", rows)
+    return Table.of(f"{paper.name}: {paper.title}, mm", rows, elsewhere="--markdown FILE")
 
 
 def pair_row(pair: Pair) -> dict[str, str]:
@@ -176,12 +162,13 @@ def pair_row(pair: Pair) -> dict[str, str]:
     }
 
 
-def ranking_table(title: str, shown: Sequence[Column], rows: Sequence[Ranked]) -> TextTable:
-    """``rows`` of a ranking with the columns of ``shown`` that any of them has."""
+def ranking_table(title: str, shown: Sequence[Column], rows: Sequence[Ranked], **look: Any) -> Table:
+    """``rows`` of a ranking with the columns of ``shown`` that any of them has, whose titles take two lines in a
+    terminal, to leave more width for the names; ``look``: further settings of the `Table`."""
     shown = [column for column in shown if column.shown_for(rows)]
     words = [number for number, column in enumerate(shown) if not column.right]
-    cells = [[column.text(row) for column in shown] for row in rows]
-    return TextTable(title, [column.title for column in shown], cells, words)
+    cells = [{_two_lines(column.title): column.text(row) for column in shown} for row in rows]
+    return Table.of(title, cells, words, elsewhere="--markdown FILE", **look)
 
 
 def group_tables(groups: Sequence[Group], sort: str, with_pairs: bool = False) -> list[Table | Text]:
@@ -191,23 +178,21 @@ def group_tables(groups: Sequence[Group], sort: str, with_pairs: bool = False) -
     parts: list[Table | Text] = []
     for group in groups:
         shown = [column for column in columns(sort) if column.from_width < ONLY_IN_FILES]
-        ranking = ranking_table(group.title, shown, group.rows)
-        shown.reverse()  # of equal importance, the rightmost is left out first
-        first_out = [_two_lines(column.title) for column in sorted(shown, key=partial(_importance, sort))]
-        titles = [*map(_two_lines, ranking.titles)]
-        names = 1 + titles.index(METHOD.title)
-        parts += [replace(ranking, titles=titles).rich(names=names, first_out=first_out)]
+        names = 1 + [column.title for column in shown if column.shown_for(group.rows)].index(METHOD.title)
+        rightmost = shown[::-1]  # of equal importance, the rightmost is left out first
+        first_out = [_two_lines(column.title) for column in sorted(rightmost, key=partial(_importance, sort))]
+        parts += [ranking_table(group.title, shown, group.rows, names=names, first_out=first_out)]
         parts += [Text("".join(f"{note}\n" for note in group.notes))]
         if with_pairs and len(group.ranked) > MOST_PAIRED:
             parts.append(Text(f"The pairs of more than {MOST_PAIRED} ranked rows are not listed.\n"))
         elif with_pairs and group.pairs:
-            pairs = TextTable.of("Pairs of these rows", [*map(pair_row, group.pairs)])
-            parts.append(pairs.rich(names=2, first_out=PAIRS_FIRST_OUT, elsewhere="--json FILE"))
+            look = {"names": 2, "first_out": PAIRS_FIRST_OUT, "elsewhere": "--json FILE"}
+            parts.append(Table.of("Pairs of these rows", [*map(pair_row, group.pairs)], **look))
     return [*parts, Text(f"{NOTE}\n")]
 
 
 def _two_lines(title: str) -> str:
-    return title.replace(" ", "\n", 1)  # leaves more width for the names
+    return title.replace(" ", "\n", 1)
 
 
 def _importance(sort: str, column: Column) -> tuple[bool, int, int]:
@@ -220,22 +205,8 @@ def paper_rich_tables(papers: Sequence[ReportedTable]) -> list[Table | Text]:
     """The tables of others under their heading."""
     parts: list[Table | Text] = [Text(REPORTED_HEADING, style="bold")] if papers else []
     for paper in papers:
-        parts += [paper_table(paper).rich(), Text(f"{paper.note}\n")]
+        parts += [paper_table(paper), Text(f"{paper.note}\n")]
     return parts
-
-
-def markdown_text(text: str) -> str:
-    """``text`` as Markdown that shows exactly this text: punctuation that could be markup becomes a character entity.
-    Entities are never structure (CommonMark 6.2): no pipe ends a table cell, no tag, link, code or mention begins."""
-    safe = "".join(c if not c.isascii() or c.isalnum() or c in _PLAIN else f"&#{ord(c)};" for c in printable(text))
-    return re.sub(r"(?i)(www)\.", r"\1&#46;", safe)  # GitHub links bare www. names too
-
-
-def markdown_rows(titles: Sequence[str], right: Sequence[bool], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table; ``right`` says which columns are aligned to the right. Cells are Markdown already."""
-    rules = (" ---: " if to_right else " --- " for to_right in right)
-    lines = ["| " + " | ".join(titles) + " |", "|" + "|".join(rules) + "|"]
-    return lines + ["| " + " | ".join(cells) + " |" for cells in rows]
 
 
 def markdown(groups: Sequence[Group], papers: Sequence[ReportedTable], sort: str) -> str:
@@ -243,12 +214,102 @@ def markdown(groups: Sequence[Group], papers: Sequence[ReportedTable], sort: str
     lines: list[str] = []
     for group in groups:
         table = ranking_table(group.title, columns(sort), group.rows)
-        lines += [f"### {markdown_text(table.title)}", "", *table.markdown(), ""]
+        lines += [f"### {markdown_text(str(table.title))}", "", *table.markdown(), ""]
         for note in group.notes:
             lines += [markdown_text(note), ""]
     lines += [NOTE.replace("*", "\\*"), ""] if groups else []
     lines += [f"### {REPORTED_HEADING}", ""] if papers else []
     for paper in papers:
         table = paper_table(paper)
-        lines += [markdown_text(table.title), "", *table.markdown(), "", paper.note, ""]
+        lines += [markdown_text(str(table.title)), "", *table.markdown(), "", paper.note, ""]
     return "\n".join(lines).rstrip("\n") + "\n"
+
+
+def table_json(groups: Sequence[Group], papers: Sequence[ReportedTable], sort: str) -> str:
+    """The whole leaderboard as JSON: groups of rows with the tests of their pairs, and the tables of others apart. A
+    table of more than `MOST_PAIRED` ranked rows has no list of pairs."""
+    of_groups = [
+        {
+            **asdict(group.key),
+            "title": group.title,
+            "rows": [_json_row(group, row) for row in group.rows],
+            "pairs": list(map(asdict, group.pairs)) if len(group.ranked) <= MOST_PAIRED else None,
+            "notes": group.notes,
+        }
+        for group in groups
+    ]
+    content = {"sorted_by": sort, "groups": of_groups, "reported_by_others": list(map(asdict, papers))}
+    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def _json_row(group: Group, row: Ranked) -> dict[str, Any]:
+    files = [part for part in (row.entry, row.unseen) if part is not None]
+    parts = [{"source": part.path.name, **part.row.model_dump(mode="json")} for part in files]
+    return {**_cells(group, row), "parts": parts}
+
+
+def table_csv(groups: Sequence[Group]) -> str:
+    """A line for each row, numbers with all digits, empty where there is none. Text that a spreadsheet would take for a
+    formula has an apostrophe before it."""
+    lines = [_cells(group, row) for group in groups for row in group.rows]
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(lines[0]) if lines else [], lineterminator="\n")
+    if lines:
+        writer.writeheader()
+    writer.writerows({key: _plain(value) for key, value in line.items()} for line in lines)
+    return text.getvalue()
+
+
+def _plain(value: object) -> object:
+    """A cell that no spreadsheet runs, whatever stands before a formula, and in whichever width its sign is written."""
+    is_formula = isinstance(value, str) and _FORMULA.match(unicodedata.normalize("NFKC", value))
+    return f"'{value}" if is_formula else value
+
+
+def _cells(group: Group, row: Ranked) -> dict[str, object]:
+    key, entry, about = group.key, row.entry, row.entry.row
+    timing, reliance, disturbed = about.timing, about.reliance, (about.robustness or {}).get("test")
+    low, high = row.interval(RANK_KEY) or (None, None)
+    covered, ause_mm = uncertainty(entry)
+    parts = {
+        f"{RANK_KEY}_{name}": part and part.value(RANK_KEY)
+        for name, part in zip(("test", "unseen"), map(row.on, (TEST, UNSEEN)), strict=True)
+    }
+    errors = dict.fromkeys((*HEADLINE, *(metric.key for metric in with_column(WIDE))))
+    return {
+        "data": key.data_title,
+        "samples": group.parts,
+        "class": key.frames,
+        "code": about.dataset.code,
+        "track": key.track,
+        "mode": key.mode,
+        "target": key.target,
+        "protocol": key.protocol_version,
+        "best_rank": row.best_rank,
+        "worst_rank": row.worst_rank,
+        "place": row.place,
+        "short_name": row.short_name,
+        "name": entry.name,
+        "method": about.submission.method,
+        "objects": len(row.objects),
+        RANK_KEY: row.value(RANK_KEY),
+        f"{RANK_KEY}_low": low,
+        f"{RANK_KEY}_high": high,
+        **parts,
+        "ratio_to_trivial": row.ratio,
+        **{name: row.value(name) for name in errors if name != RANK_KEY},
+        "latency_median_ms": entry.latency_ms,
+        "latency_p5_ms": timing and timing.latency_p5_ms,
+        "latency_p95_ms": timing and timing.latency_p95_ms,
+        "time_measured_here": entry.time_measured,
+        "timed_on": device(entry),
+        "frames_used": entry.frames,
+        "phase_reliance": reliance and reliance.score,
+        "disturbed_mae_mm": disturbed and disturbed.mae_mm,
+        "within_stated_95": covered,
+        "ause_mae_mm": ause_mm,
+        "learned_from": learned_from(about),
+        "given_truth": given_truth(key.track),
+        "provenance": row.provenance,
+        "source": entry.path.name,
+    }

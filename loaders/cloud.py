@@ -14,7 +14,7 @@ from fpp_ml_bench.errors import CaptureError
 from fpp_ml_bench.files import printable, write_files
 from fpp_ml_bench.loaders.captures.exports import camera_points, depth_ply
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.style import DEPTH_COLOURS
+from fpp_ml_bench.style import DEPTH_COLOURS, page
 
 MOST_POINTS = 150_000
 """Drawn by the page: a phone turns so many smoothly, and the file stays below 1.5 MB."""
@@ -30,7 +30,6 @@ def cloud_html(title: str, points_mm: NDArray[np.floating], grey: NDArray[np.uin
     grey levels uint8 (N,). Of more than `MOST_POINTS` it draws every k-th, and says so. Positions are rounded to
     1/65535 of the longest side of the box around them. Raises `CaptureError` for no point, points that are not finite,
     or grey levels of another length or dtype."""
-    import jinja2
     from matplotlib import colormaps
 
     points, count = np.asarray(points_mm, dtype=np.float64), len(points_mm)
@@ -53,13 +52,10 @@ def cloud_html(title: str, points_mm: NDArray[np.floating], grey: NDArray[np.uin
         "ends_mm": ends.tolist(),
         "white": max(float(np.quantile(shown, _ENDS[1])), 1.0),
     }
-    here = Path(__file__).parent
-    template = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True).from_string(
-        (here / "cloud.html").read_text(encoding="utf-8")
-    )
-    script = (here / "cloud.js").read_text(encoding="utf-8")
-    values = {"title": printable(title), "count": count, "shown": len(points), "every": every}
-    return template.render(values, data=data, script=script).encode()
+    here, title = Path(__file__).parent / "templates", printable(title)
+    style, script = ((here / name).read_text(encoding="utf-8") for name in ("cloud.css", "cloud.js"))
+    values = {"heading": title, "count": count, "shown": len(points), "every": every, "data": data}
+    return page("fpp_ml_bench.loaders", "cloud.html", title, style, script, **values)
 
 
 def _text(values: NDArray) -> str:

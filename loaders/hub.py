@@ -1,5 +1,7 @@
-"""A folder of staged files on the Hugging Face Hub: what publishing would change, and sending it; and staging a
-dataset: Parquet that the Hub's viewer shows, meshes, rig, and the head of the card.
+"""Datasets on the Hugging Face Hub. A folder of staged files: what publishing would change, and sending it. Staging a
+dataset: Parquet that the Hub's viewer shows, meshes, rig, and the head of the card. And of a dataset of the published
+layout the files that an import reads, and downloading them into the cache of ``huggingface_hub``, where a download that
+was stopped continues.
 
 Files are compared by the hashes that the Hub stores (SHA-256 of a large file, git's hash of a small one), so a dry run
 can tell what would change. Every error of the client becomes a `PublishError` that says what to do; the client reads
@@ -19,23 +21,32 @@ from typing import Any, Literal
 
 import cv2
 import pyarrow
-import yaml
-from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi, get_token
+from huggingface_hub import (
+    CommitOperationAdd,
+    CommitOperationDelete,
+    HfApi,
+    constants,
+    get_token,
+    try_to_load_from_cache,
+)
 from huggingface_hub import errors as hub_errors
-from huggingface_hub.constants import REPO_TYPES_URL_PREFIXES
 from huggingface_hub.hf_api import RepoFile
-from huggingface_hub.utils import disable_progress_bars
+from huggingface_hub.utils import disable_progress_bars, filter_repo_objects
 from huggingface_hub.utils.sha import git_hash
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.constants import REPOSITORY_NAME
-from fpp_ml_bench.errors import DatasetError, PublishError, RemoteError
-from fpp_ml_bench.files import file_hash, printable, read_json, write_atomically
-from fpp_ml_bench.loaders.storage.card import RIG_FILE, dataset_info
-from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER
+from fpp_ml_bench.constants import FULL_SIZE, REPOSITORY_NAME
+from fpp_ml_bench.errors import DatasetError, LayoutError, PublishError, RemoteError
+from fpp_ml_bench.files import check_space, printable, read_json, write_atomically
+from fpp_ml_bench.loaders.published.importing import Source
+from fpp_ml_bench.loaders.published.tree import FRINGE, INFO, RAW_SCANS, TRAINING, VARIANT_FOLDERS
+from fpp_ml_bench.loaders.sample import DEPTHS, LABELS, PREVIEW, RANGE
+from fpp_ml_bench.loaders.storage.card import NAME, RIG_FILE, front_matter
+from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER, damage_of
 from fpp_ml_bench.loaders.storage.parquet import card_configs, data_shards, overview, published_features, write_shard
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.rig_file import save_rig
+from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
 Kind = Literal["dataset", "space", "model"]
 Status = Literal["new", "changed", "unchanged", "deleted"]
@@ -55,11 +66,12 @@ _ANSWERS = {
 }
 
 
-NAME = "FPP-ML-Bench"
 PICTURE = "overview.png"
 OWNED = ("data/", f"{MESH_FOLDER}/")
 _LICENCE = re.compile(r"[a-z0-9][a-z0-9.-]{0,39}")
 _IDENTITY, _FILES = "staged.sha256", "files"
+_SCAN_FRAMES = f"{RAW_SCANS}/*/A_*.png"
+_DEPTH_BYTES = 4
 
 
 class Unreachable(PublishError, RemoteError):
@@ -101,11 +113,6 @@ class Change:
     status: Status
     path: str
     bytes: int
-
-
-def yaml_text(content: Any, allow_unicode: bool = False) -> str:
-    """YAML as the Hub's files have it: in the order given, lines of at most 110 characters."""
-    return str(yaml.safe_dump(content, sort_keys=False, width=110, allow_unicode=allow_unicode))
 
 
 def mark_bytes(publishes: str, **about: Any) -> bytes:
@@ -186,7 +193,7 @@ class Hub:
             raise self._error(f"HF_ENDPOINT: expected a URL like https://huggingface.co, got {self.endpoint!r}")
 
     def url(self, kind: Kind, repo: str) -> str:
-        return f"{self.endpoint}/{REPO_TYPES_URL_PREFIXES.get(kind, '')}{repo}"
+        return f"{self.endpoint}/{constants.REPO_TYPES_URL_PREFIXES.get(kind, '')}{repo}"
 
     def check_token(self) -> set[str]:
         """Names that the token may publish under: its user and their organisations. `PublishError` without a token."""
@@ -200,34 +207,24 @@ class Hub:
             owners = ", ".join(printable(name, 60) for name in sorted(names))
             raise PublishError(f"{repo}: does not exist, and this token may make repositories of {owners} only")
 
-    def state(self, kind: Kind, repo: str) -> Remote:
-        """A repository's commit, visibility and files; a `Remote` without a commit where no repository is visible."""
+    def state(self, kind: Kind, repo: str, revision: str | None = None) -> Remote:
+        """A repository's commit, visibility and files at a branch, tag or commit, by default on its main branch; a
+        `Remote` without a commit where no repository is visible."""
         with self._explained(f"reading {kind} {repo}"):
             try:
-                info = self._api.repo_info(repo, repo_type=kind)
+                info = self._api.repo_info(repo, repo_type=kind, revision=revision)
+            except hub_errors.RevisionNotFoundError as error:
+                raise self._error(f"{repo}: has no branch, tag or commit {printable(revision, 60)!r}") from error
+            except hub_errors.GatedRepoError:
+                raise
             except hub_errors.RepositoryNotFoundError as error:
                 # Without a token the Hub answers 401, not 404, for a repository that is private or missing.
                 if error.response.status_code == 401 and get_token():
                     raise
                 return Remote(None)
-            return self._remote(kind, repo, info)
-
-    def contents(self, repo: str, revision: str | None) -> Remote:
-        """Commit and files of a dataset at a branch, tag or commit, by default on its main branch. `RemoteError` where
-        there is none."""
-        with self._explained(f"reading dataset {repo}"):
-            try:
-                info = self._api.repo_info(repo, repo_type="dataset", revision=revision)
-            except hub_errors.RevisionNotFoundError as error:
-                raise self._error(f"{repo}: has no branch, tag or commit {printable(revision, 60)!r}") from error
-            except hub_errors.RepositoryNotFoundError as error:
-                if isinstance(error, hub_errors.GatedRepoError) or (error.response.status_code == 401 and get_token()):
-                    raise
-                raise self._error(
-                    f"{repo}: no such folder here, and no such dataset on {self.endpoint}, or it is private; check the "
-                    "name, or run 'hf auth login' with a token that may read it"
-                ) from error
-            return self._remote("dataset", repo, info)
+            tree = self._api.list_repo_tree(repo, repo_type=kind, recursive=True, revision=info.sha)
+            files = {entry.path: entry for entry in tree if isinstance(entry, RepoFile)}
+            return Remote(info.sha or "", bool(info.private), files)
 
     def download(self, repo: str, commit: str, patterns: list[str]) -> Path:
         """Download files of a dataset whose names match ``patterns`` into the client's cache, but for those that are
@@ -235,11 +232,6 @@ class Hub:
         with self._explained(f"downloading dataset {repo}"):
             folder = self._api.snapshot_download(repo, repo_type="dataset", revision=commit, allow_patterns=patterns)
         return Path(folder)
-
-    def _remote(self, kind: Kind, repo: str, info: Any) -> Remote:
-        tree = self._api.list_repo_tree(repo, repo_type=kind, recursive=True, revision=info.sha)
-        files = {entry.path: entry for entry in tree if isinstance(entry, RepoFile)}
-        return Remote(info.sha or "", bool(info.private), files)
 
     def mark(self, kind: Kind, repo: str, remote: Remote) -> dict[str, Any]:
         """Content of `MARK` in a repository; `PublishError` where the file is missing or damaged."""
@@ -363,25 +355,26 @@ def dataset_licence(dataset: DatasetFolder, license_id: str | None) -> str:
 
 def card_head(dataset: DatasetFolder, licence: str) -> str:
     """Front matter of the card, from which the Hub's viewer and ``load_dataset`` know configurations and files."""
+    from datasets import DatasetInfo, Features  # takes a second to import
+    from datasets.splits import SplitDict, SplitInfo
+
     files: dict[str, list[str]] = {split: [] for split in dataset.splits}
-    counts = {split: len(samples) for split, samples in dataset.splits.items()}
-    rows = sum(counts.values())
     for name, shard in data_shards(dataset).items():
-        files[shard.split].append(name)
-    head = {
-        "license": licence,
-        "pretty_name": NAME,
-        "task_categories": ["depth-estimation"],
-        "size_categories": ["n<1K" if rows < 1000 else "1K<n<10K" if rows < 10_000 else "10K<n<100K"],
-        "tags": ["fringe-projection-profilometry", "structured-light", "metrology", "fpp-ml-bench"],
-        # Files by name, not by pattern: a stray file can never join the data.
-        "configs": card_configs(dataset, dataset.fingerprint, files, preview=True),
-        "dataset_info": [
-            dataset_info(config, published_features(dataset, config), dataset.size, counts)
-            for config in dataset.configs
-        ],
-    }
-    return f"---\n{yaml_text(head)}---\n"
+        files[shard.split].append(name)  # by name, not by pattern: a stray file can never join the data
+    infos = []
+    for config in dataset.configs:
+        described = published_features(dataset, config)
+        levels = sum(4 if name in DEPTHS else 1 for name in described if name not in (*LABELS, *RANGE, PREVIEW))
+        row_bytes = dataset.size[0] * dataset.size[1] * levels
+        splits = [SplitInfo(name, row_bytes * len(samples), len(samples)) for name, samples in dataset.splits.items()]
+        info = DatasetInfo(
+            features=Features.from_dict(described),
+            splits=SplitDict({split.name: split for split in splits}),
+            dataset_size=sum(split.num_bytes for split in splits),
+        )
+        infos.append({"config_name": config, **info._to_yaml_dict()})
+    configs = card_configs(dataset, dataset.fingerprint, files, preview=True)
+    return front_matter(dataset.manifest, configs, licence, ["fpp-ml-bench"], dataset_info=infos)
 
 
 def stage_dataset(
@@ -399,13 +392,12 @@ def stage_dataset(
         if (folder / name).is_file():
             row_done(shard.rows)
         else:
-            write_shard(dataset, shard, folder / name, threads, row_done)
+            write_shard(dataset, shard, folder / name, row_done, threads)
     for mesh in (file for file in dataset.manifest.others if file.path.startswith(f"{MESH_FOLDER}/")):
-        source = dataset.path / mesh.path
-        if not source.is_file() or file_hash(source) != mesh.xxh3_128:
-            raise DatasetError(f"{source}: missing or damaged, it isn't published; build the dataset again")
+        if damage := damage_of(dataset.path, mesh):
+            raise DatasetError(damage)
         (folder / MESH_FOLDER).mkdir(exist_ok=True)
-        shutil.copyfile(source, folder / mesh.path)
+        shutil.copyfile(dataset.path / mesh.path, folder / mesh.path)
     save_rig(dataset.rig, folder / RIG_FILE)
     write_atomically(folder / PICTURE, overview(dataset))
     for name, text in texts.items():
@@ -414,3 +406,65 @@ def stage_dataset(
     marked = mark_bytes("dataset", **about, splits=dataset.splits, content=dataset.content)
     write_atomically(folder / MARK, marked)
     return Publication("dataset", repo, folder, f"{NAME} dataset {dataset.fingerprint[:12]}", OWNED)
+
+
+@dataclass(frozen=True)
+class Download:
+    """What an import downloads from ``source``: ``sizes`` in bytes by name of file, those matched by ``patterns``.
+    ``missing`` are those of them that ``cache`` does not hold, ``raw_scans`` the images that are left out."""
+
+    source: Source
+    patterns: tuple[str, ...]
+    sizes: dict[str, int]
+    missing: dict[str, int]
+    raw_scans: dict[str, int]
+    cache: Path
+
+
+def plan_download(hub: Hub, repository: str, revision: str | None = None, raw_scans: bool = False) -> Download:
+    """What an import of ``repository`` at ``revision`` (branch, tag or commit; None: its main branch) downloads: the
+    depth variant that it reads, the depth ranges and, with ``raw_scans``, the frames of the raw scans. Raises
+    `RemoteError` as `Hub.state`, `LayoutError` for a repository without the published layout or raw scans."""
+    remote = hub.state("dataset", repository, revision)
+    if not remote.exists:
+        raise RemoteError(
+            f"{repository}: no such folder here, and no such dataset on {hub.endpoint}, or it is private; check the "
+            "name, or run 'hf auth login' with a token that may read it"
+        )
+
+    def matching(*patterns: str) -> dict[str, int]:
+        names = filter_repo_objects(remote.files, allow_patterns=list(patterns))
+        return {name: remote.files[name].size for name in names}
+
+    variant = next((name for name in VARIANT_FOLDERS.values() if matching(f"{TRAINING}/{name}/*")), None)
+    scans = matching(_SCAN_FRAMES)
+    if variant is None:
+        hint = f"expected {TRAINING}/ with one of {', '.join(VARIANT_FOLDERS.values())}"
+        if MARK in remote.files:
+            hint = f'it holds Parquet files, which datasets.load_dataset("{repository}") opens'
+        raise LayoutError(f"{repository}: this dataset does not have the published layout; {hint}")
+    if raw_scans and not scans:
+        raise LayoutError(f"{repository}: has no raw scans ({RAW_SCANS}/), only the single-shot images and their depth")
+    patterns = (f"{TRAINING}/{variant}/*", f"{TRAINING}/{INFO}/*", *([_SCAN_FRAMES] if raw_scans else []))
+    sizes, commit = matching(*patterns), remote.commit or ""
+    missing = {
+        name: size
+        for name, size in sizes.items()
+        if not isinstance(try_to_load_from_cache(repository, name, revision=commit, repo_type="dataset"), str)
+    }
+    source = Source(repository, commit, (variant, *([RAW_SCANS] if raw_scans else [])))
+    return Download(source, patterns, sizes, missing, {} if raw_scans else scans, Path(constants.HF_HUB_CACHE))
+
+
+def fetch_tree(hub: Hub, download: Download, out: Path) -> Path:
+    """Download what is missing, with the client's own progress bars; returns the folder of the tree in the cache.
+    Raises `BuildError` where a disk has no space for the download and the dataset to be written to ``out``,
+    `RemoteError` as `Hub.download`."""
+    if download.missing:
+        # The import is estimated for images of the paper's size.
+        frames = len(PAPER_SEQUENCE) if RAW_SCANS in download.source.folders else 1
+        samples = sum(f"/{FRINGE}/" in name for name in download.sizes)
+        imported, downloaded = samples * FULL_SIZE**2 * (frames + _DEPTH_BYTES), sum(download.missing.values())
+        cure = " for the download (HF_HOME) or the dataset (--out)"
+        check_space({download.cache: downloaded, out: imported}, "download and import need", cure)
+    return hub.download(download.source.repository, download.source.commit, list(download.patterns))

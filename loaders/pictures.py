@@ -124,7 +124,7 @@ def sample_picture(dataset: DatasetFolder, sample: str, path: Path) -> None:
     drawn = panel_figure(panels, further=int(mesh.is_file()))
     drawn.suptitle(f"{sample} ({dataset.split_of_sample(sample)})")
     if mesh.is_file():
-        vertices_m, faces, _ = read_mesh(mesh)
+        vertices_m, faces, *_ = read_mesh(mesh)
         first: Any = drawn.axes[0]
         grid = first.get_subplotspec().get_gridspec()
         solid: Any = drawn.add_subplot(grid[len(panels) // _ACROSS, len(panels) % _ACROSS], projection="3d")
@@ -229,9 +229,7 @@ def contact_sheet(dataset: DatasetFolder, split: str, path: Path, most_views: in
     written."""
     if most_views < 1:
         raise DatasetError(f"--views {most_views}: expected 1 or more views of each object")
-    views: dict[str, list[str]] = {}
-    for sample in dataset.samples(split):
-        views.setdefault(dataset.measured(sample)["object"], []).append(sample)
+    views = dataset.samples_by_object(split)
     index, (height, width) = _grey_frame(dataset), dataset.size
     across = min(most_views, max(map(len, views.values())))
     tile_px = _TILE_PX * (2 if across == 1 else 1)  # the label is as long as two tiles

@@ -141,16 +141,15 @@ def row_columns(sequence: AnySequence, frames: tuple[int, ...], exact: bool) -> 
     return [*LABELS, *names, DEPTH, *([DEPTH_EXACT, *PIXEL_MAPS] if exact else []), *RANGE]
 
 
+def labels_of(row: Mapping[str, Any], split: str) -> dict[str, Any]:
+    """What the columns of labels and depth range hold of a row of `Manifest.samples`."""
+    own = {key: row[key] for key in LABELS if key != "split"}
+    return {**own, "split": split, **{key: row[f"{key}_mm"] for key in RANGE}}
+
+
 def config_columns(sequence: AnySequence, config: str, exact: bool) -> list[str]:
     """Column names of a configuration, in order."""
     return row_columns(sequence, sequence.config(config), exact)
-
-
-def group_columns(sequence: AnySequence, group: str, frames: tuple[int, ...], exact: bool) -> list[str]:
-    """Column names of a group's files, in order."""
-    if group == DATA_GROUP:
-        return row_columns(sequence, frames, exact)
-    return [sequence.frames[i].column for i in frames]
 
 
 def features(columns: list[str], size: tuple[int, int]) -> dict[str, dict[str, Any]]:

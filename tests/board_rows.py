@@ -13,7 +13,7 @@ from fpp_ml_bench.evaluation.result.file import write_result
 from fpp_ml_bench.evaluation.result.parts import RELIANCE_VERSION, Intervals, Metrics, Reliance, RelianceParts
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats, combine
-from fpp_ml_bench.leaderboard import groups
+from fpp_ml_bench.leaderboard import ranking
 from fpp_ml_bench.leaderboard.row_file import ObjectMeans, Row, RowRobustness, interval_over, mean_over
 from fpp_ml_bench.leaderboard.rows import Entry
 from fpp_ml_bench.loaders.storage import benchmark
@@ -185,5 +185,5 @@ def named_benchmarks(monkeypatch: Any, counts: Mapping[str, Any] | None = None, 
         named[-1].__dict__["_facts"] = {"content": content, "counts": {}}
     if counts is not None:
         named[0].__dict__["_facts"]["counts"] = {"test": {"standard/depth": counts}}
-    for module in (benchmark, groups):
+    for module in (benchmark, ranking):
         monkeypatch.setattr(module, "BENCHMARKS", tuple(named))

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from fpp_ml_bench.baselines.diagnostics.fits import truth
+from fpp_ml_bench.baselines.diagnostics.scenes import truth
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,9 +33,8 @@ DATA = [f"data/{split}-00000-of-00001.parquet" for split in OBJECTS]
 
 def make_all_frames(folder: Path, odd: bool = False, seed: int = 0) -> DatasetFolder:
     """All 52 frames of random pixels: what no codec may change. One object may have a name that is markup."""
-    scratch = folder / "scratch"
-    scratch.mkdir(parents=True)
-    (folder / "meshes").mkdir()
+    (folder / "meshes").mkdir(parents=True)
+    manifest = Manifest("generated", {}, {}, paper_rig(960).to_dict(), SIZE, "all", exact=True)
     plans, receipts = [], []
     rng = np.random.default_rng(seed)
     for split, names in OBJECTS.items():
@@ -48,12 +48,12 @@ def make_all_frames(folder: Path, odd: bool = False, seed: int = 0) -> DatasetFo
                 maps = np.zeros(depth.shape, np.uint8), np.full(depth.shape, 255, np.uint8)
                 rows.append(Row(sample, name, view, frames, depth, depth * np.float32(1.0001), {}, *maps))
             plans.append(plan)
-            receipts.append(ShardWriter(folder, scratch, PAPER_SEQUENCE, "all", True, SIZE).write(plan, rows))
-    shutil.rmtree(scratch)
+            receipts.append(ShardWriter(manifest).write(folder, plan, rows))
+    shutil.rmtree(folder / ".build")
     mesh = folder / "meshes" / "bowl.ply"
     mesh.write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
     others = [describe_file(folder, mesh)]
-    manifest = Manifest("generated", {}, {}, paper_rig(960).to_dict(), SIZE, "all", exact=True, others=others)
+    manifest = replace(manifest, others=others)
     Assembly(plans, lambda plan, folder: (), manifest).filled(receipts).write(folder)
     return DatasetFolder(folder)
 

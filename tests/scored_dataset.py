@@ -18,7 +18,6 @@ from fpp_ml_bench.loaders.storage.manifest import Manifest
 from fpp_ml_bench.loaders.storage.shards import ShardWriter, plan_shards
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.named_rigs import paper_rig
-from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
 OBJECTS = {"train": ("bowl",), "validation": ("mug",), "test": ("power_drill", "wooden_boards")}
 VIEWS = ("A0", "A60")
@@ -63,9 +62,8 @@ def make_dataset(
     ``scene`` gives frame and depth of a number that no other sample has; by default a flat frame and a `disk_depth`.
     ``flagged`` gives the flags of a depth, by default none. Unlit pixels lose their ``depth``, not their exact one.
     """
-    scratch = folder / ".build"
-    scratch.mkdir(parents=True)
-    writer = ShardWriter(folder, scratch, PAPER_SEQUENCE, "single_shot", exact, size)
+    manifest = Manifest("generated", {}, {}, paper_rig(960).to_dict(), size, "single_shot", exact)
+    writer = ShardWriter(manifest)
     plans, receipts = [], []
     for number, (split, names) in enumerate(OBJECTS.items()):
         objects = {name: [(f"{name}_{view}", name, view) for view in views] for name in names}
@@ -94,9 +92,8 @@ def make_dataset(
                     )
                 )
             plans.append(plan)
-            receipts.append(writer.write(plan, rows))
-    scratch.rmdir()
-    manifest = Manifest("generated", {}, {}, paper_rig(960).to_dict(), size, "single_shot", exact)
+            receipts.append(writer.write(folder, plan, rows))
+    (folder / ".build").rmdir()
     Assembly(plans, lambda plan, folder: (), manifest).filled(receipts).write(folder)
     return DatasetFolder(folder)
 

@@ -12,26 +12,36 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics import probe
-from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import (
-    REPROJECTED,
-    VIEWS_PER_OBJECT,
-    Counterfactuals,
-    SceneSet,
-)
 from fpp_ml_bench.baselines.diagnostics.probe import (
     Figure,
+    Finding,
     Picture,
+    Probe,
+    ProbeSettings,
     Progress,
     Table,
     gallery,
     mean_of,
     silent,
 )
-from fpp_ml_bench.baselines.diagnostics.scene_renderer import MovedPhase, Scene, SceneRenderer
+from fpp_ml_bench.baselines.diagnostics.scenes import (
+    REPROJECTED,
+    VIEWS_PER_OBJECT,
+    Mask,
+    MovedPhase,
+    Scene,
+    SceneRenderer,
+    Variant,
+    chosen_samples,
+    counterfactuals,
+    layer_of,
+    original,
+)
+from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.result.parts import PART_TITLES, RELIANCE_VERSION, Reliance, RelianceParts
@@ -43,7 +53,7 @@ if TYPE_CHECKING:
     from fpp_ml_bench.baselines.diagnostics.subjects import Subject
     from fpp_ml_bench.baselines.method import Method
 
-MOST_VIEWS = 6
+MARGIN_PX = 6  # around the objects in the picture
 Map = NDArray[np.floating]
 
 
@@ -57,12 +67,10 @@ class Change:
     answered: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, before: Map, after: Map, expected: Map, where: NDArray[np.bool_], zero_is_none: bool) -> "Change":
-        """From two predictions and the expected change, maps (H, W), at the pixels ``where`` (H, W). With
-        ``zero_is_none`` a 0 means that there is no prediction, and the actual change there is 0."""
-        first, second = before[where].astype(np.float64), after[where].astype(np.float64)
-        answered = (first != 0) & (second != 0) if zero_is_none else np.ones(first.shape, dtype=bool)
-        return cls(np.asarray(expected[where], dtype=np.float64), np.where(answered, second - first, 0.0), answered)
+    def of(cls, before: Map, after: Map, expected: Map, answered: Mask) -> "Change":
+        """From two predictions and the expected change (n,); where it is not ``answered``, the actual change is 0."""
+        actual = np.where(answered, np.subtract(after, before, dtype=np.float64), 0.0)
+        return cls(np.asarray(expected, dtype=np.float64), actual, answered)
 
 
 def follows(changes: Sequence[Change]) -> float | None:
@@ -82,7 +90,7 @@ def follows(changes: Sequence[Change]) -> float | None:
 
 def rms_expected(changes: Sequence[Change]) -> float:
     """Root mean square of the expected change over all pixels of ``changes``; 0 without pixels."""
-    values = np.concatenate([change.expected for change in changes]) if changes else np.zeros(0)
+    values = np.concatenate([np.zeros(0), *(change.expected for change in changes)])
     return float(np.sqrt(np.mean(values**2))) if values.size else 0.0
 
 
@@ -101,7 +109,9 @@ def relative_change(changes: Sequence[Change], unit: float) -> float | None:
 def order_free_follows(changes: Sequence[Change]) -> float | None:
     """`follows` for changes of phase in rad, modulo whole periods: 1 - (1 - <cos(d - t)>) / (1 - <cos t>), at least 0.
     A random prediction gets no credit: its <cos(d - t)> is 0, below that of a constant prediction."""
-    actual, expected = (np.concatenate([getattr(change, key) for change in changes]) for key in ("actual", "expected"))
+    actual, expected = (
+        np.concatenate([np.zeros(0), *(getattr(change, key) for change in changes)]) for key in ("actual", "expected")
+    )
     standing_still = 1 - float(np.mean(np.cos(expected))) if expected.size else 0.0
     if standing_still <= 0:
         return None
@@ -118,117 +128,124 @@ def sample_score(follow: float | None, change: float | None) -> float | None:
     return None if follow is None else follow * (1.0 if change is None else max(0.0, 1.0 - change))
 
 
-@dataclass(frozen=True)
-class SampleReliance:
-    """A sample's score, order-free score, and ``parts`` by the names of `RelianceParts`."""
+class Sample:
+    """The scenes of a sample, and what ``method`` predicts of them, in its own units. ``outline_samples``: whose
+    outlines the object may be cut to. Raises `DiagnosisError` for a method of other units than mm and normalised."""
 
-    sample: str
-    object: str
-    score: float | None
-    order_free_score: float | None
-    parts: dict[str, float | None]
-
-
-class ScenePredictor:
-    """Runs ``method`` on scenes and gives the true depth in the units of its predictions."""
-
-    def __init__(self, method: "Method | Subject", renderer: SceneRenderer) -> None:
+    def __init__(
+        self,
+        method: "Method | Subject",
+        dataset: DatasetFolder,
+        renderer: SceneRenderer,
+        sample: str,
+        outline_samples: Sequence[str],
+    ) -> None:
         self.method, self.renderer, self.in_mm = method, renderer, method.units == "mm"
-        if method.units not in ("mm", "normalised"):
-            raise DiagnosisError(f"units {method.units!r}: reliance is measured for predictions in mm, or normalised")
+        self.original = original(dataset, renderer, sample)
+        self.direction = direction_read(method.frames_used, dataset)
+        outlines = [object_mask(dataset.depth_mm(name)) for name in outline_samples]
+        self.layer = layer_of(renderer.rig, self.direction)
+        self.variants = counterfactuals(renderer, self.original, self.direction, outlines)
+        self.truth, self.before = self.true_depth(self.original), self.predict(self.original)
 
     def predict(self, scene: Scene) -> NDArray[np.float32]:
         """Predicted depth (H, W) in the units of the method."""
         frames = self.renderer.frames(scene, self.method.frames_used, self.method.uses_ground_truth_mask)
         return self.method.predict(frames)
 
-    def true_depth(self, depth_mm: NDArray[np.float64], mask: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """``depth_mm`` (H, W) in the units of the method: mm, or normalised to its range over ``mask``."""
-        if self.in_mm or not mask.any():
+    def true_depth(self, scene: Scene) -> NDArray[np.float64]:
+        """True depth (H, W) in the units of the method: mm, or normalised to its range over the scene's mask."""
+        depth_mm = scene.depth_mm
+        if self.in_mm or not scene.mask.any():
             return depth_mm
-        inside = depth_mm[mask]
-        low, span = float(inside.min()), float(np.ptp(inside))
-        return (depth_mm - low) / span if span > 0 else np.zeros_like(depth_mm)
+        inside = depth_mm[scene.mask]
+        return (depth_mm - inside.min()) / (np.ptp(inside) or np.inf)  # type: ignore[no-any-return]
+
+    def changes(self, variant: Variant) -> tuple[Change, Change | None]:
+        """The change of a prediction, and of a prediction in mm that of its phase in rad."""
+        where = variant.scene.mask & self.original.mask
+        before, after = self.before[where], self.predict(variant.scene)[where]
+        expected = self.true_depth(variant.scene)[where] - self.truth[where]
+        if not self.in_mm:
+            return Change.of(before, after, expected, np.ones(before.shape, dtype=bool)), None
+        change = Change.of(before, after, expected, (before != 0) & (after != 0))
+        layer, answered = self.layer.at(where), (before > 0) & (after > 0)
+        first, second = (layer.absolute_phase(np.where(answered, depth_mm, 1000.0)) for depth_mm in (before, after))
+        true, moved = (layer.absolute_phase(scene.depth_mm[where]) for scene in (self.original, variant.scene))
+        return change, Change.of(first, second, moved - true, answered)
+
+    def parts(self) -> dict[str, float | None]:
+        """Both scores, ``score`` and ``order_free_score``, and the parts by the names of `RelianceParts`."""
+        changes: dict[str, list[Change]] = defaultdict(list)
+        turns: dict[str, list[Change]] = defaultdict(list)
+        for variant in self.variants:
+            if variant.kind == "constant" and not self.in_mm:
+                continue
+            change, turn = self.changes(variant)
+            key = variant.name.replace(" ", "_") if variant.kind == "projected" else variant.kind
+            changes[key].append(change)
+            if turn is not None:
+                turns[key].append(turn)
+        unit = rms_expected(changes["phase"])
+        follow, outline = follows(changes["phase"]), relative_change(changes["outline"], unit)
+        parts = {"score": sample_score(follow, outline), "order_free_score": None, "follows_phase": follow}
+        parts |= {"change_outline": outline}
+        parts |= {f"follows_{kind}": follows(changes[kind]) for kind in ("light", "both", "constant")}
+        for key in (name.replace(" ", "_") for name in REPROJECTED):
+            (other,) = changes[key]
+            kept = other.answered
+            change = Change(other.expected[kept], other.actual[kept], kept[kept])
+            parts[f"change_{key}"] = relative_change([change], unit)
+            if key.startswith("no_fringe"):
+                parts[f"answered_{key}"] = float(kept.mean())
+        if self.in_mm:
+            follow, chords = order_free_follows(turns["phase"]), rms_expected(order_free(turns["phase"]))
+            outline = relative_change(order_free(turns["outline"]), chords)
+            parts |= {"order_free_follows_phase": follow, "order_free_change_outline": outline}
+            parts["order_free_score"] = sample_score(follow, outline)
+        return parts
 
 
-def measure_sample(predictor: ScenePredictor, scenes: Counterfactuals) -> SampleReliance:
-    """Runs the method on every scene of a sample and compares."""
-    original = scenes.original
-    target = original.target & (original.depth_mm > 0)
-    before, truth = predictor.predict(original.scene), predictor.true_depth(original.depth_mm, target)
-    changes: dict[str, list[Change]] = defaultdict(list)
-    turns: dict[str, list[Change]] = defaultdict(list)
-    for variant in scenes.variants:
-        if variant.kind == "constant" and not predictor.in_mm:
-            continue
-        after, where = predictor.predict(variant.scene), variant.scene.mask & target
-        key = variant.name.replace(" ", "_") if variant.kind == "projected" else variant.kind
-        true_depth = predictor.true_depth(variant.depth_mm, variant.scene.mask & (variant.depth_mm > 0))
-        changes[key].append(Change.of(before, after, true_depth - truth, where, predictor.in_mm))
-        if predictor.in_mm and key in ("phase", "outline"):
-            turns[key].append(_phase_change(scenes, before, after, variant.depth_mm, where))
-    unit = rms_expected(changes["phase"])
-    parts: dict[str, float | None] = {
-        "follows_phase": follows(changes["phase"]),
-        "change_outline": relative_change(changes["outline"], unit),
-        **{f"follows_{kind}": follows(changes[kind]) for kind in ("light", "both", "constant")},
-    }
-    for name in REPROJECTED:
-        key = name.replace(" ", "_")
-        (other,) = changes[key]
-        kept = other.answered
-        parts[f"change_{key}"] = relative_change([Change(other.expected[kept], other.actual[kept], kept[kept])], unit)
-        if name.startswith("no fringe"):
-            parts[f"answered_{key}"] = float(kept.mean())
-    order_free_score = None
-    if predictor.in_mm:
-        parts["order_free_follows_phase"] = order_free_follows(turns["phase"])
-        chords = rms_expected(order_free(turns["phase"]))
-        parts["order_free_change_outline"] = relative_change(order_free(turns["outline"]), chords)
-        order_free_score = sample_score(parts["order_free_follows_phase"], parts["order_free_change_outline"])
-    score = sample_score(parts["follows_phase"], parts["change_outline"])
-    return SampleReliance(original.sample, original.object, score, order_free_score, parts)
-
-
-def _phase_change(scenes: Counterfactuals, before: Map, after: Map, depth_mm: Map, where: NDArray[np.bool_]) -> Change:
-    """Change in rad of the phase of predictions in mm, and of the true phase."""
-    layer = scenes.layer.at(where)
-    expected = layer.absolute_phase(depth_mm[where]) - layer.absolute_phase(scenes.original.depth_mm[where])
-    answered = (before[where] > 0) & (after[where] > 0)
-    first, second = (layer.absolute_phase(np.where(answered, answer[where], 1000.0)) for answer in (before, after))
-    return Change(expected, np.where(answered, second - first, 0.0), answered)
+Samples = dict[str, dict[str, float | None]]
+"""What `Sample.parts` says of each sample."""
 
 
 def measure(
-    method: "Method | Subject", scene_set: SceneSet, weights_sha256: str | None = None, progress: Progress = silent
-) -> tuple[Reliance, list[SampleReliance]]:
-    """The reliance block of a method, and the values of every sample. Raises `DiagnosisError` for a method of other
-    units, and where no sample has a score."""
-    predictor = ScenePredictor(method, scene_set.renderer)
-    direction = direction_read(method.frames_used, scene_set.dataset)
-    samples: list[SampleReliance] = []
-    for scenes in scene_set.scenes(direction):
-        progress(len(samples), len(scene_set.samples), scenes.original.sample)
-        samples.append(measure_sample(predictor, scenes))
-    scored = [sample for sample in samples if sample.score is not None]
+    method: "Method | Subject",
+    dataset: DatasetFolder,
+    chosen: Sequence[tuple[str, list[str]]],
+    progress: Progress = silent,
+) -> tuple[Reliance, Samples]:
+    """The reliance block of a method on samples as of `chosen_samples`, and the values of every sample. Raises
+    `DiagnosisError` for a method of other units, and where no sample has a score."""
+    if method.units not in ("mm", "normalised"):
+        raise DiagnosisError(f"units {method.units!r}: reliance is measured for predictions in mm, or normalised")
+    renderer, samples = SceneRenderer.of(dataset), Samples()
+    for sample, outline_samples in chosen:
+        progress(len(samples), len(chosen), sample)
+        samples[sample] = Sample(method, dataset, renderer, sample, outline_samples).parts()
+    scored = {name: parts for name, parts in samples.items() if parts["score"] is not None}
     if not scored:
         raise DiagnosisError("no sample's phase can be moved within the working range, so there is no score")
-    interval = object_interval([sample.score for sample in scored], [sample.object for sample in scored])
+    objects = [dataset.measured(name)["object"] for name in scored]
+    interval = object_interval([parts["score"] for parts in scored.values()], objects)
+
+    def mean(key: str) -> float | None:
+        return mean_of(parts.get(key) for parts in scored.values())
+
     reliance = Reliance(
         version=RELIANCE_VERSION,
-        score=mean_of(sample.score for sample in scored) or 0.0,
+        score=mean("score") or 0.0,
         interval=[None, None] if interval is None else [min(max(end, 0.0), 1.0) for end in interval],
-        order_free_score=mean_of(sample.order_free_score for sample in scored),
-        parts=RelianceParts(
-            **{key: mean_of(sample.parts.get(key) for sample in scored) for key in RelianceParts.model_fields}
-        ),
-        units="mm" if predictor.in_mm else "normalised",
-        direction=direction,
+        order_free_score=mean("order_free_score"),
+        parts=RelianceParts(**{key: mean(key) for key in RelianceParts.model_fields}),
+        units="mm" if method.units == "mm" else "normalised",
+        direction=direction_read(method.frames_used, dataset),
         samples=len(scored),
-        objects=len({sample.object for sample in scored}),
-        dataset_fingerprint=scene_set.dataset.fingerprint,
+        objects=len(set(objects)),
+        dataset_fingerprint=dataset.fingerprint,
         protocol_version=PROTOCOL_VERSION,
-        weights_sha256=weights_sha256,
+        weights_sha256=method.weights_sha256,
     )
     return reliance, samples
 
@@ -242,7 +259,7 @@ def direction_read(frames: Sequence[int], dataset: DatasetFolder) -> MovedPhase:
     return "vertical" if "vertical" in directions else "horizontal"
 
 
-class Counterfactual(probe.Probe):
+class Counterfactual(Probe):
     """The phase-reliance score over the counterfactual scenes of all test objects, with its parts and pictures."""
 
     name = "counterfactual"
@@ -250,26 +267,19 @@ class Counterfactual(probe.Probe):
     version = 2
     question = "Does the predicted depth follow the fringe's phase, or the object's outline?"
 
-    def run(
-        self, subject: "Subject", dataset: DatasetFolder, settings: probe.ProbeSettings, progress: Progress
-    ) -> probe.Finding:
+    def run(self, subject: "Subject", dataset: DatasetFolder, settings: ProbeSettings, progress: Progress) -> Finding:
         views = 1 if settings.quick else VIEWS_PER_OBJECT
         if settings.samples is not None:
-            objects = len({dataset.measured(sample)["object"] for sample in dataset.samples("test")})
-            views = min(max(settings.samples // max(objects, 1), 1), MOST_VIEWS)
-        scene_set = SceneSet(dataset, views)
-        reliance, samples = measure(subject, scene_set, subject.weights_sha256, progress)
-        per_sample = {
-            sample.sample: {"score": sample.score, "order_free_score": sample.order_free_score, **sample.parts}
-            for sample in samples
-        }
-        # The middle sample of the list, which is the same for every method.
-        scenes = scene_set.scenes_of(len(samples) // 2, reliance.direction)
+            views = max(settings.samples // len(chosen_samples(dataset, "test", 1)), 1)
+        chosen = chosen_samples(dataset, "test", views)
+        reliance, per_sample = measure(subject, dataset, chosen, progress)
         values = {"reliance": reliance.model_dump(mode="json"), "per_sample": per_sample}
         rows = [(words, getattr(reliance.parts, key)) for key, words in PART_TITLES.items()]
         parts = Table("Parts of the score, and further measurements", ("Part", "Mean over samples"), rows)
-        drawn = _draw_scenes(ScenePredictor(subject, scene_set.renderer), scenes)
-        return self.finding(summary(reliance), values, parts, drawn)
+        # The middle sample of the list, which is the same for every method.
+        name, outline_samples = chosen[len(chosen) // 2]
+        sample = Sample(subject, dataset, SceneRenderer.of(dataset), name, outline_samples)
+        return Finding(summary(reliance), values, parts, _draw_scenes(name, sample))
 
 
 def summary(reliance: Reliance) -> str:
@@ -284,40 +294,29 @@ def summary(reliance: Reliance) -> str:
     return f"{text} {warning}" if (warning := caution(reliance.objects)) else text
 
 
-def _draw_scenes(predictor: ScenePredictor, scenes: Counterfactuals) -> Figure:
+def _draw_scenes(name: str, sample: Sample) -> Figure:
     """One column per scene: captured frame, expected change and actual change."""
-    original = scenes.original
-    target = original.target & (original.depth_mm > 0)
-    truth, before = predictor.true_depth(original.depth_mm, target), predictor.predict(original.scene)
-    shown = [one for one in scenes.of_kind("phase", "outline", "projected") if one.amplitude_rad >= 0]
-    method, box = predictor.method, _box(np.logical_or.reduce([variant.scene.mask for variant in shown]))
-    index, columns = method.frames_used[0], []
+    shown = [one for one in sample.variants if one.kind in ("phase", "outline", "projected") and one.amplitude_rad >= 0]
+    seen = np.logical_or.reduce([variant.scene.mask for variant in shown])
+    left, top, width, height = cv2.boundingRect(seen.astype(np.uint8))
+    box = np.s_[max(top - MARGIN_PX, 0) : top + height + MARGIN_PX, max(left - MARGIN_PX, 0) : left + width + MARGIN_PX]
+    method, columns = sample.method, []
     for variant in shown:
-        scene, after = variant.scene, predictor.predict(variant.scene)
-        mask = scene.mask & (variant.depth_mm > 0)
-        missing = predictor.in_mm & ((before == 0) | (after == 0))
-        images = (
-            predictor.renderer.frames(scene, [index], method.uses_ground_truth_mask)[index],
-            np.where(mask & target, predictor.true_depth(variant.depth_mm, mask) - truth, np.nan),
-            np.where(mask & target & ~missing, after - before, np.nan),
-        )
+        scene, index = variant.scene, method.frames_used[0]
+        change, maps = sample.changes(variant)[0], np.full((2, *scene.mask.shape), np.nan)
+        maps[:, scene.mask & sample.original.mask] = change.expected, np.where(change.answered, change.actual, np.nan)
+        images = sample.renderer.frames(scene, [index], method.uses_ground_truth_mask)[index], *maps
         columns.append([np.asarray(image)[box] for image in images])
     frames, *changes = zip(*columns, strict=True)
     largest = float(np.nanmax(np.abs(changes[0])))
     rows = {"captured": [Picture(frame) for frame in frames]}
-    for name, maps in zip(("expected change", "actual change"), changes, strict=True):
-        rows[name] = [Picture(one, ERROR_COLOURS, -largest, largest) for one in maps]
-    unit = "mm" if predictor.in_mm else "of the range"
+    for title, maps in zip(("expected change", "actual change"), changes, strict=True):
+        rows[title] = [Picture(one, ERROR_COLOURS, -largest, largest) for one in maps]
+    unit = "mm" if sample.in_mm else "of the range"
     title = (
-        f"{original.sample}: one thing changed at a time; {scenes.direction} phase; blue to red: -{largest:.3g} to "
-        f"{largest:.3g} {unit}; white: no prediction"
+        f"{name}: one thing changed at a time; {sample.direction} phase; blue to red: -{largest:.3g} to {largest:.3g} "
+        f"{unit}; white: no prediction"
     )
-    alt = f"Scenes of {original.sample} with changed phase, outline or fringes, and the change of its prediction"
+    alt = f"Scenes of {name} with changed phase, outline or fringes, and the change of its prediction"
     titles = [f"{variant.kind}:\n{variant.name.replace(' ', chr(10), 1)}" for variant in shown]
     return Figure(title, alt, gallery(rows, titles, 1.3))
-
-
-def _box(mask: NDArray[np.bool_], margin: int = 6) -> tuple[slice, ...]:
-    """The part of the image around ``mask``."""
-    seen = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
-    return tuple(slice(max(places[0] - margin, 0), places[-1] + margin + 1) for places in seen)

@@ -9,20 +9,27 @@ the mean D_min and D_max of the test split: a facing plane has no depth range of
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics import probe
-from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import original
-from fpp_ml_bench.baselines.diagnostics.probe import Figure, Picture, Table, gallery
-from fpp_ml_bench.baselines.diagnostics.scene_renderer import Scene, SceneRenderer, plane
+from fpp_ml_bench.baselines.diagnostics.probe import (
+    Figure,
+    Finding,
+    Picture,
+    Probe,
+    ProbeSettings,
+    Progress,
+    Table,
+    gallery,
+)
+from fpp_ml_bench.baselines.diagnostics.scenes import Mask, Scene, SceneRenderer, original, plane
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject, background_below
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.paper import paper_rows
 from fpp_ml_bench.style import DEPTH_COLOURS
@@ -36,40 +43,15 @@ KINDS = FRAME, RECTANGLE, SILHOUETTE
 GROWING = {f"{RECTANGLE}, side {side:g}": side for side in (0.3, 0.45, 0.5, 0.6, 0.7, 0.8, 0.9, 0.96, 1.0)}
 """Sides, as shares of the image's, of rectangles that face the camera at the paper's distance."""
 SIDES = {FRAME: 1.0, RECTANGLE: 0.5, **GROWING}
-STREAM = (0, "plane", "")
 PAPER = paper_rows()["probes"]["flat_plane"]
-PAPER_DISTANCE_M = PAPER["distance_m"]
-Row = Mapping[str, Any]
+FACING = TILTS_DEG[0], PAPER["distance_m"]
+"""Tilt and distance of the paper's plane."""
+Row = dict[str, Any]
+"""A plane's numbers. Mean, least and largest prediction (`Subject.answer`) in its own units, the share that collapsed
+to background, mean and error in mm."""
 
 
-@dataclass(frozen=True)
-class Scale:
-    """Converts predictions to mm: ``range_mm`` for normalised ones; ``near_mm`` is the working range's near end."""
-
-    normalised: bool
-    range_mm: tuple[float, float]
-    near_mm: float
-
-    def mm(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        low, high = self.range_mm
-        return values * (high - low) + low if self.normalised else values
-
-    @property
-    def limit(self) -> float:
-        """Predictions below it collapsed to background."""
-        return background_below(self.normalised, self.near_mm)
-
-
-@dataclass(frozen=True)
-class PlanePrediction:
-    """A plane's numbers, its image and prediction (H, W)."""
-
-    row: Row
-    frame: NDArray[np.uint8]
-    prediction: NDArray[np.float32]
-
-
-class FlatPlane(probe.Probe):
+class FlatPlane(Probe):
     """Predictions for planes in three outlines, and for the test objects as the control."""
 
     name = "flat-plane"
@@ -81,31 +63,47 @@ class FlatPlane(probe.Probe):
         reason = f"{subject.name} uses the object's mask, and a plane that fills the frame has none."
         return reason if subject.uses_ground_truth_mask else None
 
-    def run(
-        self, subject: Subject, dataset: DatasetFolder, settings: probe.ProbeSettings, progress: probe.Progress
-    ) -> probe.Finding:
-        renderer = SceneRenderer.of(dataset)
+    def run(self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, progress: Progress) -> Finding:
+        renderer, normalised = SceneRenderer.of(dataset), subject.answers_normalised
+        limit = background_below(normalised, renderer.rig.working_range_mm[0])
+        silhouettes = outlines_of(dataset, settings)
         records = [dataset.measured(sample) for sample in dataset.samples("test")]
         ranges = [(record["depth_min_mm"], record["depth_max_mm"]) for record in records if record.get("depth_max_mm")]
         low, high = (float(np.mean(ends)) for ends in zip(*ranges, strict=True))
-        normalised = subject.answers_normalised
-        scale = Scale(normalised, (low, high), renderer.rig.working_range_mm[0])
-        silhouettes = outlines_of(dataset, settings)
         masks = {outline: rectangle(renderer.shape, side) for outline, side in SIDES.items()} | silhouettes
-        poses = [
-            (outline, mask, *pose) for outline, mask in masks.items() for pose in poses_of(outline, settings.quick)
-        ]
-        planes = []
-        for outline, mask, tilt_deg, distance_m in poses:
-            planes.append(predict_plane(subject, renderer, scale, outline, mask, tilt_deg, distance_m))
-            progress(len(planes), len(poses), f"{outline}, {distance_m:g} m")
-        control = control_of(subject, dataset, renderer, list(silhouettes), scale)
-        rows, range_mm = [one.row for one in planes], [low, high] if normalised else None
-        values = {"planes": rows, "objects": control, "range_mm": range_mm, "collapse_below": scale.limit}
-        shown = {kind_of(one.row["outline"]): one for one in reversed(planes) if is_facing(one.row, PAPER_DISTANCE_M)}
-        return self.finding(
-            summary(rows, control, normalised), values, table(rows, normalised), draw(shown, normalised)
-        )
+        poses = [(outline, *pose) for outline in masks for pose in poses_of(outline, settings.quick)]
+        rows: list[Row] = []
+        shown: dict[str, tuple[Row, NDArray, NDArray]] = {}
+        for outline, tilt_deg, distance_m in poses:
+            surface = plane(renderer.rig, distance_m, tilt_deg, masks[outline])
+            lit, seen = renderer.light(surface), masks[outline].copy()
+            seen.ravel()[surface.pixels] &= lit.gain > 0  # no fringe beyond the projector's field
+            scene = Scene(surface, lit, seen, (0, "plane", ""))
+            frames = renderer.frames(scene, subject.frames_used)
+            prediction = subject.answer(frames)
+            values = prediction[seen].astype(np.float64)
+            millimetres = values * (high - low) + low if normalised else values
+            row = {
+                "outline": outline,
+                "distance_m": distance_m,
+                "tilt_deg": list(tilt_deg),
+                "pixels": int(seen.sum()),
+                "answer_mean": float(values.mean()),
+                "answer_min": float(values.min()),
+                "answer_max": float(values.max()),
+                "collapsed_share": float((values < limit).mean()),
+                "mean_mm": float(millimetres.mean()),
+                "mae_mm": float(np.abs(millimetres - scene.depth_mm[seen]).mean()),
+            }
+            rows.append(row)
+            if (tilt_deg, distance_m) == FACING:
+                shown.setdefault(kind_of(outline), (row, np.asarray(frames[subject.frames_used[0]]), prediction))
+            progress(len(rows), len(poses), f"{outline}, {distance_m:g} m")
+        control = control_of(subject, dataset, renderer, list(silhouettes), limit)
+        range_mm = [low, high] if normalised else None
+        content = {"planes": rows, "objects": control, "range_mm": range_mm, "collapse_below": limit}
+        drawn = draw([shown[kind] for kind in KINDS], normalised)
+        return Finding(summary(rows, shown[RECTANGLE][0], control, normalised), content, table(rows, normalised), drawn)
 
 
 def kind_of(outline: str) -> str:
@@ -113,29 +111,24 @@ def kind_of(outline: str) -> str:
     return outline if outline in SIDES else SILHOUETTE
 
 
-def is_facing(row: Row, distance_m: float) -> bool:
-    """Whether a plane faces the camera at a distance."""
-    return row["tilt_deg"] == [0.0, 0.0] and row["distance_m"] == distance_m
-
-
-def outlines_of(dataset: DatasetFolder, settings: probe.ProbeSettings) -> dict[str, NDArray[np.bool_]]:
-    """Silhouettes (H, W) of a test sample of each object, by sample."""
+def outlines_of(dataset: DatasetFolder, settings: ProbeSettings) -> dict[str, Mask]:
+    """Silhouettes (H, W) of a test sample of each object, by sample. Raises `DiagnosisError` without any."""
     first: dict[str, str] = {}
     for sample in dataset.samples("test"):
         first.setdefault(dataset.measured(sample)["object"], sample)
     names = settings.choose(list(first.values()), OUTLINES, QUICK_OUTLINES)
     masks = {name: object_mask(dataset.depth_mm(name)) for name in names}
+    if not any(mask.any() for mask in masks.values()):
+        raise DiagnosisError(f"{dataset.path}: split test holds no sample with an object, whose outline a plane gets")
     return {name: mask for name, mask in masks.items() if mask.any()}
 
 
 def poses_of(outline: str, quick: bool) -> list[tuple[tuple[float, float], float]]:
     """Tilts in degrees and distances in m of the planes with ``outline``."""
-    facing = outline in GROWING
-    tilts, distances = TILTS_DEG[: 1 if quick or facing else None], (PAPER_DISTANCE_M,) if facing else DISTANCES_M
-    return list(product(tilts, distances))
+    return [FACING] if outline in GROWING else list(product(TILTS_DEG[: 1 if quick else None], DISTANCES_M))
 
 
-def rectangle(shape: tuple[int, int], side: float) -> NDArray[np.bool_]:
+def rectangle(shape: tuple[int, int], side: float) -> Mask:
     """Mask of ``shape`` (H, W) of a central rectangle whose sides are the share ``side`` of the image's."""
     mask = np.zeros(shape, dtype=bool)
     down, across = (round(length * (1 - side) / 2) for length in shape)
@@ -143,61 +136,26 @@ def rectangle(shape: tuple[int, int], side: float) -> NDArray[np.bool_]:
     return mask
 
 
-def predict_plane(
-    subject: Subject,
-    renderer: SceneRenderer,
-    scale: Scale,
-    outline: str,
-    mask: NDArray[np.bool_],
-    tilt_deg: tuple[float, float],
-    distance_m: float,
-) -> PlanePrediction:
-    """A plane cut to ``mask`` (H, W), rendered and predicted (`Subject.answer`). Of its row: mean, least and largest
-    prediction in its own units, the share that collapsed to background, mean and error in mm; in float64."""
-    surface = plane(renderer.rig, distance_m, tilt_deg, mask)
-    lit, seen = renderer.light(surface), mask.copy()
-    seen.ravel()[surface.pixels] &= lit.gain > 0  # no fringe beyond the projector's field
-    frames = renderer.frames(Scene(surface.pixels.astype(np.uint32), lit, seen, STREAM), subject.frames_used)
-    prediction, true_mm = subject.answer(frames), surface.depth_mm(renderer.shape)[seen]
-    values = prediction[seen].astype(np.float64)
-    millimetres = scale.mm(values)
-    row = {
-        "outline": outline,
-        "distance_m": distance_m,
-        "tilt_deg": list(tilt_deg),
-        "pixels": int(seen.sum()),
-        "answer_mean": float(values.mean()),
-        "answer_min": float(values.min()),
-        "answer_max": float(values.max()),
-        "collapsed_share": float((values < scale.limit).mean()),
-        "mean_mm": float(millimetres.mean()),
-        "mae_mm": float(np.abs(millimetres - true_mm).mean()),
-    }
-    return PlanePrediction(row, np.asarray(frames[subject.frames_used[0]]), prediction)
-
-
 def control_of(
-    subject: Subject, dataset: DatasetFolder, renderer: SceneRenderer, samples: list[str], scale: Scale
+    subject: Subject, dataset: DatasetFolder, renderer: SceneRenderer, samples: list[str], limit: float
 ) -> dict[str, float]:
     """Share of the test objects' pixels that the subject predicts as background, and that are as near in truth."""
     shares = []
     for sample in samples:
-        unchanged = original(dataset, renderer, sample)
-        answer = subject.answer(renderer.frames(unchanged.scene, subject.frames_used))
-        true = unchanged.depth_mm[unchanged.target]
-        if scale.normalised:
+        scene = original(dataset, renderer, sample)
+        answer, true = subject.answer(renderer.frames(scene, subject.frames_used)), scene.depth_mm[scene.mask]
+        if subject.answers_normalised:
             true = (true - true.min()) / (float(np.ptp(true)) or MM_PER_M)
-        predicted = answer[unchanged.target].astype(np.float64)
-        shares.append([(values < scale.limit).mean() for values in (predicted, true)])
-    means = (float(np.mean(column)) for column in zip(*shares, strict=True))
-    return dict(zip(("collapsed_share", "collapsed_share_true"), means, strict=True))
+        shares.append([(values < limit).mean() for values in (answer[scene.mask].astype(np.float64), true)])
+    predicted, true_share = np.mean(shares, axis=0).tolist()
+    return {"collapsed_share": predicted, "collapsed_share_true": true_share}
 
 
-def summary(rows: Sequence[Row], control: Mapping[str, float], normalised: bool) -> str:
+def summary(rows: Sequence[Row], paper: Row, control: Mapping[str, float], normalised: bool) -> str:
     """The share that collapsed in each outline, and the prediction for the paper's rectangle."""
-    shares = {kind: [row["collapsed_share"] for row in rows if kind_of(row["outline"]) == kind] for kind in KINDS}
-    frame, rectangles, silhouettes = (float(np.mean(of_kind)) for of_kind in shares.values())
-    paper = next(row for row in rows if row["outline"] == RECTANGLE and is_facing(row, PAPER_DISTANCE_M))
+    frame, rectangles, silhouettes = (
+        np.mean([row["collapsed_share"] for row in rows if kind_of(row["outline"]) == kind]) for kind in KINDS
+    )
     unit = "of the range (paper: {answer_mean})".format(**PAPER) if normalised else "mm"
     return (
         f"Predicted as background: {rectangles:.0%} of a rectangular plane, {frame:.0%} of a plane that "
@@ -220,26 +178,19 @@ def table(rows: Sequence[Row], normalised: bool) -> Table:
     for row in rows:  # in the order of `SIDES`, then silhouettes
         across, down = row["tilt_deg"]
         poses[f"{kind_of(row['outline'])}, {row['distance_m']:g} m, tilt {across:g}, {down:g}"].append(row)
-    lines = {
-        pose: {key: float(np.mean([row[key] for row in same_pose])) for key in columns}
-        for pose, same_pose in poses.items()
-    }
+    lines = {pose: {key: float(np.mean([row[key] for row in same])) for key in columns} for pose, same in poses.items()}
     title = "Predictions for planes" + (", mm by the mean range of the test split" if normalised else "")
     return Table.of(title, "Outline, distance, tilt in degrees", lines, columns)
 
 
-def draw(shown: Mapping[str, PlanePrediction], normalised: bool) -> Figure:
+def draw(shown: Sequence[tuple[Row, NDArray, NDArray]], normalised: bool) -> Figure:
     """The paper's figure, input and prediction, for each outline at 1.8 m."""
     low, high, unit = (-0.2, 1.2, "share of range") if normalised else (0.0, 2400.0, "mm")
-    planes = [shown[kind] for kind in KINDS]
-    columns = [
-        "{outline}\n{answer_min:.4g} to {answer_max:.4g}, mean {answer_mean:.4g}".format(**one.row) for one in planes
-    ]
+    facts, frames, predictions = zip(*shown, strict=True)
+    columns = ["{outline}\n{answer_min:.4g} to {answer_max:.4g}, mean {answer_mean:.4g}".format(**row) for row in facts]
     rows = {
-        "fringes": [Picture(one.frame) for one in planes],
-        f"prediction,\n{low:g} to {high:g}\n{unit}": [
-            Picture(one.prediction, DEPTH_COLOURS, low, high) for one in planes
-        ],
+        "fringes": [Picture(frame) for frame in frames],
+        f"prediction,\n{low:g} to {high:g}\n{unit}": [Picture(one, DEPTH_COLOURS, low, high) for one in predictions],
     }
     alt = "Fringes on planes in three outlines, and the predictions"
     return Figure("Flat planes at 1.8 m", alt, gallery(rows, columns, 2.4))

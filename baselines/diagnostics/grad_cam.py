@@ -18,15 +18,19 @@ from captum.attr import LayerAttribution, LayerGradCam
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from fpp_ml_bench.baselines.diagnostics import probe
-from fpp_ml_bench.baselines.diagnostics.fits import edge_map
 from fpp_ml_bench.baselines.diagnostics.probe import (
     Figure,
+    Finding,
     Picture,
+    Probe,
+    ProbeSettings,
+    Progress,
     Table,
+    gallery,
     mean_of,
     with_interval,
 )
+from fpp_ml_bench.baselines.diagnostics.scenes import edge_map
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DiagnosisError
@@ -60,7 +64,7 @@ _LEAST_SPREAD = 1e-12
 _EXAMPLES = 3
 
 
-class GradCam(probe.Probe):
+class GradCam(Probe):
     """Heatmaps of the test split against edges and fringes, for the network and for random weights."""
 
     name = "grad-cam"
@@ -69,9 +73,7 @@ class GradCam(probe.Probe):
     without_network = "it has no gradient to follow"
     version = 3
 
-    def run(
-        self, subject: Subject, dataset: DatasetFolder, settings: probe.ProbeSettings, progress: probe.Progress
-    ) -> probe.Finding:
+    def run(self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, progress: Progress) -> Finding:
         samples = settings.choose(dataset.samples("test"), SAMPLES, QUICK_SAMPLES)
         if not samples:
             raise DiagnosisError(f"{dataset.path}: split test holds no sample, which Grad-CAM needs")
@@ -79,12 +81,11 @@ class GradCam(probe.Probe):
         subject = replace(subject, layer_names=cam_layers(subject))
         means = measure(subject, dataset, samples, seeds, progress)
         if means["average"][EDGES]["r"] is None:
-            return self.skip(
-                f"the heatmaps of every layer of {subject.name} ({', '.join(subject.layer_names)}) are constant."
-            )
+            layers = ", ".join(subject.layer_names)
+            return Finding(skipped=f"the heatmaps of every layer of {subject.name} ({layers}) are constant.")
         protocol = {"samples": len(samples), "seeds": seeds}
         drawn = _draw_heatmaps(subject, dataset, samples)
-        return self.finding(summary(means), {"protocol": protocol, **means}, table(means, len(samples)), drawn)
+        return Finding(summary(means), {"protocol": protocol, **means}, table(means, len(samples)), drawn)
 
 
 def cam_layers(subject: Subject) -> tuple[str, ...]:
@@ -131,11 +132,8 @@ def fringe_variation(grey: NDArray[np.uint8], period_px: float) -> Image:
 
 def correlation(first: NDArray, second: NDArray) -> float | None:
     """Pearson's r of two maps of the same shape over all pixels; None where either is constant."""
-    a, b = first.astype(np.float64).ravel(), second.astype(np.float64).ravel()
-    a, b = a - a.mean(), b - b.mean()
-    sizes = float(np.sqrt((a @ a) * (b @ b)))
-    scale = max(1.0, float(np.abs(first).max()) * float(np.abs(second).max())) * a.size
-    return None if sizes <= _LEAST_SPREAD * min(1.0, scale) else float(np.clip(a @ b / sizes, -1, 1))
+    a, b = (image.astype(np.float64).ravel() for image in (first, second))
+    return None if a.std() * b.std() * a.size <= _LEAST_SPREAD else float(np.corrcoef(a, b)[0, 1])
 
 
 def measure(
@@ -143,7 +141,7 @@ def measure(
     dataset: DatasetFolder,
     samples: Sequence[str],
     seeds: int,
-    progress: probe.Progress,
+    progress: Progress,
 ) -> dict[str, Any]:
     """`means_of` the correlations of every heatmap with both references, and of random weights' heatmaps with the
     trained ones."""
@@ -229,4 +227,4 @@ def _draw_heatmaps(subject: Subject, dataset: DatasetFolder, samples: Sequence[s
         rows[sample] = [Picture(np.asarray(image)) for image in maps]
         rows[sample] += [Picture(values[0], HEAT_COLOURS) for values in heat.values()]
     title, alt = "Heatmaps, each scaled to its own largest value", "Input, edges, fringes and Grad-CAM by layer"
-    return Figure(title, alt, probe.gallery(rows, ("input", EDGES, FRINGES, *subject.layer_names)))
+    return Figure(title, alt, gallery(rows, ("input", EDGES, FRINGES, *subject.layer_names)))

@@ -1,59 +1,92 @@
 """Linear probing (paper Section 7.1), extended by a linear probe, the phase and order as targets, and controls.
 
-Probes of two kinds (`fpp_ml_bench.baselines.diagnostics.fits`) are fitted to the layers of a network, of the same
-network with random weights, and to two controls: the raw input and the object's mask. Background has depth 0, so the
-mask alone explains much of an image's depth; therefore depth is measured on object pixels too.
+Probes of two kinds are fitted to the layers of a network, of the same network with random weights, and to two controls:
+the raw input and the object's mask. Background has depth 0, so the mask alone explains much of an image's depth;
+therefore depth is measured on object pixels too. *Linear probes* have a weight per channel, the same at every pixel (a
+1 x 1 convolution), in closed form. *Four-convolution probes* are the paper's, which gives only "four convolutional
+layers"; the other choices are ours. Both learn from the network's batches as they come, so no activations are stored.
 """
 
-from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, partial
-from typing import Any
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.nn import functional
 
-from fpp_ml_bench.baselines.diagnostics import fits, probe
-from fpp_ml_bench.baselines.diagnostics.fits import MEAN, OBJECT_DEPTH, SPATIAL, Source
 from fpp_ml_bench.baselines.diagnostics.probe import (
-    COLOURS,
-    TRAINED,
-    UNTRAINED,
     Figure,
+    Finding,
     Line,
     Panel,
+    Probe,
+    ProbeSettings,
+    Progress,
     Table,
     chart,
 )
-from fpp_ml_bench.baselines.diagnostics.subjects import Subject
+from fpp_ml_bench.baselines.diagnostics.scenes import truth
+from fpp_ml_bench.baselines.diagnostics.subjects import Subject, activations_of
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.style import INK, LINE_COLOURS
 
-PAPER = "linear_probing"
-SAMPLES, QUICK_SAMPLES, QUICK_EPOCHS = 120, 24, 4
-"""Training samples of the probes, and training samples and epochs of a quick run."""
+SAMPLES, QUICK_SAMPLES = 120, 24  # training samples of the probes
+EPOCHS, QUICK_EPOCHS = 6, 4
 SEEDS = 2
+BATCH = 4
 PIXELS = 1024  # pixels drawn with replacement from each sample: so many over the image, and as many within the object
-TITLES = {
-    "edges": "edges",
-    "depth": "depth, whole image",
-    OBJECT_DEPTH: "depth, object",
-    "distance": "depth in mm, object",
-    "phase": "wrapped phase",
-    "order": "fringe order",
-}
-CONTROLS, INPUT, SILHOUETTE = "controls", "input", "silhouette"
+SHARE, LONGEST = 4, 120
+"""Image px per grid step, and the most grid points along a side; for larger images the step grows."""
+RIDGE = 1e-6
+"""Ridge strength per pixel for standardised channels; it only makes constant or duplicate channels solvable."""
+WIDTH = 16
+LEARNING_RATE = 3e-3
+TRAINED, UNTRAINED, CONTROLS = "trained", "untrained", "controls"
+INPUT, SILHOUETTE = "input", "silhouette"
 CONTROL_TITLES = {INPUT: "raw input", SILHOUETTE: "object's mask alone"}
 """Controls, which are probed like layers: the raw input, and the object's mask (0 or 1)."""
-_STYLES = dict(zip(CONTROL_TITLES, (":", "-."), strict=True))
+OBJECT_DEPTH = "object_depth"  # depth on object pixels
 
+
+class Target(NamedTuple):
+    """What is read from a layer: its ``maps``, by the names in `truth`, and the mask ``where`` they are compared."""
+
+    title: str
+    maps: tuple[str, ...]
+    where: str = "object"
+
+
+Targets = Mapping[str, Target]
+LINEAR: Targets = {
+    "edges": Target("edges", ("edges",), "image"),
+    "depth": Target("depth, whole image", ("depth",), "image"),
+    OBJECT_DEPTH: Target("depth, object", ("depth",)),
+    "distance": Target("depth in mm, object", ("depth_mm",)),
+    "phase": Target("wrapped phase", ("sine", "cosine")),
+    "order": Target("fringe order", ("order",)),
+}
+"""Of the linear probes, each of which is fitted where it is compared; the phase is an angle and so has two maps."""
+COLOURS = {TRAINED: LINE_COLOURS[0], UNTRAINED: LINE_COLOURS[6]}
+FRINGE = ("phase", "order")  # of these, what needs fringes of a single direction
+SPATIAL: Targets = {name: LINEAR[name] for name in ("edges", "depth", OBJECT_DEPTH)}
+"""Of the four-convolution probes, which are trained on the maps of the whole image."""
+
+Image = NDArray[np.float32]
 Networks = Mapping[tuple[str, int], nn.Module]
 """By `TRAINED` or `UNTRAINED`, and the seed of the weights."""
+Source = tuple[str, int, str]
+"""What is probed: a network's name, the seed of its weights, and a layer."""
+MEAN: Source = CONTROLS, 0, "mean"  # predicting each target's mean over the training samples, the reference
+Maps = Mapping[Source, Tensor]
 Errors = dict[tuple[Source, str, int], list[float]]
 """Squared error of each validation sample, by what was probed, target and seed of the probe."""
 Score = dict[str, Any]
@@ -64,7 +97,7 @@ Scores = dict[str, dict[str, dict[str, Score]]]
 """By `TRAINED`, `UNTRAINED` or `CONTROLS`, then layer, then target."""
 
 
-class LinearProbing(probe.Probe):
+class LinearProbing(Probe):
     """Probes on frozen activations, trained on the training split and validated on the validation split."""
 
     name = "linear"
@@ -73,13 +106,11 @@ class LinearProbing(probe.Probe):
     without_network = "it has no layers to probe"
     version = 3
 
-    def run(
-        self, subject: Subject, dataset: DatasetFolder, settings: probe.ProbeSettings, progress: probe.Progress
-    ) -> probe.Finding:
+    def run(self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, progress: Progress) -> Finding:
         train = settings.choose(_samples_with_object(dataset, "train"), SAMPLES, QUICK_SAMPLES)
         validation = settings.choose(_samples_with_object(dataset, "validation"))
         seeds = settings.seeds or (1 if settings.quick else SEEDS)
-        epochs = QUICK_EPOCHS if settings.quick else fits.EPOCHS
+        epochs = QUICK_EPOCHS if settings.quick else EPOCHS
         total, done = (len(train) + len(validation)) * 2 + epochs * len(train), 0
 
         def tick(samples: int, activity: str) -> None:
@@ -89,20 +120,16 @@ class LinearProbing(probe.Probe):
 
         network, untrained = subject.networks()
         networks = {(TRAINED, 0): network} | {(UNTRAINED, seed): untrained(seed) for seed in range(seeds)}
-        fringe = subject.direction != "both"
-        measured = {name: maps for name, maps in fits.LINEAR.items() if fringe or name not in fits.FRINGE}
-        pixels = Pixels(subject, dataset, tick)
-        linear = scores(errors_of(fits.LinearProbes(measured), pixels, networks, train, validation), validation)
+        targets = {name: one for name, one in LINEAR.items() if subject.direction != "both" or name not in FRINGE}
+        linear = scores(LinearProbes(subject, dataset, targets, tick).errors(networks, train, validation), validation)
         # A linear probe of constant features is the mean itself.
         if not any(target["r2"] for layer in linear[TRAINED].values() for target in layer.values()):
             layers = ", ".join(subject.layer_names)
-            return self.skip(f"every probed layer of {subject.name} ({layers}) is constant, so it holds nothing.")
+            return Finding(skipped=f"every probed layer of {subject.name} ({layers}) is constant, so it holds nothing.")
         # Each seed of the untrained network costs another forward pass per batch, so there is one.
         first = {key: one for key, one in networks.items() if key[1] == 0}
-        counts = {TRAINED: seeds, CONTROLS: seeds, UNTRAINED: 1}
-        probes = fits.ConvolutionProbes(SPATIAL, counts, epochs * -(-len(train) // fits.BATCH))
-        grid = Grid(subject, dataset, tick)
-        spatial = scores(errors_of(probes, grid, first, train, validation, epochs), validation)
+        probes = ConvolutionProbes(subject, dataset, SPATIAL, tick, seeds, epochs)
+        spatial = scores(probes.errors(first, train, validation), validation)
         protocol = {
             "training_samples": len(train),
             "validation_samples": len(validation),
@@ -110,7 +137,7 @@ class LinearProbing(probe.Probe):
             "epochs": epochs,
         }
         values = {"protocol": protocol, "four_convolutions": spatial, "linear": linear}
-        return self.finding(summary(linear, spatial), values, table(spatial), figure(linear))
+        return Finding(summary(linear, spatial), values, table(spatial), figure(linear))
 
 
 def _samples_with_object(dataset: DatasetFolder, split: str) -> list[str]:
@@ -120,59 +147,125 @@ def _samples_with_object(dataset: DatasetFolder, split: str) -> list[str]:
     return names
 
 
-class View(ABC):
-    """Where activations and true maps are looked at; ``batch``: samples at once, None for as many as the subject's.
-    ``tick`` is called with the number of samples just looked at and the activity."""
+def at_size(features: Tensor, side: tuple[int, int]) -> Tensor:
+    """Activations (B, C, h, w) resized to a new tensor ``(B, C, *side)``: area means to shrink, bilinear to enlarge."""
+    if features.shape[2] >= side[0] and features.shape[3] >= side[1]:
+        return functional.adaptive_avg_pool2d(features, side)
+    return functional.interpolate(features, size=side, mode="bilinear", align_corners=False)
 
-    batch: int | None = None
 
-    def __init__(self, subject: Subject, dataset: DatasetFolder, tick: Callable[[int, str], None]) -> None:
-        self.subject, self.dataset, self.tick = subject, dataset, tick
-        self._targets: dict[str, dict[str, Tensor]] = {}
+def at_pixels(features: Tensor, pixels: Tensor, size: tuple[int, int]) -> Tensor:
+    """Activations (B, C, h, w) at ``pixels`` (B, P), flat indices into an image of ``size``: (B, C, 1, P); those of
+    layers of another size are interpolated bilinearly between their pixel centres."""
+    if tuple(features.shape[2:]) == size:
+        return features.flatten(2).gather(2, pixels[:, None].expand(-1, features.shape[1], -1))[:, :, None]
+    rows, columns = pixels // size[1], pixels % size[1]
+    position = torch.stack([(2 * columns + 1) / size[1] - 1, (2 * rows + 1) / size[0] - 1], dim=-1).to(features.dtype)
+    return functional.grid_sample(features, position[:, None], "bilinear", "border", align_corners=False)
 
-    @abstractmethod
-    def reduce(self, maps: Tensor, names: Sequence[str]) -> Tensor:
-        """Maps (B, C, H, W) of the samples ``names`` there, in a new tensor."""
 
-    @abstractmethod
-    def masks(self, share: Tensor) -> tuple[Tensor, Tensor]:
-        """The places over the image and those within the object, whose mask is ``share`` there, (1, 1, h, w)."""
+class NormalEquations:
+    """Sums of products of N observations of C features and T targets, float64."""
 
-    def targets(self, name: str) -> dict[str, Tensor]:
-        """The true maps of a sample there and both masks, (1, 1, h, w); kept."""
-        if name not in self._targets:
-            direction = "horizontal" if self.subject.direction == "both" else self.subject.direction
-            truth = fits.truth(self.dataset.depth_mm(name), self.dataset.rig, direction)
-            maps = {key: self.reduce(torch.from_numpy(one)[None, None], [name]) for key, one in truth.items()}
-            maps["image"], maps["object"] = self.masks(maps["object"])
-            self._targets[name] = maps
-        return self._targets[name]
+    def __init__(self, features: int, targets: int) -> None:
+        self.count = 0
+        self.inner = torch.zeros(features + 1, features + 1, dtype=torch.float64)
+        self.cross = torch.zeros(features + 1, targets, dtype=torch.float64)
+
+    def add(self, features: Tensor, targets: Tensor) -> None:
+        """Add observations (N, C) and their targets (N, T)."""
+        augmented = functional.pad(features.double(), (0, 1), value=1.0)
+        self.count += len(augmented)
+        self.inner += augmented.T @ augmented
+        self.cross += augmented.T @ targets.double()
+
+    @property
+    def target_mean(self) -> Tensor:
+        """Mean of the targets, (T,)."""
+        return self.cross[-1] / self.count
+
+    def standard(self, least_spread: float = 1e-9) -> tuple[Tensor, Tensor]:
+        """Mean and 1 / standard deviation of each feature, (C,); 0 for a constant one, which removes it. Constant: its
+        spread is below ``least_spread``, relative to 1 plus its mean."""
+        mean = self.inner[-1, :-1] / self.count
+        spread = (self.inner.diagonal()[:-1] / self.count - mean * mean).clamp(min=0).sqrt()
+        return mean, torch.where(spread > least_spread * (1 + mean.abs()), 1 / spread, torch.zeros_like(spread))
+
+    def solve(self, strength: float = RIDGE) -> Tensor:
+        """Weights (C + 1, T) float64, the last row the bias, of least squared error plus ``strength`` times N times
+        the squared weights of standardised features; the bias is free."""
+        (mean, factor), target = self.standard(), self.target_mean
+        inner = (self.inner[:-1, :-1] / self.count - torch.outer(mean, mean)) * torch.outer(factor, factor)
+        cross = (self.cross[:-1] / self.count - torch.outer(mean, target)) * factor[:, None]
+        inner.diagonal().add_(strength)
+        weight = torch.linalg.solve(inner, cross) * factor[:, None]
+        return torch.cat([weight, (target - mean @ weight)[None]])
+
+
+def apply(weights: Tensor, features: Tensor) -> Tensor:
+    """Predictions (..., T) float64 of a solved probe for features (..., C)."""
+    return functional.pad(features.double(), (0, 1), value=1.0) @ weights
+
+
+class LinearProbes:
+    """Probes of all ``targets`` for all sources together: a weight per channel, the same at every pixel. They see
+    pixels drawn from each sample over the image and then within its object, the same for every network, as maps
+    (B, C, 1, 2 P). ``tick`` is called with the number of samples just looked at and the activity."""
+
+    batch: int | None = None  # samples at once, None for as many as the subject's
+    epochs = 0
+
+    def __init__(
+        self, subject: Subject, dataset: DatasetFolder, targets: Targets, tick: Callable[[int, str], None]
+    ) -> None:
+        self.subject, self.dataset, self.targets, self.tick = subject, dataset, targets, tick
+        self.maps = list(dict.fromkeys(name for target in targets.values() for name in target.maps))
+        self.equations: dict[tuple[Source, str], NormalEquations] = {}
+
+    def errors(self, networks: Networks, train: Sequence[str], validation: Sequence[str]) -> Errors:
+        """Errors on the samples ``validation`` of probes that are fitted to the samples ``train``, and `MEAN`'s."""
+        for features, true in self.batches(networks, train, "statistics of the activations"):
+            self.observe(features, true)
+        self.start(len(train))
+        for epoch in range(self.epochs):
+            shuffled = [train[index] for index in np.random.default_rng([1, epoch]).permutation(len(train))]
+            for features, true in self.batches(networks, shuffled, "training probes"):
+                self.step(features, true)
+        errors: Errors = defaultdict(list)
+        for features, true in self.batches(networks, validation, "validating probes"):
+            for key, sample_errors in self.errors_of_batch(features, true).items():
+                errors[key] += sample_errors
+        return errors
 
     def batches(
         self, networks: Networks, samples: Sequence[str], activity: str
     ) -> Iterator[tuple[dict[Source, Tensor], dict[str, Tensor]]]:
-        """The controls and the activations of every layer, and the targets."""
+        """The controls and the activations of every layer (B, C, h, w), and the true maps and masks (B, 1, h, w)."""
         for names, fringe in self.subject.batches(self.dataset, samples, self.batch):
             reduce = partial(self.reduce, names=names)
             masks = np.stack([[object_mask(self.dataset.depth_mm(name))] for name in names], dtype=np.float32)
             images = {INPUT: fringe, SILHOUETTE: torch.from_numpy(masks)}
             features = {(CONTROLS, 0, name): reduce(image) for name, image in images.items()}
-            for (name, seed), network in networks.items():
+            for network_key, network in networks.items():
                 layers = self.subject.layers_of(network)
-                found = fits.activations_of(network, layers, fringe, reduce, self.subject.name)
-                features |= {(name, seed, layer): found[layer] for layer in layers}
-            targets = [self.targets(name) for name in names]
-            yield features, {key: torch.cat([one[key] for one in targets]) for key in targets[0]}
+                found = activations_of(network, layers, fringe, reduce, self.subject.name)
+                features |= {(*network_key, layer): activations for layer, activations in found.items()}
+            true = [self.true_maps(name) for name in names]
+            yield features, {key: torch.cat([maps[key] for maps in true]) for key in true[0]}
             self.tick(len(names), activity)
 
-
-class Pixels(View):
-    """Pixels drawn from each sample over the image and then within its object, the same for every network, as maps
-    (B, C, 1, 2 P)."""
+    @cache  # noqa: B019
+    def true_maps(self, name: str) -> dict[str, Tensor]:
+        """The true maps of a sample where probes look, with the masks ``image`` and ``object``, (1, 1, h, w); kept."""
+        direction = "horizontal" if self.subject.direction == "both" else self.subject.direction
+        maps = truth(self.dataset.depth_mm(name), self.dataset.rig, direction)
+        reduced = {key: self.reduce(torch.from_numpy(one)[None, None], [name]) for key, one in maps.items()}
+        reduced["image"], reduced["object"] = self.masks(reduced["object"])
+        return reduced
 
     @cache  # noqa: B019
     def drawn(self, name: str) -> Tensor:
-        """Flat indices of the pixels, (2 P,)."""
+        """Flat indices of a sample's pixels, (2 P,)."""
         split = self.dataset.split_of_sample(name)
         rng = np.random.default_rng([list(self.dataset.splits).index(split), self.dataset.samples(split).index(name)])
         mask = object_mask(self.dataset.depth_mm(name))
@@ -180,50 +273,143 @@ class Pixels(View):
         return torch.from_numpy(np.concatenate([over_image, inside[rng.integers(inside.size, size=PIXELS)]]))
 
     def reduce(self, maps: Tensor, names: Sequence[str]) -> Tensor:
-        pixels = torch.stack([self.drawn(name) for name in names])
-        return fits.at_pixels(maps, pixels, self.subject.image_size).transpose(1, 2)[:, :, None]
+        """Maps (B, C, H, W) of the samples ``names`` where probes look, in a new tensor."""
+        return at_pixels(maps, torch.stack([self.drawn(name) for name in names]), self.subject.image_size)
 
     def masks(self, share: Tensor) -> tuple[Tensor, Tensor]:
+        """The places over the image and those within the object, whose mask is ``share`` there, (1, 1, h, w)."""
         within = (torch.arange(2 * PIXELS) >= PIXELS).float().expand_as(share)
         return 1 - within, within
 
+    def observe(self, features: Maps, true: Mapping[str, Tensor]) -> None:
+        """Take in a batch, as of `batches`."""
+        wanted = torch.cat([true[name] for name in self.maps], dim=1)
+        for (source, maps), where in product(features.items(), ("image", "object")):
+            inside = true[where][:, 0] > 0
+            if (source, where) not in self.equations:
+                self.equations[source, where] = NormalEquations(maps.shape[1], len(self.maps))
+            self.equations[source, where].add(*(of.movedim(1, -1)[inside] for of in (maps, wanted)))
 
-class Grid(View):
-    """The coarse grid of the four-convolution probes, (B, C, h, w)."""
+    def columns(self, name: str) -> list[int]:
+        """Places of a target's maps among all."""
+        return [self.maps.index(one) for one in self.targets[name].maps]
 
-    batch = fits.BATCH
+    def mean(self, name: str) -> Tensor:
+        """Mean (T, 1, 1) of the maps of a target."""
+        place = self.targets[name].where
+        means = next(equations for (_, where), equations in self.equations.items() if where == place).target_mean
+        return means[self.columns(name)][:, None, None]
+
+    def start(self, samples: int) -> None:
+        """When all training samples, so many, were observed."""
+        self.weights = {key: equations.solve() for key, equations in self.equations.items()}
+
+    def step(self, features: Maps, true: Mapping[str, Tensor]) -> None:
+        """One training step on a batch, as of `batches`; none for a closed form."""
+
+    def predictions(self, features: Maps, name: str) -> dict[tuple[Source, int], Tensor]:
+        """The maps (B, T, h, w) of a target, by source and seed of the probe."""
+        columns, where = self.columns(name), self.targets[name].where
+        return {
+            (source, 0): apply(self.weights[source, where][:, columns], maps.movedim(1, -1)).movedim(-1, 1)
+            for source, maps in features.items()
+        }
+
+    @torch.no_grad()
+    def errors_of_batch(self, features: Maps, true: Mapping[str, Tensor]) -> Errors:
+        """Mean squared error on each sample of a batch, by source, target, and seed; with `MEAN`'s."""
+        errors = {}
+        for name, target in self.targets.items():
+            maps, mask = torch.cat([true[one] for one in target.maps], dim=1).double(), true[target.where]
+            for (source, seed), predicted in {(MEAN, 0): self.mean(name), **self.predictions(features, name)}.items():
+                square = (predicted - maps).square().mean(1, keepdim=True) * mask
+                errors[source, name, seed] = (square.sum((1, 2, 3)) / mask.sum((1, 2, 3))).tolist()
+        return errors
+
+
+def grid_of(size: tuple[int, int]) -> tuple[int, int]:
+    """Grid points (h, w) for images of ``size``: one for 4 x 4 px up to 480 px, for 8 x 8 px at 960."""
+    step = max(SHARE, -(-max(size) // LONGEST))
+    return max(1, size[0] // step), max(1, size[1] // step)
+
+
+class ConvolutionProbe(nn.Module):
+    """Four convolutions from activations (B, C, h, w) to a target (B, 1, h, w); untrained they give ``target_mean``.
+    The first is narrow so that layers of 8 and of 1024 channels get probes of similar capacity. The receptive field is
+    5 x 5 grid points."""
+
+    def __init__(self, observed: NormalEquations, target_mean: float) -> None:
+        super().__init__()
+        self.mean, self.factor = (part.float()[:, None, None] for part in observed.standard(1e-6))
+        self.body = nn.Sequential(
+            nn.Conv2d(len(self.mean), WIDTH, 1),
+            nn.ReLU(),
+            nn.Conv2d(WIDTH, WIDTH, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(WIDTH, WIDTH, 3, padding=1),
+            nn.ReLU(),
+            nn.Conv2d(WIDTH, 1, 1),
+        )
+        last = self.body[-1]
+        nn.init.zeros_(last.weight)  # type: ignore[arg-type]
+        nn.init.constant_(last.bias, target_mean)  # type: ignore[arg-type]
+
+    def forward(self, features: Tensor) -> Tensor:
+        return self.body((features - self.mean) * self.factor)
+
+
+class ConvolutionProbes(LinearProbes):
+    """Four-convolution probes on a coarse grid (B, C, h, w), trained together with Adam and cosine decay over
+    ``epochs``; ``seeds``: how many each layer gets, of random weights one."""
+
+    batch = BATCH
+
+    def __init__(
+        self,
+        subject: Subject,
+        dataset: DatasetFolder,
+        targets: Targets,
+        tick: Callable[[int, str], None],
+        seeds: int,
+        epochs: int,
+    ) -> None:
+        super().__init__(subject, dataset, targets, tick)
+        self.seeds, self.epochs = seeds, epochs
+        self.probes: dict[tuple[Source, str, int], ConvolutionProbe] = {}
 
     def reduce(self, maps: Tensor, names: Sequence[str]) -> Tensor:
-        (height, width), step = self.subject.image_size, fits.grid_step(self.subject.image_size)
-        return fits.at_size(maps, (max(1, height // step), max(1, width // step)))
+        return at_size(maps, grid_of(self.subject.image_size))
 
     def masks(self, share: Tensor) -> tuple[Tensor, Tensor]:
         # Cells across the outline mix depth with background; of a tiny object those with the largest share count.
         return torch.ones_like(share), (share == share.max()).float()
 
+    def start(self, samples: int) -> None:
+        for (source, where), target in product(self.equations, self.maps):
+            seeds = 0 if where == "object" else 1 if source[0] == UNTRAINED else self.seeds
+            for seed in range(seeds):
+                with torch.random.fork_rng(devices=[]):
+                    torch.manual_seed(seed)
+                    probe = ConvolutionProbe(self.equations[source, where], float(self.mean(target)))
+                self.probes[source, target, seed] = probe
+        parameters = [parameter for probe in self.probes.values() for parameter in probe.parameters()]
+        self._optimiser = torch.optim.Adam(parameters, lr=LEARNING_RATE, foreach=True)
+        steps = max(1, self.epochs * -(-samples // BATCH))
+        self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._optimiser, steps)
 
-def errors_of(
-    probes: fits.Probes,
-    view: View,
-    networks: Networks,
-    train: Sequence[str],
-    validation: Sequence[str],
-    epochs: int = 0,
-) -> Errors:
-    """Errors on the samples ``validation`` of ``probes`` that observe the samples ``train``, then are trained on them
-    for ``epochs``, and those of `MEAN`."""
-    for features, targets in view.batches(networks, train, "statistics of the activations"):
-        probes.observe(features, targets)
-    probes.start()
-    for epoch in range(epochs):
-        shuffled = [train[index] for index in np.random.default_rng([1, epoch]).permutation(len(train))]
-        for features, targets in view.batches(networks, shuffled, "training probes"):
-            probes.step(features, targets)
-    errors: Errors = defaultdict(list)
-    for features, targets in view.batches(networks, validation, "validating probes"):
-        for key, sample_errors in probes.errors(features, targets).items():
-            errors[key] += sample_errors
-    return errors
+    def step(self, features: Maps, true: Mapping[str, Tensor]) -> None:
+        self._optimiser.zero_grad(set_to_none=True)
+        for (source, target, _), probe in self.probes.items():
+            # One backward pass per probe: a graph of all probes would hold every intermediate map at once.
+            functional.mse_loss(probe(features[source]), true[target]).backward()
+        self._optimiser.step()
+        self._schedule.step()
+
+    def predictions(self, features: Maps, name: str) -> dict[tuple[Source, int], Tensor]:
+        (target,) = self.targets[name].maps
+        return {
+            (source, seed): probe(features[source]) for (source, of, seed), probe in self.probes.items() if of == target
+        }
 
 
 def scores(errors: Errors, validation: Sequence[str]) -> Scores:
@@ -288,20 +474,23 @@ def summary(linear: Scores, spatial: Scores) -> str:
 def table(spatial: Scores) -> Table:
     """The paper's table, with its ratio of depth's MSE to edges', and the same probes as shares of variance."""
     trained = spatial[TRAINED]
-    groups = {layer: {layer: targets} for layer, targets in trained.items()}
-    groups |= {"average": trained, "average, random weights": spatial[UNTRAINED]}
-    groups |= {CONTROL_TITLES[name]: {name: targets} for name, targets in spatial[CONTROLS].items()}
-    rows: dict[str, dict[str, Any]] = {}
-    for name, layers in groups.items():
-        rows[name] = {f"mse {key}": mean_over(layers, key, "mse") for key in SPATIAL}
-        for key in SPATIAL:
-            interval = layers[name][key]["r2_interval"] if name in layers else None
-            rows[name][f"r2 {key}"] = {"r": mean_over(layers, key), "interval": interval}
+
+    def row(layers: Mapping[str, Mapping[str, Score]], layer: str | None = None) -> dict[str, Any]:
+        """Means over ``layers``, with the interval of a ``layer``."""
+        mse = {f"mse {key}": mean_over(layers, key, "mse") for key in SPATIAL}
+        intervals = {key: layers[layer][key]["r2_interval"] if layer else None for key in SPATIAL}
+        r2 = {f"r2 {key}": {"r": mean_over(layers, key), "interval": ends} for key, ends in intervals.items()}
+        return {**mse, **r2}
+
+    rows = {layer: row({layer: targets}, layer) for layer, targets in trained.items()}
+    rows |= {"average": row(trained), "average, random weights": row(spatial[UNTRAINED])}
+    rows |= {CONTROL_TITLES[name]: row({name: targets}) for name, targets in spatial[CONTROLS].items()}
     rows["predicting the mean"] = {f"mse {key}": mean_over(trained, key, "mse_of_mean") for key in SPATIAL}
-    for row in rows.values():
-        row["ratio"] = row["mse depth"] / row["mse edges"]
-    columns = {f"mse {key}": f"MSE, {TITLES[key]}" for key in SPATIAL} | {"ratio": "Ratio depth / edges"}
-    columns |= {f"r2 {key}": f"R2, {TITLES[key]}" for key in SPATIAL}
+    for numbers in rows.values():
+        numbers["ratio"] = numbers["mse depth"] / numbers["mse edges"]
+    columns = {f"mse {key}": f"MSE, {target.title}" for key, target in SPATIAL.items()}
+    columns |= {"ratio": "Ratio depth / edges"}
+    columns |= {f"r2 {key}": f"R2, {target.title}" for key, target in SPATIAL.items()}
     return Table.of("Four-convolution probes on the validation samples", "Layer", rows, columns)
 
 
@@ -311,16 +500,16 @@ def figure(linear: Scores) -> Figure:
     panels, layers = [], list(linear[TRAINED])
     for target in linear[CONTROLS][INPUT]:
         lines = []
-        for label, source, colour, style, ends in (
-            ("trained", TRAINED, COLOURS[target], "o-", "r2_interval"),
-            ("random weights", UNTRAINED, COLOURS["random"], "s--", "seeds"),
+        for label, network, style, ends in (
+            ("trained", TRAINED, "o-", "r2_interval"),
+            ("random weights", UNTRAINED, "s--", "seeds"),
         ):
-            scores = [linear[source][layer][target] for layer in layers]
+            scores = [linear[network][layer][target] for layer in layers]
             values, intervals = ([one[key] for one in scores] for key in ("r2", ends))
-            lines.append(Line(label, layers, values, colour, style, intervals))
-        for control, title in CONTROL_TITLES.items():
+            lines.append(Line(label, layers, values, COLOURS[network], style, intervals))
+        for (control, title), style in zip(CONTROL_TITLES.items(), (":", "-."), strict=True):
             level = [linear[CONTROLS][control][target]["r2"]] * len(layers)
-            lines.append(Line(title, layers, level, COLOURS["ink"], _STYLES[control]))
-        panels.append(Panel(TITLES[target], lines, {"ylabel": "R2", "ylim": (-0.1, 1.02)}))
+            lines.append(Line(title, layers, level, INK, style))
+        panels.append(Panel(LINEAR[target].title, lines, {"ylabel": "R2", "ylim": (-0.1, 1.02)}))
     alt = "R2 of linear probes by layer, a panel for each target, with random weights and controls"
     return Figure("Linear (1 x 1) probes by layer and target", alt, chart(panels, 3, (4.4, 3.0)))

@@ -1,19 +1,33 @@
-"""What all probes share: their base class, settings and results, their names, and how figures are drawn.
+"""What all probes share: their base class, settings and results, how these are stored, drawn and reported.
 
-A probe gives rows for tables, and lines or pictures for figures; `chart` and `gallery` draw them in one style.
-Importing this module imports neither numpy nor matplotlib, so that the command line can name the probes.
+A `Subject` is the model that is diagnosed, a `Probe` is one test of it, and a `Finding` is the probe's result;
+`diagnose` puts them on one page, which loads nothing, and into a JSON file. A probe gives rows for tables, and lines or
+pictures for figures; `chart` and `gallery` draw them in one style.
 """
 
 from __future__ import annotations
 
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from hashlib import sha256
 from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from fpp_ml_bench import __version__
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.style import FRAME_COLOURS, GRID, figure, figure_png, styled
+from fpp_ml_bench.evaluation.result.file import write_json
+from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, read_json, write_atomically
+from fpp_ml_bench.machine import describe_hardware
+from fpp_ml_bench.options import did_you_mean
+from fpp_ml_bench.style import FRAME_COLOURS, GRID, data_uri, figure, figure_png, page, styled
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -21,9 +35,18 @@ if TYPE_CHECKING:
     from fpp_ml_bench.baselines.diagnostics.subjects import Subject
     from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
-TRAINED, UNTRAINED = "trained", "untrained"
-Cell = str | int | float | Sequence[float] | Mapping[str, Any] | None
-"""Of a table. A pair is a range, and a mapping a value ``r`` with its ``interval``."""
+JSON_FILE, REPORT_FILE = "diagnose.json", "index.html"
+FORMAT_VERSION = 2
+_PACKAGES = ("numpy", "torch", "captum")
+_STYLE = """
+.drawn img { display: block; width: 100%; min-width: 34rem; background: #fff; border-radius: 6px; }
+.question { font-style: italic; color: var(--soft); }
+figure + .scroll, .scroll + .scroll { margin-top: 1.25rem; }
+.dense td:first-child { text-align: left; white-space: normal; min-width: 6.5rem; }
+.dense th:first-child { text-align: left; }
+ul.short { padding-left: 1.1rem; max-width: 46rem; }
+ul.short li { margin: .5rem 0; }
+"""
 Progress = Callable[[int, int, str], None]
 """Called by a running probe with the steps done, their total, and the activity."""
 
@@ -35,18 +58,12 @@ def silent(*progress: object) -> None:
 @dataclass(frozen=True)
 class ProbeSettings:
     """How much a probe measures; None means the probe's default. ``samples``: most samples of each split, taken evenly
-    over it (`spread`). ``seeds``: repeats of what depends on random numbers. ``quick``: a short run for a first look.
-    Raises `DiagnosisError` for a number below 1."""
+    over it (`spread`). ``seeds``: repeats of what depends on random numbers. ``quick``: a short run for a first
+    look."""
 
     samples: int | None = None
     seeds: int | None = None
     quick: bool = False
-
-    def __post_init__(self) -> None:
-        for name in ("samples", "seeds"):
-            value = getattr(self, name)
-            if value is not None and value < 1:
-                raise DiagnosisError(f"{name}: expected 1 or more, got {value}")
 
     def choose(self, names: Sequence[str], usual: int | None = None, quick: int | None = None) -> list[str]:
         """At most ``samples`` of ``names``, by default ``usual``, or ``quick`` of them in a quick run."""
@@ -62,8 +79,6 @@ def spread(names: Sequence[str], limit: int | None) -> list[str]:
 
 def mean_of(values: Iterable[float | None]) -> float | None:
     """Mean of ``values`` other than None; None where there are none."""
-    import numpy as np
-
     defined = [value for value in values if value is not None]
     return float(np.mean(defined)) if defined else None
 
@@ -80,13 +95,22 @@ class Table:
 
     title: str
     header: Sequence[str]
-    rows: Sequence[Sequence[Cell]]
+    rows: Sequence[Sequence[str | float | None]]
 
     @classmethod
     def of(cls, title: str, first: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> Table:
-        """The named ``rows``; ``columns``: titles by the keys of what a row shows, and a dash where it lacks a key."""
-        cells = [(name, *(row.get(key) for key in columns)) for name, row in rows.items()]
-        return cls(title, (first, *columns.values()), cells)
+        """The named ``rows``; ``columns``: titles by the keys of what a row shows, and a dash where it lacks a key. A
+        mapping is a value ``r`` with its ``interval``."""
+        cells = [[name, *(row.get(key) for key in columns)] for name, row in rows.items()]
+        text = [[with_interval(c["r"], c["interval"]) if isinstance(c, Mapping) else c for c in row] for row in cells]
+        return cls(title, (first, *columns.values()), text)
+
+    def cells(self) -> list[list[str]]:
+        """The rows as text, a dash for None."""
+        return [
+            ["-" if c is None else f"{c:.4g}" if isinstance(c, float) else printable(c, 500) for c in row]
+            for row in self.rows
+        ]
 
 
 @dataclass(frozen=True)
@@ -103,9 +127,7 @@ class Finding:
     """The result of a probe: ``summary`` in one or two sentences, ``values`` for JSON, with None instead of NaN.
     ``skipped``: why the probe does not apply to this subject; then the other fields are empty."""
 
-    probe: str
-    title: str
-    summary: str
+    summary: str = ""
     values: Mapping[str, Any] = field(default_factory=dict)
     table: Table | None = None
     figure: Figure | None = None
@@ -133,14 +155,6 @@ class Probe(ABC):
     def run(self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, progress: Progress) -> Finding:
         """Measure ``subject``."""
 
-    def skip(self, reason: str) -> Finding:
-        """Why this probe has no result."""
-        return Finding(self.name, self.title, "", skipped=reason)
-
-    def finding(self, summary: str, values: Mapping[str, Any], table: Table, figure: Figure) -> Finding:
-        """The result of this probe."""
-        return Finding(self.name, self.title, summary, values, table, figure)
-
 
 PROBES = {
     "linear": "LinearProbing",
@@ -160,17 +174,151 @@ def make_probe(name: str) -> Probe:
     return probe
 
 
-COLOURS = {
-    "edges": "#2e8b57",
-    "depth": "#c0392b",
-    "object_depth": "#e08e79",
-    "distance": "#c0392b",
-    "phase": "#1b5bb8",
-    "order": "#8a4b00",
-    "random": "#9aa3ad",
-    "ink": "#191c20",
-}
-"""Colours of the targets, edges and depth as in the paper's figure; of the raw input, of random weights, of text."""
+def checked_names(names: Sequence[str]) -> tuple[str, ...]:
+    """``names``, each once, in the report's order; all probes if empty. Raises `DiagnosisError` for an unknown name."""
+    for name in names:
+        if name not in PROBES:
+            raise DiagnosisError(f"unknown probe {name!r}; {did_you_mean(name, PROBES)}")
+    return tuple(name for name in PROBES if not names or name in names)
+
+
+@dataclass(frozen=True)
+class ProbeResult:
+    """A finding, its seconds, and whether it was ``reused`` from an earlier run."""
+
+    probe: Probe
+    finding: Finding
+    seconds: float
+    reused: bool
+
+
+def diagnose(
+    subject: Subject,
+    dataset: DatasetFolder,
+    probe_names: Sequence[str],
+    settings: ProbeSettings,
+    out: Path,
+    progress: Callable[[Probe], Progress],
+    command: str = "",
+) -> list[ProbeResult]:
+    """Run the probes ``probe_names`` (all if empty) and write ``out/index.html`` and ``out/diagnose.json``; all results
+    in the report's order. A finding in ``out`` is reused if subject, dataset, settings and the probe's version are the
+    same; those of other probes join the report. ``progress`` is called with a probe before it runs. The report quotes
+    ``command``. Raises `DiagnosisError` if ``out`` holds other files or another process is at it, and errors of probes;
+    earlier findings stay."""
+    _prepare(out)
+    with exclusive(out / LOCK_FILE, out, "writing a report there", DiagnosisError):
+        selected = checked_names(probe_names)
+        results, nothing = [], cache(lambda: subject.predicts_nothing(dataset))
+        for name in PROBES:
+            if name not in selected and not (out / f"{name}.json").is_file():
+                continue
+            probe = make_probe(name)
+            key = finding_key(probe, subject, dataset, settings)
+            if stored := load_finding(out, name, key):
+                results.append(ProbeResult(probe, *stored, reused=True))
+            elif name in selected:
+                started = perf_counter()
+                if reason := probe.applies_to(subject) or (nothing() if probe.asks_subject else None):
+                    finding = Finding(skipped=reason)
+                else:
+                    finding = probe.run(subject, dataset, settings, progress(probe))
+                seconds = round(perf_counter() - started, 2)
+                save_finding(out, name, key, finding, seconds)
+                results.append(ProbeResult(probe, finding, seconds, reused=False))
+        context = _context(subject, dataset, settings, command)
+        findings = {
+            one.probe.name: {"seconds": one.seconds, "title": one.probe.title}
+            | {key: getattr(one.finding, key) for key in ("summary", "skipped", "values")}
+            for one in results
+        }
+        content = {"format": "fpp-ml-bench diagnosis", "version": FORMAT_VERSION, **context, "findings": findings}
+        write_json(content, out / JSON_FILE)
+        write_atomically(out / REPORT_FILE, report_page(context, results))
+        return results
+
+
+def finding_key(probe: Probe, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings) -> str:
+    """Hash (64 hex digits) of everything that a finding depends on."""
+    content = {
+        "probe": probe.name,
+        "version": probe.version,
+        "subject": subject.sha256,
+        "layers": list(subject.layer_names),
+        "dataset": dataset.fingerprint,
+        "settings": asdict(settings),
+    }
+    return sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+
+
+def save_finding(folder: Path, name: str, key: str, finding: Finding, seconds: float) -> None:
+    """Write ``NAME.json`` and its picture ``NAME.png`` into ``folder``. Raises ``ValueError`` for NaN, infinity."""
+    content = asdict(finding)
+    if content["figure"] is not None:
+        write_atomically(folder / f"{name}.png", content["figure"].pop("png"))
+    write_json({"key": key, "seconds": seconds, "finding": content}, folder / f"{name}.json")
+
+
+def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | None:
+    """The stored finding of probe ``name`` and its seconds, if it is complete and was made with the same ``key``."""
+    try:
+        content = read_json(folder / f"{name}.json", DiagnosisError)
+        if content["key"] != key:
+            return None
+        fields = content["finding"]
+        if fields["figure"] is not None:
+            fields["table"] = Table(**fields["table"])
+            fields["figure"] = Figure(**fields["figure"], png=(folder / f"{name}.png").read_bytes())
+        return Finding(**fields), float(content["seconds"])
+    except (OSError, ValueError, TypeError, KeyError):
+        return None  # absent, half written, or of another version: it is made again
+
+
+def _prepare(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        names = sorted(path.name for path in out.iterdir())
+    except OSError as error:
+        raise DiagnosisError(f"{out}: can't be made a folder ({error.strerror}); give another --out") from None
+    ours = {JSON_FILE, REPORT_FILE, LOCK_FILE, *(f"{name}.json" for name in PROBES)}
+    foreign = [name for name in names if name not in ours and not name.endswith((".png", ".tmp"))]
+    if foreign:
+        raise DiagnosisError(f"{out}: holds {foreign[0]}, which is no part of a report; give a new or empty folder")
+
+
+def _context(subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, command: str) -> dict[str, Any]:
+    subject_keys = ("name", "title", "sha256", "units", "normalisation", "frames_used", "direction")
+    return {
+        "subject": {**{key: getattr(subject, key) for key in subject_keys}, "layers": subject.layer_names},
+        "dataset": {
+            "name": dataset.path.resolve().name,
+            "fingerprint": dataset.fingerprint,
+            "size": list(dataset.size),
+            "samples": {split: len(names) for split, names in dataset.splits.items()},
+        },
+        "settings": asdict(settings),
+        "command": command,
+        "software": {"fpp_ml_bench": __version__, **{name: version(name) for name in _PACKAGES}},
+        "hardware": describe_hardware().to_dict(),
+    }
+
+
+def report_page(context: Mapping[str, Any], results: Sequence[ProbeResult]) -> bytes:
+    """The report: a section for each probe; ``context`` is what ``diagnose.json`` says about subject, dataset, settings
+    and machine."""
+    name = context["subject"]["name"]
+    return page(
+        "fpp_ml_bench.baselines.diagnostics",
+        "diagnosis.html",
+        f"{name}: diagnosis",
+        _STYLE,
+        description=f"What {name} read",
+        results=results,
+        data_uri=data_uri,
+        **context,
+    )
+
+
 _GAP = 4  # px between two pictures
 
 
@@ -207,7 +355,6 @@ class Picture:
 
     def rgb(self) -> NDArray:
         """Float (H, W, 3) in [0, 1]."""
-        import numpy as np
         from matplotlib import colormaps
 
         values = np.asarray(self.image, dtype=float)
@@ -244,7 +391,6 @@ def chart(panels: Sequence[Panel], columns: int, panel_size: tuple[float, float]
 @styled
 def gallery(rows: Mapping[str, Sequence[Picture]], columns: Sequence[str], picture_inches: float = 1.1) -> bytes:
     """Pictures in named rows and columns, so many inches wide each; PNG."""
-    import numpy as np
 
     shapes = [picture.image.shape for row in rows.values() for picture in row]
     height, width = (max(lengths) + _GAP for lengths in zip(*shapes, strict=True))

@@ -3,8 +3,11 @@
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from copy import deepcopy
 from dataclasses import dataclass
 from difflib import get_close_matches
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -27,25 +30,25 @@ from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.sequence import Direction
 
-OutputUnits = Literal["mm", "m", "normalised"]
 NORMALISATION_OF: dict[str, Normalisation] = {"mm": "raw", "m": "global", "normalised": "individual"}
+"""How a user's module represents depth, by its units."""
 BATCH = 8
 PIXELS_AT_ONCE = BATCH * 224 * 224  # most images in a batch, and most pixels: at 960 px a batch is one image
 NORMALISED_BACKGROUND = 0.1
 SAMPLES_ASKED = 6  # to find out whether a model predicts anything
 _LEAST_SPREAD = 1e-3  # relative: predictions that differ by less are the same
 _STRAY = 0.001  # share of pixels at either end that may differ
+Depth = NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
 class Subject:
     """A model under diagnosis; ``sha256`` identifies it and its settings. ``units`` of `predict`: mm, or normalised to
     the sample's own depth range. ``direction``: that of the fringes in ``frames_used``. With ``uses_ground_truth_mask``
-    it expects frames that are 0 outside the object (`captured`). ``predict_frames``: None where the prediction is the
-    network's own output. ``network`` takes the single frame in ``frames_used`` as (B, 1, H, W) in [0, 1] and outputs
-    depth in the representation ``normalisation``. Without a network, it and the following fields are None or empty.
-    ``layer_names``: the layers to probe, in forward order. ``untrained(seed)``: the same architecture with random
-    weights."""
+    it expects frames that are 0 outside the object. ``network`` takes the single frame in ``frames_used`` as
+    (B, 1, H, W) in [0, 1] and outputs depth in the representation ``normalisation``. Without a network, it and the
+    following fields are None or empty. ``layer_names``: the layers to probe, in forward order. ``untrained(seed)``: the
+    same architecture with random weights."""
 
     name: str
     title: str
@@ -54,7 +57,7 @@ class Subject:
     image_size: tuple[int, int]
     frames_used: tuple[int, ...]
     direction: Direction | Literal["both"]
-    predict_frames: Callable[[Frames], NDArray[np.float32]] | None
+    predict_frames: Callable[[Frames], Depth]
     uses_ground_truth_mask: bool = False
     normalisation: Normalisation | None = None
     network: nn.Module | None = None
@@ -77,29 +80,22 @@ class Subject:
         """The frames of ``sample`` that the subject uses, uint8 (H, W), by frame number; None for all others."""
         return captured_frames(dataset, self, sample)  # type: ignore[arg-type]  # it has what this asks a method for
 
-    def predict(self, frames: Frames) -> NDArray[np.float32]:
+    def predict(self, frames: Frames) -> Depth:
         """Depth float32 (H, W) in ``units``. Raises `DiagnosisError` for an output of another shape or not finite."""
-        if self.predict_frames is not None:
-            depth = np.asarray(self.predict_frames(frames))
-        else:
-            depth = self.represent(frames)
-            if self.normalisation not in (None, "individual"):
-                depth = denormalise(depth, self.normalisation, 0.0, 0.0).astype(np.float32)
-        if depth.shape != self.image_size:
-            raise DiagnosisError(f"{self.name}: expected a prediction of {self.image_size} px, got {depth.shape}")
-        if not np.isfinite(depth).all():
-            raise DiagnosisError(f"{self.name}: its prediction holds NaN or infinity, so it can't be diagnosed")
-        return depth.astype(np.float32, copy=False)
+        depth = torch.from_numpy(np.asarray(self.predict_frames(frames)))
+        return checked_output(depth, self.image_size, self.name).numpy()
 
     @property
     def answers_normalised(self) -> bool:
         """Whether `answer` is normalised, and not in mm."""
         return self.units == "normalised" or self.normalisation == "individual"
 
-    def answer(self, frames: Frames) -> NDArray[np.float32]:
+    def answer(self, frames: Frames) -> Depth:
         """`predict`, or the network's own output where it is normalised: range heads, which would convert it to mm, are
         not part of the paper's probes."""
-        return self.represent(frames) if self.normalisation == "individual" else self.predict(frames)
+        if self.normalisation != "individual":
+            return self.predict(frames)
+        return network_output(self.networks()[0], self.input_batch([frames]), self.name)
 
     def predicts_nothing(self, dataset: DatasetFolder) -> str | None:
         """How the subject predicts nothing for `SAMPLES_ASKED` samples of all splits: background, or the same value, on
@@ -118,11 +114,8 @@ class Subject:
         return f"{self.name} predicts nothing but {what} on the object pixels of {len(samples)} samples."
 
     def input_batch(self, stacks: Sequence[Frames]) -> Tensor:
-        """Input of ``network``, float32 (B, 1, H, W) in [0, 1]. Raises `DiagnosisError` without its frame."""
-        index = self.frames_used[0]
-        images = [frame for frame in (frames[index] for frames in stacks) if frame is not None]
-        if len(images) != len(stacks):
-            raise DiagnosisError(f"{self.name} needs frame {index}, which is missing")
+        """Input of ``network``, float32 (B, 1, H, W) in [0, 1]."""
+        images = [np.asarray(frames[self.frames_used[0]]) for frames in stacks]
         return fringe_batch(images, self.image_size, self.name)
 
     def batches(
@@ -134,20 +127,6 @@ class Subject:
             names = list(samples[start : start + size])
             yield names, self.input_batch([self.captured(dataset, name) for name in names])
 
-    def represent(self, frames: Frames) -> NDArray[np.float32]:
-        """The network's output float32 (H, W) in its ``normalisation``. Raises `DiagnosisError` without a network, for
-        one that fails, and for an output of another shape or not finite."""
-        network, _ = self.networks()
-        batch = self.input_batch([frames])
-        try:
-            with torch.inference_mode():
-                output = network(batch)
-        except Exception as error:  # the user's code can raise anything
-            reason = f"{type(error).__name__}: {printable(str(error), 400)}"
-            shape = tuple(batch.shape)
-            raise DiagnosisError(f"{self.name}: on fringes of shape {shape} it failed: {reason}") from error
-        return checked_output(output, batch, self.name)[0, 0].numpy()
-
 
 def background_below(normalised: bool, near_mm: float) -> float:
     """Predictions below it, normalised or in mm, are nearer to background than to any object, of which none is nearer
@@ -155,22 +134,59 @@ def background_below(normalised: bool, near_mm: float) -> float:
     return NORMALISED_BACKGROUND if normalised else near_mm / 2
 
 
-def checked_output(output: Tensor, batch: Tensor, name: str) -> Tensor:
-    """``output`` if it is finite and shaped as ``batch`` (B, 1, H, W); else `DiagnosisError`."""
-    shape, expected = tuple(getattr(output, "shape", ())), tuple(batch.shape)
-    if shape != expected:
-        got = shape or type(output).__name__
+def network_output(network: nn.Module, batch: Tensor, name: str) -> Depth:
+    """What ``network`` makes of the first image of ``batch``, float32 (H, W). Raises `DiagnosisError` for a network
+    that fails, and as `checked_output`."""
+    try:
+        with torch.inference_mode():
+            output = network(batch)
+    except Exception as error:  # the user's code can raise anything
+        reason = f"{type(error).__name__}: {printable(str(error), 400)}"
+        raise DiagnosisError(f"{name}: on fringes of shape {tuple(batch.shape)} it failed: {reason}") from error
+    return checked_output(output, batch.shape, name)[0, 0].numpy()
+
+
+def checked_output(output: Tensor, shape: Sequence[int], name: str) -> Tensor:
+    """``output`` as float32 if it is finite and of ``shape``; else `DiagnosisError`."""
+    found, expected = tuple(getattr(output, "shape", ())), tuple(shape)
+    if found != expected:
+        got = found or type(output).__name__
         raise DiagnosisError(f"{name}: expected an output of shape {expected}, one depth per pixel, got {got}")
     if not_finite := int((~output.isfinite()).sum()):
         raise DiagnosisError(f"{name}: {not_finite} of {output.numel()} values of its output are NaN or infinite")
     return output.float()
 
 
+def activations_of(
+    network: nn.Module, layers: dict[str, nn.Module], fringe: Tensor, reduce: Callable[[Tensor], Tensor], name: str
+) -> dict[str, Tensor]:
+    """``reduce(activations)`` of every layer by its name, of one forward pass of the network called ``name``.
+    ``reduce`` is called before a later layer can change the output in place. Its result must not be a view of the
+    output. Raises `DiagnosisError` for a layer whose output is not (B, C, h, w) or that the pass does not reach, and
+    for an output that is not a depth map."""
+    activations: dict[str, Tensor] = {}
+
+    def record(layer: str, module: nn.Module, inputs: object, output: object) -> None:
+        if not isinstance(output, Tensor) or output.dim() != 4:
+            shape = tuple(output.shape) if isinstance(output, Tensor) else type(output).__name__
+            raise DiagnosisError(f"layer {layer!r}: expected activations (B, C, h, w), got {shape}; leave it out")
+        activations[layer] = reduce(output.float())
+
+    with ExitStack() as hooks, torch.no_grad():
+        for layer, module in layers.items():
+            hooks.enter_context(module.register_forward_hook(partial(record, layer)))
+        checked_output(network(fringe), fringe.shape, name)
+    for layer in layers:
+        if layer not in activations:
+            raise DiagnosisError(f"{name}: layer {layer!r} takes no part in a forward pass; leave it out")
+    return activations
+
+
 def subject(
     name: str,
     dataset: DatasetFolder,
     layers: Sequence[str] | None = None,
-    units: OutputUnits | None = None,
+    units: str | None = None,
     frame: int | None = None,
     threads: int = 1,
     options: Mapping[str, Any] = MappingProxyType({}),
@@ -178,44 +194,23 @@ def subject(
     """The model called ``name``, ready to be diagnosed on ``dataset``. ``name``: a method of
     `fpp_ml_bench.baselines.registry`, shipped weights, a ``.safetensors`` file, or ``file.py:factory``, where
     ``factory()`` returns a torch module that maps fringes (B, 1, H, W) in [0, 1] to depth (B, 1, H, W) in ``units``
-    (default: normalised). ``layers``: names of the layers to probe, by default the network's ``probe_layers``, or every
-    child of a module without them. ``frame``: number of the network's input frame, by default the first that it was
-    trained on. ``threads``: torch threads of the process. ``options``: those of a method.
-    Raises `DiagnosisError` for a name, layer or module that
-    can't be used, and other `FppBenchError` of the model."""
+    (of `NORMALISATION_OF`; default: normalised). ``layers``: names of the layers to probe, by default the network's
+    ``probe_layers``, or every child of a module without them. ``frame``: number of the network's input frame, by
+    default the first that it was trained on. ``threads``: torch threads of the process. ``options``: those of a method.
+    Raises `DiagnosisError` for a name, layer or module that can't be used, and other `FppBenchError` of the model."""
     made = load_from_file(name) if FILE_MARK in name else Method
     if not (isinstance(made, type) and issubclass(made, Method)):
-        return _subject_of_factory(name, made, dataset, layers, units or "normalised", frame or 0, threads)
+        torch.set_num_threads(threads)
+        return _subject_of_factory(name, made, dataset, layers, units or "normalised", frame or 0)
     if units is not None:
         raise DiagnosisError(f"{name}: its units are known; set units only for your own module, file.py:factory")
-    if issubclass(find(name).method, NetworkMethod):
-        torch.set_num_threads(threads)
-        return _subject_of_network(
-            load_method(name, dataset, frame=frame, threads=threads, device="cpu"), dataset, layers
-        )
-    if given := [option for option, value in (("layers", layers), ("frame", frame)) if value is not None]:
-        raise DiagnosisError(f"{name} is a method without a network, so it has no {given[0]}; leave it out")
-    return subject_of_method(load_method(name, dataset, **options), dataset)
-
-
-def subject_of_method(depth_method: Method, dataset: DatasetFolder, **network: Any) -> Subject:
-    """A method as a subject; ``network``: the fields of a `Subject` with one."""
-    # A network's settings hold the hash of its weights; those of the machine don't matter.
-    settings = {key: value for key, value in depth_method.settings.items() if key not in ("threads", "device")}
-    same = ("name", "title", "units", "frames_used", "uses_ground_truth_mask")
-    return Subject(
-        **{key: getattr(depth_method, key) for key in same},
-        sha256=hashlib.sha256(json.dumps([depth_method.name, settings], sort_keys=True).encode()).hexdigest(),
-        image_size=dataset.size,
-        direction=_direction_of(dataset, depth_method.frames_used),
-        predict_frames=depth_method.predict,
-        **network,
-    )
-
-
-def _subject_of_network(method: Any, dataset: DatasetFolder, layers: Sequence[str] | None) -> Subject:
-    model = method.model
-    config = model.config
+    if not issubclass(find(name).method, NetworkMethod):
+        if given := [option for option, value in (("layers", layers), ("frame", frame)) if value is not None]:
+            raise DiagnosisError(f"{name} is a method without a network, so it has no {given[0]}; leave it out")
+        return subject_of_method(load_method(name, dataset, **options), dataset)
+    torch.set_num_threads(threads)
+    method: Any = load_method(name, dataset, frame=frame, threads=threads, device="cpu")
+    model, config = method.model, method.model.config
 
     def untrained(seed: int) -> nn.Module:
         with torch.random.fork_rng(devices=[]):
@@ -232,6 +227,21 @@ def _subject_of_network(method: Any, dataset: DatasetFolder, layers: Sequence[st
         weights_sha256=model.sha256,
         layer_names=_select_layers(layers, model.network, config.name),
         untrained=untrained,
+    )
+
+
+def subject_of_method(method: Method, dataset: DatasetFolder, **network: Any) -> Subject:
+    """A method as a subject; ``network``: the fields of a `Subject` with one."""
+    # A network's settings hold the hash of its weights; those of the machine don't matter.
+    settings = {key: value for key, value in method.settings.items() if key not in ("threads", "device")}
+    same = ("name", "title", "units", "frames_used", "uses_ground_truth_mask")
+    return Subject(
+        **{key: getattr(method, key) for key in same},
+        sha256=hashlib.sha256(json.dumps([method.name, settings], sort_keys=True).encode()).hexdigest(),
+        image_size=dataset.size,
+        direction=_direction_of(dataset, method.frames_used),
+        predict_frames=method.predict,
+        **network,
     )
 
 
@@ -261,27 +271,34 @@ def _direction_of(dataset: DatasetFolder, frames: Sequence[int]) -> Direction | 
 
 
 def _subject_of_factory(
-    name: str,
-    factory: Any,
-    dataset: DatasetFolder,
-    layers: Sequence[str] | None,
-    units: OutputUnits,
-    frame: int,
-    threads: int,
+    name: str, factory: Any, dataset: DatasetFolder, layers: Sequence[str] | None, units: str, frame: int
 ) -> Subject:
     """The module that ``factory`` of ``file.py:factory`` makes, as a subject. It is run on a sample, so that misfits
     show early."""
-    if units not in NORMALISATION_OF:
-        raise DiagnosisError(f"unknown units {units!r}; there are {', '.join(NORMALISATION_OF)}")
     if not 0 <= frame < len(dataset.sequence):
         raise DiagnosisError(f"frame {frame}: expected 0 to {len(dataset.sequence) - 1}, the frames of the sequence")
-    torch.set_num_threads(threads)
-    path, network = Path(name.rpartition(":")[0]), _build_network(name, factory)
+    try:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)  # random weights are the same every time
+            network = factory()
+    except (Exception, SystemExit) as error:
+        raise DiagnosisError(
+            f"{name}: calling it without arguments failed: {type(error).__name__}: {printable(str(error), 400)}"
+        ) from error
+    if not isinstance(network, nn.Module):
+        raise DiagnosisError(f"{name}: expected it to return a torch module, got {type(network).__name__}")
+    network = network.eval().requires_grad_(False).cpu()
+    path, normalisation = Path(name.rpartition(":")[0]), NORMALISATION_OF[units]
     digest = hashlib.sha256(f"{units} {frame}".encode() + path.read_bytes())
     for key, value in network.state_dict().items():
         if isinstance(value, Tensor):
             values = value.detach().cpu().contiguous().flatten().view(torch.uint8)
             digest.update(key.encode() + values.numpy().tobytes())
+
+    def predict(frames: Frames) -> Depth:
+        output = network_output(network, user_subject.input_batch([frames]), path.stem)
+        return denormalise(output, normalisation, 0.0, 1.0).astype(np.float32)
+
     user_subject = Subject(
         name=path.stem,
         title=f"{path.name}:{name.rpartition(':')[2]}",
@@ -290,16 +307,16 @@ def _subject_of_factory(
         image_size=dataset.size,
         frames_used=(frame,),
         direction=_direction_of(dataset, (frame,)),
-        predict_frames=None,
-        normalisation=NORMALISATION_OF[units],
+        predict_frames=predict,
+        normalisation=normalisation,
         network=network,
         layer_names=_select_layers(layers, network, name),
-        untrained=lambda seed: randomised(_build_network(name, factory), seed),
+        untrained=lambda seed: randomised(deepcopy(network), seed),
     )
-    first = next((sample for split in dataset.splits for sample in dataset.samples(split)), None)
-    if first is None:
+    samples = dataset.samples("all")
+    if not samples:
         raise DiagnosisError(f"{dataset.path}: holds no sample")
-    user_subject.predict(user_subject.captured(dataset, first))
+    user_subject.predict(user_subject.captured(dataset, samples[0]))
     return user_subject
 
 
@@ -317,17 +334,3 @@ def randomised(network: nn.Module, seed: int) -> nn.Module:
                 order = torch.randperm(parameter.numel())
                 parameter.copy_(parameter.reshape(-1)[order].reshape(parameter.shape))
     return network
-
-
-def _build_network(name: str, factory: Any) -> nn.Module:
-    try:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)  # random weights are the same every time
-            network = factory()
-    except (Exception, SystemExit) as error:
-        raise DiagnosisError(
-            f"{name}: calling it without arguments failed: {type(error).__name__}: {printable(str(error), 400)}"
-        ) from error
-    if not isinstance(network, nn.Module):
-        raise DiagnosisError(f"{name}: expected it to return a torch module, got {type(network).__name__}")
-    return network.eval().requires_grad_(False).cpu()

@@ -6,14 +6,12 @@ focus at both: its blur would be a hint). *An error of one period costs Z^2*,
 and along the camera's axis Z^2 kappa / (1 -+ Z kappa), one sign for each side, with kappa = P / (f_p b).
 """
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import Original, original
 from fpp_ml_bench.baselines.diagnostics.probe import (
     Figure,
     Finding,
@@ -25,8 +23,7 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     gallery,
     with_interval,
 )
-from fpp_ml_bench.baselines.diagnostics.scene_renderer import SceneRenderer, Surface, constant, moved
-from fpp_ml_bench.baselines.diagnostics.subjects import Subject
+from fpp_ml_bench.baselines.diagnostics.scenes import SceneRenderer, constant, moved, original
 from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DiagnosisError
@@ -35,6 +32,9 @@ from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Direction
 from fpp_ml_bench.style import DEPTH_COLOURS
 
+if TYPE_CHECKING:
+    from fpp_ml_bench.baselines.diagnostics.subjects import Subject
+
 DISTANCES_M = (0.3, 1.0, 1.8, 3.0, 5.0, 10.0)
 SHOWN_M = 1.8  # in the summary
 SMALL_PERIODS = 1 / 64  # an error so small that the linear model holds over all distances
@@ -42,37 +42,6 @@ ERRORS_PERIODS = {"1/64 period": SMALL_PERIODS, "a period, away": 1.0, "a period
 STARTS_PERIODS = (0.0, -1.0, -0.5)
 """Position of the first of two scenes that are a period apart, in periods from the object's own position."""
 _STEP = 1e-4  # relative step of distance in a difference quotient
-
-Maps = list[NDArray[np.float64]]
-Frames = list[NDArray[np.uint8]]
-
-
-@dataclass(frozen=True)
-class Twins:
-    """Two scenes that a frame can't tell apart: depths float64 (H, W) in mm, 0 outside the object; frames uint8."""
-
-    sample: str
-    direction: Direction
-    frame: int
-    other_frame: int
-    depths_mm: Maps
-    frames: Frames
-    other_frames: Frames
-    paint: NDArray[np.float64]
-
-    def to_dict(self) -> dict[str, Any]:
-        inside = self.depths_mm[0] > 0
-        distance_mm = np.abs(self.depths_mm[1] - self.depths_mm[0])[inside]
-        pairs = {"": self.frames, "_other_direction": self.other_frames}
-        return {
-            "sample": self.sample,
-            "direction": self.direction,
-            "frame": self.frame,
-            "object_pixels": int(inside.sum()),
-            **{f"differing_pixels{which}": int(np.not_equal(*pair).sum()) for which, pair in pairs.items()},
-            "depth_apart_mean_mm": float(distance_mm.mean()),
-            "paint_least": float(self.paint.min()),
-        }
 
 
 class Theory(Probe):
@@ -84,11 +53,11 @@ class Theory(Probe):
     version = 2
     question = "Can two depths give the same fringe, and how large is the depth error of one period at each distance?"
 
-    def run(self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, progress: Progress) -> Finding:
+    def run(self, subject: "Subject", dataset: DatasetFolder, settings: ProbeSettings, progress: Progress) -> Finding:
         progress(0, 2, "two scenes, one frame")
         twins = twins_of(dataset, SceneRenderer.of(dataset))
         progress(1, 2, "one period, many distances")
-        laws = [
+        laws: list[dict[str, Any]] = [
             {
                 "error": name,
                 "distance_m": distance_m,
@@ -98,50 +67,82 @@ class Theory(Probe):
             for name, periods in ERRORS_PERIODS.items()
             for distance_m in DISTANCES_M
         ]
-        values = {
-            "twins": twins.to_dict(),
-            "kappa_per_m": kappa_per_m(dataset.rig, twins.direction),
-            "laws": laws,
-        }
+        facts = twins.to_dict()
+        small, away, toward = (with_interval(row["exponent"]) for row in laws if row["distance_m"] == SHOWN_M)
+        summary = (
+            f"{twins.sample} and a surface {facts['depth_apart_mean_mm']:.0f} mm from it on average give the same "
+            f"{twins.direction} fringe: {facts['differing_pixels']} of the image's pixels differ (the frame of the "
+            f"other direction: {facts['differing_pixels_other_direction']}). At {SHOWN_M:g} m the depth error of a "
+            f"small phase error grows with exponent {small} of distance, that of a whole period with {away} away from "
+            f"the camera and {toward} toward it."
+        )
+        values = {"twins": facts, "kappa_per_m": kappa_per_m(dataset.rig, twins.direction), "laws": laws}
         rows = {f"{row['error']}, {row['distance_m']:g} m": row for row in laws}
         columns = {"error_mm": "Depth error, mm", "exponent": "Local exponent of distance"}
         table = Table.of("Depth error of a phase error by distance", "Phase error", rows, columns)
-        return self.finding(summary(values), values, table, _draw_twins(twins))
+        return Finding(summary, values, table, _draw_twins(twins))
+
+
+@dataclass(frozen=True)
+class Twins:
+    """Two scenes that a frame can't tell apart: ``depths_mm`` float64 (2, H, W), 0 outside the object; ``frames`` and
+    ``other_frames``, of the other direction, uint8 (2, H, W), by their numbers ``frame`` and ``other_frame``."""
+
+    sample: str
+    direction: Direction
+    frame: int
+    other_frame: int
+    depths_mm: NDArray[np.float64]
+    frames: NDArray[np.uint8]
+    other_frames: NDArray[np.uint8]
+    paint: NDArray[np.float64]
+
+    def to_dict(self) -> dict[str, Any]:
+        inside = self.depths_mm[0] > 0
+        return {
+            "sample": self.sample,
+            "direction": self.direction,
+            "frame": self.frame,
+            "object_pixels": int(inside.sum()),
+            "differing_pixels": int(np.not_equal(*self.frames).sum()),
+            "differing_pixels_other_direction": int(np.not_equal(*self.other_frames).sum()),
+            "depth_apart_mean_mm": float(np.abs(np.subtract(*self.depths_mm))[inside].mean()),
+            "paint_least": float(self.paint.min()),
+        }
 
 
 def twins_of(dataset: DatasetFolder, renderer: SceneRenderer, direction: Direction = "horizontal") -> Twins:
     """The first test object that fits into the working range twice, a whole period apart: at its own position and a
     period away, or half a period to either side. Raises `DiagnosisError` where there is none."""
-    near_m, far_m = (end / MM_PER_M for end in renderer.rig.working_range_mm)
+    rig = renderer.rig
+    near_m, far_m = (end / MM_PER_M for end in rig.working_range_mm)
+    in_focus = SceneRenderer(rig, renderer.lamp.changed("projector", defocus_px=0.0))
+    sinusoids = rig.sequence.sinusoids
+    frame, across = sinusoids(direction)[0], sinusoids("vertical" if direction == "horizontal" else "horizontal")[0]
     for sample in dataset.samples("test"):
         first = original(dataset, renderer, sample)
-        for start in STARTS_PERIODS if first.target.any() else ():
-            shifts_rad = (TAU * turns for turns in (start, start + 1))
-            pair = [moved(first.surface, renderer.rig, direction, constant, shift) for shift in shifts_rad]
-            if all(near_m <= surface.depth_m.min() and surface.depth_m.max() <= far_m for surface in pair):
-                return _photographed(renderer, first, pair, direction)
+        for start in STARTS_PERIODS if first.mask.any() else ():
+            pair = [moved(first.surface, rig, direction, constant, TAU * turns) for turns in (start, start + 1)]
+            if not all(near_m <= surface.depth_m.min() and surface.depth_m.max() <= far_m for surface in pair):
+                continue
+            lights = [in_focus.light(surface) for surface in pair]
+            # Albedo can only be lowered, so at each pixel it is lowered on the brighter surface.
+            least, most = (of(*(light.gain.astype(np.float64) for light in lights)) for of in (np.minimum, np.maximum))
+            paint = np.divide(least, most, out=np.ones_like(most), where=most > 0)
+            scenes = [
+                replace(first, surface=surface, lit=replace(light, gain=least.astype(np.float32)))
+                for surface, light in zip(pair, lights, strict=True)
+            ]
+            depths_mm = np.stack([scene.depth_mm for scene in scenes])
+            frames, other_frames = (
+                np.stack([np.asarray(in_focus.frames(scene, [index])[index]) for scene in scenes])
+                for index in (frame, across)
+            )
+            return Twins(sample, direction, frame, across, depths_mm, frames, other_frames, paint)
     raise DiagnosisError(
         f"{dataset.path}: no test object fits twice, a period of {direction} fringes apart, within "
         f"{near_m:g} to {far_m:g} m; use a rig with a finer pitch or a wider range"
     )
-
-
-def _photographed(renderer: SceneRenderer, first: Original, pair: Sequence[Surface], direction: Direction) -> Twins:
-    renderer = SceneRenderer(renderer.rig, renderer.lamp.changed("projector", defocus_px=0.0))
-    lights = [renderer.light(surface) for surface in pair]
-    gains = [light.gain.astype(np.float64) for light in lights]
-    # Albedo can only be lowered, so at each pixel it is lowered on the brighter surface.
-    least, most = np.minimum(*gains), np.maximum(*gains)
-    paint = np.divide(least, most, out=np.ones_like(most), where=most > 0)
-    scenes = [replace(first.scene, lit=replace(light, gain=least.astype(np.float32))) for light in lights]
-
-    def frames(index: int) -> Frames:
-        return [np.asarray(renderer.frames(scene, [index])[index]) for scene in scenes]
-
-    sinusoids = renderer.rig.sequence.sinusoids
-    frame, across = sinusoids(direction)[0], sinusoids("vertical" if direction == "horizontal" else "horizontal")[0]
-    depths_mm = [surface.depth_mm(renderer.shape) for surface in pair]
-    return Twins(first.sample, direction, frame, across, depths_mm, frames(frame), frames(across), paint)
 
 
 def _axis(rig: Rig, direction: Direction) -> CalibrationLayer:
@@ -157,12 +158,12 @@ def kappa_per_m(rig: Rig, direction: Direction) -> float:
 
 def depth_error_mm(rig: Rig, direction: Direction, distance_m: float, periods: float) -> float | None:
     """|depth of the wrong phase - depth| on the camera's axis, in mm; None where no point ahead has the wrong phase."""
-    layer = _axis(rig, direction)
-    residual = layer.absolute_phase(np.array([distance_m * MM_PER_M])) - layer.infinity_rad - TAU * layer.infinity_order
+    layer, true_mm = _axis(rig, direction), distance_m * MM_PER_M
+    residual = layer.residual_of_depth(np.array([true_mm]))
     # A depth error away from the camera reduces the magnitude of the residual phase.
     with np.errstate(divide="ignore"):
         (depth_mm,) = layer.depth_of_residual_mm(residual - np.sign(residual) * TAU * periods)
-    return float(abs(depth_mm - distance_m * MM_PER_M)) if 0 < depth_mm < np.inf else None
+    return float(abs(depth_mm - true_mm)) if 0 < depth_mm < np.inf else None
 
 
 def exponent(rig: Rig, direction: Direction, distance_m: float, periods: float) -> float | None:
@@ -171,25 +172,13 @@ def exponent(rig: Rig, direction: Direction, distance_m: float, periods: float) 
     return float(np.log(high / low) / np.log((1 + _STEP) / (1 - _STEP))) if low and high else None
 
 
-def summary(values: Mapping[str, Any]) -> str:
-    """Both theorems with their numbers."""
-    twins = values["twins"]
-    small, away, toward = (row["exponent"] for row in values["laws"] if row["distance_m"] == SHOWN_M)
-    return (
-        f"{twins['sample']} and a surface {twins['depth_apart_mean_mm']:.0f} mm from it on average give the same "
-        f"{twins['direction']} fringe: {twins['differing_pixels']} of the image's pixels differ (the frame of the "
-        f"other direction: {twins['differing_pixels_other_direction']}). At {SHOWN_M:g} m the depth error of a small "
-        f"phase error grows with exponent {with_interval(small)} of distance, that of a whole period with "
-        f"{with_interval(away)} away from the camera and {with_interval(toward)} toward it."
-    )
-
-
 def _draw_twins(twins: Twins) -> Figure:
     inside = twins.depths_mm[0] > 0
-    low, high = np.stack(twins.depths_mm)[:, inside].min(), np.stack(twins.depths_mm)[:, inside].max()
+    low, high = twins.depths_mm[:, inside].min(), twins.depths_mm[:, inside].max()
     pairs = {f"{twins.direction} fringe": twins.frames, "other direction": twins.other_frames}
     rows = {
-        f"{name},\n{np.not_equal(*pair).sum()} pixels differ": list(map(Picture, pair)) for name, pair in pairs.items()
+        f"{name},\n{np.not_equal(*pair).sum()} pixels differ": [Picture(frame) for frame in pair]
+        for name, pair in pairs.items()
     }
     rows[f"depth,\n{low:.0f} to {high:.0f} mm"] = [
         Picture(np.where(inside, depth, np.nan), DEPTH_COLOURS, low, high) for depth in twins.depths_mm

@@ -14,16 +14,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer, Image, Mask, wrapped
-from fpp_ml_bench.baselines.phase.carriers import Carriers
-from fpp_ml_bench.baselines.phase.crossed_observation import CrossedObservation
-from fpp_ml_bench.baselines.phase.local_fit import phase_slopes
-from fpp_ml_bench.baselines.phase.object_mask import Crop
-from fpp_ml_bench.baselines.phase.observation import Observation, Settings
-from fpp_ml_bench.baselines.phase.orders import LEAST_BRIGHTNESS, grid_of, irradiance, repeated
-from fpp_ml_bench.baselines.phase.refinement import fringes
-from fpp_ml_bench.baselines.phase.resampling import Periods
-from fpp_ml_bench.baselines.phase.route import PhaseRoute
+from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer, Carriers, Crop, Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase.candidates import irradiance
+from fpp_ml_bench.baselines.phase.depth import Fitted, PhaseRoute
+from fpp_ml_bench.baselines.phase.local_fit import fringes, phase_slopes
+from fpp_ml_bench.baselines.phase.observe import Observation, Settings
+from fpp_ml_bench.baselines.phase.order import LEAST_BRIGHTNESS
+from fpp_ml_bench.baselines.phase.resampling import Periods, grid_of, repeated
 from fpp_ml_bench.optics.rig import Rig
 
 STEPS = (-1, 0, 1)  # the candidates: a period further than the base order, the base order, a period nearer
@@ -398,7 +395,7 @@ class CrossedScene(Candidates):
         return np.stack([self.step_rad[0], np.zeros_like(self.step_rad[0]), self.step_rad[1]])
 
     @classmethod
-    def of(cls, seen: CrossedObservation) -> "CrossedScene":
+    def of(cls, seen: Fitted) -> "CrossedScene":
         """From an observation of the measured route."""
         fit, background, carriers = seen.fit, seen.background, seen.carriers
         lit = fit.brightness[seen.inside & (fit.brightness > 0)]

@@ -13,20 +13,18 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.classical import DIRECTIONS as CODED_DIRECTIONS
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method, OwnViews
-from fpp_ml_bench.baselines.phase.crossed_method import crossed_image, crossed_name, frames_of, has_crossed_fringes
-from fpp_ml_bench.baselines.phase.crossed_observation import Settings as CrossedSettings
 from fpp_ml_bench.baselines.phase.method import (
-    AMBIENT_GREY,
-    DIRECTION,
     LIT_BACKGROUND,
-    MIN_CONFIDENCE,
     ONE_ALBEDO,
-    WHITE_GREY,
     RouteMethod,
+    crossed_image,
+    crossed_name,
     direction_of,
+    frames_of,
     fringe_options,
+    has_crossed_fringes,
 )
-from fpp_ml_bench.baselines.phase.observation import Settings
+from fpp_ml_bench.baselines.phase.observe import AMBIENT_GREY, DIRECTION, MIN_CONFIDENCE, WHITE_GREY, Settings
 from fpp_ml_bench.baselines.phase.resampling import Periods
 from fpp_ml_bench.coding.phase_shift import PhaseShift
 from fpp_ml_bench.decoding.decode import Directions
@@ -291,7 +289,12 @@ class CrossedNetMethod(LearnedRoute):
         config, periods = self.weights_config, self.learned_periods("crossed")
         self.rig, self.threads, self.frames_used = rig, given.threads, frames_of(rig, self.name)
         self.route = CrossedNetRoute(
-            rig, self.file.network, config.threshold, config.lead, CrossedSettings(given.min_confidence), periods
+            rig,
+            self.file.network,
+            config.threshold,
+            config.lead,
+            Settings(min_confidence=given.min_confidence),
+            periods,
         )
         made = "" if len(self.frames_used) == 1 else ", the mean of two"
         self.title = f"Crossed fringes, one frame{made}; order, mask and correction learned{self.more}"

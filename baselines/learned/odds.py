@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.learned.inputs import Candidates
 from fpp_ml_bench.baselines.learned.network import PhaseNet
 from fpp_ml_bench.baselines.phase.calibration_layer import Image, Mask
-from fpp_ml_bench.baselines.phase.confidence import MARGIN_SCALE
-from fpp_ml_bench.baselines.phase.labels import LARGE, least_energy
-from fpp_ml_bench.baselines.phase.orders import chosen_values, links_between, nearest_inside, repeated
+from fpp_ml_bench.baselines.phase.candidates import chosen_values, links_between
+from fpp_ml_bench.baselines.phase.depth import MARGIN_SCALE
+from fpp_ml_bench.baselines.phase.labels import least_energy
+from fpp_ml_bench.baselines.phase.order import LARGE
+from fpp_ml_bench.baselines.phase.resampling import nearest_inside, repeated
 
 GRAPH = 3.0  # weight of smoothness between neighbours in the labelling of the orders, in which depth may jump
 SCALE_TO_SIGMA = float(np.sqrt(2))  # of a Laplace distribution

@@ -39,9 +39,10 @@ from fpp_ml_bench.baselines.learned.windows import (
     wrong_place,
 )
 from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Image, Mask
-from fpp_ml_bench.baselines.phase.crossed_route import CrossedRoute
-from fpp_ml_bench.baselines.phase.observation import Settings
-from fpp_ml_bench.baselines.phase.orders import chosen_values, repeated
+from fpp_ml_bench.baselines.phase.candidates import chosen_values
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute
+from fpp_ml_bench.baselines.phase.observe import Settings
+from fpp_ml_bench.baselines.phase.resampling import repeated
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import RecipeError
 from fpp_ml_bench.optics.rig import Rig
@@ -259,7 +260,7 @@ class PhaseTask(CandidateTask):
 def crossed_sample(view: View, route: CrossedRoute) -> Sample:
     """The sample of a view; its void pixels are no target, and no background either. What is missing: joint phase of
     the true nearness less that of the scene's, in rad."""
-    seen = route.observe(view.frames[0])
+    seen = route.fitted(route.observe(view.frames[0]))
     part = view.part(seen.carriers.crop)
     truth = seen.carriers.nearness(np.where(part.target, part.depth_mm, 1000.0))
     missing = np.where(part.target, (truth - seen.fit.nearness) * seen.carriers.joint_gain, 0.0)

@@ -31,15 +31,13 @@ from fpp_ml_bench.baselines.learned.odds import (
     threshold_at,
     wrong_chance,
 )
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Image, Mask, wrapped
-from fpp_ml_bench.baselines.phase.carriers import Carriers
-from fpp_ml_bench.baselines.phase.crossed_observation import CrossedMeasurement, CrossedObservation
-from fpp_ml_bench.baselines.phase.crossed_observation import Settings as CrossedSettings
-from fpp_ml_bench.baselines.phase.crossed_orders import JUMP_RAD
-from fpp_ml_bench.baselines.phase.crossed_route import CrossedRoute
-from fpp_ml_bench.baselines.phase.observation import Measurement, Settings
-from fpp_ml_bench.baselines.phase.orders import chosen_values, nearest_inside, stride_of
-from fpp_ml_bench.baselines.phase.resampling import Periods
+from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Carriers, Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase.candidates import chosen_values
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Fitted, FringeMeasurement, Measurement
+from fpp_ml_bench.baselines.phase.observe import Settings
+from fpp_ml_bench.baselines.phase.observe import Settings as CrossedSettings
+from fpp_ml_bench.baselines.phase.order import JUMP_RAD
+from fpp_ml_bench.baselines.phase.resampling import Periods, nearest_inside, stride_of
 from fpp_ml_bench.optics.rig import Rig
 
 OPEN_MARGIN = 1e-6
@@ -102,17 +100,15 @@ class PhaseNetRoute:
         self.route = self.geometry.route
         self.network, self.threshold, self.lead, self.odds = network, threshold, lead, odds or Odds()
 
-    def measure(self, image: NDArray[np.uint8]) -> Measurement:
+    def measure(self, image: NDArray[np.uint8]) -> FringeMeasurement:
         """Everything about one captured fringe uint8 (H, W). Raises `DecodeError` for another dtype or shape."""
         geometry, route = self.geometry, self.route
         seen = route.observe(image)
         base, margin = route.choose(seen)
-        seen.watch.done("order")
         if not (seen.background.calibrated and seen.inside.any()):
             return route.conclude(seen, base, margin)
         scene = PhaseScene.of(seen, base, geometry.shading)
         answers = phase_answers(self.network, scene, geometry, self.lead)
-        seen.watch.done("network")
         inside = decided_mask(answers, scene, self.threshold)
         choice = decided_order(answers, scene, inside, geometry)
         moved = seen.phase_rad + answers.correction_rad
@@ -152,17 +148,16 @@ class CrossedNetRoute:
         self.route = CrossedRoute(rig, settings, periods=periods)
         self.network, self.threshold, self.lead = network, threshold, lead
 
-    def measure(self, image: NDArray) -> CrossedMeasurement:
+    def measure(self, image: NDArray) -> Measurement:
         """Everything about one crossed frame (H, W). Raises `DecodeError` for another dtype or shape."""
-        seen = self.route.observe(image)
+        seen = self.route.fitted(self.route.observe(image))
         if not seen.inside.any():
             return self.route.conclude(seen)
         scene = CrossedScene.of(seen)
         answers = crossed_answers(self.network, scene, self.route.carriers, self.lead)
-        seen.watch.done("network")
         return self.conclude(seen, scene, answers)
 
-    def conclude(self, seen: CrossedObservation, scene: CrossedScene, answers: Answers) -> CrossedMeasurement:
+    def conclude(self, seen: Fitted, scene: CrossedScene, answers: Answers) -> Measurement:
         """The measurement from the network's answers."""
         joint, offers = seen.carriers.joint_gain, scene.offers_rad
         inside = decided_mask(answers, scene, self.threshold)
@@ -180,7 +175,6 @@ class CrossedNetRoute:
         np.put_along_axis(chances, choice[None], -1, axis=0)
         rival = (scene.nearness + chosen_values(offers, chances.argmax(axis=0)) / joint).astype(np.float32)
         fit = replace(seen.fit, nearness=nearness.astype(np.float32), uncertainty_rad=answers.sigma_rad)
-        seen.watch.done("order")
         return self.route.conclude(replace(seen, fit=fit, inside=inside, rival=rival), wrong)
 
 

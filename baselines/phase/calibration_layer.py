@@ -1,29 +1,38 @@
-"""The fixed calibration layer: wrapped phase and fringe order to depth, in closed form, for any rig.
+"""The geometry of one carrier and of two: from phase and fringe order to depth, in closed form, for any rig.
 
 With ``a = R (x, y, 1)`` the projector sees the pixel's point at ``(Z a_i + t_i) / (Z a_2 + t_2)``, and
 the point at infinity at ``a_i / a_2``. The residual phase is the absolute phase minus that of the point at infinity,
 ``psi = (2 pi f_p / P) (t_i - t_2 a_i / a_2) / (Z a_2 + t_2)``, for the paper's rig ``-2 pi f_p C / (P Z)``. It varies
 as slowly as 1 / Z does, and gives depth back without subtracting large numbers, so that float32 is enough.
+
+Two carriers share the *nearness* ``q = 1 / (Z a_2 + t_2)``, for a projector beside the camera 1 / Z: without lens
+distortion every projector coordinate is affine in it, so that carrier k shows ``phase_k = infinity_k + gain_k q``. A
+lens bends that by a hundredth of a projector px over a working range; `Carriers.depth_mm` corrects it.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.decoding.triangulation import FIXED_POINT_STEPS, rotated_ray
-from fpp_ml_bench.errors import DecodeError
+from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.optics.pinhole import Coefficients, Maps, distortion_polynomial, is_distorted
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
 
 Image = NDArray[np.float32]
 Mask = NDArray[np.bool_]
+Crop = tuple[slice, slice]
 
 TAU = 2 * np.pi
+LEAST_RANGE_RAD = 1.0
+"""Least change of the joint phase over the working range for crossed fringes to tell a depth at all."""
 
 
 def wrapped(phase_rad: NDArray) -> NDArray:
@@ -32,16 +41,7 @@ def wrapped(phase_rad: NDArray) -> NDArray:
 
 
 @dataclass(frozen=True)
-class Lens:
-    """Constants of a distorted projector: ``rays`` a (three maps), ``t`` in metres."""
-
-    rays: tuple[Any, Any, Any]
-    t: tuple[float, float, float]
-    coefficients: Coefficients
-
-
-@dataclass(frozen=True)
-class Candidates:
+class Orders:
     """Orders whose depth lies in the working range: ``first, first + 1, ..., first + count - 1``, int32 (H, W) each;
     where none does, ``count`` is 0, and ``first`` is the order nearest to the range's middle."""
 
@@ -55,7 +55,7 @@ class CalibrationLayer:
     ``infinity_rad`` in [-pi, pi) and ``infinity_order``: absolute phase of a point infinitely far away, as wrapped
     phase and order. ``gain`` rad m, ``forward`` = a_2, ``back_m`` = t_2: psi = gain / (forward Z + back_m).
     ``rad_per_unit``: phase of one normalised projector unit along u and along v, 2 pi f_p / P and 0 for fringes of one
-    direction."""
+    direction. Of a projector whose lens distorts, its coefficients ``lens``, t in metres, and ``rays``: the maps a."""
 
     infinity_rad: Any
     infinity_order: Any
@@ -63,7 +63,9 @@ class CalibrationLayer:
     forward: Any
     back_m: float
     rad_per_unit: tuple[float, float]
-    lens: Lens | None = None
+    translation_m: tuple[float, float, float]
+    lens: Coefficients | None = None
+    rays: tuple[Any, ...] = ()
 
     @classmethod
     def of(cls, rig: Rig, direction: Direction, rays: Maps | None = None) -> "CalibrationLayer":
@@ -71,48 +73,37 @@ class CalibrationLayer:
         `DecodeError` for an unknown direction."""
         if direction not in DIRECTIONS:
             raise DecodeError(f"direction: expected horizontal or vertical, got {direction!r}")
-        device, pitch_px = rig.projector, rig.pitch(direction)
-        if direction == "vertical":
-            return cls._along(rig, (TAU * device.fx / pitch_px, 0.0), TAU * device.cx / pitch_px, rays)
-        return cls._along(rig, (0.0, TAU * device.fy / pitch_px), TAU * device.cy / pitch_px, rays)
+        frequency = 1 / rig.pitch(direction)
+        return cls.of_carrier(rig, (frequency, 0.0) if direction == "vertical" else (0.0, frequency), rays)
 
     @classmethod
     def of_carrier(cls, rig: Rig, cycles_per_px: tuple[float, float], rays: Maps | None = None) -> "CalibrationLayer":
         """The layer of a fringe of any angle, with frequencies (f_u, f_v) in cycles a projector px, as those of
         `coding.Crossed.cycles_per_px`; its phase is 2 pi (f_u u + f_v v)."""
-        device, (along_u, along_v) = rig.projector, cycles_per_px
-        per_unit = TAU * device.fx * along_u, TAU * device.fy * along_v
-        return cls._along(rig, per_unit, TAU * (device.cx * along_u + device.cy * along_v), rays)
-
-    @classmethod
-    def _along(
-        cls, rig: Rig, rad_per_unit: tuple[float, float], centre_rad: float, rays: Maps | None
-    ) -> "CalibrationLayer":
         where, device = rig.camera.rays() if rays is None else rays, rig.projector
         a = (rotated_ray(where, rig, 0), rotated_ray(where, rig, 1), rotated_ray(where, rig, 2))
-        infinity: Any = centre_rad
+        along_u, along_v = cycles_per_px
+        rad_per_unit = TAU * device.fx * along_u, TAU * device.fy * along_v
+        infinity: Any = TAU * (device.cx * along_u + device.cy * along_v)
         gain: Any = 0.0
         for axis, per_unit in enumerate(rad_per_unit):
             if per_unit:
                 infinity = infinity + per_unit * (a[axis] / a[2])
                 gain = gain + per_unit * (rig.t[axis] - rig.t[2] * a[axis] / a[2])
         order = np.floor(infinity / TAU + 0.5)
-        lens = None
-        if device.is_distorted and is_distorted(device.distortion):
-            lens = Lens(a, rig.translation_m, device.distortion)
-        return cls(infinity - TAU * order, order, gain, a[2], float(rig.t[2]), rad_per_unit, lens)
+        maps = infinity - TAU * order, order, gain, a[2], float(rig.t[2]), rad_per_unit, rig.translation_m
+        distorts = device.is_distorted and is_distorted(device.distortion)
+        return cls(*maps, device.distortion, a) if distorts else cls(*maps)
 
     @property
     def maps(self) -> tuple[Any, ...]:
         """All maps: the four of the pinhole model, and the rays where the projector's lens distorts."""
-        rays = self.lens.rays if self.lens is not None else ()
-        return (self.infinity_rad, self.infinity_order, self.gain, self.forward, *rays)
+        return (self.infinity_rad, self.infinity_order, self.gain, self.forward, *self.rays)
 
     def with_maps(self, maps: Iterable[Any]) -> "CalibrationLayer":
         """The same constants with other ``maps``, in the order of `maps`."""
         infinity, order, gain, forward, *rays = maps
-        lens = replace(self.lens, rays=tuple(rays)) if self.lens is not None else None
-        return CalibrationLayer(infinity, order, gain, forward, self.back_m, self.rad_per_unit, lens)
+        return replace(self, infinity_rad=infinity, infinity_order=order, gain=gain, forward=forward, rays=tuple(rays))
 
     def at(self, where: Any) -> "CalibrationLayer":
         """The layer of a part of the image: ``where`` indexes the maps (slices, a mask)."""
@@ -139,7 +130,7 @@ class CalibrationLayer:
         """psi in rad of a point at ``depth_mm`` on each pixel's ray: an array or a tensor, as the maps."""
         z = depth_mm / MM_PER_M
         residual = self.gain / (self.forward * z + self.back_m)
-        return residual if self.lens is None else residual + self._lens_shift(self.lens, z)
+        return residual if self.lens is None else residual + self._lens_shift(z)
 
     def depth_mm(self, phase_rad: Any, order: Any) -> Any:
         """Depth in mm, the camera's z, from wrapped phase in rad and fringe order: arrays or tensors of the maps' shape
@@ -151,18 +142,18 @@ class CalibrationLayer:
         ideal = residual_rad
         if self.lens is not None:
             for _ in range(FIXED_POINT_STEPS):
-                ideal = residual_rad - self._lens_shift(self.lens, (self.gain / ideal - self.back_m) / self.forward)
+                ideal = residual_rad - self._lens_shift((self.gain / ideal - self.back_m) / self.forward)
         return (self.gain / ideal - self.back_m) / self.forward * MM_PER_M
 
-    def _lens_shift(self, lens: Lens, z: Any) -> Any:
+    def _lens_shift(self, z: Any) -> Any:
         """Phase by which the projector's lens displaces a point at z metres on the ray."""
-        ahead = z * lens.rays[2] + lens.t[2]
-        point = [(z * lens.rays[i] + lens.t[i]) / ahead for i in range(2)]
-        moved = distortion_polynomial(point[0], point[1], lens.coefficients)
+        x, y, ahead = (z * ray + t for ray, t in zip(self.rays, self.translation_m, strict=True))
+        point = x / ahead, y / ahead
+        moved = distortion_polynomial(*point, self.lens)  # type: ignore[arg-type]
         shifts = zip(self.rad_per_unit, moved, point, strict=True)
         return sum(per_unit * (after - before) for per_unit, after, before in shifts if per_unit)
 
-    def orders_in_range(self, phase_rad: ArrayLike, range_mm: tuple[float, float]) -> Candidates:
+    def orders_in_range(self, phase_rad: ArrayLike, range_mm: tuple[float, float]) -> Orders:
         """The fringe orders that put each pixel of ``phase_rad`` (H, W) within ``range_mm``; NaN phases have none."""
         phase = np.asarray(phase_rad, dtype=np.float64)
         ends = [self.absolute_phase(end) for end in range_mm]
@@ -172,4 +163,103 @@ class CalibrationLayer:
         first, last = np.ceil((low - phase) / TAU), np.floor((high - phase) / TAU)
         count = np.where(defined, np.maximum(last - first + 1, 0), 0)
         first = np.where(count > 0, first, np.rint(((low + high) / 2 - phase) / TAU))
-        return Candidates(first.astype(np.int32), count.astype(np.int32))
+        return Orders(first.astype(np.int32), count.astype(np.int32))
+
+
+@dataclass(frozen=True)
+class Carriers:
+    """The two carriers of ``rig`` at the pixels ``crop`` of its image. ``infinity_rad`` float32 (2, h, w), wrapped;
+    ``gain`` float32 (2, h, w), rad m; ``forward`` float32 (h, w) and ``back_m``: a_2 and t_2; ``step_rad`` (2, 2):
+    change of each phase per px along x and y, on a plane at the standoff."""
+
+    rig: Rig
+    family: Crossed
+    crop: Crop
+    infinity_rad: Image
+    gain: Image
+    forward: Image
+    back_m: float
+    step_rad: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, rig: Rig, family: Crossed) -> "Carriers":
+        """The carriers of a whole image. Raises `PredictionError` for carriers that hardly change with depth."""
+        x, y = rig.camera.rays()
+        forward, back_m = rotated_ray((x, y), rig, 2), float(rig.t[2])
+        ends_m = [depth_mm / MM_PER_M for depth_mm in rig.working_range_mm]
+        far_q, near_q = (1 / (forward * end + back_m) for end in reversed(ends_m))
+        near_rad, far_rad = (_phases(rig, family, x, y, end) for end in ends_m)
+        gain = (near_rad - far_rad) / (near_q - far_q)
+        infinity = near_rad - gain * near_q
+        standoff = infinity + gain / (forward * rig.standoff_m + back_m)
+        step = np.array([[np.diff(phase, axis=axis).mean() for axis in (1, 0)] for phase in standoff])
+        everywhere = slice(None), slice(None)
+        carriers = cls(
+            rig,
+            family,
+            everywhere,
+            wrapped(infinity).astype(np.float32),
+            gain.astype(np.float32),
+            forward.astype(np.float32),
+            back_m,
+            step,
+        )
+        span = float(np.median(carriers.joint_gain * np.abs(near_q - far_q)))
+        if not span >= LEAST_RANGE_RAD:
+            raise PredictionError(
+                f"crossed: over the working range {rig.working_range_mm[0]:g} to {rig.working_range_mm[1]:g} mm the "
+                f"carriers change by {span:.2g} rad, too little for a depth: turn them towards the line between camera "
+                "and projector, or make them finer (fpp-bench patterns --design)"
+            )
+        return carriers
+
+    def at(self, where: Crop) -> "Carriers":
+        """The carriers of a part of a whole image."""
+        maps = self.infinity_rad[:, *where], self.gain[:, *where], self.forward[where]
+        return replace(self, crop=where, infinity_rad=maps[0], gain=maps[1], forward=maps[2])
+
+    @property
+    def period_px(self) -> float:
+        """Image px a period of the longer carrier, on a plane at the standoff: windows have a size in it."""
+        return float((TAU / np.linalg.norm(self.step_rad, axis=1)).max())
+
+    @cached_property
+    def joint_gain(self) -> Image:
+        """Change in rad of both phases together, as the length of a vector, a unit of q, (h, w)."""
+        return np.hypot(*self.gain)  # type: ignore[no-any-return]
+
+    def phases(self, nearness: NDArray) -> NDArray:
+        """Phases (2, h, w) in rad, not wrapped, at the nearness q (h, w)."""
+        return self.infinity_rad + self.gain * nearness
+
+    def nearness(self, depth_mm: ArrayLike) -> NDArray:
+        """q of a depth in mm."""
+        return 1 / (self.forward * np.asarray(depth_mm) / MM_PER_M + self.back_m)
+
+    def depth_mm(self, nearness: NDArray) -> NDArray[np.float64]:
+        """Depth in mm, float64 (h, w), from q; corrected for a projector lens that distorts. NaN where q is not in
+        front of both devices."""
+        q = nearness.astype(np.float64)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            depth_m = np.where(q > 0, (1 / q - self.back_m) / self.forward, np.nan)
+            if any(self.rig.projector.distortion):
+                x, y = (axis[self.crop] for axis in self.rig.camera.rays())
+                exact = _phases(self.rig, self.family, x, y, depth_m)
+                misfit = wrapped(self.phases(q) - exact)
+                q = q + (misfit * self.gain).sum(axis=0) / self.joint_gain**2
+                depth_m = np.where(q > 0, (1 / q - self.back_m) / self.forward, np.nan)
+        return np.where(depth_m > 0, depth_m * MM_PER_M, np.nan)
+
+    def mm_per_rad(self, depth_mm: NDArray) -> NDArray:
+        """Change of depth in mm a rad of the joint phase, at ``depth_mm`` (h, w)."""
+        ahead = self.forward * depth_mm / MM_PER_M + self.back_m
+        return np.abs(ahead**2 / (self.joint_gain * self.forward)) * MM_PER_M
+
+
+def _phases(rig: Rig, family: Crossed, x: NDArray, y: NDArray, depth_m: ArrayLike) -> NDArray[np.float64]:
+    """Phases (2, h, w) in rad, not wrapped, of points ``depth_m`` away on the rays (x, y), by the rig's own projection;
+    those of the family's first frame."""
+    u, v = rig.project(np.stack([x * depth_m, y * depth_m, np.broadcast_to(depth_m, x.shape)], axis=-1))
+    shifts = np.radians(family.shifts_deg[0])
+    pairs = zip(family.cycles_per_px, shifts, strict=True)
+    return np.stack([TAU * (along_u * u + along_v * v) + shift for (along_u, along_v), shift in pairs])

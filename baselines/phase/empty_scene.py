@@ -1,64 +1,218 @@
-"""The background plane in a crossed frame: the pixels where both phases are the plane's, and their grey levels.
+"""The empty scene: the background plane's grey levels in the light of an image, which tell what is no object.
 
-The plane's phases are known from the rig, the light is not: the lamp's brightness, the contrast of the fringes, and the
-response of projector and camera are fitted to the pixels that show the plane. So no absolute grey level is needed.
+The plane's phase is known from the rig, the light is not: it is fitted to the pixels that show the plane. In fringes of
+one direction these are tiles whose grey levels are ambient light plus a multiple of the plane's fringe; the lamp's
+strength found so calibrates the brightness of objects. In crossed fringes they are pixels where both phases are the
+plane's; the lamp's brightness, the contrast, and the response of projector and camera are fitted, and no absolute grey
+level is needed.
 """
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase.calibration_layer import Image, Mask, wrapped
-from fpp_ml_bench.baselines.phase.carriers import Carriers
-from fpp_ml_bench.baselines.phase.demodulation import Demodulated
-from fpp_ml_bench.baselines.phase.object_mask import (
-    DEFAULT_NOISE_GREY,
-    FLOOR_NOISE_GREY,
-    Background,
-    image_noise_grey,
-    plane_irradiance,
-)
+from fpp_ml_bench.baselines.phase.calibration_layer import CalibrationLayer, Carriers, Crop, Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase.local_fit import FLOOR_NOISE_GREY, Demodulated
 from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
+from fpp_ml_bench.optics.rig import Rig
 
+SAMPLE_STEP_PX = 5
+LEAST_SHARE = 0.02  # of the image that must show the plane for the image to calibrate itself
+DARK_PERCENTILE = 1.0  # of the grey levels of an image without background that is taken for its ambient light
+DEFAULT_NOISE_GREY = 1.0  # noise of an image that shows no background to measure it on
+DIFFERENT_SIGMAS = 3.5
+"""A pixel this far from the empty scene is not background; noise alone reaches it at isolated pixels, 1 in 2,000."""
+TILE_PX_PER_PERIOD = 1.1
+"""Side of the tiles that are searched for the plane: over one period, to separate strength and ambient light."""
+TILE_NOISE_SIGMAS = 3.0  # largest misfit of a tile that may be background, in standard deviations of the image's noise
+STRENGTH_TOLERANCE = 0.4
+"""Relative deviation of the lamp's strength in an image from a strength that the user gives. A surface in the working
+range whose fringe is in phase with the plane's is two to four times as bright, and must not be taken for the plane."""
+LEAST_EXPLAINED = 0.5
+"""Least share of the variance of the tiles' grey levels that one plane must explain. A dark tile in which nothing is to
+be seen misfits no prediction; a plane that is there explains 0.8 and more even where it is as dim as noise."""
+SAME_STRENGTH = 1.35  # ratio of strengths within which tiles show the same surface: sheen changes slowly over a plane
 SAME_RAD = 0.4  # distance of a phase pair from the plane's within which a pixel may show it
 MARGIN_PERIODS = 0.4  # eroded from those pixels: a window beside an object covers it too
-SAMPLE_STEP_PX = 5
-LEAST_SHARE = 0.02  # of the image that must show the plane
 SAMPLES = 4000  # points to which the plane is fitted, about
 ROUNDS = 4
 OUTLIER_SIGMAS = 4.0
-DARK_PERCENTILE = 1.0  # of the grey levels, smoothed, that is taken for ambient light
 CURVE_POWERS = (1, 2, 3)
 """Powers of the fitted light whose sum is the plane's grey level: a gamma of projector or camera bends it."""
 
 
-class EmptySceneFit:
+@dataclass(frozen=True)
+class Background:
+    """Fit of the empty scene to one image, grey levels; ``strength``: what a white pattern gives per 1/m^2 of
+    irradiance, NaN where neither image nor user tells; ``residual`` float32 (H, W): image minus prediction; ``share``:
+    of the tiles that show the plane, 0 for none; ``weights``: of the lamp's terms 1, x, y, x^2, xy, y^2."""
+
+    ambient_grey: float
+    strength: float
+    noise_grey: float
+    residual: Image
+    share: float
+    weights: tuple[float, ...]
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether brightness can tell distances: the lamp's strength is known."""
+        return bool(np.isfinite(self.strength))
+
+    @property
+    def shown(self) -> bool:
+        """Whether the image shows the background plane, so that what differs from it is object."""
+        return self.share > 0
+
+    @property
+    def different(self) -> Mask:
+        """Pixels (H, W) whose own grey level the empty scene does not explain."""
+        return np.abs(self.residual) > DIFFERENT_SIGMAS * self.noise_grey
+
+
+class EmptyScene:
+    """The background plane as a rig and direction show it; computed once, then fitted to every image. Its phase is
+    calibrated; ambient light, the lamp's strength and a slow change of its sheen across the image are fitted to the
+    pixels that show the plane. ``white_grey`` and ``ambient_grey``, if the user gives them, are a photometric
+    calibration: the grey level of a white pattern on a surface that faces the projector at the near end of the working
+    range, and of a surface in ambient light alone. Without them an image that does not show the plane, or
+    whose rig knows none, is not calibrated, and brightness tells no distance. What is modulated is object there
+    (`modulated_region`)."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        layer: CalibrationLayer,
+        period_px: float,
+        white_grey: float | None,
+        ambient_grey: float | None,
+    ) -> None:
+        self.ambient_grey = ambient_grey
+        self.strength = np.nan if white_grey is None else white_grey * (rig.working_range_mm[0] / MM_PER_M) ** 2
+        self._rays = rig.camera.rays()
+        # Without a known background nothing is predicted, and no image shows it.
+        depth_m = np.nan if rig.background_m is None else rig.background_m
+        self._phase = layer.absolute_phase(depth_m * MM_PER_M)
+        self._fall_off = plane_irradiance(rig, depth_m)
+        self._light = np.nan_to_num(self._fall_off * (0.5 + 0.5 * np.cos(self._phase)))
+        self._terms = [np.nan_to_num(self._light * term).astype(np.float32) for term in _quadratic(*self._rays)]
+        self._tile = min(max(8, round(period_px * TILE_PX_PER_PERIOD)), *self._light.shape)
+        self._mean, self._square = self._tiles(self._light), self._tiles(self._light * self._light)
+
+    def fit(self, image: NDArray[np.uint8]) -> Background:
+        """Background of ``image`` uint8 (H, W)."""
+        grey = image.astype(np.float32)
+        plane_tiles = self._background_tiles(grey)
+        share = float(plane_tiles.mean())
+        if share < LEAST_SHARE:
+            dark = float(np.percentile(image, DARK_PERCENTILE)) if self.ambient_grey is None else self.ambient_grey
+            strength = float(np.nan_to_num(self.strength))
+            residual = grey - np.float32(dark) - np.float32(strength) * self._terms[0]
+            noise = max(image_noise_grey(image), DEFAULT_NOISE_GREY)
+            return Background(dark, float(self.strength), noise, residual, 0.0, (strength,))
+        plane_pixels = plane_tiles.repeat(self._tile, axis=0).repeat(self._tile, axis=1)
+        places = np.nonzero(plane_pixels[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX])
+        row, column = (SAMPLE_STEP_PX * place for place in places)
+        sampled = grey[row, column].astype(np.float64)
+        terms = np.stack([np.ones_like(sampled)] + [term[row, column] for term in self._terms], axis=1)
+        solution = np.linalg.lstsq(terms, sampled, rcond=None)[0]
+        misfit = sampled - terms @ solution
+        noise = _noise_of(misfit)
+        ambient_grey, *weights = solution
+        residual = grey - np.float32(ambient_grey)
+        for weight, term in zip(weights, self._terms, strict=True):
+            residual -= np.float32(weight) * term
+        return Background(float(ambient_grey), float(weights[0]), noise, residual, share, tuple(weights))
+
+    def predicted(self, background: Background, shift_rad: float, where: Crop) -> Image:
+        """Grey levels, float32 (h, w), that the plane has on the pixels ``where`` of a frame whose fringe is shifted by
+        ``shift_rad``, in the light that ``background`` was fitted to."""
+        terms = _quadratic(*(axis[where] for axis in self._rays))
+        lamp = sum(weight * term for weight, term in zip(background.weights, terms, strict=False))
+        fringe = 0.5 + 0.5 * np.cos(self._phase[where] + shift_rad)
+        plane = np.nan_to_num(lamp * self._fall_off[where] * fringe).astype(np.float32)
+        return np.float32(background.ambient_grey) + plane
+
+    def _tiles(self, image: NDArray) -> NDArray[np.float64]:
+        """Means over whole tiles."""
+        tile = self._tile
+        height, width = (length // tile * tile for length in image.shape)
+        rows = image[:height, :width].reshape(height, width // tile, tile).sum(axis=2, dtype=np.float64)
+        return rows.reshape(height // tile, tile, width // tile).sum(axis=1) / (tile * tile)
+
+    def _background_tiles(self, grey: Image) -> Mask:
+        """Tiles whose grey levels are ambient light plus a common multiple of the predicted light."""
+        mean, square = self._tiles(grey), self._tiles(grey * grey)
+        spread = self._square - self._mean**2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            covariance = self._tiles(grey * self._light) - mean * self._mean
+            slope = covariance / spread
+            misfit = np.sqrt(np.maximum(square - mean**2 - covariance * slope, 0))
+            largest = TILE_NOISE_SIGMAS * max(image_noise_grey(grey), 1.0)
+            plane_tiles = (misfit < largest) & (spread > 1e-2 * spread.max()) & (slope * np.sqrt(spread) > largest / 3)
+            if np.isfinite(self.strength):
+                plane_tiles &= np.abs(slope / self.strength - 1) < STRENGTH_TOLERANCE
+        if not plane_tiles.any():
+            return plane_tiles
+        # The plane is the surface with the most tiles of one strength.
+        ascending = np.sort(slope[plane_tiles])
+        count = np.searchsorted(ascending, ascending * SAME_STRENGTH, "right") - np.arange(ascending.size)
+        first = int(count.argmax())
+        typical = float(np.median(ascending[first : first + count[first]]))
+        plane_tiles &= np.abs(slope / typical - 1) < 0.15
+        shown = (square - mean**2)[plane_tiles].sum()
+        unexplained = (misfit[plane_tiles] ** 2).sum()
+        return plane_tiles if unexplained < (1 - LEAST_EXPLAINED) * shown else np.zeros_like(plane_tiles)
+
+
+def image_noise_grey(image: NDArray) -> float:
+    """Standard deviation of an image's noise in grey levels, by the median over pixels of a mask that removes planes
+    and slow fringes (Immerkaer 1996, Fast Noise Variance Estimation)."""
+    grey = image.astype(np.float32)
+    across = grey[:, :-2] - 2 * grey[:, 1:-1] + grey[:, 2:]
+    mask = across[:-2] - 2 * across[1:-1] + across[2:]
+    return MAD_TO_SIGMA * float(np.median(np.abs(mask))) / 6.0
+
+
+def _noise_of(misfit_grey: NDArray) -> float:
+    """Standard deviation of noise in grey levels from misfits of which some are none."""
+    return max(MAD_TO_SIGMA * float(np.median(np.abs(misfit_grey))), FLOOR_NOISE_GREY)
+
+
+def plane_irradiance(rig: Rig, depth_m: float) -> NDArray[np.float64]:
+    """Irradiance of a plane square to the camera's axis at ``depth_m``: cosine over distance squared, 1/m^2, (H, W)."""
+    x, y = rig.camera.rays()
+    centre = -rig.R.T @ rig.t
+    # The plane's normal is the camera's axis, however the projector is rotated.
+    right, down, ahead = x * depth_m - centre[0], y * depth_m - centre[1], depth_m - centre[2]
+    squared = right**2 + down**2 + ahead**2
+    return ahead / (squared * np.sqrt(squared))
+
+
+def _quadratic(x: NDArray, y: NDArray) -> tuple[NDArray, ...]:
+    return np.ones_like(x), x, y, x * x, x * y, y * y
+
+
+class CrossedEmptyScene:
     """The plane of a rig in the light of a carrier pair; computed once, then fitted to every image."""
 
     def __init__(self, carriers: Carriers, stride: int) -> None:
-        rig = carriers.rig
-        self.known = rig.background_m is not None
-        shape = rig.camera.height, rig.camera.width
-        self._coarse = slice(None, None, stride), slice(None, None, stride)
-        self._stride = stride
-        if rig.background_m is None:
-            return
-        phases = carriers.phases(carriers.nearness(rig.background_m * MM_PER_M))
-        self._phases = wrapped(phases[:, *self._coarse])
+        rig, self._stride = carriers.rig, stride
+        # Without a known background nothing is predicted, and no image shows it.
+        depth_m = np.nan if rig.background_m is None else rig.background_m
+        phases = carriers.phases(carriers.nearness(depth_m * MM_PER_M))
+        self._phases = wrapped(phases[:, ::stride, ::stride])
         x, y = (axis.astype(np.float32) for axis in rig.camera.rays())
-        fall_off = plane_irradiance(rig, rig.background_m).astype(np.float32)
+        fall_off = plane_irradiance(rig, depth_m).astype(np.float32)
         fall_off /= np.float32(np.median(fall_off))
-        lamp = [fall_off * term for term in (np.ones_like(x), x, y, x * x, x * y, y * y)]
-        first, second = (np.float32(w) * np.cos(phase) for w, phase in zip(carriers.weights, phases, strict=True))
-        self._terms = [
-            term.astype(np.float32)
-            for term in (
-                *(part * (1 + first + second) for part in lamp),
-                fall_off * first,
-                fall_off * second,
-                np.ones(shape),
-            )
-        ]
+        first, second = (
+            np.float32(w) * np.cos(phase) for w, phase in zip(carriers.family.weights, phases, strict=True)
+        )
+        terms = [fall_off * term * (1 + first + second) for term in _quadratic(x, y)]
+        terms += [fall_off * first, fall_off * second, np.ones_like(x)]
+        self._terms = [term.astype(np.float32) for term in terms]
         self._margin = 2 * max(1, round(MARGIN_PERIODS * carriers.period_px / stride)) + 1
 
     def __call__(self, grey: Image, seen: Demodulated) -> Background:
@@ -68,7 +222,7 @@ class EmptySceneFit:
         smooth = cv2.blur(grey, (3, 3))[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX]
         dark = float(np.percentile(smooth, DARK_PERCENTILE))
         noise = max(image_noise_grey(grey), FLOOR_NOISE_GREY)
-        plane_points = self._plane(seen, noise) if self.known else np.zeros(seen.mean_grey.shape, bool)
+        plane_points = self._plane(seen, noise)
         share = float(plane_points.mean())
         if share < LEAST_SHARE:
             return Background(dark, np.nan, max(noise, DEFAULT_NOISE_GREY), np.zeros_like(grey), 0.0, ())
@@ -80,7 +234,7 @@ class EmptySceneFit:
         curve = np.stack([light**power for power in CURVE_POWERS] + [np.ones_like(light)], axis=1)
         scale = np.abs(curve).max(axis=0)
         fitted, bend = _robust(curve / scale, samples)
-        noise = max(MAD_TO_SIGMA * float(np.median(np.abs(samples - fitted))), FLOOR_NOISE_GREY)
+        noise = _noise_of(samples - fitted)
         # Horner's rule on whole images, in single precision: 1e-5 of a grey level is enough here.
         first = sum((np.float32(w) * term for w, term in zip(weights, self._terms, strict=True)), np.float32(0))
         bend = (bend / scale).astype(np.float32)
@@ -104,5 +258,5 @@ def _robust(terms: NDArray[np.float64], values: NDArray[np.float64]) -> tuple[ND
         solution = np.linalg.lstsq(terms[keep], values[keep], rcond=None)[0]
         fitted = terms @ solution
         misfit = np.abs(values - fitted)
-        keep = misfit < OUTLIER_SIGMAS * max(MAD_TO_SIGMA * float(np.median(misfit[keep])), FLOOR_NOISE_GREY)
+        keep = misfit < OUTLIER_SIGMAS * _noise_of(misfit[keep])
     return fitted, solution

@@ -1,27 +1,39 @@
-"""Local least squares of a fringe under a Gaussian window, which never reaches across the object mask.
+"""Least squares of fringes under a Gaussian window, which never reaches across the object mask.
 
-First fit: ``I = a + b x + c y + C cos(theta) + S sin(theta)`` around each pixel, with theta a carrier (a plane at the
-standoff) whose phase the solution corrects by ``atan2(-S, C)``. Second fit: ``I - ambient = g (1 + cos(theta + d))``
-with g a plane. A projected fringe goes down to black, so its mean and its modulation are the same number g; with that
-constraint a slope of brightness is not taken for phase.
+One direction: ``I = a + b x + c y + C cos(theta) + S sin(theta)`` around each pixel, with theta a carrier (a plane at
+the standoff) whose phase the solution corrects by ``atan2(-S, C)`` (`carrier_fit`). Two directions: a quadratic
+brightness and both carriers, ``I = p(x, y) + sum_k Re(z_k exp(i k_k (x, y)))``. The solution z_k is a fixed combination
+of grey levels, the same at every pixel, so that it is computed with Fourier transforms, and only where it is needed:
+the filter's band is narrow, and its part of the spectrum, transformed back alone, gives z_k on a grid of every
+``stride``-th pixel (`Demodulator`).
+
+Then, for any number of directions and frames, ``I - ambient = g raised(phase + d)``, with g a polynomial and d one
+change of phase (`tied_fit`). A projected fringe goes down to black, so its mean and its modulation are the same number
+g; with that constraint a slope of brightness is not taken for phase.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import fft
 
-from fpp_ml_bench.baselines.phase.calibration_layer import Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Carriers, Image, Mask, wrapped
+from fpp_ml_bench.constants import MAD_TO_SIGMA
 
 WINDOW_SIGMAS = 3.0
 RIDGE = 1e-6  # of the window's weight, added to the diagonal: fits of a few pixels stay finite
-LARGEST_STEP_RAD = 0.7  # largest correction of the second fit: beyond it the linear model does not hold
+LARGEST_STEP_RAD = 0.7  # largest change of the phase: beyond it the linear model does not hold
 WHOLE_WINDOW = 0.9  # share of a window that lies on the object, of the pixels on which contrast is measured
 LEAST_CONTRAST = 0.3
 STEEPEST_RAD_PER_PX = 0.5
 """Largest change of the residual phase a px that counts as slope; the carrier itself changes by 0.28."""
+DEMODULATION_PERIODS = 0.4  # sigma of the demodulator's window, in periods of the longer carrier
+FLOOR_NOISE_GREY = 0.3  # noise of rounding to whole grey levels
+REACH_PX = 2  # of the pairs that are averaged
+SAME_PLANE_SIGMAS = 3.0
 
 
 PLANE = ((0, 0), (1, 0), (0, 1))
@@ -59,10 +71,14 @@ class FringeFit:
     contrast: float = 1.0
 
     @property
+    def raised(self) -> Image:
+        """Light over brightness of the fringe in the first frame."""
+        return 1 + np.float32(self.contrast) * np.cos(self.phase_rad)
+
+    @property
     def light(self) -> Image:
         """Grey levels (H, W) of the fitted fringe, without the ambient light, in the first frame."""
-        fringe = np.cos(self.phase_rad) if self.contrast == 1 else np.float32(self.contrast) * np.cos(self.phase_rad)
-        return np.maximum(self.brightness, 0) * (1 + fringe)
+        return np.maximum(self.brightness, 0) * self.raised
 
 
 def solve_symmetric(rows: list[list[Image]], right: list[Image]) -> list[Image]:
@@ -106,6 +122,31 @@ def carrier_fit(grey: Image, inside: Mask, carrier_rad: NDArray, window: Window)
     return phase, np.hypot(answer[3], answer[4])
 
 
+def tied_fit(
+    views: Iterable[tuple[NDArray, NDArray, NDArray]],
+    inside: Mask,
+    window: Window,
+    terms: Sequence[tuple[int, int]] = PLANE,
+) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Fit of ``light = g raised + s slope`` around each pixel of one or several ``views``, each light (grey levels
+    less ambient light), and light over brightness with its change by the phase, (h, w). Brightness g, the polynomial of
+    ``terms`` at the pixel; s, brightness times change of phase; share of the window on the object; mean square of the
+    slopes times that share."""
+    # The moments of more terms than a plane's are too much alike for the elimination in single precision.
+    weight: NDArray = inside.astype(np.float32 if len(terms) <= len(PLANE) else np.float64)
+    rr: NDArray
+    rr = rs = ss = lr = ls = np.zeros_like(weight)
+    for light, raised, slope in views:
+        by_raised, by_slope = weight * raised, weight * slope
+        rr, rs, ss = rr + by_raised * raised, rs + by_raised * slope, ss + by_slope * slope
+        lr, ls = lr + light * by_raised, ls + light * by_slope
+    m = window.moment
+    power = m(ss)
+    rows = [[m(rr, a + c, b + d) for c, d in terms[i:]] + [m(rs, a, b)] for i, (a, b) in enumerate(terms)] + [[power]]
+    g, *_, s = solve_symmetric(rows, [m(lr, a, b) for a, b in terms] + [m(ls)])
+    return g, s, m(weight), power
+
+
 def fringe_fit(
     greys: Sequence[Image],
     inside: Mask,
@@ -116,25 +157,18 @@ def fringe_fit(
     contrast: float = 1.0,
     terms: Sequence[tuple[int, int]] = PLANE,
 ) -> FringeFit:
-    """Fit of g (1 + c cos(carrier + shift + d)), g of the ``terms`` and c the ``contrast``, around each pixel of
-    ``greys``, float32 (H, W) each: one image, or several whose fringes are shifted by ``shifts_rad``."""
-    # The moments of more terms than a plane's are too much alike for the elimination in single precision.
+    """`tied_fit` of g (1 + c cos(carrier + shift + d)), c the ``contrast``, around each pixel of ``greys``, float32
+    (H, W) each: one image, or several whose fringes are shifted by ``shifts_rad``."""
     real: type = np.float32 if len(terms) <= len(PLANE) else np.float64
-    weight: NDArray = inside.astype(real)
-    rr: NDArray
-    rr = rs = ss = lr = ls = np.zeros_like(weight)
-    for grey, shift in zip(greys, shifts_rad, strict=True):
+
+    def view(grey: Image, shift: float) -> tuple[NDArray, NDArray, NDArray]:
         angle = carrier_rad.astype(real) + real(shift)
-        light = (grey - real(ambient)) * weight
-        raised, sine = 1 + real(contrast) * np.cos(angle), real(contrast) * np.sin(angle)
-        rr, rs, ss = rr + weight * raised * raised, rs + weight * raised * sine, ss + weight * sine * sine
-        lr, ls = lr + light * raised, ls + light * sine
-    m = window.moment
-    rows = [[m(rr, a + c, b + d) for c, d in terms[i:]] + [m(rs, a, b)] for i, (a, b) in enumerate(terms)] + [[m(ss)]]
-    g, *_, s = solve_symmetric(rows, [m(lr, a, b) for a, b in terms] + [m(ls)])
-    step = np.clip(-s / np.maximum(g, 1.0), -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
-    phase, share = (carrier_rad + step).astype(np.float32), m(weight).astype(np.float32)
-    return FringeFit(phase, g.astype(np.float32), share, contrast)
+        return grey - real(ambient), 1 + real(contrast) * np.cos(angle), -real(contrast) * np.sin(angle)
+
+    views = (view(grey, shift) for grey, shift in zip(greys, shifts_rad, strict=True))
+    g, s, share, _ = tied_fit(views, inside, window, terms)
+    step = np.clip(s / np.maximum(g, 1.0), -LARGEST_STEP_RAD, LARGEST_STEP_RAD)
+    return FringeFit((carrier_rad + step).astype(np.float32), g.astype(np.float32), share.astype(np.float32), contrast)
 
 
 def measured_contrast(light: Image, inside: Mask, fit: FringeFit) -> float:
@@ -160,3 +194,156 @@ def phase_slopes(residual_rad: Image, inside: Mask, smooth_px: float) -> tuple[I
         smooth = cv2.GaussianBlur(change, (size, size), smooth_px, borderType=cv2.BORDER_CONSTANT)
         slopes.append((smooth / total).astype(np.float32))
     return slopes[0], slopes[1]
+
+
+def fringes(carriers: Carriers, nearness: NDArray, contrast: tuple[float, float]) -> tuple[Image, Image]:
+    """Light over brightness (h, w) of crossed fringes of some ``contrast`` at ``nearness``, and its change by the joint
+    phase."""
+    raised, slope = np.ones(nearness.shape, np.float32), np.zeros(nearness.shape, np.float32)
+    shares = carriers.gain / carriers.joint_gain
+    for phase, share, modulation in zip(carriers.phases(nearness), shares, contrast, strict=True):
+        raised += np.float32(modulation) * np.cos(phase)
+        slope -= np.float32(modulation) * np.sin(phase) * share
+    return raised, slope
+
+
+@dataclass(frozen=True)
+class Demodulated:
+    """On every ``stride``-th pixel: ``amplitude`` complex64 (2, h', w'), modulation and wrapped phase of each carrier,
+    and ``mean_grey`` float32 (h', w')."""
+
+    amplitude: NDArray[np.complex64]
+    mean_grey: Image
+
+    @property
+    def phase_rad(self) -> Image:
+        """Wrapped phases float32 (2, h', w')."""
+        return np.angle(self.amplitude).astype(np.float32)
+
+    @property
+    def modulation(self) -> Image:
+        """Grey levels, float32 (2, h', w')."""
+        return np.abs(self.amplitude)
+
+
+class Demodulator:
+    """The filters of a pair of carriers, for images of their size; ``stride``: px between two answers."""
+
+    def __init__(self, carriers: Carriers, stride: int) -> None:
+        camera = carriers.rig.camera
+        self.stride, self.shape = stride, (camera.height, camera.width)
+        kernels = window_kernels(carriers.step_rad, DEMODULATION_PERIODS * carriers.period_px)
+        self._reach = kernels[0].shape[0] // 2
+        # A length that the stride divides, so that every stride-th sample is a whole number of samples apart.
+        self._coarse = [fft.next_fast_len(-(-(length + 2 * self._reach) // stride)) for length in self.shape]
+        lengths = [stride * n for n in self._coarse]
+        self._filters = []
+        for kernel, step in zip(kernels, (*carriers.step_rad, np.zeros(2)), strict=True):
+            # Bins of the carrier along rows and columns: the band around them is moved to zero frequency.
+            centre = [round(float(rad) * n / TAU) for rad, n in zip(step[::-1], lengths, strict=True)]
+            padded = np.zeros(lengths, np.complex128)
+            padded[: kernel.shape[0], : kernel.shape[1]] = kernel
+            padded = np.roll(padded, (-self._reach, -self._reach), (0, 1))
+            bins = np.ix_(*(self._band(c, n, m) for c, n, m in zip(centre, lengths, self._coarse, strict=True)))
+            response = np.conj(fft.fft2(np.conj(padded)))[bins] / stride**2
+            ramps = [
+                np.exp(1j * TAU * c * (np.arange(0, size, stride)) / n)
+                for c, n, size in zip(centre, lengths, self.shape, strict=True)
+            ]
+            self._filters.append((bins, response.astype(np.complex64), np.outer(*ramps).astype(np.complex64)))
+        self._lengths = lengths
+
+    @staticmethod
+    def _band(centre: int, length: int, coarse: int) -> NDArray[np.intp]:
+        return (centre + np.rint(fft.fftfreq(coarse, 1 / coarse)).astype(np.intp)) % length
+
+    def phases_at(self, seen: Demodulated, carriers: Carriers) -> Image:
+        """Wrapped phases float32 (2, h, w) of all pixels of ``carriers``, from those on the grid: the carrier itself
+        is taken out before interpolating, and what is left changes slowly."""
+        rows, columns = carriers.crop
+        y, x = (np.arange(part.start, part.stop, dtype=np.float32) for part in (rows, columns))
+        grid_y, grid_x = (self.stride * np.arange(n) for n in seen.mean_grey.shape)
+        places = np.meshgrid(x / self.stride, y / self.stride)
+        phases = []
+        for amplitude, (across, down) in zip(seen.amplitude, carriers.step_rad, strict=True):
+            slow = amplitude * np.outer(np.exp(-1j * down * grid_y), np.exp(-1j * across * grid_x)).astype(np.complex64)
+            real, imaginary = (
+                cv2.remap(np.ascontiguousarray(part), *places, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+                for part in (slow.real, slow.imag)
+            )
+            fast = (down * y)[:, None] + across * x
+            phases.append(wrapped(np.arctan2(imaginary, real) + fast))
+        return np.stack(phases).astype(np.float32)
+
+    def __call__(self, grey: Image) -> Demodulated:
+        """Demodulate an image float32 (H, W); beyond its border it is continued by its mirror image."""
+        (height, width), reach = self.shape, self._reach
+        after = [n - length - reach for n, length in zip(self._lengths, self.shape, strict=True)]
+        padded = np.pad(grey, ((reach, after[0]), (reach, after[1])), mode="symmetric")
+        padded = np.roll(padded, (-reach, -reach), (0, 1))
+        spectrum = fft.fft2(padded.astype(np.float32))
+        rows, columns = -(-height // self.stride), -(-width // self.stride)
+        answers = []
+        for bins, response, ramp in self._filters:
+            answers.append(fft.ifft2(spectrum[bins] * response)[:rows, :columns] * ramp)
+        return Demodulated(np.stack(answers[:2]), np.ascontiguousarray(answers[2].real))
+
+
+def window_kernels(step_rad: NDArray[np.float64], sigma_px: float) -> list[NDArray[np.complex128]]:
+    """Weights (n, n) of the grey levels around a pixel that give z of both carriers and the mean: the least-squares
+    solution of this module's model under a Gaussian window of ``sigma_px``; ``step_rad`` (2, 2) as of `Carriers`."""
+    half = int(np.ceil(WINDOW_SIGMAS * sigma_px))
+    x, y = np.meshgrid(*[np.arange(-half, half + 1, dtype=np.float64)] * 2)
+    window = np.exp(-0.5 * (x * x + y * y) / sigma_px**2).ravel()
+    terms = [(x / sigma_px) ** a * (y / sigma_px) ** b for a, b in CURVED]
+    for across, down in step_rad:
+        terms += [np.cos(across * x + down * y), np.sin(across * x + down * y)]
+    design = np.stack([term.ravel() for term in terms], axis=1)
+    weighted = window[:, None] * design
+    solution = np.linalg.solve(design.T @ weighted, weighted.T).reshape(-1, *x.shape)
+    first = len(CURVED)
+    # A cos + B sin is the real part of (A - i B) exp(i k x).
+    pairs = [solution[n] - 1j * solution[n + 1] for n in (first, first + 2)]
+    return [*pairs, solution[0] + 0j]
+
+
+def phase_noise_grey(psi: Image, modulation: Image, inside: Mask) -> float:
+    """Noise of a frame in grey levels, from the second differences of the phase ``psi`` (h, w), rad, of three frames
+    along the rows of the object; surfaces are planes to them, except for few pixels."""
+    middle = inside[:, 2:] & inside[:, :-2] & inside[:, 1:-1]
+    if not middle.any():
+        return FLOOR_NOISE_GREY
+    second = (psi[:, 2:] - 2 * psi[:, 1:-1] + psi[:, :-2])[middle] * modulation[:, 1:-1][middle]
+    return max(MAD_TO_SIGMA * float(np.median(np.abs(second))) / np.sqrt(6 * 2 / 3), FLOOR_NOISE_GREY)
+
+
+def same_plane_mean(psi: Image, sigma: Image, inside: Mask) -> tuple[Image, Image]:
+    """Mean of every pixel's phase ``psi`` (h, w), rad, of standard uncertainty ``sigma``, and of the pairs of pixels
+    opposite each other, up to `REACH_PX` away, that differ from it and from a plane through it by no more than noise;
+    and the mean's uncertainty. Opposite pixels have the mean of their plane at the pixel, so a slope adds nothing."""
+    reach, limit = REACH_PX, np.float32(SAME_PLANE_SIGMAS**2)
+    height, width = psi.shape
+    maps = np.pad(np.stack([psi, sigma * sigma, inside]).astype(np.float32), ((0, 0), (reach, reach), (reach, reach)))
+
+    def beside(down: int, right: int) -> NDArray[np.float32]:
+        return maps[:, reach + down : reach + down + height, reach + right : reach + right + width]
+
+    own = beside(0, 0)[1]
+    total, weights = psi / own, 1 / own
+    half = [(0, right) for right in range(1, reach + 1)]
+    half += [(down, right) for down in range(1, reach + 1) for right in range(-reach, reach + 1)]
+    for down, right in half:
+        (first, first_variance, first_known), (second, second_variance, second_known) = (
+            beside(down, right),
+            beside(-down, -right),
+        )
+        alike = (first_known > 0) & (second_known > 0)
+        alike &= (first - psi) ** 2 < limit * (first_variance + own)
+        alike &= (second - psi) ** 2 < limit * (second_variance + own)
+        variance = first_variance + second_variance
+        alike &= (first + second - 2 * psi) ** 2 < limit * (variance + 4 * own)
+        # The middle of a pair, each with half of its weight, has a quarter of the sum of both variances.
+        weight = np.where(alike, 4 / np.maximum(variance, np.float32(1e-12)), np.float32(0))
+        total += weight * (first + second) / 2
+        weights += weight
+    return (total / weights).astype(np.float32), np.sqrt(1 / weights).astype(np.float32)

@@ -6,24 +6,26 @@ expected error, from its phase and from its order. While that error is too large
 """
 
 import operator
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method
-from fpp_ml_bench.baselines.phase.observation import PIXELWISE, Measurement, Prior, Reason, Settings
-from fpp_ml_bench.baselines.phase.route import PhaseRoute
-from fpp_ml_bench.baselines.phase.several_frames import steps_of
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute, FringeMeasurement, PhaseRoute, Reason
+from fpp_ml_bench.baselines.phase.observe import CROSSED_FRAMES, MIN_CONFIDENCE, PIXELWISE, Settings, steps_of
+from fpp_ml_bench.baselines.phase.order import TERMS, terms_of
+from fpp_ml_bench.coding.crossed import crossed_from_pair
 from fpp_ml_bench.coding.phase_shift import PhaseShift
-from fpp_ml_bench.decoding.decode import decode_stack
+from fpp_ml_bench.decoding.decode import decode_stack, grey_levels
 from fpp_ml_bench.errors import DecodeError, PredictionError
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.captures.decoding import read_mask
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.sequence import DIRECTIONS, PAPER_SEQUENCE, Direction
+from fpp_ml_bench.optics.sequence import DIRECTIONS, PAPER_SEQUENCE
 from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
@@ -35,25 +37,11 @@ ORDER_SHARE = (0.16, 0.10, 0.05)
 The margin of an order overestimates the probability that it is wrong; these factors correct that."""
 
 
-MIN_CONFIDENCE = "mask pixels of less confidence, 0 to 1 (default: 0, dense)"
-DIRECTION = "direction of the fringes (default: horizontal)"
-WHITE_GREY = (
-    "for images without a lit background: grey level of a white pattern on a surface that faces the projector at the "
-    "near end of the working range"
-)
-AMBIENT_GREY = (
-    "for images without a lit background: grey level of a surface in ambient light alone (default: the image's darkest)"
-)
-MASK = "object mask: an image of the frames' size, above 0 on the object in every sample (default: found in each image)"
-"""Help of options that several routes have."""
 LIT_BACKGROUND = Assumption(
     "a lit background", "Assumes a lit background; not one albedo, so that little tells the fringe order."
 )
-ONE_ALBEDO = Assumption(
-    "one albedo, a lit background",
-    "Assumes one albedo for all surfaces and a lit background, which shows how strong the lamp is: the brightness of "
-    "the fringe image decides the fringe order.",
-)
+ONE_ALBEDO = Assumption("one albedo, a lit background", TERMS["shading"].assumes)
+MASK = "object mask: an image of the frames' size, above 0 on the object in every sample (default: found in each image)"
 
 
 @dataclass(frozen=True)
@@ -61,31 +49,37 @@ class PhaseOptions(Settings):
     """Options of `PhaseMethod`: those of `Settings`, an object ``mask`` (a file of `captures.read_mask`), and
     ``error_mm``, which makes it `FewestFrames`."""
 
-    direction: Direction = option("horizontal", DIRECTION, choices=DIRECTIONS)
-    frames: int = option(1, "fringes of that direction, 1 to 18; no Gray code (default: 1)", "N")
     error_mm: float | None = option(
         None,
         "instead of --frames: for each scene the fewest frames whose expected error is at most this, starting with a "
         "single fringe; may need the Gray code",
         "MM",
     )
-    prior: Prior = option(
-        "none",
-        "standoff: assume that objects are near the rig's standoff, true of fixed placement (default: none)",
-        choices=get_args(Prior),
-    )
-    shading: bool = option(True, "choose the fringe order without brightness", flag="--no-shading")
+    mask: str | Path | None = option(None, MASK, "FILE")
+
+
+@dataclass(frozen=True)
+class CrossedOptions:
+    """Options of `CrossedMethod`."""
+
+    frames: int = option(1, "crossed frames, 1 or 3 (default: 1)", "N")
     min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
-    white_grey: float | None = option(None, WHITE_GREY, "GREY")
-    ambient_grey: float | None = option(None, AMBIENT_GREY, "GREY")
     mask: str | Path | None = option(None, MASK, "FILE")
 
 
 class RouteMethod(Method):
-    """A method that measures every map of a sample at once: ``measure`` (frames) gives a measurement with ``depth_mm``
-    and ``sigma_mm``."""
+    """A method that measures every map of a sample at once by its `route`."""
 
-    measure: Callable[[Frames], Any]
+    route: Any
+    mask: NDArray[np.bool_] | None = None
+
+    def use_mask(self, mask: str | Path | None) -> dict[str, str]:
+        """Take the object mask of every sample from a file (`captures.read_mask`), if there is one; what it adds to the
+        settings."""
+        if mask is None:
+            return {}
+        self.mask = read_mask(Path(mask), (self.rig.camera.height, self.rig.camera.width))
+        return {"mask": Path(mask).name}
 
     def images(self, frames: Frames) -> list[NDArray[np.uint8]]:
         """The captured frames of `frames_used`; raises `DecodeError` for one that is missing."""
@@ -98,6 +92,10 @@ class RouteMethod(Method):
             images.append(image)
         return images
 
+    def measure(self, frames: Frames) -> Any:
+        """All maps of a captured sequence (`Measurement`); frames that are not in `frames_used` may be None."""
+        return self.route.measure(self.images(frames), self.mask)
+
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""
         return self.measure(frames).depth_mm  # type: ignore[no-any-return]
@@ -105,6 +103,10 @@ class RouteMethod(Method):
     def answer(self, frames: Frames) -> Answer:
         measurement = self.measure(frames)
         return Answer(measurement.depth_mm, measurement.sigma_mm)
+
+    def crop(self, frames: Frames) -> tuple[slice, slice]:
+        seen = self.route.observe(self.images(frames), self.mask)
+        return self.route.resampling.captured_crop(seen.crop)  # type: ignore[no-any-return]
 
 
 class PhaseMethod(RouteMethod):
@@ -119,25 +121,20 @@ class PhaseMethod(RouteMethod):
     @classmethod
     def for_rig(cls, rig: Rig, **options: Any) -> Method:
         """`FewestFrames` where ``error_mm`` is given."""
-        if options.get("error_mm") is not None and "frames" in options:
-            raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
         options = fringe_options(cls.name, rig, options)
         return cls(rig, **options) if options.get("error_mm") is None else FewestFrames(rig, **options)
 
     def __init__(self, rig: Rig, **options: Any) -> None:
         given = self.checked_options(options)
         settings = Settings(**{entry.name: getattr(given, entry.name) for entry in fields(Settings)})
-        mask = given.mask
         self.rig, self.options, self.route = rig, settings, PhaseRoute(rig, settings)
         sinusoids = rig.sequence.sinusoids(settings.direction)
         self.frames_used = tuple(sinusoids[step] for step in self.route.steps)
         frames = len(self.frames_used)
         count = f"one {settings.direction} fringe" if frames == 1 else f"{frames} {settings.direction} fringes"
-        cues = ["range"] + ["shading"] * settings.shading + ["standoff"] * (settings.prior == "standoff")
-        self.title = f"Phase route, {count}, order by {' + '.join(cues)}, nothing learned"
-        shape = rig.camera.height, rig.camera.width
-        self.mask = None if mask is None else read_mask(Path(mask), shape)
-        self.settings = asdict(settings) | ({} if mask is None else {"mask": Path(mask).name})
+        cues = " + ".join(["range", *terms_of(settings)])
+        self.title = f"Phase route, {count}, order by {cues}, nothing learned"
+        self.settings = asdict(settings) | self.use_mask(given.mask)
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
@@ -165,61 +162,97 @@ class PhaseMethod(RouteMethod):
     def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
         return ONE_ALBEDO if settings.get("shading") is True else None
 
-    def measure(self, frames: Frames) -> Measurement:
-        """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
-        return self.route.measure(self.images(frames), self.mask)
 
-    def crop(self, frames: Frames) -> tuple[slice, slice]:
-        return self.route.resampling.captured_crop(self.route.observe(self.images(frames), self.mask).crop)
+def frames_of(rig: Rig, name: str) -> tuple[int, ...]:
+    """The frames that make one crossed frame: the rig's first crossed one, or the first sinusoid of both directions,
+    whose mean is one. Raises `PredictionError` for a rig without either, in the words of the method ``name``."""
+    if crossed := rig.sequence.crossed_frames:
+        return crossed[:1]
+    if rig.fringe_directions == DIRECTIONS:
+        return tuple(sorted(rig.sequence.sinusoids(direction)[0] for direction in DIRECTIONS))
+    listed = " and ".join(rig.fringe_directions) or "no"
+    raise PredictionError(
+        f"{name}: needs a crossed frame, or one fringe of each direction to make it from; this rig projects {listed} "
+        "fringes. fpp-bench patterns --design proposes crossed fringes for a rig"
+    )
 
 
-@dataclass(frozen=True)
-class Look:
-    """Expected error with ``frames`` frames captured, means over object pixels in mm: ``phase_mm`` from the phase and
-    ``order_mm`` from the order; ``gray``: whether the Gray code is among the frames."""
+def crossed_image(images: Sequence[NDArray]) -> NDArray[np.uint8]:
+    """The crossed frame of the images of `frames_of`."""
+    grey = [grey_levels(image) for image in images]
+    return grey[0] if len(grey) == 1 else crossed_from_pair(grey[0], grey[1])
 
-    frames: int
-    gray: bool
-    phase_mm: float
-    order_mm: float
+
+def has_crossed_fringes(rig: Rig) -> bool:
+    """Whether `frames_of` finds a crossed frame."""
+    return bool(rig.sequence.crossed_frames) or rig.fringe_directions == DIRECTIONS
+
+
+def shifted_carrier(rig: Rig, name: str) -> int:
+    """The carrier that the rig's first three crossed frames shift. Raises `PredictionError`, in the words of the method
+    ``name``, for a rig without such frames."""
+    family = rig.crossed
+    shifts = np.zeros((0, 2)) if family is None else np.asarray(family.shifts_deg[:CROSSED_FRAMES], np.float64)
+    if len(shifts) == CROSSED_FRAMES:
+        different = [len(set(np.mod(column, 360))) for column in shifts.T]
+        if sorted(different) == [1, CROSSED_FRAMES]:
+            return different.index(CROSSED_FRAMES)
+    found = "none" if family is None else f"{len(family)} with shifts_deg {[list(pair) for pair in family.shifts_deg]}"
+    raise PredictionError(
+        f"{name} --frames {CROSSED_FRAMES}: needs three crossed frames that shift one carrier and keep the other "
+        f"still; this rig has {found}. Build with --rig crossed, or give the rig such shifts_deg (docs/own_rig.md)"
+    )
+
+
+class CrossedMethod(RouteMethod):
+    """Depth from one crossed frame; where the rig has none, from the mean of the first fringe of both directions, which
+    is one. With ``frames`` 3: from three that shift one carrier. ``mask``: a file
+    (`captures.read_mask`) that says where the object is in every sample. Raises `PredictionError` for a rig without
+    such frames and for an invalid option, `CaptureError` for a mask that can't be used."""
+
+    name = "crossed"
+    purpose = "one frame with two fringe directions, or three, nothing learned"
+    Options = CrossedOptions
+    scenes_rig = "crossed"
+
+    def __init__(self, rig: Rig, **options: Any) -> None:
+        given = self.checked_options(options)
+        self.rig, frames, moved = rig, given.frames, None
+        if frames == CROSSED_FRAMES:
+            self.frames_used, moved = rig.sequence.crossed_frames[:CROSSED_FRAMES], shifted_carrier(rig, self.name)
+            count = "three frames"
+        elif frames == 1:
+            self.frames_used = frames_of(rig, self.name)
+            count = "one frame" if len(self.frames_used) == 1 else "one frame, the mean of two"
+        else:
+            raise PredictionError(f"{self.name} --frames {frames}: expected 1 or {CROSSED_FRAMES} crossed frames")
+        self.route = CrossedRoute(rig, Settings(min_confidence=given.min_confidence), moved=moved)
+        pitches = " and ".join(f"{pitch:g}" for pitch in self.route.family.pitches_px)
+        self.title = f"Crossed fringes of {pitches} px, {count}, nothing learned"
+        self.settings = {"min_confidence": given.min_confidence} | self.use_mask(given.mask)
+        self.settings |= {} if frames == 1 else {"frames": frames}
 
     @classmethod
-    def of(cls, measurement: Measurement, count: int) -> "Look":
-        # A pixel without a depth because its order is ambiguous is what more frames are for.
-        on_object = (measurement.depth_mm > 0) | (measurement.reason == Reason.AMBIGUOUS)
-        if not on_object.any():
-            return cls(count, False, 0.0, 0.0)
-        order_mm = float(measurement.order_doubt_mm[on_object].mean(dtype=np.float64))
-        error_mm = float(measurement.expected_error_mm[on_object].mean(dtype=np.float64))
-        return cls(count, False, error_mm - order_mm, order_mm * ORDER_SHARE[min(count, len(ORDER_SHARE)) - 1])
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+        if not has_crossed_fringes(rig):
+            return []
+        return [{}, {"frames": CROSSED_FRAMES}] if len(rig.sequence.crossed_frames) >= CROSSED_FRAMES else [{}]
 
-    @property
-    def expected_mm(self) -> float:
-        return self.phase_mm + self.order_mm
+    @classmethod
+    def short_name(cls, submission: "Submission") -> str | None:
+        return crossed_name(submission, "Crossed fringes ")
+
+    def images(self, frames: Frames) -> list[NDArray[np.uint8]]:
+        images = super().images(frames)
+        return images if self.route.moved is not None else [crossed_image(images)]
 
 
-@dataclass(frozen=True)
-class FrameChoice:
-    """``depth_mm`` float32 (H, W) of the last look, its ``frames_used`` (indices, ascending), and all ``looks``."""
-
-    depth_mm: NDArray[np.float32]
-    frames_used: tuple[int, ...]
-    looks: tuple[Look, ...]
-
-    def report(self) -> dict[str, Any]:
-        """JSON of one sample: number of frames, their indices, and the expected error at each look."""
-        looks = [
-            {
-                "frames": look.frames,
-                "gray_code": look.gray,
-                "expected_error_mm": round(look.expected_mm, 4),
-                "by_phase_mm": round(look.phase_mm, 4),
-                "by_order_mm": round(look.order_mm, 4),
-            }
-            for look in self.looks
-        ]
-        last = {name: looks[-1][name] for name in ("frames", "expected_error_mm")}
-        return last | {"frames_used": list(self.frames_used), "looks": looks}
+def crossed_name(submission: "Submission", begins: str) -> str | None:
+    """A short name for a submission of crossed fringes whose name ``begins`` so; None for another."""
+    if not submission.name.startswith(begins):
+        return None
+    frames = {1: "1 frame", 2: "mean of 2"}.get(len(submission.frames_used), f"{len(submission.frames_used)} frames")
+    return f"{printable(submission.settings.get('weights', 'Crossed'))}, {frames}"
 
 
 def fringe_options(name: str, rig: Rig, options: dict[str, Any]) -> dict[str, Any]:
@@ -250,6 +283,48 @@ def direction_of(submission: "Submission") -> str:
     return DIRECTIONS[DIRECTIONS.index(submission.settings["direction"])]  # type: ignore[arg-type]
 
 
+@dataclass(frozen=True)
+class Look:
+    """Expected error with ``frames`` frames captured, means over object pixels in mm: from the phase and from the
+    order; ``gray_code``: whether the Gray code is among the frames."""
+
+    frames: int
+    gray_code: bool
+    expected_error_mm: float
+    by_phase_mm: float
+    by_order_mm: float
+
+    @classmethod
+    def of(cls, measurement: FringeMeasurement, count: int) -> "Look":
+        # A pixel without a depth because its order is ambiguous is what more frames are for.
+        on_object = (measurement.depth_mm > 0) | (measurement.reason == Reason.AMBIGUOUS)
+        if not on_object.any():
+            return cls(count, False, 0.0, 0.0, 0.0)
+        error_mm, order_mm = (
+            float(values[on_object].mean(dtype=np.float64))
+            for values in (measurement.expected_error_mm, measurement.order_doubt_mm)
+        )
+        by_phase_mm, by_order_mm = error_mm - order_mm, order_mm * ORDER_SHARE[min(count, len(ORDER_SHARE)) - 1]
+        return cls(count, False, by_phase_mm + by_order_mm, by_phase_mm, by_order_mm)
+
+
+@dataclass(frozen=True)
+class FrameChoice:
+    """``depth_mm`` float32 (H, W) of the last look, its ``frames_used`` (indices, ascending), and all ``looks``."""
+
+    depth_mm: NDArray[np.float32]
+    frames_used: tuple[int, ...]
+    looks: tuple[Look, ...]
+
+    def report(self) -> dict[str, Any]:
+        """JSON of one sample: number of frames, their indices, and the expected error at each look."""
+        looks = [asdict(look) for look in self.looks]
+        for look in looks:
+            look |= {key: round(value, 4) for key, value in look.items() if key.endswith("_mm")}
+        last = {name: looks[-1][name] for name in ("frames", "expected_error_mm")}
+        return last | {"frames_used": list(self.frames_used), "looks": looks}
+
+
 def levels_of(steps: int) -> tuple[int, ...]:
     """Numbers of fringes to capture in turn, each containing the fringes before: 1, 2, 3 and more where ``steps`` is a
     multiple of three, else 1 and then all."""
@@ -275,7 +350,7 @@ class FewestFrames(Method):
         if isinstance(error_mm, bool) or not isinstance(error_mm, int | float) or not 0 < error_mm < np.inf:
             raise PredictionError(f"error_mm {error_mm!r}: expected the largest error to accept, in mm, above 0")
         if "frames" in options:
-            raise PredictionError("frames and error_mm: give one of them; error_mm chooses the frames itself")
+            raise PredictionError("--frames and --error-mm: give one of them; --error-mm chooses the frames itself")
         self.rig, self.error_mm = rig, float(error_mm)
         self.methods = {n: PhaseMethod(rig, **options, frames=n) for n in levels_of(rig.sequence.steps)}
         self.options = self.methods[1].options
@@ -297,13 +372,13 @@ class FewestFrames(Method):
                 looks.append(look)
                 # The Gray code helps the order only: it is captured once the phase is good enough, or when no fringe
                 # is left.
-                phase_done = look.phase_mm <= self.error_mm or count == max(self.methods)
-                gray = look.expected_mm > self.error_mm and count >= PIXELWISE and phase_done
+                phase_done = look.by_phase_mm <= self.error_mm or count == max(self.methods)
+                gray = look.expected_error_mm > self.error_mm and count >= PIXELWISE and phase_done
             if gray:
                 depth_mm = decode_stack(frames, self.rig, direction=self.options.direction, steps=count).depth_mm
                 used = tuple(sorted({*used, *self.gray}))
-                looks.append(replace(look, frames=len(used), gray=True, order_mm=0.0))
-            if looks[-1].expected_mm <= self.error_mm:
+                looks.append(Look(len(used), True, look.by_phase_mm, look.by_phase_mm, 0.0))
+            if looks[-1].expected_error_mm <= self.error_mm:
                 break
         return FrameChoice(depth_mm, used, tuple(looks))
 

@@ -1,41 +1,22 @@
 """The object mask: pixels whose grey level the empty scene does not explain; where none is known, modulated pixels.
 
-Twice a period the object's fringe is as bright as the plane's would be, so a single pixel there can't be assigned to
-either. Inside the object, morphological closing by a quarter of a period fills these stripes. At the silhouette, a
-pixel is assigned to the better of two predictions of its grey level: that of the empty scene, and that of the object's
-fringe, extrapolated from the local fit beside it.
+Twice a period the object's fringe is as bright as the plane's would be, so a single pixel of one frame can't be
+assigned to either. Inside the object, morphological closing by a quarter of a period fills these stripes. At the
+silhouette, a pixel is assigned to the better of two predictions of its grey level: that of the empty scene, and that of
+the object's fringe, extrapolated from the local fit beside it. Of several frames every pixel is tested by itself.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase.calibration_layer import CalibrationLayer, Image, Mask
+from fpp_ml_bench.baselines.phase.calibration_layer import Crop, Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase.empty_scene import Background
 from fpp_ml_bench.coding.code import MIN_MODULATION
-from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
-from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.coding.phase_shift import phase_weights
 
-Crop = tuple[slice, slice]
-
-TILE_PX_PER_PERIOD = 1.1
-"""Side of the tiles that are searched for the plane: over one period, to separate strength and ambient light."""
-TILE_NOISE_SIGMAS = 3.0  # largest misfit of a tile that may be background, in standard deviations of the image's noise
-LEAST_SHARE = 0.02  # of the image's tiles that must show background for the image to calibrate itself
-STRENGTH_TOLERANCE = 0.4
-"""Relative deviation of the lamp's strength in an image from a strength that the user gives. A surface in the working
-range whose fringe is in phase with the plane's is two to four times as bright, and must not be taken for the plane."""
-LEAST_EXPLAINED = 0.5
-"""Least share of the variance of the tiles' grey levels that one plane must explain. A dark tile in which nothing is to
-be seen misfits no prediction; a plane that is there explains 0.8 and more even where it is as dim as noise."""
-SAME_STRENGTH = 1.35  # ratio of strengths within which tiles show the same surface: sheen changes slowly over a plane
-DARK_PERCENTILE = 1.0  # of the grey levels of an image without background that is taken for its ambient light
-SAMPLE_STEP_PX = 5
-FLOOR_NOISE_GREY = 0.3  # noise of rounding to whole grey levels
-DEFAULT_NOISE_GREY = 1.0  # noise of an image that shows no background to measure it on
-DIFFERENT_SIGMAS = 3.5
-"""A pixel this far from the empty scene is not background; noise alone reaches it at isolated pixels, 1 in 2,000."""
 CLOSING_PERIODS = 0.27
 RING_PERIODS = 0.14
 """Distance from the first mask's silhouette within which a pixel may change between object and background."""
@@ -46,153 +27,29 @@ UNLIT_SIGMAS = 4.0  # brightest grey level, above ambient light, of what counts 
 DARKEST_GREY = MIN_MODULATION / 4
 """An object pixel with less modulation has no fringe: it lies in shadow or faces away, and gets no depth."""
 LEAST_AREA_PERIODS = 0.1  # smallest object, and largest hole that is closed, in squares of one period
+PLANE_CHANCE_SIGMAS = 4.0
+"""How far, in sigmas of its own spread, the squared misfit of N frames must exceed N not to be the empty plane."""
+PLANE_TOLERANCE_GREY = 0.3  # error of the fitted empty scene, grey levels, beside noise
+SQUARE_PX = 5  # side of the square over which faint differences are averaged
+PIXELWISE_CLOSING_PERIODS = 0.2
+ALIKE = 0.2
+"""Largest relative difference from the brightness around of an object pixel that the empty scene explains as well."""
+SPECK_PX = 6  # smallest group of pixels that counts as object, and largest hole in it that is closed
+DARK_SIGMAS = 4.0
+CONTINUED_PX, CONTINUED_RAD = 3, 0.2
 
 
-@dataclass(frozen=True)
-class Background:
-    """Fit of the empty scene to one image, grey levels; ``strength``: what a white pattern gives per 1/m^2 of
-    irradiance, NaN where neither image nor user tells; ``residual`` float32 (H, W): image minus prediction; ``share``:
-    of the tiles that show the plane, 0 for none; ``weights``: of the lamp's terms 1, x, y, x^2, xy, y^2."""
-
-    ambient_grey: float
-    strength: float
-    noise_grey: float
-    residual: Image
-    share: float
-    weights: tuple[float, ...]
-
-    @property
-    def calibrated(self) -> bool:
-        """Whether brightness can tell distances: the lamp's strength is known."""
-        return bool(np.isfinite(self.strength))
-
-    @property
-    def shown(self) -> bool:
-        """Whether the image shows the background plane, so that what differs from it is object."""
-        return self.share > 0
-
-    @property
-    def different(self) -> Mask:
-        """Pixels (H, W) whose own grey level the empty scene does not explain."""
-        return np.abs(self.residual) > DIFFERENT_SIGMAS * self.noise_grey
-
-
-class EmptyScene:
-    """The background plane as a rig and direction show it; computed once, then fitted to every image. Its phase is
-    calibrated; ambient light, the lamp's strength and a slow change of its sheen across the image are fitted to the
-    pixels that show the plane. ``white_grey`` and ``ambient_grey``, if the user gives them, are a photometric
-    calibration: the grey level of a white pattern on a surface that faces the projector at the near end of the working
-    range, and of a surface in ambient light alone. Without them an image that does not show the plane, or
-    whose rig knows none, is not calibrated, and brightness tells no distance. What is modulated is object there
-    (`modulated_region`)."""
-
-    def __init__(
-        self,
-        rig: Rig,
-        layer: CalibrationLayer,
-        period_px: float,
-        white_grey: float | None,
-        ambient_grey: float | None,
-    ) -> None:
-        self.ambient_grey = ambient_grey
-        self.strength = np.nan if white_grey is None else white_grey * (rig.working_range_mm[0] / MM_PER_M) ** 2
-        self._rays = rig.camera.rays()
-        # Without a known background nothing is predicted, and no image shows it.
-        depth_m = np.nan if rig.background_m is None else rig.background_m
-        self._phase = layer.absolute_phase(depth_m * MM_PER_M)
-        self._fall_off = plane_irradiance(rig, depth_m)
-        self._light = np.nan_to_num(self._fall_off * (0.5 + 0.5 * np.cos(self._phase)))
-        self._terms = [np.nan_to_num(self._light * term).astype(np.float32) for term in _quadratic(*self._rays)]
-        self._tile = min(max(8, round(period_px * TILE_PX_PER_PERIOD)), *self._light.shape)
-        self._mean, self._square = self._tiles(self._light), self._tiles(self._light * self._light)
-
-    def fit(self, image: NDArray[np.uint8]) -> Background:
-        """Background of ``image`` uint8 (H, W)."""
-        grey = image.astype(np.float32)
-        plane_tiles = self._background_tiles(grey)
-        share = float(plane_tiles.mean())
-        if share < LEAST_SHARE:
-            dark = float(np.percentile(image, DARK_PERCENTILE)) if self.ambient_grey is None else self.ambient_grey
-            strength = float(np.nan_to_num(self.strength))
-            residual = grey - np.float32(dark) - np.float32(strength) * self._terms[0]
-            noise = max(image_noise_grey(image), DEFAULT_NOISE_GREY)
-            return Background(dark, float(self.strength), noise, residual, 0.0, (strength,))
-        plane_pixels = plane_tiles.repeat(self._tile, axis=0).repeat(self._tile, axis=1)
-        places = np.nonzero(plane_pixels[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX])
-        row, column = (SAMPLE_STEP_PX * place for place in places)
-        sampled = grey[row, column].astype(np.float64)
-        terms = np.stack([np.ones_like(sampled)] + [term[row, column] for term in self._terms], axis=1)
-        solution = np.linalg.lstsq(terms, sampled, rcond=None)[0]
-        misfit = sampled - terms @ solution
-        noise = max(MAD_TO_SIGMA * float(np.median(np.abs(misfit))), FLOOR_NOISE_GREY)
-        ambient_grey, *weights = solution
-        residual = grey - np.float32(ambient_grey)
-        for weight, term in zip(weights, self._terms, strict=True):
-            residual -= np.float32(weight) * term
-        return Background(float(ambient_grey), float(weights[0]), noise, residual, share, tuple(weights))
-
-    def predicted(self, background: Background, shift_rad: float, where: Crop) -> Image:
-        """Grey levels, float32 (h, w), that the plane has on the pixels ``where`` of a frame whose fringe is shifted by
-        ``shift_rad``, in the light that ``background`` was fitted to."""
-        terms = _quadratic(*(axis[where] for axis in self._rays))
-        lamp = sum(weight * term for weight, term in zip(background.weights, terms, strict=False))
-        fringe = 0.5 + 0.5 * np.cos(self._phase[where] + shift_rad)
-        plane = np.nan_to_num(lamp * self._fall_off[where] * fringe).astype(np.float32)
-        return np.float32(background.ambient_grey) + plane
-
-    def _tiles(self, image: NDArray) -> NDArray[np.float64]:
-        """Means over whole tiles."""
-        tile = self._tile
-        height, width = (length // tile * tile for length in image.shape)
-        rows = image[:height, :width].reshape(height, width // tile, tile).sum(axis=2, dtype=np.float64)
-        return rows.reshape(height // tile, tile, width // tile).sum(axis=1) / (tile * tile)
-
-    def _background_tiles(self, grey: Image) -> Mask:
-        """Tiles whose grey levels are ambient light plus a common multiple of the predicted light."""
-        mean, square = self._tiles(grey), self._tiles(grey * grey)
-        spread = self._square - self._mean**2
-        with np.errstate(divide="ignore", invalid="ignore"):
-            covariance = self._tiles(grey * self._light) - mean * self._mean
-            slope = covariance / spread
-            misfit = np.sqrt(np.maximum(square - mean**2 - covariance * slope, 0))
-            largest = TILE_NOISE_SIGMAS * max(image_noise_grey(grey), 1.0)
-            plane_tiles = (misfit < largest) & (spread > 1e-2 * spread.max()) & (slope * np.sqrt(spread) > largest / 3)
-            if np.isfinite(self.strength):
-                plane_tiles &= np.abs(slope / self.strength - 1) < STRENGTH_TOLERANCE
-        if not plane_tiles.any():
-            return plane_tiles
-        # The plane is the surface with the most tiles of one strength.
-        ascending = np.sort(slope[plane_tiles])
-        count = np.searchsorted(ascending, ascending * SAME_STRENGTH, "right") - np.arange(ascending.size)
-        first = int(count.argmax())
-        typical = float(np.median(ascending[first : first + count[first]]))
-        plane_tiles &= np.abs(slope / typical - 1) < 0.15
-        shown = (square - mean**2)[plane_tiles].sum()
-        unexplained = (misfit[plane_tiles] ** 2).sum()
-        return plane_tiles if unexplained < (1 - LEAST_EXPLAINED) * shown else np.zeros_like(plane_tiles)
-
-
-def image_noise_grey(image: NDArray) -> float:
-    """Standard deviation of an image's noise in grey levels, by the median over pixels of a mask that removes planes
-    and slow fringes (Immerkaer 1996, Fast Noise Variance Estimation)."""
-    grey = image.astype(np.float32)
-    across = grey[:, :-2] - 2 * grey[:, 1:-1] + grey[:, 2:]
-    mask = across[:-2] - 2 * across[1:-1] + across[2:]
-    return MAD_TO_SIGMA * float(np.median(np.abs(mask))) / 6.0
-
-
-def plane_irradiance(rig: Rig, depth_m: float) -> NDArray[np.float64]:
-    """Irradiance of a plane square to the camera's axis at ``depth_m``: cosine over distance squared, 1/m^2, (H, W)."""
-    x, y = rig.camera.rays()
-    centre = -rig.R.T @ rig.t
-    # The plane's normal is the camera's axis, however the projector is rotated.
-    right, down, ahead = x * depth_m - centre[0], y * depth_m - centre[1], depth_m - centre[2]
-    squared = right**2 + down**2 + ahead**2
-    return ahead / (squared * np.sqrt(squared))
-
-
-def _quadratic(x: NDArray, y: NDArray) -> tuple[NDArray, ...]:
-    return np.ones_like(x), x, y, x * x, x * y, y * y
+def crop_around(region: Mask, margin_px: int, step: int = 1) -> Crop:
+    """Rows and columns of ``region`` with ``margin_px`` around it, from a multiple of ``step`` on; a single pixel where
+    there is no object."""
+    left, top, width, height = cv2.boundingRect(region.astype(np.uint8))
+    if not width:
+        return slice(0, 1), slice(0, 1)
+    rows, columns = (
+        slice(max(start - margin_px, 0) // step * step, min(start + length + margin_px, size))
+        for start, length, size in zip((top, left), (height, width), region.shape, strict=True)
+    )
+    return rows, columns
 
 
 def disk(radius_px: float) -> NDArray[np.uint8]:
@@ -268,3 +125,59 @@ def refined(
     votes = without_small(clear | inner | (ring & nearer), 4)
     smooth = cv2.medianBlur(votes.astype(np.uint8), 3) > 0
     return (smooth | clear) & ring
+
+
+def differs(plane_misfits: Iterable[Image], noise_grey: float) -> Mask:
+    """Pixels (h, w) whose grey levels the empty scene does not explain, by ``plane_misfits`` (h, w) of each frame.
+    Tested for every pixel, and for means over a small square, which separate the plane from an object that happens to
+    be as bright; pixels that only the square's reach beyond the silhouette adds are removed."""
+    misfits, noise = list(plane_misfits), noise_grey**2
+    alone = sum((misfit * misfit for misfit in misfits), np.float32(0))
+    around = np.asarray(sum((cv2.blur(misfit, (SQUARE_PX, SQUARE_PX)) ** 2 for misfit in misfits), np.float32(0)))
+    square_differs = (around > _limit(noise / SQUARE_PX**2, len(misfits))).astype(np.uint8)
+    without_rim = cv2.erode(square_differs, np.ones((SQUARE_PX, SQUARE_PX), np.uint8)) > 0
+    return (alone > _limit(noise, len(misfits))) | without_rim
+
+
+def _limit(variance: float, count: int) -> float:
+    """Squared misfit of ``count`` frames that the empty scene, with noise of that variance, hardly ever exceeds."""
+    chance = count + PLANE_CHANCE_SIGMAS * np.sqrt(2 * count) + PLANE_CHANCE_SIGMAS
+    return float((variance + PLANE_TOLERANCE_GREY**2) * chance)
+
+
+def first_mask(different: Mask, period_px: float) -> Mask:
+    """Object pixels (h, w) before brightness is known: small stripes and holes closed, specks removed."""
+    return closed(different, PIXELWISE_CLOSING_PERIODS * period_px, SPECK_PX)
+
+
+def lit_object(
+    different: Mask, modulation: Image, background: Background, shifts_rad: Sequence[float], period_px: float
+) -> Mask:
+    """Object pixels (h, w): those that are ``different`` (`differs`) and modulated by more than noise. Pixels that only
+    closing has added must be as bright as the object around them, otherwise they are the plane beside a corner."""
+    _, cosine, sine = phase_weights(shifts_rad)
+    sigma = background.noise_grey * np.sqrt(max(cosine @ cosine, sine @ sine))
+    least_grey = min(max(DARKEST_GREY, DARK_SIGMAS * float(sigma)), MIN_MODULATION)
+    if not background.shown:  # nothing else tells the object
+        least_grey = MIN_MODULATION
+    region = first_mask(different, period_px)
+    certain = region & different & (modulation > least_grey)
+    side = 2 * round(PIXELWISE_CLOSING_PERIODS * period_px) + 1
+    weight = cv2.blur(certain.astype(np.float32), (side, side))
+    around = cv2.blur(modulation * certain, (side, side)) / np.maximum(weight, 1e-6)
+    alike = np.abs(modulation - around) < ALIKE * around
+    return without_small(certain | (region & ~different & alike), SPECK_PX)
+
+
+def continued(inside: Mask, region: Mask, different: Mask, residual_rad: Image) -> Mask:
+    """Object pixels (h, w), and those of ``region`` with `CONTINUED_PX` object pixels beside them that either have the
+    same ``residual_rad``, or are themselves ``different`` from the empty scene: where object and plane happen to have
+    the same grey levels in all frames, and where light from other surfaces drowns the fringe."""
+    beside, alike = np.zeros(inside.shape, np.uint8), np.zeros(inside.shape, np.uint8)
+    padded, phases = np.pad(inside, 1), np.pad(residual_rad, 1)
+    height, width = inside.shape
+    for down, right in ((0, 0), (0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1), (2, 2)):
+        there = slice(down, down + height), slice(right, right + width)
+        beside += padded[there]
+        alike += padded[there] & (np.abs(wrapped(phases[there] - residual_rad)) < CONTINUED_RAD)
+    return inside | (region & ((alike >= CONTINUED_PX) | (different & (beside >= CONTINUED_PX))))

@@ -1,4 +1,5 @@
-"""Images with a fringe period far from the one that a method was made for: resampled, and the result sampled back.
+"""Maps of every n-th pixel, and images with a fringe period far from the one that a method was made for: these are
+resampled, and the result is sampled back.
 
 Windows, steps of the grid of orders and filters of a network have a size in pixels of the fringe. So an image with a
 period of 116 px is measured at 22.6 px, and a network that learnt from 22.6 px gets an image of 6 px enlarged. A
@@ -11,17 +12,40 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer, Candidates, Image, Mask
-from fpp_ml_bench.baselines.phase.object_mask import Crop
-from fpp_ml_bench.baselines.phase.observation import Measurement, Reason
-from fpp_ml_bench.baselines.phase.orders import nearest_inside
+from fpp_ml_bench.baselines.phase.calibration_layer import Crop, Mask
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.sequence import Direction
 
 JUMP_RAD = 1.0  # difference of residual phase from which on a pixel lies beside a jump, and nothing is interpolated
 CLIPPED_SHARE = 0.1  # of an averaged pixel that makes it saturated
+NODES_PER_PERIOD = 7.5  # grid points along a period: every third pixel at 960 px
+
+
+def stride_of(period_px: float) -> int:
+    """Image px a step of the grid on which orders are chosen."""
+    return max(1, round(period_px / NODES_PER_PERIOD))
+
+
+def grid_of(stride: int, crop: Crop = (slice(None), slice(None))) -> Crop:
+    """Every ``stride``-th row and column of ``crop``."""
+    return slice(crop[0].start, crop[0].stop, stride), slice(crop[1].start, crop[1].stop, stride)
+
+
+def repeated(coarse: NDArray, stride: int, shape: tuple[int, ...]) -> NDArray:
+    """Maps (..., h', w') of every ``stride``-th pixel as maps of all (..., h, w); ``shape`` (..., h, w)."""
+    return coarse.repeat(stride, axis=-2).repeat(stride, axis=-1)[..., : shape[-2], : shape[-1]]
+
+
+def nearest_inside(inside: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns (h, w) of the pixel of ``inside`` that is nearest to every pixel; every pixel's own where
+    ``inside`` has none."""
+    if inside.all() or not inside.any():
+        places: NDArray = np.indices(inside.shape)
+    else:
+        places = distance_transform_edt(~inside, return_distances=False, return_indices=True)
+    return places[0], places[1]
 
 
 @dataclass(frozen=True)
@@ -43,12 +67,7 @@ class Resampling:
     rig: Rig
 
     @classmethod
-    def of(cls, rig: Rig, direction: Direction, periods: Periods) -> "Resampling":
-        """What brings the fringes of ``direction`` into ``periods``."""
-        return cls.to(rig, rig.image_px_per_period(direction), periods)
-
-    @classmethod
-    def to(cls, rig: Rig, seen_px: float, periods: Periods) -> "Resampling":
+    def of(cls, rig: Rig, seen_px: float, periods: Periods) -> "Resampling":
         """What brings fringes of ``seen_px`` image px a period into ``periods``."""
         camera = rig.camera
         if periods.shortest <= seen_px <= periods.longest:
@@ -102,7 +121,7 @@ class Resampling:
         ]
         return slice(*ends[0]), slice(*ends[1])
 
-    def restored_phase(
+    def restored(
         self, psi: NDArray[np.float64], inside: Mask
     ) -> tuple[Mask, NDArray[np.float64], Callable[[NDArray], NDArray]]:
         """A phase in rad without wraps, (h, w), at the captured pixels: where they are object, the phase (H, W), and
@@ -124,53 +143,3 @@ class Resampling:
         step = np.subtract(highest, lowest, out=np.zeros_like(psi), where=inside)
         beside_jump = nearest((step > JUMP_RAD).astype(np.uint8)) > 0
         return weight > 0.5, np.where(beside_jump, nearest(psi), total / np.maximum(weight, 1e-6)), nearest
-
-    def restored(
-        self,
-        measured: Measurement,
-        layer: CalibrationLayer,
-        captured_layer: CalibrationLayer,
-        range_mm: tuple[float, float],
-    ) -> Measurement:
-        """The measurement in the size of the captured image. The residual phase, order included, is interpolated (it
-        has no wraps), but not across jumps; depth, wrapped phase and order follow from it at every pixel of the
-        captured image. The other maps are taken from the nearest pixel. ``range_mm``: the range of the candidates."""
-        inside = np.isfinite(measured.wrapped_phase_rad)
-        psi = np.where(inside, layer.residual_phase(measured.wrapped_phase_rad, measured.order), 0.0)
-        on_object, phases, nearest = self.restored_phase(psi, inside)
-        part = captured_layer.at(on_object)
-        residual = phases[on_object]
-        absolute = residual + part.infinity_rad + TAU * part.infinity_order
-        order = np.rint(absolute / TAU)
-        phase = (absolute - TAU * order).astype(np.float32)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            depth_mm = part.depth_of_residual_mm(residual)
-        outside = ~self.captured.in_range(depth_mm)
-        depth_mm[outside | (nearest(measured.depth_mm)[on_object] == 0)] = 0.0
-        allowed = part.orders_in_range(phase, range_mm)
-
-        def paste(values: NDArray, dtype: type, outside: float = 0) -> NDArray:
-            image: NDArray = np.full(on_object.shape, outside, dtype=dtype)
-            image[on_object] = values
-            return image
-
-        def pasted(image: Image) -> Image:
-            return paste(nearest(image)[on_object], np.float32)
-
-        reasons = nearest(measured.reason)[on_object]
-        reasons[outside & ((reasons == Reason.MEASURED) | (reasons > Reason.OUT_OF_RANGE))] = Reason.OUT_OF_RANGE
-        reason = paste(reasons, np.uint8, Reason.BACKGROUND)
-        counts = np.bincount(reason.ravel(), minlength=len(Reason))
-        return replace(
-            measured,
-            wrapped_phase_rad=paste(phase, np.float32, np.nan),
-            order=paste(order, np.int32),
-            candidates=Candidates(paste(allowed.first, np.int32), paste(allowed.count, np.int32)),
-            depth_mm=paste(depth_mm, np.float32),
-            reason=reason,
-            counts={code.name.lower(): int(counts[code]) for code in Reason},
-            modulation_grey=pasted(measured.modulation_grey),
-            confidence=pasted(measured.confidence),
-            expected_error_mm=pasted(measured.expected_error_mm),
-            order_doubt_mm=pasted(measured.order_doubt_mm),
-        )

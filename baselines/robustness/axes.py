@@ -1,6 +1,10 @@
 """The rules of FPP-C: the axes, each of which changes one stage of the image formation at five severities
-(``axes.yaml``), and the scores: errors with a fixed charge for a pixel without an answer, and how honest the stated
-uncertainty is.
+(``axes.yaml``), the disturbed views, and the scores: errors with a fixed charge for a pixel without an answer, and how
+honest the stated uncertainty is.
+
+Of a view only the frames that a method uses are rendered, and kept in a cache: a folder for each condition with a file
+for each frame, which depends on nothing but the condition and the view, so methods share it. The folders that were used
+longest ago go where it would grow beyond its limit.
 
 Scored are the object pixels of the undisturbed scene that are not void, against its exact depth. A pixel without an
 answer is charged half an order, so that "I don't know" is better than a wrong order and worse than a right one.
@@ -9,23 +13,36 @@ After Hendrycks and Dietterich 2019, Benchmarking Neural Network Robustness to C
 every corruption is caused in the scene, not painted on the image.
 """
 
+import json
+import os
+import shutil
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, lru_cache
+from hashlib import blake2b
+from io import BytesIO
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from fpp_ml_bench.constants import GREY_LEVELS, TEST_OBJECTS, UNSEEN
+from fpp_ml_bench import __version__
+from fpp_ml_bench.baselines.diagnostics.probe import mean_of
+from fpp_ml_bench.constants import GREY_LEVELS, TEST_OBJECTS, UNSEEN, sample_name
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation.result.parts import SeverityScores
 from fpp_ml_bench.evaluation.score.sample_scores import states_sigma
-from fpp_ml_bench.files import strict_yaml
+from fpp_ml_bench.files import strict_yaml, write_atomically
 from fpp_ml_bench.loaders.render.light import Light, named_light
+from fpp_ml_bench.loaders.render.meshes import solid_mesh
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.sample import void_pixels
+from fpp_ml_bench.optics.named_rigs import NAMED_RIGS
 from fpp_ml_bench.schema import StrictModel, Text, validate
 
 FILE = Path(__file__).with_name("axes.yaml")
@@ -33,6 +50,9 @@ SetName = Literal["test", "unseen"]
 SETS: dict[SetName, tuple[str, ...]] = {"test": TEST_OBJECTS, "unseen": UNSEEN}
 """Objects of each set that a method can be measured on."""
 CLEAN = "clean"
+CACHE = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "fpp-ml-bench" / "robustness"
+LIMIT_BYTES = 10_000_000_000
+Frames = list[NDArray[np.uint8] | None]
 Share = Annotated[float, Field(gt=0, le=1)]
 Above0 = Annotated[float, Field(gt=0)]
 
@@ -101,22 +121,135 @@ def corruptions() -> Corruptions:
 
 
 Scores = dict[str, float | None]
-SCORES = ("mae_mm", "protocol_mae_mm", "wrong_share", "unanswered_share", "confident_share", "coverage")
-"""Of a view: mean error with `Corruptions.unanswered_mm` for a pixel without an answer; the same with its whole depth,
-as the protocol has it; shares of wrong orders and of pixels without an answer; of confident errors, and of pixels that
-state a sigma, both None for a method that states none."""
+SCORES = tuple(SeverityScores.model_fields)
+"""Of a view, as `SeverityScores` has them of several."""
 
 
-@dataclass(frozen=True)
-class Truth:
+class Truth(NamedTuple):
     """``depth_mm`` float32 (H, W) and ``scored`` bool (H, W) of an undisturbed view."""
 
     depth_mm: NDArray[np.float32]
     scored: NDArray[np.bool_]
 
-    @classmethod
-    def of(cls, depth_mm: NDArray[np.float32], flags: NDArray[np.uint8]) -> "Truth":
-        return cls(depth_mm, object_mask(depth_mm) & ~void_pixels(flags))
+
+@dataclass(frozen=True)
+class Condition:
+    """An axis at a severity, 1 to 5, for the objects ``objects`` seen at ``size`` px; severity 0 is the clean scene.
+    ``rig``: one of `optics.NAMED_RIGS`."""
+
+    axis: str
+    severity: int
+    objects: tuple[str, ...]
+    size: int
+    rig: str = "paper"
+
+    @property
+    def settings(self) -> BuildSettings:
+        rules = corruptions()
+        light = rules.clean if self.axis == CLEAN else rules.axes[self.axis].light(rules.clean, self.severity)
+        return BuildSettings(rig=NAMED_RIGS[self.rig](self.size), objects=self.objects, light=light)
+
+    @cache  # noqa: B019  of a few conditions
+    def key(self, frames: tuple[int, ...]) -> str:
+        """Name of the condition's folder. Where the object moves, each frame's place depends on which are captured."""
+        described = self.settings.describe()
+        del described["objects"]
+        moving = frames if described["light"]["motion_mm"] else ()
+        rig = [] if self.rig == "paper" else [self.rig]
+        text = json.dumps([__version__, self.size, described, moving, *rig], sort_keys=True)
+        return f"{self.axis}-{self.severity}-{blake2b(text.encode(), digest_size=8).hexdigest()}"
+
+
+class FrameCache:
+    """Frames and truths below ``folder``, None for no cache."""
+
+    def __init__(self, folder: Path | None) -> None:
+        self.folder = folder
+
+    def frames(self, condition: Condition, name: str, view: str, wanted: Sequence[int]) -> Frames:
+        """The sequence of a view with the frames ``wanted``, uint8 (H, W) each, and None for the others. A moving
+        object rests halfway through the frames, which are captured one after another."""
+        studio = _studio(condition)
+        shape = studio.rig.camera.height, studio.rig.camera.width
+        files = {index: self._file(condition, wanted, f"{sample_name(name, view)}-{index:02d}") for index in wanted}
+        out: Frames = [None] * len(studio.rig.sequence)
+        for index, file in files.items():
+            out[index] = _load(file, shape, np.dtype(np.uint8))
+        missing = tuple(index for index in wanted if out[index] is None)
+        if missing and studio.light.motion_mm:
+            middle = (len(wanted) - 1) / 2
+            studio.expose_moving(_mesh(name), view, {index: wanted.index(index) - middle for index in missing})
+        elif missing:
+            studio.expose(studio.trace(_mesh(name), view), missing)
+        for index in missing:
+            out[index] = frame = studio.frame(index).copy()
+            _save(files[index], frame)
+        return out
+
+    def truth(self, clean: Condition, name: str, view: str) -> Truth:
+        """Exact depth and scored pixels of an undisturbed view."""
+        studio = _studio(clean)
+        shape = studio.rig.camera.height, studio.rig.camera.width
+        file = self._file(clean, (), f"{sample_name(name, view)}-truth")
+        kept = _load(file, (2, *shape), np.dtype(np.float32))
+        if kept is None:
+            scene = studio.trace(_mesh(name), view)
+            depth_mm = studio.exact_mm(scene)
+            kept = np.stack([depth_mm, object_mask(depth_mm) & ~void_pixels(studio.flags(scene)[0])])
+            _save(file, kept)
+        return Truth(kept[0], kept[1] > 0)
+
+    def make_room(self, needed_bytes: int, limit_bytes: int = LIMIT_BYTES) -> None:
+        """Remove the folders that were used longest ago until ``needed_bytes`` more stay below the limit."""
+        if self.folder is None or not self.folder.is_dir():
+            return
+        entries = [entry for entry in self.folder.iterdir() if entry.is_dir()]
+        sizes = {entry: sum(file.stat().st_size for file in entry.iterdir()) for entry in entries}
+        total = sum(sizes.values())
+        for entry in sorted(sizes, key=lambda entry: entry.stat().st_mtime):
+            if total + needed_bytes <= limit_bytes:
+                return
+            shutil.rmtree(entry, ignore_errors=True)
+            total -= sizes[entry]
+
+    def _file(self, condition: Condition, wanted: Sequence[int], name: str) -> Path | None:
+        return None if self.folder is None else self.folder / condition.key(tuple(wanted)) / f"{name}.npy"
+
+
+_mesh = lru_cache(maxsize=max(map(len, SETS.values())))(solid_mesh)
+"""An object of a set; what its light takes from the mesh alone is kept with it."""
+
+
+@lru_cache(maxsize=2)
+def _studio(condition: Condition) -> Studio:
+    """A process holds those of the clean scene and of the condition that it is at."""
+    return Studio(condition.settings)
+
+
+def _load(file: Path | None, shape: tuple[int, ...], dtype: np.dtype) -> NDArray | None:
+    """The array of a file of the cache; None where there is none, or no whole one."""
+    if file is None:
+        return None
+    try:
+        array = np.load(file, allow_pickle=False)
+    except (OSError, ValueError, EOFError):
+        return None
+    if array.shape != shape or array.dtype != dtype:
+        return None
+    os.utime(file.parent)
+    return array  # type: ignore[no-any-return]
+
+
+def _save(file: Path | None, array: NDArray) -> None:
+    if file is None:
+        return
+    content = BytesIO()
+    np.save(content, array, allow_pickle=False)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(file, content.getvalue(), sync=False)
+    except OSError as error:
+        raise PredictionError(f"{file}: can't be written ({error.strerror}); free some space, or --no-cache") from error
 
 
 def score(
@@ -157,9 +290,10 @@ def score(
 
 def severity_means(views: Sequence[Mapping[str, Any]]) -> dict[int, Scores]:
     """Mean of each score over the views of a severity that have it."""
-    means = {}
-    for severity in sorted({view["severity"] for view in views}):
-        of_severity = [view for view in views if view["severity"] == severity]
-        columns = {key: [view[key] for view in of_severity if view.get(key) is not None] for key in SCORES}
-        means[severity] = {key: float(np.mean(values)) if values else None for key, values in columns.items()}
-    return means
+    by_severity: dict[int, list[Mapping[str, Any]]] = defaultdict(list)
+    for view in views:
+        by_severity[view["severity"]].append(view)
+    return {
+        severity: {key: mean_of(view.get(key) for view in by_severity[severity]) for key in SCORES}
+        for severity in sorted(by_severity)
+    }

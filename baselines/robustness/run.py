@@ -1,7 +1,8 @@
 """Measures a method axis by axis: predicts disturbed views in several processes, writes a file for each finished axis,
-and summarises them: means by severity, the mean over all of them, and its interval."""
+and summarises them: means by severity, the mean over all of them, its interval, and the page of all methods."""
 
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,35 +10,44 @@ from time import perf_counter
 from typing import Any
 
 from fpp_ml_bench import __version__
+from fpp_ml_bench.baselines.diagnostics.probe import Line, Panel, chart, mean_of
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, corruptions, score, severity_means
-from fpp_ml_bench.baselines.robustness.scenes import Condition, FrameCache
+from fpp_ml_bench.baselines.robustness.axes import (
+    CLEAN,
+    SETS,
+    Condition,
+    FrameCache,
+    SetName,
+    corruptions,
+    score,
+    severity_means,
+)
 from fpp_ml_bench.constants import sample_name
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.result.parts import Robustness, SeverityScores
 from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 from fpp_ml_bench.files import LOCK_FILE, exclusive, read_json, write_atomically
 from fpp_ml_bench.pool import mapping
+from fpp_ml_bench.style import LINE_COLOURS, data_uri, page
 
 QUICK_SEVERITIES = (1, 3, 5)
 SEVERITIES = (1, 2, 3, 4, 5)
+PAGE, CURVES = "index.html", "curves.png"
+_DASHES = ("-", "--", ":")
 View = dict[str, Any]
 """A row of a view: sample, object, severity, seconds, and `SCORES`."""
-Progress = Callable[[str, int], None]
 Work = tuple[Method, Condition, FrameCache, tuple[str, ...]]
 """A method, the clean scene, rendered frames, and the views of each object."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """A method on a set. ``quick``: one view of each object and three severities, for a look; ``rig``: one of
-    `optics.NAMED_RIGS`, which projects what the method needs."""
+    """A method on a set, at an image size. ``quick``: one view of each object and three severities, for a look."""
 
     method: Method
     set_name: SetName
     size: int
     quick: bool = False
-    rig: str = "paper"
 
     def __post_init__(self) -> None:
         if self.method.units != "mm":
@@ -61,11 +71,13 @@ class Setup:
 
     def conditions(self, axis: str) -> list[Condition]:
         """Those of an axis of `corruptions`, or of `CLEAN`, on the objects of the set that it disturbs."""
-        objects = tuple(SETS[self.set_name])
+        objects, severities = tuple(SETS[self.set_name]), self.severities
         if axis == CLEAN:
-            return [Condition(CLEAN, 0, objects, self.size, self.rig)]
-        disturbed = corruptions().axes[axis].seen_on(objects)
-        return [Condition(axis, severity, disturbed, self.size, self.rig) for severity in self.severities]
+            severities = (0,)
+        else:
+            objects = corruptions().axes[axis].seen_on(objects)
+        rig = self.method.scenes_rig
+        return [Condition(axis, severity, objects, self.size, rig) for severity in severities]
 
     def key(self) -> dict[str, Any]:
         """What must be equal for two measurements to be parts of one."""
@@ -89,20 +101,20 @@ def measure(
     axes: Sequence[str] = (),
     workers: int = 1,
     cache: Path | None = None,
-    progress: Progress = lambda axis, views: None,
+    progress: Callable[[int], None] = lambda views: None,
     cluster: str | None = None,
     saved: Callable[[], None] = lambda: None,
 ) -> dict[str, list[View]]:
     """The rows of every view by axis, and a file ``out/AXIS.json`` for each axis as soon as it is finished; files that
     an earlier run of the same setup left are read instead. Views are predicted and scored by so many processes, or by
-    the Ray cluster at an address. ``progress`` is called with an axis and a number of views, ``saved`` after each file.
+    the Ray cluster at an address. ``progress`` is called with a number of views, ``saved`` after each file.
     Raises PredictionError for files of another setup, `BuildError` where another process is at it, `PoolError`."""
     with exclusive(out / LOCK_FILE, out, "measuring there"):
         files = {axis: out / f"{axis}.json" for axis in setup.axes(axes)}
-        kept = {axis: _rows(file, setup.key()) for axis, file in files.items()}
-        rows = {axis: found for axis, found in kept.items() if found is not None}
-        for axis, found in rows.items():
-            progress(axis, len(found))
+        kept = {axis: read_axis(file, setup.key()) for axis, file in files.items()}
+        rows = {axis: content["views"] for axis, content in kept.items() if content is not None}
+        for found in rows.values():
+            progress(len(found))
         missing = [axis for axis in files if axis not in rows]
         frames = FrameCache(cache)
         work = setup.method, setup.conditions(CLEAN)[0], frames, setup.views
@@ -115,7 +127,7 @@ def measure(
                 rows[axis] = []
                 for views in mapped(_measure_object, *zip(*tasks, strict=True)):
                     rows[axis] += views
-                    progress(axis, len(views))
+                    progress(len(views))
                 content = {"setup": setup.key(), "axis": axis, "views": rows[axis]}
                 write_atomically(files[axis], (json.dumps(content, indent=1) + "\n").encode())
                 saved()
@@ -139,9 +151,9 @@ def _measure_object(work: Work, condition: Condition, name: str) -> list[View]:
     return rows
 
 
-def read_axis(file: Path) -> dict[str, Any] | None:
+def read_axis(file: Path, setup: Mapping[str, Any] | None = None) -> dict[str, Any] | None:
     """What an axis's file holds: ``setup``, ``axis``, ``views``; None where there is none. PredictionError for a
-    damaged one."""
+    damaged one, and for that of another ``setup``."""
     if not file.exists():
         return None
     try:
@@ -153,22 +165,12 @@ def read_axis(file: Path) -> dict[str, Any] | None:
         complete = False
     if not complete:
         raise PredictionError(f"{file}: damaged; delete it and run the same command again")
-    return content
-
-
-def _rows(file: Path, key: Mapping[str, Any]) -> list[View] | None:
-    """Rows of an axis that an earlier run of the same setup finished; None where there are none."""
-    content = read_axis(file)
-    if content is None:
-        return None
-    wanted = json.loads(json.dumps(key))
-    other = [name for name in wanted if content["setup"].get(name) != wanted[name]]
-    if other:
+    wanted = json.loads(json.dumps(setup or {}))
+    if other := [name for name in wanted if content["setup"].get(name) != wanted[name]]:
         raise PredictionError(
             f"{file}: holds another measurement (other {', '.join(other)}); give another folder, or delete it"
         )
-    views: list[View] = content["views"]
-    return views
+    return content
 
 
 def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
@@ -182,7 +184,6 @@ def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
         for axis, found in rows.items()
     }
     (clean,), axes = means[CLEAN], {axis: scores for axis, scores in means.items() if axis != CLEAN}
-    sha256 = setup.method.settings.get("weights_sha256")
     found = object_interval(*_shares_of_the_mean(rows))
     every = [scores.mae_mm for severities in axes.values() for scores in severities]
     return Robustness(
@@ -195,7 +196,7 @@ def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
         samples=len(rows[CLEAN]),
         objects=len({row["object"] for row in rows[CLEAN]}),
         size_px=setup.size,
-        weights_sha256=sha256 if isinstance(sha256, str) else None,
+        weights_sha256=setup.method.weights_sha256,
     )
 
 
@@ -204,11 +205,76 @@ def _shares_of_the_mean(rows: Mapping[str, Sequence[View]]) -> tuple[list[float]
     the mean of these numbers is that mean, also where an axis disturbs a few objects only."""
     objects = {row["sample"]: row["object"] for row in rows[CLEAN]}
     sums = dict.fromkeys(objects, 0.0)
-    conditions = 0
-    for views in (views for axis, views in rows.items() if axis != CLEAN):
-        for severity in sorted({row["severity"] for row in views}):
-            found = [row for row in views if row["severity"] == severity]
-            conditions += 1
-            for row in found:
-                sums[row["sample"]] += (row["mae_mm"] or 0.0) * len(objects) / len(found)
-    return [total / conditions for total in sums.values()], list(objects.values())
+    disturbed = [(axis, row) for axis, views in rows.items() if axis != CLEAN for row in views]
+    sizes = Counter((axis, row["severity"]) for axis, row in disturbed)
+    for axis, row in disturbed:
+        sums[row["sample"]] += (row["mae_mm"] or 0.0) * len(objects) / sizes[axis, row["severity"]]
+    return [total / len(sizes) for total in sums.values()], list(objects.values())
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A method's folder: what was measured, and mean scores by axis and severity."""
+
+    folder: Path
+    setup: dict[str, Any]
+    means: dict[str, dict[int, dict[str, float | None]]]
+
+    def mean(self, key: str = "mae_mm", axis: str | None = None) -> float | None:
+        """Mean of a score over the severities of an axis, or of all, that were measured; None where one is unknown."""
+        axes = self.means.keys() - {CLEAN} if axis is None else {axis}
+        values = [scores[key] for name, by in self.means.items() if name in axes for scores in by.values()]
+        return None if None in values else mean_of(values)
+
+
+def read_measured(out: Path) -> list[Measured]:
+    """Every method below ``out``, the best first. PredictionError for a damaged file."""
+    found = []
+    for folder in sorted(path for path in out.iterdir() if path.is_dir()):
+        files = [folder / f"{axis}.json" for axis in (CLEAN, *corruptions().axes)]
+        contents = [content for file in files if (content := read_axis(file)) is not None]
+        if contents:
+            means = {content["axis"]: severity_means(content["views"]) for content in contents}
+            found.append(Measured(folder, contents[0]["setup"], means))
+    return sorted(found, key=lambda one: (one.mean() is None, one.mean() or 0.0))
+
+
+def write_page(out: Path) -> Path:
+    """Curves and page of all methods below ``out``; the page's path."""
+    measured = read_measured(out)
+    curves = draw_curves(measured)
+    write_atomically(out / CURVES, curves)
+    content = page(
+        "fpp_ml_bench.baselines.robustness",
+        "robustness.html",
+        "Robustness: FPP-ML-Bench",
+        methods=measured,
+        axes=corruptions().axes,
+        rules=corruptions(),
+        curves=data_uri(curves),
+        clean=CLEAN,
+    )
+    write_atomically(out / PAGE, content)
+    return out / PAGE
+
+
+def draw_curves(measured: Sequence[Measured]) -> bytes:
+    """A panel for each axis: mean error against severity, a line a method; PNG."""
+    panels = []
+    for name, axis in corruptions().axes.items():
+        lines = []
+        for number, one in enumerate(measured):
+            if name not in one.means:
+                continue
+            points = {0: one.means.get(CLEAN, {}).get(0, {}), **one.means[name]}
+            label = one.setup["title"] + (", unseen" if one.setup["set"] == "unseen" else "")
+            label += " (quick)" if one.setup["quick"] else ""
+            style = "o" + _DASHES[number // len(LINE_COLOURS) % len(_DASHES)]
+            errors = [scores.get("mae_mm") for scores in points.values()]
+            lines.append(Line(label, list(points), errors, LINE_COLOURS[number % len(LINE_COLOURS)], style))
+        if lines:
+            lines.append(Line("charge for no answer", range(6), [corruptions().unanswered_mm] * 6, "0.6", ":"))
+            ticks = {"xticks": range(6), "xticklabels": ["clean", *(f"{value:g}" for value in axis.severities)]}
+            scale = {"yscale": "log", "ylim": (0.1, 1000), "ylabel": "object MAE, mm"}
+            panels.append(Panel(f"{name}, {axis.unit}", lines, {**ticks, **scale}))
+    return chart(panels, 4, (3.3, 2.9))

@@ -1,5 +1,4 @@
-"""Stability cases: how they are declared, run, judged and reported: JSON with every case, and a picture with a square
-for each.
+"""Stability cases: how they are declared, run, judged and reported: JSON with every case, and a picture of them all.
 
 A case runs a computation of the benchmark where it is ill-conditioned, and compares it with a reliable reference:
 50-digit arithmetic, a closed form, or exact sums. The error is compared with a bound from theory: a condition number
@@ -9,15 +8,12 @@ case states, never from the measured error.
 
 import json
 import math
-import re
 import time
-from bisect import bisect_right
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from enum import StrEnum
-from functools import cache, partial
+from functools import cache
 from importlib import import_module
-from itertools import groupby, product
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,8 +31,7 @@ Floats = NDArray[np.float64]
 
 U64, U32 = 2.0**-53, 2.0**-24
 """Unit round-offs."""
-
-MODULES = {
+GROUPS = {
     "phase": "frames",
     "order": "frames",
     "triangulation": "geometry",
@@ -44,45 +39,26 @@ MODULES = {
     "normalisation": "scores",
     "metrics": "scores",
     "networks": "networks",
-    "scenes": "scenes",
-    "crossed": "scenes",
+    "scenes": "geometry",
+    "crossed": "frames",
 }
-"""Groups of cases, and the module whose constant of that name declares them; only ``networks`` imports torch."""
-
-
-_LIMITS = 1e-3, 0.1, 0.5
-LEVELS = {
-    "error 0": "#dff1ea",
-    "error under 1/1000 of its bound": "#b5dfcf",
-    "1/1000 to 1/10 of the bound": "#74bf9f",
-    "1/10 to 1/2 of the bound": "#2f9470",
-    "1/2 to the whole bound": "#0b6b50",
-    "correctly refused or masked": "#b9c0c8",
-    "FAIL": "#d1242f",
-}
-"""What a square of the heat map says, and its colour."""
-_SQUARE_IN = 0.16
-
-
-class Verdict(StrEnum):
-    """WITHIN: the error is within its bound. FLAGGED: correctly refused, by an exception or an invalid mask."""
-
-    WITHIN = "within"
-    FLAGGED = "flagged"
-    FAIL = "FAIL"
+"""Groups of cases, and the module that declares them; only ``networks`` imports torch."""
+VERDICTS = {"within": "#2f9470", "flagged": "#8d96a0", "FAIL": "#d1242f"}
+"""The verdicts of a case, and their colours: the error is within its bound; correctly refused, by an exception or an
+invalid mask; anything else."""
+_SMALLEST_RATIO = 1e-6
+"""What the picture shows of smaller ones."""
 
 
 @dataclass(frozen=True)
 class Outcome:
     """The measurement of a case at its worst element, which has the largest error / bound. ``error`` is None where the
-    code refused to compute; ``note`` then holds its message. ``flagged_share``: share of elements that were refused;
-    ``may_flag``: largest share that theory allows (default: none where a number is expected, else all). ``condition``:
-    the condition number behind the bound, if any."""
+    code refused to compute; ``note`` then holds its message. ``flagged_share``: share of elements that were refused.
+    ``condition``: the condition number behind the bound, if any."""
 
     error: float | None
     bound: float = 0.0
     flagged_share: float = 0.0
-    may_flag: float | None = None
     note: str = ""
     condition: float | None = None
 
@@ -101,10 +77,10 @@ def wrong(note: str = "") -> Outcome:
 
 @dataclass(frozen=True)
 class Case:
-    """An ill-conditioned or extreme case. ``run()`` gives the `Outcome`. ``computes``, ``reference`` and ``predicts``
-    describe in a line each what is computed, its reference, and how the bound is derived. ``expects``: a number, a
-    refusal (an `FppBenchError`, or every element masked), or either. ``heavy`` cases take seconds or gigabytes and are
-    left out of a quick run."""
+    """An ill-conditioned or extreme case. ``run`` gives the `Outcome` for the ``parameters``. ``computes``,
+    ``reference`` and ``predicts`` describe in a line each what is computed, its reference, and how the bound is
+    derived. ``expects``: a number, a refusal (an `FppBenchError`, or every element masked), or either. ``heavy`` cases
+    take seconds or gigabytes and are left out of a quick run."""
 
     group: str
     family: str
@@ -123,58 +99,46 @@ class Case:
         return ", ".join([self.family, *(f"{key} {value}" for key, value in self.parameters.items())])
 
 
-@dataclass
-class Group:
-    """The cases of a group, in the order in which their families are declared."""
-
-    name: str
-    cases: list[Case] = field(default_factory=list)
-
-    def family(
-        self,
-        name: str,
-        unit: str,
-        /,
-        *,
-        expects: Expects | Callable[..., Expects] = "number",
-        heavy: Callable[..., bool] = lambda **_: False,
-        **grid: Iterable[float | str],
-    ) -> Callable[[Run], Run]:
-        """Declare a function as a family: a case for each combination of the grid's values, which the function,
-        ``expects`` and ``heavy`` get by name. Its docstring says in this form what it computes: "depth; against its
-        reference; bound: how theory predicts it"."""
-
-        def declare(run: Run) -> Run:
-            computes, reference, predicts = re.split("; against |; bound: ", " ".join((run.__doc__ or "").split()))
-            for values in product(*grid.values()):
-                given = dict(zip(grid, values, strict=True))
-                expected = expects(**given) if callable(expects) else expects
-                case = Case(
-                    self.name,
-                    name,
-                    given,
-                    computes,
-                    reference,
-                    predicts,
-                    unit,
-                    partial(run, **given),
-                    expected,
-                    heavy(**given),
-                )
-                self.cases.append(case)
-            return run
-
-        return declare
+CASES: list[Case] = []
+"""The cases of all modules of `GROUPS` that have been imported."""
 
 
-def all_cases(groups: Iterable[str] = tuple(MODULES), quick: bool = False) -> list[Case]:
+def family(
+    group: str,
+    name: str,
+    unit: str,
+    /,
+    *,
+    against: str,
+    bound: str,
+    expects: Expects | Callable[..., Expects] = "number",
+    heavy: Callable[..., bool] = lambda **_: False,
+    **grid: Iterable[float | str],
+) -> Callable[[Run], Run]:
+    """Declare a function as a family of `CASES`: a case for each combination of the grid's values, which the function,
+    ``expects`` and ``heavy`` get by name. Its docstring says what it computes, ``against`` what reference, and
+    ``bound`` how theory predicts the error."""
+
+    def declare(run: Run) -> Run:
+        computes = " ".join((run.__doc__ or "").split())
+        for values in product(*grid.values()):
+            given = dict(zip(grid, values, strict=True))
+            expected = expects(**given) if callable(expects) else expects
+            CASES.append(Case(group, name, given, computes, against, bound, unit, run, expected, heavy(**given)))
+        return run
+
+    return declare
+
+
+def all_cases(groups: Iterable[str] = tuple(GROUPS), quick: bool = False) -> list[Case]:
     """The cases of ``groups``, without the heavy ones when ``quick``. Raises `StabilityError`."""
     cases: list[Case] = []
     for group in groups:
-        if group not in MODULES:
-            raise StabilityError(f"unknown group {group!r}; there are {', '.join(MODULES)}")
-        cases += getattr(import_module(f"{__package__}.{MODULES[group]}"), group.upper()).cases
-    return [case for case in cases if not (quick and case.heavy)]
+        if group not in GROUPS:
+            raise StabilityError(f"unknown group {group!r}; there are {', '.join(GROUPS)}")
+        import_module(f"{__package__}.{GROUPS[group]}")
+        cases += [case for case in CASES if case.group == group and not (quick and case.heavy)]
+    return cases
 
 
 @dataclass(frozen=True)
@@ -188,11 +152,9 @@ class Row:
     cpu_seconds: float
 
     @property
-    def verdict(self) -> Verdict:
-        """FAIL where there is a reason against the outcome."""
-        if self.against:
-            return Verdict.FAIL
-        return Verdict.FLAGGED if self.outcome.error is None else Verdict.WITHIN
+    def verdict(self) -> str:
+        """One of `VERDICTS`."""
+        return "FAIL" if self.against else "flagged" if self.outcome.error is None else "within"
 
 
 def run_cases(cases: Sequence[Case], done: Callable[[Row], None] = lambda _: None) -> list[Row]:
@@ -203,7 +165,7 @@ def run_cases(cases: Sequence[Case], done: Callable[[Row], None] = lambda _: Non
         started = time.process_time()
         try:
             with np.errstate(all="ignore"):
-                outcome = case.run()
+                outcome = case.run(**case.parameters)
         except FppBenchError as error:
             outcome = Outcome(None, flagged_share=1.0, note=str(error))
         except Exception as error:
@@ -223,28 +185,23 @@ def judge(case: Case, outcome: Outcome) -> str:
         return f"error {outcome.error:.3g} exceeds its bound {outcome.bound:.3g}{outcome.note and f': {outcome.note}'}"
     if case.expects == "refusal":
         return "gave a number where there is none"
-    allowed = float(case.expects != "number") if outcome.may_flag is None else outcome.may_flag
-    if outcome.flagged_share > allowed:
-        return f"refused {outcome.flagged_share:.2%}, theory allows {allowed:.2%}"
+    if case.expects == "number" and outcome.flagged_share:
+        return f"refused {outcome.flagged_share:.2%} of what can be computed"
     return ""
 
 
 def worst(
-    errors: ArrayLike,
-    bounds: ArrayLike = 0.0,
-    flagged: ArrayLike = False,
-    may_flag: float | None = None,
-    condition: float | None = None,
+    errors: ArrayLike, bounds: ArrayLike = 0.0, flagged: ArrayLike = False, condition: float | None = None
 ) -> Outcome:
     """The outcome of many elements: the worst of those that are not flagged. Their NaN errors stay NaN."""
     parts = np.broadcast_arrays(np.abs(np.asarray(errors, float)), np.asarray(bounds, float), np.asarray(flagged))
     error, bound, refused = (np.ravel(part) for part in parts)
     if refused.all():
-        return Outcome(None, 0.0, 1.0, may_flag, "every element is masked", condition)
+        return Outcome(None, 0.0, 1.0, "every element is masked", condition)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(error == 0, 0.0, error / bound)
     index = int(np.argmax(np.where(refused, -1.0, ratio)))  # the first NaN, if any
-    return Outcome(float(error[index]), float(bound[index]), float(refused.mean()), may_flag, condition=condition)
+    return Outcome(float(error[index]), float(bound[index]), float(refused.mean()), condition=condition)
 
 
 @cache
@@ -286,7 +243,7 @@ def summary(rows: Sequence[Row]) -> dict[str, dict[str, Any]]:
         ratios = [row.outcome.ratio for row in part if row.outcome.ratio is not None]
         groups[group] = {
             "cases": len(part),
-            **{verdict.value: sum(row.verdict is verdict for row in part) for verdict in Verdict},
+            **{verdict: sum(row.verdict == verdict for row in part) for verdict in VERDICTS},
             "largest_ratio": max(ratios, default=None),
             "cpu_seconds": round(sum(row.cpu_seconds for row in part), 2),
         }
@@ -299,7 +256,7 @@ def document(rows: Sequence[Row]) -> dict[str, Any]:
     for row in rows:
         content = {**vars(row.case), "verdict": row.verdict, **vars(row.outcome), "ratio": row.outcome.ratio}
         content |= {"against": row.against, "cpu_seconds": round(row.cpu_seconds, 3)}
-        cases.append({key: value for key, value in content.items() if key not in ("run", "heavy", "may_flag")})
+        cases.append({key: value for key, value in content.items() if key not in ("run", "heavy")})
     content = {
         "schema_version": "1.0.0",
         "summary": summary(rows),
@@ -311,44 +268,32 @@ def document(rows: Sequence[Row]) -> dict[str, Any]:
     return named
 
 
-def _level(row: Row) -> int:
-    """The place of a case's square in `LEVELS`."""
-    if row.verdict is Verdict.WITHIN:
-        return 1 + bisect_right(_LIMITS, row.outcome.ratio) if row.outcome.ratio else 0
-    return len(LEVELS) - 1 - (row.verdict is Verdict.FLAGGED)
-
-
 @styled
-def heat_map(rows: Sequence[Row]) -> bytes:
-    """The heat map as PNG: a line for each family, a square for each case."""
-    from matplotlib.colors import ListedColormap
-    from matplotlib.patches import Patch
-
-    families = {
-        name: [*map(_level, part)] for name, part in groupby(rows, lambda row: (row.case.group, row.case.family))
-    }
-    squares = np.full((len(families), max(map(len, families.values()))), np.nan)
-    for line, levels in zip(squares, families.values(), strict=True):
-        line[: len(levels)] = levels
-    height, width = squares.shape
-    drawn = figure(_SQUARE_IN * width + 4, _SQUARE_IN * height + 1)
+def picture(rows: Sequence[Row]) -> bytes:
+    """PNG: a line for each family, and on it error / bound of each of its cases; flagged ones, which have none, stand
+    at 0, at the left."""
+    families = list(dict.fromkeys((row.case.group, row.case.family) for row in rows))
+    drawn = figure(8, 0.19 * len(families) + 1)
     axes = drawn.subplots()
-    colours = ListedColormap([*LEVELS.values()])
-    axes.pcolormesh(squares, cmap=colours, vmin=-0.5, vmax=len(LEVELS) - 0.5, edgecolors="white", linewidth=1.5)
-    axes.set_yticks(np.arange(height) + 0.5, map(": ".join, families), fontsize=7)
-    axes.set_aspect("equal")
+    for verdict, colour in VERDICTS.items():
+        part = [row for row in rows if row.verdict == verdict]
+        ratios = [np.clip(row.outcome.ratio or 0, _SMALLEST_RATIO, 1e3) for row in part]
+        places = [families.index((row.case.group, row.case.family)) for row in part]
+        marker = "x" if verdict == "flagged" else "o"
+        axes.plot(ratios, places, marker, color=colour, alpha=0.6, ms=5, mew=1, label=f"{verdict}: {len(part)}")
+    axes.axvline(1, color=VERDICTS["FAIL"], lw=1)
+    axes.set(xscale="log", xlabel="error / bound; smaller ones, 0, and what was refused stand at the left edge")
+    axes.set_yticks(range(len(families)), map(": ".join, families))
+    axes.margins(y=0.01)
     axes.invert_yaxis()
-    axes.set_xticks([])
-    axes.tick_params(length=0)
-    axes.spines[:].set_visible(False)
-    key = [Patch(color=colour, label=meaning) for meaning, colour in LEVELS.items()]
-    drawn.legend(handles=key, ncols=3, loc="outside upper center")
+    axes.grid(lw=0.5)
+    drawn.legend(ncols=3, loc="outside upper center")
     return figure_png(drawn, reduced=True)
 
 
 def write_report(rows: Sequence[Row], folder: Path) -> list[Path]:
     """Write the data and the picture into ``folder``, which is made; their paths. Raises `SubmissionError`."""
-    data, picture = folder / "stability.json", folder / "stability.png"
-    write_file(heat_map(rows), picture, new_folder=True)
+    data, image = folder / "stability.json", folder / "stability.png"
+    write_file(picture(rows), image, new_folder=True)
     write_json(document(rows), data)
-    return [data, picture]
+    return [data, image]

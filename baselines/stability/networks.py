@@ -1,5 +1,5 @@
 """Losses of zero residual, empty mask, half precisions and any magnitude; instance normalisation of nearly constant
-input; gradients; networks in single and half precision; the training metric."""
+input; networks in single and half precision; the training metric."""
 
 import math
 from collections.abc import Callable
@@ -12,16 +12,11 @@ from torch.func import functional_call
 from fpp_ml_bench.baselines.networks.base import RECENTRED_FROM, InstanceNorm, in_full_precision, torch_threads
 from fpp_ml_bench.baselines.networks.model import NETWORKS as NAMES
 from fpp_ml_bench.baselines.networks.model import build
-from fpp_ml_bench.baselines.phase.calibration_layer import CalibrationLayer
-from fpp_ml_bench.baselines.stability.cases import U32, U64, Group, Outcome, gamma, worst, wrong
+from fpp_ml_bench.baselines.stability.cases import U32, Outcome, family, gamma, worst, wrong
 from fpp_ml_bench.baselines.stability.scores import exact_scores
 from fpp_ml_bench.baselines.training.losses import EPSILON, loss_function
-from fpp_ml_bench.baselines.training.recipe import LOSSES
 from fpp_ml_bench.evaluation.score.torch_metric import DepthScores
-from fpp_ml_bench.optics.named_rigs import paper_rig
-from fpp_ml_bench.optics.sequence import DIRECTIONS
 
-NETWORKS = Group("networks")
 ALPHA = 0.7
 SMALL = {
     "unet": {"width": 4},
@@ -73,18 +68,20 @@ def _exact_loss(name: str, prediction: Tensor, target: Tensor) -> float:
     return ALPHA * inside + (1 - ALPHA) * everywhere if name.startswith("hybrid") else everywhere
 
 
-@NETWORKS.family(
+@family(
+    "networks",
     "loss",
     "1",
+    against="exactly rounded sums in float64",
+    bound="2 (log2 n + 16) u32: pairwise sums in float32 whatever the input; beyond 1e19 the square is "
+    "infinite, and training stops",
     expects=lambda scale, **_: "either" if scale > 1e19 else "number",
     name=("rmse", "hybrid_l1", "hybrid_rmse"),
     kind=("float32", "float16", "bfloat16", "zero residual", "empty mask"),
     scale=(1e-6, 2e3, 1e25),
 )
 def loss(name: str, kind: str, scale: float) -> Outcome:
-    """loss of errors of this size and its gradient, which is 0 for a residual of 0; against exactly rounded sums in
-    float64; bound: 2 (log2 n + 16) u32: pairwise sums in float32 whatever the input; beyond 1e19 the square is
-    infinite, and training stops"""
+    """loss of errors of this size and its gradient, which is 0 for a residual of 0"""
     dtype = getattr(torch, kind, torch.float32)
     target = (scale * _target()).to(dtype)
     prediction = target if kind == "zero residual" else target + (0.1 * scale * random(_SHAPE, 2)).to(dtype)
@@ -100,11 +97,18 @@ def loss(name: str, kind: str, scale: float) -> Outcome:
     return worst([value.item() - exact, slope], [gamma(2 * (math.log2(target.numel()) + 16), U32) * exact, 0.0])
 
 
-@NETWORKS.family("instance norm", "1", amplitude=(0.0, 1.0), offset=(0.0, 1.0, 1e2, 1e4, 1e6, 1e8))
+@family(
+    "networks",
+    "instance norm",
+    "1",
+    against="float64 on the same input",
+    bound="2 (d / sqrt(d^2 + variance + eps) + g |x| + g), g = (log2 n + 16) u32, d = g |offset|, the "
+    "rounding of the mean, or where the map is centred again what is left of it",
+    amplitude=(0.0, 1.0),
+    offset=(0.0, 1.0, 1e2, 1e4, 1e6, 1e8),
+)
 def instance_norm(offset: float, amplitude: float) -> Outcome:
-    """normalised map of this amplitude on this offset in float32, and whether its gradient is finite; against float64
-    on the same input; bound: 2 (d / sqrt(d^2 + variance + eps) + g |x| + g), g = (log2 n + 16) u32, d = g |offset|, the
-    rounding of the mean, or where the map is centred again what is left of it"""
+    """normalised map of this amplitude on this offset in float32, and whether its gradient is finite"""
     x = (amplitude * random((1, 2, 48, 48), 4) + offset).float().requires_grad_()  # one-pass variances cancel here
     layer = InstanceNorm(2, affine=False)
     output = layer(x)
@@ -118,46 +122,18 @@ def instance_norm(offset: float, amplitude: float) -> Outcome:
     return worst((output.detach() - exact + 0 * gradient).numpy(), bound.numpy(), condition=offset)
 
 
-def directional(function: Callable[[Tensor], Tensor], x: Tensor, step: float = 1e-3) -> Outcome:
-    """Autograd's derivative along a random direction against Richardson's extrapolated difference quotient."""
-    seed = random(tuple(x.shape), 8)
-    seed = seed / seed.norm()
-    inner = x.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(function(inner), inner)
-    slope = float((gradient * seed).sum())
-    with torch.no_grad():
-        steps = step, 2 * step, 4 * step
-        one, two, four = (float(function(x + h * seed) - function(x - h * seed)) / (2 * h) for h in steps)
-        rounding = 64 * U64 * abs(float(function(x))) * math.sqrt(x.numel()) / step
-    first, second = (4 * one - two) / 3, (4 * two - four) / 3
-    return worst(slope - first, abs(first - second) + abs(one - two) * 1e-3 + rounding)
-
-
-@NETWORKS.family("gradient", "1", of=(*LOSSES, *DIRECTIONS, "instance norm", *NAMES))
-@torch_threads(1)
-def gradient(of: str) -> Outcome:
-    """directional derivative of a loss, of the calibration layer's depth of a direction, of a layer, of a network, in
-    float64; against Richardson's extrapolated differences; bound: difference of two extrapolations (the next order) +
-    64 u |f| sqrt(n) / h of rounding"""
-    if of in LOSSES:
-        target = _target()  # all errors are away from the kink of |.|
-        return directional(lambda x: _loss(of)(x, target), target + 0.1 + random(_SHAPE, 2, torch.rand))
-    if of in DIRECTIONS:
-        exact = CalibrationLayer.of(paper_rig(16), of)  # type: ignore[arg-type]
-        layer, total = exact.tensors(torch.float64), torch.from_numpy(exact.absolute_phase(1800.0))
-        order = torch.floor(total / (2 * math.pi) + 0.5)
-        return directional(lambda phase: layer.depth_mm(phase, order).sum(), total - 2 * math.pi * order)
-    network = InstanceNorm(1, affine=True).double() if of == "instance norm" else small_network(of)
-    seed = random(_IMAGE, 10)
-    return directional(lambda image: (network(image) * seed).sum(), random(_IMAGE, 9, torch.rand), step=1e-7)
-
-
-@NETWORKS.family("network in float32", "1", name=NAMES)
+@family(
+    "networks",
+    "network in float32",
+    "1",
+    against="the same weights in float64",
+    bound="16 x what rounding each weight and pixel once (2^-24) does: condition number x unit round-off",
+    name=NAMES,
+)
 @torch_threads(1)
 @torch.no_grad()
 def network_single(name: str) -> Outcome:
-    """output in float32; against the same weights in float64; bound: 16 x what rounding each weight and pixel once
-    (2^-24) does: condition number x unit round-off"""
+    """output in float32"""
     network, x = small_network(name), random(_IMAGE, 11, torch.rand)
     exact, spread = network(x), 0.0
     for seed in (20, 21, 22):
@@ -171,12 +147,19 @@ def network_single(name: str) -> Outcome:
     return worst((single - exact).numpy(), 16 * spread, condition=condition)
 
 
-@NETWORKS.family("network in half precision", "mm", name=NAMES, dtype=("bfloat16", "float16"))
+@family(
+    "networks",
+    "network in half precision",
+    "mm",
+    against="float64 on the same features",
+    bound="10 u32 x 1810 mm: the last layer runs in float32; bfloat16 alone would be 4 mm off",
+    name=NAMES,
+    dtype=("bfloat16", "float16"),
+)
 @torch_threads(1)
 @torch.no_grad()
 def network_half(name: str, dtype: str) -> Outcome:
-    """depth of the last layer under autocast, 1800 mm; against float64 on the same features; bound: 10 u32 x 1810 mm:
-    the last layer runs in float32; bfloat16 alone would be 4 mm off"""
+    """depth of the last layer under autocast, 1800 mm"""
     kind, head = getattr(torch, dtype), nn.Conv2d(8, 1, 1)
     features = random((1, 8, 16, 16), 12, torch.rand).to(kind)
     head.bias.fill_(1800.0)  # type: ignore[union-attr]
@@ -188,9 +171,16 @@ def network_half(name: str, dtype: str) -> Outcome:
     return worst((depth.double() - head.double()(features.double())).numpy(), gamma(10, U32) * 1810.0)
 
 
-@NETWORKS.family("training metric", "relative", scale=(1.0, 1e-30, 1e30, 1e-160, 1e-300))
+@family(
+    "networks",
+    "training metric",
+    "relative",
+    against="sums in 50 digits",
+    bound="gamma of 460 roundings",
+    scale=(1.0, 1e-30, 1e30, 1e-160, 1e-300),
+)
 def metric_scale(scale: float) -> Outcome:
-    """mean RMSE of 50 samples as a torchmetrics metric; against sums in 50 digits; bound: gamma of 460 roundings"""
+    """mean RMSE of 50 samples as a torchmetrics metric"""
     metric, target = DepthScores("mm"), torch.full((1, 20, 20), 4096 * scale, dtype=torch.float64)
     predictions = target + scale * (random((50, 20, 20), 14, torch.rand) * 998 + 1)
     for prediction in predictions:

@@ -10,12 +10,12 @@ from pydantic import Field
 
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE, RANK_KEY
-from fpp_ml_bench.evaluation.report.html import interval_text, millimetres
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import Interval, ends
 from fpp_ml_bench.evaluation.score.uncertainty import FEWEST_OBJECTS, SIGNIFICANT, caution, object_interval, sign_flip_p
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.schema import Count, Share, StrictModel, Text
+from fpp_ml_bench.style import interval_text, millimetres
 
 
 class PairedSample(StrictModel):

@@ -3,24 +3,36 @@ text from a submission is shown as plain text, never as markup."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import partial
 from string import Formatter
 
 from rich.console import Group
 from rich.text import Text
 
-from fpp_ml_bench.evaluation.metrics import METRICS, NOTES, UNCERTAINTY, Metric, listed
+from fpp_ml_bench.evaluation.metrics import METRICS, NOTES, UNCERTAINTY, Metric
 from fpp_ml_bench.evaluation.protocol import PIXEL_SETS
 from fpp_ml_bench.evaluation.report.comparison import Comparison
-from fpp_ml_bench.evaluation.report.html import interval_text, millimetres, score_text, seconds, signed
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.score.uncertainty import SIGNIFICANT, caution
 from fpp_ml_bench.files import printable
+from fpp_ml_bench.style import interval_text, millimetres, percent, signed, three_digits
 from fpp_ml_bench.tables import Table
 
 WORST = 5
 _table = partial(Table, elsewhere="--json FILE")
+_WRITERS: dict[str, Callable[[float | None], str]] = {
+    "mm": millimetres,
+    "signed mm": signed,
+    "share": percent,
+    "ratio": percent,
+    "nats": partial(signed, plus=""),
+}
+
+
+def score_text(key: str, value: float | None) -> str:
+    """A value of the metric ``key`` as its unit is written: mm, or per cent for a share."""
+    return _WRITERS[(METRICS.get(key) or UNCERTAINTY[key]).unit](value)
 
 
 def result_table(result: Result) -> Group:
@@ -83,7 +95,7 @@ def _notes(result: Result) -> Text:
     if few_objects := caution(len(result.per_object)):
         lines.append(few_objects)
     known = submission.seconds_per_sample is not None
-    time = f"{seconds(submission.seconds_per_sample)} s ({submission.seconds_source})" if known else "unknown time"
+    time = f"{three_digits(submission.seconds_per_sample)} s ({submission.seconds_source})" if known else "unknown time"
     lines.append(f"Frames used: {len(submission.frames_used)}; {time} per sample.")
     return Text("\n".join(lines) + "\n")
 
@@ -91,7 +103,7 @@ def _notes(result: Result) -> Text:
 def _uncertainty(result: Result) -> Table | None:
     if (block := result.uncertainty) is None:
         return None
-    shown = [metric for metric in listed(UNCERTAINTY.values()) if metric.terminal]
+    shown = [metric for metric in UNCERTAINTY.values() if metric.terminal]
     table = _table(
         "Stated uncertainty",
         numbers=[metric.terminal for metric in shown],

@@ -4,10 +4,10 @@ file is read, and overall is checked against object and background in every samp
 
 import math
 import statistics
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime
 from functools import partial
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -41,6 +41,9 @@ from fpp_ml_bench.evaluation.score.uncertainty import intervals_over_objects
 from fpp_ml_bench.evaluation.submission.description import Submission
 from fpp_ml_bench.loaders.storage.benchmark import Counts, known_problem
 from fpp_ml_bench.schema import Count, SparseModel, StrictModel, Text
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.evaluation.score.evaluator import Scored
 
 AGREES = 1e-9
 """Relative difference up to which two computations of an average count as the same number."""
@@ -110,8 +113,6 @@ class Result(SparseModel):
             _check_weights("robustness", block.weights_sha256, self.submission)
             if name != block.set:
                 raise ValueError(f"robustness.{name} is that of the set {block.set}")
-        if self.mode not in protocol.MODES:
-            raise ValueError(f"protocol {self.protocol_version} has no mode {self.mode}")
         objects: dict[str, list[SampleResult]] = {}
         for row in self.per_sample:
             objects.setdefault(row.object, []).append(row)
@@ -123,8 +124,8 @@ class Result(SparseModel):
         void = self.mode == "standard"
         for row in self.per_sample:
             _check_sample(row, height * width, {"void": void, "unlit": void and self.target == "depth_exact"})
-        derived = _derived(self.per_sample)
-        _check_same("", self.model_dump(include=set(derived)), derived)
+        follows = derived(self.per_sample)
+        _check_same("", self.model_dump(include=set(follows)), follows)
         return self
 
 
@@ -144,20 +145,16 @@ class ArrayScores(StrictModel):
     uncertainty: Uncertainty | None = None
 
 
-def array_scores(rows: list[dict[str, Any]], stated: Mapping[str, SigmaSample]) -> ArrayScores:
-    """`ArrayScores` from ``per_sample`` rows (keys of `SampleResult`) and the ``stated`` uncertainty of all or none."""
-    per_sample = [SampleResult(**row) for row in rows]
-    uncertainty = uncertainty_of(stated, {row.sample: row.object for row in per_sample}) if stated else None
-    return ArrayScores(per_sample=per_sample, uncertainty=uncertainty, **_derived(per_sample))
+def scores_of(scored: "Sequence[Scored]") -> dict[str, Any]:
+    """Every key of `ArrayScores` from ``scored`` samples, of which all state an uncertainty or none does."""
+    per_sample = [SampleResult(sample=sample.name, object=sample.object, **sample.row) for sample in scored]
+    stated = {sample.name: sample.stated for sample in scored if sample.stated is not None}
+    owners = {sample.name: sample.object for sample in scored}
+    uncertainty = uncertainty_of(stated, owners) if stated else None
+    return {"per_sample": per_sample, "uncertainty": uncertainty, **derived(per_sample)}
 
 
-def result_from_rows(rows: list[dict[str, Any]], **fields: Any) -> Result:
-    """A `Result` from ``per_sample`` rows (keys of `SampleResult`) and the remaining keys; averages are made here."""
-    per_sample, version = [SampleResult(**row) for row in rows], protocol.RESULT_SCHEMA_VERSION
-    return Result(schema_version=version, per_sample=per_sample, **_derived(per_sample), **fields)
-
-
-def _derived(per_sample: list[SampleResult]) -> dict[str, Any]:
+def derived(per_sample: list[SampleResult]) -> dict[str, Any]:
     """Every key of `Result` that follows from the per-sample scores."""
     rows = [{key: getattr(row, key) for key in METRICS} for row in per_sample]
     objects = [row.object for row in per_sample]
@@ -205,15 +202,7 @@ def over_samples(
 
 def _deviation(values: list[float]) -> float | None:
     """Sample standard deviation (n - 1); None for fewer than two values."""
-    if len(values) < 2:
-        return None
-    mean = statistics.fmean(values)
-    largest = max(abs(value - mean) for value in values)
-    if largest == 0:
-        return 0.0
-    # Scaled, so that deviations of 1e-200 or 1e200 mm can be squared.
-    squares = math.fsum(((value - mean) / largest) ** 2 for value in values)
-    return largest * math.sqrt(squares / (len(values) - 1))
+    return statistics.stdev(values) if len(values) > 1 else None
 
 
 def pooled(inside: ErrorStats, outside: ErrorStats) -> Scores:
@@ -287,11 +276,16 @@ def _check_weights(part: str, measured: str | None, submission: Submission) -> N
 
 
 def disagreements(
-    stored: Any, computed: Any, name: str = "", rounding: float = 0.0, cancelling: float = 1e-9
+    stored: Any,
+    computed: Any,
+    name: str = "",
+    rounding: float = 0.0,
+    cancelling: float = 1e-9,
+    digits: int | None = None,
 ) -> Iterator[tuple[str, Any, Any]]:
     """Name, stored and computed value of everything in two plain contents that is not the same. ``rounding``: absolute
     difference up to which two numbers count as the same; ``cancelling``: that of scores which are a small difference of
-    large numbers, so that it depends on the machine."""
+    large numbers, so that it depends on the machine; ``digits``: significant ones of the stored numbers."""
     if isinstance(stored, Mapping) and isinstance(computed, Mapping):
         for key in dict.fromkeys((*stored, *computed)):
             metric = METRICS.get(key) or UNCERTAINTY.get(key)
@@ -300,13 +294,13 @@ def disagreements(
             pair = stored.get(key), computed.get(key)
             if pair == (None, None) and not (key in stored and key in computed):
                 yield where, *pair
-            yield from disagreements(*pair, where, limit, cancelling)
+            yield from disagreements(*pair, where, limit, cancelling, digits)
     elif isinstance(stored, list) and isinstance(computed, list):
         if len(stored) != len(computed):
             yield name, f"{len(stored)} entries", f"{len(computed)}"
         for index, pair in enumerate(zip(stored, computed, strict=False)):
-            yield from disagreements(*pair, f"{name}.{index}", rounding, cancelling)
-    elif not (stored == computed or (isinstance(stored, float) and same(stored, computed, rounding))):
+            yield from disagreements(*pair, f"{name}.{index}", rounding, cancelling, digits)
+    elif not (stored == computed or (isinstance(stored, float) and same(stored, computed, rounding, digits))):
         yield name, stored, computed
 
 
@@ -359,39 +353,45 @@ def _check_uncertainty(block: Uncertainty, rows: Mapping[str, SampleResult], met
         if None not in covered and covered != sorted(covered):
             raise ValueError(f"uncertainty.per_sample.{sample}: a wider interval holds less than a narrower one")
     stored = block.model_dump(include={"metrics", "per_object", "per_sample"})
-    derived = _uncertainty_means(stored["per_sample"], {sample: row.object for sample, row in rows.items()})
-    if set(block.per_object) != set(derived["per_object"]):
+    follows = _uncertainty_means(stored.pop("per_sample"), {sample: row.object for sample, row in rows.items()})
+    if set(block.per_object) != set(follows["per_object"]):
         raise ValueError("uncertainty.per_object: other objects than per_sample has")
-    agree = partial(_check_same, rounding=1e-12)  # a likelihood may be near 0
-    agree("uncertainty", {name: stored[name] for name in derived}, derived)
-    if (block.reliability is None) != (block.metrics.coverage_68 is None):
+    reliability, curves = block.reliability, block.sparsification
+    if (reliability is None) != (block.metrics.coverage_68 is None):
         raise ValueError("uncertainty.reliability must be there exactly where some pixel states an uncertainty")
-    if (block.sparsification is None) != (block.metrics.ause_mae_mm is None):
+    if (curves is None) != (block.metrics.ause_mae_mm is None):
         raise ValueError("uncertainty.sparsification must be there exactly where there is an object")
-    if (reliability := block.reliability) is not None:
-        if reliability.nominal != list(NOMINAL):
-            raise ValueError(f"uncertainty.reliability.nominal: expected {', '.join(map(str, NOMINAL))}")
+    facts = [(name, stored[name], follows[name]) for name in follows]
+    if reliability is not None:
+        facts.append(("reliability.nominal", reliability.nominal, list(NOMINAL)))
         for percent in COVERED:
             observed = reliability.observed[NOMINAL.index(percent / 100)]
-            stated = getattr(block.metrics, f"coverage_{percent}")
-            agree(f"uncertainty.reliability at {percent}%", observed, stated)
-    if (curves := block.sparsification) is None:
-        return
-    if curves.left_out != list(LEFT_OUT):
-        raise ValueError("uncertainty.sparsification.left_out: expected 0 to 0.95 in steps of 0.05")
-    for error in ("mae_mm", "rmse_mm"):
-        by_sigma, best = getattr(curves, error), getattr(curves, f"best_{error}")
-        whole = getattr(metrics, f"object_{error}")
-        sure, area = (getattr(block.metrics, f"{name}_{error}") for name in ("sure", "ause"))
-        agree(f"uncertainty.sparsification.{error}.0", by_sigma[0], whole)
-        agree(f"uncertainty.sparsification.best_{error}.0", best[0], whole)
-        agree(f"uncertainty.sparsification.{error}", by_sigma[LEFT_OUT.index(SURE_LEFT_OUT)], sure)
-        gap = math.fsum(first - second for first, second in zip(by_sigma, best, strict=True)) / len(LEFT_OUT)
-        agree(f"uncertainty.metrics.ause_{error}", area, max(gap, 0.0), rounding=max(AGREES * (whole or 0.0), 1e-12))
+            facts.append((f"reliability at {percent}%", observed, getattr(block.metrics, f"coverage_{percent}")))
+    roundings = {}
+    if curves is not None:
+        facts.append(("sparsification.left_out", curves.left_out, list(LEFT_OUT)))
+        for error in ("mae_mm", "rmse_mm"):
+            by_sigma, best = getattr(curves, error), getattr(curves, f"best_{error}")
+            whole = getattr(metrics, f"object_{error}")
+            sure, area = (getattr(block.metrics, f"{name}_{error}") for name in ("sure", "ause"))
+            gap = math.fsum(first - second for first, second in zip(by_sigma, best, strict=True)) / len(LEFT_OUT)
+            facts += [
+                (f"sparsification.{error}.0", by_sigma[0], whole),
+                (f"sparsification.best_{error}.0", best[0], whole),
+                (f"sparsification.{error}", by_sigma[LEFT_OUT.index(SURE_LEFT_OUT)], sure),
+                (f"metrics.ause_{error}", area, max(gap, 0.0)),
+            ]
+            roundings[f"metrics.ause_{error}"] = AGREES * (whole or 0.0)
+    for name, value, expected in facts:
+        rounding = max(roundings.get(name, 0.0), 1e-12)  # a likelihood may be near 0
+        _check_same(f"uncertainty.{name}", value, expected, rounding)
 
 
-def same(first: float | None, second: float | None, rounding: float = 0.0) -> bool:
-    """Whether two numbers differ by at most `AGREES` relatively, or ``rounding``; None equals None only."""
+def same(first: float | None, second: float | None, rounding: float = 0.0, digits: int | None = None) -> bool:
+    """Whether two numbers differ by at most `AGREES` relatively, or ``rounding``, and half a unit of the last of
+    ``digits``; None equals None only."""
     if first is None or second is None:
         return first is second
+    if digits is not None and second:
+        rounding += 0.5 * 10.0 ** (math.floor(math.log10(abs(second))) + 1 - digits) + AGREES * abs(second)
     return math.isclose(first, second, rel_tol=AGREES, abs_tol=rounding)

@@ -149,11 +149,16 @@ class DatasetInfo(SparseModel):
     def _consistent(self) -> "DatasetInfo":
         if self.benchmark is None:
             return self
-        claim, actual = f"{self.benchmark.name} version {self.benchmark.version}", benchmarks.benchmark_of(self.content)
+        claim, actual = f"{self.benchmark.name} version {self.benchmark.version}", self.known
         if actual is None or claim != actual.title:
             found = f"is that of {actual.title}" if actual else "is not that benchmark's"
             raise ValueError(f"benchmark says {claim}, but content {found}")
         return self
+
+    @property
+    def known(self) -> benchmarks.Benchmark | None:
+        """The benchmark whose scenes these are, whatever was projected."""
+        return benchmarks.benchmark_of(self.content)
 
     @property
     def truth(self) -> str:

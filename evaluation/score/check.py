@@ -4,6 +4,7 @@ checked without ground truth: its description, its files, their size and values.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import LARGEST_SIDE_PX, MM_PER_M
-from fpp_ml_bench.depth import depth_range_mm, extremes, object_mask
+from fpp_ml_bench.depth import RangeRule, depth_range_mm, extremes, object_mask
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import Mode, Units
@@ -20,12 +21,11 @@ from fpp_ml_bench.evaluation.submission.prediction_files import (
     SIGMA,
     SUBMISSION_FILE,
     Listing,
+    MapAndHash,
     declared_size,
     list_folder,
+    predictions_folder,
     read_plain,
-    read_sigma,
-    reader_for,
-    samples_in,
 )
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -87,6 +87,8 @@ def _unit_problem(values: Depth, target_mm: Depth, units: Units, high: float, re
     """Why ``values`` (H, W), finite and at most ``high``, can't be in ``units``; None where they can. Where mm are
     declared, the largest value shows whether the values are metres or shares of the range. Where m or normalised depth
     is declared, a single stray pixel must not decide, so the median over the object is compared."""
+    if not reach_mm:
+        return None
     reach = f"its largest value is {high:.4g}, and there are depths up to {reach_mm / MM_PER_M:.4g} m"
     if units == "mm":
         if not_in_mm(high, reach_mm):
@@ -159,17 +161,83 @@ def scored_pair(
 
 
 @dataclass(frozen=True)
+class Rules:
+    """By what a sample's prediction is scored: against which depth, in which units it is, over which pixels the range
+    of normalised depth is taken, and the mode."""
+
+    target: str
+    units: Units
+    range_rule: RangeRule
+    mode: Mode
+
+    def pair(self, values: Depth, dataset: DatasetFolder, sample: str) -> tuple[Depth, Depth]:
+        """`scored_pair` of ``values`` (H, W) and the sample's target."""
+        normalised = self.units == "normalised"
+        left_out = dataset.left_out(sample, self.range_rule, self.target) if normalised else None
+        target_mm = dataset.target_mm(sample, self.target)
+        return scored_pair(values, target_mm, self.units, self.mode, sample, left_out)
+
+    def void(self, dataset: DatasetFolder, sample: str) -> NDArray[np.bool_] | None:
+        """The pixels that count in no set, bool (H, W); None by rules without void."""
+        return dataset.void(sample, self.target) if self.mode == "standard" else None
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A sample's prediction as its files hold it: a map (H, W), the SHA-256 of its file, and its sigma in mm, None
+    where none is stated; ``problems`` with them, by file, usually none."""
+
+    values: Depth
+    digest: str
+    sigma_mm: Depth | None
+    problems: list[str]
+
+
+_NOTHING = np.empty((0, 0))
+
+
+def read_prediction(
+    listing: Listing,
+    read: Callable[[str], MapAndHash],
+    sample: str,
+    units: Units,
+    target_mm: Depth,
+    reach_mm: float = 0.0,
+) -> Prediction:
+    """A sample's prediction, by the ``read`` of its ``listing``, and its sigma, checked as `value_problems` does."""
+    values, digest, sigma_mm = _NOTHING, "", None
+    try:
+        values, digest = read(sample)
+        problems = value_problems(values, target_mm, reach_mm, units)
+    except PredictionError as error:
+        problems = [str(error)]
+    problems = [f"{listing.named(sample)}: {problem}" for problem in problems]
+    if listing.sigmas:
+        try:
+            height, width = target_mm.shape
+            sigma_mm = listing.sigma_mm(sample, (height, width))
+        except PredictionError as error:
+            problems.append(f"{printable(sample)}{SIGMA}: {error}")
+    return Prediction(values, digest, sigma_mm, problems)
+
+
+@dataclass(frozen=True)
 class Checked:
     """``problems``: a line for each reason to refuse the folder, usually none; ``notes``: what is worth a look.
-    ``size`` (H, W) in px; ``sigmas``: whether the samples state their uncertainty."""
+    ``size`` (H, W) in px."""
 
     problems: list[str]
     notes: list[str]
     description: Submission | None
-    samples: list[str]
-    form: str
+    listing: Listing
     size: tuple[int, int]
-    sigmas: bool
+
+    def sound(self) -> Submission:
+        """The description of a folder without problems; PredictionError names them where there are any."""
+        if self.problems or self.description is None:
+            folder = printable(str(self.listing.folder), 500)
+            raise PredictionError(f"{folder} can't be used, {len(self.problems)} problems:", self.problems)
+        return self.description
 
 
 def checked_description(folder: Path, content: dict[Any, Any], form: str, frames: int | None = None) -> Submission:
@@ -194,56 +262,38 @@ def check_folder(folder: str | Path, dataset: DatasetFolder | None = None, split
     """Check everything of a submission that needs no ground truth. With a ``dataset``, its split says which samples of
     which size are expected; without, the files' names and the size that most of them have do. Raises PredictionError
     for no folder, and for a form that can't be read without a dataset."""
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise PredictionError(f"expected a folder of predictions, found none at {printable(str(folder), 500)}")
-    samples = samples_in(folder) if dataset is None else dataset.samples(split)
-    if not samples:
+    folder = predictions_folder(folder)
+    listing = list_folder(folder, dataset, split)
+    if dataset is None and not listing.present:
         expected = "expected one {sample}.npy for each sample, found none"
         raise PredictionError(f"{printable(str(folder), 500)}: {expected}; tables need DATASET")
-    split_of = {} if dataset is None else {name: part for part, names in dataset.splits.items() for name in names}
-    listing = list_folder(folder, samples, split, split_of)
-    problems, notes = list(listing.problems), []
-    description = None
+    problems, description = list(listing.problems), None
     try:
-        content = read_plain(folder)
-        description = checked_description(
-            folder, content, listing.form, None if dataset is None else len(dataset.sequence)
-        )
+        frames = None if dataset is None else len(dataset.sequence)
+        description = checked_description(folder, read_plain(folder), listing.form, frames)
     except SubmissionError as error:
         problems.insert(0, str(error))
-    size = _declared_size(folder, listing) if dataset is None else dataset.size
-    level_mm = None if description is None else description.png_mm_per_level
-    units = "mm" if description is None else description.units
+    size = _declared_size(listing) if dataset is None else dataset.size
+    level_mm, units = (None, "mm") if description is None else (description.png_mm_per_level, description.units)
     largest = 0.0
     if listing.form != ".png" or level_mm is not None:
-        reader = reader_for(listing.form, folder, listing.present, size, level_mm)
+        read, unknown = listing.reader(size, level_mm), np.zeros(size)
         for sample in listing.present:
-            try:
-                values, _ = reader.read(sample)
-                largest = max(largest, float(values.max()))
-                found = value_problems(values, np.zeros(size), 0.0, units)
-            except PredictionError as error:
-                found = [str(error)]
-            problems += [f"{printable(reader.named(sample))}: {problem}" for problem in found]
-    for sample in listing.present if listing.sigmas else ():
-        try:
-            read_sigma(folder, sample, size)
-        except PredictionError as error:
-            problems.append(f"{printable(sample)}{SIGMA}: {error}")
-    if note := unit_note(largest, units):
-        notes.append(note)
-    return Checked(problems, notes, description, listing.present, listing.form, size, listing.sigmas)
+            prediction = read_prediction(listing, read, sample, units, unknown)
+            largest = max(largest, float(prediction.values.max(initial=0.0)))
+            problems += prediction.problems
+    note = unit_note(largest, units)
+    return Checked(problems, [note] if note else [], description, listing, size)
 
 
-def _declared_size(folder: Path, listing: Listing) -> tuple[int, int]:
+def _declared_size(listing: Listing) -> tuple[int, int]:
     """The size (H, W) that most of the files declare. PredictionError where it is too large to be read."""
     if listing.form == ".mat":
-        raise PredictionError(f"{printable(str(folder), 500)}: .mat files can only be checked with DATASET")
-    files = [folder / f"{sample}{listing.form}" for sample in listing.present]
+        raise PredictionError(f"{printable(str(listing.folder), 500)}: .mat files can only be checked with DATASET")
+    files = [listing.folder / f"{sample}{listing.form}" for sample in listing.present]
     declared = {file: size for file in files if (size := declared_size(file)) and min(size) > 0}
     if not declared:
-        named = printable(str(folder), 500)
+        named = printable(str(listing.folder), 500)
         raise PredictionError(f"{named}: no file holds a depth map (H, W); write them with np.save")
     size = Counter(declared.values()).most_common(1)[0][0]
     if max(size) > LARGEST_SIDE_PX:

@@ -18,17 +18,11 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.score.check import check_folder, scored_pair
+from fpp_ml_bench.evaluation.score.check import Rules, check_folder
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.sample_scores import gaussian_quantile, states_sigma
 from fpp_ml_bench.evaluation.submission.description import Submission, check_submission
-from fpp_ml_bench.evaluation.submission.prediction_files import (
-    SIGMA,
-    SUBMISSION_FILE,
-    list_folder,
-    read_sigma,
-    reader_for,
-)
+from fpp_ml_bench.evaluation.submission.prediction_files import SIGMA, SUBMISSION_FILE, list_folder
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
@@ -109,17 +103,17 @@ def calibrate(
 
 
 def _scores(
-    folder: Path, dataset: DatasetFolder, split: str, target: str, description: Submission
+    folder: Path, dataset: DatasetFolder, split: str, target: str, described: Submission
 ) -> Iterator[tuple[str, Scores]]:
     """|error| / sigma of the stated object pixels that are not void, (n,), of each sample."""
-    samples = dataset.samples(split)
-    form = list_folder(folder, samples, split, {}).form
-    reader = reader_for(form, folder, samples, dataset.size, description.png_mm_per_level)
-    for sample in samples:
-        pair = scored_pair(
-            reader.read(sample)[0], dataset.target_mm(sample, target), description.units, "standard", sample
-        )
-        sigma_mm = read_sigma(folder, sample, dataset.size)
+    listing, rules = (
+        list_folder(folder, dataset, split),
+        Rules(target, described.units, described.range_rule, "standard"),
+    )
+    read = listing.reader(dataset.size, described.png_mm_per_level)
+    for sample in listing.present:
+        pair = rules.pair(read(sample)[0], dataset, sample)
+        sigma_mm = listing.sigma_mm(sample, dataset.size)
         scored = object_mask(pair[1]) & ~dataset.void(sample, target) & states_sigma(pair[0], sigma_mm)
         depth, true, sigma = (np.asarray(values[scored], np.float64) for values in (*pair, sigma_mm))
         dataset.release(sample)
@@ -141,10 +135,8 @@ def write_calibrated(calibration: Calibration, folder: Path, dataset: DatasetFol
     among the settings of ``submission.yaml``; how many samples. Raises PredictionError for predictions that are
     unsound, of another method, or of objects that were calibrated on, and for an ``out`` that is there already."""
     checked = check_folder(folder, dataset, split)
-    if checked.problems or checked.description is None:
-        raise PredictionError(f"{folder} can't be used, {len(checked.problems)} problems:", checked.problems)
-    description = checked.description
-    _check_stated(folder, description, checked.sigmas)
+    description = checked.sound()
+    _check_stated(folder, description, checked.listing.sigmas)
     for key in ("name", "method", "units"):
         pair = getattr(calibration.described, key), getattr(description, key)
         if pair[0] != pair[1]:
@@ -162,8 +154,8 @@ def write_calibrated(calibration: Calibration, folder: Path, dataset: DatasetFol
     for path in sorted(folder.iterdir()):
         if not path.name.endswith(SIGMA) and path.name != SUBMISSION_FILE:
             shutil.copyfile(path, out / path.name)
-    for sample in checked.samples:
-        sigma_mm = read_sigma(folder, sample, dataset.size).astype(np.float64) * calibration.factor
+    for sample in checked.listing.present:
+        sigma_mm = checked.listing.sigma_mm(sample, dataset.size).astype(np.float64) * calibration.factor
         np.save(out / f"{sample}{SIGMA}", sigma_mm.astype(np.float32))
     settings = {
         FACTOR_KEY: calibration.factor,
@@ -178,4 +170,4 @@ def write_calibrated(calibration: Calibration, folder: Path, dataset: DatasetFol
     }
     text = check_submission(out, content).to_yaml()
     write_atomically(out / SUBMISSION_FILE, text.encode("utf-8"))
-    return len(checked.samples)
+    return len(checked.listing.present)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Lock
@@ -19,19 +20,25 @@ from fpp_ml_bench.depth import RangeRule, edge_jump_mm, extremes, object_box, ob
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import Mode, Units
-from fpp_ml_bench.evaluation.score.check import checked_description, declared_units, in_mm, scored_pair, value_problems
-from fpp_ml_bench.evaluation.score.sample_scores import SigmaSample, score_sample, score_sigma
+from fpp_ml_bench.evaluation.score.check import (
+    Rules,
+    checked_description,
+    declared_units,
+    in_mm,
+    read_prediction,
+    value_problems,
+)
+from fpp_ml_bench.evaluation.score.sample_scores import SampleScores, SigmaSample, score_sample, score_sigma
 from fpp_ml_bench.evaluation.submission.prediction_files import (
-    SIGMA,
     SUBMISSION_FILE,
-    Reader,
+    Listing,
+    MapAndHash,
     list_folder,
+    predictions_folder,
     read_plain,
-    read_sigma,
-    reader_for,
 )
 from fpp_ml_bench.files import printable
-from fpp_ml_bench.loaders.sample import Flag, image_hash, stored_frames, void_pixels
+from fpp_ml_bench.loaders.sample import Flag, image_hash, void_pixels
 from fpp_ml_bench.loaders.storage.benchmark import benchmark_of
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
@@ -43,8 +50,6 @@ if TYPE_CHECKING:
 
 Maps = NDArray[Any] | Sequence[NDArray[Any]]
 WORKERS = 4
-Outcome = tuple[list[str], list[dict[str, Any]]]
-"""Problems and rows of a sample: a line for each problem and no row, or no problem and a row."""
 
 
 def evaluate(
@@ -65,61 +70,53 @@ def evaluate(
 
     Raises SubmissionError for the description, PredictionError (naming every file with a problem) for the predictions,
     and DatasetError for a target that is not a depth map."""
-    folder = Path(folder)
-    samples = _samples(folder, dataset, split, target, mode)
-    content, description_error = None, None
+    folder = predictions_folder(folder)
+    _check_split(dataset, split, target, mode)
+    content, description, refusal = {}, None, None
     try:
         content = read_plain(folder)
     except SubmissionError as error:
-        description_error = error
-    split_of = {sample: name for name, names in dataset.splits.items() for sample in names}
-    listing = list_folder(folder, samples, split, split_of)
-    units, level_mm = (content or {}).get("units", "mm"), (content or {}).get("png_mm_per_level")
-    rule: RangeRule = "valid" if (content or {}).get("range_rule") == "valid" else "object"
+        refusal = error
+    listing = list_folder(folder, dataset, split)
     # What is no number is refused with the description, which is checked while the first files are scored, for pydantic
     # takes long to import: `result` and `submission` are packages that load what is used of them.
-    level_mm = float(level_mm) if isinstance(level_mm, int | float) and not isinstance(level_mm, bool) else None
-    problems: list[str] = list(listing.problems)
-    rows: list[dict[str, Any]] = []
-    outcomes: Iterable[Outcome] = ()
-    if units in get_args(Units):
-        reader = reader_for(listing.form, folder, listing.present, dataset.size, level_mm)
-        sigmas = folder if listing.sigmas else None
-        outcomes = _scored(
-            reader, listing.present, dataset, target, units, rule, cast(Mode, mode), edge_band_px, sigmas
-        )
-    description = None
-    if content is not None:
+    level, rule = content.get("png_mm_per_level"), "valid" if content.get("range_rule") == "valid" else "object"
+    rules = Rules(target, content.get("units", "mm"), cast(RangeRule, rule), cast(Mode, mode))
+    outcomes: Iterable[Scored | list[str]] = ()
+    if rules.units in get_args(Units):
+        read = listing.reader(dataset.size, float(level) if type(level) in (int, float) else None)
+        outcomes = _scored(listing, read, dataset, rules, edge_band_px)
+    if refusal is None:
         try:
             description = checked_description(folder, content, listing.form, len(dataset.sequence))
         except SubmissionError as error:
-            description_error = error
+            refusal = error
         import fpp_ml_bench.evaluation.result.model  # noqa: F401  pydantic takes long: while the threads score
 
         while_scoring()
-    for file_problems, file_rows in outcomes:
-        problems += file_problems
-        rows += file_rows
-    hashes: dict[tuple[str, str], dict[str, str]] = {}
-    for row in rows:
-        for column, digest in row.pop("hashes").items():
-            hashes.setdefault((split_of[row["sample"]], column), {})[row["sample"]] = digest
+    problems, scored = list(listing.problems), []
+    for outcome in outcomes:
+        if isinstance(outcome, Scored):
+            scored.append(outcome)
+        else:
+            problems += outcome
     if problems:
         summary = f"{len(problems)} problem{'' if len(problems) == 1 else 's'}"
-        lines = [str(description_error), *problems] if description_error else problems
+        lines = [str(refusal), *problems] if refusal else problems
         raise PredictionError(f"{printable(str(folder), 500)} can't be scored, {summary}:", lines)
-    if description_error or description is None:
-        raise description_error or SubmissionError(f"{printable(str(folder), 500)}: has no description")
+    if refusal or description is None:
+        raise refusal or SubmissionError(f"{printable(str(folder), 500)}: has no description")
     from fpp_ml_bench.evaluation.result.file import environment
-    from fpp_ml_bench.evaluation.result.model import result_from_rows, uncertainty_of
+    from fpp_ml_bench.evaluation.result.model import Result, scores_of
 
+    hashes: dict[tuple[str, str], dict[str, str]] = {}
+    for sample in scored:
+        for column, digest in sample.hashes.items():
+            hashes.setdefault((dataset.split_of_sample(sample.name), column), {})[sample.name] = digest
     content = dict(dataset.content_hash(*column, images) for column, images in hashes.items())
     benchmark = benchmark_of(content)
-    stated = {row["sample"]: row.pop("stated") for row in rows}
-    owners = {row["sample"]: row["object"] for row in rows}
-    return result_from_rows(
-        rows,
-        uncertainty=uncertainty_of(stated, owners) if listing.sigmas else None,
+    return Result(
+        schema_version=protocol.RESULT_SCHEMA_VERSION,
         protocol_version=protocol.PROTOCOL_VERSION,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         submission=description.model_copy(update={"predicted": None}),
@@ -130,7 +127,7 @@ def evaluate(
             "benchmark": {"name": benchmark.name, "version": benchmark.version} if benchmark else None,
             "split": split,
             "size": list(dataset.size),
-            "samples": len(rows),
+            "samples": len(scored),
         },
         target=target,
         mode=mode,
@@ -138,7 +135,24 @@ def evaluate(
         edge_band_px=edge_band_px,
         edge_jump_mm=edge_jump_mm(dataset.size[1]),
         environment=environment(),
+        **scores_of(scored),
     )
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A scored sample of an object: its ``row`` (the other keys of `SampleResult`), the scores of its stated
+    uncertainty, None without, and the hashes of what it was scored against by column."""
+
+    name: str
+    object: str
+    row: dict[str, Any]
+    stated: SigmaSample | None
+    hashes: dict[str, str]
+
+
+def _row(scores: SampleScores, digest: str) -> dict[str, Any]:
+    return {"prediction_sha256": digest, **scores.pixels(), **scores.metrics()}
 
 
 def code_of(sequence: AnySequence) -> str:
@@ -158,10 +172,8 @@ def frames_class(sequence: AnySequence, frames_used: Sequence[int]) -> protocol.
     return full_sequence if gray & set(frames_used) else few_frames
 
 
-def _samples(folder: Path, dataset: DatasetFolder, split: str, target: str, mode: str) -> list[str]:
-    """The split's samples; refuses arguments that name no folder, target, mode or sample."""
-    if not folder.is_dir():
-        raise PredictionError(f"expected a folder of predictions, found none at {printable(str(folder), 500)}")
+def _check_split(dataset: DatasetFolder, split: str, target: str, mode: str) -> None:
+    """Refuse (DatasetError) what names no target, mode or sample, and more samples than a result may have."""
     for name, given, known in (("target", target, protocol.TARGETS), ("mode", mode, protocol.MODES)):
         if given not in known:
             raise DatasetError(f"expected {name} {' or '.join(known)}, got {printable(given)!r}")
@@ -176,62 +188,46 @@ def _samples(folder: Path, dataset: DatasetFolder, split: str, target: str, mode
         raise DatasetError(
             f"{dataset.path}: split {split} has {len(objects)} and {len(samples)}, {limits} are scored at once"
         )
-    return samples
 
 
 def _scored(
-    reader: Reader,
-    samples: list[str],
-    dataset: DatasetFolder,
-    target_name: str,
-    units: Units,
-    rule: RangeRule,
-    mode: Mode,
-    edge_band_px: int,
-    sigmas: Path | None,
-) -> Iterable[Outcome]:
-    """Problems and row of each sample that has a prediction, in order; the files of its uncertainty in the folder
-    ``sigmas`` are checked. Work begins with this call, in threads, before the first outcome is taken from the
-    iterator."""
+    listing: Listing, read: Callable[[str], MapAndHash], dataset: DatasetFolder, rules: Rules, edge_band_px: int
+) -> Iterable[Scored | list[str]]:
+    """Each sample that has a prediction, scored, or the problems with its files, in order. Work begins with this call,
+    in threads, before the first outcome is taken from the iterator."""
     dataset_lock = Lock()
-    columns = protocol.scored_columns(target_name, mode, dataset.has_exact)
+    columns = protocol.scored_columns(rules.target, rules.mode, dataset.has_exact)
 
-    def work(sample: str) -> Outcome:
+    def work(sample: str) -> Scored | list[str]:
         with dataset_lock:  # reading the dataset need not be thread-safe
-            target = dataset.target_mm(sample, target_name)
-            void = dataset.void(sample, target_name) if mode == "standard" else None
-            left_out = dataset.left_out(sample, rule, target_name) if units == "normalised" else None
-            unlit_mm = dataset.unlit_mm(sample) if void is not None and target_name == "depth_exact" else None
-            scored_on = {target_name: target} | ({"flags": dataset.flags(sample)} if "flags" in columns else {})
+            target = dataset.target_mm(sample, rules.target)
+            void = rules.void(dataset, sample)
+            unlit_mm = dataset.unlit_mm(sample) if void is not None and rules.target == "depth_exact" else None
+            scored_on = {rules.target: target} | ({"flags": dataset.flags(sample)} if "flags" in columns else {})
         low, high = extremes(target)
         if not (low >= 0 and np.isfinite(high)):
             bad = "NaN, infinite or negative values"
             raise DatasetError(f"{sample}: the target depth holds {bad}; run: fpp-bench verify")
-        try:
-            values, digest = reader.read(sample)
-            problems = value_problems(values, target, dataset.rig.working_range_mm[1] if high else 0.0, units)
-            if not problems:
-                pair = scored_pair(values, target, units, mode, sample, left_out)
-                scores = score_sample(*pair, edge_band_px, void, unlit_mm)
-        except PredictionError as error:
-            problems = [str(error)]
-        problems = [f"{reader.named(sample)}: {problem}" for problem in problems]
-        hashes = {column: image_hash(image) for column, image in scored_on.items()}
-        stated = None
-        if sigmas is not None:
+        found = read_prediction(
+            listing, read, sample, rules.units, target, dataset.rig.working_range_mm[1] if high else 0.0
+        )
+        problems, outcome = found.problems, None
+        if not problems:
+            with dataset_lock:
+                pair = rules.pair(found.values, dataset, sample)
             try:
-                sigma_mm = read_sigma(sigmas, sample, dataset.size)
-                stated = None if problems else score_sigma(*pair, sigma_mm, void)
+                scores = score_sample(*pair, edge_band_px, void, unlit_mm)
             except PredictionError as error:
-                problems.append(f"{sample}{SIGMA}: {error}")
+                problems = [f"{listing.named(sample)}: {error}"]
+            else:
+                stated = None if found.sigma_mm is None else score_sigma(*pair, found.sigma_mm, void)
+                hashes = {column: image_hash(image) for column, image in scored_on.items()}
+                outcome = Scored(sample, split_sample_name(sample)[0], _row(scores, found.digest), stated, hashes)
         with dataset_lock:
             dataset.release(sample)
-        if problems:
-            return problems, []
-        row = {"hashes": hashes, "sample": sample, "prediction_sha256": digest, **scores.pixels(), **scores.metrics()}
-        return [], [row | {"object": split_sample_name(sample)[0], "stated": stated}]
+        return outcome or problems
 
-    return ThreadPoolExecutor(min(WORKERS, usable_cores())).map(work, samples)
+    return ThreadPoolExecutor(min(WORKERS, usable_cores())).map(work, listing.present)
 
 
 def evaluate_arrays(
@@ -261,8 +257,7 @@ def evaluate_arrays(
     if count == 0:
         raise PredictionError("targets: expected one depth map or more, got none")
     names = [printable(str(name)) for name in objects] if objects is not None else [f"sample {n}" for n in range(count)]
-    rows: list[dict[str, Any]] = []
-    stated: dict[str, SigmaSample] = {}
+    scored = []
     for number in range(count):
         try:
             maps = {
@@ -270,15 +265,18 @@ def evaluate_arrays(
                 for name, values in columns.items()
                 if name != "objects" and values is not None
             }
-            row, uncertainty = _scored_arrays(edge_band_px=edge_band_px, units=units, **maps)
+            prediction, target = maps["predictions"], maps["targets"]
+            void = _void(target, maps.get("flags"))
+            scores, stated = score_arrays(
+                prediction, np.ma.filled(target, 0), void, units, maps.get("sigma"), edge_band_px
+            )
         except PredictionError as error:
             raise PredictionError(f"sample {number}: {error}") from None
-        rows.append({"sample": f"sample {number}", "object": names[number], **row})
-        if uncertainty is not None:
-            stated[f"sample {number}"] = uncertainty
-    from fpp_ml_bench.evaluation.result.model import array_scores
+        row = _row(scores, hashlib.sha256(np.ascontiguousarray(prediction).data).hexdigest())
+        scored.append(Scored(f"sample {number}", names[number], row, stated, {}))
+    from fpp_ml_bench.evaluation.result.model import ArrayScores, scores_of
 
-    return array_scores(rows, stated)
+    return ArrayScores(**scores_of(scored))
 
 
 def _sequence(name: str, values: Any) -> Any:
@@ -325,33 +323,34 @@ def _void(targets: NDArray[Any], flags: NDArray[Any] | None) -> NDArray[np.bool_
     return void | void_pixels(flags.astype(np.uint8))
 
 
-def _scored_arrays(
-    predictions: NDArray[Any],
-    targets: NDArray[Any],
-    edge_band_px: int,
-    flags: NDArray[Any] | None = None,
-    sigma: NDArray[Any] | None = None,
+def score_arrays(
+    prediction: NDArray[Any],
+    target: NDArray[Any],
+    void: NDArray[np.bool_],
     units: str | None = None,
-) -> tuple[dict[str, Any], SigmaSample | None]:
-    for name, values in (("predictions", predictions), ("targets", targets), ("sigma", sigma)):
-        if values is not None and values.dtype.kind != "f":
+    sigma: NDArray[Any] | None = None,
+    edge_band_px: int = protocol.EDGE_BAND_PX,
+    check_prediction_units: bool = True,
+) -> tuple[SampleScores, SigmaSample | None]:
+    """Score floats (H, W) in ``units``, pixels in ``void`` in no set; `evaluate_arrays` says what is refused.
+    ``check_prediction_units``: whether a prediction that looks like another unit is."""
+    for name, values in (("predictions", prediction), ("targets", target), ("sigma", sigma)):
+        if values is None:
+            continue
+        if values.dtype.kind != "f":
             raise PredictionError(f"{name}: expected real floats, got {values.dtype}")
-        if values is not None and (values.ndim != 2 or values.shape != targets.shape or values.size == 0):
+        if values.ndim != 2 or values.shape != target.shape or values.size == 0:
             raise PredictionError(f"{name}: expected a map (H, W) of the target's size, got {values.shape}")
-    void = _void(targets, flags)
-    targets = np.ma.filled(targets, 0)
-    for name, values in (("targets", targets), ("sigma", sigma)):
-        if values is not None and not (values.min() >= 0 and np.isfinite(values.max())):
+        if name != "predictions" and not (values.min() >= 0 and np.isfinite(values.max())):
             raise PredictionError(f"{name}: expected finite mm of 0 and more")
-    declared = declared_units(float(targets.max()), units)
-    digest = hashlib.sha256(np.ascontiguousarray(predictions).data).hexdigest()
-    targets, largest_mm = in_mm(targets, declared), in_mm(targets.max(), declared)
-    if problems := value_problems(predictions, targets, float(largest_mm), declared):
+    declared = declared_units(float(target.max()), units)
+    target_mm = in_mm(target, declared)
+    reach_mm = float(target_mm.max()) if check_prediction_units else 0.0
+    if problems := value_problems(prediction, target_mm, reach_mm, declared):
         raise PredictionError(f"the prediction {problems[0]}")
-    predictions = in_mm(predictions, declared)
-    scores = score_sample(predictions, targets, edge_band_px, void)
-    uncertainty = None if sigma is None else score_sigma(predictions, targets, in_mm(sigma, declared), void)
-    return {"prediction_sha256": digest, **scores.pixels(), **scores.metrics()}, uncertainty
+    pair = in_mm(prediction, declared), target_mm
+    stated = None if sigma is None else score_sigma(*pair, in_mm(sigma, declared), void)
+    return score_sample(*pair, edge_band_px, void), stated
 
 
 _COMPARED: dict[str, Any] = {
@@ -386,19 +385,21 @@ def differences(scored: Result, folder: Path, dataset: DatasetFolder) -> list[st
     block, again_block = (part.pop("uncertainty", None) for part in (stored, computed))
     found = list(disagreements(stored, computed))
     if rows.keys() != again_rows.keys():
-        return [*_lines(found), "per_sample: other samples than the split has"]
+        return [*difference_lines(found), "per_sample: other samples than the split has"]
     for sample, row in again_rows.items():
         differing = disagreements(rows[sample], row, cancelling=1e-9 * (row["object_mae_mm"] or 0.0))
         found += [(f"{sample}: {name}", *pair) for name, *pair in differing]
     if (block is None) != (again_block is None):
         said = ["there is none" if part is None else "there is one" for part in (block, again_block)]
-        return [*_lines(found), f"uncertainty: {said[0]} in the result, {said[1]} recomputed"]
-    return _lines([*found, *disagreements(block, again_block, "uncertainty", rounding=1e-12)])  # nll is near 0
+        return [*difference_lines(found), f"uncertainty: {said[0]} in the result, {said[1]} recomputed"]
+    found += disagreements(block, again_block, "uncertainty", rounding=1e-12)  # nll is near 0
+    return difference_lines(found)
 
 
-def _lines(found: Iterable[tuple[str, Any, Any]]) -> list[str]:
+def difference_lines(found: Iterable[tuple[str, Any, Any]], file: str = "result") -> list[str]:
+    """The `disagreements` of a ``file``, a line each."""
     return [
-        f"{name}: {_value_text(stored)} in the result, {_value_text(value)} "
+        f"{name}: {_value_text(stored)} in the {file}, {_value_text(value)} "
         + (f"in {SUBMISSION_FILE}" if name.startswith("submission.") else "recomputed")
         for name, stored, value in found
     ]
@@ -416,7 +417,7 @@ def explain_eval(dataset: DatasetFolder, split: str, target: str, edge_band_px: 
     for sample in samples:
         boxes[sample] = _box_px(object_mask(dataset.target_mm(sample, target)))
         dataset.release(sample)
-    frames, depths = len(stored_frames(dataset.sequence, dataset.manifest.stored)), 1 + dataset.has_exact
+    frames, depths = len(dataset.manifest.stored_frames), 1 + dataset.has_exact
     read = 1 + (target != "depth")
     median = sorted(samples, key=lambda sample: boxes[sample])[len(samples) // 2]
     depth_mm = dataset.target_mm(median, target)

@@ -16,10 +16,10 @@ Gaussian: error within quantile x sigma. The area between two curves is accurate
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from statistics import NormalDist
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from fpp_ml_bench.depth import edge_jump_mm, object_box, object_mask, object_nea
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.metrics import METRICS, UNCERTAINTY
-from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, WIDE_BAND_PX, WITHIN_MM
+from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, WIDE_BAND_PX
 
 BLOCK = 9600
 """Pixels per block. OpenBLAS spreads dot products over its threads from 10,000 elements on, and the rounding of the sum
@@ -148,33 +148,18 @@ def _zones(bits: int, value: int) -> cached_property[ErrorStats]:
     return cached_property(lambda self: combine(*(stats for zone, stats in self.zones.items() if zone & bits == value)))
 
 
-class Spread(NamedTuple):
-    """How the object's errors are distributed, in mm; ``within``: the share of them of at most each of
-    `protocol.WITHIN_MM`; all None where there is no object."""
-
-    median_mm: Any = None
-    p95_mm: Any = None
-    largest_mm: Any = None
-    within: tuple[Any, ...] = (None,) * len(WITHIN_MM)
-    bias_mm: Any = None
-    valid_bias_mm: Any = None
-    shift_free_mm: Any = None
-
-
-_NO_SPREAD = Spread()
-
-
 @dataclass(frozen=True)
 class SampleScores:
     """What the metrics of a sample are made of. ``prediction_mm`` and ``target_mm`` (H, W) as they were scored,
     ``surface``: where the target has a depth, ``void_mask``: which pixels are in no set, None by rules without void;
-    and ``errors``: prediction minus target in mm on the object's pixels, float64 (n,).
+    and ``errors``: prediction minus target in mm on the object's pixels, float64 (n,), of which those in ``predicted``
+    (bool (n,)) were measured.
 
-    Statistics of the background and of the object's zones, and the object's ``spread``. A zone's number is a sum of 1
-    (nearer to a depth edge than the edge band), 2 (nearer than the wide band) and 4 (not measured: predicted 0 mm or
-    less); every MAE and RMSE of the object is that of a union of zones. ``unlit``: statistics of the unlit pixels,
-    ``unlit_valid`` of those that were measured; ``scores_unlit``: whether the rules know them. ``range_mm``: largest
-    minus smallest depth of the object."""
+    Statistics of the background and of the object's zones. A zone's number is a sum of 1 (nearer to a depth edge than
+    the edge band), 2 (nearer than the wide band) and 4 (not measured: predicted 0 mm or less); every MAE and RMSE of
+    the object is that of a union of zones. ``unlit``: statistics of the unlit pixels, ``unlit_valid`` of those that
+    were measured; ``scores_unlit``: whether the rules know them. ``range_mm``: largest minus smallest depth of the
+    object."""
 
     prediction_mm: Map
     target_mm: Map
@@ -184,16 +169,16 @@ class SampleScores:
     unlit: ErrorStats
     unlit_valid: ErrorStats
     scores_unlit: bool
-    errors: Errors = field(default_factory=lambda: np.empty(0))
-    zones: dict[int, ErrorStats] = field(default_factory=dict)
-    spread: Spread = _NO_SPREAD
-    range_mm: float = 0.0
+    errors: Errors
+    predicted: NDArray[np.bool_]
+    zones: dict[int, ErrorStats]
+    range_mm: float
 
     object = _zones(0, 0)
     interior, edge = _zones(_EDGE, 0), _zones(_EDGE, _EDGE)
     wide_interior, wide_band = _zones(_WIDE, 0), _zones(_WIDE, _WIDE)
     valid = _zones(_MISSING, 0)
-    interior_valid, edge_valid = _zones(_EDGE | _MISSING, 0), _zones(_EDGE | _MISSING, _EDGE)
+    interior_valid = _zones(_EDGE | _MISSING, 0)
 
     @cached_property
     def inside(self) -> NDArray[np.bool_]:
@@ -213,6 +198,35 @@ class SampleScores:
     @cached_property
     def overall(self) -> ErrorStats:
         return combine(self.object, self.background)
+
+    @cached_property
+    def magnitudes(self) -> Errors:
+        """The object's absolute errors in mm, ascending."""
+        return np.sort(np.abs(self.errors))
+
+    def quantile(self, level: float) -> float | None:
+        """A quantile of the object's absolute errors in mm, by linear interpolation."""
+        return _quantile(self.magnitudes, level)
+
+    def within(self, limit_mm: float) -> float | None:
+        """Share of the object whose absolute error is at most ``limit_mm``."""
+        count = self.errors.size
+        return float(np.searchsorted(self.magnitudes, limit_mm, side="right")) / count if count else None
+
+    @property
+    def bias_mm(self) -> float | None:
+        return mean_of(self.errors)
+
+    @property
+    def valid_bias_mm(self) -> float | None:
+        """That of the measured pixels."""
+        return mean_of(self.errors[self.predicted])
+
+    @property
+    def shift_free_mae_mm(self) -> float | None:
+        """MAE of the object once the median of its errors is subtracted."""
+        offset = _quantile(np.sort(self.errors), 0.5)
+        return None if offset is None else mean_of(np.abs(self.errors - offset))
 
     def metrics(self) -> dict[str, float | None]:
         """Every metric by its key: None where the pixel set is empty, and those that a file may leave out left out."""
@@ -261,69 +275,58 @@ def score_sample(
     background, flat_inside = _background(prediction, target_mm.ravel(), flat_void)
     unlit, measured = (EMPTY, EMPTY) if unlit_mm is None else _unlit_stats(prediction, unlit_mm.ravel())
     inside = flat_inside.reshape(target_mm.shape)
-    nothing = SampleScores(
-        prediction_mm, target_mm, inside, void, background, unlit, measured, scores_unlit=unlit_mm is not None
-    )
-    if (box := object_box(inside)) is None:
-        return nothing
+    box = object_box(inside) or np.s_[:0, :0]
     index = np.flatnonzero(inside[box] if void is None else inside[box] & ~void[box])
-    if not index.size:
-        return nothing
     depths = prediction_mm[box].ravel().take(index)
-    errors = depths.astype(np.float64)
     true_mm = target_mm[box].ravel().take(index)
-    errors -= true_mm
-    if not np.isfinite(errors).all():
-        raise PredictionError(NOT_FINITE)
-    missing = depths <= 0
+    errors = _errors(depths, true_mm)
+    predicted = depths > 0
     near, wide = object_near_edges(target_mm[box], (edge_band_px, WIDE_BAND_PX), edge_jump_mm(target_mm.shape[1]))
     zone = near.ravel().take(index).view(np.uint8) * np.uint8(_EDGE)
     zone |= wide.ravel().take(index).view(np.uint8) * np.uint8(_WIDE)
-    zone |= missing.view(np.uint8) * np.uint8(_MISSING)
+    zone |= (~predicted).view(np.uint8) * np.uint8(_MISSING)
     within = {code: zone == code for code in range(_EDGE + _WIDE + _MISSING + 1)}
-    zones = {code: stats_of(errors[pixels]) for code, pixels in within.items() if pixels.any()}
-    range_mm = float(true_mm.max()) - float(true_mm.min())
-    range_mm = range_mm if range_mm > 1e-150 else 0.0  # else an error may exceed it by more than a float64 can hold
-    return replace(nothing, errors=errors, zones=zones, spread=_spread(errors, missing), range_mm=range_mm)
+    range_mm = float(true_mm.max()) - float(true_mm.min()) if true_mm.size else 0.0
+    return SampleScores(
+        prediction_mm,
+        target_mm,
+        inside,
+        void,
+        background,
+        unlit,
+        measured,
+        unlit_mm is not None,
+        errors,
+        predicted,
+        {code: stats_of(errors[pixels]) for code, pixels in within.items() if pixels.any()},
+        range_mm if range_mm > 1e-150 else 0.0,  # else an error may exceed it by more than a float64 can hold
+    )
+
+
+def _errors(depths: Map, true_mm: Map) -> Errors:
+    """Errors of ``depths`` (n,) in float64. Raises PredictionError where they are not finite."""
+    errors = depths.astype(np.float64)
+    errors -= true_mm
+    if not np.isfinite(errors).all():
+        raise PredictionError(NOT_FINITE)
+    return errors
 
 
 def _unlit_stats(prediction: Map, unlit_mm: Map) -> tuple[ErrorStats, ErrorStats]:
     """Statistics of the errors (n,) where ``unlit_mm`` is above 0, and of those of them that were measured."""
     index = np.flatnonzero(object_mask(unlit_mm))
     depths = prediction.take(index)
-    errors = depths.astype(np.float64) - unlit_mm.take(index)
-    if not np.isfinite(errors).all():
-        raise PredictionError(NOT_FINITE)
+    errors = _errors(depths, unlit_mm.take(index))
     return stats_of(errors), stats_of(errors[depths > 0])
 
 
-def _spread(errors: Errors, missing: NDArray[np.bool_]) -> Spread:
-    magnitude = np.abs(errors)
-    within = tuple(np.count_nonzero(magnitude <= limit) / errors.size for limit in WITHIN_MM)
-    largest = float(magnitude.max())
-    median, p95 = _quantiles(magnitude, 0.5, 0.95)
-    signed = errors.copy()
-    offset = _quantiles(signed, 0.5)[0]
-    np.subtract(errors, offset, out=signed)
-    np.abs(signed, out=signed)
-    bias = mean_of(errors)
-    valid_bias = mean_of(errors[~missing]) if missing.any() else bias
-    return Spread(median, p95, largest, within, bias, valid_bias, mean_of(signed))
-
-
-def _quantiles(values: Errors, *levels: float) -> list[float]:
-    """Ascending quantiles by linear interpolation (NumPy's default); reorders ``values``. One partition per quantile:
-    NumPy's partition is vectorised for a single position, not for several."""
-    quantiles, first = [], 0
-    for level in levels:
-        position = level * (values.size - 1)
-        low = int(position)
-        values[first:].partition(low - first)
-        below = float(values[low])
-        above = float(values[low + 1 :].min()) if low + 1 < values.size else below
-        quantiles.append(below + (above - below) * (position - low))
-        first = low
-    return quantiles
+def _quantile(ascending: Errors, level: float) -> float | None:
+    """A quantile of ascending values (n,) by linear interpolation, NumPy's default; None for no values."""
+    if not ascending.size:
+        return None
+    below, part = divmod(level * (ascending.size - 1), 1.0)
+    low, high = ascending[int(below)], ascending[min(int(below) + 1, ascending.size - 1)]
+    return float(low + (high - low) * part)
 
 
 @dataclass(frozen=True, slots=True)

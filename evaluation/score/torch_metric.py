@@ -1,6 +1,6 @@
 """The evaluator's scores as a `torchmetrics.Metric`, for validation during training.
 
-Every sample is scored by `fpp_ml_bench.evaluation.score.sample_scores.score_sample`, on the processor, and `compute` is
+Every sample is scored by `fpp_ml_bench.evaluation.score.evaluator.score_arrays`, on the processor, and `compute` is
 the plain mean over samples. The state is a sum and a count for each score. Any batches, order, device or number of
 processes therefore give the same numbers, up to the rounding of adding a few hundred float64 values. A sampler that
 repeats samples to fill the last batch (``DistributedSampler`` without ``drop_last``) changes the mean; give each
@@ -19,8 +19,8 @@ from torchmetrics import Metric
 
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.metrics import METRICS
-from fpp_ml_bench.evaluation.score.check import MM_PER_UNIT, declared_units, not_in_mm
-from fpp_ml_bench.evaluation.score.sample_scores import score_sample
+from fpp_ml_bench.evaluation.score.check import declared_units
+from fpp_ml_bench.evaluation.score.evaluator import score_arrays
 
 KEYS = tuple(key for key, metric in METRICS.items() if metric.training)
 
@@ -52,15 +52,14 @@ class DepthScores(Metric):
         self.add_state("counts", torch.zeros(len(KEYS), dtype=torch.float64), dist_reduce_fx="sum")
 
     def update(self, prediction: Tensor, target: Tensor, void: Tensor | None = None) -> None:
-        """Add a batch. Raises PredictionError for other shapes or dtypes, for errors that are not finite, for negative
+        """Add a batch. Raises PredictionError for other shapes or dtypes, for depths that are not finite, for negative
         targets, and for depths that look like another unit."""
         predictions, targets = _maps(prediction, target)
         scored = np.ones(targets.shape, bool) if void is None else ~_checked_void(void, targets.shape)
         for predicted, truth, pixels in zip(predictions, targets, scored, strict=True):
-            mm_per_unit = _mm_per_unit(predicted[pixels], truth[pixels], self.units)
             # What a void pixel holds, as NaN, does not matter.
-            predicted_mm, true_mm = (np.where(pixels, depths, 0.0) * mm_per_unit for depths in (predicted, truth))
-            sample = score_sample(predicted_mm, true_mm, void=~pixels)
+            maps = (np.where(pixels, depths, 0.0) for depths in (predicted, truth))
+            sample, _ = score_arrays(*maps, ~pixels, self.units, check_prediction_units=self.units is None)
             for number, key in enumerate(KEYS):
                 if (score := METRICS[key].value(sample)) is not None:
                     self.sums[number] += score
@@ -96,18 +95,3 @@ def _checked_void(void: Tensor, shape: tuple[int, ...]) -> NDArray[np.bool_]:
     if void.shape != shape:
         raise PredictionError(f"void: expected {shape} (B, H, W), got {tuple(void.shape)}")
     return void.cpu().numpy()
-
-
-def _mm_per_unit(prediction: NDArray[np.float64], target: NDArray[np.float64], units: str | None) -> float:
-    """What one unit of a sample's depths (n,) is in mm; raises PredictionError for a target that is no depth, and where
-    ``units`` can't be true."""
-    if not (np.isfinite(target).all() and (target >= 0).all()):
-        raise PredictionError("target: expected finite depths of 0 and more")
-    largest, target_max = (float(depths.max(initial=0.0)) for depths in (prediction, target))
-    scale = MM_PER_UNIT[declared_units(target_max, units)]
-    if units is None and not_in_mm(largest, target_max):
-        raise PredictionError(
-            f"the prediction looks like another unit than the target: its largest value is {largest:.4g}, the target's "
-            f"{target_max:.4g}; give both in the same"
-        )
-    return scale

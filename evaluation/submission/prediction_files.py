@@ -6,21 +6,25 @@ import io
 import os
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from threading import Lock, local
 from tokenize import TokenError
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from fpp_ml_bench.containers import PNG_GREY, parse_image, parse_matrix, png_header
+from fpp_ml_bench.containers import PNG_GREY, parse_image, parse_matrix, parse_table, png_header
 from fpp_ml_bench.errors import FppBenchError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.protocol import LARGEST_MM
 from fpp_ml_bench.files import LOCK_FILE, fill, opened, printable, read_bounded, read_yaml
+
+if TYPE_CHECKING:
+    from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 SUBMISSION_FILE = "submission.yaml"
 REPORTS_FILE = "per_sample.json"
@@ -56,26 +60,82 @@ PER_SAMPLE = (".npy", ".npz", ".mat", ".png")
 SIGMA = ".sigma.npy"
 """Of a sample's optional standard uncertainty, a map (H, W) in mm, 0 where none is stated."""
 TABLES = ("predictions.parquet", "predictions.arrow")
+_SPARE_BYTES, _ARCHIVE_BYTES = 1 << 20, 1 << 16
+"""What a file of another form than .npy, and an .npz, may have beside a float64 map."""
 
 
-class Listing(NamedTuple):
-    """``form`` is one of `PER_SAMPLE` or `TABLES`; ``problems`` has a line for each missing or extra entry; ``sigmas``:
-    whether there are `SIGMA` files."""
+MapAndHash = tuple[NDArray[Any], str]
 
+
+@dataclass(frozen=True)
+class Listing:
+    """What a folder of predictions holds. ``form`` is one of `PER_SAMPLE` or `TABLES`; ``problems`` has a line for each
+    missing or extra entry; ``sigmas``: whether there are `SIGMA` files."""
+
+    folder: Path
     form: str
     problems: list[str]
     present: list[str]
     sigmas: bool
 
+    def named(self, sample: str) -> str:
+        """The name of a sample's prediction in messages: its file."""
+        return printable(f"{self.form}, sample {sample}" if self.form in TABLES else f"{sample}{self.form}")
 
-def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapping[str, str]) -> Listing:
-    """What ``folder`` holds for ``samples``: the form of most of its files, and every entry that is missing or extra.
-    ``split_of`` gives the split of every sample of the dataset, for the hint at a sample of another split."""
+    def reader(self, size: tuple[int, int], png_mm_per_level: float | None) -> Callable[[str], MapAndHash]:
+        """A function from a sample to its map ``size`` (H, W), valid until the same thread reads again, and the SHA-256
+        of its file. It may be called from several threads, and raises PredictionError, without the file's name, for a
+        file that is refused; a table is read here, and refused with its name."""
+        if self.form in TABLES:
+            return depth_maps(self.folder / self.form, self.present, size)
+        memory = local()
+
+        def read(sample: str) -> MapAndHash:
+            path = self.folder / f"{sample}{self.form}"
+            if self.form == ".npy":
+                return read_npy(path, size, memory)
+            spare_bytes = _ARCHIVE_BYTES if self.form == ".npz" else _SPARE_BYTES
+            content = read_bounded(path, _largest_npy(size) + spare_bytes)
+            if self.form == ".png":
+                depth = parse_png(content, size, png_mm_per_level)
+            else:
+                depth = (parse_npz if self.form == ".npz" else parse_mat)(content, size)
+            return depth, hashlib.sha256(content).hexdigest()
+
+        return read
+
+    def sigma_mm(self, sample: str, size: tuple[int, int]) -> NDArray[Any]:
+        """The `SIGMA` file of a sample, real floats (H, W) in mm; PredictionError, without the file's name, for any
+        other content."""
+        content = read_bounded(self.folder / f"{sample}{SIGMA}", _largest_npy(size))
+        sigma_mm = parse_npy(content, size)
+        low, high = float(sigma_mm.min()), float(sigma_mm.max())
+        if low >= 0 and high <= LARGEST_MM:  # False for NaN
+            return sigma_mm
+        found = f"found {low:g} to {high:g}"
+        raise PredictionError(f"expected finite mm of 0 and more, {found}; write 0 where none is stated")
+
+
+def predictions_folder(folder: str | Path) -> Path:
+    """``folder``, if there is one; else PredictionError."""
+    if not Path(folder).is_dir():
+        raise PredictionError(f"expected a folder of predictions, found none at {printable(str(folder), 500)}")
+    return Path(folder)
+
+
+def list_folder(folder: Path, dataset: "DatasetFolder | None" = None, split: str = "") -> Listing:
+    """What ``folder`` holds for the samples of a ``split``, or without a dataset for all that it has a file of their
+    own for: the form of most of its files, and every entry that is missing or extra."""
     try:
         names = {entry.name for entry in os.scandir(folder)}
     except OSError as error:
         name = printable(str(folder))
         raise PredictionError(f"the predictions folder {name} can't be read: {error.strerror}") from None
+    if dataset is not None:
+        samples = dataset.samples(split)
+    else:
+        stems = (name.removesuffix(suffix) for name in sorted(names) for suffix in PER_SAMPLE if name.endswith(suffix))
+        samples = list(dict.fromkeys(stem.removesuffix(SIGMA.removesuffix(".npy")) for stem in stems))
     counts = {suffix: sum(f"{sample}{suffix}" in names for sample in samples) for suffix in PER_SAMPLE}
     form = max(PER_SAMPLE, key=lambda suffix: counts[suffix])  # the first of equals: .npy where there is nothing
     if counts[form] == 0:
@@ -84,7 +144,8 @@ def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapp
 
     def hint(name: str) -> str:
         stem, suffix = os.path.splitext(name)  # noqa: PTH122  Path.suffix takes ".npy" alone for a stem
-        sample_split = split_of.get(stem) if suffix in PER_SAMPLE else None
+        splits = {} if dataset is None or suffix not in PER_SAMPLE else dataset.splits
+        sample_split = next((other for other, names in splits.items() if stem in names), None)
         if sample_split and stem not in samples:
             return f"a sample of split {sample_split}, not of {split}: move it away or score that split"
         if name == UNFINISHED_FILE:
@@ -99,18 +160,8 @@ def list_folder(folder: Path, samples: Sequence[str], split: str, split_of: Mapp
         problems += [f"{name}: is missing; write one for each sample, or none" for name in sorted(uncertain - names)]
     extra = sorted(names - {*files, *uncertain, SUBMISSION_FILE, REPORTS_FILE, LOCK_FILE})
     problems += [f"{printable(name)}: is extra ({hint(name)})" for name in extra]
-    present = list(samples) if form in TABLES else [sample for name, sample in files.items() if name in names]
-    return Listing(form, problems, present, sigmas)
-
-
-def samples_in(folder: Path) -> list[str]:
-    """The samples that a folder holds a file of its own for, by the files' names, ascending."""
-    try:
-        names = sorted(path.name for path in folder.iterdir())
-    except OSError as error:
-        raise PredictionError(f"{printable(str(folder), 500)} can't be read: {error.strerror}") from None
-    stems = (name.removesuffix(suffix) for name in names for suffix in PER_SAMPLE if name.endswith(suffix))
-    return list(dict.fromkeys(stem.removesuffix(SIGMA.removesuffix(".npy")) for stem in stems))
+    present = samples if form in TABLES else [sample for name, sample in files.items() if name in names]
+    return Listing(folder, form, problems, present, sigmas)
 
 
 HEADER_BYTES = 16384
@@ -118,9 +169,6 @@ HEADER_BYTES = 16384
 _PARSING = Lock()
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
 _NO_HEADER = (ValueError, TypeError, SyntaxError, TokenError, KeyError, RecursionError, MemoryError, OverflowError)
-MapAndHash = tuple[NDArray[Any], str]
-_Layout = tuple[np.dtype[Any], bool, int]
-"""Type, whether in Fortran order, and the offset of the first value."""
 
 
 def read_npy(path: Path, size: tuple[int, int], memory: local) -> MapAndHash:
@@ -132,12 +180,8 @@ def read_npy(path: Path, size: tuple[int, int], memory: local) -> MapAndHash:
         memory.buffer = bytearray(_largest_npy(size))
     view = memoryview(memory.buffer)
     with opened(path) as (stream, length):
-        filled = fill(stream, view[: min(HEADER_BYTES, length)])
-        layout = _layout(bytes(view[:filled]), length, size)
-        filled += fill(stream, view[filled:length])
-        if filled != length:
-            raise PredictionError(f"ended early: expected {length} bytes, got {filled}; write it again")
-    return _array_in(memory.buffer, size, layout), hashlib.sha256(view[:length]).hexdigest()
+        content = view[: fill(stream, view[:length])]
+    return parse_npy(content, size, length), hashlib.sha256(content).hexdigest()
 
 
 def _largest_npy(size: tuple[int, int]) -> int:
@@ -162,25 +206,14 @@ def declared_size(path: Path) -> tuple[int, int] | None:
     return None
 
 
-def parse_npy(content: bytes, size: tuple[int, int]) -> NDArray[Any]:
-    """The array in the bytes of a .npy file; PredictionError as `read_npy`."""
-    return _array_in(content, size, _layout(content[:HEADER_BYTES], len(content), size))
-
-
-def _array_in(content: bytes | bytearray, size: tuple[int, int], layout: _Layout) -> NDArray[Any]:
-    """The (H, W) array in a whole file's bytes, a view."""
-    dtype, fortran, start = layout
-    flat = np.frombuffer(content, dtype=dtype, count=size[0] * size[1], offset=start)
-    return flat.reshape(size, order="F" if fortran else "C")
-
-
-def _layout(head: bytes, length: int, size: tuple[int, int]) -> _Layout:
-    """Of a .npy file of ``length`` bytes that begins with ``head``; refuses what is not a map of ``size``."""
-    if head[:4] == b"PK\x03\x04":
+def parse_npy(content: bytes | memoryview, size: tuple[int, int], length: int | None = None) -> NDArray[Any]:
+    """The array (H, W) in the bytes of a .npy file, a view; ``length``: that of the file where ``content`` may be its
+    beginning only. PredictionError as `read_npy`."""
+    if content[:4] == b"PK\x03\x04":
         raise PredictionError(
             "is a zip archive (np.savez?) under the name .npy; write it with np.save, or name it .npz"
         )
-    stream = io.BytesIO(head)
+    stream = io.BytesIO(content[:HEADER_BYTES])
     try:
         version = npy.read_magic(stream)
         if (read := _HEADERS.get(version)) is not None:
@@ -191,12 +224,15 @@ def _layout(head: bytes, length: int, size: tuple[int, int]) -> _Layout:
     if read is None:
         raise PredictionError(f"has .npy format version {version}; expected 1.0 or 2.0, write it with np.save")
     _check_array(dtype, shape, size)
-    start = stream.tell()
+    start, length = stream.tell(), len(content) if length is None else length
     expected = start + size[0] * size[1] * dtype.itemsize
     if length != expected:
         problem = "is truncated" if length < expected else "has foreign bytes after the array"
         raise PredictionError(f"{problem}: expected {expected} bytes, got {length}; write it again")
-    return dtype, fortran, start
+    if len(content) != length:
+        raise PredictionError(f"ended early: expected {length} bytes, got {len(content)}; write it again")
+    flat = np.frombuffer(content, dtype=dtype, count=size[0] * size[1], offset=start)
+    return flat.reshape(size, order="F" if fortran else "C")
 
 
 def _check_array(dtype: np.dtype[Any], shape: tuple[int, ...], size: tuple[int, int]) -> None:
@@ -216,26 +252,22 @@ def _shape_text(shape: tuple[int, ...]) -> str:
     return "(" + ", ".join(str(n) if abs(n) < 10**18 else "more than 10^18" for n in shape) + ")"
 
 
-_ARCHIVE_BYTES = 65536
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _ENCRYPTED = 0x1
 
 
-def read_npz(path: Path, size: tuple[int, int]) -> MapAndHash:
-    """The array (H, W) of the archive and the SHA-256 of the file; PredictionError as `read_npy`. The array may have
-    any name. The size that the archive declares is checked before a byte is unpacked, and unpacking stops at the limit
-    even where the archive declares a wrong size."""
-    largest = _largest_npy(size)
-    content = read_bounded(path, largest + _ARCHIVE_BYTES)
+def parse_npz(content: bytes, size: tuple[int, int]) -> NDArray[Any]:
+    """The array (H, W) in an .npz archive; PredictionError as `read_npy`. The array may have any name. The size that
+    the archive declares is checked before a byte is unpacked, and unpacking stops at the limit even where the archive
+    declares a wrong size."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            array = parse_npy(_unpacked(archive, largest), size)
+            return parse_npy(_unpacked(archive, _largest_npy(size)), size)
     except PredictionError:
         raise
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, ValueError, RuntimeError) as error:
         reason = printable(str(error), 80)
         raise PredictionError(f"is no .npz archive, or damaged ({reason}); write it with np.savez") from None
-    return array, hashlib.sha256(content).hexdigest()
 
 
 def _unpacked(archive: zipfile.ZipFile, largest: int) -> bytes:
@@ -263,17 +295,15 @@ def _unpacked(archive: zipfile.ZipFile, largest: int) -> bytes:
 
 
 PNG_LEVELS = 65535
-_PNG_SPARE_BYTES = _MAT_SPARE_BYTES = 1 << 20
 _PNG_ADVICE = "write 16-bit grey levels (cv2.imwrite of a uint16 array)"
 
 
-def read_png(path: Path, size: tuple[int, int], mm_per_level: float | None) -> MapAndHash:
-    """Depth (H, W) float64 in mm and the SHA-256 of the file; PredictionError as `read_npy`. The header is checked
-    before the image is decoded, every checksum and the unpacked length (`containers.parse_image`), too. A level of
-    65535 is refused: there a depth that does not fit was cut off."""
+def parse_png(content: bytes, size: tuple[int, int], mm_per_level: float | None) -> NDArray[Any]:
+    """Depth (H, W) float64 in mm in a 16-bit PNG; PredictionError as `read_npy`. The header is checked before the image
+    is decoded, every checksum and the unpacked length (`containers.parse_image`), too. A level of 65535 is refused:
+    there a depth that does not fit was cut off."""
     if mm_per_level is None:
         raise PredictionError("has no scale: give png_mm_per_level, the mm of one level, in submission.yaml")
-    content = read_bounded(path, size[0] * size[1] * 2 + _PNG_SPARE_BYTES)
     header = png_header(content)
     if header is None:
         raise PredictionError(f"is no PNG file; {_PNG_ADVICE}")
@@ -291,56 +321,109 @@ def read_png(path: Path, size: tuple[int, int], mm_per_level: float | None) -> M
     if image.levels.max() == PNG_LEVELS:
         cut_off = f"where depth above {PNG_LEVELS * mm_per_level:g} mm is cut off"
         raise PredictionError(f"reaches level {PNG_LEVELS}, {cut_off}; use a larger png_mm_per_level")
-    return image.levels.astype(np.float64) * mm_per_level, hashlib.sha256(content).hexdigest()
+    return image.levels.astype(np.float64) * mm_per_level
 
 
-def read_mat(path: Path, size: tuple[int, int]) -> MapAndHash:
-    """The variable ``depth`` of a MATLAB file and the SHA-256 of the file; PredictionError as `read_npy`."""
-    largest = size[0] * size[1] * 8 + _MAT_SPARE_BYTES
-    content = read_bounded(path, largest)
+def parse_mat(content: bytes, size: tuple[int, int]) -> NDArray[Any]:
+    """The variable ``depth`` (H, W) of a MATLAB file; PredictionError as `read_npy`."""
     try:
-        depth = parse_matrix(content, "depth", largest)
+        depth = parse_matrix(content, "depth", _largest_npy(size) + _SPARE_BYTES)
     except PredictionError as error:
         advice = "write it with save(file, 'depth') from a real single or double matrix"
         raise PredictionError(f"{error}; {advice}") from None
     _check_array(depth.dtype, depth.shape, size)
-    return depth, hashlib.sha256(content).hexdigest()
+    return depth
 
 
-def read_sigma(folder: Path, sample: str, size: tuple[int, int]) -> NDArray[Any]:
-    """The `SIGMA` file of a sample, real floats (H, W) in mm; PredictionError, without the file's name, for any other
-    content."""
-    sigma_mm = parse_npy(read_bounded(folder / f"{sample}{SIGMA}", size[0] * size[1] * 8 + HEADER_BYTES), size)
-    low, high = float(sigma_mm.min()), float(sigma_mm.max())
-    if low >= 0 and high <= LARGEST_MM:  # False for NaN
-        return sigma_mm
-    found = f"found {low:g} to {high:g}"
-    raise PredictionError(f"expected finite mm of 0 and more, {found}; write 0 where none is stated")
+_SLACK_BYTES, _SLACK_PER_SAMPLE = 1 << 20, 1 << 16
+_TABLE_ADVICE = "write columns sample (text) and depth (list of H lists of W floats) with pyarrow"
 
 
-class Reader(NamedTuple):
-    """``read(sample)`` gives a map (H, W), valid until the same thread reads again, and the SHA-256 of its file. It may
-    be called from several threads, and raises PredictionError, without the file's name, for a file that is refused.
-    ``named(sample)`` is the name of the sample's prediction in messages: its file."""
+def depth_maps(path: Path, samples: Sequence[str], size: tuple[int, int]) -> Callable[[str], MapAndHash]:
+    """A function from a sample to its map (H, W) and the SHA-256 of the file, an Arrow (IPC stream or file) or Parquet
+    table with the columns ``sample`` (text) and ``depth``, whose rows hold H lists of W floats, one list of H W floats,
+    or a tensor. PredictionError with the file's name. The whole table is held in memory: at most a float64 map per
+    sample."""
+    count, pixels = len(samples), size[0] * size[1]
+    largest = count * (pixels * 8 + size[0] * 16 + _SLACK_PER_SAMPLE) + _SLACK_BYTES
+    try:
+        content = read_bounded(path, largest)
+        # Twice what is needed, so that an extra row is refused by its name and not by the size of the file.
+        try:
+            table = parse_table(content, 2 * largest, 2 * count * (pixels + 1))
+        except PredictionError as error:
+            raise PredictionError(f"{error}; {_TABLE_ADVICE}") from None
+        _check_columns(table.schema)
+        rows = _rows(table.column("sample").to_pylist(), samples)
+    except PredictionError as error:
+        raise PredictionError(f"{printable(str(path), 500)} {error}") from None
+    digest = hashlib.sha256(content).hexdigest()
 
-    read: Callable[[str], MapAndHash]
-    named: Callable[[str], str]
+    def depth_map(sample: str) -> MapAndHash:
+        column = table.column("depth").slice(rows[sample], 1).combine_chunks()
+        return _depth_map(column.chunk(0) if hasattr(column, "chunk") else column, size), digest
+
+    return depth_map
 
 
-def reader_for(
-    form: str, folder: Path, samples: Sequence[str], size: tuple[int, int], png_mm_per_level: float | None
-) -> Reader:
-    """The reader of ``form`` (of `PER_SAMPLE` or `TABLES`) for maps of ``size`` (H, W)."""
-    if form in TABLES:
-        from fpp_ml_bench.evaluation.submission.table import depth_maps  # needs pyarrow, which other forms do not
+def _check_columns(schema: Any) -> None:
+    """Refuse a ``pyarrow.Schema`` of other columns."""
+    if sorted(schema.names) != ["depth", "sample"]:
+        names = printable(", ".join(schema.names), 120)
+        raise PredictionError(f"holds the columns {names}; expected sample and depth: {_TABLE_ADVICE}")
+    name, declared = (schema.field(column).type for column in ("sample", "depth"))
+    if str(name) not in ("string", "large_string"):
+        raise PredictionError(f"column sample: expected text, got {name}; {_TABLE_ADVICE}")
+    value = declared
+    while (inner := _item_type(value)) is not None:
+        value = inner
+    if value == declared or str(value) not in ("halffloat", "float", "double"):
+        given = f"got {printable(str(declared), 80)}"
+        why = "whole numbers wrap around, other types are not depth"
+        raise PredictionError(
+            f"column depth: expected lists of float16, float32 or float64, {given}; {why}: {_TABLE_ADVICE}"
+        )
 
-        maps = depth_maps(folder / form, samples, size)
-        return Reader(maps, lambda sample: f"{form}, sample {printable(sample)}")
-    memory = local()
-    read = {
-        ".npy": lambda path: read_npy(path, size, memory),
-        ".npz": lambda path: read_npz(path, size),
-        ".png": lambda path: read_png(path, size, png_mm_per_level),
-        ".mat": lambda path: read_mat(path, size),
-    }[form]
-    return Reader(lambda sample: read(folder / f"{sample}{form}"), lambda sample: f"{sample}{form}")
+
+def _item_type(value: Any) -> Any:
+    """What a tensor or list type holds; None for any other ``pyarrow.DataType``."""
+    import pyarrow as pa  # no other form needs it
+
+    if isinstance(value, pa.BaseExtensionType):
+        return value.storage_type
+    if pa.types.is_list(value) or pa.types.is_large_list(value) or pa.types.is_fixed_size_list(value):
+        return value.value_type
+    return None
+
+
+def _rows(names: list[str], samples: Sequence[str]) -> dict[str, int]:
+    """The row of each sample; refuses a table of other samples."""
+    rows = {name: row for row, name in enumerate(names)}
+    problems = [f"lacks the sample {sample}" for sample in samples if sample not in rows]
+    problems += [
+        f"holds {printable(name)}, which is no sample of this split" for name in rows if name not in set(samples)
+    ]
+    problems += [f"holds the sample {printable(name)} twice" for name in rows if names.count(name) > 1]
+    if problems:
+        raise PredictionError(f"{'; '.join(problems[:20])}; write one row for each sample")
+    return rows
+
+
+def _depth_map(values: Any, size: tuple[int, int]) -> NDArray[Any]:
+    """The (H, W) map in a ``pyarrow.Array`` of one row."""
+    shape: list[int] = []
+    while True:
+        values = getattr(values, "storage", values)
+        if values.null_count:
+            raise PredictionError("holds missing values (null); write 0 where nothing was measured")
+        if _item_type(values.type) is None:
+            break
+        lengths = values.value_lengths().unique().to_pylist()
+        if len(lengths) != 1:
+            raise PredictionError(f"expected rows of one length, got {len(lengths)} different ones; write H x W values")
+        shape += lengths
+        values = values.flatten()
+    if tuple(shape) not in (tuple(size), (size[0] * size[1],)):
+        raise PredictionError(f"expected shape {size} (H, W), got {tuple(shape)}; predict at that size")
+    dtype = np.dtype(values.type.to_pandas_dtype())
+    return np.frombuffer(values.buffers()[1], dtype, len(values), values.offset * dtype.itemsize).reshape(size)

@@ -13,6 +13,7 @@ all poses share, tell which (`same_labels`).
 """
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -30,15 +31,13 @@ also fixes what the images can't: the estimated points fit the nominal ones best
 LEAST_SIGMA_PX = 1e-6
 TOLERANCE = 1e-11
 
-Blocks = list[tuple[slice, NDArray]]
-"""Non-zero columns of a Jacobian: which, and what is in them."""
 OUTLINE_POINTS = 180
 SWEEPS = 5
 
 
 class Bundle:
-    """The residuals of ``poses`` and their derivatives. ``corners`` and ``targets`` are the coordinates to be met, (n,
-    2) for each pose, NaN where there are none."""
+    """The residuals of ``poses`` and their derivatives. ``targets``: the coordinates to be met in camera and projector,
+    (n, 2) for each pose, NaN where there are none. ``free``: `free_of` all poses."""
 
     def __init__(self, poses: Sequence[Pose], points_mm: NDArray, lenses: tuple[Lens, Lens], free_board: bool) -> None:
         self.poses, self.points_mm, self.lenses, self.free_board = poses, points_mm, lenses, free_board
@@ -48,6 +47,7 @@ class Bundle:
         starts = [0, *ends[:-1]]
         self.camera, self.projector, self.stereo, self.boards, self.board = map(slice, starts, ends.tolist())
         self.size = int(ends[-1])
+        self.free = self.free_of(range(len(poses)))
 
     def pose(self, index: int) -> slice:
         return slice(self.boards.start + 6 * index, self.boards.start + 6 * index + 6)
@@ -56,7 +56,7 @@ class Bundle:
         """What ``of_pose`` gives for camera and projector, (n, 2) each, of all poses one after the other."""
         return [np.concatenate(parts) for parts in zip(*map(of_pose, range(len(self.poses))), strict=True)]
 
-    def free(self, poses: Sequence[int], only_poses: bool = False) -> NDArray[np.float64]:
+    def free_of(self, poses: Sequence[int], only_poses: bool = False) -> NDArray[np.float64]:
         """Matrix from the free parameters to the whole vector: the given board poses, and unless ``only_poses`` the
         lenses' free intrinsics, the pose of the projector and the board's points if they are estimated."""
         unit = np.eye(self.size)
@@ -68,31 +68,27 @@ class Bundle:
             columns.append(unit[:, self.board] if self.free_board else unit[:, :0])
         return np.hstack(columns)
 
-    def project(self, x: NDArray[np.float64], index: int) -> tuple[list[NDArray], list[Blocks]]:
-        """Projections (n, 2) of the board's points into camera and projector in pose ``index``, and their derivatives
-        (2 n, k) in blocks of columns."""
+    def project(self, x: NDArray[np.float64], index: int) -> tuple[list[NDArray], list[tuple[NDArray, NDArray]]]:
+        """Projections (n, 2) of the board's points into camera and projector in pose ``index``, and for each of them
+        the parameters (k,) that it depends on, with its derivatives (2 n, k)."""
         points, board, stereo = x[self.board].reshape(-1, 3), x[self.pose(index)], x[self.stereo]
         composed = cv2.composeRT(board[:3], board[3:], stereo[:3], stereo[3:])
+        of_board, of_stereo = (np.block([[*composed[k : k + 2]], [*composed[k + 4 : k + 6]]]) for k in (2, 4))
+        in_camera = self.camera, board[:3], board[3:], [(self.pose(index), np.eye(6))]
+        in_projector = self.projector, *composed[:2], [(self.pose(index), of_board), (self.stereo, of_stereo)]
         projections, derivatives = [], []
-        for part, rotation, translation in ((self.camera, board[:3], board[3:]), (self.projector, *composed[:2])):
+        for part, rotation, translation, chain in (in_camera, in_projector):
             image, jacobian = cv2.projectPoints(points, rotation, translation, *opencv_lens(x[part]))[:2]
             projections.append(image.reshape(-1, 2))
-            of_turn, of_shift = jacobian[:, :3], jacobian[:, 3:6]
-            blocks: Blocks = [(part, jacobian[:, 6 : 6 + part.stop - part.start])]
-            if part is self.camera:
-                blocks.append((self.pose(index), jacobian[:, :6]))
-            else:
-                chain = [
-                    sum(outer @ composed[k] for outer, k in ((of_turn, first), (of_shift, first + 4)))
-                    for first in (2, 3, 4, 5)
-                ]
-                blocks += [(self.pose(index), np.hstack(chain[:2])), (self.stereo, np.hstack(chain[2:]))]
+            blocks = [(part, jacobian[:, 6 : 6 + part.stop - part.start])]
+            blocks += [(columns, jacobian[:, :6] @ of_place) for columns, of_place in chain]
             if self.free_board:
-                of_points = of_shift.reshape(-1, 2, 3) @ cv2.Rodrigues(rotation)[0]
-                spread = np.zeros((len(points), 2, len(points), 3))
-                spread[np.arange(len(points)), :, np.arange(len(points))] = of_points
-                blocks.append((self.board, spread.reshape(2 * len(points), -1)))
-            derivatives.append(blocks)
+                of_points = np.zeros((len(points), 2, len(points), 3))
+                each = np.arange(len(points))
+                of_points[each, :, each] = jacobian[:, 3:6].reshape(-1, 2, 3) @ cv2.Rodrigues(rotation)[0]
+                blocks.append((self.board, of_points.reshape(2 * len(points), -1)))
+            columns, values = zip(*blocks, strict=True)
+            derivatives.append((np.r_[columns], np.hstack(values)))
         return projections, derivatives
 
     def sigmas(self, index: int) -> list[NDArray[np.float64]]:
@@ -107,19 +103,18 @@ class Bundle:
         projections = self.project(x, index)[0]
         return [image - target for image, target in zip(projections, self.targets[index], strict=True)]
 
-    def system(self, x: NDArray, poses: Sequence[int], free: NDArray, prior: bool) -> tuple[NDArray, NDArray]:
+    def system(self, x: NDArray, poses: Sequence[int], free: NDArray) -> tuple[NDArray, NDArray]:
         """Weighted residuals (m,) and their derivatives (m, f) with respect to the free parameters."""
         values, rows = [], []
         for index in poses:
             projections, derivatives = self.project(x, index)
-            for image, target, sigma, blocks in zip(
+            for image, target, sigma, (columns, jacobian) in zip(
                 projections, self.targets[index], self.sigmas(index), derivatives, strict=True
             ):
-                seen = np.isfinite(target).all(1)
-                values.append(((image - target) / sigma)[seen].ravel())
-                row = sum(block @ free[columns] for columns, block in blocks)
-                rows.append((row.reshape(-1, 2, free.shape[1]) / sigma[:, :, None])[seen].reshape(-1, free.shape[1]))
-        if prior:
+                seen = np.isfinite(target).ravel()
+                values.append(((image - target) / sigma).ravel()[seen])
+                rows.append((jacobian[seen] @ free[columns]) / sigma.ravel()[seen, None])
+        if free[self.board].any():  # the board's points are sought
             sigma_mm = BOARD_SHARE * np.linalg.norm(self.points_mm[1] - self.points_mm[0])
             values.append((x[self.board] - self.points_mm.ravel()) / sigma_mm)
             rows.append(free[self.board] / sigma_mm)
@@ -127,31 +122,26 @@ class Bundle:
 
     def fit(
         self, start: NDArray[np.float64], poses: Sequence[int] | None = None, only_poses: bool = False
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """The parameters of the least squares over ``poses`` (all), their weighted Jacobian (m, f), and the matrix from
-        the free parameters to all. Raises `CalibrationError` where the search does not end."""
+    ) -> NDArray[np.float64]:
+        """The parameters of the least squares over ``poses`` (all). Raises `CalibrationError` where the search does not
+        end."""
         poses = range(len(self.poses)) if poses is None else poses
-        free = self.free(poses, only_poses)
-        prior = self.free_board and not only_poses
-        cache: dict[bytes, tuple[NDArray, NDArray]] = {}
+        free = self.free_of(poses, only_poses)
 
-        def system(step: NDArray) -> tuple[NDArray, NDArray]:
-            key = step.tobytes()
-            if key not in cache:
-                cache.clear()
-                cache[key] = self.system(start + free @ step, poses, free, prior)
-            return cache[key]
+        @lru_cache(maxsize=1)  # asked for the residuals of a step, then for their derivatives
+        def system(step: bytes) -> tuple[NDArray, NDArray]:
+            return self.system(start + free @ np.frombuffer(step), poses, free)
 
-        unknowns = free.shape[1]
-        if len(system(np.zeros(unknowns))[0]) < unknowns:
-            raise CalibrationError(f"{len(poses)} poses give too few points for {unknowns} unknowns: capture more")
+        none = np.zeros(free.shape[1])
+        if len(system(none.tobytes())[0]) < none.size:
+            raise CalibrationError(f"{len(poses)} poses give too few points for {none.size} unknowns: capture more")
         try:
             found = least_squares(
-                lambda step: system(step)[0],
-                np.zeros(unknowns),
-                lambda step: system(step)[1],
+                lambda step: system(step.tobytes())[0],
+                none,
+                lambda step: system(step.tobytes())[1],
                 method="lm",
-                x_scale=1 / np.maximum(np.linalg.norm(system(np.zeros(unknowns))[1], axis=0), 1e-300),
+                x_scale="jac",
                 ftol=TOLERANCE,
                 xtol=TOLERANCE,
                 gtol=TOLERANCE,
@@ -159,16 +149,27 @@ class Bundle:
             )
         except (ValueError, cv2.error) as error:  # coordinates that are not finite any more
             raise CalibrationError(f"the fit of the rig failed ({error}): look at the poses") from error
-        return start + free @ found.x, system(found.x)[1], free
+        return start + free @ found.x
 
-    def weigh(self, x: NDArray[np.float64], unknowns: int) -> None:
+    def spread(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A root (p, f) of the covariance of all p parameters at the solution ``x``: the covariance is its product with
+        its transpose. Infinite where the data don't determine the f free ones."""
+        jacobian = self.system(x, range(len(self.poses)), self.free)[1]
+        norm = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+        try:
+            inverse = np.linalg.inv(np.linalg.qr(jacobian / norm, mode="r"))
+        except np.linalg.LinAlgError:
+            return np.full_like(self.free, np.inf)
+        return self.free @ (inverse / norm[:, None])
+
+    def weigh(self, x: NDArray[np.float64]) -> None:
         """Set the common standard deviations of camera and projector coordinates from the residuals at ``x``: what is
-        left of their mean square after the points' own uncertainty, freed from the fit's ``unknowns``."""
+        left of their mean square after the points' own uncertainty, freed from the fit's unknowns."""
         residuals = self.joined(lambda index: self.residuals(x, index))
         own = np.nan_to_num(np.concatenate([pose.projector.sigma_px for pose in self.poses]))
         seen = [np.isfinite(residual) for residual in residuals]
         count = sum(int(part.sum()) for part in seen)
-        inflation = count / max(count - unknowns, 1)
+        inflation = count / max(count - self.free.shape[1], 1)
         camera, projector = (
             max(inflation * (residual[part] ** 2).mean() - (known[part] ** 2).mean(), LEAST_SIGMA_PX**2) ** 0.5
             for residual, known, part in zip(residuals, (np.zeros_like(own), own), seen, strict=True)
@@ -182,21 +183,11 @@ def opencv_lens(intrinsics: NDArray[np.float64]) -> tuple[NDArray[np.float64], N
     return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), intrinsics[4:]
 
 
-def spread(jacobian: NDArray[np.float64], free: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A root (p, f) of the covariance of all p parameters, which is its product with its transpose, from `Bundle.fit`'s
-    Jacobian (m, f) and matrix of free parameters (p, f); infinite where the data don't determine them."""
-    norm = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
-    try:
-        inverse = np.linalg.inv(np.linalg.qr(jacobian / norm, mode="r"))
-    except np.linalg.LinAlgError:
-        return np.full_like(free, np.inf)
-    return free @ (inverse / norm[:, None])
-
-
 def without_bias(
-    pose: Pose, bundle: Bundle, x: NDArray[np.float64], index: int, radius_mm: float
+    bundle: Bundle, x: NDArray[np.float64], index: int, radius_mm: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Image and projector coordinates (n, 2) px of the circles' centres, from those measured at their centroids."""
+    pose = bundle.poses[index]
     points = x[bundle.board].reshape(-1, 3)
     board, lens = x[bundle.pose(index)], opencv_lens(x[bundle.camera])
     angle = np.linspace(0, 2 * np.pi, OUTLINE_POINTS, endpoint=False)
@@ -216,8 +207,9 @@ def polygon_centroids(polygons: NDArray) -> NDArray[np.float64]:
     return ((polygons + following) * cross[..., None]).sum(1) / (3 * cross.sum(1))[:, None]
 
 
-def same_labels(poses: Sequence[Pose], board: Board, bundle: Bundle, x: NDArray[np.float64]) -> list[Pose]:
+def same_labels(board: Board, bundle: Bundle, x: NDArray[np.float64]) -> list[Pose]:
     """The poses, relabelled by the turns of the grid that make the points' deviations agree best between poses."""
+    poses = bundle.poses
     if board.kind not in ("checker", "circles"):
         return list(poses)
     grid = np.arange(board.columns * board.rows).reshape(board.rows, board.columns)

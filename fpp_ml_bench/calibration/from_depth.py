@@ -10,7 +10,7 @@ The phase's origin is the centre of pixel 0, as in the patterns; another origin 
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Set
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -24,7 +24,6 @@ from fpp_ml_bench.calibration.projection import (
     PITCH,
     POSE,
     DepthView,
-    Measured,
     Projection,
     Projector,
     measured_in,
@@ -35,7 +34,7 @@ from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
 from fpp_ml_bench.decoding.triangulation import depth_from_both
 from fpp_ml_bench.errors import CalibrationError, RigError
 from fpp_ml_bench.optics.pinhole import Pinhole
-from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.rig import Rig, rotation_matrix
 from fpp_ml_bench.optics.sequence import AXES
 
 LEAST_PX = 200
@@ -110,17 +109,25 @@ def fit_projector(
         )
     width, height = size or (rig.projector.width, rig.projector.height)
     measured = measured_in(views, most_px)
-    start = projection_from(measured.points_m, measured.periods.T)
-    search = _Search(measured.only(start.kept), (width, height), frozenset({"k1"} if lens else ()))
+    start = projection_from(measured.points_m, measured.periods)
+    kept, always = measured.only(start.kept), POSE | ({"k1"} if lens else set())
+
+    def fit(values: dict[str, float], *free: Set[str]) -> Projector:
+        return refined(kept, values, always.union(*free))
+
     if pitch_px is not None:
-        fitted = first = search.with_pitch(start, pitch_px)
+        fitted = first = fit(_values(start, pitch_px), {"focal", "aspect"}, CENTRE)
         pitch_from = "given"
     elif focal_px is not None:
-        fitted, first, pitch_from = search.with_focal(start, focal_px)
+        first = fit(_values(start, focal_px / start.focal), CENTRE, PITCH)
+        fitted, rounded = _rounded(fit, first, (width, height), CENTRE)
+        pitch_from = f"focal length given{rounded}"
     else:
-        fitted, first, pitch_from = search.with_middle(start)
+        first = _with_middle(fit, start, (width, height))
+        fitted, rounded = _rounded(fit, first, (width, height))
+        pitch_from = f"square pixels, principal point in the pattern's middle{rounded}"
     _check_fit(fitted, first)
-    result = _rig_of(fitted, rig, (width, height), measured.points_m[:, 2] * MM_PER_M)
+    result = _rig_of(fitted, rig, (width, height), measured.points_m[2] * MM_PER_M)
     differences = [_differences(view, result) for view in views]
     residuals = tuple(_residual(view.name, values) for view, values in zip(views, differences, strict=True))
     total = _residual("all", np.concatenate(differences, axis=1))
@@ -128,62 +135,40 @@ def fit_projector(
     return result, DepthFit(residuals, total, first.pair("pitch_u", "pitch_v"), errors, pitch_from)
 
 
-@dataclass(frozen=True)
-class _Search:
-    """The fits of a projector of ``size`` px (W, H), in the order that what is known of it allows."""
+def _with_middle(fit: Callable[..., Projector], start: Projection, size: tuple[int, int]) -> Projector:
+    """The fit with square pixels and the principal point in the middle of a pattern of ``size`` px (W, H)."""
+    middle = (np.array(size) - 1) / 2
+    if not (start.centre > 0).all():
+        raise CalibrationError(
+            f"the principal point lies outside the pattern (at {start.centre[0]:.3g} and {start.centre[1]:.3g} "
+            "periods), so the pitch can't be taken from the pattern's middle; give the pitch or the focal length"
+        )
+    free = fit(_values(start, middle / start.centre), {"focal", "aspect"}, PITCH)
+    aspect, error = free.values["aspect"], free.errors["aspect"]
+    if abs(aspect - 1) > max(MOST_OFF_SQUARE, _SIGMAS * error):
+        raise CalibrationError(
+            f"with the principal point in the middle of {size[0]} x {size[1]} px, the pixels would not be square "
+            f"(aspect {aspect:.4f} +- {error:.4f}). Give the projector's size, its pitch or its focal length"
+        )
+    return fit(free.values | {"aspect": 1.0}, {"focal"}, PITCH)
 
-    measured: Measured
-    size: tuple[int, int]
-    lens: frozenset[str]
 
-    def _fit(self, start: Projector, *free: frozenset[str]) -> Projector:
-        return refined(self.measured, start, POSE.union(self.lens, *free))
-
-    def with_pitch(self, start: Projection, pitch_px: Pair) -> Projector:
-        return self._fit(_projector(start, pitch_px), frozenset({"focal", "aspect"}), CENTRE)
-
-    def with_focal(self, start: Projection, focal_px: float) -> tuple[Projector, Projector, str]:
-        pitch_u, pitch_v = (focal_px / start.focal).tolist()
-        free = self._fit(_projector(start, (pitch_u, pitch_v)), CENTRE, PITCH)
-        fitted, rounded = self._rounded(free, CENTRE)
-        return fitted, free, f"focal length given{rounded}"
-
-    def with_middle(self, start: Projection) -> tuple[Projector, Projector, str]:
-        middle = tuple((length - 1) / 2 for length in self.size)
-        if not (start.centre > 0).all():
-            raise CalibrationError(
-                f"the principal point lies outside the pattern (at {start.centre[0]:.3g} and {start.centre[1]:.3g} "
-                "periods), so the pitch can't be taken from the pattern's middle; give the pitch or the focal length"
-            )
-        begun = _projector(start, (middle[0] / start.centre[0], middle[1] / start.centre[1]))
-        begun = begun.having(c_u=middle[0], c_v=middle[1])
-        free = self._fit(begun, frozenset({"focal", "aspect"}), PITCH)
-        off, error = abs(free.values["aspect"] - 1), free.errors["aspect"]
-        if off > max(MOST_OFF_SQUARE, _SIGMAS * error):
-            raise CalibrationError(
-                f"with the principal point in the middle of {self.size[0]} x {self.size[1]} px, the pixels would not "
-                f"be square (aspect {free.values['aspect']:.4f} +- {error:.4f}). Give the projector's size, its pitch "
-                "or its focal length"
-            )
-        square = self._fit(free.having(aspect=1.0), frozenset({"focal"}), PITCH)
-        fitted, rounded = self._rounded(square, frozenset())
-        return fitted, square, f"square pixels, principal point in the pattern's middle{rounded}"
-
-    def _rounded(self, found: Projector, centre: frozenset[str]) -> tuple[Projector, str]:
-        """The fit with a whole pitch where the found one may be it, else the found one; and words that say so."""
-        pitches, words, certain = {}, [], True
-        for name, length in zip(("pitch_u", "pitch_v"), self.size, strict=True):
-            if whole := _whole_pitch(found.values[name], found.errors[name], length):
-                pitches[name], title = whole
-                words.append(title)
-                certain &= abs(pitches[name] - found.values[name]) <= _SIGMAS * found.errors[name]
-        if not pitches:
-            return found, ""
-        start = found.having(**pitches)
-        fitted = self._fit(start, frozenset({"focal"}), centre, PITCH - pitches.keys())
-        if not certain and fitted.sigma_px > _MOST_WORSE * found.sigma_px + _WORSE_PX:
-            return found, ""
-        return fitted, "; rounded to " + " and ".join(dict.fromkeys(words))
+def _rounded(
+    fit: Callable[..., Projector], found: Projector, size: tuple[int, int], centre: Set[str] = frozenset()
+) -> tuple[Projector, str]:
+    """The fit with a whole pitch where the found one may be it, else the found one; and words that say so."""
+    pitches, words, certain = {}, [], True
+    for name, length in zip(("pitch_u", "pitch_v"), size, strict=True):
+        if whole := _whole_pitch(found.values[name], found.errors[name], length):
+            pitches[name], title = whole
+            words.append(title)
+            certain &= abs(pitches[name] - found.values[name]) <= _SIGMAS * found.errors[name]
+    if not pitches:
+        return found, ""
+    fitted = fit(found.values | pitches, {"focal"}, centre, PITCH - pitches.keys())
+    if not certain and fitted.sigma_px > _MOST_WORSE * found.sigma_px + _WORSE_PX:
+        return found, ""
+    return fitted, "; rounded to " + " and ".join(dict.fromkeys(words))
 
 
 def _whole_pitch(pitch_px: float, error_px: float, length_px: int) -> tuple[float, str] | None:
@@ -199,10 +184,11 @@ def _whole_pitch(pitch_px: float, error_px: float, length_px: int) -> tuple[floa
     return None
 
 
-def _projector(start: Projection, pitch_px: Pair) -> Projector:
-    (focal_u, focal_v), (c_u, c_v) = (start.focal * pitch_px).tolist(), (start.centre * pitch_px).tolist()
-    numbers = 0.0, 0.0, 0.0, *start.t.tolist(), focal_u, focal_v / focal_u, c_u, c_v, *pitch_px, 0.0
-    return Projector(dict(zip(NAMES, numbers, strict=True)), start.R, {})
+def _values(start: Projection, pitch_px: Pair | NDArray[np.float64]) -> dict[str, float]:
+    """The projector's numbers, given the pitch that the projection is in."""
+    focal, centre = start.focal * pitch_px, start.centre * pitch_px
+    numbers = np.concatenate([start.turn, start.t, [focal[0], focal[1] / focal[0]], centre, pitch_px, [0.0]])
+    return dict(zip(NAMES, numbers.tolist(), strict=True))
 
 
 def _check_fit(found: Projector, first: Projector) -> None:
@@ -228,12 +214,12 @@ def _rig_of(found: Projector, rig: Rig, size: tuple[int, int], depths_mm: NDArra
     high_mm, low_mm = np.percentile(depths_mm, _LEVELS).tolist()
     near = min(rig.working_range_mm[0], _STEP_MM * math.floor(low_mm / _STEP_MM - 1))
     far = max(rig.working_range_mm[1], _STEP_MM * math.ceil(high_mm / _STEP_MM + 1))
-    x, y, z = (float(found.values[name]) for name in ("t_x", "t_y", "t_z"))
+    turn, (x, y, z) = ([found.values[name] for name in NAMES[at : at + 3]] for at in (0, 3))
     try:
         return replace(
             rig,
             projector=Pinhole(*size, focal, focal * aspect, c_u, c_v, (found.values["k1"], 0.0, 0.0, 0.0, 0.0)),
-            rotation=tuple(map(tuple, found.rotation.tolist())),
+            rotation=tuple(map(tuple, rotation_matrix(turn).tolist())),
             translation_m=(x, y, z),
             pitch_vertical_px=found.values["pitch_u"],
             pitch_horizontal_px=found.values["pitch_v"],
@@ -250,7 +236,7 @@ def _differences(view: DepthView, rig: Rig) -> NDArray[np.float64]:
     (u_px, v_px), weights = view.periods * pitches, (view.modulation / pitches) ** 2
     x, y = view.rays
     depth_mm = depth_from_both((x, y), u_px, v_px, rig, weights[0], weights[1]).depth_mm
-    projected_u, projected_v = rig.project(view.points_m)
+    projected_u, projected_v = rig.project(view.points_m.T)
     return np.stack([depth_mm - view.depth_mm, projected_u - u_px, projected_v - v_px])
 
 

@@ -10,19 +10,21 @@ Geometry*, 2nd ed., algorithm 7.1; the decomposition is theirs too (6.2.4). Robu
 projector's thirteen numbers, of which some are free.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence, Set
+from dataclasses import replace
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
 
 from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import CalibrationError
-from fpp_ml_bench.optics.pinhole import Pinhole, distortion_polynomial
-from fpp_ml_bench.optics.rig import Rig, rotation_matrix
+from fpp_ml_bench.optics.pinhole import Pinhole
+from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import AXES, Direction
 
 MOST_PX = 50_000
@@ -41,7 +43,7 @@ _SMALLEST_PERIODS = 1e-9
 POSE = frozenset({"turn_x", "turn_y", "turn_z", "t_x", "t_y", "t_z"})
 CENTRE, PITCH = frozenset({"c_u", "c_v"}), frozenset({"pitch_u", "pitch_v"})
 NAMES = ("turn_x", "turn_y", "turn_z", "t_x", "t_y", "t_z", "focal", "aspect", "c_u", "c_v", "pitch_u", "pitch_v", "k1")
-"""``turn`` a rotation vector (rad) applied after the start's rotation, t in m, ``focal`` that of u in px, ``aspect``
+"""``turn`` a rotation vector in rad, t in m, ``focal`` that of u in px, ``aspect``
 that of v over it, c and pitch in px, ``k1`` the first radial term of the lens."""
 MOST_CONDITION = 1e7
 """Of the Jacobian with its columns scaled to equal length; the benchmark's objects give some thousands."""
@@ -50,8 +52,7 @@ _BANDS = 16
 _MOST_EVALUATIONS = 100
 
 
-@dataclass(frozen=True)
-class DepthView:
+class DepthView(NamedTuple):
     """n pixels of a view, float64: ``rays`` (2, n) normalised x and y, ``depth_mm`` (n,), and of the vertical and the
     horizontal fringes ``periods`` (2, n), absolute phase / 2 pi, and ``modulation`` (2, n), of which only ratios
     count."""
@@ -64,8 +65,8 @@ class DepthView:
 
     @property
     def points_m(self) -> NDArray[np.float64]:
-        """The surface in the camera's frame, (n, 3)."""
-        return np.stack([*self.rays, np.ones(len(self.depth_mm))], axis=1) * self.depth_mm[:, None] / MM_PER_M
+        """The surface in the camera's frame, (3, n)."""
+        return np.stack([*self.rays, np.ones(len(self.depth_mm))]) * self.depth_mm / MM_PER_M
 
 
 def view_from_maps(
@@ -97,9 +98,10 @@ def view_from_maps(
         raise CalibrationError(
             f"{name}: depth is negative, NaN or infinite at some pixels; write 0 where there is none"
         )
-    rays = np.stack([axis.reshape(-1) for axis in camera.rays()])
-    measured = np.stack([np.asarray(periods[d], dtype=np.float64).reshape(-1) for d in AXES])
-    strength = np.stack([np.asarray(strengths[d], dtype=np.float64).reshape(-1) for d in AXES])
+    rays, measured, strength = (
+        np.stack([np.asarray(values, dtype=np.float64).reshape(-1) for values in pair])
+        for pair in (camera.rays(), [periods[d] for d in AXES], [strengths[d] for d in AXES])
+    )
     usable = np.isfinite(rays).all(axis=0) & np.isfinite(measured).all(axis=0) & (strength > 0).all(axis=0)
     pixels = np.flatnonzero(object_mask(np.asarray(depth_mm)).reshape(-1) & usable)
     pixels = pixels[:: max(1, -(-len(pixels) // most_px))]
@@ -134,10 +136,10 @@ def view_from_frames(
 
 
 class Projection(NamedTuple):
-    """R (3, 3), t (3,) in m, and in periods: focal lengths (2,) and principal point (2,), along u and v; ``kept`` bool
-    (n,): the points it was found from."""
+    """Rotation vector (3,) in rad, t (3,) in m, and in periods: focal lengths (2,) and principal point (2,), along u
+    and v; ``kept`` bool (n,): the points it was found from."""
 
-    R: NDArray[np.float64]
+    turn: NDArray[np.float64]
     t: NDArray[np.float64]
     focal: NDArray[np.float64]
     centre: NDArray[np.float64]
@@ -145,8 +147,9 @@ class Projection(NamedTuple):
 
 
 def projection_from(points_m: NDArray[np.float64], periods: NDArray[np.float64]) -> Projection:
-    """The projection of points (n, 3) in the camera's frame, m, to ``periods`` (n, 2), from those that agree with the
+    """The projection of points (3, n) in the camera's frame, m, to ``periods`` (2, n), from those that agree with the
     rest. Raises `CalibrationError` where the points are flat, fit no projection, or only a mirrored or oblique one."""
+    points_m, periods = points_m.T, periods.T
     kept = np.ones(len(points_m), dtype=bool)
     for _ in range(_MOST_TRIMMINGS):
         matrix, singular = _dlt(points_m[kept], periods[kept])
@@ -193,29 +196,24 @@ def _dlt(points: NDArray[np.float64], periods: NDArray[np.float64]) -> tuple[NDA
 
 
 def _decomposed(matrix: NDArray[np.float64], kept: NDArray[np.bool_]) -> Projection:
-    from scipy.linalg import rq
-
     if np.linalg.det(matrix[:, :3]) < 0:
         raise CalibrationError(
             "the projector's coordinates are mirrored: u, v and depth make a left-handed frame. One direction's "
             "fringes run backwards (check the frame order), or the images are flipped"
         )
-    upper, turned = rq(matrix[:, :3])
-    signs = np.sign(np.diag(upper))
-    upper, rotation = upper * signs, turned * signs[:, None]
-    translation = np.linalg.solve(upper, matrix[:, 3])
+    upper, rotation, place = cv2.decomposeProjectionMatrix(matrix)[:3]
     upper = upper / upper[2, 2]
     if abs(upper[0, 1]) > MOST_SKEW * upper[0, 0]:
         raise CalibrationError(
             f"the best projector has oblique axes (skew {upper[0, 1] / upper[0, 0]:.3f} of its focal length, expected "
             f"under {MOST_SKEW}); check the camera, the frame order, and that the depth belongs to these frames"
         )
-    return Projection(rotation, translation, np.diag(upper)[:2].copy(), upper[:2, 2].copy(), kept)
+    translation = -rotation @ (place[:3] / place[3])
+    return Projection(cv2.Rodrigues(rotation)[0][:, 0], translation[:, 0], np.diag(upper)[:2], upper[:2, 2], kept)
 
 
-@dataclass(frozen=True)
-class Measured:
-    """The pixels of all views: points (n, 3) in m, periods and weights (2, n), and a number for each band of rows of
+class Measured(NamedTuple):
+    """The pixels of all views: points (3, n) in m, periods and weights (2, n), and a number for each band of rows of
     each view (n,). Errors of neighbouring pixels go together; those of bands are taken as independent."""
 
     points_m: NDArray[np.float64]
@@ -224,73 +222,60 @@ class Measured:
     bands: NDArray[np.intp]
 
     def only(self, kept: NDArray[np.bool_]) -> "Measured":
-        return Measured(self.points_m[kept], self.periods[:, kept], self.weights[:, kept], self.bands[kept])
+        return Measured(*(values[..., kept] for values in self))
 
 
 def measured_in(views: list[DepthView], most_px: int) -> Measured:
     """What ``views`` measure, thinned evenly to about ``most_px`` pixels."""
     step = max(1, -(-sum(len(view.depth_mm) for view in views) // most_px))
-    strength = np.concatenate([view.modulation[:, ::step] for view in views], axis=1)
-    counts = [len(view.depth_mm[::step]) for view in views]
-    bands = [number * _BANDS + np.arange(count) * _BANDS // max(count, 1) for number, count in enumerate(counts)]
-    return Measured(
-        np.concatenate([view.points_m[::step] for view in views]),
-        np.concatenate([view.periods[:, ::step] for view in views], axis=1),
-        strength / np.median(strength, axis=1, keepdims=True),  # the noise of a phase goes as 1 / modulation
-        np.concatenate(bands),
-    )
+    points, periods, strength, bands = [], [], [], []
+    for number, view in enumerate(views):
+        count = len(view.depth_mm[::step])
+        bands.append(number * _BANDS + np.arange(count) * _BANDS // max(count, 1))
+        for listed, values in ((points, view.points_m), (periods, view.periods), (strength, view.modulation)):
+            listed.append(values[:, ::step])
+    weights = np.concatenate(strength, axis=1)
+    weights /= np.median(weights, axis=1, keepdims=True)  # the noise of a phase goes as 1 / modulation
+    return Measured(np.concatenate(points, axis=1), np.concatenate(periods, axis=1), weights, np.concatenate(bands))
 
 
-@dataclass(frozen=True)
-class Projector:
-    """``values`` of `NAMES` and their standard errors (0 where not fitted), the start's rotation (3, 3), and the robust
-    standard deviation of the residuals in px, weighted."""
+class Projector(NamedTuple):
+    """``values`` of `NAMES` and the standard ``errors`` of those that were fitted, and the robust standard deviation of
+    the residuals in px, weighted."""
 
     values: dict[str, float]
-    start: NDArray[np.float64]
     errors: dict[str, float]
-    sigma_px: float = np.inf
-
-    @property
-    def rotation(self) -> NDArray[np.float64]:
-        x, y, z = (self.values[name] for name in ("turn_x", "turn_y", "turn_z"))
-        return rotation_matrix((x, y, z)) @ self.start
+    sigma_px: float
 
     def pair(self, first: str, second: str) -> tuple[float, float]:
         return self.values[first], self.values[second]
 
-    def having(self, **values: float) -> "Projector":
-        """The projector with other numbers, not fitted yet."""
-        return replace(self, values=self.values | values, errors={}, sigma_px=np.inf)
+
+def projected(points_m: NDArray[np.float64], values: Mapping[str, float]) -> NDArray[np.float64]:
+    """Absolute phase / 2 pi of points (3, n) in the camera's frame, (2, n), by a projector's `NAMES`."""
+    place, (focal, aspect, c_u, c_v, *pitches, k1) = np.split(np.array([values[name] for name in NAMES]), [6])
+    lens = np.array([[focal, 0, c_u], [0, focal * aspect, c_v], [0, 0, 1]]), np.array([k1, 0, 0, 0])
+    pixels = cv2.projectPoints(np.ascontiguousarray(points_m.T), place[:3], place[3:], *lens)[0]
+    return pixels.reshape(-1, 2).T / np.array(pitches)[:, None]
 
 
-def projected(points_m: NDArray[np.float64], p: Projector) -> NDArray[np.float64]:
-    """Absolute phase / 2 pi of points (n, 3) in the camera's frame, (2, n)."""
-    v = p.values
-    x, y, z = p.rotation @ points_m.T + np.array([[v["t_x"]], [v["t_y"]], [v["t_z"]]])
-    with np.errstate(all="ignore"):
-        x, y = distortion_polynomial(x / z, y / z, (v["k1"], 0.0, 0.0, 0.0, 0.0))
-    u, w = v["focal"] * x + v["c_u"], v["focal"] * v["aspect"] * y + v["c_v"]
-    return np.stack([u / v["pitch_u"], w / v["pitch_v"]])
-
-
-def refined(measured: Measured, start: Projector, free: frozenset[str]) -> Projector:
-    """The projector whose ``free`` numbers fit the phases best (soft L1 loss beyond three robust standard deviations of
-    the start), with standard errors that allow for errors shared within a band. Raises `CalibrationError` where the
-    numbers can't be told apart."""
-    from scipy.optimize import least_squares
-
+def refined(measured: Measured, start: Mapping[str, float], free: Set[str]) -> Projector:
+    """The projector whose ``free`` numbers, from those of ``start`` on, fit the phases best (soft L1 loss beyond three
+    robust standard deviations of the start), with standard errors that allow for errors shared within a band. Raises
+    `CalibrationError` where the numbers can't be told apart."""
     names = [name for name in NAMES if name in free]
     # One unit for both directions: noise is the same in periods, whatever their pitches.
-    scale_px = measured.weights * float(np.mean(start.pair("pitch_u", "pitch_v")))
+    scale_px = measured.weights * (start["pitch_u"] + start["pitch_v"]) / 2
+
+    def with_numbers(numbers: NDArray[np.float64]) -> dict[str, float]:
+        return {**start, **dict(zip(names, numbers.tolist(), strict=True))}
 
     def residuals_px(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-        tried = start.having(**dict(zip(names, numbers.tolist(), strict=True)))
-        difference = (projected(measured.points_m, tried) - measured.periods) * scale_px
+        difference = (projected(measured.points_m, with_numbers(numbers)) - measured.periods) * scale_px
         # A step of the search that turns a point behind the projector is refused by its cost.
         return np.nan_to_num(difference, nan=1e6, posinf=1e6, neginf=-1e6).ravel()
 
-    begin = np.array([start.values[name] for name in names])
+    begin = np.array([start[name] for name in names])
     knee_px = max(3 * _sigma(residuals_px(begin)), _SMALLEST_PX)
     solution = least_squares(
         residuals_px,
@@ -304,9 +289,10 @@ def refined(measured: Measured, start: Projector, free: frozenset[str]) -> Proje
         ftol=1e-12,
         gtol=1e-12,
     )
-    jacobian = solution.jac
-    lengths = np.linalg.norm(jacobian, axis=0)
-    condition = np.inf if not (lengths > 0).all() else float(np.linalg.cond(np.linalg.qr(jacobian / lengths, mode="r")))
+    lengths = np.linalg.norm(solution.jac, axis=0)
+    with np.errstate(all="ignore"):
+        unit = solution.jac / lengths
+    condition = float(np.linalg.cond(np.linalg.qr(unit, mode="r"))) if (lengths > 0).all() else np.inf
     if condition > MOST_CONDITION:
         raise CalibrationError(
             f"the views don't tell {', '.join(names)} apart (condition {condition:.1g}); give views at more places and "
@@ -314,15 +300,12 @@ def refined(measured: Measured, start: Projector, free: frozenset[str]) -> Proje
         )
     # least_squares scales the Jacobian for its loss; with these residuals, their products are the gradient's terms.
     bent = solution.fun * (1 + (solution.fun / knee_px) ** 2) ** 0.25
-    terms = (jacobian * bent[:, None]).reshape(2, -1, len(names)).sum(axis=0)
-    by_band = np.stack([np.bincount(measured.bands, weights=column) for column in terms.T], axis=1)
-    solved = np.linalg.pinv(jacobian / lengths)
-    inverse = solved @ solved.T / np.outer(lengths, lengths)
-    errors = np.sqrt(np.maximum(np.diag(inverse @ (by_band.T @ by_band) @ inverse), 0.0))
-    values = start.values | dict(zip(names, solution.x.tolist(), strict=True))
-    return replace(
-        start, values=values, errors=dict(zip(names, errors.tolist(), strict=True)), sigma_px=_sigma(solution.fun)
-    )
+    terms = (unit * bent[:, None]).reshape(2, -1, len(names)).sum(axis=0)
+    by_band = np.stack([np.bincount(measured.bands, weights=column) for column in terms.T])
+    inverse = np.linalg.inv(unit.T @ unit)
+    errors = np.linalg.norm(inverse @ by_band, axis=1) / lengths
+    fitted = with_numbers(solution.x)
+    return Projector(fitted, dict(zip(names, errors.tolist(), strict=True)), _sigma(solution.fun))
 
 
 def _sigma(values: NDArray[np.float64]) -> float:

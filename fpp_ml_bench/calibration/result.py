@@ -1,6 +1,7 @@
 """What a calibration found: lens models, both devices, the pose between them, errors, and how sure it is of each; its
 residuals as a picture; and how far a rig's depth is from another's over the working volume."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -19,14 +20,15 @@ from fpp_ml_bench.style import DEPTH_COLOURS, figure, figure_png, styled
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-MODELS: dict[str, tuple[tuple[int, ...], int]] = {
-    "none": ((), cv2.CALIB_FIX_K1 + cv2.CALIB_FIX_K2 + cv2.CALIB_FIX_K3 + cv2.CALIB_ZERO_TANGENT_DIST),
-    "radial-1": ((0,), cv2.CALIB_FIX_K2 + cv2.CALIB_FIX_K3 + cv2.CALIB_ZERO_TANGENT_DIST),
-    "radial-2": ((0, 1), cv2.CALIB_FIX_K3 + cv2.CALIB_ZERO_TANGENT_DIST),
-    "radial-3+tangential": ((0, 1, 2, 3, 4), 0),
-    "rational": ((0, 1, 2, 3, 4, 5, 6, 7), cv2.CALIB_RATIONAL_MODEL),
+MODELS = {
+    "none": (),
+    "radial-1": (0,),
+    "radial-2": (0, 1),
+    "radial-3+tangential": (0, 1, 2, 3, 4),
+    "rational": (0, 1, 2, 3, 4, 5, 6, 7),
 }
-"""Free coefficients, by their place in OpenCV's (k1, k2, p1, p2, k3, k4, k5, k6), and OpenCV's flags."""
+"""Free coefficients, by their place in OpenCV's (k1, k2, p1, p2, k3, k4, k5, k6)."""
+_FIXED = {0: cv2.CALIB_FIX_K1, 1: cv2.CALIB_FIX_K2, 2: cv2.CALIB_ZERO_TANGENT_DIST, 4: cv2.CALIB_FIX_K3}
 SPOILER_SIGMAS, SPOILER_SHARE = 3.5, 1.2
 """A pose is named when its held-out error lies above the median by this many robust sigmas and by half of the median,
 and its error in the fit is this many times the median: one that is only unlike the others predicts badly, but fits."""
@@ -58,8 +60,10 @@ class Lens:
     @property
     def flags(self) -> int:
         """For cv2.calibrateCamera."""
+        fixed = sum(flag for place, flag in _FIXED.items() if place not in MODELS[self.model])
+        rational = cv2.CALIB_RATIONAL_MODEL * (self.coefficients == 8)
         square = cv2.CALIB_FIX_ASPECT_RATIO * self.square_pixels
-        return MODELS[self.model][1] + square + cv2.CALIB_FIX_PRINCIPAL_POINT * self.centred
+        return fixed + rational + square + cv2.CALIB_FIX_PRINCIPAL_POINT * self.centred
 
     @property
     def free(self) -> NDArray[np.float64]:
@@ -67,59 +71,62 @@ class Lens:
         unit = np.eye(4 + self.coefficients)
         focal = [unit[0] + unit[1]] if self.square_pixels else [unit[0], unit[1]]
         centre = [] if self.centred else [unit[2], unit[3]]
-        return np.stack([*focal, *centre, *(unit[4 + i] for i in MODELS[self.model][0])], axis=1)
+        return np.stack([*focal, *centre, *(unit[4 + i] for i in MODELS[self.model])], axis=1)
 
 
-@dataclass(frozen=True)
-class Device:
-    """Camera or projector: size in px, intrinsics in px with their standard uncertainties ``sigma`` (fx, fy, cx, cy; 0
-    = not estimated), OpenCV's distortion coefficients (5, or 8 of the rational model) with theirs."""
+class Device(NamedTuple):
+    """Camera or projector: its lens model, and the standard uncertainties ``sigma`` of fx, fy, cx, cy in px and of the
+    distortion coefficients; 0 = not estimated."""
 
     lens: Lens
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, ...]
+    pinhole: Pinhole
     sigma: tuple[float, ...]
-    distortion_sigma: tuple[float, ...]
 
-    def pinhole(self) -> Pinhole:
-        """As a part of the package's `Rig`. Raises `RigError` where it can't be one."""
-        return Pinhole(self.width, self.height, self.fx, self.fy, self.cx, self.cy, self.distortion)  # type: ignore[arg-type]
+
+class Errors(NamedTuple):
+    """OpenCV's reprojection errors in px, the root of the mean squared distance over all points: of camera, projector
+    and both."""
+
+    camera: float
+    projector: float
+    both: float
+
+
+def errors_px(camera: NDArray[np.float64], projector: NDArray[np.float64]) -> Errors:
+    """The errors of residuals (n, 2) in px; NaN are left out."""
+    parts = camera, projector, np.concatenate([camera, projector])
+    return Errors(*(float(np.sqrt(np.nanmean((residuals**2).sum(axis=1)))) for residuals in parts))
 
 
 @dataclass(frozen=True)
 class FittedPose:
-    """A pose of the board: rotation vector (rad) and translation (mm) to the camera's frame, its RMS errors, and the
-    residuals, projected less measured (n, 2) px, NaN where not measured. ``held_out_rms_px``: the RMS over both devices
-    when the rig comes from the other poses and only the board's pose from this one; NaN where that was not computed."""
+    """A pose of the board: rotation vector (rad) and translation (mm) to the camera's frame. Of camera and projector
+    the measured coordinates and the residuals, projected less measured, (n, 2) px each, NaN where not measured.
+    ``held_out_rms_px``: the RMS over both devices when the rig comes from the other poses and only the board's pose
+    from this one; NaN where that was not computed."""
 
     name: str
     rotation_vector: tuple[float, ...]
     translation_mm: tuple[float, ...]
-    camera_rms_px: float
-    projector_rms_px: float
-    stereo_rms_px: float
     held_out_rms_px: float
-    corners_px: NDArray[np.float64] = field(repr=False, compare=False)
-    projector_px: NDArray[np.float64] = field(repr=False, compare=False)
-    camera_residuals_px: NDArray[np.float64] = field(repr=False, compare=False)
-    projector_residuals_px: NDArray[np.float64] = field(repr=False, compare=False)
+    measured_px: Sequence[NDArray[np.float64]] = field(repr=False, compare=False)
+    residuals_px: Sequence[NDArray[np.float64]] = field(repr=False, compare=False)
+
+    @property
+    def rms_px(self) -> Errors:
+        return errors_px(*self.residuals_px)
 
 
 @dataclass(frozen=True)
 class Calibration:
     """A calibrated rig. A point goes from the camera's frame to the projector's by ``X_p = rotation X_c +
     translation_mm``; ``rotation_sigma_rad`` is the uncertainty of a small turn about the axes of OpenCV's rotation
-    vector. RMS errors are OpenCV's, the root of the mean squared distance over all points: of the joint fit, and
-    ``alone_rms_px`` of cv2.calibrateCamera for camera and projector each on its own with a perfect board.
-    ``noise_px``: standard deviations of camera and projector coordinates that the residuals show, with whose inverse
-    squares they were weighted. ``board_mm``: the board's points (n, 3), estimated or given. Uncertainties take the
-    residuals for independent: errors that all poses share, such as those of a board that is taken for perfect, make
-    them too small."""
+    vector. ``scale`` says what the lengths were taken from. ``alone_rms_px``: the RMS of cv2.calibrateCamera for camera
+    and projector each on its own with a perfect board. ``noise_px``: standard deviations of camera and projector
+    coordinates that the residuals show, with whose inverse squares they were weighted. ``bic``: Bayesian information
+    criterion. ``board_mm``: the board's points (n, 3), estimated or given. Uncertainties take the residuals for
+    independent: errors that all poses share, such as those of a board that is taken for perfect, make them too
+    small."""
 
     camera: Device
     projector: Device
@@ -127,18 +134,18 @@ class Calibration:
     translation_mm: tuple[float, float, float]
     rotation_sigma_rad: tuple[float, ...]
     translation_sigma_mm: tuple[float, ...]
-    baseline_sigma_mm: float
-    spacing_mm: float
     scale: str
-    camera_rms_px: float
-    projector_rms_px: float
-    stereo_rms_px: float
     alone_rms_px: tuple[float, float]
     noise_px: tuple[float, float]
     bic: float
-    board_estimated: bool
     board_mm: NDArray[np.float64] = field(repr=False, compare=False)
     poses: tuple[FittedPose, ...] = field(repr=False)
+
+    @property
+    def rms_px(self) -> Errors:
+        """The errors of the joint fit, over the points of all poses."""
+        camera, projector = zip(*(pose.residuals_px for pose in self.poses), strict=True)
+        return errors_px(np.concatenate(camera), np.concatenate(projector))
 
     @property
     def baseline_mm(self) -> float:
@@ -146,7 +153,6 @@ class Calibration:
 
     @property
     def translation_m(self) -> tuple[float, float, float]:
-        """For the package's `Rig`, with `rotation` and the pinholes of `camera` and `projector`."""
         x, y, z = (length / MM_PER_M for length in self.translation_mm)
         return x, y, z
 
@@ -158,7 +164,7 @@ class Calibration:
     @property
     def spoilers(self) -> tuple[str, ...]:
         """Names of poses that fit the others badly (`SPOILER_SIGMAS`)."""
-        fitted = np.array([pose.stereo_rms_px for pose in self.poses])
+        fitted = np.array([pose.rms_px.both for pose in self.poses])
         held_out = np.array([pose.held_out_rms_px for pose in self.poses])
         errors = fitted if np.isnan(held_out).any() else held_out
         middle = np.median(errors)
@@ -177,15 +183,20 @@ def draw_residuals(calibration: Calibration) -> bytes:
     colours = colormaps[DEPTH_COLOURS](np.linspace(0.05, 0.95, len(poses)))
     drawn = figure(13, 8)
     plots = drawn.subplots(2, 3)
-    for row, (name, device) in enumerate((("camera", calibration.camera), ("projector", calibration.projector))):
+    for row, (name, device) in enumerate(
+        (("camera", calibration.camera.pinhole), ("projector", calibration.projector.pinhole))
+    ):
         scatter, cover = plots[row, 0], plots[row, 1]
         for pose, colour in zip(poses, colours, strict=True):
-            errors = pose.projector_residuals_px if row else pose.camera_residuals_px
-            pixels = pose.projector_px if row else pose.corners_px
-            scatter.plot(*errors.T, ".", ms=3, color=colour, label=pose.name)
-            cover.quiver(*pixels.T, *errors.T, color=colour, angles="xy", width=0.003)
-        rms = calibration.projector_rms_px if row else calibration.camera_rms_px
-        scatter.set(title=f"{name}: residuals, RMS {rms:.3f} px", xlabel="x, px", ylabel="y, px", aspect="equal")
+            errors = pose.residuals_px[row].T
+            scatter.plot(*errors, ".", ms=3, color=colour, label=pose.name)
+            cover.quiver(*pose.measured_px[row].T, *errors, color=colour, angles="xy", width=0.003)
+        scatter.set(
+            title=f"{name}: residuals, RMS {calibration.rms_px[row]:.3f} px",
+            xlabel="x, px",
+            ylabel="y, px",
+            aspect="equal",
+        )
         scatter.axhline(0, color="0.6", lw=0.6)
         scatter.axvline(0, color="0.6", lw=0.6)
         cover.set(
@@ -207,8 +218,8 @@ def _bars(axes: "Axes", calibration: Calibration) -> None:
     """RMS of each pose in camera and projector, and held out; poses that spoil the fit are marked."""
     poses, place = calibration.poses, np.arange(len(calibration.poses))
     series = {
-        "camera": [pose.camera_rms_px for pose in poses],
-        "projector": [pose.projector_rms_px for pose in poses],
+        "camera": [pose.rms_px.camera for pose in poses],
+        "projector": [pose.rms_px.projector for pose in poses],
         "both, held out": [pose.held_out_rms_px for pose in poses],
     }
     for number, (label, values) in enumerate(series.items()):

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fpp_ml_bench.calibration.boards import Board
-from fpp_ml_bench.calibration.bundle import Bundle, same_labels, spread, without_bias
+from fpp_ml_bench.calibration.bundle import Bundle, same_labels, without_bias
 from fpp_ml_bench.calibration.projector_points import Pose
-from fpp_ml_bench.calibration.result import Calibration, Device, FittedPose, Lens
+from fpp_ml_bench.calibration.result import Calibration, Device, FittedPose, Lens, errors_px
 from fpp_ml_bench.errors import CalibrationError
+from fpp_ml_bench.optics.pinhole import Pinhole
 
 FEWEST_POSES = 3
 FEWEST_POINTS = 6
@@ -22,7 +23,6 @@ LARGEST_FOCAL_SIGMA = 0.05
 """Relative standard uncertainty of a focal length."""
 MARGIN = 0.1
 """By which projector coordinates may lie outside the projector, in its sizes: the fringes end there."""
-Lenses = str | Lens | tuple[Lens, Lens]
 WEIGHT_ROUNDS = 4
 CIRCLE_ROUNDS = 10
 CIRCLE_TOLERANCE_PX = 1e-7
@@ -96,7 +96,7 @@ def calibrate(
     board: Board,
     camera_size: tuple[int, int],
     projector_size: tuple[int, int],
-    lens: Lenses = "radial-3+tangential",
+    lenses: tuple[Lens, Lens] = (Lens(), Lens()),
     *,
     estimate_board: bool = False,
     baseline_mm: float | None = None,
@@ -104,51 +104,44 @@ def calibrate(
 ) -> Calibration:
     """Calibrate a rig from at least three poses of a flat board; sizes are (width, height) in px.
 
-    ``lens``: a model of `MODELS` or a `Lens` for both devices, or a pair for camera and projector. No point is
-    rejected. Camera and projector residuals are weighted by the inverse of the variances that they show, the
-    projector's with the own uncertainty of each point. ``estimate_board``: the board's points are estimated too, about
-    their nominal places (Strobl and Hirzinger, More accurate pinhole camera calibration with imperfect planar target,
-    ICCV Workshops 2011). ``baseline_mm``: lengths are scaled so that the baseline has this
-    length; without it the scale is that of the board's spacing. ``hold_out``: compute the held-out errors (a fit for
-    each pose; needs four).
+    ``lenses``: of camera and projector. No point is rejected. Camera and projector residuals are weighted by the
+    inverse of the variances that they show, the projector's with the own uncertainty of each point. ``estimate_board``:
+    the board's points are estimated too, about their nominal places (Strobl and Hirzinger, More accurate pinhole camera
+    calibration with imperfect planar target, ICCV Workshops 2011). ``baseline_mm``: lengths are scaled so that the
+    baseline has this length; without it the scale is that of the board's spacing. ``hold_out``: compute the held-out
+    errors (a fit for each pose; needs four).
 
     Raises `CalibrationError` for too few or parallel poses, other image sizes, mirrored images, points outside the
     projector, and where the captures don't determine the rig; it names the pose."""
-    lenses = _pair(lens)
     sizes = (camera_size, projector_size)
     check_poses(poses, board, sizes)
     if baseline_mm is not None and not 0 < baseline_mm < np.inf:
         raise CalibrationError(f"baseline_mm: expected a positive number of mm, got {baseline_mm!r}")
-    bundle, x, jacobian, free, alone = _without_circle_bias(poses, board, sizes, lenses)
+    bundle, x, alone = _without_circle_bias(poses, board, sizes, lenses)
     if estimate_board:
-        poses = same_labels(poses, board, bundle, x)
-        bundle, x, jacobian, free, alone = _without_circle_bias(poses, board, sizes, lenses, free_board=True)
-    root = spread(jacobian, free)
+        poses = same_labels(board, bundle, x)
+        bundle, x, alone = _without_circle_bias(poses, board, sizes, lenses, free_board=True)
+    root = bundle.spread(x)
     check_solution(bundle, x, np.linalg.norm(root, axis=1))
     held_out = _held_out(bundle, x) if hold_out and len(poses) > 3 else [float("nan")] * len(poses)
-    return _result(bundle, x, root, free.shape[1], alone, held_out, board, sizes, baseline_mm)
-
-
-def _pair(lens: Lenses) -> tuple[Lens, Lens]:
-    lens = Lens(lens) if isinstance(lens, str) else lens
-    return lens if isinstance(lens, tuple) else (lens, lens)
+    return _result(bundle, x, root, alone, held_out, board, sizes, baseline_mm)
 
 
 def _without_circle_bias(
     poses: Sequence[Pose], board: Board, sizes: tuple, lenses: tuple[Lens, Lens], free_board: bool = False
-) -> tuple[Bundle, NDArray, NDArray, NDArray, tuple[float, float]]:
+) -> tuple[Bundle, NDArray[np.float64], tuple[float, float]]:
     """The fit, with the bias of circles' centroids taken off and fitted again until it stays."""
     start, alone = _start(poses, board, sizes, lenses)
     bundle = Bundle(poses, board.points_mm(), lenses, free_board)
-    x, jacobian, free = _weighted_fit(bundle, start)
+    x = _weighted_fit(bundle, start)
     for _ in range(CIRCLE_ROUNDS if board.radius_mm else 0):
-        targets = [without_bias(pose, bundle, x, i, board.radius_mm) for i, pose in enumerate(poses)]
+        targets = [without_bias(bundle, x, index, board.radius_mm) for index in range(len(poses))]
         change = max(np.nanmax(np.abs(new[0] - old[0])) for new, old in zip(targets, bundle.targets, strict=True))
         bundle.targets = targets
-        x, jacobian, free = _weighted_fit(bundle, x)
+        x = _weighted_fit(bundle, x)
         if change < CIRCLE_TOLERANCE_PX:
             break
-    return bundle, x, jacobian, free, alone
+    return bundle, x, alone
 
 
 def _start(
@@ -162,27 +155,22 @@ def _start(
         seen = [[pose.corners_px, pose.projector.points_px][device] for pose in poses]
         kept = [np.isfinite(pixels).all(1) for pixels in seen]
         objects = [points[keep] for keep in kept]
-        images = [pixels[keep].astype(np.float32)[:, None] for pixels, keep in zip(seen, kept, strict=True)]
+        # OpenCV refuses a start whose principal point is outside the image, where a projector's may well be: the image
+        # gets a margin of its own size all round.
+        images = [(pixels[keep] + size).astype(np.float32)[:, None] for pixels, keep in zip(seen, kept, strict=True)]
+        with_margin = tuple(3 * length for length in size)
         simple = Lens("radial-1" if lens.model != "none" else "none", True, lens.centred)
         try:
-            _, matrix, distortion, turns, _ = cv2.calibrateCamera(objects, images, size, None, None, flags=simple.flags)
+            _, matrix, distortion, turns, _ = cv2.calibrateCamera(
+                objects, images, with_margin, None, None, flags=simple.flags
+            )
             if device == 0:
                 check_start(poses, turns)
-            # OpenCV refuses a start whose principal point is outside the image, where a projector's may well be: the
-            # image gets a margin of its own size all round.
-            margin = np.array(size, dtype=np.float32)
-            matrix, distortion = np.array(matrix, dtype=np.float64), np.ravel(distortion).astype(np.float64)
-            matrix[:2, 2] += np.array(size)
+            guess = np.asarray(matrix, dtype=np.float64), np.resize(np.asarray(distortion, dtype=np.float64), 5)
+            flags = lens.flags + cv2.CALIB_USE_INTRINSIC_GUESS
             error, matrix, distortion, turns, shifts = cv2.calibrateCamera(
-                objects,
-                [image + margin for image in images],
-                tuple(3 * length for length in size),
-                matrix,
-                np.resize(distortion, 5),
-                flags=lens.flags + cv2.CALIB_USE_INTRINSIC_GUESS,
+                objects, images, with_margin, *guess, flags=flags
             )
-            matrix = np.array(matrix, dtype=np.float64)
-            matrix[:2, 2] -= np.array(size)
         except cv2.error as problem:
             raise CalibrationError(
                 f"OpenCV can't calibrate the {'projector' if device else 'camera'} from these poses ({problem.err}): "
@@ -191,7 +179,7 @@ def _start(
         distortion = np.resize(np.ravel(distortion), lens.coefficients)
         if not (np.isfinite(matrix).all() and np.isfinite(distortion).all()):
             raise CalibrationError("the poses don't determine the intrinsics: show the board from other directions")
-        intrinsics.append(np.concatenate([matrix[[0, 1, 0, 1], [0, 1, 2, 2]], distortion]))
+        intrinsics.append(np.concatenate([np.diag(matrix)[:2], matrix[:2, 2] - size, distortion]))
         rms.append(float(error))
         views.append((turns, shifts))
     first, second = (Rotation.from_rotvec(np.reshape(vectors, (-1, 3))) for vectors, _ in views)
@@ -202,39 +190,31 @@ def _start(
     return np.concatenate([*intrinsics, *stereo, boards, board.points_mm().ravel()]), (rms[0], rms[1])
 
 
-def _weighted_fit(bundle: Bundle, start: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
+def _weighted_fit(bundle: Bundle, start: NDArray[np.float64]) -> NDArray[np.float64]:
     """The fit, repeated with the variances of camera and projector that the last one showed."""
-    x, jacobian, free = bundle.fit(start)
+    x = bundle.fit(start)
     for _ in range(WEIGHT_ROUNDS):
-        before = np.array(bundle.extra_px)
-        bundle.weigh(x, free.shape[1])
-        x, jacobian, free = bundle.fit(x)
+        before = bundle.extra_px
+        bundle.weigh(x)
+        x = bundle.fit(x)
         if np.allclose(before, bundle.extra_px, rtol=1e-3):
             break
-    return x, jacobian, free
+    return x
 
 
 def _held_out(bundle: Bundle, x: NDArray[np.float64]) -> list[float]:
     errors = []
     for index in range(len(bundle.poses)):
         others = [i for i in range(len(bundle.poses)) if i != index]
-        rig, _, _ = bundle.fit(x, others)
-        fitted, _, _ = bundle.fit(rig, [index], only_poses=True)
-        errors.append(rms_px(*bundle.residuals(fitted, index)))
+        fitted = bundle.fit(bundle.fit(x, others), [index], only_poses=True)
+        errors.append(errors_px(*bundle.residuals(fitted, index)).both)
     return errors
-
-
-def rms_px(*residuals: NDArray[np.float64]) -> float:
-    """Root of the mean squared length of all residuals (n, 2), NaN left out: OpenCV's reprojection error."""
-    squares = np.concatenate([(residual**2).sum(1) for residual in residuals])
-    return float(np.sqrt(np.nanmean(squares)))
 
 
 def _result(
     bundle: Bundle,
     x: NDArray,
     root: NDArray,
-    unknowns: int,
     alone: tuple[float, float],
     held_out: list[float],
     board: Board,
@@ -243,65 +223,43 @@ def _result(
 ) -> Calibration:
     sigma = np.linalg.norm(root, axis=1)
     devices = []
-    for part, lens, (width, height) in zip((bundle.camera, bundle.projector), bundle.lenses, sizes, strict=True):
-        (fx, fy, cx, cy, *terms), sigmas = x[part].tolist(), sigma[part].tolist()
-        device = Device(lens, width, height, fx, fy, cx, cy, tuple(terms), tuple(sigmas[:4]), tuple(sigmas[4:]))
-        devices.append(device)
+    for part, lens, size in zip((bundle.camera, bundle.projector), bundle.lenses, sizes, strict=True):
+        fx, fy, cx, cy, *terms = x[part].tolist()
+        devices.append(Device(lens, Pinhole(*size, fx, fy, cx, cy, tuple(terms)), tuple(sigma[part].tolist())))
     turn, shift = x[bundle.stereo][:3], x[bundle.stereo][3:]
-    along = shift / np.linalg.norm(shift)
     of_shift = root[bundle.stereo][3:]
     scale, factor = f"from the board's spacing of {board.spacing_mm:g} mm", 1.0
-    baseline_sigma = float(np.linalg.norm(along @ of_shift))
     if baseline_mm is not None:
-        factor = baseline_mm / float(np.linalg.norm(shift))
+        length = float(np.linalg.norm(shift))
+        factor, along = baseline_mm / length, shift / length
         spacing = f"{board.spacing_mm * factor:.4f}"
         scale = f"from the baseline of {baseline_mm:g} mm; the board's spacing is then {spacing} mm"
-        of_shift, baseline_sigma = of_shift - np.outer(along, along @ of_shift), 0.0
+        of_shift = of_shift - np.outer(along, along @ of_shift)
     fitted = []
     for index, pose in enumerate(bundle.poses):
-        residuals = bundle.residuals(x, index)
         place = x[bundle.pose(index)]
-        fitted.append(
-            FittedPose(
-                pose.name,
-                tuple(place[:3].tolist()),
-                tuple((factor * place[3:]).tolist()),
-                rms_px(residuals[0]),
-                rms_px(residuals[1]),
-                rms_px(*residuals),
-                held_out[index],
-                *bundle.targets[index],
-                *residuals,
-            )
-        )
-    of_camera, of_projector = bundle.joined(lambda index: bundle.residuals(x, index))
-    rotation = cv2.Rodrigues(turn)[0].tolist()
+        turned, moved = tuple(place[:3].tolist()), tuple((factor * place[3:]).tolist())
+        residuals = bundle.residuals(x, index)
+        fitted.append(FittedPose(pose.name, turned, moved, held_out[index], bundle.targets[index], residuals))
     return Calibration(
-        devices[0],
-        devices[1],
-        tuple(map(tuple, rotation)),
+        *devices,
+        tuple(map(tuple, cv2.Rodrigues(turn)[0].tolist())),
         tuple((factor * shift).tolist()),
         tuple(sigma[bundle.stereo][:3].tolist()),
         tuple((factor * np.linalg.norm(of_shift, axis=1)).tolist()),
-        factor * baseline_sigma,
-        board.spacing_mm * factor,
         scale,
-        rms_px(of_camera),
-        rms_px(of_projector),
-        rms_px(of_camera, of_projector),
         alone,
         bundle.extra_px,
-        _bic(bundle, x, unknowns),
-        bundle.free_board,
+        _bic(bundle, x),
         factor * x[bundle.board].reshape(-1, 3),
         tuple(fitted),
     )
 
 
-def _bic(bundle: Bundle, x: NDArray, unknowns: int) -> float:
+def _bic(bundle: Bundle, x: NDArray) -> float:
     """Bayesian information criterion: -2 log likelihood + unknowns x log(coordinates)."""
     residuals = np.concatenate(bundle.joined(lambda index: bundle.residuals(x, index)))
     sigmas = np.concatenate(bundle.joined(bundle.sigmas))
     seen = np.isfinite(residuals)
     terms = (residuals[seen] / sigmas[seen]) ** 2 + np.log(2 * np.pi * sigmas[seen] ** 2)
-    return float(terms.sum()) + (unknowns + 2) * float(np.log(terms.size))
+    return float(terms.sum()) + (bundle.free.shape[1] + 2) * float(np.log(terms.size))

@@ -15,7 +15,6 @@ from contextlib import contextmanager, suppress
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from textwrap import indent
 from time import monotonic
 from types import FrameType
 from typing import Any, NamedTuple
@@ -23,7 +22,7 @@ from typing import Any, NamedTuple
 import click
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.cli.options import HELP_WIDTH, problem_of, write_sections
+from fpp_ml_bench.cli.options import help_text, problem_of
 from fpp_ml_bench.errors import FppBenchError
 from fpp_ml_bench.files import DISK_FULL, cause_of
 from fpp_ml_bench.machine import limit_threads, usable_cores
@@ -112,7 +111,7 @@ BENCH = Program(
             ),
             "decode": ("decode:decode", "decode captured frames: depth, point cloud, uncertainty, reasons"),
             "fuse": (
-                "fuse:fuse",
+                "decode:fuse",
                 "put an object's views into one point cloud, and find the pixels that other views contradict",
             ),
         },
@@ -169,27 +168,14 @@ Exit status: 0 done, 1 a check failed, 2 bad input or failed, 130 stopped (143 b
 """
 
 
-def run_command(command: click.Command, prog: str, argv: Sequence[str]) -> int:
-    """Parse ``argv`` and run the command. An error of this package, an unreadable file, a full disk, Ctrl-C or SIGTERM
-    becomes a message and a status; where nobody reads the output any more, there is a status alone."""
-    return _guarded(prog, partial(_parsed_and_run, lambda: command, prog, argv))
-
-
-def _parsed_and_run(command: Callable[[], Any], prog: str, argv: Sequence[str]) -> int:
-    found = command()
-    if isinstance(found, Program):
-        return run_program(found, argv)
-    with found.make_context(prog, list(argv)) as ctx:
-        status: int = found.invoke(ctx)
-        return status
-
-
-def _guarded(prog: str, action: Callable[[], int]) -> int:
+def run_command(load: Callable[[], Any], prog: str, argv: Sequence[str]) -> int:
+    """Import a command, parse ``argv`` and run it. An error of this package, an unreadable file, a full disk, Ctrl-C or
+    SIGTERM becomes a message and a status; where nobody reads the output any more, there is a status alone."""
     for name in _STREAMS:
         if getattr(sys, name) is None:  # closed by the caller: its number must not become that of a data file
             setattr(sys, name, Path(os.devnull).open("w"))  # noqa: SIM115
     try:
-        status = _status_of(prog, action)
+        status = _status_of(prog, load, argv)
     except SystemExit as stop:  # of rich where its output is closed
         if not isinstance(stop.__context__, BrokenPipeError):
             raise
@@ -205,11 +191,16 @@ def _guarded(prog: str, action: Callable[[], int]) -> int:
     return status
 
 
-def _status_of(prog: str, action: Callable[[], int]) -> int:
+def _status_of(prog: str, load: Callable[[], Any], argv: Sequence[str]) -> int:
     try:
         with _terminable():
-            return action()
-    except click.exceptions.Exit as leaving:  # of --help
+            command = load()
+            if isinstance(command, Program):
+                return run_program(command, argv)
+            with command.make_context(prog, list(argv)) as ctx:
+                status: int = command.invoke(ctx)
+                return status
+    except click.exceptions.Exit as leaving:  # of --help and --version
         return leaving.exit_code
     except click.UsageError as error:
         return _refused(error.ctx.command_path if error.ctx else prog, problem_of(error))
@@ -275,61 +266,53 @@ def _say(text: str) -> None:
         print(text, file=sys.stderr)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point of ``fpp-bench``."""
-    return run_program(BENCH, argv)
-
-
-def main_eval(argv: Sequence[str] | None = None) -> int:
-    """Entry point of ``fpp-eval``."""
-    return run_program(EVAL, argv)
-
-
 def run_program(program: Program, argv: Sequence[str] | None = None) -> int:
     """Run the command that the first word of ``argv`` (default: the process's) names, or the default one."""
     words = list(sys.argv[1:] if argv is None else argv)
-    first = words[0] if words else "--help"
+    name, first = program.name, words[0] if words else ""
+    # A folder of predictions has any name; one that is not there and almost that of a command is a slip.
+    slip = nearest(first, program.commands) and not Path(first).exists()
     if first in program.commands:
         if first in (*ONE_THREAD, "diagnose"):  # before the command's module loads NumPy
             threads = re.search(r"--threads[ =](\d+)", " ".join(words))
             limit_threads(int(threads[1]) if threads else 1 if first in ONE_THREAD else usable_cores())
-        name = f"{program.name} {first}"
-        return _guarded(name, partial(_parsed_and_run, partial(program.command, first), name, words[1:]))
-    # A folder of predictions has any name; one that is not there and almost that of a command is a slip.
-    slip = nearest(first, program.commands) and not Path(first).exists()
-    if program.default and first not in ("--help", "-h", "--version") and not slip:
-        load = partial(program.command, program.default)
-        return _guarded(program.name, partial(_parsed_and_run, load, program.name, words))
-    return _guarded(program.name, partial(_without_command, program, words))
+        name, command, words = f"{name} {first}", first, words[1:]
+    elif program.default and first not in ("", "--help", "-h", "--version") and not slip:
+        command = program.default
+    else:
+        return run_command(partial(_without_command, program, first), name, words)
+    return run_command(partial(program.command, command), name, words)
 
 
-def _without_command(program: Program, words: list[str]) -> int:
-    """Help, version, or what is wrong with the command's name."""
-    first = words[0] if words else ""
+def _without_command(program: Program, first: str) -> None:
+    """Help, version, or what is wrong with the command's name, raised as click's exception."""
     if first == "--version":
         print(f"fpp-ml-bench {__version__}")
-        return OK
-    if first.startswith("-") and first not in ("--help", "-h"):
-        return _refused(program.name, f"unknown option {first!r} before a command; see {program.name} --help")
-    if first and first not in ("--help", "-h"):
-        return _refused(program.name, f"unknown command {first!r}; {did_you_mean(first, program.commands)}")
-    print(help_of(program), end="", file=sys.stdout if first else sys.stderr)
-    return OK if first else BAD_INPUT
+    elif first in ("", "--help", "-h"):
+        print(help_of(program), end="", file=sys.stdout if first else sys.stderr)
+    elif first.startswith("-"):
+        raise click.UsageError(f"unknown option {first!r} before a command; see {program.name} --help")
+    else:
+        raise click.UsageError(f"unknown command {first!r}; {did_you_mean(first, program.commands)}")
+    raise click.exceptions.Exit(OK if first else BAD_INPUT)
 
 
 def help_of(program: Program) -> str:
     """The help of a program: its commands by group, and the options of its default command."""
-    formatter = click.HelpFormatter(width=HELP_WIDTH)
-    formatter.write_usage(program.name, "[--help] [--version] COMMAND ...", "usage: ")
+    usages = [(program.name, "[--help] [--version] COMMAND ...")]
     sections = {
         group: [(name, line) for name, (_, line) in commands.items()] for group, commands in program.groups.items()
     }
     if program.default:
         command = program.command(program.default)
         ctx = click.Context(command, info_name=program.name)
-        formatter.write_usage(program.name, command.usage(ctx), "usage: ")
+        usages.append((program.name, command.usage(ctx)))
         sections |= command.sections(ctx)
-    formatter.write(f"\n{program.purpose}\n")
-    write_sections(sections, formatter)
-    formatter.write(f"\nexamples:\n{indent(program.examples, '  ')}\n{_MEANINGS.format(name=program.name)}")
-    return formatter.getvalue()
+    text = help_text(usages, program.purpose, sections, program.examples)
+    return f"{text}\n{_MEANINGS.format(name=program.name)}"
+
+
+main = partial(run_program, BENCH)
+"""Entry point of ``fpp-bench``."""
+main_eval = partial(run_program, EVAL)
+"""Entry point of ``fpp-eval``."""

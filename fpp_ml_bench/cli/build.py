@@ -5,7 +5,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import Literal
 
-from fpp_ml_bench.cli.console import gigabytes, progress_bar, say_benchmark
+from fpp_ml_bench.cli.console import contents, progress_bar, say_benchmark
 from fpp_ml_bench.cli.options import Explain, Pool, command, names, value, whole
 from fpp_ml_bench.coding.gray_code import bits_needed
 from fpp_ml_bench.constants import CONFIGS, LARGEST_SIDE_PX, PRESETS
@@ -119,7 +119,6 @@ fpp-bench build --out data/pen --objects pen --explain             what was left
 )
 def build(settings: BuildCommandSettings) -> None:
     """Generate the benchmark: virtual rig, objects, six views each, decoded and exact ground truth."""
-    settings.check()
     build_settings, workers = settings_of(settings), settings.processes
     assembly = assembly_of(build_settings)
     rows = sum(len(plan.samples) for plan in assembly.plans)
@@ -137,9 +136,7 @@ def build(settings: BuildCommandSettings) -> None:
     # The first step is what an interrupted run had left: it took no time now.
     made = sum(steps[1:]) * frames
     rate = f"{made:,} of them made in {seconds:.1f} s ({made / seconds:,.0f} images/s)" if made else "complete already"
-    parts = ", ".join(f"{split} {len(rows)}" for split, rows in manifest.samples.items())
-    size = gigabytes(sum(file.bytes for file in manifest.files))
-    print(f"{out}: {parts} samples, {rows * frames:,} images, {size}; {rate}")
+    print(f"{out}: {contents(manifest)}; {rate}")
     for line in ground_truth_summary(manifest):
         print(f"  {line}")
     say_benchmark(manifest)

@@ -191,7 +191,7 @@ def _virtual(settings: CalibrateSettings, folder: Path) -> None:
 
 def _from_depth(settings: CalibrateSettings, tree: Path) -> None:
     known_rig = None if settings.camera is None else load_rig(settings.camera)
-    reader = plan_import(tree, known_rig, settings.frame_order).reader
+    reader = plan_import(tree, known_rig, settings.frame_order).rows
     with progress_bar("reading", len(reader.samples), "views") as advance:
         views = tree_views(reader, settings.workers or usable_cores(), advance)
     rig, fit = fit_projector(
@@ -231,7 +231,7 @@ def _from_board(
         compared = Table("lens model", numbers=("RMS, px", "left out, px", "BIC"))
         for one in found:
             compared.add_row(
-                str(one.camera.lens), f"{one.stereo_rms_px:.4f}", f"{one.held_out_rms_px:.4f}", f"{one.bic:.0f}"
+                str(one.camera.lens), f"{one.rms_px.both:.4f}", f"{one.held_out_rms_px:.4f}", f"{one.bic:.0f}"
             )
         show(compared)
     best = min(found, key=lambda one: one.held_out_rms_px) if len(found) > 1 else found[0]
@@ -249,8 +249,7 @@ def _from_board(
     written = [settings.out, settings.out.with_suffix(".png")]
     write_atomically(written[-1], draw_residuals(best))
     if settings.opencv is not None:
-        errors = (best.camera_rms_px, best.projector_rms_px, best.stereo_rms_px)
-        content = OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m, *errors)
+        content = OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m, *best.rms_px)
         write_opencv_calibration(content, settings.opencv)
         written.append(settings.opencv)
     print(f"wrote {', '.join(map(str, written))}; next: fpp-bench decode {settings.out} FRAMES --out OUT")
@@ -272,11 +271,10 @@ def print_calibration(found: "Calibration") -> None:
     columns = "camera", "projector", "both", "left out"
     table = Table("", numbers=columns, title="reprojection error (RMS, px; no point rejected)")
     for pose in found.poses:
-        errors = (pose.camera_rms_px, pose.projector_rms_px, pose.stereo_rms_px, pose.held_out_rms_px)
+        errors = (*pose.rms_px, pose.held_out_rms_px)
         named = f"{pose.name} (!)" if pose.name in found.spoilers else pose.name
         table.add_row(named, *(f"{error:.4f}" for error in errors), end_section=pose is found.poses[-1])
-    total = (found.camera_rms_px, found.projector_rms_px, found.stereo_rms_px, found.held_out_rms_px)
-    table.add_row("all", *(f"{error:.4f}" for error in total))
+    table.add_row("all", *(f"{error:.4f}" for error in (*found.rms_px, found.held_out_rms_px)))
     show(table)
     if found.spoilers:
         print(f"  (!) {', '.join(found.spoilers)}: fits the other poses badly; look at it, or capture it again")
@@ -286,12 +284,10 @@ def print_calibration(found: "Calibration") -> None:
     print(f"alone           {alone} px (each device by OpenCV's calibrateCamera, with a perfect board)")
     for name, device in (("camera", found.camera), ("projector", found.projector)):
         values = [
-            f"{label} {value:.2f} +- {sigma:.2f}" if sigma else f"{label} {value:.2f} (fixed)"
-            for label, value, sigma in zip(
-                ("fx", "fy", "cx", "cy"), (device.fx, device.fy, device.cx, device.cy), device.sigma, strict=True
-            )
+            f"{label} {getattr(device.pinhole, label):.2f} " + (f"+- {sigma:.2f}" if sigma else "(fixed)")
+            for label, sigma in zip(("fx", "fy", "cx", "cy"), device.sigma, strict=False)
         ]
-        terms = ", ".join(f"{term:.5f}" for term in device.distortion)
+        terms = ", ".join(f"{term:.5f}" for term in device.pinhole.distortion)
         print(f"{name:<15} {', '.join(values)} px; {device.lens}: {terms}")
     x, y, z = (
         f"{length:.2f} +- {sigma:.2f}"

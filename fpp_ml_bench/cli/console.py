@@ -38,6 +38,13 @@ def gigabytes(count: float) -> str:
     return f"{count:.2f} GB"
 
 
+def contents(manifest: "Manifest") -> str:
+    """What a dataset holds, as text: samples of each split, images and bytes."""
+    parts = ", ".join(f"{split} {len(rows)}" for split, rows in manifest.samples.items())
+    images = len(manifest.stored_frames) * sum(map(len, manifest.samples.values()))
+    return f"{parts} samples, {images:,} images, {gigabytes(sum(file.bytes for file in manifest.files))}"
+
+
 def millimetres(value: float | None) -> str:
     """A length in mm as text for a table; a dash for None."""
     return "-" if value is None else f"{value:.3f}"
@@ -57,19 +64,14 @@ def say_findings(examination: Examination, where: str = "", notes: bool = True) 
             print(f"{level}: {where}{finding}", file=sys.stderr)
 
 
-def output_width() -> int:
-    """Columns of text there are: the terminal's, those COLUMNS says, or a fixed number into pipes and files."""
-    if sys.stdout.isatty() or "COLUMNS" in os.environ:
-        return Console().width
-    return WIDTH_IN_PIPES
-
-
 def show(*parts: RenderableType) -> None:
-    """Print to stdout: plain text of a fixed width into pipes and files, colours only on a terminal."""
+    """Print to stdout: plain text of a fixed width into pipes and files, of the width that COLUMNS says, and colours
+    only on a terminal."""
     # A name may hold characters that the terminal's encoding lacks; a table with a mark in it beats a traceback.
     if hasattr(sys.stdout, "reconfigure"):
         sys.stdout.reconfigure(errors="replace")
-    console = Console(width=output_width(), highlight=False, markup=False, emoji=False)
+    width = None if sys.stdout.isatty() or "COLUMNS" in os.environ else WIDTH_IN_PIPES
+    console = Console(width=width, highlight=False, markup=False, emoji=False)
     for part in parts:
         console.print(part)
 

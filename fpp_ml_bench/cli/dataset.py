@@ -23,7 +23,7 @@ from fpp_ml_bench.loaders.published.exporting import export as export_published
 from fpp_ml_bench.loaders.render.scene import PHOTOGRAPHED_BY
 from fpp_ml_bench.loaders.sample import DEPTH, DEPTH_EXACT
 from fpp_ml_bench.loaders.storage.benchmark import benchmark_of, benchmark_sentence
-from fpp_ml_bench.loaders.storage.card import split_statistics, whole_statistics
+from fpp_ml_bench.loaders.storage.card import split_statistics
 from fpp_ml_bench.loaders.storage.manifest import Manifest, read_manifest
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.loaders.storage.verification import verify as verify_dataset
@@ -47,25 +47,25 @@ def info(
     """Print what a dataset holds: sizes, configurations, splits, rig, and how exact its ground truth is."""
     opened = DatasetFolder(dataset)
     benchmark = benchmark_of(opened.content)
-    statistics = split_statistics(opened.manifest)
+    manifest, rig = opened.manifest, opened.rig
+    statistics, error = split_statistics(manifest), _calibration_error(manifest)
     if json is not None:
         content = {
             "path": str(opened.path),
             "fingerprint": opened.fingerprint,
             "benchmark": None if benchmark is None else {"name": benchmark.name, "version": benchmark.version},
-            "origin": opened.manifest.origin,
+            "origin": manifest.origin,
             "size": list(opened.size),
             "configs": list(opened.configs),
-            "bytes": sum(file.bytes for file in opened.manifest.files),
-            "settings": opened.manifest.settings,
-            "rig": opened.manifest.rig,
-            "calibration_error": None if (error := _calibration_error(opened.manifest)) is None else error._asdict(),
-            "splits": statistics,
-            "all": whole_statistics(opened.manifest),
+            "bytes": sum(file.bytes for file in manifest.files),
+            "settings": manifest.settings,
+            "rig": manifest.rig,
+            "calibration_error": None if error is None else error._asdict(),
+            "splits": statistics[:-1],
+            "all": statistics[-1],
             "samples": opened.splits,
         }
         write_json(content, json)
-    manifest, rig = opened.manifest, opened.rig
     groups: dict[str, int] = {}
     for shard in manifest.shards:
         groups[shard.group] = groups.get(shard.group, 0) + shard.bytes
@@ -85,14 +85,13 @@ def info(
     print(f"configurations  {', '.join(opened.configs)}")
     print(f"on disk         {', '.join(f'{name} {gigabytes(size)}' for name, size in groups.items())}")
     print(f"rig             baseline {MM_PER_M * rig.baseline_m:.1f} mm, range {near:g}-{far:g} mm")
-    if error := _calibration_error(manifest):
+    if error is not None:
         lengths = f"{error.rms_mm:.3f} mm RMS, {error.worst_mm:.3f} mm at most"
         print(f"calibration     decoded with this rig, photographed by another; depths differ by {lengths}")
     for line in _fringe_lines(rig):
         print(line)
     print(f"settings        {', '.join(f'{key} {value}' for key, value in built_with.items())}")
     title = "lengths in mm, means over samples; ground-truth error: decoded - exact depth"
-    statistics = [*statistics, whole_statistics(manifest)]
     table = Table("", numbers=[split["split"] for split in statistics], title=title, elsewhere="--json FILE")
     for row_title, cell in _ROWS:
         table.add_row(row_title, *map(cell, statistics))

@@ -1,17 +1,22 @@
-"""``fpp-bench decode``: captured frames to depth."""
+"""``fpp-bench decode``: captured frames to depth; and ``fpp-bench fuse``: an object's views in one point cloud."""
 
 import sys
 from pathlib import Path
 from time import perf_counter
 
-from fpp_ml_bench.baselines.classical import DIRECTIONS
+import numpy as np
+
+from fpp_ml_bench.baselines import views
 from fpp_ml_bench.cli.console import progress_bar, say_findings, show
-from fpp_ml_bench.cli.options import AT_LEAST_ONE, WORKING_RANGE, command, names, value
+from fpp_ml_bench.cli.options import AT_LEAST_ONE, SPLITS, WORKING_RANGE, command, names, value
+from fpp_ml_bench.coding.code import MIN_MODULATION
 from fpp_ml_bench.decoding.decode import Directions
 from fpp_ml_bench.examination.findings import RefusedCapture
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.captures.decoding import DecodedCapture, decode_capture, read_mask
 from fpp_ml_bench.loaders.captures.exports import FORMS, check_outputs, write_capture, write_refusal
 from fpp_ml_bench.loaders.captures.images import read_frames
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.rig_file import check_lengths, load_rig
 from fpp_ml_bench.options import REQUIRED, argument, option
@@ -33,15 +38,13 @@ def decode(
     file: Path = argument("rig file (.yaml, .json)", "RIG"),
     frames: str = argument("folder of images, or a pattern in quotes", "FRAMES"),
     out: Path = option(REQUIRED, "folder for the results", "DIR"),
-    direction: Directions = option(
-        "both", "which of the coded directions to use (default: all there are)", choices=DIRECTIONS
-    ),
+    direction: Directions = option("both", "which of the coded directions to use (default: all there are)"),
     working_range: tuple[float, float] | None = option(
         None, "working range in mm (default: the rig's)", "NEAR,FAR", parse=WORKING_RANGE
     ),
     mask: Path | None = option(None, "image or .npy: decode where it is not 0", "FILE"),
-    min_modulation: float | None = option(
-        None, "least modulation of a pixel in grey levels of 255 (default: 5)", "GREY"
+    min_modulation: float = option(
+        MIN_MODULATION, "least modulation of a pixel in grey levels of 255 (default: 5)", "GREY"
     ),
     noise: float | None = option(
         None,
@@ -72,7 +75,6 @@ def decode(
         capture = read_frames(frames, count=len(rig.sequence), bits=bits, colour=colour)
         advance(1)
         object_mask = None if mask is None else read_mask(mask, capture.frames.shape[1:])
-        least = {} if min_modulation is None else {"min_modulation": min_modulation}
         try:
             result = decode_capture(
                 capture,
@@ -80,9 +82,9 @@ def decode(
                 direction,
                 mask=object_mask,
                 noise_grey=noise,
+                min_modulation=min_modulation,
                 threads=threads,
                 anyway=anyway,
-                **least,
             )
         except RefusedCapture as refused:
             write_refusal(out, capture, rig, refused.examination)
@@ -99,8 +101,6 @@ def decode(
 
 
 def _print(result: "DecodedCapture") -> None:
-    import numpy as np
-
     counts, decoded = result.decoded.counts, result.decoded
     lit = decoded.reason.size - counts["low_modulation"] - counts["not_asked"]
     table = Table("", numbers=("pixels", "of the lit"))
@@ -117,3 +117,48 @@ def _print(result: "DecodedCapture") -> None:
     if result.examination.not_checked:
         print(f"not checked     {'; '.join(result.examination.not_checked)}")
     print(f"uncertainty     {np.median(sigmas):.3f} mm (standard, median over pixels; by {noise})")
+
+
+@command(
+    """\
+fpp-bench predict phase data/full --out predictions
+fpp-bench fuse predictions data/full --out fused
+fpp-bench fuse predictions data/full --object power_drill --out fused
+fpp-bench fuse depth_exact data/full --out fused-exact          the cloud of the exact depth
+"""
+)
+def fuse(
+    *,
+    predictions: str = argument(
+        "predictions of a split; or depth or depth_exact, the dataset's own (a folder: ./depth)", "PREDICTIONS"
+    ),
+    dataset: Path = argument("folder of a generated dataset", "DATASET"),
+    split: str = option("test", "split of PREDICTIONS (default: test)", choices=SPLITS),
+    only: str | None = option(None, "only this object (default: all of the split)", "NAME", flag="--object"),
+    cell_mm: float = option(views.CELL_MM, "edge of the cells in which points are averaged (default: 2)", "MM"),
+    out: Path = option(REQUIRED, "folder for {object}.ply (metres, object coordinates) and fusion.json", "DIR"),
+) -> None:
+    """Put the views of each object into one point cloud by their known placement, and compare them with each other.
+
+    Prints what was counted. Raises FppBenchError for unusable predictions or data."""
+    opened = DatasetFolder(dataset)
+    name, count, objects = views.fuse_split(predictions, opened, split, out, only, cell_mm)
+    table = Table(
+        "object", numbers=("points in the cloud", "pixels with a depth", "contradicted"), title=printable(name)
+    )
+    total = np.zeros(3, int)
+    with progress_bar("fusing", count, "objects") as advance:
+        for obj, counts in objects:
+            numbers = np.array([counts[key] for key in ("cloud_points", "answered_px", "contradicted_px")], int)
+            total += numbers
+            points, answered, wrong = numbers
+            table.add_row(obj, f"{points:,}", f"{answered:,}", f"{wrong:,} ({_percent(wrong, answered)})")
+            advance(1)
+    show(table)
+    _, answered, wrong = total
+    print(f"other views contradict {wrong:,} of {answered:,} pixels with a depth ({_percent(wrong, answered)})")
+    print(f"{out}: {{object}}.ply, {views.FUSION_FILE}")
+
+
+def _percent(part: int, whole: int) -> str:
+    return f"{100 * part / whole:.1f}%" if whole else "-"

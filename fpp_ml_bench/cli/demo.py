@@ -18,7 +18,7 @@ from fpp_ml_bench.constants import MINI_OBJECTS, TEST_OBJECTS
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import RANK_KEY
 from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE
-from fpp_ml_bench.leaderboard.names import assumption
+from fpp_ml_bench.leaderboard.columns import assumption
 from fpp_ml_bench.leaderboard.rows import Entry, read_entry
 from fpp_ml_bench.options import option
 from fpp_ml_bench.tables import Table
@@ -27,6 +27,7 @@ OBJECTS = tuple(name for name in MINI_OBJECTS if name in TEST_OBJECTS)
 SAMPLE = "power_drill_A60"
 METHODS = {"classical": "mini", "phase": "mini", "crossed": "mini-crossed"}
 """Each method of the demo, and the dataset that it is run on."""
+_FORMS = ".2f", ".2f", ".0f", ".2f"
 NOTES = """\
 Object MAE: mean error on the object's pixels, against the exact depth. Overall MAE: the same over all pixels.
 Time: median of one depth map on one thread of this machine. Frames: images that are captured for a depth map.
@@ -35,40 +36,30 @@ Two objects are too few for a ranking."""
 
 
 class Step(NamedTuple):
-    """A public command as ``words``; ``kept`` says whether what it writes is there from an earlier run."""
+    """A public command as a line of a shell; ``kept`` says whether what it writes is there from an earlier run."""
 
-    words: list[str]
+    line: str
     kept: Callable[[], bool] = lambda: False
 
 
 def steps_in(out: Path) -> Iterator[Step]:
     """The commands of the demo, in their order, with everything they write below ``out``."""
+    below = shlex.quote(str(out))
     for name in dict.fromkeys(METHODS.values()):
-        rig = ["--rig", "crossed"] if name == "mini-crossed" else []
-        build = [
-            "fpp-bench",
-            "build",
-            "--out",
-            str(out / name),
-            "--preset",
-            "mini",
-            "--objects",
-            ",".join(OBJECTS),
-            *rig,
-        ]
-        yield Step(build)  # of a finished dataset it only says so
+        rig = " --rig crossed" if name == "mini-crossed" else ""
+        # Of a finished dataset it only says so.
+        yield Step(f"fpp-bench build --out {below}/{name} --preset mini --objects {','.join(OBJECTS)}{rig}")
     for method, name in METHODS.items():
-        data, predictions, result = str(out / name), out / method, out / f"{method}.json"
-        predict = ["fpp-bench", "predict", method, data, "--out", str(predictions)]
-        yield Step(predict, (predictions / SUBMISSION_FILE).is_file)
-        yield Step(["fpp-eval", str(predictions), "--target", "depth_exact", "--json", str(result)], result.is_file)
-        reliance = ["fpp-bench", "reliance", method, data, "--views", "1", "--into", str(result)]
-        yield Step(reliance, partial(_has_reliance, result))
-    results = [str(out / f"{method}.json") for method in METHODS]
-    pictured = [word for method in METHODS for word in ("--predictions", str(out / method))]
-    yield Step(["fpp-bench", "leaderboard", *results, "--page", str(out / "page"), *pictured])
-    show_it = ["fpp-bench", "show", str(out / "mini-crossed"), SAMPLE, "--predictions", str(out / "crossed")]
-    yield Step([*show_it, "--cloud", "--out", str(out / f"{SAMPLE}.png")])
+        data, predictions, result = f"{below}/{name}", f"{below}/{method}", f"{below}/{method}.json"
+        written = out / f"{method}.json"
+        yield Step(f"fpp-bench predict {method} {data} --out {predictions}", (out / method / SUBMISSION_FILE).is_file)
+        yield Step(f"fpp-eval {predictions} --target depth_exact --json {result}", written.is_file)
+        yield Step(f"fpp-bench reliance {method} {data} --views 1 --into {result}", partial(_has_reliance, written))
+    results = " ".join(f"{below}/{method}.json" for method in METHODS)
+    pictured = " ".join(f"--predictions {below}/{method}" for method in METHODS)
+    yield Step(f"fpp-bench leaderboard {results} --page {below}/page {pictured}")
+    picture = f"--predictions {below}/crossed --cloud --out {below}/{SAMPLE}.png"
+    yield Step(f"fpp-bench show {below}/mini-crossed {SAMPLE} {picture}")
 
 
 def _has_reliance(result: Path) -> bool:
@@ -95,13 +86,13 @@ def demo(*, out: Path = option(Path("demo"), "folder for all that it writes (def
 
     It takes about a minute on two cores. It runs public commands and prints them; a run that was stopped continues."""
     started, steps = perf_counter(), list(steps_in(out))
-    for number, (words, kept) in enumerate(steps, 1):
-        line = shlex.join(words)
+    for number, (line, kept) in enumerate(steps, 1):
         print(f"[{number}/{len(steps)}] {'kept: ' if kept() else ''}{line}", file=sys.stderr, flush=True)
         if kept():
             continue
+        program, *words = shlex.split(line)
         with redirect_stdout(StringIO()):
-            status = run_program({"fpp-bench": BENCH, "fpp-eval": EVAL}[words[0]], words[1:])
+            status = run_program({"fpp-bench": BENCH, "fpp-eval": EVAL}[program], words)
         if status != OK:
             print(f"fpp-bench demo: stopped at step {number}; the same command continues there", file=sys.stderr)
             return status
@@ -112,7 +103,7 @@ def demo(*, out: Path = option(Path("demo"), "folder for all that it writes (def
     print(NOTES, f"Assumed of the scene. {'; '.join(assumed)}.", "", "Written, to look at:", sep="\n")
     for what, path in written.items():
         print(f"  {what:8}{path}")
-    print("\nThe same by hand:", *(f"  {shlex.join(words)}" for words, _ in steps), sep="\n")
+    print("\nThe same by hand:", *(f"  {line}" for line, _ in steps), sep="\n")
     print(f"\n{perf_counter() - started:.0f} s. Next: a method of yours, your predictions, your rig (README.md).")
     return OK
 
@@ -124,8 +115,8 @@ def _table(entries: list[Entry]) -> Table:
     table = Table("Method", numbers=numbers, title=title)
     for entry in entries:
         row = entry.row
-        values = (entry.value(RANK_KEY), 2), (row.metrics.overall_mae_mm, 2), (entry.latency_ms, 0)
         reliance = None if row.reliance is None else row.reliance.score
-        cells = ("-" if value is None else f"{value:.{digits}f}" for value, digits in (*values, (reliance, 2)))
+        values = entry.value(RANK_KEY), row.metrics.overall_mae_mm, entry.latency_ms, reliance
+        cells = ("-" if value is None else format(value, form) for value, form in zip(values, _FORMS, strict=True))
         table.add_row(row.submission.method, str(entry.frames), *cells)
     return table

@@ -1,25 +1,34 @@
 """What a model reads: ``fpp-bench diagnose`` probes it, ``fpp-bench reliance`` measures how far it follows the fringe's
 phase."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
-from rich import progress as bar
 from rich.console import Console
+from rich.progress import Progress
 from rich.text import Text
 
 from fpp_ml_bench.baselines import registry
 from fpp_ml_bench.baselines.diagnostics.counterfactual import measure as measure_reliance
-from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import SceneSet
-from fpp_ml_bench.baselines.diagnostics.probe import PROBES, Probe, ProbeSettings, Progress
+from fpp_ml_bench.baselines.diagnostics.probe import (
+    JSON_FILE,
+    PROBES,
+    REPORT_FILE,
+    Probe,
+    ProbeSettings,
+    checked_names,
+)
+from fpp_ml_bench.baselines.diagnostics.probe import diagnose as run_diagnosis
+from fpp_ml_bench.baselines.diagnostics.scenes import chosen_samples
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.cli.console import progress_bar, show
-from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings, OfMethods
+from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
 from fpp_ml_bench.cli.options import COUNT, command, command_line, names, value
 from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.evaluation.result.parts import PART_TITLES, Reliance
-from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_reliance
+from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_block
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.options import REQUIRED, argument, option
@@ -29,8 +38,8 @@ from fpp_ml_bench.tables import Table
 class DiagnoseCommand(MethodCommand):
     """A command whose options are also those of the methods without a network that is probed layer by layer."""
 
-    def methods(self, words: Sequence[str]) -> list[type[Method]]:
-        return list(registry.methods().values())
+    def methods(self, words: Sequence[str]) -> dict[str, type[Method]]:
+        return registry.methods()
 
 
 @command(
@@ -70,32 +79,21 @@ def diagnose(
         None, "layers to probe, comma separated (default: the model's own)", "A,B", parse=names
     ),
     threads: int | None = option(None, "threads (default: every core)", "N", parse=COUNT),
-    options: OfMethods,
+    options: dict[str, Any],
 ) -> None:
     """Diagnose a network or method with the paper's probes and further ones; writes an HTML report and a JSON file.
 
     Raises FppBenchError for what can't be diagnosed."""
-    from fpp_ml_bench.baselines.diagnostics.diagnosis import JSON_FILE, REPORT_FILE, checked_names
-    from fpp_ml_bench.baselines.diagnostics.diagnosis import diagnose as run_diagnosis
     from fpp_ml_bench.baselines.diagnostics.subjects import subject as subject_of
 
     probe_names = checked_names(probe)
     opened = DatasetFolder(dataset)
-    method = registry.methods().get(model, registry.network_method())
-    of_method = options.of(method, model)
-    subject = subject_of(model, opened, layers, units, frame, threads or usable_cores(), of_method)
+    subject = subject_of(model, opened, layers, units, frame, threads or usable_cores(), options)
     probing = ProbeSettings(samples, seeds, quick)
-    again = command_line(threads=None)
-    columns = (
-        bar.TextColumn("{task.description}"),
-        bar.BarColumn(),
-        bar.TaskProgressColumn(),
-        bar.TimeElapsedColumn(),
-        bar.TimeRemainingColumn(),
-    )
-    with bar.Progress(*columns, console=Console(stderr=True)) as bars:
+    again = re.sub(r" --threads[ =]\S+", "", command_line())
+    with Progress(console=Console(stderr=True)) as bars:
 
-        def progress(probe: "Probe") -> "Progress":
+        def progress(probe: Probe) -> Callable[[int, int, str], None]:
             task = bars.add_task(probe.title, total=None)
             return lambda done, total, activity: bars.update(
                 task, completed=done, total=total, description=f"{probe.title}: {activity}"
@@ -141,17 +139,15 @@ def reliance(
     entry = None if into is None else read_entry(into)
     if entry is not None:
         check_same_method(entry, method)
-    scene_set = SceneSet(opened, views)
-    found = method.settings.get("weights_sha256")
-    sha256 = found if isinstance(found, str) else None
-    with progress_bar(f"reliance of {chosen.name}", len(scene_set.samples), "samples") as advance:
+    samples = chosen_samples(opened, "test", views)
+    with progress_bar(f"reliance of {chosen.name}", len(samples), "samples") as advance:
         # Called before each sample, so the first call is for none.
-        measured, _ = measure_reliance(method, scene_set, sha256, lambda done, total, sample: advance(min(done, 1)))
+        measured, _ = measure_reliance(method, opened, samples, lambda done, total, sample: advance(min(done, 1)))
         advance(1)
     if json is not None:
         write_json(measured.model_dump(mode="json"), json)
     if entry is not None:
-        write_reliance(entry, measured)
+        write_block(entry, measured)
     moved = [value for key, value in measured.parts if not key.startswith("answered")]
     if any(moved):
         show(_reliance_table(method.title, measured))
@@ -162,7 +158,7 @@ def reliance(
         )
 
 
-def _reliance_table(title: str, reliance: "Reliance") -> Table:
+def _reliance_table(title: str, reliance: Reliance) -> Table:
     heading = Text(f"{title}: {reliance.samples} samples of {reliance.objects} objects")
     table = Table("", numbers=("value",), title=heading)
     low, high = reliance.interval

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from fpp_ml_bench.cli import CHECK_FAILED, OK
 from fpp_ml_bench.cli.options import SPLITS, Explain, command, value
-from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
+from fpp_ml_bench.errors import DatasetError, SubmissionError
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, MODES, TARGETS
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.machine import prepare_process
@@ -72,7 +72,6 @@ def score_folder(
     from fpp_ml_bench.loaders.storage.benchmark import benchmark_sentence
 
     prepare_process()
-    account.check()
     _check_outputs(json, page, predictions)
     opened, split = scored_data(predictions, dataset, split)
     scored = evaluate_folder(
@@ -113,12 +112,11 @@ def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[D
     """The dataset in ``place`` and the ``split`` to score; where they are not given, those that ``folder`` was
     predicted from, by its submission.yaml. Raises `SubmissionError` where that does not say, and `DatasetError` where
     the dataset is gone or another one now."""
-    from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE, read_plain
+    from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE, predictions_folder, read_plain
     from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
     shown, predicted_from, content = printable(str(folder), 500), Path(), {}
-    if not folder.is_dir():
-        raise PredictionError(f"expected a folder of predictions, found none at {shown}")
+    predictions_folder(folder)
     give = f"give the dataset: fpp-eval {shown} DATASET"
     try:  # by hand: pydantic, which takes long to import, checks the file while the first samples are scored
         predicted = read_plain(folder).get("predicted") or {}
@@ -209,9 +207,9 @@ def check(
             print(f"  {line}")
         return CHECK_FAILED
     height, width = checked.size
-    sigma = ", with an uncertainty" if checked.sigmas else ""
+    listing, sigma = checked.listing, ", with an uncertainty" if checked.listing.sigmas else ""
     against = "" if dataset is None else f" of split {split}"
-    print(f"{folder}: {len(checked.samples)} samples{against}, {checked.form}, {width}x{height} px{sigma}; sound")
+    print(f"{folder}: {len(listing.present)} samples{against}, {listing.form}, {width}x{height} px{sigma}; sound")
     if checked.description is not None:
         frames, track = len(checked.description.frames_used), checked.description.track
         print(f"submission.yaml: {track} track, {frames} {'frame' if frames == 1 else 'frames'}; sound")

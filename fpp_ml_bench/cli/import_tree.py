@@ -9,7 +9,7 @@ from typing import Any
 
 from fpp_ml_bench.calibration.from_depth import fit_projector
 from fpp_ml_bench.cli.calibrate import print_fit
-from fpp_ml_bench.cli.console import gigabytes, progress_bar, show
+from fpp_ml_bench.cli.console import contents, gigabytes, progress_bar, show
 from fpp_ml_bench.cli.options import AT_LEAST_ONE, command, given
 from fpp_ml_bench.coding.code import Limits, Reason
 from fpp_ml_bench.constants import REPOSITORY_NAME
@@ -19,6 +19,7 @@ from fpp_ml_bench.loaders.captures.decoding import capture_notes, plan_captures
 from fpp_ml_bench.loaders.captures.images import read_splits
 from fpp_ml_bench.loaders.published.importing import (
     AGREEING_MM,
+    RowReader,
     Source,
     depth_difference_mm,
     import_notes,
@@ -27,6 +28,7 @@ from fpp_ml_bench.loaders.published.importing import (
     tree_views,
 )
 from fpp_ml_bench.loaders.published.tree import INFO
+from fpp_ml_bench.loaders.storage.assembly import Assembly
 from fpp_ml_bench.loaders.storage.manifest import Manifest
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.rig_file import load_rig
@@ -144,12 +146,17 @@ def _import_captures(settings: ImportSettings) -> None:
     plan = plan_captures(
         settings.tree, load_rig(settings.rig), splits, limits, settings.bits, settings.colour, settings.anyway
     )
-    count, images = len(plan.reader.samples), len(plan.reader.rig.sequence)
-    started = perf_counter()
-    with progress_bar("importing", count, "samples") as advance:
-        manifest = import_rows(settings.out, plan, settings.workers or usable_cores(), advance)
+    manifest, seconds = _written(settings, plan)
     _print_captures(manifest)
-    _print_end(settings.out, manifest, images, perf_counter() - started, capture_notes(manifest))
+    _print_end(settings.out, manifest, seconds, capture_notes(manifest))
+
+
+def _written(settings: ImportSettings, plan: Assembly[RowReader]) -> tuple[Manifest, float]:
+    """Write the planned dataset; its manifest, and the seconds that it took."""
+    started = perf_counter()
+    with progress_bar("importing", len(plan.rows.samples), "samples") as advance:
+        manifest = import_rows(settings.out, plan, settings.workers or usable_cores(), advance)
+    return manifest, perf_counter() - started
 
 
 def _print_captures(manifest: "Manifest") -> None:
@@ -167,10 +174,8 @@ def _print_captures(manifest: "Manifest") -> None:
     show(table)
 
 
-def _print_end(out: Path, manifest: "Manifest", images: int, seconds: float, notes: list[str]) -> None:
-    size, count = sum(file.bytes for file in manifest.files), sum(map(len, manifest.samples.values()))
-    parts = ", ".join(f"{split} {len(rows)}" for split, rows in manifest.samples.items())
-    print(f"{out}: {parts} samples, {count * images:,} images, {gigabytes(size)} in {seconds:.1f} s")
+def _print_end(out: Path, manifest: "Manifest", seconds: float, notes: list[str]) -> None:
+    print(f"{out}: {contents(manifest)} in {seconds:.1f} s")
     for note in notes:
         print(f"  {note}")
     print(f"next: fpp-bench info {out}")
@@ -178,8 +183,7 @@ def _print_end(out: Path, manifest: "Manifest", images: int, seconds: float, not
 
 def _fetch(settings: ImportSettings) -> tuple[Path, Source]:
     """Download what the import needs of a dataset of the Hub: the folder of its tree, and where it is from."""
-    from fpp_ml_bench.loaders.hub import Hub  # imports huggingface_hub, for which no other import waits
-    from fpp_ml_bench.loaders.published.fetching import fetch_tree, plan_download
+    from fpp_ml_bench.loaders.hub import Hub, fetch_tree, plan_download  # imports huggingface_hub, which others don't
 
     hub = Hub(sending=False)
     raw_scans = settings.raw_scans or settings.fit_rig or settings.frame_order != "auto"
@@ -207,19 +211,15 @@ def _import_tree(settings: ImportSettings, from_hub: bool) -> None:
     tree, source = _fetch(settings) if from_hub else (settings.tree, None)
     plan = plan_import(tree, rig, settings.frame_order, source)
     if settings.fit_rig:
-        with progress_bar("reading", len(plan.reader.samples), "views") as advance:
-            views = tree_views(plan.reader, settings.workers or usable_cores(), advance)
-        rig, fit = fit_projector(views, plan.reader.rig)
+        with progress_bar("reading", len(plan.rows.samples), "views") as advance:
+            views = tree_views(plan.rows, settings.workers or usable_cores(), advance)
+        rig, fit = fit_projector(views, plan.rows.rig)
         print_fit(rig, fit)
         plan = plan_import(tree, rig, settings.frame_order, source)
-    sample_count = len(plan.reader.samples)
-    images = len(plan.assembly.manifest.stored_frames)
-    started = perf_counter()
-    with progress_bar("importing", sample_count, "samples") as advance:
-        manifest = import_rows(settings.out, plan, settings.workers or usable_cores(), advance)
-    _print_end(settings.out, manifest, images, perf_counter() - started, import_notes(manifest))
+    manifest, seconds = _written(settings, plan)
+    _print_end(settings.out, manifest, seconds, import_notes(manifest))
     if rig is None:
-        _warn_of_other_rig(tree, depth_difference_mm(plan.reader))
+        _warn_of_other_rig(tree, depth_difference_mm(plan.rows))
 
 
 def _warn_of_other_rig(tree: Path, difference_mm: float | None) -> None:

@@ -9,14 +9,12 @@ from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import METRICS, RANK_KEY, sort_keys
 from fpp_ml_bench.evaluation.result.file import write_file
-from fpp_ml_bench.leaderboard.data_files import table_csv, table_json
-from fpp_ml_bench.leaderboard.page.page import write_page
-from fpp_ml_bench.leaderboard.page.samples import predicted_samples
+from fpp_ml_bench.leaderboard.page.page import predicted_samples, write_page
 from fpp_ml_bench.leaderboard.ranking import discover, expand, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.ranking import rank as rank_files
 from fpp_ml_bench.leaderboard.row_file import write_row
 from fpp_ml_bench.leaderboard.rows import read_entry, vouching_line
-from fpp_ml_bench.leaderboard.tables import chosen_tables, group_tables, paper_rich_tables
+from fpp_ml_bench.leaderboard.tables import chosen_tables, group_tables, paper_rich_tables, table_csv, table_json
 from fpp_ml_bench.leaderboard.tables import markdown as board_markdown
 from fpp_ml_bench.options import argument, option
 

@@ -4,7 +4,7 @@ an instance."""
 import json
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stdout, suppress
 from dataclasses import MISSING, Field, dataclass
 from functools import partial
@@ -13,12 +13,11 @@ from io import StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from textwrap import indent
-from typing import TYPE_CHECKING, Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args, get_origin
 
 import click
-from click.core import ParameterSource
 
-from fpp_ml_bench.errors import FppBenchError, PoolError
+from fpp_ml_bench.errors import PoolError
 from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.options import described, did_you_mean, flag_of, option, options_of
@@ -32,17 +31,18 @@ STANDARD_OUTPUT = "-"
 OPTIONS = "options"
 """Heading of the options of a settings class that has no ``HEADING`` of its own."""
 
-T = TypeVar("T")
+Row = tuple[str, str]
+"""A line of the help: a term, and what it means."""
 
 
 # ---- how the text of an option becomes its value
 
 
-def value(expected: str, parse: Callable[[str], T], sound: Callable[[T], bool] = lambda result: True) -> Any:
+def value(expected: str, parse: Callable[[str], Any], sound: Callable[[Any], bool] = lambda result: True) -> Any:
     """``parse`` of an option: text that ``parse`` makes a ``sound`` value of, without ValueError; else it says what was
     ``expected``."""
 
-    def parsed(text: str) -> T:
+    def parsed(text: str) -> Any:
         with suppress(ValueError):
             if sound(result := parse(text)):
                 return result
@@ -62,6 +62,16 @@ def number_pair(text: str) -> tuple[float, float]:
     return first, second
 
 
+def new_file(text: str) -> Path:
+    """A file that may be written: no folder, and in one that is there."""
+    path = Path(text)
+    if path.is_dir():
+        raise ValueError("expected a file to write, found a folder")
+    if not path.absolute().parent.is_dir():
+        raise ValueError(f"the folder {path.parent} does not exist; make it first")
+    return path
+
+
 def whole(least: int, most: int, unit: str = "") -> Any:
     """A whole number from ``least`` to ``most``."""
     expected = f"{least} to {most}" if unit else f"a whole number from {least} to {most}"
@@ -77,14 +87,19 @@ WORKING_RANGE = value("NEAR,FAR in mm such as 350,450", number_pair, lambda ends
 
 def parser_of(entry: "Field[Any]") -> Callable[[str], Any]:
     """What makes the value of a field of its text: its own ``parse``, else by its choices or its type."""
-    about = described(entry)
+    about, kinds = described(entry), _kinds(entry)
     if about.parse is not None:
         return about.parse
-    if about.choices:
-        return partial(_choice, about.choices)
-    kinds = _kinds(entry)
-    plain = {"float": value("a number", float), "int": value("a whole number", int), "Path": Path}
-    return str if "str" in kinds else next((plain[kind] for kind in plain if kind in kinds), str)
+    if choices := choices_of(entry):
+        return partial(_choice, choices)
+    plain = {"str": str, "float": value("a number", float), "int": value("a whole number", int), "Path": Path}
+    return next((plain[kind] for kind in plain if kind in kinds), str)
+
+
+def choices_of(entry: "Field[Any]") -> tuple[str, ...]:
+    """The values that a field may have: those that it says, or those of a ``Literal`` in its annotation."""
+    literal = next((kind for kind in (entry.type, *get_args(entry.type)) if get_origin(kind) is Literal), None)
+    return described(entry).choices or get_args(literal)
 
 
 def _choice(choices: tuple[str, ...], text: str) -> str:
@@ -101,30 +116,24 @@ def _kinds(entry: "Field[Any]") -> set[str]:
     return {getattr(kind, "__name__", "") for kind in get_args(annotation) or (annotation,)}
 
 
-def parse_value(flag: str, text: str, parse: Callable[[str], T]) -> T:
-    """The value of an option; ValueError with its flag and text."""
-    try:
-        return parse(text)
-    except ValueError as error:
-        raise ValueError(f"{flag} {printable(text)}: {error}") from None
-
-
 class _Value(click.ParamType[Any]):
+    """The value that ``parse`` makes of the text of an option or argument. Defaults are values already."""
+
     name = "value"
 
     def __init__(self, parse: Callable[[str], Any]) -> None:
         self.parse = parse
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        if param is None or ctx is None:
+        if not isinstance(value, str) or param is None or ctx is None:
             return value
         called = param.opts[0] if isinstance(param, click.Option) else param.make_metavar(ctx)
         if value in flags_of(ctx):
             raise click.UsageError(f"{called}: expected a value behind it, got the option {value}", ctx)
         try:
-            return parse_value(called, value, self.parse)
+            return self.parse(value)
         except ValueError as error:
-            raise click.UsageError(str(error), ctx) from None
+            raise click.UsageError(f"{called} {printable(value)}: {error}", ctx) from None
 
 
 # ---- settings that several commands have
@@ -157,15 +166,9 @@ class Explain:
 
     HEADING = "skipped work"
     explain: bool = option(False, "print which work was left out and what that saved (takes a moment)")
-    explain_json: Path | None = option(None, "write the same as JSON into FILE; implies --explain", "FILE")
-
-    def check(self) -> None:
-        """Raises `FppBenchError`, before any work, for a JSON file that can't be written."""
-        path = self.explain_json
-        if path is not None and (path.is_dir() or not path.absolute().parent.is_dir()):
-            raise FppBenchError(
-                f"--explain-json {path}: expected a file in an existing folder; create the folder first"
-            )
+    explain_json: Path | None = option(
+        None, "write the same as JSON into FILE; implies --explain", "FILE", parse=new_file
+    )
 
     def say(self, account: Callable[[], "Explanation"]) -> None:
         """Print the account as a table with the rules for the seconds below, and write it as JSON, if asked for."""
@@ -185,52 +188,28 @@ def given(settings: Any, part: type) -> list[str]:
     return [flag_of(entry) for entry in options_of(part) if getattr(settings, entry.name) != entry.default]
 
 
-def command_line(**changed: Any) -> str:
-    """The command that runs, with all it was given, but for the parameters ``changed``; None leaves one out."""
+def command_line() -> str:
+    """The command that runs, as it was typed."""
     ctx = click.get_current_context()
-    values = {name: value for name, value in ctx.params.items() if given_in(ctx, name)} | changed
-    words = ctx.command_path.split()
-    for param in ctx.command.get_params(ctx):
-        value = values.get(str(param.name))
-        many = getattr(param, "multiple", False) or param.nargs != 1
-        for one in () if value is None else value if many else (value,):
-            flag = [] if isinstance(param, click.Argument) else param.opts[:1]
-            words += flag if isinstance(one, bool) else [*flag, _text_of(one)]
-    return shlex.join(words)
-
-
-def _text_of(value: Any) -> str:
-    if isinstance(value, tuple):
-        return ",".join(map(_text_of, value))
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    return shlex.join([*ctx.command_path.split(), *ctx.obj])
 
 
 # ---- commands
 
 
-class Option(click.Option):
-    """An option, and the ``heading`` above it in the help."""
-
-    heading = OPTIONS
-
-
-def parameter_of(
-    entry: "Field[Any]", name: str = "", heading: str = OPTIONS, parse: Callable[[str], Any] | None = None
-) -> Any:
-    """The `Option` or click.Argument that a field is, of the field's name if it has no other, and with the field's way
-    to ``parse`` its text if there is no other. Its default stays with the field."""
-    about, required = described(entry), entry.default is MISSING
-    kind = _Value(parse or parser_of(entry))
+def parameter_of(entry: "Field[Any]", heading: str = OPTIONS) -> Any:
+    """The click.Option or click.Argument that a field is, listed in the help below ``heading``."""
+    about, required, words = described(entry), entry.default is MISSING, [flag_of(entry), entry.name]
+    told: dict[str, Any] = {"help": about.help} if required else {"help": about.help, "default": entry.default}
+    shown = about.metavar or "|".join(choices_of(entry))
+    valued = {"type": _Value(parser_of(entry)), "required": required, "metavar": shown, **told}
     if about.positional:
-        count = -1 if about.many else 1
-        return click.Argument([entry.name], required, about.help, type=kind, nargs=count, metavar=about.metavar)
-    words = [flag_of(entry), name or entry.name]
-    if _kinds(entry) == {"bool"}:
-        made = Option(words, is_flag=True, flag_value=not entry.default, help=about.help)
+        made: Any = click.Argument([entry.name], nargs=-1 if about.many else 1, **valued)
+    elif _kinds(entry) == {"bool"}:
+        made = click.Option(words, is_flag=True, flag_value=not entry.default, **told)
     else:
-        shown = about.metavar or "|".join(about.choices)
-        made = Option(words, type=kind, multiple=about.many, required=required, metavar=shown, help=about.help)
-    made.heading = heading
+        made = click.Option(words, multiple=about.many, **valued)
+    made.heading = "arguments" if about.positional else heading
     return made
 
 
@@ -241,27 +220,31 @@ class Command(click.Command):
 
     def __init__(self, function: Callable[..., int | None], examples: str) -> None:
         self.function, self.examples = function, examples
-        self.defaults: dict[str, Any] = {}
-        self.groups: dict[str, Any] = {}
+        self.kinds: dict[str, Any] = {}
         params = []
         for name, parameter in signature(function).parameters.items():
+            group = self.kinds[name] = parameter.annotation
             if isinstance(entry := parameter.default, Field):
-                entry.name, entry.type = name, parameter.annotation
-                self.defaults[name] = entry.default
+                entry.name, entry.type = name, group
                 params.append(parameter_of(entry))
             else:
-                group = self.groups[name] = parameter.annotation
-                params += [parameter_of(entry, heading=heading_of(group, entry.name)) for entry in options_of(group)]
-        look = {"terminal_width": HELP_WIDTH, "help_option_names": ["-h", "--help"]}
+                params += [parameter_of(entry, heading_of(group, entry.name)) for entry in options_of(group)]
+        look = {"help_option_names": ["-h", "--help"]}
         super().__init__(function.__name__, look, params=params, help=getdoc(function))
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        ctx.obj = [*args]
+        return super().parse_args(ctx, args)
 
     def values(self, ctx: click.Context) -> dict[str, Any]:
         """The function's arguments by what the command line gives."""
-        given = {name: value for name, value in ctx.params.items() if given_in(ctx, name)}
-        values = {name: given.get(name, default) for name, default in self.defaults.items()}
-        for name, group in self.groups.items():
-            values[name] = group(**{key: given[key] for key in group.__dataclass_fields__ if key in given})
-        return values
+        given = ctx.params
+        return {
+            name: given[name]
+            if name in given
+            else kind(**{key: given[key] for key in kind.__dataclass_fields__ if key in given})
+            for name, kind in self.kinds.items()
+        }
 
     def invoke(self, ctx: click.Context) -> int:
         values = self.values(ctx)
@@ -284,20 +267,16 @@ class Command(click.Command):
                 pieces.append(shown if param.required else f"[{shown}]")
         return " ".join(pieces)
 
-    def format_help(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
-        formatter.write_usage(ctx.command_path, self.usage(ctx), "usage: ")
-        formatter.write_paragraph()
-        formatter.write_text((self.help or "").split("\n\n")[0])
-        write_sections(self.sections(ctx), formatter)
-        formatter.write(f"\nexamples:\n{indent(self.examples, '  ')}")
+    def get_help(self, ctx: click.Context) -> str:
+        purpose = (self.help or "").split("\n\n")[0]
+        return help_text([(ctx.command_path, self.usage(ctx))], purpose, self.sections(ctx), self.examples.rstrip("\n"))
 
-    def sections(self, ctx: click.Context) -> dict[str, list[tuple[str, str]]]:
+    def sections(self, ctx: click.Context) -> dict[str, list[Row]]:
         """What the help lists: terms and what they mean, by heading."""
-        found: dict[str, list[tuple[str, str]]] = {"arguments": [], OPTIONS: []}
+        found: dict[str, list[Row]] = {"arguments": [], OPTIONS: []}
         for param in self.get_params(ctx):
             if not getattr(param, "hidden", False):
-                heading = "arguments" if isinstance(param, click.Argument) else getattr(param, "heading", OPTIONS)
-                found.setdefault(heading, []).append(row_of(param, ctx))
+                found.setdefault(getattr(param, "heading", OPTIONS), []).append(row_of(param, ctx))
         return found
 
 
@@ -307,25 +286,25 @@ def heading_of(group: type, name: str) -> str:
     return str(vars(owner).get("HEADING", OPTIONS))
 
 
-def given_in(ctx: click.Context, name: str | None) -> bool:
-    """Whether the command line gives a parameter."""
-    return ctx.get_parameter_source(str(name)) is ParameterSource.COMMANDLINE
-
-
-def row_of(param: click.Parameter, ctx: click.Context) -> tuple[str, str]:
+def row_of(param: click.Parameter, ctx: click.Context) -> Row:
     """What a parameter is called in help and messages, with the metavar of its value, and what it is."""
-    flags = ", ".join(param.opts) if isinstance(param, click.Option) else ""
-    shown = flags if getattr(param, "is_flag", False) else f"{flags} {param.make_metavar(ctx)}".strip()
-    return shown, getattr(param, "help", None) or ""
+    shown = param.get_help_spec(ctx) if isinstance(param, click.Option) else param.make_metavar(ctx)
+    return shown, param.help or ""
 
 
-def write_sections(sections: dict[str, list[tuple[str, str]]], formatter: click.HelpFormatter) -> None:
-    """Headings with lists of terms and what they mean."""
+def help_text(usages: Sequence[Row], purpose: str, sections: Mapping[str, Sequence[Row]], examples: str) -> str:
+    """The help of a program or command: how it is run (its name, and the words behind it), its purpose, terms and what
+    they mean by heading, and examples."""
+    formatter = click.HelpFormatter(width=HELP_WIDTH)
+    for name, words in usages:
+        formatter.write_usage(name, words, "usage: ")
+    formatter.write_paragraph()
+    formatter.write_text(purpose)
     for heading, rows in sections.items():
-        if not rows:
-            continue
-        with formatter.section(heading):
-            formatter.write_dl(rows, LEFT_COLUMN)
+        if rows:
+            with formatter.section(heading):
+                formatter.write_dl(rows, LEFT_COLUMN)
+    return f"{formatter.getvalue()}\nexamples:\n{indent(examples, '  ')}"
 
 
 def command(examples: str, kind: type[Command] = Command) -> Callable[[Callable[..., int | None]], Command]:

@@ -5,11 +5,10 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from fpp_ml_bench.cli.console import show
-from fpp_ml_bench.cli.options import POSITIVE, WORKING_RANGE, command, given, number_pair, value
+from fpp_ml_bench.cli.options import command, given, value
 from fpp_ml_bench.coding.crossed import Crossed
-from fpp_ml_bench.design.assumptions import Assumptions
 from fpp_ml_bench.design.rivals import EpipolarLines
-from fpp_ml_bench.design.search import ANGLES_DEG, Candidate, Design, describe, draw_design, search
+from fpp_ml_bench.design.search import ANGLES_DEG, Assumptions, Candidate, Design, describe, draw_design, search
 from fpp_ml_bench.errors import CaptureError, RigError
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.optics.named_rigs import FIRST_SHIFTED_DEG, NAMED_RIGS
@@ -23,7 +22,6 @@ ROWS = 8
 """Pairs of the front that are shown, evenly spread, beside the proposed one."""
 MOST_WRONG = 0.05
 """Share of wrong orders beyond which a pair of the front is not shown."""
-_DEFAULT = Assumptions()
 
 
 def _numbers(text: str) -> tuple[float, ...]:
@@ -47,11 +45,10 @@ def _family(text: str) -> "Crossed":
 PERIODS = value(
     "numbers such as 12,14,18 or 12-18", _numbers, lambda found: found != () and all(0 <= one < 1e5 for one in found)
 )
-INTERVAL = value("LEAST,MOST such as 10,40", number_pair, lambda ends: 0 < ends[0] < ends[1] < 1e5)
 
 
 @dataclass(frozen=True, kw_only=True)
-class DesignSettings:
+class DesignSettings(Assumptions):
     """What crossed fringes are searched, and by what they are judged."""
 
     HEADING = "design of crossed fringes"
@@ -70,55 +67,6 @@ class DesignSettings:
         "P,Q[,A,B]",
         parse=_family,
         many=True,
-    )
-    image_px: tuple[float, float] = option(
-        _DEFAULT.image_px,
-        "limits of a period in the image, px; MOST of a beat too (default: "
-        f"{_DEFAULT.image_px[0]:g},{_DEFAULT.image_px[1]:g})",
-        "LEAST,MOST",
-        parse=INTERVAL,
-    )
-    surfaces: tuple[float, float] | None = option(
-        None,
-        "where surfaces are expected, mm, for the share of wrong orders (default: the whole range)",
-        "NEAR,FAR",
-        parse=WORKING_RANGE,
-    )
-    phase_sigma: float = option(
-        _DEFAULT.phase_sigma,
-        f"error of a phase at 20 image px a period, for orders (default: {_DEFAULT.phase_sigma:g})",
-        "RAD",
-        parse=POSITIVE,
-    )
-    blur: float = option(
-        _DEFAULT.blur_px,
-        f"sigma of the projector's blur, projector px (default: {_DEFAULT.blur_px:g})",
-        "PX",
-        parse=POSITIVE,
-    )
-    wrong: float = option(
-        100 * _DEFAULT.wrong_share,
-        f"wrong orders that may be left to the neighbours (default: {100 * _DEFAULT.wrong_share:g})",
-        "PERCENT",
-        parse=POSITIVE,
-    )
-    noise: float = option(
-        _DEFAULT.noise_grey,
-        f"camera noise, grey levels of 255, for the depth noise (default: {_DEFAULT.noise_grey:g})",
-        "GREY",
-        parse=POSITIVE,
-    )
-    white: float = option(
-        _DEFAULT.white_grey,
-        f"grey level of white at the near end (default: {_DEFAULT.white_grey:g})",
-        "GREY",
-        parse=POSITIVE,
-    )
-    window: float = option(
-        _DEFAULT.window_px,
-        f"Gaussian window, sigma in image px, for the depth noise (default: {_DEFAULT.window_px:g})",
-        "PX",
-        parse=POSITIVE,
     )
     picture: Path | None = option(None, "draw the proposed pair beside the rig's own or 18/18", "FILE.png")
 
@@ -195,27 +143,17 @@ def _design(settings: PatternSettings) -> None:
     """Search, print, and write what is asked for. Raises `RigError` for a rig that can't be used."""
     named = settings.rig in NAMED_RIGS
     rig = NAMED_RIGS[settings.rig]() if named else load_rig(settings.rig)
-    assumed = Assumptions(
-        settings.image_px,
-        settings.phase_sigma,
-        settings.blur,
-        settings.noise,
-        settings.white,
-        settings.window,
-        settings.surfaces,
-        settings.wrong / 100,
-    )
-    found = search(rig, assumed, settings.pitches, settings.angles or ANGLES_DEG)
+    found = search(rig, settings, settings.pitches, settings.angles or ANGLES_DEG)
     families = dict.fromkeys(settings.pair, "asked for")
     if len(rig.fringe_directions) == 2:
         families.setdefault(replace(Crossed.of_pair(rig), shifts_deg=((0.0, 0.0),)), "its pair")
     if rig.crossed is not None:
         families.setdefault(rig.crossed, "its crossed")
-    others = describe(rig, list(families), assumed)
-    _print_design(rig, assumed, found, list(zip(others, families.values(), strict=True)))
+    others = describe(rig, list(families), settings)
+    _print_design(rig, settings, found, list(zip(others, families.values(), strict=True)))
     if settings.picture is not None:
-        beside = others[0] if others else describe(rig, [Crossed((18.0, 18.0))], assumed)[0]
-        write_atomically(settings.picture, draw_design(rig, found.proposed, beside, assumed))
+        beside = others[0] if others else describe(rig, [Crossed((18.0, 18.0))], settings)[0]
+        write_atomically(settings.picture, draw_design(rig, found.proposed, beside, settings))
         print(f"wrote {settings.picture}")
     if settings.out is not None:
         family = replace(found.proposed.crossed, shifts_deg=FIRST_SHIFTED_DEG)
@@ -223,12 +161,7 @@ def _design(settings: PatternSettings) -> None:
         print(f"wrote {settings.out}; next: fpp-bench patterns {settings.out} --out DIR")
 
 
-def _print_design(
-    rig: "Rig",
-    assumed: "Assumptions",
-    found: "Design",
-    others: "list[tuple[Candidate, str]]",
-) -> None:
+def _print_design(rig: Rig, assumed: Assumptions, found: Design, others: list[tuple[Candidate, str]]) -> None:
     (near_mm, far_mm), flat_deg = rig.working_range_mm, EpipolarLines.of(rig).flat_angle_deg
     print(
         f"rig             range {near_mm:g} to {far_mm:g} mm; a carrier at {flat_deg:.0f} degrees runs along the "

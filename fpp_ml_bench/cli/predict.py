@@ -10,8 +10,7 @@ from fpp_ml_bench.baselines.run import explain_predict, predict_split
 from fpp_ml_bench.baselines.timing import check_target, time_method, write_timing
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
-from fpp_ml_bench.cli.options import COUNT, SPLITS, Explain, command
-from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.cli.options import COUNT, SPLITS, Explain, command, new_file
 from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.evaluation.result.parts import Timing
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -45,16 +44,15 @@ def predict(
     account: Explain,
 ) -> None:
     """Run a method over a split and write predictions that fpp-eval scores."""
-    account.check()
     opened = DatasetFolder(dataset)
     method = chosen.load(opened)
     samples = len(opened.samples(split))
     bar = progress_bar(f"{chosen.name}, {split}", samples, "samples")
     with working_copy(out) as (folder, _), bar as advance:
-        finished = predict_split(opened, method, split, folder, advance)
+        seconds = predict_split(opened, method, split, folder, advance)
     print(
-        f"{out}: {finished.samples} predictions by {method.title}; {len(method.frames_used)} frames and "
-        f"{finished.seconds_per_sample:.3f} s a sample (median)"
+        f"{out}: {samples} predictions by {method.title}; {len(method.frames_used)} frames and "
+        f"{seconds:.3f} s a sample (median)"
     )
     how = f"{_scoring(method, opened)} --json result.json"
     if isinstance(out, Path):
@@ -88,7 +86,7 @@ def time(
     split: str = option("test", "default: test", choices=SPLITS),
     batch: int = option(4, "images a batch (default: 4)", "N", parse=COUNT),
     repeats: int = option(20, "timed runs (default: 20)", "N", parse=COUNT),
-    json: Path | None = option(None, "write the timing here; - is standard output", "FILE"),
+    json: Path | None = option(None, "write the timing here; - is standard output", "FILE", parse=new_file),
     into: tuple[Path, ...] = option(
         (),
         "put it into this submission.yaml or result file of the same method; may be given again",
@@ -102,8 +100,6 @@ def time(
     method = chosen.load(opened)
     for path in into:
         check_target(path, method)
-    if json is not None and not json.absolute().parent.is_dir():
-        raise SubmissionError(f"--json {json}: the folder {json.parent} does not exist; make it first")
     with progress_bar(f"timing {chosen.name}", repeats, "images") as advance:
         timing = time_method(opened, method, split, batch, repeats, advance)
     if json is not None:
@@ -116,7 +112,7 @@ def time(
         print(f"Written: {path}")
 
 
-def _timing_table(title: str, timing: "Timing") -> Table:
+def _timing_table(title: str, timing: Timing) -> Table:
     def mib(value: float | None) -> str:
         return "unknown" if value is None else f"{value:,.0f} MiB"
 
@@ -124,18 +120,20 @@ def _timing_table(title: str, timing: "Timing") -> Table:
     table = Table("", show_header=False, title=Text(f"{title}, measured here"), title_justify="left")
     table.add_column(justify="right", overflow="fold")
     ways = "at once" if timing.batched else "one after another"
-    for name, value in (
-        ("latency at batch 1, median", f"{timing.latency_median_ms:.4g} ms"),
-        ("  5th to 95th percentile", f"{timing.latency_p5_ms:.4g} to {timing.latency_p95_ms:.4g} ms"),
-        ("  runs", f"{timing.repeats}, images of {width}x{height} px"),
-        (f"throughput at batch {timing.batch}", f"{timing.throughput_per_s:.4g} images/s, {ways}"),
-        ("frames needed", str(timing.frames)),
-        ("parameters", f"{timing.parameters:,}"),
-        ("memory one image adds", mib(timing.working_memory_mib)),
-        ("peak memory of the process", mib(timing.peak_memory_mib)),
-        *([("peak GPU memory", mib(timing.gpu_memory_mib))] if timing.gpu_memory_mib is not None else []),
-        ("device", timing.device),
-        ("machine", f"{machine.gpu or 'no GPU'}; {machine.cpu}, {machine.cores} cores, {machine.memory_gib} GiB"),
-    ):
-        table.add_row(name, Text(value))
+    rows = {
+        "latency at batch 1, median": f"{timing.latency_median_ms:.4g} ms",
+        "  5th to 95th percentile": f"{timing.latency_p5_ms:.4g} to {timing.latency_p95_ms:.4g} ms",
+        "  runs": f"{timing.repeats}, images of {width}x{height} px",
+        f"throughput at batch {timing.batch}": f"{timing.throughput_per_s:.4g} images/s, {ways}",
+        "frames needed": str(timing.frames),
+        "parameters": f"{timing.parameters:,}",
+        "memory one image adds": mib(timing.working_memory_mib),
+        "peak memory of the process": mib(timing.peak_memory_mib),
+        "peak GPU memory": "" if timing.gpu_memory_mib is None else mib(timing.gpu_memory_mib),
+        "device": timing.device,
+        "machine": f"{machine.gpu or 'no GPU'}; {machine.cpu}, {machine.cores} cores, {machine.memory_gib} GiB",
+    }
+    for name, value in rows.items():
+        if value:
+            table.add_row(name, Text(value))
     return table

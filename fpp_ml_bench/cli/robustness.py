@@ -1,31 +1,27 @@
 """``fpp-bench robustness``: how a method's error grows when the scene is disturbed, axis by axis."""
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 
 from fpp_ml_bench.baselines.registry import find
-from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, SetName, severity_means
-from fpp_ml_bench.baselines.robustness.report import write_page
-from fpp_ml_bench.baselines.robustness.run import Setup, View
+from fpp_ml_bench.baselines.robustness.axes import CACHE, CLEAN, SETS, Condition, severity_means
+from fpp_ml_bench.baselines.robustness.run import Setup, View, write_page
 from fpp_ml_bench.baselines.robustness.run import measure as measure_robustness
 from fpp_ml_bench.baselines.robustness.run import robustness as robustness_block
-from fpp_ml_bench.baselines.robustness.scenes import CACHE, Condition
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
 from fpp_ml_bench.cli.options import Pool, command, names
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import PredictionError
-from fpp_ml_bench.evaluation.report.html import millimetres, percent
-from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_robustness
+from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_block
 from fpp_ml_bench.loaders.render.builder import assembly_of
-from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.storage.manifest import Manifest
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import AnySequence
 from fpp_ml_bench.options import REQUIRED, option
 from fpp_ml_bench.remote import RemoteFolder, place, working_copy
+from fpp_ml_bench.style import millimetres, percent
 from fpp_ml_bench.tables import Table
 
 
@@ -70,64 +66,45 @@ def robust(
     workers = pool.processes
     if into is not None and (axes or quick):
         raise PredictionError("--into: needs all axes and severities; leave out --axes and --quick")
-    rig = find(chosen.name).method.scenes_rig
-    method = chosen.load(Scenes.of(objects, size, rig), warn=False)
+    settings = Condition(CLEAN, 0, SETS[objects], size, find(chosen.name).method.scenes_rig).settings
+    rig, manifest = settings.rig, assembly_of(settings).manifest
+    scenes = Scenes(Path("the robustness scenes"), rig, (rig.camera.height, rig.camera.width), rig.sequence, manifest)
+    method = chosen.load(scenes, warn=False)
     entry = None if into is None else read_entry(into)
     if entry is not None:
         check_same_method(entry, method)
-    setup = Setup(method, objects, size, quick, rig)
+    setup = Setup(method, objects, size, quick)
     # The nodes of a cluster have folders of their own, which nobody would keep small.
     cache = None if no_cache else cache or (None if pool.cluster else CACHE)
     views = sum(len(c.objects) * len(setup.views) for axis in setup.axes(axes) for c in setup.conditions(axis))
     with working_copy(out) as (below, save):
         folder = below / slug(setup)
         with progress_bar(f"{chosen.name}, {objects}", views, "views") as advance:
-            rows = measure_robustness(
-                setup, folder, axes, workers, cache, lambda axis, count: advance(count), pool.cluster, save
-            )
+            rows = measure_robustness(setup, folder, axes, workers, cache, advance, pool.cluster, save)
         page = f"{out}/{write_page(below).name}"
     if entry is not None:
-        write_robustness(entry, robustness_block(setup, rows))
+        write_block(entry, robustness_block(setup, rows))
     show(_table(setup, rows))
     print(f"{page}: curves of all methods measured there")
 
 
-@dataclass(frozen=True)
-class Scenes:
+class Scenes(NamedTuple):
     """What a method is chosen for, in place of a dataset: the scenes are rendered when they are needed."""
 
-    settings: "BuildSettings"
-
-    @classmethod
-    def of(cls, objects: "SetName", size: int, rig: str) -> "Scenes":
-        return cls(Condition(CLEAN, 0, tuple(SETS[objects]), size, rig).settings)
-
-    path = Path("the robustness scenes")
-
-    @property
-    def rig(self) -> "Rig":
-        return self.settings.rig
-
-    @property
-    def size(self) -> tuple[int, int]:
-        return self.rig.camera.height, self.rig.camera.width
-
-    @property
-    def sequence(self) -> "AnySequence":
-        return self.rig.sequence
-
-    @property
-    def manifest(self) -> "Manifest":
-        return assembly_of(self.settings).manifest
+    path: Path
+    rig: Rig
+    size: tuple[int, int]
+    sequence: AnySequence
+    manifest: Manifest
 
 
-def slug(setup: "Setup") -> str:
+def slug(setup: Setup) -> str:
     """Name of a measurement's folder."""
     plain = re.sub(r"[^a-z0-9]+", "-", setup.method.title.casefold()).strip("-")[:80]
     return f"{plain}-{setup.set_name}-{setup.size}{'-quick' if setup.quick else ''}"
 
 
-def _table(setup: "Setup", rows: "dict[str, list[View]]") -> Table:
+def _table(setup: Setup, rows: dict[str, list[View]]) -> Table:
     """Errors by axis, clean and at each severity; shares at the last severity."""
     severities = (0, *setup.severities)
     columns = [f"severity {severity}" if severity else "clean" for severity in severities]

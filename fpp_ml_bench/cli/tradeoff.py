@@ -5,7 +5,7 @@ from typing import Literal
 
 from fpp_ml_bench.baselines.tradeoff.measure import planned
 from fpp_ml_bench.baselines.tradeoff.measure import tradeoff as run_tradeoff
-from fpp_ml_bench.baselines.tradeoff.report import remarks, rich_tables, write_report
+from fpp_ml_bench.baselines.tradeoff.report import growth_table, point_table, remarks, write_report
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.options import command, whole
 from fpp_ml_bench.options import argument, option
@@ -57,7 +57,7 @@ def measure(
     with progress_bar("measuring", len(plan.points), "points") as advance:
         measured = run_tradeoff(plan, lambda label: advance(1))
     written = write_report(measured, out)
-    show(*rich_tables(measured))
+    show(point_table(measured), growth_table(measured))
     for line in remarks(measured):
         print(line)
     for path in written:

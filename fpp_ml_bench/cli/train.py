@@ -1,16 +1,18 @@
 """``fpp-bench train``: one recipe, one weights file; and ``fpp-bench reproduce``: the paper's tables and its further
 directions, trained and scored here."""
 
+import re
 import sys
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from fpp_ml_bench.baselines import registry
 from fpp_ml_bench.baselines.reproduce.plan import Folders, planned, variants
 from fpp_ml_bench.baselines.training.recipe import PRESETS, TABLES, load_recipe, table_rows
 from fpp_ml_bench.cli import CHECK_FAILED, OK
 from fpp_ml_bench.cli.console import show
-from fpp_ml_bench.cli.methods import MethodCommand, OfMethods
+from fpp_ml_bench.cli.methods import MethodCommand
 from fpp_ml_bench.cli.options import MINUTES, command, command_line
 from fpp_ml_bench.errors import RecipeError, TrainingError
 from fpp_ml_bench.files import printable
@@ -51,7 +53,7 @@ def train(
     minutes: float | None = option(
         None, "stop before an epoch that would not finish in time, everything saved", "M", parse=MINUTES
     ),
-    options: OfMethods,
+    options: dict[str, Any],
 ) -> int:
     """Train one recipe, a shipped one or a YAML file of yours, into a weights file that predict takes.
 
@@ -70,9 +72,8 @@ def train(
         import cv2
 
         cv2.setNumThreads(1)
-        finished = method.train(method.Training(**options.of(method, recipe, "Training")), out, minutes)
+        finished = method.train(method.Training(**options), out, minutes)
         return OK if finished else CHECK_FAILED
-    options.of(registry.network_method(), recipe, "Training")
     if not Path(recipe).exists() and nearest(recipe, methods):
         raise RecipeError(f"no recipe {recipe!r}; {did_you_mean(recipe, methods)}")
     if dataset is None:
@@ -87,7 +88,7 @@ def train(
         print(f"{out}: stopped after {trained.epochs} epochs, everything saved; run the same command to resume")
         return CHECK_FAILED
     weights = trained.weights
-    if resolved.normalisation == "individual" and not resolved.background_removed:
+    if "predicted" in variants(resolved):
         weights = out / "model.safetensors"
         save_with_heads(trained.weights, dataset, weights)
     print(f"{weights}: {resolved.title}, epoch {trained.best_epoch} of {trained.epochs}, {trained.seconds:.0f} s")
@@ -162,14 +163,18 @@ def reproduce_tables(
     def report(line: str) -> None:  # with the time, where the engine's progress is too
         print(f"{datetime.now():%H:%M:%S} {line}", file=sys.stderr, flush=True)
 
-    again = command_line(preset=preset, only_missing=True)
-    options = (dataset, only_missing, minutes, anyway)
-    reproduce_settings = ReproduceSettings(tables, folders, again, reproduced, *options, report, row=row)
-    outcome = run_reproduce(reproduce_settings)
+    again = command_line()
+    if "--preset" not in again:
+        again = re.sub(r"(?= --)|$", f" --preset {preset}", again, count=1)
+    if not only_missing:
+        again = re.sub(r"--preset[ =]\S+", r"\g<0> --only-missing", again, count=1)
+    outcome = run_reproduce(
+        ReproduceSettings(tables, folders, again, reproduced, dataset, only_missing, minutes, anyway, report, row)
+    )
     for name, path in zip(tables, outcome.tables, strict=True):
         lines = reproduced.table_lines(name, outcome.jobs, folders, outcome.opened)
         show(
-            reproduced.text_table(name, lines, preset).rich(elsewhere="the page below"),
+            reproduced.line_table(name, lines, preset),
             reproduced.conclusion(name, lines),
         )
         print(f"Written: {path}")

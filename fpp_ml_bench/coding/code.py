@@ -6,7 +6,7 @@ direction.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -167,13 +167,6 @@ class Code(ABC):
         """The entries of a rig file; `code_from_dict` gives an equal code back."""
 
 
-def entry(entries: Mapping[str, Any], key: str, default: Any = None) -> Any:
-    """An entry of a rig file; raises `RigError` where it is missing and has no ``default``."""
-    if key not in entries and default is None:
-        raise RigError(f"{key}: missing")
-    return entries.get(key, default)
-
-
 def check_keys(entries: Mapping[str, Any], keys: tuple[str, ...]) -> None:
     """Raise `RigError` for an entry that is none of ``keys``."""
     unknown = [str(key) for key in entries if key not in keys]
@@ -181,15 +174,35 @@ def check_keys(entries: Mapping[str, Any], keys: tuple[str, ...]) -> None:
         raise RigError(f"{unknown[0]}: unknown key; expected some of {', '.join(keys)}")
 
 
-def whole(value: object, key: str, least: int, most: int) -> int:
+def whole(value: object, name: str, least: int, most: int) -> int:
     """``value`` as a whole number from ``least`` to ``most``; raises `RigError` naming the key."""
-    if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-        raise RigError(f"{key}: expected a whole number from {least} to {most}, got {value!r}")
-    return value
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not least <= value <= most:
+        raise RigError(f"{name}: expected a whole number from {least} to {most}, got {value!r}")
+    return int(value)
 
 
-def real(value: object, key: str) -> float:
-    """``value`` as a finite number of at most `LARGEST`; raises `RigError` naming the key."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= LARGEST:
-        raise RigError(f"{key}: expected a finite number of at most {LARGEST:g}, got {value!r}")
+def require(met: object, message: str) -> None:
+    """Raise `RigError` with ``message`` unless ``met``."""
+    if not met:
+        raise RigError(message)
+
+
+def number(value: object, name: str, *, positive: bool = False) -> float:
+    """``value`` as a finite float; raises `RigError` naming the key for anything else (text, booleans, NaN)."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        raise RigError(f"{name}: expected a number, got {value!r}")
+    if not -LARGEST <= value <= LARGEST or (positive and value <= 0):
+        kind = f"{'positive ' if positive else ''}finite number of at most {LARGEST:g}"
+        raise RigError(f"{name}: expected a {kind}, got {value!r}")
     return float(value)
+
+
+def numbers(value: object, counts: int | tuple[int, ...], name: str) -> tuple[float, ...]:
+    """``value`` as finite floats, as many as ``counts`` allows; raises `RigError` naming the key and the entry."""
+    counts = (counts,) if isinstance(counts, int) else counts
+    expected = f"{name}: expected {' or '.join(map(str, counts))} numbers"
+    if isinstance(value, str | bytes | dict) or not isinstance(value, Iterable):
+        raise RigError(f"{expected}, got {value!r}")
+    entries = list(value)
+    require(len(entries) in counts, f"{expected}, got {len(entries)}")
+    return tuple(number(entry, f"{name}[{i}]") for i, entry in enumerate(entries))

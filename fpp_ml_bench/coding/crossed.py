@@ -4,6 +4,9 @@ Frame n is ``127.5 + 127.5 (w1 cos(2 pi c1 / P1 + s1n) + w2 cos(2 pi c2 / P2 + s
 ``c_k = v cos(a_k) + u sin(a_k)`` across carrier k. One carrier leaves the fringe order open; the wrapped phases of two
 agree in depth at few orders (`fpp_ml_bench.design` finds periods for which only the true one is left). Each carrier is
 found from its neighbourhood, or from three frames that shift the first and keep the second still.
+
+`Composite` is the other code with several sinusoids in a frame: periods of one direction. It tells a coordinate only
+together with its neighbours, so that it is made and described here, and demodulated by methods that look at windows.
 """
 
 from __future__ import annotations
@@ -11,14 +14,23 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.coding.code import SMALLEST_PITCH_PX, check_keys, entry, real
+from fpp_ml_bench.coding.code import (
+    SMALLEST_PITCH_PX,
+    Code,
+    Coordinates,
+    Limits,
+    Shown,
+    check_keys,
+    numbers,
+    require,
+)
 from fpp_ml_bench.constants import GREY_LEVELS
-from fpp_ml_bench.errors import RigError
+from fpp_ml_bench.errors import DecodeError, RigError
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
 if TYPE_CHECKING:
@@ -65,15 +77,13 @@ class Crossed:
     def from_entries(cls, entries: Mapping[str, Any]) -> Crossed:
         """The family of a rig file's entries; `RigError` naming the key."""
         check_keys(entries, _KEYS)
-        given: dict[str, Any] = {"pitches_px": _pair(entry(entries, "pitches_px"), "pitches_px")}
-        for key in ("angles_deg", "weights"):
-            if key in entries:
-                given[key] = _pair(entries[key], key)
+        require("pitches_px" in entries, "pitches_px: missing")
+        given: dict[str, Any] = {key: numbers(entries[key], 2, key) for key in entries if key != "shifts_deg"}
         if "shifts_deg" in entries:
             shifts = entries["shifts_deg"]
-            if not isinstance(shifts, list):
-                raise RigError(f"shifts_deg: expected a list with a pair of degrees for each frame, got {shifts!r}")
-            given["shifts_deg"] = tuple(_pair(pair, f"shifts_deg[{n}]") for n, pair in enumerate(shifts))
+            pairs = f"shifts_deg: expected a list with a pair of degrees for each frame, got {shifts!r}"
+            require(isinstance(shifts, list), pairs)
+            given["shifts_deg"] = tuple(numbers(pair, 2, f"shifts_deg[{n}]") for n, pair in enumerate(shifts))
         return cls(**given)
 
     @classmethod
@@ -133,13 +143,6 @@ class Crossed:
         return np.rint(half + half * (first + second)).astype(np.uint8)
 
 
-def _pair(values: object, key: str) -> Pair:
-    if not isinstance(values, list) or len(values) != 2:
-        raise RigError(f"{key}: expected a list of two numbers, one for each carrier, got {values!r}")
-    first, second = (real(value, f"{key}[{i}]") for i, value in enumerate(values))
-    return first, second
-
-
 def crossed_from_pair(first_horizontal: NDArray[np.uint8], first_vertical: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """The crossed frame that a camera would have taken, from the first sinusoids of both directions, uint8 (H, W) each:
     their mean, rounded half to even, uint8 (H, W). Its family is `Crossed.of_pair`. The mean of two exposures has less
@@ -150,3 +153,52 @@ def crossed_from_pair(first_horizontal: NDArray[np.uint8], first_vertical: NDArr
         raise RigError(f"crossed frame of a pair: expected two uint8 images of one shape (H, W), got {given}")
     total = first_horizontal.astype(np.uint16) + first_vertical
     return np.rint(total / 2).astype(np.uint8)
+
+
+@dataclass(frozen=True)
+class Composite(Code):
+    """``127.5 + 127.5 / K sum cos(2 pi w / P_k)`` of the K periods ``pitches_px``."""
+
+    scheme: ClassVar[str] = "composite"
+    pitches_px: tuple[float, ...]
+
+    @classmethod
+    def from_entries(cls, entries: Mapping[str, Any], length_px: int) -> Composite:
+        check_keys(entries, ("pitches_px",))
+        pitches = entries.get("pitches_px")
+        if not isinstance(pitches, list) or len(pitches) < 2:
+            raise RigError(f"pitches_px: expected a list of two periods and more, got {pitches!r}")
+        return cls(numbers(pitches, len(pitches), "pitches_px"))
+
+    def to_dict(self) -> dict[str, Any]:
+        return {"scheme": self.scheme, "pitches_px": list(self.pitches_px)}
+
+    @property
+    def title(self) -> str:
+        return f"one frame of {' + '.join(f'{pitch:g}' for pitch in self.pitches_px)} px"
+
+    @property
+    def shown(self) -> tuple[Shown, ...]:
+        return (Shown("sinusoid"),)
+
+    @property
+    def pitch_px(self) -> float:
+        return min(self.pitches_px)
+
+    def check(self, length_px: int) -> None:
+        if not self.pitch_px >= SMALLEST_PITCH_PX:
+            raise RigError(f"pitches_px: expected {SMALLEST_PITCH_PX:g} px and more, got {self.pitch_px:g} px")
+
+    def profiles(self, length_px: int) -> NDArray[np.uint8]:
+        waves = [cosine_of_turns(np.arange(length_px) / pitch) for pitch in self.pitches_px]
+        half = GREY_LEVELS / 2
+        return np.rint(half + half * (sum(waves[1:], waves[0]) / len(waves)))[None].astype(np.uint8)
+
+    def decode(self, levels: NDArray, length_px: int, limits: Limits) -> Coordinates:
+        raise DecodeError(
+            "a single frame with several periods can't be decoded pixel by pixel; project each period in three steps "
+            "or more (phase-shift), or use a method for one frame"
+        )
+
+    def sigma_px(self, modulation: ArrayLike, noise_grey: ArrayLike) -> NDArray[np.float64]:
+        raise DecodeError("a single frame with several periods has no uncertainty pixel by pixel")

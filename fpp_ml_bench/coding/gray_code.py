@@ -9,12 +9,12 @@ the order can be wrong by 1; a median filter hides such errors but moves depth e
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.coding.code import AMBIGUOUS_FRACTION, Code, Coordinates, Limits, Shown, check_keys, real, whole
+from fpp_ml_bench.coding.code import AMBIGUOUS_FRACTION, Code, Coordinates, Limits, Shown, check_keys, number, whole
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import RigError
 
@@ -87,16 +87,6 @@ def decode_cells(
     return cells, trusted
 
 
-def absolute_phase(
-    phase: NDArray[np.float64], cells: NDArray[np.int32], centres_rad: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Absolute phase ``phi + 2 pi k`` with k nearest to the cell's centre, float64 rad (H, W), and whether the two
-    agree, bool (H, W): the cell exists and its centre, of `cell_centres_rad`, is within `INCONSISTENT_RAD`."""
-    centre = centres_rad[np.minimum(cells, len(centres_rad) - 1)]
-    absolute = phase + 2 * np.pi * np.floor((centre - phase) / (2 * np.pi) + 0.5)
-    return absolute, (cells < len(centres_rad)) & (np.abs(absolute - centre) <= INCONSISTENT_RAD)
-
-
 class DecodedCells(NamedTuple):
     """Cell ``number`` and the ``other`` that it would be with all ambiguous bits flipped (itself where none is), int32
     (n,) each. ``trusted`` bool (n,): no bit is ambiguous, or a single one that makes the other a neighbour."""
@@ -123,7 +113,7 @@ class GrayCells:
     least_first: bool = False
 
     @classmethod
-    def from_entries(cls, entries: Any, length_px: int, cell_px: float | None = None) -> "GrayCells":
+    def from_entries(cls, entries: Any, length_px: int, cell_px: float = 1.0) -> Self:
         """From a rig file's mapping, whose keys are the fields; ``cell_px`` by default as given here, ``bits`` as many
         as the pattern needs. Raises `RigError`."""
         if not isinstance(entries, Mapping):
@@ -131,10 +121,10 @@ class GrayCells:
                 f"gray: expected a mapping with some of cell_px, bits, inverse, origin_px, least_first; got {entries!r}"
             )
         check_keys(entries, ("cell_px", "bits", "inverse", "origin_px", "least_first"))
-        size = real(entries.get("cell_px", cell_px), "cell_px")
+        size = number(entries.get("cell_px", cell_px), "cell_px")
         if not size >= 1:
             raise RigError(f"cell_px: expected 1 px and more, got {size:g}")
-        origin_px, least_first = real(entries.get("origin_px", 0.0), "origin_px"), entries.get("least_first", False)
+        origin_px, least_first = number(entries.get("origin_px", 0.0), "origin_px"), entries.get("least_first", False)
         if not isinstance(least_first, bool):
             raise RigError(f"least_first: expected true or false, got {least_first!r}")
         bits = whole(entries.get("bits", bits_needed(length_px - origin_px, 2 * size)), "bits", 1, 15)
@@ -191,8 +181,8 @@ class GrayCells:
             centres = np.where(first <= last, (first + last) / 2, np.nan)
         return np.append(centres, np.nan)[np.minimum(number, len(centres))]
 
-    def decode(
-        self, levels: NDArray, threshold: NDArray, modulation: NDArray, ambiguous_fraction: float = AMBIGUOUS_FRACTION
+    def cells_of(
+        self, levels: NDArray, threshold: NDArray, modulation: NDArray, ambiguous_fraction: float
     ) -> DecodedCells:
         """Cells of n pixels from grey levels (frames, n). ``threshold`` and ``modulation`` (n,): mean and amplitude of
         what the bits swing between; with inverse frames a bit is the half difference of its pair."""
@@ -209,57 +199,42 @@ class GrayCells:
 
 
 @dataclass(frozen=True)
-class GrayOnly(Code):
+class GrayOnly(GrayCells, Code):
     """Gray code alone, with a black and a white frame as its threshold, or with inverse frames: a coordinate to a cell,
     and to the edge of two where a bit is ambiguous there."""
 
     scheme: ClassVar[str] = "gray"
-    cells: GrayCells
 
     @property
     def needs_flat(self) -> bool:
-        return self.cells.inverse == "none"
+        return self.inverse == "none"
 
     @property
     def step_px(self) -> float:
-        return self.cells.cell_px / 2
-
-    @classmethod
-    def from_entries(cls, entries: Mapping[str, Any], length_px: int) -> "GrayOnly":
-        return cls(GrayCells.from_entries(entries, length_px, 1.0))
+        return self.cell_px / 2
 
     def to_dict(self) -> dict[str, Any]:
-        return {"scheme": self.scheme, **self.cells.to_dict()}
+        return {"scheme": self.scheme, **super().to_dict()}
 
     @property
     def title(self) -> str:
-        return f"Gray code, cells of {self.cells.cell_px:g} px"
-
-    @property
-    def shown(self) -> tuple[Shown, ...]:
-        return self.cells.shown
+        return f"Gray code, cells of {self.cell_px:g} px"
 
     @property
     def pitch_px(self) -> None:
         return None
 
-    def check(self, length_px: int) -> None:
-        self.cells.check(length_px)
-
-    def profiles(self, length_px: int) -> NDArray[np.uint8]:
-        return self.cells.profiles(length_px)
-
     def decode(self, levels: NDArray, length_px: int, limits: Limits) -> Coordinates:
         if self.needs_flat:
             black, white = levels[-2].astype(np.float64), levels[-1].astype(np.float64)
         else:
-            plain, inverse = (levels[rows].astype(np.float64) for rows in self.cells.rows)
+            plain, inverse = (levels[rows].astype(np.float64) for rows in self.rows)
             black = np.minimum(plain, inverse).max(axis=0)
             white = black + np.abs(plain - inverse).max(axis=0)  # the finest bits lose contrast to blur
         threshold, modulation = (white + black) / 2, (white - black) / 2
         fraction = min(limits.ambiguous_fraction, AMBIGUOUS_ALONE)
-        cells = self.cells.decode(levels[: len(self.shown)], threshold, modulation, fraction)
-        centre_px, other_px = (self.cells.centre_px(n, length_px) for n in (cells.number, cells.other))
+        cells = self.cells_of(levels[: len(self.shown)], threshold, modulation, fraction)
+        centre_px, other_px = (self.centre_px(n, length_px) for n in (cells.number, cells.other))
         coordinate_px = np.where(np.isnan(other_px), centre_px, (centre_px + other_px) / 2)
         inconsistent = ~cells.trusted | np.isnan(centre_px)
         saturated = black >= GREY_LEVELS
@@ -268,4 +243,4 @@ class GrayOnly(Code):
 
     def sigma_px(self, modulation: ArrayLike, noise_grey: ArrayLike) -> NDArray[np.float64]:
         """That of a uniform distribution over a cell, whatever the noise."""
-        return np.full(np.broadcast(modulation, noise_grey).shape, self.cells.cell_px / math.sqrt(12))
+        return np.full(np.broadcast(modulation, noise_grey).shape, self.cell_px / math.sqrt(12))

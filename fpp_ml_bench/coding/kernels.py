@@ -1,8 +1,8 @@
-"""Compiled kernels of the codes: the sums of `phase` and `gray_code` in the same order, fused.
+"""Compiled kernels of the codes: phase, cell and order of a block of pixels, fused.
 
-Import only where `fpp_ml_bench.machine.numba_enabled`. Pixels are processed in tiles that stay in the first-level
-cache, frame by frame and without branches, so that the compiler can use vector instructions. The NumPy functions are
-the reference.
+They are imported where they are called, since numba takes longer to import than most commands take. Pixels are
+processed in tiles that stay in the first-level cache, frame by frame and without branches, so that the compiler can use
+vector instructions.
 """
 
 import math
@@ -10,17 +10,32 @@ import math
 import numpy as np
 
 from fpp_ml_bench.machine import njit
-from fpp_ml_bench.portable import ATAN_BOTTOM as BOTTOM
-from fpp_ml_bench.portable import ATAN_TOP as TOP
-from fpp_ml_bench.portable import TAN_EIGHTH
 
 TILE = 1024
 _TAU = 2 * math.pi
+TOP = (
+    -6.485021904942025371773e1,
+    -1.228866684490136173410e2,
+    -7.500855792314704667340e1,
+    -1.615753718733365076637e1,
+    -8.750608600031904122785e-1,
+)
+BOTTOM = (
+    1.945506571482613964425e2,
+    4.853903996359136964868e2,
+    4.328810604912902668951e2,
+    1.650270098316988542046e2,
+    2.485846490142306297962e1,
+    1.0,
+)
+"""Cephes (Moshier 1989): atan(t) = t + t z P(z) / Q(z) with z = t^2 on [0, tan(pi/8)], lowest coefficient first."""
+TAN_EIGHTH = math.sqrt(2.0) - 1.0
 
 
 @njit
 def _minus_atan2(y, x):  # type: ignore[no-untyped-def]
-    """-atan2(y, x) in [-pi, pi) to 2 ulp: `portable.arctangent2` without calls, which would stop vectorisation."""
+    """-atan2(y, x) in [-pi, pi) to 2 ulp, with the same bits on every processor; without calls, which would stop
+    vectorisation."""
     ax, ay = abs(x), abs(y)
     small, large = min(ax, ay), max(ax, ay)
     upper = small > TAN_EIGHTH * large

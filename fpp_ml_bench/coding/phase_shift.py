@@ -15,7 +15,6 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from types import ModuleType
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -29,15 +28,15 @@ from fpp_ml_bench.coding.code import (
     Limits,
     Shown,
     check_keys,
-    entry,
-    real,
+    number,
+    numbers,
+    require,
     whole,
 )
 from fpp_ml_bench.coding.gray_code import GrayCells
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import DecodeError, RigError
-from fpp_ml_bench.machine import numba_enabled
-from fpp_ml_bench.portable import arctangent2, cosine_of_turns, sine_of_turns
+from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
 TAU = 2 * math.pi
 CLEAR_RATIO = 4.0
@@ -54,15 +53,6 @@ class Phase(NamedTuple):
     phase: NDArray[np.floating]
     modulation: NDArray[np.floating]
     mean: NDArray[np.floating]
-
-
-def compiled_kernels() -> ModuleType | None:
-    """The codes' compiled kernels, or None where NumPy is to be used."""
-    if not numba_enabled():
-        return None
-    from fpp_ml_bench.coding import kernels
-
-    return kernels
 
 
 def choose_steps(steps: int, count: int) -> tuple[int, ...]:
@@ -133,12 +123,10 @@ def weighted_sums(images: Iterable[NDArray], weights: NDArray[np.float64]) -> li
 
 def minus_atan2(sine: NDArray[np.float64], cosine: NDArray[np.float64]) -> NDArray[np.float64]:
     """``-atan2(sine, cosine)`` in [-pi, pi), float64 to 2 ulp, with the same bits on every processor."""
-    if kernels := compiled_kernels():
-        phase = np.empty(np.shape(sine))
-        kernels.minus_atan2_all(np.ravel(sine), np.ravel(cosine), phase.ravel())
-        return phase
-    phase = -arctangent2(sine, cosine)
-    phase[phase >= np.pi] = -np.pi
+    from fpp_ml_bench.coding import kernels  # imports numba, which takes longer than most commands
+
+    phase = np.empty(np.shape(sine))
+    kernels.minus_atan2_all(np.ravel(sine), np.ravel(cosine), phase.ravel())
     return phase
 
 
@@ -179,7 +167,7 @@ class PhaseShift(Code):
         pitches = entries.get("pitches_px", [entries["pitch_px"]] if "pitch_px" in entries else None)
         if not isinstance(pitches, list) or not pitches or ("pitch_px" in entries and "pitches_px" in entries):
             raise RigError("pitches_px: expected a list of periods in projector px (or pitch_px: a single one)")
-        periods = [real(pitch, f"pitches_px[{i}]") for i, pitch in enumerate(pitches)]
+        periods = numbers(pitches, len(pitches), "pitches_px")
         shifts = entries.get("shifts_deg")
         if shifts is not None:
             if "steps" in entries or "sign" in entries:
@@ -189,9 +177,10 @@ class PhaseShift(Code):
             lists = shifts if isinstance(shifts[0], list) else [shifts] * len(periods)
             if not all(isinstance(listed, list) for listed in lists):
                 raise RigError(f"shifts_deg: expected a list of degrees, or one for each period, got {shifts!r}")
-            angles = [tuple(real(v, f"shifts_deg[{i}]") for v in listed) for i, listed in enumerate(lists)]
+            angles = [numbers(listed, len(listed), f"shifts_deg[{i}]") for i, listed in enumerate(lists)]
         else:
-            steps, sign = entry(entries, "steps"), entries.get("sign", 1)
+            require("steps" in entries, "steps: missing")
+            steps, sign = entries["steps"], entries.get("sign", 1)
             if sign not in (1, -1):
                 raise RigError(f"sign: expected 1 (step n is shifted by +360 n / N degrees) or -1, got {sign!r}")
             counts = steps if isinstance(steps, list) else [steps] * len(periods)
@@ -202,7 +191,7 @@ class PhaseShift(Code):
         gray = entries.get("gray")
         finest = min(periods)
         cells = None if gray is None else GrayCells.from_entries(gray, length_px, finest / 2)
-        return cls(fringes, real(entries.get("origin_px", 0.0), "origin_px"), cells)
+        return cls(fringes, number(entries.get("origin_px", 0.0), "origin_px"), cells)
 
     def to_dict(self) -> dict[str, Any]:
         content: dict[str, Any] = {"scheme": self.scheme, "pitches_px": [fringe.pitch_px for fringe in self.fringes]}
@@ -247,10 +236,10 @@ class PhaseShift(Code):
         return plain and gray is not None and gray == GrayCells(first.pitch_px / 2, gray.bits)
 
     def check(self, length_px: int) -> None:
-        for number, fringe in enumerate(self.fringes):
+        for index, fringe in enumerate(self.fringes):
             if not fringe.pitch_px >= SMALLEST_PITCH_PX:
                 raise RigError(
-                    f"pitches_px[{number}]: expected {SMALLEST_PITCH_PX:g} px and more, got {fringe.pitch_px:g} px"
+                    f"pitches_px[{index}]: expected {SMALLEST_PITCH_PX:g} px and more, got {fringe.pitch_px:g} px"
                 )
         if self.gray:
             self.gray.check(length_px)
@@ -290,7 +279,7 @@ class PhaseShift(Code):
             first += steps
         finest = self.finest
         if self.gray is not None:
-            cells = self.gray.decode(levels[first:], means[finest], modulations[finest], limits.ambiguous_fraction)
+            cells = self.gray.cells_of(levels[first:], means[finest], modulations[finest], limits.ambiguous_fraction)
             near = self.gray.centre_px(cells.number, length_px)
             away = near - self.origin_px
             order = np.floor(away / self.pitch_px - phases[finest] + 0.5)
@@ -313,16 +302,16 @@ class PhaseShift(Code):
         finest, count = self.finest, phases[0].size
         pitch = self.fringes[finest].pitch_px
         best, second, chosen = np.full(count, np.inf), np.full(count, np.inf), np.full(count, np.nan)
-        others = [number for number in range(len(self.fringes)) if number != finest]
+        others = [other for other in range(len(self.fringes)) if other != finest]
         for order in range(
             math.floor(-self.origin_px / pitch) - 1, math.ceil((length_px - self.origin_px) / pitch) + 1
         ):
             away = (phases[finest] + order) * pitch
             misfit = np.zeros(count)
-            for number in others:
-                turns = away / self.fringes[number].pitch_px - phases[number]
+            for other in others:
+                turns = away / self.fringes[other].pitch_px - phases[other]
                 turns -= np.rint(turns)
-                misfit += len(self.fringes[number].shifts_deg) * (modulations[number] * turns) ** 2
+                misfit += len(self.fringes[other].shifts_deg) * (modulations[other] * turns) ** 2
             misfit[(away + self.origin_px < -0.5) | (away + self.origin_px > length_px - 0.5)] = np.inf
             better = misfit < best
             second = np.where(better, best, np.minimum(second, misfit))
@@ -341,12 +330,12 @@ class PhaseShift(Code):
         if len(fine) == 1:
             return coordinate_px
         total, weights = np.zeros_like(coordinate_px), np.zeros_like(coordinate_px)
-        for number in fine:
-            fringe = self.fringes[number]
-            turns = (coordinate_px - self.origin_px) / fringe.pitch_px - phases[number]
+        for index in fine:
+            fringe = self.fringes[index]
+            turns = (coordinate_px - self.origin_px) / fringe.pitch_px - phases[index]
             with np.errstate(invalid="ignore"):
                 own = coordinate_px - (turns - np.rint(turns)) * fringe.pitch_px
-            weight = len(fringe.shifts_deg) * (modulations[number] / fringe.pitch_px) ** 2
+            weight = len(fringe.shifts_deg) * (modulations[index] / fringe.pitch_px) ** 2
             total, weights = total + weight * own, weights + weight
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(weights > 0, total / weights, coordinate_px)

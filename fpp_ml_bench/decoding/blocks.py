@@ -1,20 +1,17 @@
-"""Decoding a block of pixels: the stages, each compiled or in NumPy, then a depth or a reason for every pixel."""
+"""Decoding a block of pixels: the stages, then a depth or a reason for every pixel."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from types import ModuleType
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.coding.code import CLIPPED_STEPS_DIVISOR, STAGE_REASONS, Code, Coordinates, Limits, Reason
-from fpp_ml_bench.coding.gray_code import INCONSISTENT_RAD, absolute_phase, cell_centres_rad, decode_cells
-from fpp_ml_bench.coding.phase_shift import PhaseShift, choose_steps, minus_atan2, phase_weights, weighted_sums
-from fpp_ml_bench.coding.phase_shift import compiled_kernels as compiled_coding_kernels
-from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
-from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate
+from fpp_ml_bench.coding.gray_code import INCONSISTENT_RAD, cell_centres_rad
+from fpp_ml_bench.coding.phase_shift import Fringes, PhaseShift, choose_steps, phase_weights
+from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate, geometry
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.machine import numba_enabled
 from fpp_ml_bench.optics.pinhole import Maps
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import AXES, Direction, Sequence
@@ -79,9 +76,10 @@ def plan_direction(rig: Rig, direction: Direction, steps: int | None, limits: Li
     chosen = choose_steps(len(available), len(available) if steps is None else steps)
     allowed = limits.max_clipped_steps
     sinusoids = tuple(available[i] for i in chosen)
+    (fringes,) = code.fringes
     return DirectionPlan(
         direction,
-        code,
+        replace(code, fringes=(Fringes(code.pitch_px, tuple(fringes.shifts_deg[i] for i in chosen)),)),
         length,
         (*sinusoids, *rig.sequence.gray(direction)),
         sinusoids=sinusoids,
@@ -103,20 +101,6 @@ def plain_plan(rig: Rig, direction: Direction, steps: int | None, limits: Limits
     return plan
 
 
-def compiled_kernels() -> ModuleType | None:
-    """The triangulation's compiled kernels, or None where NumPy is to be used."""
-    if not numba_enabled():
-        return None
-    from fpp_ml_bench.decoding import kernels
-
-    return kernels
-
-
-def geometry(rig: Rig) -> tuple[NDArray, NDArray, tuple[float, float], tuple[float, float]]:
-    """The rig as the kernels take it: R, t, and the projector's focal lengths and principal point."""
-    return rig.R, rig.t, rig.projector.focal, rig.projector.centre
-
-
 def range_m(rig: Rig) -> tuple[float, float]:
     """The near and far end of the working range in m."""
     near_mm, far_mm = rig.working_range_mm
@@ -131,23 +115,18 @@ def projected(rays: Maps, depth_m: float, rig: Rig) -> Maps:
 
 def decode_direction(grey: NDArray, plan: DirectionPlan, limits: Limits) -> Coordinates:
     """Projector coordinate of a block from its grey levels, uint8 or float32 (rows of the plan, n)."""
-    steps, count = len(plan.sinusoids), grey.shape[1]
-    if grey.dtype == np.uint8 and (kernels := compiled_coding_kernels()):
-        results = np.empty(count), np.empty(count), np.empty(count), np.empty(count, dtype=np.uint8)
-        thresholds = float(limits.min_modulation), float(plan.max_clipped_steps), float(limits.ambiguous_fraction)
-        code = len(plan.gray), plan.centres_rad, plan.pitch_px, float(plan.length_px)
-        reasons = tuple(float(reason) for reason in STAGE_REASONS)
-        kernels.decode_block(grey, plan.weights, code, (*thresholds, INCONSISTENT_RAD), reasons, results)
-        return Coordinates(*results)
-    mean, cosine, sine = weighted_sums(grey[:steps], plan.weights)
-    modulation = np.sqrt(cosine * cosine + sine * sine)
-    phase = minus_atan2(sine, cosine)
-    cells, trusted = decode_cells(grey[steps:], mean, modulation, limits.ambiguous_fraction)
-    absolute, consistent = absolute_phase(phase, cells, plan.centres_rad)
-    coordinate = absolute * (plan.pitch_px / (2 * np.pi))
-    saturated = (grey[:steps] >= GREY_LEVELS).sum(axis=0) > plan.max_clipped_steps
-    inconsistent = ~(trusted & consistent)
-    return Coordinates.judged(coordinate, modulation, phase, saturated, inconsistent, plan.length_px, limits)
+    if grey.dtype != np.uint8:
+        code = plan.code if plan.gray else replace(plan.code, gray=None)  # type: ignore[call-arg]
+        return code.decode(grey, plan.length_px, limits)
+    from fpp_ml_bench.coding import kernels
+
+    count = grey.shape[1]
+    results = np.empty(count), np.empty(count), np.empty(count), np.empty(count, dtype=np.uint8)
+    thresholds = float(limits.min_modulation), float(plan.max_clipped_steps), float(limits.ambiguous_fraction)
+    code = len(plan.gray), plan.centres_rad, plan.pitch_px, float(plan.length_px)
+    reasons = tuple(float(reason) for reason in STAGE_REASONS)
+    kernels.decode_block(grey, plan.weights, code, (*thresholds, INCONSISTENT_RAD), reasons, results)
+    return Coordinates(*results)
 
 
 def depth_and_reason(
@@ -155,25 +134,16 @@ def depth_and_reason(
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Depth in mm, float32 (n,), 0 = none, and reason, uint8 (n,), of a block, from one direction or both."""
     reasons = [coordinates.reason for coordinates in measured.values()]
-    kernels = None if rig.projector.is_distorted else compiled_kernels()
-    depth_mm = np.empty(len(reasons[0]))
     if len(measured) == 1:
         ((direction, coordinates),) = measured.items()
-        reason, coordinate_px = coordinates.reason.copy(), coordinates.coordinate_px
-        if kernels:
-            kernels.depth_from_coordinate(rays, coordinate_px, AXES.index(direction), geometry(rig), depth_mm)
-        else:
-            depth_mm = depth_from_coordinate(rays, coordinate_px, rig, direction)
+        reason = coordinates.reason.copy()
+        depth_mm = depth_from_coordinate(rays, coordinates.coordinate_px, rig, direction)
     else:
         lower = np.minimum(*reasons)
         reason = np.where(lower == 0, np.maximum(*reasons), lower)
         u, v = (measured[direction].coordinate_px for direction in AXES)
-        weights = tuple(_relative_precision(measured[direction], rig, direction) for direction in AXES)
-        disagreement_px = np.empty(len(reason))
-        if kernels:
-            kernels.depth_from_both(rays, (u, v), weights, geometry(rig), (depth_mm, disagreement_px))
-        else:
-            depth_mm, disagreement_px = depth_from_both(rays, u, v, rig, *(weight * weight for weight in weights))
+        weights = (_relative_weight(measured[direction], rig, direction) for direction in AXES)
+        depth_mm, disagreement_px = depth_from_both(rays, u, v, rig, *weights)
         reason[(reason == 0) & (disagreement_px > limits.max_disagreement_px)] = Reason.DIRECTIONS_DISAGREE
     missing = np.isnan(depth_mm)
     reason[(reason == 0) & ~missing & ~rig.in_range(depth_mm)] = Reason.OUTSIDE_RANGE
@@ -181,28 +151,24 @@ def depth_and_reason(
     return np.where(reason == 0, depth_mm, 0.0).astype(np.float32), reason
 
 
-def _relative_precision(measured: Coordinates, rig: Rig, direction: Direction) -> NDArray[np.float64]:
-    """1 / sigma of a coordinate, up to a factor that both directions share."""
-    if isinstance(rig.sequence, Sequence):
-        return measured.modulation / rig.pitch(direction)  # both directions have the same number of steps
+def _relative_weight(measured: Coordinates, rig: Rig, direction: Direction) -> NDArray[np.float64]:
+    """1 / sigma^2 of a coordinate, up to a factor that both directions share."""
     with np.errstate(divide="ignore"):
-        return 1.0 / rig.code(direction).sigma_px(measured.modulation, 1.0)
+        if isinstance(rig.sequence, Sequence):
+            precision = measured.modulation / rig.pitch(direction)  # both directions have the same number of steps
+        else:
+            precision = 1.0 / rig.code(direction).sigma_px(measured.modulation, 1.0)
+    precision *= precision
+    return precision
 
 
 def within_reach(coordinate_px: NDArray, rays: Maps, direction: Direction, rig: Rig, limits: Limits) -> NDArray:
     """Pixels that may still get a depth from both directions; bool (n,). For projectors without distortion only.
     ``coordinate_px`` (n,) of ``direction``, ``rays`` the pixels' normalised (x, y), (n,) each. Pixels that can't be
     ruled out are True, those with NaN rays too."""
-    axis = AXES.index(direction)
-    if kernels := compiled_kernels():
-        reached = np.empty(len(coordinate_px), dtype=np.bool_)
-        allowance = float(limits.max_disagreement_px), SLACK_PX
-        kernels.reach(rays, coordinate_px, axis, geometry(rig), range_m(rig), allowance, reached)
-        return reached
-    with np.errstate(all="ignore"):
-        near_px, far_px = (projected(rays, depth_m, rig) for depth_m in range_m(rig))
-        along, across = (far_px[i] - near_px[i] for i in (axis, 1 - axis))
-        margin = limits.max_disagreement_px * np.sqrt(along * along + across * across) / np.abs(across) + SLACK_PX
-        low = np.minimum(near_px[axis], far_px[axis]) - margin
-        high = np.maximum(near_px[axis], far_px[axis]) + margin
-        return ~((coordinate_px < low) | (coordinate_px > high))
+    from fpp_ml_bench.decoding import kernels
+
+    reached = np.empty(len(coordinate_px), dtype=np.bool_)
+    allowance = float(limits.max_disagreement_px), SLACK_PX
+    kernels.reach(rays, coordinate_px, AXES.index(direction), geometry(rig), range_m(rig), allowance, reached)
+    return reached

@@ -18,8 +18,8 @@ from fpp_ml_bench.coding.code import MAX_DISAGREEMENT_PX, Coordinates, Limits, R
 from fpp_ml_bench.coding.gray_code import binary_to_gray, cell_count, cell_of
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.decoding import blocks
-from fpp_ml_bench.decoding.blocks import CodePlan, DirectionPlan, compiled_kernels
-from fpp_ml_bench.decoding.triangulation import depth_noise_mm
+from fpp_ml_bench.decoding.blocks import CodePlan, DirectionPlan
+from fpp_ml_bench.decoding.triangulation import depth_noise_mm, geometry
 from fpp_ml_bench.optics.pinhole import Maps
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import AXES, Direction
@@ -157,6 +157,8 @@ def nearest_pair(
     """The pair of fringe orders that lies nearest to the epipolar line, for every pixel. Returns the orders of each
     direction, whole numbers as float64 (n,), and the pair's distance from the line in projector px, inf where no order
     lies in the range."""
+    from fpp_ml_bench.decoding import kernels
+
     a = AXES.index(joint.driver)
     b, tolerance_px = 1 - a, joint.tolerance_px
     first, second = measured[AXES[a]].phase, measured[AXES[b]].phase
@@ -164,26 +166,8 @@ def nearest_pair(
     tries = math.ceil(joint.most_periods + 2 * tolerance_px / pitches[0]) + 1
     order_a, order_b, nearest = np.zeros(first.shape), np.zeros(first.shape), np.full(first.shape, np.inf)
     orders = {AXES[a]: order_a, AXES[b]: order_b}
-    if kernels := compiled_kernels():
-        results, search = (order_a, order_b, nearest), (tolerance_px, tries)
-        geometry, range_m = blocks.geometry(rig), blocks.range_m(rig)
-        kernels.joint_orders(rays, (first, second), a, geometry, range_m, pitches, search, results)
-        return orders, nearest
-    near, far = (blocks.projected(rays, depth_m, rig) for depth_m in blocks.range_m(rig))
-    with np.errstate(all="ignore"):
-        line = far[0] - near[0], far[1] - near[1]
-        slope, share = line[b] / line[a], np.abs(line[a]) / np.hypot(*line)
-        low, high = np.minimum(near[a], far[a]) - tolerance_px, np.maximum(near[a], far[a]) + tolerance_px
-        start = np.ceil(low / pitches[0] - first / (2 * np.pi))
-        for step in range(tries):
-            first_order = start + step
-            position_px = (first + 2 * np.pi * first_order) * (pitches[0] / (2 * np.pi))
-            predicted = near[b] + (position_px - near[a]) * slope
-            second_order = np.floor(predicted / pitches[1] - second / (2 * np.pi) + 0.5)
-            distance_px = np.abs((second + 2 * np.pi * second_order) * (pitches[1] / (2 * np.pi)) - predicted) * share
-            better = (distance_px < nearest) & (position_px <= high)
-            for result, value in ((nearest, distance_px), (order_a, first_order), (order_b, second_order)):
-                result[better] = value[better]
+    results, search = (order_a, order_b, nearest), (tolerance_px, tries)
+    kernels.joint_orders(rays, (first, second), a, geometry(rig), blocks.range_m(rig), pitches, search, results)
     return orders, nearest
 
 

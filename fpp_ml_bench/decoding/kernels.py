@@ -1,6 +1,6 @@
-"""Compiled kernels of the triangulation: the sums of `triangulation` in the same order, fused.
+"""Compiled kernels of the triangulation and of the orders from two phases. `fpp_ml_bench.coding.kernels` says how they
+work, and that they are imported where they are called.
 
-Import only where `fpp_ml_bench.machine.numba_enabled`, as `fpp_ml_bench.coding.kernels`, which says how they work.
 ``rays`` are the pixels' normalised (x, y), (n,) each; ``geometry`` is R, t and the projector's (fx, fy) and (cx, cy);
 results are filled in.
 """
@@ -10,10 +10,15 @@ import math
 import numpy as np
 
 from fpp_ml_bench.coding.kernels import TILE
-from fpp_ml_bench.decoding.triangulation import GAUSS_NEWTON_STEPS, LEAST_PARALLAX
 from fpp_ml_bench.machine import njit
 
 _TAU = 2 * math.pi
+GAUSS_NEWTON_STEPS = 3
+"""The algebraic start is exact for a projector beside the camera (t_2 = 0), close otherwise, and each step squares its
+error; after three steps it is below float64's resolution."""
+LEAST_PARALLAX = 2.0**-49
+"""Least ``|a_0 - x_p a_2|``, relative to the magnitudes of its terms and of the coordinate, of which its round-off is
+up to 8 x 2^-53. Below it ray and plane count as parallel: up to half of the depth would be round-off."""
 
 
 @njit
@@ -28,17 +33,18 @@ def _depth(z, forward, tz):  # type: ignore[no-untyped-def]
 
 
 @njit
-def depth_from_coordinate(rays, coordinate, axis, geometry, depth_mm):  # type: ignore[no-untyped-def]
-    """`triangulation.depth_from_coordinate` for an undistorted projector; all arrays (n,)."""
-    (x, y), (rotation, translation, focals, centres) = rays, geometry
-    t, tz, focal, centre = translation[axis], translation[2], focals[axis], centres[axis]
+def depth_from_coordinate(rays, straight, pixels, axis, geometry, depth_mm):  # type: ignore[no-untyped-def]
+    """`triangulation.depth_from_coordinate`: coordinates ``straight``, without the lens's distortion, in ``pixels``:
+    their size, the place of the principal point, and what their round-off is more than theirs; all arrays (n,)."""
+    (x, y), (size, origin, more), (rotation, translation, _, _) = rays, pixels, geometry
+    t, tz = translation[axis], translation[2]
     for i in range(len(x)):
-        ideal = (coordinate[i] - centre) / focal
+        ideal = (straight[i] - origin) / size
         forward = _rotated(rotation, 2, x[i], y[i])
         along, across = _rotated(rotation, axis, x[i], y[i]), ideal * forward
         depth = _depth((ideal * tz - t) / (along - across), forward, tz)
-        size = abs(along) + (abs(coordinate[i]) + abs(centre)) / focal * abs(forward)
-        depth_mm[i] = depth if abs(along - across) > LEAST_PARALLAX * size else np.nan
+        least = LEAST_PARALLAX * (abs(along) + ((abs(straight[i]) + abs(origin)) / size + more) * abs(forward))
+        depth_mm[i] = depth if abs(along - across) > least else np.nan
 
 
 @njit
@@ -48,11 +54,12 @@ def _residual_and_slope(c, d, q, tz, w):  # type: ignore[no-untyped-def]
 
 
 @njit
-def depth_from_both(rays, coordinates, weights, geometry, results):  # type: ignore[no-untyped-def]
-    """`triangulation.depth_from_both` for an undistorted projector; ``results`` = depth in mm, disagreement in px;
-    ``weights`` are B / P here and squared inside."""
-    (x, y), (u, v), (weight_u, weight_v) = rays, coordinates, weights
-    rotation, translation, (fx, fy), (cx, cy) = geometry
+def depth_from_both(rays, straight, pixels, weights, geometry, results):  # type: ignore[no-untyped-def]
+    """`triangulation.depth_from_both`: ``straight`` coordinates and ``pixels`` as in `depth_from_coordinate`, of both
+    directions; ``results`` = depth in mm, disagreement in px. The residual in px is ``f (c - d w) / (forward + t_2 w)``
+    at inverse depth w; c and d, with f in them, are fixed by the measurement."""
+    (x, y), (u, v), ((su, ou), (sv, ov)), (weight_u, weight_v) = rays, straight, pixels, weights
+    rotation, translation, (fx, fy), _ = geometry
     depth_mm, disagreement = results
     tx, ty, tz = translation[0], translation[1], translation[2]
     cu, du, cv, dv = np.empty(TILE), np.empty(TILE), np.empty(TILE), np.empty(TILE)
@@ -65,15 +72,15 @@ def depth_from_both(rays, coordinates, weights, geometry, results):  # type: ign
             a0 = rotation[0, 0] * x[j] + rotation[0, 1] * y[j] + rotation[0, 2]
             a1 = rotation[1, 0] * x[j] + rotation[1, 1] * y[j] + rotation[1, 2]
             forward[i] = rotation[2, 0] * x[j] + rotation[2, 1] * y[j] + rotation[2, 2]
-            px, py = (u[j] - cx) / fx, (v[j] - cy) / fy
-            wu, wv = weight_u[j] * weight_u[j], weight_v[j] * weight_v[j]
+            wu, wv = weight_u[j], weight_v[j]
+            px, py = (u[j] - ou) / su, (v[j] - ov) / sv
             cu[i], du[i] = fx * (a0 - px * forward[i]), fx * (px * tz - tx)
             cv[i], dv[i] = fy * (a1 - py * forward[i]), fy * (py * tz - ty)
             inverse[i] = (wu * cu[i] * du[i] + wv * cv[i] * dv[i]) / (wu * du[i] * du[i] + wv * dv[i] * dv[i])
         if tz != 0.0:
             for _ in range(GAUSS_NEWTON_STEPS):
                 for i in range(n):
-                    wu, wv = weight_u[start + i] * weight_u[start + i], weight_v[start + i] * weight_v[start + i]
+                    wu, wv = weight_u[start + i], weight_v[start + i]
                     q = forward[i] + tz * inverse[i]
                     ru, gu = _residual_and_slope(cu[i], du[i], q, tz, inverse[i])
                     rv, gv = _residual_and_slope(cv[i], dv[i], q, tz, inverse[i])

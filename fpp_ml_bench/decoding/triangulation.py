@@ -27,15 +27,9 @@ from fpp_ml_bench.optics.sequence import AXES, DIRECTIONS, Direction
 if TYPE_CHECKING:
     from fpp_ml_bench.decoding.decode import Decoded
 
-GAUSS_NEWTON_STEPS = 3
-"""The algebraic start is exact for a projector beside the camera (t_2 = 0), close otherwise, and each step squares its
-error; after three steps it is below float64's resolution."""
 FIXED_POINT_STEPS = 50
 FIXED_POINT_TOLERANCE = 1e-13
 """Largest last change, in normalised units, of a projector coordinate after its distortion was removed by iteration."""
-LEAST_PARALLAX = 2.0**-49
-"""Least ``|a_0 - x_p a_2|``, relative to the magnitudes of its terms and of the coordinate, of which its round-off is
-up to 8 x 2^-53. Below it ray and plane count as parallel: up to half of the depth would be round-off."""
 ASSUMED_NOISE_GREY = 1.0
 """Where the frames don't tell: three steps fit any three grey levels."""
 _SAMPLED_PX, _LEAST_PX = 50_000, 100
@@ -63,18 +57,12 @@ def rotated_ray(rays: Maps, rig: Rig, axis: int) -> NDArray[np.float64]:
     return rig.R[axis, 0] * x + rig.R[axis, 1] * y + rig.R[axis, 2]
 
 
-def _depth_in_front(depth_m: NDArray, forward: NDArray, rig: Rig) -> NDArray[np.float64]:
-    """Depth in mm where ``depth_m`` is finite and in front of both devices, else NaN."""
-    good = (depth_m > 0) & (depth_m < np.inf) & (forward * depth_m + rig.t[2] > 0)
-    return np.where(good, depth_m * MM_PER_M, np.nan)
-
-
-def _ideal_coordinate(rays: Maps, coordinate: NDArray, rig: Rig, axis: int) -> NDArray[np.float64]:
-    """Ideal normalised projector coordinate from a distorted coordinate, when the second coordinate is unknown. The ray
-    supplies the second coordinate: each step takes the depth from the present estimate, projects the point and
-    subtracts its distortion from the measured coordinate. Coordinates that do not settle are NaN."""
+def _ideal_coordinate(rays: Maps, coordinate_px: NDArray, rig: Rig, axis: int) -> NDArray[np.float64]:
+    """Ideal normalised projector coordinate from a distorted one in px, when the second coordinate is unknown. The ray
+    supplies it: each step takes the depth from the present estimate, projects the point and subtracts its distortion
+    from the measured coordinate. Coordinates that do not settle are NaN."""
     device = rig.projector
-    measured = (coordinate - device.centre[axis]) / device.focal[axis]
+    measured = (coordinate_px - device.centre[axis]) / device.focal[axis]
     rotated = [rotated_ray(rays, rig, i) for i in range(3)]
     ideal, change = measured, np.full(np.shape(measured), np.inf)
     for _ in range(FIXED_POINT_STEPS):
@@ -95,18 +83,30 @@ def depth_from_coordinate(rays: Maps, coordinate_px: ArrayLike, rig: Rig, direct
     "vertical", v_p for "horizontal", in px, same shape."""
     if direction not in DIRECTIONS:
         raise DecodeError(f"direction: expected horizontal or vertical, got {direction!r}")
+    from fpp_ml_bench.decoding import kernels
+
     axis, device = AXES.index(direction), rig.projector
-    centre, focal = device.centre[axis], device.focal[axis]
-    coordinate = np.asarray(coordinate_px, dtype=np.float64)
-    with np.errstate(all="ignore"):
-        undistorted = not device.is_distorted
-        ideal = (coordinate - centre) / focal if undistorted else _ideal_coordinate(rays, coordinate, rig, axis)
-        forward = rotated_ray(rays, rig, 2)
-        along, across = rotated_ray(rays, rig, axis), ideal * forward
-        depth = (ideal * rig.t[2] - rig.t[axis]) / (along - across)
-        size = np.abs(along) + (np.abs(coordinate) + abs(centre)) / focal * np.abs(forward)
-        parallel = np.abs(along - across) <= LEAST_PARALLAX * size
-        return np.where(parallel, np.nan, _depth_in_front(depth, forward, rig))
+    x, y, straight = _arrays(*rays, coordinate_px)
+    focal, centre = device.focal[axis], device.centre[axis]
+    pixels = focal, centre, 0.0
+    if device.is_distorted:
+        with np.errstate(all="ignore"):
+            straight, pixels = _ideal_coordinate((x, y), straight, rig, axis), (1.0, 0.0, 2 * abs(centre) / focal)
+    depth_mm = np.empty(straight.shape)
+    flat = (x.ravel(), y.ravel()), straight.ravel(), pixels
+    kernels.depth_from_coordinate(*flat, axis, geometry(rig), depth_mm.ravel())
+    return depth_mm
+
+
+def geometry(rig: Rig) -> tuple[NDArray, NDArray, tuple[float, float], tuple[float, float]]:
+    """The rig as the kernels take it: R, t, and the projector's focal lengths and principal point."""
+    return rig.R, rig.t, rig.projector.focal, rig.projector.centre
+
+
+def _arrays(*values: ArrayLike) -> list[NDArray[np.float64]]:
+    """The values as contiguous float64 arrays of one shape."""
+    alike = len({np.shape(value) for value in values}) == 1  # as in the decoder, whose blocks are small
+    return [np.asarray(array, np.float64, "C") for array in (values if alike else np.broadcast_arrays(*values))]
 
 
 def depth_from_both(
@@ -115,33 +115,19 @@ def depth_from_both(
     """Depth in mm from both projector coordinates by weighted least squares in projector px, float64; NaN = no depth.
 
     ``weight_u`` and ``weight_v``: 1 / sigma^2 of the coordinates, up to a common factor; for sinusoids (B / P)^2.
-    Solved for the inverse depth w, in which ``u - u_p(w)`` is a ratio of linear functions: algebraic start, then
-    `GAUSS_NEWTON_STEPS`. ``disagreement_px`` is the measured point's distance from the epipolar line, for any weights,
+    Solved for the inverse depth w, in which ``u - u_p(w)`` is a ratio of linear functions: algebraic start, then three
+    Gauss-Newton steps. ``disagreement_px`` is the measured point's distance from the epipolar line, for any weights,
     in undistorted px."""
-    device = rig.projector
-    u, v = np.asarray(u_px, dtype=np.float64), np.asarray(v_px, dtype=np.float64)
-    tx, ty, tz = rig.t
-    with np.errstate(all="ignore"):
-        px, py = device.normalised(u, v)
-        weight_u, weight_v = np.asarray(weight_u, dtype=np.float64), np.asarray(weight_v, dtype=np.float64)
-        forward = rotated_ray(rays, rig, 2)
-        # f (c - d w) / (forward + t_2 w) is the residual in px; c and d, with f in them, are fixed by the measurement.
-        cu, du = device.fx * (rotated_ray(rays, rig, 0) - px * forward), device.fx * (px * tz - tx)
-        cv, dv = device.fy * (rotated_ray(rays, rig, 1) - py * forward), device.fy * (py * tz - ty)
+    from fpp_ml_bench.decoding import kernels
 
-        def residuals_and_slopes(w: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
-            q = forward + tz * w
-            ru, rv = (cu - du * w) / q, (cv - dv * w) / q
-            return ru, rv, (du + ru * tz) / q, (dv + rv * tz) / q
-
-        w = (weight_u * cu * du + weight_v * cv * dv) / (weight_u * du * du + weight_v * dv * dv)
-        if tz != 0.0:
-            for _ in range(GAUSS_NEWTON_STEPS):
-                ru, rv, gu, gv = residuals_and_slopes(w)
-                w = w + (weight_u * ru * gu + weight_v * rv * gv) / (weight_u * gu * gu + weight_v * gv * gv)
-        ru, rv, gu, gv = residuals_and_slopes(w)
-        disagreement = np.abs(ru * gv - rv * gu) / np.sqrt(gu * gu + gv * gv)
-        return DepthFromBoth(_depth_in_front(1.0 / w, forward, rig), disagreement)
+    x, y, u, v, *weights = _arrays(*rays, u_px, v_px, weight_u, weight_v)
+    straight, pixels, device = (u, v), tuple(zip(rig.projector.focal, rig.projector.centre, strict=True)), rig.projector
+    if device.is_distorted:
+        straight, pixels = device.normalised(u, v), ((1.0, 0.0), (1.0, 0.0))
+    result = DepthFromBoth(np.empty(u.shape), np.empty(u.shape))
+    flat = [(first.ravel(), second.ravel()) for first, second in ((x, y), straight, weights, result)]
+    kernels.depth_from_both(*flat[:2], pixels, flat[2], geometry(rig), flat[3])
+    return result
 
 
 def depth_noise_mm(
@@ -163,34 +149,26 @@ def depth_noise_mm(
         raise DecodeError(f"direction: expected horizontal, vertical or both, got {direction!r}")
     if steps < 3:
         raise DecodeError(f"steps: expected at least 3, got {steps}")
-    z = np.asarray(depth_mm, dtype=np.float64) / MM_PER_M
-    normalised: Maps = rays if rays is not None else (np.zeros(()), np.zeros(()))
-    forward = rotated_ray(normalised, rig, 2)
+    along: Maps = rays if rays is not None else (np.zeros(()), np.zeros(()))
     precision: NDArray[np.float64] | float = 0.0
     with np.errstate(divide="ignore", invalid="ignore"):
         sigma_phase = np.sqrt(2.0 / steps) * np.asarray(noise) / np.asarray(modulation)
         for name in DIRECTIONS if direction == "both" else (direction,):
-            slope = _slope_px_per_m(rig, name, normalised, forward, z)
+            slope = coordinate_slope_px_per_mm(rig, depth_mm, name, along)  # type: ignore[arg-type]
             sigma_px = rig.pitch(name) * sigma_phase / (2 * np.pi)  # type: ignore[arg-type]
             precision = precision + (slope / sigma_px) ** 2
-        return MM_PER_M / np.sqrt(precision)
+        return 1.0 / np.sqrt(precision)
 
 
 def coordinate_slope_px_per_mm(rig: Rig, depth_mm: ArrayLike, direction: Direction, rays: Maps) -> NDArray[np.float64]:
     """Projector px by which the coordinate of ``direction`` changes for a mm of depth, at normalised ``rays`` (x, y);
     float64. The projector's distortion is ignored, as in `depth_noise_mm`."""
+    axis, forward = AXES.index(direction), rotated_ray(rays, rig, 2)
     with np.errstate(divide="ignore", invalid="ignore"):
         z_m = np.asarray(depth_mm, dtype=np.float64) / MM_PER_M
-        return _slope_px_per_m(rig, direction, rays, rotated_ray(rays, rig, 2), z_m) / MM_PER_M
-
-
-def _slope_px_per_m(
-    rig: Rig, direction: Direction, rays: Maps, forward: NDArray, z_m: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    axis = AXES.index(direction)
-    slope = rig.projector.focal[axis] * (rotated_ray(rays, rig, axis) * rig.t[2] - rig.t[axis] * forward)
-    quotient: NDArray[np.float64] = slope / (forward * z_m + rig.t[2]) ** 2
-    return quotient
+        slope = rig.projector.focal[axis] * (rotated_ray(rays, rig, axis) * rig.t[2] - rig.t[axis] * forward)
+        px_per_mm: NDArray[np.float64] = slope / (forward * z_m + rig.t[2]) ** 2 / MM_PER_M
+        return px_per_mm
 
 
 def depth_sigma_mm(

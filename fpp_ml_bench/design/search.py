@@ -5,13 +5,12 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.coding.crossed import LEAST_ANGLE_DEG, Crossed
-from fpp_ml_bench.design.assumptions import SIGMA_PERIOD_PX, Assumptions
 from fpp_ml_bench.design.rivals import (
     TAU,
     EpipolarLines,
@@ -22,6 +21,7 @@ from fpp_ml_bench.design.rivals import (
 )
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.options import flag_of, option, options_of
 from fpp_ml_bench.style import figure, figure_png, styled
 
 if TYPE_CHECKING:
@@ -35,6 +35,65 @@ BACKGROUND_SIGMAS = 3.0
 much farther: each is a depth like the true one, and half of the way to it is enough."""
 _CHUNK = 20_000
 _PLACES = np.linspace(0.0, 1.0, 400)
+SIGMA_PERIOD_PX = 20.0
+"""Image px of the period at which a phase error is stated."""
+
+
+def _pair(text: str) -> tuple[float, float]:
+    least, most = (float(part) for part in text.split(","))
+    return least, most
+
+
+@dataclass(frozen=True, kw_only=True)
+class Assumptions:
+    """What the figures of a pair rest on. Raises `RigError` for numbers that are not above 0 and finite.
+
+    ``image_px``: shortest and longest period in the image; the longest also of the beats of the two carriers, since a
+    window must tell their spectra from each other and from the mean light. ``surfaces_mm``: where surfaces are
+    expected, None for anywhere in the range; a rival may be anywhere in it. ``phase_sigma``: error in rad of a phase
+    from a single frame, at a period of `SIGMA_PERIOD_PX` in the image and in proportion to it, since the spectra of
+    edges and texture fall with the frequency; it decides orders. ``blur_px``: sigma of the projector's blur, projector
+    px, which takes modulation from fine periods. ``wrong_percent``: percentage of wrong orders that may be left to the
+    neighbours. ``noise_grey``: the camera's noise, which alone decides the depth noise on smooth surfaces, with
+    ``white_grey``, the grey level of white at the near end (falling with the square of the distance), and a Gaussian
+    window of ``window_px`` (sigma, image px).
+    """
+
+    HEADING = "design of crossed fringes"
+    image_px: tuple[float, float] = option(
+        (12.0, 40.0),
+        "limits of a period in the image, px; MOST of a beat too (default: 12,40)",
+        "LEAST,MOST",
+        parse=_pair,
+    )
+    surfaces_mm: tuple[float, float] | None = option(
+        None,
+        "where surfaces are expected, mm, for the share of wrong orders (default: the whole range)",
+        "NEAR,FAR",
+        flag="--surfaces",
+        parse=_pair,
+    )
+    phase_sigma: float = option(0.2, "error of a phase at 20 image px a period, for orders (default: 0.2)", "RAD")
+    blur_px: float = option(1.0, "sigma of the projector's blur, projector px (default: 1)", "PX", flag="--blur")
+    wrong_percent: float = option(
+        0.02, "wrong orders that may be left to the neighbours (default: 0.02)", "PERCENT", flag="--wrong"
+    )
+    noise_grey: float = option(
+        1.0, "camera noise, grey levels of 255, for the depth noise (default: 1)", "GREY", flag="--noise"
+    )
+    white_grey: float = option(180.0, "grey level of white at the near end (default: 180)", "GREY", flag="--white")
+    window_px: float = option(
+        6.0, "Gaussian window, sigma in image px, for the depth noise (default: 6)", "PX", flag="--window"
+    )
+
+    def __post_init__(self) -> None:
+        for entry in options_of(Assumptions):
+            given = getattr(self, entry.name)
+            if isinstance(given, float) and not 0 < given < 1e6:
+                raise RigError(f"{flag_of(entry)}: expected a number above 0, got {given:g}")
+        least, most = self.image_px
+        if not 0 < least < most < 1e5:
+            raise RigError(f"--image-px: expected LEAST,MOST such as 10,40, got {least:g},{most:g}")
 
 
 @dataclass(frozen=True)
@@ -62,8 +121,7 @@ class Candidate:
         return tuple(k for k in (0, 1) if self.turns[k] < FLAT_TURNS)
 
 
-@dataclass(frozen=True)
-class Design:
+class Design(NamedTuple):
     """The outcome of a search over ``searched`` pairs: those that no other beats in both depth noise and the distance
     of rivals in phase errors (``front``, the largest distance first), all clear of the background, and the one
     ``proposed`` with its ``reason``."""
@@ -85,25 +143,56 @@ def describe(rig: Rig, families: Sequence[Crossed], assumed: Assumptions) -> lis
     if not -1e-9 <= first < last <= 1 + 1e-9:
         raise RigError(f"surfaces: expected a part of the working range {near_mm:g} to {far_mm:g} mm")
     cycles = np.array([family.cycles_per_px for family in families])
-    pitches = np.array([family.pitches_px for family in families])
     image_px = np.array([[rig.image_px_of_carrier(tuple(carrier)) for carrier in family] for family in cycles])
-    turns = np.stack([lines.turns(family) for family in families])
-    rival, background = _distances(turns, lines)
-    sigma = _sigma_across(turns, _sigmas(assumed, pitches, image_px))
-    weights = np.array([family.weights for family in families])
-    slopes = np.stack([lines.far_px_per_mm @ pair.T for pair in cycles])
-    noise = _depth_noise_mm(slopes, pitches, weights, lines, assumed)
-    wrong = wrong_order_rate(turns, sigma, (first, last)).max(axis=-1)
+    pitches, weights = (np.array([getattr(f, name) for f in families]) for name in ("pitches_px", "weights"))
+    turns, rival, background, sigma, noise = _figures(lines, assumed, cycles, pitches, image_px, weights)
     figures = (
         rival.tolist(),
         [None] * len(families) if background is None else background.tolist(),
         sigma.max(axis=1).tolist(),
         noise.tolist(),
-        wrong.tolist(),
+        wrong_order_rate(turns, sigma, (first, last)).max(axis=-1).tolist(),
         map(tuple, image_px.tolist()),
         map(tuple, np.abs(turns).max(axis=1).tolist()),
     )
     return [Candidate(*of_pair) for of_pair in zip(families, *figures, strict=True)]
+
+
+class _Figures(NamedTuple):
+    """Of K pairs on n lines: turns over the range (K, n, 2), rival and background distance in rad (K,), error of the
+    two phases across the line, the direction of rivals, in rad (K, n), and depth noise at the far end in mm (K,)."""
+
+    turns: NDArray[np.float64]
+    rival: NDArray[np.float64]
+    background: NDArray[np.float64] | None
+    sigma: NDArray[np.float64]
+    noise: NDArray[np.float64]
+
+
+def _figures(
+    lines: EpipolarLines,
+    assumed: Assumptions,
+    cycles_per_px: NDArray[np.float64],
+    pitches_px: NDArray[np.float64],
+    image_px: NDArray[np.float64],
+    weights: NDArray[np.float64] | float = 0.5,
+) -> _Figures:
+    """The figures of pairs of carriers: frequencies (K, 2, 2), periods on the projector and in the image and shares of
+    the modulation (K, 2). A phase in a Gaussian window of sigma W has the noise ``s / (B W sqrt(2 pi))`` at noise s and
+    modulation B."""
+    turns, slopes = (along @ cycles_per_px.swapaxes(1, 2) for along in (lines.across_px, lines.far_px_per_mm))
+    background = None if lines.background is None else background_distance(turns, lines.background).min(axis=1)
+    kept = np.exp(-2 * (math.pi * assumed.blur_px / pitches_px) ** 2)  # of the modulation, by the blur
+    sigmas = (assumed.phase_sigma * image_px / (SIGMA_PERIOD_PX * kept))[:, None]
+    length = np.maximum(np.hypot(turns[..., 0], turns[..., 1]), np.finfo(np.float64).tiny)
+    sigma = np.hypot(sigmas[..., 0] * turns[..., 1], sigmas[..., 1] * turns[..., 0]) / length
+    near_mm, far_mm = lines.range_mm
+    modulation = weights * kept * (assumed.white_grey / 2 * (near_mm / far_mm) ** 2)
+    phase_noise = assumed.noise_grey / (modulation * assumed.window_px * math.sqrt(TAU))
+    precision = ((TAU * slopes / phase_noise[:, None]) ** 2).sum(axis=-1)
+    with np.errstate(divide="ignore"):
+        noise = (1.0 / np.sqrt(precision)).max(axis=-1)
+    return _Figures(turns, rival_distance(turns).min(axis=1), background, sigma, noise)
 
 
 def search(
@@ -123,23 +212,17 @@ def search(
             f"{assumed.image_px[1]:g} px in an image of {rig.camera.width} x {rig.camera.height} px; give other "
             "--pitches and --angles, or wider limits (--image-px)"
         )
-    lines, cycles, pitches = EpipolarLines.of(rig), _cycles(carriers), carriers[:, 0]
+    lines, cycles = EpipolarLines.of(rig), _cycles(carriers)
     image_px = np.array([rig.image_px_of_carrier(tuple(carrier)) for carrier in cycles])
-    sigmas = _sigmas(assumed, pitches, image_px)
-    turns, slopes = (
-        np.stack([of_lines @ carrier for carrier in cycles]) for of_lines in (lines.across_px, lines.far_px_per_mm)
-    )
     clearance, noise = np.empty((2, len(pairs)))
     for start in range(0, len(pairs), _CHUNK):
         part = slice(start, start + _CHUNK)
-        chosen = pairs[part]
-        across = turns[chosen].swapaxes(1, 2)
-        rival, background = _distances(across, lines)
-        sigma = np.maximum(_sigma_across(across, sigmas[chosen]).max(axis=-1), np.finfo(np.float64).tiny)
+        of_part = (values[pairs[part]] for values in (cycles, carriers[:, 0], image_px))
+        _, rival, background, across, noise[part] = _figures(lines, assumed, *of_part)
+        sigma = np.maximum(across.max(axis=-1), np.finfo(np.float64).tiny)
         clearance[part] = rival / sigma
         if background is not None:
             clearance[part][background < BACKGROUND_SIGMAS * sigma] = 0.0
-        noise[part] = _depth_noise_mm(slopes[chosen].swapaxes(1, 2), pitches[chosen], 0.5, lines, assumed)
     if not clearance.any():
         raise RigError(
             f"all {len(pairs):,} pairs show the background at {rig.background:g} m as they show a depth in the range; "
@@ -147,8 +230,8 @@ def search(
         )
     families = [Crossed(*map(tuple, carriers[pairs[index]].T.tolist())) for index in _front(clearance, noise)]
     front = tuple(describe(rig, families, assumed))
-    limit = f"{100 * assumed.wrong_share:g}% wrong orders"
-    few = [candidate for candidate in front if candidate.wrong_share <= assumed.wrong_share]
+    limit = f"{assumed.wrong_percent:g}% wrong orders"
+    few = [candidate for candidate in front if 100 * candidate.wrong_share <= assumed.wrong_percent]
     if few:
         return Design(few[-1], f"the least depth noise of those with at most {limit}", front, len(pairs))
     return Design(front[0], f"none has at most {limit}; the largest distance", front, len(pairs))
@@ -193,52 +276,6 @@ def _apart(rig: Rig, carriers: NDArray[np.float64], assumed: Assumptions) -> NDA
     first_deg, second_deg = carriers[pairs, 1].T
     across = np.abs((first_deg - second_deg + 90.0) % 180.0 - 90.0) >= LEAST_ANGLE_DEG
     return pairs[apart[0] & apart[1] & across]
-
-
-def _distances(
-    turns: NDArray[np.float64], lines: EpipolarLines
-) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """Rival and background distance of ``turns`` (K, n, 2), the least over the lines; (K,) each."""
-    rival = rival_distance(turns).min(axis=1)
-    return rival, None if lines.background is None else background_distance(turns, lines.background).min(axis=1)
-
-
-def _kept(assumed: Assumptions, pitches_px: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The share of the modulation that blur leaves to periods of any shape."""
-    return np.exp(-2 * (math.pi * assumed.blur_px / pitches_px) ** 2)  # type: ignore[no-any-return]
-
-
-def _sigmas(
-    assumed: Assumptions, pitches_px: NDArray[np.float64], image_px: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Error in rad of the phases of carriers, of any shape."""
-    return assumed.phase_sigma * image_px / (SIGMA_PERIOD_PX * _kept(assumed, pitches_px))
-
-
-def _sigma_across(turns: NDArray[np.float64], sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Error in rad of the two phases across the line, the direction of rivals; ``turns`` (K, n, 2), ``sigmas`` (K, 2)
-    of the carriers; returns (K, n)."""
-    first, second = turns[..., 0], turns[..., 1]
-    length = np.maximum(np.hypot(first, second), np.finfo(np.float64).tiny)
-    return np.hypot(sigmas[:, None, 0] * second, sigmas[:, None, 1] * first) / length  # type: ignore[no-any-return]
-
-
-def _depth_noise_mm(
-    slopes: NDArray[np.float64],
-    pitches_px: NDArray[np.float64],
-    weights: NDArray[np.float64] | float,
-    lines: EpipolarLines,
-    assumed: Assumptions,
-) -> NDArray[np.float64]:
-    """Depth noise at the far end, the most over the lines, of both carriers together (K,); ``slopes`` (K, n, 2) in
-    turns per mm, ``pitches_px`` (K, 2). A phase in a Gaussian window of sigma W has the noise ``s / (B W sqrt(2 pi))``
-    at noise s and modulation B."""
-    near_mm, far_mm = lines.range_mm
-    modulation = weights * _kept(assumed, pitches_px) * (assumed.white_grey / 2 * (near_mm / far_mm) ** 2)
-    phase_noise = assumed.noise_grey / (modulation * assumed.window_px * math.sqrt(TAU))
-    precision = ((TAU * slopes / phase_noise[:, None]) ** 2).sum(axis=-1)
-    with np.errstate(divide="ignore"):
-        return (1.0 / np.sqrt(precision)).max(axis=-1)  # type: ignore[no-any-return]
 
 
 def _front(clearance: NDArray[np.float64], noise: NDArray[np.float64]) -> list[int]:

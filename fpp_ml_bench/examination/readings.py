@@ -258,7 +258,7 @@ def _rearranged(rig: Rig, runs: list[list[int]], **changes: Any) -> tuple[int, .
 
     def captured(run: list[int]) -> list[int]:
         code: Any = rig.code(rig.sequence.frames[run[0]].direction or "vertical")
-        cells: GrayCells = code.cells if isinstance(code, GrayOnly) else code.gray
+        cells: GrayCells = code if isinstance(code, GrayOnly) else code.gray
         if "inverse" in changes and cells.inverse == "none":
             return run
         shown = replace(cells, **changes).shown

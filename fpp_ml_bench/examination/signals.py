@@ -305,7 +305,7 @@ def gray_edges(lines: Lines, one: FringeSet, rig: Rig, limits: Limits) -> Edges 
     if not isinstance(code, PhaseShift) or code.gray is None or one.number != code.finest:
         return None
     length, levels = rig.pattern_length(one.direction), lines.levels[list(rig.sequence.gray(one.direction))]
-    cells = code.gray.decode(levels, one.mean, one.modulation, limits.ambiguous_fraction)
+    cells = code.gray.cells_of(levels, one.mean, one.modulation, limits.ambiguous_fraction)
     usable = one.good & cells.trusted
     first = np.flatnonzero(usable[:-1] & usable[1:] & lines.joined[:-1])
     first = first[np.abs(cells.number[first + 1] - cells.number[first]) == 1]

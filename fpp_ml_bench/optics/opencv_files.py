@@ -5,12 +5,9 @@ distCoeffs1, ..., R, T), procamcalib and scan3d-capture (cam_K, cam_kc, proj_K, 
 kp, Rp, Tp). In all of them a point goes from the camera's frame to the projector's by ``X_p = R X_c + T``.
 
 On damaged files OpenCV's reader writes outside its memory (OpenCV 5.0: a few thousand random changes of a file end the
-process), so it runs in a process of its own.
+process), so it runs in the process of `fpp_ml_bench.containers`.
 """
 
-import json
-import subprocess
-import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,17 +16,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.coding.code import require
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.errors import RigError
+from fpp_ml_bench.containers import Answer, guarded, limit_memory
+from fpp_ml_bench.errors import PredictionError, RigError
 from fpp_ml_bench.files import file_content, printable, strict_json, strict_yaml, write_atomically
-from fpp_ml_bench.optics.pinhole import Pinhole, require
+from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.optics.rig import Matrix3
 
 UNITS = {"mm": MM_PER_M, "m": 1.0}
 """Units of a file's translation, in a metre."""
 SUFFIXES = (".xml", ".yaml", ".yml", ".json")
 LARGEST_BYTES = 1 << 24
-TIMEOUT_S = 60
 _LONGEST_YAML = 1 << 18
 """Characters that are looked at for the cause where OpenCV can't read a file: parsing YAML in Python is slow."""
 ROUNDED = 1e-5
@@ -225,13 +223,13 @@ def _nodes(path: Path) -> dict[str, Any]:
         text = content.decode("utf-8")
     except UnicodeDecodeError:
         raise RigError(f"{path}: expected text, found other bytes; {cure}") from None
-    answer = _parsed_elsewhere(str(path.resolve()))
-    if "nodes" not in answer:
+    try:
+        return guarded(_read_nodes, content, LARGEST_BYTES)[0]["nodes"]
+    except PredictionError as error:
         if keys := _keys(text, path.suffix.lower()):
-            raise RigError(f"{path}: {_other_layout(keys)}")
-        reason = f": {printable(answer['problem'])}" if "problem" in answer else ""
-        raise RigError(f"{path}: the file is damaged or of another format, OpenCV can't read it{reason}; {cure}")
-    return answer["nodes"]
+            raise RigError(f"{path}: {_other_layout(keys)}") from None
+        problem = "the file is damaged or of another format, OpenCV can't read it"
+        raise RigError(f"{path}: {problem} ({error}); {cure}") from None
 
 
 def _other_layout(keys: Iterable[str]) -> str:
@@ -249,19 +247,11 @@ def _keys(text: str, suffix: str) -> list[str]:
     return list(content) if isinstance(content, dict) else []
 
 
-def _parsed_elsewhere(path: str) -> dict[str, Any]:
-    """`_parsed` in another process; nothing where that ended."""
-    command = [sys.executable, "-P", "-m", __name__, path]
-    try:
-        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, timeout=TIMEOUT_S)
-        return json.loads(done.stdout) if done.returncode == 0 else {}
-    except (subprocess.TimeoutExpired, ValueError):
-        return {}
-
-
-def _parsed(path: str) -> dict[str, Any]:
-    """What the other process answers for a file: its nodes, or the problem."""
+def _read_nodes(content: bytes, largest: int) -> Answer:
+    """The nodes of a file's text; `PredictionError` with the problem where OpenCV can't read it."""
     import cv2
+
+    limit_memory(largest)
 
     def value(node: Any) -> Any:
         if node.isMap():
@@ -281,18 +271,16 @@ def _parsed(path: str) -> dict[str, Any]:
 
     name = None
     try:
-        storage = cv2.FileStorage()
-        if not storage.open(path, cv2.FILE_STORAGE_READ) or storage.root().empty() or not storage.root().isMap():
-            return {"problem": "it has no named nodes"}
+        storage = cv2.FileStorage(content.decode(), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        if storage.root().empty() or not storage.root().isMap():
+            raise PredictionError("it has no named nodes")
         nodes, names = {}, storage.root().keys()
         for name in names:
             nodes[name] = value(storage.getNode(name))
-        return {"nodes": nodes}
+        return {"nodes": nodes}, b""
     except (cv2.error, SystemError) as error:
         if name is not None:
-            return {"problem": f"node {name} is incomplete, or its numbers do not fill its rows and columns"}
-        return {"problem": " ".join(str(error).partition("error: ")[2].split()) or "it can't be parsed"}
-
-
-if __name__ == "__main__":
-    print(json.dumps(_parsed(sys.argv[1])))
+            raise PredictionError(
+                f"node {name} is incomplete, or its numbers do not fill its rows and columns"
+            ) from None
+        raise PredictionError(" ".join(str(error).partition("error: ")[2].split()) or "it can't be parsed") from None

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.coding.code import Code
 from fpp_ml_bench.constants import GREY_LEVELS
+from fpp_ml_bench.containers import png_bytes
 from fpp_ml_bench.errors import FppBenchError, RigError
 from fpp_ml_bench.optics.rig import Rig
 
@@ -65,18 +66,13 @@ def pattern_image(rig: Rig, index: int) -> NDArray[np.uint8]:
 def export_patterns(rig: Rig, folder: str | Path) -> list[Path]:
     """Write every pattern as ``A_{i}.png`` (8-bit grey, lossless) into ``folder`` and return the paths in frame order;
     `FppBenchError` where the folder can't be made or a file can't be written."""
-    import cv2
-
     target = Path(folder)
     paths = []
     try:
         target.mkdir(parents=True, exist_ok=True)
         for index in range(len(rig.sequence)):
-            done, png = cv2.imencode(".png", np.ascontiguousarray(pattern_image(rig, index)))
-            if not done:
-                raise FppBenchError(f"pattern {index}: OpenCV could not encode a PNG")
             paths.append(target / f"A_{index}.png")
-            paths[-1].write_bytes(png.tobytes())
+            paths[-1].write_bytes(png_bytes(pattern_image(rig, index)))
     except OSError as error:
         raise FppBenchError(f"{target}: patterns can't be written: {error.strerror or error}") from error
     return paths

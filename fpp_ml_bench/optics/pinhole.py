@@ -20,8 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.coding.code import LARGEST
-from fpp_ml_bench.errors import RigError
+from fpp_ml_bench.coding.code import number, numbers, require, whole
 
 Coefficients = tuple[float, ...]
 """5, 8, 12 or 14 of them."""
@@ -178,33 +177,6 @@ def undistort(x: ArrayLike, y: ArrayLike, coefficients: Coefficients) -> Maps:
     return np.where(good, xi, np.nan), np.where(good, yi, np.nan)
 
 
-def require(met: object, message: str) -> None:
-    """Raise `RigError` with ``message`` unless ``met``."""
-    if not met:
-        raise RigError(message)
-
-
-def number(value: object, name: str, *, positive: bool = False) -> float:
-    """``value`` as a finite float; raises `RigError` naming the key for anything else (text, booleans, NaN)."""
-    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        raise RigError(f"{name}: expected a number, got {value!r}")
-    if not -LARGEST <= value <= LARGEST or (positive and value <= 0):
-        kind = f"{'positive ' if positive else ''}finite number of at most {LARGEST:g}"
-        raise RigError(f"{name}: expected a {kind}, got {value!r}")
-    return float(value)
-
-
-def numbers(value: object, counts: int | tuple[int, ...], name: str) -> tuple[float, ...]:
-    """``value`` as finite floats, as many as ``counts`` allows; raises `RigError` naming the key and the entry."""
-    counts = (counts,) if isinstance(counts, int) else counts
-    expected = f"{name}: expected {' or '.join(map(str, counts))} numbers"
-    if isinstance(value, str | bytes | dict) or not isinstance(value, Iterable):
-        raise RigError(f"{expected}, got {value!r}")
-    entries = list(value)
-    require(len(entries) in counts, f"{expected}, got {len(entries)}")
-    return tuple(number(entry, f"{name}[{i}]") for i, entry in enumerate(entries))
-
-
 @dataclass(frozen=True)
 class Pinhole:
     """Size and intrinsics in px, distortion as in this module's docstring; to four coefficients k3 = 0 is added. Raises
@@ -221,10 +193,7 @@ class Pinhole:
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 1 <= value <= 65536:
-                raise RigError(f"{name}: expected a whole number of pixels from 1 to 65536, got {value!r}")
-            object.__setattr__(self, name, int(value))
+            object.__setattr__(self, name, whole(getattr(self, name), name, 1, 65536))
         for name in ("fx", "fy", "cx", "cy"):
             object.__setattr__(self, name, number(getattr(self, name), name, positive=name in ("fx", "fy")))
         distortion = numbers(self.distortion, COEFFICIENT_COUNTS, "distortion")

@@ -12,16 +12,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from fpp_ml_bench.coding.code import SMALLEST_PITCH_PX, Code
+from fpp_ml_bench.coding.code import SMALLEST_PITCH_PX, Code, number, numbers, require
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.coding.gray_code import bits_needed, cell_count
 from fpp_ml_bench.coding.phase_shift import PhaseShift
 from fpp_ml_bench.constants import BACKGROUND_M, MM_PER_M, STANDOFF_M, WORKING_RANGE_MM
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.optics.pinhole import Maps, Pinhole, number, numbers, require
+from fpp_ml_bench.optics.pinhole import Maps, Pinhole
 from fpp_ml_bench.optics.sequence import (
     AXES,
     DIRECTIONS,
+    PAPER_PITCH_PX,
     PAPER_SEQUENCE,
     CodedSequence,
     Direction,
@@ -50,8 +51,8 @@ class Rig:
     projector: Pinhole
     rotation: Matrix3
     translation_m: tuple[float, float, float]
-    pitch_horizontal_px: float | None = 18.0
-    pitch_vertical_px: float | None = 18.0
+    pitch_horizontal_px: float | None = PAPER_PITCH_PX
+    pitch_vertical_px: float | None = PAPER_PITCH_PX
     sequence: Sequence | CodedSequence = PAPER_SEQUENCE
     working_range_mm: tuple[float, float] = WORKING_RANGE_MM
     standoff_m: float = STANDOFF_M

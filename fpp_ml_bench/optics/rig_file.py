@@ -42,11 +42,12 @@ from typing import Any
 import numpy as np
 import yaml
 
+from fpp_ml_bench.coding.code import numbers, require
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.files import read_json, read_yaml, write_atomically
 from fpp_ml_bench.optics.opencv_files import read_opencv_calibration
-from fpp_ml_bench.optics.pinhole import Pinhole, numbers, require
+from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.optics.rig import Rig, middle_m, rotation_matrix
 from fpp_ml_bench.optics.sequence import AXES, CODED_KEYS, DIRECTIONS, Direction, sequence_from_dict
 
@@ -177,21 +178,11 @@ def load_projection(path: str | Path, camera_size: tuple[int, int] | None = None
         entries = dict(data)  # type: ignore[call-overload]
         device = entries.get("projector")
         require(isinstance(device, Mapping), f"projector: expected a mapping with width and height, got {device!r}")
-        sizes = {"camera": camera_size or (1, 1)}
         for key in ("width", "height"):
             require(key in device, f"projector.{key}: missing")
-        sizes["projector"] = device["width"], device["height"]
-        devices = {}
-        for name, (width, height) in sizes.items():
-            devices[name] = {
-                "width": width,
-                "height": height,
-                "fx": 1e3,
-                "fy": 1e3,
-                "cx": 0.0,
-                "cy": 0.0,
-                "distortion": [0.0] * 5,
-            }
+        sizes = {"camera": camera_size or (1, 1), "projector": (device["width"], device["height"])}
+        lens = {"fx": 1e3, "fy": 1e3, "cx": 0.0, "cy": 0.0, "distortion": [0.0] * 5}
+        devices = {name: {"width": width, "height": height, **lens} for name, (width, height) in sizes.items()}
         kept = {key: entries[key] for key in ("sequence", "pitch_px") if key in entries}
         pose = {"rotation": np.eye(3).tolist(), "translation_m": [0.1, 0.0, 0.0], "working_range_mm": [1.0, 1e9]}
         return rig_from_dict({**devices, **kept, **pose})

@@ -16,9 +16,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding.code import Code, Kind
-from fpp_ml_bench.coding.crossed import Crossed
-from fpp_ml_bench.coding.gray_code import GrayCells
+from fpp_ml_bench.coding.code import Code, Kind, whole
+from fpp_ml_bench.coding.crossed import Composite, Crossed
+from fpp_ml_bench.coding.gray_code import GrayCells, GrayOnly
 from fpp_ml_bench.coding.phase_shift import Fringes, PhaseShift, equal_shifts
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.errors import RigError
@@ -28,6 +28,8 @@ Direction = Literal["horizontal", "vertical"]
 DIRECTIONS: tuple[Direction, Direction] = ("horizontal", "vertical")
 AXES: tuple[Direction, Direction] = ("vertical", "horizontal")
 """The direction whose fringes measure the projector's u, then the direction whose fringes measure its v."""
+PAPER_PITCH_PX = 18.0
+"""Period of the paper's fringes in projector px."""
 CODED_KEYS = ("order", "crossed", *DIRECTIONS)
 """Entries of a rig file's sequence that is not of the paper's kind."""
 
@@ -79,12 +81,26 @@ class AnySequence(ABC):
         """Phase steps of the finest sinusoids, the fewest of the coded directions."""
 
     @abstractmethod
-    def equal_steps(self) -> list[tuple[Direction, tuple[int, ...], NDArray[np.float64]]]:
-        """Every set of sinusoids of one period in equal steps: direction, frame indices, and shifts in turns."""
+    def code(self, direction: Direction, pitch_px: float = PAPER_PITCH_PX) -> Code:
+        """The code of a direction; of the paper's kind with fringes of a period of ``pitch_px``. Raises `RigError`
+        where it has none."""
 
     @abstractmethod
     def to_dict(self) -> dict[str, Any]:
         """The entry ``sequence`` of a rig file."""
+
+    def equal_steps(self) -> list[tuple[tuple[int, ...], NDArray[np.float64]]]:
+        """Every set of sinusoids of one period in equal steps: frame indices, and shifts in turns."""
+        found = []
+        for direction in self.directions:
+            code = self.code(direction)
+            for number, fringe in enumerate(code.fringes if isinstance(code, PhaseShift) else ()):
+                steps = len(fringe.shifts_deg)
+                for sign in (1, -1):
+                    if steps >= 3 and fringe.shifts_deg == equal_shifts(steps, sign):
+                        found.append((self.period(direction, number), sign * np.arange(steps) / steps))
+                        break
+        return found
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -98,7 +114,7 @@ class AnySequence(ABC):
         ranked = sorted(found, key=lambda frame: (frame.kind != "sinusoid", frame.index))
         return tuple(frame.index for frame in ranked)
 
-    def sinusoids(self, direction: Direction) -> tuple[int, ...] | range:
+    def sinusoids(self, direction: Direction) -> tuple[int, ...]:
         """Frame indices of a direction's finest sinusoids, in the order of their steps; none where it has none."""
         return self.period(direction, self._finest(direction))
 
@@ -110,7 +126,7 @@ class AnySequence(ABC):
             if frame.kind == "sinusoid" and frame.direction == direction and frame.fringe == fringe
         )
 
-    def gray(self, direction: Direction) -> tuple[int, ...] | range:
+    def gray(self, direction: Direction) -> tuple[int, ...]:
         """Frame indices of a direction's Gray code, in the order of its frames; none where it has none."""
         return tuple(f.index for f in self.frames if f.kind == "gray" and f.direction == direction)
 
@@ -137,7 +153,7 @@ class AnySequence(ABC):
     def config(self, name: str) -> tuple[int, ...]:
         """Frame indices of a dataset configuration (paper Section 5.4): see ``CONFIGS``; empty where the sequence has
         none."""
-        horizontal, vertical = tuple(self.sinusoids("horizontal")), tuple(self.sinusoids("vertical"))
+        horizontal, vertical = self.sinusoids("horizontal"), self.sinusoids("vertical")
         crossed = self.crossed_frames
         single = ((0,) if 0 in crossed else horizontal or vertical or crossed or (0,))[:1]
         frames = (single, crossed, horizontal, vertical, horizontal + vertical, tuple(range(len(self))))
@@ -156,14 +172,8 @@ class Sequence(AnySequence):
     bits_vertical: int = 7
 
     def __post_init__(self) -> None:
-        if self.steps < 3:
-            raise ValueError(f"a phase needs at least 3 steps, got steps={self.steps}")
-        across, down = self.bits_horizontal, self.bits_vertical
-        if not (1 <= across <= 15 and 1 <= down <= 15):
-            raise ValueError(f"Gray bits must be 1 to 15 per direction, got {across} horizontal and {down} vertical")
-
-    def __len__(self) -> int:
-        return 2 * self.steps + self.bits_horizontal + self.bits_vertical + 2
+        for name, least, most in (("steps", 3, 1000), ("bits_horizontal", 1, 15), ("bits_vertical", 1, 15)):
+            whole(getattr(self, name), f"sequence.{name}", least, most)
 
     @property
     def directions(self) -> tuple[Direction, ...]:
@@ -172,40 +182,20 @@ class Sequence(AnySequence):
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)
 
-    def bits(self, direction: Direction) -> int:
-        return self.bits_horizontal if direction == "horizontal" else self.bits_vertical
+    def code(self, direction: Direction, pitch_px: float = PAPER_PITCH_PX) -> PhaseShift:
+        return _paper_code(self.steps, self._bits[direction], pitch_px)
 
-    def equal_steps(self) -> list[tuple[Direction, tuple[int, ...], NDArray[np.float64]]]:
-        turns = np.arange(self.steps) / self.steps
-        return [(direction, tuple(self.sinusoids(direction)), turns) for direction in DIRECTIONS]
-
-    def code(self, direction: Direction, pitch_px: float) -> PhaseShift:
-        """The code of a direction whose fringes have a period of ``pitch_px``."""
-        return _paper_code(self.steps, self.bits(direction), pitch_px)
+    @property
+    def _bits(self) -> dict[Direction, int]:
+        return {"horizontal": self.bits_horizontal, "vertical": self.bits_vertical}
 
     @cached_property
     def frames(self) -> tuple[Frame, ...]:
         described: list[tuple[Kind, Direction | None, int]]
         described = [("sinusoid", direction, n) for direction in DIRECTIONS for n in range(self.steps)]
-        described += [("gray", direction, bit) for direction in DIRECTIONS for bit in range(self.bits(direction))]
+        described += [("gray", direction, bit) for direction in DIRECTIONS for bit in range(self._bits[direction])]
         described += [("black", None, 0), ("white", None, 0)]
         return tuple(Frame(i, *d) for i, d in enumerate(described))
-
-    def sinusoids(self, direction: Direction) -> range:
-        first = 0 if direction == "horizontal" else self.steps
-        return range(first, first + self.steps)
-
-    def gray(self, direction: Direction) -> range:
-        first = 2 * self.steps + (0 if direction == "horizontal" else self.bits_horizontal)
-        return range(first, first + self.bits(direction))
-
-    @property
-    def black(self) -> int:
-        return len(self) - 2
-
-    @property
-    def white(self) -> int:
-        return len(self) - 1
 
 
 @lru_cache
@@ -244,8 +234,7 @@ class CodedSequence(AnySequence):
     def directions(self) -> tuple[Direction, ...]:
         return tuple(direction for direction in DIRECTIONS if getattr(self, direction) is not None)
 
-    def code(self, direction: Direction, pitch_px: float | None = None) -> Code:
-        """The code of a direction. Raises `RigError` where it has none."""
+    def code(self, direction: Direction, pitch_px: float = PAPER_PITCH_PX) -> Code:
         code: Code | None = getattr(self, direction)
         if code is None:
             others = (*self.directions, "crossed")[0]
@@ -255,19 +244,6 @@ class CodedSequence(AnySequence):
     @property
     def steps(self) -> int:
         return min((len(self.sinusoids(direction)) for direction in self.directions), default=0)
-
-    def equal_steps(self) -> list[tuple[Direction, tuple[int, ...], NDArray[np.float64]]]:
-        found = []
-        for direction in self.directions:
-            code = self.code(direction)
-            for number, fringe in enumerate(code.fringes if isinstance(code, PhaseShift) else ()):
-                steps = len(fringe.shifts_deg)
-                indices = self.period(direction, number)
-                for sign in (1, -1):
-                    if steps >= 3 and fringe.shifts_deg == equal_shifts(steps, sign):
-                        found.append((direction, indices, sign * np.arange(steps) / steps))
-                        break
-        return found
 
     @cached_property
     def frames(self) -> tuple[Frame, ...]:
@@ -296,10 +272,27 @@ class CodedSequence(AnySequence):
         return {"order": list(self.order), **crossed, **codes}
 
 
+SCHEMES: dict[str, type[Code]] = {scheme.scheme: scheme for scheme in (PhaseShift, GrayOnly, Composite)}
+
+
+def code_from_dict(entries: Mapping[str, Any], length_px: int, where: str) -> Code:
+    """The code that a rig file's entry describes, on a pattern ``length_px`` long. Raises `RigError` naming the key."""
+    if not isinstance(entries, Mapping):
+        raise RigError(f"{where}: expected a mapping with the key scheme, got {entries!r}")
+    scheme = entries.get("scheme")
+    if not isinstance(scheme, str) or scheme not in SCHEMES:
+        raise RigError(f"{where}.scheme: expected {', '.join(SCHEMES)}, got {scheme!r}")
+    rest = {key: value for key, value in entries.items() if key != "scheme"}
+    try:
+        code: Code = SCHEMES[scheme].from_entries(rest, length_px)
+        code.check(length_px)
+    except RigError as error:
+        raise RigError(f"{where}.{error}") from error
+    return code
+
+
 def sequence_from_dict(entries: object, lengths_px: Mapping[Direction, int]) -> Sequence | CodedSequence:
     """The sequence that a rig file describes, on patterns of ``lengths_px``. Raises `RigError` naming the key."""
-    from fpp_ml_bench.coding.schemes import code_from_dict
-
     if not isinstance(entries, Mapping):
         raise RigError(f"sequence: expected a mapping, got {entries!r}")
     paper = ("steps", "bits_horizontal", "bits_vertical")
@@ -334,13 +327,7 @@ def sequence_from_dict(entries: object, lengths_px: Mapping[Direction, int]) -> 
             f"sequence: {', '.join(problems)}; expected exactly {', '.join(paper)}, or a code for each direction under "
             f"{' and '.join(DIRECTIONS)}"
         )
-    for key in paper:
-        if isinstance(entries[key], bool) or not isinstance(entries[key], int):
-            raise RigError(f"sequence.{key}: expected a whole number, got {entries[key]!r}")
-    try:
-        return Sequence(**entries)
-    except ValueError as error:
-        raise RigError(f"sequence: {error}") from error
+    return Sequence(**entries)
 
 
 PAPER_SEQUENCE = Sequence()

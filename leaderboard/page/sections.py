@@ -10,17 +10,15 @@ from itertools import groupby
 from string import ascii_lowercase
 from typing import Any
 
-from fpp_ml_bench.baselines.tradeoff.drawing import Mark, Scatter
-from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, Tradeoff, pareto_front
-from fpp_ml_bench.baselines.tradeoff.report import scatter, tables
+from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, Tradeoff
+from fpp_ml_bench.baselines.tradeoff.report import Mark, Scatter, growth_table, point_table, scatter
 from fpp_ml_bench.evaluation.metrics import RANK_KEY
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
-from fpp_ml_bench.evaluation.report.html import interval_text, signed
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import columns
-from fpp_ml_bench.leaderboard.groups import MOST_PAIRED, Group, Ranked, is_trivial
-from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT
+from fpp_ml_bench.leaderboard.ranking import DEFAULT_SORT, MOST_PAIRED, Group, Ranked, is_trivial
 from fpp_ml_bench.loaders.storage.benchmark import benchmark_before
+from fpp_ml_bench.style import interval_text, signed
 
 _SPARSE = (*columns.PARTS, columns.RATIO, columns.RANGE, *columns.UNCERTAINTY, columns.LEARNED)
 _TRADEOFF_PICTURE = 430, 380
@@ -42,7 +40,7 @@ def blocks(groups: Sequence[Group], slugs: Mapping[int, str]) -> list[dict[str, 
         numbered = [(n, row.short_name, slugs[id(row.entry)]) for n, row in enumerate(rows, start=1)]
         datasets.append(
             {
-                "numbered": numbered if len(rows) <= MOST_LABELLED else [],
+                "numbered": numbered if len(rows) <= _MOST_LISTED else [],
                 "id": f"data-{hashlib.sha256(data.encode()).hexdigest()[:8]}",
                 "title": data,
                 "short": key.special_data or name,
@@ -134,7 +132,11 @@ def tradeoff_section(run: Tradeoff | None) -> dict[str, Any] | None:
         if picture := scatter(run, cost):
             about = f"Object MAE in mm against {picture.across}, both logarithmic"
             pictures.append(drawn(picture, "scatter", *_TRADEOFF_PICTURE, about))
-    return {"benchmark": benchmark_before(run.fingerprint), "pictures": pictures, "tables": tables(run)}
+    return {
+        "benchmark": benchmark_before(run.fingerprint),
+        "pictures": pictures,
+        "tables": [point_table(run), growth_table(run)],
+    }
 
 
 def _shade(error: float | None, low: float, high: float) -> int | None:
@@ -150,8 +152,8 @@ SIZES = (("wide", 570, 430), ("narrow", 360, 380))
 COSTS = {"seconds": "median time per image at batch 1, s", "frames": "captured frames"}
 CLASS_COLOURS = dict(zip(FRAMES_CLASSES, ("verified", "reported", "measured"), strict=True))
 _TRIVIAL_COLOUR = "soft"
-_MOST_NAMES, MOST_LABELLED = 24, 100
-"""Marks up to which a picture names them, and up to which it has labels: finding room for them takes quadratic time."""
+_MOST_NAMES, _MOST_LISTED = 24, 100
+"""Marks up to which a picture names them, and up to which the page lists their numbers."""
 
 
 def overview(groups: Sequence[Group], cost: str, slugs: Mapping[int, str]) -> Scatter | None:
@@ -159,16 +161,12 @@ def overview(groups: Sequence[Group], cost: str, slugs: Mapping[int, str]) -> Sc
     without any. On the front are rows that were given no ground truth and are not trivial. ``slugs``: the name of a
     row's page by id of its entry."""
     rows = [(group, row) for group in groups for row in group.rows]
-    marks, can_lead = [], []
-    for number, (group, row) in enumerate(rows, start=1):
-        if (mark := _mark(number, group, row, cost, slugs.get(id(row.entry), ""))) is not None:
-            marks.append(mark)
-            if group.key.track == "metric" and not is_trivial(row):
-                can_lead.append(mark)
-    front = [can_lead[index] for index in pareto_front([(mark.x, mark.y) for mark in can_lead])]
-    leading = set(map(id, front))
-    labelled = [*front, *(mark for mark in marks if id(mark) not in leading)] if len(marks) <= MOST_LABELLED else []
-    return Scatter(marks, front, COSTS[cost], labelled, names=len(marks) <= _MOST_NAMES) if marks else None
+    drawn = [
+        _mark(number, group, row, cost, slugs.get(id(row.entry), ""))
+        for number, (group, row) in enumerate(rows, start=1)
+    ]
+    marks = [mark for mark in drawn if mark is not None]
+    return Scatter(marks, COSTS[cost], names=len(marks) <= _MOST_NAMES) if marks else None
 
 
 def _mark(number: int, group: Group, row: Ranked, cost: str, page: str) -> Mark | None:
@@ -189,6 +187,7 @@ def _mark(number: int, group: Group, row: Ranked, cost: str, page: str) -> Mark 
         _TRIVIAL_COLOUR if is_trivial(row) else CLASS_COLOURS[group.key.frames],
         shape="o" if group.key.track == "metric" else "s",
         hollow=hollow,
+        can_lead=group.key.track == "metric" and not is_trivial(row),
         x_span=span if cost == "seconds" else None,
         y_span=row.interval(DEFAULT_SORT),
         title=f"{entry.name}: {error:.3g} mm, {time}, {frames}, {group.key.track} track, {row.provenance}",

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.calibration.boards import Board
-from fpp_ml_bench.calibration.projector_points import Pose, measure_pose
-from fpp_ml_bench.calibration.response import Levels, Response, fit_response, levels_of
+from fpp_ml_bench.calibration.projector_points import Levels, Pose, Response, fit_response, levels_of, measure_pose
 from fpp_ml_bench.calibration.result import Calibration
 from fpp_ml_bench.coding.code import MIN_MODULATION, Limits, Reason
 from fpp_ml_bench.constants import GREY_LEVELS
@@ -34,8 +33,9 @@ from fpp_ml_bench.loaders.captures.images import (
     read_frames,
     split_captures,
 )
-from fpp_ml_bench.loaders.published.importing import ImportPlan, RowReader, import_plan
+from fpp_ml_bench.loaders.published.importing import RowReader, import_plan
 from fpp_ml_bench.loaders.sample import Row
+from fpp_ml_bench.loaders.storage.assembly import Assembly
 from fpp_ml_bench.loaders.storage.manifest import CAPTURED, Manifest
 from fpp_ml_bench.loaders.storage.shards import ShardPlan, plan_rows
 from fpp_ml_bench.optics.rig import Rig, rotation_matrix
@@ -238,7 +238,7 @@ def plan_captures(
     bits: int | None = None,
     colour: str | None = None,
     anyway: bool = False,
-) -> ImportPlan[CaptureReader]:
+) -> Assembly[CaptureReader]:
     """Find the captures ``root/{object}/{view}/`` or ``root/{object}/``, each a folder of all frames of
     ``rig.sequence``. ``splits``: which objects are in which; None puts all into ``test``. ``limits``: of the decoder;
     ``bits`` and ``colour``: see `read_frames`; ``anyway``: captures that the examination refuses too.
@@ -361,8 +361,8 @@ def calibrated_rig(found: Calibration, stand_in: Rig, range_mm: tuple[float, flo
     near, far = range_mm or (float(np.min(depths)) * (1 - RANGE_MARGIN), float(np.max(depths)) * (1 + RANGE_MARGIN))
     return replace(
         stand_in,
-        camera=found.camera.pinhole(),
-        projector=found.projector.pinhole(),
+        camera=found.camera.pinhole,
+        projector=found.projector.pinhole,
         rotation=found.rotation,
         translation_m=found.translation_m,
     ).with_range((near, far))

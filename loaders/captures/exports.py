@@ -54,7 +54,6 @@ def export_capture(
     camera: Pinhole,
     grey: ArrayLike | None = None,
     forms: Sequence[str] = FORMS,
-    step_mm: float | None = None,
 ) -> list[Path]:
     """Write a depth map (H, W) in mm, 0 = none, into ``folder``; returns the files written, in the order of ``forms``::
 
@@ -66,8 +65,7 @@ def export_capture(
                levels of 0 to 255, as intensity and colour
         mesh   mesh.ply: the same points, neighbours joined by triangles
 
-    ``step_mm``: the largest step in depth between neighbours of one surface, by default `STEEPEST` times their
-    distance. Raises `CaptureError` for a map that is not finite, negative, empty or of another size than the camera's,
+    Raises `CaptureError` for a map that is not finite, negative, empty or of another size than the camera's,
     for grey levels that do not fit, an unknown form, or a folder that can't be written."""
     if not forms or not set(forms) <= set(FORMS):
         raise CaptureError(f"forms: expected some of {', '.join(FORMS)}, got {', '.join(map(str, forms)) or 'none'}")
@@ -79,8 +77,8 @@ def export_capture(
         "npy": lambda: ("depth.npy", _npy(depth)),
         "mat": lambda: ("depth.mat", matrix_bytes({"depthMap": depth})),
         "png": lambda: _png(depth),
-        "ply": lambda: ("points.ply", depth_ply(depth, camera, shade, step_mm)),
-        "mesh": lambda: ("mesh.ply", depth_ply(depth, camera, shade, step_mm, joined=True)),
+        "ply": lambda: ("points.ply", depth_ply(depth, camera, shade)),
+        "mesh": lambda: ("mesh.ply", depth_ply(depth, camera, shade, joined=True)),
     }
     return write_files(Path(folder), dict(written[form]() for form in forms), CaptureError)
 
@@ -91,15 +89,15 @@ def _npy(values: NDArray) -> bytes:
     return buffer.getvalue()
 
 
-def pixel_normals(depth_mm: ArrayLike, camera: Pinhole, step_mm: float | None = None) -> NDArray[np.float64]:
+def pixel_normals(depth_mm: ArrayLike, camera: Pinhole) -> NDArray[np.float64]:
     """Unit normals float64 (H, W, 3) of a depth map (H, W) in mm, towards the camera; 0 where there is no depth. From
-    the differences to the neighbours that belong to the same surface (``step_mm`` as in `export_capture`), and along
-    the ray where there are too few. Raises `CaptureError` as `export_capture`."""
+    the differences to the neighbours that belong to the same surface, and along the ray where there are too few. Raises
+    `CaptureError` as `export_capture`."""
     rays, depth = _rays_and_depth(depth_mm, camera)
     points = rays * depth[..., None]
     tangents = []
     for one, other in (((_BEFORE, _ALL), (_AFTER, _ALL)), ((_ALL, _BEFORE), (_ALL, _AFTER))):
-        joined = _joined(rays, depth, one, other, step_mm)
+        joined = _joined(rays, depth, one, other)
         difference = np.where(joined[..., None], points[other] - points[one], 0.0)
         tangent = np.zeros_like(points)
         tangent[one] += difference
@@ -112,17 +110,16 @@ def pixel_normals(depth_mm: ArrayLike, camera: Pinhole, step_mm: float | None = 
     return np.where(depth[..., None] > 0, normals / np.where(length > 0, length, 1.0), 0.0)
 
 
-def triangles(depth_mm: ArrayLike, camera: Pinhole, step_mm: float | None = None) -> NDArray[np.int64]:
-    """Triangles (M, 3) between neighbouring pixels of one surface (``step_mm`` as in `export_capture`), as indices of
-    pixels, row * W + column, in the order that makes their normals point at the camera. A square of four pixels is
-    divided along the diagonal that gives more triangles, or has the smaller step. Raises `CaptureError` as
-    `export_capture`."""
+def triangles(depth_mm: ArrayLike, camera: Pinhole) -> NDArray[np.int64]:
+    """Triangles (M, 3) between neighbouring pixels of one surface, as indices of pixels, row * W + column, in the order
+    that makes their normals point at the camera. A square of four pixels is divided along the diagonal that gives more
+    triangles, or has the smaller step. Raises `CaptureError` as `export_capture`."""
     rays, depth = _rays_and_depth(depth_mm, camera)
     index = np.arange(depth.size).reshape(depth.shape)
 
     def whole(*corners: Part) -> tuple[NDArray[np.bool_], tuple[Part, ...]]:
         """Where three corners belong to one surface, pair by pair."""
-        pairs = [_joined(rays, depth, one, other, step_mm) for one, other in combinations(corners, 2)]
+        pairs = [_joined(rays, depth, one, other) for one, other in combinations(corners, 2)]
         return np.logical_and.reduce(pairs), corners
 
     falling = whole(_FIRST, _BELOW, _ACROSS), whole(_FIRST, _ACROSS, _RIGHT)
@@ -160,15 +157,11 @@ def _rays_and_depth(depth_mm: ArrayLike, camera: Pinhole) -> tuple[NDArray[np.fl
     return rays, np.where(seen, _checked(depth_mm, camera, "depth_mm"), 0.0)
 
 
-def _joined(
-    rays: NDArray[np.float64], depth: NDArray[np.float64], one: Part, other: Part, step_mm: float | None
-) -> NDArray[np.bool_]:
+def _joined(rays: NDArray[np.float64], depth: NDArray[np.float64], one: Part, other: Part) -> NDArray[np.bool_]:
     """Whether the pixels at ``one`` and ``other`` have a depth and belong to the same surface."""
-    if step_mm is not None and not 0 < step_mm < np.inf:
-        raise CaptureError(f"step_mm: expected a positive number of mm, got {step_mm!r}; leave it out for the default")
     near, far = depth[one], depth[other]
     apart = (near + far) / 2 * np.linalg.norm(rays[one] - rays[other], axis=-1)
-    return (near > 0) & (far > 0) & (np.abs(near - far) <= (STEEPEST * apart if step_mm is None else step_mm))
+    return (near > 0) & (far > 0) & (np.abs(near - far) <= STEEPEST * apart)
 
 
 def _png(depth: NDArray[np.float32]) -> tuple[str, bytes]:
@@ -209,7 +202,6 @@ def depth_ply(
     depth_mm: ArrayLike,
     camera: Pinhole,
     grey: ArrayLike | None = None,
-    step_mm: float | None = None,
     joined: bool = False,
 ) -> bytes:
     """PLY of `camera_points` with their normals and ``grey`` (H, W), grey levels of 0 to 255, ``joined`` by `triangles`
@@ -219,8 +211,8 @@ def depth_ply(
     points, there = camera_points(depth_mm, camera)
     shade = None if grey is None else _checked(grey, camera, "grey", GREY_LEVELS)[there]
     place = np.cumsum(there.ravel()) - 1
-    faces = place[triangles(depth_mm, camera, step_mm)] if joined else None
-    return ply_bytes(points, faces, pixel_normals(depth_mm, camera, step_mm)[there], shade)
+    faces = place[triangles(depth_mm, camera)] if joined else None
+    return ply_bytes(points, faces, pixel_normals(depth_mm, camera)[there], shade)
 
 
 def check_outputs(folder: Path) -> list[Path]:

@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import PUBLISHED_SPLIT_FOLDERS, VIEWS
 from fpp_ml_bench.containers import matrix_bytes, png_bytes
 from fpp_ml_bench.decoding.decode import decode_stack
-from fpp_ml_bench.depth import normalise, object_mask
+from fpp_ml_bench.depth import depth_range_mm, normalise, object_mask
 from fpp_ml_bench.errors import BuildError, DatasetError
 from fpp_ml_bench.files import LOCK_FILE, exclusive
 from fpp_ml_bench.loaders.published import tree
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
 from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER
 from fpp_ml_bench.loaders.storage.parquet import write_parquet
-from fpp_ml_bench.loaders.storage.shards import depth_range_mm
 from fpp_ml_bench.loaders.storage.store import ALL_SPLITS, DatasetFolder
 from fpp_ml_bench.optics.patterns import export_patterns
 from fpp_ml_bench.optics.sequence import Direction, Sequence
@@ -52,7 +51,7 @@ def _write_sample(dataset: DatasetFolder, folder: Path, split: str, sample: str)
     frame = dataset.frame(sample, SINGLE_SHOT_FRAME)
     fringe = png_bytes(frame)
     background_removed = png_bytes(np.where(object_mask(depth_mm), frame, np.uint8(0)))
-    low_mm, high_mm = depth_range_mm(depth_mm, sample)
+    low_mm, high_mm = depth_range_mm(depth_mm)
     training = folder / tree.TRAINING
     for name, variable in tree.VARIABLES.items():
         represented: NDArray = depth_mm

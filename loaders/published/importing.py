@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from fpp_ml_bench import __version__
 from fpp_ml_bench.calibration.projection import MOST_PX, DepthView, view_from_frames
 from fpp_ml_bench.containers import from_file, parse_image, parse_matrix
 from fpp_ml_bench.decoding.decode import decode_stack
-from fpp_ml_bench.depth import Normalisation, denormalise, object_mask
+from fpp_ml_bench.depth import Normalisation, denormalise, depth_problem, depth_range_mm, object_mask
 from fpp_ml_bench.errors import CaptureError, DecodeError, LayoutError, PredictionError, RigError
 from fpp_ml_bench.loaders.captures.images import listed
 from fpp_ml_bench.loaders.published import tree as published_tree
@@ -100,28 +100,23 @@ class RowReader:
 Reader = TypeVar("Reader", bound=RowReader)
 
 
-class ImportPlan(NamedTuple, Generic[Reader]):
-    """An import that is ready to start: the reader of the samples found, and the dataset to assemble."""
-
-    reader: Reader
-    assembly: Assembly
-
-
 def import_plan(
     reader: Reader, plans: list[ShardPlan], origin: str, settings: dict[str, Any], stored: str
-) -> ImportPlan[Reader]:
-    """The plan of a dataset of ``reader``'s rows, with ``stored`` frames of its rig."""
+) -> Assembly[Reader]:
+    """What there is to do for a dataset of ``reader``'s rows, with ``stored`` frames of its rig."""
     camera, generator = reader.rig.camera, {"name": "fpp-ml-bench", "version": __version__}
     size = camera.height, camera.width
     manifest = Manifest(origin, generator, settings, reader.rig.to_dict(), size, stored, exact=False)
-    return ImportPlan(reader, Assembly(plans, reader, manifest))
+    return Assembly(plans, reader, manifest)
 
 
-def import_rows(folder: Path, plan: ImportPlan, workers: int, progress: Progress = lambda rows: None) -> Manifest:
+def import_rows(
+    folder: Path, plan: Assembly[RowReader], workers: int, progress: Progress = lambda rows: None
+) -> Manifest:
     """Write the planned dataset into ``folder``, or go on with one that was interrupted. When a sample can't be read,
     all others are tried too, and the reader's refusal of all problems is raised, a `LayoutError` or `CaptureError`.
     Raises `BuildError` as a build does, and when a file changed after ``folder`` was finished."""
-    reader = plan.reader
+    reader = plan.rows
 
     def problems_of(sample: Any) -> list[str]:
         problems: list[str] = []
@@ -129,9 +124,9 @@ def import_rows(folder: Path, plan: ImportPlan, workers: int, progress: Progress
             reader.read(sample)
         return problems
 
-    forget_outdated(folder, plan.assembly.plans, lambda name: reader.samples[name].files)
+    forget_outdated(folder, plan.plans, lambda name: reader.samples[name].files)
     try:
-        return assemble(folder, plan.assembly, workers, progress)
+        return assemble(folder, plan, workers, progress)
     except (LayoutError, CaptureError) as error:
         with ThreadPoolExecutor(_CHECK_THREADS) as pool:
             problems = [line for found in pool.map(problems_of, reader.samples.values()) for line in found]
@@ -218,8 +213,7 @@ class SampleReader(RowReader):
                     f"most {AGREEMENT_MM} mm"
                 )
         if limits is not None and first != "individual":
-            inside = depth_mm[object_mask(depth_mm)]
-            actual = float(inside.min()), float(inside.max())
+            actual = depth_range_mm(depth_mm)
             if np.abs(np.subtract(actual, limits)).max() > AGREEMENT_MM:
                 problems.append(
                     f"{sample.info}: gives {limits[0]:.3f} to {limits[1]:.3f} mm, but {files[first]} has "
@@ -232,17 +226,13 @@ class SampleReader(RowReader):
         height, width = self.tree.size
         if values.shape != (height, width):
             raise LayoutError(f"{path}: expected {height} x {width} like the images, got {values.shape}")
-        for wrong, are in ((~np.isfinite(values), "NaN or infinite"), (values < 0, "negative; background is 0")):
-            if wrong.any():
-                raise LayoutError(f"{path}: {np.count_nonzero(wrong)} pixels are {are}")
-        inside = object_mask(values)
-        if not inside.any():
-            raise LayoutError(f"{path}: no pixel is above 0, so there is no object")
+        if problem := depth_problem(values):
+            raise LayoutError(f"{path}: {problem}")
         if variant == "individual" and values.max() > 1 + _ROUNDING:
             raise LayoutError(f"{path}: expected values in [0, 1], got up to {values.max():g}")
-        depth_mm = np.where(inside, denormalise(values, variant, *limits), 0.0)
+        depth_mm = np.where(object_mask(values), denormalise(values, variant, *limits), 0.0)
         near, far = self.rig.working_range_mm
-        low, high = float(depth_mm[inside].min()), float(depth_mm[inside].max())
+        low, high = depth_range_mm(depth_mm)
         if low < near / _UNIT_SLACK or high > far * _UNIT_SLACK:
             unit = "m" if variant == "global" else "mm"
             raise LayoutError(
@@ -269,7 +259,7 @@ def _disagreement_mm(variant_mm: NDArray[np.float64], depth_mm: NDArray[np.float
 
 def plan_import(
     root: Path, rig: Rig | None = None, frame_order: str = AUTO, source: Source | None = None
-) -> ImportPlan[SampleReader]:
+) -> Assembly[SampleReader]:
     """Scan the tree at ``root`` and determine how it is read. ``rig``: the rig that took the images; None assumes the
     paper's rig, scaled to the image size. ``frame_order``: see `FrameOrder`; ``auto`` determines it from the first
     sample's images, and checks all others against it. ``source``: where the tree was downloaded from. Raises

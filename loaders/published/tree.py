@@ -2,8 +2,9 @@
 Only directory entries and PNG headers are read here; contents are checked when a sample is read
 (`fpp_ml_bench.loaders.published.importing`). Names that begin with a dot, and files beside the folders, are ignored."""
 
+import re
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,7 +42,12 @@ NOT_STORED = (WRAPPED_PHASE, UNWRAPPED_PHASE, HEIGHTS)
 
 LISTED_PROBLEMS = 50
 _KINDS = {FRINGE: ".png", DEPTH: ".mat"}
+_SAMPLE_FILE = re.compile(rf"{OBJECT_NAME.pattern}_({'|'.join(VIEWS)})\.(png|mat)")
 
+_LAYOUT = (
+    f"SPLIT/{FRINGE}/OBJECT_VIEW.png and SPLIT/{DEPTH}/OBJECT_VIEW.mat, splits "
+    f"{', '.join(PUBLISHED_SPLIT_FOLDERS.values())}, views {', '.join(VIEWS)}"
+)
 _COLOURS = {PNG_GREY: "grey", PNG_RGB: "RGB", 3: "palette", 4: "grey + alpha", 6: "RGB + alpha"}
 
 
@@ -135,36 +141,51 @@ def scan_tree(root: Path, frames: int, only: Collection[str] | None = None) -> P
     the folders of variants and raw scans, those that ``only`` names are read; None: all."""
     training, scans = _locate(root)
     scans = scans if only is None or RAW_SCANS in only else None
-    scan, frame_files = _Scan(), [frame_file(index) for index in range(frames)]
     read = {name: folder for name, folder in VARIANT_FOLDERS.items() if only is None or folder in only}
     variants = tuple(name for name, folder in read.items() if (training / folder).is_dir())
-    folders = [training / VARIANT_FOLDERS[name] for name in variants]
-    names = PUBLISHED_SPLIT_FOLDERS.values()
-    present = {name for folder in folders for name in scan.known(folder, names, f"the folders {', '.join(names)}")}
-    info = training / INFO if (training / INFO).is_dir() else None
-    if info:
-        scan.known(info, present, f"the folders {', '.join(sorted(present))}")
+    folders, info = [training / VARIANT_FOLDERS[name] for name in variants], training / INFO
+    names, problems = PUBLISHED_SPLIT_FOLDERS.values(), list[str]()
+    files = {file for folder in folders for file in _files(folder, (names, _KINDS, _SAMPLE_FILE), _LAYOUT, problems)}
+    expected = set[Path]()
+    if info.is_dir():
+        files |= _files(info, (names, (DEPTH,), _SAMPLE_FILE), _LAYOUT, problems)
     elif variants == ("individual",):
-        reason = "normalised depth can't be converted to mm without it"
-        scan.problems.append(f"{training / INFO}: the folder is missing; {reason}")
+        problems.append(f"{info}: the folder is missing; normalised depth can't be converted to mm without it")
     samples: list[PublishedSample] = []
     for split, name in PUBLISHED_SPLIT_FOLDERS.items():
         parts = [folder / name for folder in folders]
-        ranges = info / name / DEPTH if info else None
-        for stem in sorted(scan.stems(parts, ranges) if name in present else (), key=_place):
+        stems = {file.stem for file in files if file.parent.parent in parts and file.suffix == _KINDS[file.parent.name]}
+        for stem in sorted(stems, key=_place):
             fringes, depths = (tuple(part / kind / f"{stem}{_KINDS[kind]}" for part in parts) for kind in _KINDS)
-            label, limits = split_sample_name(stem), ranges / f"{stem}.mat" if ranges else None
-            raw = [scans.joinpath(*label, name) for name in frame_files] if scans else ()
+            label, limits = split_sample_name(stem), info / name / DEPTH / f"{stem}.mat" if info.is_dir() else None
+            raw = [scans.joinpath(*label, frame_file(index)) for index in range(frames)] if scans else ()
             samples.append(PublishedSample(stem, *label, split, fringes, depths, limits, tuple(raw)))
-    scan.objects(samples)
+            expected.update(samples[-1].files)
+    problems += [f"{file}: belongs to no sample of this split" for file in sorted(files - expected)]
     if scans:
-        scan.raw_scans(scans, {sample.sample for sample in samples}, frame_files)
-    if not samples and not scan.problems:
-        scan.problems.append(f"{folders[0]}: holds no sample")
-    images = [path for sample in samples for path in (*sample.fringes, *sample.frames)]
-    size = scan.size([path for path in images if path.exists() or path.is_symlink()])
-    if scan.problems:
-        raise layout_error(root, scan.problems)
+        frame_files = [frame_file(index) for index in range(frames)]
+        layout = f"OBJECT/VIEW/ with {frame_files[0]} to {frame_files[-1]}, {', '.join(NOT_STORED)}"
+        raw_files = _files(scans, (OBJECT_NAME, VIEWS, {*frame_files, *NOT_STORED}), layout, problems)
+        views = {file.parent for file in raw_files} - {path.parent for path in expected}
+        problems += [f"{view}: a raw scan without depth; {TRAINING} has no such sample" for view in sorted(views)]
+        files |= raw_files
+    missing = sorted(expected - files)
+    problems += [
+        f"{folder}: the {'raw scan' if scans in folder.parents else 'folder'} is missing"
+        for folder in dict.fromkeys(path.parent for path in missing)
+        if not folder.is_dir()
+    ]
+    problems += [
+        f"{path}: is missing, and other files of its sample are there" for path in missing if path.parent.is_dir()
+    ]
+    problems += _object_problems(samples)
+    if not samples and not problems:
+        problems.append(f"{folders[0]}: holds no sample")
+    size = _image_size(
+        [path for sample in samples for path in (*sample.fringes, *sample.frames) if path in files], problems
+    )
+    if problems:
+        raise layout_error(root, problems)
     ignored = [name for name in BACKGROUND_REMOVED_FOLDERS.values() if (training / name).is_dir()]
     if scans:
         ignored += [f"{RAW_SCANS}/*/*/{name}" for name in NOT_STORED if next(scans.glob(f"*/*/{name}"), None)]
@@ -177,104 +198,52 @@ def _place(stem: str) -> tuple[int, str, int]:
     return OBJECTS.index(name) if name in OBJECTS else len(OBJECTS), name, VIEWS.index(view)
 
 
-class _Scan:
-    """Lists files folder by folder, and collects ``problems``, a line each."""
+def _files(
+    folder: Path, levels: Sequence[Collection[str] | re.Pattern[str]], layout: str, problems: list[str]
+) -> set[Path]:
+    """Files below a folder whose path has a name of each level; adds a problem for any other file or folder, which says
+    what ``layout`` is expected."""
+    (names, *below), files = levels, set[Path]()
+    for entry in visible(folder, LayoutError):
+        fits = names.fullmatch(entry.name) if isinstance(names, re.Pattern) else entry.name in names
+        if not fits or entry.is_dir() != bool(below):
+            named = names is _SAMPLE_FILE and entry.suffix in _KINDS.values()
+            problems.append(f"{entry}: {'' if named else 'does not belong here; '}expected {layout}")
+        elif below:
+            files |= _files(entry, below, layout, problems)
+        else:
+            files.add(entry)
+    return files
 
-    def __init__(self) -> None:
-        self.problems: list[str] = []
 
-    def _foreign(self, entry: Path, expected: str) -> None:
-        self.problems.append(f"{entry}: does not belong here; expected {expected}")
+def _object_problems(samples: list[PublishedSample]) -> list[str]:
+    """Objects that are in two splits or lack views."""
+    problems, first_files = [], dict[str, dict[str, Path]]()
+    for sample in samples:
+        first_files.setdefault(sample.object, {}).setdefault(sample.split, sample.fringes[0])
+    stems = {sample.sample for sample in samples}
+    for name, by_split in first_files.items():
+        first, *others = by_split.values()
+        if others:
+            problems.append(f"{first}: object {name} is in two splits, see {', '.join(map(str, others))}")
+        if missing := [stem for view in VIEWS if (stem := sample_name(name, view)) not in stems]:
+            problems.append(f"{first.parent}: object {name} lacks {', '.join(missing)}")
+    return problems
 
-    def _entries(self, folder: Path) -> list[Path]:
-        if folder.is_dir():
-            return visible(folder, LayoutError)
-        self.problems.append(f"{folder}: the folder is missing")
-        return []
 
-    def known(self, folder: Path, names: Collection[str], expected: str) -> dict[str, Path]:
-        """Entries called ``names`` in a folder; reports everything else in it."""
-        entries = {entry.name: entry for entry in self._entries(folder)}
-        for name in sorted(entries.keys() - names):
-            self._foreign(entries.pop(name), expected)
-        return entries
-
-    def stems(self, parts: list[Path], ranges: Path | None) -> set[str]:
-        """Samples of which the folders ``parts`` of a split hold a fringe or a depth; reports what is not there for
-        each of them, and depth ranges in the folder ``ranges`` that belong to none."""
-        listed: dict[Path, set[str]] = {}
-        for part in parts:
-            self.known(part, _KINDS, f"the folders {' and '.join(_KINDS)}")
-            listed |= {part / kind: self._named(part / kind) for kind in _KINDS}
-        stems = set[str]().union(*listed.values())
-        if ranges:
-            listed[ranges] = self._named(ranges)
-            extra = sorted(listed[ranges] - stems)
-            self.problems += [f"{ranges / stem}.mat: belongs to no sample of this split" for stem in extra]
-        for folder, present in listed.items():
-            for stem in sorted(stems - present):
-                other = next(place for place, there in listed.items() if stem in there)
-                found = f"{other / stem}{_KINDS[other.name]}"
-                self.problems.append(f"{folder / stem}{_KINDS[folder.name]}: is missing; {found} is there")
-        return stems
-
-    def _named(self, folder: Path) -> set[str]:
-        """Samples with a file in a folder of fringes or depths."""
-        suffix, stems = _KINDS[folder.name], set()
-        for entry in self._entries(folder):
-            name, _, view = entry.stem.rpartition("_")
-            if entry.suffix != suffix or not entry.is_file():
-                self._foreign(entry, f"files ending in {suffix}")
-            elif not OBJECT_NAME.fullmatch(name) or view not in VIEWS:
-                self.problems.append(f"{entry}: expected a name like power_drill_A60{suffix}, views {', '.join(VIEWS)}")
-            else:
-                stems.add(entry.stem)
-        return stems
-
-    def raw_scans(self, root: Path, samples: set[str], names: list[str]) -> None:
-        """Report what is not a raw scan of frames ``names`` for each of the ``samples``."""
-        scans: dict[str, Path] = {}
-        for folder in visible(root, LayoutError):
-            if not folder.is_dir():
-                self._foreign(folder, "one folder per object")
-                continue
-            views = self.known(folder, VIEWS, f"the folders {', '.join(VIEWS)}")
-            scans |= {sample_name(folder.name, name): view for name, view in views.items()}
-        for stem, view in scans.items():
-            if stem not in samples:
-                self.problems.append(f"{view}: a raw scan without depth; {TRAINING} has no sample {stem}")
-                continue
-            present = self.known(view, {*names, *NOT_STORED}, f"{names[0]} to {names[-1]}, {', '.join(NOT_STORED)}")
-            self.problems += [f"{view / name}: is missing" for name in names if name not in present]
-        missing = (root.joinpath(*split_sample_name(stem)) for stem in sorted(samples - scans.keys()))
-        self.problems += [f"{view}: the raw scan is missing" for view in missing]
-
-    def objects(self, samples: list[PublishedSample]) -> None:
-        """Report objects that are in two splits or lack views."""
-        first_files: dict[str, dict[str, Path]] = {}
-        for sample in samples:
-            first_files.setdefault(sample.object, {}).setdefault(sample.split, sample.fringes[0])
-        stems = {sample.sample for sample in samples}
-        for name, by_split in first_files.items():
-            first, *others = by_split.values()
-            if others:
-                self.problems.append(f"{first}: object {name} is in two splits, see {', '.join(map(str, others))}")
-            if missing := [stem for view in VIEWS if (stem := sample_name(name, view)) not in stems]:
-                self.problems.append(f"{first.parent}: object {name} lacks {', '.join(missing)}")
-
-    def size(self, paths: list[Path]) -> tuple[int, int]:
-        """Image size of most PNG headers; reports every file of another size."""
-        sizes: dict[Path, tuple[int, int]] = {}
-        for path in paths:
-            try:
-                with opened(path, links=True) as (stream, _):
-                    sizes[path] = png_size(stream.read(PNG_HEADER_BYTES))
-            except PredictionError as error:
-                self.problems.append(f"{path}: {error}")
-        common = Counter(sizes.values()).most_common(1)[0][0] if sizes else (0, 0)
-        self.problems += [
-            f"{path}: expected {common[1]} x {common[0]} px as most images here, got {size[1]} x {size[0]}"
-            for path, size in sizes.items()
-            if size != common
-        ]
-        return common
+def _image_size(paths: list[Path], problems: list[str]) -> tuple[int, int]:
+    """Image size of most PNG headers; adds a problem for every file of another size."""
+    sizes: dict[Path, tuple[int, int]] = {}
+    for path in paths:
+        try:
+            with opened(path, links=True) as (stream, _):
+                sizes[path] = png_size(stream.read(PNG_HEADER_BYTES))
+        except PredictionError as error:
+            problems.append(f"{path}: {error}")
+    common = Counter(sizes.values()).most_common(1)[0][0] if sizes else (0, 0)
+    problems += [
+        f"{path}: expected {common[1]} x {common[0]} px as most images here, got {size[1]} x {size[0]}"
+        for path, size in sizes.items()
+        if size != common
+    ]
+    return common

@@ -7,7 +7,7 @@ of the range, and rho the albedo. Surfaces are matte for this light. Between sur
 normal, as an irradiance cache does (Ward, Rubinstein and Clear 1988).
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +29,7 @@ _TOGETHER = 64
 _MOST = 27 * SIDES * SLABS
 
 
-@dataclass(frozen=True)
-class PlaneLight:
+class PlaneLight(NamedTuple):
     """What the lit part of the background plane sends back in each frame: ``table`` float64 (Y, X, F), in cells of
     ``cell_m`` from ``corner_m`` (x, y) on, at ``distance_m``; camera coordinates."""
 
@@ -74,10 +73,7 @@ class PlaneLight:
             surfels.open_starts,
             np.ascontiguousarray(turned(surfels.open_directions, degrees)),
             np.ascontiguousarray(turned(surfels.grid.position_m, degrees) + offset_m),
-            self.distance_m,
-            self.corner_m,
-            self.cell_m,
-            self.table,
+            self,
             arriving,
         )
         return arriving
@@ -116,14 +112,10 @@ def gather_form_factors(starts, seen, share, leaving, arriving):  # type: ignore
 
 
 @njit
-def from_plane(  # type: ignore[no-untyped-def]
-    starts, directions, position, distance, corner, cell, table, arriving
-):
-    """Irradiance from the plane z = ``distance``: adds to ``arriving`` (K, F) what each open ray meets there.
-
-    ``directions`` (E, 3) and ``position`` (K, 3) in camera coordinates; ``table`` (Y, X, F): what leaves the plane, in
-    cells of ``cell`` m from ``corner`` (x, y) on, and nothing beyond.
-    """
+def from_plane(starts, directions, position, plane, arriving):  # type: ignore[no-untyped-def]
+    """Irradiance from a `PlaneLight`: adds to ``arriving`` (K, F) what each open ray meets there, nothing beyond its
+    table. ``directions`` (E, 3) and ``position`` (K, 3) in camera coordinates."""
+    distance, corner, cell, table = plane.distance_m, plane.corner_m, plane.cell_m, plane.table
     for k in range(starts.size - 1):
         row = arriving[k]
         for entry in range(starts[k], starts[k + 1]):
@@ -147,18 +139,7 @@ def at_points(
     ``position_m`` and unit ``normal`` float64 (n, 3), object coordinates.
     """
     out = np.empty((values.shape[1], len(position_m)), dtype=np.float32)
-    interpolate(
-        grid.corner_m,
-        grid.cell_m,
-        grid.table,
-        grid.position_m,
-        grid.normal,
-        grid.area_m2,
-        values,
-        position_m,
-        normal,
-        out,
-    )
+    interpolate(grid, values, position_m, normal, out)
     return out
 
 
@@ -177,16 +158,15 @@ def mix_frames(modes, mix, factor, points, out):  # type: ignore[no-untyped-def]
 
 
 @njit
-def interpolate(  # type: ignore[no-untyped-def]
-    corner, cell, table, position, normal, area, values, points, facing, out
-):
+def interpolate(grid, values, points, facing, out):  # type: ignore[no-untyped-def]
     """Weighted means of the surfels within a cell's width of each point: fills ``out`` (F, n).
 
     The weight is the surfel's area, times (1 - d^2)^2 at a distance of d cells, in which the part along the normal
     counts four times, times the fourth power of the cosine between the normals: it fades to nothing, so the mean is
     continuous. Without a surfel in reach the nearest counts.
     """
-    nearby, weights = np.empty(_MOST, np.int64), np.empty(_MOST)
+    corner, cell, table, position, normal = grid.corner_m, grid.cell_m, grid.table, grid.position_m, grid.normal
+    area, nearby, weights = grid.area_m2, np.empty(_MOST, np.int64), np.empty(_MOST)
     sums = np.empty((_TOGETHER, values.shape[1]))
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]

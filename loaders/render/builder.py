@@ -15,7 +15,7 @@ from fpp_ml_bench.loaders.render.meshes import solid_mesh, write_ply
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.sample import Row
-from fpp_ml_bench.loaders.storage.assembly import Assembly, Progress, assemble, assemble_remote
+from fpp_ml_bench.loaders.storage.assembly import Assembly, Progress, assemble
 from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER, Manifest
 from fpp_ml_bench.loaders.storage.shards import ShardPlan, plan_shards
 from fpp_ml_bench.remote import RemoteFolder
@@ -76,8 +76,6 @@ def build(
     """Build a dataset into ``folder``, or go on with one that was interrupted, by so many processes or by the Ray
     cluster at an address. Same settings, same bytes. Raises `BuildError` (folder in use, other settings, disk full),
     `MeshError` (an object does not fit), and `PoolError` and `RemoteError` for a cluster or URL that fails."""
-    if isinstance(folder, RemoteFolder):
-        return assemble_remote(folder, assembly_of(settings), workers, cluster, progress)
     return assemble(folder, assembly_of(settings), workers, progress, cluster)
 
 

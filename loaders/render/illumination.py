@@ -2,9 +2,15 @@
 
 Inverse square, cosine, the projector's falloff and its field; points turned away, outside the pattern or, on request,
 in shadow get none. Brightness is in grey levels of the 8-bit image at exposure 1.
+
+A surface returns light by a matte part, and a microfacet lobe beside it:
+``f = (1 - gloss) albedo / pi + gloss D G / (4 cos_l cos_v)`` with the GGX distribution D and Smith's G (Walter et al.
+2007, Microfacet Models for Refraction, equations 33 and 34), alpha the square of the roughness: a blend of a diffuse
+surface and a rough mirror, as Mitsuba's ``blendbsdf`` of ``diffuse`` and ``roughconductor`` is.
 """
 
 from dataclasses import dataclass, replace
+from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +19,12 @@ from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.loaders.render.light import Light
 from fpp_ml_bench.loaders.render.projector import PatternLight, PatternPlace
 from fpp_ml_bench.loaders.render.raycast import TracedObject
-from fpp_ml_bench.loaders.render.surface import reflectance
 from fpp_ml_bench.optics.rig import Rig
 
 NEAREST_M = 1e-3
 """A point nearer to a centre of projection is inside that lens and gets no light: the inverse square has no limit."""
 
+Values = NDArray[np.float64]
 Axes = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 """x, y and z (n,) each: operations on (n, 3) arrays run three numbers at a time, on (n,) arrays n."""
 
@@ -150,3 +156,31 @@ def grey_of_white(light: Light) -> float:
 def in_pattern(u: NDArray[np.float64], v: NDArray[np.float64], rig: Rig) -> NDArray[np.bool_]:
     """Which projector pixels (n,), (n,) lie on the pattern, outer pixels included whole; NaN does not; bool (n,)."""
     return (u >= -0.5) & (u <= rig.projector.width - 0.5) & (v >= -0.5) & (v <= rig.projector.height - 0.5)
+
+
+def reflectance(
+    cos_light: Values,
+    cos_view: Values,
+    cos_half: Values,
+    albedo: Values | float,
+    gloss: Values | float,
+    roughness: float,
+) -> Values:
+    """pi f for unit cosines (n,) between the normal and light, view and the direction half-way; float64 (n,).
+
+    Times the irradiance it is what a matte surface of that albedo would send: 1 for a white one.
+    """
+    matte = (1.0 - gloss) * albedo
+    if not np.any(gloss):
+        return matte + np.zeros_like(cos_light)
+    squared = roughness**4
+    ground = np.clip(cos_half, 0.0, 1.0) ** 2 * (squared - 1.0) + 1.0
+    facets = squared / (pi * ground * ground)
+    light, view = np.clip(cos_light, 1e-6, 1.0), np.clip(cos_view, 1e-6, 1.0)
+    return matte + gloss * pi * facets * _unhidden(light, squared) * _unhidden(view, squared) / (4.0 * light * view)
+
+
+def _unhidden(cosine: Values, squared: float) -> Values:
+    """Smith's share of facets that are seen from an angle."""
+    tangent = (1.0 - cosine * cosine) / (cosine * cosine)
+    return 2.0 / (1.0 + np.sqrt(1.0 + squared * tangent))

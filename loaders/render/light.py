@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.files import read_yaml
-from fpp_ml_bench.schema import NonNegative, Positive, Share, StrictModel, Text, validate
+from fpp_ml_bench.schema import NonNegative, Positive, Share, StrictModel, Text, as_tuple, validate
 
 LIGHTS = Path(__file__).resolve().parent / "lights"
 NAMED = ("paper", "workshop", "hard")
@@ -27,13 +27,9 @@ def _ascending(curve: tuple[float, ...]) -> tuple[float, ...]:
     return curve
 
 
-def _as_tuple(value: Any) -> Any:
-    return tuple(value) if isinstance(value, list) else value
-
-
 Power = Annotated[float, Field(ge=0.2, le=5)]
 Curve = Annotated[tuple[Share, ...], Field(min_length=2, max_length=256), AfterValidator(_ascending)]
-Response = Annotated[Power | Curve, BeforeValidator(_as_tuple)]
+Response = Annotated[Power | Curve, BeforeValidator(as_tuple)]
 """The power of the input, or outputs at evenly spaced inputs from 0 to 1."""
 Blur = Annotated[float, Field(ge=0, le=20)]
 Falloff = Annotated[int, Field(ge=-3, le=8)]
@@ -85,7 +81,7 @@ class CameraLight(StrictModel):
     blur_px: Blur = 0.0
     falloff: Annotated[int, Field(ge=0, le=8)] = 0
     reference_grey: Annotated[float, Field(gt=0, le=1e4)] = 180.0
-    exposure: Annotated[Positive | tuple[Positive, Positive], BeforeValidator(_as_tuple)] = 1.0
+    exposure: Annotated[Positive | tuple[Positive, Positive], BeforeValidator(as_tuple)] = 1.0
     black_grey: Annotated[float, Field(ge=0, le=64)] = 0.0
     full_well_e: Annotated[float, Field(ge=100, le=1e9)] | None = 32500.0
     read_noise_e: NonNegative = 10.0

@@ -85,26 +85,22 @@ def ply_bytes(
     return trimesh.exchange.ply.export_ply(solid, vertex_normal=normals is not None)
 
 
-def read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], Paint | None]:
-    """Vertices float64 (V, 3) in the file's unit, faces int32 (F, 3), and the mesh's paint if it has colours. Raises
-    `MeshError` for a file that can't be read as a mesh, has no triangles, vertices that are not finite, triangles
-    between vertices that are not there, or a texture that is damaged or missing."""
-    return _read(path)[:3]
-
-
 def content_hash(path: Path) -> str:
     """Hash of a mesh file with all materials and textures that it names, 32 hex digits."""
     own = file_hash(path)
     if path.suffix.lower() == ".stl":  # which names none
         return own
-    beside = _read(path)[3].read
+    *_, beside = read_mesh(path)
     digest = xxhash.xxh3_128(own.encode())
     for content in beside:
         digest.update(xxhash.xxh3_128(content).digest())
     return digest.hexdigest() if beside else own
 
 
-def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], Paint | None, _Beside]:
+def read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], Paint | None, list[bytes]]:
+    """Vertices float64 (V, 3) in the file's unit, faces int32 (F, 3), the mesh's paint if it has colours, and the files
+    that it names. Raises `MeshError` for a file that can't be read as a mesh, has no triangles, vertices that are not
+    finite, triangles between vertices that are not there, or a texture that is damaged or missing."""
     # Its log would put a traceback of its own on the screen; what matters of it is in our message.
     logging.getLogger("trimesh").addHandler(logging.NullHandler())
     kind = path.suffix.lower().removeprefix(".")
@@ -137,7 +133,7 @@ def _read(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], Paint | N
         ) from error
     before = np.cumsum([0, *(len(part) for part in vertices[:-1])])
     faces = np.concatenate([part.faces + first for part, first in zip(parts, before, strict=True)])
-    return np.concatenate(vertices), faces.astype(np.int32), paint, beside
+    return np.concatenate(vertices), faces.astype(np.int32), paint, beside.read
 
 
 def _image_problems(content: bytes, name: str) -> list[str]:

@@ -1,23 +1,24 @@
 """Meshes by name: procedural objects, and users' own files (OBJ, PLY, STL, GLB) with scale and pose."""
 
-import math
+import re
 from collections import Counter
-from dataclasses import fields
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import BeforeValidator, Field
 
-from fpp_ml_bench.constants import OBJECT_NAME, OBJECTS, SPLITS, UNSEEN
+from fpp_ml_bench.constants import OBJECTS, UNSEEN
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.files import is_file, printable, read_yaml, write_atomically
 from fpp_ml_bench.loaders.render.mesh_files import MESH_SUFFIXES, content_hash, ply_bytes, read_mesh
 from fpp_ml_bench.loaders.render.objects import object_mesh
 from fpp_ml_bench.loaders.render.scene import SolidMesh, UserMesh
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
+from fpp_ml_bench.schema import Positive, StrictModel, as_tuple, validate
 
-_NAME_CHARACTERS = set("abcdefghijklmnopqrstuvwxyz0123456789_")
+Triple = Annotated[tuple[float, float, float], BeforeValidator(as_tuple)]
 _KEPT = 4
 """The benchmark's objects that a process keeps, and with them their surfels (`Lighting`, about 10 MB each): drawing and
 tracing one takes about a second."""
@@ -39,7 +40,7 @@ def _drawn(name: str) -> SolidMesh:
 def load_user_mesh(description: UserMesh) -> SolidMesh:
     """Read, scale and pose a user's mesh: x scale, then turns about x, y and z, then centred, then shifted. Its
     colours and textures come along. Raises `MeshError` as `read_mesh` does."""
-    vertices, faces, paint = read_mesh(Path(description.path))
+    vertices, faces, paint, _ = read_mesh(Path(description.path))
     vertices_m = vertices * description.scale
     for axis, degrees in enumerate(description.rotation_deg):
         cosine, sine = cosine_of_turns(degrees / 360), sine_of_turns(degrees / 360)
@@ -58,64 +59,50 @@ def write_ply(mesh: SolidMesh, path: Path) -> None:
     write_atomically(path, ply_bytes(mesh.vertices_m, mesh.faces))
 
 
+class MeshEntry(StrictModel):
+    """An entry of a list of meshes. ``path`` is relative to the list's own folder; ``scale`` takes the file's unit to
+    metres; then come turns (degrees about x, y, z, in that order), centring and a shift."""
+
+    name: Annotated[str, Field(pattern="^[a-z0-9_]{1,100}$")]
+    path: str
+    scale: Positive = 1.0
+    rotation_deg: Triple = (0.0, 0.0, 0.0)
+    offset_m: Triple = (0.0, 0.0, 0.0)
+    centre: bool = True
+    split: Literal["train", "validation", "test"] = "test"
+
+    def mesh(self, list_file: Path) -> UserMesh:
+        """The mesh that it names. Raises `MeshError` for a name of the benchmark and a file that is no mesh."""
+        if self.name in (*OBJECTS, *UNSEEN):
+            raise MeshError(f"{list_file}: {self.name!r} is one of the benchmark's own objects; choose another name")
+        file = list_file.parent / self.path
+        if file.suffix.lower() not in MESH_SUFFIXES or not is_file(file):
+            shown = printable(str(file), 500)
+            raise MeshError(f"{list_file}: {shown} is no mesh file; expected {', '.join(MESH_SUFFIXES)}")
+        return UserMesh(**{**self.model_dump(), "path": str(file)}, content=content_hash(file))
+
+
 def read_mesh_list(path: Path) -> tuple[UserMesh, ...]:
-    """Users' meshes from a YAML list; raises `MeshError` naming the entry and the key.
+    """Users' meshes from a YAML list of `MeshEntry`; raises `MeshError` naming the entry and the key.
 
     ::
 
         - {name: my_part, path: part.stl, scale: 0.001, rotation_deg: [90, 0, 0], split: test}
-
-    ``path`` is relative to the list's own folder; ``scale`` takes the file's unit to metres.
     """
     content = read_yaml(path, MeshError)
     if not isinstance(content, list) or not content:
         raise MeshError(f"{path}: expected a list of meshes, each with name and path, got {type(content).__name__}")
-    meshes = tuple(_entry(entry, f"{path}, entry {i + 1}", path.parent) for i, entry in enumerate(content))
-    name, count = Counter(mesh.name for mesh in meshes).most_common(1)[0]
+    entries = [
+        validate(MeshEntry, value, path, f"list of meshes, entry {number}", MeshError)
+        for number, value in enumerate(content, 1)
+    ]
+    name, count = Counter(entry.name for entry in entries).most_common(1)[0]
     if count > 1:
         raise MeshError(f"{path}: the name {name!r} is given twice")
-    return meshes
+    return tuple(entry.mesh(path) for entry in entries)
 
 
 def single_mesh(path: Path) -> UserMesh:
     """A user's mesh given by its file alone: named after the file, in metres, in split test."""
-    stem = "".join(c if c in _NAME_CHARACTERS else "_" for c in path.stem.lower())
-    return _entry({"name": stem, "path": path.name}, str(path), path.parent)
-
-
-def _entry(entry: object, where: str, folder: Path) -> UserMesh:
-    keys = {item.name for item in fields(UserMesh)} - {"content"}
-    if not isinstance(entry, dict) or not {"name", "path"} <= set(entry):
-        raise MeshError(f"{where}: expected a mapping with name and path, got {entry!r}")
-    unknown = set(map(str, entry)) - keys
-    if unknown:
-        raise MeshError(f"{where}: unknown key {sorted(unknown)[0]!r}; there are {', '.join(sorted(keys))}")
-    name = entry["name"]
-    if not isinstance(name, str) or not OBJECT_NAME.fullmatch(name) or not set(name) <= _NAME_CHARACTERS:
-        raise MeshError(f"{where}: name must be of a-z, 0-9 and _, at most 100 of them, got {printable(name)!r}")
-    if name in (*OBJECTS, *UNSEEN):
-        raise MeshError(f"{where}: {name!r} is one of the benchmark's own objects; choose another name")
-    file = folder / str(entry["path"])
-    if file.suffix.lower() not in MESH_SUFFIXES or not is_file(file):
-        raise MeshError(f"{where}: {printable(str(file), 500)} is no mesh file; expected {', '.join(MESH_SUFFIXES)}")
-    split, scale = entry.get("split", "test"), _finite(entry.get("scale", 1.0), f"{where}: scale")
-    if split not in SPLITS:
-        raise MeshError(f"{where}: split {split!r}, expected {', '.join(SPLITS)}")
-    if scale <= 0:
-        raise MeshError(f"{where}: scale must be above 0, got {scale:g}")
-    triples: dict[str, Any] = {}
-    for key in ("rotation_deg", "offset_m"):
-        values = entry.get(key, [0.0, 0.0, 0.0])
-        if not isinstance(values, list) or len(values) != 3:
-            raise MeshError(f"{where}: {key} must be three numbers, got {values!r}")
-        triples[key] = tuple(_finite(value, f"{where}: {key}") for value in values)
-    centre = entry.get("centre", True)
-    if not isinstance(centre, bool):
-        raise MeshError(f"{where}: centre must be true or false, got {centre!r}")
-    return UserMesh(name, str(file), scale, centre=centre, split=split, content=content_hash(file), **triples)
-
-
-def _finite(value: object, where: str) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise MeshError(f"{where} must be a number, got {value!r}")
-    return float(value)
+    name = re.sub("[^a-z0-9_]", "_", path.stem.lower())
+    return validate(MeshEntry, {"name": name, "path": path.name}, path, "mesh", MeshError).mesh(path)

@@ -34,11 +34,6 @@ class MixedPixels:
     void: NDArray[np.bool_]
     share: NDArray[np.float64]
 
-    @property
-    def on_object(self) -> NDArray[np.bool_]:
-        """Which rays meet the object; bool (m s^2,)."""
-        return self.triangle >= 0
-
 
 @np.errstate(divide="ignore", invalid="ignore")
 def mixed_pixels(

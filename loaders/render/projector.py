@@ -3,24 +3,32 @@
 Light is a fraction of the brightest pixel's. A pattern varies along one coordinate, so blur acts along it alone. Its
 variances add: of the transfer function in focus, of the camera pixel's footprint, and of the defocus, whose sigma grows
 with the distance from the focus in dioptres, as a thin lens's blur circle does. A Gaussian of variance q px^2 takes
-exp(-2 pi^2 q / P^2) of the modulation of a sinusoid of period P, and makes the edges of Gray code soft. Crossed fringes
-vary along both coordinates and have a table of their own (`crossed_light`).
+exp(-2 pi^2 q / P^2) of the modulation of a sinusoid of period P, and makes the edges of Gray code soft.
+
+Crossed fringes vary along both coordinates, but their light depends on two phases alone, so that one small table over
+the phases of both carriers serves every pixel and every shift. It is a sum of harmonics ``cos 2 pi (m t1 + n t2)`` of
+the carriers' turns t1, t2: (1, 0) and (0, 1) alone if light is proportional to the pattern's level. Each has a
+frequency on the pattern, and blur takes exp(-2 pi^2 q F^2) of it, as of a sinusoid of a single direction. Between the
+centres of projector pixels light is linear here too. The pattern's rounding to 8 bits, 0.3 grey levels RMS, is left
+out.
 """
 
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.loaders.render.crossed_light import carrier_waves, fill_crossed, phase_table
 from fpp_ml_bench.loaders.render.light import ProjectorLight
 from fpp_ml_bench.machine import njit
 from fpp_ml_bench.optics.patterns import pattern_profile
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import AXES, DIRECTIONS, AnySequence, Frame
-from fpp_ml_bench.portable import cosine_of_turns, gaussian_weights, power, sine_of_turns
+from fpp_ml_bench.portable import cosine_of_turns, exponential, gaussian_weights, power, sine_of_turns
 
 FINE = 4
 """Samples a projector pixel where blur depends on the distance; linear interpolation between them costs a sinusoid of
@@ -29,10 +37,14 @@ MOST_DEFOCUS_PX = 100.0
 """Largest sigma within the range and on the background plane."""
 ALONG_V, ALONG_U, ALONG_BOTH = 0, 1, 2
 """The projector coordinate that a frame varies along; crossed fringes vary along both."""
+SIDE = 128
+"""Entries a turn: linear interpolation between them costs 0.02% of a carrier's modulation."""
+HARMONICS = 16
+"""The highest m and n of a response that is no line; a projector gamma of 2.2 leaves 2e-6 of the light beyond."""
+_LEAST = 1e-9
 
 
-@dataclass(frozen=True)
-class PatternPlace:
+class PatternPlace(NamedTuple):
     """Where n surface points read `PatternLight`: of u and of v the sample, uint16 (n,), and the weight of the next
     one, float32 (n,); for blur the ``level`` uint8 (n,) and the weight of the next one, empty where there is one level.
     """
@@ -45,8 +57,7 @@ class PatternPlace:
     level_weight: NDArray[np.float32]
 
 
-@dataclass(frozen=True)
-class PatternLight:
+class PatternLight(NamedTuple):
     """Linear light of every frame along the coordinate it varies with.
 
     ``table`` float32 (F, S, L + 1) in [0, 1]: per frame and blur level, ``per_px`` samples a projector pixel, the last
@@ -100,7 +111,7 @@ class PatternLight:
         count = len(self.table)
         taken, given, like = [], [], []  # per mode: the weight of each frame in it, in each frame, a frame of its kind
         sets = sequence.equal_steps()
-        for _, indices, turns in sets:
+        for indices, turns in sets:
             frames = list(indices)
             cosine, sine = cosine_of_turns(turns), sine_of_turns(turns)
             for weights, scale in ((np.ones(len(frames)), 1.0), (cosine, 2.0), (sine, 2.0)):
@@ -108,7 +119,7 @@ class PatternLight:
                 given.append(np.zeros(count))
                 taken[-1][frames], given[-1][frames] = scale / len(frames) * weights, weights
                 like.append(frames[0])
-        sinusoids = {index for _, indices, _ in sets for index in indices}
+        sinusoids = {index for indices, _ in sets for index in indices}
         for frame in (frame for frame in range(count) if frame not in sinusoids and frame != sequence.black):
             taken.append(np.eye(count)[frame])
             given.append(np.eye(count)[frame])
@@ -118,7 +129,7 @@ class PatternLight:
             for place in np.flatnonzero(weights):  # in order, on every processor
                 row += weights[place] * self.table[place]
         mix = np.stack(given, axis=1).astype(np.float32)
-        return replace(self, table=table.astype(np.float32), along=self.along[like], waves=self.waves[like]), mix
+        return self._replace(table=table.astype(np.float32), along=self.along[like], waves=self.waves[like]), mix
 
     def uniform(self, rig: Rig) -> "PatternLight":
         """The mean light of each frame over the projector's pixels, which end where the pattern is carried on."""
@@ -129,7 +140,7 @@ class PatternLight:
             table[frame] = known.mean(axis=1, keepdims=True)
         crossed = np.empty_like(self.crossed)
         crossed[:] = self.crossed[:, :-1, :-1].mean(axis=(1, 2), keepdims=True)
-        return replace(self, table=table, crossed=crossed)
+        return self._replace(table=table, crossed=crossed)
 
     def place(
         self,
@@ -154,22 +165,7 @@ class PatternLight:
     def read(self, place: PatternPlace, irradiance: NDArray[np.float64], out: NDArray[np.float64]) -> None:
         """Irradiance in every frame at points whose irradiance under white is ``irradiance`` (n,): fills ``out``
         float64 (F, n)."""
-        p = place
-        read_kernel(
-            out,
-            irradiance,
-            self.table,
-            self.along,
-            self.crossed,
-            self.waves,
-            self.per_px,
-            p.u_index,
-            p.u_weight,
-            p.v_index,
-            p.v_weight,
-            p.level,
-            p.level_weight,
-        )
+        read_kernel(out, irradiance, self, place)
 
     def _sample(self, coordinate_px: NDArray[np.float64], length: int) -> tuple[NDArray, NDArray]:
         last = (length - 1.0) * self.per_px
@@ -243,6 +239,61 @@ def _levels(most: float) -> NDArray[np.float64]:
     return np.array(levels)
 
 
+def carrier_waves(crossed: Crossed, frame: int) -> NDArray[np.float64]:
+    """Of both carriers in ``frame``: cycles per projector px along u and v, and turns at pixel (0, 0); (2, 3)."""
+    shifts = crossed.shifts_deg[frame]
+    return np.array([[*cycles, shift / 360] for cycles, shift in zip(crossed.cycles_per_px, shifts, strict=True)])
+
+
+def phase_table(
+    crossed: Crossed,
+    light_of_level: Callable[[NDArray[np.float64]], NDArray[np.float64]],
+    variance_px2: NDArray[np.float64],
+) -> NDArray[np.float32]:
+    """Light in [0, 1] over the carriers' turns, float32 (S, SIDE + 1, SIDE + 1), the first entry repeated at the end.
+    ``light_of_level`` maps pattern levels in [0, 1] to linear light; ``variance_px2`` (S, 2): of the blur along u and
+    v."""
+    turns, orders = np.arange(SIDE) / SIDE, range(HARMONICS + 1)
+    cosine, sine = (function(np.array(orders)[:, None] * turns) for function in (cosine_of_turns, sine_of_turns))
+    first, second = (weight * cosine[1] for weight in crossed.weights)
+    share = _cosine_series(light_of_level(np.clip(0.5 + 0.5 * (first[:, None] + second), 0.0, 1.0)), cosine)
+    table = np.zeros((len(variance_px2), SIDE, SIDE))
+    for n in orders:  # in order, on every processor
+        even, odd = np.zeros((2, len(variance_px2), SIDE))
+        for m in (m for m in orders if abs(share[m, n]) > _LEAST):
+            summed, differing = (_kept(crossed, m, sign * n, variance_px2)[:, None] for sign in (1, -1))
+            even += share[m, n] / 2 * (summed + differing) * cosine[m]
+            odd += share[m, n] / 2 * (differing - summed) * sine[m]
+        if even.any():
+            table += even[:, :, None] * cosine[n] + odd[:, :, None] * sine[n]
+    return np.pad(np.clip(table, 0.0, 1.0), ((0, 0), (0, 1), (0, 1)), mode="wrap").astype(np.float32)
+
+
+def _cosine_series(values: NDArray[np.float64], cosine: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Coefficients c of ``values[k, l] = sum c[m, n] cos(2 pi m k / K) cos(2 pi n l / K)``; (M, N)."""
+    for _ in range(2):  # first over the rows, then over what were the columns
+        total = np.zeros((len(cosine), values.shape[1]))
+        for row, weights in zip(values, cosine.T, strict=True):
+            total += weights[:, None] * row
+        total *= np.where(np.arange(len(cosine)) > 0, 2.0, 1.0)[:, None] / SIDE
+        values = total.T
+    return values
+
+
+def _kept(crossed: Crossed, m: int, n: int, variance_px2: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What blur and the interpolation between pixels leave of the harmonic (m, n); float64 (S,)."""
+    kept = np.zeros(len(variance_px2))
+    for axis in (0, 1):
+        frequency = m * crossed.cycles_per_px[0][axis] + n * crossed.cycles_per_px[1][axis]
+        kept -= 2 * math.pi**2 * frequency**2 * variance_px2[:, axis]
+    kept = exponential(np.maximum(kept, -20.0))
+    for axis in (0, 1):
+        frequency = m * crossed.cycles_per_px[0][axis] + n * crossed.cycles_per_px[1][axis]
+        if frequency != 0:
+            kept *= (float(sine_of_turns(frequency / 2)) / (math.pi * frequency)) ** 2
+    return kept
+
+
 @njit
 def fill_pattern(light, profiles, index, weight, level, level_weight):  # type: ignore[no-untyped-def]
     """Pattern light of n points in a frame: fills ``light`` (n,) from its ``profiles`` (S, L + 1)."""
@@ -260,37 +311,47 @@ def fill_pattern(light, profiles, index, weight, level, level_weight):  # type: 
 
 
 @njit
-def fill_frame(  # type: ignore[no-untyped-def]
-    light, frame, table, along, crossed, waves, per_px, u_index, u_weight, v_index, v_weight, level, level_weight
-):
-    """Pattern light of n points in ``frame``: fills ``light`` (n,)."""
-    if along[frame] == ALONG_U:
-        fill_pattern(light, table[frame], u_index, u_weight, level, level_weight)
-    elif along[frame] == ALONG_V:
-        fill_pattern(light, table[frame], v_index, v_weight, level, level_weight)
-    else:
-        fill_crossed(light, crossed, waves[frame], per_px, u_index, u_weight, v_index, v_weight, level, level_weight)
+def fill_crossed(light, table, waves, per_px, place):  # type: ignore[no-untyped-def]
+    """Pattern light of n points in a crossed frame: fills ``light`` (n,) from a `phase_table` and the frame's
+    `carrier_waves`."""
+    side = table.shape[1] - 1
+    for k in range(light.size):
+        u = (place.u_index[k] + np.float64(place.u_weight[k])) / per_px
+        v = (place.v_index[k] + np.float64(place.v_weight[k])) / per_px
+        first = waves[0, 0] * u + waves[0, 1] * v + waves[0, 2]
+        second = waves[1, 0] * u + waves[1, 1] * v + waves[1, 2]
+        first, second = (first - np.floor(first)) * side, (second - np.floor(second)) * side
+        i, j = min(np.int64(first), side - 1), min(np.int64(second), side - 1)
+        a, b = first - i, second - j
+        low = 0 if table.shape[0] == 1 else np.int64(place.level[k])
+        sharp = table[low]
+        value = _between(sharp, i, j, a, b)
+        if table.shape[0] > 1:
+            value += place.level_weight[k] * (_between(table[low + 1], i, j, a, b) - value)
+        light[k] = value
 
 
 @njit
-def read_kernel(  # type: ignore[no-untyped-def]
-    out, irradiance, table, along, crossed, waves, per_px, u_index, u_weight, v_index, v_weight, level, level_weight
-):
-    for frame in range(table.shape[0]):
-        fill_frame(
-            out[frame],
-            frame,
-            table,
-            along,
-            crossed,
-            waves,
-            per_px,
-            u_index,
-            u_weight,
-            v_index,
-            v_weight,
-            level,
-            level_weight,
-        )
+def _between(sheet, i, j, a, b):  # type: ignore[no-untyped-def]
+    top = sheet[i, j] + b * (sheet[i, j + 1] - sheet[i, j])
+    bottom = sheet[i + 1, j] + b * (sheet[i + 1, j + 1] - sheet[i + 1, j])
+    return top + a * (bottom - top)
+
+
+@njit
+def fill_frame(light, frame, pattern, place):  # type: ignore[no-untyped-def]
+    """Light of n points in ``frame`` of a `PatternLight`: fills ``light`` (n,)."""
+    if pattern.along[frame] == ALONG_U:
+        fill_pattern(light, pattern.table[frame], place.u_index, place.u_weight, place.level, place.level_weight)
+    elif pattern.along[frame] == ALONG_V:
+        fill_pattern(light, pattern.table[frame], place.v_index, place.v_weight, place.level, place.level_weight)
+    else:
+        fill_crossed(light, pattern.crossed, pattern.waves[frame], pattern.per_px, place)
+
+
+@njit
+def read_kernel(out, irradiance, pattern, place):  # type: ignore[no-untyped-def]
+    for frame in range(pattern.table.shape[0]):
+        fill_frame(out[frame], frame, pattern, place)
         for k in range(irradiance.size):
             out[frame, k] *= irradiance[k]

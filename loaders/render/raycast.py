@@ -42,15 +42,11 @@ class PixelRays:
         self.x, self.y = np.ascontiguousarray(x), np.ascontiguousarray(y)
         self.columns, self.rows = _bounds(self.x, 0), _bounds(self.y, 1)
 
-    @classmethod
-    def of(cls, camera: Pinhole) -> "PixelRays":
+    @staticmethod
+    @lru_cache(maxsize=2)
+    def of(camera: Pinhole) -> "PixelRays":
         """The rays of a camera; those of the two latest cameras are kept."""
-        return _camera_rays(camera)
-
-
-@lru_cache(maxsize=2)
-def _camera_rays(camera: Pinhole) -> PixelRays:
-    return PixelRays(*camera.rays())
+        return PixelRays(*camera.rays())
 
 
 def _bounds(rays: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
@@ -140,11 +136,7 @@ class TracedObject:
         toward = light_m - points_m
         lengths = np.sqrt(toward[:, 0] ** 2 + toward[:, 1] ** 2 + toward[:, 2] ** 2)
         origins = points_m + toward * (_SHADOW_OFFSET_M / lengths)[:, None]
-        return self.blocked(origins, np.broadcast_to(light_m, points_m.shape))
-
-    def blocked(self, origins_m: NDArray[np.float64], targets_m: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Whether the object lies between each origin and its target, both (n, 3) in camera coordinates; bool (n,)."""
-        return self.met(origins_m, targets_m, any_suffices=True)[1] >= 0
+        return self.met(origins, np.broadcast_to(light_m, points_m.shape), any_suffices=True)[1] >= 0
 
     def met(
         self, origins_m: NDArray[np.float64], targets_m: NDArray[np.float64], any_suffices: bool = False

@@ -9,6 +9,7 @@ Noise follows EMVA 1288: a variance of read noise, and one of shot noise that is
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +18,7 @@ from scipy.special import ndtri
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.loaders.render.illumination import LitPixels
 from fpp_ml_bench.loaders.render.light import CameraLight, Light
-from fpp_ml_bench.loaders.render.projector import PatternLight, fill_frame, respond
+from fpp_ml_bench.loaders.render.projector import PatternLight, PatternPlace, fill_frame, respond
 from fpp_ml_bench.loaders.render.scene import modulation_at, name_bytes
 from fpp_ml_bench.machine import njit
 from fpp_ml_bench.optics.rig import Rig
@@ -29,8 +30,7 @@ _CHUNK = 2048
 _MASK = (1 << TABLE_BITS) - 1
 
 
-@dataclass(frozen=True)
-class Noise:
+class Noise(NamedTuple):
     """Shot and read noise in grey levels: variance = ``read_variance`` + ``shot_per_grey`` x signal."""
 
     read_variance: float
@@ -76,6 +76,11 @@ def stream_keys(*name: object) -> NDArray[np.uint32]:
     return np.frombuffer(name_bytes(*name), dtype="<u4").astype(np.uint32)
 
 
+def frame_keys(stream: tuple[object, ...], frames: Sequence[int]) -> NDArray[np.uint32]:
+    """`stream_keys` of each of a view's k ``frames``; uint32 (k, 2)."""
+    return np.array([stream_keys(*stream, index) for index in frames], dtype=np.uint32).reshape(-1, 2)
+
+
 def hash_pixels(pixels: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDArray[np.uint32]:
     """32-bit hash of each pixel number: a keyed two-round multiply-xorshift, a bijection of the pixel number."""
     with np.errstate(over="ignore"):
@@ -96,20 +101,22 @@ def standard_normal(pixels: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDA
     return table[h & mask] + table[(h >> np.uint32(TABLE_BITS)) & mask]
 
 
-@dataclass(frozen=True)
-class Sensor:
-    """What turns the light of a pixel into a byte: black level in grey levels, noise, and the 8-bit grey level of each
-    code of the converter, uint8 (2^bits,)."""
+class Sensor(NamedTuple):
+    """What turns the light of a pixel into a byte: black level in grey levels, noise, the 8-bit grey level of each code
+    of the converter, uint8 (2^bits,), whether the two are the same, and the `normal_table`."""
 
-    black_grey: float
+    black_grey: np.float32
     noise: Noise
     grey_of_code: NDArray[np.uint8]
+    plain: bool
+    table: NDArray[np.float32]
 
     @classmethod
     def of(cls, camera: CameraLight) -> "Sensor":
         codes = np.arange(1 << camera.bits)
-        grey = GREY_LEVELS * respond(camera.response, codes / codes[-1])
-        return cls(camera.black_grey, Noise.of_camera(camera), np.rint(grey).astype(np.uint8))
+        grey = np.rint(GREY_LEVELS * respond(camera.response, codes / codes[-1])).astype(np.uint8)
+        noise = Noise(*map(_FLOAT, Noise.of_camera(camera)))
+        return cls(_FLOAT(camera.black_grey), noise, grey, np.array_equal(grey, codes), normal_table())
 
 
 @dataclass(frozen=True)
@@ -140,15 +147,14 @@ class Exposure:
         ``frames``, written into ``out`` if given.
         """
         result = np.empty((len(frames), pixels.size), dtype=np.uint8) if out is None else out
-        inputs = (*self._light(frames, lit, stream), pixels, *self._sensor(frames, stream))
-        expose_kernel(result, *inputs)
+        expose_kernel(result, self._light(frames, lit, stream), pixels, frame_keys(stream, frames), self.sensor)
         return result
 
     def radiance(
         self, frames: Sequence[int], lit: LitPixels, stream: tuple[object, ...], out: NDArray[np.float32]
     ) -> NDArray[np.float32]:
         """The light of pixels in grey levels before the lens and the sensor: fills ``out`` float32 (k, n)."""
-        radiance_kernel(out, *self._light(frames, lit, stream))
+        radiance_kernel(out, self._light(frames, lit, stream))
         return out
 
     def sense(
@@ -160,94 +166,51 @@ class Exposure:
         out: NDArray[np.uint8],
     ) -> NDArray[np.uint8]:
         """The sensor's answer to ``radiance`` (k, n): fills ``out`` uint8 (k, n)."""
-        sense_kernel(out, radiance, pixels, *self._sensor(frames, stream))
+        sense_kernel(out, radiance, pixels, frame_keys(stream, frames), self.sensor)
         return out
 
-    def _light(self, frames: Sequence[int], lit: LitPixels, stream: tuple[object, ...]) -> tuple:
-        p, pattern = lit.place, self.pattern
+    def _light(self, frames: Sequence[int], lit: LitPixels, stream: tuple[object, ...]) -> "PointLight":
         lamp = np.ones(len(frames), dtype=np.float32)
         if self.flicker:
-            keys = np.array([stream_keys(*stream, "lamp", index) for index in frames], dtype=np.uint32).reshape(-1, 2)
+            keys = frame_keys((*stream, "lamp"), frames)
             lamp += np.float32(self.flicker) * np.array([standard_normal(np.zeros(1, np.uint32), k)[0] for k in keys])
         bounced = np.empty((0, 0), dtype=np.float32) if lit.bounced is None else lit.bounced
-        return (
-            np.array(frames, dtype=np.int64),
-            pattern.table,
-            pattern.along,
-            pattern.crossed,
-            pattern.waves,
-            pattern.per_px,
-            p.u_index,
-            p.u_weight,
-            p.v_index,
-            p.v_weight,
-            p.level,
-            p.level_weight,
-            lit.gain,
-            lit.ambient,
-            bounced,
-            lamp,
-        )
+        indices = np.array(frames, dtype=np.int64)
+        return PointLight(indices, lamp, self.pattern, lit.place, lit.gain, lit.ambient, bounced)
 
-    def _sensor(self, frames: Sequence[int], stream: tuple[object, ...]) -> tuple:
-        keys = np.array([stream_keys(*stream, index) for index in frames], dtype=np.uint32).reshape(-1, 2)
-        noise, sensor = self.sensor.noise, self.sensor
-        plain = np.array_equal(sensor.grey_of_code, np.arange(GREY_LEVELS + 1))
-        return (
-            normal_table(),
-            keys,
-            _FLOAT(noise.read_variance),
-            _FLOAT(noise.shot_per_grey),
-            _FLOAT(sensor.black_grey),
-            np.empty(0, dtype=np.uint8) if plain else sensor.grey_of_code,
-        )
+
+class PointLight(NamedTuple):
+    """What `fill_signal` needs: the ``frames`` int64 (k,) and the strength of the ``lamp`` float32 (k,) in each; and
+    what `LitPixels` says of the points, with the pattern."""
+
+    frames: NDArray[np.int64]
+    lamp: NDArray[np.float32]
+    pattern: PatternLight
+    place: PatternPlace
+    gain: NDArray[np.float32]
+    ambient: NDArray[np.float32]
+    bounced: NDArray[np.float32]
 
 
 @njit
-def fill_signal(  # type: ignore[no-untyped-def]
-    signal,
-    row,
-    frame,
-    table,
-    along,
-    crossed,
-    waves,
-    per_px,
-    u_index,
-    u_weight,
-    v_index,
-    v_weight,
-    level,
-    level_weight,
-    gain,
-    ambient,
-    bounced,
-    lamp,
-    start,
-):
-    """Light of the points from ``start`` on in one frame: fills ``signal`` float32 (n,)."""
-    stop = start + signal.size
+def fill_signal(signal, row, light, start):  # type: ignore[no-untyped-def]
+    """Light of the points from ``start`` on in frame number ``row`` of a `PointLight`: fills ``signal`` (n,)."""
+    stop, p, frame = start + signal.size, light.place, light.frames[row]
     # Slices, not offsets: only then does the compiler see plain loops over plain arrays (1.75 times faster).
-    fill_frame(
-        signal,
-        frame,
-        table,
-        along,
-        crossed,
-        waves,
-        per_px,
-        u_index[start:stop],
-        u_weight[start:stop],
-        v_index[start:stop],
-        v_weight[start:stop],
-        level[start:stop],
-        level_weight[start:stop],
+    place = PatternPlace(
+        p.u_index[start:stop],
+        p.u_weight[start:stop],
+        p.v_index[start:stop],
+        p.v_weight[start:stop],
+        p.level[start:stop],
+        p.level_weight[start:stop],
     )
-    factor, offset, flash = gain[start:stop], ambient[start:stop], lamp[row]
+    fill_frame(signal, frame, light.pattern, place)
+    factor, offset, flash = light.gain[start:stop], light.ambient[start:stop], light.lamp[row]
     for k in range(signal.size):
         signal[k] = offset[k] + flash * factor[k] * signal[k]
-    if bounced.size > 0:
-        more = bounced[frame, start:stop]
+    if light.bounced.size > 0:
+        more = light.bounced[frame, start:stop]
         for k in range(signal.size):
             signal[k] += flash * more[k]
 
@@ -265,11 +228,11 @@ def average(signal, pixels, samples):  # type: ignore[no-untyped-def]
 
 
 @njit
-def fill_bytes(  # type: ignore[no-untyped-def]
-    target, signal, numbers, hashes, normal, first, second, table, read_variance, shot_per_grey, black, grey_of_code
-):
-    """The sensor's answer to ``signal``: fills ``target`` uint8 (n,). ``numbers``: hashed pixel numbers uint32 (n,)."""
-    n = target.size
+def fill_bytes(target, signal, numbers, hashes, normal, keys, sensor):  # type: ignore[no-untyped-def]
+    """The answer of a `Sensor` to ``signal`` under the ``keys`` (2,) of a noise stream: fills ``target`` uint8 (n,).
+    ``numbers``: pixel numbers times the first factor of the hash, uint32 (n,)."""
+    n, table, grey_of_code, first, second = target.size, sensor.table, sensor.grey_of_code, keys[0], keys[1]
+    read_variance, shot_per_grey, black = sensor.noise.read_variance, sensor.noise.shot_per_grey, sensor.black_grey
     for k in range(n):
         h = numbers[k] ^ first
         h ^= h >> np.uint32(16)
@@ -282,7 +245,7 @@ def fill_bytes(  # type: ignore[no-untyped-def]
     for k in range(n):
         h = hashes[k]
         normal[k] = table[h & np.uint32(_MASK)] + table[(h >> np.uint32(TABLE_BITS)) & np.uint32(_MASK)]
-    if grey_of_code.size == 0:
+    if sensor.plain:
         for k in range(n):
             value = signal[k] + black + np.sqrt(read_variance + shot_per_grey * signal[k]) * normal[k] + np.float32(0.5)
             value = min(max(value, np.float32(0)), np.float32(255))
@@ -297,43 +260,15 @@ def fill_bytes(  # type: ignore[no-untyped-def]
 
 
 @njit
-def expose_kernel(  # type: ignore[no-untyped-def]
-    out,
-    frames,
-    light,
-    along,
-    crossed,
-    waves,
-    per_px,
-    u_index,
-    u_weight,
-    v_index,
-    v_weight,
-    level,
-    level_weight,
-    gain,
-    ambient,
-    bounced,
-    lamp,
-    pixels,
-    table,
-    keys,
-    read_variance,
-    shot_per_grey,
-    black,
-    grey_of_code,
-):
-    """Expose ``frames`` (k,) at n pixels: row i of ``out`` uint8 (k, n) is frame ``frames[i]``.
-
-    ``light`` (F, S, L + 1), ``along``, ``crossed``, ``waves`` and ``per_px`` as in `PatternLight`, then the places and
-    brightnesses of the points (`LitPixels`), ``lamp`` float32 (k,), pixel numbers uint32 (n,), and ``keys`` uint32 (k,
-    2) of the noise streams.
+def expose_kernel(out, light, pixels, keys, sensor):  # type: ignore[no-untyped-def]
+    """Expose k frames of a `PointLight` at n ``pixels`` uint32 (n,): row i of ``out`` uint8 (k, n) is its frame i, as
+    the `Sensor` has it under the ``keys`` uint32 (k, 2) of the noise streams.
 
     Pixels are processed in chunks, with all frames for each chunk, so that values common to the frames (a pixel's place
     in the pattern, its brightness) are read from memory once. Each stage is a separate loop, because the compiler turns
     simple loops into vector instructions (2.5 times faster here than a single loop with all stages).
     """
-    samples = gain.size // max(pixels.size, 1)
+    samples = light.gain.size // max(pixels.size, 1)
     step = max(_CHUNK // max(samples, 1), 1)
     numbers, hashes = np.empty(step, np.uint32), np.empty(step, np.uint32)
     normal, signal = np.empty(step, np.float32), np.empty(step * max(samples, 1), np.float32)
@@ -342,117 +277,34 @@ def expose_kernel(  # type: ignore[no-untyped-def]
         number = pixels[start : start + n]
         for k in range(n):
             numbers[k] = np.uint32(number[k] * np.uint32(0x9E3779B1))
-        for row in range(frames.size):
-            fill_signal(
-                signal[: n * samples],
-                row,
-                frames[row],
-                light,
-                along,
-                crossed,
-                waves,
-                per_px,
-                u_index,
-                u_weight,
-                v_index,
-                v_weight,
-                level,
-                level_weight,
-                gain,
-                ambient,
-                bounced,
-                lamp,
-                start * samples,
-            )
+        for row in range(light.frames.size):
+            fill_signal(signal[: n * samples], row, light, start * samples)
             average(signal, n, samples)
-            fill_bytes(
-                out[row, start : start + n],
-                signal[:n],
-                numbers,
-                hashes,
-                normal,
-                keys[row, 0],
-                keys[row, 1],
-                table,
-                read_variance,
-                shot_per_grey,
-                black,
-                grey_of_code,
-            )
+            fill_bytes(out[row, start : start + n], signal[:n], numbers, hashes, normal, keys[row], sensor)
 
 
 @njit
-def radiance_kernel(  # type: ignore[no-untyped-def]
-    out,
-    frames,
-    light,
-    along,
-    crossed,
-    waves,
-    per_px,
-    u_index,
-    u_weight,
-    v_index,
-    v_weight,
-    level,
-    level_weight,
-    gain,
-    ambient,
-    bounced,
-    lamp,
-):
-    """The light of ``frames`` (k,) at n pixels: fills ``out`` float32 (k, n)."""
+def radiance_kernel(out, light):  # type: ignore[no-untyped-def]
+    """The light of k frames of a `PointLight` at n pixels: fills ``out`` float32 (k, n)."""
     count = out.shape[1]
-    samples = gain.size // max(count, 1)
+    samples = light.gain.size // max(count, 1)
     signal = np.empty(_CHUNK * max(samples, 1), np.float32)
     for start in range(0, count, _CHUNK):
         n = min(start + _CHUNK, count) - start
-        for row in range(frames.size):
-            fill_signal(
-                signal[: n * samples],
-                row,
-                frames[row],
-                light,
-                along,
-                crossed,
-                waves,
-                per_px,
-                u_index,
-                u_weight,
-                v_index,
-                v_weight,
-                level,
-                level_weight,
-                gain,
-                ambient,
-                bounced,
-                lamp,
-                start * samples,
-            )
+        for row in range(light.frames.size):
+            fill_signal(signal[: n * samples], row, light, start * samples)
             average(signal, n, samples)
             out[row, start : start + n] = signal[:n]
 
 
 @njit
-def sense_kernel(out, radiance, pixels, table, keys, read_variance, shot_per_grey, black, grey_of_code):  # type: ignore[no-untyped-def]
-    """The sensor's answer to ``radiance`` float32 (k, n) at n pixels: fills ``out`` uint8 (k, n)."""
+def sense_kernel(out, radiance, pixels, keys, sensor):  # type: ignore[no-untyped-def]
+    """The answer of a `Sensor` to ``radiance`` float32 (k, n) at n pixels: fills ``out`` uint8 (k, n)."""
     numbers, hashes, normal = np.empty(_CHUNK, np.uint32), np.empty(_CHUNK, np.uint32), np.empty(_CHUNK, np.float32)
     for start in range(0, pixels.size, _CHUNK):
         n = min(start + _CHUNK, pixels.size) - start
         for k in range(n):
             numbers[k] = np.uint32(pixels[start + k] * np.uint32(0x9E3779B1))
         for row in range(out.shape[0]):
-            fill_bytes(
-                out[row, start : start + n],
-                radiance[row, start : start + n],
-                numbers,
-                hashes,
-                normal,
-                keys[row, 0],
-                keys[row, 1],
-                table,
-                read_variance,
-                shot_per_grey,
-                black,
-                grey_of_code,
-            )
+            answer = out[row, start : start + n]
+            fill_bytes(answer, radiance[row, start : start + n], numbers, hashes, normal, keys[row], sensor)

@@ -8,6 +8,7 @@ are a fixed sequence, so the same object gives the same bits.
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +33,7 @@ OFF_PLANE = 15.0
 SIDES, SLABS = 6, 4
 
 
-@dataclass(frozen=True)
-class SurfacePoints:
+class SurfacePoints(NamedTuple):
     """Points spread evenly over an object: ``position_m`` and unit ``normal`` float64 (P, 3), sorted by the surfel
     that each belongs to: those of surfel k are ``starts[k]:starts[k + 1]``, int64 (K + 1,). ``triangle`` int64 (P,):
     the rows of the mesh's faces that they lie on."""
@@ -49,8 +49,7 @@ class SurfacePoints:
         return np.add.reduceat(values, self.starts[:-1], axis=0) / counts
 
 
-@dataclass(frozen=True)
-class SurfelGrid:
+class SurfelGrid(NamedTuple):
     """Finds surfels by place: ``table`` int32 (X, Y, Z, 2), the first of each cell's and the one after its last; cells
     of ``cell_m`` from ``corner_m`` (3,) on; of each surfel the mean ``position_m`` and ``normal`` (K, 3), and its
     ``area_m2``."""
@@ -94,32 +93,11 @@ class Surfels:
         radius = np.sqrt(height)
         local = np.column_stack([radius * cosine_of_turns(disk), radius * sine_of_turns(disk), np.sqrt(1.0 - height)])
         origin_m, direction = np.empty((count * RAYS, 3)), np.empty((count * RAYS, 3))
-        aim_rays(
-            points.position_m,
-            points.normal,
-            points.starts,
-            local,
-            cosine_of_turns(turn),
-            sine_of_turns(turn),
-            origin_m,
-            direction,
-        )
+        aim_rays(points, local, cosine_of_turns(turn), sine_of_turns(turn), origin_m, direction)
         reach_m = float(np.sqrt((np.ptp(mesh.vertices_m, axis=0) ** 2).sum())) + 1.0
         along, triangle = traced.met(origin_m, origin_m + reach_m * direction)
         target: NDArray[np.int32] = np.empty(len(along), dtype=np.int32)
-        assign_hits(
-            origin_m,
-            reach_m * direction,
-            along,
-            triangle,
-            traced.tree_corners,
-            grid.corner_m,
-            grid.cell_m,
-            grid.table,
-            grid.position_m,
-            grid.normal,
-            target,
-        )
+        assign_hits(origin_m, reach_m * direction, along, triangle, traced.tree_corners, grid, target)
         target = target.reshape(count, RAYS)
         left = target < 0
         open_starts = np.concatenate([[0], np.cumsum(left.sum(axis=1))])
@@ -187,13 +165,13 @@ def place_surfels(corners: NDArray[np.float64], faces: int | None = None) -> tup
 
 
 @njit
-def aim_rays(position, normal, starts, local, cosine, sine, origin, direction):  # type: ignore[no-untyped-def]
-    """Rays of every surfel from its points: fills ``origin`` and ``direction`` (K RAYS, 3).
+def aim_rays(points, local, cosine, sine, origin, direction):  # type: ignore[no-untyped-def]
+    """Rays of every surfel from its `SurfacePoints`: fills ``origin`` and ``direction`` (K RAYS, 3).
 
     ``local`` (RAYS, 3): directions about z; of surfel k they are turned by (``cosine[k]``, ``sine[k]``) about the
     normal. Frame about a normal: Duff et al. 2017, Building an Orthonormal Basis, Revisited.
     """
-    rays = local.shape[0]
+    rays, position, normal, starts = local.shape[0], points.position_m, points.normal, points.starts
     for k in range(starts.size - 1):
         count = starts[k + 1] - starts[k]
         for i in range(rays):
@@ -215,13 +193,13 @@ def aim_rays(position, normal, starts, local, cosine, sine, origin, direction): 
 
 
 @njit
-def assign_hits(  # type: ignore[no-untyped-def]
-    origin, way, along, triangle, corners, corner, cell, table, position, normal, target
-):
-    """The surfel that each ray meets, the nearest one with the normal of the place: fills ``target`` (n,), -1 for none.
+def assign_hits(origin, way, along, triangle, corners, grid, target):  # type: ignore[no-untyped-def]
+    """The surfel of a `SurfelGrid` that each ray meets, the nearest one with the normal of the place: fills ``target``
+    (n,), -1 for none.
 
     ``way`` (n, 3) leads from the origin to the ray's end, ``along`` of which it comes to ``triangle``.
     """
+    corner, cell, table, position, normal = grid.corner_m, grid.cell_m, grid.table, grid.position_m, grid.normal
     for i in range(along.size):
         f = triangle[i]
         target[i] = -1

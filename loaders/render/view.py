@@ -76,8 +76,7 @@ class Studio:
         """
         scene = self.trace(mesh, view)
         shadow_rays = self.expose_view(mesh, view, scene)
-        exact_mm = np.zeros(self._frames.shape[1:], dtype=np.float32)
-        exact_mm.ravel()[scene.hits.pixels] = scene.hits.depth_m * MM_PER_M
+        exact_mm = self.exact_mm(scene)
         depth_mm = self.ground_truth_mm(object_mask(exact_mm))
         if not depth_mm.any():
             counts = decode_stack(self._frames, self.settings.stated_rig, mask=object_mask(exact_mm)).counts
@@ -121,6 +120,12 @@ class Studio:
             mixed = mixed_pixels(traced, hits, rig, light.camera.rays_across, shaded)
             mixed_lit = object_light.at(mixed.points_m, mixed.normals, mixed.triangle)
         return TracedView(traced, distance_m, hits, lit, mixed, mixed_lit, self.brightness(stream), stream)
+
+    def exact_mm(self, scene: TracedView) -> NDArray[np.float32]:
+        """Exact depth (H, W) of what the camera sees of the object, 0 beyond."""
+        exact_mm = np.zeros(self._frames.shape[1:], dtype=np.float32)
+        exact_mm.ravel()[scene.hits.pixels] = scene.hits.depth_m * MM_PER_M
+        return exact_mm
 
     def brightness(self, stream: tuple[object, ...]) -> NDArray[np.float32] | np.float32:
         """The view's exposure times the lens's vignetting, for every pixel or one for all."""

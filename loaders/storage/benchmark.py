@@ -31,7 +31,8 @@ class Counts(NamedTuple):
 @dataclass(frozen=True)
 class Benchmark:
     """A named dataset: ``name``, ``version``, and the ``preset``, image ``size`` in px, ``light`` and ``rig`` that
-    build it. ``earlier``: fingerprints of the manifests of version 1, which had the same images, depths and cover."""
+    build it. ``earlier``: start of the fingerprint of version 1, which had the same images, depths and cover, where
+    weights that come with the package name it."""
 
     name: str
     version: int
@@ -65,33 +66,21 @@ class Benchmark:
 
 
 BENCHMARKS = (
-    Benchmark("fpp-bench-full", 2, "full", FULL_SIZE, earlier="394c1522fe3442ef4e2afbbe6ea76b42"),
+    Benchmark("fpp-bench-full", 2, "full", FULL_SIZE),
     Benchmark("fpp-bench-full-224", 2, "full", 224, earlier="a5dbf28a2e1ee5d2d772711f45a4f048"),
-    Benchmark("fpp-bench-mini", 2, "mini", MINI_SIZE, earlier="6dc6e35e4d5c2f194ba052443086af16"),
-    Benchmark("fpp-bench-unseen", 2, "unseen", FULL_SIZE, earlier="d865570932e66a32c8f381880dd98f1b"),
+    Benchmark("fpp-bench-mini", 2, "mini", MINI_SIZE),
+    Benchmark("fpp-bench-unseen", 2, "unseen", FULL_SIZE),
     # The same objects and views under other lights.
-    Benchmark("fpp-bench-workshop", 2, "full", FULL_SIZE, "workshop", earlier="fc627a8a95ad848c68a08a46415ebfa6"),
-    Benchmark("fpp-bench-hard", 2, "full", FULL_SIZE, "hard", earlier="23ee324d806d73b97d40e9ffe849f2be"),
+    Benchmark("fpp-bench-workshop", 2, "full", FULL_SIZE, "workshop"),
+    Benchmark("fpp-bench-hard", 2, "full", FULL_SIZE, "hard"),
     # The same objects and views with crossed fringes: other frames, and so another decoded depth.
-    Benchmark("fpp-bench-crossed", 2, "full", FULL_SIZE, rig="crossed", earlier="526914ee31b78a34f41cd050f3e63707"),
-    Benchmark(
-        "fpp-bench-crossed-unseen", 2, "unseen", FULL_SIZE, rig="crossed", earlier="b197093e8930f767ccab588ea8772de7"
-    ),
+    Benchmark("fpp-bench-crossed", 2, "full", FULL_SIZE, rig="crossed"),
+    Benchmark("fpp-bench-crossed-unseen", 2, "unseen", FULL_SIZE, rig="crossed"),
     # The test objects alone, to score methods in lights that nothing here is trained in.
-    Benchmark("fpp-bench-test-workshop", 2, "test", FULL_SIZE, "workshop", earlier="7d2b42bb8e89330dd8e62190fb33b962"),
-    Benchmark("fpp-bench-test-hard", 2, "test", FULL_SIZE, "hard", earlier="ae15c33431eb62c8f938e4ac22b0b8bf"),
-    Benchmark(
-        "fpp-bench-test-crossed-workshop",
-        2,
-        "test",
-        FULL_SIZE,
-        "workshop",
-        "crossed",
-        "ec64e96ac523335ec5bf7be0a2c13265",
-    ),
-    Benchmark(
-        "fpp-bench-test-crossed-hard", 2, "test", FULL_SIZE, "hard", "crossed", "1b681c74c7f3b56f606b279d1e05fce4"
-    ),
+    Benchmark("fpp-bench-test-workshop", 2, "test", FULL_SIZE, "workshop"),
+    Benchmark("fpp-bench-test-hard", 2, "test", FULL_SIZE, "hard"),
+    Benchmark("fpp-bench-test-crossed-workshop", 2, "test", FULL_SIZE, "workshop", "crossed"),
+    Benchmark("fpp-bench-test-crossed-hard", 2, "test", FULL_SIZE, "hard", "crossed"),
 )
 """The current version of each. ``fpp-bench-full-224`` is what `fpp-bench reproduce --preset cpu` trains on."""
 

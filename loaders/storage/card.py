@@ -3,55 +3,27 @@
 ``datasets.load_from_disk(FOLDER)`` follows ``dataset_dict.json`` and the split folders' ``state.json``, in place."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.sample import (
     DATA_GROUP,
-    DEPTHS,
-    LABELS,
     MEANINGS,
-    PREVIEW,
-    RANGE,
-    available_configs,
     features,
-    group_columns,
-    row_columns,
-    stored_groups,
 )
 from fpp_ml_bench.loaders.storage.manifest import CAPTURED, GENERATED, Manifest
 from fpp_ml_bench.optics.rig_file import rig_from_dict, save_rig
 
 RIG_FILE = "rig.yaml"
-_HEAD = """\
----
-license: {license}
-pretty_name: FPP-ML-Bench
-task_categories:
-- depth-estimation
-size_categories:
-- n<1K
-tags:
-- fringe-projection-profilometry
-- structured-light
-- metrology
-configs:
-"""
-_CARD = """\
-- config_name: single_shot
-  default: true
-  version: {version}
-  data_files:
-{data_files}
----
-# FPP-ML-Bench dataset ({origin})
-
-{rows} samples of {height} x {width} px; depth in mm, 0 = background. Frames stored: `{stored}`.
+NAME = "FPP-ML-Bench"
+_FOLDER_TEXT = """\
+Frames stored: `{stored}`.
 
 ```python
 from fpp_ml_bench import load_dataset            # every configuration, memory-mapped, no copy
@@ -63,8 +35,7 @@ import datasets                                   # frame {first} and depth
 ```
 
 `fpp-bench info` says what is in it, `fpp-bench verify` proves it intact. Made by fpp-ml-bench {package}.
-
-{end}"""
+"""
 _LIMITS = {
     GENERATED: """\
 - The images are rendered. Objects with names of the paper's objects are procedural models that stand in for them, not
@@ -115,14 +86,47 @@ _END = """\
 """
 
 
-def card_head(manifest: Manifest) -> str:
-    """Front matter of every card, up to its configurations; captures are under no licence until their owner says so."""
-    return _HEAD.format(license="unknown" if manifest.origin == CAPTURED else "mit")
+def yaml_text(content: Any, allow_unicode: bool = False) -> str:
+    """YAML as the Hub's files have it: in the order given, lines of at most 110 characters."""
+    return str(yaml.safe_dump(content, sort_keys=False, width=110, allow_unicode=allow_unicode))
 
 
-def data_version(fingerprint: str) -> str:
-    """Version for a card; it changes with the data, because ``datasets`` looks up its cached copies by version."""
-    return f"1.0.{int(fingerprint[:7], 16)}"
+def front_matter(
+    manifest: Manifest, configs: list[Any], licence: str | None = None, tags: Sequence[str] = (), **more: Any
+) -> str:
+    """Front matter of a card: from it Hugging Face tools know configurations and files. ``licence`` is by default MIT,
+    for captures unknown, as they are under none until their owner says so; ``more`` are other keys."""
+    rows = sum(map(len, manifest.samples.values()))
+    head = {
+        "license": licence or ("unknown" if manifest.origin == CAPTURED else "mit"),
+        "pretty_name": NAME,
+        "task_categories": ["depth-estimation"],
+        "size_categories": ["n<1K" if rows < 1000 else "1K<n<10K" if rows < 10_000 else "10K<n<100K"],
+        "tags": ["fringe-projection-profilometry", "structured-light", "metrology", *tags],
+        "configs": configs,
+        **more,
+    }
+    return f"---\n{yaml_text(head)}---\n"
+
+
+def card_config(config: str, identity: str, files: Mapping[str, object], default: bool) -> dict[str, Any]:
+    """A configuration in the front matter; ``files`` are a pattern or names for each split, ``identity`` 64 hex digits
+    that change with the data, because ``datasets`` looks up its cached copies by version."""
+    return {
+        "config_name": config,
+        **({"default": True} if default else {}),
+        "version": f"1.0.{int(identity[:7], 16)}",
+        "data_files": [{"split": split, "path": paths} for split, paths in files.items()],
+    }
+
+
+def card(manifest: Manifest, configs: list[Any], form: str, rows: int, text: str) -> bytes:
+    """The card of a folder with ``rows`` of the dataset in some ``form``; ``text`` says how to open it."""
+    height, width = manifest.size
+    title = f"# {NAME} dataset ({manifest.origin}){form}"
+    counts = f"{rows} samples of {height} x {width} px; depth in mm, 0 = background."
+    end = card_end(manifest, features(manifest.columns(), manifest.size))
+    return f"{front_matter(manifest, configs)}{title}\n\n{counts} {text}\n{end}".encode()
 
 
 def card_end(manifest: Manifest, described: Mapping[str, Mapping[str, Any]]) -> str:
@@ -149,33 +153,8 @@ def card_end(manifest: Manifest, described: Mapping[str, Mapping[str, Any]]) -> 
     return _END.format(columns="\n".join(rows), limits=limits)
 
 
-def dataset_info(
-    config: str, described: Mapping[str, Mapping[str, Any]], size: tuple[int, int], rows: Mapping[str, int]
-) -> dict[str, Any]:
-    """What the front matter says of a configuration: columns by their `features`, and ``rows`` of each split with the
-    size of their decoded images. ``size`` is (H, W)."""
-    columns: list[dict[str, Any]] = []
-    bytes_per_pixel = 0
-    for name, feature in described.items():
-        if feature["_type"] == "Array2D":
-            dtype: Any = {"array2_d": {"shape": feature["shape"], "dtype": feature["dtype"]}}
-        else:
-            dtype = feature.get("dtype", "image")
-        columns.append({"name": name, "dtype": dtype})
-        if name not in (*LABELS, *RANGE, PREVIEW):
-            bytes_per_pixel += 4 if name in DEPTHS else 1
-    row_bytes = size[0] * size[1] * bytes_per_pixel
-    splits = [{"name": name, "num_bytes": row_bytes * count, "num_examples": count} for name, count in rows.items()]
-    total = row_bytes * sum(rows.values())
-    return {"config_name": config, "features": columns, "splits": splits, "dataset_size": total}
-
-
 def write_card(folder: Path, manifest: Manifest) -> list[str]:
     """Write card, rig and Hugging Face state files of a dataset with finished shards; returns their relative paths."""
-    rig = rig_from_dict(manifest.rig)
-    sequence = rig.sequence
-    frames = stored_groups(sequence, manifest.stored)[DATA_GROUP]
-    columns = group_columns(sequence, DATA_GROUP, frames, manifest.exact)
     contents: dict[str, Any] = {"dataset_dict.json": {"splits": list(manifest.samples)}}
     for split in manifest.samples:
         files = [shard.path for shard in manifest.shards if (shard.group, shard.split) == (DATA_GROUP, split)]
@@ -191,43 +170,35 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
         contents[f"{split}/dataset_info.json"] = {
             "citation": "",
             "description": "",
-            "features": features(columns, manifest.size),
+            "features": features(manifest.columns(DATA_GROUP), manifest.size),
             "homepage": "",
             "license": "" if manifest.origin == CAPTURED else "mit",
         }
     for name, content in contents.items():
+        (folder / name).parent.mkdir(exist_ok=True)
         write_atomically(folder / name, json.dumps(content, indent=1).encode() + b"\n")
-    save_rig(rig, folder / RIG_FILE)
-    paths = (f"  - split: {split}\n    path: {split}/{DATA_GROUP}-*.arrow" for split in manifest.samples)
-    text = card_head(manifest) + _CARD.format(
-        version=data_version(manifest.fingerprint),
-        data_files="\n".join(paths),
-        origin=manifest.origin,
-        rows=sum(len(rows) for rows in manifest.samples.values()),
-        height=manifest.size[0],
-        width=manifest.size[1],
+    save_rig(rig_from_dict(manifest.rig), folder / RIG_FILE)
+    patterns = {split: f"{split}/{DATA_GROUP}-*.arrow" for split in manifest.samples}
+    text = _FOLDER_TEXT.format(
         stored=manifest.stored,
         split=next(iter(manifest.samples)),
-        config=available_configs(sequence, manifest.stored)[-1],
+        config=manifest.configs[-1],
         package=__version__,
-        first=frames[0],
-        end=card_end(manifest, features(row_columns(sequence, manifest.stored_frames, manifest.exact), manifest.size)),
+        first=manifest.groups[DATA_GROUP][0],
     )
-    write_atomically(folder / "README.md", text.encode())
+    rows = sum(len(rows) for rows in manifest.samples.values())
+    configs = [card_config("single_shot", manifest.fingerprint, patterns, default=True)]
+    write_atomically(folder / "README.md", card(manifest, configs, "", rows, text))
     return ["README.md", RIG_FILE, *contents]
 
 
 def split_statistics(manifest: Manifest) -> list[dict[str, Any]]:
-    """Statistics of each split that has rows in the manifest: lengths in mm, shares from 0 to 1, None where a dataset
-    has no exact depth. ``gt_mae_mm`` and ``gt_rmse_mm`` are the uncertainty of the ground truth: decoded against exact
-    depth over all object pixels, averaged over samples like every score; ``gt_interior_*`` over those 3 px or more from
-    depth edges."""
-    return [_split(split, rows, manifest) for split, rows in manifest.samples.items()]
-
-
-def whole_statistics(manifest: Manifest) -> dict[str, Any]:
-    """Statistics of all rows together, as a split called ``all``."""
-    return _split("all", [row for rows in manifest.samples.values() for row in rows], manifest)
+    """Statistics of each split that has rows in the manifest, and last of all rows together, as a split called ``all``:
+    lengths in mm, shares from 0 to 1, None where a dataset has no exact depth. ``gt_mae_mm`` and ``gt_rmse_mm`` are the
+    uncertainty of the ground truth: decoded against exact depth over all object pixels, averaged over samples like
+    every score; ``gt_interior_*`` over those 3 px or more from depth edges."""
+    whole = [row for rows in manifest.samples.values() for row in rows]
+    return [_split(split, rows, manifest) for split, rows in (*manifest.samples.items(), ("all", whole))]
 
 
 def _split(split: str, rows: list[dict[str, Any]], manifest: Manifest) -> dict[str, Any]:
@@ -264,6 +235,6 @@ def ground_truth_summary(manifest: Manifest) -> list[str]:
         f"{s['split']}: ground truth within {s['gt_mae_mm']:.3f} mm MAE, {s['gt_rmse_mm']:.3f} mm RMSE of the exact "
         f"depth ({s['gt_interior_mae_mm']:.3f} mm 3 px or more from depth edges); {100 * s['undecoded_share']:.2f}% of "
         f"object pixels not decodable, {100 * s['void_share']:.2f}% void (unlit, or surfaces mixed in a pixel)"
-        for s in split_statistics(manifest)
+        for s in split_statistics(manifest)[:-1]
         if None not in (s["gt_mae_mm"], s["gt_interior_mae_mm"], s["undecoded_share"])
     ]

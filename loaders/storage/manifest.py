@@ -6,6 +6,7 @@ import json
 import re
 from collections import Counter
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from functools import cached_property
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin
@@ -13,7 +14,7 @@ from typing import Any, TypeVar, get_args, get_origin
 from fpp_ml_bench.constants import OBJECT_NAME, REPOSITORY_NAME, SAMPLE_NAME, SCHEMA_VERSION, SPLITS, VIEW_NAME
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import file_hash, path_problem, printable, read_json, text_problem, write_atomically
-from fpp_ml_bench.loaders.sample import available_configs, stored_frames, stored_groups
+from fpp_ml_bench.loaders.sample import DATA_GROUP, available_configs, row_columns, stored_frames, stored_groups
 from fpp_ml_bench.optics.rig_file import rig_from_dict
 from fpp_ml_bench.optics.sequence import AnySequence
 
@@ -80,9 +81,25 @@ class Manifest:
             content.pop(key)
         return sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()
 
-    @property
+    @cached_property
     def sequence(self) -> AnySequence:
         return rig_from_dict(self.rig).sequence
+
+    @cached_property
+    def groups(self) -> dict[str, tuple[int, ...]]:
+        """Indices of the frames in each column group's files, as `stored_groups`."""
+        return stored_groups(self.sequence, self.stored)
+
+    @property
+    def configs(self) -> tuple[str, ...]:
+        """Configurations whose frames are stored."""
+        return available_configs(self.sequence, self.stored)
+
+    def columns(self, group: str | None = None) -> list[str]:
+        """Column names of a group's files, or of a table with all that is stored (None), in order."""
+        if group in (None, DATA_GROUP):
+            return row_columns(self.sequence, self.groups[group] if group else self.stored_frames, self.exact)
+        return [self.sequence.frames[i].column for i in self.groups[group]]
 
     @property
     def stored_frames(self) -> tuple[int, ...]:
@@ -191,10 +208,9 @@ def check_row(row: dict[str, Any]) -> None:
 
 def _check(manifest: Manifest) -> None:
     """Raise ValueError for what no dataset can have."""
-    rig = rig_from_dict(manifest.rig)
     if not all(0 < side <= LARGEST_PX for side in manifest.size):
         raise ValueError(f"size {manifest.size}: expected 1 to {LARGEST_PX} px a side")
-    if manifest.stored not in available_configs(rig.sequence, manifest.stored):
+    if manifest.stored not in manifest.configs:
         raise ValueError(f"stored: {printable(manifest.stored)!r} is no configuration of the rig's sequence")
     if problem := next(filter(None, map(text_problem, (manifest.origin, *manifest.generator.values()))), None):
         raise ValueError(f"origin and generator: {problem}")
@@ -206,15 +222,29 @@ def _check(manifest: Manifest) -> None:
         raise ValueError("samples: expected some in every split")
     for row in (row for rows in manifest.samples.values() for row in rows):
         check_row(row)
-    groups = stored_groups(rig.sequence, manifest.stored)
-    if unknown := {shard.group for shard in manifest.shards} - groups.keys():
-        raise ValueError(f"unknown group {printable(sorted(unknown)[0])!r}, expected {', '.join(groups)}")
+    if unknown := {shard.group for shard in manifest.shards} - manifest.groups.keys():
+        raise ValueError(f"unknown group {printable(sorted(unknown)[0])!r}, expected {', '.join(manifest.groups)}")
     path, count = Counter(file.path for file in manifest.files).most_common(1)[0] if manifest.files else ("", 0)
     if count > 1:
         raise ValueError(f"{path}: is listed twice")
     for name, digest in manifest.content.items():
         if not re.fullmatch(rf"({'|'.join(SPLITS)})/[a-z0-9_]{{1,60}} [0-9a-f]{{32}}", f"{name} {digest}"):
             raise ValueError(f"content {printable(name)!r}: expected split/column and a hash of 32 hex digits")
+
+
+def damage_of(folder: Path, file: ShardFile | OtherFile, whole: bool = True) -> str | None:
+    """What is wrong with a file of the dataset, a sentence that names it, or None: it is missing, of another size, or
+    ``whole``, which reads it, of another content."""
+    path = folder / file.path
+    if not path.is_file():
+        problem = "is missing"
+    elif (size := path.stat().st_size) != file.bytes:
+        problem = f"has {size} bytes, expected {file.bytes}"
+    elif whole and file_hash(path) != file.xxh3_128:
+        problem = "its content has changed (checksum differs)"
+    else:
+        return None
+    return f"{path}: {problem}; copy or build the dataset again"
 
 
 def describe_file(folder: Path, path: Path) -> OtherFile:

@@ -9,8 +9,9 @@ of a file is in memory at a time.
 
 import json
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -19,17 +20,15 @@ import cv2
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-import yaml
 from numpy.typing import NDArray
 
 from fpp_ml_bench.containers import png_bytes
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders import sample as layout
 from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTHS, LABELS, PIXEL_MAPS, PREVIEW, RANGE, config_columns
-from fpp_ml_bench.loaders.storage.card import card_end, card_head, data_version
-from fpp_ml_bench.loaders.storage.manifest import ShardFile
+from fpp_ml_bench.loaders.storage.card import card, card_config
+from fpp_ml_bench.loaders.storage.manifest import ShardFile, damage_of
 from fpp_ml_bench.loaders.storage.shards import arrow_schema
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
@@ -42,12 +41,8 @@ _GROUP_BYTES, _VIEWER_GROUP_BYTES = 1 << 28, 200_000_000
 _MOST_ROWS_PER_GROUP = 24
 _LEVEL = 3  # of zstd: a fifth smaller than level 1, hardly slower; level 6: 7% smaller, 1.5 times the time
 _LEAF = ".list.element.list.element"
-_CARD = """\
-{configs}
----
-# FPP-ML-Bench dataset ({origin}), Parquet
-
-{rows} samples of {height} x {width} px; depth in mm, 0 = background. Exported from the dataset with fingerprint
+_TEXT = """\
+Exported from the dataset with fingerprint
 `{fingerprint}`.
 
 ```python
@@ -56,33 +51,26 @@ train = datasets.load_dataset("THIS FOLDER", "{config}", split="{split}")
 ```
 
 Configurations: {names}. A configuration reads only its own columns.
-
-{end}"""
+"""
 
 
 def columns(dataset: DatasetFolder, config: str | None = None) -> list[str]:
     """Columns of a configuration as published, or of the files (None): those of the dataset, and the preview."""
-    names = _all_columns(dataset) if config is None else config_columns(dataset.sequence, config, dataset.has_exact)
+    names = (
+        dataset.manifest.columns() if config is None else config_columns(dataset.sequence, config, dataset.has_exact)
+    )
     place = names.index(DEPTH)
     return [*names[:place], PREVIEW, *names[place:]]
 
 
 def card_configs(dataset: DatasetFolder, identity: str, files: Mapping[str, object], preview: bool) -> list[Any]:
     """The configurations as a card lists them; ``files`` are a pattern or names for each split."""
-    return [
-        {
-            "config_name": config,
-            **({"default": True} if config == dataset.configs[0] else {}),
-            "version": data_version(identity),
-            "data_files": [{"split": split, "path": paths} for split, paths in files.items()],
-            "columns": [name for name in columns(dataset, config) if preview or name != PREVIEW],
-        }
-        for config in dataset.configs
-    ]
-
-
-def _all_columns(dataset: DatasetFolder) -> list[str]:
-    return layout.row_columns(dataset.sequence, dataset.manifest.stored_frames, dataset.has_exact)
+    configs = []
+    for config in dataset.configs:
+        names = [name for name in columns(dataset, config) if preview or name != PREVIEW]
+        described = card_config(config, identity, files, default=config == dataset.configs[0])
+        configs.append({**described, "columns": names})
+    return configs
 
 
 def data_shards(dataset: DatasetFolder) -> dict[str, ShardFile]:
@@ -105,108 +93,88 @@ def write_parquet(
     (folder / "data").mkdir(parents=True, exist_ok=True)
     files = [(folder / name, shard) for name, shard in data_shards(dataset).items() if shard.split in splits]
     with ThreadPoolExecutor(threads) as pool:  # the first error cancels what has not begun
-        list(pool.map(lambda file: _write_arrays(dataset, file[0], file[1], rows_done), files))
-    (folder / "README.md").write_text(_card(dataset, splits), encoding="utf-8")
+        list(pool.map(lambda file: write_shard(dataset, file[1], file[0], rows_done), files))
+    # Exports of the same dataset with different splits must not share a cache entry.
+    identity = sha256(" ".join([dataset.fingerprint, *splits]).encode()).hexdigest()
+    configs = card_configs(dataset, identity, {split: f"data/{split}-*.parquet" for split in splits}, preview=False)
+    names = ", ".join(f"`{config}`" for config in dataset.configs)
+    text = _TEXT.format(fingerprint=dataset.fingerprint, config=dataset.configs[0], split=splits[0], names=names)
+    rows = sum(len(dataset.samples(split)) for split in splits)
+    (folder / "README.md").write_bytes(card(dataset.manifest, configs, ", Parquet", rows, text))
 
 
-def _write_arrays(dataset: DatasetFolder, path: Path, shard: ShardFile, rows_done: Callable[[int], None]) -> None:
-    names = _all_columns(dataset)
-    schema = arrow_schema(names, dataset.size)
-    stored = _stored_columns(dataset, _parts(dataset, shard))
-    table = pa.Table.from_arrays([stored[name] for name in names], schema=schema)
-    depths = [name for name in names if name in DEPTHS]
-    settings = {
-        "compression": "zstd",
-        "compression_level": _LEVEL,
-        "use_dictionary": [name if name in LABELS else name + _LEAF for name in names if name not in (*depths, *RANGE)],
-        "column_encoding": {name + _LEAF: "BYTE_STREAM_SPLIT" for name in depths},
-        "write_statistics": [*LABELS, *RANGE],  # the range of grey levels of an image is of no use to a reader
-    }
-    rows = _rows_per_group(dataset, _GROUP_BYTES)
-    groups = (table.slice(first, rows) for first in range(0, table.num_rows, rows))
-    _write_groups(path, schema, settings, groups, rows_done)
-
-
-def write_shard(dataset: DatasetFolder, shard: ShardFile, out: Path, threads: int, done: Callable[[int], None]) -> None:
-    """Write the rows of one data shard, all columns, for the Hub; the file appears complete or not at all. Raises
-    `DatasetError` where a file of the dataset no longer has its checksum, ``OSError`` for a failed write."""
-    parts = _parts(dataset, shard)
+def write_shard(
+    dataset: DatasetFolder, shard: ShardFile, out: Path, done: Callable[[int], None], picture_threads: int | None = None
+) -> None:
+    """Write the rows of one data shard, all columns: arrays, or with ``picture_threads``, by so many threads, what the
+    Hub's viewer shows. The file appears complete or not at all. Raises `DatasetError` where a file of the dataset no
+    longer has its checksum, ``OSError`` for a failed write."""
+    parts = [part for part in dataset.manifest.shards if (part.split, part.first_row) == (shard.split, shard.first_row)]
     for part in parts:
-        if file_hash(dataset.path / part.path) != part.xxh3_128:
-            raise DatasetError(f"{dataset.path / part.path}: damaged, its checksum does not match; it isn't published")
-    names = columns(dataset)
-    pictures = [name for name in names if name == PREVIEW or name.startswith("frame_")]
-    depths = [name + _LEAF for name in names if name in DEPTHS]
-    plain = [*LABELS, *RANGE, *(name + _LEAF for name in names if name in PIXEL_MAPS)]
-    settings = {
-        # A PNG is compressed already.
-        "compression": {
-            **dict.fromkeys([*plain, *depths], "zstd"),
-            **dict.fromkeys((f"{name}.{part}" for name in pictures for part in ("bytes", "path")), "none"),
-        },
-        "compression_level": dict.fromkeys([*plain, *depths], _LEVEL),
-        "use_dictionary": list(LABELS),
-        "column_encoding": dict.fromkeys(depths, "BYTE_STREAM_SPLIT"),
-        "write_statistics": plain,
-        "write_page_index": True,
-    }
-    schema = _viewer_schema(dataset, names, pictures)
-    stored = _stored_columns(dataset, [shard])
+        if damage := damage_of(dataset.path, part):
+            raise DatasetError(damage)
+    viewer = picture_threads is not None
+    names = columns(dataset) if viewer else dataset.manifest.columns()
+    pictures = [name for name in names if viewer and (name == PREVIEW or name.startswith("frame_"))]
+    schema = _viewer_schema(dataset, names, pictures) if viewer else arrow_schema(names, dataset.size)
+    stored = _stored_columns(dataset, [shard] if viewer else parts)
     samples = dataset.splits[shard.split][shard.first_row : shard.first_row + shard.rows]
-    rows = _rows_per_group(dataset, _VIEWER_GROUP_BYTES)
-
-    def groups(pool: ThreadPoolExecutor) -> Iterator[pa.Table]:
-        for first in range(0, len(samples), rows):
-            group = samples[first : first + rows]
-            encoded = {}
-            for name in pictures:
-                index = None if name == PREVIEW else int(name.removeprefix("frame_"))
-                contents = pool.map(lambda sample, index=index: _png(dataset, sample, index), group)
-                cells = [{"bytes": content, "path": None} for content in contents]
-                encoded[name] = pa.array(cells, schema.field(name).type)
-            plain = {name: column.slice(first, len(group)) for name, column in stored.items()}
-            yield pa.Table.from_arrays([(plain | encoded)[name] for name in names], schema=schema)
-
+    group_bytes = _VIEWER_GROUP_BYTES if viewer else _GROUP_BYTES
+    rows = max(1, min(_MOST_ROWS_PER_GROUP, group_bytes // dataset.manifest.row_bytes))
     out.parent.mkdir(parents=True, exist_ok=True)
     temporary = out.with_name(f".{out.name}.{os.getpid()}.tmp")
     try:
-        with ThreadPoolExecutor(threads) as pool:
-            _write_groups(temporary, schema, settings, groups(pool), done)
+        with (
+            ThreadPoolExecutor(picture_threads) as pool,
+            pq.ParquetWriter(temporary, schema, **_settings(names, pictures, viewer)) as writer,
+        ):
+            for first in range(0, len(samples), rows):
+                group = samples[first : first + rows]
+                cells = {name: column.slice(first, len(group)) for name, column in stored.items()}
+                for name in pictures:
+                    contents = pool.map(partial(_png, dataset, column=name), group)
+                    encoded = [{"bytes": content, "path": None} for content in contents]
+                    cells[name] = pa.array(encoded, schema.field(name).type)
+                table = pa.Table.from_arrays([cells[name] for name in names], schema=schema)
+                writer.write_table(table, row_group_size=len(group))
+                done(len(group))
         with temporary.open("rb") as file:
             os.fsync(file.fileno())
         temporary.replace(out)
+    except pa.ArrowException as error:
+        raise OSError(f"{out.name}: {error}") from error
     finally:
         temporary.unlink(missing_ok=True)
         for part in parts:
             dataset.forget(part)  # else the memory maps of all shards would stay open
 
 
-def _write_groups(
-    path: Path, schema: pa.Schema, settings: dict[str, Any], groups: Iterator[pa.Table], done: Callable[[int], None]
-) -> None:
-    try:
-        with pq.ParquetWriter(path, schema, **settings) as writer:
-            for group in groups:
-                writer.write_table(group, row_group_size=group.num_rows)
-                done(group.num_rows)
-    except pa.ArrowException as error:
-        raise OSError(f"{path.name}: {error}") from error
-
-
-def _rows_per_group(dataset: DatasetFolder, group_bytes: int) -> int:
-    return max(1, min(_MOST_ROWS_PER_GROUP, group_bytes // dataset.manifest.row_bytes))
-
-
-def _parts(dataset: DatasetFolder, shard: ShardFile) -> list[ShardFile]:
-    """The files of all groups that hold the rows of a data shard."""
-    return [s for s in dataset.manifest.shards if (s.split, s.first_row) == (shard.split, shard.first_row)]
+def _settings(names: list[str], pictures: list[str], viewer: bool) -> dict[str, Any]:
+    """How columns are packed. The range of grey levels of an image is of no use to a reader; a PNG is compressed."""
+    depths = [name + _LEAF for name in names if name in DEPTHS]
+    values = [name for name in names if name in (*LABELS, *RANGE)]
+    packed = {"compression_level": _LEVEL, "column_encoding": dict.fromkeys(depths, "BYTE_STREAM_SPLIT")}
+    if not viewer:
+        images = [name + _LEAF for name in names if name not in (*values, *DEPTHS)]
+        return {**packed, "compression": "zstd", "use_dictionary": [*LABELS, *images], "write_statistics": values}
+    plain = [*values, *(name + _LEAF for name in names if name in PIXEL_MAPS)]
+    compressed = [*plain, *depths]
+    whole = [f"{name}.{part}" for name in pictures for part in ("bytes", "path")]
+    return {
+        **packed,
+        "compression_level": dict.fromkeys(compressed, _LEVEL),
+        "compression": {**dict.fromkeys(compressed, "zstd"), **dict.fromkeys(whole, "none")},
+        "use_dictionary": list(LABELS),
+        "write_statistics": plain,
+        "write_page_index": True,
+    }
 
 
 def _stored_columns(dataset: DatasetFolder, parts: list[ShardFile]) -> dict[str, pa.ChunkedArray]:
     """Columns of shard files, memory-mapped from disk: what is written has the same bits."""
     stored = {}
     for part in parts:
-        batches = dataset.record_batches(part)
+        batches = dataset.mapped(part).batches
         for name in batches[0].schema.names:
             # An Array2D extension where `datasets` has been imported; the lists it stores are the same.
             arrays = (batch.column(name) for batch in batches)
@@ -229,10 +197,11 @@ def _viewer_schema(dataset: DatasetFolder, names: list[str], pictures: list[str]
     return pa.schema(fields, metadata={b"huggingface": json.dumps(content).encode()})
 
 
-def _png(dataset: DatasetFolder, sample: str, index: int | None) -> bytes:
-    """A frame, or the preview (None), as PNG. Noisy fringes have no repetition to search for: with Huffman coding
-    alone the files are 22% smaller than at OpenCV's level 1, and decode 1.7 times as fast (measured)."""
-    image = preview(dataset.depth_mm(sample)) if index is None else dataset.frame(sample, index)
+def _png(dataset: DatasetFolder, sample: str, column: str) -> bytes:
+    """A frame, or the preview, as PNG. Noisy fringes have no repetition to search for: with Huffman coding alone the
+    files are 22% smaller than at OpenCV's level 1, and decode 1.7 times as fast (measured)."""
+    depth = column == PREVIEW
+    image = preview(dataset.depth_mm(sample)) if depth else dataset.frame(sample, int(column.removeprefix("frame_")))
     settings = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
     done, content = cv2.imencode(".png", np.ascontiguousarray(image), settings)
     if not done:
@@ -266,22 +235,3 @@ def overview(dataset: DatasetFolder) -> bytes:
         depth[shades == 0] = 0
         panels.append(np.vstack([cv2.cvtColor(small, cv2.COLOR_GRAY2BGR), depth]))
     return png_bytes(np.hstack(panels))
-
-
-def _card(dataset: DatasetFolder, splits: list[str]) -> str:
-    manifest = dataset.manifest
-    # Exports of the same dataset with different splits must not share a cache entry.
-    identity = sha256(" ".join([manifest.fingerprint, *splits]).encode()).hexdigest()
-    configs = card_configs(dataset, identity, {split: f"data/{split}-*.parquet" for split in splits}, preview=False)
-    return card_head(manifest) + _CARD.format(
-        configs=yaml.safe_dump(configs, sort_keys=False, width=120).rstrip(),
-        origin=manifest.origin,
-        rows=sum(len(dataset.samples(split)) for split in splits),
-        height=dataset.size[0],
-        width=dataset.size[1],
-        fingerprint=manifest.fingerprint,
-        config=dataset.configs[0],
-        split=splits[0],
-        names=", ".join(f"`{config}`" for config in dataset.configs),
-        end=card_end(manifest, layout.features(_all_columns(dataset), dataset.size)),
-    )

@@ -4,72 +4,39 @@ import json
 import os
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import xxhash
 from numpy.typing import NDArray
 
-from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.depth import depth_problem, depth_range_mm, object_mask
 from fpp_ml_bench.errors import BuildError
+from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders import sample as layout
 from fpp_ml_bench.loaders.sample import COVER, DATA_GROUP, DEPTH, DEPTH_EXACT, DEPTHS, FLAGS, LABELS, RANGE, Row
-from fpp_ml_bench.loaders.storage.manifest import ShardFile
-from fpp_ml_bench.optics.sequence import AnySequence
-
-
-class HashedFile:
-    """A new file for sequential writing, in the form that ``pyarrow.PythonFile`` takes. After `close`, ``size`` bytes
-    with hash ``xxh3_128`` are on the disk, and no longer in the cache, where gigabytes of shards would push out
-    everything else. Raises ``OSError`` where the disk can't be written."""
-
-    def __init__(self, path: Path) -> None:
-        self._hash = xxhash.xxh3_128()
-        self._file = path.open("wb", buffering=0)
-        self.size = 0
-
-    def write(self, data: object) -> int:
-        """Append ``data`` (any bytes-like object); returns its length."""
-        view = memoryview(data).cast("B")  # type: ignore[arg-type]
-        self._hash.update(view)
-        self.size += len(view)
-        rest = view
-        while len(rest):
-            rest = rest[self._file.write(rest) :]
-        return len(view)
-
-    def flush(self) -> None:
-        """Does nothing, but pyarrow calls it."""
-
-    @property
-    def closed(self) -> bool:
-        return self._file.closed
-
-    def close(self) -> None:
-        """Wait until everything is on the disk."""
-        if self.closed:
-            return
-        try:
-            os.fdatasync(self._file.fileno())
-            os.posix_fadvise(self._file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-        finally:
-            self._file.close()
-
-    @property
-    def xxh3_128(self) -> str:
-        """Hash of everything written."""
-        return self._hash.hexdigest()
-
+from fpp_ml_bench.loaders.storage.manifest import WORK_FOLDER, Manifest, OtherFile, ShardFile
 
 OBJECTS_PER_SHARD = 4
 """Four objects are 24 rows: with batches of that size, batch boundaries no longer slow down reading (measured)."""
 ROWS_PER_SHARD, SHARD_PX = 24, 1 << 26
 """A shard's frame and depth map of every row are in memory until it is written: 0.3 GB for so many pixels."""
-Receipt = tuple[list[ShardFile], list[dict[str, Any]]]
-"""Files of a written shard, and per row its labels and measurements, and ``hashes`` of its images by column."""
+
+
+@dataclass(frozen=True)
+class Receipt:
+    """What is written of a shard: its files, per row the labels and measurements and the ``hashes`` of its images by
+    column, and the meshes of its objects."""
+
+    files: list[ShardFile]
+    rows: list[dict[str, Any]]
+    meshes: list[OtherFile] = field(default_factory=list)
+
+    @property
+    def written(self) -> tuple[ShardFile | OtherFile, ...]:
+        return (*self.files, *self.meshes)
 
 
 @dataclass(frozen=True)
@@ -138,71 +105,65 @@ def arrow_schema(columns: list[str], size: tuple[int, int]) -> pa.Schema:
 
 
 class ShardWriter:
-    """Writes shards of one dataset, one after the other. Pixels are copied once, into buffers that all shards reuse.
-    ``sequence``, ``stored``, ``exact`` and ``size`` (H, W) are the dataset's, as in its `Manifest`; unfinished files
-    lie in ``scratch``."""
+    """Writes shards of the dataset that ``manifest`` describes, one after the other. Pixels are copied once, into
+    buffers that all shards reuse."""
 
-    def __init__(
-        self, folder: Path, scratch: Path, sequence: AnySequence, stored: str, exact: bool, size: tuple[int, int]
-    ) -> None:
-        self._folder, self._scratch, self._sequence, self._size = folder, scratch, sequence, size
-        self._groups = layout.stored_groups(sequence, stored)
-        self._schemas = {
-            group: arrow_schema(layout.group_columns(sequence, group, frames, exact), size)
-            for group, frames in self._groups.items()
-        }
+    def __init__(self, manifest: Manifest) -> None:
+        self._manifest, self._size = manifest, manifest.size
+        self._schemas = {group: arrow_schema(manifest.columns(group), manifest.size) for group in manifest.groups}
         self._images = [name for name in self._schemas[DATA_GROUP].names if name not in (*LABELS, *RANGE)]
         # Mapping 200 MB of new pages for every shard takes longer than filling them.
         self._buffers: dict[str, NDArray] = {}
 
-    def write(self, plan: ShardPlan, rows: Iterable[Row], row_done: Callable[[], None] = lambda: None) -> Receipt:
-        """Write the rows of ``plan``, which come in its order, and call ``row_done`` after each. Raises `BuildError`
-        when the disk is full or can't be written; no unfinished file is left."""
-        temporary = {group: self._scratch / f"{plan.name}.{os.getpid()}.{group}.tmp" for group in self._groups}
+    def write(
+        self, folder: Path, plan: ShardPlan, rows: Iterable[Row], row_done: Callable[[], None] = lambda: None
+    ) -> Receipt:
+        """Write the rows of ``plan``, which come in its order, into the dataset's folder, and call ``row_done`` after
+        each. Raises `BuildError` when the disk is full or can't be written; no unfinished file is left."""
+        scratch = folder / WORK_FOLDER
+        temporary = {group: scratch / f"{plan.name}.{os.getpid()}.{group}.tmp" for group in self._schemas}
         try:
-            described, sinks = self._write_streams(plan, rows, temporary, row_done)
+            scratch.mkdir(parents=True, exist_ok=True)
+            described = self._write_streams(plan, rows, temporary, row_done)
             files = []
             for group, path in temporary.items():
-                target = self._folder / plan.path(group)
+                size, digest = _settled(path)
+                target = folder / plan.path(group)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 path.replace(target)
                 place = (plan.path(group), plan.split, group, plan.first_row, len(plan.samples))
-                files.append(ShardFile(*place, bytes=sinks[group].size, xxh3_128=sinks[group].xxh3_128))
+                files.append(ShardFile(*place, size, digest))
         except (OSError, pa.ArrowException) as error:
             number = getattr(error, "errno", None)
             reason = os.strerror(number) if number else error
-            where = self._folder / plan.path(DATA_GROUP)
+            where = folder / plan.path(DATA_GROUP)
             advice = "free some space or choose another disk, then run the same command again: it resumes"
             raise BuildError(f"{where}: can't be written ({reason}); {advice}") from error
         finally:
             for path in temporary.values():
                 path.unlink(missing_ok=True)
-        return files, described
+        return Receipt(files, described)
 
     def _write_streams(
         self, plan: ShardPlan, rows: Iterable[Row], paths: dict[str, Path], row_done: Callable[[], None]
-    ) -> tuple[list[dict[str, Any]], dict[str, HashedFile]]:
+    ) -> list[dict[str, Any]]:
         with ExitStack() as files:
-            sinks, writers = {}, {}
+            writers = {}
             for group, path in paths.items():
-                sinks[group] = HashedFile(path)
-                files.callback(sinks[group].close)
-                writers[group] = pa.ipc.new_stream(pa.PythonFile(sinks[group], mode="w"), self._schemas[group])
+                sink = files.enter_context(path.open("wb"))
+                writers[group] = pa.ipc.new_stream(pa.PythonFile(sink, mode="w"), self._schemas[group])
             described = []
-            data: dict[str, list[Any]] = {name: [] for name in (*LABELS, *RANGE)}
             for number, row in enumerate(_in_order(plan, rows)):
-                low_mm, high_mm = depth_range_mm(row.depth_mm, row.sample)
+                low_mm, high_mm = checked_range_mm(row.depth_mm, row.sample)
                 labels = {"sample": row.sample, "object": row.object, "view": row.view}
                 object_px = int(np.count_nonzero(object_mask(row.depth_mm)))
                 measured = {"object_px": object_px, "depth_min_mm": low_mm, "depth_max_mm": high_mm, **row.measured}
                 hashes: dict[str, str] = {}
                 described.append({**labels, **measured, "hashes": hashes})
-                for values, value in zip(data.values(), (*labels.values(), plan.split, low_mm, high_mm), strict=True):
-                    values.append(value)
                 # The data group is one batch of all rows. All frames but the first are written at once, one row per
                 # batch, and not held in memory.
-                for group, frames in self._groups.items():
-                    images: dict[str, Any] = {self._sequence.frames[i].column: row.frames[i] for i in frames}
+                for group, frames in self._manifest.groups.items():
+                    images: dict[str, Any] = {self._manifest.sequence.frames[i].column: row.frames[i] for i in frames}
                     if group == DATA_GROUP:
                         images |= {DEPTH: row.depth_mm, DEPTH_EXACT: row.depth_exact_mm}
                         images |= {FLAGS: row.flags, COVER: row.cover}
@@ -216,12 +177,15 @@ class ShardWriter:
                     for column, image in images.items():
                         self._buffer(column, len(plan.samples))[number] = image
                 row_done()
-            schema = self._schemas[DATA_GROUP]
-            columns = [data.get(name) or self._buffer(name, len(plan.samples)) for name in schema.names]
-            writers[DATA_GROUP].write_batch(_record_batch(columns, schema))
+            labelled = [layout.labels_of(row, plan.split) for row in described]
+            columns = [
+                self._buffer(name, len(plan.samples)) if name in self._images else [row[name] for row in labelled]
+                for name in self._schemas[DATA_GROUP].names
+            ]
+            writers[DATA_GROUP].write_batch(_record_batch(columns, self._schemas[DATA_GROUP]))
             for writer in writers.values():
                 writer.close()
-        return described, sinks
+        return described
 
     def _buffer(self, column: str, rows: int) -> NDArray:
         if column not in self._buffers or len(self._buffers[column]) < rows:
@@ -234,6 +198,16 @@ class ShardWriter:
             received = "nothing" if image is None else f"{image.dtype} {image.shape}"
             raise BuildError(f"column {column}: expected {_dtype(column)} {self._size}, got {received}")
         return image
+
+
+def _settled(path: Path) -> tuple[int, str]:
+    """Bytes and hash of a file just written. It is on the disk then, and no longer in the cache, where gigabytes of
+    shards would push out everything else."""
+    with path.open("rb") as file:
+        os.fdatasync(file.fileno())
+        digest = file_hash(path)
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+        return file.seek(0, os.SEEK_END), digest
 
 
 def _dtype(column: str) -> np.dtype:
@@ -271,13 +245,9 @@ def _image_column(images: NDArray, kind: pa.DataType) -> pa.Array:
     return pa.ListArray.from_arrays(pa.array(np.arange(rows + 1, dtype=np.int32) * height), inner)
 
 
-def depth_range_mm(depth_mm: NDArray[np.float32], sample: str) -> tuple[float, float]:
+def checked_range_mm(depth_mm: NDArray[np.float32], sample: str) -> tuple[float, float]:
     """Least and greatest depth above 0 of a sample (paper Section 3.3), mm. Raises `BuildError` for a map without
     object pixels, or with a depth that is negative or not finite."""
-    if not (np.isfinite(depth_mm).all() and depth_mm.min() >= 0):
-        raise BuildError(f"sample {sample!r}: its depth map has depths that are negative or not finite")
-    inside = depth_mm[object_mask(depth_mm)]
-    if inside.size == 0:
-        expected = "expected an object in the working range"
-        raise BuildError(f"sample {sample!r}: its depth map has no pixel above 0 mm; {expected}")
-    return float(inside.min()), float(inside.max())
+    if problem := depth_problem(depth_mm):
+        raise BuildError(f"sample {sample!r}: its depth map: {problem}")
+    return depth_range_mm(depth_mm)

@@ -29,10 +29,9 @@ from fpp_ml_bench.loaders.sample import (
     Flag,
     config_columns,
     exact_void,
-    stored_groups,
     void_pixels,
 )
-from fpp_ml_bench.loaders.storage.manifest import MANIFEST, ShardFile, read_manifest
+from fpp_ml_bench.loaders.storage.manifest import MANIFEST, ShardFile, damage_of, read_manifest
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.rig_file import rig_from_dict
 from fpp_ml_bench.optics.sequence import AnySequence
@@ -56,23 +55,14 @@ class DatasetFolder:
         """With ``check`` off, the folder opens even if some of its files are missing or cut."""
         self.path = Path(path)
         self.manifest = read_manifest(self.path)
-        self._batches: dict[str, list[pa.RecordBatch]] = {}
-        self._images: dict[tuple[str, str], list[NDArray]] = {}
-        self._maps: dict[str, mmap.mmap] = {}
-        self._look_s: dict[str, float] = {}
+        self._mapped: dict[str, MappedShard] = {}
         for shard in self.manifest.shards if check else ():
-            file = self.path / shard.path
-            size = file.stat().st_size if file.is_file() else None
-            if size != shard.bytes:
-                found = "it is missing" if size is None else f"it has {size}"
-                raise DatasetError(f"{file}: expected {shard.bytes} bytes, {found}; build or copy the dataset again")
+            if damage := damage_of(self.path, shard, whole=False):
+                raise DatasetError(damage)
 
     def forget(self, shard: ShardFile) -> None:
         """Close the memory maps of a file."""
-        self._batches.pop(shard.path, None)
-        self._maps.pop(shard.path, None)
-        for key in [key for key in self._images if key[0] == shard.path]:
-            del self._images[key]
+        self._mapped.pop(shard.path, None)
 
     def __reduce__(self) -> tuple[type["DatasetFolder"], tuple[Path]]:
         return DatasetFolder, (self.path,)
@@ -112,14 +102,14 @@ class DatasetFolder:
         """The rig whose camera took the images."""
         return rig_from_dict(self.manifest.rig)
 
-    @cached_property
+    @property
     def sequence(self) -> AnySequence:
         return self.manifest.sequence
 
     @property
     def configs(self) -> tuple[str, ...]:
         """Configurations whose frames are stored here."""
-        return layout.available_configs(self.sequence, self.manifest.stored)
+        return self.manifest.configs
 
     @property
     def has_exact(self) -> bool:
@@ -151,6 +141,13 @@ class DatasetFolder:
         """The builder's measurements of a sample: labels, cover, distance, and the ground-truth error if available."""
         split, row = self._find(sample)
         return self.manifest.samples[split][row]
+
+    def samples_by_object(self, split: str) -> dict[str, list[str]]:
+        """The samples of each object of ``split``, in the order of `samples`."""
+        views: dict[str, list[str]] = {}
+        for sample in self.samples(split):
+            views.setdefault(self.measured(sample)["object"], []).append(sample)
+        return views
 
     def _find(self, sample: str) -> tuple[str, int]:
         if sample not in self._position:
@@ -200,7 +197,7 @@ class DatasetFolder:
 
     def frame(self, sample: str, index: int) -> NDArray[np.uint8]:
         """One captured frame, uint8 (H, W). Raises `DatasetError` when the dataset does not store it."""
-        for group, frames in stored_groups(self.sequence, self.manifest.stored).items():
+        for group, frames in self.manifest.groups.items():
             if index in frames:
                 return self._image(sample, group, self.sequence.frames[index].column)
         raise DatasetError(
@@ -217,12 +214,9 @@ class DatasetFolder:
         a split, it keeps the memory from growing with the number of samples."""
         split, row = self._find(sample)
         for shard in self.manifest.shards:
-            mapped_file = self._maps.get(shard.path)
-            if mapped_file is None or shard.split != split or not 0 <= row - shard.first_row < shard.rows:
+            if shard.path not in self._mapped or shard.split != split or not 0 <= row - shard.first_row < shard.rows:
                 continue
-            for column in self.record_batches(shard)[0].schema.names:
-                if (shard.path, column) in self._images:
-                    release_pages(self._row_of(shard, column, row), mapped_file)
+            self._mapped[shard.path].release(row - shard.first_row)
             if row - shard.first_row == shard.rows - 1:
                 self.forget(shard)  # pages between its images stay mapped as long as the file is
 
@@ -230,51 +224,61 @@ class DatasetFolder:
         split, row = self._find(sample)
         for shard in self.manifest.shards:
             if shard.split == split and shard.group == group and 0 <= row - shard.first_row < shard.rows:
-                return self._row_of(shard, column, row)
+                return self.mapped(shard).image(column, row - shard.first_row)
         raise DatasetError(f"{self.path}: no file holds row {row} of {group} in {split}; run: fpp-bench verify")
 
-    def _row_of(self, shard: ShardFile, column: str, row: int) -> NDArray:
-        """Image of row ``row`` of the split, from the file that holds it."""
-        row -= shard.first_row
-        for images in self.column_images(shard, column):
+    def mapped(self, shard: ShardFile) -> "MappedShard":
+        """A file of the dataset, memory-mapped."""
+        if shard.path not in self._mapped:
+            self._mapped[shard.path] = MappedShard(self.path / shard.path, self.size)
+        return self._mapped[shard.path]
+
+
+class MappedShard:
+    """An Arrow file, memory-mapped: its record ``batches``, and their columns as images of ``size`` (H, W). Raises
+    `DatasetError` naming the file where it can't be read."""
+
+    def __init__(self, path: Path, size: tuple[int, int]) -> None:
+        import pyarrow as pa
+
+        self.path, self._size = path, size
+        self._images: dict[str, list[NDArray]] = {}
+        self._look_s = 0.0
+        try:
+            with path.open("rb") as file:
+                self._file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+            self.batches: list[pa.RecordBatch] = list(pa.ipc.open_stream(pa.py_buffer(self._file)))
+        except (pa.ArrowException, OSError, ValueError) as error:
+            raise DatasetError(f"{path}: can't be read as Arrow ({error}); run: fpp-bench verify") from error
+
+    def images(self, column: str) -> list[NDArray]:
+        """A column as images: a read-only view (rows, H, W) per record batch."""
+        if column not in self._images:
+            try:
+                self._images[column] = [self._views(batch.column(column)) for batch in self.batches]
+            except (ValueError, KeyError, AttributeError) as error:
+                expected = f"does not hold images of {self._size[0]} x {self._size[1]} px ({error})"
+                raise DatasetError(f"{self.path}: column {column} {expected}; run: fpp-bench verify") from error
+        if (now_s := monotonic()) > self._look_s:
+            self._look_s = now_s + LOOK_EVERY_S
+            if (size := self._file.size()) < len(self._file):
+                # Reading pages that the file no longer has would end the process (SIGBUS).
+                cut = f"was cut to {size} of {len(self._file)} bytes while it was read"
+                raise DatasetError(f"{self.path}: {cut}; build or copy the dataset again")
+        return self._images[column]
+
+    def image(self, column: str, row: int) -> NDArray:
+        """The image of a row of the file."""
+        for images in self.images(column):
             if row < len(images):
                 return images[row]
             row -= len(images)
-        raise DatasetError(f"{self.path / shard.path}: fewer rows than its manifest says; run: fpp-bench verify")
+        raise DatasetError(f"{self.path}: fewer rows than its manifest says; run: fpp-bench verify")
 
-    def record_batches(self, shard: ShardFile) -> "list[pa.RecordBatch]":
-        """Record batches of a file, memory-mapped."""
-        if shard.path not in self._batches:
-            import pyarrow as pa
-
-            path = self.path / shard.path
-            try:
-                with path.open("rb") as file:
-                    mapped_file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-                self._batches[shard.path] = list(pa.ipc.open_stream(pa.py_buffer(mapped_file)))
-                self._maps[shard.path] = mapped_file
-            except (pa.ArrowException, OSError, ValueError) as error:
-                raise DatasetError(f"{path}: can't be read as Arrow ({error}); run: fpp-bench verify") from error
-        return self._batches[shard.path]
-
-    def column_images(self, shard: ShardFile, column: str) -> list[NDArray]:
-        """A column of a file as images: a read-only view (rows, H, W) per record batch."""
-        key = shard.path, column
-        if key not in self._images:
-            try:
-                self._images[key] = [self._views(batch.column(column)) for batch in self.record_batches(shard)]
-            except (ValueError, KeyError, AttributeError) as error:
-                expected = f"does not hold images of {self.size[0]} x {self.size[1]} px ({error})"
-                where = f"{self.path / shard.path}: column {column}"
-                raise DatasetError(f"{where} {expected}; run: fpp-bench verify") from error
-        if (now_s := monotonic()) > self._look_s.get(shard.path, 0.0):
-            self._look_s[shard.path] = now_s + LOOK_EVERY_S
-            mapped_file = self._maps.get(shard.path)
-            if mapped_file is not None and (size := mapped_file.size()) < len(mapped_file):
-                # Reading pages that the file no longer has would end the process (SIGBUS).
-                cut = f"was cut to {size} of {len(mapped_file)} bytes while it was read"
-                raise DatasetError(f"{self.path / shard.path}: {cut}; build or copy the dataset again")
-        return self._images[key]
+    def release(self, row: int) -> None:
+        """Release the memory of the images of a row that were read."""
+        for column in self._images:
+            release_pages(self.image(column, row), self._file)
 
     def _views(self, column: "pa.Array") -> NDArray:
         storage = getattr(column, "storage", column)  # an Array2D extension where `datasets` has been imported
@@ -282,7 +286,7 @@ class DatasetFolder:
         dtype = np.dtype(np.uint8 if flat.type.bit_width == 8 else np.float32)
         # Not flat.to_numpy(): that imports pandas where it is installed, which takes longer than scoring a test split.
         pixels = np.frombuffer(flat.buffers()[1], dtype, len(flat), flat.offset * dtype.itemsize)
-        return pixels.reshape(len(storage), *self.size)
+        return pixels.reshape(len(storage), *self._size)
 
 
 FAULT_AROUND_BYTES = 1 << 16
@@ -304,7 +308,38 @@ def release_pages(view: NDArray[Any], mapped_file: mmap.mmap) -> None:
 
 
 def load_dataset(folder: str | Path, config: str = "single_shot", split: str | None = None) -> "Dataset | DatasetDict":
-    """A built or imported dataset folder as ``datasets`` objects; see `fpp_ml_bench.load_dataset`."""
+    """Open a dataset folder as a ``datasets.Dataset`` on the memory-mapped shards.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Dataset written by ``fpp-bench build`` or ``fpp-bench import``.
+    config : {"single_shot", "crossed", "horizontal", "vertical", "sinusoidal", "all"}
+        Which frames: the first one, the crossed ones of a rig that has them, those of a direction, all sinusoids, or
+        the whole sequence.
+    split : {"train", "validation", "test"}, optional
+        None for all of them, as a ``DatasetDict``.
+
+    Returns
+    -------
+    datasets.Dataset or datasets.DatasetDict
+        Columns ``sample``, ``object``, ``view``, ``split``; a uint8 (H, W) column ``frame_NN`` for each frame;
+        ``depth`` and, for generated data, ``depth_exact`` (float32 (H, W), mm, 0 = background); ``depth_min`` and
+        ``depth_max`` (mm).
+
+    Raises
+    ------
+    DatasetError
+        For a folder that is no finished dataset, and for an unknown or unstored configuration or split.
+
+    Examples
+    --------
+    >>> import fpp_ml_bench as fpp
+    >>> test = fpp.load_dataset("data/mini", "single_shot", split="test")
+    >>> row = test.with_format("numpy")[0]
+    >>> row["frame_00"].shape == row["depth"].shape
+    True
+    """
     dataset = DatasetFolder(folder)
     if config not in CONFIGS:
         raise DatasetError(f"unknown configuration {config!r}; there are {', '.join(CONFIGS)}")
@@ -330,7 +365,7 @@ def _joined_split(dataset: DatasetFolder, config: str, split: str) -> "Dataset":
 
     columns = config_columns(dataset.sequence, config, dataset.has_exact)
     tables = []
-    for group in stored_groups(dataset.sequence, dataset.manifest.stored):
+    for group in dataset.manifest.groups:
         shards = [s for s in dataset.manifest.shards if s.split == split and s.group == group]
         files = [MemoryMappedTable.from_file(str(dataset.path / shard.path)) for shard in shards]
         names = [name for name in files[0].column_names if name in columns]

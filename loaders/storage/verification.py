@@ -4,16 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import OBJECTS, UNSEEN, VIEWS, sample_name, split_of
-from fpp_ml_bench.depth import object_mask
+from fpp_ml_bench.depth import depth_problem, depth_range_mm
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.files import file_hash
 from fpp_ml_bench.loaders.sample import (
     DATA_GROUP,
     DEPTH,
@@ -23,11 +20,18 @@ from fpp_ml_bench.loaders.sample import (
     PIXEL_MAPS,
     RANGE,
     Flag,
-    group_columns,
     image_hash,
-    stored_groups,
+    labels_of,
 )
-from fpp_ml_bench.loaders.storage.manifest import CAPTURED, GENERATED, MANIFEST, WORK_FOLDER, Manifest, ShardFile
+from fpp_ml_bench.loaders.storage.manifest import (
+    CAPTURED,
+    GENERATED,
+    MANIFEST,
+    WORK_FOLDER,
+    Manifest,
+    ShardFile,
+    damage_of,
+)
 from fpp_ml_bench.loaders.storage.shards import arrow_schema
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
@@ -58,8 +62,7 @@ def verify(folder: Path, progress: Callable[[int], None] = lambda files: None) -
     findings = _foreign_files(folder, manifest)
     hashes = ImageHashes()
     for file in manifest.files:
-        damage = _file_damage(folder / file.path, file.bytes, file.xxh3_128)
-        if damage:
+        if damage := damage_of(folder, file):
             findings.append(damage)
         elif isinstance(file, ShardFile):
             # Straight after its checksum the file is still in the page cache, so looking inside costs no second read.
@@ -85,40 +88,37 @@ def _foreign_files(folder: Path, manifest: Manifest) -> list[str]:
     return findings
 
 
-def _file_damage(path: Path, size: int, expected_hash: str) -> str | None:
-    """What is wrong with one file, or None."""
-    if not path.is_file():
-        return f"{path}: is missing; copy or build the dataset again"
-    if path.stat().st_size != size:
-        return f"{path}: has {path.stat().st_size} bytes, expected {size}; copy or build the dataset again"
-    if file_hash(path) != expected_hash:
-        return f"{path}: its content has changed (checksum differs); copy or build the dataset again"
-    return None
-
-
 def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: ImageHashes) -> list[str]:
     """Look inside one intact file: rows, columns, labels, values; and note every image's hash."""
     path = opened.path / shard.path
     manifest = opened.manifest
     rows = manifest.samples.get(shard.split, [])[shard.first_row : shard.first_row + shard.rows]
-    frames = stored_groups(opened.sequence, manifest.stored).get(shard.group)
-    if frames is None or len(rows) != shard.rows:
-        return [f"{path}: the manifest has no such rows or columns"]
-    expected = group_columns(opened.sequence, shard.group, frames, manifest.exact)
-    batches = opened.record_batches(shard)
+    if len(rows) != shard.rows:
+        return [f"{path}: the manifest has no such rows"]
+    expected = manifest.columns(shard.group)
+    mapped = opened.mapped(shard)
+    batches = mapped.batches
     right = batches and _types(batches[0].schema) == _types(arrow_schema(expected, manifest.size))
     if not right or sum(len(b) for b in batches) != shard.rows:
         return [f"{path}: its rows or columns are not those the manifest says"]
-    findings = _label_findings(path, shard, rows, batches) if shard.group == DATA_GROUP else []
+    findings = []
+    if shard.group == DATA_GROUP:
+        stored = [labels for batch in batches for labels in batch.select([*LABELS, *RANGE]).to_pylist()]
+        wanted = [labels_of(row, shard.split) for row in rows]
+        pairs = zip(wanted, stored, strict=True)
+        findings += [f"{path}: expected labels {row}, found {labels}" for row, labels in pairs if labels != row]
     for column in expected:
         if column in (*LABELS, *RANGE):
             continue
-        images = (image for batch in opened.column_images(shard, column) for image in batch)
+        images = (image for batch in mapped.images(column) for image in batch)
         for row, image in zip(rows, images, strict=True):
-            if column in DEPTHS:
-                findings += _depth_findings(f"{path}: sample {row['sample']!r}, column {column}", column, row, image)
+            problem = depth_problem(image) if column in DEPTHS else None
+            if column == DEPTH and not problem and depth_range_mm(image) != (row["depth_min_mm"], row["depth_max_mm"]):
+                problem = "depth_min and depth_max do not fit its depth"
             if column == FLAGS and image.max() > sum(Flag):
-                findings.append(f"{path}: sample {row['sample']!r}, column {column}: unknown flags")
+                problem = "unknown flags"
+            if problem:
+                findings.append(f"{path}: sample {row['sample']!r}, column {column}: {problem}")
             hashes.add(shard.split, column, row["sample"], image)
     opened.forget(shard)
     return findings
@@ -129,33 +129,11 @@ def _types(schema: pa.Schema) -> list[tuple[str, pa.DataType]]:
     return [(field.name, getattr(field.type, "storage_type", field.type)) for field in schema]
 
 
-def _depth_findings(where: str, column: str, row: dict[str, Any], image: NDArray[np.float32]) -> list[str]:
-    if not (np.isfinite(image).all() and image.min() >= 0):
-        return [f"{where}: depths that are not finite or negative"]
-    inside = image[object_mask(image)]
-    if inside.size == 0:
-        return [f"{where}: no depth above 0, so there is nothing to measure"]
-    if column == DEPTH and (float(inside.min()), float(inside.max())) != (row["depth_min_mm"], row["depth_max_mm"]):
-        return [f"{where}: depth_min and depth_max do not fit its depth"]
-    return []
-
-
-def _label_findings(path: Path, shard: ShardFile, rows: list[dict], batches: list[pa.RecordBatch]) -> list[str]:
-    findings = []
-    stored = [record for batch in batches for record in batch.select([*LABELS, *RANGE]).to_pylist()]
-    for row, labels in zip(rows, stored, strict=True):
-        expected = {"sample": row["sample"], "object": row["object"], "view": row["view"], "split": shard.split}
-        expected.update(zip(RANGE, (row["depth_min_mm"], row["depth_max_mm"]), strict=True))
-        if labels != expected:
-            findings.append(f"{path}: expected labels {expected}, found {labels}")
-    return findings
-
-
 def _coverage_findings(manifest: Manifest) -> list[str]:
     """Rows that no file holds, or more than one: every group's files must follow on from each other."""
     findings = []
     for split, rows in manifest.samples.items():
-        for group in stored_groups(manifest.sequence, manifest.stored):
+        for group in manifest.groups:
             files = [shard for shard in manifest.shards if (shard.split, shard.group) == (split, group)]
             ends = list(accumulate((shard.rows for shard in files), initial=0))
             if ends[-1] != len(rows) or ends[:-1] != [shard.first_row for shard in files]:

@@ -56,7 +56,7 @@ def test_it_goes_on_behind_the_last_finished_sample(dataset, stopped):
     written = {name: (stopped / name).stat().st_mtime_ns for name in names}
     (stopped / "wooden_boards_A0.tmp").write_bytes(b"half")
     method, advanced = Counting(), []
-    assert predict_split(dataset, method, SPLIT, stopped, advanced.append).samples == 4
+    predict_split(dataset, method, SPLIT, stopped, advanced.append)
     assert method.answers == 2 and advanced == [1] * 4
     assert {name: (stopped / name).stat().st_mtime_ns for name in names} == written
     assert {path.name for path in stopped.iterdir()} >= {"submission.yaml", "per_sample.json"}

@@ -26,19 +26,21 @@ def _truth():
 def _values(calibration):
     values, sigmas = [], []
     for device in (calibration.camera, calibration.projector):
-        values += [device.fx, device.fy, device.cx, device.cy, *device.distortion]
-        sigmas += [*device.sigma, *device.distortion_sigma]
+        pinhole = device.pinhole
+        values += [*pinhole.focal, *pinhole.centre, *pinhole.distortion]
+        sigmas += device.sigma
     values += [*cv2.Rodrigues(np.array(calibration.rotation))[0].ravel(), *calibration.translation_mm]
     return np.array(values), np.array([*sigmas, *calibration.rotation_sigma_rad, *calibration.translation_sigma_mm])
 
 
 def test_exact_points_give_the_exact_rig():
     calibration = calibrate(rigs.poses(BOARD.points_mm()), BOARD, *SIZES)
-    assert calibration.stereo_rms_px < 1e-6 and calibration.held_out_rms_px < 1e-6
+    assert calibration.rms_px.both < 1e-6 and calibration.held_out_rms_px < 1e-6
     np.testing.assert_allclose(_values(calibration)[0], _truth(), rtol=1e-6, atol=1e-7)
-    assert calibration.camera.pinhole().fx == pytest.approx(1500, abs=1e-4)
-    camera, projector = calibration.camera.pinhole(), calibration.projector.pinhole()
-    rig = Rig(camera, projector, calibration.rotation, calibration.translation_m)
+    assert calibration.camera.pinhole.fx == pytest.approx(1500, abs=1e-4)
+    rig = Rig(
+        calibration.camera.pinhole, calibration.projector.pinhole, calibration.rotation, calibration.translation_m
+    )
     assert rig.baseline_m * 1000 == pytest.approx(calibration.baseline_mm)
 
 
@@ -50,7 +52,7 @@ def test_noise_stays_within_the_stated_uncertainties():
         values, sigmas = _values(calibration)
         scores.append((values - _truth()) / sigmas)
         assert calibration.noise_px == pytest.approx((0.05, 0.05), rel=0.12)
-        assert calibration.stereo_rms_px == pytest.approx(0.05 * 2**0.5, rel=0.1)
+        assert calibration.rms_px.both == pytest.approx(0.05 * 2**0.5, rel=0.1)
     assert 0.7 < np.sqrt(np.mean(np.square(scores))) < 1.4 and np.abs(scores).max() < 4
 
 
@@ -76,9 +78,10 @@ def test_the_start_is_opencvs_calibration_and_its_error_is_reported():
     images = [pose.corners_px.astype(np.float32) for pose in poses]
     rms = cv2.calibrateCamera(points, images, rigs.CAMERA_SIZE, None, None, flags=lens.flags)[0]
     assert calibration.alone_rms_px[0] == pytest.approx(rms, rel=1e-4)
-    assert calibration.camera.fx == calibration.camera.fy and calibration.camera.sigma[2:] == (0.0, 0.0)
-    assert (calibration.camera.cx, calibration.camera.cy) == (639.5, 479.5)
-    assert calibration.camera.distortion[1:] == (0.0,) * 4 and calibration.projector.fx != calibration.projector.fy
+    camera, projector = calibration.camera.pinhole, calibration.projector.pinhole
+    assert camera.fx == camera.fy and calibration.camera.sigma[2:4] == (0.0, 0.0)
+    assert camera.centre == (639.5, 479.5)
+    assert camera.distortion[1:] == (0.0,) * 4 and projector.fx != projector.fy
 
 
 def test_a_given_baseline_sets_the_scale():
@@ -86,10 +89,11 @@ def test_a_given_baseline_sets_the_scale():
     free = calibrate(poses, BOARD, *SIZES, hold_out=False)
     scaled = calibrate(poses, BOARD, *SIZES, baseline_mm=200.0, hold_out=False)
     factor = 200.0 / free.baseline_mm
-    assert scaled.baseline_mm == pytest.approx(200.0) and scaled.baseline_sigma_mm == 0 < free.baseline_sigma_mm
-    assert scaled.spacing_mm == pytest.approx(18 * factor) and "from the baseline of 200 mm" in scaled.scale
+    assert scaled.baseline_mm == pytest.approx(200.0)
+    spacing_mm = np.linalg.norm(scaled.board_mm[1] - scaled.board_mm[0])
+    assert spacing_mm == pytest.approx(18 * factor) and "from the baseline of 200 mm" in scaled.scale
     np.testing.assert_allclose(scaled.poses[2].translation_mm, factor * np.array(free.poses[2].translation_mm))
-    assert scaled.stereo_rms_px == pytest.approx(free.stereo_rms_px, rel=1e-9)
+    assert scaled.rms_px.both == pytest.approx(free.rms_px.both, rel=1e-9)
 
 
 @pytest.mark.parametrize("radius_known", [True, False])
@@ -117,7 +121,7 @@ def test_the_bias_of_circles_is_taken_off(radius_known):
     calibration = calibrate(poses, board, *SIZES, hold_out=False)
     error = np.abs(_values(calibration)[0] - _truth())
     if radius_known:
-        assert calibration.stereo_rms_px < 1e-4 and error[:2].max() < 0.01 and error[-3:].max() < 0.002
+        assert calibration.rms_px.both < 1e-4 and error[:2].max() < 0.01 and error[-3:].max() < 0.002
     else:
         assert error[:2].max() > 0.1  # which the residuals don't show
 
@@ -148,7 +152,7 @@ def test_an_irregular_board_is_estimated_whatever_its_labels():
         poses[index] = poses[index]._replace(corners_px=poses[index].corners_px[::-1], projector=turned)
     given = calibrate(poses, board, *SIZES, hold_out=False)
     estimated = calibrate(poses, board, *SIZES, estimate_board=True, hold_out=False)
-    assert given.stereo_rms_px > 0.15 and estimated.stereo_rms_px < 0.045
+    assert given.rms_px.both > 0.15 and estimated.rms_px.both < 0.045
     errors = [
         [np.sqrt(np.mean((points - irregular)[:, :2] ** 2)) for points in (found, np.flipud(_turned(found, board)))]
         for found in (estimated.board_mm, given.board_mm)
@@ -163,7 +167,7 @@ def _turned(points, board):
 
 def test_the_lens_that_was_there_predicts_best_and_a_bad_pose_is_named():
     poses = rigs.poses(BOARD.points_mm(), noise_px=0.05)
-    found = [calibrate(poses, BOARD, *SIZES, lens) for lens in ("radial-1", "radial-3+tangential")]
+    found = [calibrate(poses, BOARD, *SIZES, (Lens(name), Lens(name))) for name in ("radial-1", "radial-3+tangential")]
     found.sort(key=lambda calibration: calibration.held_out_rms_px)
     assert found[0].camera.lens.model == "radial-3+tangential"
     assert found[0].bic == min(calibration.bic for calibration in found) and found[0].spoilers == ()
@@ -179,13 +183,14 @@ def test_missing_points_are_left_out():
         pose.projector.points_px[3:9] = np.nan
         pose.projector.sigma_px[3:9] = np.nan
     calibration = calibrate(poses, BOARD, *SIZES, hold_out=False)
-    assert calibration.stereo_rms_px < 1e-6
+    assert calibration.rms_px.both < 1e-6
     np.testing.assert_allclose(_values(calibration)[0], _truth(), rtol=1e-6, atol=1e-7)
 
 
 def test_the_rational_lens_has_eight_terms():
-    calibration = calibrate(rigs.poses(BOARD.points_mm(), noise_px=0.02), BOARD, *SIZES, "rational", hold_out=False)
-    assert len(calibration.camera.distortion) == 8 and calibration.stereo_rms_px < 0.03
+    poses, lenses = rigs.poses(BOARD.points_mm(), noise_px=0.02), (Lens("rational"), Lens("rational"))
+    calibration = calibrate(poses, BOARD, *SIZES, lenses, hold_out=False)
+    assert len(calibration.camera.pinhole.distortion) == 8 and calibration.rms_px.both < 0.03
 
 
 def _refused(poses, message, **options):
@@ -197,7 +202,8 @@ def test_captures_that_give_no_rig_are_refused_by_name():
     poses = rigs.poses(BOARD.points_mm(), count=4)
     _refused(poses[:2], "at least 3 poses of the board, got 2")
     _refused([poses[0]._replace(size=(640, 480)), *poses[1:]], "pose pose0: the image is 640 x 480 px")
-    _refused(poses, "expected one of none", lens="fisheye")
+    with pytest.raises(CalibrationError, match="expected one of none"):
+        Lens("fisheye")
     _refused(poses, "baseline_mm", baseline_mm=-1.0)
     mirrored = poses[2]._replace(corners_px=poses[2].corners_px * [-1, 1] + [1279, 0])
     _refused([*poses[:2], mirrored], "pose pose2: the camera sees the board mirrored")

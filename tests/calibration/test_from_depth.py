@@ -115,13 +115,13 @@ def mirrored(side):
     width = 912 / 24 if side == 0 else 1140 / 20
     periods = v.periods.copy()
     periods[side] = width - periods[side]
-    return replace(v, periods=periods)
+    return v._replace(periods=periods)
 
 
 def scrambled():
     v = view()
     rng = np.random.default_rng(0)
-    return replace(v, periods=rng.permuted(v.periods, axis=1))
+    return v._replace(periods=rng.permuted(v.periods, axis=1))
 
 
 @pytest.mark.parametrize(

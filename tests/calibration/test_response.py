@@ -2,7 +2,7 @@
 
 import pytest
 
-from fpp_ml_bench.calibration.response import fit_response
+from fpp_ml_bench.calibration.projector_points import fit_response
 from fpp_ml_bench.loaders.captures.decoding import board_poses
 from fpp_ml_bench.loaders.render.boards.captures import photograph_board
 from fpp_ml_bench.loaders.render.boards.poses import board_poses as poses_of

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.calibration.projector_points import measure_pose
-from fpp_ml_bench.calibration.result import volume_error_mm
+from fpp_ml_bench.calibration.result import Lens, volume_error_mm
 from fpp_ml_bench.calibration.solve import calibrate
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.errors import CalibrationError
@@ -72,12 +72,12 @@ def test_a_photographed_board_gives_the_rig_back_and_a_wrong_spacing_shows(captu
     true, board, poses = captured
     given = replace(board, spacing_mm=spacing_given * board.spacing_mm, detail_mm=spacing_given * board.detail_mm)
     sizes = ((device.width, device.height) for device in (true.camera, true.projector))
-    found = calibrate(poses, given, *sizes, "none", hold_out=False)
-    assert found.camera_rms_px < 0.05 and found.projector_rms_px < 0.1  # an image px is 2.6 projector px
+    found = calibrate(poses, given, *sizes, (Lens("none"), Lens("none")), hold_out=False)
+    assert found.rms_px.camera < 0.05 and found.rms_px.projector < 0.1  # an image px is 2.6 projector px
     rig = replace(
         true,
-        camera=found.camera.pinhole(),
-        projector=found.projector.pinhole(),
+        camera=found.camera.pinhole,
+        projector=found.projector.pinhole,
         rotation=found.rotation,
         translation_m=found.translation_m,
     )

@@ -20,7 +20,7 @@ from disks import small_disk
 from scored_dataset import make_dataset
 
 from fpp_ml_bench import pool
-from fpp_ml_bench.baselines.diagnostics.diagnosis import diagnose
+from fpp_ml_bench.baselines.diagnostics.probe import diagnose
 from fpp_ml_bench.baselines.learned.filter_recipe import FilterRecipe
 from fpp_ml_bench.baselines.learned.recipes import CrossedRecipe, PhaseRecipe
 from fpp_ml_bench.baselines.learned.training import train_net
@@ -247,7 +247,7 @@ def test_a_shard_that_is_cut_while_it_is_open_is_named(tmp_path, monkeypatch):
     os.truncate(opened.path / shard.path, 4096)
     with pytest.raises(DatasetError, match=rf"{shard.path}: was cut to 4096 of {shard.bytes} bytes while it was read"):
         opened.depth_mm(sample)
-    with pytest.raises(DatasetError, match=rf"{shard.path}: expected {shard.bytes} bytes"):
+    with pytest.raises(DatasetError, match=rf"{shard.path}: has 4096 bytes, expected {shard.bytes}"):
         DatasetFolder(opened.path)
 
 
@@ -353,7 +353,7 @@ def test_sigterm_ends_a_command_as_ctrl_c_does(capsys, tmp_path):
             write_atomically(tmp_path / "saved", b"x")
 
     before = signal.getsignal(signal.SIGTERM)
-    assert run_command(run, "fpp-bench x", []) == 143
+    assert run_command(lambda: run, "fpp-bench x", []) == 143
     assert capsys.readouterr().err == "fpp-bench x: stopped\n"
     assert (tmp_path / "saved").exists() and signal.getsignal(signal.SIGTERM) == before
 
@@ -365,7 +365,7 @@ def test_sigterm_during_an_import_is_not_swallowed(tmp_path):
         "from fpp_ml_bench.cli import run_command\n"
         "from fpp_ml_bench.cli.options import command\n"
         "@command('')\ndef stopped():\n    import swallows\n"
-        "run_command(stopped, 'x', [])"
+        "run_command(lambda: stopped, 'x', [])"
     )
     done = _python(code, tmp_path)
     assert (done.returncode, done.stderr) == (-signal.SIGTERM, "")

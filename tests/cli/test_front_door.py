@@ -86,7 +86,7 @@ def test_a_stopped_demo_goes_on_and_prints_what_was_computed(demo):
     for name in ("page/index.html", f"{SAMPLE}.png", f"{SAMPLE}.ply", f"{SAMPLE}.html"):
         assert (out / name).stat().st_size > 0
     commands = [line.strip() for line in printed.splitlines() if line.startswith("  fpp-")]
-    assert commands == [shlex.join(step.words) for step in steps_in(out)]
+    assert commands == [step.line for step in steps_in(out)]
     for line in commands[-2:]:  # that of the picture, and that of the page: they run by hand, too
         run(line)
 

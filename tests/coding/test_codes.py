@@ -10,13 +10,12 @@ import pytest
 from fpp_ml_bench.coding.code import Limits, Reason
 from fpp_ml_bench.coding.gray_code import GrayCells, GrayOnly
 from fpp_ml_bench.coding.phase_shift import PhaseShift
-from fpp_ml_bench.coding.schemes import SCHEMES, code_from_dict
 from fpp_ml_bench.errors import DecodeError, RigError
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.patterns import pattern_image
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.rig_file import load_rig, rig_from_dict, save_rig
-from fpp_ml_bench.optics.sequence import CodedSequence
+from fpp_ml_bench.optics.sequence import SCHEMES, CodedSequence, code_from_dict
 
 LENGTH = 912
 LIMITS = Limits()
@@ -71,7 +70,7 @@ def test_a_code_gives_its_own_pixels_back(name):
     assert (found.reason == Reason.DECODED).mean() > (0.9 if name == "whole-period cells" else 0.99)
     good = found.reason == 0
     # 8-bit patterns are rounded to half a grey level of 127.5; a cell knows its pixels to half its width.
-    bound = code.cells.cell_px / 2 if isinstance(code, GrayOnly) else 0.05
+    bound = code.cell_px / 2 if isinstance(code, GrayOnly) else 0.05
     assert np.abs(found.coordinate_px - pixels)[good].max() <= bound
     assert len(code.shown) == len(code.profiles(LENGTH))
     assert code.step_px == (bound if isinstance(code, GrayOnly) else 0)

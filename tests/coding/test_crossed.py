@@ -109,7 +109,7 @@ def test_a_pair_of_frames_makes_the_crossed_frame_of_its_family():
     "changes, said",
     [
         ({"pitches_px": [18, 2]}, "crossed.pitches_px: expected 4 px and more"),
-        ({"pitches_px": 18}, "crossed.pitches_px: expected a list of two numbers"),
+        ({"pitches_px": 18}, "crossed.pitches_px: expected 2 numbers"),
         ({"pitches_px": [18, float("nan")]}, r"crossed.pitches_px\[1\]: expected a finite number"),
         ({"pitches_px": [18, 3000]}, "exceeds the pattern of 912 x 1140 px"),
         ({"angles_deg": [0, 182]}, "0 and 182 degrees are parallel"),
@@ -117,7 +117,7 @@ def test_a_pair_of_frames_makes_the_crossed_frame_of_its_family():
         ({"weights": [0.7, 0.4]}, "weights: expected two above 0 with a sum of at most 1"),
         ({"weights": [1, 0]}, "weights: expected two above 0"),
         ({"shifts_deg": []}, "a pair of degrees for each frame"),
-        ({"shifts_deg": [[0, 0], [120]]}, r"shifts_deg\[1\]: expected a list of two"),
+        ({"shifts_deg": [[0, 0], [120]]}, r"shifts_deg\[1\]: expected 2 numbers"),
         ({"steps": 3}, "crossed.steps: unknown key"),
     ],
 )

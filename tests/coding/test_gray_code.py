@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fpp_ml_bench.coding.code import Limits, Reason
 from fpp_ml_bench.coding.gray_code import (
-    absolute_phase,
+    GrayCells,
     binary_to_gray,
     bits_needed,
     cell_centres_rad,
@@ -15,7 +16,7 @@ from fpp_ml_bench.coding.gray_code import (
     decode_cells,
     gray_to_binary,
 )
-from fpp_ml_bench.coding.phase_shift import wrapped_phase
+from fpp_ml_bench.coding.phase_shift import Fringes, PhaseShift, equal_shifts
 
 
 def test_code_is_the_reflected_code():
@@ -78,19 +79,20 @@ def captured_at(u, pitch, length, steps, blur_px, noise, modulation, seed, gray_
     return np.clip(np.stack(images)[:, None, :], 0, 255)
 
 
-def orders(images, pitch, length, steps):
-    wrapped = wrapped_phase(images[:steps])
-    cells, trusted = decode_cells(images[steps:], wrapped.mean, wrapped.modulation)
-    phase, consistent = absolute_phase(wrapped.phase, cells, cell_centres_rad(length, pitch))
-    return phase[0] * pitch / (2 * np.pi), (trusted & consistent)[0]
+def decoded(levels, pitch, length, steps):
+    """What the code of a period in equal steps and Gray code in half periods makes of grey levels (frames, n)."""
+    code = PhaseShift((Fringes(pitch, equal_shifts(steps, 1)),), 0.0, GrayCells(pitch / 2, len(levels) - steps))
+    return code.decode(levels, length, Limits())
 
 
 @pytest.mark.parametrize("pitch, length", [(18, 912), (18, 1140), (12.8, 400), (6, 200)])
 @pytest.mark.parametrize("blur_px, noise, modulation", [(0.0, 1.0, 60.0), (1.5, 2.0, 40.0), (3.0, 1.5, 25.0)])
 def test_no_position_ever_slips_a_period(pitch, length, blur_px, noise, modulation):
     u = np.arange(2, length - 3, 0.0137)
-    measured, trusted = orders(captured_at(u, pitch, length, 18, blur_px, noise, modulation, seed=1), pitch, length, 18)
-    assert np.abs(measured - u)[trusted].max() < pitch / 8  # an order wrong by 1 is a whole pitch
+    images = captured_at(u, pitch, length, 18, blur_px, noise, modulation, seed=1)
+    measured = decoded(images[:, 0], pitch, length, 18)
+    trusted = measured.reason == 0
+    assert np.abs(measured.coordinate_px - u)[trusted].max() < pitch / 8  # an order wrong by 1 is a whole pitch
     assert trusted.mean() > 0.999
 
 
@@ -99,10 +101,7 @@ def test_code_edges_may_be_off_by_almost_a_quarter_period(shift):
     """Misread cells at the edges: displaced by up to 4 px of 18, under a quarter period (4.5 px), no order is wrong."""
     u = np.arange(6, 900, 0.05)
     images = captured_at(u, 18, 912, 18, 1.0, 0.5, 60.0, seed=2, gray_shift_px=shift)
-    wrapped = wrapped_phase(images[:18])
-    cells, _ = decode_cells(images[18:], wrapped.mean, wrapped.modulation)
-    phase, _ = absolute_phase(wrapped.phase, cells, cell_centres_rad(912, 18))
-    assert np.abs(phase[0] * 18 / (2 * np.pi) - u).max() < 1.0
+    assert np.abs(decoded(images[:, 0], 18, 912, 18).coordinate_px - u).max() < 1.0
 
 
 def test_a_single_ambiguous_bit_is_trusted_only_at_its_edge():
@@ -125,14 +124,20 @@ def test_a_single_ambiguous_bit_is_trusted_only_at_its_edge():
 def test_consistent_pairs_are_kept_and_give_the_position(cell, offset):
     centres = cell_centres_rad(912, 18)
     phase = centres[cell] + offset * np.pi
-    wrapped = np.array([[(phase + np.pi) % (2 * np.pi) - np.pi]])
-    absolute, good = absolute_phase(wrapped, np.array([[cell]], dtype=np.int32), centres)
-    assert good.all() and absolute[0, 0] == pytest.approx(phase, abs=1e-9)
+    measured = decoded(levels_of(np.array([phase]), np.array([cell])), 18, 912, 4)
+    assert measured.reason[0] in (0, Reason.OUTSIDE_PATTERN)  # the last cell ends beyond it
+    assert measured.coordinate_px[0] == pytest.approx(phase * 9 / np.pi, abs=1e-9)
 
 
 def test_phase_on_the_far_side_of_the_circle_and_cells_off_the_pattern_are_rejected():
-    centres = cell_centres_rad(912, 18)
-    wrapped = (centres[:, None] + 0.9 * np.pi + np.pi) % (2 * np.pi) - np.pi
-    assert not absolute_phase(wrapped, np.arange(102, dtype=np.int32)[:, None], centres)[1].any()
-    beyond = np.array([[102, 127]], dtype=np.int32)
-    assert not absolute_phase(np.zeros((1, 2)), beyond, centres)[1].any()
+    far = levels_of(cell_centres_rad(912, 18) + 0.9 * np.pi, np.arange(102))
+    beyond = levels_of(np.zeros(2), np.array([102, 127]))
+    for levels in (far, beyond):
+        assert (decoded(levels, 18, 912, 4).reason == Reason.INCONSISTENT_ORDER).all()
+
+
+def levels_of(phase, cell):
+    """Four steps and seven bits of mean 100 and modulation 50, (11, n)."""
+    steps = [100 + 50 * np.cos(phase + step * np.pi / 2) for step in range(4)]
+    bits = [100 + 50 * (2 * (binary_to_gray(cell) >> (6 - bit) & 1) - 1) for bit in range(7)]
+    return np.array([*steps, *bits])

@@ -3,6 +3,7 @@
 
 import numpy as np
 import pytest
+from edges import edge_distance_px
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -12,7 +13,6 @@ from fpp_ml_bench.depth import (
     NORMALISATIONS,
     denormalise,
     depth_edges,
-    edge_distance_px,
     edge_jump_mm,
     extremes,
     normalise,

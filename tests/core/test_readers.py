@@ -5,16 +5,16 @@ import os
 import re
 import shutil
 import socket
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import pytest
 from mutations import ODD, sealed_manifest, sources, tree_outcome
 from published_trees import make_tree
 from synthetic import assembly, make
 
+from fpp_ml_bench.baselines.run import UNFINISHED_FILE, UnfinishedRun
 from fpp_ml_bench.baselines.training import weights as weights_files
 from fpp_ml_bench.baselines.training.weights import DEPTH_NETWORKS
-from fpp_ml_bench.baselines.unfinished import UNFINISHED_FILE, Finished, UnfinishedRun
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import DatasetError, FppBenchError, LayoutError, RemoteError, RigError, SubmissionError
 from fpp_ml_bench.evaluation.result.file import read_result
@@ -23,6 +23,7 @@ from fpp_ml_bench.loaders.captures.decoding import read_mask
 from fpp_ml_bench.loaders.published.importing import plan_import
 from fpp_ml_bench.loaders.storage.assembly import assemble, planned_receipt
 from fpp_ml_bench.loaders.storage.manifest import read_manifest
+from fpp_ml_bench.loaders.storage.shards import ShardWriter
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.loaders.storage.verification import verify
 from fpp_ml_bench.optics.opencv_files import read_opencv_calibration
@@ -388,11 +389,11 @@ def test_a_receipt_that_no_shard_left_is_as_none(value, tmp_path):
     planned = assembly({"train": ("bowl",)})
     (plan,) = planned.plans
     (tmp_path / "set").mkdir()
-    files, rows = planned.writer(tmp_path / "set", tmp_path).write(plan, planned.rows(plan, tmp_path))
-    good = {"files": [vars(file) for file in files], "rows": rows, "meshes": []}
+    written = ShardWriter(planned.manifest).write(tmp_path / "set", plan, planned.rows(plan, tmp_path))
+    good, rows = asdict(written), written.rows
     receipt = tmp_path / "receipt.json"
     receipt.write_text(json.dumps(good))
-    assert planned_receipt(receipt, plan) == ((files, rows), [])
+    assert planned_receipt(receipt, plan) == written
     assert planned_receipt(receipt, replace(plan, index=1)) is None  # a shard of another name
     for key in ("path", "split", "group", "xxh3_128"):
         receipt.write_text(json.dumps({**good, "files": [{**good["files"][0], key: value}]}))
@@ -442,7 +443,7 @@ def test_damaged_lines_of_a_stopped_run_do_not_count(tmp_path):
         '{"sample": "b", "seconds": NaN,',
     )
     (tmp_path / UNFINISHED_FILE).write_text("\n".join([json.dumps(run), *bad, json.dumps(good)]) + "\n")
-    assert UnfinishedRun(tmp_path, run).finished == {"a": Finished(0.5, {})}
+    assert UnfinishedRun(tmp_path, run).finished == {"a": (0.5, {})}
 
 
 def test_a_missing_file_is_named(tmp_path):

@@ -21,7 +21,6 @@ from fpp_ml_bench.loaders.render.raycast import PixelRays, TracedObject
 from fpp_ml_bench.loaders.render.scene import SolidMesh, place
 from fpp_ml_bench.loaders.render.sensor import Exposure
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.machine import NUMBA_SWITCH as COMPILED
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.skipping import SWITCH, skipping, skipping_enabled
 
@@ -124,10 +123,8 @@ def sparse(rig, share=0.3):
 
 
 @RIGS
-@pytest.mark.parametrize("compiled", ["1", "0"])
 @pytest.mark.parametrize("steps", [3, None])
-def test_depth_alone_is_the_depth_with_reasons(rig, compiled, steps, monkeypatch):
-    monkeypatch.setenv(COMPILED, compiled)
+def test_depth_alone_is_the_depth_with_reasons(rig, steps):
     frames, seen = sparse(rig)
     everything = decode_stack(frames, rig, steps=steps)
     alone = decode_stack(frames, rig, steps=steps, reasons=False)

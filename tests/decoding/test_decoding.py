@@ -15,13 +15,11 @@ from fpp_ml_bench.decoding.blocks import decode_direction, plain_plan
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm, depth_noise_mm
 from fpp_ml_bench.errors import DecodeError
-from fpp_ml_bench.machine import NUMBA_SWITCH, numba_enabled
 from fpp_ml_bench.optics.rig_file import rig_from_dict
 from fpp_ml_bench.optics.sequence import DIRECTIONS, Sequence
 
 MODULATION = 0.45 * 127.5
 RIGS = pytest.mark.parametrize("rig", [PAPER, TURNED, LENSES], ids=["paper", "turned", "lenses"])
-NEEDS_NUMBA = pytest.mark.skipif(not numba_enabled(), reason="numba is not in use")
 
 
 @RIGS
@@ -101,14 +99,12 @@ def test_uneven_subsets_are_unbiased(steps):
 
 @RIGS
 @pytest.mark.parametrize("direction", ["vertical", "horizontal", "both"])
-@NEEDS_NUMBA
-def test_compiled_and_numpy_agree(rig, direction, monkeypatch):
+def test_frames_of_floats_decode_as_those_of_bytes(rig, direction):
     frames = capture(rig, tilted(rig), noise=3.0, albedo=0.9)
     for frame in frames[::3]:
         frame[:20] = np.random.default_rng(1).integers(0, 256, frame[:20].shape, dtype=np.uint8)  # no signal at all
     compiled = decode_stack(frames, rig, direction, details=True)
-    monkeypatch.setenv(NUMBA_SWITCH, "0")
-    plain = decode_stack(frames, rig, direction, details=True)
+    plain = decode_stack([frame.astype(np.float32) for frame in frames], rig, direction, details=True)
     assert np.array_equal(compiled.reason, plain.reason) and compiled.counts == plain.counts
     assert len(np.unique(plain.reason)) >= 3
     # Both round a float64 depth once to float32: at most one unit in the last place apart.
@@ -122,7 +118,6 @@ def test_compiled_and_numpy_agree(rig, direction, monkeypatch):
         )
 
 
-@NEEDS_NUMBA
 def test_the_compiled_arctangent_is_numpys_on_every_side():
     from fpp_ml_bench.coding.kernels import _minus_atan2
 
@@ -135,9 +130,7 @@ def test_the_compiled_arctangent_is_numpys_on_every_side():
     assert [_minus_atan2(0.0, -1.0), _minus_atan2(-0.0, -1.0), _minus_atan2(0.0, 0.0)] == [-np.pi, -np.pi, 0.0]
 
 
-@pytest.mark.parametrize("switch", ["0", "1"])
-def test_mask_threads_and_layout_change_no_bit(switch, monkeypatch):
-    monkeypatch.setenv(NUMBA_SWITCH, switch)
+def test_mask_threads_and_layout_change_no_bit():
     frames = capture(PAPER, tilted(PAPER))
     full = decode_stack(frames, PAPER, details=True)
     mask = np.random.default_rng(3).random(frames[0].shape) < 0.3
@@ -161,9 +154,7 @@ def reasons(frames, rig=PAPER, direction="both", **arguments):
     return decode_stack(frames, rig, direction, **arguments).reason
 
 
-@pytest.mark.parametrize("switch", ["0", "1"])
-def test_every_reason_is_given_where_it_holds(switch, monkeypatch):
-    monkeypatch.setenv(NUMBA_SWITCH, switch)
+def test_every_reason_is_given_where_it_holds():
     depth = tilted(PAPER)
     frames = capture(PAPER, depth, noise=0.3)
     inside = np.s_[80:120, 80:120]

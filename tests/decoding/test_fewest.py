@@ -18,7 +18,6 @@ from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.sample import VOID, Flag
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.machine import NUMBA_SWITCH as COMPILED
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.sequence import DIRECTIONS
 
@@ -78,7 +77,6 @@ def fewer(rig, frames, direction):
     return [frame if index in indices else None for index, frame in enumerate(frames)]
 
 
-@pytest.mark.parametrize("compiled", ["1", "0"])
 @pytest.mark.parametrize(
     ("rig", "direction", "gray"),
     [
@@ -90,8 +88,7 @@ def fewer(rig, frames, direction):
         (LENSES, "both", None),
     ],
 )
-def test_depth_with_the_fewest_frames_is_the_same_bytes(rig, direction, gray, compiled, monkeypatch):
-    monkeypatch.setenv(COMPILED, compiled)
+def test_depth_with_the_fewest_frames_is_the_same_bytes(rig, direction, gray):
     surface = tilted(rig)
     surface[: surface.shape[0] // 4] = rig.background_m
     frames = capture(rig, surface)

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.coding.crossed import Crossed
-from fpp_ml_bench.design.assumptions import Assumptions
 from fpp_ml_bench.design.rivals import EpipolarLines, background_distance, rival_distance, wrong_order_rate
-from fpp_ml_bench.design.search import describe, draw_design, search
+from fpp_ml_bench.design.search import Assumptions, describe, draw_design, search
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.optics.named_rigs import CROSSED, paper_rig
 
@@ -140,7 +139,7 @@ def test_the_search_reaches_far_and_proposes_the_finest_of_the_safe():
     for first, second in zip(found.front, found.front[1:], strict=False):
         assert first.rival_rad / first.sigma_rad >= second.rival_rad / second.sigma_rad
         assert first.noise_mm > second.noise_mm
-    none = search(PAPER, Assumptions(wrong_share=1e-9), (18, 20), (0, 90))
+    none = search(PAPER, Assumptions(wrong_percent=1e-7), (18, 20), (0, 90))
     assert "none has at most" in none.reason and none.proposed is none.front[0]
 
 

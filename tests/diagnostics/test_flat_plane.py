@@ -7,10 +7,9 @@ import pytest
 
 from fpp_ml_bench.baselines.diagnostics import flat_plane
 from fpp_ml_bench.baselines.diagnostics.counterfactual import Counterfactual
-from fpp_ml_bench.baselines.diagnostics.diagnosis import save_finding
-from fpp_ml_bench.baselines.diagnostics.flat_plane import FlatPlane, Scale
-from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, silent
-from fpp_ml_bench.baselines.diagnostics.subjects import subject_of_method
+from fpp_ml_bench.baselines.diagnostics.flat_plane import FlatPlane
+from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, save_finding, silent
+from fpp_ml_bench.baselines.diagnostics.subjects import background_below, subject_of_method
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.stability.cases import U32
 
@@ -49,7 +48,7 @@ def test_the_exact_decoder_finds_every_plane(decoded, tmp_path):
         assert row["mean_mm"] == pytest.approx(1000 * row["distance_m"], abs=0.5)
     assert finding.values["objects"]["collapsed_share"] <= 0.02 and finding.values["range_mm"] is None
     assert len(finding.figure.png) > 5000
-    save_finding(tmp_path, "key", finding, 1.0)
+    save_finding(tmp_path, "known", "key", finding, 1.0)
 
 
 def test_background_everywhere_is_a_collapse(opened, monkeypatch):
@@ -83,11 +82,9 @@ def test_the_rectangle_grows_and_a_collapse_from_a_side_on_is_told(opened, monke
 
 
 def test_collapse_is_nearer_to_background_than_to_any_object():
-    mm, normalised = Scale(False, (1700.0, 1900.0), 1500.0), Scale(True, (1700.0, 1900.0), 1500.0)
     values = np.array([-1.0, 0.0, 749.0, 751.0])
-    assert (values < mm.limit).tolist() == [True, True, True, False] and mm.mm(values) is values
-    assert (np.array([-1.2, 0.09, 0.11]) < normalised.limit).tolist() == [True, True, False]
-    assert normalised.mm(np.array([0.5])).tolist() == [1800.0]
+    assert (values < background_below(False, 1500.0)).tolist() == [True, True, True, False]
+    assert (np.array([-1.2, 0.09, 0.11]) < background_below(True, 1500.0)).tolist() == [True, True, False]
 
 
 def test_who_is_told_the_mask_is_not_asked(opened):
@@ -102,4 +99,4 @@ def test_the_counterfactual_probe_reports_and_draws(opened, tmp_path):
     assert finding.values["reliance"]["score"] == 0
     assert "does not follow the phase" in finding.summary
     assert len(finding.figure.png) > 5000
-    save_finding(tmp_path, "key", finding, 1.0)
+    save_finding(tmp_path, "known", "key", finding, 1.0)

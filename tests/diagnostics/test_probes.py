@@ -8,21 +8,26 @@ from scipy import ndimage
 from torch import nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.diagnostics import fits, linear
-from fpp_ml_bench.baselines.diagnostics.fits import (
+from fpp_ml_bench.baselines.diagnostics.grad_cam import fringe_variation
+from fpp_ml_bench.baselines.diagnostics.linear import (
+    CONTROLS,
+    INPUT,
     LINEAR,
     MEAN,
+    OBJECT_DEPTH,
+    SILHOUETTE,
     SPATIAL,
+    ConvolutionProbes,
+    LinearProbes,
     NormalEquations,
-    activations_of,
     apply,
     at_pixels,
     at_size,
-    edge_map,
-    truth,
+    grid_of,
+    score,
 )
-from fpp_ml_bench.baselines.diagnostics.grad_cam import fringe_variation
-from fpp_ml_bench.baselines.diagnostics.linear import CONTROLS, INPUT, SILHOUETTE, score
+from fpp_ml_bench.baselines.diagnostics.scenes import edge_map, truth
+from fpp_ml_bench.baselines.diagnostics.subjects import activations_of
 from fpp_ml_bench.baselines.stability.cases import U32
 from fpp_ml_bench.coding.phase_shift import wrapped_phase
 from fpp_ml_bench.decoding.triangulation import depth_from_coordinate
@@ -78,7 +83,7 @@ def test_phase_and_order_together_are_the_depth(opened):
     decoded_mm = depth_from_coordinate(rig.camera.rays(), np.where(inside, row, np.nan), rig, "horizontal")
     # Sine and cosine are rounded to float32: 2 u in phase, and 1 rad is less than half of the depth.
     assert decoded_mm[inside] == pytest.approx(depth_mm[inside], rel=2 * U32)
-    with pytest.raises(ValueError, match="background throughout"):
+    with pytest.raises(ValueError, match="zero-size array"):
         truth(np.zeros_like(depth_mm), rig, "horizontal")
 
 
@@ -127,9 +132,9 @@ def test_pixels_of_a_coarse_layer_are_those_of_the_upsampled_one():
     expected = functional.interpolate(features, size=size, mode="bilinear", align_corners=False).flatten(2)
     # A place in the map is rounded to some u of its width, and neighbours differ by twice the largest value at most.
     tolerance = 8 * U32 * 2 * 7 * float(features.abs().max())
-    assert torch.allclose(at_pixels(features, pixels, size), expected.transpose(1, 2), rtol=0, atol=tolerance)
+    assert torch.allclose(at_pixels(features, pixels, size)[:, :, 0], expected, rtol=0, atol=tolerance)
     fine = torch.randn(2, 3, *size)
-    assert torch.equal(at_pixels(fine, pixels, size), fine.flatten(2).transpose(1, 2))
+    assert torch.equal(at_pixels(fine, pixels, size)[:, :, 0], fine.flatten(2))
     # Means of 16 values, added in any order.
     tolerance = 16 * U32 * float(fine.abs().max())
     assert torch.allclose(at_size(fine, (5, 7)), functional.avg_pool2d(fine, 4), rtol=0, atol=tolerance)
@@ -187,19 +192,19 @@ def test_a_four_convolution_probe_starts_at_the_mean_and_learns_what_is_there():
     torch.manual_seed(0)
 
     def batch():
-        features = {("here", 0, "a"): torch.randn(8, 3, 12, 12), ("else", 0, "b"): torch.randn(8, 3, 12, 12)}
-        bumps = features["here", 0, "a"][:, :1].abs()
+        features = {("trained", 0, "a"): torch.randn(8, 3, 12, 12), ("untrained", 0, "b"): torch.randn(8, 3, 12, 12)}
+        bumps = features["trained", 0, "a"][:, :1].abs()
         edges = functional.avg_pool2d(bumps, 3, 1, 1, count_include_pad=False)
         return features, {"image": torch.ones_like(bumps), "object": torch.ones_like(bumps), "edges": edges}
 
     features, target = batch()
-    probes = fits.ConvolutionProbes({"edges": SPATIAL["edges"]}, {"here": 2, "else": 1}, 90)
+    probes = ConvolutionProbes(None, None, {"edges": SPATIAL["edges"]}, None, 2, 90)
     probes.observe(features, target)
-    probes.start()
-    here, other = ("here", 0, "a"), ("else", 0, "b")
+    probes.start(1)
+    here, other = ("trained", 0, "a"), ("untrained", 0, "b")
     assert set(probes.probes) == {(here, "edges", 0), (here, "edges", 1), (other, "edges", 0)}
     reference = (target["edges"].double() - target["edges"].double().mean()).square().mean((1, 2, 3))
-    found = probes.errors(features, target)
+    found = probes.errors_of_batch(features, target)
     assert set(found) == {*probes.probes, (MEAN, "edges", 0)}
     for errors in found.values():
         # Each difference is rounded to float32 once, which its square doubles.
@@ -207,7 +212,8 @@ def test_a_four_convolution_probe_starts_at_the_mean_and_learns_what_is_there():
     for _ in range(90):
         probes.step(*batch())
     remaining = {
-        key: np.mean(moment) / float(reference.mean()) for key, moment in probes.errors(features, target).items()
+        key: np.mean(moment) / float(reference.mean())
+        for key, moment in probes.errors_of_batch(features, target).items()
     }
     assert remaining[here, "edges", 0] < 0.7 and remaining[here, "edges", 1] < 0.7
     assert remaining[other, "edges", 0] > 0.9
@@ -216,15 +222,13 @@ def test_a_four_convolution_probe_starts_at_the_mean_and_learns_what_is_there():
 # ---- networks whose answer is known
 
 
-def errors_of(subject, opened, probes, view, step, epochs=0):
+def errors_of(probes, opened, step):
     train, validation = opened.samples("train")[::step], opened.samples("validation")
-    networks = {("trained", 0): subject.network}
-    view = view(subject, opened, lambda count, activity: None)
-    return linear.errors_of(probes, view, networks, train, validation, epochs)
+    return probes.errors({("trained", 0): probes.subject.network}, train, validation)
 
 
 def linear_r2(subject, opened):
-    errors = errors_of(subject, opened, fits.LinearProbes(LINEAR), linear.Pixels, 2)
+    errors = errors_of(LinearProbes(subject, opened, LINEAR, lambda count, activity: None), opened, 2)
     return {
         (layer, target): 1 - np.mean(sample_errors) / np.mean(errors[MEAN, target, 0])
         for ((_, _, layer), target, _), sample_errors in errors.items()
@@ -232,14 +236,14 @@ def linear_r2(subject, opened):
 
 
 def spatial_errors(subject, opened, epochs):
-    probes = fits.ConvolutionProbes(SPATIAL, {"trained": 1, CONTROLS: 1}, epochs * len(opened.samples("train")))
-    return errors_of(subject, opened, probes, linear.Grid, 3, epochs)
+    probes = ConvolutionProbes(subject, opened, SPATIAL, lambda count, activity: None, 1, epochs)
+    return errors_of(probes, opened, 3)
 
 
 @pytest.mark.parametrize("target", LINEAR)
 def test_what_a_layer_holds_is_read_from_it(opened, target):
     """A network that outputs the Sobel map is a pure edge reader, one that holds sine and cosine reads the phase."""
-    r2 = linear_r2(oracle(opened, LINEAR[target][0]), opened)
+    r2 = linear_r2(oracle(opened, LINEAR[target].maps), opened)
     assert r2["out", target] > 0.999
     for other_target in {"edges", "phase"} - {target}:
         assert r2["out", other_target] < 0.5
@@ -285,7 +289,7 @@ def test_a_layer_that_holds_the_mask_alone_is_the_silhouette_control(opened):
 
 def test_depth_on_the_object_is_compared_there_and_with_the_mean_there(opened):
     errors = spatial_errors(oracle(opened, ("depth",)), opened, 1)
-    side = tuple(length // fits.grid_step(opened.size) for length in opened.size)
+    side = grid_of(opened.size)
 
     def within(name):
         depth_mm = opened.depth_mm(name)
@@ -295,4 +299,4 @@ def test_depth_on_the_object_is_compared_there_and_with_the_mean_there(opened):
 
     mean = np.concatenate([within(name) for name in opened.samples("train")[::3]]).mean()
     expected = [np.mean((within(name) - mean) ** 2) for name in opened.samples("validation")]
-    assert errors[MEAN, fits.OBJECT_DEPTH, 0] == pytest.approx(expected)
+    assert errors[MEAN, OBJECT_DEPTH, 0] == pytest.approx(expected)

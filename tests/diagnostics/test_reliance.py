@@ -17,8 +17,9 @@ from fpp_ml_bench.baselines.diagnostics.counterfactual import (
     rms_expected,
     sample_score,
 )
-from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import SceneSet
+from fpp_ml_bench.baselines.diagnostics.scenes import chosen_samples
 from fpp_ml_bench.baselines.registry import load_method
+from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 
@@ -70,11 +71,10 @@ def test_a_change_with_the_outline_counts_in_units_of_what_the_phase_asks():
 
 
 def test_an_answer_of_zero_mm_is_none():
-    before, after = np.array([[0.0, 5.0, 5.0]]), np.array([[7.0, 0.0, 7.0]])
-    where, expected = np.ones((1, 3), dtype=bool), np.full((1, 3), 2.0)
-    zero_change = Change.of(before, after, expected, where, zero_is_none=True)
+    before, after, expected = np.array([0.0, 5.0, 5.0]), np.array([7.0, 0.0, 7.0]), np.full(3, 2.0)
+    zero_change = Change.of(before, after, expected, (before != 0) & (after != 0))
     assert zero_change.actual.tolist() == [0, 0, 2] and zero_change.answered.tolist() == [False, False, True]
-    assert Change.of(before, after, expected, where, zero_is_none=False).actual.tolist() == [7, -5, 2]
+    assert Change.of(before, after, expected, np.ones(3, dtype=bool)).actual.tolist() == [7, -5, 2]
 
 
 def test_order_free_forgives_periods_and_credits_no_chance():
@@ -94,6 +94,7 @@ class Reader:
     frames_used: tuple[int, ...] = (0,)
     units: str = "mm"
     uses_ground_truth_mask: bool = False
+    weights_sha256: str | None = None
 
     def predict(self, frames):
         return np.asarray(self.answer(frames), dtype=np.float32)
@@ -124,7 +125,7 @@ def normalised(depth_mm):
 
 @pytest.fixture(scope="module")
 def scene_set(opened):
-    return SceneSet(opened, views=1, split="train")
+    return opened, chosen_samples(opened, "train", 1)
 
 
 @pytest.fixture(scope="module")
@@ -138,16 +139,15 @@ def test_the_exact_decoder_is_a_pure_phase_reader(units, scene_set, exact):
         depth_mm = exact.predict(frames)
         return depth_mm if units == "mm" else normalised(depth_mm)
 
-    reliance, samples = measure(Reader(answer, exact.frames_used, units), scene_set)
+    reliance, samples = measure(Reader(answer, exact.frames_used, units), *scene_set)
     assert reliance.score >= 0.98
     assert reliance.parts.follows_light is not None and reliance.parts.follows_light <= 0.02
     assert reliance.parts.change_outline <= 0.02 and reliance.parts.change_no_fringe_outside <= 0.02
     assert (
-        reliance.units == units
-        and reliance.objects == 2
-        and reliance.dataset_fingerprint == scene_set.dataset.fingerprint
+        reliance.units == units and reliance.objects == 2 and reliance.dataset_fingerprint == scene_set[0].fingerprint
     )
-    interval = object_interval([sample.score for sample in samples], [sample.object for sample in samples])
+    scores = [sample["score"] for sample in samples.values()]
+    interval = object_interval(scores, [split_sample_name(name)[0] for name in samples])
     assert reliance.interval == pytest.approx(list(np.clip(interval, 0, 1)))
     if units == "mm":
         assert reliance.order_free_score >= 0.98 and reliance.parts.follows_constant >= 0.98
@@ -171,7 +171,7 @@ def test_the_exact_decoder_is_a_pure_phase_reader(units, scene_set, exact):
     ids=["edges of the fringe", "edges in mm", "edges of the mask", "template", "constant", "brightness", "no answer"],
 )
 def test_readers_of_shape_have_no_phase_reliance(reader, scene_set):
-    reliance, _ = measure(reader, scene_set)
+    reliance, _ = measure(reader, *scene_set)
     assert 0 <= reliance.score <= 0.02
     assert reliance.order_free_score is None or reliance.order_free_score <= 0.02
 
@@ -180,16 +180,16 @@ def test_half_a_phase_reader_has_half_the_score(scene_set, exact):
     def answer(frames):
         return 900 + 0.5 * exact.predict(frames)
 
-    reliance, _ = measure(Reader(answer, exact.frames_used), scene_set)
+    reliance, _ = measure(Reader(answer, exact.frames_used), *scene_set)
     assert reliance.score == pytest.approx(0.5, abs=0.02)
 
 
 def test_a_shape_reader_changes_with_the_outline_alone(scene_set):
-    reliance, _ = measure(Reader(template, (51,)), scene_set)
+    reliance, _ = measure(Reader(template, (51,)), *scene_set)
     assert reliance.parts.change_outline > 0.1
     assert reliance.parts.follows_phase == 0 and reliance.parts.change_other_pitch == 0
 
 
 def test_units_that_have_no_truth_are_refused(scene_set):
     with pytest.raises(DiagnosisError, match="'m'"):
-        measure(Reader(lambda frames: frames[0], units="m"), scene_set)
+        measure(Reader(lambda frames: frames[0], units="m"), *scene_set)

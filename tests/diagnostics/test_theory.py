@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, silent
-from fpp_ml_bench.baselines.diagnostics.scene_renderer import SceneRenderer
+from fpp_ml_bench.baselines.diagnostics.scenes import SceneRenderer
 from fpp_ml_bench.baselines.diagnostics.theory import (
     DISTANCES_M,
     Theory,

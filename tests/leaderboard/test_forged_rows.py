@@ -13,10 +13,10 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE
 from fpp_ml_bench.evaluation.result.parts import Timing
 from fpp_ml_bench.leaderboard import columns, rows
-from fpp_ml_bench.leaderboard.data_files import table_csv
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.row_file import ObjectMeans, Row, interval_over, mean_over, row_json, write_row
 from fpp_ml_bench.leaderboard.rows import read_entry
+from fpp_ml_bench.leaderboard.tables import table_csv
 
 OBJECTS = [f"object {n}" for n in range(8)]
 HONEST = {"first": 1.0, "second": 2.0, "third": 3.0}
@@ -232,7 +232,7 @@ def test_blocks_that_predictions_dont_tell_are_marked(base, board):
     blocks = {"reliance": reliance(score=1.0, interval=[0.9, 1.0]), "robustness": {"test": robustness()}}
     (group,) = board(content_of(row.model_copy(update=blocks)))
     shown = {row.short_name: row for row in group.rows}["forged"]
-    cells = [columns.reliance(shown.entry), columns.robustness(shown.entry), columns.milliseconds_text(shown)]
+    cells = [columns.reliance(shown.entry), columns.robustness(shown.entry), columns.time_text(shown, 1000)]
     assert cells == ["1.00*", "31.0*", "0.01*"] and not shown.entry.time_measured
 
 

@@ -13,9 +13,10 @@ from fpp_ml_bench.cli import main_eval as evaluate_main
 from fpp_ml_bench.evaluation.result.file import write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.leaderboard import ranking, rows
-from fpp_ml_bench.leaderboard.names import cut_at_word
-from fpp_ml_bench.leaderboard.tables import SHOWN_BY_DEFAULT, markdown_text, paper_tables
+from fpp_ml_bench.leaderboard.ranking import cut_at_word
+from fpp_ml_bench.leaderboard.tables import SHOWN_BY_DEFAULT, paper_tables
 from fpp_ml_bench.paper import AVERAGE, paper_layers
+from fpp_ml_bench.tables import markdown_text
 
 SHIPPED = rows.SHIPPED_ROWS
 

@@ -12,10 +12,9 @@ from scored_dataset import make_dataset
 from upkeep import readme_block
 
 from fpp_ml_bench.evaluation.submission.description import Submission
-from fpp_ml_bench.leaderboard.columns import CODE
-from fpp_ml_bench.leaderboard.names import LONGEST_NAME, assumption, assumption_sentences, cut_at_word, short_names
+from fpp_ml_bench.leaderboard.columns import CODE, assumption, assumption_sentences
 from fpp_ml_bench.leaderboard.page.page import page_files
-from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
+from fpp_ml_bench.leaderboard.ranking import LONGEST_NAME, cut_at_word, rank, read_entries, shipped_rows, short_names
 from fpp_ml_bench.leaderboard.tables import chosen_tables
 
 

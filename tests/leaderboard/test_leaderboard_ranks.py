@@ -17,14 +17,12 @@ from scored_dataset import make_dataset
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, Track
-from fpp_ml_bench.evaluation.score.uncertainty import sign_flip_bounds, sign_flip_p
+from fpp_ml_bench.evaluation.score.uncertainty import behind, pairs, sign_flip_bounds, sign_flip_p
 from fpp_ml_bench.evaluation.submission.description import LearnedFrom, Submission
-from fpp_ml_bench.leaderboard.columns import columns, uncertainty
-from fpp_ml_bench.leaderboard.data_files import table_json
-from fpp_ml_bench.leaderboard.groups import behind, pairs
-from fpp_ml_bench.leaderboard.names import given_truth, learned_from
+from fpp_ml_bench.leaderboard.columns import columns, given_truth, learned_from, uncertainty
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.leaderboard.row_file import RowUncertainty, _uncertainty, write_row
+from fpp_ml_bench.leaderboard.tables import table_json
 
 EIGHT = [f"object {n}" for n in range(8)]
 FULL, UNSEEN = ({"test/depth": letter * 32} for letter in "fe")

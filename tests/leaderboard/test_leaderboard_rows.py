@@ -16,6 +16,7 @@ from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
 from fpp_ml_bench.evaluation.result.file import read_result
+from fpp_ml_bench.evaluation.result.model import same
 from fpp_ml_bench.leaderboard import columns, rows
 from fpp_ml_bench.leaderboard.page.page import page_files
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
@@ -200,7 +201,7 @@ def test_fpp_eval_verifies_a_row_from_its_predictions(files, dataset, tmp_path, 
     ],
 )
 def test_a_mean_may_differ_by_what_five_digits_leave_open(stored, computed, agree):
-    assert rows._agree(stored, computed, 1.0) is agree
+    assert same(stored, computed, digits=5) is agree
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from fpp_ml_bench.baselines.learned.routes import CrossedNetRoute, stated_rad
 from fpp_ml_bench.baselines.learned.scenes import Group, View, read_views, render_views, with_unions
 from fpp_ml_bench.baselines.learned.training import train_net
 from fpp_ml_bench.baselines.learned.windows import IGNORED, Sample, symmetric
-from fpp_ml_bench.baselines.phase.crossed_route import CrossedRoute
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import PredictionError, TrainingError, WeightsError
@@ -136,7 +136,7 @@ def test_depths_lie_on_measured_candidates_whatever_the_network_says(folder: Pat
     recipe = CrossedRecipe(widths=(4, 4), order_widths=(4, 4), fine=4, squeezed=4)
     learned = CrossedNetRoute(crossed_rig(SIZE), recipe.network().eval(), threshold=0.0, lead=0.0)
     view = next(read_views(folder, GROUPS, "train"))
-    seen = learned.route.observe(view.frames[0])
+    seen = learned.route.fitted(learned.route.observe(view.frames[0]))
     scene = CrossedScene.of(seen)
     shape = scene.light.shape
     rng = np.random.default_rng(0)

@@ -62,9 +62,7 @@ def test_a_pixel_alone_faces_the_camera_and_steps_are_not_joined():
     depth[:, 32:] = 600.0
     flat = pixel_normals(depth, CAMERA)
     np.testing.assert_allclose(flat, np.broadcast_to([0.0, 0.0, -1.0], flat.shape), atol=1e-12)
-    assert np.abs(pixel_normals(depth, CAMERA, step_mm=200.0)[:, 31:33, 0]).min() > 0.5
-    joined = triangles(depth, CAMERA, step_mm=200.0)
-    assert len(joined) == 2 * 47 * 63 and len(triangles(depth, CAMERA)) == 2 * 47 * 62
+    assert len(triangles(depth, CAMERA)) == 2 * 47 * 62
 
 
 def test_triangles_of_a_plane_are_its_normal_and_cover_it():
@@ -183,8 +181,6 @@ NAN = np.where(np.arange(64) == 3, np.nan, PLANE_MM)
         (PLANE_MM, {"grey": np.full((48, 64), 256.0)}, "grey: expected finite numbers from 0 to 255, got 3072"),
         (PLANE_MM, {"forms": ["obj"]}, "forms: expected some of npy, mat, png, ply, mesh, got obj"),
         (PLANE_MM, {"forms": []}, "forms: expected some of .*got none"),
-        (PLANE_MM, {"step_mm": float("nan")}, "step_mm: expected a positive number"),
-        (PLANE_MM, {"step_mm": 0.0}, "step_mm: expected a positive number"),
     ],
 )
 def test_what_can_not_be_written_is_refused_and_nothing_is_left(tmp_path, depth, options, message):

@@ -217,9 +217,11 @@ def _wait(met, most_s: float = 5.0) -> bool:
 
 
 def test_without_webgl_the_page_says_so(browser, tmp_path):
-    page = cloud_html("bowl", POINTS_MM, GREY[THERE]).replace(b'getContext("webgl"', b'getContext("no such"')
-    (tmp_path / "old.html").write_bytes(page)
+    (tmp_path / "old.html").write_bytes(cloud_html("bowl", POINTS_MM, GREY[THERE]))
+    source = "HTMLCanvasElement.prototype.getContext = () => null"
+    script = browser.call("Page.addScriptToEvaluateOnNewDocument", source=source)["identifier"]
     browser.open(tmp_path / "old.html")
+    browser.call("Page.removeScriptToEvaluateOnNewDocument", identifier=script)
     assert browser.run("document.getElementById('without').hidden") is False
     assert browser.run("document.getElementById('viewer').hidden") is True
     assert browser.complaints() == []

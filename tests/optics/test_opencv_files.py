@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.errors import RigError
-from fpp_ml_bench.optics import opencv_files
 from fpp_ml_bench.optics.opencv_files import OpenCvCalibration, read_opencv_calibration, write_opencv_calibration
 from fpp_ml_bench.optics.pinhole import Pinhole
 
@@ -30,12 +29,6 @@ VALUES = {
 SLSTUDIO = ("Kc", "kc", "Kp", "kp", "Rp", "Tp")
 PROCAMCALIB = ("cam_K", "cam_kc", "proj_K", "proj_kc", "R", "T")
 OPENCV = ("cameraMatrix1", "distCoeffs1", "cameraMatrix2", "distCoeffs2", "R", "T")
-
-
-@pytest.fixture
-def sound(monkeypatch):
-    """What OpenCV wrote itself is read in this process, which is faster."""
-    monkeypatch.setattr(opencv_files, "_parsed_elsewhere", opencv_files._parsed)
 
 
 def write(path, values):
@@ -66,7 +59,7 @@ def test_opencvs_names(tmp_path, suffix):
 
 
 @pytest.mark.parametrize("names", [SLSTUDIO, PROCAMCALIB, OPENCV])
-def test_other_names(sound, tmp_path, names):
+def test_other_names(tmp_path, names):
     matrices = dict(zip(names, (VALUES[name] for name in ("M1", "D1", "M2", "D2", "R", "T")), strict=True))
     errors = {"cam_error": 0.28, "proj_error": 0.46, "stereo_error": 0.42}
     expected = read_opencv_calibration(write(tmp_path / "a.xml", VALUES))
@@ -77,7 +70,7 @@ def test_other_names(sound, tmp_path, names):
     assert read_opencv_calibration(write(tmp_path / "c.yml", {**matrices, **errors, **sizes})) == expected
 
 
-def test_intrinsics_and_pose_in_two_files_and_in_metres(sound, tmp_path):
+def test_intrinsics_and_pose_in_two_files_and_in_metres(tmp_path):
     pose = {"R": TURN, "T": T_MM[None] / 1000}
     inner = write(tmp_path / "intrinsics.yml", changed(R=None, T=None))
     read = read_opencv_calibration(inner, write(tmp_path / "extrinsics.yml", pose), unit="m")
@@ -86,7 +79,7 @@ def test_intrinsics_and_pose_in_two_files_and_in_metres(sound, tmp_path):
         read_opencv_calibration(write(tmp_path / "all.yml", VALUES), tmp_path / "extrinsics.yml")
 
 
-def test_a_rotation_in_float32_becomes_an_exact_one(sound, tmp_path):
+def test_a_rotation_in_float32_becomes_an_exact_one(tmp_path):
     rounded = TURN.astype(np.float32)
     read = read_opencv_calibration(write(tmp_path / "a.xml", changed(R=rounded)))
     matrix = np.array(read.rotation)
@@ -95,7 +88,7 @@ def test_a_rotation_in_float32_becomes_an_exact_one(sound, tmp_path):
 
 
 @pytest.mark.parametrize("suffix", ["xml", "yaml", "yml", "json"])
-def test_writing_and_reading_gives_equal_numbers(sound, tmp_path, suffix):
+def test_writing_and_reading_gives_equal_numbers(tmp_path, suffix):
     rng = np.random.default_rng(3)
     for unit, translation in (("mm", tuple((rng.normal(size=3) * 100 / 1000).tolist())), ("m", (1 / 3, 1e-17, -0.1))):
         turn = tuple(tuple(row) for row in TURN.tolist())
@@ -109,7 +102,7 @@ def test_writing_and_reading_gives_equal_numbers(sound, tmp_path, suffix):
         assert read_opencv_calibration(tmp_path / f"again.{suffix}", unit=unit) == read
 
 
-def test_the_written_file_is_a_stereo_calibration_for_opencv(sound, tmp_path):
+def test_the_written_file_is_a_stereo_calibration_for_opencv(tmp_path):
     write_opencv_calibration(read_opencv_calibration(write(tmp_path / "a.xml", VALUES)), tmp_path / "b.yml")
     storage = cv2.FileStorage(str(tmp_path / "b.yml"), cv2.FILE_STORAGE_READ)
     for name in ("M1", "D1", "M2", "D2", "R", "T"):
@@ -142,7 +135,7 @@ def test_the_written_file_is_a_stereo_calibration_for_opencv(sound, tmp_path):
         (changed(cam_error="small"), "cam_error: expected a reprojection error in px"),
     ],
 )
-def test_wrong_calibrations_are_refused(sound, tmp_path, values, message):
+def test_wrong_calibrations_are_refused(tmp_path, values, message):
     path = write(tmp_path / "calibration.xml", values)
     with pytest.raises(RigError, match=message) as caught:
         read_opencv_calibration(path)
@@ -201,7 +194,7 @@ def test_a_sound_file_of_another_layout_is_not_called_damaged(tmp_path, name, co
     )
 
 
-def test_arguments_that_contradict_or_make_no_sense_are_refused(sound, tmp_path):
+def test_arguments_that_contradict_or_make_no_sense_are_refused(tmp_path):
     path = write(tmp_path / "a.xml", VALUES)
     for arguments, message in (
         ({"unit": "inch"}, "unit: expected mm or m, got 'inch'"),

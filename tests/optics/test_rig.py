@@ -169,7 +169,7 @@ def _changed(path: str, value: object) -> dict:
         ("pitch_px.vertical", 913.0, "pitch_px.vertical"),
         ("pitch_px.horizontal", 17.0, "bits_horizontal.*8 bits, got 7"),
         ("pitch_px", {"vertical": 18}, "pitch_px.*missing key horizontal"),
-        ("sequence.steps", 2, "at least 3 steps"),
+        ("sequence.steps", 2, "from 3 to 1000, got 2"),
         ("sequence.steps", 18.0, "sequence.steps.*whole"),
         ("sequence.bits_vertical", 6, "102 Gray cells.*7 bits, got 6"),
         ("working_range_mm", [2100, 1500], "working_range_mm.*near < far"),

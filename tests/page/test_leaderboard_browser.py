@@ -14,10 +14,8 @@ from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, shipped_tradeoff
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.submission.description import LearnedFrom
 from fpp_ml_bench.leaderboard import rows
-from fpp_ml_bench.leaderboard.groups import is_trivial, more_than_trivial
-from fpp_ml_bench.leaderboard.page.page import write_page
-from fpp_ml_bench.leaderboard.page.samples import predicted_samples
-from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
+from fpp_ml_bench.leaderboard.page.page import predicted_samples, write_page
+from fpp_ml_bench.leaderboard.ranking import is_trivial, more_than_trivial, rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.tables import chosen_tables
 
 HOSTILE = "</script><script>window.hacked = 1</script><img src=x onerror='window.hacked = 1'>"

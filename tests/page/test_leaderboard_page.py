@@ -17,20 +17,19 @@ from hypothesis import strategies as st
 from matplotlib.transforms import Bbox
 from scored_dataset import make_dataset
 
-from fpp_ml_bench.baselines.tradeoff.drawing import Mark, Scatter, free_box
 from fpp_ml_bench.baselines.tradeoff.measure import pareto_front
+from fpp_ml_bench.baselines.tradeoff.report import Mark, Scatter, free_box
 from fpp_ml_bench.cli import leaderboard as leaderboard_command
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.evaluation.report.html import escaped, page
 from fpp_ml_bench.evaluation.report.report_page import write_report
 from fpp_ml_bench.evaluation.result.file import parse_result, write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
-from fpp_ml_bench.leaderboard.page.page import page_files, slug
-from fpp_ml_bench.leaderboard.page.samples import predicted_samples
+from fpp_ml_bench.leaderboard.page.page import page_files, predicted_samples, slug
 from fpp_ml_bench.leaderboard.page.sections import LogScale, overview
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries
 from fpp_ml_bench.leaderboard.tables import chosen_tables
 from fpp_ml_bench.optics.named_rigs import paper_rig
+from fpp_ml_bench.style import escaped, page
 
 
 @pytest.fixture(scope="module")
@@ -209,7 +208,7 @@ def test_dangerous_text_is_refused_by_every_output(name, message, files, tmp_pat
 def test_escaping_holds_without_the_checks_before_it():
     assert escaped("\x1b[31m<b>\u202e") == "\\x1b[31m&lt;b&gt;\\u202e"
     assert len(escaped("<" * 10_000_000)) < 1000
-    assert "<title>&lt;/title&gt;</title>" in page("</title>", "")
+    assert "<title>&lt;/title&gt;</title>" in page("fpp_ml_bench", "parts.html", "</title>").decode()
 
 
 def test_a_slug_is_a_file_name_of_its_own(files):
@@ -240,9 +239,8 @@ def drawings(draw):
         x, y = draw(value), draw(value)
         span = (0.0, y * 1.5) if draw(st.booleans()) else None
         name = "x" * draw(st.integers(1, 36))
-        marks.append(Mark(x, y, number, name, "verified", radius=draw(st.floats(4, 12)), y_span=span))
-    front = [marks[index] for index in pareto_front([(mark.x, mark.y) for mark in marks])]
-    return Scatter(marks, front, "a cost", marks, names=draw(st.booleans()))
+        marks.append(Mark(x, y, number, name, "verified", y_span=span))
+    return Scatter(marks, "a cost", names=draw(st.booleans()))
 
 
 @given(drawings(), st.sampled_from([(360, 380), (860, 430)]))
@@ -283,7 +281,7 @@ def test_hostile_names_are_text_in_a_picture():
     """Also what matplotlib would take for mathematics, and what looks like an attribute that is rewritten."""
     names = [*HOSTILE, "$x^2$ and \\frac", 'x style="fill: #191c20" id="mark-1"']
     marks = [Mark(10.0**n, 10.0**-n, n, name, "verified", title=name, row=name) for n, name in enumerate(names)]
-    svg, _ = Scatter(marks, marks, "a cost", marks).svg(3000, 2000, "wide scatter", "A picture")
+    svg, _ = Scatter(marks, "a cost").svg(3000, 2000, "wide scatter", "A picture")
     parsed = Parsed(svg)
     assert all(parsed.text.count(name) >= 2 for name in names)  # label and tooltip
     assert {tag for tag, _ in parsed.elements} == {"svg", "g", "path", "defs", "use", "text", "title"}

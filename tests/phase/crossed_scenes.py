@@ -6,7 +6,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase.crossed_route import CrossedRoute
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
 from fpp_ml_bench.optics.rig import Rig

@@ -8,11 +8,9 @@ from crossed_scenes import FAMILY, NO_PLANE, RIG, frame, route, slab
 from numpy.typing import NDArray
 from skimage.filters import gabor_kernel
 
-from fpp_ml_bench.baselines.phase.calibration_layer import wrapped
-from fpp_ml_bench.baselines.phase.carriers import Carriers
-from fpp_ml_bench.baselines.phase.crossed_observation import CrossedReason
-from fpp_ml_bench.baselines.phase.crossed_route import CrossedRoute, reaching
-from fpp_ml_bench.baselines.phase.demodulation import POWERS, WINDOW_PERIODS, Demodulator, window_kernels
+from fpp_ml_bench.baselines.phase.calibration_layer import Carriers, wrapped
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Reason, reaching
+from fpp_ml_bench.baselines.phase.local_fit import CURVED, DEMODULATION_PERIODS, Demodulator, window_kernels
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.coding.crossed import Crossed, crossed_from_pair
 from fpp_ml_bench.errors import DecodeError, PredictionError
@@ -73,7 +71,7 @@ def test_beyond_the_end_of_the_range_there_is_no_depth(name: str, options: dict[
     assert measured.depth_mm.max() <= 2100
     assert (np.abs(measured.depth_mm - depth_mm)[within] < 8).mean() > 0.98
     assert (measured.depth_mm[beyond] == 0).mean() > 0.97
-    assert (measured.reason[beyond] == CrossedReason.OUT_OF_RANGE).mean() > 0.97
+    assert (measured.reason[beyond] == Reason.OUT_OF_RANGE).mean() > 0.97
     without = measured.depth_mm == 0
     assert not measured.sigma_mm[without].any() and not measured.confidence[without].any()
 
@@ -101,11 +99,11 @@ def test_demodulation_is_the_least_squares_solution_of_the_window() -> None:
     image = frame(slab()).astype(np.float32)
     carriers = Carriers.of(RIG, FAMILY)
     coarse, seen = (Demodulator(carriers, stride)(image) for stride in (3, 1))
-    sigma_px = WINDOW_PERIODS * carriers.period_px
+    sigma_px = DEMODULATION_PERIODS * carriers.period_px
     half = int(np.ceil(3 * sigma_px))
     dy, dx = np.mgrid[-half : half + 1, -half : half + 1]
     root = np.exp(-0.25 * (dx**2 + dy**2) / sigma_px**2).ravel()
-    columns = [(dx.astype(float) ** a * dy.astype(float) ** b).ravel() for a, b in POWERS]
+    columns = [(dx.astype(float) ** a * dy.astype(float) ** b).ravel() for a, b in CURVED]
     for across, down in carriers.step_rad:
         columns += [f(across * dx + down * dy).ravel() for f in (np.cos, np.sin)]
     for row, column in ((60, 60), (159, 162), (201, 120)):
@@ -165,7 +163,7 @@ def test_one_direction_lost_is_said() -> None:
     lost = Crossed(FAMILY.pitches_px, FAMILY.angles_deg, (0.5, 1e-9))
     measured = route().measure(frame(depth_mm, family=lost, background_grey=50.0))
     inside = depth_mm > 0
-    said = np.isin(measured.reason[inside], [CrossedReason.ONE_DIRECTION, CrossedReason.AMBIGUOUS])
+    said = np.isin(measured.reason[inside], [Reason.ONE_DIRECTION, Reason.AMBIGUOUS])
     assert said.mean() > 0.8
     wrong = np.abs(measured.depth_mm - depth_mm)[inside] > 150
     confident = measured.sigma_mm[inside] < 0.25 * np.abs(measured.depth_mm - depth_mm)[inside]
@@ -188,7 +186,7 @@ def test_saturated_crests_are_said() -> None:
     depth_mm = slab()
     measured = route().measure(frame(depth_mm, white_grey=420.0, background_grey=90.0))
     inside = depth_mm > 0
-    assert (measured.reason[inside] == CrossedReason.SATURATED).mean() > 0.9
+    assert (measured.reason[inside] == Reason.SATURATED).mean() > 0.9
 
 
 def test_nothing_but_background() -> None:

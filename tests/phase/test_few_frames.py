@@ -14,7 +14,7 @@ from synthetic import make
 from fpp_ml_bench.baselines.method import Answer, Method
 from fpp_ml_bench.baselines.phase.local_fit import FringeFit, Window, fringe_fit
 from fpp_ml_bench.baselines.phase.method import FewestFrames, PhaseMethod, levels_of
-from fpp_ml_bench.baselines.phase.several_frames import steps_of
+from fpp_ml_bench.baselines.phase.observe import steps_of
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm
@@ -158,7 +158,7 @@ def test_a_depth_edge_blurs_one_frame_and_no_more() -> None:
 def test_frames_are_added_until_the_stated_error_is_expected() -> None:
     frames, truth = scene(1.8, 1.72), exact_mm(1.8, 1.72)
     looks = FewestFrames(RIG, 1e-3).choose(frames).looks
-    assert [(look.frames, look.gray) for look in looks] == [
+    assert [(look.frames, look.gray_code) for look in looks] == [
         (1, False),
         (2, False),
         (3, False),
@@ -167,14 +167,14 @@ def test_frames_are_added_until_the_stated_error_is_expected() -> None:
         (25, True),
     ]
     # Two frames still average over a small window, which a plane rewards; from three on noise falls as the root.
-    assert looks[0].expected_mm > 2 * looks[1].expected_mm
-    assert looks[2].expected_mm == pytest.approx(looks[4].expected_mm * 6**0.5, rel=0.2)
+    assert looks[0].expected_error_mm > 2 * looks[1].expected_error_mm
+    assert looks[2].expected_error_mm == pytest.approx(looks[4].expected_error_mm * 6**0.5, rel=0.2)
     for place in (0, 1):
-        error_mm = 1.001 * looks[place].expected_mm
+        error_mm = 1.001 * looks[place].expected_error_mm
         chosen = FewestFrames(RIG, error_mm).choose(frames)
         assert chosen.looks == looks[: len(chosen.looks)]
-        assert chosen.looks[-1].expected_mm <= error_mm
-        assert all(look.expected_mm > error_mm for look in chosen.looks[:-1])
+        assert chosen.looks[-1].expected_error_mm <= error_mm
+        assert all(look.expected_error_mm > error_mm for look in chosen.looks[:-1])
         assert len(chosen.frames_used) == chosen.looks[-1].frames
         assert np.abs(chosen.depth_mm - truth)[truth > 0].mean() < 2.0
         assert chosen.report()["frames"] == len(chosen.frames_used)
@@ -183,9 +183,9 @@ def test_frames_are_added_until_the_stated_error_is_expected() -> None:
 def test_doubt_about_the_order_asks_for_the_gray_code() -> None:
     frames, truth = scene(1.8, 1.8), exact_mm(1.8, 1.8)
     chosen = FewestFrames(RIG, 2.0, shading=False).choose(frames)  # nothing but the range: two orders are as good
-    assert chosen.looks[-1].gray and chosen.looks[-1].frames == 3 + RIG.sequence.bits("horizontal")
-    assert not any(look.gray for look in chosen.looks[:-1])
-    assert chosen.looks[-2].order_mm > 2.0
+    assert chosen.looks[-1].gray_code and chosen.looks[-1].frames == 3 + RIG.sequence.bits("horizontal")
+    assert not any(look.gray_code for look in chosen.looks[:-1])
+    assert chosen.looks[-2].by_order_mm > 2.0
     assert np.abs(chosen.depth_mm - truth)[truth > 0].mean() < 2.0
 
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from flat_planes import DIRECT, FIRST, OTHER_RIG, PAPER, RIG, USERS_WORD, photograph, plane_depth_m, plane_fringe
 
+from fpp_ml_bench.baselines.phase.depth import PhaseRoute, Reason
+from fpp_ml_bench.baselines.phase.empty_scene import image_noise_grey
 from fpp_ml_bench.baselines.phase.method import PhaseMethod
-from fpp_ml_bench.baselines.phase.object_mask import image_noise_grey
-from fpp_ml_bench.baselines.phase.observation import Reason, Settings
-from fpp_ml_bench.baselines.phase.route import PhaseRoute
+from fpp_ml_bench.baselines.phase.observe import Settings
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm
@@ -130,18 +130,18 @@ def test_confidence_orders_errors_and_the_strict_mode_uses_it() -> None:
 
 
 def test_depth_lies_on_the_candidates_whoever_chooses() -> None:
-    random = np.random.default_rng(0)
-
-    def guess(question, rig, settings):  # type: ignore[no-untyped-def]
-        places = random.integers(0, len(question.exists), question.inside.shape).astype(np.int32)
-        return places, np.zeros(places.shape, np.float32)
-
-    random_route = PhaseRoute(RIG, Settings(), guess)
-    measurement = random_route.measure(photograph("cork", "A60").frames[0])
+    random_route = PhaseRoute(RIG, Settings())
+    seen = random_route.observe(photograph("cork", "A60").frames[0])
+    first, count = seen.candidates.first, np.maximum(seen.candidates.count, 1)
+    order = first + np.random.default_rng(0).integers(0, count).astype(np.int32)
+    measurement = random_route.conclude(seen, order, np.zeros(order.shape, np.float32))
     on_object = measurement.depth_mm > 0
+    assert on_object.sum() > 3000 and np.array_equal(measurement.order[seen.crop][seen.inside], order[seen.inside])
     layer = random_route.layer.at(on_object)
     again = layer.depth_mm(measurement.wrapped_phase_rad[on_object].astype(np.float64), measurement.order[on_object])
     assert np.abs(again - measurement.depth_mm[on_object]).max() < 1e-2
+    with pytest.raises(DecodeError, match="an order and a margin"):
+        random_route.conclude(seen, order[1:], np.zeros(order.shape, np.float32))
 
 
 def test_nothing_is_measured_where_nothing_is() -> None:

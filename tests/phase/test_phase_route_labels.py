@@ -1,14 +1,12 @@
 """Least energy over candidates: exact on chains, close to the optimum on grids, compiled or not."""
 
-import sys
 from itertools import product
 
 import numpy as np
 import pytest
 
-from fpp_ml_bench.baselines.phase import label_kernels
+from fpp_ml_bench.baselines.phase import labels
 from fpp_ml_bench.baselines.phase.labels import least_energy
-from fpp_ml_bench.machine import NUMBA_SWITCH as SWITCH
 
 
 def problem(shape: tuple[int, int], count: int, seed: int) -> tuple[np.ndarray, ...]:
@@ -63,26 +61,16 @@ def test_a_weak_majority_wins_a_strongly_coupled_field() -> None:
 
 @pytest.mark.parametrize("shape", [(6, 5), (1, 7), (7, 1), (13, 20)])
 @pytest.mark.parametrize("count", [1, 2, 3])
-def test_the_switch_to_numpy_gives_the_same_numbers(
+def test_the_compiled_code_gives_the_numbers_of_the_lines_it_was_made_from(
     shape: tuple[int, int], count: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     arrays = problem(shape, count, 11)
     for link in arrays[2:]:
         link[link < 0.1] = 0  # pixels that are not object
-    results = []
-    for switch in ("1", "0"):
-        monkeypatch.setenv(SWITCH, switch)
-        results.append(least_energy(*arrays, limit_rad=1.5))
+    results = [least_energy(*arrays, limit_rad=1.5)]
+    for name in ("iterate", "decide", "_send"):
+        monkeypatch.setattr(labels, name, getattr(labels, name).py_func)
+    results.append(least_energy(*arrays, limit_rad=1.5))
     assert np.array_equal(results[0][0], results[1][0])
     assert np.array_equal(results[0][1], results[1][1])
     assert not np.array_equal(results[0][0], arrays[0].argmin(axis=0)) or count == 1  # smoothness had a say
-
-
-def test_the_switch_keeps_the_compiled_lines_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(SWITCH, "0")
-    monkeypatch.setitem(sys.modules, label_kernels.__name__, None)  # importing it would fail
-    choice, _ = least_energy(*problem((4, 4), 2, 3), limit_rad=1.5)
-    assert choice.shape == (4, 4)
-    monkeypatch.setenv(SWITCH, "1")
-    with pytest.raises(ImportError):
-        least_energy(*problem((4, 4), 2, 3), limit_rad=1.5)

@@ -9,14 +9,10 @@ from crossed_scenes import FAMILY, NO_PLANE, RIG, frame, slab
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from fpp_ml_bench.baselines.phase.crossed_observation import CrossedMeasurement
-from fpp_ml_bench.baselines.phase.three_frames import (
-    ThreeFrameRoute,
-    continued,
-    local_median,
-    phase_noise_grey,
-    same_plane_mean,
-)
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Measurement
+from fpp_ml_bench.baselines.phase.local_fit import phase_noise_grey, same_plane_mean
+from fpp_ml_bench.baselines.phase.object_mask import continued
+from fpp_ml_bench.baselines.phase.order import local_median
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.errors import DecodeError, PredictionError
@@ -29,17 +25,17 @@ CUT = replace(WHOLE, camera=replace(WHOLE.camera, width=320, height=320, cx=159.
 
 
 @cache
-def route(rig: Rig = CUT) -> ThreeFrameRoute:
-    return ThreeFrameRoute(rig, moved=0)
+def route(rig: Rig = CUT) -> CrossedRoute:
+    return CrossedRoute(rig, moved=0)
 
 
-def measured(depths_mm: list[NDArray], noise_grey: float = 0.7, rig: Rig = CUT, **light: float) -> CrossedMeasurement:
+def measured(depths_mm: list[NDArray], noise_grey: float = 0.7, rig: Rig = CUT, **light: float) -> Measurement:
     """Of three frames, each of a surface of its own."""
     images = [
         frame(depth_mm, rig, rig.crossed, noise_grey=noise_grey, number=number, **light)  # type: ignore[arg-type]
         for number, depth_mm in enumerate(depths_mm)
     ]
-    return route(rig).measure_frames(images)
+    return route(rig).measure(images)
 
 
 @pytest.mark.parametrize("middle_mm", [1560.0, 1800.0, 2040.0])
@@ -138,7 +134,7 @@ def test_the_method_and_what_it_refuses() -> None:
     answer = method.answer(frames)
     assert np.array_equal(answer.depth, method.predict(frames))
     with pytest.raises(DecodeError, match="3 crossed frames, got 2"):
-        route().measure_frames(frames[:2])  # type: ignore[arg-type]
+        route().measure(frames[:2])  # type: ignore[arg-type]
     with pytest.raises(PredictionError, match="1 or 3"):
         load_method("crossed", RIG, frames=2)
     for rig in (paper_rig(320), NO_PLANE):

@@ -10,10 +10,10 @@ import pytest
 from flat_planes import RIG, photograph, plane_depth_m, plane_fringe
 from numpy.typing import NDArray
 
+from fpp_ml_bench.baselines.phase.depth import PhaseRoute, Reason
 from fpp_ml_bench.baselines.phase.method import PhaseMethod
-from fpp_ml_bench.baselines.phase.observation import Reason, Settings
+from fpp_ml_bench.baselines.phase.observe import Settings
 from fpp_ml_bench.baselines.phase.resampling import Periods
-from fpp_ml_bench.baselines.phase.route import PhaseRoute
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import CaptureError

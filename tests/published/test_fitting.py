@@ -49,7 +49,7 @@ def test_the_hidden_pitch_is_found_exactly_and_the_depth_to_a_twentieth_of_a_mm(
     printed = capsys.readouterr().out
     assert "power_drill_A240" in printed and "whole px" in printed and "wrote" in printed
 
-    reader = plan_import(tree).reader
+    reader = plan_import(tree).rows
     read: list[int] = []
     found, fit = fit_projector(tree_views(reader, 2, read.append), reader.rig)
     assert found == rig
@@ -70,7 +70,7 @@ def test_import_warns_of_another_rig_and_finds_it_where_asked(tree, tmp_path, ca
 
 
 def test_what_is_known_is_used(tree):
-    reader = plan_import(tree).reader
+    reader = plan_import(tree).rows
     views = tree_views(reader)
     rig, fit = fit_projector(views, reader.rig, pitch_px=(30.0, 26.0))
     assert fit.pitch_from == "given" and rig.projector.focal == pytest.approx((1650, 1650), rel=0.003)
@@ -107,7 +107,7 @@ def test_a_missing_frame_and_frames_of_another_depth_are_refused(tree, tmp_path)
     for number in range(52):
         shutil.copyfile(scans / "A0" / f"A_{number}.png", scans / "A60" / f"A_{number}.png")
     with pytest.raises(LayoutError, match="differs from the single-shot input"):
-        tree_views(plan_import(broken).reader)
+        tree_views(plan_import(broken).rows)
     (scans / "A120" / "A_7.png").unlink()
     with pytest.raises(LayoutError, match=r"A_7\.png: is missing"):
         plan_import(broken)

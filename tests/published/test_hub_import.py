@@ -18,7 +18,6 @@ from publishing import ROOT
 import fpp_ml_bench
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.loaders.published import fetching
 from fpp_ml_bench.loaders.published.exporting import export
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
@@ -204,7 +203,7 @@ def test_offline(run, monkeypatch):
 
 def test_a_disk_that_is_too_small(run, monkeypatch):
     usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(fetching.shutil, "disk_usage", lambda folder: usage(10**9, 10**9, 10**6))
+    monkeypatch.setattr("shutil.disk_usage", lambda folder: usage(10**9, 10**9, 10**6))
     refused(run, [NAME], "the disk has 0.00 GB free, and download and import need about 0.11 GB there")
     assert run.downloaded == set()
 

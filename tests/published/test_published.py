@@ -335,7 +335,7 @@ def test_folders_that_are_no_published_tree(tmp_path, make, message):
 def test_an_interrupted_import_resumes_and_reads_a_changed_file_again(tmp_path, monkeypatch):
     tree = make_tree(tmp_path / "tree")
     expected = imported(tree, tmp_path / "whole").fingerprint
-    reader = plan_import(tree).reader.__class__
+    reader = plan_import(tree).rows.__class__
     read = reader.read
     read_samples = []
 

@@ -26,6 +26,7 @@ from fpp_ml_bench.loaders.render.meshes import single_mesh
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.sensor import camera_noise
 from fpp_ml_bench.loaders.sample import Row, available_configs, stored_frames, stored_groups
+from fpp_ml_bench.loaders.storage.manifest import Manifest
 from fpp_ml_bench.loaders.storage.shards import ShardWriter, plan_shards
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.named_rigs import paper_rig
@@ -234,12 +235,13 @@ def row(sample="bowl_A0", depth=None, frames=None):
 
 def write(tmp_path, rows):
     (plan,) = plan_shards("train", {"bowl": [("bowl_A0", "bowl", "A0")]})
-    return ShardWriter(tmp_path, tmp_path, PAPER_SEQUENCE, "single_shot", True, (8, 6)).write(plan, rows)
+    manifest = Manifest("generated", {}, {}, paper_rig().to_dict(), (8, 6), "single_shot", exact=True)
+    return ShardWriter(manifest).write(tmp_path, plan, rows)
 
 
 @pytest.mark.parametrize(
     ("value", "message"),
-    [(np.nan, "not finite"), (np.inf, "not finite"), (-1.0, "negative"), (0.0, "no pixel above 0")],
+    [(np.nan, "NaN or infinite"), (np.inf, "NaN or infinite"), (-1.0, "negative"), (0.0, "no pixel is above 0")],
 )
 def test_writer_takes_no_bad_depth(tmp_path, value, message):
     depth = np.full((8, 6), 1800 if value else 0, np.float32)

@@ -40,7 +40,7 @@ def image_of(pixels, values, rest=0.0):
 def test_a_pixel_that_is_partly_covered(across, quarters):
     """The left edge of a sheet runs ``quarters`` quarters from the right side of the pixels of column 60."""
     hits, found = mixed(plate(60.5 - quarters / 4 + 0.01, 120.49, 20.51, 150.49), across=across)
-    cover = image_of(found.pixels, found.on_object.reshape(-1, across**2).mean(axis=1))
+    cover = image_of(found.pixels, (found.triangle >= 0).reshape(-1, across**2).mean(axis=1))
     assert (cover[21:151, 60] == quarters / 4).all()
     assert np.count_nonzero(cover) == 130  # no other pixel mixes
     assert image_of(found.pixels, found.void).sum() == 130
@@ -55,8 +55,8 @@ def test_a_pixel_that_is_partly_covered(across, quarters):
     offsets = (np.arange(across) + 0.5) / across - 0.5
     np.testing.assert_allclose(u.reshape(across, across), np.broadcast_to(60 + offsets, (across, across)), atol=1e-9)
     np.testing.assert_allclose(v.reshape(across, across).T, np.broadcast_to(80 + offsets, (across, across)), atol=1e-9)
-    np.testing.assert_allclose(rays[found.on_object.reshape(-1, across**2)[k], 2], 1.8)
-    np.testing.assert_allclose(rays[~found.on_object.reshape(-1, across**2)[k], 2], RIG.background_m)
+    np.testing.assert_allclose(rays[(found.triangle >= 0).reshape(-1, across**2)[k], 2], 1.8)
+    np.testing.assert_allclose(rays[~(found.triangle >= 0).reshape(-1, across**2)[k], 2], RIG.background_m)
 
 
 def test_a_half_covered_pixel_has_the_mean_light():
@@ -93,7 +93,7 @@ def test_a_step_mixes_from_two_millimetres_on():
         near, far = plate(40.49, 90.2, 30.51, 130.49, 1.8), plate(80.0, 140.49, 30.51, 130.49, 1.8 + step_mm / 1000)
         _, found = mixed(near, far, across=4)
         assert found.void.sum() == found_px
-        assert (found.pixels % 176 == 90).all() and found.on_object.all()
+        assert (found.pixels % 176 == 90).all() and (found.triangle >= 0).all()
 
 
 def test_an_edge_mixes_light_but_not_depth():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fpp_ml_bench.loaders.render.surface import reflectance
+from fpp_ml_bench.loaders.render.illumination import reflectance
 
 
 def directions(cosine, azimuth):

@@ -5,11 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from edges import edge_distance_px
 from rendering import CENTRE, DIRECT, PAPER, RIG, X, Y, kept, sheet, solid, studio
 from scipy import stats
 
 from fpp_ml_bench.decoding.decode import decode_stack
-from fpp_ml_bench.depth import edge_distance_px, object_mask
+from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.loaders.render import lighting, view
 from fpp_ml_bench.loaders.render.light import named_light
 from fpp_ml_bench.loaders.render.raycast import TracedObject
@@ -309,7 +310,7 @@ def test_mixed_pixels_are_the_outline_of_a_ball():
     assert (row.cover[~mixed] == 255).all()
     # The covered area, rays counted, is that of the outline: of the cone that holds the ball.
     covered, found = seen.astype(float), at.trace(ball, "A0").mixed
-    covered.ravel()[found.pixels] = found.on_object.reshape(-1, 4).mean(axis=1)
+    covered.ravel()[found.pixels] = (found.triangle >= 0).reshape(-1, 4).mean(axis=1)
     sine = 0.12 / 1.8
     assert covered.sum() == pytest.approx(np.pi * (RIG.camera.fx * sine) ** 2 / (1 - sine**2), rel=5e-3)
     # Cover counts the rays on the surface of the central one: fewer where the ball curves away within the pixel.

@@ -13,15 +13,16 @@ from scored_dataset import make_dataset, write_description, write_predictions
 
 from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
-from fpp_ml_bench.evaluation.report.figures import (
+from fpp_ml_bench.evaluation.report.report_page import (
     CLIP_PERCENTILE,
+    chosen_samples,
     errors_figure,
-    figure_uri,
     sample_panels,
+    write_report,
 )
-from fpp_ml_bench.evaluation.report.report_page import chosen_samples, write_report
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.loaders.pictures import panel_figure
+from fpp_ml_bench.style import figure_png
 
 
 @pytest.fixture(scope="module")
@@ -100,13 +101,13 @@ def test_panels_show_the_errors_they_claim():
 @pytest.mark.parametrize("value", [0.0, 1800.0])
 def test_flat_and_empty_samples_have_pictures(value):
     target = np.full((8, 8), value, np.float32)
-    picture = figure_uri(panel_figure(sample_panels(np.zeros((8, 8), np.uint8), target, target)))
-    assert decoded(base64.b64decode(picture.removeprefix("data:image/png;base64,"))).shape[0] > 200
+    picture = figure_png(panel_figure(sample_panels(np.zeros((8, 8), np.uint8), target, target)))
+    assert decoded(picture).shape[0] > 200
 
 
 @pytest.mark.parametrize("errors", [[1.0], [0.0, 0.0], [2.0, np.nextafter(2.0, 3)], [1e-320, 1e-300], [0.0, 1e30]])
 def test_any_errors_have_a_figure(errors):
-    image = decoded(base64.b64decode(errors_figure(errors, None).removeprefix("data:image/png;base64,")))
+    image = decoded(errors_figure(errors, None))
     assert image.shape[0] > 200 and image[..., :3].min() < 100
 
 

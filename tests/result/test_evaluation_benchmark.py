@@ -13,7 +13,8 @@ from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result import model
 from fpp_ml_bench.evaluation.result.file import read_result, result_json, write_result
-from fpp_ml_bench.evaluation.result.model import result_from_rows
+from fpp_ml_bench.evaluation.result.model import Result, derived
+from fpp_ml_bench.evaluation.result.parts import SampleResult
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats, combine
 from fpp_ml_bench.loaders.render.builder import build
@@ -138,15 +139,14 @@ def test_other_counts_of_a_named_benchmark_are_refused(named, tmp_path, monkeypa
     path = result_file(named, tmp_path)
     scored = read_result(path)
     rows = [row.model_dump() for row in scored.per_sample]
-    derived = {"per_sample", "metrics", "intervals", "median", "pooled", "per_object", "bootstrap", "seeds"}
-    kept = set(type(scored).model_fields) - derived - {"schema_version"} - {"samples_without_object"}
-    fields = {key: getattr(scored, key) for key in kept - {"samples_without_background"}}
+    fields = {key: getattr(scored, key) for key in set(Result.model_fields) - {"per_sample", *derived([])}}
 
     def refused(changed, message):
         with monkeypatch.context() as forging:
             forging.setattr(model, "known_problem", lambda *claimed: None)
             data = scored.dataset.model_copy(update={"samples": len(changed)})
-            write_result(result_from_rows(changed, **{**fields, "dataset": data}), path)
+            samples = [SampleResult(**row) for row in changed]
+            write_result(Result(per_sample=samples, **derived(samples), **{**fields, "dataset": data}), path)
         with pytest.raises(SubmissionError, match=message) as refusal:
             read_result(path)
         assert str(path) in str(refusal.value)

@@ -14,7 +14,7 @@ from fpp_ml_bench.evaluation.result.file import json_schema, read_result, result
 from fpp_ml_bench.evaluation.result.parts import PART_TITLES, Reliance, RelianceParts
 from fpp_ml_bench.leaderboard.page.page import page_files
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
-from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_reliance
+from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_block
 
 SHA = "a" * 64
 
@@ -46,8 +46,8 @@ def test_it_is_written_read_back_and_replaced(row, file, tmp_path, capsys):
         assert main(["leaderboard", str(file), "--row", str(made)]) == 0
         file = made
     entry = read_entry(file)
-    write_reliance(entry, Reliance(**block(score=0.1)))
-    write_reliance(read_entry(file), Reliance(**block()))
+    write_block(entry, Reliance(**block(score=0.1)))
+    write_block(read_entry(file), Reliance(**block()))
     again = read_entry(file)
     assert again.is_row_file == row and again.row.reliance == Reliance(**block())
     changed = {"reliance": None, "result_sha256": entry.row.result_sha256}
@@ -55,7 +55,7 @@ def test_it_is_written_read_back_and_replaced(row, file, tmp_path, capsys):
     if not row:
         assert read_result(file).reliance == Reliance(**block())
     before = file.read_bytes()
-    write_reliance(again, Reliance(**block()))
+    write_block(again, Reliance(**block()))
     assert file.read_bytes() == before
 
 
@@ -94,7 +94,7 @@ def test_the_schema_knows_it_and_every_part_has_words():
 
 def test_it_stands_on_the_leaderboard_beside_error_and_time(file, tmp_path, dataset):
     other = write_result_file(tmp_path / "other.json", dataset, 2.0, name="Not asked")
-    write_reliance(read_entry(file), Reliance(**block()))
+    write_block(read_entry(file), Reliance(**block()))
     groups = rank(read_entries([file, other]))
     shown = readme_block(groups)
     assert re.search(r"\| A method \|.*\| 0\.62 \|", shown) and re.search(r"\| Not asked \|.*\| not measured \|", shown)

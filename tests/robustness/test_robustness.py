@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.baselines.method import Answer, Method
-from fpp_ml_bench.baselines.robustness import axes, run, scenes
-from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, Truth, corruptions, score
-from fpp_ml_bench.baselines.robustness.report import write_page
-from fpp_ml_bench.baselines.robustness.run import Setup, measure, robustness
-from fpp_ml_bench.baselines.robustness.scenes import Condition, FrameCache
+from fpp_ml_bench.baselines.robustness import axes, run
+from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, Condition, FrameCache, Truth, corruptions, score
+from fpp_ml_bench.baselines.robustness.run import Setup, measure, robustness, write_page
 from fpp_ml_bench.baselines.trivial import ConstantMethod
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.constants import VIEWS
@@ -201,7 +199,7 @@ def test_processes_and_a_cluster_give_the_same_rows_as_one(tmp_path, fake_ray):
 def test_the_cache_is_used_mended_and_kept_small(tmp_path, monkeypatch):
     first = frames("ambient-light", 2, cache=tmp_path)
     (file,) = tmp_path.rglob("*.npy")
-    monkeypatch.setattr(scenes, "solid_mesh", None)  # no object, nothing is rendered
+    monkeypatch.setattr(axes, "_mesh", None)  # no object, nothing is rendered
     assert np.array_equal(frames("ambient-light", 2, cache=tmp_path)[0], first[0])
     monkeypatch.undo()
     file.write_bytes(file.read_bytes()[:500])

@@ -120,7 +120,7 @@ def test_gradients_are_not_held_and_bad_batches_are_refused():
     metric = DepthScores()
     metric.update(prediction.requires_grad_(), target)
     assert not metric.sums.requires_grad
-    with pytest.raises(PredictionError, match="finite"):
+    with pytest.raises(PredictionError, match="the prediction holds 1920 NaN"):
         metric.update(torch.full_like(target, float("nan")), target)
     with pytest.raises(PredictionError, match="shape"):
         metric.update(prediction[:, 1:], target)
@@ -137,9 +137,9 @@ BATCHES = {
     "void of another shape": ({}, (DEPTH, DEPTH, DEPTH[0] > 0), "void: expected .1, 4, 5."),
     "an array": ({}, (DEPTH.numpy(), DEPTH), "prediction: expected a tensor, got ndarray"),
     "both in metres": ({}, (DEPTH / 1000, DEPTH / 1000), "the largest depth is 1.8, which could be metres"),
-    "metres": ({}, (DEPTH / 1000, DEPTH), "looks like another unit than the target"),
-    "metres close by": ({}, (DEPTH / 5000, DEPTH / 5), "looks like another unit than the target"),
-    "negative target": ({}, (DEPTH, -DEPTH), "target: expected finite depths of 0 and more"),
+    "metres": ({}, (DEPTH / 1000, DEPTH), "the prediction looks like metres"),
+    "metres close by": ({}, (DEPTH / 5000, DEPTH / 5), "the prediction looks like metres"),
+    "negative target": ({}, (DEPTH, -DEPTH), "targets: expected finite mm of 0 and more"),
     "unknown units": ({"units": "inch"}, None, "units: expected mm or m"),
 }
 
@@ -166,7 +166,7 @@ def test_what_a_void_pixel_holds_does_not_matter():
     metric = DepthScores()
     metric.update(prediction, target, void)
     assert float(metric.compute()["object_mae_mm"]) == 2.0
-    with pytest.raises(PredictionError, match="target: expected finite depths"):
+    with pytest.raises(PredictionError, match="targets: expected finite mm"):
         metric.update(prediction, target)
     metric.update(prediction, target, torch.ones_like(void))  # no pixel counts
     assert float(metric.compute()["object_mae_mm"]) == 2.0

@@ -180,7 +180,7 @@ def test_one_object_has_no_interval(dataset, tmp_path):
         (["per_sample", 0, "object_median_mm"], 99.0, "out of order"),
         (["per_sample", 0, "object_p95_mm"], None, "null all together"),
         (["mode"], "paper", r"dataset\.content: expected hashes of test/depth, got"),
-        (["mode"], "paper-individual", "has no mode paper-individual"),
+        (["mode"], "paper-individual", "mode: Input should be 'standard' or 'paper'"),
         (["target"], "depth_exact", r"dataset\.content: expected hashes of test/depth_exact, test/flags"),
         (["environment", "code_sha256"], "x", "code_sha256"),
     ],

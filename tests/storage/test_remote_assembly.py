@@ -7,7 +7,7 @@ from conftest import file_bytes
 from synthetic import SyntheticRows, assembly
 
 from fpp_ml_bench.errors import BuildError, PoolError
-from fpp_ml_bench.loaders.storage.assembly import ShardWork, assemble, assemble_remote
+from fpp_ml_bench.loaders.storage.assembly import ShardWork, assemble
 from fpp_ml_bench.remote import RemoteFolder
 
 SHARDS = [12, 6, 6]
@@ -48,31 +48,31 @@ def remote(tmp_path):
 
 def test_a_url_gets_the_same_files(local, remote, tmp_path):
     advanced = []
-    manifest = assemble_remote(remote, noise(), progress=advanced.append)
+    manifest = assemble(remote, noise(), progress=advanced.append)
     assert file_bytes(tmp_path / "remote") == local and advanced == [0, *SHARDS]
     (tmp_path / "remote/.build").mkdir()
     (tmp_path / "remote/.build/settings.json").write_text("{}")
-    assert assemble_remote(remote, noise()) == manifest  # finished
+    assert assemble(remote, noise()) == manifest  # finished
     assert file_bytes(tmp_path / "remote") == local
     with pytest.raises(BuildError, match=r"other settings: seed \(there 42, now 7\)"):
-        assemble_remote(remote, noise(7))
+        assemble(remote, noise(7))
     (tmp_path / "remote/meshes/mug.ply").unlink()
     with pytest.raises(BuildError, match=r"meshes/mug\.ply is missing or cut off"):
-        assemble_remote(remote, noise())
+        assemble(remote, noise())
 
 
 def test_in_the_middle_only_what_is_missing_or_cut_off_is_written_again(local, remote, tmp_path):
     folder, advanced = tmp_path / "remote", []
     with pytest.raises(KeyboardInterrupt):
-        assemble_remote(remote, noise(stop="test"))
+        assemble(remote, noise(stop="test"))
     with pytest.raises(BuildError, match="other settings"):
-        assemble_remote(remote, noise(7))
+        assemble(remote, noise(7))
     assert not (folder / "manifest.json").exists() and len(list(folder.rglob("*.arrow"))) == 2
     (folder / "train/.data-00000-of-00001.arrow.123.tmp").write_bytes(b"of a killed task")
     shard = folder / "validation/data-00000-of-00001.arrow"
     shard.write_bytes(shard.read_bytes()[:-1])
     (folder / ".build/test-00000-of-00001.json").write_text("{")
-    assemble_remote(remote, noise(), progress=advanced.append)
+    assemble(remote, noise(), progress=advanced.append)
     assert advanced == [SHARDS[0], *SHARDS[1:]] and file_bytes(folder) == local
 
 
@@ -80,7 +80,7 @@ def test_a_url_with_other_files_is_refused(remote, tmp_path):
     (tmp_path / "remote").mkdir()
     (tmp_path / "remote/letter.txt").write_text("mine")
     with pytest.raises(BuildError, match="holds other files and no dataset"):
-        assemble_remote(remote, noise())
+        assemble(remote, noise())
 
 
 @pytest.mark.parametrize("shared", [True, False])
@@ -91,7 +91,7 @@ def test_a_cluster_writes_the_same_files_and_goes_on_where_it_died(shared, local
         if shared:
             assemble(tmp_path / "remote", noise(), 1, progress, fake_ray.address)
         else:
-            assemble_remote(remote, noise(), 1, fake_ray.address, progress)
+            assemble(remote, noise(), 1, progress, fake_ray.address)
 
     fake_ray.dies = 2
     with pytest.raises(PoolError, match="the cluster failed"):

@@ -382,7 +382,7 @@ def test_full_disk_is_refused_beforehand(full_disk, capsys):
 
 def test_disk_that_fills_up_during_the_build(full_disk, uninterrupted, monkeypatch, capsys):
     """A real ENOSPC in the second shard; after freeing space the same command resumes."""
-    monkeypatch.setattr(assembling, "_check_space", lambda *_: None)
+    monkeypatch.setattr(assembling, "check_space", lambda *_: None)
     folder = full_disk / "set"
     for filler_kb in (300, 0):  # 1.2 MB without the filler: one shard fits, not two
         filler = full_disk / "filler"

@@ -169,10 +169,10 @@ def test_missing_and_cut_shards_are_noticed_when_opening(copied):
     shard = copied / read_manifest(copied).shards[3].path
     content = shard.read_bytes()
     shard.write_bytes(content[:-1])
-    with pytest.raises(DatasetError, match=f"expected {len(content)} bytes, it has {len(content) - 1}"):
+    with pytest.raises(DatasetError, match=f"has {len(content) - 1} bytes, expected {len(content)}"):
         DatasetFolder(copied)
     shard.unlink()
-    with pytest.raises(DatasetError, match="it is missing"):
+    with pytest.raises(DatasetError, match="is missing"):
         DatasetFolder(copied)
 
 

@@ -161,16 +161,16 @@ def test_other_columns_under_a_right_checksum(clean):
 @pytest.mark.parametrize(
     ("value", "message"),
     [
-        (np.nan, "not finite or negative"),
-        (np.inf, "not finite or negative"),
-        (-1.0, "not finite or negative"),
-        (0.0, "no depth above 0"),
+        (np.nan, "1 pixels are NaN or infinite"),
+        (np.inf, "1 pixels are NaN or infinite"),
+        (-1.0, "1 pixels are negative"),
+        (0.0, "no pixel is above 0"),
         (9000.0, "depth_min and depth_max do not fit"),
     ],
 )
 def test_depths_that_no_sample_may_have(tmp_path, monkeypatch, value, message):
     """The writer refuses them, but a dataset written by another program may contain them."""
-    monkeypatch.setattr(writing, "depth_range_mm", lambda depth, sample: (1500.0, 2100.0))
+    monkeypatch.setattr(writing, "checked_range_mm", lambda depth, sample: (1500.0, 2100.0))
     folder = make(tmp_path / "set", spoil=("mug_A60", value))
     findings = [finding for finding in verify(folder) if "mug_A60" in finding]
     assert len(findings) == 1 and message in findings[0] and "column depth" in findings[0]

@@ -28,7 +28,7 @@ from fpp_ml_bench.baselines.tradeoff.measure import (
     power,
     read_tradeoff,
 )
-from fpp_ml_bench.baselines.tradeoff.report import growth_rows, point_rows, remarks, write_report
+from fpp_ml_bench.baselines.tradeoff.report import growth_table, point_table, remarks, write_report
 from fpp_ml_bench.baselines.training.weights import shipped_names
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import BuildError, DatasetError, PredictionError, SubmissionError
@@ -159,7 +159,7 @@ def test_what_cant_be_measured_says_why_and_has_no_numbers(small, tmp_path, answ
     assert one_size.object_mae_mm == 8.5 and one_size.pixel_seconds is None
     assert remarks(run)[0].startswith("Not measured: good frame=7: ")
     assert remarks(run)[1] == "Not measured at other sizes: bad offset_mm=9.0: works at one size only"
-    assert point_rows(run)[0][1:] == ["", "-", "-", "-", "-", "-"] and len(growth_rows(run)) == 1
+    assert point_table(run).texts[0][1:] == ("", "-", "-", "-", "-", "-") and len(growth_table(run).texts) == 1
     for wrong in (np.float32([[1]]), np.full(small.size, np.nan, np.float32)):
         monkeypatch.setattr(Answer, "predict", lambda self, frames, wrong=wrong: wrong)
         (point,) = measure.tradeoff(plan_of(small, tmp_path / "wrong", "bad")).points
@@ -169,7 +169,7 @@ def test_what_cant_be_measured_says_why_and_has_no_numbers(small, tmp_path, answ
 def test_told_and_trivial_methods_are_on_no_front(small, tmp_path, answers, monkeypatch):
     monkeypatch.setattr(Answer, "uses_ground_truth_mask", True)
     run = measure.tradeoff(plan_of(small, tmp_path / "told", "bad"))
-    assert run.points[0].off_front_reason == "given the view's object mask" == point_rows(run)[0][1]
+    assert run.points[0].off_front_reason == "given the view's object mask" == point_table(run).texts[0][1]
     monkeypatch.setattr(Answer, "uses_ground_truth_mask", False)
     answers.trivial = True
     run = measure.tradeoff(plan_of(small, tmp_path / "trivial", "bad"))
@@ -264,11 +264,11 @@ def test_growth_over_pixels_and_frames(small):
     second = point("a", 4.0, 20, 1.0).model_copy(update={"options": {"steps": 9}})
     other = point("a", 4.0, 5, 1.0).model_copy(update={"options": {"steps": 9, "fewest": True}})
     run = tradeoff_of(small, [first, second, other, point("b", 1.0, 1, 9.0)])
-    assert growth_rows(run) == [
-        ["a steps=4", "1, 2, 4", "1", "2", "1,000"],
-        ["a steps=9", "-", "-", "2", "4,000"],
-        ["a steps=9 fewest", "-", "-", "-", "4,000"],
-        ["b", "-", "-", "-", "1,000"],
+    assert growth_table(run).texts == [
+        ("a steps=4", "1, 2, 4", "1", "2", "1,000"),
+        ("a steps=9", "-", "-", "2", "4,000"),
+        ("a steps=9 fewest", "-", "-", "-", "4,000"),
+        ("b", "-", "-", "-", "1,000"),
     ]
 
 
@@ -339,7 +339,7 @@ def test_files_hold_what_was_measured(small, tmp_path):
     lines = (tmp_path / "tradeoff.md").read_text().splitlines()
     assert lines[0].startswith("small, 40 x 32 px, 1 test views, against depth_exact; wall-clock time, 1 thread(s)")
     assert lines[4] == "| exact | time, frames, memory | 0.500 | 0.0% | 20 | 10 | 2 |"
-    assert lines[5] == "| few\\|frames | frames | 9.000 | 0.0% | 200 | 1 | 2 |"
+    assert lines[5] == "| few&#124;frames | frames | 9.000 | 0.0% | 200 | 1 | 2 |"
     assert read_tradeoff(tmp_path / TRADEOFF_FILE) == run
     broken = json.loads((tmp_path / TRADEOFF_FILE).read_text())
     broken["points"][0]["frames"] = "ten"

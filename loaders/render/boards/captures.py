@@ -5,12 +5,12 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from shutil import rmtree
 
-import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 
 from fpp_ml_bench.calibration.boards import Board
+from fpp_ml_bench.containers import png_bytes
 from fpp_ml_bench.errors import CaptureError
 from fpp_ml_bench.files import LOCK_FILE, exclusive, write_atomically
 from fpp_ml_bench.loaders.render.boards.poses import BoardPose, board_poses
@@ -22,8 +22,6 @@ from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.rig_file import load_rig, save_rig
 
 BOARD_FILE, RIG_FILE = "board.yaml", "rig.yaml"
-_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
-"""Noise does not compress; higher levels take three times as long for 1% less."""
 
 
 def board_studio(rig: Rig, board: Board, light: Light | None = None, seed: int = 42) -> Studio:
@@ -124,10 +122,7 @@ def _write_pose(place: Path, name: str, frames: list[NDArray[np.uint8]]) -> None
     digits = max(2, len(str(len(frames) - 1)))
 
     def write(index: int) -> None:
-        done, content = cv2.imencode(".png", frames[index], _PNG)
-        if not done:
-            raise CaptureError(f"{name}, frame {index}: OpenCV could not encode a PNG")
-        (unfinished / f"frame_{index:0{digits}d}.png").write_bytes(content.tobytes())
+        (unfinished / f"frame_{index:0{digits}d}.png").write_bytes(png_bytes(frames[index]))
 
     with ThreadPoolExecutor() as pool:
         list(pool.map(write, range(len(frames))))

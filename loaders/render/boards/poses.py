@@ -24,7 +24,8 @@ MARGIN = {"checker": 1.5, "circles": 0.75, "circles-asymmetric": 0.75, "charuco"
 """From the outer points to the end of the sheet, in spacings."""
 COVERED = 0.65
 """Share of the image at the standoff that the longer side of `fitting_board` takes."""
-LEAST_TILT = 0.4
+MOST_TILT, LEAST_TILT = 30 / 360, 0.4
+"""Largest tilt of a pose in turns, and the least as its share."""
 NICE = (1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0)
 _STEPS = 20
 _MARGIN_PX = 2.0
@@ -68,12 +69,12 @@ def fitting_board(rig: Rig, kind: str = "circles", columns: int = 5, rows: int =
     return Board(kind, columns, rows, float(f"{spacing:g}"), float(f"{unit.detail_mm * spacing:g}"))
 
 
-def board_poses(rig: Rig, board: Board, count: int = BOARD_POSES, tilt_deg: float = 30.0) -> tuple[BoardPose, ...]:
+def board_poses(rig: Rig, board: Board, count: int = BOARD_POSES) -> tuple[BoardPose, ...]:
     """``count`` poses at which the sheet is within the working range, the image and the pattern: towards the middle,
-    the corners and the sides of the image in turn, tilted by up to ``tilt_deg`` in directions all round, upright and
+    the corners and the sides of the image in turn, tilted by up to `MOST_TILT` in directions all round, upright and
     turned by a quarter, at distances over the whole range. Raises `CalibrationError` for a board that does not fit."""
-    if count < 1 or not 0 <= tilt_deg <= 60:
-        raise CalibrationError(f"expected 1 or more poses and a tilt of 0 to 60 degrees, got {count} and {tilt_deg:g}")
+    if count < 1:
+        raise CalibrationError(f"expected 1 or more poses, got {count}")
     (left, top), (right, bottom) = (np.array(corner) / MM_PER_M for corner in sheet_corners_mm(board))
     corners = np.array([[x, y, 0.0] for y in (top, bottom) for x in (left, right)])
     centre = np.array([(left + right) / 2, (top + bottom) / 2, 0.0])
@@ -82,7 +83,7 @@ def board_poses(rig: Rig, board: Board, count: int = BOARD_POSES, tilt_deg: floa
     for index in range(count):
         share = 1.0 if count == 1 else LEAST_TILT + (1 - LEAST_TILT) * (index * _PLASTIC % 1.0)
         roll = 0.25 * (index % 2) + 0.03 * (index % 3 - 1)
-        rotation = _product(_tilt(tilt_deg / 360 * share, index * _GOLDEN % 1.0), _roll(roll))
+        rotation = _product(_tilt(MOST_TILT * share, index * _GOLDEN % 1.0), _roll(roll))
         place = np.array(_PLACES[index % len(_PLACES)]) * reach
         about = BoardPose(rotation, (0.0, 0.0, 0.0)).points_m(corners - centre)
         pose = _fitting_pose(rig, rotation, about, centre, middle, place, index * _GOLDEN % 1.0)

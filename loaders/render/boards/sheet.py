@@ -5,7 +5,7 @@ The print is a function of the place on the sheet, neither mesh nor picture. A p
 their centroid where it should be, to a thousandth of a pixel (`tests/render/test_photographed_boards.py`).
 """
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,29 +29,27 @@ Footprint = tuple[Values, ...]
 """How x and y on the board, mm, change over the width of a ray's part of the image, and then over its height: four."""
 
 
-@dataclass(frozen=True)
-class OnBoard:
-    """Where n rays meet the board's plane: ``x_mm`` and ``y_mm`` on the board, ``depth_m``; NaN where they don't."""
+class OnBoard(NamedTuple):
+    """Where n rays meet the board's plane: ``x_mm`` and ``y_mm`` on the board, ``depth_m``, NaN where they don't; and
+    whether that is on its ``sheet``."""
 
     x_mm: Values
     y_mm: Values
     depth_m: Values
+    sheet: NDArray[np.bool_]
 
-    @classmethod
-    @np.errstate(divide="ignore", invalid="ignore")
-    def of(cls, x: Values, y: Values, pose: BoardPose) -> "OnBoard":
-        """Of rays (x, y, 1), any equal shapes."""
-        turn, (tx, ty, tz) = pose.rotation, pose.translation_m
-        ax, ay, az = (row[2] for row in turn)  # the board's normal
-        depth = (ax * tx + ay * ty + az * tz) / (ax * x + ay * y + az)
-        depth = np.where(depth > 0, depth, np.nan)
-        dx, dy, dz = depth * x - tx, depth * y - ty, depth - tz
-        across, down = ((turn[0][i] * dx + turn[1][i] * dy + turn[2][i] * dz) * MM_PER_M for i in (0, 1))
-        return cls(across, down, depth)
 
-    def on_sheet(self, board: Board) -> NDArray[np.bool_]:
-        (left, top), (right, bottom) = sheet_corners_mm(board)
-        return (self.x_mm >= left) & (self.x_mm <= right) & (self.y_mm >= top) & (self.y_mm <= bottom)
+@np.errstate(divide="ignore", invalid="ignore")
+def meet(x: Values, y: Values, board: Board, pose: BoardPose) -> OnBoard:
+    """Where rays (x, y, 1), any equal shapes, meet the board."""
+    turn, (tx, ty, tz) = pose.rotation, pose.translation_m
+    ax, ay, az = (row[2] for row in turn)  # the board's normal
+    depth = (ax * tx + ay * ty + az * tz) / (ax * x + ay * y + az)
+    depth = np.where(depth > 0, depth, np.nan)
+    dx, dy, dz = depth * x - tx, depth * y - ty, depth - tz
+    across, down = ((turn[0][i] * dx + turn[1][i] * dy + turn[2][i] * dz) * MM_PER_M for i in (0, 1))
+    (left, top), (right, bottom) = sheet_corners_mm(board)
+    return OnBoard(across, down, depth, (across >= left) & (across <= right) & (down >= top) & (down <= bottom))
 
 
 def dark_share(board: Board, x_mm: Values, y_mm: Values, footprint: Footprint) -> Values:
@@ -100,12 +98,12 @@ def board_view(studio: Studio, board: Board, pose: BoardPose, stream: tuple[obje
     """The board before the studio's camera, lit; ``stream`` names its noise. It is flat and matte, its white is the
     light's material, and it stands alone: it gets the projector's light and the lamps', no further bounces."""
     rig, light, camera = studio.rig, studio.light, studio.rig.camera
-    place = OnBoard.of(*camera.rays(), pose)
+    place = meet(*camera.rays(), board, pose)
     (x_down, x_across), (y_down, y_across) = np.gradient(place.x_mm), np.gradient(place.y_mm)
     footprint = x_across, y_across, x_down, y_down
     # Over twice the pixel's part: strictly between 0 and 1 wherever an edge crosses the pixel.
     dark = dark_share(board, place.x_mm, place.y_mm, tuple(np.multiply(2.0, part) for part in footprint))
-    sheet = place.on_sheet(board)
+    sheet = place.sheet
     edges = np.flatnonzero(_border(sheet) | (sheet & (dark > 0) & (dark < 1)))
     traced, facing = _outline(board, pose), -np.array([row[2] for row in pose.rotation])
     white = (1.0 - light.surface.gloss) * light.surface.albedo
@@ -126,8 +124,8 @@ def board_view(studio: Studio, board: Board, pose: BoardPose, stream: tuple[obje
     rows, columns = (axis[:, None] for axis in np.divmod(edges, camera.width))
     down, across = ((axis + 0.5) / EDGE_RAYS - 0.5 for axis in np.divmod(np.arange(count), EDGE_RAYS))
     x, y = camera.normalised((columns + across).ravel(), (rows + down).ravel())
-    place = OnBoard.of(x, y, pose)
-    upon = place.on_sheet(board)
+    place = meet(x, y, board, pose)
+    upon = place.sheet
     parts = tuple(np.nan_to_num(np.repeat(part.ravel()[edges], count)) / EDGE_RAYS for part in footprint)
     print_share = np.where(upon, dark_share(board, place.x_mm, place.y_mm, parts), 0.0)
     points_m = _points(x, y, np.where(upon, place.depth_m, rig.background))

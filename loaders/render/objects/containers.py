@@ -20,6 +20,7 @@ from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
     place,
     plate,
     polygon,
+    post,
     rectangle,
     ring,
     rod,
@@ -29,6 +30,7 @@ from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
     text_section,
     tube,
     union,
+    upright,
     wrapped,
 )
 
@@ -36,10 +38,11 @@ from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
 def ribbed_cap(radius: float, height: float, ribs: int = 36) -> Solid:
     """Screw cap standing on z = 0 with vertical grips."""
     feet = [(radius * c, radius * s) for c, s in around(ribs)]
-    grips = [rod((x, y, 1.5), (x, y, height - 2.5), 0.07 * radius) for x, y in feet]
+    grips = [post(1.5, height - 2.5, 0.07 * radius, at=(x, y)) for x, y in feet]
     return union(lathe([(radius, 0), (radius, height - 2), (radius - 2, height)]), *grips)
 
 
+@upright(1.48, (0, 0, 30))
 def mustard_bottle() -> Solid:
     """Oval squeeze bottle, 96 x 58 x 190 mm, with a pointed nozzle."""
     body = loft(
@@ -59,10 +62,11 @@ def mustard_bottle() -> Solid:
     closure = lathe([(23, 152), (23, 163), *curve([(21, 165), (14, 169), (8, 176), (5.5, 184), (4.2, 192)])])
     grips = [ring(23, 0.8, z) for z in (155, 158, 161)]
     panel = embossed(body, rectangle(72, 84, 14, (0, 66)), 0.8)
-    words = text_section("MUSTARD", 62).translate((0, 80)) + rectangle(46, 3, 0, (0, 58)) + rectangle(34, 3, 0, (0, 50))
-    return place(union(body, closure, panel, embossed(body, words, 2.2), *grips), turn=(0, 0, 30))
+    words = text_section("MUSTARD", 62, (0, 80)) + rectangle(46, 3, 0, (0, 58)) + rectangle(34, 3, 0, (0, 50))
+    return union(body, closure, panel, embossed(body, words, 2.2), *grips)
 
 
+@upright(1.35, (0, 0, 30))
 def bleach_cleanser() -> Solid:
     """Cleanser bottle, 98 x 66 x 250 mm: square shoulders, a waist to hold it by and a ribbed cap."""
     body = loft(
@@ -81,14 +85,15 @@ def bleach_cleanser() -> Solid:
         ],
         smooth=8,
     )
-    neck = rod((0, 0, 205), (0, 0, 222), 16)
-    cap = union(ribbed_cap(20, 22).translate((0, 0, 216)), rod((0, 0, 236), (0, 0, 250), 11, 8))
-    words = text_section("BLEACH", 74).translate((0, 70))
+    neck = post(205, 222, 16)
+    cap = union(ribbed_cap(20, 22).translate((0, 0, 216)), post(236, 250, 11, 8))
+    words = text_section("BLEACH", 74, (0, 70))
     for width, height in ((76, 50), (60, 40), (66, 30)):
         words = words + rectangle(width, 2.6, 0, (0, height))
-    return place(union(body, neck, cap, embossed(body, words, 1.5)), turn=(0, 0, 30))
+    return union(body, neck, cap, embossed(body, words, 1.5))
 
 
+@upright(1.8, (0, -3, -6))
 def container_bottle() -> Solid:
     """Canister with a handle through its shoulder, 170 x 105 x 280 mm, and a wide screw cap."""
     body = loft(
@@ -110,14 +115,15 @@ def container_bottle() -> Solid:
     thinner = [place(block(40, 60, 120, 18), (s * 56, -0.0 + 62, 190), (0, s * -6, 0)) for s in (-1, 1)]
     cap = union(ribbed_cap(31, 26, 44).translate((0, 0, 258)), ring(31, 2.2, 259))
     panel = embossed(body, rectangle(118, 96, 12, (-4, 78)), 1.0)
-    marks = text_section("LITRE", 84).translate((-4, 100)) + rectangle(90, 7, 3, (-4, 70))
+    marks = text_section("LITRE", 84, (-4, 100)) + rectangle(90, 7, 3, (-4, 70))
     marks = marks + rectangle(60, 7, 3, (-19, 48))
     for step in range(7):
         marks = marks + rectangle(14 if step % 2 else 9, 2.6, 0, (66, 40 + 18.0 * step))
     drained = cut(union(body, panel, embossed(body, marks, 2.4)), hole, *thinner)
-    return place(union(drained, cap), turn=(0, -3, -6))
+    return union(drained, cap)
 
 
+@upright(1.6, (0, 0, 1))
 def spray_bottle() -> Solid:
     """Trigger sprayer, 78 mm wide at its foot and 275 mm tall, seen from its side at the first view."""
     side = [(39, 5), (39, 60), (38, 100), (34, 125), (30, 140), (28.5, 155), (25, 172), (18, 186), (14.5, 192)]
@@ -147,9 +153,10 @@ def spray_bottle() -> Solid:
     nozzle = facing(union(rod((-60, 257, 0), (-72, 257, 0), 11), block(8, 24, 24, 1, (-74, 257, 0)), tip))
     grip = [ring(39.2, 0.9, z) for z in (16, 22, 28)]
     words = wrapped(text_section("SPRAY", 56), 38.8, 74, 1.3)
-    return place(union(body, collar, facing(plate(head, 19)), facing(trigger), nozzle, words, *grip), turn=(0, 0, 1))
+    return union(body, collar, facing(plate(head, 19)), facing(trigger), nozzle, words, *grip)
 
 
+@upright(4.6)
 def vial() -> Solid:
     """Medicine vial, 24 x 58 mm: round shoulder, crimped cap over a rubber stopper, a label."""
     glass = lathe([(10.5, 0), (12, 1.5), (12, 36), (11.3, 39), (9, 42), (7, 44), (6.6, 46), (6.6, 51)], 0.8)
@@ -161,6 +168,7 @@ def vial() -> Solid:
     return union(glass, crimp, stopper, label, words, *lines)
 
 
+@upright(4.5, (0, -2, 0))
 def cork() -> Solid:
     """Tapered stopper, 34 mm wide, with lenticels and pits."""
     body = lathe([(11.5, 0), (12.6, 1.2), (16.2, 40.6), (15.2, 42)], segments=SEGMENTS)
@@ -171,9 +179,9 @@ def cork() -> Solid:
         side = angle + 0.09 * (0.6 + 1.9 * ((k * 0.7320508) % 1.0))
         ends = [(radius * float(np.cos(a)), radius * float(np.sin(a)), at) for a, at in ((angle, z), (side, z + 0.4))]
         pits.append(rod(ends[0], ends[1], 0.4, 0.75, rounded=True))
-    holes = [rod((x, y, 40), (x, y, 44), 0.9) for x, y in ((4, 3), (-6, 2), (1, -7), (-3, -3), (9, -4))]
+    holes = [post(40, 44, 0.9, at=(x, y)) for x, y in ((4, 3), (-6, 2), (1, -7), (-3, -3), (9, -4))]
     split = block(10, 0.8, 14, 0, (-14, 4, 36))
-    return place(cut(body, *pits, *holes, split), turn=(0, -2, 0))
+    return cut(body, *pits, *holes, split)
 
 
 def _rimmed(radius: float, height: float, ribs: tuple[float, ...] = ()) -> Solid:
@@ -183,26 +191,28 @@ def _rimmed(radius: float, height: float, ribs: tuple[float, ...] = ()) -> Solid
     for z in ribs:
         wall += [(radius, z - 1.8), (radius + 0.9, z - 0.6), (radius + 0.9, z + 0.6), (radius, z + 1.8)]
     wall += [(radius, height - 3.6), (rim, height - 2.6), (rim, height - 0.8), (rim - 1, height)]
-    sunk_lid = rod((0, 0, height - 3), (0, 0, height + 1), radius - 1.2)
+    sunk_lid = post(height - 3, height + 1, radius - 1.2)
     return cut(lathe(wall), sunk_lid)
 
 
 def _pull_tab(scale: float = 1.0) -> Solid:
     """Ring-pull lying on z = 0, its rivet at the origin and its ring towards -x."""
     tab = (rectangle(22, 15, 7.4, (-9, 0)) - softened(rectangle(10, 9, 4.4, (-13, 0)), 1)).scale((scale, scale))
-    return union(plate(tab, 1.6).translate((0, 0, 1.2)), rod((0, 0, -1), (0, 0, 2.6), 3.0 * scale))
+    return union(plate(tab, 1.6).translate((0, 0, 1.2)), post(-1, 2.6, 3.0 * scale))
 
 
+@upright(1.32)
 def master_chef_can() -> Solid:
     """Coffee can, 102 x 139 mm, with an overhanging plastic lid and its name on a label that does not quite close."""
     body = _rimmed(50, 132)
-    lid = cut(lathe([(52.5, 126), (53, 127), (53, 137), (51.5, 139)]), rod((0, 0, 137), (0, 0, 141), 46))
+    lid = cut(lathe([(52.5, 126), (53, 127), (53, 137), (51.5, 139)]), post(137, 141, 46))
     label = wrapped(rectangle(292, 112), 50, 65, 0.6)
     name = union(*lettered(50.6, 1.0, ("MASTER", 76, 92), ("CHEF", 58, 70)), wrapped(disc(17), 50.6, 36, 1.0))
-    grips = [rod((53 * c, 53 * s, 127.5), (53 * c, 53 * s, 136.5), 0.9) for c, s in around(60)]
+    grips = [post(127.5, 136.5, 0.9, at=(53 * c, 53 * s)) for c, s in around(60)]
     return union(body, lid, label, name, *grips)
 
 
+@upright(2.25)
 def tomato_soup_can() -> Solid:
     """Soup can, 66 x 101 mm, with ring-pull, two ribs and a label."""
     body = _rimmed(32.5, 101, ribs=(10, 91))
@@ -211,6 +221,7 @@ def tomato_soup_can() -> Solid:
     return union(body, label, name, _pull_tab().translate((-8, 0, 98)))
 
 
+@upright(3.0, (0, -48, 0))
 def tuna_fish_can() -> Solid:
     """Flat can, 85 x 33 mm, tipped to show its lid with the ring-pull and steps."""
     body = _rimmed(42, 33, ribs=(9, 24))
@@ -218,9 +229,10 @@ def tuna_fish_can() -> Solid:
     name = wrapped(text_section("TUNA", 40), 42, 16.5, 1.0)
     fish_body = plate(disc(10).scale((1.5, 0.75)) + rectangle(9, 9).rotate(45).translate((17, 0)), 2)
     fish = place(fish_body, (12, 0, 30), (0, 0, 90))
-    return place(union(body, steps, name, fish, _pull_tab(1.2).translate((-14, 0, 30))), turn=(0, -48, 0))
+    return union(body, steps, name, fish, _pull_tab(1.2).translate((-14, 0, 30)))
 
 
+@upright(2.65, (0, 0, 2))
 def potted_meat_can() -> Solid:
     """Rectangular meat tin with round corners, 97 x 50 x 82 mm, a sunk lid with ring-pull."""
     waist, rim, outline = (95, 48), (97.5, 50.5), 5.0
@@ -228,11 +240,12 @@ def potted_meat_can() -> Solid:
     lid = loft([(79.5, 92, 45, outline), (84, 92, 45, outline)])
     body = loft([(height, *size, outline) for height, size in levels])
     label = embossed(body, rectangle(84, 60, 3, (0, 41)), 0.6)
-    words = text_section("MEAT", 68).translate((0, 50)) + text_section("POTTED", 56).translate((0, 26))
+    words = text_section("MEAT", 68, (0, 50)) + text_section("POTTED", 56, (0, 26))
     tab = place(_pull_tab(1.1), (0, 12, 78.5), (0, 0, 90))
-    return place(union(cut(body, lid), label, embossed(body, words, 1.8), tab), turn=(0, 0, 2))
+    return union(cut(body, lid), label, embossed(body, words, 1.8), tab)
 
 
+@upright(1.32)
 def container_tin() -> Solid:
     """Kitchen canister, 110 x 158 mm: rolled seams, an overlapping domed lid with a knob, a label plate."""
     body = lathe([(53, 0), (54.4, 0.8), (54.4, 2.6), (53, 3.6), (53, 112)])
@@ -248,11 +261,12 @@ def container_tin() -> Solid:
 _BRUSH_MARK = [(-20, -6), (-10, 4), (-2, -4), (8, 5), (20, -2)]
 
 
+@upright(3.0)
 def paint_container_bottle() -> Solid:
     """Craft-paint bottle, 44 x 118 mm, with a flip-top cap and a daub of paint on its label."""
     body = lathe([(19, 0), (21.5, 2), (22, 6), (22, 72), *curve([(21.5, 78), (17, 86), (12, 90), (11, 94)])])
     top = lathe([(12.4, 103), (12.6, 112), (11, 115)])
-    cap = union(ribbed_cap(13, 13, 28).translate((0, 0, 91)), top, rod((0, 0, 114), (0, 0, 119), 4, 3))
+    cap = union(ribbed_cap(13, 13, 28).translate((0, 0, 91)), top, post(114, 119, 4, 3))
     notch = block(5, 11, 4, 1, (-13.6, 0, 104))
     label = wrapped(rectangle(112, 52), 22, 38, 0.35)
     daub = wrapped(stroke(_BRUSH_MARK, 12).scale((0.66, 0.8)), 22.4, 28, 0.9)
@@ -260,6 +274,7 @@ def paint_container_bottle() -> Solid:
     return union(body, cut(cap, notch), label, words)
 
 
+@upright(1.68)
 def paint_container_jar() -> Solid:
     """Wide paint jar, 76 x 84 mm, with a ribbed lid and paint running down from under it."""
     body = lathe([(32, 0), (37, 3), (38, 8), (38, 52), (36, 58), (33, 62), (33, 68)], 1.2)
@@ -273,6 +288,7 @@ def paint_container_jar() -> Solid:
     return union(body, lid, hem, words, *runs)
 
 
+@upright(2.05)
 def paint_container_spraycan() -> Solid:
     """Spray can, 66 x 195 mm: domed shoulder, valve cup and spray button with its nozzle."""
     dome = curve([(32, 156), (27, 163), (19, 168), (14.5, 169.5)])
@@ -307,37 +323,41 @@ def _tube(length: float, width: float, cap_radius: float, cap_height: float, cri
     return union(body, fold, neck, rim, *pleats, ribbed_cap(cap_radius, cap_height, 24))
 
 
+@upright(4.35, (1, 0, 0), (0, 0, 30))
 def paint_container_tube_small() -> Solid:
     """Stubby watercolour tube, 21 x 84 mm."""
     body = _tube(62, 20.5, 7.0, 10, 6)
-    words = embossed(body, text_section("RED", 13).translate((0, 48)), 0.5)
-    return place(union(body, words), turn=(1, 0, 0)).rotate((0, 0, 30))
+    words = embossed(body, text_section("RED", 13, (0, 48)), 0.5)
+    return union(body, words)
 
 
+@upright(2.88, (-1, 0, 0), (0, 0, 30))
 def paint_container_tube() -> Solid:
     """Oil-paint tube, 30 x 130 mm, rolled up a little at its end."""
     body = _tube(106, 30, 7.5, 13, 8)
     roll = rod((-3.2, -15.6, 126), (-3.2, 15.6, 126), 4.6)
-    words = text_section("OIL", 19).translate((0, 72)) + stroke(_BRUSH_MARK, 9).scale((0.5, 0.6)).translate((0, 50))
-    return place(union(body, roll, embossed(body, words, 0.7)), turn=(-1, 0, 0)).rotate((0, 0, 30))
+    words = text_section("OIL", 19, (0, 72)) + stroke(_BRUSH_MARK, 9).scale((0.5, 0.6)).translate((0, 50))
+    return union(body, roll, embossed(body, words, 0.7))
 
 
+@upright(1.78, (1, 0, 0), (0, 0, 30))
 def paint_container_tube_large() -> Solid:
     """Large acrylic tube, 52 x 192 mm, squeezed at its waist and standing on a wide flip cap."""
     body = _tube(156, 52, 19, 26, 9)
     dent = place(ball(26), (-32, 8, 140))
     hinge = block(6, 12, 8, 1, (18, 0, 24))
-    words = text_section("ACRYL", 36).translate((0, 64)) + rectangle(32, 3, 0, (0, 82)) + rectangle(24, 3, 0, (0, 90))
-    return place(union(cut(union(body, embossed(body, words, 1.0)), dent), hinge), turn=(1, 0, 0)).rotate((0, 0, 30))
+    words = text_section("ACRYL", 36, (0, 64)) + rectangle(32, 3, 0, (0, 82)) + rectangle(24, 3, 0, (0, 90))
+    return union(cut(union(body, embossed(body, words, 1.0)), dent), hinge)
 
 
+@upright(1.7, (0, -1, 3))
 def paint_thinner() -> Solid:
     """Rectangular solvent can, 165 x 100 x 240 mm: seams, sunk top with screw spout and a strap handle."""
     wall, seam_size = (163, 98), (166, 101)
     levels = ((0, wall), (2, seam_size), (6, seam_size), (7, wall), (193, wall), (194, seam_size), (199, seam_size))
     body = union(loft([(height, *size, 9) for height, size in (*levels, (200, wall))]))
     top = loft([(196, 157, 92, 9), (203, 157, 92, 9)])
-    spout = union(rod((0, 50, 190), (0, 50, 216), 19), ribbed_cap(22, 20, 36).translate((0, 50, 202)))
+    spout = union(post(190, 216, 19, at=(0, 50)), ribbed_cap(22, 20, 36).translate((0, 50, 202)))
     bow = [(16, 196), (12, 224), (-14, 238), (-48, 234), (-64, 214), (-66, 196)]
     strap = tube(curve([(0, y, z) for y, z in bow]), 9, flatten=0.28, up=(0, 0.3, 1))
     words = union(
@@ -348,4 +368,4 @@ def paint_thinner() -> Solid:
         *(plate(rectangle(74, 4, 0, (28, y)), 3) for y in (-36, -46, -56)),
     )
     seam = block(3, 8, 190, 1, (49, -30, 100))
-    return place(union(cut(body, top), spout, strap, facing(words).translate((-49.2, 0, 96)), seam), turn=(0, -1, 3))
+    return union(cut(body, top), spout, strap, facing(words).translate((-49.2, 0, 96)), seam)

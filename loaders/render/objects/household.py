@@ -11,12 +11,13 @@ from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
     curve,
     cut,
     disc,
-    facing,
+    drawn,
     lathe,
     lettered,
     place,
     plate,
     polygon,
+    post,
     rectangle,
     ring,
     rod,
@@ -27,28 +28,32 @@ from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
     text_section,
     tube,
     union,
+    upright,
     vessel,
     wrapped,
 )
 
 
+@upright(2.6, (0, -50, 0))
 def bowl() -> Solid:
     """Bowl, 160 x 60 mm, with foot, rolled rim and two turned lines inside, tipped so that its hollow is seen."""
     body = vessel([(27, 0), (30, 0), *curve([(30, 5), (50, 11), (66, 24), (76, 42), (80, 60)])], 3.2, 0.6)
     lines = [ring(r, 0.7, z) for r, z in ((73.6, 44), (70.4, 37.5))]
-    return place(union(body, ring(79.2, 2.4, 59.5), *lines), turn=(0, -50, 0))
+    return union(body, ring(79.2, 2.4, 59.5), *lines)
 
 
+@upright(3.2, (0, -30, 0))
 def mug() -> Solid:
     """Mug, 82 x 92 mm and its handle, tipped a little to show the hollow."""
     body = vessel([(35, 0), (38, 1.5), (40.5, 10), (41, 40), (41, 92)], 3.6, 1.2)
     ear = curve([(0, -38, 76), (0, -52, 79), (0, -66, 68), (0, -69, 50), (0, -62, 32), (0, -50, 22), (0, -37, 19)])
     handle = tube(ear, 5.2, flatten=1.35, up=(1, 0, 0))
     badge = wrapped(stroke([(-16, 8), (-8, 18), (0, 10), (8, 18), (16, 8), (0, -14), (-16, 8)], 3.4), 41, 46, 1.2)
-    solid = cut(union(body, handle), rod((0, 0, 4.5), (0, 0, 88), 37.3))
-    return place(union(solid, badge, ring(39.5, 1.7, 91.5)), turn=(0, -30, 0))
+    solid = cut(union(body, handle), post(4.5, 88, 37.3))
+    return union(solid, badge, ring(39.5, 1.7, 91.5))
 
 
+@upright(1.85, (0, -10, 0))
 def pitcher() -> Solid:
     """Pitcher, 130 x 240 mm: tapered, with a pulled spout, a big handle and ridges round its foot."""
     wall = 3.4
@@ -61,7 +66,7 @@ def pitcher() -> Solid:
     heights = enumerate(range(50, 200, 20))
     marks = [wrapped(rectangle(14 if k % 2 else 26, 2.4), 48.6 + 0.062 * z, z, 1.4, 24) for k, z in heights]
     shell = cut(union(body, lip, handle, *ridges, *marks), throat, bore)
-    return place(shell, turn=(0, -10, 0))
+    return shell
 
 
 def _spout(inset: float) -> Solid:
@@ -78,6 +83,7 @@ def _spout(inset: float) -> Solid:
     return Solid.batch_hull([ball(2.5, point) for point in outline]).trim_by_plane((0, 0, -1), -rim)
 
 
+@upright(1.5, (0, -20, 0))
 def cleaning_bucket() -> Solid:
     """Pail, 280 x 250 mm, with bands, ears, and a bail handle with its grip, tipped to show the inside."""
     body = vessel([(98, 0), (102, 2), (138, 250)], 3.5, 1.2)
@@ -89,10 +95,11 @@ def cleaning_bucket() -> Solid:
     grip = rod((-118, -46, 312), (-118, 46, 312), 11)
     words = wrapped(text_section("CLEAN", 150), 120, 130, 2.0)
     rivets = [ball(4.5, (0, s * 147, 236)) for s in (-1, 1)]
-    solid = cut(union(body, *bands, *ears), rod((0, 0, 8), (0, 0, 252), 97.5, 134.2))
-    return place(union(solid, bail, grip, words, *rivets), turn=(0, -20, 0))
+    solid = cut(union(body, *bands, *ears), post(8, 252, 97.5, 134.2))
+    return union(solid, bail, grip, words, *rivets)
 
 
+@upright(1.75)
 def lighting_candles() -> Solid:
     """Five burning candles of different height and girth, in cups on a narrow holder 250 mm long."""
     holder = union(block(34, 250, 12, 3, (0, 0, 6)), *(block(44, 14, 8, 2, (0, s * 84, 4)) for s in (-1, 1)))
@@ -110,25 +117,27 @@ def _candle(radius: float, height: float) -> Solid:
         angle = 1.11 + 1.31 * k + 0.03 * height
         x, y = (radius - 0.4) * float(np.cos(angle)), (radius - 0.4) * float(np.sin(angle))
         runs.append(rod((x, y, height - 4), (x, y, height - 16 - 9 * ((k * 3) % 4)), 2.6, 3.4, rounded=True))
-    wick = rod((0, 0, height - 8), (0, 0, height + 10), 1.6)
+    wick = post(height - 8, height + 10, 1.6)
     flame = ((0.6, 4), (4.5, 8), (6.6, 15), (4.6, 25), (0.6, 38))
     flame_side = curve([(radius, height + above) for radius, above in flame], 6)
     return union(body, *runs, wick, lathe(flame_side, segments=SMALL_SEGMENTS))
 
 
+@upright(2.4, (0, -90, 0), (0, 0, 16), (0, -5, 0))
 def duct_tape() -> Solid:
     """Roll of tape, 128 x 50 mm, on a cardboard core, its end lifted; stood on edge with the hole to the viewer."""
     turns = lathe([(64, 0), (64, 50)], 0.6)
-    core = cut(rod((0, 0, -0.6), (0, 0, 50.6), 41), rod((0, 0, -2), (0, 0, 53), 38))
+    core = cut(post(-0.6, 50.6, 41), post(-2, 53, 38))
     rings = [(r, z) for r in range(45, 63, 4) for z in (-0.7, 49.1)]
-    windings = [cut(rod((0, 0, z), (0, 0, z + 1.6), r + 0.8), rod((0, 0, -3), (0, 0, 55), r)) for r, z in rings]
+    windings = [cut(post(z, z + 1.6, r + 0.8), post(-3, 55, r)) for r, z in rings]
     bent = np.linspace(-1.4, 0.15, 24)
     reach = 64.0 + 30 * np.clip(bent + 0.5, 0, 1) ** 2
     end = stroke(np.stack([reach * np.cos(bent), reach * np.sin(bent)], axis=1), 1.4).extrude(50)
-    roll = union(cut(union(turns, end), rod((0, 0, -2), (0, 0, 53), 40)), core, *windings)
-    return place(roll.translate((0, 0, -25)), turn=(0, -90, 0)).rotate((0, 0, 16)).rotate((0, -5, 0))
+    roll = union(cut(union(turns, end), post(-2, 53, 40)), core, *windings)
+    return roll.translate((0, 0, -25))
 
 
+@upright(3.0, (32, 0, 0), (0, 4, 4))
 def banana() -> Solid:
     """Banana, about 190 mm along its bend: five blunt edges, a stalk and a dark tip."""
     bend = np.linspace(np.radians(-38), np.radians(46), 61)
@@ -159,20 +168,22 @@ def banana() -> Solid:
     rings = path[:, None, :] + (reach * np.cos(angle))[:, :, None] * across[:, None, :]
     rings = rings + (reach * np.sin(angle))[:, :, None] * above[:, None, :]
     tip = rod(tuple(path[0]), tuple(path[0] + 0.6 * (path[0] - path[2])), 3.4, 2.8)
-    return place(union(skin(rings), tip), turn=(32, 0, 0)).rotate((0, 4, 4))
+    return union(skin(rings), tip)
 
 
+@upright(4.0, (4, -2, 0))
 def marker() -> Solid:
     """Felt marker, 18 x 132 mm, its cap off at the writing end: stepped barrel, chisel tip, end plug."""
     side = [(7.6, 0), (8.6, 1), (8.6, 3), (9, 4), (9, 84), (8.4, 86), (8.4, 94), (5.6, 100), (5.2, 116), (3.4, 120)]
     barrel = lathe(side)
-    tip = cut(rod((0, 0, 118), (0, 0, 131), 2.9, 2.7), place(block(12, 12, 10), (-4, 0, 131), (0, 40, 0)))
+    tip = cut(post(118, 131, 2.9, 2.7), place(block(12, 12, 10), (-4, 0, 131), (0, 40, 0)))
     label = wrapped(rectangle(52, 64), 9, 44, 0.3)
     words = wrapped(text_section("MARKER", 54).rotate(90), 9.2, 44, 0.6)
     grooves = [ring(9, 0.45, z) for z in (7, 9, 11, 80)]
-    return place(union(cut(barrel, *grooves), tip, label, words), turn=(4, -2, 0))
+    return union(cut(barrel, *grooves), tip, label, words)
 
 
+@upright(4.2, (4, -2, 0))
 def pen() -> Solid:
     """Retractable ballpoint, 12 x 145 mm: push button, clip, ribbed rubber grip and a fine point."""
     rib = ((0, 0), (0.5, 1), (1.3, 1), (1.8, 0))
@@ -197,9 +208,10 @@ def pen() -> Solid:
     button = lathe([(3, 128), (3, 140), (2.3, 142)], 0.4, SMALL_SEGMENTS)
     foot = block(5, 4.2, 5, 0.8, (-6.4, 0, 127.5))
     clip = union(block(2.2, 4.2, 52, 0.8, (-8.4, 0, 104)), foot, ball(2.2, (-7.6, 0, 79)))
-    return place(union(barrel, button, clip), turn=(4, -2, 0))
+    return union(barrel, button, clip)
 
 
+@upright(4.9, (5, -3, 0))
 def chalk_stick() -> Solid:
     """Stick of chalk, 14 x 84 mm: tapered, one end broken off, the other worn to a slope, a few chips."""
     body = lathe([(6.6, 0), (7.0, 0.6), (5.9, 83), (5.2, 84)], segments=72)
@@ -208,9 +220,10 @@ def chalk_stick() -> Solid:
     broken = [place(block(18, 18, 8), (x, y, -3.2), turn) for x, y, turn in breaks]
     places = ((-1, 0.2, 22), (0.6, 0.8, 40), (0.3, -0.95, 61), (-0.7, -0.7, 70))
     chips = [ball(2.2, (8.1 * c, 8.1 * s, z)) for c, s, z in places]
-    return place(cut(body, worn, *broken, *chips), turn=(5, -3, 0))
+    return cut(body, worn, *broken, *chips)
 
 
+@drawn(2.55, (0, 12, 0))
 def eyeglasses() -> Solid:
     """Spectacles, 140 mm wide, on open temples: rims with lenses, bridge, nose pads, hinges, hooked ear ends."""
     rim = superellipse(56, 46, 2.6, 96)
@@ -228,9 +241,10 @@ def eyeglasses() -> Solid:
             tube(curve([(side * x, y, z) for x, y, z in arm]), 0.9, up=(1, 0, 0), sides=12),
         ]
     parts.append(tube(curve([(-9, 6, 0), (-4, 9.5, 1), (4, 9.5, 1), (9, 6, 0)]), 2.3, flatten=1.2, sides=20))
-    return place(facing(union(*parts)), turn=(0, 12, 0))
+    return union(*parts)
 
 
+@upright(4.9, (0, -3, 0))
 def battery() -> Solid:
     """Round cell, 26 x 50 mm, tipped to show its positive nub: crimped collar, sleeve with lettering."""
     body = lathe(
@@ -251,9 +265,10 @@ def battery() -> Solid:
     collar = union(ring(12.9, 0.45, 36), ring(12.9, 0.45, 34.8), ring(8, 0.5, 47.3))
     lines = [wrapped(rectangle(30, 1.2), 13, z, 0.45) for z in (15, 29)]
     words = union(*lettered(13, 0.5, ("+", 9, 41), ("-", 7, 6), ("BATTERY", 32, 22)), *lines)
-    return place(union(body, nub, collar, words), turn=(0, -3, 0))
+    return union(body, nub, collar, words)
 
 
+@drawn(4.2, (0, -1, 2))
 def battery_case() -> Solid:
     """Open holder with four cells head to tail, 66 x 60 x 18 mm: springs, contact tabs, ribs and two leads."""
     tray = cut(block(68, 64, 17, 1.2), block(62, 60.5, 17, 0.5, (0, 0, 3)))
@@ -269,7 +284,7 @@ def battery_case() -> Solid:
         cells += [cell, stem, plus, *spring, block(1.4, 9, 11, 0, (side * 31, y, 2))]
     leads = [tube(curve([(30, y, -4), (37, y, -4), (41, y + 5, -3), (42, 20 + y, 0)]), 1.3, sides=20) for y in (6, 12)]
     clips = [block(8, 4, 5, 1, (x, s * 31, 8)) for x in (-16, 16) for s in (-1, 1)]
-    return place(facing(union(tray, *walls, *cells, *leads, *clips)), turn=(0, -1, 2))
+    return union(tray, *walls, *cells, *leads, *clips)
 
 
 def _carton(width: float, height: float, depth: float, lines: list[tuple[str, float, float]], *art: Solid) -> Solid:
@@ -283,23 +298,26 @@ def _carton(width: float, height: float, depth: float, lines: list[tuple[str, fl
     return union(block(width, height, depth, 0.8), face, face.rotate((0, 180, 0)), *flaps, seam)
 
 
+@drawn(1.75, (0, 0, 3))
 def cracker_box() -> Solid:
     """Cracker carton, 160 x 213 x 60 mm, with its name and three pricked crackers in relief."""
     pricked = disc(22)
     for hole in ((4.5 * i, 4.5 * j) for i in (-2, 0, 2) for j in (-2, 0, 2)):
         pricked = pricked - disc(1.6, hole)
     crackers = [plate(pricked.rotate(14 * k), 4).translate((47.0 * k, -35 - 9 * (k % 2), 0)) for k in (-1, 0, 1)]
-    return place(facing(_carton(160, 213, 60, [("CRACKERS", 138, 62), ("CRISP", 70, 28)], *crackers)), turn=(0, 0, 3))
+    return _carton(160, 213, 60, [("CRACKERS", 138, 62), ("CRISP", 70, 28)], *crackers)
 
 
+@drawn(2.1, (0, 0, 2))
 def sugar_box() -> Solid:
     """Sugar carton, 89 x 176 x 40 mm, with a pouring flap drawn out at its side."""
     flap = place(plate(polygon([(0, 0), (24, 0), (15, 17), (6, 17)]), 22), (44, 48, 0), (0, 0, -62))
     cubes = [block(17, 17, 5, 1, (x, y, 0)).rotate((0, 0, 4)) for x, y in ((-20, -56), (0, -56), (20, -56), (-10, -37))]
     body = _carton(89, 176, 40, [("SUGAR", 74, 38), ("PURE", 40, 6)], *cubes)
-    return place(facing(union(body, flap)), turn=(0, 0, 2))
+    return union(body, flap)
 
 
+@drawn(2.7, (0, -1.5, 3))
 def pudding_box() -> Solid:
     """Pudding carton, 112 x 90 x 36 mm, with a filled glass in relief."""
     half = [(16, 20), (11, -4), (3, -8), (3, -16), (11, -20)]
@@ -307,9 +325,10 @@ def pudding_box() -> Solid:
     cream = plate(disc(7, (-7, 20)) + disc(8, (4, 22)) + disc(4, (0, 30)), 5)
     art = [solid.translate((30, -10, 0)) for solid in (glass, cream)]
     body = _carton(112, 90, 36, [("PUDDING", 92, 29), ("MILK", 38, -2)], *art)
-    return place(facing(body), turn=(0, -1.5, 3))
+    return body
 
 
+@drawn(3.3, (0, -1.5, -3))
 def gelatin_box() -> Solid:
     """Gelatin carton, 88 x 73 x 29 mm, with a moulded jelly in relief."""
     mould = plate(polygon([(-24, 0), (24, 0), (20, 9), (11, 20), (-11, 20), (-20, 9)], 3), 5)
@@ -317,9 +336,10 @@ def gelatin_box() -> Solid:
     dish = plate(rectangle(62, 4, 1.9, (0, -2)), 5)
     art = [solid.translate((0, -25, 0)) for solid in (mould, dish, *ribs)]
     body = _carton(88, 73, 29, [("GELATIN", 72, 18)], *art)
-    return place(facing(body), turn=(0, -1.5, -3))
+    return body
 
 
+@upright(2.1, (0, -0.4, 2))
 def wood_block() -> Solid:
     """Square timber block, 85 x 85 x 200 mm, with drying cracks, grain on its ends and one chamfered corner."""
     body = block(85, 85, 200, 1.5)
@@ -330,9 +350,10 @@ def wood_block() -> Solid:
     ends = [solid.translate((6, -4, s * 100)) for solid in grain for s in (-1, 1)]
     knot = rod((-39, -12, 30), (-46, -12, 30), 9)
     chipped = place(block(20, 20, 40), (-42, 42, 96), (0, 30, 45))
-    return place(cut(body, *cracks, *sides, *ends, knot, chipped), turn=(0, -0.4, 2))
+    return cut(body, *cracks, *sides, *ends, knot, chipped)
 
 
+@upright(1.65, (0, 0, 90), (0, 14, 0))
 def open_book() -> Solid:
     """Open book standing on its lower edge, 2 x 150 x 215 mm: bowed page blocks between boards."""
     spread = 24.0  # degrees by which each leaf turns towards the reader
@@ -345,14 +366,15 @@ def open_book() -> Solid:
     lines = ((182, 60), *((164 - 11 * k, 98 - 7 * (k % 3)) for k in range(11)), (43, 50))
     drawn = [(z, inked ^ rectangle(width, 60, 0, (28 + width / 2, 0))) for z, width in lines]
     text = [line.extrude(3.4).translate((0, 0, z)).rotate((0, 0, spread)) for z, line in drawn]
-    spine = rod((0, -1.5, -5), (0, -1.5, 210), 4)
+    spine = post(-5, 210, 4, at=(0, -1.5))
     left = union(pages.extrude(205), cover).rotate((0, 0, spread)).mirror((1, 0, 0))
     printed = [line.mirror((1, 0, 0)) for line in text]
     ribbon = stroke([(0, 14), (9, 22), (13, 26)], 1.6).extrude(150).translate((0, 0, -22))
     book = union(right, left, spine, ribbon, *printed)
-    return place(book, turn=(0, 0, 90)).rotate((0, 14, 0))
+    return book
 
 
+@upright(1.27, (0, -9, 6))
 def magazine_stack() -> Solid:
     """Ten slightly rotated magazines, 212 x 280 mm, thick and thin, the topmost with its cover curling up."""
     turns = (3, -5, 8, -2, -9, 6, 1, -7, 11, -4)
@@ -369,9 +391,10 @@ def magazine_stack() -> Solid:
     photo = place(block(110, 150, 2.0, 0), (22, 8, base), (0, 0, -4))
     curl = curve([(-40, 0), (20, 1), (70, 8), (104, 26), (112, 36)])
     cover = place(stroke(curl, 1.4).extrude(280), (2, 144, base), (90, 0, -4))
-    return place(union(*magazines, title, photo, cover), turn=(0, -9, 6))
+    return union(*magazines, title, photo, cover)
 
 
+@upright(1.0)
 def wooden_boards() -> Solid:
     """Planks at full size: a low pile running away from the camera and five taller planks leaning back behind it."""
     pile = []

@@ -6,12 +6,14 @@ where the camera stands at the first view. *Drawn* solids (scissors, lettering) 
 viewer sees them, z towards the viewer, and :func:`facing` stands them up. Source: own.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial, reduce
 from itertools import pairwise
 from typing import TypeAlias
 
 import numpy as np
 from manifold3d import CrossSection, JoinType, Manifold, Mesh64, OpType
+from numpy.typing import ArrayLike
 
 Solid: TypeAlias = Manifold
 Section: TypeAlias = CrossSection
@@ -21,6 +23,8 @@ Points: TypeAlias = Sequence[Sequence[float]] | np.ndarray
 Level = tuple[float, float, float, float]
 """Height, size along y, size along x, and power of a superellipse."""
 
+DRAWINGS: dict[str, Callable[[], Solid]] = {}
+"""What makes each object, by its name, as it stands in the scene, in mm."""
 GRID_MM = 2.0**-14
 """Solids are put on this grid before they are joined or cut, so that booleans decide alike on every processor."""
 SEGMENTS = 120  # round a turned part: chord error 0.05 mm at a radius of 150 mm, a fifteenth of a pixel at 1.8 m
@@ -62,6 +66,23 @@ def facing(solid: Solid) -> Solid:
 def laid(solid: Solid) -> Solid:
     """An upright solid laid into the drawing frame, its front towards the viewer: the inverse of :func:`facing`."""
     return solid.rotate((0, 0, 90)).rotate((-90, 0, 0))
+
+
+def upright(
+    enlarged: float, *turns: Point3, stood: Callable[[Solid], Solid] = lambda solid: solid
+) -> Callable[[Callable[[], Solid]], Callable[[], Solid]]:
+    """Make an object of a function that draws an upright solid at its real size: it stands in the scene turned by
+    degrees about x, then y, then z, by one of ``turns`` after the other, and ``enlarged``."""
+
+    def add(draw: Callable[[], Solid]) -> Callable[[], Solid]:
+        DRAWINGS[draw.__name__] = lambda: reduce(Solid.rotate, turns, stood(draw())).scale((enlarged,) * 3)
+        return draw
+
+    return add
+
+
+drawn = partial(upright, stood=facing)
+"""The same of a function that draws a solid as the viewer sees it (`facing`)."""
 
 
 def embossed(body: Solid, section: Section, relief: float) -> Solid:
@@ -160,6 +181,11 @@ def rod(start: Point3, end: Point3, radius: float, end_radius: float | None = No
     return place(Manifold.cylinder(length, radius, last, segments_for(max(radius, last))), start, (0, polar, azimuth))
 
 
+def post(low: float, high: float, radius: float, end_radius: float | None = None, at: Point2 = (0, 0)) -> Solid:
+    """A `rod` along z, from height ``low`` to ``high``."""
+    return rod((*at, low), (*at, high), radius, end_radius)
+
+
 def block(width: float, depth: float, height: float, soften: float = 0.0, at: Point3 = (0, 0, 0)) -> Solid:
     """Box of size x, y, z centred at ``at``, edges and corners rounded to ``soften``."""
     if soften <= 0:
@@ -175,18 +201,29 @@ def curve(points: Points, per_span: int = 10) -> np.ndarray:
     control = np.asarray(points, dtype=np.float64)
     padded = np.concatenate([2 * control[:1] - control[1:2], control, 2 * control[-1:] - control[-2:-1]])
     knots = np.concatenate([[0.0], np.cumsum(np.sqrt(np.linalg.norm(np.diff(padded, axis=0), axis=1)))])
-    spans = []
-    for i in range(1, len(padded) - 2):
-        t = np.linspace(knots[i], knots[i + 1], per_span, endpoint=False)[:, None]
-        t0, t1, t2, t3 = knots[i - 1 : i + 3]
-        p0, p1, p2, p3 = padded[i - 1 : i + 3]
-        a1 = ((t1 - t) * p0 + (t - t0) * p1) / (t1 - t0)
-        a2 = ((t2 - t) * p1 + (t - t1) * p2) / (t2 - t1)
-        a3 = ((t3 - t) * p2 + (t - t2) * p3) / (t3 - t2)
-        b1 = ((t2 - t) * a1 + (t - t0) * a2) / (t2 - t0)
-        b2 = ((t3 - t) * a2 + (t - t1) * a3) / (t3 - t1)
-        spans.append(((t2 - t) * b1 + (t - t1) * b2) / (t2 - t1))
-    return np.concatenate([*spans, control[-1:]])
+    t = np.linspace(knots[1:-2], knots[2:-1], per_span, endpoint=False, axis=1)[..., None]
+    count = len(control) - 1
+
+    def between(first: np.ndarray, second: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+        return ((high - t) * first + (t - low) * second) / (high - low)
+
+    t0, t1, t2, t3 = (knots[k : k + count, None, None] for k in range(4))
+    p0, p1, p2, p3 = (padded[k : k + count, None] for k in range(4))
+    middle = between(p1, p2, t1, t2)
+    before = between(between(p0, p1, t0, t1), middle, t0, t2)
+    behind = between(middle, between(p2, p3, t2, t3), t1, t3)
+    return np.concatenate([between(before, behind, t1, t2).reshape(-1, control.shape[1]), control[-1:]])
+
+
+def symmetric(half: Points) -> np.ndarray:
+    """Outline through ``half`` (N, 2), which starts or ends on x = 0, and its mirror image: a `curve` through each."""
+    mirrored = np.asarray(half, dtype=np.float64)[::-1] * (-1.0, 1.0)
+    return np.concatenate([curve(half), curve(mirrored)[1:]])
+
+
+def cushioned(section: Section, thickness: float, inset: float, middle: float) -> Solid:
+    """The section as a plate that is ``middle`` mm thick where it is ``inset`` mm from its edge."""
+    return union(plate(section, thickness), plate(section.offset(-inset), middle))
 
 
 def skin(rings: np.ndarray, closed: bool = False) -> Solid:
@@ -245,10 +282,15 @@ def loft(levels: Points, smooth: int = 0, sides: int = 120) -> Solid:
 
 
 def tube(
-    path: Points, radius: float, flatten: float = 1.0, up: Point3 = (0, 0, 1), closed: bool = False, sides: int = 32
+    path: Points,
+    radius: ArrayLike,
+    flatten: float = 1.0,
+    up: Point3 = (0, 0, 1),
+    closed: bool = False,
+    sides: int = 32,
 ) -> Solid:
-    """Round (or, with ``flatten`` other than 1, oval) bar along a path (N, 3). ``up`` fixes how an oval section lies:
-    its radius towards ``up`` is ``flatten`` times the one across."""
+    """Round (or, with ``flatten`` other than 1, oval) bar along a path (N, 3), of one ``radius`` or of one at each
+    point (N,). ``up`` fixes how an oval section lies: its radius towards ``up`` is ``flatten`` times the one across."""
     points = np.asarray(path, dtype=np.float64)
     if closed:
         tangents = np.roll(points, -1, axis=0) - np.roll(points, 1, axis=0)
@@ -261,7 +303,8 @@ def tube(
     angle = angles(sides)[None, :, None]
     ring_across = np.cos(angle) * across[:, None, :]
     ring_above = flatten * np.sin(angle) * above[:, None, :]
-    return skin(points[:, None, :] + float(radius) * (ring_across + ring_above), closed)
+    reach = np.asarray(radius, dtype=np.float64).reshape(-1, 1, 1)
+    return skin(points[:, None, :] + reach * (ring_across + ring_above), closed)
 
 
 _GLYPHS = {
@@ -296,8 +339,8 @@ _GLYPHS = {
 _ROWS, _ADVANCE = 7, 6
 
 
-def text_section(text: str, width: float) -> Section:
-    """The text as a flat section, ``width`` mm wide, centred at the origin; cells overlap a little where they meet."""
+def text_section(text: str, width: float, at: Point2 = (0, 0)) -> Section:
+    """The text as a flat section, ``width`` mm wide, centred at ``at``; cells overlap a little where they meet."""
     runs = []
     for place, letter in enumerate(text):
         for row, digit in enumerate(_GLYPHS[letter]):
@@ -308,7 +351,7 @@ def text_section(text: str, width: float) -> Section:
     section = CrossSection.batch_boolean(runs, OpType.Add)
     cells_wide = len(text) * _ADVANCE - 1
     scale = width / cells_wide
-    return section.translate((-cells_wide / 2, -_ROWS / 2)).scale((scale, scale))
+    return section.translate((-cells_wide / 2, -_ROWS / 2)).scale((scale, scale)).translate(at)
 
 
 def text_plate(text: str, width: float, relief: float) -> Solid:

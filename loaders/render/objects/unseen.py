@@ -16,23 +16,26 @@ from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
     curve,
     cut,
     disc,
-    facing,
+    drawn,
     lathe,
     on_grid,
     place,
     plate,
     polygon,
+    post,
     rectangle,
     rod,
     skin,
     tube,
     union,
+    upright,
 )
 
 _ADD = OpType.Add
 _TO_CAMERA = (0, -90, 0)  # turns a lathe so that its top points to the camera of the first view
 
 
+@upright(1.0, (0, 0, 90), (18, 4, 0))
 def v_groove() -> Solid:
     """A block with a groove of 90 degrees and one of 60 beside it, 380 x 300 mm."""
     outline = polygon(
@@ -49,33 +52,37 @@ def v_groove() -> Solid:
             (-190, 160),
         ]
     )
-    return place(outline.extrude(300), turn=(0, 0, 90)).rotate((18, 4, 0))
+    return outline.extrude(300)
 
 
+@upright(1.0, _TO_CAMERA, (0, 6, 9))
 def concave_dish() -> Solid:
     """A deep paraboloid with a flat rim, 400 mm across, open to the first view."""
     radius = np.linspace(14, 176, 24)
     front = np.column_stack([radius, radius * radius / 190])
     profile = [*(front - (0, 11))[:-1], (178, 152), (204, 152), (204, 163.5), *front[::-1]]
-    return place(lathe(profile), turn=_TO_CAMERA).rotate((0, 6, 9))
+    return lathe(profile)
 
 
+@upright(1.0, (3, 4, 0))
 def hinged_leaves() -> Solid:
     """Two boards at 70 degrees, like a book that stands open, and the rod that they turn about."""
     leaves = [
         place(block(12, width, 330, 2, (0, side * width / 2, 0)), turn=(0, 0, side * 55))
         for side, width in ((1, 250), (-1, 210))
     ]
-    return place(union(*leaves, rod((0, 0, -165), (0, 0, 165), 11)), turn=(3, 4, 0))
+    return union(*leaves, post(-165, 165, 11))
 
 
+@upright(1.0, (6, -4, 0))
 def step_wedge() -> Solid:
     """Eight steps of 12 to 40 mm, 300 mm wide."""
     rises = np.cumsum([12, 40, 16, 36, 20, 32, 24, 28]).tolist()
     steps = [block(rise, 300, 44, 0, (-rise / 2, 0, 44 * (3.5 - k))) for k, rise in enumerate(rises)]
-    return place(union(*steps, block(40, 300, 352, 0, (18, 0, 0))), turn=(6, -4, 0))
+    return union(*steps, block(40, 300, 352, 0, (18, 0, 0)))
 
 
+@upright(1.0, (2, 3, 20))
 def stair_tower() -> Solid:
     """Twelve sectors that climb 38 mm each about a column."""
     treads = []
@@ -83,16 +90,18 @@ def stair_tower() -> Solid:
         turn = 2 * np.pi * (k + np.linspace(0, 1.02, 6)) / 12
         arc = np.column_stack([np.cos(turn), np.sin(turn)]) * 130
         treads.append(polygon([(0, 0), *arc]).extrude(60 + 38 * k))
-    return place(union(*treads, lathe([(38, 0), (38, 560), (20, 590)])), turn=(2, 3, 20))
+    return union(*treads, lathe([(38, 0), (38, 560), (20, 590)]))
 
 
+@drawn(1.0, (0, 5, 0))
 def thin_fin() -> Solid:
     """A bent sheet 5 mm thick with a swept outline, on a foot."""
     outline = polygon([*curve([(-160, -170), (-110, -40), (-20, 90), (90, 190)]), (170, 190), (150, 20), (130, -170)])
     sheet = _bent(plate(outline, 5), lambda x, y: 55 * (x / 160) ** 2 - 30 * (y / 180) ** 2)
-    return place(facing(union(sheet, block(311, 91, 83, 6, (-4, -163, 3)))), turn=(0, 5, 0))
+    return union(sheet, block(311, 91, 83, 6, (-4, -163, 3)))
 
 
+@upright(1.0)
 def wire_loop() -> Solid:
     """A closed wire, 20 mm thick, that swings to and fro in three directions."""
     turn = angles(360)
@@ -100,24 +109,27 @@ def wire_loop() -> Solid:
     return tube(path, 10, up=(1, 0.3, 0.2), closed=True, sides=20)
 
 
+@upright(1.0, (1, 2, 20))
 def tall_column() -> Solid:
     """A fluted column on a square base, 660 mm."""
     shaft = lathe([(66, 0), (66, 12), (58, 24), (56, 60), (48, 560), (56, 576), (70, 596), (70, 610)], 2)
     flutes = [rod((60 * x, 60 * y, 64), (52 * x, 52 * y, 548), 8, rounded=True) for x, y in around(16)]
     ends = [block(150, 150, 30, 3, (0, 0, -14)), block(160, 160, 24, 3, (0, 0, 620))]
-    return place(union(cut(shaft, *flutes), *ends), turn=(1, 2, 20))
+    return union(cut(shaft, *flutes), *ends)
 
 
+@drawn(1.0, (9, 12, 0))
 def gear() -> Solid:
     """A gear of 18 teeth with a hub, six lightening holes and a keyway, 390 mm across."""
     tooth = polygon([(150, -22), (174, -18), (194, -9), (194, 9), (174, 18), (150, 22)])
     wheel = CrossSection.batch_boolean([disc(160), *(tooth.rotate(20 * k) for k in range(18))], _ADD)
-    body = cut(plate(wheel, 56), *(rod((98 * x, 98 * y, -40), (98 * x, 98 * y, 40), 30) for x, y in around(6)))
+    body = cut(plate(wheel, 56), *(post(-40, 40, 30, at=(98 * x, 98 * y)) for x, y in around(6)))
     hub = lathe([(62, -46), (62, 40), (54, 48)], 1)
-    bore = union(rod((0, 0, -80), (0, 0, 80), 26), block(16, 66, 160, 0, (0, 0, 0)))
-    return place(facing(cut(union(body, hub), bore)), turn=(9, 12, 0))
+    bore = union(post(-80, 80, 26), block(16, 66, 160, 0, (0, 0, 0)))
+    return cut(union(body, hub), bore)
 
 
+@upright(1.0)
 def turbine_blade() -> Solid:
     """A twisted and tapered aerofoil on a root with three ribs, 560 mm."""
     along = np.concatenate([np.linspace(0, 1, 40), np.linspace(1, 0, 40)[1:-1]])
@@ -136,6 +148,7 @@ def turbine_blade() -> Solid:
     return union(skin(np.array(rings)), *root)
 
 
+@upright(1.0)
 def blob() -> Solid:
     """A smooth body like a bust: the level set of a sum of eight fading bumps."""
     bumps = (
@@ -161,21 +174,24 @@ def blob() -> Solid:
     return cut(body, block(600, 600, 200, 0, (0, 0, -280)))
 
 
+@drawn(1.0, (8, 0, 5))
 def saddle() -> Solid:
     """A hyperbolic paraboloid 14 mm thick, 380 x 360 mm."""
     sheet = _bent(block(380, 360, 14), lambda x, y: 75 * (x * x - y * y) / 190**2)
-    return place(facing(sheet), turn=(8, 0, 5))
+    return sheet
 
 
+@drawn(1.0, (3, 5, 0))
 def wave_plate() -> Solid:
     """A corrugated sheet: waves of 95 mm at a slant, with lower ones across."""
     sheet = _bent(
         block(360, 380, 16),
         lambda x, y: 22 * np.sin(2 * np.pi * (x + 0.35 * y) / 95) + 9 * np.sin(2 * np.pi * y / 210),
     )
-    return place(facing(sheet), turn=(3, 5, 0))
+    return sheet
 
 
+@upright(1.0)
 def sphere_pair() -> Solid:
     """Two balls that touch, and a third behind them."""
     centres = ((0, -92, -30, 112), (-30, 98, 20, 78), (40, 30, 130, 72))
@@ -183,14 +199,16 @@ def sphere_pair() -> Solid:
     return union(*(Manifold.sphere(radius, 96).translate((x, y, z)) for x, y, z, radius in centres), *rods)
 
 
+@upright(1.0, (7, -10, 0))
 def cone_stack() -> Solid:
     """Five cones on top of each other, each smaller, like a fir."""
     profile = [(60, 0), (60, 30)]
     for k in range(5):
         profile += [(170 - 30 * k, 40 + 84 * k), (62 - 12 * k, 124 + 84 * k)]
-    return place(lathe([*profile[:-1], (3, 500)], 1), turn=(7, -10, 0))
+    return lathe([*profile[:-1], (3, 500)], 1)
 
 
+@upright(1.0, (28, 22, 15))
 def hollow_cube() -> Solid:
     """The frame of a cube of 280 mm, and the sphere that its beams hold."""
     windows = [block(400, 200, 200), block(200, 400, 200), block(200, 200, 400)]
@@ -199,41 +217,36 @@ def hollow_cube() -> Solid:
         for way in ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
     ]
     body = union(cut(block(280, 280, 280, 6), *windows), *beams, Manifold.sphere(70, 64))
-    return place(body, turn=(28, 22, 15))
+    return body
 
 
+@drawn(1.0, (6, 0, 4))
 def perforated_plate() -> Solid:
     """A bent plate with 42 round holes of growing radius."""
     holes = [disc(8 + 1.1 * (i + j), (54 * i - 162, 58 * j - 145)) for i in range(7) for j in range(6)]
     section = rectangle(400, 360, 20) - CrossSection.batch_boolean(holes, _ADD)
-    return place(facing(_bent(plate(section, 16), lambda x, y: -50 * (x / 200) ** 2)), turn=(6, 0, 4))
+    return _bent(plate(section, 16), lambda x, y: -50 * (x / 200) ** 2)
 
 
+@upright(1.0, (0, 10, 14))
 def torus_knot() -> Solid:
     """A trefoil knot of a bar 56 mm thick."""
     turn = angles(300)
     ring = 118 + 58 * np.cos(3 * turn)
     path = np.column_stack([85 * np.sin(3 * turn), ring * np.cos(2 * turn), ring * np.sin(2 * turn)])
-    return place(tube(path, 28, up=(1, 0, 0), closed=True, sides=40), turn=(0, 10, 14))
+    return tube(path, 28, up=(1, 0, 0), closed=True, sides=40)
 
 
+@upright(1.0, (15, 0, 30))
 def spiral_shell() -> Solid:
     """A horn that winds out of its tip in two and a half turns, each wider."""
     share = np.linspace(0, 1, 150)
     turn, growth = 2 * np.pi * 2.5 * share, 0.16 * 6.25**share
     path = np.column_stack([190 * growth * np.cos(turn), 190 * growth * np.sin(turn), 330 * (1 - growth)])
-    tangents = np.gradient(path, axis=0)
-    tangents /= np.sqrt((tangents**2).sum(axis=1, keepdims=True))
-    across = np.cross([0, 0, 1], tangents)
-    across /= np.sqrt((across**2).sum(axis=1, keepdims=True))
-    above = np.cross(tangents, across)
-    turn = angles(48)[None, :, None]
-    reach = (84 * growth)[:, None, None]
-    return place(
-        skin(path[:, None] + reach * (np.cos(turn) * across[:, None] + np.sin(turn) * above[:, None])), turn=(15, 0, 30)
-    )
+    return tube(path, 84 * growth, sides=48)
 
 
+@drawn(1.0, (5, 7, 4))
 def honeycomb() -> Solid:
     """A plate of 31 hexagonal cells, 55 mm deep, closed at the back."""
     cell = CrossSection.circle(36, 6)
@@ -241,7 +254,7 @@ def honeycomb() -> Solid:
     spots = [(60 * i, 69.282 * (j + i / 2)) for i, j in steps]
     outline = CrossSection.batch_boolean([CrossSection.circle(47, 6).translate(spot) for spot in spots], _ADD)
     cells = [cell.extrude(100).translate((*spot, -20)) for spot in spots]
-    return place(facing(cut(plate(outline, 64), *cells)), turn=(5, 7, 4))
+    return cut(plate(outline, 64), *cells)
 
 
 def _bent(sheet: Solid, height: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Solid:

@@ -6,24 +6,24 @@ import numpy as np
 import pytest
 from conftest import tiny_settings
 
-from fpp_ml_bench.baselines.diagnostics.counterfactual_scenes import (
+from fpp_ml_bench.baselines.diagnostics.scenes import (
     LARGEST_SHIFT_RAD,
-    chosen_samples,
-    counterfactuals,
-    original,
-)
-from fpp_ml_bench.baselines.diagnostics.scene_renderer import (
+    ONE_SURFACE_MM,
     PITCH_FACTOR,
     Scene,
     SceneRenderer,
+    chosen_samples,
+    counterfactuals,
     direct_light,
     layer_of,
     moved,
-    normals_of_depth,
+    original,
     plane,
 )
-from fpp_ml_bench.baselines.phase.carriers import Carriers
+from fpp_ml_bench.baselines.phase.calibration_layer import Carriers
+from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
+from fpp_ml_bench.loaders.captures.exports import pixel_normals
 from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.render.light import named_light
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -38,8 +38,17 @@ def renderer(opened):
 
 
 @pytest.fixture(scope="module")
-def scenes(opened, renderer):
-    return counterfactuals(opened, renderer, SAMPLE, "horizontal", [OTHER])
+def sample_scene(opened, renderer):
+    return original(opened, renderer, SAMPLE)
+
+
+@pytest.fixture(scope="module")
+def scenes(opened, renderer, sample_scene):
+    return counterfactuals(renderer, sample_scene, "horizontal", [object_mask(opened.depth_mm(OTHER))])
+
+
+def of_kind(scenes, *kinds):
+    return [variant for variant in scenes if variant.kind in kinds]
 
 
 WORN = (
@@ -62,12 +71,12 @@ def test_an_unchanged_scene_is_the_datasets_own(light, tmp_path):
     assert renderer.lamp == settings.light
     for sample in (SAMPLE, OTHER):
         sample_scene = original(dataset, renderer, sample)
-        frames = renderer.frames(sample_scene.scene, range(len(dataset.sequence)))
+        frames = renderer.frames(sample_scene, range(len(dataset.sequence)))
         for index, frame in enumerate(frames):
             difference = np.abs(frame.astype(int) - dataset.frame(sample, index))
             assert difference.max() <= 1
             assert (difference > 0).sum() <= 5
-        same = sample_scene.target == (dataset.depth_mm(sample) > 0)
+        same = sample_scene.mask == (dataset.depth_mm(sample) > 0)
         assert (~same).sum() <= 1
 
 
@@ -91,22 +100,22 @@ def test_direct_light_keeps_projector_sensor_and_brightness():
     assert direct.camera.exposure == pytest.approx(np.sqrt(low * high)) and direct_light(direct) == direct
 
 
-def test_a_move_shifts_the_phase_and_keeps_outline_and_brightness(opened, renderer, scenes):
-    sample_scene, sequence = scenes.original, opened.sequence
-    before = scenes.layer.at(sample_scene.target).absolute_phase(sample_scene.depth_mm[sample_scene.target])
-    moves = scenes.of_kind("phase", "constant")
+def test_a_move_shifts_the_phase_and_keeps_outline_and_brightness(opened, renderer, sample_scene, scenes):
+    sequence, layer = opened.sequence, layer_of(opened.rig, "horizontal")
+    before = layer.at(sample_scene.mask).absolute_phase(sample_scene.depth_mm[sample_scene.mask])
+    moves = of_kind(scenes, "phase", "constant")
     assert {move.name for move in moves} == {"constant", "ramp across", "ramp down", "bump"}
     near_mm, far_mm = renderer.rig.working_range_mm
     for move in moves:
-        assert ((move.depth_mm > 0) == (sample_scene.depth_mm > 0)).all()
-        object_depths = move.depth_mm[move.depth_mm > 0]
+        assert ((move.scene.depth_mm > 0) == (sample_scene.depth_mm > 0)).all()
+        object_depths = move.scene.depth_mm[move.scene.depth_mm > 0]
         assert near_mm - 1e-6 <= object_depths.min() and object_depths.max() <= far_mm + 1e-6
-        shift = scenes.layer.at(sample_scene.target).absolute_phase(move.depth_mm[sample_scene.target]) - before
+        shift = layer.at(sample_scene.mask).absolute_phase(move.scene.depth_mm[sample_scene.mask]) - before
         assert np.abs(shift).max() <= abs(move.amplitude_rad) + 1e-9 <= LARGEST_SHIFT_RAD + 2e-9
         white = renderer.frames(move.scene, [sequence.white])[sequence.white]
-        np.testing.assert_array_equal(white, renderer.frames(sample_scene.scene, [sequence.white])[sequence.white])
-    bump = next(move for move in scenes.of_kind("light") if move.name == "bump")
-    fringe, unmoved = (renderer.frames(scene, [0])[0] for scene in (bump.scene, sample_scene.scene))
+        np.testing.assert_array_equal(white, renderer.frames(sample_scene, [sequence.white])[sequence.white])
+    bump = next(move for move in of_kind(scenes, "light") if move.name == "bump")
+    fringe, unmoved = (renderer.frames(scene, [0])[0] for scene in (bump.scene, sample_scene))
     assert (fringe != unmoved).any()
 
 
@@ -125,8 +134,7 @@ def test_a_moved_plane_keeps_its_law():
     np.testing.assert_allclose(design @ law, 1 / tilted.depth_m, rtol=1e-9)
     normal = -law / np.linalg.norm(law)
     np.testing.assert_allclose(tilted.normals, np.tile(normal, (surface.x.size, 1)), atol=1e-5)
-    x, y = rig.camera.rays()
-    normals = normals_of_depth(surface.depth_mm(x.shape), x, y)
+    normals = pixel_normals(surface.depth_mm((176, 176)), rig.camera, ONE_SURFACE_MM).reshape(-1, 3)
     np.testing.assert_allclose(normals, surface.normals, atol=1e-9)
 
 
@@ -152,7 +160,7 @@ def test_a_move_shifts_both_carriers_of_crossed_frames_as_a_change_of_depth_does
 def test_crossed_fringes_are_mirrored_and_widened():
     renderer = SceneRenderer(crossed_rig(320))
     surface = plane(renderer.rig, 1.8)
-    scene = Scene(surface.pixels.astype(np.uint32), renderer.light(surface), np.ones(renderer.shape, bool), (0,))
+    scene = Scene(surface, renderer.light(surface), np.ones(renderer.shape, bool), (0,))
     light = {
         name: renderer.frames(replace(scene, projected=name), [0])[0]
         for name in ("sequence", "other direction", "other pitch")
@@ -167,17 +175,16 @@ def test_crossed_fringes_are_mirrored_and_widened():
     assert np.corrcoef(mirrored[0].ravel(), mirrored[1].ravel())[0, 1] > 0.9
 
 
-def test_another_outline_leaves_what_is_kept_as_it_was(renderer, scenes):
-    sample_scene = scenes.original
-    frame = renderer.frames(sample_scene.scene, [0])[0]
-    outline_changes = scenes.of_kind("outline")
+def test_another_outline_leaves_what_is_kept_as_it_was(renderer, sample_scene, scenes):
+    frame = renderer.frames(sample_scene, [0])[0]
+    outline_changes = of_kind(scenes, "outline")
     assert [outline_change.name for outline_change in outline_changes] == [
         "ellipse",
         "another object's outline",
         "grown",
     ]
     for outline_change in outline_changes:
-        unchanged = outline_change.scene.mask & sample_scene.target
+        unchanged = outline_change.scene.mask & sample_scene.mask
         assert unchanged.any() and (outline_change.name == "grown" or (outline_change.scene.mask == unchanged).all())
         changed_frame = renderer.frames(outline_change.scene, [0])[0]
         np.testing.assert_array_equal(changed_frame[unchanged], frame[unchanged])
@@ -185,17 +192,17 @@ def test_another_outline_leaves_what_is_kept_as_it_was(renderer, scenes):
         masked_frame = renderer.frames(outline_change.scene, [0], masked=True)[0]
         assert (masked_frame[~outline_change.scene.mask] == 0).all()
     ellipse, _, grown = outline_changes
-    assert 0.45 < ellipse.scene.mask.sum() / sample_scene.target.sum() < 0.55
-    assert (sample_scene.target <= grown.scene.mask).all() and sample_scene.target.sum() < grown.scene.mask.sum()
+    assert 0.45 < ellipse.scene.mask.sum() / sample_scene.mask.sum() < 0.55
+    assert (sample_scene.mask <= grown.scene.mask).all() and sample_scene.mask.sum() < grown.scene.mask.sum()
 
 
-def test_fringes_are_removed_swapped_and_widened_where_it_says(opened, renderer, scenes):
-    sample_scene, sequence = scenes.original, opened.sequence
-    reprojected = {variant.name: variant.scene for variant in scenes.of_kind("projected")}
+def test_fringes_are_removed_swapped_and_widened_where_it_says(opened, renderer, sample_scene, scenes):
+    sequence = opened.sequence
+    reprojected = {variant.name: variant.scene for variant in of_kind(scenes, "projected")}
     inside = np.zeros(renderer.shape, dtype=bool)
     inside.ravel()[sample_scene.surface.pixels] = True
     steps = [*sequence.sinusoids("horizontal")[:6]]
-    usual = np.stack([renderer.frames(sample_scene.scene, steps)[index] for index in steps]).astype(float)
+    usual = np.stack([renderer.frames(sample_scene, steps)[index] for index in steps]).astype(float)
 
     def swing(name):
         frames = renderer.frames(reprojected[name], steps)
@@ -206,19 +213,19 @@ def test_fringes_are_removed_swapped_and_widened_where_it_says(opened, renderer,
     # The mean of whole periods is half of white light.
     level = renderer.frames(reprojected["no fringe inside"], steps)[steps[0]][inside].astype(float)
     white, black = (
-        renderer.frames(sample_scene.scene, [index])[index][inside].astype(float)
+        renderer.frames(sample_scene, [index])[index][inside].astype(float)
         for index in (sequence.white, sequence.black)
     )
     assert np.median(level - (white + black) / 2) == pytest.approx(0, abs=1.0)
     np.testing.assert_array_equal(swing("no fringe inside")[~inside], np.ptp(usual, axis=0)[~inside])
     np.testing.assert_array_equal(swing("no fringe outside")[inside], np.ptp(usual, axis=0)[inside])
     swapped = renderer.frames(reprojected["other direction"], [0, sequence.white])
-    np.testing.assert_array_equal(swapped[0], renderer.frames(sample_scene.scene, [sequence.steps])[sequence.steps])
+    np.testing.assert_array_equal(swapped[0], renderer.frames(sample_scene, [sequence.steps])[sequence.steps])
     np.testing.assert_array_equal(
-        swapped[sequence.white], renderer.frames(sample_scene.scene, [sequence.white])[sequence.white]
+        swapped[sequence.white], renderer.frames(sample_scene, [sequence.white])[sequence.white]
     )
     column = renderer.frames(reprojected["other pitch"], [0])[0][:, 4].astype(float)
-    plain = renderer.frames(sample_scene.scene, [0])[0][:, 4].astype(float)
+    plain = renderer.frames(sample_scene, [0])[0][:, 4].astype(float)
 
     def period(values):
         return 1 / np.fft.rfftfreq(4096)[np.argmax(np.abs(np.fft.rfft(values - values.mean(), 4096)))]

@@ -1,0 +1,516 @@
+"""First stop: what frames show before any order is chosen. Background, object mask, phase and brightness.
+
+A *measurement model* is one carrier or two, in one frame or a few. With three or more shifted frames the phase is the
+N-step least squares of `fpp_ml_bench.decoding`, pixel by pixel, so that two surfaces are never mixed at a depth edge.
+One frame has more unknowns than grey levels, and a window of neighbours is fitted (`local_fit`). Two frames have one
+equation too few, but a projected fringe goes down to black: its mean is its modulation plus ambient light. With that
+constraint a window of a few px (`Settings.pair_window`) is enough. Three crossed frames shift one carrier and keep the
+other still, which is left in their mean, where the shifted one cancels.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal, get_args
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fpp_ml_bench.baselines.phase.calibration_layer import (
+    LEAST_RANGE_RAD,
+    CalibrationLayer,
+    Carriers,
+    Crop,
+    Image,
+    Mask,
+    Orders,
+    wrapped,
+)
+from fpp_ml_bench.baselines.phase.empty_scene import Background, CrossedEmptyScene, EmptyScene
+from fpp_ml_bench.baselines.phase.local_fit import (
+    CURVED,
+    Demodulator,
+    FringeFit,
+    Window,
+    carrier_fit,
+    fringe_fit,
+    measured_contrast,
+    phase_slopes,
+)
+from fpp_ml_bench.baselines.phase.object_mask import (
+    DARKEST_GREY,
+    RING_PERIODS,
+    continued,
+    crop_around,
+    differs,
+    explained,
+    first_mask,
+    lit_object,
+    modulated_region,
+    object_region,
+    refined,
+    unlit,
+)
+from fpp_ml_bench.baselines.phase.resampling import Periods, Resampling, nearest_inside, repeated, stride_of
+from fpp_ml_bench.coding.code import MIN_MODULATION
+from fpp_ml_bench.coding.crossed import Crossed
+from fpp_ml_bench.coding.phase_shift import choose_steps, wrapped_phase
+from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
+from fpp_ml_bench.decoding.decode import grey_levels
+from fpp_ml_bench.errors import DecodeError, PredictionError
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
+from fpp_ml_bench.options import option
+
+Frames = NDArray | Sequence[NDArray]
+Prior = Literal["none", "standoff"]
+PIXELWISE = 3  # frames from which on every pixel has a phase of its own
+CROSSED_FRAMES = 3  # that shift one carrier
+PAIR_DEGREES = 120.0
+"""Phase shift between two frames: that of the first two of three, so that a third frame completes them."""
+MARGIN_PERIODS = 0.5  # of the crop around the object: covers the windows, and the mask may grow into it
+FRINGE_NOISE = 0.03  # uncertainty of a fringe extrapolated beyond its window, as a share of its brightness
+CONTRAST_ROUNDS, FREE_ROUNDS = 3, 2  # fits that measure the contrast of the fringes, and that use it
+PAIR_ROUNDS = 2  # fits to two frames over the small window
+MOST_SLACK_PERIODS = 0.07
+"""Largest slack of the working range, in periods at its middle: 17 mm of the paper's rig, whose `Settings.slack_mm` is
+15, and 4 mm of a rig whose period is 57 mm deep, where 15 mm would let almost every pixel have a second order."""
+LEAST_CONTRAST = 0.08
+CONTRAST_RIM_PERIODS = 0.5  # grid points this near to the silhouette don't measure the contrast
+MIN_CONFIDENCE = "mask pixels of less confidence, 0 to 1 (default: 0, dense)"
+DIRECTION = "direction of the fringes (default: horizontal)"
+WHITE_GREY = (
+    "for images without a lit background: grey level of a white pattern on a surface that faces the projector at the "
+    "near end of the working range"
+)
+AMBIENT_GREY = (
+    "for images without a lit background: grey level of a surface in ambient light alone (default: the image's darkest)"
+)
+"""Help of options that several methods have."""
+_POSITIVE = "first_window", "second_window", "pair_window", "slope_window", "jump_rad", "shading_spread"
+
+
+@dataclass(frozen=True)
+class Settings:
+    """``direction`` of the fringes and how many ``frames`` of them, 1 to all that are projected; what the choice of
+    the order may use: ``shading`` and ``prior`` ("standoff": objects are near the rig's standoff, true of fixed
+    placement); ``min_confidence``: pixels below it are 0 (0: dense, every object pixel gets a depth). The defaults
+    were chosen on train and validation objects.
+
+    Windows, in fringe periods: of the first fit, of the second, of the last one to two frames, and of the slopes. Costs
+    (no unit): ``shading_cost`` a pixel for each ``shading_spread`` of log brightness, up to ``shading_limit`` of them;
+    ``prior_cost`` a pixel for each 100 mm; ``jump_rad``: a jump of phase between neighbours from which on it costs no
+    more. ``slack_mm`` widens the range in which orders are chosen, for noise at its ends: a depth
+    beyond them is left out, and no other order is taken to be within. ``white_grey`` and ``ambient_grey``, if given,
+    calibrate brightness (see `EmptyScene`); without them it is taken from the lit background, and where the image
+    shows none, range and continuity settle the order, or it is ambiguous and has no depth (see `continuity`).
+    """
+
+    direction: Direction = option("horizontal", DIRECTION, choices=DIRECTIONS)
+    frames: int = option(1, "fringes of that direction, 1 to 18; no Gray code (default: 1)", "N")
+    shading: bool = option(True, "choose the fringe order without brightness", flag="--no-shading")
+    prior: Prior = option(
+        "none",
+        "standoff: assume that objects are near the rig's standoff, true of fixed placement (default: none)",
+        choices=get_args(Prior),
+    )
+    min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
+    first_window: float = 0.35
+    second_window: float = 0.27
+    pair_window: float = 0.06
+    slope_window: float = 0.13
+    shading_cost: float = 0.003
+    shading_spread: float = 0.1
+    shading_limit: float = 3.0
+    prior_cost: float = 0.002
+    jump_rad: float = 2.5
+    slack_mm: float = 15.0
+    white_grey: float | None = option(None, WHITE_GREY, "GREY")
+    ambient_grey: float | None = option(None, AMBIENT_GREY, "GREY")
+
+    def __post_init__(self) -> None:
+        if self.direction not in DIRECTIONS:
+            raise PredictionError(f"direction {self.direction!r}: one fringe is {' or '.join(DIRECTIONS)}, not both")
+        if self.prior not in get_args(Prior):
+            raise PredictionError(f"prior {self.prior!r}: expected {' or '.join(get_args(Prior))}")
+        if not 0 <= self.min_confidence < 1:
+            raise PredictionError(f"min_confidence {self.min_confidence!r}: expected 0 (dense) to below 1")
+        for name in (*_POSITIVE, *(["white_grey"] if self.white_grey is not None else [])):
+            if not 0 < getattr(self, name) < np.inf:
+                raise PredictionError(f"{name} {getattr(self, name)!r}: expected more than 0")
+        if self.ambient_grey is not None and not 0 <= self.ambient_grey <= GREY_LEVELS:
+            raise PredictionError(f"ambient_grey {self.ambient_grey!r}: expected 0 to {GREY_LEVELS} grey levels")
+
+
+@dataclass(frozen=True)
+class Capture:
+    """Frames measured around the object: maps (h, w) of the part ``crop`` of images of ``shape`` (H, W). ``greys``:
+    float32 grey levels of each frame; ``background``: fit of the empty scene; ``inside``: object, ``given`` by the user
+    or found; ``period_px``: of the fringe in the image, the longer one of two; orders are chosen on a grid of every
+    ``stride``-th pixel, for depths of ``range_mm``. An image without an object has a crop of one pixel."""
+
+    rig: Rig
+    period_px: float
+    range_mm: tuple[float, float]
+    stride: int
+    shape: tuple[int, ...]
+    crop: Crop
+    greys: tuple[Image, ...]
+    background: Background
+    inside: Mask
+    given: bool
+
+    @property
+    def pixelwise(self) -> bool:
+        """Whether there are frames enough for every pixel to have a phase of its own."""
+        return len(self.greys) >= PIXELWISE
+
+    @property
+    def saturated(self) -> Mask:
+        """Object pixels that are clipped in any of the frames."""
+        return np.any([grey >= GREY_LEVELS for grey in self.greys], axis=0) & self.inside
+
+    def spread(self, values: NDArray) -> NDArray:
+        """Maps of the grid (..., h', w') at all pixels, each that of its grid point or of the nearest one inside."""
+        return repeated(values[..., *self._nearest], self.stride, (*values.shape[:-2], *self.inside.shape))
+
+    @cached_property
+    def _nearest(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        return nearest_inside(self.inside[:: self.stride, :: self.stride])
+
+
+@dataclass(frozen=True)
+class Observation(Capture):
+    """Fringes of one direction, whose frames are shifted by ``shifts_rad``. ``layer``: calibration layer of the crop;
+    ``fit``: phase, not wrapped, and brightness; ``phase_rad`` float32, the fit's phase in [-pi, pi]; ``slopes``: change
+    of the residual phase in rad a px along x and y; ``mean_grey``: of pixelwise frames; ``uncertainty_rad`` float32: of
+    the phase, without the order, None for that of the fit (`depth`)."""
+
+    layer: CalibrationLayer
+    shifts_rad: tuple[float, ...]
+    fit: FringeFit
+    phase_rad: Image
+    slopes: tuple[Image, Image]
+    mean_grey: Image | None
+    uncertainty_rad: Image | None = None
+
+    @cached_property
+    def candidates(self) -> Orders:
+        """The orders that the working range allows."""
+        return self.layer.orders_in_range(self.phase_rad, self.range_mm)
+
+
+@dataclass(frozen=True)
+class CrossedObservation(Capture):
+    """Fringes of two directions in ``grey``, the one frame or the mean of three that shift the carrier ``moved``.
+    ``phase_rad`` and ``modulation`` float32 (2, h, w): wrapped phases and grey levels, of windows, or of the pixel
+    itself for the carrier ``moved``; ``point_phase_rad`` (2, h', w'): the phases measured on the grid of orders;
+    ``contrast``: modulation over mean of each carrier, in this image."""
+
+    carriers: Carriers
+    moved: int | None
+    grey: Image
+    phase_rad: Image
+    point_phase_rad: Image
+    modulation: Image
+    contrast: tuple[float, float]
+
+    @property
+    def light(self) -> Image:
+        """Grey levels less ambient light."""
+        return self.grey - np.float32(self.background.ambient_grey)
+
+    def spread(self, values: NDArray) -> NDArray:
+        return super().spread(values) if self.moved is None else values
+
+
+class MeasurementModel:
+    """What a rig photographs, and how phase is measured in it. Images whose fringe period ``seen_px`` is beyond
+    ``periods`` are resampled: then ``rig`` is that of the resampled images, which an observation is of; images and
+    masks have the captured size. ``frames``: their number and what they are."""
+
+    def __init__(
+        self, rig: Rig, settings: Settings, seen_px: float, periods: Periods | None, frames: tuple[int, str]
+    ) -> None:
+        self.settings, self.frames = settings, frames
+        self.resampling = Resampling.of(rig, seen_px, periods or Periods())
+        self.rig = self.resampling.rig
+
+    @property
+    def range_mm(self) -> tuple[float, float]:
+        """The working range with its slack."""
+        (near, far), slack = self.rig.working_range_mm, self.settings.slack_mm
+        return near - slack, far + slack
+
+    def images(self, given: Frames) -> list[NDArray]:
+        """Grey levels of captured frames, uint8 or float32 (H, W) each, in the size of ``rig``. Raises `DecodeError`
+        for another number, dtype or shape."""
+        frames = [given] if isinstance(given, np.ndarray) and given.ndim == 2 else list(given)
+        count, kind = self.frames
+        if len(frames) != count:
+            raise DecodeError(f"expected {count} {kind}, got {len(frames)}")
+        camera = self.resampling.captured.camera
+        images = [grey_levels(frame) for frame in frames]
+        for image in images:
+            if image.dtype not in (np.uint8, np.float32) or image.shape != (camera.height, camera.width):
+                raise DecodeError(
+                    f"expected {kind} of uint8 grey levels, shape (H, W) = {(camera.height, camera.width)} of the "
+                    f"rig's camera, got {image.dtype} {image.shape}; use rig.scaled(width) for a resized image"
+                )
+        return [self.resampling.image(image) for image in images]
+
+
+class OneCarrier(MeasurementModel):
+    """Fringes of one direction, ``settings.frames`` of them (`steps_of`)."""
+
+    def __init__(self, rig: Rig, settings: Settings | None = None, periods: Periods | None = None) -> None:
+        settings = settings or Settings()
+        rig.check_sampling()
+        shifts_rad = rig.shifts_rad(settings.direction)
+        self.steps = steps_of(len(shifts_rad), settings.frames)
+        self.shifts_rad = tuple(shifts_rad[step] for step in self.steps)
+        frames = len(self.steps), f"fringes, those of steps {self.steps}"
+        super().__init__(rig, settings, rig.image_px_per_period(settings.direction), periods, frames)
+        rig = self.rig
+        self.layer = CalibrationLayer.of(rig, settings.direction)
+        (near, far), periods_in_range = rig.working_range_mm, rig.periods_in_range(settings.direction)
+        most_slack_mm = MOST_SLACK_PERIODS * (far - near) / periods_in_range if periods_in_range > 0 else np.inf
+        self.settings = replace(settings, slack_mm=min(settings.slack_mm, most_slack_mm))
+        self.period_px = rig.image_px_per_period(settings.direction)
+        self._scene = EmptyScene(rig, self.layer, self.period_px, settings.white_grey, settings.ambient_grey)
+        self._carrier = np.nan_to_num(self.layer.absolute_phase(rig.standoff_m * MM_PER_M)).astype(np.float32)
+        self.windows = [Window(share * self.period_px) for share in (settings.first_window, settings.second_window)]
+        if settings.frames == 2:
+            self.windows += [Window(settings.pair_window * self.period_px)] * PAIR_ROUNDS
+
+    @cached_property
+    def captured_layer(self) -> CalibrationLayer:
+        """The calibration layer of the captured images."""
+        return CalibrationLayer.of(self.resampling.captured, self.settings.direction)
+
+    def observe(self, image: Frames, mask: Mask | None = None) -> Observation:
+        """Mask and phase of captured fringes: one, uint8 (H, W), or the frames of ``steps``. ``mask`` bool (H, W)
+        replaces the object mask that is found. Raises `DecodeError` for another number, dtype or shape."""
+        images = self.images(image)
+        background = self._scene.fit(images[0])
+        if mask is not None:
+            region = self.resampling.mask(mask)
+        elif background.shown:
+            region = object_region(background, self.period_px)
+        else:
+            first = images[0].astype(np.float32)
+            _, modulation = carrier_fit(first, np.ones(first.shape, bool), self._carrier, self.windows[0])
+            region = modulated_region(first, modulation, background, self.period_px)
+        crop = crop_around(region, int(np.ceil(MARGIN_PERIODS * self.period_px)))
+        greys = tuple(frame[crop].astype(np.float32) for frame in images)
+        background = replace(background, residual=background.residual[crop])
+        layer, inside, mean_grey = self.layer.at(crop), region[crop], None
+        if len(greys) >= PIXELWISE:
+            fitted = wrapped_phase(greys, self.shifts_rad, np.float32)
+            phase, modulation, mean_grey = (np.asarray(values, np.float32) for values in fitted)
+            if mask is None:
+                different = differs(self._plane_misfits(greys, background, crop), background.noise_grey)
+                inside = lit_object(different, modulation, background, self.shifts_rad, self.period_px)
+            # The share of a window on the object is what the use of slopes needs.
+            fit = FringeFit(phase, modulation, self.windows[1].moment(inside.astype(np.float32)))
+        else:
+            inside, fit = self._local_fits(greys, background, crop, inside, mask is not None)
+        phase = wrapped(fit.phase_rad).astype(np.float32)
+        residual = wrapped(phase - layer.infinity_rad).astype(np.float32)
+        slopes = phase_slopes(residual, inside, self.settings.slope_window * self.period_px)
+        return Observation(
+            rig=self.rig,
+            period_px=self.period_px,
+            range_mm=self.range_mm,
+            stride=stride_of(self.period_px),
+            shape=images[0].shape,
+            crop=crop,
+            greys=greys,
+            background=background,
+            inside=inside,
+            given=mask is not None,
+            layer=layer,
+            shifts_rad=self.shifts_rad,
+            fit=fit,
+            phase_rad=phase,
+            slopes=slopes,
+            mean_grey=mean_grey,
+        )
+
+    def _plane_misfits(self, greys: Sequence[Image], background: Background, crop: Crop) -> list[Image]:
+        """Each frame (h, w) less what the empty scene gives there, grey levels."""
+        pairs = zip(greys, self.shifts_rad, strict=True)
+        return [grey - self._scene.predicted(background, shift, crop) for grey, shift in pairs]
+
+    def _local_fits(
+        self, greys: Sequence[Image], background: Background, crop: Crop, region: Mask, given: bool
+    ) -> tuple[Mask, FringeFit]:
+        """Object mask and local fits of one or two frames, each window starting from the phase of the last; ``region``:
+        where the first frame differs, or the ``given`` mask."""
+        period_px, inside, grey = self.period_px, region, greys[0]
+        if not given:
+            dark = unlit(np.maximum.reduce(greys), background, period_px)
+            if len(greys) > 1:
+                different = differs(self._plane_misfits(greys, background, crop), background.noise_grey)
+                differing = first_mask(different, period_px)
+                region = differing if background.shown else region & differing
+            inside = region & ~dark
+        carrier = self._carrier[crop]
+        phase, _ = carrier_fit(grey, inside, carrier, self.windows[0])
+        for window in self.windows[1:]:
+            fit = fringe_fit(greys, inside, phase, background.ambient_grey, window, self.shifts_rad)
+            phase = fit.phase_rad
+        if not background.calibrated:
+            # Fringes of any contrast on surfaces of any brightness: the contrast is measured, then the fits start
+            # again, because a fit keeps the ripple of the phase that it starts from.
+            ambient = background.ambient_grey
+            for _ in range(CONTRAST_ROUNDS):
+                if not given:
+                    inside = inside & explained(grey, np.float32(ambient) + fit.light, ambient, period_px)
+                contrast = measured_contrast(grey - np.float32(ambient), inside, fit)
+                light = ambient, self.windows[0], self.shifts_rad, contrast, CURVED
+                fit = fringe_fit(greys, inside, fit.phase_rad, *light)
+            phase, _ = carrier_fit(grey, inside, carrier, self.windows[0])
+            for _ in range(FREE_ROUNDS):
+                fit = fringe_fit(greys, inside, phase, *light)
+                phase = fit.phase_rad
+        if given:
+            return inside, fit
+        if len(greys) == 1:
+            bright = np.maximum(fit.brightness, 0)
+            predicted = (background.ambient_grey + fit.light).astype(np.float32)
+            inside = refined(inside, background, predicted, grey, FRINGE_NOISE * bright, RING_PERIODS * period_px)
+        inside = inside & ~dark & (fit.brightness > (DARKEST_GREY if background.shown else MIN_MODULATION))
+        return inside, fit
+
+
+class TwoCarriers(MeasurementModel):
+    """Crossed fringes of a ``family`` (default: the rig's own), one frame; or three frames of the rig, of which the
+    carrier ``moved`` is shifted. Raises `PredictionError` where carriers hardly change with depth."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        settings: Settings | None = None,
+        family: Crossed | None = None,
+        periods: Periods | None = None,
+        moved: int | None = None,
+    ) -> None:
+        self.family = family or rig.crossed or Crossed.of_pair(rig)
+        rig.check_sampling()
+        seen_px = max(rig.image_px_of_carrier(cycles) for cycles in self.family.cycles_per_px)
+        frames = (1, "crossed frame") if moved is None else (CROSSED_FRAMES, "crossed frames")
+        super().__init__(rig, settings or Settings(), seen_px, periods, frames)
+        self.moved = moved
+        self.carriers = Carriers.of(self.rig, self.family)
+        self.period_px = self.carriers.period_px
+        self.stride = stride_of(self.period_px)
+        self.demodulator = Demodulator(self.carriers, self.stride)
+        self._scenes = [CrossedEmptyScene(self.carriers, self.stride)]
+        if moved is None:
+            return
+        shifted = self.family.shifts_deg[:CROSSED_FRAMES]
+        self.shifts_rad = [float(np.radians(pair[moved])) for pair in shifted]
+        near_q, far_q = (float(np.median(self.carriers.nearness(end))) for end in self.rig.working_range_mm)
+        span = float(np.median(np.abs(self.carriers.gain[moved]))) * abs(near_q - far_q)
+        if not span >= LEAST_RANGE_RAD:
+            raise PredictionError(
+                f"crossed --frames {CROSSED_FRAMES}: over the working range the carrier that the frames shift changes "
+                f"by {span:.2g} rad, too little for a depth; shift the other carrier"
+            )
+        for pair in shifted[1:]:
+            carriers = Carriers.of(self.rig, Crossed(**vars(self.family) | {"shifts_deg": (pair,)}))
+            self._scenes.append(CrossedEmptyScene(carriers, self.stride))
+
+    @cached_property
+    def captured_carriers(self) -> Carriers:
+        """The carriers of the captured images."""
+        return Carriers.of(self.resampling.captured, self.family)
+
+    def observe(self, image: Frames, mask: Mask | None = None) -> CrossedObservation:
+        """Mask and both phases of one crossed frame, uint8 (H, W) or float32 grey levels of the same range, or of
+        three. ``mask`` bool (H, W) replaces the object mask that is found. Raises `DecodeError` for another number,
+        dtype or shape."""
+        greys, moved = [grey.astype(np.float32) for grey in self.images(image)], self.moved
+        grey, period_px, stride = greys[0], self.period_px, self.stride
+        if moved is not None:
+            fitted = wrapped_phase(greys, self.shifts_rad, np.float32)
+            own_phase, own_modulation, grey = (np.asarray(values, np.float32) for values in fitted)
+            # `Carriers` has the phases of the first frame.
+            own_phase = wrapped(own_phase + np.float32(self.shifts_rad[0]))
+        seen = self.demodulator(grey)
+        pairs = zip(self._scenes, greys, strict=True)
+        planes = [scene(frame, seen if frame is grey else self.demodulator(frame)) for scene, frame in pairs]
+        background = planes[0]
+        if mask is not None:
+            region = self.resampling.mask(mask)
+        elif not all(plane.shown for plane in planes):
+            background = replace(background, share=0.0)
+            modulation = repeated(seen.modulation.max(axis=0), stride, grey.shape) if moved is None else own_modulation
+            region = modulated_region(grey, modulation, background, period_px)
+        elif moved is None:
+            region = object_region(background, period_px)
+        else:
+            different = differs([plane.residual for plane in planes], background.noise_grey)
+            region = lit_object(different, own_modulation, background, self.shifts_rad, period_px)
+            residual = wrapped(own_phase - self.carriers.infinity_rad[moved])
+            region = continued(region, first_mask(different, period_px), different, residual)
+        crop = crop_around(region, int(np.ceil(MARGIN_PERIODS * period_px)), stride)
+        background, inside = replace(background, residual=background.residual[crop]), region[crop]
+        if mask is None and moved is None:
+            inside = inside & ~unlit(grey[crop], background, period_px)
+        grid = tuple(slice(part.start // stride, -(-part.stop // stride)) for part in crop)
+        carriers = self.carriers.at(crop)
+        points, mean_grey = inside[::stride, ::stride], seen.mean_grey[grid] - background.ambient_grey
+        phases, modulation = self.demodulator.phases_at(seen, carriers), seen.modulation[:, *grid]
+        if moved is None:
+            whole = repeated(modulation[..., *nearest_inside(points)], stride, (2, *inside.shape))
+        else:
+            phases[moved], modulation[moved] = own_phase[crop], own_modulation[crop][::stride, ::stride]
+            whole = repeated(modulation, stride, (2, *inside.shape))
+            whole[moved] = own_modulation[crop]
+        return CrossedObservation(
+            rig=self.rig,
+            period_px=period_px,
+            range_mm=self.range_mm,
+            stride=stride if moved is None else 1,
+            shape=grey.shape,
+            crop=crop,
+            greys=tuple(frame[crop] for frame in greys),
+            background=background,
+            inside=inside,
+            given=mask is not None,
+            carriers=carriers,
+            moved=moved,
+            grey=grey[crop],
+            phase_rad=phases,
+            point_phase_rad=seen.phase_rad[:, *grid] if moved is None else phases,
+            modulation=whole,
+            contrast=self._contrast(modulation, mean_grey, points),
+        )
+
+    def _contrast(self, modulation: Image, mean_grey: Image, points: Mask) -> tuple[float, float]:
+        """Modulation over mean of both carriers on the object; as projected where too little of it is seen."""
+        reach = 2 * max(1, round(CONTRAST_RIM_PERIODS * self.period_px / self.stride)) + 1
+        inner = cv2.erode(points.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0  # type: ignore[call-overload]
+        inner &= mean_grey > MIN_MODULATION
+        if not inner.any():
+            return self.carriers.family.weights
+        shares = np.median(modulation[:, inner] / mean_grey[inner], axis=1)
+        least, most = np.float32(LEAST_CONTRAST), np.asarray(self.carriers.family.weights, np.float32)
+        first, second = np.clip(shares, least, most).tolist()
+        return first, second
+
+
+def steps_of(steps: int, frames: int) -> tuple[int, ...]:
+    """Which of ``steps`` phase shifts ``frames`` of them are: 0 alone, 0 and a third, or `choose_steps`. Raises
+    `PredictionError` for a number of frames that can't be had."""
+    if isinstance(frames, bool) or not isinstance(frames, int | np.integer) or not 1 <= frames <= steps:
+        raise PredictionError(
+            f"frames {frames!r}: expected a whole number from 1 to the {steps} sinusoids of a direction that were "
+            "projected"
+        )
+    if frames < PIXELWISE:
+        return (0, round(steps * PAIR_DEGREES / 360))[:frames]
+    return choose_steps(steps, frames)
