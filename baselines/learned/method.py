@@ -67,9 +67,7 @@ class LearnedMethod(Method):
         given = {key: value for key, value in vars(training).items() if value is not None}
         start = given.pop("start", None)
         recipe = cls.recipe(**given)
-        trained = train_net(
-            recipe, out, start=start, minutes=minutes, workers=usable_cores(), show=True, print_line=print
-        )
+        trained = train_net(recipe, out, start=start, minutes=minutes, workers=usable_cores(), show=True)
         if trained.weights is None:
             steps = f"{trained.steps} of {recipe.steps} steps"
             print(f"{out}: stopped after {steps}, all saved; run the same command to resume")

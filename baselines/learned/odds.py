@@ -17,7 +17,6 @@ from fpp_ml_bench.baselines.phase.depth import MARGIN_SCALE
 from fpp_ml_bench.baselines.phase.labels import least_energy
 from fpp_ml_bench.baselines.phase.order import LARGE
 from fpp_ml_bench.baselines.phase.resampling import nearest_inside, repeated
-from fpp_ml_bench.baselines.training.records import Panel, draw_curves
 
 GRAPH = 3.0  # weight of smoothness between neighbours in the labelling of the orders, in which depth may jump
 SCALE_TO_SIGMA = float(np.sqrt(2))  # of a Laplace distribution
@@ -191,6 +190,8 @@ def reliability(judged: Sequence[Judged], odds: Odds) -> list[tuple[float, float
 
 def draw_reliability(path: Path, judged: Sequence[Judged], odds: Odds) -> None:
     """Picture of `reliability`: how often orders are wrong over how often they are said to be, in percent."""
+    from fpp_ml_bench.baselines.training.engine import Panel, draw_curves  # which a prediction does without
+
     rows = reliability(judged, odds)
     stated, seen, share = ([100 * row[column] for row in rows] for column in range(3))
     label = "stated chance of a wrong order, %"

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.training.records import Display
+from fpp_ml_bench.baselines.training.engine import Display
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M, OBJECTS, VIEWS, split_of
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.files import write_atomically
@@ -188,7 +188,7 @@ def render_views(
             folder.mkdir(parents=True, exist_ok=True)
             with mapping((rig, frames, folder), workers) as mapped:
                 for count in mapped(_render_group, missing):
-                    display.advance(count)
+                    display.step(count)
 
 
 def _render_group(work: tuple[Rig, tuple[int, ...], Path], group: Group) -> int:

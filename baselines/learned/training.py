@@ -10,7 +10,7 @@ import hashlib
 import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -44,8 +44,16 @@ from fpp_ml_bench.baselines.learned.windows import (
     view_scores,
 )
 from fpp_ml_bench.baselines.phase.calibration_layer import Image, Mask
-from fpp_ml_bench.baselines.training.engine import CHECKPOINT, Training, alone_in, claim_folder, reproducible
-from fpp_ml_bench.baselines.training.records import Display, Panel, Record
+from fpp_ml_bench.baselines.training.engine import (
+    CHECKPOINT,
+    Display,
+    Panel,
+    Record,
+    Training,
+    alone_in,
+    claim_folder,
+    reproducible,
+)
 from fpp_ml_bench.baselines.training.weights import (
     PHASE_NETWORKS,
     Family,
@@ -62,6 +70,7 @@ VIEWS = "views"
 SMALL_RAD = 0.05  # error of the phase below which its loss is quadratic
 IMPOSSIBLE = -1e4  # logit of an order that puts its pixel out of the working range: finite, for gradients to stay so
 LARGEST_GRADIENT = 50.0
+MOST = {"views_a_light": 40, "unions": 100}  # of a recipe
 
 Batch = dict[str, Tensor]  # the fields of a window with a leading axis B
 
@@ -123,15 +132,13 @@ class StepRecipe(ABC):
     """Which of `NAMED_RIGS` it trains for by default."""
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "window", "validate_every"):
-            if not getattr(self, name) >= 1:
-                raise RecipeError(f"{name} {getattr(self, name)!r}: expected 1 or more")
+        ones = "steps", "batch", "window", "validate_every", "views_a_light", "textured_every"
+        for name in (*ones, "lights", "unions", "validation_lights"):
+            least, most, value = int(name in ones), MOST.get(name, math.inf), getattr(self, name)
+            if not least <= value <= most:
+                raise RecipeError(f"{name} {value!r}: expected {least} to {most}")
         if not self.rate > 0 or not 0 <= self.averaged < 1:
             raise RecipeError(f"expected rate above 0 and averaged 0 to below 1, got {self.rate} and {self.averaged}")
-        drawn = {"lights": (0, 10000), "views_a_light": (1, 40), "unions": (0, 100)}
-        for name, (least, most) in (drawn | {"textured_every": (1, 10000), "validation_lights": (0, 10000)}).items():
-            if not least <= getattr(self, name) <= most:
-                raise RecipeError(f"{name} {getattr(self, name)!r}: expected {least} to {most}")
 
     @property
     def weights_name(self) -> str:
@@ -215,25 +222,27 @@ class WindowRecipe(StepRecipe):
 
 
 class WindowTraining(Training):
-    """Training in intervals between two validations, on the processor. ``draw`` gives a random window; ``validate``:
-    scores of a network, those of ``recipe.scores`` among them, or nothing. ``start``: the network whose weights it
-    starts from (None: random ones). ``print_line`` is given a line for every new record. Raises `TrainingError` where
+    """Training in intervals between two validations, on the processor. Windows are those of ``task``, drawn
+    from ``samples``; it is validated on ``scored``. ``start``: the network whose weights it starts from (None: random
+    ones). ``show``: every new record is printed. Raises `TrainingError` where
     ``start`` is another network than the recipe's, and for a checkpoint of another recipe."""
 
     largest_gradient = LARGEST_GRADIENT
 
     def __init__(
         self,
-        recipe: StepRecipe,
-        draw: Callable[[np.random.Generator], Window],
-        validate: Callable[[Any], dict[str, float]],
+        task: "Task",
+        samples: list[Sample],
+        scored: list[Sample],
         out: Path,
         start: PhaseNet | None = None,
-        print_line: Callable[[str], None] = lambda line: None,
+        show: bool = False,
     ) -> None:
+        recipe: StepRecipe = task.recipe
         super().__init__(out, {"recipe": recipe.digest}, recipe.seed, cpu=True)
-        self.recipe, self.draw, self.validate, self.print_line = recipe, draw, validate, print_line
+        self.recipe, self.task, self.samples, self.scored, self.show = recipe, task, samples, scored, show
         self.name = self.title = recipe.name
+        self.interval_steps, self.total_steps = recipe.validate_every, recipe.steps
         network = recipe.network()
         network = network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         if start is not None:
@@ -260,14 +269,6 @@ class WindowTraining(Training):
         return self.averaged.module.eval()
 
     @property
-    def interval_steps(self) -> int:
-        return self.recipe.validate_every
-
-    @property
-    def total_steps(self) -> int:
-        return self.recipe.steps
-
-    @property
     def _next_validation(self) -> int:
         return min(self.steps_done + self.interval_steps, self.total_steps)
 
@@ -280,7 +281,7 @@ class WindowTraining(Training):
 
         def make(step: int) -> Batch:
             random = np.random.default_rng([recipe.seed, step])
-            return batch_of([self.draw(random) for _ in range(recipe.batch)])
+            return batch_of([self.task.draw(self.samples, random) for _ in range(recipe.batch)])
 
         with ThreadPoolExecutor(1) as pool:
             coming = pool.submit(make, first)
@@ -297,8 +298,9 @@ class WindowTraining(Training):
         seconds, steps = perf_counter() - began, self._next_validation
         record: Record = {"step": steps, "rate": self.recipe.rate_at(steps - 1), "seconds": seconds}
         record |= {f"loss_{name}": value for name, value in losses.items()}
-        record |= self.validate(self.network)
-        self.print_line("  ".join(f"{key} {value:.4g}" for key, value in record.items()))
+        record |= self.task.scores(self.network, self.scored)
+        if self.show:
+            print("  ".join(f"{key} {value:.4g}" for key, value in record.items()))
         return record
 
     def progress(self) -> str:
@@ -450,11 +452,10 @@ def train_net(
     minutes: float | None = None,
     workers: int = 1,
     show: bool = False,
-    print_line: Callable[[str], None] = lambda line: None,
 ) -> Trained:
     """Train for ``rig`` (default: that of the recipe), starting from the weights in ``start`` or from random ones; the
-    same call resumes a training that was stopped. ``show``: progress on stderr; ``print_line`` is given a line for
-    every validation. Raises `TrainingError` for a folder of another recipe or rig."""
+    same call resumes a training that was stopped. ``show``: progress on stderr, and a line for every
+    validation. Raises `TrainingError` for a folder of another recipe or rig."""
     started, rig = perf_counter(), rig or NAMED_RIGS[recipe.rig]()
     groups = groups_of(
         recipe.lights, recipe.views_a_light, recipe.seed, recipe.textured_every, recipe.validation_lights
@@ -475,20 +476,14 @@ def train_net(
         with Display("measuring views", sum(len(group.views) for group in groups), show) as display:
 
             def measured(split: str, unions: int) -> list[Sample]:
-                views = display.followed(read_views(out / VIEWS, groups, split))
+                views = display.track(read_views(out / VIEWS, groups, split), task_id=display.bar)
                 return task.samples(with_unions(views, unions, recipe.seed))
 
             samples, validation = measured("train", recipe.unions), measured("validation", 0)
-        scored = validation[:: task.scored_share]
         with reproducible(cpu=True):
-            ongoing = WindowTraining(
-                recipe,
-                partial(task.draw, samples),
-                lambda network: task.scores(network, scored),
-                out,
-                None if first is None else first.network,
-                print_line,
-            )
+            start_network = None if first is None else first.network
+            scored = validation[:: task.scored_share]
+            ongoing = WindowTraining(task, samples, scored, out, start_network, show)
             ongoing.run(started, minutes, show)
             if not ongoing.over:
                 return Trained(None, ongoing.steps_done, 0.0, {})

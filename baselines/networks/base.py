@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -21,11 +21,13 @@ class FringeNetwork(nn.Module, ABC):
     ``forward`` takes a floating tensor (B, 1, H, W), fringe in [0, 1], and gives the same shape. H and W must be
     multiples of `stride` and at least twice it, so that a bottleneck has a spread; else `NetworkError`.
 
-    name: what `build` calls it. options: JSON scalars with which `build` makes it again.
+    name: what `build` calls it. options: JSON scalars with which `build` makes it again, and checks them by the type of
+    their defaults and by ``rules``, where a whole number has another least value than 1, or must be a multiple.
     last_layer: name in `probe_layers` of the last decoder layer, whose output is (B, C, H, W), before the 1x1 head.
     """
 
     name: str
+    rules: ClassVar[dict[str, tuple[int, int]]] = {}
     stride: int
     last_layer: str
 
@@ -81,19 +83,17 @@ def _nearest(side: int, stride: int, least: int) -> str:
     return str(below) if below == above else f"({below} or {above})"
 
 
-def whole(network: str, option: str, value: object, least: int = 1, multiple: int = 1) -> int:
-    """``value`` if it is a whole number, at least ``least`` and a multiple of ``multiple``; else `NetworkError`."""
-    if isinstance(value, bool) or not isinstance(value, int) or value < least or value % multiple:
-        rule = f"a whole number, at least {least}" + (f" and a multiple of {multiple}" if multiple > 1 else "")
-        raise NetworkError(f"{network}: {option} must be {rule}; it was {value!r}")
-    return value
-
-
-def rate(network: str, option: str, value: object) -> float:
-    """``value`` as a float if it is in [0, 1); else `NetworkError`."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1:
-        raise NetworkError(f"{network}: {option} must be a number in [0, 1); it was {value!r}")
-    return float(value)
+def checked_option(network: str, option: str, value: object, kind: type, rule: tuple[int, int]) -> int | float:
+    """``value`` as a ``kind``: a float in [0, 1), or a whole number, by ``rule`` at least so much and a multiple of so
+    much; else `NetworkError`."""
+    least, multiple = rule
+    words = f"a whole number, at least {least}" + (f" and a multiple of {multiple}" if multiple > 1 else "")
+    allowed = isinstance(value, int) and value >= least and value % multiple == 0
+    if kind is float:
+        words, allowed = "a number in [0, 1)", isinstance(value, int | float) and 0 <= value < 1
+    if isinstance(value, bool) or not allowed:
+        raise NetworkError(f"{network}: {option} must be {words}; it was {value!r}")
+    return kind(value)  # type: ignore[no-any-return]
 
 
 def trains_channels_last(module: nn.Module) -> bool:

@@ -3,6 +3,7 @@ without exchange between them, then a U of global transformers over the branches
 authors' published code (AnushLak/fpp-ml-bench)."""
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -132,12 +133,11 @@ class Hformer(FringeNetwork):
     """
 
     name = "hformer"
+    rules: ClassVar = {"width": (4, 4)}
     stride = 32
     last_layer = "up2"
 
     def __init__(self, *, width: int = 32, drop_path: float = 0.4) -> None:
-        width = base.whole(self.name, "width", width, least=4, multiple=4)
-        drop_path = base.rate(self.name, "drop_path", drop_path)
         super().__init__(width=width, drop_path=drop_path)
         first = (9 * width + 8) // 16
         branches = [first * 2**level for level in range(4)]

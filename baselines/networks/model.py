@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.networks.base import FringeNetwork, tiny_floats_are_zero
+from fpp_ml_bench.baselines.networks.base import FringeNetwork, checked_option, tiny_floats_are_zero
 from fpp_ml_bench.baselines.networks.hformer import Hformer
 from fpp_ml_bench.baselines.networks.pix2pix import Discriminator, Pix2Pix, Pix2PixUNet
 from fpp_ml_bench.baselines.networks.unet import ResUNet, TransUNet, UNet
@@ -41,20 +41,22 @@ def build(name: str, **options: int | float) -> FringeNetwork:
     unknown option, or a value that the network can't have."""
     if name not in _CLASSES:
         raise NetworkError(f"unknown network {name!r}; there are {', '.join(NETWORKS)}")
-    return _constructed(f"network {name!r}", _CLASSES[name], options)
+    return _constructed(name, _CLASSES[name], options)
 
 
 def discriminator(**options: int | float) -> Discriminator:
     """The two-scale discriminator of a GAN (`pix2pix.Discriminator`); `NetworkError` as `build`."""
-    return _constructed("the discriminator", Discriminator, options)
+    return _constructed("discriminator", Discriminator, options)
 
 
-def _constructed(label: str, cls: type, options: dict[str, Any]) -> Any:
+def _constructed(name: str, cls: Any, options: dict[str, Any]) -> Any:
     parameters = inspect.signature(cls).parameters
     if unknown := sorted(set(options) - set(parameters)):
         available = ", ".join(f"{p.name} (default {p.default})" for p in parameters.values())
-        raise NetworkError(f"{label} has no option {', '.join(map(repr, unknown))}; there are: {available}")
-    return cls(**options)
+        raise NetworkError(f"network {name!r} has no option {', '.join(map(repr, unknown))}; there are: {available}")
+    kinds = {option: type(parameters[option].default) for option in options}
+    checked = {n: checked_option(name, n, value, kinds[n], cls.rules.get(n, (1, 1))) for n, value in options.items()}
+    return cls(**checked)
 
 
 def fringe_batch(fringes: Sequence[Fringe] | Fringe, size: tuple[int, int], trained_on: str) -> Tensor:

@@ -29,7 +29,14 @@ _SHORT_OPTIONS = {
     "guided by phase": "guided",
 }
 """A recipe's title and the short name of each option of a network."""
-_SHORT_LOSSES = {"rmse": "RMSE", "l1": "L1", "gan": "GAN"}
+_SHORT_LOSSES = {
+    "rmse": "RMSE",
+    "l1": "L1",
+    "gan": "GAN",
+    "hybrid": "hybrid",
+    "masked": "masked",
+    "physics": "+ physics",
+}
 
 
 @dataclass(frozen=True)
@@ -103,9 +110,9 @@ class NetworkMethod(Method):
         if trained_frames not in CONFIGS:
             return None
         frames = {"single_shot": "", "all": " all frames"}.get(trained_frames, f" {trained_frames}")
-        loss, _, weight = str(settings["loss"]).partition("_physics_")
-        physics = f" + physics {float(weight):g}" if weight else ""
-        parts = [f"{network}{normalisation} {_short_loss(loss)}{physics}{frames}"]
+        # The other words of a loss are its weights.
+        loss = " ".join(_SHORT_LOSSES.get(word) or f"{float(word):g}" for word in str(settings["loss"]).split("_"))
+        parts = [f"{network}{normalisation} {loss}{frames}"]
         parts += [word for words, word in _SHORT_OPTIONS.items() if f", {words}" in submission.name]
         parts.append("no background" if settings["background_removed"] else "")
         parts.append(_SHORT_RANGES[settings.get("depth_range")])  # type: ignore[index]
@@ -210,17 +217,6 @@ def _checked_range(model: "Model", depth_range: str | None) -> Any:
 def _loss(loss: Any) -> str | None:
     """The recipe's loss as in the names of runs: ``hybrid_l1_0.7``."""
     return Loss.model_validate(loss).label if isinstance(loss, dict) else loss
-
-
-def _short_loss(label: str) -> str:
-    """``hybrid_l1_0.7`` as ``hybrid L1 0.7``; the weight is checked to be a number."""
-    kind, _, rest = label.partition("_")
-    if kind == "gan" and rest:
-        return f"{_SHORT_LOSSES[kind]} {float(rest):g}"
-    if kind == "hybrid":
-        loss, _, weight = rest.partition("_")
-        return f"hybrid {_SHORT_LOSSES[loss]} {float(weight):g}"
-    return f"masked {_SHORT_LOSSES[rest]}" if kind == "masked" else _SHORT_LOSSES[label]
 
 
 def weights_of_recipe(recipe: str, size: int) -> Path:

@@ -6,6 +6,8 @@ blocks and no skips. Both are here. The paper gives no sizes: those of pix2pixHD
 U-Net generator of Isola et al., with as many levels as divide the image.
 """
 
+from typing import ClassVar
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
@@ -62,21 +64,30 @@ class Generator(nn.Sequential):
         return x
 
 
-class Pix2Pix(FringeNetwork):
-    """The generator in [0, 1] on both sides: the image is mapped to [-1, 1], the Tanh output back. Output can't leave
-    [0, 1], so the network suits representations in that range. width: channels of the first layer. Convolutions start
-    from N(0, 0.02). Probe layers: stem, down1..down4, bottleneck (nine blocks at 16 x width channels, 1/16 of the
-    image), up4..up1 (up1 at full resolution, ``width`` channels)."""
+class UnitNetwork(FringeNetwork):
+    """A ``generator`` in [-1, 1] as a network in [0, 1] on both sides, which its output can't leave: it suits
+    representations in that range. Convolutions start from N(0, 0.02)."""
+
+    last_layer = "up1"
+
+    def __init__(self, generator: nn.Module, **options: int) -> None:
+        super().__init__(**options)
+        self.generator = generator
+        base.initialise(self, "gan")
+
+    def represent(self, fringe: Tensor) -> Tensor:
+        return (self.generator(2.0 * fringe - 1.0) + 1.0) / 2.0
+
+
+class Pix2Pix(UnitNetwork):
+    """pix2pixHD's generator. width: channels of the first layer. Probe layers: stem, down1..down4, bottleneck (nine
+    blocks at 16 x width channels, 1/16 of the image), up4..up1 (up1 at full resolution, ``width`` channels)."""
 
     name = "pix2pix"
     stride = 2**DOWNSAMPLINGS
-    last_layer = "up1"
 
     def __init__(self, *, width: int = 64) -> None:
-        width = base.whole(self.name, "width", width)
-        super().__init__(width=width)
-        self.generator = Generator(width)
-        base.initialise(self, "gan")
+        super().__init__(Generator(width), width=width)
 
     @property
     def probe_layers(self) -> dict[str, nn.Module]:
@@ -84,9 +95,6 @@ class Pix2Pix(FringeNetwork):
         layers |= {f"down{level}": layer for level, layer in enumerate(self.generator.down, 1)}
         layers["bottleneck"] = self.generator.bottleneck
         return layers | {f"up{DOWNSAMPLINGS - step}": layer for step, layer in enumerate(self.generator.up)}
-
-    def represent(self, fringe: Tensor) -> Tensor:
-        return (self.generator(2.0 * fringe - 1.0) + 1.0) / 2.0
 
 
 class UNetGenerator(nn.Module):
@@ -121,30 +129,23 @@ class UNetGenerator(nn.Module):
         return in_full_precision(self.head, x)
 
 
-class Pix2PixUNet(FringeNetwork):
-    """The U-Net generator in [0, 1] on both sides, as `Pix2Pix`; 29,367,809 parameters at width 64 and 6 levels. width:
-    channels of the first level. levels: halvings of the image. Convolutions start from N(0, 0.02). Probe layers:
-    down1..downN (down1 at half the resolution), of which the last is bottleneck, upN..up1 (up1 at full resolution,
-    ``width`` channels)."""
+class Pix2PixUNet(UnitNetwork):
+    """The U-Net generator; 29,367,809 parameters at width 64 and 6 levels. width: channels of the first level. levels:
+    halvings of the image. Probe layers: down1..downN (down1 at half the resolution), of which the last is bottleneck,
+    upN..up1 (up1 at full resolution, ``width`` channels)."""
 
     name = "pix2pix_unet"
-    last_layer = "up1"
+    rules: ClassVar = {"levels": (2, 1)}
 
     def __init__(self, *, width: int = 64, levels: int = 6) -> None:
-        width, levels = base.whole(self.name, "width", width), base.whole(self.name, "levels", levels, least=2)
-        super().__init__(width=width, levels=levels)
+        super().__init__(UNetGenerator(width, levels), width=width, levels=levels)
         self.stride = 2**levels
-        self.generator = UNetGenerator(width, levels)
-        base.initialise(self, "gan")
 
     @property
     def probe_layers(self) -> dict[str, nn.Module]:
         *down, bottleneck = self.generator.down
         layers = {f"down{level}": layer for level, layer in enumerate(down, 1)} | {"bottleneck": bottleneck}
         return layers | {f"up{len(down) + 1 - step}": layer for step, layer in enumerate(self.generator.up)}
-
-    def represent(self, fringe: Tensor) -> Tensor:
-        return (self.generator(2.0 * fringe - 1.0) + 1.0) / 2.0
 
 
 class Discriminator(nn.Module):
@@ -153,10 +154,9 @@ class Discriminator(nn.Module):
     first, no shared weights), the feature maps after its ``layers + 2`` convolutions; the last is the judgement, (B, 1,
     h, w), unbounded. Convolutions start from N(0, 0.02). width: channels of the first layer."""
 
+    rules: ClassVar[dict] = {}
+
     def __init__(self, *, width: int = 64, layers: int = 3, scales: int = 2) -> None:
-        width = base.whole("discriminator", "width", width)
-        layers = base.whole("discriminator", "layers", layers)
-        scales = base.whole("discriminator", "scales", scales)
         super().__init__()
         self.options: dict[str, int | float] = {"width": width, "layers": layers, "scales": scales}
         self.scales = nn.ModuleList(_patch_discriminator(width, layers) for _ in range(scales))

@@ -37,22 +37,20 @@ def fit_heads(
     network: FringeNetwork,
     config: ModelConfig,
     dataset_folder: str | Path,
-    progress: Callable[[int], None] = lambda pairs: None,
 ) -> dict[str, Tensor]:
     """Tensors of the `RangeHeads` of ``network``, which is not changed; ``save_weights(..., heads=...)`` stores them.
 
     Mean range, ridge regression and mask come from the training split; the ridge's strength and the masks' thresholds
-    (one for each twin, of least overall MAE in mm) from the validation split. Deterministic. ``progress`` is given the
-    number of pairs done. Raises `WeightsError` for a network of another normalisation, a dataset of another size or
-    fingerprint than ``config`` says, or without an object in either split; `PredictionError` where the network's output
-    is not finite."""
+    (one for each twin, of least overall MAE in mm) from the validation split. Deterministic. Raises `WeightsError` for
+    a network of another normalisation, a dataset of another size or fingerprint than ``config`` says, or without an
+    object in either split; `PredictionError` where the network's output is not finite."""
     if config.normalisation != "individual":
         raise WeightsError(f"{config.name}: its output is metric ({config.normalisation}); it needs no range heads")
     was_training = network.training
     network.eval()
     try:
         with torch.no_grad(), probed(network) as probe:
-            run = partial(_run, network, probe, config.name, progress)
+            run = partial(_run, network, probe, config.name)
             train = _chosen_pairs(config, dataset_folder, "train", TRAIN_PAIRS)
             validation = _chosen_pairs(config, dataset_folder, "validation", VALIDATION_PAIRS)
             return vars(_fit(probe, config.image_size, partial(run, *train), partial(run, *validation)))
@@ -92,7 +90,6 @@ def _run(
     network: FringeNetwork,
     probe: Probe,
     name: str,
-    progress: Callable[[int], None],
     data: FringeDepthDataset,
     order: list[int],
 ) -> Iterator[tuple[Tensor, NDArray[np.float32], Values]]:
@@ -103,7 +100,6 @@ def _run(
         depth = [data.source.depth_mm(data.samples[int(row)]) for row in batch.row]
         edges = batch.depth_range_mm.double().numpy()
         yield values, np.stack(depth), np.stack([edges[:, 0], edges[:, 1] - edges[:, 0]], axis=1)
-        progress(len(depth))
 
 
 Run = Callable[[], Iterator[tuple[Tensor, NDArray[np.float32], Values]]]

@@ -13,6 +13,7 @@ layer computes: the network has to choose one, not to find it."""
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -153,12 +154,11 @@ class UNet(UShape):
     """
 
     name = "unet"
+    rules: ClassVar = {"standardised": (0, 1), "guided": (0, 1)}
 
     def __init__(self, *, width: int = 64, dropout: float = 0.0, standardised: int = 0, guided: int = 0) -> None:
-        width = base.whole(self.name, "width", width)
-        dropout = base.rate(self.name, "dropout", dropout)
         flags = {"standardised": standardised, "guided": guided}
-        given = {name: 1 for name, flag in flags.items() if base.whole(self.name, name, flag, least=0)}
+        given = {name: 1 for name, flag in flags.items() if flag}
         bottleneck = DoubleConvolution(8 * width, 16 * width)
         base.initialise(bottleneck, "convolutions")
         deepest = nn.Sequential(bottleneck, nn.Dropout2d(dropout))
@@ -212,11 +212,9 @@ class TransUNet(UShape):
     """
 
     name = "transunet"
+    rules: ClassVar = {"map_size": (2, 1)}
 
     def __init__(self, *, width: int = 64, patch: int = 6, map_size: int = 60) -> None:
-        width = base.whole(self.name, "width", width)
-        patch = base.whole(self.name, "patch", patch)
-        map_size = base.whole(self.name, "map_size", map_size, least=2)
         if map_size % patch:
             raise NetworkError(f"{self.name}: patch must divide map_size; they were {patch} and {map_size}")
         bottleneck = TokenBottleneck(8 * width, 16 * width, 12 * width, map_size, patch)
@@ -241,7 +239,6 @@ class ResUNet(Levels):
     pooled = False
 
     def __init__(self, *, width: int = 120) -> None:
-        width = base.whole(self.name, "width", width)
         super().__init__(width=width)
         widths = [width * 2**level for level in range(4)]
         self.encoder = nn.ModuleList(

@@ -29,10 +29,19 @@ from fpp_ml_bench.baselines.networks.model import build as build_network
 from fpp_ml_bench.baselines.networks.model import discriminator
 from fpp_ml_bench.baselines.networks.unet import re_projection_loss
 from fpp_ml_bench.baselines.phase.calibration_layer import CalibrationLayer
-from fpp_ml_bench.baselines.training.engine import DIVERGED, Training, alone_in, claim_folder, reproducible
+from fpp_ml_bench.baselines.training.engine import (
+    CURVE_FILE,
+    DIVERGED,
+    LOG_FILE,
+    Panel,
+    Record,
+    Training,
+    alone_in,
+    claim_folder,
+    reproducible,
+)
 from fpp_ml_bench.baselines.training.losses import Adversarial, AdversarialSettings, Regression
 from fpp_ml_bench.baselines.training.recipe import GAN, Linear, Plateau, Recipe
-from fpp_ml_bench.baselines.training.records import CURVE_FILE, LOG_FILE, Panel, Record
 from fpp_ml_bench.baselines.training.weights import ModelConfig, save_weights, training_benchmark
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import Normalisation
@@ -184,7 +193,8 @@ def at_minimum(rule: Plateau | Linear, rate: float) -> bool:
 
 
 class DepthTraining(Training):
-    """`Training` of a recipe in epochs, on pairs of a fringe image and depth; every epoch is validated."""
+    """`Training` of a recipe in epochs, on pairs of a fringe image and depth; every epoch is validated. ``epochs``: at
+    most; a plateau may end it sooner."""
 
     objective: Regression | Adversarial
 
@@ -195,6 +205,10 @@ class DepthTraining(Training):
         super().__init__(out, identity, recipe.seed, recipe.precision)
         self.recipe, self.data, self.validation = recipe, data, validation
         self.name, self.title = recipe.name, recipe.title
+        schedule, most = recipe.schedule, recipe.max_epochs
+        self.epochs = min(schedule.constant + schedule.decay, most) if isinstance(schedule, Linear) else most
+        self.interval_steps = len(self._indices())
+        self.total_steps = self.epochs * self.interval_steps
         network = build_network(recipe.network, width=recipe.width, **recipe.options)
         if recipe.loss.name == GAN:
             settings = AdversarialSettings.of(recipe.loss.alpha)
@@ -238,12 +252,6 @@ class DepthTraining(Training):
         return len(self.history)
 
     @property
-    def epochs(self) -> int:
-        """Epochs at most; a plateau may end it sooner."""
-        rule, most = self.recipe.schedule, self.recipe.max_epochs
-        return min(rule.constant + rule.decay, most) if isinstance(rule, Linear) else most
-
-    @property
     def best(self) -> Record:
         return min(self.history, key=lambda record: record["validation_loss"])
 
@@ -255,14 +263,6 @@ class DepthTraining(Training):
     @property
     def over(self) -> bool:
         return super().over or (self.epoch > 0 and at_minimum(self.recipe.schedule, self.learning_rate))
-
-    @property
-    def interval_steps(self) -> int:
-        return len(self._indices())
-
-    @property
-    def total_steps(self) -> int:
-        return self.epochs * self.interval_steps
 
     def _indices(self) -> list[list[int]]:
         """The pairs of each batch of this process in the coming epoch; all processes have as many batches."""

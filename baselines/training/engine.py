@@ -1,15 +1,18 @@
 """The training loop of all networks, on the devices that `accelerate` finds, or that ``accelerate launch`` gives it; a
 batch of the recipe is that of one process.
 
-After each interval (an epoch, or a number of steps) the folder holds all that is needed to resume. On one processor
+After each interval (an epoch, or a number of steps) the folder holds all that is needed to resume: the checkpoint, a
+safetensors file, never a pickle, of networks, optimisers and history; and the log. On one processor
 type and number of threads the same recipe and data give the same bits on the CPU, stopped and resumed or not.
 """
 
 import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -18,33 +21,146 @@ import torch
 from accelerate import Accelerator
 from accelerate.state import AcceleratorState
 from accelerate.utils import broadcast_object_list, gather_object, set_seed
+from pydantic import TypeAdapter
+from rich import progress as bar
+from rich.console import Console
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from fpp_ml_bench.baselines.networks.base import tiny_floats_are_zero
-from fpp_ml_bench.baselines.training import records
-from fpp_ml_bench.baselines.training.records import Display, Panel, Record
-from fpp_ml_bench.errors import TrainingError
+from fpp_ml_bench.baselines.training.weights import Family, file_bytes, read_file
+from fpp_ml_bench.errors import TrainingError, WeightsError
 from fpp_ml_bench.files import LOCK_FILE, cause_of, exclusive, read_json, write_atomically
 from fpp_ml_bench.machine import keep_freed_memory
+from fpp_ml_bench.style import figure, figure_png, styled
 
 CHECKPOINT, RECIPE = "checkpoint.safetensors", "recipe.json"
 CHECK_EVERY = 16
 """Steps between two checks of the losses: reading a loss makes a GPU wait."""
 DIVERGED = 1e6
 """Multiple of the first loss from which on a training counts as diverged."""
+LOG_FILE, CURVE_FILE = "log.jsonl", "curve.png"
+State = dict[str, Tensor]
+Record = dict[str, Any]
+CHECKPOINTS = Family("fpp-ml-bench training", TypeAdapter(Record), "RECIPE", nn.Module)
+
+
+def optimizer_tensors(optimizer: Optimizer, prefix: str) -> State:
+    """The optimiser's state as tensors, ``prefix.parameter number.key``."""
+    state = optimizer.state_dict()["state"]
+    items = ((f"{prefix}.{number}.{key}", v) for number, values in state.items() for key, v in values.items())
+    return {name: value for name, value in items if isinstance(value, Tensor)}
+
+
+def restore_optimizer(optimizer: Optimizer, tensors: State, prefix: str) -> None:
+    """Put back what `optimizer_tensors` took; the rate and other settings stay as they are."""
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, value in tensors.items():
+        if name.startswith(f"{prefix}."):
+            number, key = name[len(prefix) + 1 :].split(".", 1)
+            state.setdefault(int(number), {})[key] = value
+    optimizer.load_state_dict({"state": state, "param_groups": optimizer.state_dict()["param_groups"]})
+
+
+def save_checkpoint(path: Path, tensors: State, state: Record) -> None:
+    """Write ``tensors`` and the JSON mapping ``state``, sealed with a digest of both."""
+    seal = sha256(file_bytes(CHECKPOINTS, state, tensors)).hexdigest()
+    write_atomically(path, file_bytes(CHECKPOINTS, {**state, "sha256": seal}, tensors))
+
+
+def read_checkpoint(path: Path) -> tuple[State, Record]:
+    """What `save_checkpoint` wrote. TrainingError for a file that is cut off, changed or something else."""
+    cure = f"delete {path} to train again from the start"
+    try:
+        state, tensors, _ = read_file(path, CHECKPOINTS)
+    except WeightsError as error:
+        raise TrainingError(f"{error}; {cure}") from None
+    if state.pop("sha256", None) != sha256(file_bytes(CHECKPOINTS, state, tensors)).hexdigest():
+        raise TrainingError(f"{path}: its content does not match its own checksum, it was damaged; {cure}")
+    return tensors, state
+
+
+def write_log(folder: Path, history: list[Record]) -> None:
+    """``log.jsonl``: a line for each record: step or epoch (from 1), rate, losses, scores in mm, seconds."""
+    lines = "".join(json.dumps(record, allow_nan=False) + "\n" for record in history)
+    write_atomically(folder / LOG_FILE, lines.encode("utf-8"))
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A diagram of the curve: ``lines`` of a label (none: ``_``), its x and its y; a single point becomes a mark."""
+
+    title: str
+    x_label: str
+    lines: dict[str, tuple[Sequence[float], Sequence[float]]]
+    log: bool = False
+
+    @classmethod
+    def of(cls, title: str, history: list[Record], x: str, labels: Mapping[str, str], log: bool = False) -> "Panel":
+        """The values of the keys ``labels`` over those of ``x``, where there are some."""
+        lines: dict[str, tuple[Sequence[float], Sequence[float]]] = {}
+        for key, label in labels.items():
+            known = [record for record in history if record.get(key) is not None]
+            lines[label] = [record[x] for record in known], [record[key] for record in known]
+        return cls(title, x, lines, log)
+
+
+@styled
+def draw_curves(path: Path, title: str, panels: Sequence[Panel]) -> None:
+    """Write the ``panels`` side by side as the picture ``path``."""
+    from matplotlib.ticker import MaxNLocator
+
+    drawn = figure(10, 3.2)
+    for axes, panel in zip(drawn.subplots(1, len(panels)), panels, strict=True):
+        for label, (x, y) in panel.lines.items():
+            axes.plot(x, y, "o" if len(x) == 1 else "-", label=label)
+        axes.set(title=panel.title, xlabel=panel.x_label, **({"yscale": "log"} if panel.log else {"ylim": (0, None)}))
+        axes.grid()
+        axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+        if not all(label.startswith("_") for label in panel.lines):
+            axes.legend()
+    drawn.suptitle(title)
+    write_atomically(path, figure_png(drawn))
+
+
+class Display(bar.Progress):
+    """A progress bar on standard error over at most ``steps`` steps; silent when ``show`` is False."""
+
+    def __init__(self, name: str, steps: int, show: bool) -> None:
+        super().__init__(
+            bar.TextColumn("{task.description}"),
+            bar.BarColumn(bar_width=20),
+            bar.TextColumn("{task.fields[state]}"),
+            bar.TimeElapsedColumn(),
+            bar.TextColumn("left at most"),
+            bar.TimeRemainingColumn(),
+            console=Console(stderr=True, quiet=not show),
+            disable=not show,
+        )
+        self.bar = self.add_task(name, total=steps, state="")
+
+    def step(self, steps: int = 1) -> None:
+        """So many more steps are done."""
+        self.advance(self.bar, steps)
+
+    def at(self, steps_done: int, state: str) -> None:
+        """All steps so far, now or by an earlier call, and words on where they led."""
+        self.update(self.bar, completed=steps_done, state=state)
 
 
 class Training(ABC):
     """A training's state and loop; a subclass says what is trained on what, at which rate, and how it is validated.
     ``objective``: its ``modules`` have an optimiser each. ``bare``: the modules themselves, not compiled or
-    distributed, as they are saved. ``identity``: recipe and data, which a checkpoint must share."""
+    distributed, as they are saved. ``identity``: recipe and data, which a checkpoint must share. ``interval_steps``: of
+    an interval, but the last may have fewer; ``total_steps`` at most."""
 
     name: str
     title: str
     objective: Any
     optimizers: dict[str, Optimizer]
     bare: dict[str, nn.Module]
+    interval_steps: int
+    total_steps: int
     largest_gradient: float | None = None
 
     def __init__(self, out: Path, identity: Record, seed: int, precision: str = "fp32", cpu: bool = False) -> None:
@@ -56,16 +172,6 @@ class Training(ABC):
         self.first_loss: float | None = None
         self.before, self.resumed_at = 0.0, 0
         """Seconds of earlier calls, and intervals that they trained."""
-
-    @property
-    @abstractmethod
-    def interval_steps(self) -> int:
-        """Steps of an interval; the last may have fewer."""
-
-    @property
-    @abstractmethod
-    def total_steps(self) -> int:
-        """Steps at most."""
 
     @property
     def steps_done(self) -> int:
@@ -107,7 +213,7 @@ class Training(ABC):
         Returns the seconds so far, those of earlier calls included."""
         with Display(self.name, self.total_steps, show and self.accelerator.is_main_process) as display:
             if self.history:
-                display.update(self.steps_done, self.progress())
+                display.at(self.steps_done, self.progress())
             last_interval_s = 0.0
             while not self.over:
                 in_time = minutes is None or perf_counter() - started + last_interval_s < 60 * minutes
@@ -118,14 +224,14 @@ class Training(ABC):
                 self.history.append(self.validated(self._train_interval(display), began))
                 if self.accelerator.is_main_process:
                     self._save()
-                    records.write_log(self.out, self.history)
+                    write_log(self.out, self.history)
                 self.accelerator.wait_for_everyone()
-                display.update(self.steps_done, self.progress())
+                display.at(self.steps_done, self.progress())
                 last_interval_s = perf_counter() - began
         seconds = round(self.before + perf_counter() - started, 1)
         if self.accelerator.is_main_process and self.history:
-            records.write_log(self.out, self.history)
-            records.draw_curves(self.out / records.CURVE_FILE, self.title, self.panels())
+            write_log(self.out, self.history)
+            draw_curves(self.out / CURVE_FILE, self.title, self.panels())
         return seconds
 
     def step(self, batch: Any) -> dict[str, Tensor]:
@@ -145,14 +251,14 @@ class Training(ABC):
     def resume(self) -> None:
         """Continue from the checkpoint, where there is one. Call it when all modules and optimisers are made."""
         if (path := self.out / CHECKPOINT).exists():
-            tensors, state = records.read_checkpoint(path)
+            tensors, state = read_checkpoint(path)
             if any(state.get(key) != value for key, value in self.identity.items()):
                 raise TrainingError(f"{path}: belongs to another recipe, dataset or depth range; give a new folder")
             for name, module in self.bare.items():
                 prefix = f"module.{name}."
                 module.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
             for name, optimizer in self.optimizers.items():
-                records.restore_optimizer(optimizer, tensors, f"optimizer.{name}")
+                restore_optimizer(optimizer, tensors, f"optimizer.{name}")
             self.history, self.first_loss, self.before = state["history"], state["first_loss"], state["seconds"]
             self.resumed_at = len(self.history)
         if len(set(gather_object([len(self.history)]))) > 1:
@@ -174,7 +280,7 @@ class Training(ABC):
             count += 1
             if len(unchecked) == CHECK_EVERY:
                 self._check_losses(unchecked, sums)
-            display.advance()
+            display.step()
         self._check_losses(unchecked, sums)
         return {name: value / count for name, value in sums.items()}
 
@@ -200,10 +306,10 @@ class Training(ABC):
         for name, module in self.bare.items():
             tensors |= {f"module.{name}.{key}": value for key, value in module.state_dict().items()}
         for name, optimizer in self.optimizers.items():
-            tensors |= records.optimizer_tensors(optimizer, f"optimizer.{name}")
+            tensors |= optimizer_tensors(optimizer, f"optimizer.{name}")
         seconds = self.before + sum(record["seconds"] for record in self.history[self.resumed_at :])
         state = {"history": self.history, "first_loss": self.first_loss, "seconds": seconds}
-        records.save_checkpoint(self.out / CHECKPOINT, tensors, {**self.identity, **state})
+        save_checkpoint(self.out / CHECKPOINT, tensors, {**self.identity, **state})
 
 
 def alone_in(out: Path) -> AbstractContextManager[None]:

@@ -19,7 +19,7 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.depth import Normalisation, RangeRule
 from fpp_ml_bench.errors import FppBenchError, WeightsError
-from fpp_ml_bench.files import file_content, printable, strict_json, write_atomically
+from fpp_ml_bench.files import file_content, printable, write_atomically
 from fpp_ml_bench.loaders.storage.benchmark import benchmark_before, benchmark_of, intended_benchmark
 from fpp_ml_bench.loaders.storage.manifest import Manifest
 from fpp_ml_bench.options import did_you_mean
@@ -32,8 +32,8 @@ SHIPPED = Path(__file__).resolve().parent.parent / "weights"
 """Folder of the weights that come with the package, ``{name}.safetensors``."""
 SUFFIX = ".safetensors"
 VERSION = "1"
-LARGEST_BYTES, _LONGEST_HEADER = 1 << 32, 1 << 24
-"""Of a weights file, and of its header, in bytes."""
+LARGEST_BYTES = 1 << 32
+"""Of a weights file, in bytes."""
 HEAD_PREFIX = "range_head."
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -263,28 +263,13 @@ def read_file(path: Path, family: Family) -> "tuple[Any, dict[str, Tensor], str]
     """The checked configuration, the tensors as they are, and the SHA-256 of a file of ``family``. Raises
     `WeightsError`, naming file, expectation, finding and cure, for a file that is absent, damaged, a pickle or of
     another kind or version, or has unknown or missing keys in its configuration."""
-    from safetensors import SafetensorError
+    from safetensors import SafetensorError, safe_open
     from safetensors.torch import load
 
     if not path.is_file():
         actual = "a folder" if path.is_dir() else "no file" if path.exists() else "nothing"
         raise _fault(path, f": expected weights of {family.format} (*{SUFFIX}), found {actual} there")
     data = file_content(path, LARGEST_BYTES, WeightsError, "give a weights file")
-    metadata = _metadata(path, data, family)
-    try:
-        tensors = load(data)
-    except (SafetensorError, ValueError, KeyError, RuntimeError) as error:
-        raise _fault(path, f": damaged ({printable(str(error), 200)}); copy or train it again") from None
-    try:
-        config = family.config.validate_json(metadata.get("config", ""))
-    except ValidationError as error:
-        lines = "\n  ".join(problems_of(error))
-        raise _fault(path, f": its configuration is not valid; train or save it again:\n  {lines}") from None
-    return config, tensors, sha256(data).hexdigest()
-
-
-def _metadata(path: Path, data: bytes, family: Family) -> dict[str, Any]:
-    """The header's ``__metadata__``; refuses what is no file of ``family`` before anything is unpacked."""
     if data[:4] == b"PK\x03\x04" or (data[:1] == b"\x80" and data[1:2] in b"\x02\x03\x04\x05"):
         raise _fault(
             path,
@@ -293,23 +278,27 @@ def _metadata(path: Path, data: bytes, family: Family) -> dict[str, Any]:
             "fpp_ml_bench.baselines.training.weights.save_weights",
         )
     try:
-        length = int.from_bytes(data[:8], "little")
-        if len(data) < 8 or length > min(len(data) - 8, _LONGEST_HEADER):
-            raise ValueError(f"{len(data)} bytes, cut off or no {SUFFIX} at all")
-        metadata = strict_json(data[8 : 8 + length].decode("utf-8")).get("__metadata__", {})
-        if not isinstance(metadata, dict):
-            raise ValueError("its metadata is no mapping")
-    except (ValueError, AttributeError) as error:
-        words = f": damaged or no {SUFFIX} file ({printable(str(error), 200)}); copy or train it again"
-        raise _fault(path, words) from None
-    form, version = (printable(str(metadata.get(key)), 60) for key in ("format", "version"))
+        with safe_open(path, "pt") as file:
+            metadata = file.metadata() or {}
+    except (SafetensorError, OSError, ValueError) as error:
+        raise _fault(
+            path, f": damaged or no {SUFFIX} file ({printable(str(error), 200)}); copy or train it again"
+        ) from None
+    form, version = (printable(metadata.get(key), 60) for key in ("format", "version"))
     if metadata.get("format") != family.format:
         cure = f"give what fpp-bench train {family.recipe} wrote"
         raise _fault(path, f": expected weights of {family.format}, got format {form!r}; {cure}")
     if metadata.get("version") != VERSION:
         cure = "read it with the version of fpp-ml-bench that wrote it, or train again"
         raise _fault(path, f": expected version {VERSION}, got {version!r}; {cure}")
-    return metadata
+    try:
+        tensors, config = load(data), family.config.validate_json(metadata.get("config", ""))
+    except (SafetensorError, KeyError, RuntimeError) as error:
+        raise _fault(path, f": damaged ({printable(str(error), 200)}); copy or train it again") from None
+    except ValidationError as error:
+        lines = "\n  ".join(problems_of(error))
+        raise _fault(path, f": its configuration is not valid; train or save it again:\n  {lines}") from None
+    return config, tensors, sha256(data).hexdigest()
 
 
 def _built(path: Path, config: Any, tensors: "Mapping[str, Tensor]", family: Family) -> "nn.Module":

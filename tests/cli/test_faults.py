@@ -24,8 +24,7 @@ from fpp_ml_bench.baselines.diagnostics.probe import diagnose
 from fpp_ml_bench.baselines.learned.filter_recipe import FilterRecipe
 from fpp_ml_bench.baselines.learned.recipes import CrossedRecipe, PhaseRecipe
 from fpp_ml_bench.baselines.learned.training import train_net
-from fpp_ml_bench.baselines.training.engine import CHECKPOINT, alone_in
-from fpp_ml_bench.baselines.training.records import save_checkpoint
+from fpp_ml_bench.baselines.training.engine import CHECKPOINT, alone_in, save_checkpoint
 from fpp_ml_bench.cli import main, main_eval, run_command
 from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import DatasetError, DiagnosisError, PoolError, RemoteError, TrainingError

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from time import perf_counter
 
@@ -133,13 +132,11 @@ def test_turning_for_the_network_and_back() -> None:
 def test_stopping_and_going_on_gives_the_same_weights(tmp_path: Path) -> None:
     samples, small = [plane(1.7), plane(1.9)], task(SMALL.window, SMALL.vary)
 
-    def scores(network: PhaseNet) -> dict[str, float]:
-        return small.scores(network, samples[:1])
-
     def trained(name: str, recipe: PhaseRecipe = SMALL, minutes: float | None = None) -> WindowTraining:
         (tmp_path / name).mkdir(exist_ok=True)
         with reproducible(cpu=True):
-            training = WindowTraining(recipe, partial(small.draw, samples), scores, tmp_path / name)
+            small.recipe = recipe
+            training = WindowTraining(small, samples, samples[:1], tmp_path / name)
             training.run(perf_counter(), minutes, show=False)
         return training
 

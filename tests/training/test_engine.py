@@ -22,9 +22,15 @@ from fpp_ml_bench.baselines.training.depth_training import (
     spread,
     train,
 )
-from fpp_ml_bench.baselines.training.engine import CHECKPOINT, reproducible
+from fpp_ml_bench.baselines.training.engine import (
+    CHECKPOINT,
+    CURVE_FILE,
+    Display,
+    read_checkpoint,
+    reproducible,
+    save_checkpoint,
+)
 from fpp_ml_bench.baselines.training.recipe import Linear, Plateau, load_recipe, recipe_from_dict
-from fpp_ml_bench.baselines.training.records import CURVE_FILE, Display, read_checkpoint, save_checkpoint
 from fpp_ml_bench.depth import denormalise
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.evaluation.result.model import over_samples
@@ -91,7 +97,7 @@ def test_killed_and_resumed_is_uninterrupted(uninterrupted, tiny, tmp_path, monk
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(Display, "advance", kill)
+        patch.setattr(Display, "step", kill)
         train(small(), tiny, tmp_path / "run", show=False)
     resumed = train(small(), tiny, tmp_path / "run", show=False)
     assert resumed.weights.read_bytes() == uninterrupted.weights.read_bytes()
