@@ -264,7 +264,7 @@ def _judged(
     error is ``error_mm``: confidence, reason, and what is left of depth and error where pixels are masked. ``window``:
     what a pixel was measured in, None for itself alone; ``reasons``: those of the model's own; ``guessed``: pixels
     without a depth, since their order is a guess."""
-    clipped = seen.saturated.astype(np.float32)
+    clipped: NDArray = seen.saturated.astype(np.float32)
     if window is not None:
         clipped = window.moment(clipped) / np.maximum(fit.weight, 1e-3)
     found, least = depth_mm > 0, settings.min_confidence
