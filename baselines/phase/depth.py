@@ -264,7 +264,7 @@ def _judged(
     error is ``error_mm``: confidence, reason, and what is left of depth and error where pixels are masked. ``window``:
     what a pixel was measured in, None for itself alone; ``reasons``: those of the model's own; ``guessed``: pixels
     without a depth, since their order is a guess."""
-    clipped = seen.saturated.astype(np.float32)
+    clipped: NDArray = seen.saturated.astype(np.float32)
     if window is not None:
         clipped = window.moment(clipped) / np.maximum(fit.weight, 1e-3)
     found, least = depth_mm > 0, settings.min_confidence
@@ -303,19 +303,14 @@ def _restored(
     those that were ``known``. Other maps are taken from the ``nearest`` pixel, but for ``maps``."""
     in_range = model.resampling.captured.in_range(depth_mm)
     found = on_object & in_range & (nearest(measured.depth_mm) > 0)
-    beyond = on_object & ~in_range
     # The nearest depth says nothing of a pixel that has none for a reason of its own.
     own = np.where(known, np.uint8(Reason.BACKGROUND), measured.reason)
     own = cv2.resize(own, found.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
     reason = np.where(on_object, nearest(measured.reason), own)
-    reason[beyond & ((reason == Reason.MEASURED) | (reason > Reason.OUT_OF_RANGE))] = Reason.OUT_OF_RANGE
-    for name, where in (
-        ("sigma_mm", found),
-        ("confidence", on_object & in_range),
-        ("order_doubt_mm", on_object),
-        ("modulation_grey", on_object),
-    ):
-        maps[name] = np.where(where, nearest(getattr(measured, name)), np.float32(0))
+    reason[on_object & ~in_range & ((reason == Reason.MEASURED) | (reason > Reason.OUT_OF_RANGE))] = Reason.OUT_OF_RANGE
+    for name in ("sigma_mm", "confidence", "order_doubt_mm"):
+        maps[name] = np.where(on_object & in_range, nearest(getattr(measured, name)), np.float32(0))
+    maps["modulation_grey"] = np.where(on_object, nearest(measured.modulation_grey), np.float32(0))
     maps["depth_mm"] = np.where(found, depth_mm, 0).astype(np.float32)
     return replace(measured, reason=reason.astype(np.uint8), **maps)
 
