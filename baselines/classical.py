@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Answer, Frames, Method, Photographed
-from fpp_ml_bench.coding.code import Limits
 from fpp_ml_bench.coding.phase_shift import PhaseShift
-from fpp_ml_bench.decoding.blocks import DirectionPlan, plan_direction
+from fpp_ml_bench.decoding.blocks import plan_direction
 from fpp_ml_bench.decoding.decode import Decoded, Directions, decode_stack
 from fpp_ml_bench.decoding.fewest import fewest_plans, fewest_steps
 from fpp_ml_bench.decoding.triangulation import ASSUMED_NOISE_GREY, SYSTEMATIC_RAD, depth_sigma_mm, noise_by_light
@@ -74,13 +73,13 @@ class ClassicalMethod(Method):
         if self.options.depth_noise is not None:
             raise PredictionError(f"{self.name}: depth_noise needs a dataset, which says how noisy its frames are")
         directions = rig.directions if direction == "both" else (direction,)
-        plans = [plan_direction(rig, way, steps, Limits()) for way in directions]
+        plans = [plan_direction(rig, way, steps) for way in directions]
         if fewest:
             plans = fewest_plans(rig, plans)[0]
         self.rig, self.threads, self.fewest = rig, threads, fewest
         self.direction: Directions = "both" if len(directions) > 1 else directions[0]
         self.frames_used = tuple(sorted({index for plan in plans for index in plan.frames}))
-        counts = {len(plan.sinusoids) if isinstance(plan, DirectionPlan) else 0 for plan in plans}
+        counts = {len(plan.sinusoids) for plan in plans}
         if len(counts) > 1 or 0 in counts:
             if fewest:
                 raise DecodeError(

@@ -37,7 +37,6 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate
-from fpp_ml_bench.machine import NUMBA_SWITCH, numba_enabled
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.patterns import pattern_image
 from fpp_ml_bench.optics.rig import Rig
@@ -98,10 +97,7 @@ def run_ours(scene: Scene, repeats: int) -> list[Row]:
     rig = scene.rig
     frames = scene.capture([pattern_image(rig, i) for i in range(len(rig.sequence))], seed=1)
     rows = []
-    variants = [("numba", 1), ("numba", os.cpu_count() or 1)] if numba_enabled() else []
-    for kind, threads in [*variants, ("NumPy", 1)]:
-        previous = os.environ.get(NUMBA_SWITCH)
-        os.environ[NUMBA_SWITCH] = "1" if kind == "numba" else "0"
+    for threads in dict.fromkeys((1, os.cpu_count() or 1)):
         for direction in ("both", "vertical"):
 
             def call(direction: Any = direction, threads: int = threads) -> Any:
@@ -110,12 +106,9 @@ def run_ours(scene: Scene, repeats: int) -> list[Row]:
             seconds, decoded = timed(call, repeats)
             exact = decode_stack(frames, rig, direction, details=True).details["vertical"].coordinate_px
             depth = np.where(decoded.depth_mm > 0, decoded.depth_mm, np.nan)
-            name = f"ours, {kind}, {direction}"
+            name = f"ours, {direction}"
             error = depth - scene.depth_mm
             rows.append(Row(name, "depth", len(decoded.frames_used), threads, seconds, exact - scene.u, error))
-        os.environ.pop(NUMBA_SWITCH)
-        if previous is not None:
-            os.environ[NUMBA_SWITCH] = previous
     return rows
 
 

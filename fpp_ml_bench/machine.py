@@ -1,7 +1,7 @@
 """This machine and this process: its hardware, threads and memory, and whether numba compiles the kernels.
 
-Imports neither NumPy nor torch. Compiled kernels are imported only when `numba_enabled` says so, each beside a NumPy
-function that gives the same numbers (but for ray casting and the labelling of orders, always compiled).
+Imports neither NumPy nor torch. Ray casting, decoding and the labelling of orders are always compiled; other kernels
+are imported only when `numba_enabled` says so, each beside a NumPy function that gives the same numbers.
 ``FPP_BENCH_NUMBA=0`` selects NumPy.
 """
 

@@ -27,7 +27,7 @@ from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.coding.gray_code import bits_needed, cell_count
 from fpp_ml_bench.coding.phase_shift import minus_atan2, wrapped_phase
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.decoding.blocks import decode_direction, plain_plan, projected
+from fpp_ml_bench.decoding.blocks import plan_direction, projected
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
 from fpp_ml_bench.optics.rig import Rig
@@ -120,8 +120,7 @@ def plane_stack(
 
 def coordinate_error(rig: Rig, levels: NDArray, exact_px: NDArray) -> tuple[Floats, NDArray]:
     """Error in px of the vertical coordinate, decoded with the default limits, and the flagged pixels."""
-    plan = plain_plan(rig, "vertical", rig.sequence.steps, Limits())
-    decoded = decode_direction(grey(levels), plan, Limits())
+    decoded = plan_direction(rig, "vertical", rig.sequence.steps).decode(grey(levels), Limits())
     return decoded.coordinate_px - exact_px, decoded.reason != Reason.DECODED
 
 

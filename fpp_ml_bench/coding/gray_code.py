@@ -8,6 +8,7 @@ the order can be wrong by 1; a median filter hides such errors but moves depth e
 
 import math
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
@@ -56,6 +57,7 @@ def bits_needed(length_px: float, pitch_px: float) -> int:
     return max(1, (cell_count(length_px, pitch_px) - 1).bit_length())
 
 
+@lru_cache(maxsize=8)
 def cell_centres_rad(length_px: int, pitch_px: float) -> NDArray[np.float64]:
     """Absolute phase at the centre of the pixels of each cell, float64 (cells,): with 9 px per cell 9j + 4. Half a
     pixel later, at (j + 1/2) P/2, it would reduce the tolerance of a quarter period."""

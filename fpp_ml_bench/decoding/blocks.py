@@ -23,12 +23,15 @@ SLACK_PX = 1e-3
 @dataclass(frozen=True)
 class CodePlan:
     """What decoding a direction needs besides the grey levels; the same for every pixel. ``rows`` are the frame indices
-    in the order in which `decode` takes the grey levels."""
+    in the order in which `decode` takes the grey levels. Of the paper's kind of code, which has compiled kernels,
+    ``rows`` begins with some of its ``sinusoids``, with their ``weights`` (3, N) in mean, cosine and sine."""
 
     direction: Direction
     code: Code
     length_px: int
     rows: tuple[int, ...]
+    sinusoids: tuple[int, ...] = ()
+    weights: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 0)))
     constant_levels: Mapping[int, int] = field(default_factory=dict)
     """Grey level by frame index of the frames that need not be captured: the same at every pixel the camera sees."""
 
@@ -37,31 +40,30 @@ class CodePlan:
         """Indices of the frames that must be captured and read."""
         return tuple(index for index in self.rows if index not in self.constant_levels)
 
-    def decode(self, grey: NDArray, limits: Limits) -> Coordinates:
-        """Projector coordinate of a block from its grey levels, uint8 or float32 (rows, n)."""
-        return self.code.decode(grey, self.length_px, limits)
-
-
-@dataclass(frozen=True)
-class DirectionPlan(CodePlan):
-    """The plan of the paper's kind of code, which has compiled kernels, with some of its steps."""
-
-    code: PhaseShift
-    sinusoids: tuple[int, ...] = ()
-    weights: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 0)))
-    centres_rad: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    pitch_px: float = 0.0
-    max_clipped_steps: int = 0
-
     @property
     def gray(self) -> tuple[int, ...]:
         return self.rows[len(self.sinusoids) :]
 
     def decode(self, grey: NDArray, limits: Limits) -> Coordinates:
-        return decode_direction(grey, self, limits)
+        """Projector coordinate of a block from its grey levels, uint8 or float32 (rows, n)."""
+        if not self.sinusoids or grey.dtype != np.uint8:
+            code = self.code
+            if isinstance(code, PhaseShift) and not self.gray:
+                code = replace(code, gray=None)
+            return code.decode(grey, self.length_px, limits)
+        from fpp_ml_bench.coding import kernels
+
+        count, steps, pitch_px = grey.shape[1], len(self.sinusoids), float(self.code.pitch_px or 0.0)
+        results = np.empty(count), np.empty(count), np.empty(count), np.empty(count, dtype=np.uint8)
+        most = steps // CLIPPED_STEPS_DIVISOR if limits.max_clipped_steps is None else limits.max_clipped_steps
+        thresholds = float(limits.min_modulation), float(most), float(limits.ambiguous_fraction), INCONSISTENT_RAD
+        cells = len(self.gray), cell_centres_rad(self.length_px, pitch_px), pitch_px, float(self.length_px)
+        reasons = tuple(float(reason) for reason in STAGE_REASONS)
+        kernels.decode_block(grey, self.weights, cells, thresholds, reasons, results)
+        return Coordinates(*results)
 
 
-def plan_direction(rig: Rig, direction: Direction, steps: int | None, limits: Limits) -> CodePlan:
+def plan_direction(rig: Rig, direction: Direction, steps: int | None) -> CodePlan:
     """Plan for a direction with ``steps`` of the rig's sinusoids, all with None. Raises `DecodeError` for an impossible
     number, and for some of the steps of a code of another kind than the paper's."""
     code, length, rows = rig.code(direction), rig.pattern_length(direction), rig.sequence.coded(direction)
@@ -75,31 +77,10 @@ def plan_direction(rig: Rig, direction: Direction, steps: int | None, limits: Li
         return CodePlan(direction, code, length, (*rows, *(index for index in flat if index is not None)))
     available = rig.sequence.sinusoids(direction)
     chosen = choose_steps(len(available), len(available) if steps is None else steps)
-    allowed = limits.max_clipped_steps
-    sinusoids = tuple(available[i] for i in chosen)
-    (fringes,) = code.fringes
-    return DirectionPlan(
-        direction,
-        replace(code, fringes=(Fringes(code.pitch_px, tuple(fringes.shifts_deg[i] for i in chosen)),)),
-        length,
-        (*sinusoids, *rig.sequence.gray(direction)),
-        sinusoids=sinusoids,
-        weights=phase_weights(2 * np.pi * np.array(chosen) / len(available)),
-        centres_rad=cell_centres_rad(length, code.pitch_px),
-        pitch_px=code.pitch_px,
-        max_clipped_steps=len(chosen) // CLIPPED_STEPS_DIVISOR if allowed is None else allowed,
-    )
-
-
-def plain_plan(rig: Rig, direction: Direction, steps: int | None, limits: Limits) -> DirectionPlan:
-    """`plan_direction` for a rig with the paper's kind of code; `DecodeError` for any other."""
-    plan = plan_direction(rig, direction, steps, limits)
-    if not isinstance(plan, DirectionPlan):
-        raise DecodeError(
-            f"the {direction} code of this rig is not of the paper's kind: sinusoids of one period in equal steps from "
-            "pixel 0 and Gray code in half periods"
-        )
-    return plan
+    sinusoids, (fringes,) = tuple(available[i] for i in chosen), code.fringes
+    chosen_code = replace(code, fringes=(Fringes(code.pitch_px, tuple(fringes.shifts_deg[i] for i in chosen)),))
+    weights = phase_weights(2 * np.pi * np.array(chosen) / len(available))
+    return CodePlan(direction, chosen_code, length, (*sinusoids, *rig.sequence.gray(direction)), sinusoids, weights)
 
 
 def range_m(rig: Rig) -> tuple[float, float]:
@@ -112,22 +93,6 @@ def projected(rays: Maps, depth_m: float, rig: Rig) -> Maps:
     """Projector px (u, v) of the rays' points at ``depth_m``; NaN behind the projector."""
     x, y = rays
     return rig.project(np.stack([x * depth_m, y * depth_m, np.full_like(x, depth_m)], axis=-1))
-
-
-def decode_direction(grey: NDArray, plan: DirectionPlan, limits: Limits) -> Coordinates:
-    """Projector coordinate of a block from its grey levels, uint8 or float32 (rows of the plan, n)."""
-    if grey.dtype != np.uint8:
-        code = plan.code if plan.gray else replace(plan.code, gray=None)
-        return code.decode(grey, plan.length_px, limits)
-    from fpp_ml_bench.coding import kernels
-
-    count = grey.shape[1]
-    results = np.empty(count), np.empty(count), np.empty(count), np.empty(count, dtype=np.uint8)
-    thresholds = float(limits.min_modulation), float(plan.max_clipped_steps), float(limits.ambiguous_fraction)
-    cells = len(plan.gray), plan.centres_rad, plan.pitch_px, float(plan.length_px)
-    reasons = tuple(float(reason) for reason in STAGE_REASONS)
-    kernels.decode_block(grey, plan.weights, cells, (*thresholds, INCONSISTENT_RAD), reasons, results)
-    return Coordinates(*results)
 
 
 def depth_and_reason(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.coding.code import Coordinates, Limits, Reason
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.decoding import blocks
-from fpp_ml_bench.decoding.blocks import CodePlan, DirectionPlan
+from fpp_ml_bench.decoding.blocks import CodePlan
 from fpp_ml_bench.decoding.fewest import JointCode, decode_wrapped, fewest_plans, nearest_pair, with_order
 from fpp_ml_bench.errors import DecodeError
 from fpp_ml_bench.optics.pinhole import Maps
@@ -114,7 +114,7 @@ def mask_indices(mask: NDArray | None, shape: tuple[int, int]) -> NDArray[np.int
     return np.flatnonzero(mask)
 
 
-def check_frames(flat: Mapping[int, NDArray], plan: DirectionPlan, indices: NDArray | None, rig: Rig) -> None:
+def check_frames(flat: Mapping[int, NDArray], plan: CodePlan, indices: NDArray | None, rig: Rig) -> None:
     """Raise `DecodeError`, naming the frame, where a sinusoid of ``plan`` contradicts the others. ``flat`` frames by
     index, uint8 (pixels,); at most `SAMPLED_PX` of the pixels at ``indices`` (None: all) are tested."""
     pixel_count = len(flat[plan.sinusoids[0]]) if indices is None else len(indices)
@@ -261,7 +261,7 @@ class _Image:
             else:
                 # All indices lie in the image; mode "clip" only saves the bounds check and a copy.
                 self.frames[index].take(block.pixels, out=row, mode="clip")
-        if self.joint and isinstance(plan, DirectionPlan):
+        if self.joint:
             block.measured[plan.direction] = decode_wrapped(levels, plan, self.limits)
         else:
             block.measured[plan.direction] = plan.decode(levels, self.limits)
@@ -350,14 +350,14 @@ def decode_stack(
         # A code in cells misses the epipolar line by up to its own step.
         step_px = math.hypot(*(rig.code(name).step_px for name in directions))
         limits = replace(limits, max_disagreement_px=limits.max_disagreement_px + step_px)
-    plans, joint = [blocks.plan_direction(rig, name, steps, limits) for name in directions], None
+    plans, joint = [blocks.plan_direction(rig, name, steps) for name in directions], None
     if fewest:
         plans, joint = fewest_plans(rig, plans)
     used = tuple(sorted(index for plan in plans for index in plan.frames))
     flat, shape = flat_frames(frames, used, rig), (rig.camera.height, rig.camera.width)
     pixels = mask_indices(mask, shape)
     for plan in plans:
-        if isinstance(plan, DirectionPlan):
+        if plan.sinusoids:
             check_frames(flat, plan, pixels, rig)
     # With a mask of most of the image, decoding whole blocks and clearing the rest is faster than reading by index.
     dense = pixels is not None and not details and len(pixels) > MOST_PICKED_SHARE * shape[0] * shape[1]

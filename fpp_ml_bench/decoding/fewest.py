@@ -18,7 +18,7 @@ from fpp_ml_bench.coding.code import MAX_DISAGREEMENT_PX, Coordinates, Limits, R
 from fpp_ml_bench.coding.gray_code import binary_to_gray, cell_count, cell_of
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.decoding import blocks
-from fpp_ml_bench.decoding.blocks import CodePlan, DirectionPlan
+from fpp_ml_bench.decoding.blocks import CodePlan
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm, geometry
 from fpp_ml_bench.optics.pinhole import Maps
 from fpp_ml_bench.optics.rig import Rig
@@ -129,21 +129,18 @@ def fewest_steps(
 def fewest_plans(rig: Rig, plans: list[CodePlan]) -> tuple[list[CodePlan], JointCode | None]:
     """The plans with only the Gray frames that the working range needs, and the joint code if it replaces them all;
     those of codes that are not the paper's kind as they are."""
-    plain = [plan for plan in plans if isinstance(plan, DirectionPlan)]
-    joint = orders_from_phases(rig) if len(plain) == 2 else None
+    joint = orders_from_phases(rig) if len(plans) == 2 and all(plan.sinusoids for plan in plans) else None
     if joint is not None and joint.unambiguous:
-        return [replace(plan, rows=plan.sinusoids) for plan in plain], joint
+        return [replace(plan, rows=plan.sinusoids) for plan in plans], joint
     fewer: list[CodePlan] = []
     for plan in plans:
-        if not isinstance(plan, DirectionPlan):
-            fewer.append(plan)
-            continue
-        levels = zip(plan.gray, gray_levels_in_view(rig, plan.direction), strict=True)
-        fewer.append(replace(plan, constant_levels={frame: level for frame, level in levels if level is not None}))
+        levels = gray_levels_in_view(rig, plan.direction) if plan.sinusoids else ()
+        same = {frame: level for frame, level in zip(plan.gray, levels, strict=False) if level is not None}
+        fewer.append(replace(plan, constant_levels=same))
     return fewer, None
 
 
-def decode_wrapped(grey: NDArray[np.uint8], plan: DirectionPlan, limits: Limits) -> Coordinates:
+def decode_wrapped(grey: NDArray[np.uint8], plan: CodePlan, limits: Limits) -> Coordinates:
     """Phase and modulation of a block without Gray frames; reasons that depend on a fringe order are cleared."""
     coordinates = plan.decode(grey, limits)
     reason = coordinates.reason

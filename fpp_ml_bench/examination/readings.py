@@ -73,7 +73,7 @@ def fit(lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits,
     seen = replace(lines, levels=levels)
     measured, edges = {}, 1.0
     for direction in directions:
-        plan = plan_direction(rig, direction, None, limits)
+        plan = plan_direction(rig, direction, None)
         measured[direction] = plan.decode(np.ascontiguousarray(levels[list(plan.rows)]), limits)
     reasons = np.stack([coordinates.reason for coordinates in measured.values()])
     reason = np.where(reasons == 0, np.uint8(Reason.NOT_ASKED), reasons).min(axis=0)

@@ -89,14 +89,14 @@ def test_noise_is_what_the_code_says_and_no_order_slips(name):
 
 
 def test_the_papers_code_is_one_of_them_bit_for_bit(monkeypatch):
-    from fpp_ml_bench.decoding.blocks import decode_direction, plain_plan
+    from fpp_ml_bench.decoding.blocks import plan_direction
 
     rig = paper_rig(64)
-    code, plan = rig.code("vertical"), plain_plan(rig, "vertical", None, LIMITS)
+    code, plan = rig.code("vertical"), plan_direction(rig, "vertical", None)
     assert isinstance(code, PhaseShift) and code.is_plain and code == code_of("the paper's")
     levels = np.clip(np.rint(seen(code, np.random.default_rng(0).uniform(0, 911, 4000), noise=2)), 0, 255)
     levels = levels.astype(np.uint8)
-    compiled, general = decode_direction(levels, plan, LIMITS), code.decode(levels, 912, LIMITS)
+    compiled, general = plan.decode(levels, LIMITS), code.decode(levels, 912, LIMITS)
     good = compiled.reason == 0
     assert good.mean() > 0.98 and np.mean(general.reason == compiled.reason) > 0.999
     np.testing.assert_allclose(general.coordinate_px[good], compiled.coordinate_px[good], atol=1e-11)

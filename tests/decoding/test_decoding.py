@@ -11,7 +11,7 @@ from captures import LENSES, PAPER, TURNED, capture, tilted
 from fpp_ml_bench.baselines.stability.frames import coded_rig, direction_levels, plane_stack, sinusoids
 from fpp_ml_bench.coding.code import Limits, Reason
 from fpp_ml_bench.coding.gray_code import binary_to_gray
-from fpp_ml_bench.decoding.blocks import decode_direction, plain_plan
+from fpp_ml_bench.decoding.blocks import plan_direction
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm, depth_noise_mm
 from fpp_ml_bench.errors import DecodeError
@@ -220,7 +220,7 @@ def test_every_cell_of_a_full_code_has_its_coordinate(bits):
     )
     exact_px = np.arange(2**bits) * 2 + 0.5
     levels = np.rint(direction_levels(rig, exact_px)).astype(np.uint8)
-    decoded = decode_direction(levels, plain_plan(rig, "vertical", 3, Limits()), Limits())
+    decoded = plan_direction(rig, "vertical", 3).decode(levels, Limits())
     assert (decoded.reason == Reason.DECODED).all()
     assert np.abs(decoded.coordinate_px - exact_px).max() < 0.01  # 4 px / 2 pi of half a grey level in 100
 
@@ -230,7 +230,7 @@ def test_a_flipped_bit_alone_is_flagged_or_wrong_by_whole_periods(bit):
     exact_px = np.arange(3.0, 909.0, 0.25)
     levels = np.rint(direction_levels(coded_rig(), exact_px)).astype(np.uint8)
     levels[18 + bit] = 255 - levels[18 + bit]
-    decoded = decode_direction(levels, plain_plan(coded_rig(), "vertical", 18, Limits()), Limits())
+    decoded = plan_direction(coded_rig(), "vertical", 18).decode(levels, Limits())
     slip = ((decoded.coordinate_px - exact_px) / 18.0)[decoded.reason == Reason.DECODED]
     assert np.abs(slip - np.rint(slip)).max() < 0.002
 
@@ -240,7 +240,7 @@ def test_a_code_that_names_a_cell_beyond_the_pattern_is_masked():
     for cell in (102, 103, 111, 127):
         bits = np.repeat((binary_to_gray(cell) >> np.arange(6, -1, -1)[:, None]) & 1, 50, axis=1)
         levels = np.rint(np.concatenate([sinusoids(phase, 18), 27.5 + 200 * bits])).astype(np.uint8)
-        decoded = decode_direction(levels, plain_plan(coded_rig(), "vertical", 18, Limits()), Limits())
+        decoded = plan_direction(coded_rig(), "vertical", 18).decode(levels, Limits())
         assert (decoded.reason != Reason.DECODED).all()
 
 
