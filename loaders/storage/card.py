@@ -15,7 +15,6 @@ from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.loaders.sample import (
     DATA_GROUP,
     MEANINGS,
-    features,
 )
 from fpp_ml_bench.loaders.storage.manifest import CAPTURED, GENERATED, Manifest
 from fpp_ml_bench.optics.rig_file import rig_from_dict, save_rig
@@ -125,7 +124,7 @@ def card(manifest: Manifest, configs: list[Any], form: str, rows: int, text: str
     height, width = manifest.size
     title = f"# {NAME} dataset ({manifest.origin}){form}"
     counts = f"{rows} samples of {height} x {width} px; depth in mm, 0 = background."
-    end = card_end(manifest, features(manifest.columns(), manifest.size))
+    end = card_end(manifest, manifest.features())
     return f"{front_matter(manifest, configs)}{title}\n\n{counts} {text}\n{end}".encode()
 
 
@@ -170,7 +169,7 @@ def write_card(folder: Path, manifest: Manifest) -> list[str]:
         contents[f"{split}/dataset_info.json"] = {
             "citation": "",
             "description": "",
-            "features": features(manifest.columns(DATA_GROUP), manifest.size),
+            "features": manifest.features(DATA_GROUP),
             "homepage": "",
             "license": "" if manifest.origin == CAPTURED else "mit",
         }

@@ -14,7 +14,14 @@ from typing import Any, TypeVar, get_args, get_origin
 from fpp_ml_bench.constants import OBJECT_NAME, REPOSITORY_NAME, SAMPLE_NAME, SCHEMA_VERSION, SPLITS, VIEW_NAME
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import file_hash, path_problem, printable, read_json, text_problem, write_atomically
-from fpp_ml_bench.loaders.sample import DATA_GROUP, available_configs, row_columns, stored_frames, stored_groups
+from fpp_ml_bench.loaders.sample import (
+    DATA_GROUP,
+    available_configs,
+    features,
+    row_columns,
+    stored_frames,
+    stored_groups,
+)
 from fpp_ml_bench.optics.rig_file import rig_from_dict
 from fpp_ml_bench.optics.sequence import AnySequence
 
@@ -120,6 +127,10 @@ class Manifest:
     @property
     def splits(self) -> dict[str, list[str]]:
         return {split: [row["sample"] for row in rows] for split, rows in self.samples.items()}
+
+    def features(self, group: str | None = None) -> dict[str, dict[str, Any]]:
+        """The `columns` as `sample.features`."""
+        return features(self.columns(group), self.size)
 
     def write(self, folder: Path) -> None:
         """Write ``manifest.json`` complete or not at all."""

@@ -7,7 +7,6 @@ Array2D of float32, the same bits, whose bytes are split by significance, which 
 of a file is in memory at a time.
 """
 
-import json
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -116,7 +115,7 @@ def write_shard(
     viewer = picture_threads is not None
     names = columns(dataset) if viewer else dataset.manifest.columns()
     pictures = [name for name in names if viewer and (name == PREVIEW or name.startswith("frame_"))]
-    schema = _viewer_schema(dataset, names, pictures) if viewer else arrow_schema(names, dataset.size)
+    schema = arrow_schema(published_features(dataset) if viewer else dataset.manifest.features())
     stored = _stored_columns(dataset, [shard] if viewer else parts)
     samples = dataset.splits[shard.split][shard.first_row : shard.first_row + shard.rows]
     group_bytes = _VIEWER_GROUP_BYTES if viewer else _GROUP_BYTES
@@ -187,14 +186,6 @@ def published_features(dataset: DatasetFolder, config: str | None = None) -> dic
     names = columns(dataset, config)
     pictures = {name: {"_type": "Image"} for name in names if name == PREVIEW or name.startswith("frame_")}
     return {**layout.features(names, dataset.size), **pictures}
-
-
-def _viewer_schema(dataset: DatasetFolder, names: list[str], pictures: list[str]) -> pa.Schema:
-    schema = arrow_schema([name for name in names if name not in pictures], dataset.size)
-    image = pa.struct({"bytes": pa.binary(), "path": pa.string()})
-    fields = [pa.field(name, image) if name in pictures else schema.field(name) for name in names]
-    content = {"info": {"features": published_features(dataset)}}
-    return pa.schema(fields, metadata={b"huggingface": json.dumps(content).encode()})
 
 
 def _png(dataset: DatasetFolder, sample: str, column: str) -> bytes:

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -85,14 +85,16 @@ def _numbered(split: str, chunks: list[tuple[Sample, ...]]) -> list[ShardPlan]:
     return plans
 
 
-def arrow_schema(columns: list[str], size: tuple[int, int]) -> pa.Schema:
-    """The Arrow schema that ``datasets.Features(...).arrow_schema`` has, written without importing ``datasets``. Arrays
-    are the storage type of its Array2D extension, a list of rows, with the extension named in the field's metadata: a
-    reader that has imported ``datasets`` sees Array2D, all others see plain lists."""
-    fields, described = [], layout.features(columns, size)
+def arrow_schema(described: Mapping[str, Mapping[str, Any]]) -> pa.Schema:
+    """The Arrow schema of columns with these `features`, as ``datasets.Features(...).arrow_schema`` has it, written
+    without importing ``datasets``. Arrays are the storage type of its Array2D extension, a list of rows, with the
+    extension named in the field's metadata: a reader that has imported ``datasets`` sees Array2D, all others see plain
+    lists."""
+    fields = []
     types = {"string": pa.string(), "float32": pa.float32(), "uint8": pa.uint8()}
+    image = pa.struct({"bytes": pa.binary(), "path": pa.string()})
     for name, feature in described.items():
-        kind = types[feature["dtype"]]
+        kind = image if feature["_type"] == "Image" else types[feature["dtype"]]
         if feature["_type"] == "Array2D":
             metadata = {
                 b"ARROW:extension:name": b"datasets.features.features.Array2DExtensionType",
@@ -110,7 +112,7 @@ class ShardWriter:
 
     def __init__(self, manifest: Manifest) -> None:
         self._manifest, self._size = manifest, manifest.size
-        self._schemas = {group: arrow_schema(manifest.columns(group), manifest.size) for group in manifest.groups}
+        self._schemas = {group: arrow_schema(manifest.features(group)) for group in manifest.groups}
         self._images = [name for name in self._schemas[DATA_GROUP].names if name not in (*LABELS, *RANGE)]
         # Mapping 200 MB of new pages for every shard takes longer than filling them.
         self._buffers: dict[str, NDArray] = {}

@@ -1,12 +1,10 @@
 """Proving a dataset intact and its splits clean. Every finding is a sentence that names the file or sample."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from itertools import accumulate
 from pathlib import Path
 
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import OBJECTS, UNSEEN, VIEWS, sample_name, split_of
 from fpp_ml_bench.depth import depth_problem, depth_range_mm
@@ -35,19 +33,8 @@ from fpp_ml_bench.loaders.storage.manifest import (
 from fpp_ml_bench.loaders.storage.shards import arrow_schema
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
-
-@dataclass
-class ImageHashes:
-    """Hash of every image, by split and column and then by sample; ``uniform`` those of images of a single value, which
-    (black without noise) say nothing about what they show."""
-
-    by_column: dict[tuple[str, str], dict[str, str]] = field(default_factory=dict)
-    uniform: set[str] = field(default_factory=set)
-
-    def add(self, split: str, column: str, sample: str, image: NDArray) -> None:
-        digest = self.by_column.setdefault((split, column), {})[sample] = image_hash(image)
-        if image.min() == image.max():
-            self.uniform.add(digest)
+Hashes = dict[tuple[str, str], dict[str, str]]
+"""Of every image, by split and column and then by sample."""
 
 
 def verify(folder: Path, progress: Callable[[int], None] = lambda files: None) -> list[str]:
@@ -60,18 +47,18 @@ def verify(folder: Path, progress: Callable[[int], None] = lambda files: None) -
     opened = DatasetFolder(folder, check=False)
     manifest = opened.manifest
     findings = _foreign_files(folder, manifest)
-    hashes = ImageHashes()
+    hashes, uniform = Hashes(), set[str]()
     for file in manifest.files:
         if damage := damage_of(folder, file):
             findings.append(damage)
         elif isinstance(file, ShardFile):
             # Straight after its checksum the file is still in the page cache, so looking inside costs no second read.
             try:
-                findings += _shard_findings(opened, file, hashes)
+                findings += _shard_findings(opened, file, hashes, uniform)
             except DatasetError as error:  # no Arrow file, or images of another size
                 findings.append(str(error))
         progress(1)
-    findings += _coverage_findings(manifest) + _split_findings(manifest) + _duplicate_images(hashes)
+    findings += _coverage_findings(manifest) + _split_findings(manifest) + _duplicate_images(hashes, uniform)
     return findings or _content_findings(opened, hashes)
 
 
@@ -88,8 +75,9 @@ def _foreign_files(folder: Path, manifest: Manifest) -> list[str]:
     return findings
 
 
-def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: ImageHashes) -> list[str]:
-    """Look inside one intact file: rows, columns, labels, values; and note every image's hash."""
+def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: Hashes, uniform: set[str]) -> list[str]:
+    """Look inside one intact file: rows, columns, labels, values. Notes every image's hash, and in ``uniform`` those of
+    images of a single value, which (black without noise) say nothing about what they show."""
     path = opened.path / shard.path
     manifest = opened.manifest
     rows = manifest.samples.get(shard.split, [])[shard.first_row : shard.first_row + shard.rows]
@@ -98,7 +86,7 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: ImageHashes
     expected = manifest.columns(shard.group)
     mapped = opened.mapped(shard)
     batches = mapped.batches
-    right = batches and _types(batches[0].schema) == _types(arrow_schema(expected, manifest.size))
+    right = batches and _types(batches[0].schema) == _types(arrow_schema(manifest.features(shard.group)))
     if not right or sum(len(b) for b in batches) != shard.rows:
         return [f"{path}: its rows or columns are not those the manifest says"]
     findings = []
@@ -119,7 +107,9 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: ImageHashes
                 problem = "unknown flags"
             if problem:
                 findings.append(f"{path}: sample {row['sample']!r}, column {column}: {problem}")
-            hashes.add(shard.split, column, row["sample"], image)
+            digest = hashes.setdefault((shard.split, column), {})[row["sample"]] = image_hash(image)
+            if image.min() == image.max():
+                uniform.add(digest)
     opened.forget(shard)
     return findings
 
@@ -164,24 +154,24 @@ def _split_findings(manifest: Manifest) -> list[str]:
     return findings
 
 
-def _content_findings(opened: DatasetFolder, hashes: ImageHashes) -> list[str]:
+def _content_findings(opened: DatasetFolder, hashes: Hashes) -> list[str]:
     """Columns whose images are not those that the manifest was written for, and so maybe no benchmark's."""
     findings = []
-    for (split, column), images in hashes.by_column.items():
+    for (split, column), images in hashes.items():
         try:
             opened.content_hash(split, column, images)
         except DatasetError as error:
             findings.append(str(error))
-    named = {f"{split}/{column}" for split, column in hashes.by_column}
+    named = {f"{split}/{column}" for split, column in hashes}
     return findings + [f"{opened.path}: {name} is in {MANIFEST} only" for name in opened.content if name not in named]
 
 
-def _duplicate_images(hashes: ImageHashes) -> list[str]:
+def _duplicate_images(hashes: Hashes, uniform: set[str]) -> list[str]:
     """Images that stand in more than one split, by the hash of their pixels."""
     findings, places = [], dict[str, list[tuple[str, str, str]]]()
-    for (split, column), images in hashes.by_column.items():
+    for (split, column), images in hashes.items():
         for sample, digest in images.items():
-            if column not in PIXEL_MAPS and digest not in hashes.uniform:
+            if column not in PIXEL_MAPS and digest not in uniform:
                 places.setdefault(digest, []).append((split, sample, column))
     for copies in places.values():
         if len({split for split, _, _ in copies}) > 1:

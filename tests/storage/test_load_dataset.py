@@ -196,7 +196,10 @@ def test_schema_is_what_datasets_itself_would_write(config, exact):
         }
     )
     # Through a file, as a reader gets it: with `datasets` imported, the extension type comes from the metadata.
-    schema, expected = pa.ipc.read_schema(arrow_schema(columns, (120, 160)).serialize()), expected_features.arrow_schema
+    schema, expected = (
+        pa.ipc.read_schema(arrow_schema(features(columns, (120, 160))).serialize()),
+        expected_features.arrow_schema,
+    )
     assert schema.equals(expected)
     assert json.loads(schema.metadata[b"huggingface"]) == json.loads(expected.metadata[b"huggingface"])
     assert datasets.Features.from_arrow_schema(schema) == expected_features
