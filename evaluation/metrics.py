@@ -365,9 +365,9 @@ UNCERTAINTY = {metric.key: metric for metric in _STATED}
 
 def with_column(width: int) -> list[Metric]:
     """Those with a column in the leaderboard's tables where the terminal has ``width`` characters, the most important
-    first."""
+    and the errors over the object first."""
     shown = (metric for metric in METRICS.values() if metric.column and metric.column_from <= width)
-    return sorted(shown, key=lambda metric: (metric.column_from, metric.role != "rank"))
+    return sorted(shown, key=lambda metric: (metric.column_from, not (metric.headline and metric.over == "object")))
 
 
 def sort_keys() -> tuple[str, ...]:
