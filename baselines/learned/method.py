@@ -54,6 +54,7 @@ class LearnedMethod(Method):
     recipe: ClassVar[str]
     """Module and class of the recipe of its training."""
     packages = ("numpy", "numba", "torch")
+    file: "WeightsFile"
     weights_config: "NetConfig"
 
     @classmethod
@@ -80,8 +81,9 @@ class LearnedMethod(Method):
         from fpp_ml_bench.baselines.learned.network import SHIPPED, load_net
         from fpp_ml_bench.baselines.training.weights import PHASE_NETWORKS, WeightsFile, shipped_names
 
-        given = isinstance(weights, WeightsFile)
-        self.file = weights if given else load_net(weights, family is None, family or PHASE_NETWORKS)
+        if not isinstance(weights, WeightsFile):
+            weights = load_net(weights, family is None, family or PHASE_NETWORKS)
+        self.file = weights
         self.weights_config = config = self.file.config
         self.parameters = sum(parameter.numel() for parameter in self.file.network.parameters())
         self.more = "" if config.name in shipped_names(SHIPPED) else f" ({config.name})"

@@ -339,7 +339,7 @@ class CrossedTask(CandidateTask):
     def changes_rad(self, answers: Answers, sample: Sample) -> Image:
         return chosen_values(sample.scene.single().offers_rad, answers.logits.argmax(axis=0)) + answers.correction_rad
 
-    def depth_mm(self, sample: Sample, change_rad: Image) -> Image:
+    def depth_mm(self, sample: Sample, change_rad: Image) -> NDArray:
         part = self.route.carriers.at(sample.scene.crop)
         return part.depth_mm(sample.scene.nearness + change_rad / part.joint_gain)
 

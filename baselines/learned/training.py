@@ -20,6 +20,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
@@ -371,7 +372,7 @@ class CandidateTask(Task):
         """By how much the answers change the phase of a sample's scene: each pixel's likeliest order is taken."""
 
     @abstractmethod
-    def depth_mm(self, sample: Sample, change_rad: Image) -> Image:
+    def depth_mm(self, sample: Sample, change_rad: Image) -> NDArray:
         """Depth with the phase of a sample's scene changed."""
 
     def draw(self, samples: list[Sample], random: np.random.Generator) -> Window:

@@ -317,7 +317,7 @@ class DepthTraining(Training):
         }
         if all(loss < before["validation_loss"] for before in self.history) and self.accelerator.is_main_process:
             network, data = self.bare["network"], self.data
-            config = model_config(self.recipe, network, data.source, record["epoch"], scores)
+            config = model_config(self.recipe, network, data.source, self.epoch + 1, scores)
             save_weights(self.out / WEIGHTS, network, replace(config, range_rule=data.range_rule))
         return record
 
