@@ -420,23 +420,20 @@ class CrossedScene(Candidates):
         part, nearer = carriers.at(self.crop), candidate == 2
         where = where & self.exists[candidate]
         change_rad = self.step_rad[int(nearer)] * where
-        nothing, back = np.full_like(change_rad, np.pi), np.zeros_like(change_rad)
-        old_base, beyond = (0, 2) if nearer else (2, 0)
-        misfit, exists, step = self.misfit_rad.copy(), self.exists.copy(), self.step_rad.copy()
-        misfit[1], exists[1] = self.misfit_rad[candidate], True
-        misfit[old_base], exists[old_base] = self.misfit_rad[1], True
-        misfit[beyond], exists[beyond] = nothing, False
-        step[int(not nearer)], step[int(nearer)] = -change_rad, back
+        zero, old, new = np.zeros_like(change_rad), self.misfit_rad[1], self.misfit_rad[candidate]
+        misfits, exists, steps = [old, new, zero + np.float32(np.pi)], [True, True, False], [-change_rad, zero]
+        one_way = 1 if nearer else -1  # from further to nearer, or back
         change = change_rad / part.joint_gain
         window = wrapped(self.window_rad - part.gain * change).astype(np.float32)
         nearness = (self.nearness + change).astype(np.float32)
-        new = {"misfit_rad": misfit, "exists": exists, "step_rad": step, "window_rad": window, "nearness": nearness}
-        return replace(self, **{name: np.where(where, maps, getattr(self, name)) for name, maps in new.items()})
-
-
-def without_plane(scene: CrossedScene) -> CrossedScene:
-    """The same where no plane is known."""
-    return replace(scene, plane_misfit=np.zeros_like(scene.plane_misfit), shown=False)
+        maps = {
+            "misfit_rad": np.stack(misfits[::one_way]),
+            "exists": np.array(exists[::one_way])[:, None, None],
+            "step_rad": np.stack(steps[::one_way]),
+            "window_rad": window,
+            "nearness": nearness,
+        }
+        return replace(self, **{name: np.where(where, values, getattr(self, name)) for name, values in maps.items()})
 
 
 def crossed_channels(scene: CrossedScene, carriers: Carriers) -> tuple[Image, Mask]:

@@ -226,8 +226,9 @@ class PhaseTask(CandidateTask):
     def answers(self, network: PhaseNet, sample: Sample) -> Answers:
         return phase_answers(network, sample.scene.single(), self.geometries[sample.direction])
 
-    def changes_rad(self, answers: Answers, sample: Sample) -> Image:
-        return TAU * np.array(STEPS, np.int32)[answers.logits.argmax(axis=0)] + answers.correction_rad
+    def changes_rad(self, answers: Answers, sample: Sample, choice: NDArray[np.intp] | None = None) -> Image:
+        likeliest = answers.logits.argmax(axis=0) if choice is None else choice
+        return TAU * np.array(STEPS, np.int32)[likeliest] + answers.correction_rad
 
     def depth_mm(self, sample: Sample, change_rad: Image) -> Image:
         scene = sample.scene.single()
@@ -239,8 +240,7 @@ class PhaseTask(CandidateTask):
         scene = sample.scene.single()
         inside = decided_mask(answers, scene, threshold)
         choice = decided_order(answers, scene, inside, self.geometries[sample.direction])
-        change = TAU * np.array(STEPS, np.int32)[choice] + answers.correction_rad
-        wrong = np.abs(change - sample.missing) > self.wrong_rad
+        wrong = np.abs(self.changes_rad(answers, sample, choice) - sample.missing) > self.wrong_rad
         places = np.nonzero((sample.target & inside)[::JUDGED_PX, ::JUDGED_PX])
         row, column = (JUDGED_PX * place for place in places)
         return Judged(sample.group, answers.logits[:, row, column], choice[row, column], wrong[row, column])
@@ -322,7 +322,7 @@ class CrossedTask(CandidateTask):
             scene = scene.with_base(int(random.choice((0, 2))), where, carriers)
             missing = np.where(target, missing - (scene.nearness - before) * carriers.at(scene.crop).joint_gain, 0)
         if random.random() < vary.no_plane:
-            scene = inputs.without_plane(scene)
+            scene = replace(scene, plane_misfit=np.zeros_like(scene.plane_misfit), shown=False)
         x, exists = inputs.crossed_channels(scene, carriers)
         distance = missing - scene.offers_rad
         apart = np.where(exists, np.abs(distance), np.inf)

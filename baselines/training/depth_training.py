@@ -137,12 +137,9 @@ def epoch_order(pairs: int, drawn: int | None, seed: int, epoch: int) -> list[in
     all pairs after the other: every pair comes once before any comes twice."""
     drawn = min(drawn or pairs, pairs)
     first = epoch * drawn
-    order: list[int] = []
-    for turn in range(first // pairs, (first + drawn - 1) // pairs + 1):
-        shuffled = np.random.default_rng([seed, turn]).permutation(pairs)
-        start = max(0, first - turn * pairs)
-        order += shuffled[start : first + drawn - turn * pairs].tolist()
-    return order
+    turns = range(first // pairs, (first + drawn - 1) // pairs + 1)
+    rounds = np.concatenate([np.random.default_rng([seed, turn]).permutation(pairs) for turn in turns])
+    return rounds[first % pairs :][:drawn].tolist()
 
 
 def spread(pairs: int, drawn: int | None) -> list[int]:
