@@ -128,33 +128,22 @@ class Rotation:
         return (-self.sign if self.reversed else self.sign) * down, self.sign * right
 
 
-@dataclass(frozen=True)
-class Geometry:
-    """Route and rotation for all images of a rig and fringe direction."""
+class Geometry(PhaseRoute):
+    """The measured route of a rig and fringe direction, and the rotation of all its images."""
 
-    rig: Rig
-    route: PhaseRoute
-    rotation: Rotation
-
-    @classmethod
-    def of(cls, rig: Rig, settings: Settings, periods: Periods | None = None) -> "Geometry":
-        """As `phase.PhaseRoute`: ``rig`` of the geometry is that of the images resampled to ``periods``."""
-        route = PhaseRoute(rig, settings, periods=periods)
-        return cls(route.rig, route, Rotation.of(route.layer, settings.direction))
-
-    @property
-    def layer(self) -> CalibrationLayer:
-        return self.route.layer
+    def __init__(self, rig: Rig, settings: Settings, periods: Periods | None = None) -> None:
+        super().__init__(rig, settings, periods)
+        self.rotation = Rotation.of(self.layer, settings.direction)
 
     @property
     def shading(self) -> bool:
         """Whether brightness is a cue for the order: one albedo for all surfaces."""
-        return self.route.settings.shading
+        return self.settings.shading
 
     def in_range(self, depth_mm: NDArray) -> Mask:
         """Whether a depth lies in the working range, or its slack."""
-        (near, far), slack = self.rig.working_range_mm, self.route.settings.slack_mm
-        return (depth_mm > near - slack) & (depth_mm < far + slack)
+        low, high = self.range_mm
+        return (depth_mm > low) & (depth_mm < high)
 
 
 @dataclass(frozen=True)
@@ -297,7 +286,7 @@ def phase_channels(scene: PhaseScene, geometry: Geometry) -> tuple[Image, Mask]:
     relief = np.nan_to_num(rotation.sign * (residual - scene.middle_rad)) / RELIEF_RAD
     # The correction c that a pixel's own light asks for if its brightness g is right: light = g (1 + cos(phase + c)).
     guess = -misfit * rotation.sign * sine / (sine * sine + SINE_FLOOR)
-    unit = geometry.route.period_px / TAU
+    unit = geometry.period_px / TAU
     down, right = rotation.down_and_right(scene.slopes)
     fitted = np.stack(
         [
@@ -364,7 +353,7 @@ def _turned_sides(scene: PhaseScene, layer: CalibrationLayer, geometry: Geometry
     phase = turn(sign * scene.phase_rad)
     turned_maps = (*rotation.down_and_right(scene.slopes), scene.bright, scene.inside.astype(np.float32))
     maps = np.stack([psi, *map(turn, turned_maps)])
-    reach_px = max(1, round(SIDE_PERIODS * geometry.route.period_px))
+    reach_px = max(1, round(SIDE_PERIODS * geometry.period_px))
     return from_the_sides(turn(scene.light), maps, reach_px, lambda step: 1 + np.cos(phase + step), wrapped)
 
 
@@ -431,23 +420,20 @@ class CrossedScene(Candidates):
         part, nearer = carriers.at(self.crop), candidate == 2
         where = where & self.exists[candidate]
         change_rad = self.step_rad[int(nearer)] * where
-        nothing, back = np.full_like(change_rad, np.pi), np.zeros_like(change_rad)
-        old_base, beyond = (0, 2) if nearer else (2, 0)
-        misfit, exists, step = self.misfit_rad.copy(), self.exists.copy(), self.step_rad.copy()
-        misfit[1], exists[1] = self.misfit_rad[candidate], True
-        misfit[old_base], exists[old_base] = self.misfit_rad[1], True
-        misfit[beyond], exists[beyond] = nothing, False
-        step[int(not nearer)], step[int(nearer)] = -change_rad, back
+        zero, old, new = np.zeros_like(change_rad), self.misfit_rad[1], self.misfit_rad[candidate]
+        misfits, exists, steps = [old, new, zero + np.float32(np.pi)], [True, True, False], [-change_rad, zero]
+        one_way = 1 if nearer else -1  # from further to nearer, or back
         change = change_rad / part.joint_gain
         window = wrapped(self.window_rad - part.gain * change).astype(np.float32)
         nearness = (self.nearness + change).astype(np.float32)
-        new = {"misfit_rad": misfit, "exists": exists, "step_rad": step, "window_rad": window, "nearness": nearness}
-        return replace(self, **{name: np.where(where, maps, getattr(self, name)) for name, maps in new.items()})
-
-
-def without_plane(scene: CrossedScene) -> CrossedScene:
-    """The same where no plane is known."""
-    return replace(scene, plane_misfit=np.zeros_like(scene.plane_misfit), shown=False)
+        maps = {
+            "misfit_rad": np.stack(misfits[::one_way]),
+            "exists": np.array(exists[::one_way])[:, None, None],
+            "step_rad": np.stack(steps[::one_way]),
+            "window_rad": window,
+            "nearness": nearness,
+        }
+        return replace(self, **{name: np.where(where, values, getattr(self, name)) for name, values in maps.items()})
 
 
 def crossed_channels(scene: CrossedScene, carriers: Carriers) -> tuple[Image, Mask]:

@@ -1,16 +1,15 @@
 """The learned methods of ``fpp-bench predict``: phase-net and crossed-net measure depth in one captured frame, without
 a range given; classical-net averages and fills what the decoder finds."""
 
-from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.classical import DIRECTIONS as CODED_DIRECTIONS
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method, OwnViews
 from fpp_ml_bench.baselines.phase.method import (
@@ -32,11 +31,10 @@ from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
+from fpp_ml_bench.optics.sequence import Direction
 from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.baselines.learned.training import StepRecipe
     from fpp_ml_bench.baselines.training.weights import Family, NetConfig, WeightsFile
     from fpp_ml_bench.evaluation.submission.description import Submission
 
@@ -45,20 +43,19 @@ STEPS = 3
 away."""
 WEIGHTS = "weights file of fpp-bench train (default: the weights that come with the package)"
 """Help of an option that all learned methods have."""
-ALBEDOS = ("one", "any")
+Albedo = Literal["one", "any"]
+ALBEDOS: tuple[Albedo, ...] = get_args(Albedo)
 
 
 class LearnedMethod(Method):
     """A method whose network learns from views that its training renders of the training objects."""
 
     Training = OwnViews
+    recipe: ClassVar[str]
+    """Module and class of the recipe of its training."""
     packages = ("numpy", "numba", "torch")
+    file: "WeightsFile"
     weights_config: "NetConfig"
-
-    @classmethod
-    @abstractmethod
-    def recipe(cls, **given: Any) -> "StepRecipe":
-        """The recipe of its training, with the values that were given."""
 
     @classmethod
     def train(cls, training: Any, out: Path, minutes: float | None = None) -> bool:
@@ -66,7 +63,8 @@ class LearnedMethod(Method):
 
         given = {key: value for key, value in vars(training).items() if value is not None}
         start = given.pop("start", None)
-        recipe = cls.recipe(**given)
+        module, name = cls.recipe.split(":")
+        recipe = getattr(import_module(f"fpp_ml_bench.baselines.learned.{module}"), name)(**given)
         trained = train_net(recipe, out, start=start, minutes=minutes, workers=usable_cores(), show=True)
         if trained.weights is None:
             steps = f"{trained.steps} of {recipe.steps} steps"
@@ -83,8 +81,9 @@ class LearnedMethod(Method):
         from fpp_ml_bench.baselines.learned.network import SHIPPED, load_net
         from fpp_ml_bench.baselines.training.weights import PHASE_NETWORKS, WeightsFile, shipped_names
 
-        given = isinstance(weights, WeightsFile)
-        self.file = weights if given else load_net(weights, family is None, family or PHASE_NETWORKS)
+        if not isinstance(weights, WeightsFile):
+            weights = load_net(weights, family is None, family or PHASE_NETWORKS)
+        self.file = weights
         self.weights_config = config = self.file.config
         self.parameters = sum(parameter.numel() for parameter in self.file.network.parameters())
         self.more = "" if config.name in shipped_names(SHIPPED) else f" ({config.name})"
@@ -106,13 +105,8 @@ class LearnedRoute(LearnedMethod, RouteMethod):
     fringe period in px differs by more than ``period_tolerance`` from that of the training images are resampled to
     theirs."""
 
-    route: Any
     threads: int
     period_tolerance: float
-
-    @abstractmethod
-    def image(self, frames: Frames) -> NDArray[np.uint8]:
-        """The image (H, W) that is measured, of a captured sequence."""
 
     def learned_periods(self, fringes: str) -> Periods:
         """Raises `PredictionError` for ``fringes`` that the weights did not learn from."""
@@ -125,29 +119,23 @@ class LearnedRoute(LearnedMethod, RouteMethod):
         return Periods(learned_px / self.period_tolerance, learned_px, learned_px * self.period_tolerance)
 
     def measure(self, frames: Frames) -> Any:
-        """All maps of a captured sequence; frames that are not in `frames_used` may be None."""
         from fpp_ml_bench.baselines.networks.base import torch_threads
 
         with torch_threads(self.threads):
-            return self.route.measure(self.image(frames))
-
-    def crop(self, frames: Frames) -> tuple[slice, slice]:
-        route = self.route.route
-        return route.resampling.captured_crop(route.observe(self.image(frames)).crop)
+            return super().measure(frames)
 
 
 @dataclass(frozen=True)
 class PhaseNetOptions:
     """Options of `PhaseNetMethod`; ``weights``: also a file that was read."""
 
-    direction: Direction = option("horizontal", DIRECTION, choices=DIRECTIONS)
+    direction: Direction = option("horizontal", DIRECTION)
     weights: "str | Path | WeightsFile | None" = option(None, WEIGHTS, "FILE")
     min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
-    albedo: str | None = option(
+    albedo: Albedo | None = option(
         None,
         "one: all surfaces have the background's albedo, and brightness tells the order; any: brightness is not used, "
         "and the order is ambiguous unless range and shape tell it (default: one)",
-        choices=ALBEDOS,
     )
     threads: int = 1
     white_grey: float | None = option(None, WHITE_GREY, "GREY")
@@ -158,9 +146,7 @@ class PhaseNetOptions:
 class PhaseNetTraining(OwnViews):
     """Training of phase-net; ``start``: weights to start from."""
 
-    albedo: str | None = option(
-        None, "one: brightness is a cue for the order; any: it is not (default: one)", choices=ALBEDOS
-    )
+    albedo: Albedo | None = option(None, "one: brightness is a cue for the order; any: it is not (default: one)")
     start: Path | None = option(None, "weights to start from (default: none)", "FILE")
 
 
@@ -172,6 +158,7 @@ class PhaseNetMethod(LearnedRoute):
     for weights that can't be used, and `PredictionError` for an invalid option."""
 
     name = "phase-net"
+    recipe = "recipes:PhaseRecipe"
     period_tolerance = 1.4
     purpose = "one fringe; order, mask and correction learned"
     Options = PhaseNetOptions
@@ -180,12 +167,6 @@ class PhaseNetMethod(LearnedRoute):
     @classmethod
     def for_rig(cls, rig: Rig, **options: Any) -> Method:
         return cls(rig, **fringe_options(cls.name, rig, options))
-
-    @classmethod
-    def recipe(cls, **given: Any) -> "StepRecipe":
-        from fpp_ml_bench.baselines.learned.recipes import PhaseRecipe
-
-        return PhaseRecipe(**given)
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
@@ -243,9 +224,6 @@ class PhaseNetMethod(LearnedRoute):
             **vars(odds),
         }
 
-    def image(self, frames: Frames) -> NDArray[np.uint8]:
-        return self.images(frames)[0]
-
 
 @dataclass(frozen=True)
 class CrossedNetOptions:
@@ -262,16 +240,11 @@ class CrossedNetMethod(LearnedRoute):
     `WeightsError` for weights that can't be used, and `PredictionError` for a rig whose fringes they did not learn."""
 
     name = "crossed-net"
+    recipe = "recipes:CrossedRecipe"
     period_tolerance = 2.2
     purpose = "one crossed frame, with order, mask and correction learned"
     Options = CrossedNetOptions
     scenes_rig = "crossed"
-
-    @classmethod
-    def recipe(cls, **given: Any) -> "StepRecipe":
-        from fpp_ml_bench.baselines.learned.recipes import CrossedRecipe
-
-        return CrossedRecipe(**given)
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
@@ -300,17 +273,15 @@ class CrossedNetMethod(LearnedRoute):
         self.title = f"Crossed fringes, one frame{made}; order, mask and correction learned{self.more}"
         self.settings = {**vars(given), **self.weights_settings, "order_lead": config.lead}
 
-    def image(self, frames: Frames) -> NDArray[np.uint8]:
-        return crossed_image(self.images(frames))
+    def images(self, frames: Frames) -> list[NDArray[np.uint8]]:
+        return [crossed_image(super().images(frames))]
 
 
 @dataclass(frozen=True)
 class ClassicalNetOptions:
     """Options of `ClassicalNetMethod`."""
 
-    direction: Directions | None = option(
-        None, "fringes to use (default: those that the weights learned)", choices=CODED_DIRECTIONS
-    )
+    direction: Directions | None = option(None, "fringes to use (default: those that the weights learned)")
     steps: int | None = option(None, "phase steps a direction, 3 to 18, with Gray code (default: 3)", "N")
     weights: str | Path = option("classical-net", WEIGHTS, "FILE")
     threads: int = 1
@@ -323,14 +294,9 @@ class ClassicalNetMethod(LearnedMethod):
     `PredictionError` for a code whose uncertainty is not known."""
 
     name = "classical-net"
+    recipe = "filter_recipe:FilterRecipe"
     purpose = "classical frames; noise and missed pixels learned"
     Options = ClassicalNetOptions
-
-    @classmethod
-    def recipe(cls, **given: Any) -> "StepRecipe":
-        from fpp_ml_bench.baselines.learned.filter_recipe import FilterRecipe
-
-        return FilterRecipe(**given)
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:

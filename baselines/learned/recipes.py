@@ -10,13 +10,14 @@ windows are turned, and some lose what the plane tells.
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.learned import inputs
 from fpp_ml_bench.baselines.learned.inputs import CROSSED_CHANNELS, STEPS, CrossedScene, Geometry, PhaseScene
+from fpp_ml_bench.baselines.learned.method import ALBEDOS, Albedo
 from fpp_ml_bench.baselines.learned.network import PhaseNet
 from fpp_ml_bench.baselines.learned.odds import (
     Answers,
@@ -48,7 +49,6 @@ from fpp_ml_bench.errors import RecipeError
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
 
-Albedo = Literal["one", "any"]
 RELIABILITY = "reliability.png"
 JUDGED_PX = 3  # the stated chances are calibrated on every so many-th pixel
 MIRRORED = 2  # as of `symmetric`: as with a projector on the other side
@@ -90,8 +90,8 @@ class PhaseRecipe(WindowRecipe):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.albedo not in get_args(Albedo):
-            raise RecipeError(f"albedo {self.albedo!r}: expected {' or '.join(get_args(Albedo))}")
+        if self.albedo not in ALBEDOS:
+            raise RecipeError(f"albedo {self.albedo!r}: expected {' or '.join(ALBEDOS)}")
         if not self.directions or any(direction not in DIRECTIONS for direction in self.directions):
             raise RecipeError(f"directions {self.directions}: expected some of {', '.join(DIRECTIONS)}")
 
@@ -111,17 +111,17 @@ def phase_sample(view: View, image: NDArray[np.uint8], geometry: Geometry) -> Sa
     """Sample of an image uint8 (H, W) of a view, whose void pixels count nowhere, in half precision; None where nothing
     calibrates its brightness, or no object is seen. What is missing: true absolute phase less that of the base order,
     in rad."""
-    observation = geometry.route.observe(image)
+    observation = geometry.observe(image)
     if not observation.background.calibrated or not observation.inside.any():
         return None
-    order, _ = geometry.route.choose(observation)
+    order, _ = geometry.choose(observation)
     scene, part = PhaseScene.of(observation, order, geometry.shading), view.part(observation.crop)
     if not part.target.any():
         return None
     true_phase = observation.layer.absolute_phase(np.where(part.target, part.depth_mm, 1000.0))
     missing = np.where(part.target, true_phase - observation.phase_rad - TAU * order, 0.0)
     half = np.nan_to_num(missing).astype(np.float16)
-    return Sample.of(part, scene.single(np.float16), half, direction=geometry.route.settings.direction)
+    return Sample.of(part, scene.single(np.float16), half, direction=geometry.settings.direction)
 
 
 def _moved(
@@ -184,7 +184,7 @@ class PhaseTask(CandidateTask):
     def __init__(self, recipe: PhaseRecipe, rig: Rig) -> None:
         super().__init__(recipe, rig)
         self.geometries: Geometries = {
-            direction: Geometry.of(rig, Settings(direction=direction, shading=recipe.albedo == "one"))
+            direction: Geometry(rig, Settings(direction=direction, shading=recipe.albedo == "one"))
             for direction in recipe.directions
         }
         self.frames = tuple(rig.sequence.sinusoids(direction)[0] for direction in recipe.directions)
@@ -226,8 +226,9 @@ class PhaseTask(CandidateTask):
     def answers(self, network: PhaseNet, sample: Sample) -> Answers:
         return phase_answers(network, sample.scene.single(), self.geometries[sample.direction])
 
-    def changes_rad(self, answers: Answers, sample: Sample) -> Image:
-        return TAU * np.array(STEPS, np.int32)[answers.logits.argmax(axis=0)] + answers.correction_rad
+    def changes_rad(self, answers: Answers, sample: Sample, choice: NDArray[np.intp] | None = None) -> Image:
+        likeliest = answers.logits.argmax(axis=0) if choice is None else choice
+        return TAU * np.array(STEPS, np.int32)[likeliest] + answers.correction_rad
 
     def depth_mm(self, sample: Sample, change_rad: Image) -> Image:
         scene = sample.scene.single()
@@ -239,8 +240,7 @@ class PhaseTask(CandidateTask):
         scene = sample.scene.single()
         inside = decided_mask(answers, scene, threshold)
         choice = decided_order(answers, scene, inside, self.geometries[sample.direction])
-        change = TAU * np.array(STEPS, np.int32)[choice] + answers.correction_rad
-        wrong = np.abs(change - sample.missing) > self.wrong_rad
+        wrong = np.abs(self.changes_rad(answers, sample, choice) - sample.missing) > self.wrong_rad
         places = np.nonzero((sample.target & inside)[::JUDGED_PX, ::JUDGED_PX])
         row, column = (JUDGED_PX * place for place in places)
         return Judged(sample.group, answers.logits[:, row, column], choice[row, column], wrong[row, column])
@@ -252,9 +252,7 @@ class PhaseTask(CandidateTask):
         odds = chosen_odds(seen)
         draw_reliability(out / RELIABILITY, seen, odds)
         fields["validation"]["confident_percent"] = 100 * max(confident_shares(seen, odds).values())
-        fields |= vars(odds) | {
-            "period_px": {way: geometry.route.period_px for way, geometry in self.geometries.items()}
-        }
+        fields |= vars(odds) | {"period_px": {way: geometry.period_px for way, geometry in self.geometries.items()}}
 
 
 def crossed_sample(view: View, route: CrossedRoute) -> Sample:
@@ -324,7 +322,7 @@ class CrossedTask(CandidateTask):
             scene = scene.with_base(int(random.choice((0, 2))), where, carriers)
             missing = np.where(target, missing - (scene.nearness - before) * carriers.at(scene.crop).joint_gain, 0)
         if random.random() < vary.no_plane:
-            scene = inputs.without_plane(scene)
+            scene = replace(scene, plane_misfit=np.zeros_like(scene.plane_misfit), shown=False)
         x, exists = inputs.crossed_channels(scene, carriers)
         distance = missing - scene.offers_rad
         apart = np.where(exists, np.abs(distance), np.inf)
@@ -341,7 +339,7 @@ class CrossedTask(CandidateTask):
     def changes_rad(self, answers: Answers, sample: Sample) -> Image:
         return chosen_values(sample.scene.single().offers_rad, answers.logits.argmax(axis=0)) + answers.correction_rad
 
-    def depth_mm(self, sample: Sample, change_rad: Image) -> Image:
+    def depth_mm(self, sample: Sample, change_rad: Image) -> NDArray:
         part = self.route.carriers.at(sample.scene.crop)
         return part.depth_mm(sample.scene.nearness + change_rad / part.joint_gain)
 

@@ -34,8 +34,7 @@ from fpp_ml_bench.baselines.learned.odds import (
 from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Carriers, Image, Mask, wrapped
 from fpp_ml_bench.baselines.phase.candidates import chosen_values
 from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Fitted, FringeMeasurement, Measurement
-from fpp_ml_bench.baselines.phase.observe import Settings
-from fpp_ml_bench.baselines.phase.observe import Settings as CrossedSettings
+from fpp_ml_bench.baselines.phase.observe import Frames, Settings
 from fpp_ml_bench.baselines.phase.order import JUMP_RAD
 from fpp_ml_bench.baselines.phase.resampling import Periods, nearest_inside, stride_of
 from fpp_ml_bench.optics.rig import Rig
@@ -77,11 +76,11 @@ def decided_order(answers: Answers, scene: PhaseScene, inside: Mask, geometry: G
     """Index of each pixel's candidate (h, w): `least_energy_order`."""
     base = geometry.layer.at(scene.crop).residual_phase(scene.phase_rad, scene.order)
     phases = np.stack([base + TAU * step for step in STEPS]).astype(np.float32)
-    stride, jump_rad = stride_of(geometry.route.period_px), geometry.route.settings.jump_rad
+    stride, jump_rad = stride_of(geometry.period_px), geometry.settings.jump_rad
     return least_energy_order(answers.logits, phases, inside, stride, jump_rad)
 
 
-class PhaseNetRoute:
+class PhaseNetRoute(Geometry):
     """One rig, one fringe direction, one network; images whose fringe period is beyond ``periods`` are resampled. An
     image whose brightness nothing calibrates (`phase.EmptyScene`) is measured without the network: what it learnt
     of order and mask rests on the brightness of a lit background."""
@@ -96,28 +95,25 @@ class PhaseNetRoute:
         odds: Odds | None = None,
         periods: Periods | None = None,
     ) -> None:
-        self.geometry = Geometry.of(rig, settings, periods)
-        self.route = self.geometry.route
+        super().__init__(rig, settings, periods)
         self.network, self.threshold, self.lead, self.odds = network, threshold, lead, odds or Odds()
 
-    def measure(self, image: NDArray[np.uint8]) -> FringeMeasurement:
-        """Everything about one captured fringe uint8 (H, W). Raises `DecodeError` for another dtype or shape."""
-        geometry, route = self.geometry, self.route
-        seen = route.observe(image)
-        base, margin = route.choose(seen)
+    def measure(self, image: Frames, mask: Mask | None = None) -> FringeMeasurement:
+        seen = self.observe(image, mask)
+        base, margin = self.choose(seen)
         if not (seen.background.calibrated and seen.inside.any()):
-            return route.conclude(seen, base, margin)
-        scene = PhaseScene.of(seen, base, geometry.shading)
-        answers = phase_answers(self.network, scene, geometry, self.lead)
+            return self.conclude(seen, base, margin)
+        scene = PhaseScene.of(seen, base, self.shading)
+        answers = phase_answers(self.network, scene, self, self.lead)
         inside = decided_mask(answers, scene, self.threshold)
-        choice = decided_order(answers, scene, inside, geometry)
+        choice = decided_order(answers, scene, inside, self)
         moved = seen.phase_rad + answers.correction_rad
         phase = wrapped(moved).astype(np.float32)
         order = base + np.array(STEPS, np.int32)[choice] + np.rint((moved - phase) / TAU).astype(np.int32)
         uncertainty = np.float32(EXPECTED_SHARE) * answers.sigma_rad
         seen = replace(seen, inside=inside, phase_rad=phase, uncertainty_rad=uncertainty)
         margin = margin_of(wrong_chance(answers.logits, choice, self.odds))
-        return route.conclude(seen, order, margin, -np.inf if geometry.shading else OPEN_MARGIN)
+        return self.conclude(seen, order, margin, -np.inf if self.shading else OPEN_MARGIN)
 
 
 def crossed_answers(network: PhaseNet, scene: CrossedScene, carriers: Carriers, lead: float = 0.0) -> Answers:
@@ -133,7 +129,7 @@ def stated_rad(sigma_rad: Image) -> Image:
     return np.float32(STATED_SHARE) * np.sqrt(rest)  # type: ignore[no-any-return]
 
 
-class CrossedNetRoute:
+class CrossedNetRoute(CrossedRoute):
     """One rig and network; ``threshold`` on the logit of the mask."""
 
     def __init__(
@@ -142,22 +138,20 @@ class CrossedNetRoute:
         network: PhaseNet,
         threshold: float,
         lead: float,
-        settings: CrossedSettings | None = None,
+        settings: Settings | None = None,
         periods: Periods | None = None,
     ) -> None:
-        self.route = CrossedRoute(rig, settings, periods=periods)
+        super().__init__(rig, settings, periods=periods)
         self.network, self.threshold, self.lead = network, threshold, lead
 
-    def measure(self, image: NDArray) -> Measurement:
-        """Everything about one crossed frame (H, W). Raises `DecodeError` for another dtype or shape."""
-        seen = self.route.fitted(self.route.observe(image))
+    def measure(self, image: Frames, mask: Mask | None = None) -> Measurement:
+        seen = self.fitted(self.observe(image, mask))
         if not seen.inside.any():
-            return self.route.conclude(seen)
+            return self.conclude(seen)
         scene = CrossedScene.of(seen)
-        answers = crossed_answers(self.network, scene, self.route.carriers, self.lead)
-        return self.conclude(seen, scene, answers)
+        return self.answered(seen, scene, crossed_answers(self.network, scene, self.carriers, self.lead))
 
-    def conclude(self, seen: Fitted, scene: CrossedScene, answers: Answers) -> Measurement:
+    def answered(self, seen: Fitted, scene: CrossedScene, answers: Answers) -> Measurement:
         """The measurement from the network's answers."""
         joint, offers = seen.carriers.joint_gain, scene.offers_rad
         inside = decided_mask(answers, scene, self.threshold)
@@ -165,7 +159,7 @@ class CrossedNetRoute:
         perhaps = scene.inside | (answers.object_logit > threshold_at(scene.strength, self.threshold) - PERHAPS)
         psi = scene.nearness * joint
         candidates = np.stack([psi + scene.step_rad[0], psi, psi + scene.step_rad[1]])
-        choice = least_energy_order(answers.logits, candidates, perhaps, self.route.stride, JUMP_RAD)
+        choice = least_energy_order(answers.logits, candidates, perhaps, self.stride, JUMP_RAD)
         nearness = scene.nearness + (chosen_values(offers, choice) + answers.correction_rad) / joint
         known = scene.known
         if not known[inside].all():  # beyond the reach of any window: as the nearest pixel within it
@@ -175,7 +169,7 @@ class CrossedNetRoute:
         np.put_along_axis(chances, choice[None], -1, axis=0)
         rival = (scene.nearness + chosen_values(offers, chances.argmax(axis=0)) / joint).astype(np.float32)
         fit = replace(seen.fit, nearness=nearness.astype(np.float32), uncertainty_rad=answers.sigma_rad)
-        return self.route.conclude(replace(seen, fit=fit, inside=inside, rival=rival), wrong)
+        return self.conclude(replace(seen, fit=fit, inside=inside, rival=rival), wrong)
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
@@ -371,7 +372,7 @@ class CandidateTask(Task):
         """By how much the answers change the phase of a sample's scene: each pixel's likeliest order is taken."""
 
     @abstractmethod
-    def depth_mm(self, sample: Sample, change_rad: Image) -> Image:
+    def depth_mm(self, sample: Sample, change_rad: Image) -> NDArray:
         """Depth with the phase of a sample's scene changed."""
 
     def draw(self, samples: list[Sample], random: np.random.Generator) -> Window:
@@ -467,38 +468,38 @@ def train_net(
     with alone_in(out):
         claim_folder(out, {"recipe": described, "dataset_fingerprint": fingerprint})
         weights = out / f"{recipe.weights_name}.safetensors"
-        if weights.exists():
-            config = open_weights(weights, recipe.family).config
-            scores = {key: float(value or 0) for key, value in config.validation.items()}
-            return Trained(weights, config.steps, config.threshold, scores)
-        task = recipe.task(rig)
-        render_views(groups, rig, task.frames, out / VIEWS, workers, show)
-        with Display("measuring views", sum(len(group.views) for group in groups), show) as display:
+        if not weights.exists():
+            task = recipe.task(rig)
+            render_views(groups, rig, task.frames, out / VIEWS, workers, show)
+            with Display("measuring views", sum(len(group.views) for group in groups), show) as display:
 
-            def measured(split: str, unions: int) -> list[Sample]:
-                views = display.track(read_views(out / VIEWS, groups, split), task_id=display.bar)
-                return task.samples(with_unions(views, unions, recipe.seed))
+                def measured(split: str, unions: int) -> list[Sample]:
+                    views, done = read_views(out / VIEWS, groups, split), int(display.tasks[0].completed)
+                    followed = display.track(views, completed=done, task_id=display.bar)
+                    return task.samples(with_unions(followed, unions, recipe.seed))
 
-            samples, validation = measured("train", recipe.unions), measured("validation", 0)
-        with reproducible(cpu=True):
-            start_network = None if first is None else first.network
-            scored = validation[:: task.scored_share]
-            ongoing = WindowTraining(task, samples, scored, out, start_network, show)
-            ongoing.run(started, minutes, show)
-            if not ongoing.over:
-                return Trained(None, ongoing.steps_done, 0.0, {})
-            network = ongoing.network
-            fields = task.chosen(network, samples, validation, out)
-        config = NetConfig(
-            name=recipe.weights_name,
-            title=recipe.title,
-            options=network.options,
-            dataset_fingerprint=fingerprint,
-            benchmark=TrainingBenchmark(f"{recipe.name} views", 1),
-            steps=recipe.steps,
-            recipe=described,
-            **fields,
-        )
-        save_weights(weights, network, config, family=recipe.family)
-        (out / CHECKPOINT).unlink(missing_ok=True)
-        return Trained(weights, recipe.steps, config.threshold, dict(fields["validation"]))
+                samples, validation = measured("train", recipe.unions), measured("validation", 0)
+            with reproducible(cpu=True):
+                start_network = None if first is None else first.network
+                scored = validation[:: task.scored_share]
+                ongoing = WindowTraining(task, samples, scored, out, start_network, show)
+                ongoing.run(started, minutes, show)
+                if not ongoing.over:
+                    return Trained(None, ongoing.steps_done, 0.0, {})
+                network = ongoing.network
+                fields = task.chosen(network, samples, validation, out)
+            trained = NetConfig(
+                name=recipe.weights_name,
+                title=recipe.title,
+                options=network.options,
+                dataset_fingerprint=fingerprint,
+                benchmark=TrainingBenchmark(f"{recipe.name} views", 1),
+                steps=recipe.steps,
+                recipe=described,
+                **fields,
+            )
+            save_weights(weights, network, trained, family=recipe.family)
+            (out / CHECKPOINT).unlink(missing_ok=True)
+        config = open_weights(weights, recipe.family).config
+        scores = {key: float(value or 0) for key, value in config.validation.items()}
+        return Trained(weights, config.steps, config.threshold, scores)

@@ -6,7 +6,7 @@ blocks and no skips. Both are here. The paper gives no sizes: those of pix2pixHD
 U-Net generator of Isola et al., with as many levels as divide the image.
 """
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -69,6 +69,7 @@ class UnitNetwork(FringeNetwork):
     representations in that range. Convolutions start from N(0, 0.02)."""
 
     last_layer = "up1"
+    generator: Any
 
     def __init__(self, generator: nn.Module, **options: int) -> None:
         super().__init__(**options)

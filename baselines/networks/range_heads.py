@@ -212,7 +212,7 @@ def _gains(logits: NDArray, depth_mm: NDArray, target_mm: NDArray) -> Values:
     bins = np.floor((logits.astype(np.float64) + LOGIT_LIMIT) / LOGIT_STEP).clip(0, LOGIT_BINS - 1).astype(int)
     true = target_mm.astype(np.float64)
     gain = np.abs(depth_mm.astype(np.float64) - true) - true
-    return np.bincount(bins.ravel(), gain.ravel(), LOGIT_BINS)
+    return np.bincount(bins.ravel(), gain.ravel(), LOGIT_BINS).astype(np.float64)
 
 
 def _best_threshold(gain: Values) -> float:

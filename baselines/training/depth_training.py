@@ -137,12 +137,9 @@ def epoch_order(pairs: int, drawn: int | None, seed: int, epoch: int) -> list[in
     all pairs after the other: every pair comes once before any comes twice."""
     drawn = min(drawn or pairs, pairs)
     first = epoch * drawn
-    order: list[int] = []
-    for turn in range(first // pairs, (first + drawn - 1) // pairs + 1):
-        shuffled = np.random.default_rng([seed, turn]).permutation(pairs)
-        start = max(0, first - turn * pairs)
-        order += shuffled[start : first + drawn - turn * pairs].tolist()
-    return order
+    turns = range(first // pairs, (first + drawn - 1) // pairs + 1)
+    rounds = np.concatenate([np.random.default_rng([seed, turn]).permutation(pairs) for turn in turns])
+    return rounds[first % pairs :][:drawn].tolist()
 
 
 def spread(pairs: int, drawn: int | None) -> list[int]:
@@ -317,7 +314,7 @@ class DepthTraining(Training):
         }
         if all(loss < before["validation_loss"] for before in self.history) and self.accelerator.is_main_process:
             network, data = self.bare["network"], self.data
-            config = model_config(self.recipe, network, data.source, record["epoch"], scores)
+            config = model_config(self.recipe, network, data.source, self.epoch + 1, scores)
             save_weights(self.out / WEIGHTS, network, replace(config, range_rule=data.range_rule))
         return record
 

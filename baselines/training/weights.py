@@ -268,7 +268,7 @@ def read_file(path: Path, family: Family) -> "tuple[Any, dict[str, Tensor], str]
 
     if not path.is_file():
         actual = "a folder" if path.is_dir() else "no file" if path.exists() else "nothing"
-        raise _fault(path, f": expected weights of {family.format} (*{SUFFIX}), found {actual} there")
+        raise _fault(path, f": expected a weights file (*{SUFFIX}), found {actual} there")
     data = file_content(path, LARGEST_BYTES, WeightsError, "give a weights file")
     if data[:4] == b"PK\x03\x04" or (data[:1] == b"\x80" and data[1:2] in b"\x02\x03\x04\x05"):
         raise _fault(

@@ -136,7 +136,7 @@ def test_depths_lie_on_measured_candidates_whatever_the_network_says(folder: Pat
     recipe = CrossedRecipe(widths=(4, 4), order_widths=(4, 4), fine=4, squeezed=4)
     learned = CrossedNetRoute(crossed_rig(SIZE), recipe.network().eval(), threshold=0.0, lead=0.0)
     view = next(read_views(folder, GROUPS, "train"))
-    seen = learned.route.fitted(learned.route.observe(view.frames[0]))
+    seen = learned.fitted(learned.observe(view.frames[0]))
     scene = CrossedScene.of(seen)
     shape = scene.light.shape
     rng = np.random.default_rng(0)
@@ -144,7 +144,7 @@ def test_depths_lie_on_measured_candidates_whatever_the_network_says(folder: Pat
     logits[1] = np.maximum(logits[1], -50)
     correction = rng.uniform(-1.5, 1.5, shape)
     answers = Answers(logits, np.full(shape, 9.0), correction, np.full(shape, 0.1))
-    measured = learned.conclude(seen, scene, answers)
+    measured = learned.answered(seen, scene, answers)
     part = seen.carriers
     known = scene.known & (measured.depth_mm[part.crop] > 0)
     psi = part.nearness(np.where(known, measured.depth_mm[part.crop], 1000.0)) * part.joint_gain

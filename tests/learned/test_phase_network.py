@@ -44,7 +44,7 @@ def test_random_weights_stay_on_the_candidates(direction: str) -> None:
     settings = Settings(direction=direction)
     network_route = PhaseNetRoute(RIG, settings, wild(bound), threshold=-1e9)
     image = photograph("cork", "A60").frames[FIRST[direction]]
-    measurement, measured = network_route.measure(image), network_route.geometry.route
+    measurement, measured = network_route.measure(image), network_route
     observation = measured.observe(image)
     base, _ = measured.choose(observation)
     on_object = measurement.depth_mm[observation.crop] > 0
@@ -68,7 +68,7 @@ def test_a_range_under_one_period_settles_the_order(direction: str) -> None:
     assert short.periods_in_range(direction) < 1  # type: ignore[arg-type]
     image = photograph("cork", "A60").frames[FIRST[direction]]
     route = PhaseNetRoute(short, Settings(direction=direction), wild(0.5), threshold=-1e9)  # type: ignore[arg-type]
-    measurement, observation = route.measure(image), route.geometry.route.observe(image)
+    measurement, observation = route.measure(image), route.observe(image)
     crop, candidates = observation.crop, observation.candidates
     one = (candidates.count == 1) & (measurement.depth_mm[crop] > 0)
     absolute = observation.layer.absolute_phase(np.where(one, measurement.depth_mm[crop], 1000.0))
@@ -98,7 +98,7 @@ def test_brighter_or_darker_frames_have_the_same_depth() -> None:
     method = PhaseNetMethod(RIG)
     full = method.route.measure(image)
     # Light above the ambient grey level, halved; what is rounded to whole grey levels is noise of half a level.
-    background = method.route.geometry.route.observe(image).background
+    background = method.route.observe(image).background
     half_grey = background.ambient_grey + (image - background.ambient_grey) / 2
     half = method.route.measure(np.rint(half_grey).astype(np.uint8))
     both = (full.depth_mm > 0) & (half.depth_mm > 0)
@@ -174,7 +174,7 @@ def test_short_periods_are_resampled_to_those_of_training(direction: str) -> Non
     rig = paper_rig(320)
     assert rig.image_px_per_period("horizontal") < 8
     for size, resampled in ((480, True), (720, False), (960, False), (1920, True)):
-        assert PhaseNetMethod(paper_rig(size)).route.geometry.route.resampling.needed is resampled
+        assert PhaseNetMethod(paper_rig(size)).route.resampling.needed is resampled
     row = photograph("cracker_box", "A60", rig)
     measurement = PhaseNetMethod(rig, direction=direction).route.measure(row.frames[FIRST[direction]])  # type: ignore[arg-type]
     target = row.depth_mm > 0

@@ -53,7 +53,7 @@ CONFIG = NetConfig(
 
 def geometry(direction: str = "horizontal") -> Geometry:
     """Of a calibrated lamp: planes that fill the frame show no background to take its strength from."""
-    return Geometry.of(RIG, Settings(direction=direction, **USERS_WORD))  # type: ignore[arg-type]
+    return Geometry(RIG, Settings(direction=direction, **USERS_WORD))  # type: ignore[arg-type]
 
 
 def plane(distance_m: float, direction: str = "horizontal") -> Sample:
