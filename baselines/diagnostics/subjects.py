@@ -82,7 +82,9 @@ class Subject:
 
     def predict(self, frames: Frames) -> Depth:
         """Depth float32 (H, W) in ``units``. Raises `DiagnosisError` for an output of another shape or not finite."""
-        depth = torch.from_numpy(np.asarray(self.predict_frames(frames)))
+        depth: Any = np.asarray(self.predict_frames(frames))
+        if depth.shape == self.image_size:
+            depth = torch.from_numpy(depth.astype(np.float32))
         return checked_output(depth, self.image_size, self.name).numpy()
 
     @property
@@ -232,12 +234,12 @@ def subject(
 
 def subject_of_method(method: Method, dataset: DatasetFolder, **network: Any) -> Subject:
     """A method as a subject; ``network``: the fields of a `Subject` with one."""
-    # A network's settings hold the hash of its weights; those of the machine don't matter.
-    settings = {key: value for key, value in method.settings.items() if key not in ("threads", "device")}
+    # A network's settings hold the hash of its weights.
+    identity = json.dumps([method.name, method.settings_of_depth], sort_keys=True)
     same = ("name", "title", "units", "frames_used", "uses_ground_truth_mask")
     return Subject(
         **{key: getattr(method, key) for key in same},
-        sha256=hashlib.sha256(json.dumps([method.name, settings], sort_keys=True).encode()).hexdigest(),
+        sha256=hashlib.sha256(identity.encode()).hexdigest(),
         image_size=dataset.size,
         direction=_direction_of(dataset, method.frames_used),
         predict_frames=method.predict,
