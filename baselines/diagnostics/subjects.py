@@ -4,7 +4,6 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from copy import deepcopy
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial
@@ -279,17 +278,7 @@ def _subject_of_factory(
     show early."""
     if not 0 <= frame < len(dataset.sequence):
         raise DiagnosisError(f"frame {frame}: expected 0 to {len(dataset.sequence) - 1}, the frames of the sequence")
-    try:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)  # random weights are the same every time
-            network = factory()
-    except (Exception, SystemExit) as error:
-        raise DiagnosisError(
-            f"{name}: calling it without arguments failed: {type(error).__name__}: {printable(str(error), 400)}"
-        ) from error
-    if not isinstance(network, nn.Module):
-        raise DiagnosisError(f"{name}: expected it to return a torch module, got {type(network).__name__}")
-    network = network.eval().requires_grad_(False).cpu()
+    network = _build_network(name, factory)
     path, normalisation = Path(name.rpartition(":")[0]), NORMALISATION_OF[units]
     digest = hashlib.sha256(f"{units} {frame}".encode() + path.read_bytes())
     for key, value in network.state_dict().items():
@@ -313,7 +302,7 @@ def _subject_of_factory(
         normalisation=normalisation,
         network=network,
         layer_names=_select_layers(layers, network, name),
-        untrained=lambda seed: randomised(deepcopy(network), seed),
+        untrained=lambda seed: randomised(_build_network(name, factory), seed),
     )
     samples = dataset.samples("all")
     if not samples:
@@ -336,3 +325,17 @@ def randomised(network: nn.Module, seed: int) -> nn.Module:
                 order = torch.randperm(parameter.numel())
                 parameter.copy_(parameter.reshape(-1)[order].reshape(parameter.shape))
     return network
+
+
+def _build_network(name: str, factory: Any) -> nn.Module:
+    try:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)  # random weights are the same every time
+            network = factory()
+    except (Exception, SystemExit) as error:
+        raise DiagnosisError(
+            f"{name}: calling it without arguments failed: {type(error).__name__}: {printable(str(error), 400)}"
+        ) from error
+    if not isinstance(network, nn.Module):
+        raise DiagnosisError(f"{name}: expected it to return a torch module, got {type(network).__name__}")
+    return network.eval().requires_grad_(False).cpu()
