@@ -216,6 +216,11 @@ class Method(ABC):
         return {"data": "train-split", "versions": [title]}
 
     @property
+    def settings_of_depth(self) -> dict[str, Setting]:
+        """The settings without those of the machine, which change its time and not its depth."""
+        return {key: value for key, value in self.settings.items() if key not in ("threads", "device")}
+
+    @property
     def weights_sha256(self) -> str | None:
         """Hash of the weights file, of a method that has one."""
         sha256 = self.settings.get("weights_sha256")

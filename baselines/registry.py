@@ -100,6 +100,9 @@ def load_method(name: str | Path, source: Photographed | Rig, **options: Any) ->
     Raises `PredictionError` for an unknown name, and what the method refuses: unusable weights, invalid options.
     """
     method, preset = find(name)
+    if inspect.isabstract(method):
+        missing = ", ".join(sorted(method.__abstractmethods__))
+        raise PredictionError(f"{name}: does not define {missing}, which a method needs")
     make = method.for_rig if isinstance(source, Rig) else method.for_dataset
     return make(source, **preset, **options)  # type: ignore[arg-type]
 
@@ -204,9 +207,6 @@ def _checked(method: Any, where: str) -> type[Method]:
     name = getattr(method, "name", None)
     if not isinstance(name, str) or not name or printable(name) != name or any(c in name for c in " /:\\"):
         raise PredictionError(f"{where}: its name is {name!r}; expected text without spaces, slashes and colons")
-    if inspect.isabstract(method):
-        missing = ", ".join(sorted(method.__abstractmethods__))
-        raise PredictionError(f"{where}: does not define {missing}, which a method needs")
     return method
 
 

@@ -128,9 +128,9 @@ def sample_score(follow: float | None, change: float | None) -> float | None:
     return None if follow is None else follow * (1.0 if change is None else max(0.0, 1.0 - change))
 
 
-class Sample:
+class SampleScenes:
     """The scenes of a sample, and what ``method`` predicts of them, in its own units. ``outline_samples``: whose
-    outlines the object may be cut to. Raises `DiagnosisError` for a method of other units than mm and normalised."""
+    outlines the object may be cut to."""
 
     def __init__(
         self,
@@ -206,8 +206,8 @@ class Sample:
         return parts
 
 
-Samples = dict[str, dict[str, float | None]]
-"""What `Sample.parts` says of each sample."""
+PartsBySample = dict[str, dict[str, float | None]]
+"""What `SampleScenes.parts` says of each sample."""
 
 
 def measure(
@@ -215,15 +215,15 @@ def measure(
     dataset: DatasetFolder,
     chosen: Sequence[tuple[str, list[str]]],
     progress: Progress = silent,
-) -> tuple[Reliance, Samples]:
+) -> tuple[Reliance, PartsBySample]:
     """The reliance block of a method on samples as of `chosen_samples`, and the values of every sample. Raises
     `DiagnosisError` for a method of other units, and where no sample has a score."""
     if method.units not in ("mm", "normalised"):
         raise DiagnosisError(f"units {method.units!r}: reliance is measured for predictions in mm, or normalised")
-    renderer, samples = SceneRenderer.of(dataset), Samples()
+    renderer, samples = SceneRenderer.of(dataset), PartsBySample()
     for sample, outline_samples in chosen:
         progress(len(samples), len(chosen), sample)
-        samples[sample] = Sample(method, dataset, renderer, sample, outline_samples).parts()
+        samples[sample] = SampleScenes(method, dataset, renderer, sample, outline_samples).parts()
     scored = {name: parts for name, parts in samples.items() if parts["score"] is not None}
     if not scored:
         raise DiagnosisError("no sample's phase can be moved within the working range, so there is no score")
@@ -276,7 +276,7 @@ class Counterfactual(Probe):
         parts = Table("Parts of the score, and further measurements", ("Part", "Mean over samples"), rows)
         # The middle sample of the list, which is the same for every method.
         name, outline_samples = chosen[len(chosen) // 2]
-        sample = Sample(subject, dataset, SceneRenderer.of(dataset), name, outline_samples)
+        sample = SampleScenes(subject, dataset, SceneRenderer.of(dataset), name, outline_samples)
         return Finding(summary(reliance), values, parts, _draw_scenes(name, sample))
 
 
@@ -292,7 +292,7 @@ def summary(reliance: Reliance) -> str:
     return f"{text} {warning}" if (warning := caution(reliance.objects)) else text
 
 
-def _draw_scenes(name: str, sample: Sample) -> Figure:
+def _draw_scenes(name: str, sample: SampleScenes) -> Figure:
     """One column per scene: captured frame, expected change and actual change."""
     shown = [one for one in sample.variants if one.kind in ("phase", "outline", "projected") and one.amplitude_rad >= 0]
     seen = np.logical_or.reduce([variant.scene.mask for variant in shown])

@@ -43,8 +43,8 @@ Image = NDArray[np.float32]
 Mean = dict[str, Any]
 """``r``: mean of the correlations of so many ``samples``, and its 95% ``interval``, resampled over objects; None where
 there is none."""
-Correlations = dict[tuple[int, str, str], list[float | None]]
-"""Pearson's r of each sample, by network (0: the trained one, others: random weights), reference and layer."""
+Correlations = Mapping[tuple[str, str], Mapping[int, Sequence[float | None]]]
+"""Pearson's r of each sample, by column and layer, then by network: 0 is trained, others have random weights."""
 
 PAPER = "grad_cam"
 SAMPLES, QUICK_SAMPLES = 30, 6
@@ -147,7 +147,7 @@ def measure(
     trained ones."""
     network, untrained = subject.networks()
     networks = [network, *map(untrained, range(seeds))]
-    found: Correlations = defaultdict(list)
+    found: dict[tuple[str, str], dict[int, list[float | None]]] = defaultdict(lambda: defaultdict(list))
     edges_with_fringes: list[float | None] = []
     done = 0
     for names, fringe in subject.batches(dataset, samples):
@@ -159,7 +159,8 @@ def measure(
             own = own or heat
             for layer, sample in product(subject.layer_names, range(len(names))):
                 for target, reference in {**compared[sample], OWN: own[layer][sample]}.items():
-                    found[number, target, layer].append(correlation(heat[layer][sample], reference))
+                    column = f"{RANDOM}{target}" if number else target
+                    found[column, layer][number].append(correlation(heat[layer][sample], reference))
             done += len(names)
             progress(done, len(samples) * len(networks), "Grad-CAM" + (" of random weights" if number else ""))
     objects = [split_sample_name(name)[0] for name in samples]
@@ -171,16 +172,10 @@ def means_of(found: Correlations, layers: Sequence[str], objects: Sequence[str])
     edges over correlation with fringes, None where undefined; those of random weights are means over seeds."""
 
     def means(names: Sequence[str]) -> dict[str, Any]:
-        row: dict[str, Any] = {}
-        for column in COLUMNS:
-            random, target = column.startswith(RANDOM), column.removeprefix(RANDOM)
-            chosen = [
-                values
-                for (network, reference, layer), values in found.items()
-                if (network > 0, reference) == (random, target) and layer in names
-            ]
-            row[column] = _mean(chosen, objects)
-        return row
+        return {
+            column: _mean([values for layer in names for values in found[column, layer].values()], objects)
+            for column in COLUMNS
+        }
 
     rows, average = {layer: means([layer]) for layer in layers}, means(layers)
     for column, mean in average.items():  # as in the paper's bottom row, with an interval over samples

@@ -201,23 +201,22 @@ def diagnose(
     progress: Callable[[Probe], Progress],
     command: str = "",
 ) -> list[ProbeResult]:
-    """Run the probes ``probe_names`` (all if empty) and write ``out/index.html`` and ``out/diagnose.json``; all results
+    """Run the probes ``probe_names`` and write ``out/index.html`` and ``out/diagnose.json``; all results
     in the report's order. A finding in ``out`` is reused if subject, dataset, settings and the probe's version are the
     same; those of other probes join the report. ``progress`` is called with a probe before it runs. The report quotes
     ``command``. Raises `DiagnosisError` if ``out`` holds other files or another process is at it, and errors of probes;
     earlier findings stay."""
     _prepare(out)
     with exclusive(out / LOCK_FILE, out, "writing a report there", DiagnosisError):
-        selected = checked_names(probe_names)
         results, nothing = [], cache(lambda: subject.predicts_nothing(dataset))
         for name in PROBES:
-            if name not in selected and not (out / f"{name}.json").is_file():
+            if name not in probe_names and not (out / f"{name}.json").is_file():
                 continue
             probe = make_probe(name)
             key = finding_key(probe, subject, dataset, settings)
             if stored := load_finding(out, name, key):
                 results.append(ProbeResult(probe, *stored, reused=True))
-            elif name in selected:
+            elif name in probe_names:
                 started = perf_counter()
                 if reason := probe.applies_to(subject) or (nothing() if probe.asks_subject else None):
                     finding = Finding(skipped=reason)

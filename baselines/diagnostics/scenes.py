@@ -115,22 +115,27 @@ class Surface:
         return whole
 
 
+def seen_by(rig: Rig, pixels: NDArray[np.int64], depth_m: Values, normals: Values) -> Surface:
+    """The surface on the rays of ``pixels`` (n,), with depth (n,) and normals (n, 3)."""
+    x, y = (rays.ravel()[pixels] for rays in rig.camera.rays())
+    return Surface(pixels, x, y, depth_m, normals)
+
+
 def surface_of_sample(dataset: DatasetFolder, sample: str) -> Surface:
     """The object of ``sample``: a built dataset's mesh as its camera sees it, of an imported dataset the depth map with
     `pixel_normals`."""
-    (x, y), record = dataset.rig.camera.rays(), dataset.measured(sample)
+    rig, record = dataset.rig, dataset.measured(sample)
     mesh_file = dataset.path / MESH_FOLDER / f"{record['object']}.ply"
     if mesh_file.is_file() and record.get("distance_mm") is not None:
         mesh = load_user_mesh(UserMesh(mesh_file.stem, str(mesh_file), centre=False))
         placed_m = turned(mesh.vertices_m, VIEW_DEGREES[VIEWS.index(record["view"])])
         placed_m += np.array([0, 0, record["distance_mm"] / MM_PER_M])
-        hits = TracedObject(mesh, placed_m).primary(PixelRays.of(dataset.rig.camera))
-        return Surface(hits.pixels, x.ravel()[hits.pixels], y.ravel()[hits.pixels], hits.depth_m, hits.normals)
+        hits = TracedObject(mesh, placed_m).primary(PixelRays.of(rig.camera))
+        return seen_by(rig, hits.pixels, hits.depth_m, hits.normals)
     depth_mm = dataset.depth_mm(sample, DEPTH_EXACT if dataset.has_exact else DEPTH).astype(np.float64)
     pixels = np.flatnonzero(object_mask(depth_mm))
-    normals = pixel_normals(depth_mm, dataset.rig.camera, ONE_SURFACE_MM).reshape(-1, 3)
-    depth_m = depth_mm.ravel()[pixels] / MM_PER_M
-    return Surface(pixels, x.ravel()[pixels], y.ravel()[pixels], depth_m, normals[pixels])
+    normals = pixel_normals(depth_mm, rig.camera, ONE_SURFACE_MM).reshape(-1, 3)[pixels]
+    return seen_by(rig, pixels, depth_mm.ravel()[pixels] / MM_PER_M, normals)
 
 
 def plane(rig: Rig, distance_m: float, tilt_deg: tuple[float, float] = (0.0, 0.0), mask: Mask | None = None) -> Surface:
@@ -403,8 +408,7 @@ def _grown(sample: Scene, renderer: SceneRenderer) -> Scene:
     distance_px, nearest = distance_transform_edt(~target, return_indices=True)
     ring = (distance_px > 0) & (distance_px <= GROWTH * np.sqrt(target.sum())) & (surface_index < 0)
     source = surface_index[tuple(nearest)][ring]
-    x, y = (rays[ring] for rays in renderer.rig.camera.rays())
-    added = Surface(np.flatnonzero(ring), x, y, surface.depth_m[source], surface.normals[source])
+    added = seen_by(renderer.rig, np.flatnonzero(ring), surface.depth_m[source], surface.normals[source])
     both = Surface(*(np.concatenate(pair) for pair in zip(vars(surface).values(), vars(added).values(), strict=True)))
     lit = replace(renderer.light(both), gain=np.concatenate([sample.lit.gain, sample.lit.gain[source]]))
     return replace(sample, surface=both, lit=lit, mask=target | ring)

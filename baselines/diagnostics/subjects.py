@@ -4,7 +4,6 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from copy import deepcopy
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import partial
@@ -82,7 +81,9 @@ class Subject:
 
     def predict(self, frames: Frames) -> Depth:
         """Depth float32 (H, W) in ``units``. Raises `DiagnosisError` for an output of another shape or not finite."""
-        depth = torch.from_numpy(np.asarray(self.predict_frames(frames)))
+        depth: Any = np.asarray(self.predict_frames(frames))
+        if depth.shape == self.image_size:
+            depth = torch.from_numpy(depth.astype(np.float32))
         return checked_output(depth, self.image_size, self.name).numpy()
 
     @property
@@ -232,12 +233,12 @@ def subject(
 
 def subject_of_method(method: Method, dataset: DatasetFolder, **network: Any) -> Subject:
     """A method as a subject; ``network``: the fields of a `Subject` with one."""
-    # A network's settings hold the hash of its weights; those of the machine don't matter.
-    settings = {key: value for key, value in method.settings.items() if key not in ("threads", "device")}
+    # A network's settings hold the hash of its weights.
+    identity = json.dumps([method.name, method.settings_of_depth], sort_keys=True)
     same = ("name", "title", "units", "frames_used", "uses_ground_truth_mask")
     return Subject(
         **{key: getattr(method, key) for key in same},
-        sha256=hashlib.sha256(json.dumps([method.name, settings], sort_keys=True).encode()).hexdigest(),
+        sha256=hashlib.sha256(identity.encode()).hexdigest(),
         image_size=dataset.size,
         direction=_direction_of(dataset, method.frames_used),
         predict_frames=method.predict,
@@ -277,17 +278,7 @@ def _subject_of_factory(
     show early."""
     if not 0 <= frame < len(dataset.sequence):
         raise DiagnosisError(f"frame {frame}: expected 0 to {len(dataset.sequence) - 1}, the frames of the sequence")
-    try:
-        with torch.random.fork_rng(devices=[]):
-            torch.manual_seed(0)  # random weights are the same every time
-            network = factory()
-    except (Exception, SystemExit) as error:
-        raise DiagnosisError(
-            f"{name}: calling it without arguments failed: {type(error).__name__}: {printable(str(error), 400)}"
-        ) from error
-    if not isinstance(network, nn.Module):
-        raise DiagnosisError(f"{name}: expected it to return a torch module, got {type(network).__name__}")
-    network = network.eval().requires_grad_(False).cpu()
+    network = _build_network(name, factory)
     path, normalisation = Path(name.rpartition(":")[0]), NORMALISATION_OF[units]
     digest = hashlib.sha256(f"{units} {frame}".encode() + path.read_bytes())
     for key, value in network.state_dict().items():
@@ -311,7 +302,7 @@ def _subject_of_factory(
         normalisation=normalisation,
         network=network,
         layer_names=_select_layers(layers, network, name),
-        untrained=lambda seed: randomised(deepcopy(network), seed),
+        untrained=lambda seed: randomised(_build_network(name, factory), seed),
     )
     samples = dataset.samples("all")
     if not samples:
@@ -334,3 +325,17 @@ def randomised(network: nn.Module, seed: int) -> nn.Module:
                 order = torch.randperm(parameter.numel())
                 parameter.copy_(parameter.reshape(-1)[order].reshape(parameter.shape))
     return network
+
+
+def _build_network(name: str, factory: Any) -> nn.Module:
+    try:
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(0)  # random weights are the same every time
+            network = factory()
+    except (Exception, SystemExit) as error:
+        raise DiagnosisError(
+            f"{name}: calling it without arguments failed: {type(error).__name__}: {printable(str(error), 400)}"
+        ) from error
+    if not isinstance(network, nn.Module):
+        raise DiagnosisError(f"{name}: expected it to return a torch module, got {type(network).__name__}")
+    return network.eval().requires_grad_(False).cpu()

@@ -83,7 +83,6 @@ class Setup:
 
     def key(self) -> dict[str, Any]:
         """What must be equal for two measurements to be parts of one."""
-        threads = ("threads", "device")
         return {
             "fpp_ml_bench": __version__,
             "axes_version": corruptions().version,
@@ -93,7 +92,7 @@ class Setup:
             "method": self.method.name,
             "title": self.method.title,
             "frames_used": list(self.method.frames_used),
-            "settings": {key: value for key, value in self.method.settings.items() if key not in threads},
+            "settings": self.method.settings_of_depth,
         }
 
 

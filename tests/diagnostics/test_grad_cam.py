@@ -84,11 +84,11 @@ def test_correlation_is_pearsons():
 
 
 def test_means_leave_out_maps_that_are_constant_and_average_layers_as_the_paper_does():
-    correlations = {(0, target, layer): [0.1] * 3 for layer in "ab" for target in (EDGES, FRINGES)}
-    correlations[0, EDGES, "a"] = [0.4, 0.2, None]
-    for number, r in ((1, 0.2), (2, 0.4)):
-        for layer, target in product("ab", (EDGES, FRINGES, OWN)):
-            correlations[number, target, layer] = [r if target == OWN else None] * 3
+    correlations = {(target, layer): {0: [0.1] * 3} for layer in "ab" for target in (EDGES, FRINGES)}
+    correlations[EDGES, "a"] = {0: [0.4, 0.2, None]}
+    for layer, target in product("ab", (EDGES, FRINGES, OWN)):
+        by_network = {number: [r if target == OWN else None] * 3 for number, r in ((1, 0.2), (2, 0.4))}
+        correlations[RANDOM + target, layer] = by_network
     means = means_of(correlations, ("a", "b"), ["x", "x", "y"])
     first = means["layers"]["a"]
     assert first[EDGES]["r"] == pytest.approx(0.3) and first[EDGES]["samples"] == 2
@@ -96,7 +96,7 @@ def test_means_leave_out_maps_that_are_constant_and_average_layers_as_the_paper_
     assert means["average"][EDGES]["r"] == pytest.approx(0.2) and means["average"][EDGES]["samples"] == 3
     assert means["average"]["ratio"] == pytest.approx(2)
     for missing in (0.0, None):
-        correlations[0, FRINGES, "a"] = [missing] * 3
+        correlations[FRINGES, "a"] = {0: [missing] * 3}
         assert means_of(correlations, ("a", "b"), ["x", "x", "y"])["layers"]["a"]["ratio"] is None
 
 
