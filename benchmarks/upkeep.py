@@ -52,7 +52,7 @@ from fpp_ml_bench.leaderboard import columns
 from fpp_ml_bench.leaderboard.columns import NOT_CHECKED, Column, device, error
 from fpp_ml_bench.leaderboard.groups import Group, Ranked, is_trivial
 from fpp_ml_bench.leaderboard.names import assumption, short_names
-from fpp_ml_bench.leaderboard.page.sections import of_one_target
+from fpp_ml_bench.leaderboard.page.page import of_one_target
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries, shipped_rows
 from fpp_ml_bench.leaderboard.row_file import row_json, write_row
 from fpp_ml_bench.leaderboard.rows import VOUCHED, Entry, read_entry, vouching_line

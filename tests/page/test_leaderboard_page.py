@@ -24,8 +24,7 @@ from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.report.report_page import write_report
 from fpp_ml_bench.evaluation.result.file import parse_result, write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
-from fpp_ml_bench.leaderboard.page.page import page_files, predicted_samples, slug
-from fpp_ml_bench.leaderboard.page.sections import LogScale, overview
+from fpp_ml_bench.leaderboard.page.page import LogScale, overview, page_files, predicted_samples, slug
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries
 from fpp_ml_bench.leaderboard.tables import chosen_tables
 from fpp_ml_bench.optics.named_rigs import paper_rig
