@@ -105,7 +105,6 @@ def page_files(
     data = {DATA: table_json(groups, papers, DEFAULT_SORT), TABLE: table_csv(groups)}
     groups = more_than_trivial(groups)
     style = (_HERE / "page.css").read_text("utf-8")
-    slugs = {id(row.entry): slug(row.entry) for group in groups for row in group.rows}
     rows = [(group, row) for group in groups for row in group.rows]
     shared: dict[str, Any] = {"meaning": MEANING, "learned_from": learned_from}
     filters: dict[str, tuple[str, list[str]]] = {
@@ -129,8 +128,8 @@ def page_files(
         given_truth=given_truth,
         assumption=assumption,
         search=_search,
-        slug=lambda entry: slugs[id(entry)],
-        blocks=blocks(groups, slugs),
+        slug=slug,
+        blocks=blocks(groups),
         tradeoff=tradeoff_section(run),
         provenances=[name for name in MEANING if name in present],
         colours=CLASS_COLOURS,
@@ -141,7 +140,7 @@ def page_files(
     )
     files = {INDEX: index} | {name: text.encode("utf-8") for name, text in data.items()}
     for group, row in rows:
-        own, name = samples.get(row.entry.row.result_sha256), slugs[id(row.entry)]
+        own, name = samples.get(row.entry.row.result_sha256), slug(row.entry)
         title, values = f"{row.entry.name}: FPP-ML-Bench", shared | _submission(group, row)
         text = page(_PACKAGE, "submission.html", title, style, **values, samples=own, slug=name)
         files[f"{SUBMISSIONS}/{name}.html"] = text
@@ -233,7 +232,7 @@ def _samples(result: Result, folder: Path, dataset: DatasetFolder) -> Samples:
     )
 
 
-def blocks(groups: Sequence[Group], slugs: Mapping[int, str]) -> list[dict[str, Any]]:
+def blocks(groups: Sequence[Group]) -> list[dict[str, Any]]:
     """What the template needs of each dataset: its title and a ``short`` one, whether it is ``main`` (the first, or
     not `GroupKey.special_data`), the pictures of all its rows, and its tables."""
     datasets: list[dict[str, Any]] = []
@@ -242,7 +241,7 @@ def blocks(groups: Sequence[Group], slugs: Mapping[int, str]) -> list[dict[str, 
         key, drawn_groups = of_data[0].key, of_one_target(of_data)
         rows = [row for group in drawn_groups for row in group.rows]
         name = key.benchmark.name if key.benchmark is not None else data.split(", ")[0]
-        numbered = [(n, row.short_name, slugs[id(row.entry)]) for n, row in enumerate(rows, start=1)]
+        numbered = [(n, row.short_name, slug(row.entry)) for n, row in enumerate(rows, start=1)]
         datasets.append(
             {
                 "numbered": numbered if len(rows) <= _MOST_LISTED else [],
@@ -250,7 +249,7 @@ def blocks(groups: Sequence[Group], slugs: Mapping[int, str]) -> list[dict[str, 
                 "title": data,
                 "short": key.special_data or name,
                 "main": not datasets or not key.special_data,
-                "figures": overview_figures(drawn_groups, slugs),
+                "figures": overview_figures(drawn_groups),
                 "against": drawn_groups[0].key.against,
                 "left_out": len({group.key.against for group in of_data}) > 1,
                 "sections": [_section(group, _link(group, of_data)) for group in of_data],
@@ -352,20 +351,16 @@ def _shade(error: float | None, low: float, high: float) -> int | None:
     return min(_SHADES - 1, int(share * _SHADES))
 
 
-def overview(groups: Sequence[Group], cost: str, slugs: Mapping[int, str]) -> Scatter | None:
+def overview(groups: Sequence[Group], cost: str) -> Scatter | None:
     """The rows of ``groups`` that have a place on log axes: a known cost, of `COSTS`, and an error above 0; None
-    without any. On the front are rows that were given no ground truth and are not trivial. ``slugs``: the name of a
-    row's page by id of its entry."""
+    without any. On the front are rows that were given no ground truth and are not trivial."""
     rows = [(group, row) for group in groups for row in group.rows]
-    drawn = [
-        _mark(number, group, row, cost, slugs.get(id(row.entry), ""))
-        for number, (group, row) in enumerate(rows, start=1)
-    ]
+    drawn = [_mark(number, group, row, cost) for number, (group, row) in enumerate(rows, start=1)]
     marks = [mark for mark in drawn if mark is not None]
     return Scatter(marks, COSTS[cost], names=len(marks) <= _MOST_NAMES) if marks else None
 
 
-def _mark(number: int, group: Group, row: Ranked, cost: str, page: str) -> Mark | None:
+def _mark(number: int, group: Group, row: Ranked, cost: str) -> Mark | None:
     entry, timing, error = row.entry, row.entry.row.timing, row.value(DEFAULT_SORT)
     seconds = entry.value("seconds_per_sample")
     x = seconds if cost == "seconds" else float(entry.frames)
@@ -388,8 +383,8 @@ def _mark(number: int, group: Group, row: Ranked, cost: str, page: str) -> Mark 
         y_span=row.interval(DEFAULT_SORT),
         title=f"{entry.name}: {error:.3g} mm, {time}, {frames}, {group.key.track} track, {row.provenance}",
         css=f"p-{row.provenance.replace(' ', '-')}{' hollow' if hollow else ''}",
-        row=page,
-        url=f"submissions/{page}.html",
+        row=slug(entry),
+        url=f"{SUBMISSIONS}/{slug(entry)}.html",
     )
 
 
@@ -399,11 +394,11 @@ def drawn(picture: Scatter, css: str, width: int, height: int, about: str) -> di
     return {"svg": svg, "css": css.split()[0], "numbered": sorted((mark.number, mark.name) for mark in numbered)}
 
 
-def overview_figures(groups: Sequence[Group], slugs: Mapping[int, str]) -> list[dict[str, Any]]:
+def overview_figures(groups: Sequence[Group]) -> list[dict[str, Any]]:
     """For each cost that any row has: its name, the pictures in both `SIZES`, and the front, cheapest first."""
     figures = []
     for cost, across in COSTS.items():
-        if (picture := overview(groups, cost, slugs)) is None:
+        if (picture := overview(groups, cost)) is None:
             continue
         front = [mark.name for mark in picture.front]
         about = f"Object MAE in mm against {across}, both logarithmic. On the front, cheapest first: {', '.join(front)}"

@@ -105,7 +105,7 @@ def test_groups_stay_apart_and_the_papers_rows_too(files):
 def test_front_is_those_nobody_beats(files):
     groups = rank(read_entries(files))
     for cost in ("seconds", "frames"):
-        picture = overview(groups, cost, {})
+        picture = overview(groups, cost)
         assert [mark.name for mark in picture.front] == ["Fast and rough", "Slow and fine"]
         assert len(picture.marks) == 4  # the row that was told is drawn, and leads no front
 
