@@ -50,7 +50,7 @@ from fpp_ml_bench.evaluation.result.parts import Robustness
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.leaderboard import columns
 from fpp_ml_bench.leaderboard.columns import NOT_CHECKED, Column, assumption, device, error
-from fpp_ml_bench.leaderboard.page.sections import of_one_target
+from fpp_ml_bench.leaderboard.page.page import of_one_target
 from fpp_ml_bench.leaderboard.ranking import (
     Group,
     Ranked,

@@ -50,12 +50,15 @@ def _draw(axes: Any, title: str, image: NDArray, colours: str, low: float, high:
 
 
 @styled
-def panel_figure(panels: Sequence[Panel], further: int = 0) -> "Figure":
-    """A figure of panels, five in a line, with room for ``further`` ones."""
-    grid = -(-(len(panels) + further) // _ACROSS), _ACROSS
-    drawn = figure(3.4 * _ACROSS, 3.7 * grid[0])
+def panel_figure(panels: Sequence[Panel], further: str = "") -> "Figure":
+    """A figure of panels, five in a line, and as the last of its axes empty ones of the projection ``further``, if
+    any."""
+    lines = -(-(len(panels) + bool(further)) // _ACROSS)
+    drawn = figure(3.4 * _ACROSS, 3.7 * lines)
     for number, panel in enumerate(panels, 1):
-        _draw(drawn.add_subplot(*grid, number), *panel)
+        _draw(drawn.add_subplot(lines, _ACROSS, number), *panel)
+    if further:
+        drawn.add_subplot(lines, _ACROSS, len(panels) + 1, projection=further)
     return drawn
 
 
@@ -74,15 +77,9 @@ def capture_picture(
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
-    lines = [line for finding in findings for line in wrap(str(finding), _LETTERS)]
-    drawn = figure(17, 3.9 + 0.17 * len(lines))
-    if lines:
-        drawn.supxlabel("\n".join(lines), fontsize=8, x=0.01, ha="left", color="#b00020")
-    drawn.suptitle(title)
     found = depth_mm > 0
     low, high = np.quantile(depth_mm[found], (0.005, 0.995)) if found.any() else (0.0, 1.0)
     top = float(np.quantile(sigma_mm[found], 0.95)) if found.any() else 1.0
-    *maps, pixels = drawn.subplots(1, 5)
     panels: tuple[Panel, ...] = (
         ("mean of the frames, grey levels", grey, FRAME_COLOURS, 0.0, max(float(np.quantile(grey, 0.999)), 1.0)),
         ("depth, mm", np.where(found, depth_mm, np.nan), DEPTH_COLOURS, low, high),
@@ -95,8 +92,13 @@ def capture_picture(
             float(max(np.nanmax(modulation, initial=1.0), 1.0)),
         ),
     )
-    for axes, panel in zip(maps, panels, strict=True):
-        _draw(axes, *panel)
+    drawn = panel_figure(panels, "rectilinear")
+    lines = [line for finding in findings for line in wrap(str(finding), _LETTERS)]
+    drawn.set_figheight(3.9 + 0.17 * len(lines))
+    if lines:
+        drawn.supxlabel("\n".join(lines), fontsize=8, x=0.01, ha="left", color="#b00020")
+    drawn.suptitle(title)
+    pixels = drawn.axes[-1]
     pixels.imshow(reason, cmap=ListedColormap(_COLOURS), vmin=0, vmax=len(_COLOURS) - 1, interpolation="nearest")
     pixels.set(title="pixels", xticks=[], yticks=[])
     shares = np.bincount(reason.ravel(), minlength=len(_COLOURS)) / reason.size
@@ -121,13 +123,11 @@ def sample_picture(dataset: DatasetFolder, sample: str, path: Path) -> None:
 
     panels = _panels(dataset, sample)
     mesh = dataset.path / MESH_FOLDER / f"{dataset.measured(sample)['object']}.ply"
-    drawn = panel_figure(panels, further=int(mesh.is_file()))
+    drawn = panel_figure(panels, "3d" if mesh.is_file() else "")
     drawn.suptitle(f"{sample} ({dataset.split_of_sample(sample)})")
     if mesh.is_file():
         vertices_m, faces, *_ = read_mesh(mesh)
-        first: Any = drawn.axes[0]
-        grid = first.get_subplotspec().get_gridspec()
-        solid: Any = drawn.add_subplot(grid[len(panels) // _ACROSS, len(panels) % _ACROSS], projection="3d")
+        solid: Any = drawn.axes[-1]
         solid.plot_trisurf(*vertices_m.T, triangles=faces, color="0.9", linewidth=0, antialiased=False)
         solid.set(title="ground-truth mesh", aspect="equal")
         solid.set_axis_off()

@@ -54,6 +54,7 @@ from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE
 from fpp_ml_bench.files import exclusive, read_json, write_atomically
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.schema import Count, StrictModel, Text, validate
+from fpp_ml_bench.style import millimetres
 
 PAPER_PRESET = "paper"
 REASON_LENGTH = 400
@@ -164,7 +165,9 @@ def _score(job: Job, run: TrainingRun, settings: ReproduceSettings, opened: Data
             settings.leaderboard.check_row_is_of(path, opened)
             result = score_method(opened, method, path, folders)
         settings.leaderboard.write_measured(result, path)
-        settings.report(f"  {path.stem}: object MAE {_mm(result.metrics.object_mae_mm)}, {result.track} track")
+        settings.report(
+            f"  {path.stem}: object MAE {millimetres(result.metrics.object_mae_mm)} mm, {result.track} track"
+        )
 
 
 def _score_all_frames(recipe: Recipe, model: Model, settings: ReproduceSettings, opened: DatasetFolder) -> None:
@@ -182,11 +185,7 @@ def _score_all_frames(recipe: Recipe, model: Model, settings: ReproduceSettings,
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(scores.model_dump(mode="json"), path)
-    settings.report(f"  {path.stem}: object MAE {_mm(scores.metrics.object_mae_mm)} on {scores.pairs} pairs")
-
-
-def _mm(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f} mm"
+    settings.report(f"  {path.stem}: object MAE {millimetres(scores.metrics.object_mae_mm)} mm on {scores.pairs} pairs")
 
 
 def is_trained(out: Path) -> bool:

@@ -191,17 +191,19 @@ def judge(case: Case, outcome: Outcome) -> str:
 
 
 def worst(
-    errors: ArrayLike, bounds: ArrayLike = 0.0, flagged: ArrayLike = False, condition: float | None = None
+    errors: ArrayLike, bounds: ArrayLike = 0.0, flagged: ArrayLike = False, condition: ArrayLike | None = None
 ) -> Outcome:
-    """The outcome of many elements: the worst of those that are not flagged. Their NaN errors stay NaN."""
+    """The outcome of many elements: the worst of those that are not flagged, and the largest of their ``condition``
+    numbers. NaN errors stay NaN."""
+    largest = None if condition is None else float(np.max(condition))
     parts = np.broadcast_arrays(np.abs(np.asarray(errors, float)), np.asarray(bounds, float), np.asarray(flagged))
     error, bound, refused = (np.ravel(part) for part in parts)
     if refused.all():
-        return Outcome(None, 0.0, 1.0, "every element is masked", condition)
+        return Outcome(None, 0.0, 1.0, "every element is masked", largest)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.where(error == 0, 0.0, error / bound)
     index = int(np.argmax(np.where(refused, -1.0, ratio)))  # the first NaN, if any
-    return Outcome(float(error[index]), float(bound[index]), float(refused.mean()), condition=condition)
+    return Outcome(float(error[index]), float(bound[index]), float(refused.mean()), condition=largest)
 
 
 @cache

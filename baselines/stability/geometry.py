@@ -89,7 +89,7 @@ def closed_form(coordinate: NDArray, rig: Rig, axis: int = 0, indistinct: NDArra
     # Where the bound exceeds half of the depth, the number is round-off and must be as behind the camera.
     nothing = ~(bound < 0.5) | ~(exact.astype(float) > 0)
     error, flagged = np.where(nothing, np.inf, relative(depth_mm, exact)), np.isnan(depth_mm) & (nothing | indistinct)
-    return worst(error, bound, flagged, float(condition.max()))
+    return worst(error, bound, flagged, condition)
 
 
 @family(
@@ -124,9 +124,7 @@ def both_coordinates(baseline_mm: float, ahead: float) -> Outcome:
     u, v = coordinates = exact_coordinates(1.8, rig)
     depth_mm = depth_from_both(RAYS, u, v, rig, 0.7, 1.3).depth_mm
     bounds, conditions = zip(*(conditioning(px, rig, axis) for axis, px in enumerate(coordinates)), strict=True)
-    return worst(
-        depth_mm / 1800.0 - 1, 8 * np.maximum(*bounds), np.isnan(depth_mm), condition=float(np.max(conditions))
-    )
+    return worst(depth_mm / 1800.0 - 1, 8 * np.maximum(*bounds), condition=conditions)
 
 
 @family(
@@ -163,7 +161,7 @@ def single_coordinate(baseline_mm: float, range_m: float) -> Outcome:
     condition = np.abs(coordinate) / np.abs(coordinate - centre - focal * RAYS[0])
     bound = 1.001 * U32 * condition / (1 - U32 * condition)
     error = relative(depth_mm, exact_depth_mm(coordinate, rig))
-    return worst(error, bound, np.isnan(depth_mm), condition=float(condition.max()))
+    return worst(error, bound, condition=condition)
 
 
 @family(
@@ -201,7 +199,7 @@ def intrinsics(focal_px: float, centre_px: float) -> Outcome:
         return wrong("rays that are not finite")
     size = np.abs(u - centre_px) + abs(centre_px)
     back = camera.pixels(*camera.normalised(u, u))[0]
-    return worst(back - u, 3 * U64 * size + U64 * np.abs(u), condition=float(np.max(size / 960)))
+    return worst(back - u, 3 * U64 * size + U64 * np.abs(u), condition=size / 960)
 
 
 @family(
@@ -224,7 +222,7 @@ def off_orthonormal(off: float, kind: str) -> Outcome:
     rounding, condition = conditioning(coordinate, base)
     # Each row of R moves by off at most: the difference a - x_p a_2 by off times the condition number, twice.
     bound = rounding + 2 * off * condition
-    return worst(depth_mm / 1800.0 - 1, bound / (1 - bound), np.isnan(depth_mm), condition=float(condition.max()))
+    return worst(depth_mm / 1800.0 - 1, bound / (1 - bound), condition=condition)
 
 
 @family(
@@ -291,7 +289,7 @@ def lens_inverse(k1: float, k2: float, k3: float, p1: float) -> Outcome:
     if fold < 1.6 and not np.isnan(nowhere).all():
         return wrong("an ideal point beyond the fold")
     bound = 32 * U64 * np.maximum(size, 1) / np.where(right, slope, 1.0)
-    return worst(error, bound, right & np.isnan(error), condition=float(1 / slope[right].min()))
+    return worst(error, bound, condition=1 / slope[right])
 
 
 SCENE_RIG = paper_rig(176)
@@ -338,7 +336,7 @@ def edge_on(off_deg: float) -> Outcome:
     # Rounding of normal (12), plane (6) and products (4), times the condition; clipped to the wall's own extent, which
     # also bounds the error of a ray on the wrong side of an edge.
     bound = np.minimum(22 * U64 * condition * 1.9 * 12, float(high - low))
-    return worst(np.asarray(depth_m - exact, float), bound, condition=float(condition.max()))
+    return worst(np.asarray(depth_m - exact, float), bound, condition=condition)
 
 
 @family(

@@ -24,8 +24,7 @@ from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.report.report_page import write_report
 from fpp_ml_bench.evaluation.result.file import parse_result, write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
-from fpp_ml_bench.leaderboard.page.page import page_files, predicted_samples, slug
-from fpp_ml_bench.leaderboard.page.sections import LogScale, overview
+from fpp_ml_bench.leaderboard.page.page import LogScale, overview, page_files, predicted_samples, slug
 from fpp_ml_bench.leaderboard.ranking import expand, rank, read_entries
 from fpp_ml_bench.leaderboard.tables import chosen_tables
 from fpp_ml_bench.optics.named_rigs import paper_rig
@@ -106,7 +105,7 @@ def test_groups_stay_apart_and_the_papers_rows_too(files):
 def test_front_is_those_nobody_beats(files):
     groups = rank(read_entries(files))
     for cost in ("seconds", "frames"):
-        picture = overview(groups, cost, {})
+        picture = overview(groups, cost)
         assert [mark.name for mark in picture.front] == ["Fast and rough", "Slow and fine"]
         assert len(picture.marks) == 4  # the row that was told is drawn, and leads no front
 
