@@ -1,9 +1,5 @@
-"""This machine and this process: its hardware, threads and memory, and whether numba compiles the kernels.
-
-Imports neither NumPy nor torch. Ray casting, decoding and the labelling of orders are always compiled; other kernels
-are imported only when `numba_enabled` says so, each beside a NumPy function that gives the same numbers.
-``FPP_BENCH_NUMBA=0`` selects NumPy.
-"""
+"""This machine and this process: its hardware, threads and memory, and how kernels are compiled. Imports neither NumPy nor
+torch."""
 
 import ctypes
 import gc
@@ -22,7 +18,6 @@ from typing import Any, TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
-NUMBA_SWITCH = "FPP_BENCH_NUMBA"
 THREAD_COUNTS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
 """Parameters of mallopt(3)."""
@@ -131,11 +126,6 @@ def _numba() -> Any:
     return numba
 
 
-def numba_enabled() -> bool:
-    """Whether compiled kernels are to be used; reads ``FPP_BENCH_NUMBA`` on every call."""
-    return os.environ.get(NUMBA_SWITCH, "1") != "0" and _numba() is not None
-
-
 @cache
 def _code_cache() -> Any:
     """Numba's cache of machine code, where a file that is damaged or can't be written is as if there were none."""
@@ -178,8 +168,8 @@ def _code_cache() -> Any:
 
 
 def njit(function: Function) -> Function:
-    """Compile ``function`` to run without the GIL; the machine code is kept on disk. Without numba it stays as it is.
-    No ``fastmath``, and no multiplication is fused with an addition: the same input gives the same bytes on every
+    """Compile ``function`` to run without the GIL; the machine code is kept on disk. Without numba it stays as it is,
+    and is slow. No ``fastmath``, and no multiplication is fused with an addition: the same input gives the same bytes on every
     processor and for any number of threads."""
     if _numba() is None:
         return function

@@ -22,7 +22,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from fpp_ml_bench.errors import FppBenchError, StabilityError
 from fpp_ml_bench.evaluation.result.file import environment, write_file, write_json
-from fpp_ml_bench.machine import numba_enabled
 from fpp_ml_bench.style import figure, figure_png, styled
 
 Expects = Literal["number", "refusal", "either"]
@@ -262,7 +261,6 @@ def document(rows: Sequence[Row]) -> dict[str, Any]:
     content = {
         "schema_version": "1.0.0",
         "summary": summary(rows),
-        "compiled_decoder": numba_enabled(),
         "environment": environment().model_dump(mode="json"),
         "cases": cases,
     }
