@@ -1,5 +1,5 @@
-"""This machine and this process: its hardware, threads and memory, and how kernels are compiled. Imports neither NumPy nor
-torch."""
+"""This machine and this process: its hardware, threads and memory, and how kernels are compiled. Imports neither NumPy
+nor torch."""
 
 import ctypes
 import gc
@@ -169,8 +169,8 @@ def _code_cache() -> Any:
 
 def njit(function: Function) -> Function:
     """Compile ``function`` to run without the GIL; the machine code is kept on disk. Without numba it stays as it is,
-    and is slow. No ``fastmath``, and no multiplication is fused with an addition: the same input gives the same bytes on every
-    processor and for any number of threads."""
+    and is slow. No ``fastmath``, and no multiplication is fused with an addition: the same input gives the same bytes
+    on every processor and for any number of threads."""
     if _numba() is None:
         return function
     compiled = _numba().njit(nogil=True, error_model="numpy")(function)
