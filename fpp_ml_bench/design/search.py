@@ -40,7 +40,10 @@ SIGMA_PERIOD_PX = 20.0
 
 
 def _pair(text: str) -> tuple[float, float]:
-    least, most = (float(part) for part in text.split(","))
+    try:
+        least, most = (float(part) for part in text.split(","))
+    except ValueError:
+        raise ValueError("expected two numbers with a comma between them, such as 10,40") from None
     return least, most
 
 
