@@ -35,7 +35,7 @@ from fpp_ml_bench.leaderboard.row_file import Row, row_of, view_means, write_row
 from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEASURED_HERE, Entry, read_entry
 from fpp_ml_bench.leaderboard.tables import PAPER_DEPTHS, paper_tables
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.style import percent
+from fpp_ml_bench.style import percent, three_digits
 from fpp_ml_bench.tables import Table, markdown_text
 
 _NOT_IN_THE_PAPER = {
@@ -252,7 +252,7 @@ def _cells(line: Line, preset: str) -> dict[str, str]:
         "Parameters": _count(timing and timing.parameters),
         "Epochs": _count(settings.get("epochs_trained")),
         "Training, s": _count(settings.get("training_seconds")),
-        "Latency, ms": "-" if latency_ms is None else f"{latency_ms:.3g}",
+        "Latency, ms": three_digits(latency_ms),
     }
 
 
