@@ -22,7 +22,7 @@ from fpp_ml_bench.baselines.stability.cases import (
     wrong,
 )
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate
+from fpp_ml_bench.decoding.triangulation import depth_from_both, depth_from_coordinate, depth_noise_mm
 from fpp_ml_bench.loaders.render.illumination import light_surface, projector_centre_m
 from fpp_ml_bench.loaders.render.light import named_light
 from fpp_ml_bench.loaders.render.projector import PatternLight
@@ -50,9 +50,9 @@ def scaled_baseline(baseline_mm: float, ahead: float = 0.0) -> Rig:
     return replace(PAPER, rotation=(TURN if ahead else np.eye(3)).tolist(), translation_m=tuple(t.tolist()))
 
 
-def exact_coordinates(depth_m: float, rig: Rig) -> Floats:
-    """Projector px (2, n) of the points at ``depth_m`` on the rays, in 50 digits, rounded once."""
-    a, b, c = wide(rig.R) @ wide(AHEAD) * depth_m + wide(rig.t)[:, None]
+def exact_coordinates(depth_m: float, rig: Rig, rays: NDArray = AHEAD) -> Floats:
+    """Projector px (2, n) of the points at ``depth_m`` on the ``rays`` (3, n), in 50 digits, rounded once."""
+    a, b, c = wide(rig.R) @ wide(rays) * depth_m + wide(rig.t)[:, None]
     device = rig.projector
     return np.stack([device.fx * a / c + device.cx, device.fy * b / c + device.cy]).astype(float)
 
@@ -142,6 +142,27 @@ def near_parallel(shift_px: float) -> Outcome:
     coordinate = focal * RAYS[0] + centre + shift_px  # depth f b / shift
     size = (np.abs(coordinate) + centre) / focal + np.abs(RAYS[0])
     return closed_form(coordinate, PAPER, 0, 8 * U64 * size * focal > 0.2 * abs(shift_px))
+
+
+@family(
+    "triangulation",
+    "noise law",
+    "1",
+    against="sigma_u Z^2 / (f_p b), the noise of a coordinate propagated to the depth",
+    bound="4 standard errors of 20,000 draws, and 8 (sigma_Z / Z)^2 of second order",
+    direction=AXES,
+    baseline_mm=(160.0, 50.0, 10.0, 1.0),
+)
+def noise_law(baseline_mm: float, direction: Direction) -> Outcome:
+    """rms depth error over the stated one, minus 1"""
+    rig, count, modulation, axis = scaled_baseline(baseline_mm), 20_000, 60.0, np.zeros(20_000)
+    coordinate = exact_coordinates(1.8, rig, np.array([[0], [0], [1]]))[AXES.index(direction)]
+    sigma_px = rig.pitch(direction) * math.sqrt(2 / 18) / modulation / (2 * math.pi)
+    noisy = coordinate + sigma_px * np.random.default_rng(8).standard_normal(count)
+    errors = depth_from_coordinate((axis, axis), noisy, rig, direction) - 1800.0
+    law = float(depth_noise_mm(rig, 1800.0, direction, 18, modulation))
+    bound = 4 / math.sqrt(2 * count) + 8 * (law / 1800.0) ** 2
+    return worst(np.sqrt(np.mean(errors**2)) / law - 1, bound, condition=1800.0 / law)
 
 
 @family(
