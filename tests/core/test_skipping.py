@@ -56,17 +56,17 @@ SHADY = SHADY.changed("camera", rays_across=1)
 def counting(monkeypatch):
     """What really happens: shadow rays traced, pixels exposed whole or in part."""
     counts = {"rays": 0, "exposed": 0}
-    blocked, expose = TracedObject.blocked, Exposure.expose
+    shadowed, expose = TracedObject.shadowed, Exposure.expose
 
-    def counted_rays(self, origins, targets):
-        counts["rays"] += len(origins)
-        return blocked(self, origins, targets)
+    def counted_rays(self, points_m, light_m):
+        counts["rays"] += len(points_m)
+        return shadowed(self, points_m, light_m)
 
     def counted_expose(self, frames, lit, pixels, *rest):
         counts["exposed"] += len(frames) * pixels.size
         return expose(self, frames, lit, pixels, *rest)
 
-    monkeypatch.setattr(TracedObject, "blocked", counted_rays)
+    monkeypatch.setattr(TracedObject, "shadowed", counted_rays)
     monkeypatch.setattr(Exposure, "expose", counted_expose)
     return counts
 
@@ -231,6 +231,6 @@ def test_frames_that_a_method_does_not_use_are_not_read(tiny):
     sample = opened.samples("test")[0]
     frames = captured_frames(opened, method, sample)
     assert [i for i, frame in enumerate(frames) if frame is not None] == list(method.frames_used)
-    groups = {"/".join(path.split("/")[-2:]).split("-")[0] for path, _ in opened._images}
-    assert groups == {"test/vertical", "test/codes"} and len(opened._images) == len(method.frames_used) == 10
-    assert set(opened._maps) == {path for path, _ in opened._images}  # nor are other files mapped
+    read = {path: mapped._images for path, mapped in opened._mapped.items()}  # no other files are mapped
+    groups = {"/".join(path.split("/")[-2:]).split("-")[0] for path in read}
+    assert groups == {"test/vertical", "test/codes"} and sum(map(len, read.values())) == len(method.frames_used) == 10
