@@ -57,7 +57,7 @@ VIEWS_PER_OBJECT = 2
 GROWTH = 0.1  # how far a grown object reaches beyond its outline, in units of sqrt(area): it gains about half its area
 KEPT_SHARE = 0.5
 """Share of the object that an ellipse leaves; of the other objects' outlines the nearest to this share is used."""
-ONE_SURFACE_MM = 1e9  # all pixels of an object belong to one surface
+ONE_SURFACE = 1e9  # steepness up to which neighbours belong to one surface: all pixels of an object do
 _STEP = 1e-6  # step of difference quotients in normalised ray coordinates: far below a pixel, far above rounding
 _GRAZING = 0.02
 """Smallest cosine between ray and normal at which the tangent plane is extrapolated to a neighbouring ray."""
@@ -134,7 +134,7 @@ def surface_of_sample(dataset: DatasetFolder, sample: str) -> Surface:
         return seen_by(rig, hits.pixels, hits.depth_m, hits.normals)
     depth_mm = dataset.depth_mm(sample, DEPTH_EXACT if dataset.has_exact else DEPTH).astype(np.float64)
     pixels = np.flatnonzero(object_mask(depth_mm))
-    normals = pixel_normals(depth_mm, rig.camera, ONE_SURFACE_MM).reshape(-1, 3)[pixels]
+    normals = pixel_normals(depth_mm, rig.camera, ONE_SURFACE).reshape(-1, 3)[pixels]
     return seen_by(rig, pixels, depth_mm.ravel()[pixels] / MM_PER_M, normals)
 
 

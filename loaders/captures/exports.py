@@ -89,15 +89,15 @@ def _npy(values: NDArray) -> bytes:
     return buffer.getvalue()
 
 
-def pixel_normals(depth_mm: ArrayLike, camera: Pinhole) -> NDArray[np.float64]:
+def pixel_normals(depth_mm: ArrayLike, camera: Pinhole, steepest: float = STEEPEST) -> NDArray[np.float64]:
     """Unit normals float64 (H, W, 3) of a depth map (H, W) in mm, towards the camera; 0 where there is no depth. From
-    the differences to the neighbours that belong to the same surface, and along the ray where there are too few. Raises
-    `CaptureError` as `export_capture`."""
+    the differences to the neighbours that belong to the same surface (``steepest`` as `STEEPEST`), and along the ray
+    where there are too few. Raises `CaptureError` as `export_capture`."""
     rays, depth = _rays_and_depth(depth_mm, camera)
     points = rays * depth[..., None]
     tangents = []
     for one, other in (((_BEFORE, _ALL), (_AFTER, _ALL)), ((_ALL, _BEFORE), (_ALL, _AFTER))):
-        joined = _joined(rays, depth, one, other)
+        joined = _joined(rays, depth, one, other, steepest)
         difference = np.where(joined[..., None], points[other] - points[one], 0.0)
         tangent = np.zeros_like(points)
         tangent[one] += difference
@@ -157,11 +157,13 @@ def _rays_and_depth(depth_mm: ArrayLike, camera: Pinhole) -> tuple[NDArray[np.fl
     return rays, np.where(seen, _checked(depth_mm, camera, "depth_mm"), 0.0)
 
 
-def _joined(rays: NDArray[np.float64], depth: NDArray[np.float64], one: Part, other: Part) -> NDArray[np.bool_]:
+def _joined(
+    rays: NDArray[np.float64], depth: NDArray[np.float64], one: Part, other: Part, steepest: float = STEEPEST
+) -> NDArray[np.bool_]:
     """Whether the pixels at ``one`` and ``other`` have a depth and belong to the same surface."""
     near, far = depth[one], depth[other]
     apart = (near + far) / 2 * np.linalg.norm(rays[one] - rays[other], axis=-1)
-    return (near > 0) & (far > 0) & (np.abs(near - far) <= STEEPEST * apart)
+    return (near > 0) & (far > 0) & (np.abs(near - far) <= steepest * apart)
 
 
 def _png(depth: NDArray[np.float32]) -> tuple[str, bytes]:
