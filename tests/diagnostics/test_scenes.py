@@ -8,7 +8,7 @@ from conftest import tiny_settings
 
 from fpp_ml_bench.baselines.diagnostics.scenes import (
     LARGEST_SHIFT_RAD,
-    ONE_SURFACE_MM,
+    ONE_SURFACE,
     PITCH_FACTOR,
     Scene,
     SceneRenderer,
@@ -134,7 +134,7 @@ def test_a_moved_plane_keeps_its_law():
     np.testing.assert_allclose(design @ law, 1 / tilted.depth_m, rtol=1e-9)
     normal = -law / np.linalg.norm(law)
     np.testing.assert_allclose(tilted.normals, np.tile(normal, (surface.x.size, 1)), atol=1e-5)
-    normals = pixel_normals(surface.depth_mm((176, 176)), rig.camera, ONE_SURFACE_MM).reshape(-1, 3)
+    normals = pixel_normals(surface.depth_mm((176, 176)), rig.camera, ONE_SURFACE).reshape(-1, 3)
     np.testing.assert_allclose(normals, surface.normals, atol=1e-9)
 
 
