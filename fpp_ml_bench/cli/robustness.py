@@ -16,6 +16,7 @@ from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_block
 from fpp_ml_bench.loaders.render.builder import assembly_of
+from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.storage.manifest import Manifest
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import AnySequence
@@ -67,9 +68,7 @@ def robust(
     if into is not None and (axes or quick):
         raise PredictionError("--into: needs all axes and severities; leave out --axes and --quick")
     settings = Condition(CLEAN, 0, SETS[objects], size, find(chosen.name).method.scenes_rig).settings
-    rig, manifest = settings.rig, assembly_of(settings).manifest
-    scenes = Scenes(Path("the robustness scenes"), rig, (rig.camera.height, rig.camera.width), rig.sequence, manifest)
-    method = chosen.load(scenes, warn=False)
+    method = chosen.load(Scenes.of(settings), warn=False)
     entry = None if into is None else read_entry(into)
     if entry is not None:
         check_same_method(entry, method)
@@ -96,6 +95,12 @@ class Scenes(NamedTuple):
     size: tuple[int, int]
     sequence: AnySequence
     manifest: Manifest
+
+    @classmethod
+    def of(cls, settings: BuildSettings) -> "Scenes":
+        """The scenes that ``settings`` would build."""
+        rig, manifest = settings.rig, assembly_of(settings).manifest
+        return cls(Path("the robustness scenes"), rig, manifest.size, rig.sequence, manifest)
 
 
 def slug(setup: Setup) -> str:

@@ -42,6 +42,7 @@ NOT_STORED = (WRAPPED_PHASE, UNWRAPPED_PHASE, HEIGHTS)
 
 LISTED_PROBLEMS = 50
 _KINDS = {FRINGE: ".png", DEPTH: ".mat"}
+_EXAMPLE = "power_drill_A60"
 _SAMPLE_FILE = re.compile(rf"{OBJECT_NAME.pattern}_({'|'.join(VIEWS)})\.(png|mat)")
 
 _LAYOUT = (
@@ -207,8 +208,10 @@ def _files(
     for entry in visible(folder, LayoutError):
         fits = names.fullmatch(entry.name) if isinstance(names, re.Pattern) else entry.name in names
         if not fits or entry.is_dir() != bool(below):
-            named = names is _SAMPLE_FILE and entry.suffix in _KINDS.values()
-            problems.append(f"{entry}: {'' if named else 'does not belong here; '}expected {layout}")
+            if names is _SAMPLE_FILE and entry.suffix in _KINDS.values():
+                problems.append(f"{entry}: expected a name like {_EXAMPLE}{entry.suffix}, views {', '.join(VIEWS)}")
+            else:
+                problems.append(f"{entry}: does not belong here; expected {layout}")
         elif below:
             files |= _files(entry, below, layout, problems)
         else:

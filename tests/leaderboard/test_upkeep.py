@@ -18,6 +18,7 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result.parts import Robustness, SeverityScores
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, check_same_method, read_entry
+from fpp_ml_bench.loaders.render.scene import preset_settings
 
 BEGIN, END = "<!-- leaderboard:begin -->", "<!-- leaderboard:end -->"
 
@@ -145,7 +146,7 @@ def test_a_rows_command_is_of_the_method_that_was_scored(row):
     words = [name, "data", *options, "--out", "predictions"]
     command = BENCH.command("predict")
     chosen = command.values(command.make_context("fpp-bench predict", words))["chosen"]
-    method = chosen.load(Scenes.of("test", 960, "paper"), warn=False)
+    method = chosen.load(Scenes.of(preset_settings("test")), warn=False)
     check_same_method(read_entry(SHIPPED_ROWS / f"{row}.json"), method)
 
 

@@ -13,7 +13,6 @@ from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders.render.builder import build, plan_build
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.training import FringeDepthDataset, unit_range
-from fpp_ml_bench.machine import NUMBA_SWITCH as SWITCH
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
@@ -87,9 +86,7 @@ def test_tensors_are_the_papers(tiny, opened, normalisation, background_removed,
             assert (item.fringe[0].numpy()[depth == 0] == 0).all()
 
 
-@pytest.mark.parametrize("switch", ["0", "1"])
-def test_grey_levels_become_the_unit_range(monkeypatch, switch):
-    monkeypatch.setenv(SWITCH, switch)
+def test_grey_levels_become_the_unit_range():
     grey = np.arange(256, dtype=np.uint8).reshape(16, 16)
     out = np.full((16, 16), np.nan, np.float32)
     unit_range(grey, out)

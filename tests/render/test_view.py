@@ -18,7 +18,6 @@ from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.sensor import camera_noise
 from fpp_ml_bench.loaders.render.view import Studio, ground_truth_error
 from fpp_ml_bench.loaders.sample import WEAK_GREY, Flag
-from fpp_ml_bench.machine import NUMBA_SWITCH as SWITCH
 from fpp_ml_bench.optics.named_rigs import crossed_rig
 from fpp_ml_bench.optics.sequence import Sequence
 from fpp_ml_bench.skipping import skipping
@@ -165,17 +164,6 @@ def test_ground_truth_error_by_hand():
     assert errors["gt_interior_mae_mm"] == pytest.approx(3 / 36)
     empty = ground_truth_error(np.zeros_like(exact), exact, flags)
     assert empty["gt_mae_mm"] is None and empty["gt_max_mm"] is None and empty["undecoded_px"] == 144
-
-
-def test_a_view_is_the_same_with_and_without_numba(monkeypatch):
-    rows = {}
-    for switch in ("1", "0"):
-        monkeypatch.setenv(SWITCH, switch)
-        rows[switch] = studio(noisy(1.0)).photograph(BALL, "A60")
-    for index, frame in rows["1"].frames.items():
-        np.testing.assert_array_equal(frame, rows["0"].frames[index])
-    np.testing.assert_array_equal(rows["1"].depth_exact_mm, rows["0"].depth_exact_mm)
-    np.testing.assert_array_equal(rows["1"].depth_mm, rows["0"].depth_mm)
 
 
 def test_storing_fewer_frames_changes_no_byte_of_the_rest():

@@ -88,9 +88,7 @@ class Trainer:
         if isinstance(outcome, BaseException):
             raise outcome
         if outcome == "out of time":
-            return depth_training.TrainingRun(
-                out / depth_training.WEIGHTS, 1, 1, 1.0, False, out / "log.jsonl", out / "curve.png"
-            )
+            return depth_training.TrainingRun(out, 1, 1, 1.0, finished=False)
         self.trained.append(recipe.name)
         torch.manual_seed(self.seed)
         network = build(recipe.network, width=recipe.width)
