@@ -336,9 +336,9 @@ def test_death_of_a_worker_is_an_error_that_says_so_and_the_rest_is_kept(tmp_pat
     assert file_bytes(folder) == uninterrupted
 
 
-def test_sigterm_to_a_build_in_processes_makes_no_noise(tmp_path, uninterrupted):
+def test_sigterm_to_a_build_in_processes_makes_no_noise(tmp_path, uninterrupted, direct_light):
     folder = tmp_path / "set"
-    process = start(folder, "--objects", "cork,mug", "--config", "single_shot", workers=2)
+    process = start(folder, "--objects", "cork,mug", "--config", "single_shot", "--light", direct_light, workers=2)
     assert wait_for(lambda: list(folder.glob(".build/*.tmp")), process)
     os.killpg(process.pid, signal.SIGTERM)
     errors = process.communicate(timeout=60)[1]
