@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.learned.network import DepthFilter
+from fpp_ml_bench.baselines.learned.network import DepthFilter, mask_loss, mean_over, scale_loss
 from fpp_ml_bench.baselines.learned.routes import (
     DEPTH_CHANNELS,
     DepthScene,
@@ -23,14 +23,7 @@ from fpp_ml_bench.baselines.learned.routes import (
     filtered,
 )
 from fpp_ml_bench.baselines.learned.scenes import View
-from fpp_ml_bench.baselines.learned.training import (
-    Batch,
-    StepRecipe,
-    Task,
-    mask_loss,
-    mean_over,
-    scale_loss,
-)
+from fpp_ml_bench.baselines.learned.training import Batch, StepRecipe, Task
 from fpp_ml_bench.baselines.learned.windows import Sample, Window, mean_scores, view_scores
 from fpp_ml_bench.baselines.training.weights import FILTER_NETWORKS, Family
 from fpp_ml_bench.optics.rig import Rig

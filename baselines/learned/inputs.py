@@ -18,9 +18,10 @@ from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer
 from fpp_ml_bench.baselines.phase.candidates import irradiance
 from fpp_ml_bench.baselines.phase.depth import Fitted, PhaseRoute
 from fpp_ml_bench.baselines.phase.local_fit import fringes, phase_slopes
-from fpp_ml_bench.baselines.phase.observe import Observation, Settings
+from fpp_ml_bench.baselines.phase.observe import Observation
 from fpp_ml_bench.baselines.phase.order import LEAST_BRIGHTNESS
 from fpp_ml_bench.baselines.phase.resampling import Periods, grid_of, repeated
+from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.optics.rig import Rig
 
 STEPS = (-1, 0, 1)  # the candidates: a period further than the base order, the base order, a period nearer

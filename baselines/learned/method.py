@@ -23,8 +23,8 @@ from fpp_ml_bench.baselines.phase.method import (
     fringe_options,
     has_crossed_fringes,
 )
-from fpp_ml_bench.baselines.phase.observe import AMBIENT_GREY, DIRECTION, MIN_CONFIDENCE, WHITE_GREY, Settings
 from fpp_ml_bench.baselines.phase.resampling import Periods
+from fpp_ml_bench.baselines.phase.settings import AMBIENT_GREY, DIRECTION, MIN_CONFIDENCE, WHITE_GREY, Settings
 from fpp_ml_bench.coding.phase_shift import PhaseShift
 from fpp_ml_bench.decoding.decode import Directions
 from fpp_ml_bench.errors import PredictionError

@@ -1,5 +1,5 @@
 """The networks inside a route, a small U-Net with heads each: of a phase (order, mask, correction, scale), and of a
-decoded depth (neighbours' weights, mask, scale). Also their weights, by name."""
+decoded depth (neighbours' weights, mask, scale). Also the losses of these heads, and their weights by name."""
 
 from copy import deepcopy
 from dataclasses import replace
@@ -213,3 +213,19 @@ def load_net(name_or_path: str | Path = DEFAULT, folded: bool = True, family: Fa
     (`PhaseNet.folded`), False to train on. Raises what `open_weights` raises."""
     file = open_weights(weights_path(name_or_path, SHIPPED), family)
     return replace(file, network=file.network.folded()) if folded else file
+
+
+def mean_over(values: Tensor, where: Tensor) -> Tensor:
+    """Mean of ``values`` over the pixels ``where``; 0 without one."""
+    return (values * where).sum() / where.sum().clamp(min=1)
+
+
+def mask_loss(logit: Tensor, target: Tensor, valid: Tensor) -> Tensor:
+    """Binary cross-entropy of the object's ``logit`` over ``valid`` pixels."""
+    by_pixel = functional.binary_cross_entropy_with_logits(logit, target.float(), reduction="none")
+    return mean_over(by_pixel, valid)
+
+
+def scale_loss(error: Tensor, scale: Tensor, where: Tensor) -> Tensor:
+    """Negative log-likelihood of an absolute ``error`` under a Laplace distribution of ``scale``, a logarithm."""
+    return mean_over(error * torch.exp(-scale) + scale, where)

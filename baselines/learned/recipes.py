@@ -42,8 +42,8 @@ from fpp_ml_bench.baselines.learned.windows import (
 from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Image, Mask
 from fpp_ml_bench.baselines.phase.candidates import chosen_values
 from fpp_ml_bench.baselines.phase.depth import CrossedRoute
-from fpp_ml_bench.baselines.phase.observe import Settings
 from fpp_ml_bench.baselines.phase.resampling import repeated
+from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import RecipeError
 from fpp_ml_bench.optics.rig import Rig

@@ -34,9 +34,10 @@ from fpp_ml_bench.baselines.learned.odds import (
 from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Carriers, Image, Mask, wrapped
 from fpp_ml_bench.baselines.phase.candidates import chosen_values
 from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Fitted, FringeMeasurement, Measurement
-from fpp_ml_bench.baselines.phase.observe import Frames, Settings
+from fpp_ml_bench.baselines.phase.observe import Frames
 from fpp_ml_bench.baselines.phase.order import JUMP_RAD
 from fpp_ml_bench.baselines.phase.resampling import Periods, nearest_inside, stride_of
+from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.optics.rig import Rig
 
 OPEN_MARGIN = 1e-6

@@ -26,7 +26,7 @@ from torch.nn import functional
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from fpp_ml_bench.baselines.learned.inputs import PHASE_CHANNELS
-from fpp_ml_bench.baselines.learned.network import PhaseNet, load_net
+from fpp_ml_bench.baselines.learned.network import PhaseNet, load_net, mask_loss, mean_over, scale_loss
 from fpp_ml_bench.baselines.learned.odds import Answers, decided_mask
 from fpp_ml_bench.baselines.learned.scenes import (
     View,
@@ -74,22 +74,6 @@ LARGEST_GRADIENT = 50.0
 MOST = {"views_a_light": 40, "unions": 100}  # of a recipe
 
 Batch = dict[str, Tensor]  # the fields of a window with a leading axis B
-
-
-def mean_over(values: Tensor, where: Tensor) -> Tensor:
-    """Mean of ``values`` over the pixels ``where``; 0 without one."""
-    return (values * where).sum() / where.sum().clamp(min=1)
-
-
-def mask_loss(logit: Tensor, target: Tensor, valid: Tensor) -> Tensor:
-    """Binary cross-entropy of the object's ``logit`` over ``valid`` pixels."""
-    by_pixel = functional.binary_cross_entropy_with_logits(logit, target.float(), reduction="none")
-    return mean_over(by_pixel, valid)
-
-
-def scale_loss(error: Tensor, scale: Tensor, where: Tensor) -> Tensor:
-    """Negative log-likelihood of an absolute ``error`` under a Laplace distribution of ``scale``, a logarithm."""
-    return mean_over(error * torch.exp(-scale) + scale, where)
 
 
 def batch_of(windows: Sequence[Window]) -> Batch:

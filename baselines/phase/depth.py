@@ -42,10 +42,10 @@ from fpp_ml_bench.baselines.phase.observe import (
     Frames,
     Observation,
     OneCarrier,
-    Settings,
     TwoCarriers,
 )
 from fpp_ml_bench.baselines.phase.order import CrossedOrder, crossed_order, fringe_order, margin_by_range
+from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.coding.code import MIN_MODULATION
 from fpp_ml_bench.coding.phase_shift import phase_weights
 from fpp_ml_bench.constants import MM_PER_M

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method
 from fpp_ml_bench.baselines.phase.depth import CrossedRoute, FringeMeasurement, PhaseRoute, Reason
-from fpp_ml_bench.baselines.phase.observe import CROSSED_FRAMES, MIN_CONFIDENCE, PIXELWISE, Settings, steps_of
+from fpp_ml_bench.baselines.phase.observe import CROSSED_FRAMES
 from fpp_ml_bench.baselines.phase.order import TERMS, terms_of
+from fpp_ml_bench.baselines.phase.settings import MIN_CONFIDENCE, PIXELWISE, Settings, steps_of
 from fpp_ml_bench.coding.crossed import crossed_from_pair
 from fpp_ml_bench.coding.phase_shift import PhaseShift
 from fpp_ml_bench.decoding.decode import decode_stack, grey_levels

@@ -11,7 +11,6 @@ other still, which is left in their mean, where the shifted one cancels.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, get_args
 
 import cv2
 import numpy as np
@@ -53,22 +52,17 @@ from fpp_ml_bench.baselines.phase.object_mask import (
     unlit,
 )
 from fpp_ml_bench.baselines.phase.resampling import Periods, Resampling, nearest_inside, repeated, stride_of
+from fpp_ml_bench.baselines.phase.settings import PIXELWISE, Settings, steps_of
 from fpp_ml_bench.coding.code import MIN_MODULATION
 from fpp_ml_bench.coding.crossed import Crossed
-from fpp_ml_bench.coding.phase_shift import choose_steps, wrapped_phase
+from fpp_ml_bench.coding.phase_shift import wrapped_phase
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
 from fpp_ml_bench.decoding.decode import grey_levels
 from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
-from fpp_ml_bench.options import option
 
 Frames = NDArray | Sequence[NDArray]
-Prior = Literal["none", "standoff"]
-PIXELWISE = 3  # frames from which on every pixel has a phase of its own
 CROSSED_FRAMES = 3  # that shift one carrier
-PAIR_DEGREES = 120.0
-"""Phase shift between two frames: that of the first two of three, so that a third frame completes them."""
 MARGIN_PERIODS = 0.5  # of the crop around the object: covers the windows, and the mask may grow into it
 FRINGE_NOISE = 0.03  # uncertainty of a fringe extrapolated beyond its window, as a share of its brightness
 CONTRAST_ROUNDS, FREE_ROUNDS = 3, 2  # fits that measure the contrast of the fringes, and that use it
@@ -78,70 +72,6 @@ MOST_SLACK_PERIODS = 0.07
 15, and 4 mm of a rig whose period is 57 mm deep, where 15 mm would let almost every pixel have a second order."""
 LEAST_CONTRAST = 0.08
 CONTRAST_RIM_PERIODS = 0.5  # grid points this near to the silhouette don't measure the contrast
-MIN_CONFIDENCE = "mask pixels of less confidence, 0 to 1 (default: 0, dense)"
-DIRECTION = "direction of the fringes (default: horizontal)"
-WHITE_GREY = (
-    "for images without a lit background: grey level of a white pattern on a surface that faces the projector at the "
-    "near end of the working range"
-)
-AMBIENT_GREY = (
-    "for images without a lit background: grey level of a surface in ambient light alone (default: the image's darkest)"
-)
-"""Help of options that several methods have."""
-_POSITIVE = "first_window", "second_window", "pair_window", "slope_window", "jump_rad", "shading_spread"
-
-
-@dataclass(frozen=True)
-class Settings:
-    """``direction`` of the fringes and how many ``frames`` of them, 1 to all that are projected; what the choice of
-    the order may use: ``shading`` and ``prior`` ("standoff": objects are near the rig's standoff, true of fixed
-    placement); ``min_confidence``: pixels below it are 0 (0: dense, every object pixel gets a depth). The defaults
-    were chosen on train and validation objects.
-
-    Windows, in fringe periods: of the first fit, of the second, of the last one to two frames, and of the slopes. Costs
-    (no unit): ``shading_cost`` a pixel for each ``shading_spread`` of log brightness, up to ``shading_limit`` of them;
-    ``prior_cost`` a pixel for each 100 mm; ``jump_rad``: a jump of phase between neighbours from which on it costs no
-    more. ``slack_mm`` widens the range in which orders are chosen, for noise at its ends: a depth
-    beyond them is left out, and no other order is taken to be within. ``white_grey`` and ``ambient_grey``, if given,
-    calibrate brightness (see `EmptyScene`); without them it is taken from the lit background, and where the image
-    shows none, range and continuity settle the order, or it is ambiguous and has no depth (`order.margin_by_range`).
-    Of these, crossed fringes use ``min_confidence`` and ``slack_mm`` alone.
-    """
-
-    direction: Direction = option("horizontal", DIRECTION, choices=DIRECTIONS)
-    frames: int = option(1, "fringes of that direction, 1 to 18; no Gray code (default: 1)", "N")
-    shading: bool = option(True, "choose the fringe order without brightness", flag="--no-shading")
-    prior: Prior = option(
-        "none",
-        "standoff: assume that objects are near the rig's standoff, true of fixed placement (default: none)",
-        choices=get_args(Prior),
-    )
-    min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
-    first_window: float = 0.35
-    second_window: float = 0.27
-    pair_window: float = 0.06
-    slope_window: float = 0.13
-    shading_cost: float = 0.003
-    shading_spread: float = 0.1
-    shading_limit: float = 3.0
-    prior_cost: float = 0.002
-    jump_rad: float = 2.5
-    slack_mm: float = 15.0
-    white_grey: float | None = option(None, WHITE_GREY, "GREY")
-    ambient_grey: float | None = option(None, AMBIENT_GREY, "GREY")
-
-    def __post_init__(self) -> None:
-        if self.direction not in DIRECTIONS:
-            raise PredictionError(f"direction {self.direction!r}: one fringe is {' or '.join(DIRECTIONS)}, not both")
-        if self.prior not in get_args(Prior):
-            raise PredictionError(f"prior {self.prior!r}: expected {' or '.join(get_args(Prior))}")
-        if not 0 <= self.min_confidence < 1:
-            raise PredictionError(f"min_confidence {self.min_confidence!r}: expected 0 (dense) to below 1")
-        for name in (*_POSITIVE, *(["white_grey"] if self.white_grey is not None else [])):
-            if not 0 < getattr(self, name) < np.inf:
-                raise PredictionError(f"{name} {getattr(self, name)!r}: expected more than 0")
-        if self.ambient_grey is not None and not 0 <= self.ambient_grey <= GREY_LEVELS:
-            raise PredictionError(f"ambient_grey {self.ambient_grey!r}: expected 0 to {GREY_LEVELS} grey levels")
 
 
 @dataclass(frozen=True)
@@ -498,16 +428,3 @@ class TwoCarriers(MeasurementModel):
         least, most = np.float32(LEAST_CONTRAST), np.asarray(self.carriers.family.weights, np.float32)
         first, second = np.clip(shares, least, most).tolist()
         return first, second
-
-
-def steps_of(steps: int, frames: int) -> tuple[int, ...]:
-    """Which of ``steps`` phase shifts ``frames`` of them are: 0 alone, 0 and a third, or `choose_steps`. Raises
-    `PredictionError` for a number of frames that can't be had."""
-    if isinstance(frames, bool) or not isinstance(frames, int | np.integer) or not 1 <= frames <= steps:
-        raise PredictionError(
-            f"frames {frames!r}: expected a whole number from 1 to the {steps} sinusoids of a direction that were "
-            "projected"
-        )
-    if frames < PIXELWISE:
-        return (0, round(steps * PAIR_DEGREES / 360))[:frames]
-    return choose_steps(steps, frames)

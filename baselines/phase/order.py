@@ -25,8 +25,9 @@ from fpp_ml_bench.baselines.phase.candidates import (
     links_between,
 )
 from fpp_ml_bench.baselines.phase.object_mask import disk
-from fpp_ml_bench.baselines.phase.observe import Capture, CrossedObservation, Observation, Settings
+from fpp_ml_bench.baselines.phase.observe import Capture, CrossedObservation, Observation
 from fpp_ml_bench.baselines.phase.resampling import nearest_inside
+from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.constants import MM_PER_M
 
 LARGE = np.float32(1e4)  # cost of a candidate that does not exist

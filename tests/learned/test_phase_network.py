@@ -13,7 +13,7 @@ from fpp_ml_bench.baselines.learned.network import PhaseNet, load_net
 from fpp_ml_bench.baselines.learned.routes import PhaseNetRoute
 from fpp_ml_bench.baselines.phase.calibration_layer import TAU
 from fpp_ml_bench.baselines.phase.depth import Reason
-from fpp_ml_bench.baselines.phase.observe import Settings
+from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.errors import DecodeError, FppBenchError, NetworkError, PredictionError
 from fpp_ml_bench.optics.named_rigs import paper_rig

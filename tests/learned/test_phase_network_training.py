@@ -17,7 +17,7 @@ from fpp_ml_bench.baselines.learned.recipes import PhaseRecipe, PhaseTask, Varia
 from fpp_ml_bench.baselines.learned.scenes import Group, View, read_views
 from fpp_ml_bench.baselines.learned.training import WindowTraining, train_net
 from fpp_ml_bench.baselines.learned.windows import Sample
-from fpp_ml_bench.baselines.phase.observe import Settings
+from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.training.engine import CHECKPOINT, reproducible
 from fpp_ml_bench.baselines.training.weights import PHASE_NETWORKS, SHIPPED, NetConfig, save_weights

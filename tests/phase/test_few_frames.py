@@ -14,7 +14,7 @@ from synthetic import make
 from fpp_ml_bench.baselines.method import Answer, Method
 from fpp_ml_bench.baselines.phase.local_fit import FringeFit, Window, fringe_fit
 from fpp_ml_bench.baselines.phase.method import FewestFrames, PhaseMethod, levels_of
-from fpp_ml_bench.baselines.phase.observe import steps_of
+from fpp_ml_bench.baselines.phase.settings import steps_of
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm

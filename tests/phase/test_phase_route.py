@@ -12,7 +12,7 @@ from flat_planes import DIRECT, FIRST, OTHER_RIG, PAPER, RIG, USERS_WORD, photog
 from fpp_ml_bench.baselines.phase.depth import PhaseRoute, Reason
 from fpp_ml_bench.baselines.phase.empty_scene import image_noise_grey
 from fpp_ml_bench.baselines.phase.method import PhaseMethod
-from fpp_ml_bench.baselines.phase.observe import Settings
+from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm

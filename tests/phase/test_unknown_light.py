@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase.depth import PhaseRoute, Reason
 from fpp_ml_bench.baselines.phase.method import PhaseMethod
-from fpp_ml_bench.baselines.phase.observe import Settings
 from fpp_ml_bench.baselines.phase.resampling import Periods
+from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import CaptureError
