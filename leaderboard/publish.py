@@ -79,7 +79,7 @@ def task_id(single_shot: bool, track: Track) -> str:
     return f"{'single_shot' if single_shot else 'multi_frame'}_depth{'' if track == TRACKS[0] else '_oracle_range'}"
 
 
-def score(object_mae_mm: float) -> float:
+def hub_score(object_mae_mm: float) -> float:
     """Score in [0, 100] of an object MAE in mm (0 or more); 6 decimals."""
     return round(100.0 / (1.0 + object_mae_mm / SCORE_HALF_MM), _SCORE_DIGITS)
 
@@ -202,7 +202,7 @@ def stage_results(
         published = EvalResultEntry(
             dataset_id=scored_on,
             task_id=task,
-            value=score(error_mm),
+            value=hub_score(error_mm),
             dataset_revision=revision,
             date=row.created[:10],
             source_url=source_url,

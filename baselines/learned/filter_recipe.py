@@ -133,7 +133,7 @@ class FilterTask(Task):
         }
 
     def scores(self, network: DepthFilter, samples: list[Sample]) -> dict[str, float]:
-        return mean_scores(score(filtered(network, sample.scene), sample, 0.0) for sample in samples)
+        return mean_scores(filter_scores(filtered(network, sample.scene), sample, 0.0) for sample in samples)
 
     def chosen(
         self, network: DepthFilter, samples: list[Sample], validation: list[Sample], out: Path
@@ -142,11 +142,11 @@ class FilterTask(Task):
         answers = [filtered(folded, sample.scene) for sample in validation]
         threshold = chosen_threshold(answers, validation)
         pairs = zip(answers, validation, strict=True)
-        means = mean_scores(score(answer, sample, threshold) for answer, sample in pairs)
+        means = mean_scores(filter_scores(answer, sample, threshold) for answer, sample in pairs)
         return {"threshold": threshold, "period_px": {}, "validation": means}
 
 
-def score(answer: Filtered, sample: Sample, threshold: float) -> dict[str, float | None]:
+def filter_scores(answer: Filtered, sample: Sample, threshold: float) -> dict[str, float | None]:
     """`view_scores` of a view, filtered and, as ``input_*``, as decoded; ``invented_kpx`` counts what the filter added.
     ``within_percent``: share of errors within the stated standard uncertainty."""
     scene, target = sample.scene, sample.target

@@ -180,7 +180,7 @@ class CroppedMaps:
 
 
 @dataclass(frozen=True)
-class Candidates(CroppedMaps):
+class CandidateScene(CroppedMaps):
     """A measured view with three candidates for each pixel's order: a turn further than the base, the base, a turn
     nearer. ``light`` without ambient light and ``bright``, half the modulation, of the local fit, in one unit;
     ``inside``: mask of the measured route; ``share`` of the fit's window that lies on the object; ``strength``: the
@@ -207,7 +207,7 @@ class Candidates(CroppedMaps):
 
 
 @dataclass(frozen=True)
-class PhaseScene(Candidates):
+class PhaseScene(CandidateScene):
     """Maps in the image's own orientation. ``light`` and ``plane_light``, the empty scene's prediction of it, as
     multiples of a plane like the background at the standoff, or of the object's median brightness, ``noise`` in the
     same unit; ``phase_rad`` in [-pi, pi] and ``order``: the base order; ``slopes`` (2, h, w) of the residual phase, rad
@@ -359,7 +359,7 @@ def _turned_sides(scene: PhaseScene, layer: CalibrationLayer, geometry: Geometry
 
 
 @dataclass(frozen=True)
-class CrossedScene(Candidates):
+class CrossedScene(CandidateScene):
     """Maps (h, w), or (n, h, w). ``light`` and ``bright`` as multiples of the object's median brightness;
     ``plane_misfit``: arcsinh of the light less the plane's in sigmas, 0 where no plane is ``shown``; ``nearness``
     float32: of the fit; ``window_rad`` (2): phases of the first windows less the fit's; ``modulation`` (2) of these,

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.learned.inputs import Candidates
+from fpp_ml_bench.baselines.learned.inputs import CandidateScene
 from fpp_ml_bench.baselines.learned.network import PhaseNet
 from fpp_ml_bench.baselines.phase.calibration_layer import Image, Mask
 from fpp_ml_bench.baselines.phase.candidates import chosen_values, links_between
@@ -50,7 +50,7 @@ def threshold_at(strength: float, threshold: float) -> float:
     return threshold + SPREAD * float(np.clip(2 * place - 1, -1, 1))
 
 
-def decided_mask(answers: Answers, scene: Candidates, threshold: float) -> Mask:
+def decided_mask(answers: Answers, scene: CandidateScene, threshold: float) -> Mask:
     """Object pixels (h, w) of those that are usable: their logit is above the `threshold_at` the scene's strength, or
     they are of the measured route's mask and their logit is at most ``denied`` below it."""
     logit, threshold = answers.object_logit, threshold_at(scene.strength, threshold)

@@ -28,7 +28,7 @@ from fpp_ml_bench.baselines.phase.local_fit import (
     CURVED,
     LARGEST_STEP_RAD,
     FringeFit,
-    Window,
+    GaussianWindow,
     fringes,
     phase_noise_grey,
     same_plane_mean,
@@ -165,7 +165,7 @@ class Fitted(CrossedObservation, CrossedOrder):
     fit: NearnessFit
 
 
-def _uncertainty_rad(seen: Observation, window: Window) -> Image:
+def _uncertainty_rad(seen: Observation, window: GaussianWindow) -> Image:
     """Expected absolute error of the phase of each pixel in rad, float32 (h, w), apart from the order."""
     fit, background = seen.fit, seen.background
     bright = np.maximum(fit.brightness, 0.5)
@@ -191,7 +191,7 @@ def _uncertainty_rad(seen: Observation, window: Window) -> Image:
     return np.sqrt(averaged + systematic) / bright * (share + rim) + np.hypot(*seen.slopes) * rim  # type: ignore[no-any-return]
 
 
-def _noise_and_rest(seen: Capture, power: NDArray, window: Window, weight: NDArray) -> tuple[NDArray, NDArray]:
+def _noise_and_rest(seen: Capture, power: NDArray, window: GaussianWindow, weight: NDArray) -> tuple[NDArray, NDArray]:
     """Of the ``power`` of a misfit: noise that is left of white noise after averaging, and what is no noise."""
     # A window of sigma s averages 4 pi s^2 pixels of white noise; what is not noise does not average.
     noise = seen.background.noise_grey**2
@@ -200,7 +200,7 @@ def _noise_and_rest(seen: Capture, power: NDArray, window: Window, weight: NDArr
 
 def _window_fit(seen: CrossedObservation, nearness: NDArray) -> NearnessFit:
     """The fit to one frame under a window, from the turns of both phases that are nearest to ``nearness``."""
-    carriers, light, window = seen.carriers, seen.light, Window(WINDOW_PERIODS * seen.period_px)
+    carriers, light, window = seen.carriers, seen.light, GaussianWindow(WINDOW_PERIODS * seen.period_px)
     beside = wrapped(seen.phase_rad - carriers.phases(nearness))
     nearness = nearness + (carriers.gain * beside).sum(axis=0) / carriers.joint_gain**2
     view = light, *fringes(carriers, nearness, seen.contrast)
@@ -231,7 +231,7 @@ def _own_fit(seen: CrossedObservation, nearness: Image, moved: int) -> NearnessF
     misfit = seen.light - brightness * fringes(carriers, nearness, still)[0]
     unexplained = np.maximum(np.abs(misfit) - NOISE_SIGMAS * noise_grey / contrast, 0)
     uncertainty = np.hypot(sigma, OWN_SYSTEMATIC_SHARE * unexplained / bright) * carriers.joint_gain / np.abs(gain)
-    weight = Window(WINDOW_PERIODS * seen.period_px).moment(seen.inside.astype(np.float32))
+    weight = GaussianWindow(WINDOW_PERIODS * seen.period_px).moment(seen.inside.astype(np.float32))
     maps = (nearness, brightness, misfit, weight, uncertainty)
     return NearnessFit(*(np.asarray(values, np.float32) for values in maps))
 
@@ -256,7 +256,7 @@ def _judged(
     depth_mm: NDArray,
     error_mm: NDArray,
     fit: FringeFit | NearnessFit,
-    window: Window | None,
+    window: GaussianWindow | None,
     reasons: Mapping[Reason, Mask],
     guessed: Mask | bool = False,
 ) -> dict[str, Any]:
@@ -451,7 +451,7 @@ class CrossedRoute(TwoCarriers):
         mm_per_rad = carriers.mm_per_rad(np.maximum(depth_mm, 1.0))
         doubt_rad = reaching(np.abs(seen.rival - fit.nearness) * carriers.joint_gain, wrong_chance)
         sigma_mm = mm_per_rad * np.hypot(fit.uncertainty_rad, doubt_rad)
-        window = Window(WINDOW_PERIODS * seen.period_px)
+        window = GaussianWindow(WINDOW_PERIODS * seen.period_px)
         misfit = window.moment((fit.misfit_grey**2 * seen.inside).astype(np.float32)) / np.maximum(fit.weight, 1e-3)
         texture = (np.sqrt(misfit) > TEXTURE_SHARE * bright) | (seen.candidates.misfit_rad[1] > TEXTURE_RAD)
         reasons = {

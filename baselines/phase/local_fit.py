@@ -41,7 +41,7 @@ PLANE = ((0, 0), (1, 0), (0, 1))
 CURVED = (*PLANE, (2, 0), (1, 1), (0, 2))
 
 
-class Window:
+class GaussianWindow:
     """A Gaussian of ``sigma_px`` and its moments up to the fourth, for `cv2.sepFilter2D`."""
 
     def __init__(self, sigma_px: float) -> None:
@@ -101,7 +101,7 @@ def solve_symmetric(rows: list[list[Image]], right: list[Image]) -> list[Image]:
     return right
 
 
-def carrier_fit(grey: Image, inside: Mask, carrier_rad: NDArray, window: Window) -> tuple[Image, Image]:
+def carrier_fit(grey: Image, inside: Mask, carrier_rad: NDArray, window: GaussianWindow) -> tuple[Image, Image]:
     """Phase in rad and modulation in grey levels, float32 (H, W), from the five-term fit of ``grey`` around each pixel;
     use them inside only."""
     weight = inside.astype(np.float32)
@@ -125,7 +125,7 @@ def carrier_fit(grey: Image, inside: Mask, carrier_rad: NDArray, window: Window)
 def tied_fit(
     views: Iterable[tuple[NDArray, NDArray, NDArray]],
     inside: Mask,
-    window: Window,
+    window: GaussianWindow,
     terms: Sequence[tuple[int, int]],
 ) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Fit of ``light = g raised + s slope`` around each pixel of one or several ``views``, each light (grey levels
@@ -152,7 +152,7 @@ def fringe_fit(
     inside: Mask,
     carrier_rad: Image,
     ambient: float,
-    window: Window,
+    window: GaussianWindow,
     shifts_rad: Sequence[float],
     contrast: float = 1.0,
     terms: Sequence[tuple[int, int]] = PLANE,

@@ -31,7 +31,7 @@ from fpp_ml_bench.baselines.phase.local_fit import (
     CURVED,
     Demodulator,
     FringeFit,
-    Window,
+    GaussianWindow,
     carrier_fit,
     fringe_fit,
     measured_contrast,
@@ -210,9 +210,11 @@ class OneCarrier(MeasurementModel):
         self.period_px = rig.image_px_per_period(settings.direction)
         self._scene = EmptyScene(rig, self.layer, self.period_px, settings.white_grey, settings.ambient_grey)
         self._carrier = np.nan_to_num(self.layer.absolute_phase(rig.standoff_m * MM_PER_M)).astype(np.float32)
-        self.windows = [Window(share * self.period_px) for share in (settings.first_window, settings.second_window)]
+        self.windows = [
+            GaussianWindow(share * self.period_px) for share in (settings.first_window, settings.second_window)
+        ]
         if settings.frames == 2:
-            self.windows += [Window(settings.pair_window * self.period_px)] * PAIR_ROUNDS
+            self.windows += [GaussianWindow(settings.pair_window * self.period_px)] * PAIR_ROUNDS
 
     @cached_property
     def captured_layer(self) -> CalibrationLayer:

@@ -17,7 +17,7 @@ from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.evaluation.result.file import write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
-from fpp_ml_bench.leaderboard.publish import score
+from fpp_ml_bench.leaderboard.publish import hub_score
 from fpp_ml_bench.loaders.hub import Change, Publication, Remote, changes, check_repo_name
 from fpp_ml_bench.loaders.storage.parquet import preview
 
@@ -165,9 +165,9 @@ def test_the_page_of_results(client, scored, tmp_path):
 
 def test_the_score_falls_with_the_error_and_stays_between_0_and_100():
     errors = [0.0, 1e-3, 0.5, 1.0, 9.99, 10.0, 100.0, 1800.0, 1e6]
-    scores = [score(error) for error in errors]
+    scores = [hub_score(error) for error in errors]
     assert all(higher > lower for higher, lower in itertools.pairwise(scores))
-    assert scores[0] == 100.0 and score(10.0) == 50.0 and score(1e30) == 0.0
+    assert scores[0] == 100.0 and hub_score(10.0) == 50.0 and hub_score(1e30) == 0.0
 
 
 @pytest.mark.parametrize("name", ["a/b", "A-1/b.c_d", "alice/" + "n" * 96])

@@ -16,7 +16,7 @@ from fpp_ml_bench.baselines.learned.filter_recipe import (
     FilterRecipe,
     chosen_threshold,
     depth_sample,
-    score,
+    filter_scores,
 )
 from fpp_ml_bench.baselines.learned.method import ClassicalNetMethod
 from fpp_ml_bench.baselines.learned.network import BOUND_SIGMAS, REACH, DepthFilter
@@ -185,7 +185,7 @@ def test_scores_count_a_missed_pixel_with_its_whole_depth(samples: list[Sample])
         np.ones_like(sample.target),
     )
     found = replace(sample.scene, found=sample.scene.found & (np.arange(sample.target.shape[1]) % 2 == 0))
-    scores = score(exact, replace(sample, scene=found), 0.0)
+    scores = filter_scores(exact, replace(sample, scene=found), 0.0)
     missed = sample.target & ~found.found
     whole = (sample.missing + found.middle_mm)[missed].sum(dtype=np.float64) / sample.target.sum()
     assert scores["object_mae_mm"] == pytest.approx(whole, rel=1e-5)

@@ -12,7 +12,7 @@ from flat_planes import PAPER, USERS_WORD
 from synthetic import make
 
 from fpp_ml_bench.baselines.method import Answer, Method
-from fpp_ml_bench.baselines.phase.local_fit import FringeFit, Window, fringe_fit
+from fpp_ml_bench.baselines.phase.local_fit import FringeFit, GaussianWindow, fringe_fit
 from fpp_ml_bench.baselines.phase.method import FewestFrames, PhaseMethod, levels_of
 from fpp_ml_bench.baselines.phase.settings import steps_of
 from fpp_ml_bench.baselines.registry import load_method
@@ -109,7 +109,9 @@ def test_two_frames_solve_the_tied_fringe() -> None:
     def fitted(frames: int) -> FringeFit:
         carrier = start
         for _ in range(3):
-            fit = fringe_fit(greys[:frames], np.ones(phase.shape, bool), carrier, 6.0, Window(1.5), shifts[:frames])
+            fit = fringe_fit(
+                greys[:frames], np.ones(phase.shape, bool), carrier, 6.0, GaussianWindow(1.5), shifts[:frames]
+            )
             carrier = fit.phase_rad
         return fit
 
