@@ -23,10 +23,10 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     Probe,
     ProbeSettings,
     Progress,
-    Table,
     gallery,
     mean_of,
     silent,
+    table_of,
 )
 from fpp_ml_bench.baselines.diagnostics.scenes import (
     REPROJECTED,
@@ -272,8 +272,9 @@ class Counterfactual(Probe):
         chosen = chosen_samples(dataset, "test", views)
         reliance, per_sample = measure(subject, dataset, chosen, progress)
         values = {"reliance": reliance.model_dump(mode="json"), "per_sample": per_sample}
-        rows = [(words, getattr(reliance.parts, key)) for key, words in PART_TITLES.items()]
-        parts = Table("Parts of the score, and further measurements", ("Part", "Mean over samples"), rows)
+        rows = {words: {"mean": getattr(reliance.parts, key)} for key, words in PART_TITLES.items()}
+        title = "Parts of the score, and further measurements"
+        parts = table_of(title, "Part", rows, {"mean": "Mean over samples"})
         # The middle sample of the list, which is the same for every method.
         name, outline_samples = chosen[len(chosen) // 2]
         sample = SampleScenes(subject, dataset, SceneRenderer.of(dataset), name, outline_samples)

@@ -22,8 +22,8 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     Probe,
     ProbeSettings,
     Progress,
-    Table,
     gallery,
+    table_of,
 )
 from fpp_ml_bench.baselines.diagnostics.scenes import Mask, Scene, SceneRenderer, original, plane
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject, background_below
@@ -33,6 +33,7 @@ from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.paper import paper_rows
 from fpp_ml_bench.style import DEPTH_COLOURS
+from fpp_ml_bench.tables import Table
 
 TILTS_DEG = ((0.0, 0.0), (20.0, 0.0), (0.0, 20.0))
 DISTANCES_M = (1.6, 1.8, 2.0)
@@ -180,7 +181,7 @@ def table(rows: Sequence[Row], normalised: bool) -> Table:
         poses[f"{kind_of(row['outline'])}, {row['distance_m']:g} m, tilt {across:g}, {down:g}"].append(row)
     lines = {pose: {key: float(np.mean([row[key] for row in same])) for key in columns} for pose, same in poses.items()}
     title = "Predictions for planes" + (", mm by the mean range of the test split" if normalised else "")
-    return Table.of(title, "Outline, distance, tilt in degrees", lines, columns)
+    return table_of(title, "Outline, distance, tilt in degrees", lines, columns)
 
 
 def draw(shown: Sequence[tuple[Row, NDArray, NDArray]], normalised: bool) -> Figure:

@@ -26,8 +26,8 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     Probe,
     ProbeSettings,
     Progress,
-    Table,
     panels,
+    table_of,
     with_legend,
 )
 from fpp_ml_bench.baselines.diagnostics.scenes import truth
@@ -38,6 +38,7 @@ from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.style import INK, LINE_COLOURS, styled
+from fpp_ml_bench.tables import Table
 
 SAMPLES, QUICK_SAMPLES = 120, 24  # training samples of the probes
 EPOCHS, QUICK_EPOCHS = 6, 4
@@ -490,7 +491,7 @@ def table(spatial: Scores) -> Table:
     columns = {f"mse {key}": f"MSE, {target.title}" for key, target in SPATIAL.items()}
     columns |= {"ratio": "Ratio depth / edges"}
     columns |= {f"r2 {key}": f"R2, {target.title}" for key, target in SPATIAL.items()}
-    return Table.of("Four-convolution probes on the validation samples", "Layer", rows, columns)
+    return table_of("Four-convolution probes on the validation samples", "Layer", rows, columns)
 
 
 @styled

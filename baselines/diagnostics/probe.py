@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from hashlib import sha256
 from importlib import import_module
@@ -28,6 +28,7 @@ from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, read_json, write
 from fpp_ml_bench.machine import describe_hardware
 from fpp_ml_bench.options import did_you_mean
 from fpp_ml_bench.style import FRAME_COLOURS, GRID, data_uri, figure, figure_png, page, styled
+from fpp_ml_bench.tables import Table
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -89,28 +90,20 @@ def with_interval(value: float | None, interval: Sequence[float] | None = None) 
     return "-" if value is None else f"{value:.3f}{span}"
 
 
-@dataclass(frozen=True)
-class Table:
-    """Rows under a header. The first cell of a row names it; floats are shown with four significant digits."""
+def table_of(title: str, first: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> Table:
+    """The named ``rows``; ``columns``: titles by the keys of what a row shows. Floats have four significant digits; a
+    mapping is a value ``r`` with its ``interval``; a dash stands for None, and where a row lacks a key."""
 
-    title: str
-    header: Sequence[str]
-    rows: Sequence[Sequence[str | float | None]]
+    def text(value: Any) -> str:
+        if isinstance(value, Mapping):
+            return with_interval(value["r"], value["interval"])
+        return "-" if value is None else f"{value:.4g}"
 
-    @classmethod
-    def of(cls, title: str, first: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> Table:
-        """The named ``rows``; ``columns``: titles by the keys of what a row shows, and a dash where it lacks a key. A
-        mapping is a value ``r`` with its ``interval``."""
-        cells = [[name, *(row.get(key) for key in columns)] for name, row in rows.items()]
-        text = [[with_interval(c["r"], c["interval"]) if isinstance(c, Mapping) else c for c in row] for row in cells]
-        return cls(title, (first, *columns.values()), text)
-
-    def cells(self) -> list[list[str]]:
-        """The rows as text, a dash for None."""
-        return [
-            ["-" if c is None else f"{c:.4g}" if isinstance(c, float) else printable(c, 500) for c in row]
-            for row in self.rows
-        ]
+    cells = [
+        {first: printable(name, 500), **{columns[key]: text(row.get(key)) for key in columns}}
+        for name, row in rows.items()
+    ]
+    return Table.of(title, cells)
 
 
 @dataclass(frozen=True)
@@ -252,7 +245,9 @@ def finding_key(probe: Probe, subject: Subject, dataset: DatasetFolder, settings
 
 def save_finding(folder: Path, name: str, key: str, finding: Finding, seconds: float) -> None:
     """Write ``NAME.json`` and its picture ``NAME.png`` into ``folder``. Raises ``ValueError`` for NaN, infinity."""
-    content = asdict(finding)
+    content, table = asdict(replace(finding, table=None)), finding.table
+    if table is not None:
+        content["table"] = {"title": str(table.title), "columns": table.titles, "rows": table.texts}
     if content["figure"] is not None:
         write_atomically(folder / f"{name}.png", content["figure"].pop("png"))
     write_json({"key": key, "seconds": seconds, "finding": content}, folder / f"{name}.json")
@@ -266,7 +261,10 @@ def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | N
             return None
         fields = content["finding"]
         if fields["figure"] is not None:
-            fields["table"] = Table(**fields["table"])
+            table = fields["table"]
+            fields["table"] = Table.of(
+                table["title"], [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
+            )
             fields["figure"] = Figure(**fields["figure"], png=(folder / f"{name}.png").read_bytes())
         return Finding(**fields), float(content["seconds"])
     except (OSError, ValueError, TypeError, KeyError):

@@ -19,8 +19,8 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     Probe,
     ProbeSettings,
     Progress,
-    Table,
     gallery,
+    table_of,
     with_interval,
 )
 from fpp_ml_bench.baselines.diagnostics.scenes import SceneRenderer, constant, moved, original
@@ -79,7 +79,7 @@ class Theory(Probe):
         values = {"twins": facts, "kappa_per_m": kappa_per_m(dataset.rig, twins.direction), "laws": laws}
         rows = {f"{row['error']}, {row['distance_m']:g} m": row for row in laws}
         columns = {"error_mm": "Depth error, mm", "exponent": "Local exponent of distance"}
-        table = Table.of("Depth error of a phase error by distance", "Phase error", rows, columns)
+        table = table_of("Depth error of a phase error by distance", "Phase error", rows, columns)
         return Finding(summary, values, table, _draw_twins(twins))
 
 

@@ -18,11 +18,11 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     Finding,
     ProbeResult,
     ProbeSettings,
-    Table,
     checked_names,
     load_finding,
     save_finding,
     spread,
+    table_of,
 )
 from fpp_ml_bench.baselines.diagnostics.subjects import subject
 from fpp_ml_bench.baselines.stability.cases import U32
@@ -256,13 +256,14 @@ def test_findings_come_back_as_they_were_and_only_whole(tmp_path):
     finding = Finding(
         "Said.",
         {"a": [1, None], "b": {"c": 0.5}},
-        Table("T", ("x", "y"), (("a", 1.5), ("b", None))),
+        table_of("T", "x", {"a": {"y": 1.5}, "b": {}}, {"y": "y"}),
         Figure("F", "alt", b"png"),
     )
     save_finding(tmp_path, "linear", "key", finding, 1.25)
     stored, seconds = load_finding(tmp_path, "linear", "key")
     assert seconds == 1.25 and stored.values == finding.values and stored.figure == finding.figure
-    assert [list(row) for row in stored.table.rows] == [["a", 1.5], ["b", None]]
+    assert (str(stored.table.title), stored.table.titles) == ("T", ["x", "y"])
+    assert stored.table.texts == [("a", "1.5"), ("b", "-")]
     assert load_finding(tmp_path, "linear", "other") is None and load_finding(tmp_path, "absent", "key") is None
     (tmp_path / "linear.png").unlink()
     assert load_finding(tmp_path, "linear", "key") is None
@@ -281,7 +282,7 @@ def test_text_of_a_finding_can_only_be_text(tmp_path):
         "command": "fpp-bench <i>",
         "hardware": {"cpu": "c", "cores": 1},
     }
-    table = Table("<u>", ("<u>",), (("<script>",), (0.123456,), (None,)))
+    table = table_of("<u>", "<u>", {"<script>": {"<u>2": 0.123456}, "b": {}}, {"<u>2": "<u>2"})
     counted = Counted()
     counted.title, counted.question = "<t>", "<q>?"
     page = probe.report_page(context, [ProbeResult(counted, Finding("<s>", table=table), 1.0, False)]).decode()
