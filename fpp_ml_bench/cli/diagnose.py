@@ -72,7 +72,6 @@ def diagnose(
     units: Literal["mm", "m", "normalised"] | None = option(
         None,
         "output of your own module: depth in mm, in m, or normalised to the sample's range (default)",
-        choices=("mm", "m", "normalised"),
     ),
     quick: bool = option(False, "a short run for a first look; its numbers are not reliable"),
     layers: tuple[str, ...] | None = option(

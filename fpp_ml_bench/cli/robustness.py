@@ -48,9 +48,7 @@ def robust(
         parse=place,
     ),
     axes: tuple[str, ...] = option((), "only these axes (default: all that apply to the method)", "A,B", parse=names),
-    objects: Literal["test", "unseen"] = option(
-        "test", "objects (default: test)", choices=("test", "unseen"), flag="--set"
-    ),
+    objects: Literal["test", "unseen"] = option("test", "objects (default: test)", flag="--set"),
     size: int = option(FULL_SIZE, f"image size (default: {FULL_SIZE})", "PX"),
     quick: bool = option(False, "one view of each object and three severities, for a look"),
     into: Path | None = option(

@@ -42,7 +42,6 @@ def measure(
     clock: Literal["wall", "processor"] = option(
         "wall",
         "processor: processor time of this process, for a shared machine (default: wall)",
-        choices=("wall", "processor"),
     ),
 ) -> None:
     """Error against run time, frames and memory for every method on this machine, and how the time grows.
