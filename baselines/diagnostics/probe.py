@@ -26,7 +26,6 @@ from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, read_json, write_atomically
 from fpp_ml_bench.machine import describe_hardware
-from fpp_ml_bench.options import did_you_mean
 from fpp_ml_bench.style import FRAME_COLOURS, GRID, data_uri, figure, figure_png, page, styled
 from fpp_ml_bench.tables import Table
 
@@ -165,14 +164,6 @@ def make_probe(name: str) -> Probe:
     module = import_module(f"{__package__}.{name.replace('-', '_')}")
     probe: Probe = getattr(module, PROBES[name])()
     return probe
-
-
-def checked_names(names: Sequence[str]) -> tuple[str, ...]:
-    """``names``, each once, in the report's order; all probes if empty. Raises `DiagnosisError` for an unknown name."""
-    for name in names:
-        if name not in PROBES:
-            raise DiagnosisError(f"unknown probe {name!r}; {did_you_mean(name, PROBES)}")
-    return tuple(name for name in PROBES if not names or name in names)
 
 
 @dataclass(frozen=True)

@@ -72,6 +72,14 @@ def new_file(text: str) -> Path:
     return path
 
 
+def new_folder(text: str) -> Path:
+    """A folder to write into, which need not be there."""
+    path = Path(text)
+    if path.exists() and not path.is_dir():
+        raise ValueError("expected a folder to write into, found a file")
+    return path
+
+
 def whole(least: int, most: int, unit: str = "") -> Any:
     """A whole number from ``least`` to ``most``."""
     expected = f"{least} to {most}" if unit else f"a whole number from {least} to {most}"
