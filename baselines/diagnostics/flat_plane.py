@@ -114,10 +114,8 @@ def kind_of(outline: str) -> str:
 
 def outlines_of(dataset: DatasetFolder, settings: ProbeSettings) -> dict[str, Mask]:
     """Silhouettes (H, W) of a test sample of each object, by sample. Raises `DiagnosisError` without any."""
-    first: dict[str, str] = {}
-    for sample in dataset.samples("test"):
-        first.setdefault(dataset.measured(sample)["object"], sample)
-    names = settings.choose(list(first.values()), OUTLINES, QUICK_OUTLINES)
+    first = [samples[0] for samples in dataset.samples_by_object("test").values()]
+    names = settings.choose(first, OUTLINES, QUICK_OUTLINES)
     masks = {name: object_mask(dataset.depth_mm(name)) for name in names}
     if not any(mask.any() for mask in masks.values()):
         raise DiagnosisError(f"{dataset.path}: split test holds no sample with an object, whose outline a plane gets")

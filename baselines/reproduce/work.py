@@ -5,7 +5,7 @@ No training is ever deleted: a finished training is used, a stopped one continue
 In the paper's multi-frame table (Section 5.4) scores are averages over all (view, frame) pairs of a condition's test
 set. Here each sample's score is the mean over its frames, and the headline the mean over samples: the same number, for
 every sample has the same frames, and the interval can then be taken over objects. The rules are the evaluator's own
-(`scored_pair`, `score_sample`).
+(`Rules`, `score_sample`).
 """
 
 import json
@@ -39,14 +39,13 @@ from fpp_ml_bench.baselines.training.depth_training import DONE, SCORING, WEIGHT
 from fpp_ml_bench.baselines.training.engine import RECIPE
 from fpp_ml_bench.baselines.training.recipe import Recipe
 from fpp_ml_bench.constants import split_sample_name
-from fpp_ml_bench.depth import RangeRule
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError, TrainingError, WeightsError
 from fpp_ml_bench.evaluation.metrics import HEADLINE
-from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION, Mode, Units
+from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.result.file import write_json, write_result
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import Headline, Intervals, Sha256
-from fpp_ml_bench.evaluation.score.check import scored_pair
+from fpp_ml_bench.evaluation.score.check import Rules
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 from fpp_ml_bench.evaluation.score.uncertainty import intervals_over_objects
@@ -175,13 +174,13 @@ def _score_all_frames(recipe: Recipe, model: Model, settings: ReproduceSettings,
     path = settings.folders.all_frames(recipe)
     if settings.only_missing and all_frames_that_hold(path, opened.fingerprint, model.sha256) is not None:
         return
+    units, mode = SCORING[recipe.normalisation]
     scores = score_all_frames(
         opened,
         lambda frame: model.predict_representation([frame])[0],
         opened.sequence.config(recipe.frames),
-        SCORING[recipe.normalisation],
+        Rules(TARGET, units, model.config.range_rule, mode),
         model.sha256,
-        model.config.range_rule,
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(scores.model_dump(mode="json"), path)
@@ -333,26 +332,22 @@ def score_all_frames(
     opened: DatasetFolder,
     predict: Callable[[NDArray[np.uint8]], NDArray[np.float32]],
     frames: Sequence[int],
-    scoring: tuple[Units, Mode],
+    rules: Rules,
     weights_sha256: str,
-    rule: RangeRule = "object",
 ) -> AllFrames:
-    """Score ``predict`` (a frame (H, W) in, depth (H, W) in the units of ``scoring`` out, normalised by
-    ``rule``) on every test sample and frame; ``weights_sha256``: of the network. Raises PredictionError for a
-    prediction that is not finite, and what `scored_pair` raises."""
+    """Score ``predict`` (a frame (H, W) in, depth (H, W) out) by ``rules`` on every test sample and frame;
+    ``weights_sha256``: of the network. Raises PredictionError for a prediction that is not finite, and what
+    `Rules.pair` raises."""
     samples = opened.samples(SPLIT)
     rows: list[Scores] = []
     for sample in samples:
-        target_mm = opened.target_mm(sample)
-        void = opened.void(sample) if scoring[1] == "standard" else None
-        left_out = opened.left_out(sample, rule)
+        void = rules.void(opened, sample)
         scores: list[Scores] = []
         for frame in frames:
             values = predict(opened.frame(sample, frame))
             if not np.isfinite(values).all():
                 raise PredictionError(f"{sample}, frame {frame}: the network gave values that are not finite")
-            pair = scored_pair(values, target_mm, *scoring, sample, left_out)
-            scores.append(score_sample(*pair, void=void).metrics())
+            scores.append(score_sample(*rules.pair(values, opened, sample), void=void).metrics())
         rows.append(_mean(scores))
     objects = [split_sample_name(sample)[0] for sample in samples]
     ends = intervals_over_objects(rows, objects, HEADLINE)

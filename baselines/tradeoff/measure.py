@@ -24,11 +24,10 @@ from fpp_ml_bench.baselines.registry import failure_in_file, find, load_method, 
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.baselines.timing import added_mib, four_digits
 from fpp_ml_bench.baselines.training.weights import open_weights, shipped_names, weights_path
-from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DatasetError, FppBenchError, PredictionError, RigError, SubmissionError
 from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.evaluation.result.parts import HardwareInfo
-from fpp_ml_bench.evaluation.score.check import scored_pair
+from fpp_ml_bench.evaluation.score.check import Rules
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 from fpp_ml_bench.files import LOCK_FILE, NAME_LIMIT, exclusive, printable, read_json
 from fpp_ml_bench.loaders.render.meshes import solid_mesh
@@ -225,9 +224,7 @@ def _networks(size: tuple[int, int]) -> list[str]:
 def choose_views(opened: DatasetFolder, per_object: int, split: str = "test") -> list[str]:
     """``per_object`` views of each object of ``split``, spread over its views, in row order. `DatasetError` for a split
     without samples."""
-    samples_by_object: dict[str, list[str]] = {}
-    for sample in opened.samples(split):
-        samples_by_object.setdefault(split_sample_name(sample)[0], []).append(sample)
+    samples_by_object = opened.samples_by_object(split)
     if not samples_by_object:
         raise DatasetError(f"{opened.path}: split {split} holds no sample; there is nothing to measure")
     chosen: list[str] = []
@@ -309,7 +306,7 @@ def measured(plan: Plan, point: Point) -> Point:
 def _figures(plan: Plan, method: Method) -> dict[str, Any]:
     """Errors, seconds and memory of ``method`` on the plan's views, as fields of a `Point`. Frames are in memory before
     the clock starts."""
-    opened, target = plan.opened, plan.target
+    opened, rules = plan.opened, Rules(plan.target, method.units, method.range_rule, method.mode)
     seconds, errors_mm, missing = list[float](), list[float](), list[float]()
     memory_mib = None
     for name in plan.views:
@@ -320,9 +317,7 @@ def _figures(plan: Plan, method: Method) -> dict[str, Any]:
         seconds.append(run_s)
         if depth.shape != opened.size or not np.isfinite(depth).all():
             raise PredictionError(f"{name}: expected finite depth (H, W) {opened.size}, the method gave another")
-        left_out = opened.left_out(name, method.range_rule, target)
-        pair = scored_pair(depth, opened.target_mm(name, target), method.units, method.mode, name, left_out)
-        sample = score_sample(*pair, void=opened.void(name, target) if method.mode == "standard" else None)
+        sample = score_sample(*rules.pair(depth, opened, name), void=rules.void(opened, name))
         if sample.object.mae_mm is not None:
             errors_mm.append(sample.object.mae_mm)
             missing.append(sample.missing / sample.object.pixels)
