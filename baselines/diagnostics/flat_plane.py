@@ -15,16 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics.probe import (
-    Figure,
-    Finding,
-    Picture,
-    Probe,
-    ProbeSettings,
-    Progress,
-    gallery,
-    table_of,
-)
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, table_of
 from fpp_ml_bench.baselines.diagnostics.scenes import Mask, Scene, SceneRenderer, original, plane
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject, background_below
 from fpp_ml_bench.constants import MM_PER_M
@@ -32,7 +23,7 @@ from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.paper import paper_rows
-from fpp_ml_bench.style import DEPTH_COLOURS
+from fpp_ml_bench.style import DEPTH_COLOURS, Picture, gallery
 from fpp_ml_bench.tables import Table
 
 TILTS_DEG = ((0.0, 0.0), (20.0, 0.0), (0.0, 20.0))

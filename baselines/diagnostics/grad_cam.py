@@ -21,12 +21,9 @@ from torch import Tensor, nn
 from fpp_ml_bench.baselines.diagnostics.probe import (
     Figure,
     Finding,
-    Picture,
     Probe,
     ProbeSettings,
     Progress,
-    gallery,
-    mean_of,
     table_of,
     with_interval,
 )
@@ -34,10 +31,10 @@ from fpp_ml_bench.baselines.diagnostics.scenes import edge_map
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.evaluation.score.uncertainty import object_interval
+from fpp_ml_bench.evaluation.score.uncertainty import mean_of, object_interval
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.paper import AVERAGE, paper_layers
-from fpp_ml_bench.style import HEAT_COLOURS
+from fpp_ml_bench.style import HEAT_COLOURS, Picture, gallery
 from fpp_ml_bench.tables import Table
 
 Image = NDArray[np.float32]

@@ -15,11 +15,9 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.diagnostics.probe import (
     Figure,
     Finding,
-    Picture,
     Probe,
     ProbeSettings,
     Progress,
-    gallery,
     table_of,
     with_interval,
 )
@@ -30,7 +28,7 @@ from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Direction
-from fpp_ml_bench.style import DEPTH_COLOURS
+from fpp_ml_bench.style import DEPTH_COLOURS, Picture, gallery
 
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.diagnostics.subjects import Subject

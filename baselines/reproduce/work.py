@@ -11,7 +11,6 @@ every sample has the same frames, and the interval can then be taken over object
 import json
 import shlex
 import shutil
-import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
@@ -48,7 +47,7 @@ from fpp_ml_bench.evaluation.result.parts import Headline, Intervals, Sha256
 from fpp_ml_bench.evaluation.score.check import Rules
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
-from fpp_ml_bench.evaluation.score.uncertainty import intervals_over_objects
+from fpp_ml_bench.evaluation.score.uncertainty import intervals_over_objects, mean_of
 from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE
 from fpp_ml_bench.files import exclusive, read_json, write_atomically
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -80,10 +79,6 @@ class ReproduceSettings:
     report: Report = print
     row: str = ""
 
-    def wants(self, job: Job) -> bool:
-        """Whether a job is to be done."""
-        return not self.row or f"{self.tables[0]}/{self.row}" in job.rows
-
 
 @dataclass
 class Outcome:
@@ -105,28 +100,26 @@ def reproduce(settings: ReproduceSettings) -> Outcome:
     folder; and what predicting and scoring raise."""
     folders = settings.folders
     jobs = plan.planned(settings.tables, folders.preset)
-    wanted = [job for job in jobs if settings.wants(job)]
+    wanted = [job for job in jobs if not settings.row or f"{settings.tables[0]}/{settings.row}" in job.rows]
     check_run_folders(wanted, folders)
     check_machine(wanted, folders, settings.anyway, settings.command)
     with exclusive(folders.runs / "lock", folders.runs, "reproducing into this folder"):
         opened = plan.open_dataset(settings.data, jobs, folders, settings.report)
-        check_same_dataset(opened, wanted, folders)
+        check_run_folders(wanted, folders, opened)
         outcome = Outcome(opened, jobs)
         try:
-            _work(settings, outcome)
+            _work(settings, outcome, wanted)
         finally:
             for table in settings.tables:
                 outcome.tables.append(settings.leaderboard.write_table(table, settings, outcome))
     return outcome
 
 
-def _work(settings: ReproduceSettings, outcome: Outcome) -> None:
+def _work(settings: ReproduceSettings, outcome: Outcome, jobs: Sequence[Job]) -> None:
     """Every job in turn, until the minutes run out."""
-    folders = settings.folders
-    jobs = [job for job in outcome.jobs if settings.wants(job)]
     started = perf_counter()
     for number, job in enumerate(jobs, 1):
-        name, out = job.recipe.name, folders.training(job.recipe)
+        name, out = job.recipe.name, settings.folders.training(job.recipe)
         minutes_left = None if settings.minutes is None else settings.minutes - (perf_counter() - started) / 60
         if minutes_left is not None and minutes_left <= 0:
             outcome.stopped = name
@@ -197,15 +190,16 @@ def state_of(out: Path) -> str:
     return "trained" if is_trained(out) else "begun" if out.is_dir() and any(out.iterdir()) else "missing"
 
 
-def check_run_folders(jobs: Sequence[Job], folders: Folders) -> None:
+def check_run_folders(jobs: Sequence[Job], folders: Folders, opened: DatasetFolder | None = None) -> None:
     """Refuse, before hours of work, a training folder of another recipe: TrainingError names the folder, the settings
-    that differ and the cure."""
+    that differ and the cure. With the dataset, also that of another one: DatasetError names both."""
     for job in jobs:
         path = folders.training(job.recipe) / RECIPE
         if not path.is_file():
             continue
+        stored = _stored(path)
         try:
-            differs = plan.differing(job.recipe.to_dict(), _stored(path)["recipe"], "{1} there, {0} in the recipe")
+            differs = plan.differing(job.recipe.to_dict(), stored["recipe"], "{1} there, {0} in the recipe")
         except (KeyError, TypeError, AttributeError) as error:
             raise TrainingError(f"{path}: expected the recipe of a training, it can't be read ({error})") from None
         if differs:
@@ -214,14 +208,8 @@ def check_run_folders(jobs: Sequence[Job], folders: Folders) -> None:
                 f"{path.parent}: holds a training of another recipe, {job.rows[0]} differs in {differs}; to keep both, "
                 f"mv {out} {out}-before, or give another --out"
             )
-
-
-def check_same_dataset(opened: DatasetFolder, jobs: Sequence[Job], folders: Folders) -> None:
-    """Refuse a dataset other than that of the trainings that were begun: DatasetError names both."""
-    for job in jobs:
-        path = folders.training(job.recipe) / RECIPE
-        trained_on = str(_stored(path).get("fingerprint")) if path.is_file() else opened.fingerprint
-        if trained_on != opened.fingerprint:
+        trained_on = str(stored.get("fingerprint"))
+        if opened is not None and trained_on != opened.fingerprint:
             raise DatasetError(
                 f"{opened.path}: has fingerprint {opened.fingerprint[:8]}, but the training in {path.parent} is of "
                 f"{trained_on[:8]}; give that dataset as DATASET, or another --out"
@@ -367,8 +355,7 @@ def score_all_frames(
 
 def _mean(rows: Sequence[Scores]) -> Scores:
     """Plain mean of each headline score over the rows that have it."""
-    values_by_key = {key: [value for row in rows if (value := row[key]) is not None] for key in HEADLINE}
-    return {key: statistics.fmean(values) if values else None for key, values in values_by_key.items()}
+    return {key: mean_of(row[key] for row in rows) for key in HEADLINE}
 
 
 def read_all_frames(path: Path) -> AllFrames:

@@ -33,7 +33,7 @@ from fpp_ml_bench.cli.options import COUNT, Pool, command, command_line, names, 
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.result.file import write_json
-from fpp_ml_bench.evaluation.result.parts import PART_TITLES, Reliance
+from fpp_ml_bench.evaluation.result.parts import Reliance
 from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_block
 from fpp_ml_bench.loaders.render.builder import assembly_of
 from fpp_ml_bench.loaders.render.scene import BuildSettings
@@ -183,10 +183,9 @@ def _reliance_table(title: str, reliance: Reliance) -> Table:
     table.add_row("phase reliance, 0 to 1", f"{reliance.score:.3f}{interval}")
     if reliance.order_free_score is not None:
         table.add_row("  without whole periods", f"{reliance.order_free_score:.3f}")
-    for key, words in PART_TITLES.items():
-        value = getattr(reliance.parts, key)
-        if value is not None:
-            table.add_row(words, f"{value:.3f}")
+    for words, part in reliance.parts.titled().items():
+        if part is not None:
+            table.add_row(words, f"{part:.3f}")
     return table
 
 

@@ -319,7 +319,9 @@ def test_all_frames_of_one_frame_is_the_evaluators_score(opened, tmp_path):
     for sample, values in noise.items():
         np.save(folder / f"{sample}.npy", values)
     result = evaluate(folder, opened, mode="paper")
-    scores = score_all_frames(opened, lambda frame: next(waiting), [0], Rules("depth", "normalised", "object", "paper"), 64 * "a")
+    scores = score_all_frames(
+        opened, lambda frame: next(waiting), [0], Rules("depth", "normalised", "object", "paper"), 64 * "a"
+    )
     for key, value in scores.metrics:
         assert value == pytest.approx(getattr(result.metrics, key), rel=1e-12)
 
