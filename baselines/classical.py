@@ -42,7 +42,6 @@ class ClassicalOptions:
     direction: Directions = option(
         "both",
         "fringes to use: one direction is enough for a depth (default: all that the rig codes)",
-        choices=DIRECTIONS,
     )
     fewest: bool = option(
         False, "capture only the Gray frames that the rig's range needs: with both directions usually none"

@@ -10,16 +10,20 @@ the given hashes: the page sends no request, and an injected script can't run. T
 import hashlib
 import html
 from base64 import b64encode
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache, wraps
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar
 
+import numpy as np
+
 from fpp_ml_bench.files import NAME_LIMIT, printable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+    from numpy.typing import NDArray
 
 FRAME_COLOURS, DEPTH_COLOURS, ERROR_COLOURS = "gray", "viridis", "coolwarm"
 SIGMA_COLOURS, HEAT_COLOURS = "magma", "inferno"
@@ -81,6 +85,75 @@ def figure_png(drawn: "Figure", reduced: bool = False) -> bytes:
     image = Image.open(content).convert("RGB").quantize(256, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
     image.save(smaller, format="png", optimize=True)
     return smaller.getvalue()
+
+
+LINE = {"markersize": 4, "linewidth": 1.2}
+_GAP = 4  # px between two pictures
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A map (H, W) from ``low`` to ``high`` (default: its largest value) in matplotlib's ``colours``; NaN is white."""
+
+    image: "NDArray[Any]"
+    colours: str = FRAME_COLOURS
+    low: float = 0.0
+    high: float | None = None
+
+    def rgb(self) -> "NDArray[Any]":
+        """Float (H, W, 3) in [0, 1]."""
+        from matplotlib import colormaps
+        from matplotlib.colors import Normalize
+
+        values = np.ma.masked_invalid(np.asarray(self.image, dtype=float))
+        colours = colormaps[self.colours].with_extremes(bad="white")
+        shades: NDArray[Any] = colours(Normalize(self.low, self.high, clip=True)(values))
+        return shades[..., :3]
+
+
+def panels(titles: Sequence[str], columns: int, width_in: float, height_in: float) -> tuple[Any, list[Any]]:
+    """An empty figure with a panel for each title, in rows of ``columns``, of so many inches each; its panels."""
+    rows = max(-(-len(titles) // columns), 1)
+    drawn = figure(width_in * columns, height_in * rows)
+    axes_of = drawn.subplots(rows, columns, squeeze=False)
+    for axes in axes_of.flat[len(titles) :]:
+        axes.axis("off")
+    for axes, title in zip(axes_of.flat, titles, strict=False):
+        axes.set_title(title, loc="left")
+        axes.tick_params(axis="x", rotation=40)
+        axes.grid(axis="y", color=GRID)
+    return drawn, list(axes_of.flat[: len(titles)])
+
+
+def with_legend(drawn: Any, columns: int) -> bytes:
+    """A figure with one legend of the lines of all its panels; PNG."""
+    handles = {label: h for axes in drawn.axes for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    drawn.legend(handles.values(), handles, ncols=columns, loc="outside lower center")
+    return figure_png(drawn, reduced=True)
+
+
+@styled
+def gallery(rows: Mapping[str, Sequence[Picture]], columns: Sequence[str], picture_inches: float = 1.1) -> bytes:
+    """Pictures in named rows and columns, so many inches wide each; PNG."""
+
+    shapes = [picture.image.shape for row in rows.values() for picture in row]
+    height, width = (max(lengths) + _GAP for lengths in zip(*shapes, strict=True))
+    # One image: fifty small axes take ten times as long to lay out.
+    sheet = np.ones((height * len(rows), width * len(columns), 3))
+    for down, row in enumerate(rows.values()):
+        for across, picture in enumerate(row):
+            part = picture.rgb()
+            sheet[down * height :, across * width :][: part.shape[0], : part.shape[1]] = part
+    size = picture_inches * len(columns), picture_inches * len(rows) * height / width
+    drawn = figure(size[0] + 1.2, size[1] + 0.6)
+    axes = drawn.subplots()
+    axes.imshow(sheet, interpolation="nearest")
+    axes.xaxis.tick_top()
+    axes.set_xticks(width * (np.arange(len(columns)) + 0.5), columns)
+    axes.set_yticks(height * (np.arange(len(rows)) + 0.5), list(rows))
+    axes.tick_params(length=0, labelsize=7)
+    axes.spines[:].set_visible(False)
+    return figure_png(drawn, reduced=True)
 
 
 def millimetres(value: float | None) -> str:

@@ -16,18 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics.probe import (
-    Figure,
-    Finding,
-    Picture,
-    Probe,
-    ProbeSettings,
-    Progress,
-    Table,
-    gallery,
-    mean_of,
-    silent,
-)
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, silent, table_of
 from fpp_ml_bench.baselines.diagnostics.scenes import (
     REPROJECTED,
     VIEWS_PER_OBJECT,
@@ -44,10 +33,10 @@ from fpp_ml_bench.baselines.diagnostics.scenes import (
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
-from fpp_ml_bench.evaluation.result.parts import PART_TITLES, RELIANCE_VERSION, Reliance, RelianceParts
-from fpp_ml_bench.evaluation.score.uncertainty import caution, object_interval
+from fpp_ml_bench.evaluation.result.parts import RELIANCE_VERSION, Reliance, RelianceParts
+from fpp_ml_bench.evaluation.score.uncertainty import caution, mean_of, object_interval
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.style import ERROR_COLOURS
+from fpp_ml_bench.style import ERROR_COLOURS, Picture, gallery
 
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.diagnostics.subjects import Subject
@@ -272,8 +261,9 @@ class Counterfactual(Probe):
         chosen = chosen_samples(dataset, "test", views)
         reliance, per_sample = measure(subject, dataset, chosen, progress)
         values = {"reliance": reliance.model_dump(mode="json"), "per_sample": per_sample}
-        rows = [(words, getattr(reliance.parts, key)) for key, words in PART_TITLES.items()]
-        parts = Table("Parts of the score, and further measurements", ("Part", "Mean over samples"), rows)
+        rows = {words: {"mean": value} for words, value in reliance.parts.titled().items()}
+        title = "Parts of the score, and further measurements"
+        parts = table_of(title, "Part", rows, {"mean": "Mean over samples"})
         # The middle sample of the list, which is the same for every method.
         name, outline_samples = chosen[len(chosen) // 2]
         sample = SampleScenes(subject, dataset, SceneRenderer.of(dataset), name, outline_samples)

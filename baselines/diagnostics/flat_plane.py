@@ -15,16 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.diagnostics.probe import (
-    Figure,
-    Finding,
-    Picture,
-    Probe,
-    ProbeSettings,
-    Progress,
-    Table,
-    gallery,
-)
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, table_of
 from fpp_ml_bench.baselines.diagnostics.scenes import Mask, Scene, SceneRenderer, original, plane
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject, background_below
 from fpp_ml_bench.constants import MM_PER_M
@@ -32,7 +23,8 @@ from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.paper import paper_rows
-from fpp_ml_bench.style import DEPTH_COLOURS
+from fpp_ml_bench.style import DEPTH_COLOURS, Picture, gallery
+from fpp_ml_bench.tables import Table
 
 TILTS_DEG = ((0.0, 0.0), (20.0, 0.0), (0.0, 20.0))
 DISTANCES_M = (1.6, 1.8, 2.0)
@@ -113,10 +105,8 @@ def kind_of(outline: str) -> str:
 
 def outlines_of(dataset: DatasetFolder, settings: ProbeSettings) -> dict[str, Mask]:
     """Silhouettes (H, W) of a test sample of each object, by sample. Raises `DiagnosisError` without any."""
-    first: dict[str, str] = {}
-    for sample in dataset.samples("test"):
-        first.setdefault(dataset.measured(sample)["object"], sample)
-    names = settings.choose(list(first.values()), OUTLINES, QUICK_OUTLINES)
+    first = [samples[0] for samples in dataset.samples_by_object("test").values()]
+    names = settings.choose(first, OUTLINES, QUICK_OUTLINES)
     masks = {name: object_mask(dataset.depth_mm(name)) for name in names}
     if not any(mask.any() for mask in masks.values()):
         raise DiagnosisError(f"{dataset.path}: split test holds no sample with an object, whose outline a plane gets")
@@ -180,7 +170,7 @@ def table(rows: Sequence[Row], normalised: bool) -> Table:
         poses[f"{kind_of(row['outline'])}, {row['distance_m']:g} m, tilt {across:g}, {down:g}"].append(row)
     lines = {pose: {key: float(np.mean([row[key] for row in same])) for key in columns} for pose, same in poses.items()}
     title = "Predictions for planes" + (", mm by the mean range of the test split" if normalised else "")
-    return Table.of(title, "Outline, distance, tilt in degrees", lines, columns)
+    return table_of(title, "Outline, distance, tilt in degrees", lines, columns)
 
 
 def draw(shown: Sequence[tuple[Row, NDArray, NDArray]], normalised: bool) -> Figure:

@@ -21,23 +21,21 @@ from torch import Tensor, nn
 from fpp_ml_bench.baselines.diagnostics.probe import (
     Figure,
     Finding,
-    Picture,
     Probe,
     ProbeSettings,
     Progress,
-    Table,
-    gallery,
-    mean_of,
+    table_of,
     with_interval,
 )
 from fpp_ml_bench.baselines.diagnostics.scenes import edge_map
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DiagnosisError
-from fpp_ml_bench.evaluation.score.uncertainty import object_interval
+from fpp_ml_bench.evaluation.score.uncertainty import mean_of, object_interval
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.paper import AVERAGE, paper_layers
-from fpp_ml_bench.style import HEAT_COLOURS
+from fpp_ml_bench.style import HEAT_COLOURS, Picture, gallery
+from fpp_ml_bench.tables import Table
 
 Image = NDArray[np.float32]
 Mean = dict[str, Any]
@@ -210,7 +208,7 @@ def table(means: Mapping[str, Any], samples: int) -> Table:
     """The paper's table with random weights beside it."""
     rows = means["layers"] | {"average": means["average"], "edges with fringes": {EDGES: means["edges_with_fringes"]}}
     title = f"Correlation of Grad-CAM over {samples} test samples"
-    return Table.of(title, "Layer", rows, COLUMNS | {"ratio": "Ratio edges / fringes"})
+    return table_of(title, "Layer", rows, COLUMNS | {"ratio": "Ratio edges / fringes"})
 
 
 def _draw_heatmaps(subject: Subject, dataset: DatasetFolder, samples: Sequence[str]) -> Figure:

@@ -9,9 +9,10 @@ layers"; the other choices are ours. Both learn from the network's batches as th
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache, partial
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -19,17 +20,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.diagnostics.probe import (
-    LINE,
-    Figure,
-    Finding,
-    Probe,
-    ProbeSettings,
-    Progress,
-    Table,
-    panels,
-    with_legend,
-)
+from fpp_ml_bench.baselines.diagnostics.probe import Figure, Finding, Probe, ProbeSettings, Progress, table_of
 from fpp_ml_bench.baselines.diagnostics.scenes import truth
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject, activations_of
 from fpp_ml_bench.constants import split_sample_name
@@ -37,7 +28,8 @@ from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.style import INK, LINE_COLOURS, styled
+from fpp_ml_bench.style import INK, LINE, LINE_COLOURS, panels, styled, with_legend
+from fpp_ml_bench.tables import Table
 
 SAMPLES, QUICK_SAMPLES = 120, 24  # training samples of the probes
 EPOCHS, QUICK_EPOCHS = 6, 4
@@ -129,12 +121,8 @@ class LinearProbing(Probe):
         first = {key: one for key, one in networks.items() if key[1] == 0}
         probes = ConvolutionProbes(subject, dataset, SPATIAL, tick, seeds, epochs)
         spatial = scores(probes.errors(first, train, validation), validation)
-        protocol = {
-            "training_samples": len(train),
-            "validation_samples": len(validation),
-            "seeds": seeds,
-            "epochs": epochs,
-        }
+        sizes = {"training_samples": len(train), "validation_samples": len(validation)}
+        protocol = {**sizes, "seeds": seeds, "epochs": epochs}
         values = {"protocol": protocol, "four_convolutions": spatial, "linear": linear}
         return Finding(summary(linear, spatial), values, table(spatial), draw(linear))
 
@@ -206,19 +194,23 @@ def apply(weights: Tensor, features: Tensor) -> Tensor:
     return functional.pad(features.double(), (0, 1), value=1.0) @ weights
 
 
+@dataclass(eq=False)
 class LinearProbes:
     """Probes of all ``targets`` for all sources together: a weight per channel, the same at every pixel. They see
     pixels drawn from each sample over the image and then within its object, the same for every network, as maps
-    (B, C, 1, 2 P). ``tick`` is called with the number of samples just looked at and the activity."""
+    (B, C, 1, 2 P). ``tick`` is called with the number of samples just looked at and the activity. ``seeds`` and
+    ``epochs`` are those of `ConvolutionProbes`."""
 
-    batch: int | None = None  # samples at once, None for as many as the subject's
-    epochs = 0
+    subject: Subject
+    dataset: DatasetFolder
+    targets: Targets
+    tick: Callable[[int, str], None]
+    seeds: int = 1
+    epochs: int = 0
+    batch: ClassVar[int | None] = None  # samples at once, None for as many as the subject's
 
-    def __init__(
-        self, subject: Subject, dataset: DatasetFolder, targets: Targets, tick: Callable[[int, str], None]
-    ) -> None:
-        self.subject, self.dataset, self.targets, self.tick = subject, dataset, targets, tick
-        self.maps = list(dict.fromkeys(name for target in targets.values() for name in target.maps))
+    def __post_init__(self) -> None:
+        self.maps = list(dict.fromkeys(name for target in self.targets.values() for name in target.maps))
         self.equations: dict[tuple[Source, str], NormalEquations] = {}
 
     def errors(self, networks: Networks, train: Sequence[str], validation: Sequence[str]) -> Errors:
@@ -363,19 +355,6 @@ class ConvolutionProbes(LinearProbes):
 
     batch = BATCH
 
-    def __init__(
-        self,
-        subject: Subject,
-        dataset: DatasetFolder,
-        targets: Targets,
-        tick: Callable[[int, str], None],
-        seeds: int,
-        epochs: int,
-    ) -> None:
-        super().__init__(subject, dataset, targets, tick)
-        self.seeds, self.epochs = seeds, epochs
-        self.probes: dict[tuple[Source, str, int], ConvolutionProbe] = {}
-
     def reduce(self, maps: Tensor, names: Sequence[str]) -> Tensor:
         return at_size(maps, grid_of(self.subject.image_size))
 
@@ -384,6 +363,7 @@ class ConvolutionProbes(LinearProbes):
         return torch.ones_like(share), (share == share.max()).float()
 
     def start(self, samples: int) -> None:
+        self.probes: dict[tuple[Source, str, int], ConvolutionProbe] = {}
         for (source, where), target in product(self.equations, self.maps):
             seeds = 0 if where == "object" else 1 if source[0] == UNTRAINED else self.seeds
             for seed in range(seeds):
@@ -490,7 +470,7 @@ def table(spatial: Scores) -> Table:
     columns = {f"mse {key}": f"MSE, {target.title}" for key, target in SPATIAL.items()}
     columns |= {"ratio": "Ratio depth / edges"}
     columns |= {f"r2 {key}": f"R2, {target.title}" for key, target in SPATIAL.items()}
-    return Table.of("Four-convolution probes on the validation samples", "Layer", rows, columns)
+    return table_of("Four-convolution probes on the validation samples", "Layer", rows, columns)
 
 
 @styled

@@ -2,15 +2,15 @@
 
 A `Subject` is the model that is diagnosed, a `Probe` is one test of it, and a `Finding` is the probe's result;
 `diagnose` puts them on one page, which loads nothing, and into a JSON file. A probe gives rows for tables, and lines or
-pictures for figures; `panels` and `gallery` draw them in one style.
+pictures for figures; `style.panels` and `style.gallery` draw them in one style.
 """
 
 from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from hashlib import sha256
 from importlib import import_module
@@ -19,19 +19,15 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from fpp_ml_bench import __version__
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, read_json, write_atomically
 from fpp_ml_bench.machine import describe_hardware
-from fpp_ml_bench.options import did_you_mean
-from fpp_ml_bench.style import FRAME_COLOURS, GRID, data_uri, figure, figure_png, page, styled
+from fpp_ml_bench.style import data_uri, page
+from fpp_ml_bench.tables import Table
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from fpp_ml_bench.baselines.diagnostics.subjects import Subject
     from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
@@ -77,40 +73,26 @@ def spread(names: Sequence[str], limit: int | None) -> list[str]:
     return [names[(2 * place + 1) * len(names) // (2 * limit)] for place in range(limit)]
 
 
-def mean_of(values: Iterable[float | None]) -> float | None:
-    """Mean of ``values`` other than None; None where there are none."""
-    defined = [value for value in values if value is not None]
-    return float(np.mean(defined)) if defined else None
-
-
 def with_interval(value: float | None, interval: Sequence[float] | None = None) -> str:
     """A mean with its interval as a table's cell; a dash for None."""
     span = "" if interval is None else f" ({interval[0]:.3f} to {interval[1]:.3f})"
     return "-" if value is None else f"{value:.3f}{span}"
 
 
-@dataclass(frozen=True)
-class Table:
-    """Rows under a header. The first cell of a row names it; floats are shown with four significant digits."""
+def table_of(title: str, first: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> Table:
+    """The named ``rows``; ``columns``: titles by the keys of what a row shows. Floats have four significant digits; a
+    mapping is a value ``r`` with its ``interval``; a dash stands for None, and where a row lacks a key."""
 
-    title: str
-    header: Sequence[str]
-    rows: Sequence[Sequence[str | float | None]]
+    def text(value: Any) -> str:
+        if isinstance(value, Mapping):
+            return with_interval(value["r"], value["interval"])
+        return "-" if value is None else f"{value:.4g}"
 
-    @classmethod
-    def of(cls, title: str, first: str, rows: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str]) -> Table:
-        """The named ``rows``; ``columns``: titles by the keys of what a row shows, and a dash where it lacks a key. A
-        mapping is a value ``r`` with its ``interval``."""
-        cells = [[name, *(row.get(key) for key in columns)] for name, row in rows.items()]
-        text = [[with_interval(c["r"], c["interval"]) if isinstance(c, Mapping) else c for c in row] for row in cells]
-        return cls(title, (first, *columns.values()), text)
-
-    def cells(self) -> list[list[str]]:
-        """The rows as text, a dash for None."""
-        return [
-            ["-" if c is None else f"{c:.4g}" if isinstance(c, float) else printable(c, 500) for c in row]
-            for row in self.rows
-        ]
+    cells = [
+        {first: printable(name, 500), **{columns[key]: text(row.get(key)) for key in columns}}
+        for name, row in rows.items()
+    ]
+    return Table.of(title, cells)
 
 
 @dataclass(frozen=True)
@@ -172,14 +154,6 @@ def make_probe(name: str) -> Probe:
     module = import_module(f"{__package__}.{name.replace('-', '_')}")
     probe: Probe = getattr(module, PROBES[name])()
     return probe
-
-
-def checked_names(names: Sequence[str]) -> tuple[str, ...]:
-    """``names``, each once, in the report's order; all probes if empty. Raises `DiagnosisError` for an unknown name."""
-    for name in names:
-        if name not in PROBES:
-            raise DiagnosisError(f"unknown probe {name!r}; {did_you_mean(name, PROBES)}")
-    return tuple(name for name in PROBES if not names or name in names)
 
 
 @dataclass(frozen=True)
@@ -252,7 +226,9 @@ def finding_key(probe: Probe, subject: Subject, dataset: DatasetFolder, settings
 
 def save_finding(folder: Path, name: str, key: str, finding: Finding, seconds: float) -> None:
     """Write ``NAME.json`` and its picture ``NAME.png`` into ``folder``. Raises ``ValueError`` for NaN, infinity."""
-    content = asdict(finding)
+    content, table = asdict(replace(finding, table=None)), finding.table
+    if table is not None:
+        content["table"] = {"title": str(table.title), "columns": table.titles, "rows": table.texts}
     if content["figure"] is not None:
         write_atomically(folder / f"{name}.png", content["figure"].pop("png"))
     write_json({"key": key, "seconds": seconds, "finding": content}, folder / f"{name}.json")
@@ -266,7 +242,10 @@ def load_finding(folder: Path, name: str, key: str) -> tuple[Finding, float] | N
             return None
         fields = content["finding"]
         if fields["figure"] is not None:
-            fields["table"] = Table(**fields["table"])
+            table = fields["table"]
+            fields["table"] = Table.of(
+                table["title"], [dict(zip(table["columns"], row, strict=True)) for row in table["rows"]]
+            )
             fields["figure"] = Figure(**fields["figure"], png=(folder / f"{name}.png").read_bytes())
         return Finding(**fields), float(content["seconds"])
     except (OSError, ValueError, TypeError, KeyError):
@@ -316,71 +295,3 @@ def report_page(context: Mapping[str, Any], results: Sequence[ProbeResult]) -> b
         data_uri=data_uri,
         **context,
     )
-
-
-LINE = {"markersize": 4, "linewidth": 1.2}
-_GAP = 4  # px between two pictures
-
-
-@dataclass(frozen=True)
-class Picture:
-    """A map (H, W) from ``low`` to ``high`` (default: its largest value) in matplotlib's ``colours``; NaN is white."""
-
-    image: NDArray
-    colours: str = FRAME_COLOURS
-    low: float = 0.0
-    high: float | None = None
-
-    def rgb(self) -> NDArray:
-        """Float (H, W, 3) in [0, 1]."""
-        from matplotlib import colormaps
-
-        values = np.asarray(self.image, dtype=float)
-        high = np.nanmax(values) if self.high is None else self.high
-        share = np.clip((np.nan_to_num(values) - self.low) / ((high - self.low) or 1.0), 0, 1)
-        return np.where(np.isnan(values)[..., None], 1.0, colormaps[self.colours](share)[..., :3])
-
-
-def panels(titles: Sequence[str], columns: int, width_in: float, height_in: float) -> tuple[Any, list[Any]]:
-    """An empty figure with a panel for each title, in rows of ``columns``, of so many inches each; its panels."""
-    rows = max(-(-len(titles) // columns), 1)
-    drawn = figure(width_in * columns, height_in * rows)
-    axes_of = drawn.subplots(rows, columns, squeeze=False)
-    for axes in axes_of.flat[len(titles) :]:
-        axes.axis("off")
-    for axes, title in zip(axes_of.flat, titles, strict=False):
-        axes.set_title(title, loc="left")
-        axes.tick_params(axis="x", rotation=40)
-        axes.grid(axis="y", color=GRID)
-    return drawn, list(axes_of.flat[: len(titles)])
-
-
-def with_legend(drawn: Any, columns: int) -> bytes:
-    """A figure with one legend of the lines of all its panels; PNG."""
-    handles = {label: h for axes in drawn.axes for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    drawn.legend(handles.values(), handles, ncols=columns, loc="outside lower center")
-    return figure_png(drawn, reduced=True)
-
-
-@styled
-def gallery(rows: Mapping[str, Sequence[Picture]], columns: Sequence[str], picture_inches: float = 1.1) -> bytes:
-    """Pictures in named rows and columns, so many inches wide each; PNG."""
-
-    shapes = [picture.image.shape for row in rows.values() for picture in row]
-    height, width = (max(lengths) + _GAP for lengths in zip(*shapes, strict=True))
-    # One image: fifty small axes take ten times as long to lay out.
-    sheet = np.ones((height * len(rows), width * len(columns), 3))
-    for down, row in enumerate(rows.values()):
-        for across, picture in enumerate(row):
-            part = picture.rgb()
-            sheet[down * height :, across * width :][: part.shape[0], : part.shape[1]] = part
-    size = picture_inches * len(columns), picture_inches * len(rows) * height / width
-    drawn = figure(size[0] + 1.2, size[1] + 0.6)
-    axes = drawn.subplots()
-    axes.imshow(sheet, interpolation="nearest")
-    axes.xaxis.tick_top()
-    axes.set_xticks(width * (np.arange(len(columns)) + 0.5), columns)
-    axes.set_yticks(height * (np.arange(len(rows)) + 0.5), list(rows))
-    axes.tick_params(length=0, labelsize=7)
-    axes.spines[:].set_visible(False)
-    return figure_png(drawn, reduced=True)

@@ -433,10 +433,11 @@ def _ellipse(target: Mask) -> Mask:
 def chosen_samples(dataset: DatasetFolder, split: str, views: int) -> list[tuple[str, list[str]]]:
     """``views`` samples of each object of ``split``, each with a sample of every other object, whose outlines it may be
     cut to. Raises `DiagnosisError` for a split without an object."""
-    by_object: dict[str, list[str]] = {}
-    for sample in dataset.samples(split):
-        if object_mask(dataset.depth_mm(sample)).any():
-            by_object.setdefault(dataset.measured(sample)["object"], []).append(sample)
+    views_by_object = {
+        name: [sample for sample in samples if object_mask(dataset.depth_mm(sample)).any()]
+        for name, samples in dataset.samples_by_object(split).items()
+    }
+    by_object = {name: samples for name, samples in views_by_object.items() if samples}
     if not by_object:
         raise DiagnosisError(f"{dataset.path}: {split} holds no sample with an object")
     chosen = []

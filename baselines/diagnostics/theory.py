@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.diagnostics.probe import (
     Figure,
     Finding,
-    Picture,
     Probe,
     ProbeSettings,
     Progress,
-    Table,
-    gallery,
+    table_of,
     with_interval,
 )
 from fpp_ml_bench.baselines.diagnostics.scenes import SceneRenderer, constant, moved, original
@@ -30,7 +28,7 @@ from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Direction
-from fpp_ml_bench.style import DEPTH_COLOURS
+from fpp_ml_bench.style import DEPTH_COLOURS, Picture, gallery
 
 if TYPE_CHECKING:
     from fpp_ml_bench.baselines.diagnostics.subjects import Subject
@@ -79,7 +77,7 @@ class Theory(Probe):
         values = {"twins": facts, "kappa_per_m": kappa_per_m(dataset.rig, twins.direction), "laws": laws}
         rows = {f"{row['error']}, {row['distance_m']:g} m": row for row in laws}
         columns = {"error_mm": "Depth error, mm", "exponent": "Local exponent of distance"}
-        table = Table.of("Depth error of a phase error by distance", "Phase error", rows, columns)
+        table = table_of("Depth error of a phase error by distance", "Phase error", rows, columns)
         return Finding(summary, values, table, _draw_twins(twins))
 
 

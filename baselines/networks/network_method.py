@@ -44,11 +44,10 @@ class NetworkOptions:
     """Options of `NetworkMethod`; the name of the method gives ``weights``, a file, or the ``recipe`` that trained
     them."""
 
-    depth_range: str | None = option(
+    depth_range: DepthRange | None = option(
         None,
         "depth range of an individually normalised network: the test sample's own (oracle track), predicted from the "
         "image, or the training set's mean (default: predicted where the weights can, else oracle)",
-        choices=DEPTH_RANGES,
         flag="--range",
     )
     frame: int | None = option(None, "frame to take (default: the first it was trained on)", "N")

@@ -45,13 +45,12 @@ class Settings:
     Of these, crossed fringes use ``min_confidence`` and ``slack_mm`` alone.
     """
 
-    direction: Direction = option("horizontal", DIRECTION, choices=DIRECTIONS)
+    direction: Direction = option("horizontal", DIRECTION)
     frames: int = option(1, "fringes of that direction, 1 to 18; no Gray code (default: 1)", "N")
     shading: bool = option(True, "choose the fringe order without brightness", flag="--no-shading")
     prior: Prior = option(
         "none",
         "standoff: assume that objects are near the rig's standoff, true of fixed placement (default: none)",
-        choices=get_args(Prior),
     )
     min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
     first_window: float = 0.35

@@ -6,8 +6,8 @@ which is built where it is missing and is the same for every row of a run. Rows 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
+from fpp_ml_bench.baselines.networks.network_method import DepthRange
 from fpp_ml_bench.baselines.training.recipe import Recipe, load_recipe, table_rows
 from fpp_ml_bench.constants import FULL_SIZE, OBJECTS
 from fpp_ml_bench.errors import DatasetError, RecipeError
@@ -19,7 +19,6 @@ from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.named_rigs import paper_rig
 
 Report = Callable[[str], object]
-DepthRange = Literal["oracle", "predicted", "mean"] | None
 RUNS = Path("runs")
 
 
@@ -36,7 +35,7 @@ class Job:
         return any(row.startswith("multi_frame/") for row in self.rows)
 
 
-def variants(recipe: Recipe) -> tuple[DepthRange, ...]:
+def variants(recipe: Recipe) -> tuple[DepthRange | None, ...]:
     """The rows that a training gives, by the depth range that turns its output into mm (see `NetworkMethod`). Under
     individual normalisation it is given the test sample's range, as in the paper; its metric twins are not. With the
     background removed the object's mask is given anyway, and there are no twins."""
@@ -60,7 +59,7 @@ class Folders:
         """Best weights, with range heads where the normalisation needs them: the file to ship."""
         return self.runs / "weights" / f"{recipe.name}.safetensors"
 
-    def row(self, recipe: Recipe, depth_range: DepthRange) -> Path:
+    def row(self, recipe: Recipe, depth_range: DepthRange | None) -> Path:
         twin = "" if depth_range in (None, "oracle") else f"-range-{depth_range}"
         return self.rows / f"{self.preset}-{recipe.name}{twin}.json"
 

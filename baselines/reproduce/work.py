@@ -5,13 +5,12 @@ No training is ever deleted: a finished training is used, a stopped one continue
 In the paper's multi-frame table (Section 5.4) scores are averages over all (view, frame) pairs of a condition's test
 set. Here each sample's score is the mean over its frames, and the headline the mean over samples: the same number, for
 every sample has the same frames, and the interval can then be taken over objects. The rules are the evaluator's own
-(`scored_pair`, `score_sample`).
+(`Rules`, `score_sample`).
 """
 
 import json
 import shlex
 import shutil
-import statistics
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from hashlib import sha256
@@ -39,17 +38,16 @@ from fpp_ml_bench.baselines.training.depth_training import DONE, SCORING, WEIGHT
 from fpp_ml_bench.baselines.training.engine import RECIPE
 from fpp_ml_bench.baselines.training.recipe import Recipe
 from fpp_ml_bench.constants import split_sample_name
-from fpp_ml_bench.depth import RangeRule
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError, TrainingError, WeightsError
 from fpp_ml_bench.evaluation.metrics import HEADLINE
-from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION, Mode, Units
+from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.result.file import write_json, write_result
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import Headline, Intervals, Sha256
-from fpp_ml_bench.evaluation.score.check import scored_pair
+from fpp_ml_bench.evaluation.score.check import Rules
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
-from fpp_ml_bench.evaluation.score.uncertainty import intervals_over_objects
+from fpp_ml_bench.evaluation.score.uncertainty import intervals_over_objects, mean_of
 from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE
 from fpp_ml_bench.files import exclusive, read_json, write_atomically
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -81,10 +79,6 @@ class ReproduceSettings:
     report: Report = print
     row: str = ""
 
-    def wants(self, job: Job) -> bool:
-        """Whether a job is to be done."""
-        return not self.row or f"{self.tables[0]}/{self.row}" in job.rows
-
 
 @dataclass
 class Outcome:
@@ -106,28 +100,26 @@ def reproduce(settings: ReproduceSettings) -> Outcome:
     folder; and what predicting and scoring raise."""
     folders = settings.folders
     jobs = plan.planned(settings.tables, folders.preset)
-    wanted = [job for job in jobs if settings.wants(job)]
+    wanted = [job for job in jobs if not settings.row or f"{settings.tables[0]}/{settings.row}" in job.rows]
     check_run_folders(wanted, folders)
     check_machine(wanted, folders, settings.anyway, settings.command)
     with exclusive(folders.runs / "lock", folders.runs, "reproducing into this folder"):
         opened = plan.open_dataset(settings.data, jobs, folders, settings.report)
-        check_same_dataset(opened, wanted, folders)
+        check_run_folders(wanted, folders, opened)
         outcome = Outcome(opened, jobs)
         try:
-            _work(settings, outcome)
+            _work(settings, outcome, wanted)
         finally:
             for table in settings.tables:
                 outcome.tables.append(settings.leaderboard.write_table(table, settings, outcome))
     return outcome
 
 
-def _work(settings: ReproduceSettings, outcome: Outcome) -> None:
+def _work(settings: ReproduceSettings, outcome: Outcome, jobs: Sequence[Job]) -> None:
     """Every job in turn, until the minutes run out."""
-    folders = settings.folders
-    jobs = [job for job in outcome.jobs if settings.wants(job)]
     started = perf_counter()
     for number, job in enumerate(jobs, 1):
-        name, out = job.recipe.name, folders.training(job.recipe)
+        name, out = job.recipe.name, settings.folders.training(job.recipe)
         minutes_left = None if settings.minutes is None else settings.minutes - (perf_counter() - started) / 60
         if minutes_left is not None and minutes_left <= 0:
             outcome.stopped = name
@@ -175,13 +167,13 @@ def _score_all_frames(recipe: Recipe, model: Model, settings: ReproduceSettings,
     path = settings.folders.all_frames(recipe)
     if settings.only_missing and all_frames_that_hold(path, opened.fingerprint, model.sha256) is not None:
         return
+    units, mode = SCORING[recipe.normalisation]
     scores = score_all_frames(
         opened,
         lambda frame: model.predict_representation([frame])[0],
         opened.sequence.config(recipe.frames),
-        SCORING[recipe.normalisation],
+        Rules(TARGET, units, model.config.range_rule, mode),
         model.sha256,
-        model.config.range_rule,
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(scores.model_dump(mode="json"), path)
@@ -198,15 +190,16 @@ def state_of(out: Path) -> str:
     return "trained" if is_trained(out) else "begun" if out.is_dir() and any(out.iterdir()) else "missing"
 
 
-def check_run_folders(jobs: Sequence[Job], folders: Folders) -> None:
+def check_run_folders(jobs: Sequence[Job], folders: Folders, opened: DatasetFolder | None = None) -> None:
     """Refuse, before hours of work, a training folder of another recipe: TrainingError names the folder, the settings
-    that differ and the cure."""
+    that differ and the cure. With the dataset, also that of another one: DatasetError names both."""
     for job in jobs:
         path = folders.training(job.recipe) / RECIPE
         if not path.is_file():
             continue
+        stored = _stored(path)
         try:
-            differs = plan.differing(job.recipe.to_dict(), _stored(path)["recipe"], "{1} there, {0} in the recipe")
+            differs = plan.differing(job.recipe.to_dict(), stored["recipe"], "{1} there, {0} in the recipe")
         except (KeyError, TypeError, AttributeError) as error:
             raise TrainingError(f"{path}: expected the recipe of a training, it can't be read ({error})") from None
         if differs:
@@ -215,14 +208,8 @@ def check_run_folders(jobs: Sequence[Job], folders: Folders) -> None:
                 f"{path.parent}: holds a training of another recipe, {job.rows[0]} differs in {differs}; to keep both, "
                 f"mv {out} {out}-before, or give another --out"
             )
-
-
-def check_same_dataset(opened: DatasetFolder, jobs: Sequence[Job], folders: Folders) -> None:
-    """Refuse a dataset other than that of the trainings that were begun: DatasetError names both."""
-    for job in jobs:
-        path = folders.training(job.recipe) / RECIPE
-        trained_on = str(_stored(path).get("fingerprint")) if path.is_file() else opened.fingerprint
-        if trained_on != opened.fingerprint:
+        trained_on = str(stored.get("fingerprint"))
+        if opened is not None and trained_on != opened.fingerprint:
             raise DatasetError(
                 f"{opened.path}: has fingerprint {opened.fingerprint[:8]}, but the training in {path.parent} is of "
                 f"{trained_on[:8]}; give that dataset as DATASET, or another --out"
@@ -333,26 +320,22 @@ def score_all_frames(
     opened: DatasetFolder,
     predict: Callable[[NDArray[np.uint8]], NDArray[np.float32]],
     frames: Sequence[int],
-    scoring: tuple[Units, Mode],
+    rules: Rules,
     weights_sha256: str,
-    rule: RangeRule = "object",
 ) -> AllFrames:
-    """Score ``predict`` (a frame (H, W) in, depth (H, W) in the units of ``scoring`` out, normalised by
-    ``rule``) on every test sample and frame; ``weights_sha256``: of the network. Raises PredictionError for a
-    prediction that is not finite, and what `scored_pair` raises."""
+    """Score ``predict`` (a frame (H, W) in, depth (H, W) out) by ``rules`` on every test sample and frame;
+    ``weights_sha256``: of the network. Raises PredictionError for a prediction that is not finite, and what
+    `Rules.pair` raises."""
     samples = opened.samples(SPLIT)
     rows: list[Scores] = []
     for sample in samples:
-        target_mm = opened.target_mm(sample)
-        void = opened.void(sample) if scoring[1] == "standard" else None
-        left_out = opened.left_out(sample, rule)
+        void = rules.void(opened, sample)
         scores: list[Scores] = []
         for frame in frames:
             values = predict(opened.frame(sample, frame))
             if not np.isfinite(values).all():
                 raise PredictionError(f"{sample}, frame {frame}: the network gave values that are not finite")
-            pair = scored_pair(values, target_mm, *scoring, sample, left_out)
-            scores.append(score_sample(*pair, void=void).metrics())
+            scores.append(score_sample(*rules.pair(values, opened, sample), void=void).metrics())
         rows.append(_mean(scores))
     objects = [split_sample_name(sample)[0] for sample in samples]
     ends = intervals_over_objects(rows, objects, HEADLINE)
@@ -372,8 +355,7 @@ def score_all_frames(
 
 def _mean(rows: Sequence[Scores]) -> Scores:
     """Plain mean of each headline score over the rows that have it."""
-    values_by_key = {key: [value for row in rows if (value := row[key]) is not None] for key in HEADLINE}
-    return {key: statistics.fmean(values) if values else None for key, values in values_by_key.items()}
+    return {key: mean_of(row[key] for row in rows) for key in HEADLINE}
 
 
 def read_all_frames(path: Path) -> AllFrames:

@@ -30,12 +30,12 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.diagnostics.probe import mean_of
 from fpp_ml_bench.constants import GREY_LEVELS, TEST_OBJECTS, UNSEEN, sample_name
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.result.parts import SeverityScores
 from fpp_ml_bench.evaluation.score.sample_scores import states_sigma
+from fpp_ml_bench.evaluation.score.uncertainty import mean_of
 from fpp_ml_bench.files import strict_yaml, write_atomically
 from fpp_ml_bench.loaders.render.light import Light, named_light
 from fpp_ml_bench.loaders.render.meshes import solid_mesh

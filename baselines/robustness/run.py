@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.diagnostics.probe import LINE, mean_of, panels, with_legend
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.robustness.axes import (
     CLEAN,
@@ -27,10 +26,10 @@ from fpp_ml_bench.baselines.robustness.axes import (
 from fpp_ml_bench.constants import sample_name
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.result.parts import Robustness, SeverityScores
-from fpp_ml_bench.evaluation.score.uncertainty import object_interval
+from fpp_ml_bench.evaluation.score.uncertainty import mean_of, object_interval
 from fpp_ml_bench.files import LOCK_FILE, exclusive, read_json, write_atomically
 from fpp_ml_bench.pool import mapping
-from fpp_ml_bench.style import LINE_COLOURS, data_uri, page, styled
+from fpp_ml_bench.style import LINE, LINE_COLOURS, data_uri, page, panels, styled, with_legend
 
 QUICK_SEVERITIES = (1, 3, 5)
 SEVERITIES = (1, 2, 3, 4, 5)

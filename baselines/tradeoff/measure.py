@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 from functools import cached_property, partial
 from hashlib import sha256
 from pathlib import Path
-from statistics import fmean, linear_regression, median
+from statistics import linear_regression, median
 from time import perf_counter, process_time
 from typing import Annotated, Any, Literal, get_args
 
@@ -24,12 +24,12 @@ from fpp_ml_bench.baselines.registry import failure_in_file, find, load_method, 
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.baselines.timing import added_mib, four_digits
 from fpp_ml_bench.baselines.training.weights import open_weights, shipped_names, weights_path
-from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DatasetError, FppBenchError, PredictionError, RigError, SubmissionError
 from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.evaluation.result.parts import HardwareInfo
-from fpp_ml_bench.evaluation.score.check import scored_pair
-from fpp_ml_bench.evaluation.score.sample_scores import score_sample
+from fpp_ml_bench.evaluation.score.check import Rules
+from fpp_ml_bench.evaluation.score.sample_scores import SampleScores, score_sample
+from fpp_ml_bench.evaluation.score.uncertainty import mean_of
 from fpp_ml_bench.files import LOCK_FILE, NAME_LIMIT, exclusive, printable, read_json
 from fpp_ml_bench.loaders.render.meshes import solid_mesh
 from fpp_ml_bench.loaders.render.scene import BuildSettings
@@ -225,9 +225,7 @@ def _networks(size: tuple[int, int]) -> list[str]:
 def choose_views(opened: DatasetFolder, per_object: int, split: str = "test") -> list[str]:
     """``per_object`` views of each object of ``split``, spread over its views, in row order. `DatasetError` for a split
     without samples."""
-    samples_by_object: dict[str, list[str]] = {}
-    for sample in opened.samples(split):
-        samples_by_object.setdefault(split_sample_name(sample)[0], []).append(sample)
+    samples_by_object = opened.samples_by_object(split)
     if not samples_by_object:
         raise DatasetError(f"{opened.path}: split {split} holds no sample; there is nothing to measure")
     chosen: list[str] = []
@@ -309,8 +307,8 @@ def measured(plan: Plan, point: Point) -> Point:
 def _figures(plan: Plan, method: Method) -> dict[str, Any]:
     """Errors, seconds and memory of ``method`` on the plan's views, as fields of a `Point`. Frames are in memory before
     the clock starts."""
-    opened, target = plan.opened, plan.target
-    seconds, errors_mm, missing = list[float](), list[float](), list[float]()
+    opened, rules = plan.opened, Rules(plan.target, method.units, method.range_rule, method.mode)
+    seconds, scored = list[float](), list[SampleScores]()
     memory_mib = None
     for name in plan.views:
         frames = captured_frames(opened, method, name)
@@ -320,12 +318,7 @@ def _figures(plan: Plan, method: Method) -> dict[str, Any]:
         seconds.append(run_s)
         if depth.shape != opened.size or not np.isfinite(depth).all():
             raise PredictionError(f"{name}: expected finite depth (H, W) {opened.size}, the method gave another")
-        left_out = opened.left_out(name, method.range_rule, target)
-        pair = scored_pair(depth, opened.target_mm(name, target), method.units, method.mode, name, left_out)
-        sample = score_sample(*pair, void=opened.void(name, target) if method.mode == "standard" else None)
-        if sample.object.mae_mm is not None:
-            errors_mm.append(sample.object.mae_mm)
-            missing.append(sample.missing / sample.object.pixels)
+        scored.append(score_sample(*rules.pair(depth, opened, name), void=rules.void(opened, name)))
     batch = [captured_frames(opened, method, name) for name in plan.views[:BATCH]]
     return {
         "title": method.title,
@@ -334,6 +327,6 @@ def _figures(plan: Plan, method: Method) -> dict[str, Any]:
         "seconds": four_digits(median(seconds)),
         "batch_seconds": four_digits(plan.timed(method.predict_batch, batch)[0] / len(batch)),
         "working_memory_mib": memory_mib,
-        "object_mae_mm": fmean(errors_mm) if errors_mm else None,
-        "missing_share": fmean(missing) if missing else None,
+        "object_mae_mm": mean_of(sample.object.mae_mm for sample in scored),
+        "missing_share": mean_of(sample.missing / sample.object.pixels for sample in scored if sample.object.pixels),
     }

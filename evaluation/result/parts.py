@@ -262,9 +262,9 @@ class RelianceParts(StrictModel):
     order_free_follows_phase: Annotated[Share | None, "follows the phase, without whole periods"]
     order_free_change_outline: Annotated[NonNegative | None, "changes with another outline, without whole periods"]
 
-
-PART_TITLES: dict[str, str] = {name: field.metadata[0] for name, field in RelianceParts.model_fields.items()}
-"""Each part in words."""
+    def titled(self) -> dict[str, float | None]:
+        """Each part by what it is in words."""
+        return {str(field.metadata[0]): getattr(self, name) for name, field in type(self).model_fields.items()}
 
 
 class Reliance(StrictModel):

@@ -11,7 +11,7 @@ difference of each object could as well have the other sign. Where many pairs ar
 """
 
 import math
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import combinations
@@ -35,6 +35,12 @@ _EXACT_OBJECTS = 32
 _FLIPS = 100_000
 _ROUNDING = 1e-12
 """Sums of flips that differ by less than this share of the sum of magnitudes are equal but for rounding."""
+
+
+def mean_of(values: Iterable[float | None]) -> float | None:
+    """Mean of ``values`` other than None; None where there are none."""
+    defined = [value for value in values if value is not None]
+    return fmean(defined) if defined else None
 
 
 def object_interval(values: Sequence[float | None], objects: Sequence[Hashable]) -> Interval | None:

@@ -87,11 +87,11 @@ BENCH = Program(
                 "measure phase reliance: does the depth follow the fringes or the outline?",
             ),
             "robustness": (
-                "robustness:robust",
+                "diagnose:robust",
                 "error where light, camera, surface, calibration or motion disturb the scene",
             ),
             "tradeoff": ("tradeoff:measure", "error against run time, frames and memory, and how the time grows"),
-            "stability": ("stability:check", "check extreme cases against higher precision and theory"),
+            "stability": ("tradeoff:check", "check extreme cases against higher precision and theory"),
         },
         "learn": {
             "train": ("train:train", "train a recipe, shipped or yours, into a weights file"),

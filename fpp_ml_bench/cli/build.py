@@ -37,9 +37,7 @@ class BuildCommandSettings(Explain, Pool):
     objects: tuple[str, ...] | None = option(
         None, "objects by name, comma separated (default: the preset's)", "A,B", parse=names
     )
-    placement: Literal["fixed", "varied"] = option(
-        "fixed", "all objects at the standoff, or a distance drawn per view", choices=("fixed", "varied")
-    )
+    placement: Literal["fixed", "varied"] = option("fixed", "all objects at the standoff, or a distance drawn per view")
     config: str | None = option(
         None, "configuration of frames to store (default: all; with --rig crossed: crossed)", choices=CONFIGS
     )

@@ -10,7 +10,7 @@ from fpp_ml_bench.baselines.views import prediction_maps
 from fpp_ml_bench.calibration.result import VolumeError, volume_error_mm
 from fpp_ml_bench.cli import CHECK_FAILED
 from fpp_ml_bench.cli.console import gigabytes, millimetres, progress_bar, say_benchmark, show
-from fpp_ml_bench.cli.options import SPLITS, command
+from fpp_ml_bench.cli.options import SPLITS, command, new_file
 from fpp_ml_bench.constants import MM_PER_M, VIEWS
 from fpp_ml_bench.errors import BuildError, DatasetError
 from fpp_ml_bench.evaluation.result.file import write_json
@@ -42,7 +42,9 @@ fpp-bench info data/mini --json - | jq .splits
 def info(
     *,
     dataset: Path = argument("dataset folder", "DATASET"),
-    json: Path | None = option(None, "write all of it as JSON; - is standard output, without the table", "FILE"),
+    json: Path | None = option(
+        None, "write all of it as JSON; - is standard output, without the table", "FILE", parse=new_file
+    ),
 ) -> None:
     """Print what a dataset holds: sizes, configurations, splits, rig, and how exact its ground truth is."""
     opened = DatasetFolder(dataset)

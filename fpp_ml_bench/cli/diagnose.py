@@ -1,10 +1,10 @@
-"""What a model reads: ``fpp-bench diagnose`` probes it, ``fpp-bench reliance`` measures how far it follows the fringe's
-phase."""
+"""What a model reads and what breaks it: ``fpp-bench diagnose`` probes it, ``fpp-bench reliance`` measures how far it
+follows the fringe's phase, ``fpp-bench robustness`` how its error grows when the scene is disturbed, axis by axis."""
 
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from rich.console import Console
 from rich.progress import Progress
@@ -18,20 +18,33 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     REPORT_FILE,
     Probe,
     ProbeSettings,
-    checked_names,
 )
 from fpp_ml_bench.baselines.diagnostics.probe import diagnose as run_diagnosis
 from fpp_ml_bench.baselines.diagnostics.scenes import chosen_samples
 from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.registry import find
+from fpp_ml_bench.baselines.robustness.axes import CACHE, CLEAN, SETS, Condition, severity_means
+from fpp_ml_bench.baselines.robustness.run import Setup, View, write_page
+from fpp_ml_bench.baselines.robustness.run import measure as measure_robustness
+from fpp_ml_bench.baselines.robustness.run import robustness as robustness_block
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
-from fpp_ml_bench.cli.options import COUNT, command, command_line, names, value
+from fpp_ml_bench.cli.options import COUNT, Pool, command, command_line, names, new_file, value
+from fpp_ml_bench.constants import FULL_SIZE
+from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.result.file import write_json
-from fpp_ml_bench.evaluation.result.parts import PART_TITLES, Reliance
+from fpp_ml_bench.evaluation.result.parts import Reliance
 from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_block
+from fpp_ml_bench.loaders.render.builder import assembly_of
+from fpp_ml_bench.loaders.render.scene import BuildSettings
+from fpp_ml_bench.loaders.storage.manifest import Manifest
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
+from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import AnySequence
 from fpp_ml_bench.options import REQUIRED, argument, option
+from fpp_ml_bench.remote import RemoteFolder, place, working_copy
+from fpp_ml_bench.style import millimetres, percent
 from fpp_ml_bench.tables import Table
 
 
@@ -62,7 +75,11 @@ def diagnose(
     dataset: Path = argument("dataset folder, of the model's image size", "DATASET"),
     out: Path = option(REQUIRED, "index.html and diagnose.json go here", "DIR"),
     probe: tuple[str, ...] = option(
-        (), f"run only this probe; can be repeated: {', '.join(PROBES)} (default: all)", "NAME", many=True
+        tuple(PROBES),
+        f"run only this probe; can be repeated: {', '.join(PROBES)} (default: all)",
+        "NAME",
+        choices=PROBES,
+        many=True,
     ),
     samples: int | None = option(
         None, "most samples of a split, taken evenly (default: the probe's)", "N", parse=COUNT
@@ -72,7 +89,6 @@ def diagnose(
     units: Literal["mm", "m", "normalised"] | None = option(
         None,
         "output of your own module: depth in mm, in m, or normalised to the sample's range (default)",
-        choices=("mm", "m", "normalised"),
     ),
     quick: bool = option(False, "a short run for a first look; its numbers are not reliable"),
     layers: tuple[str, ...] | None = option(
@@ -86,7 +102,6 @@ def diagnose(
     Raises FppBenchError for what can't be diagnosed."""
     from fpp_ml_bench.baselines.diagnostics.subjects import subject as subject_of
 
-    probe_names = checked_names(probe)
     opened = DatasetFolder(dataset)
     subject = subject_of(model, opened, layers, units, frame, threads or usable_cores(), options)
     probing = ProbeSettings(samples, seeds, quick)
@@ -99,7 +114,7 @@ def diagnose(
                 task, completed=done, total=total, description=f"{probe.title}: {activity}"
             )
 
-        results = run_diagnosis(subject, opened, probe_names, probing, out, progress, again)
+        results = run_diagnosis(subject, opened, probe, probing, out, progress, again)
     table = Table("Probe", "Summary", numbers=("Seconds",), title=Text(subject.title))
     for probed in results:
         text = f"not run: {probed.finding.skipped}" if probed.finding.skipped else probed.finding.summary
@@ -129,7 +144,9 @@ def reliance(
     into: Path | None = option(
         None, "write the score into this result or leaderboard row of the same method (.json)", "FILE"
     ),
-    json: Path | None = option(None, "write the score and its parts to this file; - is standard output", "FILE"),
+    json: Path | None = option(
+        None, "write the score and its parts to this file; - is standard output", "FILE", parse=new_file
+    ),
 ) -> None:
     """Measure phase reliance: does the predicted depth follow the fringe's phase, or the object's outline?
 
@@ -166,8 +183,103 @@ def _reliance_table(title: str, reliance: Reliance) -> Table:
     table.add_row("phase reliance, 0 to 1", f"{reliance.score:.3f}{interval}")
     if reliance.order_free_score is not None:
         table.add_row("  without whole periods", f"{reliance.order_free_score:.3f}")
-    for key, words in PART_TITLES.items():
-        value = getattr(reliance.parts, key)
-        if value is not None:
-            table.add_row(words, f"{value:.3f}")
+    for words, part in reliance.parts.titled().items():
+        if part is not None:
+            table.add_row(words, f"{part:.3f}")
+    return table
+
+
+@command(
+    """\
+fpp-bench robustness phase --quick --out robustness                    a look, some minutes
+fpp-bench robustness phase --out robustness                            the test set, resumable axis by axis
+fpp-bench robustness classical --steps 6 --set unseen --axes motion,gloss --out robustness-unseen
+fpp-bench robustness phase-net --out robustness --into leaderboard/rows/phase-net-horizontal.json
+fpp-bench robustness unet-global-rmse --size 224 --out robustness-224
+fpp-bench robustness phase --out s3://bucket/robustness --cluster ray://head:10001
+""",
+    MethodCommand,
+)
+def robust(
+    *,
+    chosen: MethodSettings,
+    pool: Pool,
+    out: Path | RemoteFolder = option(
+        REQUIRED,
+        "folder of measurements: each method has its own below it, and one page shows all; or a URL",
+        "DIR",
+        parse=place,
+    ),
+    axes: tuple[str, ...] = option((), "only these axes (default: all that apply to the method)", "A,B", parse=names),
+    objects: Literal["test", "unseen"] = option("test", "objects (default: test)", flag="--set"),
+    size: int = option(FULL_SIZE, f"image size (default: {FULL_SIZE})", "PX"),
+    quick: bool = option(False, "one view of each object and three severities, for a look"),
+    into: Path | None = option(
+        None, "write the block into this result or row of the same method (.json); needs all axes", "FILE"
+    ),
+    cache: Path | None = option(
+        None, "rendered frames, at most 10 GB (default: the user's cache folder; with --cluster none)", "DIR"
+    ),
+    no_cache: bool = option(False, "render every frame anew, keep none"),
+) -> None:
+    """Measure what breaks a method: scenes disturbed axis by axis, at five severities each, in the image formation.
+
+    A file that can't take the block raises FppBenchError before measuring."""
+    workers = pool.processes
+    if into is not None and (axes or quick):
+        raise PredictionError("--into: needs all axes and severities; leave out --axes and --quick")
+    settings = Condition(CLEAN, 0, SETS[objects], size, find(chosen.name).method.scenes_rig).settings
+    method = chosen.load(Scenes.of(settings), warn=False)
+    entry = None if into is None else read_entry(into)
+    if entry is not None:
+        check_same_method(entry, method)
+    setup = Setup(method, objects, size, quick)
+    # The nodes of a cluster have folders of their own, which nobody would keep small.
+    cache = None if no_cache else cache or (None if pool.cluster else CACHE)
+    views = sum(len(c.objects) * len(setup.views) for axis in setup.axes(axes) for c in setup.conditions(axis))
+    with working_copy(out) as (below, save):
+        folder = below / slug(setup)
+        with progress_bar(f"{chosen.name}, {objects}", views, "views") as advance:
+            rows = measure_robustness(setup, folder, axes, workers, cache, advance, pool.cluster, save)
+        page = f"{out}/{write_page(below).name}"
+    if entry is not None:
+        write_block(entry, robustness_block(setup, rows))
+    show(_table(setup, rows))
+    print(f"{page}: curves of all methods measured there")
+
+
+class Scenes(NamedTuple):
+    """What a method is chosen for, in place of a dataset: the scenes are rendered when they are needed."""
+
+    path: Path
+    rig: Rig
+    size: tuple[int, int]
+    sequence: AnySequence
+    manifest: Manifest
+
+    @classmethod
+    def of(cls, settings: BuildSettings) -> "Scenes":
+        """The scenes that ``settings`` would build."""
+        rig, manifest = settings.rig, assembly_of(settings).manifest
+        return cls(Path("the robustness scenes"), rig, manifest.size, rig.sequence, manifest)
+
+
+def slug(setup: Setup) -> str:
+    """Name of a measurement's folder."""
+    plain = re.sub(r"[^a-z0-9]+", "-", setup.method.title.casefold()).strip("-")[:80]
+    return f"{plain}-{setup.set_name}-{setup.size}{'-quick' if setup.quick else ''}"
+
+
+def _table(setup: Setup, rows: dict[str, list[View]]) -> Table:
+    """Errors by axis, clean and at each severity; shares at the last severity."""
+    severities = (0, *setup.severities)
+    columns = [f"severity {severity}" if severity else "clean" for severity in severities]
+    columns += ["wrong orders", "unanswered", "confident errors"]
+    table = Table("axis", numbers=columns, title=f"{setup.method.title}: object MAE in mm")
+    for axis, found in rows.items():
+        means = severity_means(found)
+        last = means[max(means)]
+        cells = [millimetres(means[severity]["mae_mm"]) if severity in means else "" for severity in severities]
+        shares = [percent(last[key]) for key in ("wrong_share", "unanswered_share", "confident_share")]
+        table.add_row(axis, *cells, *shares)
     return table

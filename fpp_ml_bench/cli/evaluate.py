@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fpp_ml_bench.cli import CHECK_FAILED, OK
-from fpp_ml_bench.cli.options import SPLITS, Explain, command, value
+from fpp_ml_bench.cli.options import SPLITS, Explain, command, new_file, new_folder, value
 from fpp_ml_bench.errors import DatasetError, SubmissionError
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, MODES, TARGETS
 from fpp_ml_bench.files import printable
@@ -59,8 +59,12 @@ def score_folder(
         "its rule for normalised depth; never ranked with the others",
         choices=MODES,
     ),
-    json: Path | None = option(None, "write the result here, per-sample scores included; - is standard output", "FILE"),
-    page: Path | None = option(None, "write an HTML page with figures into this folder", "DIR", flag="--report"),
+    json: Path | None = option(
+        None, "write the result here, per-sample scores included; - is standard output", "FILE", parse=new_file
+    ),
+    page: Path | None = option(
+        None, "write an HTML page with figures into this folder", "DIR", flag="--report", parse=new_folder
+    ),
     account: Explain,
 ) -> None:
     """Score a folder of predictions: MAE and RMSE in mm over the full grid, the object and the background.
@@ -146,20 +150,12 @@ def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[D
 
 
 def _check_outputs(file: Path | None, page: Path | None, folder: Path) -> None:
-    """Refuse, before any work, what can't be written or would be an extra file among the predictions."""
+    """Refuse, before any work, what would be an extra file among the predictions."""
     inside = "is inside the predictions folder, where it would be an extra file; move it"
-    if file is not None:
-        if file.is_dir():
-            raise SubmissionError(f"--json {file}: expected a file to write, found a folder")
-        if not file.absolute().parent.is_dir():
-            raise SubmissionError(f"--json {file}: the folder {file.parent} does not exist; make it first")
-        if file.absolute().parent.resolve() == folder.resolve():
-            raise SubmissionError(f"--json {file}: {inside} out")
-    if page is not None:
-        if page.is_file():
-            raise SubmissionError(f"--report {page}: expected a folder to write into, found a file")
-        if page.resolve().is_relative_to(folder.resolve()):
-            raise SubmissionError(f"--report {page}: {inside}")
+    if file is not None and file.absolute().parent.resolve() == folder.resolve():
+        raise SubmissionError(f"--json {file}: {inside} out")
+    if page is not None and page.resolve().is_relative_to(folder.resolve()):
+        raise SubmissionError(f"--report {page}: {inside}")
 
 
 @command(
@@ -226,7 +222,9 @@ def compare(
     *,
     first: Path = argument("a result of fpp-eval --json, or a row of the leaderboard", "A.json"),
     second: Path = argument("a result of another method on the same data, split, target and track", "B.json"),
-    json: Path | None = option(None, "write the comparison here, each sample's included; - is standard output", "FILE"),
+    json: Path | None = option(
+        None, "write the comparison here, each sample's included; - is standard output", "FILE", parse=new_file
+    ),
 ) -> None:
     """Compare two results of the same samples: paired differences, their 95% intervals, and a sentence on them.
 

@@ -72,6 +72,14 @@ def new_file(text: str) -> Path:
     return path
 
 
+def new_folder(text: str) -> Path:
+    """A folder to write into, which need not be there."""
+    path = Path(text)
+    if path.exists() and not path.is_dir():
+        raise ValueError("expected a folder to write into, found a file")
+    return path
+
+
 def whole(least: int, most: int, unit: str = "") -> Any:
     """A whole number from ``least`` to ``most``."""
     expected = f"{least} to {most}" if unit else f"a whole number from {least} to {most}"
@@ -80,7 +88,6 @@ def whole(least: int, most: int, unit: str = "") -> Any:
 
 COUNT = whole(1, 100_000)
 AT_LEAST_ONE = value("1 or more", int, lambda number: number >= 1)
-POSITIVE = value("a number above 0", float, lambda number: 0 < number < 1e6)
 MINUTES = value("minutes above 0", float, lambda minutes: 0 < minutes < 1e6)
 WORKING_RANGE = value("NEAR,FAR in mm such as 350,450", number_pair, lambda ends: 0 < ends[0] < ends[1] < 1e9)
 

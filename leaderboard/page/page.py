@@ -23,7 +23,6 @@ from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
 from fpp_ml_bench.evaluation.report.report_page import SampleMaps, chosen_samples, sample_maps
 from fpp_ml_bench.evaluation.report.terminal import score_text
 from fpp_ml_bench.evaluation.result.model import Result
-from fpp_ml_bench.evaluation.result.parts import PART_TITLES
 from fpp_ml_bench.evaluation.score.uncertainty import FEWEST_OBJECTS
 from fpp_ml_bench.files import printable, write_atomically
 from fpp_ml_bench.leaderboard import columns, tables
@@ -159,8 +158,7 @@ def _submission(group: Group, row: Ranked) -> dict[str, Any]:
     about = row.entry.row
     parts = [about] if row.unseen is None else [about, row.unseen.row]
     bars = [(mean, name) for name, mean in row.object_means(DEFAULT_SORT).items()]
-    changes = about.reliance.parts if about.reliance else None
-    changed = [(words, getattr(changes, key)) for key, words in PART_TITLES.items()] if changes else []
+    changes = about.reliance.parts.titled() if about.reliance else {}
     return {
         "row": row,
         "group": group,
@@ -170,7 +168,7 @@ def _submission(group: Group, row: Ranked) -> dict[str, Any]:
         "scored": [(_data_words(part), _score_cells(part)) for part in parts],
         "bars": sorted(bars, key=lambda bar: (-bar[0], bar[1])),
         "longest_mm": max(bars, default=(0.0, ""))[0],
-        "parts": [(words, f"{value:.2f}") for words, value in changed if value is not None],
+        "parts": [(words, f"{value:.2f}") for words, value in changes.items() if value is not None],
     }
 
 
@@ -340,7 +338,8 @@ def tradeoff_section(run: Tradeoff | None) -> dict[str, Any] | None:
     for cost in COST_KEYS:
         if picture := scatter(run, cost):
             about = f"Object MAE in mm against {picture.across}, both logarithmic"
-            pictures.append(drawn(picture, "scatter", *_TRADEOFF_PICTURE, about))
+            svg, numbered = picture.svg(*_TRADEOFF_PICTURE, "scatter", about)
+            pictures.append({"svg": svg, "numbered": sorted((mark.number, mark.name) for mark in numbered)})
     return {
         "benchmark": benchmark_before(run.fingerprint),
         "pictures": pictures,
@@ -393,12 +392,6 @@ def _mark(number: int, group: Group, row: Ranked, cost: str) -> Mark | None:
     )
 
 
-def drawn(picture: Scatter, css: str, width: int, height: int, about: str) -> dict[str, Any]:
-    """What the template needs of a picture: its SVG, its class, and the names of the marks that have a number."""
-    svg, numbered = picture.svg(width, height, css, about)
-    return {"svg": svg, "css": css.split()[0], "numbered": sorted((mark.number, mark.name) for mark in numbered)}
-
-
 def overview_figures(groups: Sequence[Group]) -> list[dict[str, Any]]:
     """For each cost that any row has: its name, the pictures in both `SIZES`, and the front, cheapest first."""
     figures = []
@@ -408,7 +401,7 @@ def overview_figures(groups: Sequence[Group]) -> list[dict[str, Any]]:
         front = [mark.name for mark in picture.front]
         about = f"Object MAE in mm against {across}, both logarithmic. On the front, cheapest first: {', '.join(front)}"
         about += f". {groups[0].key.data_title}"
-        sizes = [drawn(picture, f"{css} scatter", width, height, about) for css, width, height in SIZES]
+        sizes = [picture.svg(width, height, f"{css} scatter", about)[0] for css, width, height in SIZES]
         figures.append({"cost": cost, "pictures": sizes, "front": front})
     return figures
 

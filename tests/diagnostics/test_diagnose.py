@@ -18,11 +18,10 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     Finding,
     ProbeResult,
     ProbeSettings,
-    Table,
-    checked_names,
     load_finding,
     save_finding,
     spread,
+    table_of,
 )
 from fpp_ml_bench.baselines.diagnostics.subjects import subject
 from fpp_ml_bench.baselines.stability.cases import U32
@@ -178,7 +177,7 @@ def test_layers_that_are_constant_get_a_sentence_though_the_network_predicts(tin
     ("model", "options", "says"),
     [
         ("unett", (), "unknown method 'unett'; there are classical"),
-        ("MINE:make", ("--probe", "gradcam"), "unknown probe 'gradcam'; did you mean 'grad-cam'"),
+        ("MINE:make", ("--probe", "gradcam"), "--probe gradcam: did you mean 'grad-cam'"),
         ("MINE:make", ("--layers", "encodr"), "has no layer 'encodr'; there are encoder"),
         ("MINE:make", ("--layers", "unused", "--probe", "linear"), "'unused' takes no part in a forward pass"),
         ("MINE:make", ("--frame", "99"), "expected 0 to 51"),
@@ -256,13 +255,14 @@ def test_findings_come_back_as_they_were_and_only_whole(tmp_path):
     finding = Finding(
         "Said.",
         {"a": [1, None], "b": {"c": 0.5}},
-        Table("T", ("x", "y"), (("a", 1.5), ("b", None))),
+        table_of("T", "x", {"a": {"y": 1.5}, "b": {}}, {"y": "y"}),
         Figure("F", "alt", b"png"),
     )
     save_finding(tmp_path, "linear", "key", finding, 1.25)
     stored, seconds = load_finding(tmp_path, "linear", "key")
     assert seconds == 1.25 and stored.values == finding.values and stored.figure == finding.figure
-    assert [list(row) for row in stored.table.rows] == [["a", 1.5], ["b", None]]
+    assert (str(stored.table.title), stored.table.titles) == ("T", ["x", "y"])
+    assert stored.table.texts == [("a", "1.5"), ("b", "-")]
     assert load_finding(tmp_path, "linear", "other") is None and load_finding(tmp_path, "absent", "key") is None
     (tmp_path / "linear.png").unlink()
     assert load_finding(tmp_path, "linear", "key") is None
@@ -281,7 +281,7 @@ def test_text_of_a_finding_can_only_be_text(tmp_path):
         "command": "fpp-bench <i>",
         "hardware": {"cpu": "c", "cores": 1},
     }
-    table = Table("<u>", ("<u>",), (("<script>",), (0.123456,), (None,)))
+    table = table_of("<u>", "<u>", {"<script>": {"<u>2": 0.123456}, "b": {}}, {"<u>2": "<u>2"})
     counted = Counted()
     counted.title, counted.question = "<t>", "<q>?"
     page = probe.report_page(context, [ProbeResult(counted, Finding("<s>", table=table), 1.0, False)]).decode()
@@ -290,9 +290,7 @@ def test_text_of_a_finding_can_only_be_text(tmp_path):
     assert "0.1235" in page
 
 
-def test_probes_by_name_and_samples_evenly():
-    assert checked_names(()) == tuple(PROBES)
-    assert checked_names(("theory", "linear", "theory")) == ("linear", "theory")
+def test_samples_evenly():
     assert spread("abcdefgh", 3) == ["b", "e", "g"]
     assert spread("abc", None) == spread("abc", 9) == ["a", "b", "c"]
 

@@ -13,7 +13,7 @@ from scored_dataset import make_dataset
 from upkeep import SHOWN, readme_block
 
 from fpp_ml_bench.cli import BENCH, EVAL
-from fpp_ml_bench.cli.robustness import Scenes
+from fpp_ml_bench.cli.diagnose import Scenes
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result.parts import Robustness, SeverityScores
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries

@@ -28,6 +28,7 @@ from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError
 from fpp_ml_bench.evaluation.result.file import read_result, write_json
+from fpp_ml_bench.evaluation.score.check import Rules
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.leaderboard.rows import read_entry
@@ -292,7 +293,7 @@ def test_all_frames_files_are_read_strictly(opened, tmp_path):
     def zeros(frame):
         return np.zeros(frame.shape, np.float32)
 
-    scores = score_all_frames(opened, zeros, [0, 3], ("mm", "standard"), 64 * "a")
+    scores = score_all_frames(opened, zeros, [0, 3], Rules("depth", "mm", "object", "standard"), 64 * "a")
     path = tmp_path / "all.json"
     write_json(scores.model_dump(mode="json"), path)
     assert read_all_frames(path) == scores == all_frames_that_hold(path, opened.fingerprint, 64 * "a")
@@ -303,7 +304,7 @@ def test_all_frames_files_are_read_strictly(opened, tmp_path):
         read_all_frames(path)
     assert all_frames_that_hold(path, opened.fingerprint, 64 * "a") is None
     with pytest.raises(PredictionError, match=r"frame 0.*not finite"):
-        score_all_frames(opened, lambda f: zeros(f) + np.nan, [0], ("mm", "standard"), 64 * "a")
+        score_all_frames(opened, lambda f: zeros(f) + np.nan, [0], Rules("depth", "mm", "object", "standard"), 64 * "a")
 
 
 def test_all_frames_of_one_frame_is_the_evaluators_score(opened, tmp_path):
@@ -318,7 +319,9 @@ def test_all_frames_of_one_frame_is_the_evaluators_score(opened, tmp_path):
     for sample, values in noise.items():
         np.save(folder / f"{sample}.npy", values)
     result = evaluate(folder, opened, mode="paper")
-    scores = score_all_frames(opened, lambda frame: next(waiting), [0], ("normalised", "paper"), 64 * "a")
+    scores = score_all_frames(
+        opened, lambda frame: next(waiting), [0], Rules("depth", "normalised", "object", "paper"), 64 * "a"
+    )
     for key, value in scores.metrics:
         assert value == pytest.approx(getattr(result.metrics, key), rel=1e-12)
 

@@ -217,6 +217,6 @@ def test_the_command(tmp_path, capsys, monkeypatch):
     assert main(["stability", "--group", "rig", "--out", str(tmp_path / "file")]) == 2
     assert main(["stability", "--group", "chance"]) == 2
     broken = break_interval(monkeypatch)
-    monkeypatch.setattr("fpp_ml_bench.cli.stability.all_cases", lambda *_, **__: broken)
+    monkeypatch.setattr("fpp_ml_bench.cli.tradeoff.all_cases", lambda *_, **__: broken)
     assert main(["stability", "--group", "order"]) == 1
     assert "FAIL order: arctangent" in capsys.readouterr().out
