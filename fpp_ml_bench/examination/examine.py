@@ -55,7 +55,7 @@ _UNITS = {
 
 
 def examine(
-    frames: NDArray | Sequence[NDArray],
+    frames: NDArray,
     rig: Rig,
     names: Sequence[str] | None = None,
     *,
@@ -216,7 +216,7 @@ def _steps_and_response(
     """A step that is not what it should be, and the response, which is no fault of the capture."""
     findings: list[Finding] = []
     waves = ripples(lines, one) if _is_finest(one, rig) else {}
-    step, twice = step_errors(lines, one), waves.get(2)
+    step, twice = step_errors(one), waves.get(2)
     name = f"{one.direction} fringes of {one.pitch_px:g} px"
     wrong_step = step is not None and abs(step[1].value) > max(STEP_RAD, SIGMAS * step[1].sigma)
     wrong_wave = twice is not None and twice.value > max(RIPPLE_RAD, SIGMAS * twice.sigma)

@@ -9,7 +9,7 @@ what neighbours can't have in common with the scene: a surface is smooth within 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from typing import NamedTuple
 
@@ -56,37 +56,49 @@ class Lines:
         step = max(1, int(self.lit.sum() // most_px))
         # Every step-th row and every step-th column: both kinds stay.
         order = np.arange(len(starts))
-        picked = np.flatnonzero(self.lit & (order % step == step // 2)[line])
+        return self.at(np.flatnonzero(self.lit & (order % step == step // 2)[line]))
+
+    def at(self, picked: NDArray[np.intp]) -> "Lines":
+        """The pixels at the ascending indices ``picked``."""
         joined = self.joined[picked] & np.append(np.diff(picked) == 1, False)
-        return Lines(
-            self.levels[:, picked], self.column[picked], self.row[picked], joined, self.across[picked], self.lit[picked]
-        )
+        others = self.column[picked], self.row[picked], joined, self.across[picked], self.lit[picked]
+        return Lines(self.levels[:, picked], *others)
 
 
-def take_lines(frames: NDArray | Sequence[NDArray], mask: NDArray[np.bool_] | None = None) -> Lines:
-    """The lines of ``frames`` (F, H, W) that hold the most lit pixels, evenly spread; those in ``mask`` alone count."""
-    stack = frames if isinstance(frames, np.ndarray) else np.stack(list(frames))
+def _thinned(pixels: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Indices of some `_EQUAL_PX` of the pixels, evenly spread."""
+    return np.flatnonzero(pixels)[:: max(1, int(pixels.sum() // _EQUAL_PX))]
+
+
+def take_lines(stack: NDArray, mask: NDArray[np.bool_] | None = None) -> Lines:
+    """The lines of frames, ``stack`` (F, H, W), that hold the most lit pixels, evenly spread; those in ``mask`` alone
+    count."""
     height, width = stack.shape[1:]
     step = max(1, int(np.sqrt(height * width / _LOOKED_AT_PX)))
     coarse = np.ptp(stack[:, ::step, ::step], axis=0) >= LEAST_LIT_GREY
     if mask is not None:
         coarse &= mask[::step, ::step]
     count = max(4, min(LINES, MOST_PX // (height + width)))
-    parts, of_rows = [], coarse.sum(axis=1)
-    for counts, across in ((of_rows, True), (coarse.sum(axis=0), False)):
+    chosen = []
+    for counts in (coarse.sum(axis=1), coarse.sum(axis=0)):
         cumulated = np.cumsum(counts) / max(counts.sum(), 1)
-        chosen = np.unique(np.searchsorted(cumulated, (np.arange(count) + 0.5) / count).clip(0, len(counts) - 1)) * step
-        along = np.arange(width if across else height)
-        fixed, moving = np.repeat(chosen, len(along)), np.tile(along, len(chosen))
-        parts.append((fixed, moving, across) if across else (moving, fixed, across))
-    row, column = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
-    across_all = np.concatenate([np.full(len(part[0]), part[2]) for part in parts])
-    ends = np.concatenate([(part[1] == width - 1) if part[2] else (part[0] == height - 1) for part in parts])
-    levels = stack[:, row, column]
-    lit = np.ptp(levels, axis=0) >= LEAST_LIT_GREY
-    if mask is not None:
-        lit &= mask[row, column]
-    return Lines(levels, column, row, ~ends, across_all, lit)
+        spread = np.searchsorted(cumulated, (np.arange(count) + 0.5) / count)
+        chosen.append(np.unique(spread.clip(0, len(counts) - 1)) * step)
+    lines = lines_at(stack, *chosen)
+    lit = np.ptp(lines.levels, axis=0) >= LEAST_LIT_GREY
+    return replace(lines, lit=lit if mask is None else lit & mask[lines.row, lines.column])
+
+
+def lines_at(frames: Sequence[NDArray] | NDArray, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Lines:
+    """These rows, then these columns of ``frames`` (F, H, W); all pixels count as lit."""
+    height, width = frames[0].shape
+    row = np.concatenate([np.repeat(rows, width), np.tile(np.arange(height), len(columns))])
+    column = np.concatenate([np.tile(np.arange(width), len(rows)), np.repeat(columns, height)])
+    across = np.arange(len(row)) < len(rows) * width
+    last = np.where(across, column == width - 1, row == height - 1)
+    return Lines(
+        np.stack([frame[row, column] for frame in frames]), column, row, ~last, across, np.ones(len(row), bool)
+    )
 
 
 class Estimate(NamedTuple):
@@ -98,14 +110,15 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True)
 class FringeSet:
-    """The sinusoids of one period: ``frames`` their indices, ``shifts_rad`` (N,), mean, modulation and phase (n,) of
-    the lines' pixels, and ``good`` pixels: modulated and never saturated."""
+    """The sinusoids of one period: ``frames`` their indices, ``shifts_rad`` (N,), ``levels`` (N, n), mean, modulation
+    and phase (n,) of the lines' pixels, and ``good`` pixels: modulated and never saturated."""
 
     direction: Direction
     number: int
     pitch_px: float
     frames: tuple[int, ...]
     shifts_rad: NDArray[np.float64]
+    levels: NDArray
     mean: NDArray[np.float64]
     cosine: NDArray[np.float64]
     sine: NDArray[np.float64]
@@ -134,7 +147,18 @@ def fringe_sets(lines: Lines, rig: Rig, directions: Sequence[Direction]) -> list
             phase = minus_atan2(sine, cosine)
             sets.append(
                 FringeSet(
-                    direction, number, fringe.pitch_px, frames, shifts, mean, cosine, sine, phase, modulation, good
+                    direction,
+                    number,
+                    fringe.pitch_px,
+                    frames,
+                    shifts,
+                    levels,
+                    mean,
+                    cosine,
+                    sine,
+                    phase,
+                    modulation,
+                    good,
                 )
             )
     return sets
@@ -147,18 +171,17 @@ def equal_frames(
     set, and one after the other."""
     found = []
     for one in sets:
-        picked = np.flatnonzero(one.good)[:: max(1, int(one.good.sum() // _EQUAL_PX))]
+        picked = _thinned(one.good)
         if len(picked) < LEAST_PX:
             continue
-        joined = lines.joined[picked] & np.append(np.diff(picked) == 1, False)
+        joined, levels = lines.at(picked).joined, one.levels[:, picked].astype(np.float64)
         middle = float(np.median(one.modulation[picked]))
         for i, j in combinations(range(one.steps), 2):
-            first, second = (lines.levels[one.frames[k]][picked].astype(np.float64) for k in (i, j))
             expected = 2 * middle * abs(math.sin((one.shifts_rad[i] - one.shifts_rad[j]) / 2)) / math.sqrt(2)
-            if expected > 0 and _same(first, second, joined, EQUAL_SHARE * expected):
+            if expected > 0 and _same(levels[i], levels[j], joined, EQUAL_SHARE * expected):
                 found.append((one.frames[i], one.frames[j]))
     frames = [frame for frame in rig.sequence if frame.direction is None or frame.direction in directions]
-    lit = np.flatnonzero(lines.lit)[:: max(1, int(lines.lit.sum() // _EQUAL_PX))]
+    lit = _thinned(lines.lit)
     if len(lit) < LEAST_PX:
         return found
     levels = lines.levels[:, lit].astype(np.float64)
@@ -195,14 +218,14 @@ def _trimmed(values: NDArray) -> float:
     return float(np.sort(values)[: -(-9 * len(values) // 10)].mean())
 
 
-def step_errors(lines: Lines, one: FringeSet) -> tuple[int, Estimate] | None:
+def step_errors(one: FringeSet) -> tuple[int, Estimate] | None:
     """Of four steps and more: the position of the step whose shift is farthest from the rig file's, and by how many rad
     (with four, all are as far). None where too little tells, and where a narrow range of phases can't tell it from
     other faults."""
-    picked = np.flatnonzero(one.good)[:: max(1, int(one.good.sum() // _EQUAL_PX))]
+    picked = _thinned(one.good)
     if one.steps < 4 or len(picked) < LEAST_PX:
         return None
-    levels = lines.levels[list(one.frames)][:, picked].astype(np.float64)
+    levels = one.levels[:, picked].astype(np.float64)
     mean, cosine, sine, modulation = (part[picked] for part in (one.mean, one.cosine, one.sine, one.modulation))
     weights = phase_weights(one.shifts_rad)
     model = np.stack([np.ones(one.steps), np.cos(one.shifts_rad), np.sin(one.shifts_rad)], axis=1)
