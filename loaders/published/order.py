@@ -212,6 +212,8 @@ def _codes(scan: _Scan, numbers: list[int], direction: Direction, axis: int) -> 
     changes = np.diff(code)
     edges = [changes[:, pairs].sum(axis=1) / count for pairs, count in zip(scan.pairs, scan.line_counts, strict=True)]
     along, across = edges[axis], edges[1 - axis]
+    own = scan.lines.across == (axis == 0)
+    grey, code, pairs = grey[:, own], code[:, own], scan.lines.joined[own][:-1]
     problems = [
         f"A_{numbers[i]}.png: expected {direction} Gray bit {i}, varying along image {'xy'[axis]}; it does not"
         for i in np.flatnonzero((across > along) & (across > _LEAST_EDGES_A_LINE))
@@ -230,7 +232,7 @@ def _codes(scan: _Scan, numbers: list[int], direction: Direction, axis: int) -> 
     def jumps(order: NDArray[np.intp]) -> int:
         """How irregular the code is along the lines, with its bits in ``order``."""
         cells = gray_to_binary(np.tensordot(values, code[order], 1))
-        return int(np.abs(np.diff(cells))[scan.pairs[axis]].sum())
+        return int(np.abs(np.diff(cells))[pairs].sum())
 
     as_is = jumps(straight)
     return [
