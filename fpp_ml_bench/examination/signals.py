@@ -171,25 +171,18 @@ def equal_frames(
     set, and one after the other."""
     found = []
     for one in sets:
-        picked = _thinned(one.good)
-        if len(picked) < LEAST_PX:
-            continue
-        joined, levels = lines.at(picked).joined, one.levels[:, picked].astype(np.float64)
-        middle = float(np.median(one.modulation[picked]))
+        part = lines.at(_thinned(one.good))
+        middle = float(np.median(one.modulation[one.good])) if one.good.any() else 0.0
         for i, j in combinations(range(one.steps), 2):
-            expected = 2 * middle * abs(math.sin((one.shifts_rad[i] - one.shifts_rad[j]) / 2)) / math.sqrt(2)
-            if expected > 0 and _same(levels[i], levels[j], joined, EQUAL_SHARE * expected):
+            apart = one.shifts_rad[i] - one.shifts_rad[j]
+            most = EQUAL_SHARE * math.sqrt(2) * abs(math.sin(apart / 2)) * middle
+            if most > 0 and _same(part, one.frames[i], one.frames[j], most):
                 found.append((one.frames[i], one.frames[j]))
-    frames = [frame for frame in rig.sequence if frame.direction is None or frame.direction in directions]
-    lit = _thinned(lines.lit)
-    if len(lit) < LEAST_PX:
-        return found
-    levels = lines.levels[:, lit].astype(np.float64)
+    levels = lines.levels[:, _thinned(lines.lit)].astype(np.float64)
     low, high = levels.min(axis=0), levels.max(axis=0)
-    bright = (levels > (low + high) / 2).mean(axis=1)
-    span = float(np.median(high - low))
-    for first_frame, second_frame in pairwise(frames):
-        i, j = first_frame.index, second_frame.index
+    bright, span = (levels > (low + high) / 2).mean(axis=1), float(np.median(high - low))
+    coded = [frame.index for frame in rig.sequence if frame.direction is None or frame.direction in directions]
+    for i, j in pairwise(coded):
         same_set = any({i, j} <= set(one.frames) for one in sets)
         # A frame that is bright or dark all over may well be followed by another one.
         varied = all(0.05 < bright[k] < 0.95 for k in (i, j))
@@ -199,14 +192,16 @@ def equal_frames(
     return found
 
 
-def _same(first: NDArray, second: NDArray, joined: NDArray[np.bool_], most: float) -> bool:
-    if np.array_equal(first, second):
-        return True
+def _same(part: Lines, i: int, j: int, most: float) -> bool:
+    """Whether two frames show the same but for noise and brightness, with less than ``most`` grey levels between."""
+    first, second = (part.levels[k].astype(np.float64) for k in (i, j))
+    if len(first) < LEAST_PX or np.array_equal(first, second):
+        return len(first) >= LEAST_PX
     gain = float(np.cov(first, second)[0, 1] / max(first.var(), 1e-12))
     if abs(gain - 1) > GAIN:
         return False
     rest = second - second.mean() - gain * (first - first.mean())
-    steps = np.diff(rest)[joined[:-1]]
+    steps = np.diff(rest)[part.joined[:-1]]
     if len(steps) < LEAST_PX:
         return False
     size, noise = _trimmed(rest**2), max(_trimmed(steps**2) / 2, 1 / 12)

@@ -67,25 +67,18 @@ class OpenCvCalibration:
 
 
 def read_opencv_calibration(
-    *paths: str | Path,
+    path: str | Path,
+    *,
     camera_size: tuple[int, int] | None = None,
     projector_size: tuple[int, int] | None = None,
     unit: str = "mm",
 ) -> OpenCvCalibration:
-    """The calibration in a file, or in several that hold parts of it (OpenCV's sample writes intrinsics and extrinsics
-    apart). ``camera_size`` and ``projector_size``: (width, height) in px, needed where the files do not store them;
-    ``unit``: mm or m, of the files' translation. A rotation rounded to float32 becomes the nearest exact one. Raises
-    `RigError` naming the file for anything missing, of a wrong shape, not finite, or impossible."""
+    """The calibration in a file. ``camera_size`` and ``projector_size``: (width, height) in px, needed where the file
+    does not store them; ``unit``: mm or m, of its translation. A rotation rounded to float32 becomes the nearest exact
+    one. Raises `RigError` naming the file for anything missing, of a wrong shape, not finite, or impossible."""
     require(unit in UNITS, f"unit: expected {' or '.join(UNITS)}, got {unit!r}")
-    require(paths, "expected a calibration file, got none")
-    nodes: dict[str, Any] = {}
-    for path in map(Path, paths):
-        content = _nodes(path)
-        twice = ", ".join(name for name in content if name in nodes)
-        require(not twice, f"{path}: {twice} is also in another of the files; give one calibration only")
-        nodes.update(content)
-    file = ", ".join(map(str, paths))
-    require(any(name in nodes for names in _NAMES.values() for name in names), f"{file}: {_other_layout(nodes)}")
+    nodes = _nodes(Path(path))
+    require(any(name in nodes for names in _NAMES.values() for name in names), f"{path}: {_other_layout(nodes)}")
     try:
         translation = _matrix(nodes, "translation", (3, 1), (1, 3)).ravel()
         require(np.any(translation), "the translation is zero, so no depth can be triangulated; calibrate again")
@@ -97,7 +90,7 @@ def read_opencv_calibration(
             *[_error(nodes, name) for name in _ERRORS],
         )
     except RigError as error:
-        raise RigError(f"{file}: {error}") from error
+        raise RigError(f"{path}: {error}") from error
 
 
 def write_opencv_calibration(calibration: OpenCvCalibration, path: str | Path, unit: str = "mm") -> None:

@@ -37,6 +37,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -101,15 +102,29 @@ def load_rig(path: str | Path) -> Rig:
     """Read a rig from a YAML or JSON file; raises `RigError` naming the file and the key that is wrong."""
 
     def build(data: object) -> Rig:
-        rig = rig_from_dict(_with_calibration(data, Path(path).parent))
         if not isinstance(data, Mapping) or "calibration" not in data:
+            rig = rig_from_dict(data)
             check_lengths(rig, "translation_m", "m")
             return rig
-        named = data["calibration"]
+        entries = dict(data)
+        named = entries.pop("calibration")
+        twice = [key for key in ("camera", "projector", "rotation", "translation_m") if key in entries]
+        require(not twice, f"calibration: {', '.join(twice)} given besides; a rig has one calibration")
         given = named if isinstance(named, Mapping) else {"file": named}
-        unit = given.get("unit", "mm")
+        given = mapping(given, ("file",), "calibration", ("unit", "camera_size", "projector_size"))
+        file, unit = given["file"], str(given.get("unit", "mm"))
+        require(isinstance(file, str), f"calibration.file: expected the name of a file, got {file!r}")
+        sizes: dict[str, Any] = {
+            key: tuple(map(int, numbers(given[key], 2, f"calibration.{key}")))
+            for key in ("camera_size", "projector_size")
+            if key in given
+        }
+        found = read_opencv_calibration(Path(path).parent / file, unit=unit, **sizes)
+        devices = {"camera": found.camera.to_dict(), "projector": found.projector.to_dict()}
+        pose = {"rotation": found.rotation, "translation_m": found.translation_m}
+        rig = rig_from_dict({**entries, **devices, **pose})
         cure = f"write calibration: {{file: ..., unit: {'m' if unit == 'mm' else 'mm'}}}"
-        check_lengths(rig, f"{given['file']}: the translation", unit, cure)
+        check_lengths(rig, f"{file}: the translation", unit, cure)
         return rig
 
     return _loaded(Path(path), build)
@@ -176,33 +191,6 @@ def load_projection(path: str | Path, camera_size: tuple[int, int] | None = None
         return rig_from_dict({**devices, **kept, **pose})
 
     return _loaded(Path(path), stand_in)
-
-
-def _with_calibration(data: object, folder: Path) -> object:
-    """A rig file's content with camera, projector and pose from the OpenCV file that ``calibration`` names."""
-    if not isinstance(data, Mapping) or "calibration" not in data:
-        return data
-    entries = dict(data)
-    named = entries.pop("calibration")
-    given = named if isinstance(named, Mapping) else {"file": named}
-    twice = [key for key in ("camera", "projector", "rotation", "translation_m") if key in entries]
-    require(not twice, f"calibration: {', '.join(twice)} given besides; a rig has one calibration")
-    given = mapping(given, ("file",), "calibration", ("unit", "camera_size", "projector_size"))
-    file = given["file"]
-    require(isinstance(file, str), f"calibration.file: expected the name of a file, got {file!r}")
-    sizes: dict[str, tuple[int, int]] = {}
-    for key in ("camera_size", "projector_size"):
-        if key in given:
-            width, height = numbers(given[key], 2, f"calibration.{key}")
-            sizes[key] = int(width), int(height)
-    found = read_opencv_calibration(folder / str(file), unit=str(given.get("unit", "mm")), **sizes)  # type: ignore[arg-type]
-    return {
-        **entries,
-        "camera": found.camera.to_dict(),
-        "projector": found.projector.to_dict(),
-        "rotation": [list(row) for row in found.rotation],
-        "translation_m": list(found.translation_m),
-    }
 
 
 def _loaded(file: Path, build: Callable[[object], Rig]) -> Rig:

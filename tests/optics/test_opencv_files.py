@@ -70,13 +70,9 @@ def test_other_names(tmp_path, names):
     assert read_opencv_calibration(write(tmp_path / "c.yml", {**matrices, **errors, **sizes})) == expected
 
 
-def test_intrinsics_and_pose_in_two_files_and_in_metres(tmp_path):
-    pose = {"R": TURN, "T": T_MM[None] / 1000}
-    inner = write(tmp_path / "intrinsics.yml", changed(R=None, T=None))
-    read = read_opencv_calibration(inner, write(tmp_path / "extrinsics.yml", pose), unit="m")
+def test_a_translation_in_metres(tmp_path):
+    read = read_opencv_calibration(write(tmp_path / "a.yml", changed(T=T_MM[None] / 1000)), unit="m")
     np.testing.assert_allclose(read.translation_m, T_MM / 1000, rtol=1e-15)
-    with pytest.raises(RigError, match="R, T is also in another"):
-        read_opencv_calibration(write(tmp_path / "all.yml", VALUES), tmp_path / "extrinsics.yml")
 
 
 def test_a_rotation_in_float32_becomes_an_exact_one(tmp_path):
