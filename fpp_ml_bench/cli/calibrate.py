@@ -23,7 +23,7 @@ from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.opencv_files import OpenCvCalibration, write_opencv_calibration
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.rig_file import check_lengths, load_rig, save_rig
+from fpp_ml_bench.optics.rig_file import check_lengths, is_json, load_rig, save_rig
 from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.tables import Table
 
@@ -149,8 +149,7 @@ def calibrate(settings: CalibrateSettings) -> None:
 
     Raises FppBenchError for unusable captures, rigs or files."""
     out = settings.out
-    if out.suffix.lower() not in (".yaml", ".yml", ".json"):
-        raise RigError(f"{out}: expected a rig file ending in .yaml, .yml or .json")
+    is_json(out)
     if not out.absolute().parent.is_dir():
         raise RigError(f"{out}: the folder {out.parent} does not exist; make it first")
     if sum(given is not None for given in (settings.captures, settings.from_depth, settings.virtual)) != 1:
@@ -249,7 +248,7 @@ def _from_board(
     written = [settings.out, settings.out.with_suffix(".png")]
     write_atomically(written[-1], draw_residuals(best))
     if settings.opencv is not None:
-        content = OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m, *best.rms_px)
+        content = OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m, best.rms_px)
         write_opencv_calibration(content, settings.opencv)
         written.append(settings.opencv)
     print(f"wrote {', '.join(map(str, written))}; next: fpp-bench decode {settings.out} FRAMES --out OUT")

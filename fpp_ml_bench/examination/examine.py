@@ -28,8 +28,6 @@ from fpp_ml_bench.examination.signals import (
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Direction
 
-SIGMAS = 6.0
-"""Standard errors above which a figure is none of chance."""
 OFFSET_TURNS, OFFSET_EDGES = 0.02, 100
 """Smallest common offset of phase and Gray code that is a finding: 0.4 px of 18 px, which no light of ours makes by
 more than chance; and the edges that are needed to measure it."""
@@ -159,9 +157,8 @@ def _exchanged_flat(lines: Lines, rig: Rig) -> list[Finding]:
 
 
 def _is_offset(found: Edges) -> bool:
-    offset, sigma = abs(found.offset_turns.value), found.offset_turns.sigma
     clear = found.edges >= OFFSET_EDGES and found.agreeing > 0.8 and found.forward > 0.8
-    return clear and offset > OFFSET_TURNS and offset > SIGMAS * sigma
+    return clear and found.offset_turns.exceeds(OFFSET_TURNS)
 
 
 def _offset(found: Edges, rig: Rig, direction: Direction) -> Finding:
@@ -201,44 +198,38 @@ def _steps_and_response(
     systematic: dict[str, float],
 ) -> list[Finding]:
     """A step that is not what it should be, and the response, which is no fault of the capture."""
-    findings: list[Finding] = []
     waves = ripples(lines, one) if one.pitch_px <= _FINEST * rig.pitch(one.direction) else {}
-    step, twice = step_errors(one), waves.get(2)
-    name = f"{one.direction} fringes of {one.pitch_px:g} px"
-    wrong_step = step is not None and abs(step[1].value) > max(STEP_RAD, SIGMAS * step[1].sigma)
-    wrong_wave = twice is not None and twice.value > max(RIPPLE_RAD, SIGMAS * twice.sigma)
-    if twice is not None:
+    name, faults = f"{one.direction} fringes of {one.pitch_px:g} px", []
+    if (step := step_errors(one)) is not None and step[1].exceeds(STEP_RAD):
+        which = f"of {titles[one.frames[step[0]]]}" if one.steps > 4 else "of one of four steps"
+        faults.append(f"the shift {which} is {abs(np.rad2deg(step[1].value)):.0f} degrees off")
+    if (twice := waves.get(2)) is not None:
         measured[f"{one.direction}_{one.pitch_px:g}px_ripple_rad"] = twice.value
-    if wrong_step or wrong_wave:
-        evidence = []
-        if step is not None and wrong_step:
-            which = f"of {titles[one.frames[step[0]]]}" if one.steps > 4 else "of one of four steps"
-            evidence.append(f"the shift {which} is {abs(np.rad2deg(step[1].value)):.0f} degrees off")
-        if twice is not None and wrong_wave:
-            evidence.append(f"the phase has an error of {twice.value:.3f} rad that repeats twice a period")
-        findings.append(
+        if twice.exceeds(RIPPLE_RAD):
+            faults.append(f"the phase has an error of {twice.value:.3f} rad that repeats twice a period")
+    if faults:
+        return [
             Finding(
                 "wrong step",
                 "refuse",
-                f"{name}: {', and '.join(evidence)}, which neither noise nor gamma explains",
+                f"{name}: {', and '.join(faults)}, which neither noise nor gamma explains",
                 "a frame that was exposed while the pattern changed, came late, or was shown at another brightness",
                 CAPTURE_IN_TIME,
             )
+        ]
+    bent = waves.get(one.steps)
+    if bent is None or not bent.exceeds(RESPONSE_RAD):
+        return []
+    systematic[one.direction] = max(systematic.get(one.direction, 0.0), bent.value / math.sqrt(2))
+    return [
+        Finding(
+            "response",
+            "note",
+            f"{name}: the phase has an error of {bent.value:.3f} rad that repeats {one.steps} times a period",
+            "the response of projector and camera is not straight (gamma)",
+            "the stated uncertainty holds it; set projector and camera to gamma 1, or use more steps",
         )
-    bent = waves.get(one.steps) if one.steps > 2 else None
-    if bent is not None and bent.value > max(RESPONSE_RAD, SIGMAS * bent.sigma) and not findings:
-        error_rad = bent.value / math.sqrt(2)
-        systematic[one.direction] = max(systematic.get(one.direction, 0.0), error_rad)
-        findings.append(
-            Finding(
-                "response",
-                "note",
-                f"{name}: the phase has an error of {bent.value:.3f} rad that repeats {one.steps} times a period",
-                "the response of projector and camera is not straight (gamma)",
-                "the stated uncertainty holds it; set projector and camera to gamma 1, or use more steps",
-            )
-        )
-    return findings
+    ]
 
 
 def _moved(sets: Sequence[FringeSet]) -> list[Finding]:

@@ -105,7 +105,7 @@ def fit(lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits,
     contradicting = lit & (reason != 0) & ~(alone & (reason == Reason.INCONSISTENT_ORDER))
     for one in fringe_sets(lines, rig, directions):
         if one.steps > 3:
-            shown = one.mean + np.cos(one.shifts_rad)[:, None] * one.cosine + np.sin(one.shifts_rad)[:, None] * one.sine
+            shown = one.mean + one.modulation * np.cos(one.phase + one.shifts_rad[:, None])
             misfit = ((one.levels - shown) ** 2).mean(axis=0)
             reason[(reason == 0) & (misfit > (LARGEST_MISFIT * one.modulation) ** 2)] = Reason.INCONSISTENT_ORDER
         found = gray_edges(lines, one, rig, limits)

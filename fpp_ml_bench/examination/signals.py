@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.coding.code import MIN_MODULATION, Limits
-from fpp_ml_bench.coding.phase_shift import PhaseShift, minus_atan2, phase_weights, weighted_sums
+from fpp_ml_bench.coding.phase_shift import PhaseShift, phase_weights, wrapped_phase
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Direction
@@ -35,6 +35,8 @@ WHITE_RATIO, EQUAL_SHARE, GAIN = 1.8, 0.35, 0.1
 """Two frames are equal where their difference is white (its mean square below so many times that of noise), below a
 share of what their steps would make, and their gain within this of 1."""
 _EQUAL_PX = 30_000
+SIGMAS = 6.0
+"""Standard errors above which a figure is none of chance."""
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,10 @@ class Estimate(NamedTuple):
     value: float
     sigma: float
 
+    def exceeds(self, least: float) -> bool:
+        """Whether it is larger than ``least``, either way, and none of chance."""
+        return abs(self.value) > max(least, SIGMAS * self.sigma)
+
 
 @dataclass(frozen=True)
 class FringeSet:
@@ -119,11 +125,9 @@ class FringeSet:
     frames: tuple[int, ...]
     shifts_rad: NDArray[np.float64]
     levels: NDArray
-    mean: NDArray[np.float64]
-    cosine: NDArray[np.float64]
-    sine: NDArray[np.float64]
-    phase: NDArray[np.float64]
-    modulation: NDArray[np.float64]
+    mean: NDArray[np.floating]
+    phase: NDArray[np.floating]
+    modulation: NDArray[np.floating]
     good: NDArray[np.bool_]
 
     @property
@@ -141,25 +145,10 @@ def fringe_sets(lines: Lines, rig: Rig, directions: Sequence[Direction]) -> list
             if len(frames) < 3:
                 continue
             shifts, levels = TAU * fringe.turns, lines.levels[list(frames)]
-            mean, cosine, sine = weighted_sums(levels, phase_weights(shifts))
-            modulation = np.sqrt(cosine * cosine + sine * sine)
+            phase, modulation, mean = (part[0] for part in wrapped_phase(levels[:, None], shifts))
             good = lines.lit & (modulation >= MIN_MODULATION) & (levels < GREY_LEVELS).all(axis=0)
-            phase = minus_atan2(sine, cosine)
             sets.append(
-                FringeSet(
-                    direction,
-                    number,
-                    fringe.pitch_px,
-                    frames,
-                    shifts,
-                    levels,
-                    mean,
-                    cosine,
-                    sine,
-                    phase,
-                    modulation,
-                    good,
-                )
+                FringeSet(direction, number, fringe.pitch_px, frames, shifts, levels, mean, phase, modulation, good)
             )
     return sets
 
@@ -220,16 +209,15 @@ def step_errors(one: FringeSet) -> tuple[int, Estimate] | None:
     picked = _thinned(one.good)
     if one.steps < 4 or len(picked) < LEAST_PX:
         return None
-    levels = one.levels[:, picked].astype(np.float64)
-    mean, cosine, sine, modulation = (part[picked] for part in (one.mean, one.cosine, one.sine, one.modulation))
+    mean, phase, modulation = one.mean[picked], one.phase[picked], one.modulation[picked]
     weights = phase_weights(one.shifts_rad)
     model = np.stack([np.ones(one.steps), np.cos(one.shifts_rad), np.sin(one.shifts_rad)], axis=1)
     influence = np.einsum("ij,ji->i", model, weights)
     worst: tuple[int, Estimate] | None = None
     for n, shift in enumerate(one.shifts_rad):
-        residual = levels[n] - mean - cosine * math.cos(shift) - sine * math.sin(shift)
-        turned = 2 * (one.phase[picked] + shift)
-        terms = np.stack([mean, cosine, sine, modulation * np.cos(turned), modulation * np.sin(turned)], axis=1)
+        residual = one.levels[n, picked] - mean - modulation * np.cos(phase + shift)
+        waves = [wave(angle) for angle in (phase, 2 * (phase + shift)) for wave in (np.cos, np.sin)]
+        terms = np.stack([mean, *(modulation * wave for wave in waves)], axis=1)
         scaled = terms / np.maximum(np.linalg.norm(terms, axis=0), 1e-12)
         if np.linalg.cond(scaled) > 60:
             return None
@@ -237,7 +225,7 @@ def step_errors(one: FringeSet) -> tuple[int, Estimate] | None:
         solution = np.linalg.lstsq(terms[kept], residual[kept], rcond=None)[0] / (1 - influence[n])
         error = residual[kept] / (1 - influence[n]) - terms[kept] @ solution
         covariance = np.linalg.inv(terms[kept].T @ terms[kept]) * error.var() * 4  # neighbours share their errors
-        along = np.array([0, -math.sin(shift), math.cos(shift), 0, 0])
+        along = np.array([0, -math.sin(shift), -math.cos(shift), 0, 0])
         estimate = Estimate(float(along @ solution), float(np.sqrt(along @ covariance @ along)))
         if worst is None or abs(estimate.value) > abs(worst[1].value):
             worst = n, estimate

@@ -54,16 +54,14 @@ _ERRORS = ("cam_error", "proj_error", "stereo_error")
 
 @dataclass(frozen=True)
 class OpenCvCalibration:
-    """Camera and projector, and the pose between them: ``X_p = rotation X_c + translation_m``. ``*_error_px``: the
-    reprojection errors that the calibrating tool reported, None where the file has none."""
+    """Camera and projector, and the pose between them: ``X_p = rotation X_c + translation_m``. ``errors_px``: the
+    reprojection errors of camera, projector and both that the calibrating tool reported, None where it did not."""
 
     camera: Pinhole
     projector: Pinhole
     rotation: Matrix3
     translation_m: tuple[float, float, float]
-    camera_error_px: float | None = None
-    projector_error_px: float | None = None
-    stereo_error_px: float | None = None
+    errors_px: tuple[float | None, ...] = (None, None, None)
 
 
 def read_opencv_calibration(
@@ -87,7 +85,7 @@ def read_opencv_calibration(
             _device(nodes, "projector", projector_size),
             _rotation(_matrix(nodes, "rotation", (3, 3))),
             tuple((translation / UNITS[unit]).tolist()),
-            *[_error(nodes, name) for name in _ERRORS],
+            tuple(_error(nodes, name) for name in _ERRORS),
         )
     except RigError as error:
         raise RigError(f"{path}: {error}") from error
@@ -115,8 +113,7 @@ def write_opencv_calibration(calibration: OpenCvCalibration, path: str | Path, u
         storage.endWriteStruct()
     storage.write("R", np.array(calibration.rotation))
     storage.write("T", np.array([[_in_unit(t, UNITS[unit])] for t in calibration.translation_m]))
-    errors = calibration.camera_error_px, calibration.projector_error_px, calibration.stereo_error_px
-    for name, error_px in zip(_ERRORS, errors, strict=True):
+    for name, error_px in zip(_ERRORS, calibration.errors_px, strict=True):
         if error_px is not None:
             storage.write(name, error_px)
     try:

@@ -92,7 +92,8 @@ def rig_from_dict(data: object) -> Rig:
     return Rig(**entries)
 
 
-def _is_json(path: Path) -> bool:
+def is_json(path: Path) -> bool:
+    """Whether a rig file is JSON, else YAML, by its suffix. Raises `RigError` for any other."""
     suffix = path.suffix.lower()
     require(suffix in (".yaml", ".yml", ".json"), f"{path}: expected a rig file ending in .yaml, .yml or .json")
     return suffix == ".json"
@@ -194,7 +195,7 @@ def load_projection(path: str | Path, camera_size: tuple[int, int] | None = None
 
 
 def _loaded(file: Path, build: Callable[[object], Rig]) -> Rig:
-    content = (read_json if _is_json(file) else read_yaml)(file, RigError)
+    content = (read_json if is_json(file) else read_yaml)(file, RigError)
     try:
         require(content is not None, f"the file is empty; expected the keys {', '.join(_RIG_KEYS)}")
         return build(content)
@@ -206,7 +207,7 @@ def save_rig(rig: Rig, path: str | Path) -> None:
     """Write a rig as YAML or JSON (by the suffix); `load_rig` gives an equal rig back, to the last bit."""
     file = Path(path)
     data = rig.to_dict()
-    text = json.dumps(data, indent=2) + "\n" if _is_json(file) else yaml.safe_dump(data, sort_keys=False, width=120)
+    text = json.dumps(data, indent=2) + "\n" if is_json(file) else yaml.safe_dump(data, sort_keys=False, width=120)
     try:
         write_atomically(file, text.encode("utf-8"))
     except OSError as error:
