@@ -76,9 +76,9 @@ class AnySequence(ABC):
         """The directions that are coded, in the order of `DIRECTIONS`."""
 
     @property
-    @abstractmethod
     def steps(self) -> int:
         """Phase steps of the finest sinusoids, the fewest of the coded directions."""
+        return min((len(self.sinusoids(direction)) for direction in self.directions), default=0)
 
     @abstractmethod
     def code(self, direction: Direction, pitch_px: float = PAPER_PITCH_PX) -> Code:
@@ -167,7 +167,7 @@ class Sequence(AnySequence):
     """The paper's kind: ``steps`` sinusoids, of a period that the rig names, and ``bits`` Gray-code frames per
     direction, black and white."""
 
-    steps: int = 18  # type: ignore[assignment]  # a field is the property that is asked for
+    steps: int = 18  # type: ignore[assignment]  # a field takes the place of the property
     bits_horizontal: int = 7
     bits_vertical: int = 7
 
@@ -241,26 +241,17 @@ class CodedSequence(AnySequence):
             raise RigError(f"this rig projects no {direction} fringes or codes, only {others} ones")
         return code
 
-    @property
-    def steps(self) -> int:
-        return min((len(self.sinusoids(direction)) for direction in self.directions), default=0)
-
     @cached_property
     def frames(self) -> tuple[Frame, ...]:
-        frames: list[Frame] = []
+        shown: list[tuple[Any, ...]] = []
         for name in self.order:
-            if name in ("black", "white"):
-                frames.append(Frame(len(frames), "black" if name == "black" else "white"))
-                continue
             if name == "crossed":
-                frames += [Frame(len(frames) + n, "crossed", step=n) for n in range(len(self.crossed or ()))]
-                continue
-            direction: Direction = "horizontal" if name == "horizontal" else "vertical"
-            frames += [
-                Frame(len(frames) + i, shown.kind, direction, shown.step, shown.fringe, shown.inverse)
-                for i, shown in enumerate(self.code(direction).shown)
-            ]
-        return tuple(frames)
+                shown += [(name, None, step) for step in range(len(self.crossed or ()))]
+            elif name in DIRECTIONS:
+                shown += [(kind, name, *about) for kind, *about in getattr(self, name).shown]
+            else:
+                shown.append((name,))
+        return tuple(Frame(index, *about) for index, about in enumerate(shown))
 
     def _finest(self, direction: Direction) -> int:
         code = getattr(self, direction)
