@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.coding.code import MIN_MODULATION, Limits
-from fpp_ml_bench.coding.phase_shift import PhaseShift, phase_weights, wrapped_phase
+from fpp_ml_bench.coding.phase_shift import TAU, PhaseShift, phase_weights, wrapped_phase
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Direction
@@ -26,7 +26,6 @@ LINES, MOST_PX = 40, 150_000
 LEAST_LIT_GREY = 3 * MIN_MODULATION
 """A pixel is lit where its grey levels differ by so much from frame to frame."""
 _LOOKED_AT_PX = 40_000
-TAU = 2 * math.pi
 LEAST_PX = 200
 WINDOW_PERIODS = 2.5
 """Length of the windows in which a surface is taken for a cubic; a period must be seen by 4 px and more."""
@@ -235,19 +234,17 @@ def step_errors(one: FringeSet) -> tuple[int, Estimate] | None:
 def ripples(lines: Lines, one: FringeSet) -> dict[int, Estimate]:
     """Amplitude in rad, by harmonic, of the error of the phase that goes with twice and N times the phase; none where
     the image shows too few windows of two periods and more."""
-    best: tuple[float, NDArray] | None = None
+    slopes = []
     for across in (True, False):
         pixels = one.good & (lines.across == across)
         pairs = np.flatnonzero(pixels[:-1] & pixels[1:] & lines.joined[:-1])
-        if len(pairs) < LEAST_PX:
-            continue
-        slope = float(np.median(np.abs(_wrapped(one.phase[pairs + 1] - one.phase[pairs]))))
-        if best is None or slope > best[0]:
-            best = slope, pixels
-    if best is None or best[0] <= 0 or not SHORTEST_PERIOD_PX <= TAU / best[0] <= LONGEST_WINDOW_PX / WINDOW_PERIODS:
+        if len(pairs) >= LEAST_PX:
+            slopes.append((float(np.median(np.abs(_wrapped(one.phase[pairs + 1] - one.phase[pairs])))), across))
+    slope, across = max(slopes, default=(0.0, True))
+    period = TAU / slope if slope > 0 else math.inf
+    if not SHORTEST_PERIOD_PX <= period <= LONGEST_WINDOW_PX / WINDOW_PERIODS:
         return {}
-    period = TAU / best[0]
-    windows = _windows(best[1], lines.joined, math.ceil(WINDOW_PERIODS * period))
+    windows = _windows(one.good & (lines.across == across), lines.joined, math.ceil(WINDOW_PERIODS * period))
     if len(windows) < FEWEST_WINDOWS:
         return {}
     phase = np.unwrap(one.phase[windows], axis=1)
@@ -262,7 +259,6 @@ def ripples(lines: Lines, one: FringeSet) -> dict[int, Estimate]:
     terms = np.stack([flat(wave(h * phase)) for h in harmonics for wave in (np.cos, np.sin)], axis=-1)
     size = np.sqrt((rest**2).mean(axis=1))
     kept = size <= min(3 * float(np.median(size)), 1.0)
-    solution = np.zeros(terms.shape[-1])
     for _ in range(3):
         design, target = terms[kept].reshape(-1, terms.shape[-1]), rest[kept].ravel()
         solution = np.linalg.lstsq(design, target, rcond=None)[0]
