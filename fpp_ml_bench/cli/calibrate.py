@@ -232,7 +232,7 @@ def _from_board(
             )
         show(compared)
     best = min(found, key=lambda one: one.held_out_rms_px)
-    rig = calibrated_rig(best, rig, settings.working_range or (like and like.working_range_mm))
+    rig = calibrated_rig(best, rig, settings.working_range or (like.working_range_mm if like else None))
     if like is not None:
         rig = replace(rig, standoff_m=like.standoff_m, background_m=like.background_m)
     check_lengths(rig, "the spacing of --board, in mm,")
