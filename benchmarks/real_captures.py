@@ -111,7 +111,7 @@ def calibrate(folder: Path, theirs: "OpenCvCalibration", scratch: Path, out: Pat
             f"levels, white on the board {response.white_grey:.0f} of 255"
         )
     print("calibration, RMS in px                            camera  alone  projector  alone  stereo  left out")
-    errors = theirs.camera_error_px, theirs.projector_error_px, theirs.stereo_error_px
+    errors = theirs.errors_px
     print(f"{'authors':<50}{errors[0]:6.3f}{'':9}{errors[1]:8.3f}{'':7}{errors[2]:8.3f}")
     own = (Lens("radial-1", True, True), Lens("radial-1", True))
     radial, full = (Lens("radial-1"), Lens("radial-1")), (Lens(), Lens())

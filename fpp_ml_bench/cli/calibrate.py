@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from fpp_ml_bench.calibration.boards import Board, parse_board
-from fpp_ml_bench.calibration.from_depth import DepthFit, Residual, fit_projector
+from fpp_ml_bench.calibration.from_depth import DepthFit, fit_projector
 from fpp_ml_bench.calibration.result import Calibration, Lens, draw_residuals, volume_error_mm
 from fpp_ml_bench.calibration.solve import calibrate as calibrate_rig
 from fpp_ml_bench.cli.console import progress_bar, say_findings, show
@@ -23,7 +23,7 @@ from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.opencv_files import OpenCvCalibration, write_opencv_calibration
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.rig_file import check_lengths, load_rig, save_rig
+from fpp_ml_bench.optics.rig_file import check_lengths, is_json, load_rig, save_rig
 from fpp_ml_bench.options import REQUIRED, argument, option
 from fpp_ml_bench.tables import Table
 
@@ -149,8 +149,7 @@ def calibrate(settings: CalibrateSettings) -> None:
 
     Raises FppBenchError for unusable captures, rigs or files."""
     out = settings.out
-    if out.suffix.lower() not in (".yaml", ".yml", ".json"):
-        raise RigError(f"{out}: expected a rig file ending in .yaml, .yml or .json")
+    is_json(out)
     if not out.absolute().parent.is_dir():
         raise RigError(f"{out}: the folder {out.parent} does not exist; make it first")
     if sum(given is not None for given in (settings.captures, settings.from_depth, settings.virtual)) != 1:
@@ -180,8 +179,7 @@ def _virtual(settings: CalibrateSettings, folder: Path) -> None:
     poses = board_poses(true_rig, board, settings.poses or BOARD_POSES)
     with progress_bar("photographing", len(poses) * len(true_rig.sequence), "images") as advance:
         photograph_board(folder, true_rig, board, poses, progress=advance)
-    range_mm = settings.working_range or true_rig.working_range_mm
-    found = _from_board(settings, folder, board, folder / "rig.yaml", range_mm, true_rig)
+    found = _from_board(settings, folder, board, folder / "rig.yaml", true_rig)
     error = volume_error_mm(found, true_rig)
     print(
         f"against truth   depth over the working range: {error.rms_mm:.3f} mm RMS, {error.worst_mm:.3f} mm at most, "
@@ -207,10 +205,9 @@ def _from_board(
     folder: Path,
     board: "Board",
     sequence: Path,
-    range_mm: tuple[float, float] | None = None,
     like: "Rig | None" = None,
 ) -> "Rig":
-    """Calibrate, print and write; the rig, with standoff and background of ``like``."""
+    """Calibrate, print and write; the rig, with standoff, background and (if none is given) range of ``like``."""
     lenses = _lenses(settings)
     examined: dict[str, Examination] = {}
     with progress_bar("finding the board", len(pose_folders(folder)), "poses") as advance:
@@ -234,8 +231,8 @@ def _from_board(
                 str(one.camera.lens), f"{one.rms_px.both:.4f}", f"{one.held_out_rms_px:.4f}", f"{one.bic:.0f}"
             )
         show(compared)
-    best = min(found, key=lambda one: one.held_out_rms_px) if len(found) > 1 else found[0]
-    rig = calibrated_rig(best, rig, range_mm or settings.working_range)
+    best = min(found, key=lambda one: one.held_out_rms_px)
+    rig = calibrated_rig(best, rig, settings.working_range or (like.working_range_mm if like else None))
     if like is not None:
         rig = replace(rig, standoff_m=like.standoff_m, background_m=like.background_m)
     check_lengths(rig, "the spacing of --board, in mm,")
@@ -249,7 +246,7 @@ def _from_board(
     written = [settings.out, settings.out.with_suffix(".png")]
     write_atomically(written[-1], draw_residuals(best))
     if settings.opencv is not None:
-        content = OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m, *best.rms_px)
+        content = OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m, best.rms_px)
         write_opencv_calibration(content, settings.opencv)
         written.append(settings.opencv)
     print(f"wrote {', '.join(map(str, written))}; next: fpp-bench decode {settings.out} FRAMES --out OUT")
@@ -303,7 +300,9 @@ def print_fit(rig: "Rig", fit: "DepthFit") -> None:
     more = f", the worst {len(shown)} of {len(fit.views)} views" if len(shown) < len(fit.views) else ""
     table = Table("", numbers=columns, title=f"depth by the rig minus the depth given, mm{more}")
     for view in (*shown, fit.total):
-        table.add_row(*_cells(view), end_section=view is shown[-1])
+        lengths = (f"{view.median_mm:.4f}", f"{view.sigma_mm:.4f}", f"{view.rms_mm:.4f}", f"{view.rms_px:.3f}")
+        cells = lengths if view.pixels else "----"
+        table.add_row(view.name, str(view.pixels), str(view.missing), *cells, end_section=view is shown[-1])
     projector, (x, y, z) = rig.projector, (MM_PER_M * shift for shift in rig.translation_m)
     measured = " and ".join(f"{p:.3f} +- {e:.3f}" for p, e in zip(fit.pitch_px, fit.pitch_error_px, strict=True))
     show(table)
@@ -316,8 +315,3 @@ def print_fit(rig: "Rig", fit: "DepthFit") -> None:
     if projector.is_distorted:
         print(f"  lens          k1 {projector.distortion[0]:.5f}")
     print(f"translation     {x:.2f}, {y:.2f}, {z:.2f} mm; baseline {MM_PER_M * rig.baseline_m:.2f} mm")
-
-
-def _cells(view: "Residual") -> list[str]:
-    lengths = (f"{view.median_mm:.4f}", f"{view.sigma_mm:.4f}", f"{view.rms_mm:.4f}", f"{view.rms_px:.3f}")
-    return [view.name, str(view.pixels), str(view.missing), *(lengths if view.pixels else "----")]

@@ -14,7 +14,7 @@ from fpp_ml_bench.decoding.decode import Directions
 from fpp_ml_bench.examination.findings import RefusedCapture
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.captures.decoding import DecodedCapture, decode_capture, read_mask
-from fpp_ml_bench.loaders.captures.exports import FORMS, check_outputs, write_capture, write_refusal
+from fpp_ml_bench.loaders.captures.exports import FORMS, check_outputs, clear_outputs, write_capture, write_report
 from fpp_ml_bench.loaders.captures.images import read_frames
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
@@ -87,7 +87,8 @@ def decode(
                 anyway=anyway,
             )
         except RefusedCapture as refused:
-            write_refusal(out, capture, rig, refused.examination)
+            clear_outputs(out)
+            write_report(out, capture, rig, refused.examination)
             raise
         advance(2)
         write_capture(out, capture, rig, result, forms)

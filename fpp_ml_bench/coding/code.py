@@ -52,6 +52,10 @@ class Reason(IntEnum):
     OUTSIDE_RANGE = 7
     NOT_ASKED = 8
 
+    @property
+    def words(self) -> str:
+        return self.name.lower().replace("_", " ")
+
 
 STAGE_REASONS = (Reason.LOW_MODULATION, Reason.SATURATED, Reason.INCONSISTENT_ORDER, Reason.OUTSIDE_PATTERN)
 """Reasons that a code gives, in the order in which they are looked at."""

@@ -12,7 +12,7 @@ from fpp_ml_bench.coding.code import Limits
 from fpp_ml_bench.coding.phase_shift import PhaseShift
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.examination.findings import Examination, Finding
-from fpp_ml_bench.examination.readings import AS_GIVEN, Fit, fit, search
+from fpp_ml_bench.examination.readings import AS_GIVEN, Fit, Reading, fit, search
 from fpp_ml_bench.examination.signals import (
     LEAST_PX,
     Edges,
@@ -28,8 +28,6 @@ from fpp_ml_bench.examination.signals import (
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Direction
 
-SIGMAS = 6.0
-"""Standard errors above which a figure is none of chance."""
 OFFSET_TURNS, OFFSET_EDGES = 0.02, 100
 """Smallest common offset of phase and Gray code that is a finding: 0.4 px of 18 px, which no light of ours makes by
 more than chance; and the edges that are needed to measure it."""
@@ -46,6 +44,7 @@ CONTRADICTING, DOUBTFUL = 0.6, 0.5
 MOVED_SHARE, NEIGHBOURS_PX = 0.05, 9
 """Share of the lit pixels at which mean images differ, averaged over so many neighbours, where the scene moved."""
 _FINEST, _SCORED_PX = 2.0, 4000
+CAPTURE_IN_TIME = "capture again: trigger the camera by the projector, or wait longer after each pattern"
 _UNITS = {
     1000.0: "metres were read as mm",
     10.0: "cm were read as mm",
@@ -55,7 +54,7 @@ _UNITS = {
 
 
 def examine(
-    frames: NDArray | Sequence[NDArray],
+    frames: NDArray,
     rig: Rig,
     names: Sequence[str] | None = None,
     *,
@@ -81,26 +80,27 @@ def examine(
     if pairs:
         return Examination((_equal(pairs, titles),), not_checked)
     findings: list[Finding] = []
-    edges = {
-        way: found for way, found in ((one.direction, gray_edges(lines, one, rig, limits)) for one in sets) if found
-    }
     part = lines.part(_SCORED_PX)
     given = fit(part, rig, directions, limits, AS_GIVEN, calibrated)
-    shares = {"coherent": given.coherent, "in_range": given.fitting, "contradicting": given.contradicting}
-    measured = {f"{name}_share": share for name, share in shares.items()}
+    measured = {
+        "coherent_share": given.coherent,
+        "in_range_share": given.fitting,
+        "contradicting_share": given.contradicting,
+    }
     systematic: dict[str, float] = {}
     for one in sets:
         findings += _steps_and_response(lines, one, rig, titles, measured, systematic)
-    for way, found in edges.items():
-        measured[f"{way}_offset_turns"] = found.offset_turns.value
+    for one in sets:
+        if (found := gray_edges(lines, one, rig, limits)) is None:
+            continue
+        measured[f"{one.direction}_offset_turns"] = found.offset_turns.value
         # A frame that is late shifts all phases, too.
         if _is_offset(found) and not any(finding.severity == "refuse" for finding in findings):
-            return Examination((_offset(found, rig, way),), not_checked, measured)
+            return Examination((_offset(found, rig, one.direction),), not_checked, measured)
     doubtful = given.contradicting > TRIED or given.agreeing < 1 - 2 * TRIED or given.coherent < TRIED
-    if doubtful or given.fitting < IN_RANGE * given.coherent:
-        other = _other_readings(lines, rig, directions, limits, given, calibrated)
-        if other:
-            return Examination(tuple(other), not_checked, measured)
+    doubtful = doubtful or given.fitting < IN_RANGE * given.coherent
+    if doubtful and (other := search(lines, rig, directions, limits, given, calibrated)):
+        return Examination((_another_reading(other, given),), not_checked, measured)
     findings += _exchanged_flat(lines, rig) or _moved(sets)
     if given.contradicting > DOUBTFUL:
         findings.append(_contradictions(given))
@@ -130,10 +130,6 @@ def _not_checked(rig: Rig, directions: Sequence[Direction], calibrated: bool) ->
     return tuple(parts)
 
 
-def _is_finest(one: FringeSet, rig: Rig) -> bool:
-    return one.pitch_px <= _FINEST * rig.pitch(one.direction)
-
-
 def _equal(pairs: Sequence[tuple[int, int]], titles: Sequence[str]) -> Finding:
     listed = ", ".join(f"{titles[i]} and {titles[j]}" for i, j in pairs[:4]) + (" and others" if len(pairs) > 4 else "")
     return Finding(
@@ -141,7 +137,7 @@ def _equal(pairs: Sequence[tuple[int, int]], titles: Sequence[str]) -> Finding:
         "refuse",
         f"{listed} show the same image, and their patterns differ",
         "the camera delivered a frame twice, or a pattern was not shown in time, or a file was copied",
-        "capture again: trigger the camera by the projector, or wait longer after each pattern",
+        CAPTURE_IN_TIME,
     )
 
 
@@ -150,23 +146,19 @@ def _exchanged_flat(lines: Lines, rig: Rig) -> list[Finding]:
     if black is None or white is None:
         return []
     dark, bright = (lines.levels[index][lines.lit].astype(np.float64).mean() for index in (black, white))
-    if bright >= dark:
-        return []
-    return [
-        Finding(
-            "white and black",
-            "refuse",
-            f"white has {bright:.0f} grey levels, and black {dark:.0f}",
-            "they changed places, or the frames are in another order",
-            "rename the files, or correct the sequence's order",
-        )
-    ]
+    exchanged = Finding(
+        "white and black",
+        "refuse",
+        f"white has {bright:.0f} grey levels, and black {dark:.0f}",
+        "they changed places, or the frames are in another order",
+        "rename the files, or correct the sequence's order",
+    )
+    return [exchanged] if bright < dark else []
 
 
 def _is_offset(found: Edges) -> bool:
-    offset, sigma = abs(found.offset_turns.value), found.offset_turns.sigma
     clear = found.edges >= OFFSET_EDGES and found.agreeing > 0.8 and found.forward > 0.8
-    return clear and offset > OFFSET_TURNS and offset > SIGMAS * sigma
+    return clear and found.offset_turns.exceeds(OFFSET_TURNS)
 
 
 def _offset(found: Edges, rig: Rig, direction: Direction) -> Finding:
@@ -185,24 +177,16 @@ def _offset(found: Edges, rig: Rig, direction: Direction) -> Finding:
     )
 
 
-def _other_readings(
-    lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits, given: Fit, calibrated: bool
-) -> list[Finding]:
-    found = search(lines, rig, directions, limits, given, calibrated)
-    if not found:
-        return []
+def _another_reading(found: Sequence[tuple[Reading, Fit]], given: Fit) -> Finding:
     listed = "; or ".join(f"{reading.what} ({100 * fits.fitting:.0f}%)" for reading, fits in found[:4])
     alike = " (these frames can't tell which)" if len(found) > 1 else ""
-    changes = "; or ".join(dict.fromkeys(reading.change for reading, _ in found[:4]))
-    return [
-        Finding(
-            "another reading fits",
-            "refuse",
-            f"{100 * given.fitting:.0f}% of the lit pixels fit as the rig file says, and far more fit another reading",
-            f"{listed}{alike}",
-            changes,
-        )
-    ]
+    return Finding(
+        "another reading fits",
+        "refuse",
+        f"{100 * given.fitting:.0f}% of the lit pixels fit as the rig file says, and far more fit another reading",
+        f"{listed}{alike}",
+        "; or ".join(dict.fromkeys(reading.change for reading, _ in found[:4])),
+    )
 
 
 def _steps_and_response(
@@ -214,44 +198,38 @@ def _steps_and_response(
     systematic: dict[str, float],
 ) -> list[Finding]:
     """A step that is not what it should be, and the response, which is no fault of the capture."""
-    findings: list[Finding] = []
-    waves = ripples(lines, one) if _is_finest(one, rig) else {}
-    step, twice = step_errors(lines, one), waves.get(2)
-    name = f"{one.direction} fringes of {one.pitch_px:g} px"
-    wrong_step = step is not None and abs(step[1].value) > max(STEP_RAD, SIGMAS * step[1].sigma)
-    wrong_wave = twice is not None and twice.value > max(RIPPLE_RAD, SIGMAS * twice.sigma)
-    if twice is not None:
+    waves = ripples(lines, one) if one.pitch_px <= _FINEST * rig.pitch(one.direction) else {}
+    name, faults = f"{one.direction} fringes of {one.pitch_px:g} px", []
+    if (step := step_errors(one)) is not None and step[1].exceeds(STEP_RAD):
+        which = f"of {titles[one.frames[step[0]]]}" if one.steps > 4 else "of one of four steps"
+        faults.append(f"the shift {which} is {abs(np.rad2deg(step[1].value)):.0f} degrees off")
+    if (twice := waves.get(2)) is not None:
         measured[f"{one.direction}_{one.pitch_px:g}px_ripple_rad"] = twice.value
-    if wrong_step or wrong_wave:
-        evidence = []
-        if step is not None and wrong_step:
-            which = f"of {titles[one.frames[step[0]]]}" if one.steps > 4 else "of one of four steps"
-            evidence.append(f"the shift {which} is {abs(np.rad2deg(step[1].value)):.0f} degrees off")
-        if twice is not None and wrong_wave:
-            evidence.append(f"the phase has an error of {twice.value:.3f} rad that repeats twice a period")
-        findings.append(
+        if twice.exceeds(RIPPLE_RAD):
+            faults.append(f"the phase has an error of {twice.value:.3f} rad that repeats twice a period")
+    if faults:
+        return [
             Finding(
                 "wrong step",
                 "refuse",
-                f"{name}: {', and '.join(evidence)}, which neither noise nor gamma explains",
+                f"{name}: {', and '.join(faults)}, which neither noise nor gamma explains",
                 "a frame that was exposed while the pattern changed, came late, or was shown at another brightness",
-                "capture again: trigger the camera by the projector, or wait longer after each pattern",
+                CAPTURE_IN_TIME,
             )
+        ]
+    bent = waves.get(one.steps)
+    if bent is None or not bent.exceeds(RESPONSE_RAD):
+        return []
+    systematic[one.direction] = max(systematic.get(one.direction, 0.0), bent.value / math.sqrt(2))
+    return [
+        Finding(
+            "response",
+            "note",
+            f"{name}: the phase has an error of {bent.value:.3f} rad that repeats {one.steps} times a period",
+            "the response of projector and camera is not straight (gamma)",
+            "the stated uncertainty holds it; set projector and camera to gamma 1, or use more steps",
         )
-    bent = waves.get(one.steps) if one.steps > 2 else None
-    if bent is not None and bent.value > max(RESPONSE_RAD, SIGMAS * bent.sigma) and not findings:
-        error_rad = bent.value / math.sqrt(2)
-        systematic[one.direction] = max(systematic.get(one.direction, 0.0), error_rad)
-        findings.append(
-            Finding(
-                "response",
-                "note",
-                f"{name}: the phase has an error of {bent.value:.3f} rad that repeats {one.steps} times a period",
-                "the response of projector and camera is not straight (gamma)",
-                "the stated uncertainty holds it; set projector and camera to gamma 1, or use more steps",
-            )
-        )
-    return findings
+    ]
 
 
 def _moved(sets: Sequence[FringeSet]) -> list[Finding]:
@@ -292,15 +270,10 @@ def _contradictions(given: Fit) -> Finding:
 def _out_of_range(depth_mm: NDArray[np.float64], rig: Rig) -> Finding:
     low, middle, high = np.quantile(depth_mm, (0.02, 0.5, 0.98))
     near, far = rig.working_range_mm
-    units = [f"{why} ({factor:g} times)" for factor, why in _UNITS.items() if near <= factor * middle <= far]
-    cause = (
-        f"a wrong unit of the rig's translation: {units[0]}" if units else "another working range than the rig file's"
-    )
-    change = (
-        "correct the translation or the calibration's unit"
-        if units
-        else f"give the range: --range {low:.0f},{high:.0f}"
-    )
+    cause, change = "another working range than the rig file's", f"give the range: --range {low:.0f},{high:.0f}"
+    if units := [f"{why} ({factor:g} times)" for factor, why in _UNITS.items() if near <= factor * middle <= far]:
+        cause = f"a wrong unit of the rig's translation: {units[0]}"
+        change = "correct the translation or the calibration's unit"
     baseline = MM_PER_M * rig.baseline_m
     return Finding(
         "nothing in the range",

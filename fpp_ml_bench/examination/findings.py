@@ -1,8 +1,8 @@
 """What an examination finds, as data: a name, how bad it is, the evidence, the likely cause, and what to change."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
-from typing import Any, Literal
+from dataclasses import dataclass, field
+from typing import Literal
 
 from fpp_ml_bench.errors import CaptureError
 
@@ -39,14 +39,6 @@ class Examination:
     @property
     def refused(self) -> tuple[Finding, ...]:
         return tuple(finding for finding in self.findings if finding.severity == "refuse")
-
-    def to_dict(self) -> dict[str, Any]:
-        return {
-            "findings": [asdict(finding) for finding in self.findings],
-            "not_checked": list(self.not_checked),
-            "measured": dict(self.measured),
-            "systematic_rad": dict(self.systematic_rad),
-        }
 
 
 class RefusedCapture(CaptureError):

@@ -6,10 +6,10 @@ coordinates grow along the image as they do on a plane (the ordering constraint 
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations, permutations
+from itertools import combinations, groupby, permutations
 from typing import Any
 
 import numpy as np
@@ -36,17 +36,39 @@ _BACKGROUND_SHARE = 0.03
 _WIDE_MM = (1e-6, 1e12)
 
 
+Change = Callable[[Lines, Rig], tuple[Lines, Rig]]
+
+
 @dataclass(frozen=True)
 class Reading:
-    """A way to read the images: ``what`` is different from the rig file, ``change`` to do; the place of every frame of
-    the sequence in the capture, a change of the grey levels, a way to turn the image, and another rig."""
+    """A way to read the images: ``what`` is different from the rig file, the ``change`` to do, and ``seen``, which
+    gives the lines and the rig as this reading has them."""
 
     what: str
     change: str
-    frames: tuple[int, ...] | None = None
-    levels: Callable[[NDArray], NDArray] | None = None
-    flips: tuple[bool, bool] = (False, False)
-    rig: Rig | None = None
+    seen: Change = lambda lines, rig: (lines, rig)
+
+
+def _in_order(place: Sequence[int]) -> Change:
+    """Frames of the sequence at other places of the capture, ``place[index]`` for each of them."""
+    return lambda lines, rig: (replace(lines, levels=lines.levels[list(place)]), rig)
+
+
+def _with_levels(change: Callable[[NDArray], NDArray]) -> Change:
+    return lambda lines, rig: (replace(lines, levels=change(lines.levels)), rig)
+
+
+def _flipped(across: bool, down: bool) -> Change:
+    def seen(lines: Lines, rig: Rig) -> tuple[Lines, Rig]:
+        column = rig.camera.width - 1 - lines.column if across else lines.column
+        return replace(lines, column=column, row=rig.camera.height - 1 - lines.row if down else lines.row), rig
+
+    return seen
+
+
+def _inverse_pose(lines: Lines, rig: Rig) -> tuple[Lines, Rig]:
+    turned: Any = tuple(tuple(column) for column in rig.R.T.tolist())
+    return lines, replace(rig, rotation=turned, translation_m=tuple((-rig.R.T @ rig.t).tolist()))
 
 
 @dataclass(frozen=True)
@@ -67,10 +89,8 @@ AS_GIVEN = Reading("as the rig file says", "")
 
 def fit(lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits, reading: Reading, solid: bool) -> Fit:
     """How well the reading fits; without ``solid`` (a rig that is not calibrated) depth and order don't count."""
-    rig = reading.rig or rig
-    levels = lines.levels if reading.frames is None else lines.levels[list(reading.frames)]
-    levels = levels if reading.levels is None else reading.levels(levels)
-    seen = replace(lines, levels=levels)
+    lines, rig = reading.seen(lines, rig)
+    levels = lines.levels
     measured, edges = {}, 1.0
     for direction in directions:
         plan = plan_direction(rig, direction, None)
@@ -83,12 +103,12 @@ def fit(lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits,
     # Gray code alone has no second opinion: a doubtful bit there is blur.
     alone = all(isinstance(rig.code(way), GrayOnly) for way in directions)
     contradicting = lit & (reason != 0) & ~(alone & (reason == Reason.INCONSISTENT_ORDER))
-    for one in fringe_sets(seen, rig, directions):
+    for one in fringe_sets(lines, rig, directions):
         if one.steps > 3:
-            shown = one.mean + np.cos(one.shifts_rad)[:, None] * one.cosine + np.sin(one.shifts_rad)[:, None] * one.sine
-            misfit = ((levels[list(one.frames)] - shown) ** 2).mean(axis=0)
+            shown = one.mean + one.modulation * np.cos(one.phase + one.shifts_rad[:, None])
+            misfit = ((one.levels - shown) ** 2).mean(axis=0)
             reason[(reason == 0) & (misfit > (LARGEST_MISFIT * one.modulation) ** 2)] = Reason.INCONSISTENT_ORDER
-        found = gray_edges(seen, one, rig, limits)
+        found = gray_edges(lines, one, rig, limits)
         edges *= 1.0 if found is None or found.edges < _FEWEST_PAIRS else min(found.agreeing, found.forward)
     bright = max(int((lit | saturated).sum()), 1)
     counted = (lit | (np.ptp(levels, axis=0) >= CLEARLY_LIT_GREY)) & ~saturated
@@ -97,10 +117,7 @@ def fit(lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits,
     if not solid:
         share = edges * float((reason[counted] == 0).mean())
         return Fit(share, share, float(contradicting.sum()) / bright, edges)
-    width, height = rig.camera.width, rig.camera.height
-    column = width - 1 - lines.column if reading.flips[0] else lines.column
-    row = height - 1 - lines.row if reading.flips[1] else lines.row
-    rays = tuple(axis[row, column] for axis in rig.camera.rays())
+    rays = tuple(axis[lines.row, lines.column] for axis in rig.camera.rays())
     forward = min(
         (_forward(lines, rays, measured[way].coordinate_px, reason == 0, rig, way) for way in directions), default=1.0
     )
@@ -158,28 +175,14 @@ def search(
     return []
 
 
-def _runs(rig: Rig) -> list[list[int]]:
-    """Frame indices of every run of one kind, direction and period."""
-    runs: list[list[int]] = []
-    last: object = None
-    for frame in rig.sequence:
-        key = frame.kind, frame.direction, frame.fringe
-        runs.append([]) if key != last else None
-        runs[-1].append(frame.index)
-        last = key
-    return runs
-
-
-def _placed(rig: Rig, captured: Sequence[int]) -> tuple[int, ...]:
-    """Where each frame of the sequence is, when the capture holds the frames ``captured`` in this order."""
-    place = {index: position for position, index in enumerate(captured)}
-    return tuple(place[index] for index in range(len(rig.sequence)))
-
-
 def _single(rig: Rig, solid: bool) -> Iterator[Reading]:
     """All readings but exchanges of two frames."""
-    frames, runs = rig.sequence.frames, _runs(rig)
+    frames = rig.sequence.frames
     everything = list(range(len(frames)))
+    runs = [
+        [frame.index for frame in run]
+        for _, run in groupby(frames, key=lambda frame: (frame.kind, frame.direction, frame.fringe))
+    ]
     if solid:
         for flips, name in (
             ((True, False), "mirrored left to right"),
@@ -187,46 +190,67 @@ def _single(rig: Rig, solid: bool) -> Iterator[Reading]:
             ((True, True), "turned by 180 degrees"),
         ):
             change = f"write the images as the calibrated camera sees them: they are {name}"
-            yield Reading(f"images that are {name}", change, flips=flips)
-        turned: Any = tuple(tuple(column) for column in rig.R.T.tolist())
-        inverse = replace(rig, rotation=turned, translation_m=tuple((-rig.R.T @ rig.t).tolist()))
+            yield Reading(f"images that are {name}", change, _flipped(*flips))
         change = "invert rotation and translation of the rig"
-        yield Reading("a pose that goes from the projector to the camera", change, rig=inverse)
+        yield Reading("a pose that goes from the projector to the camera", change, _inverse_pose)
     alone = rig.directions if len(rig.directions) > 1 else ()
     for ways, of in ((rig.directions, ""), *(((way,), f"{way} ") for way in alone)):
-        for reading in _of_code(rig, runs, ways):
+        for reading in _of_code(rig, [run for run in runs if frames[run[0]].direction in ways]):
             yield replace(reading, what=of + reading.what)
-    yield Reading("all frames inverted (black for white)", "invert the images", levels=_inverted)
+    yield Reading("all frames inverted (black for white)", "invert the images", _with_levels(_inverted))
     change = "rename the files in the opposite order"
-    yield Reading("all frames in the opposite order", change, _placed(rig, everything[::-1]))
+    yield Reading("all frames in the opposite order", change, _in_order(everything[::-1]))
     for shift in range(1, len(frames)):
         change = f"rename the files: the first {len(frames) - shift} are the sequence's last ones"
         captured = everything[shift:] + everything[:shift]
-        yield Reading(f"a capture that starts with frame {frames[shift].title}", change, _placed(rig, captured))
-    done = {tuple(everything)}
-    for captured in _orders(frames, runs):
-        if tuple(captured) not in done:
-            done.add(tuple(captured))
+        yield Reading(f"a capture that starts with frame {frames[shift].title}", change, _captured(captured))
+    orders = dict.fromkeys(tuple(index for run in ordered for index in run) for ordered in _orders(frames, runs))
+    for order in orders:
+        if list(order) != everything:
             change = "write this order in the rig file's sequence, or rename the files"
-            yield Reading(f"frames in the order {', '.join(_names(frames, captured))}", change, _placed(rig, captured))
+            yield Reading(f"frames in the order {', '.join(_names(frames, order))}", change, _captured(order))
 
 
-def _of_code(rig: Rig, runs: list[list[int]], ways: Sequence[Direction]) -> Iterator[Reading]:
-    """What may be different in the codes of ``ways``."""
+def _captured(indices: Sequence[int]) -> Change:
+    """The frames of the sequence where they are in a capture that holds ``indices`` in this order."""
+    return _in_order(np.argsort(indices).tolist())
+
+
+def _of_code(rig: Rig, own: list[list[int]]) -> Iterator[Reading]:
+    """What may be different in the codes whose runs of frames are ``own``."""
     frames, everything = rig.sequence.frames, list(range(len(rig.sequence)))
-    own = [run for run in runs if frames[run[0]].direction in ways]
     sinusoids = [run for run in own if frames[run[0]].kind == "sinusoid" and len(run) > 2]
     bits = [run for run in own if frames[run[0]].kind == "gray"]
+
+    def moved(runs: list[list[int]], change: Callable[[list[int]], list[int]]) -> list[int]:
+        """Everything with the frames of each run in another order."""
+        place = list(everything)
+        for run in runs:
+            for index, other in zip(run, change(run), strict=True):
+                place[index] = other
+        return place
+
+    def rearranged(run: list[int], changes: Mapping[str, Any]) -> list[int]:
+        """Where the Gray frames of ``run`` are, when captured as with ``changes`` of their `GrayCells`."""
+        code: Any = rig.code(frames[run[0]].direction or "vertical")
+        cells: GrayCells = code if isinstance(code, GrayOnly) else code.gray
+        if "inverse" in changes and cells.inverse == "none":
+            return run
+        shown = replace(cells, **changes).shown
+        return [run[shown.index(frame)] for frame in cells.shown]
+
     if sinusoids:
-        flipped = _moved(everything, sinusoids, lambda run: [run[0], *run[:0:-1]])
-        yield Reading("phase shifts of the other sign", "change the entry sign of the sequence (1, -1)", flipped)
+        flipped = moved(sinusoids, lambda run: [run[0], *run[:0:-1]])
+        yield Reading(
+            "phase shifts of the other sign", "change the entry sign of the sequence (1, -1)", _in_order(flipped)
+        )
         for quarters in (1, 2, 3):
             if all(quarters * len(run) % 4 == 0 for run in sinusoids):
-                turned = _moved(everything, sinusoids, partial(_turned, quarters))
+                turned = moved(sinusoids, partial(_turned, quarters))
                 what = f"phases that are {90 * quarters} degrees further (sine for cosine)"
-                yield Reading(what, "give shifts_deg with this angle added", turned)
-        backward, change = _moved(everything, sinusoids, lambda run: run[::-1]), "give shifts_deg in this order"
-        yield Reading("phase steps in the opposite order", f"rename the files, or {change}", backward)
+                yield Reading(what, "give shifts_deg with this angle added", _in_order(turned))
+        backward, change = moved(sinusoids, lambda run: run[::-1]), "give shifts_deg in this order"
+        yield Reading("phase steps in the opposite order", f"rename the files, or {change}", _in_order(backward))
     if bits:
         for key, value, what in (
             ("least_first", True, "with the least significant bit first"),
@@ -234,42 +258,18 @@ def _of_code(rig: Rig, runs: list[list[int]], ways: Sequence[Direction]) -> Iter
             ("inverse", "after each", "whose inverse frames come after each"),
             ("inverse", "after all", "whose inverse frames come after all"),
         ):
-            place = _rearranged(rig, bits, **{key: value})
-            if place != tuple(everything):
-                yield Reading(f"Gray code {what}", f"write {key}: {str(value).lower()}", place)
+            place = moved(bits, partial(rearranged, changes={key: value}))
+            if place != everything:
+                yield Reading(f"Gray code {what}", f"write {key}: {str(value).lower()}", _in_order(place))
         change = "project it as the rig file says, or exchange white and black of its images"
-        levels = partial(_gray_levels, bits, True)
-        yield Reading("Gray code that is inverted (black for white)", change, levels=levels)
+        levels = _with_levels(partial(_gray_levels, bits, True))
+        yield Reading("Gray code that is inverted (black for white)", change, levels)
         change = "project Gray code: at the edges of binary numbers several bits change at once"
-        yield Reading("binary numbers for Gray code", change, levels=partial(_gray_levels, bits, False))
-
-
-def _moved(everything: list[int], runs: list[list[int]], change: Callable[[list[int]], list[int]]) -> tuple[int, ...]:
-    """``everything`` with the frames of each run in another order."""
-    place = list(everything)
-    for run in runs:
-        for index, other in zip(run, change(run), strict=True):
-            place[index] = other
-    return tuple(place)
-
-
-def _rearranged(rig: Rig, runs: list[list[int]], **changes: Any) -> tuple[int, ...]:
-    """Where each frame is, when the Gray frames of ``runs`` were captured as with ``changes`` of their `GrayCells`."""
-
-    def captured(run: list[int]) -> list[int]:
-        code: Any = rig.code(rig.sequence.frames[run[0]].direction or "vertical")
-        cells: GrayCells = code if isinstance(code, GrayOnly) else code.gray
-        if "inverse" in changes and cells.inverse == "none":
-            return run
-        shown = replace(cells, **changes).shown
-        return [run[shown.index(frame)] for frame in cells.shown]
-
-    return _moved(list(range(len(rig.sequence))), runs, captured)
+        yield Reading("binary numbers for Gray code", change, _with_levels(partial(_gray_levels, bits, False)))
 
 
 def _turned(quarters: int, run: list[int]) -> list[int]:
-    start = len(run) - quarters * len(run) // 4
-    return run[start:] + run[:start]
+    return np.roll(run, quarters * len(run) // 4).tolist()  # type: ignore[no-any-return]
 
 
 def _inverted(levels: NDArray) -> NDArray:
@@ -289,38 +289,33 @@ def _gray_levels(runs: list[list[int]], invert: bool, levels: NDArray) -> NDArra
     return result
 
 
-def _orders(frames: Sequence[Frame], runs: list[list[int]]) -> Iterator[list[int]]:
+def _orders(frames: Sequence[Frame], runs: list[list[int]]) -> Iterator[list[list[int]]]:
     """Other orders of the runs: by kind and direction, and with two runs exchanged."""
-    directions = list(dict.fromkeys(frames[run[0]].direction for run in runs if frames[run[0]].direction))
-    kinds = list(dict.fromkeys(frames[run[0]].kind for run in runs))
-    for kind_order in permutations(kinds):
-        for way_order in permutations(directions):
-            ranks = {
-                run[0]: (kind_order.index(frames[run[0]].kind), [None, *way_order].index(frames[run[0]].direction))
-                for run in runs
-            }
-            for first in (0, 1):
-                ordered = sorted(runs, key=lambda run: (ranks[run[0]][first], ranks[run[0]][1 - first]))
-                yield [index for run in ordered for index in run]
+    firsts = [frames[run[0]] for run in runs]
+    directions = dict.fromkeys(frame.direction for frame in firsts if frame.direction)
+    for kinds in permutations(dict.fromkeys(frame.kind for frame in firsts)):
+        for ways in permutations(directions):
+            ranks = [(kinds.index(frame.kind), (None, *ways).index(frame.direction)) for frame in firsts]
+            for major in (0, 1):
+                keys = [(rank[major], rank[1 - major]) for rank in ranks]
+                yield [runs[i] for i in sorted(range(len(runs)), key=keys.__getitem__)]
     for first, second in combinations(range(len(runs)), 2):
         ordered = list(runs)
         ordered[first], ordered[second] = runs[second], runs[first]
-        yield [index for run in ordered for index in run]
+        yield ordered
 
 
 def _names(frames: Sequence[Frame], captured: Sequence[int]) -> list[str]:
     """The runs of a capture in words."""
-    names: list[str] = []
-    for index in captured:
+    several = any(frame.fringe for frame in frames)
+
+    def name(index: int) -> str:
         frame = frames[index]
         kind = {"sinusoid": "sinusoids", "gray": "Gray code"}.get(frame.kind, frame.kind)
-        period = (
-            f" of period {frame.fringe}" if any(other.fringe for other in frames) and frame.kind == "sinusoid" else ""
-        )
-        name = f"{frame.direction} {kind}{period}" if frame.direction else kind
-        if not names or names[-1] != name:
-            names.append(name)
-    return names
+        period = f" of period {frame.fringe}" if several and frame.kind == "sinusoid" else ""
+        return f"{frame.direction} {kind}{period}" if frame.direction else kind
+
+    return [named for named, _ in groupby(captured, name)]
 
 
 def _exchanges(rig: Rig) -> Iterator[Reading]:
@@ -331,5 +326,5 @@ def _exchanges(rig: Rig) -> Iterator[Reading]:
         place[first], place[second] = second, first
         titles = [frames[index].title for index in (first, second)]
         yield Reading(
-            f"frames that changed places: {titles[0]} and {titles[1]}", "rename these two files", tuple(place)
+            f"frames that changed places: {titles[0]} and {titles[1]}", "rename these two files", _in_order(place)
         )

@@ -9,7 +9,7 @@ what neighbours can't have in common with the scene: a surface is smooth within 
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.coding.code import MIN_MODULATION, Limits
-from fpp_ml_bench.coding.phase_shift import PhaseShift, minus_atan2, phase_weights, weighted_sums
+from fpp_ml_bench.coding.phase_shift import TAU, PhaseShift, phase_weights, wrapped_phase
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Direction
@@ -26,7 +26,6 @@ LINES, MOST_PX = 40, 150_000
 LEAST_LIT_GREY = 3 * MIN_MODULATION
 """A pixel is lit where its grey levels differ by so much from frame to frame."""
 _LOOKED_AT_PX = 40_000
-TAU = 2 * math.pi
 LEAST_PX = 200
 WINDOW_PERIODS = 2.5
 """Length of the windows in which a surface is taken for a cubic; a period must be seen by 4 px and more."""
@@ -35,6 +34,8 @@ WHITE_RATIO, EQUAL_SHARE, GAIN = 1.8, 0.35, 0.1
 """Two frames are equal where their difference is white (its mean square below so many times that of noise), below a
 share of what their steps would make, and their gain within this of 1."""
 _EQUAL_PX = 30_000
+SIGMAS = 6.0
+"""Standard errors above which a figure is none of chance."""
 
 
 @dataclass(frozen=True)
@@ -56,37 +57,49 @@ class Lines:
         step = max(1, int(self.lit.sum() // most_px))
         # Every step-th row and every step-th column: both kinds stay.
         order = np.arange(len(starts))
-        picked = np.flatnonzero(self.lit & (order % step == step // 2)[line])
+        return self.at(np.flatnonzero(self.lit & (order % step == step // 2)[line]))
+
+    def at(self, picked: NDArray[np.intp]) -> "Lines":
+        """The pixels at the ascending indices ``picked``."""
         joined = self.joined[picked] & np.append(np.diff(picked) == 1, False)
-        return Lines(
-            self.levels[:, picked], self.column[picked], self.row[picked], joined, self.across[picked], self.lit[picked]
-        )
+        others = self.column[picked], self.row[picked], joined, self.across[picked], self.lit[picked]
+        return Lines(self.levels[:, picked], *others)
 
 
-def take_lines(frames: NDArray | Sequence[NDArray], mask: NDArray[np.bool_] | None = None) -> Lines:
-    """The lines of ``frames`` (F, H, W) that hold the most lit pixels, evenly spread; those in ``mask`` alone count."""
-    stack = frames if isinstance(frames, np.ndarray) else np.stack(list(frames))
+def _thinned(pixels: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Indices of some `_EQUAL_PX` of the pixels, evenly spread."""
+    return np.flatnonzero(pixels)[:: max(1, int(pixels.sum() // _EQUAL_PX))]
+
+
+def take_lines(stack: NDArray, mask: NDArray[np.bool_] | None = None) -> Lines:
+    """The lines of frames, ``stack`` (F, H, W), that hold the most lit pixels, evenly spread; those in ``mask`` alone
+    count."""
     height, width = stack.shape[1:]
     step = max(1, int(np.sqrt(height * width / _LOOKED_AT_PX)))
     coarse = np.ptp(stack[:, ::step, ::step], axis=0) >= LEAST_LIT_GREY
     if mask is not None:
         coarse &= mask[::step, ::step]
     count = max(4, min(LINES, MOST_PX // (height + width)))
-    parts, of_rows = [], coarse.sum(axis=1)
-    for counts, across in ((of_rows, True), (coarse.sum(axis=0), False)):
+    chosen = []
+    for counts in (coarse.sum(axis=1), coarse.sum(axis=0)):
         cumulated = np.cumsum(counts) / max(counts.sum(), 1)
-        chosen = np.unique(np.searchsorted(cumulated, (np.arange(count) + 0.5) / count).clip(0, len(counts) - 1)) * step
-        along = np.arange(width if across else height)
-        fixed, moving = np.repeat(chosen, len(along)), np.tile(along, len(chosen))
-        parts.append((fixed, moving, across) if across else (moving, fixed, across))
-    row, column = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
-    across_all = np.concatenate([np.full(len(part[0]), part[2]) for part in parts])
-    ends = np.concatenate([(part[1] == width - 1) if part[2] else (part[0] == height - 1) for part in parts])
-    levels = stack[:, row, column]
-    lit = np.ptp(levels, axis=0) >= LEAST_LIT_GREY
-    if mask is not None:
-        lit &= mask[row, column]
-    return Lines(levels, column, row, ~ends, across_all, lit)
+        spread = np.searchsorted(cumulated, (np.arange(count) + 0.5) / count)
+        chosen.append(np.unique(spread.clip(0, len(counts) - 1)) * step)
+    lines = lines_at(stack, *chosen)
+    lit = np.ptp(lines.levels, axis=0) >= LEAST_LIT_GREY
+    return replace(lines, lit=lit if mask is None else lit & mask[lines.row, lines.column])
+
+
+def lines_at(frames: Sequence[NDArray] | NDArray, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Lines:
+    """These rows, then these columns of ``frames`` (F, H, W); all pixels count as lit."""
+    height, width = frames[0].shape
+    row = np.concatenate([np.repeat(rows, width), np.tile(np.arange(height), len(columns))])
+    column = np.concatenate([np.tile(np.arange(width), len(rows)), np.repeat(columns, height)])
+    across = np.arange(len(row)) < len(rows) * width
+    last = np.where(across, column == width - 1, row == height - 1)
+    return Lines(
+        np.stack([frame[row, column] for frame in frames]), column, row, ~last, across, np.ones(len(row), bool)
+    )
 
 
 class Estimate(NamedTuple):
@@ -95,22 +108,25 @@ class Estimate(NamedTuple):
     value: float
     sigma: float
 
+    def exceeds(self, least: float) -> bool:
+        """Whether it is larger than ``least``, either way, and none of chance."""
+        return abs(self.value) > max(least, SIGMAS * self.sigma)
+
 
 @dataclass(frozen=True)
 class FringeSet:
-    """The sinusoids of one period: ``frames`` their indices, ``shifts_rad`` (N,), mean, modulation and phase (n,) of
-    the lines' pixels, and ``good`` pixels: modulated and never saturated."""
+    """The sinusoids of one period: ``frames`` their indices, ``shifts_rad`` (N,), ``levels`` (N, n), mean, modulation
+    and phase (n,) of the lines' pixels, and ``good`` pixels: modulated and never saturated."""
 
     direction: Direction
     number: int
     pitch_px: float
     frames: tuple[int, ...]
     shifts_rad: NDArray[np.float64]
-    mean: NDArray[np.float64]
-    cosine: NDArray[np.float64]
-    sine: NDArray[np.float64]
-    phase: NDArray[np.float64]
-    modulation: NDArray[np.float64]
+    levels: NDArray
+    mean: NDArray[np.floating]
+    phase: NDArray[np.floating]
+    modulation: NDArray[np.floating]
     good: NDArray[np.bool_]
 
     @property
@@ -128,14 +144,10 @@ def fringe_sets(lines: Lines, rig: Rig, directions: Sequence[Direction]) -> list
             if len(frames) < 3:
                 continue
             shifts, levels = TAU * fringe.turns, lines.levels[list(frames)]
-            mean, cosine, sine = weighted_sums(levels, phase_weights(shifts))
-            modulation = np.sqrt(cosine * cosine + sine * sine)
+            phase, modulation, mean = (part[0] for part in wrapped_phase(levels[:, None], shifts))
             good = lines.lit & (modulation >= MIN_MODULATION) & (levels < GREY_LEVELS).all(axis=0)
-            phase = minus_atan2(sine, cosine)
             sets.append(
-                FringeSet(
-                    direction, number, fringe.pitch_px, frames, shifts, mean, cosine, sine, phase, modulation, good
-                )
+                FringeSet(direction, number, fringe.pitch_px, frames, shifts, levels, mean, phase, modulation, good)
             )
     return sets
 
@@ -147,26 +159,18 @@ def equal_frames(
     set, and one after the other."""
     found = []
     for one in sets:
-        picked = np.flatnonzero(one.good)[:: max(1, int(one.good.sum() // _EQUAL_PX))]
-        if len(picked) < LEAST_PX:
-            continue
-        joined = lines.joined[picked] & np.append(np.diff(picked) == 1, False)
-        middle = float(np.median(one.modulation[picked]))
+        part = lines.at(_thinned(one.good))
+        middle = float(np.median(one.modulation[one.good])) if one.good.any() else 0.0
         for i, j in combinations(range(one.steps), 2):
-            first, second = (lines.levels[one.frames[k]][picked].astype(np.float64) for k in (i, j))
-            expected = 2 * middle * abs(math.sin((one.shifts_rad[i] - one.shifts_rad[j]) / 2)) / math.sqrt(2)
-            if expected > 0 and _same(first, second, joined, EQUAL_SHARE * expected):
+            apart = one.shifts_rad[i] - one.shifts_rad[j]
+            most = EQUAL_SHARE * math.sqrt(2) * abs(math.sin(apart / 2)) * middle
+            if most > 0 and _same(part, one.frames[i], one.frames[j], most):
                 found.append((one.frames[i], one.frames[j]))
-    frames = [frame for frame in rig.sequence if frame.direction is None or frame.direction in directions]
-    lit = np.flatnonzero(lines.lit)[:: max(1, int(lines.lit.sum() // _EQUAL_PX))]
-    if len(lit) < LEAST_PX:
-        return found
-    levels = lines.levels[:, lit].astype(np.float64)
+    levels = lines.levels[:, _thinned(lines.lit)].astype(np.float64)
     low, high = levels.min(axis=0), levels.max(axis=0)
-    bright = (levels > (low + high) / 2).mean(axis=1)
-    span = float(np.median(high - low))
-    for first_frame, second_frame in pairwise(frames):
-        i, j = first_frame.index, second_frame.index
+    bright, span = (levels > (low + high) / 2).mean(axis=1), float(np.median(high - low))
+    coded = [frame.index for frame in rig.sequence if frame.direction is None or frame.direction in directions]
+    for i, j in pairwise(coded):
         same_set = any({i, j} <= set(one.frames) for one in sets)
         # A frame that is bright or dark all over may well be followed by another one.
         varied = all(0.05 < bright[k] < 0.95 for k in (i, j))
@@ -176,14 +180,16 @@ def equal_frames(
     return found
 
 
-def _same(first: NDArray, second: NDArray, joined: NDArray[np.bool_], most: float) -> bool:
-    if np.array_equal(first, second):
-        return True
+def _same(part: Lines, i: int, j: int, most: float) -> bool:
+    """Whether two frames show the same but for noise and brightness, with less than ``most`` grey levels between."""
+    first, second = (part.levels[k].astype(np.float64) for k in (i, j))
+    if len(first) < LEAST_PX or np.array_equal(first, second):
+        return len(first) >= LEAST_PX
     gain = float(np.cov(first, second)[0, 1] / max(first.var(), 1e-12))
     if abs(gain - 1) > GAIN:
         return False
     rest = second - second.mean() - gain * (first - first.mean())
-    steps = np.diff(rest)[joined[:-1]]
+    steps = np.diff(rest)[part.joined[:-1]]
     if len(steps) < LEAST_PX:
         return False
     size, noise = _trimmed(rest**2), max(_trimmed(steps**2) / 2, 1 / 12)
@@ -195,23 +201,22 @@ def _trimmed(values: NDArray) -> float:
     return float(np.sort(values)[: -(-9 * len(values) // 10)].mean())
 
 
-def step_errors(lines: Lines, one: FringeSet) -> tuple[int, Estimate] | None:
+def step_errors(one: FringeSet) -> tuple[int, Estimate] | None:
     """Of four steps and more: the position of the step whose shift is farthest from the rig file's, and by how many rad
     (with four, all are as far). None where too little tells, and where a narrow range of phases can't tell it from
     other faults."""
-    picked = np.flatnonzero(one.good)[:: max(1, int(one.good.sum() // _EQUAL_PX))]
+    picked = _thinned(one.good)
     if one.steps < 4 or len(picked) < LEAST_PX:
         return None
-    levels = lines.levels[list(one.frames)][:, picked].astype(np.float64)
-    mean, cosine, sine, modulation = (part[picked] for part in (one.mean, one.cosine, one.sine, one.modulation))
+    mean, phase, modulation = one.mean[picked], one.phase[picked], one.modulation[picked]
     weights = phase_weights(one.shifts_rad)
     model = np.stack([np.ones(one.steps), np.cos(one.shifts_rad), np.sin(one.shifts_rad)], axis=1)
     influence = np.einsum("ij,ji->i", model, weights)
     worst: tuple[int, Estimate] | None = None
     for n, shift in enumerate(one.shifts_rad):
-        residual = levels[n] - mean - cosine * math.cos(shift) - sine * math.sin(shift)
-        turned = 2 * (one.phase[picked] + shift)
-        terms = np.stack([mean, cosine, sine, modulation * np.cos(turned), modulation * np.sin(turned)], axis=1)
+        residual = one.levels[n, picked] - mean - modulation * np.cos(phase + shift)
+        waves = [wave(angle) for angle in (phase, 2 * (phase + shift)) for wave in (np.cos, np.sin)]
+        terms = np.stack([mean, *(modulation * wave for wave in waves)], axis=1)
         scaled = terms / np.maximum(np.linalg.norm(terms, axis=0), 1e-12)
         if np.linalg.cond(scaled) > 60:
             return None
@@ -219,7 +224,7 @@ def step_errors(lines: Lines, one: FringeSet) -> tuple[int, Estimate] | None:
         solution = np.linalg.lstsq(terms[kept], residual[kept], rcond=None)[0] / (1 - influence[n])
         error = residual[kept] / (1 - influence[n]) - terms[kept] @ solution
         covariance = np.linalg.inv(terms[kept].T @ terms[kept]) * error.var() * 4  # neighbours share their errors
-        along = np.array([0, -math.sin(shift), math.cos(shift), 0, 0])
+        along = np.array([0, -math.sin(shift), -math.cos(shift), 0, 0])
         estimate = Estimate(float(along @ solution), float(np.sqrt(along @ covariance @ along)))
         if worst is None or abs(estimate.value) > abs(worst[1].value):
             worst = n, estimate
@@ -229,19 +234,17 @@ def step_errors(lines: Lines, one: FringeSet) -> tuple[int, Estimate] | None:
 def ripples(lines: Lines, one: FringeSet) -> dict[int, Estimate]:
     """Amplitude in rad, by harmonic, of the error of the phase that goes with twice and N times the phase; none where
     the image shows too few windows of two periods and more."""
-    best: tuple[float, NDArray] | None = None
+    slopes = []
     for across in (True, False):
         pixels = one.good & (lines.across == across)
         pairs = np.flatnonzero(pixels[:-1] & pixels[1:] & lines.joined[:-1])
-        if len(pairs) < LEAST_PX:
-            continue
-        slope = float(np.median(np.abs(_wrapped(one.phase[pairs + 1] - one.phase[pairs]))))
-        if best is None or slope > best[0]:
-            best = slope, pixels
-    if best is None or best[0] <= 0 or not SHORTEST_PERIOD_PX <= TAU / best[0] <= LONGEST_WINDOW_PX / WINDOW_PERIODS:
+        if len(pairs) >= LEAST_PX:
+            slopes.append((float(np.median(np.abs(_wrapped(one.phase[pairs + 1] - one.phase[pairs])))), across))
+    slope, across = max(slopes, default=(0.0, True))
+    period = TAU / slope if slope > 0 else math.inf
+    if not SHORTEST_PERIOD_PX <= period <= LONGEST_WINDOW_PX / WINDOW_PERIODS:
         return {}
-    period = TAU / best[0]
-    windows = _windows(best[1], lines.joined, math.ceil(WINDOW_PERIODS * period))
+    windows = _windows(one.good & (lines.across == across), lines.joined, math.ceil(WINDOW_PERIODS * period))
     if len(windows) < FEWEST_WINDOWS:
         return {}
     phase = np.unwrap(one.phase[windows], axis=1)
@@ -256,7 +259,6 @@ def ripples(lines: Lines, one: FringeSet) -> dict[int, Estimate]:
     terms = np.stack([flat(wave(h * phase)) for h in harmonics for wave in (np.cos, np.sin)], axis=-1)
     size = np.sqrt((rest**2).mean(axis=1))
     kept = size <= min(3 * float(np.median(size)), 1.0)
-    solution = np.zeros(terms.shape[-1])
     for _ in range(3):
         design, target = terms[kept].reshape(-1, terms.shape[-1]), rest[kept].ravel()
         solution = np.linalg.lstsq(design, target, rcond=None)[0]

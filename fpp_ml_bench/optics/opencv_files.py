@@ -54,38 +54,29 @@ _ERRORS = ("cam_error", "proj_error", "stereo_error")
 
 @dataclass(frozen=True)
 class OpenCvCalibration:
-    """Camera and projector, and the pose between them: ``X_p = rotation X_c + translation_m``. ``*_error_px``: the
-    reprojection errors that the calibrating tool reported, None where the file has none."""
+    """Camera and projector, and the pose between them: ``X_p = rotation X_c + translation_m``. ``errors_px``: the
+    reprojection errors of camera, projector and both that the calibrating tool reported, None where it did not."""
 
     camera: Pinhole
     projector: Pinhole
     rotation: Matrix3
     translation_m: tuple[float, float, float]
-    camera_error_px: float | None = None
-    projector_error_px: float | None = None
-    stereo_error_px: float | None = None
+    errors_px: tuple[float | None, ...] = (None, None, None)
 
 
 def read_opencv_calibration(
-    *paths: str | Path,
+    path: str | Path,
+    *,
     camera_size: tuple[int, int] | None = None,
     projector_size: tuple[int, int] | None = None,
     unit: str = "mm",
 ) -> OpenCvCalibration:
-    """The calibration in a file, or in several that hold parts of it (OpenCV's sample writes intrinsics and extrinsics
-    apart). ``camera_size`` and ``projector_size``: (width, height) in px, needed where the files do not store them;
-    ``unit``: mm or m, of the files' translation. A rotation rounded to float32 becomes the nearest exact one. Raises
-    `RigError` naming the file for anything missing, of a wrong shape, not finite, or impossible."""
+    """The calibration in a file. ``camera_size`` and ``projector_size``: (width, height) in px, needed where the file
+    does not store them; ``unit``: mm or m, of its translation. A rotation rounded to float32 becomes the nearest exact
+    one. Raises `RigError` naming the file for anything missing, of a wrong shape, not finite, or impossible."""
     require(unit in UNITS, f"unit: expected {' or '.join(UNITS)}, got {unit!r}")
-    require(paths, "expected a calibration file, got none")
-    nodes: dict[str, Any] = {}
-    for path in map(Path, paths):
-        content = _nodes(path)
-        twice = ", ".join(name for name in content if name in nodes)
-        require(not twice, f"{path}: {twice} is also in another of the files; give one calibration only")
-        nodes.update(content)
-    file = ", ".join(map(str, paths))
-    require(any(name in nodes for names in _NAMES.values() for name in names), f"{file}: {_other_layout(nodes)}")
+    nodes = _nodes(Path(path))
+    require(any(name in nodes for names in _NAMES.values() for name in names), f"{path}: {_other_layout(nodes)}")
     try:
         translation = _matrix(nodes, "translation", (3, 1), (1, 3)).ravel()
         require(np.any(translation), "the translation is zero, so no depth can be triangulated; calibrate again")
@@ -94,10 +85,10 @@ def read_opencv_calibration(
             _device(nodes, "projector", projector_size),
             _rotation(_matrix(nodes, "rotation", (3, 3))),
             tuple((translation / UNITS[unit]).tolist()),
-            *[_error(nodes, name) for name in _ERRORS],
+            tuple(_error(nodes, name) for name in _ERRORS),
         )
     except RigError as error:
-        raise RigError(f"{file}: {error}") from error
+        raise RigError(f"{path}: {error}") from error
 
 
 def write_opencv_calibration(calibration: OpenCvCalibration, path: str | Path, unit: str = "mm") -> None:
@@ -122,8 +113,7 @@ def write_opencv_calibration(calibration: OpenCvCalibration, path: str | Path, u
         storage.endWriteStruct()
     storage.write("R", np.array(calibration.rotation))
     storage.write("T", np.array([[_in_unit(t, UNITS[unit])] for t in calibration.translation_m]))
-    errors = calibration.camera_error_px, calibration.projector_error_px, calibration.stereo_error_px
-    for name, error_px in zip(_ERRORS, errors, strict=True):
+    for name, error_px in zip(_ERRORS, calibration.errors_px, strict=True):
         if error_px is not None:
             storage.write(name, error_px)
     try:

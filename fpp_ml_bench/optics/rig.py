@@ -175,9 +175,7 @@ class Rig:
 
     def code(self, direction: Direction) -> Code:
         """How the direction is coded. Raises `RigError` where it is not."""
-        if isinstance(self.sequence, CodedSequence):
-            return self.sequence.code(direction)
-        return self.sequence.code(direction, self.pitch(direction))
+        return self.sequence.code(direction, self._pitch(direction) or PAPER_PITCH_PX)
 
     def shifts_rad(self, direction: Direction) -> tuple[float, ...]:
         """Phase shifts of the finest fringes of a direction, frame by frame, so that frame n shows ``cos(2 pi w / P +

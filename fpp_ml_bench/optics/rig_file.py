@@ -37,6 +37,7 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import yaml
@@ -91,7 +92,8 @@ def rig_from_dict(data: object) -> Rig:
     return Rig(**entries)
 
 
-def _is_json(path: Path) -> bool:
+def is_json(path: Path) -> bool:
+    """Whether a rig file is JSON, else YAML, by its suffix. Raises `RigError` for any other."""
     suffix = path.suffix.lower()
     require(suffix in (".yaml", ".yml", ".json"), f"{path}: expected a rig file ending in .yaml, .yml or .json")
     return suffix == ".json"
@@ -101,15 +103,29 @@ def load_rig(path: str | Path) -> Rig:
     """Read a rig from a YAML or JSON file; raises `RigError` naming the file and the key that is wrong."""
 
     def build(data: object) -> Rig:
-        rig = rig_from_dict(_with_calibration(data, Path(path).parent))
         if not isinstance(data, Mapping) or "calibration" not in data:
+            rig = rig_from_dict(data)
             check_lengths(rig, "translation_m", "m")
             return rig
-        named = data["calibration"]
+        entries = dict(data)
+        named = entries.pop("calibration")
+        twice = [key for key in ("camera", "projector", "rotation", "translation_m") if key in entries]
+        require(not twice, f"calibration: {', '.join(twice)} given besides; a rig has one calibration")
         given = named if isinstance(named, Mapping) else {"file": named}
-        unit = given.get("unit", "mm")
+        given = mapping(given, ("file",), "calibration", ("unit", "camera_size", "projector_size"))
+        file, unit = given["file"], str(given.get("unit", "mm"))
+        require(isinstance(file, str), f"calibration.file: expected the name of a file, got {file!r}")
+        sizes: dict[str, Any] = {
+            key: tuple(map(int, numbers(given[key], 2, f"calibration.{key}")))
+            for key in ("camera_size", "projector_size")
+            if key in given
+        }
+        found = read_opencv_calibration(Path(path).parent / file, unit=unit, **sizes)
+        devices = {"camera": found.camera.to_dict(), "projector": found.projector.to_dict()}
+        pose = {"rotation": found.rotation, "translation_m": found.translation_m}
+        rig = rig_from_dict({**entries, **devices, **pose})
         cure = f"write calibration: {{file: ..., unit: {'m' if unit == 'mm' else 'mm'}}}"
-        check_lengths(rig, f"{given['file']}: the translation", unit, cure)
+        check_lengths(rig, f"{file}: the translation", unit, cure)
         return rig
 
     return _loaded(Path(path), build)
@@ -178,35 +194,8 @@ def load_projection(path: str | Path, camera_size: tuple[int, int] | None = None
     return _loaded(Path(path), stand_in)
 
 
-def _with_calibration(data: object, folder: Path) -> object:
-    """A rig file's content with camera, projector and pose from the OpenCV file that ``calibration`` names."""
-    if not isinstance(data, Mapping) or "calibration" not in data:
-        return data
-    entries = dict(data)
-    named = entries.pop("calibration")
-    given = named if isinstance(named, Mapping) else {"file": named}
-    twice = [key for key in ("camera", "projector", "rotation", "translation_m") if key in entries]
-    require(not twice, f"calibration: {', '.join(twice)} given besides; a rig has one calibration")
-    given = mapping(given, ("file",), "calibration", ("unit", "camera_size", "projector_size"))
-    file = given["file"]
-    require(isinstance(file, str), f"calibration.file: expected the name of a file, got {file!r}")
-    sizes: dict[str, tuple[int, int]] = {}
-    for key in ("camera_size", "projector_size"):
-        if key in given:
-            width, height = numbers(given[key], 2, f"calibration.{key}")
-            sizes[key] = int(width), int(height)
-    found = read_opencv_calibration(folder / str(file), unit=str(given.get("unit", "mm")), **sizes)  # type: ignore[arg-type]
-    return {
-        **entries,
-        "camera": found.camera.to_dict(),
-        "projector": found.projector.to_dict(),
-        "rotation": [list(row) for row in found.rotation],
-        "translation_m": list(found.translation_m),
-    }
-
-
 def _loaded(file: Path, build: Callable[[object], Rig]) -> Rig:
-    content = (read_json if _is_json(file) else read_yaml)(file, RigError)
+    content = (read_json if is_json(file) else read_yaml)(file, RigError)
     try:
         require(content is not None, f"the file is empty; expected the keys {', '.join(_RIG_KEYS)}")
         return build(content)
@@ -218,7 +207,7 @@ def save_rig(rig: Rig, path: str | Path) -> None:
     """Write a rig as YAML or JSON (by the suffix); `load_rig` gives an equal rig back, to the last bit."""
     file = Path(path)
     data = rig.to_dict()
-    text = json.dumps(data, indent=2) + "\n" if _is_json(file) else yaml.safe_dump(data, sort_keys=False, width=120)
+    text = json.dumps(data, indent=2) + "\n" if is_json(file) else yaml.safe_dump(data, sort_keys=False, width=120)
     try:
         write_atomically(file, text.encode("utf-8"))
     except OSError as error:

@@ -76,9 +76,9 @@ class AnySequence(ABC):
         """The directions that are coded, in the order of `DIRECTIONS`."""
 
     @property
-    @abstractmethod
     def steps(self) -> int:
         """Phase steps of the finest sinusoids, the fewest of the coded directions."""
+        return min((len(self.sinusoids(direction)) for direction in self.directions), default=0)
 
     @abstractmethod
     def code(self, direction: Direction, pitch_px: float = PAPER_PITCH_PX) -> Code:
@@ -108,11 +108,15 @@ class AnySequence(ABC):
     def __iter__(self) -> Iterator[Frame]:
         return iter(self.frames)
 
+    def indices(self, **wanted: object) -> tuple[int, ...]:
+        """Indices of the frames whose attributes are as wanted, in the order of the sequence."""
+        return tuple(
+            frame.index for frame in self.frames if all(getattr(frame, name) == value for name, value in wanted.items())
+        )
+
     def coded(self, direction: Direction) -> tuple[int, ...]:
         """Frame indices of a direction's code, in the code's own order: sinusoids, then Gray code."""
-        found = [frame for frame in self.frames if frame.direction == direction]
-        ranked = sorted(found, key=lambda frame: (frame.kind != "sinusoid", frame.index))
-        return tuple(frame.index for frame in ranked)
+        return self.indices(direction=direction, kind="sinusoid") + self.gray(direction)
 
     def sinusoids(self, direction: Direction) -> tuple[int, ...]:
         """Frame indices of a direction's finest sinusoids, in the order of their steps; none where it has none."""
@@ -120,35 +124,31 @@ class AnySequence(ABC):
 
     def period(self, direction: Direction, fringe: int) -> tuple[int, ...]:
         """Frame indices of a direction's sinusoids of the ``fringe``-th period, in the order of their steps."""
-        return tuple(
-            frame.index
-            for frame in self.frames
-            if frame.kind == "sinusoid" and frame.direction == direction and frame.fringe == fringe
-        )
+        return self.indices(direction=direction, kind="sinusoid", fringe=fringe)
 
     def gray(self, direction: Direction) -> tuple[int, ...]:
         """Frame indices of a direction's Gray code, in the order of its frames; none where it has none."""
-        return tuple(f.index for f in self.frames if f.kind == "gray" and f.direction == direction)
+        return self.indices(direction=direction, kind="gray")
 
     @property
     def crossed_frames(self) -> tuple[int, ...]:
         """Frame indices of crossed fringes, in the order of their steps; none where the sequence has none."""
-        return tuple(frame.index for frame in self.frames if frame.kind == "crossed")
+        return self.indices(kind="crossed")
 
     def bits(self, direction: Direction) -> int:
         """Gray bits of a direction."""
-        return sum(not self.frames[index].inverse for index in self.gray(direction))
+        return len(self.indices(direction=direction, kind="gray", inverse=False))
 
     def _finest(self, direction: Direction) -> int:
         return 0
 
     @property
     def black(self) -> int | None:
-        return next((frame.index for frame in self.frames if frame.kind == "black"), None)
+        return next(iter(self.indices(kind="black")), None)
 
     @property
     def white(self) -> int | None:
-        return next((frame.index for frame in self.frames if frame.kind == "white"), None)
+        return next(iter(self.indices(kind="white")), None)
 
     def config(self, name: str) -> tuple[int, ...]:
         """Frame indices of a dataset configuration (paper Section 5.4): see ``CONFIGS``; empty where the sequence has
@@ -167,7 +167,7 @@ class Sequence(AnySequence):
     """The paper's kind: ``steps`` sinusoids, of a period that the rig names, and ``bits`` Gray-code frames per
     direction, black and white."""
 
-    steps: int = 18  # type: ignore[assignment]  # a field is the property that is asked for
+    steps: int = 18  # type: ignore[assignment]  # a field takes the place of the property
     bits_horizontal: int = 7
     bits_vertical: int = 7
 
@@ -241,26 +241,17 @@ class CodedSequence(AnySequence):
             raise RigError(f"this rig projects no {direction} fringes or codes, only {others} ones")
         return code
 
-    @property
-    def steps(self) -> int:
-        return min((len(self.sinusoids(direction)) for direction in self.directions), default=0)
-
     @cached_property
     def frames(self) -> tuple[Frame, ...]:
-        frames: list[Frame] = []
+        shown: list[tuple[Any, ...]] = []
         for name in self.order:
-            if name in ("black", "white"):
-                frames.append(Frame(len(frames), "black" if name == "black" else "white"))
-                continue
             if name == "crossed":
-                frames += [Frame(len(frames) + n, "crossed", step=n) for n in range(len(self.crossed or ()))]
-                continue
-            direction: Direction = "horizontal" if name == "horizontal" else "vertical"
-            frames += [
-                Frame(len(frames) + i, shown.kind, direction, shown.step, shown.fringe, shown.inverse)
-                for i, shown in enumerate(self.code(direction).shown)
-            ]
-        return tuple(frames)
+                shown += [(name, None, step) for step in range(len(self.crossed or ()))]
+            elif name in DIRECTIONS:
+                shown += [(kind, name, *about) for kind, *about in getattr(self, name).shown]
+            else:
+                shown.append((name,))
+        return tuple(Frame(index, *about) for index, about in enumerate(shown))
 
     def _finest(self, direction: Direction) -> int:
         code = getattr(self, direction)

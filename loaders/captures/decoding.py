@@ -104,8 +104,8 @@ def decode_capture(
         notes.append(f"three steps can't tell their noise; {noise:g} grey level assumed, --noise sets it")
     notes += _clipped(capture, modulation >= min_modulation)
     if not decoded.depth_mm.any():
-        cause = _main_reason(decoded)
-        raise DecodeError(f"no pixel could be decoded; of most pixels: {_words(cause)}; probably {CAUSES[cause]}")
+        reason = _main_reason(decoded)
+        raise DecodeError(f"no pixel could be decoded; of most pixels: {reason.words}; probably {CAUSES[reason]}")
     sigma_mm = depth_sigma_mm(decoded, rig, noise, systematic_rad=examination.systematic_rad)
     grey = frames.mean(axis=0, dtype=np.float64).astype(np.float32)
     return DecodedCapture(
@@ -147,10 +147,6 @@ def _examined_and_decoded(
 def _main_reason(decoded: Decoded) -> Reason:
     """The reason of most pixels without depth."""
     return max(CAUSES, key=lambda reason: decoded.counts[reason.name.lower()])
-
-
-def _words(reason: Reason) -> str:
-    return reason.name.lower().replace("_", " ")
 
 
 def _clipped(capture: CapturedFrames, lit: NDArray[np.bool_]) -> list[str]:
@@ -214,7 +210,7 @@ class CaptureReader(RowReader):
             raise CaptureError(
                 f"{capture.folder}: only {100 * decoded_share:.2f}% of the pixels can be decoded, expected "
                 f"at least {100 * LEAST_DECODED_SHARE:g}%; {100 * share:.0f}% are refused as "
-                f"{_words(reason)}: probably {CAUSES[reason]}"
+                f"{reason.words}: probably {CAUSES[reason]}"
             )
         weakest = np.minimum.reduce([measured.modulation for measured in decoded.details.values()])
         measured = {

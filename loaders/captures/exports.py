@@ -7,7 +7,8 @@ Points are in mm in the camera's frame (x right, y down, z forward), their norma
 import io
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import asdict
 from itertools import combinations
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.containers import matrix_bytes
 from fpp_ml_bench.errors import CaptureError
 from fpp_ml_bench.examination.findings import Examination
-from fpp_ml_bench.files import write_atomically, write_files
+from fpp_ml_bench.files import write_files
 from fpp_ml_bench.loaders.captures.decoding import DecodedCapture
 from fpp_ml_bench.loaders.captures.images import CapturedFrames
 from fpp_ml_bench.loaders.pictures import capture_picture
@@ -259,32 +260,27 @@ def write_capture(
         ),
     }
     write_files(folder, contents, CaptureError)
-    content = {
-        "pixels": decoded.counts,
-        "noise_grey": result.noise_grey,
-        "noise_measured": result.noise_measured,
-        "median_sigma_mm": float(np.median(result.sigma_mm[found])),
-        "notes": list(result.notes),
-        "reasons": {reason.name.lower(): int(reason) for reason in Reason},
-    }
-    _write_report(folder, capture, rig, result.examination, content)
+    write_report(
+        folder,
+        capture,
+        rig,
+        result.examination,
+        pixels=decoded.counts,
+        noise_grey=result.noise_grey,
+        noise_measured=result.noise_measured,
+        median_sigma_mm=float(np.median(sigma_mm[found])),
+        notes=list(result.notes),
+        reasons={reason.name.lower(): int(reason) for reason in Reason},
+    )
 
 
-def write_refusal(folder: Path, capture: CapturedFrames, rig: Rig, examination: Examination) -> None:
-    """Write `REPORT` alone, in place of what an earlier decoding left in ``folder``."""
-    clear_outputs(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    _write_report(folder, capture, rig, examination, {})
-
-
-def _write_report(
-    folder: Path, capture: CapturedFrames, rig: Rig, examination: Examination, content: Mapping[str, object]
-) -> None:
+def write_report(folder: Path, capture: CapturedFrames, rig: Rig, examination: Examination, **content: object) -> None:
+    """Write `REPORT` with ``content``, which a refused capture has none of."""
     report = {
         "rig": rig.to_dict(),
         "frames": capture.names,
         "full_scale": capture.full_scale,
-        "examination": examination.to_dict(),
+        "examination": asdict(examination),
         **content,
     }
-    write_atomically(folder / REPORT, (json.dumps(report, indent=1) + "\n").encode())
+    write_files(folder, {REPORT: (json.dumps(report, indent=1) + "\n").encode()}, CaptureError)

@@ -7,7 +7,7 @@ sinusoids. The check uses a few image rows and columns and takes a few ms per fo
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, compress, product
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.coding.gray_code import gray_to_binary
 from fpp_ml_bench.coding.phase_shift import phase_weights, weighted_sums
 from fpp_ml_bench.errors import LayoutError
+from fpp_ml_bench.examination.signals import lines_at
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction, Frame, Sequence
 
@@ -99,62 +100,66 @@ def all_orders() -> Iterator[FrameOrder]:
 
 def find_order(files: list[NDArray[np.uint8]], rig: Rig) -> FrameOrder | None:
     """The named order that the images of a raw scan fit, or None."""
-    lines = _Lines(files)
-    return next((order for order in all_orders() if not _misfits(lines, order, rig)), None)
+    scan = _Scan(files)
+    return next((order for order in all_orders() if not _misfits(scan, order, rig)), None)
 
 
 def check_order(files: list[NDArray[np.uint8]], order: FrameOrder, rig: Rig) -> list[str]:
     """Contradictions between ``order`` and the images of a raw scan, uint8 (H, W) in file order; empty if they fit."""
-    return _misfits(_Lines(files), order, rig)
+    return _misfits(_Scan(files), order, rig)
 
 
-class _Lines:
-    """A raw scan on some image rows and columns: ``parts`` along x (F, lines, W) and along y (F, lines, H), float32;
-    which of their pixels the projector reaches, ``lit``, by the darkest and the brightest image."""
+class _Scan:
+    """A raw scan on some image rows and columns: ``lines``, float32, of the pixels that the projector reaches by the
+    darkest and the brightest image; the least share of these along x and along y, ``lit_share``; and which of them have
+    their successor as neighbour along x and along y, ``pairs``."""
 
     def __init__(self, files: list[NDArray[np.uint8]]) -> None:
-        rows, columns = (np.unique(np.linspace(0, side - 1, _LINES).astype(int)) for side in files[0].shape)
-        along_x, along_y = [image[rows] for image in files], [image[:, columns].T for image in files]
-        self.parts = tuple(np.stack(lines).astype(np.float32) for lines in (along_x, along_y))
+        places = [np.unique(np.linspace(0, side - 1, _LINES).astype(int)) for side in files[0].shape]
+        lines = lines_at(files, *places)
         self.mean = np.array([float(image.mean(dtype=np.float64)) for image in files])
         self.darkest, self.brightest = int(self.mean.argmin()), int(self.mean.argmax())
-        self.lit = [part[self.brightest] - part[self.darkest] >= _LEAST_CONTRAST for part in self.parts]
+        lit = lines.levels[self.brightest] >= lines.levels[self.darkest] + _LEAST_CONTRAST
+        self.lit_share = min(float(lit[lines.across == across].mean()) for across in (True, False))
+        self.lines = replace(lines, levels=lines.levels.astype(np.float32)).at(np.flatnonzero(lit))
+        self.pairs = [(self.lines.joined & (self.lines.across == across))[:-1] for across in (True, False)]
+        self.line_counts = [len(place) for place in places]
 
     @cached_property
     def middle(self) -> NDArray[np.float64]:
-        """Share of each image's lit pixels in the middle half between black and white; (F,)."""
-        grey = np.concatenate([part[:, lit] for part, lit in zip(self.parts, self.lit, strict=True)], axis=1)
+        """Share of each image's pixels in the middle half between black and white; (F,)."""
+        grey = self.lines.levels
         share = (grey - grey[self.darkest]) / (grey[self.brightest] - grey[self.darkest])
         return ((share > _MIDDLE[0]) & (share < _MIDDLE[1])).mean(axis=1)
 
 
-def _misfits(lines: _Lines, order: FrameOrder, rig: Rig) -> list[str]:
+def _misfits(scan: _Scan, order: FrameOrder, rig: Rig) -> list[str]:
     """Contradictions between the files and ``order``. Cheap checks come first; the others run only if those pass."""
     sequence = rig.paper_sequence
     frames = order.frames(sequence)
     file_of_frame = {frame.index: number for number, frame in enumerate(frames)}
     black, white = (file_of_frame[frame.index] for frame in sequence if frame.direction is None)
-    darkest, brightest = lines.darkest, lines.brightest
+    darkest, brightest = scan.darkest, scan.brightest
     # A code with more bits than its cells need has a first frame that is black all over, too.
-    if max(lines.mean[black] - lines.mean[darkest], lines.mean[brightest] - lines.mean[white]) > _SAME_MEAN:
+    if max(scan.mean[black] - scan.mean[darkest], scan.mean[brightest] - scan.mean[white]) > _SAME_MEAN:
         return [
             f"A_{darkest}.png is the darkest and A_{brightest}.png the brightest image; expected black in "
             f"A_{black}.png and white in A_{white}.png"
         ]
-    if min(float(lit.mean()) for lit in lines.lit) < _LEAST_LIT:
+    if scan.lit_share < _LEAST_LIT:
         return [f"A_{white}.png is hardly brighter than A_{black}.png: too little contrast to check an order"]
     problems = []
     for number, frame in enumerate(frames):
-        if frame.kind == "gray" and lines.middle[number] > _MOST_MIDDLE_OF_GRAY:
+        if frame.kind == "gray" and scan.middle[number] > _MOST_MIDDLE_OF_GRAY:
             problems.append(f"A_{number}.png: expected a Gray code frame with two grey levels, got many levels between")
-        if frame.kind == "sinusoid" and lines.middle[number] < _LEAST_MIDDLE_OF_SINUSOID:
+        if frame.kind == "sinusoid" and scan.middle[number] < _LEAST_MIDDLE_OF_SINUSOID:
             problems.append(f"A_{number}.png: expected a sinusoid, got an image of two grey levels")
     if not problems:
         for direction in DIRECTIONS:
             expected = _expected_gradient(direction, rig)
             sinusoids, codes = sequence.sinusoids(direction), sequence.gray(direction)
-            problems += _sinusoids(lines, [file_of_frame[i] for i in sinusoids], direction, expected)
-            problems += _codes(lines, [file_of_frame[i] for i in codes], direction, int(np.abs(expected).argmax()))
+            problems += _sinusoids(scan, [file_of_frame[i] for i in sinusoids], direction, expected)
+            problems += _codes(scan, [file_of_frame[i] for i in codes], direction, int(np.abs(expected).argmax()))
     return problems
 
 
@@ -167,23 +172,16 @@ def _expected_gradient(direction: Direction, rig: Rig) -> NDArray[np.float64]:
     return coordinate_px[1:] - coordinate_px[0]
 
 
-def _sinusoids(lines: _Lines, numbers: list[int], direction: Direction, expected: NDArray[np.float64]) -> list[str]:
+def _sinusoids(scan: _Scan, numbers: list[int], direction: Direction, expected: NDArray[np.float64]) -> list[str]:
     steps = len(numbers)
     shifts = 2 * np.pi * np.arange(steps) / steps
-    weights = phase_weights(shifts)
-    residuals, waves, gradients = [], [], []
-    for part, lit in zip(lines.parts, lines.lit, strict=True):
-        stack = part[numbers]
-        mean, cosine, sine = weighted_sums(stack, weights)
-        wave = cosine - 1j * sine
-        turn = np.angle(wave[:, 1:] * wave[:, :-1].conj())
-        gradients.append(float(np.median(turn[lit[:, 1:] & lit[:, :-1]])))
-        residuals.append((stack - mean)[:, lit])
-        waves.append(wave[lit])
-    # I_n - A = Re(wave) cos(delta_n) - Im(wave) sin(delta_n), solved for delta_n over all pixels.
-    wave = np.concatenate(waves).conj()
-    model = np.stack([wave.real, wave.imag], axis=1)
-    solved = np.linalg.lstsq(model, np.concatenate(residuals, axis=1).T, rcond=None)[0]
+    levels = scan.lines.levels[numbers]
+    mean, cosine, sine = weighted_sums(levels, phase_weights(shifts))
+    wave = cosine - 1j * sine
+    turn = np.angle(wave[1:] * wave[:-1].conj())
+    gradients = [float(np.median(turn[pairs])) for pairs in scan.pairs]
+    # I_n - A = C cos(delta_n) + S sin(delta_n), solved for delta_n over all pixels.
+    solved = np.linalg.lstsq(np.stack([cosine, sine], axis=1), (levels - mean).T, rcond=None)[0]
     foreign = np.flatnonzero(np.hypot(*solved) < _LEAST_SHARE)
     if foreign.size:
         # A foreign image disturbs the phase of all others a little, so only the foreign images are reported.
@@ -207,15 +205,15 @@ def _sinusoids(lines: _Lines, numbers: list[int], direction: Direction, expected
     return problems
 
 
-def _codes(lines: _Lines, numbers: list[int], direction: Direction, axis: int) -> list[str]:
-    parts, edges = [], []
-    for part, lit in zip(lines.parts, lines.lit, strict=True):
-        code = part[numbers] > (part[lines.darkest] + part[lines.brightest]) / 2
-        pairs = lit[:, 1:] & lit[:, :-1]
-        parts.append((part[numbers], code, pairs))
-        # Changes of each bit per image line: (bits,) along x and along y.
-        edges.append(((code[:, :, 1:] != code[:, :, :-1]) & pairs).sum(axis=(1, 2)) / code.shape[1])
-    (grey, code, pairs), along, across = parts[axis], edges[axis], edges[1 - axis]
+def _codes(scan: _Scan, numbers: list[int], direction: Direction, axis: int) -> list[str]:
+    levels, grey = scan.lines.levels, scan.lines.levels[numbers]
+    code = grey > (levels[scan.darkest] + levels[scan.brightest]) / 2
+    # Changes of each bit per image line: (bits,) along x and along y.
+    changes = np.diff(code)
+    edges = [changes[:, pairs].sum(axis=1) / count for pairs, count in zip(scan.pairs, scan.line_counts, strict=True)]
+    along, across = edges[axis], edges[1 - axis]
+    own = scan.lines.across == (axis == 0)
+    grey, code, pairs = grey[:, own], code[:, own], scan.lines.joined[own][:-1]
     problems = [
         f"A_{numbers[i]}.png: expected {direction} Gray bit {i}, varying along image {'xy'[axis]}; it does not"
         for i in np.flatnonzero((across > along) & (across > _LEAST_EDGES_A_LINE))
@@ -234,7 +232,7 @@ def _codes(lines: _Lines, numbers: list[int], direction: Direction, axis: int) -
     def jumps(order: NDArray[np.intp]) -> int:
         """How irregular the code is along the lines, with its bits in ``order``."""
         cells = gray_to_binary(np.tensordot(values, code[order], 1))
-        return int(np.abs(np.diff(cells, axis=-1))[pairs].sum())
+        return int(np.abs(np.diff(cells))[pairs].sum())
 
     as_is = jumps(straight)
     return [

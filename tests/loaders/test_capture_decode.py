@@ -154,11 +154,11 @@ def test_findings_are_told_and_anyway_decodes(capture, tmp_path, capsys):
 def test_a_decoding_killed_in_the_middle_leaves_nothing_that_the_next_refuses(capture, tmp_path, monkeypatch):
     folder, _ = capture
 
-    def killed(*_):
+    def killed(*_, **__):
         raise KeyboardInterrupt
 
     assert decode(folder, folder / "scan", tmp_path / "out", "--forms", "png") == 0
-    monkeypatch.setattr("fpp_ml_bench.loaders.captures.exports._write_report", killed)
+    monkeypatch.setattr("fpp_ml_bench.loaders.captures.exports.write_report", killed)
     assert decode(folder, folder / "scan", tmp_path / "out", "--forms", "npy") == 130
     assert not (tmp_path / "out" / "decode.json").exists()  # what is there is no result
     (tmp_path / "out" / ".mesh.ply.31.tmp").write_bytes(b"cut off")
