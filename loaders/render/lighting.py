@@ -18,7 +18,7 @@ from fpp_ml_bench.loaders.render.illumination import (
 from fpp_ml_bench.loaders.render.light import Light
 from fpp_ml_bench.loaders.render.projector import PatternLight
 from fpp_ml_bench.loaders.render.raycast import TracedObject
-from fpp_ml_bench.loaders.render.scene import SolidMesh, turned, unturned
+from fpp_ml_bench.loaders.render.scene import SolidMesh, along_rays, turned, unturned
 from fpp_ml_bench.loaders.render.surfels import Surfels
 from fpp_ml_bench.loaders.render.textures import material_of
 from fpp_ml_bench.optics.rig import Rig
@@ -34,7 +34,7 @@ class Lighting:
     def __init__(self, rig: Rig, light: Light, pattern: PatternLight) -> None:
         self.rig, self.light, self.pattern = rig, light, pattern
         x, y = (rays.ravel() for rays in rig.camera.rays())
-        self._points_m = np.column_stack([x, y, np.ones_like(x)]) * rig.background
+        self._points_m = along_rays(x, y, rig.background)
         self._normals = np.broadcast_to(np.array([0.0, 0.0, -1.0]), self._points_m.shape)
         self._empty = self._plane()
         self.modes, self.mix = pattern.modes(rig.sequence)

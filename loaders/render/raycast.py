@@ -50,8 +50,8 @@ class PixelRays:
 
 
 def _bounds(rays: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    greatest = np.where(np.isnan(rays), -np.inf, rays).max(axis=axis)
-    least = np.where(np.isnan(rays), np.inf, rays).min(axis=axis)
+    greatest = np.fmax.reduce(rays, axis=axis, initial=-np.inf)  # of those that are not NaN
+    least = np.fmin.reduce(rays, axis=axis, initial=np.inf)
     return np.stack([np.maximum.accumulate(greatest), np.minimum.accumulate(least[::-1])[::-1]])
 
 

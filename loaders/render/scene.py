@@ -188,7 +188,7 @@ def photographing_rig(rig: Rig, calibration_px: float, seed: int) -> Rig:
     near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
     across, down = ((np.arange(16) + 0.5) * (length / 16) - 0.5 for length in (rig.camera.width, rig.camera.height))
     x, y = (axis.ravel() for axis in rig.camera.normalised(*np.meshgrid(across, down)))
-    points = np.concatenate([np.column_stack([x, y, np.ones_like(x)]) * depth for depth in (near_m, far_m)])
+    points = np.concatenate([along_rays(x, y, depth) for depth in (near_m, far_m)])
     before = rig.project(points)
     scale = 1.0 / rig.projector.fx
     for _ in range(3):  # displacements are all but linear in the scale
@@ -232,6 +232,11 @@ def unturned(points_m: NDArray[np.float64], degrees: float) -> NDArray[np.float6
     cosine, sine = cosine_of_turns(degrees / 360), sine_of_turns(degrees / 360)
     x, y = points_m[:, 2], -points_m[:, 0]
     return np.column_stack([cosine * x + sine * y, cosine * y - sine * x, -points_m[:, 1]])
+
+
+def along_rays(x: NDArray[np.float64], y: NDArray[np.float64], depth_m: NDArray[np.float64] | float) -> NDArray:
+    """Points at a depth, a number or (n,), on the rays (x, y, 1), (n,) each; float64 (n, 3) in metres."""
+    return np.column_stack([x, y, np.ones_like(x)]) * np.reshape(depth_m, (-1, 1))
 
 
 def distance_bounds_m(about_axis_m: NDArray[np.float64], rig: Rig) -> tuple[float, float]:
