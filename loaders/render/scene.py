@@ -194,19 +194,23 @@ def photographing_rig(rig: Rig, calibration_px: float, seed: int) -> Rig:
     for _ in range(3):  # displacements are all but linear in the scale
         turn = np.array(draws[:3]) * (scale / 2)
         cross = np.array([[0.0, -turn[2], turn[1]], [turn[2], 0.0, -turn[0]], [-turn[1], turn[0], 0.0]])
-        square = np.array([[sum(cross[i, k] * cross[k, j] for k in range(3)) for j in range(3)] for i in range(3)])
-        small = np.eye(3) + 2.0 / (1.0 + float((turn * turn).sum())) * (cross + square)  # Cayley's formula
-        rotation = [[sum(small[i, k] * rig.R[k, j] for k in range(3)) for j in range(3)] for i in range(3)]
-        shift_m = [sum(small[i, k] * rig.t[k] for k in range(3)) for i in range(3)]
+        small = np.eye(3) + 2.0 / (1.0 + float((turn * turn).sum())) * (
+            cross + _product(cross, cross)
+        )  # Cayley's formula
         shifted = {"cx": draws[3] * scale * rig.projector.fx, "cy": draws[4] * scale * rig.projector.fx}
         projector = replace(rig.projector, cx=rig.projector.cx + shifted["cx"], cy=rig.projector.cy + shifted["cy"])
-        rows = tuple((float(a), float(b), float(c)) for a, b, c in rotation)
-        tx, ty, tz = map(float, shift_m)
-        other = replace(rig, projector=projector, rotation=rows, translation_m=(tx, ty, tz))
+        first, second, third = (tuple(row) for row in _product(small, rig.R).tolist())
+        tx, ty, tz = _product(small, rig.t[:, None]).ravel().tolist()
+        other = replace(rig, projector=projector, rotation=(first, second, third), translation_m=(tx, ty, tz))
         u, v = other.project(points)
         squares = (u - before[0]) ** 2 + (v - before[1]) ** 2
         scale *= calibration_px / float(np.sqrt(np.nanmean(squares)))
     return other
+
+
+def _product(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matrix product of (3, 3) and (3, n), added in order: the same bits on every processor."""
+    return a[:, :1] * b[0] + a[:, 1:2] * b[1] + a[:, 2:] * b[2]
 
 
 def name_bytes(*name: object) -> bytes:

@@ -93,9 +93,13 @@ class Surfels:
         local = np.column_stack([radius * cosine_of_turns(disk), radius * sine_of_turns(disk), np.sqrt(1.0 - height)])
         origin_m, direction = aim_rays(points, local, cosine_of_turns(turn), sine_of_turns(turn))
         reach_m = float(np.sqrt((np.ptp(mesh.vertices_m, axis=0) ** 2).sum())) + 1.0
-        along, triangle = traced.met(origin_m, origin_m + reach_m * direction)
-        target: NDArray[np.int32] = np.empty(len(along), dtype=np.int32)
-        assign_hits(origin_m, reach_m * direction, along, triangle, traced.tree_corners, grid, target)
+        way = reach_m * direction
+        along, triangle = traced.met(origin_m, origin_m + way)
+        facing, hit = traced.normals[triangle], triangle >= 0
+        behind = facing[:, 0] * way[:, 0] + facing[:, 1] * way[:, 1] + facing[:, 2] * way[:, 2] > 0.0
+        target: NDArray[np.int32] = np.full(len(along), -1, dtype=np.int32)
+        place_m = origin_m + along[:, None] * way
+        assign_hits(place_m, np.where(behind[:, None], -facing, facing), np.flatnonzero(hit), grid, target)
         target = target.reshape(count, RAYS)
         left = target < 0
         open_starts = np.concatenate([[0], np.cumsum(left.sum(axis=1))])
@@ -178,25 +182,13 @@ def aim_rays(
 
 
 @njit
-def assign_hits(origin, way, along, triangle, corners, grid, target):  # type: ignore[no-untyped-def]
-    """The surfel of a `SurfelGrid` that each ray meets, the nearest one with the normal of the place: fills ``target``
-    (n,), -1 for none.
-
-    ``way`` (n, 3) leads from the origin to the ray's end, ``along`` of which it comes to ``triangle``.
-    """
+def assign_hits(place, facing, rays, grid, target):  # type: ignore[no-untyped-def]
+    """The surfel of a `SurfelGrid` that each of the ``rays`` (m,) meets at its ``place`` (n, 3), the nearest one with
+    the normal that is ``facing`` (n, 3) the ray there: fills ``target`` (n,)."""
     corner, cell, table, position, normal = grid.corner_m, grid.cell_m, grid.table, grid.position_m, grid.normal
-    for i in range(along.size):
-        f = triangle[i]
-        target[i] = -1
-        if f < 0:
-            continue
-        a, b, c, to = corners[f, 0], corners[f, 1], corners[f, 2], way[i]
-        x, y, z = origin[i, 0] + along[i] * to[0], origin[i, 1] + along[i] * to[1], origin[i, 2] + along[i] * to[2]
-        ux, uy, uz, vx, vy, vz = b[0] - a[0], b[1] - a[1], b[2] - a[2], c[0] - a[0], c[1] - a[1], c[2] - a[2]
-        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        turn = -1.0 if nx * to[0] + ny * to[1] + nz * to[2] > 0.0 else 1.0
-        length = turn * np.sqrt(nx * nx + ny * ny + nz * nz)
-        nx, ny, nz = nx / length, ny / length, nz / length
+    for i in rays:
+        x, y, z = place[i, 0], place[i, 1], place[i, 2]
+        nx, ny, nz = facing[i, 0], facing[i, 1], facing[i, 2]
         cx, cy, cz = int((x - corner[0]) / cell), int((y - corner[1]) / cell), int((z - corner[2]) / cell)
         best = np.inf
         for around in range(2):  # where no point fell into this cell, the cells about it
