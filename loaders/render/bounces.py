@@ -61,8 +61,7 @@ class PlaneLight(NamedTuple):
         grid = np.stack(np.meshgrid(fine_x, fine_y), axis=-1).reshape(-1, 2)
         points = np.column_stack([grid, np.full(len(grid), rig.background)])
         arriving = shine(points, np.tile([0.0, 0.0, -1.0], (len(points), 1)), rig, light, pattern)
-        table = np.zeros((frames, len(points)))
-        pattern.read(arriving.place, arriving.irradiance, table)
+        table = pattern.read(arriving.place, arriving.irradiance)
         albedo = (1.0 - light.surface.gloss) * light.surface.albedo
         cells = table.reshape(frames, rows, PLANE_POINTS, columns, PLANE_POINTS).mean(axis=(2, 4))
         return cls(np.ascontiguousarray(np.moveaxis(cells, 0, 2)) * albedo, corner, cell, rig.background)

@@ -131,8 +131,7 @@ class ObjectLight:
         points = surfels.points
         placed = turned(points.position_m, self.degrees) + self.offset_m
         arriving = shine(placed, turned(points.normal, self.degrees), rig, light, pattern, self.traced)
-        direct = np.empty((len(pattern.table), len(placed)))
-        pattern.read(arriving.place, arriving.irradiance, direct)
+        direct = pattern.read(arriving.place, arriving.irradiance)
         material = material_of(self.mesh, points.position_m, points.normal, light.surface, points.triangle)
         albedo = points.mean(np.broadcast_to((1.0 - material.gloss) * material.albedo, len(placed)))
         outside = plane.upon(surfels, self.degrees, self.offset_m)

@@ -163,10 +163,11 @@ class PatternLight(NamedTuple):
             *self._sample(u_px, rig.projector.width), *self._sample(v_px, rig.projector.height), level, level_weight
         )
 
-    def read(self, place: PatternPlace, irradiance: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-        """Irradiance in every frame at points whose irradiance under white is ``irradiance`` (n,): fills ``out``
-        float64 (F, n)."""
+    def read(self, place: PatternPlace, irradiance: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Irradiance in every frame, float64 (F, n), at points whose irradiance under white is ``irradiance`` (n,)."""
+        out = np.empty((len(self.table), irradiance.size))
         read_kernel(out, irradiance, self, place)
+        return out
 
     def _sample(self, coordinate_px: NDArray[np.float64], length: int) -> tuple[NDArray, NDArray]:
         last = (length - 1.0) * self.per_px
