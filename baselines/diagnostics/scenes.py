@@ -32,7 +32,7 @@ from fpp_ml_bench.loaders.render.illumination import LitPixels, light_surface
 from fpp_ml_bench.loaders.render.light import Light, named_light
 from fpp_ml_bench.loaders.render.meshes import load_user_mesh
 from fpp_ml_bench.loaders.render.raycast import PixelRays, TracedObject
-from fpp_ml_bench.loaders.render.scene import UserMesh, turned
+from fpp_ml_bench.loaders.render.scene import UserMesh, along_rays, turned
 from fpp_ml_bench.loaders.render.sensor import Exposure
 from fpp_ml_bench.loaders.sample import DEPTH, DEPTH_EXACT
 from fpp_ml_bench.loaders.storage.manifest import MESH_FOLDER
@@ -106,7 +106,7 @@ class Surface:
 
     def points_m(self) -> Values:
         """Camera coordinates in metres (n, 3)."""
-        return np.column_stack([self.x, self.y, np.ones_like(self.x)]) * self.depth_m[:, None]
+        return along_rays(self.x, self.y, self.depth_m)
 
     def depth_mm(self, shape: tuple[int, int]) -> Values:
         """Depth map (H, W) in mm, 0 outside the surface."""

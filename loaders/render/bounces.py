@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from fpp_ml_bench.loaders.render.illumination import projector_centre_m, shine
 from fpp_ml_bench.loaders.render.light import Light
@@ -60,23 +61,24 @@ class PlaneLight(NamedTuple):
         grid = np.stack(np.meshgrid(fine_x, fine_y), axis=-1).reshape(-1, 2)
         points = np.column_stack([grid, np.full(len(grid), rig.background)])
         arriving = shine(points, np.tile([0.0, 0.0, -1.0], (len(points), 1)), rig, light, pattern)
-        table = np.zeros((frames, len(points)))
-        pattern.read(arriving.place, arriving.irradiance, table)
+        table = pattern.read(arriving.place, arriving.irradiance)
         albedo = (1.0 - light.surface.gloss) * light.surface.albedo
         cells = table.reshape(frames, rows, PLANE_POINTS, columns, PLANE_POINTS).mean(axis=(2, 4))
         return cls(np.ascontiguousarray(np.moveaxis(cells, 0, 2)) * albedo, corner, cell, rig.background)
 
     def upon(self, surfels: Surfels, degrees: float, offset_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Irradiance of an object's surfels from the plane, float64 (K, F), the object turned and then moved."""
-        arriving = np.zeros((len(surfels.grid.area_m2), self.table.shape[2]))
-        from_plane(
-            surfels.open_starts,
-            np.ascontiguousarray(turned(surfels.open_directions, degrees)),
-            np.ascontiguousarray(turned(surfels.grid.position_m, degrees) + offset_m),
-            self,
-            arriving,
-        )
-        return arriving
+        way = turned(surfels.open_directions, degrees)
+        start = np.repeat(turned(surfels.grid.position_m, degrees) + offset_m, np.diff(surfels.open_starts), axis=0)
+        rows, columns, frames = self.table.shape
+        with np.errstate(divide="ignore", invalid="ignore"):  # of rays along the plane, which don't meet it
+            share = (self.distance_m - start[:, 2]) / way[:, 2]
+            across, down = ((start[:, i] + share * way[:, i] - self.corner_m[i]) / self.cell_m for i in (0, 1))
+        met = (way[:, 2] > 0) & (across >= 0) & (across < columns) & (down >= 0) & (down < rows)
+        cell = down[met].astype(np.int64) * columns + across[met].astype(np.int64)
+        starts = np.concatenate([[0], np.cumsum(met)])[surfels.open_starts]
+        rays = csr_array((np.full(cell.size, 1 / RAYS), cell, starts), shape=(len(starts) - 1, rows * columns))
+        return rays @ self.table.reshape(-1, frames)  # type: ignore[no-any-return]
 
 
 def between_surfels(
@@ -88,47 +90,14 @@ def between_surfels(
     float64 (K,), below 1.
     """
     total = outside.copy()
-    arriving = np.empty_like(direct)
     leaving = albedo[:, None] * (direct + outside)
     for _ in range(MOST_BOUNCES):
-        gather_form_factors(surfels.starts, surfels.seen, surfels.share, leaving, arriving)
+        arriving = surfels.form_factors @ leaving
         total += arriving
         if float(np.abs(arriving).max(initial=0.0)) < SMALLEST:
             break
         leaving = albedo[:, None] * arriving
     return total
-
-
-@njit
-def gather_form_factors(starts, seen, share, leaving, arriving):  # type: ignore[no-untyped-def]
-    """``arriving`` (K, F) = F ``leaving`` (K, F), F in compressed rows; in the order of its entries."""
-    for k in range(starts.size - 1):
-        row = arriving[k]
-        row[:] = 0.0
-        for entry in range(starts[k], starts[k + 1]):
-            weight, source = share[entry], leaving[seen[entry]]
-            for f in range(row.size):
-                row[f] += weight * source[f]
-
-
-@njit
-def from_plane(starts, directions, position, plane, arriving):  # type: ignore[no-untyped-def]
-    """Irradiance from a `PlaneLight`: adds to ``arriving`` (K, F) what each open ray meets there, nothing beyond its
-    table. ``directions`` (E, 3) and ``position`` (K, 3) in camera coordinates."""
-    distance, corner, cell, table = plane.distance_m, plane.corner_m, plane.cell_m, plane.table
-    for k in range(starts.size - 1):
-        row = arriving[k]
-        for entry in range(starts[k], starts[k + 1]):
-            dz = directions[entry, 2]
-            if dz <= 0.0:
-                continue
-            way = (distance - position[k, 2]) / dz
-            across = (position[k, 0] + way * directions[entry, 0] - corner[0]) / cell
-            down = (position[k, 1] + way * directions[entry, 1] - corner[1]) / cell
-            if 0.0 <= across < table.shape[1] and 0.0 <= down < table.shape[0]:
-                source = table[int(down), int(across)]
-                for f in range(row.size):
-                    row[f] += source[f] / RAYS
 
 
 def at_points(

@@ -5,11 +5,10 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-
 from fpp_ml_bench import __version__
 from fpp_ml_bench.calibration.result import volume_error_mm
 from fpp_ml_bench.constants import SPLITS, VIEWS, sample_name, split_of
+from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.loaders.render.meshes import solid_mesh, write_ply
 from fpp_ml_bench.loaders.render.scene import BuildSettings
@@ -95,8 +94,7 @@ def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
     made = studio.stored + studio.unstored
     scene = studio.trace(solid_mesh(row["object"], settings.user_meshes), row["view"])
     studio.expose(scene, made)
-    seen = np.zeros((camera.height, camera.width), dtype=bool)
-    seen.ravel()[scene.hits.pixels] = True
+    seen = object_mask(studio.exact_mm(scene))
     rule = (
         f"processor seconds of one view ({row['sample']}) with skipping off less on, measured now, times what all "
         "views left out"

@@ -1,6 +1,7 @@
 """The light of a scene: what the projector, its further bounces and other lamps give to the object and the plane."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -18,7 +19,7 @@ from fpp_ml_bench.loaders.render.illumination import (
 from fpp_ml_bench.loaders.render.light import Light
 from fpp_ml_bench.loaders.render.projector import PatternLight
 from fpp_ml_bench.loaders.render.raycast import TracedObject
-from fpp_ml_bench.loaders.render.scene import SolidMesh, turned, unturned
+from fpp_ml_bench.loaders.render.scene import SolidMesh, along_rays, turned, unturned
 from fpp_ml_bench.loaders.render.surfels import Surfels
 from fpp_ml_bench.loaders.render.textures import material_of
 from fpp_ml_bench.optics.rig import Rig
@@ -34,11 +35,11 @@ class Lighting:
     def __init__(self, rig: Rig, light: Light, pattern: PatternLight) -> None:
         self.rig, self.light, self.pattern = rig, light, pattern
         x, y = (rays.ravel() for rays in rig.camera.rays())
-        self._points_m = np.column_stack([x, y, np.ones_like(x)]) * rig.background
+        self._points_m = along_rays(x, y, rig.background)
         self._normals = np.broadcast_to(np.array([0.0, 0.0, -1.0]), self._points_m.shape)
         self._empty = self._plane()
         self.modes, self.mix = pattern.modes(rig.sequence)
-        self._returned = PlaneLight.of(rig, light, self.modes) if light.bounces.interreflection else None
+        self.returned = PlaneLight.of(rig, light, self.modes) if light.bounces.interreflection else None
 
     def _plane(self, occluder: TracedObject | None = None) -> LitPixels:
         return light_surface(self._points_m, self._normals, self.rig, self.light, self.pattern, occluder=occluder)
@@ -68,29 +69,28 @@ class Lighting:
         self, mesh: SolidMesh, traced: TracedObject, degrees: float, offset_m: NDArray[np.float64]
     ) -> "ObjectLight":
         """The light upon ``mesh``, turned by ``degrees`` and moved by ``offset_m`` (3,) to be ``traced``."""
-        surfels = None
-        if self.light.bounces.interreflection or self.light.bounces.ambient_occlusion:
-            surfels = _SURFELS.get(mesh)
-            if surfels is None:
-                surfels = _SURFELS[mesh] = Surfels.of(mesh)
-        upon = ObjectLight(self, mesh, traced, degrees, offset_m, surfels, None)
-        if surfels is None or self._returned is None:
-            return upon
-        return replace(upon, bounced=upon.between_surfels(surfels, self._returned))
+        return ObjectLight(self, mesh, traced, degrees, offset_m)
 
 
 @dataclass(frozen=True)
 class ObjectLight:
-    """The light upon a placed object. ``bounced`` float64 (K, J): irradiance of its surfels by further bounces, in the
-    modes of the patterns."""
+    """The light upon a placed object."""
 
     lighting: Lighting
     mesh: SolidMesh
     traced: TracedObject
     degrees: float
     offset_m: NDArray[np.float64]
-    surfels: Surfels | None
-    bounced: NDArray[np.float64] | None
+
+    @cached_property
+    def surfels(self) -> Surfels | None:
+        """The surfels of the mesh where the light has bounces or ambient occlusion."""
+        bounces = self.lighting.light.bounces
+        if not (bounces.interreflection or bounces.ambient_occlusion):
+            return None
+        if self.mesh not in _SURFELS:
+            _SURFELS[self.mesh] = Surfels.of(self.mesh)
+        return _SURFELS[self.mesh]
 
     def at(self, points_m: NDArray[np.float64], normals: NDArray[np.float64], triangle: NDArray[np.int32]) -> LitPixels:
         """Light of points (n, 3) with unit normals (n, 3), camera coordinates, on triangles ``triangle`` (n,), rows of
@@ -120,15 +120,18 @@ class ObjectLight:
             mix_frames(arriving[1:], self.lighting.mix, factor, own, bounced)
         return replace(lit, ambient=ambient, bounced=bounced)
 
-    def between_surfels(self, surfels: Surfels, plane: PlaneLight) -> NDArray[np.float64]:
-        """Irradiance of the surfels by further bounces in every mode, of light that ``plane`` sends back too; float64
-        (K, J)."""
+    @cached_property
+    def bounced(self) -> NDArray[np.float64] | None:
+        """Irradiance of the surfels by further bounces in every mode of the patterns, of light that the plane sends
+        back too; float64 (K, J)."""
+        surfels, plane = self.surfels, self.lighting.returned
+        if surfels is None or plane is None:
+            return None
         rig, light, pattern = self.lighting.rig, self.lighting.light, self.lighting.modes
         points = surfels.points
         placed = turned(points.position_m, self.degrees) + self.offset_m
         arriving = shine(placed, turned(points.normal, self.degrees), rig, light, pattern, self.traced)
-        direct = np.empty((len(pattern.table), len(placed)))
-        pattern.read(arriving.place, arriving.irradiance, direct)
+        direct = pattern.read(arriving.place, arriving.irradiance)
         material = material_of(self.mesh, points.position_m, points.normal, light.surface, points.triangle)
         albedo = points.mean(np.broadcast_to((1.0 - material.gloss) * material.albedo, len(placed)))
         outside = plane.upon(surfels, self.degrees, self.offset_m)

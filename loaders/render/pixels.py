@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.loaders.render.raycast import Hits, PixelRays, TracedObject
+from fpp_ml_bench.loaders.render.scene import along_rays
 from fpp_ml_bench.machine import njit
 from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.optics.rig import Rig
@@ -50,7 +51,10 @@ def mixed_pixels(
     n = hits.normals
     distance = hits.depth_m * (n[:, 0] * ray_x[hits.pixels] + n[:, 1] * ray_y[hits.pixels] + n[:, 2])
     mark_neighbours(width, central, hits.pixels, hits.depth_m, n, distance, ray_x, ray_y, chosen)
-    borders = np.zeros(count, dtype=bool) if lit is None else _at_borders(hits, lit, camera)
+    state = np.zeros((camera.height, width), dtype=np.int8)  # without light to tell apart no borders
+    if lit is not None:
+        state.ravel()[hits.pixels] = np.where(lit, 1, -1)
+    borders = at_borders(state)
     pixels = np.flatnonzero(chosen | borders)
     fine = PixelRays.of(camera.scaled(width * across))
     ray = _fine_pixels(pixels, width, across)
@@ -79,7 +83,7 @@ def mixed_pixels(
     share = same.reshape(-1, total).mean(axis=1)
     mixes = (share < 1.0) | ~alike.reshape(-1, total).all(axis=1) | borders[pixels]
     of_mixed = np.repeat(mixes, total)
-    points = (np.column_stack([x, y, np.ones(ray.size)]) * depth_m[:, None])[of_mixed]
+    points = along_rays(x, y, depth_m)[of_mixed]
     pixels, share = pixels[mixes], share[mixes]
     return MixedPixels(pixels, points, normals[of_mixed], triangle[of_mixed], share < 1.0, share)
 
@@ -107,10 +111,8 @@ def mark_neighbours(width, central, pixels, depth_m, normals, distance, x, y, ch
                     chosen[other] = True
 
 
-def _at_borders(hits: Hits, lit: NDArray[np.bool_], camera: Pinhole) -> NDArray[np.bool_]:
-    """Hit pixels beside one, across or along, that is lit where they are not, or the reverse; bool (H W,)."""
-    state = np.zeros((camera.height, camera.width), dtype=np.int8)
-    state.ravel()[hits.pixels] = np.where(lit, 1, -1)
+def at_borders(state: NDArray[np.int8]) -> NDArray[np.bool_]:
+    """The pixels beside one, across or along, with the opposite sign of ``state`` (H, W); bool (H W,)."""
     border = np.zeros(state.shape, dtype=bool)
     for one, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
         changes = state[one] * state[other] < 0

@@ -62,7 +62,8 @@ class PatternLight(NamedTuple):
 
     ``table`` float32 (F, S, L + 1) in [0, 1]: per frame and blur level, ``per_px`` samples a projector pixel, the last
     one repeated; crossed frames read ``crossed`` instead, a `phase_table` with S levels, at the turns of their
-    ``waves`` float64 (F, 2, 3). ``variance_px2`` float64 (S,), ascending: the blur of each level. ``along`` uint8 (F,):
+    ``waves`` float64 (F, 2, 3): of both carriers the cycles per projector px along u and v, and the turns at pixel
+    (0, 0). ``variance_px2`` float64 (S,), ascending: the blur of each level. ``along`` uint8 (F,):
     `ALONG_V` and so on; black and white vary along neither.
     """
 
@@ -100,8 +101,8 @@ class PatternLight(NamedTuple):
             area_px2 = np.array([footprint[direction] if pixel_area else 0.0 for direction in AXES])
             blur = (levels + still)[:, None] + area_px2
             crossed = phase_table(rig.crossed, lambda level: respond(light.response, level), blur)
-            for step, index in enumerate(rig.sequence.crossed_frames):
-                waves[index] = carrier_waves(rig.crossed, step)
+            for index, shifts in zip(rig.sequence.crossed_frames, rig.crossed.shifts_deg, strict=True):
+                waves[index, :, :2], waves[index, :, 2] = rig.crossed.cycles_per_px, np.divide(shifts, 360)
         return cls(table, along, levels, per_px, crossed, waves)
 
     def modes(self, sequence: AnySequence) -> tuple["PatternLight", NDArray[np.float32]]:
@@ -162,10 +163,11 @@ class PatternLight(NamedTuple):
             *self._sample(u_px, rig.projector.width), *self._sample(v_px, rig.projector.height), level, level_weight
         )
 
-    def read(self, place: PatternPlace, irradiance: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-        """Irradiance in every frame at points whose irradiance under white is ``irradiance`` (n,): fills ``out``
-        float64 (F, n)."""
+    def read(self, place: PatternPlace, irradiance: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Irradiance in every frame, float64 (F, n), at points whose irradiance under white is ``irradiance`` (n,)."""
+        out = np.empty((len(self.table), irradiance.size))
         read_kernel(out, irradiance, self, place)
+        return out
 
     def _sample(self, coordinate_px: NDArray[np.float64], length: int) -> tuple[NDArray, NDArray]:
         last = (length - 1.0) * self.per_px
@@ -239,12 +241,6 @@ def _levels(most: float) -> NDArray[np.float64]:
     return np.array(levels)
 
 
-def carrier_waves(crossed: Crossed, frame: int) -> NDArray[np.float64]:
-    """Of both carriers in ``frame``: cycles per projector px along u and v, and turns at pixel (0, 0); (2, 3)."""
-    shifts = crossed.shifts_deg[frame]
-    return np.array([[*cycles, shift / 360] for cycles, shift in zip(crossed.cycles_per_px, shifts, strict=True)])
-
-
 def phase_table(
     crossed: Crossed,
     light_of_level: Callable[[NDArray[np.float64]], NDArray[np.float64]],
@@ -283,12 +279,11 @@ def _cosine_series(values: NDArray[np.float64], cosine: NDArray[np.float64]) -> 
 def _kept(crossed: Crossed, m: int, n: int, variance_px2: NDArray[np.float64]) -> NDArray[np.float64]:
     """What blur and the interpolation between pixels leave of the harmonic (m, n); float64 (S,)."""
     kept = np.zeros(len(variance_px2))
-    for axis in (0, 1):
-        frequency = m * crossed.cycles_per_px[0][axis] + n * crossed.cycles_per_px[1][axis]
+    frequencies = [m * first + n * second for first, second in zip(*crossed.cycles_per_px, strict=True)]
+    for axis, frequency in enumerate(frequencies):
         kept -= 2 * math.pi**2 * frequency**2 * variance_px2[:, axis]
     kept = exponential(np.maximum(kept, -20.0))
-    for axis in (0, 1):
-        frequency = m * crossed.cycles_per_px[0][axis] + n * crossed.cycles_per_px[1][axis]
+    for frequency in frequencies:
         if frequency != 0:
             kept *= (float(sine_of_turns(frequency / 2)) / (math.pi * frequency)) ** 2
     return kept
@@ -313,7 +308,7 @@ def fill_pattern(light, profiles, index, weight, level, level_weight):  # type: 
 @njit
 def fill_crossed(light, table, waves, per_px, place):  # type: ignore[no-untyped-def]
     """Pattern light of n points in a crossed frame: fills ``light`` (n,) from a `phase_table` and the frame's
-    `carrier_waves`."""
+    ``waves``."""
     side = table.shape[1] - 1
     for k in range(light.size):
         u = (place.u_index[k] + np.float64(place.u_weight[k])) / per_px

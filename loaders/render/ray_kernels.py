@@ -17,19 +17,6 @@ _NEAR_M = 1e-6
 
 
 @njit
-def _first_at_least(values, limit):  # type: ignore[no-untyped-def]
-    """First index with ``values[index] >= limit``; values ascend."""
-    low, high = 0, values.size
-    while low < high:
-        middle = (low + high) // 2
-        if values[middle] >= limit:
-            high = middle
-        else:
-            low = middle + 1
-    return low
-
-
-@njit
 def rasterise(  # type: ignore[no-untyped-def]
     corners, normals, offsets, x, y, columns, rows, left, top, wanted, depth_m, triangle
 ):
@@ -56,10 +43,10 @@ def rasterise(  # type: ignore[no-untyped-def]
         if bounded:
             xa, xb, xc = a[0] / a[2], b[0] / b[2], c[0] / c[2]
             ya, yb, yc = a[1] / a[2], b[1] / b[2], c[1] / c[2]
-            first = max(_first_at_least(columns[0], min(xa, xb, xc) - SLACK) - left, 0)
-            last = min(_first_at_least(columns[1], max(xa, xb, xc) + SLACK) - left, width - 1)
-            first_row = max(_first_at_least(rows[0], min(ya, yb, yc) - SLACK) - top, 0)
-            last_row = min(_first_at_least(rows[1], max(ya, yb, yc) + SLACK) - top, height - 1)
+            first = max(np.searchsorted(columns[0], min(xa, xb, xc) - SLACK) - left, 0)
+            last = min(np.searchsorted(columns[1], max(xa, xb, xc) + SLACK) - left, width - 1)
+            first_row = max(np.searchsorted(rows[0], min(ya, yb, yc) - SLACK) - top, 0)
+            last_row = min(np.searchsorted(rows[1], max(ya, yb, yc) + SLACK) - top, height - 1)
         nx, ny, nz, offset = normals[f, 0], normals[f, 1], normals[f, 2], offsets[f]
         turn = gx0 * a[0] + gy0 * a[1] + gz0 * a[2]
         size = abs(gx0 * a[0]) + abs(gy0 * a[1]) + abs(gz0 * a[2])
@@ -82,8 +69,8 @@ def rasterise(  # type: ignore[no-untyped-def]
                         high = min(high, -rest / gx)
                     elif rest < 0.0:
                         high = -np.inf
-                begin = max(first, _first_at_least(columns[0], low - SLACK) - left)
-                end = min(last, _first_at_least(columns[1], high + SLACK) - left)
+                begin = max(first, np.searchsorted(columns[0], low - SLACK) - left)
+                end = min(last, np.searchsorted(columns[1], high + SLACK) - left)
             for column in range(begin, end + 1):
                 if not wanted[top + row, left + column]:
                     continue

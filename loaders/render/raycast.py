@@ -50,13 +50,14 @@ class PixelRays:
 
 
 def _bounds(rays: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
-    greatest = np.where(np.isnan(rays), -np.inf, rays).max(axis=axis)
-    least = np.where(np.isnan(rays), np.inf, rays).min(axis=axis)
+    greatest = np.fmax.reduce(rays, axis=axis, initial=-np.inf)  # of those that are not NaN
+    least = np.fmin.reduce(rays, axis=axis, initial=np.inf)
     return np.stack([np.maximum.accumulate(greatest), np.minimum.accumulate(least[::-1])[::-1]])
 
 
 class TracedObject:
-    """One placed object, ready for rays: ``vertices_m`` (V, 3) in camera coordinates."""
+    """One placed object, ready for rays: ``vertices_m`` (V, 3) in camera coordinates. ``corners`` float64 (F, 3, 3) and
+    unit ``normals`` float64 (F, 3) are those of its triangles that have an area."""
 
     def __init__(self, mesh: SolidMesh, vertices_m: NDArray[np.float64]) -> None:
         corners = vertices_m[mesh.faces]
@@ -66,9 +67,9 @@ class TracedObject:
         if not solid.any():
             raise MeshError(f"object {mesh.name!r} has no triangle with an area")
         self._row = np.flatnonzero(solid).astype(np.int32)
-        self._corners = np.ascontiguousarray(corners[solid], dtype=np.float64)
-        self._normals = normals[solid] / lengths[solid, None]
-        self._offsets = _dot(self._normals, self._corners[:, 0])
+        self.corners = np.ascontiguousarray(corners[solid], dtype=np.float64)
+        self.normals = normals[solid] / lengths[solid, None]
+        self._offsets = _dot(self.normals, self.corners[:, 0])
         self._vertices_m = vertices_m
 
     def primary(self, rays: PixelRays, wanted: NDArray[np.bool_] | None = None) -> Hits:
@@ -79,8 +80,8 @@ class TracedObject:
         depth_m, triangle = np.full(shape, np.inf), np.full(shape, -1, dtype=np.int32)
         if triangle.size:
             rasterise(
-                self._corners,
-                self._normals,
+                self.corners,
+                self.normals,
                 self._offsets,
                 rays.x,
                 rays.y,
@@ -95,7 +96,7 @@ class TracedObject:
         row, column = np.nonzero(triangle >= 0)
         seen = triangle[row, column]
         row, column = row + top, column + left
-        normals = self._normals[seen]
+        normals = self.normals[seen]
         facing = normals[:, 0] * rays.x[row, column] + normals[:, 1] * rays.y[row, column] + normals[:, 2]
         return Hits(
             pixels=row * rays.x.shape[1] + column,
@@ -106,11 +107,11 @@ class TracedObject:
 
     def _window(self, rays: PixelRays) -> tuple[tuple[int, int], tuple[int, int]]:
         """First row and column, and those behind the last, of the box that the object can cover in the image."""
-        z = self._corners[..., 2]
+        z = self.corners[..., 2]
         if z.min() <= 0:
             return (0, rays.x.shape[0]), (0, rays.x.shape[1])
         spans = []
-        for bounds, across in ((rays.rows, self._corners[..., 1] / z), (rays.columns, self._corners[..., 0] / z)):
+        for bounds, across in ((rays.rows, self.corners[..., 1] / z), (rays.columns, self.corners[..., 0] / z)):
             first = np.searchsorted(bounds[0], across.min() - SLACK, "left")
             behind = np.searchsorted(bounds[1], across.max() + SLACK, "right")
             spans.append((int(first), int(behind)))
@@ -140,26 +141,22 @@ class TracedObject:
 
     def met(
         self, origins_m: NDArray[np.float64], targets_m: NDArray[np.float64], any_suffices: bool = False
-    ) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Where the lines from origins to targets, both (n, 3), first meet the object: the share of the way, float64
-        (n,), and the triangle as a row of `tree_corners`, int32 (n,), -1 for none. `nearest_hit` says more."""
+        (n,), and the triangle as a row of ``corners``, int64 (n,), -1 for none. `nearest_hit` says more."""
         along, triangle = np.empty(len(origins_m)), np.empty(len(origins_m), dtype=np.int32)
-        nearest_hit(*self._tree, origins_m, targets_m, any_suffices, along, triangle)
-        return along, triangle
-
-    @property
-    def tree_corners(self) -> NDArray[np.float64]:
-        """Corners of the triangles, float64 (F, 3, 3), in the order of the box tree."""
-        return self._tree[0]
+        order, corners, starts, boxes = self._tree
+        nearest_hit(corners, starts, boxes, origins_m, targets_m, any_suffices, along, triangle)
+        return along, np.where(triangle >= 0, order[triangle], -1)
 
     @cached_property
-    def _tree(self) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
-        """Triangles in the order of a box tree, where its leaves start, and its boxes."""
-        count = len(self._corners)
+    def _tree(self) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64], NDArray[np.float64]]:
+        """The order of the triangles in a box tree, their corners in it, where its leaves start, and its boxes."""
+        count = len(self.corners)
         leaves = 1 << (-(-count // LEAF) - 1).bit_length()
         order, starts, boxes = np.empty(count, np.int64), np.empty(leaves + 1, np.int64), np.empty((2 * leaves, 6))
-        build_tree(self._corners, order, starts, boxes)
-        return self._corners[order], starts, boxes
+        build_tree(self.corners, order, starts, boxes)
+        return order, self.corners[order], starts, boxes
 
 
 def _dot(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -188,25 +188,29 @@ def photographing_rig(rig: Rig, calibration_px: float, seed: int) -> Rig:
     near_m, far_m = (limit / MM_PER_M for limit in rig.working_range_mm)
     across, down = ((np.arange(16) + 0.5) * (length / 16) - 0.5 for length in (rig.camera.width, rig.camera.height))
     x, y = (axis.ravel() for axis in rig.camera.normalised(*np.meshgrid(across, down)))
-    points = np.concatenate([np.column_stack([x, y, np.ones_like(x)]) * depth for depth in (near_m, far_m)])
+    points = np.concatenate([along_rays(x, y, depth) for depth in (near_m, far_m)])
     before = rig.project(points)
     scale = 1.0 / rig.projector.fx
     for _ in range(3):  # displacements are all but linear in the scale
         turn = np.array(draws[:3]) * (scale / 2)
         cross = np.array([[0.0, -turn[2], turn[1]], [turn[2], 0.0, -turn[0]], [-turn[1], turn[0], 0.0]])
-        square = np.array([[sum(cross[i, k] * cross[k, j] for k in range(3)) for j in range(3)] for i in range(3)])
-        small = np.eye(3) + 2.0 / (1.0 + float((turn * turn).sum())) * (cross + square)  # Cayley's formula
-        rotation = [[sum(small[i, k] * rig.R[k, j] for k in range(3)) for j in range(3)] for i in range(3)]
-        shift_m = [sum(small[i, k] * rig.t[k] for k in range(3)) for i in range(3)]
+        small = np.eye(3) + 2.0 / (1.0 + float((turn * turn).sum())) * (
+            cross + _product(cross, cross)
+        )  # Cayley's formula
         shifted = {"cx": draws[3] * scale * rig.projector.fx, "cy": draws[4] * scale * rig.projector.fx}
         projector = replace(rig.projector, cx=rig.projector.cx + shifted["cx"], cy=rig.projector.cy + shifted["cy"])
-        rows = tuple((float(a), float(b), float(c)) for a, b, c in rotation)
-        tx, ty, tz = map(float, shift_m)
-        other = replace(rig, projector=projector, rotation=rows, translation_m=(tx, ty, tz))
+        first, second, third = (tuple(row) for row in _product(small, rig.R).tolist())
+        tx, ty, tz = _product(small, rig.t[:, None]).ravel().tolist()
+        other = replace(rig, projector=projector, rotation=(first, second, third), translation_m=(tx, ty, tz))
         u, v = other.project(points)
         squares = (u - before[0]) ** 2 + (v - before[1]) ** 2
         scale *= calibration_px / float(np.sqrt(np.nanmean(squares)))
     return other
+
+
+def _product(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Matrix product of (3, 3) and (3, n), added in order: the same bits on every processor."""
+    return a[:, :1] * b[0] + a[:, 1:2] * b[1] + a[:, 2:] * b[2]
 
 
 def name_bytes(*name: object) -> bytes:
@@ -232,6 +236,11 @@ def unturned(points_m: NDArray[np.float64], degrees: float) -> NDArray[np.float6
     cosine, sine = cosine_of_turns(degrees / 360), sine_of_turns(degrees / 360)
     x, y = points_m[:, 2], -points_m[:, 0]
     return np.column_stack([cosine * x + sine * y, cosine * y - sine * x, -points_m[:, 1]])
+
+
+def along_rays(x: NDArray[np.float64], y: NDArray[np.float64], depth_m: NDArray[np.float64] | float) -> NDArray:
+    """Points at a depth, a number or (n,), on the rays (x, y, 1), (n,) each; float64 (n, 3) in metres."""
+    return np.column_stack([x, y, np.ones_like(x)]) * np.reshape(depth_m, (-1, 1))
 
 
 def distance_bounds_m(about_axis_m: NDArray[np.float64], rig: Rig) -> tuple[float, float]:

@@ -92,9 +92,9 @@ def hash_pixels(pixels: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDArray
 
 def standard_normal(pixels: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDArray[np.float32]:
     """Standard normal deviate of each pixel number under a stream's keys; float32."""
-    mask, table = np.uint32((1 << TABLE_BITS) - 1), normal_table()
-    h = hash_pixels(pixels, keys)
-    return table[h & mask] + table[(h >> np.uint32(TABLE_BITS)) & mask]
+    normal = np.empty(pixels.size, dtype=np.float32)
+    fill_normal(normal, hash_pixels(pixels, keys), normal_table())
+    return normal
 
 
 class Sensor(NamedTuple):
@@ -239,15 +239,21 @@ def fill_hashes(hashes, numbers, keys):  # type: ignore[no-untyped-def]
 
 
 @njit
+def fill_normal(normal, hashes, table):  # type: ignore[no-untyped-def]
+    """Standard normal deviates of hashes, by the `normal_table`: fills ``normal`` float32 (n,)."""
+    for k in range(normal.size):
+        h = hashes[k]
+        normal[k] = table[h & np.uint32(_MASK)] + table[(h >> np.uint32(TABLE_BITS)) & np.uint32(_MASK)]
+
+
+@njit
 def fill_bytes(target, signal, numbers, hashes, normal, keys, sensor):  # type: ignore[no-untyped-def]
     """The answer of a `Sensor` to ``signal`` under the ``keys`` (2,) of a noise stream: fills ``target`` uint8 (n,).
     ``numbers``: pixel numbers times `_FIRST_FACTOR`, uint32 (n,)."""
-    n, table, grey_of_code = target.size, sensor.table, sensor.grey_of_code
+    n, grey_of_code = target.size, sensor.grey_of_code
     read_variance, shot_per_grey, black = sensor.noise.read_variance, sensor.noise.shot_per_grey, sensor.black_grey
     fill_hashes(hashes[:n], numbers, keys)
-    for k in range(n):
-        h = hashes[k]
-        normal[k] = table[h & np.uint32(_MASK)] + table[(h >> np.uint32(TABLE_BITS)) & np.uint32(_MASK)]
+    fill_normal(normal[:n], hashes, sensor.table)
     if sensor.plain:
         for k in range(n):
             value = signal[k] + black + np.sqrt(read_variance + shot_per_grey * signal[k]) * normal[k] + np.float32(0.5)

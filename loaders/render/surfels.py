@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
 from fpp_ml_bench.loaders.render.raycast import TracedObject
 from fpp_ml_bench.loaders.render.scene import SolidMesh
@@ -64,15 +65,13 @@ class SurfelGrid(NamedTuple):
 
 @dataclass(frozen=True)
 class Surfels:
-    """An object's surfels with their form factors: row k holds ``share[starts[k]:starts[k + 1]]`` of the surfels
-    ``seen[...]``. ``open_directions`` float64 (E, 3) are those of the rays that leave the object, sorted by surfel:
-    ``open_starts`` int64 (K + 1,); each carries 1 / `RAYS` of its surfel's hemisphere."""
+    """An object's surfels with their ``form_factors``, a sparse float64 (K, K): row k has the shares of surfel k's rays
+    that meet each other surfel. ``open_directions`` float64 (E, 3) are those of the rays that leave the object, sorted
+    by surfel: ``open_starts`` int64 (K + 1,); each carries 1 / `RAYS` of its surfel's hemisphere."""
 
     points: SurfacePoints
     grid: SurfelGrid
-    starts: NDArray[np.int64]
-    seen: NDArray[np.int32]
-    share: NDArray[np.float64]
+    form_factors: csr_array
     open_starts: NDArray[np.int64]
     open_directions: NDArray[np.float64]
 
@@ -92,26 +91,21 @@ class Surfels:
         height = (np.arange(RAYS) + 0.5) / RAYS
         radius = np.sqrt(height)
         local = np.column_stack([radius * cosine_of_turns(disk), radius * sine_of_turns(disk), np.sqrt(1.0 - height)])
-        origin_m, direction = np.empty((count * RAYS, 3)), np.empty((count * RAYS, 3))
-        aim_rays(points, local, cosine_of_turns(turn), sine_of_turns(turn), origin_m, direction)
+        origin_m, direction = aim_rays(points, local, cosine_of_turns(turn), sine_of_turns(turn))
         reach_m = float(np.sqrt((np.ptp(mesh.vertices_m, axis=0) ** 2).sum())) + 1.0
-        along, triangle = traced.met(origin_m, origin_m + reach_m * direction)
-        target: NDArray[np.int32] = np.empty(len(along), dtype=np.int32)
-        assign_hits(origin_m, reach_m * direction, along, triangle, traced.tree_corners, grid, target)
+        way = reach_m * direction
+        along, triangle = traced.met(origin_m, origin_m + way)
+        facing, hit = traced.normals[triangle], triangle >= 0
+        behind = facing[:, 0] * way[:, 0] + facing[:, 1] * way[:, 1] + facing[:, 2] * way[:, 2] > 0.0
+        target: NDArray[np.int32] = np.full(len(along), -1, dtype=np.int32)
+        place_m = origin_m + along[:, None] * way
+        assign_hits(place_m, np.where(behind[:, None], -facing, facing), np.flatnonzero(hit), grid, target)
         target = target.reshape(count, RAYS)
         left = target < 0
         open_starts = np.concatenate([[0], np.cumsum(left.sum(axis=1))])
-        # Runs of equal targets in each sorted row are the entries of the matrix.
-        ordered = np.sort(target, axis=1)
-        first = np.ones(ordered.shape, dtype=bool)
-        first[:, 1:] = ordered[:, 1:] != ordered[:, :-1]
-        runs = np.flatnonzero(first.ravel())
-        lengths = np.diff(np.append(runs, ordered.size))
-        seen = ordered.ravel()[runs]
-        row = runs // RAYS
-        inside = seen >= 0
-        starts = np.concatenate([[0], np.cumsum(np.bincount(row[inside], minlength=count))])
-        return cls(points, grid, starts, seen[inside], lengths[inside] / RAYS, open_starts, direction[left.ravel()])
+        row, meeting = np.nonzero(~left)
+        entries = np.full(row.size, 1 / RAYS), (row, target[row, meeting])  # those at one place are added up
+        return cls(points, grid, csr_array(entries, shape=(count, count)), open_starts, direction[left.ravel()])
 
 
 def _sides(mesh: SolidMesh) -> NDArray[np.float64]:
@@ -164,54 +158,37 @@ def place_surfels(corners: NDArray[np.float64], faces: int | None = None) -> tup
     return points, SurfelGrid(corner, cell_m, table, points.mean(points.position_m), mean_normal, area)
 
 
-@njit
-def aim_rays(points, local, cosine, sine, origin, direction):  # type: ignore[no-untyped-def]
-    """Rays of every surfel from its `SurfacePoints`: fills ``origin`` and ``direction`` (K RAYS, 3).
+def aim_rays(
+    points: SurfacePoints, local: NDArray[np.float64], cosine: NDArray[np.float64], sine: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rays of every surfel from its points: their origins and directions, float64 (K RAYS, 3) each.
 
     ``local`` (RAYS, 3): directions about z; of surfel k they are turned by (``cosine[k]``, ``sine[k]``) about the
     normal. Frame about a normal: Duff et al. 2017, Building an Orthonormal Basis, Revisited.
     """
-    rays, position, normal, starts = local.shape[0], points.position_m, points.normal, points.starts
-    for k in range(starts.size - 1):
-        count = starts[k + 1] - starts[k]
-        for i in range(rays):
-            p = starts[k] + i % count
-            nx, ny, nz = normal[p, 0], normal[p, 1], normal[p, 2]
-            sign = 1.0 if nz >= 0.0 else -1.0
-            a = -1.0 / (sign + nz)
-            b = nx * ny * a
-            x = local[i, 0] * cosine[k] - local[i, 1] * sine[k]
-            y = local[i, 0] * sine[k] + local[i, 1] * cosine[k]
-            z = local[i, 2]
-            row = k * rays + i
-            direction[row, 0] = x * (1.0 + sign * nx * nx * a) + y * b + z * nx
-            direction[row, 1] = x * (sign * b) + y * (sign + ny * ny * a) + z * ny
-            direction[row, 2] = -x * (sign * nx) - y * ny + z * nz
-            origin[row, 0] = position[p, 0] + _OFFSET_M * nx
-            origin[row, 1] = position[p, 1] + _OFFSET_M * ny
-            origin[row, 2] = position[p, 2] + _OFFSET_M * nz
+    point = (points.starts[:-1, None] + np.arange(RAYS) % np.diff(points.starts)[:, None]).ravel()
+    normal = points.normal[point]
+    nx, ny, nz = normal.T
+    sign = np.where(nz >= 0.0, 1.0, -1.0)
+    a = -1.0 / (sign + nz)
+    b = nx * ny * a
+    x = (local[:, 0] * cosine[:, None] - local[:, 1] * sine[:, None]).ravel()
+    y = (local[:, 0] * sine[:, None] + local[:, 1] * cosine[:, None]).ravel()
+    z = np.tile(local[:, 2], len(cosine))
+    across = x * (1.0 + sign * nx * nx * a) + y * b + z * nx
+    down = x * (sign * b) + y * (sign + ny * ny * a) + z * ny
+    direction = np.column_stack([across, down, -x * (sign * nx) - y * ny + z * nz])
+    return points.position_m[point] + _OFFSET_M * normal, direction
 
 
 @njit
-def assign_hits(origin, way, along, triangle, corners, grid, target):  # type: ignore[no-untyped-def]
-    """The surfel of a `SurfelGrid` that each ray meets, the nearest one with the normal of the place: fills ``target``
-    (n,), -1 for none.
-
-    ``way`` (n, 3) leads from the origin to the ray's end, ``along`` of which it comes to ``triangle``.
-    """
+def assign_hits(place, facing, rays, grid, target):  # type: ignore[no-untyped-def]
+    """The surfel of a `SurfelGrid` that each of the ``rays`` (m,) meets at its ``place`` (n, 3), the nearest one with
+    the normal that is ``facing`` (n, 3) the ray there: fills ``target`` (n,)."""
     corner, cell, table, position, normal = grid.corner_m, grid.cell_m, grid.table, grid.position_m, grid.normal
-    for i in range(along.size):
-        f = triangle[i]
-        target[i] = -1
-        if f < 0:
-            continue
-        a, b, c, to = corners[f, 0], corners[f, 1], corners[f, 2], way[i]
-        x, y, z = origin[i, 0] + along[i] * to[0], origin[i, 1] + along[i] * to[1], origin[i, 2] + along[i] * to[2]
-        ux, uy, uz, vx, vy, vz = b[0] - a[0], b[1] - a[1], b[2] - a[2], c[0] - a[0], c[1] - a[1], c[2] - a[2]
-        nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-        turn = -1.0 if nx * to[0] + ny * to[1] + nz * to[2] > 0.0 else 1.0
-        length = turn * np.sqrt(nx * nx + ny * ny + nz * nz)
-        nx, ny, nz = nx / length, ny / length, nz / length
+    for i in rays:
+        x, y, z = place[i, 0], place[i, 1], place[i, 2]
+        nx, ny, nz = facing[i, 0], facing[i, 1], facing[i, 2]
         cx, cy, cz = int((x - corner[0]) / cell), int((y - corner[1]) / cell), int((z - corner[2]) / cell)
         best = np.inf
         for around in range(2):  # where no point fell into this cell, the cells about it

@@ -15,7 +15,7 @@ from fpp_ml_bench.loaders.render.illumination import LitPixels
 from fpp_ml_bench.loaders.render.lighting import Lighting
 from fpp_ml_bench.loaders.render.pixels import MixedPixels, blur_image, mixed_pixels, vignetting
 from fpp_ml_bench.loaders.render.raycast import Hits, PixelRays, TracedObject
-from fpp_ml_bench.loaders.render.scene import BuildSettings, SolidMesh, photographing_rig, place, uniform
+from fpp_ml_bench.loaders.render.scene import BuildSettings, SolidMesh, along_rays, photographing_rig, place, uniform
 from fpp_ml_bench.loaders.render.sensor import Exposure
 from fpp_ml_bench.loaders.sample import WEAK_GREY, Flag, Row, stored_frames, void_pixels
 from fpp_ml_bench.portable import cosine_of_turns, gaussian_weights, power, sine_of_turns
@@ -112,7 +112,7 @@ class Studio:
         stream = (settings.seed, mesh.name, view)
         object_light = self.lighting.upon(mesh, traced, VIEW_DEGREES[VIEWS.index(view)], offset_m)
         x, y = (axis.ravel()[hits.pixels] for axis in rig.camera.rays())
-        points_m = np.column_stack([x, y, np.ones_like(x)]) * hits.depth_m[:, None]
+        points_m = along_rays(x, y, hits.depth_m)
         lit = object_light.at(points_m, hits.normals, hits.triangle)
         mixed = mixed_lit = None
         if light.camera.rays_across > 1:
@@ -178,8 +178,8 @@ class Studio:
         # An object that moves leaves pixels of the first frame, where all are decoded.
         everything = not skipping_enabled() or self.light.motion_mm > 0
         whole = tuple(frame for frame in frames if everything or frame not in self.unstored)
-        for run in _runs(whole):
-            exposure.expose(run, behind, self._pixels, scene.stream, images[run.start : run.stop])
+        for run in np.split(whole, np.flatnonzero(np.diff(whole) > 1) + 1) if whole else ():  # runs of neighbours
+            exposure.expose(run.tolist(), behind, self._pixels, scene.stream, images[run[0] : run[-1] + 1])
         for pixels, lit in parts:
             exposed = exposure.expose(frames, lit, pixels.astype(np.uint32), scene.stream)
             for index, values in zip(frames, exposed, strict=True):
@@ -232,17 +232,6 @@ class Studio:
         if skipping_enabled():
             return decode_stack(self._frames, rig, direction="both", mask=seen).depth_mm
         return np.where(seen, decode_stack(self._frames, rig, direction="both").depth_mm, np.float32(0))
-
-
-def _runs(indices: tuple[int, ...]) -> list[range]:
-    """Ascending indices as runs of neighbours."""
-    runs: list[range] = []
-    for index in indices:
-        if runs and runs[-1].stop == index:
-            runs[-1] = range(runs[-1].start, index + 1)
-        else:
-            runs.append(range(index, index + 1))
-    return runs
 
 
 def ground_truth_error(

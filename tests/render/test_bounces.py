@@ -32,11 +32,7 @@ def hollow_sphere():
 
 def matrix(surfels):
     """Form factors as a full matrix (K, K)."""
-    count = len(surfels.grid.area_m2)
-    full = np.zeros((count, count))
-    row = np.repeat(np.arange(count), np.diff(surfels.starts))
-    np.add.at(full, (row, surfels.seen), surfels.share)
-    return full
+    return surfels.form_factors.toarray()
 
 
 def bounced(surfels, direct, rho):
@@ -222,7 +218,7 @@ def test_rows_and_reciprocity(name):
 )
 def test_a_convex_object_gets_nothing_from_itself(mesh):
     surfels = Surfels.of(mesh)
-    assert surfels.open_share.min() == 1 and surfels.share.size == 0
+    assert surfels.open_share.min() == 1 and surfels.form_factors.nnz == 0
     outside = np.random.default_rng(0).random((len(surfels.grid.area_m2), 2))
     np.testing.assert_array_equal(between_surfels(surfels, outside, outside, np.full(len(outside), 0.9)), outside)
 

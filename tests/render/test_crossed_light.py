@@ -46,8 +46,7 @@ def test_light_is_the_image_through_response_and_blur(response, defocus_px):
     pattern, index = PatternLight.of(rig, light), rig.sequence.crossed_frames[0]
     u, v = np.random.default_rng(3).uniform(190, 250, (2, 500))
     distance_m = np.full(500, 2.1)
-    out = np.empty((len(rig.sequence), 500))
-    pattern.read(pattern.place(u, v, distance_m, rig, light), np.full(500, 2.0), out)
+    out = pattern.read(pattern.place(u, v, distance_m, rig, light), np.full(500, 2.0))
     fine, image = 4, response_table(response)[family.image(912, 1140, 0)[150:290, 150:290]]
     places = np.arange(139 * fine + 1) / fine
     whole = map_coordinates(image, np.meshgrid(places, places, indexing="ij"), order=1)

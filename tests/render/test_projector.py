@@ -39,9 +39,7 @@ def read(light, frame, coordinate_px, distance_m, pixel_area=False):
     """Light (n,) of a frame at projector coordinates (n,), along the one it varies with, at a distance."""
     pattern = pattern_light(light, pixel_area)
     place = pattern.place(coordinate_px, coordinate_px, np.full(coordinate_px.size, distance_m), SMALL, light)
-    out = np.empty((len(SMALL.sequence), coordinate_px.size))
-    pattern.read(place, np.ones(coordinate_px.size), out)
-    return out[frame]
+    return pattern.read(place, np.ones(coordinate_px.size))[frame]
 
 
 def modulation(light, frame, distance_m, pixel_area=False):

@@ -309,7 +309,7 @@ def test_where_a_line_first_meets_the_object(name):
     np.testing.assert_allclose(along, nearest, atol=1e-10)
     assert 0.2 < (triangle >= 0).mean() < 0.95 and (along[triangle < 0] == 1).all()
     # The triangle named is the one that holds the point.
-    a, b, c = np.moveaxis(obj.tree_corners[triangle[triangle >= 0]], 1, 0)
+    a, b, c = np.moveaxis(obj.corners[triangle[triangle >= 0]], 1, 0)
     point = (starts + along[:, None] * way)[triangle >= 0]
     normal = np.cross(b - a, c - a)
     area = np.linalg.norm(normal, axis=1)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.calibration.boards import Board
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import CalibrationError
+from fpp_ml_bench.loaders.render.scene import along_rays
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 
@@ -132,7 +133,7 @@ def _seen_by_both(rig: Rig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     camera, projector = rig.camera, rig.projector
     column, row = (axis.ravel() for axis in np.meshgrid(np.arange(camera.width), np.arange(camera.height)))
     x, y = (axis.ravel() for axis in camera.rays())
-    u, v = rig.project(np.column_stack([x, y, np.ones_like(x)]) * rig.standoff_m)
+    u, v = rig.project(along_rays(x, y, rig.standoff_m))
     lit = (u >= 0) & (u <= projector.width - 1) & (v >= 0) & (v <= projector.height - 1)
     if not lit.any():
         raise CalibrationError(

@@ -15,9 +15,9 @@ from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import CalibrationError
 from fpp_ml_bench.loaders.render.boards.poses import BoardPose, sheet_corners_mm
 from fpp_ml_bench.loaders.render.illumination import LitPixels, Material, light_surface
-from fpp_ml_bench.loaders.render.pixels import MixedPixels
+from fpp_ml_bench.loaders.render.pixels import MixedPixels, at_borders
 from fpp_ml_bench.loaders.render.raycast import Hits, TracedObject
-from fpp_ml_bench.loaders.render.scene import SolidMesh
+from fpp_ml_bench.loaders.render.scene import SolidMesh, along_rays
 from fpp_ml_bench.loaders.render.view import Studio, TracedView
 
 DARK = 0.25
@@ -104,7 +104,7 @@ def board_view(studio: Studio, board: Board, pose: BoardPose, stream: tuple[obje
     # Over twice the pixel's part: strictly between 0 and 1 wherever an edge crosses the pixel.
     dark = dark_share(board, place.x_mm, place.y_mm, tuple(np.multiply(2.0, part) for part in footprint))
     sheet = place.sheet
-    edges = np.flatnonzero(_border(sheet) | (sheet & (dark > 0) & (dark < 1)))
+    edges = np.flatnonzero(at_borders(np.where(sheet, 1, -1)) | (sheet & (dark > 0) & (dark < 1)).ravel())
     traced, facing = _outline(board, pose), -np.array([row[2] for row in pose.rotation])
     white = (1.0 - light.surface.gloss) * light.surface.albedo
 
@@ -115,7 +115,7 @@ def board_view(studio: Studio, board: Board, pose: BoardPose, stream: tuple[obje
     pixels = np.flatnonzero(sheet)
     depth_m = place.depth_m.ravel()[pixels]
     x, y = (axis.ravel()[pixels] for axis in camera.rays())
-    points_m = _points(x, y, depth_m)
+    points_m = along_rays(x, y, depth_m)
     normals = np.tile(facing, (len(pixels), 1))
     hits = Hits(pixels, depth_m, normals, np.zeros(len(pixels), dtype=np.int32))
     board_light = lit(points_m, normals, dark.ravel()[pixels])
@@ -128,7 +128,7 @@ def board_view(studio: Studio, board: Board, pose: BoardPose, stream: tuple[obje
     upon = place.sheet
     parts = tuple(np.nan_to_num(np.repeat(part.ravel()[edges], count)) / EDGE_RAYS for part in footprint)
     print_share = np.where(upon, dark_share(board, place.x_mm, place.y_mm, parts), 0.0)
-    points_m = _points(x, y, np.where(upon, place.depth_m, rig.background))
+    points_m = along_rays(x, y, np.where(upon, place.depth_m, rig.background))
     normals = np.where(upon[:, None], facing, [0.0, 0.0, -1.0])
     covered = upon.reshape(-1, count).mean(axis=1)
     mixed = MixedPixels(edges, points_m, normals, np.where(upon, 0, -1).astype(np.int32), covered < 1, covered)
@@ -150,17 +150,3 @@ def _outline(board: Board, pose: BoardPose) -> TracedObject:
     corners = np.array([[left, top, 0.0], [right, top, 0.0], [right, bottom, 0.0], [left, bottom, 0.0]])
     mesh = SolidMesh("board", corners, np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32))
     return TracedObject(mesh, pose.points_m(corners))
-
-
-def _points(x: Values, y: Values, depth_m: Values) -> Values:
-    return np.column_stack([x, y, np.ones_like(x)]) * depth_m[:, None]
-
-
-def _border(marked: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The pixels on both sides of where ``marked`` (H, W) changes."""
-    border = np.zeros_like(marked)
-    for one, other in ((np.s_[1:], np.s_[:-1]), (np.s_[:, 1:], np.s_[:, :-1])):
-        changes = marked[one] != marked[other]
-        border[one] |= changes
-        border[other] |= changes
-    return border
