@@ -252,7 +252,7 @@ def chosen_samples_of_nothing(opened):
     class Empty:
         path = opened.path
 
-        def samples(self, split):
-            return []
+        def samples_by_object(self, split):
+            return {}
 
     return chosen_samples(Empty(), "test", 2)
