@@ -270,7 +270,7 @@ def _contradictions(given: Fit) -> Finding:
 def _out_of_range(depth_mm: NDArray[np.float64], rig: Rig) -> Finding:
     low, middle, high = np.quantile(depth_mm, (0.02, 0.5, 0.98))
     near, far = rig.working_range_mm
-    cause, change = "another working range than the rig file's", f"give the range: --range {low:.0f},{high:.0f}"
+    cause, change = "another working range than the rig file's", f"give the range: --working-range {low:.0f},{high:.0f}"
     if units := [f"{why} ({factor:g} times)" for factor, why in _UNITS.items() if near <= factor * middle <= far]:
         cause = f"a wrong unit of the rig's translation: {units[0]}"
         change = "correct the translation or the calibration's unit"

@@ -213,11 +213,11 @@ def test_depths_out_of_the_range_name_the_range_or_the_unit():
     rig = vertical(FOUR)
     frames = frames_of(rig)
     text = said(frames, rig.with_range((500, 900)))[0][1]
-    near, far = (float(end) for end in text.split("--range ")[1].split()[0].split(","))
+    near, far = (float(end) for end in text.split("--working-range ")[1].split()[0].split(","))
     assert near < 1800 < far and "another working range" in text
     tenth = replace(rig, translation_m=tuple(length / 10 for length in rig.translation_m))
     text = said(frames, tenth)[0][1]
-    assert "cm were read as mm (10 times)" in text and "--range" not in text
+    assert "cm were read as mm (10 times)" in text and "--working-range" not in text
 
 
 def test_what_a_rig_can_not_tell_is_listed():
