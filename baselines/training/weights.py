@@ -304,9 +304,18 @@ def read_file(path: Path, family: Family) -> "tuple[Any, dict[str, Tensor], str]
 def _built(path: Path, config: Any, tensors: "Mapping[str, Tensor]", family: Family) -> "nn.Module":
     """The network that ``config`` makes, without memory. Refuses tensors that are not exactly its own."""
     import torch
+    from torch.overrides import TorchFunctionMode
+
+    class Undrawn(TorchFunctionMode):
+        """Draws no first weights: on "meta", which has no values, torch would import its compiler for that: 0.8 s."""
+
+        def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+            if func.__name__ in ("normal_", "uniform_"):
+                return args[0] if args else kwargs["tensor"]
+            return func(*args, **(kwargs or {}))
 
     try:
-        with torch.device("meta"):
+        with torch.device("meta"), Undrawn():
             network = family.build(config)
         expected = network.state_dict()
     except (FppBenchError, TypeError, ValueError, RuntimeError) as error:

@@ -6,7 +6,6 @@ from time import perf_counter
 
 import numpy as np
 
-from fpp_ml_bench.baselines import views
 from fpp_ml_bench.cli.console import progress_bar, say_findings, show
 from fpp_ml_bench.cli.options import AT_LEAST_ONE, SPLITS, WORKING_RANGE, command, names, value
 from fpp_ml_bench.coding.code import MIN_MODULATION
@@ -136,14 +135,17 @@ def fuse(
     dataset: Path = argument("folder of a generated dataset", "DATASET"),
     split: str = option("test", "split of PREDICTIONS (default: test)", choices=SPLITS),
     only: str | None = option(None, "only this object (default: all of the split)", "NAME", flag="--object"),
-    cell_mm: float = option(views.CELL_MM, "edge of the cells in which points are averaged (default: 2)", "MM"),
+    cell_mm: float | None = option(None, "edge of the cells in which points are averaged (default: 2)", "MM"),
     out: Path = option(REQUIRED, "folder for {object}.ply (metres, object coordinates) and fusion.json", "DIR"),
 ) -> None:
     """Put the views of each object into one point cloud by their known placement, and compare them with each other.
 
     Prints what was counted. Raises FppBenchError for unusable predictions or data."""
+    from fpp_ml_bench.baselines import views  # trimesh takes 0.2 s, which decode does not need
+
     opened = DatasetFolder(dataset)
-    name, count, objects = views.fuse_split(predictions, opened, split, out, only, cell_mm)
+    size_mm = views.CELL_MM if cell_mm is None else cell_mm
+    name, count, objects = views.fuse_split(predictions, opened, split, out, only, size_mm)
     table = Table(
         "object", numbers=("points in the cloud", "pixels with a depth", "contradicted"), title=printable(name)
     )
