@@ -29,6 +29,7 @@ from fpp_ml_bench.baselines.phase.local_fit import (
     LARGEST_STEP_RAD,
     FringeFit,
     GaussianWindow,
+    best_sides,
     fringes,
     phase_noise_grey,
     same_plane_mean,
@@ -215,6 +216,18 @@ def _window_fit(seen: CrossedObservation, nearness: NDArray) -> NearnessFit:
     uncertainty = np.sqrt((averaged + rest * acting) / curvature) / bright
     maps = (nearness, brightness, misfit, share, uncertainty)
     return NearnessFit(*(np.asarray(values, np.float32) for values in maps))
+
+
+def _of_best_sides(seen: CrossedObservation, fit: NearnessFit) -> NearnessFit:
+    """The fit of every pixel, or of the neighbour whose surface explains the frame there better (`best_sides`)."""
+
+    def raised(nearness: Image) -> Image:
+        return fringes(seen.carriers, nearness, seen.contrast)[0]
+
+    noise_grey, fitted = seen.background.noise_grey, (fit.nearness, fit.brightness)
+    nearness, brightness, places = best_sides(fitted, seen.light, seen.inside, raised, noise_grey, seen.period_px)
+    misfit = np.asarray(seen.light - brightness * raised(nearness), np.float32)
+    return NearnessFit(nearness, brightness, misfit, fit.weight[*places], fit.uncertainty_rad[*places])
 
 
 def _own_fit(seen: CrossedObservation, nearness: Image, moved: int) -> NearnessFit:
@@ -427,7 +440,10 @@ class CrossedRoute(TwoCarriers):
         """The order of every pixel, and the nearness that follows."""
         order = crossed_order(seen, crossed_candidates(seen), self.settings)
         nearness = order.candidates.nearness[1]
-        fit = _window_fit(seen, nearness) if seen.moved is None else _own_fit(seen, nearness, seen.moved)
+        if seen.moved is None:
+            fit = _of_best_sides(seen, _window_fit(seen, nearness))
+        else:
+            fit = _own_fit(seen, nearness, seen.moved)
         if seen.moved is None and not seen.given and not seen.background.shown:
             seen = replace(seen, inside=seen.inside & (fit.brightness > MIN_MODULATION))
         known = {entry.name: getattr(seen, entry.name) for entry in fields(seen)}

@@ -36,6 +36,11 @@ be seen misfits no prediction; a plane that is there explains 0.8 and more even 
 SAME_STRENGTH = 1.35  # ratio of strengths within which tiles show the same surface: sheen changes slowly over a plane
 SAME_RAD = 0.4  # distance of a phase pair from the plane's within which a pixel may show it
 MARGIN_PERIODS = 0.4  # eroded from those pixels: a window beside an object covers it too
+TEXTURED = 3.0
+"""Misfit of the plane over the frame's noise from which on its albedo is taken to change from place to place."""
+ALBEDO_PERIODS, ALBEDO_SIDES = 0.27, 0.5
+"""In periods: sigma of the window in which an albedo is measured, and how far away the albedo of a side is taken."""
+ALBEDO_SHARE = 0.03  # of the plane's light that counts as noise where its albedo changes
 SAMPLES = 4000  # points to which the plane is fitted, about
 ROUNDS = 4
 OUTLIER_SIGMAS = 4.0
@@ -202,7 +207,7 @@ class CrossedEmptyScene:
         # Without a known background nothing is predicted, and no image shows it.
         depth_m = np.nan if rig.background_m is None else rig.background_m
         phases = carriers.phases(carriers.nearness(depth_m * MM_PER_M))
-        self._phases = wrapped(phases[:, ::stride, ::stride])
+        self._phases, self._known = wrapped(phases[:, ::stride, ::stride]), rig.background_m is not None
         x, y = (axis.astype(np.float32) for axis in rig.camera.rays())
         fall_off = plane_irradiance(rig, depth_m).astype(np.float32)
         fall_off /= np.float32(np.median(fall_off))
@@ -212,6 +217,7 @@ class CrossedEmptyScene:
         terms = [fall_off * term * (1 + first + second) for term in _quadratic(x, y)]
         terms += [fall_off * first, fall_off * second, np.ones_like(x)]
         self._terms = [term.astype(np.float32) for term in terms]
+        self._period_px = carriers.period_px
         self._margin = 2 * max(1, round(MARGIN_PERIODS * carriers.period_px / stride)) + 1
 
     def __call__(self, grey: Image, seen: Demodulated) -> Background:
@@ -231,21 +237,46 @@ class CrossedEmptyScene:
         terms = np.stack([term[row, column] for term in self._terms], axis=1).astype(np.float64)
         light, weights = _least_squares(terms, samples)
         curve = np.stack([light**power for power in CURVE_POWERS] + [np.ones_like(light)], axis=1)
-        scale = np.abs(curve).max(axis=0)
+        scale = np.maximum(np.abs(curve).max(axis=0), 1e-6)
         fitted, bend = _least_squares(curve / scale, samples)
         noise = _noise_of(samples - fitted)
         # Horner's rule on whole images, in single precision: 1e-5 of a grey level is enough here.
         first = sum((np.float32(w) * term for w, term in zip(weights, self._terms, strict=True)), np.float32(0))
         bend = (bend / scale).astype(np.float32)
         plane = ((bend[2] * first + bend[1]) * first + bend[0]) * first + bend[3]
+        if noise > TEXTURED * (own_noise := max(image_noise_grey(grey), DEFAULT_NOISE_GREY)):
+            return Background(dark, np.nan, own_noise, self._of_any_albedo(grey, plane, dark, own_noise), share, ())
         return Background(dark, np.nan, noise, grey - plane, share, ())
 
+    def _of_any_albedo(self, grey: Image, plane: Image, dark: float, noise_grey: float) -> Image:
+        """Misfit of a plane whose albedo changes from place to place, in units of the noise: the fringe of ``plane`` is
+        as bright as the frame says around the pixel, or on one of its sides."""
+        light, seen = plane - np.float32(dark), grey - np.float32(dark)
+        sigma_px = ALBEDO_PERIODS * self._period_px
+        power = cv2.GaussianBlur(light * light, (0, 0), sigma_px)
+        albedo = cv2.GaussianBlur(seen * light, (0, 0), sigma_px) / np.maximum(power, noise_grey**2)
+        reach = round(self._period_px * ALBEDO_SIDES)
+        around = cv2.copyMakeBorder(albedo, reach, reach, reach, reach, cv2.BORDER_REPLICATE)
+        height, width = grey.shape
+        least = np.full(grey.shape, np.inf, np.float32)
+        for down, right in ((0, 0), (-1, 0), (1, 0), (0, -1), (0, 1), (-1, -1), (-1, 1), (1, -1), (1, 1)):
+            y, x = reach * (1 + down), reach * (1 + right)
+            misfit = seen - around[y : y + height, x : x + width] * light
+            least = np.where(np.abs(misfit) < np.abs(least), misfit, least)
+        return least / np.hypot(1, np.float32(ALBEDO_SHARE / noise_grey) * light)
+
     def _plane(self, seen: Demodulated, noise_grey: float) -> Mask:
-        """Grid points (h', w') whose windows show the plane alone."""
-        distance = np.hypot(*wrapped(seen.phase_rad - self._phases))
-        visible = seen.modulation.min(axis=0) > noise_grey / 4
-        same = ((distance < SAME_RAD) & visible).astype(np.uint8)
-        return cv2.erode(same, np.ones((self._margin, self._margin), np.uint8), borderValue=1) > 0  # type: ignore[call-overload,no-any-return]
+        """Grid points (h', w') whose windows show the plane alone; where its fringes are nowhere to be seen, those
+        without any fringe: they are blurred out, or there is no wall."""
+        modulation, square = seen.modulation, np.ones((self._margin, self._margin), np.uint8)
+        same = np.hypot(*wrapped(seen.phase_rad - self._phases)) < SAME_RAD
+        fringed, plain = modulation.min(axis=0) > noise_grey / 4, modulation.max(axis=0) < noise_grey / 2
+        alone: Mask = np.zeros(plain.shape, bool)
+        for points in (same & fringed, plain & self._known):
+            alone = cv2.erode(points.astype(np.uint8), square, borderValue=1) > 0  # type: ignore[call-overload]
+            if alone.mean() >= LEAST_SHARE:
+                break
+        return alone
 
 
 def _least_squares(

@@ -12,7 +12,7 @@ change of phase (`tied_fit`). A projected fringe goes down to black, so its mean
 g; with that constraint a slope of brightness is not taken for phase.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -34,6 +34,11 @@ DEMODULATION_PERIODS = 0.4  # sigma of the demodulator's window, in periods of t
 FLOOR_NOISE_GREY = 0.3  # noise of rounding to whole grey levels
 REACH_PX = 2  # of the pairs that are averaged
 SAME_PLANE_SIGMAS = 3.0
+SIDES, SIDE_PERIODS = 8, (0.25, 0.5, 0.75)  # neighbours that are asked: directions, and distances in periods
+SIDE_WINDOW_PX, SIDE_SLOPE_PX = 2.0, 3.0  # sigmas of the window in which offers are compared, and of their slopes
+SIDE_SHARE = 0.08  # of the brightness that counts as noise there
+SIDE_CAP = 16.0  # most that the misfit of one pixel counts, in squared sigmas
+SIDE_COST = 0.5  # of an offer from a period away
 
 
 PLANE = ((0, 0), (1, 0), (0, 1))
@@ -347,3 +352,51 @@ def same_plane_mean(psi: Image, sigma: Image, inside: Mask) -> tuple[Image, Imag
         total += weight * (first + second) / 2
         weights += weight
     return (total / weights).astype(np.float32), np.sqrt(1 / weights).astype(np.float32)
+
+
+def best_sides(
+    fit_of: tuple[Image, Image],
+    light: Image,
+    inside: Mask,
+    raised: Callable[[Image], Image],
+    noise_grey: float,
+    period_px: float,
+) -> tuple[Image, Image, NDArray[np.intp]]:
+    """The window of a pixel near a depth edge or a crease covers two surfaces, and its fit lies between them. The
+    windows of some of its neighbours, up to three quarters of a period away, cover one: each offers its plane, and the
+    offer wins that explains the grey levels around the pixel best.
+
+    ``fit_of``: what was fitted, a map that depth follows from and the brightness, (h, w); ``raised``: light over
+    brightness that follows from such a map; ``light``: grey levels less ambient light. Returns both maps, and rows and
+    columns (2, h, w) of the neighbours that they are from."""
+    if min(inside.shape) < 2:  # no object
+        return *fit_of, np.indices(inside.shape)
+    weight = inside.astype(np.float32)
+    share = np.maximum(cv2.GaussianBlur(weight, (0, 0), SIDE_SLOPE_PX), 1e-6)
+    maps = [*fit_of, weight]
+    for values in fit_of:
+        maps += np.gradient(cv2.GaussianBlur(values * weight, (0, 0), SIDE_SLOPE_PX) / share)
+    reach = round(max(SIDE_PERIODS) * period_px)
+    padded = np.pad(np.stack(maps).astype(np.float32), ((0, 0), (reach, reach), (reach, reach)))
+    turns = TAU * np.arange(SIDES) / SIDES
+    offsets = [(0, 0)] + [
+        (round(distance * period_px * np.sin(turn)), round(distance * period_px * np.cos(turn)))
+        for distance in SIDE_PERIODS
+        for turn in turns
+    ]
+    share = np.maximum(cv2.GaussianBlur(weight, (0, 0), SIDE_WINDOW_PX), 1e-6)
+    height, width = inside.shape
+    best, away = np.full((3, height, width), np.inf, np.float32), np.zeros((2, height, width), np.intp)
+    for down, right in offsets:
+        there = slice(reach + down, reach + down + height), slice(reach + right, reach + right + width)
+        values, bright, known, by_y, by_x, bright_y, bright_x = padded[:, *there]
+        offered = values - down * by_y - right * by_x
+        bright = np.maximum(bright - down * bright_y - right * bright_x, 0)
+        cost = (light - bright * raised(offered)) ** 2 / (noise_grey**2 + (SIDE_SHARE * bright) ** 2)
+        cost = np.where(known > 0, np.minimum(cost, SIDE_CAP), SIDE_CAP) * weight
+        mean = cv2.GaussianBlur(cost, (0, 0), SIDE_WINDOW_PX) / share + SIDE_COST * np.hypot(down, right) / period_px
+        won = inside & (known > 0) & (mean < best[0])
+        best[:, won] = mean[won], offered[won], bright[won]
+        away[0][won], away[1][won] = down, right
+    best[1:, ~inside] = np.stack(fit_of)[:, ~inside]
+    return best[1], best[2], np.indices(inside.shape) + away

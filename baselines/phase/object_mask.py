@@ -18,6 +18,9 @@ from fpp_ml_bench.coding.code import MIN_MODULATION
 from fpp_ml_bench.coding.phase_shift import phase_weights
 
 CLOSING_PERIODS = 0.27
+ENCLOSED_PERIODS, ENCLOSED_WINDOW_PERIODS, ENCLOSED_EXCESS = 0.6, 0.2, 1.0
+"""Radius of the closing whose pixels join the object where the mean square of the plane's misfit, in a window of this
+sigma, exceeds that of noise by this multiple: ten standard deviations of such a mean."""
 RING_PERIODS = 0.14
 """Distance from the first mask's silhouette within which a pixel may change between object and background."""
 LARGEST_MISFIT = 0.35  # of a fringe that is there, squared, as a share of its own square
@@ -30,6 +33,7 @@ LEAST_AREA_PERIODS = 0.1  # smallest object, and largest hole that is closed, in
 PLANE_CHANCE_SIGMAS = 4.0
 """How far, in sigmas of its own spread, the squared misfit of N frames must exceed N not to be the empty plane."""
 PLANE_TOLERANCE_GREY = 0.3  # error of the fitted empty scene, grey levels, beside noise
+UNLIT_PX = 3  # side of the square that is averaged to tell faint light
 SQUARE_PX = 5  # side of the square over which faint differences are averaged
 PIXELWISE_CLOSING_PERIODS = 0.2
 ALIKE = 0.2
@@ -78,6 +82,14 @@ def object_region(background: Background, period_px: float) -> Mask:
     return closed(background.different, CLOSING_PERIODS * period_px, LEAST_AREA_PERIODS * period_px**2)
 
 
+def enclosed(region: Mask, background: Background, period_px: float) -> Mask:
+    """Pixels (H, W) within the closed ``region`` around which the empty scene does not explain the grey levels, though
+    it explains each one alone: dark parts of an object in a noisy frame."""
+    around = cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_CLOSE, disk(ENCLOSED_PERIODS * period_px)) > 0
+    power = cv2.GaussianBlur(background.residual**2, (0, 0), ENCLOSED_WINDOW_PERIODS * period_px)
+    return around & (power > (1 + ENCLOSED_EXCESS) * background.noise_grey**2)
+
+
 def modulated_region(grey: Image, modulation: Image, background: Background, period_px: float) -> Mask:
     """First mask (H, W) of an image that shows no known background: pixels with a fringe, by ``modulation`` in grey
     levels (`local_fit.carrier_fit`), whose stripes are also as bright as such a fringe: the window of ``modulation``
@@ -94,9 +106,14 @@ def stripes_filled(grey: Image, period_px: float) -> Image:
     return cv2.morphologyEx(grey, cv2.MORPH_CLOSE, square, borderType=cv2.BORDER_REPLICATE)  # type: ignore[return-value]
 
 
-def unlit(grey: Image, background: Background, period_px: float) -> Mask:
-    """Pixels (H, W) in ambient light alone over most of a period: closing fills the dark stripes of a fringe first."""
-    return stripes_filled(grey, period_px) < background.ambient_grey + UNLIT_SIGMAS * background.noise_grey
+def unlit(grey: Image, background: Background, period_px: float, side_px: int = 1) -> Mask:
+    """Pixels (H, W) in ambient light alone over most of a period: closing fills the dark stripes of a fringe first.
+    Squares of ``side_px`` are averaged, so that a weaker light is told from noise."""
+    limit_grey = UNLIT_SIGMAS * background.noise_grey / side_px
+    if side_px == 1:
+        return stripes_filled(grey, period_px) < background.ambient_grey + limit_grey
+    means: Image = cv2.blur(grey, (side_px, side_px))  # type: ignore[assignment]
+    return stripes_filled(means, period_px) < background.ambient_grey + limit_grey + PLANE_TOLERANCE_GREY
 
 
 def explained(grey: Image, predicted: Image, ambient_grey: float, period_px: float) -> Mask:

@@ -40,9 +40,11 @@ from fpp_ml_bench.baselines.phase.local_fit import (
 from fpp_ml_bench.baselines.phase.object_mask import (
     DARKEST_GREY,
     RING_PERIODS,
+    UNLIT_PX,
     continued,
     crop_around,
     differs,
+    enclosed,
     explained,
     first_mask,
     lit_object,
@@ -379,6 +381,7 @@ class TwoCarriers(MeasurementModel):
             region = modulated_region(grey, modulation, background, period_px)
         elif moved is None:
             region = object_region(background, period_px)
+            region |= enclosed(region, background, period_px)
         else:
             different = differs([plane.residual for plane in planes], background.noise_grey)
             closed = first_mask(different, period_px)
@@ -388,7 +391,7 @@ class TwoCarriers(MeasurementModel):
         crop = crop_around(region, int(np.ceil(MARGIN_PERIODS * period_px)), stride)
         background, inside = replace(background, residual=background.residual[crop]), region[crop]
         if mask is None and moved is None:
-            inside = inside & ~unlit(grey[crop], background, period_px)
+            inside = inside & ~unlit(grey[crop], background, period_px, UNLIT_PX)
         grid = tuple(slice(part.start // stride, -(-part.stop // stride)) for part in crop)
         carriers = self.carriers.at(crop)
         points, mean_grey = inside[::stride, ::stride], seen.mean_grey[grid] - background.ambient_grey

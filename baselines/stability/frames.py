@@ -364,7 +364,7 @@ def flipped_bit(bit: int, direction: Direction) -> Outcome:
     return worst(error, bound_mm, decoded.reason[inside] != Reason.DECODED)
 
 
-CROSSED_RIG = replace(crossed_rig(320), background_m=None)
+CROSSED_RIG = replace(crossed_rig(320, "crossed-18"), background_m=None)
 CARRIERS: Crossed = CROSSED_RIG.crossed  # type: ignore[assignment]
 DEPTH_M, AMBIENT, NOISE = 1.78, 6.0, 0.7
 MIDDLE = slice(120, 200), slice(120, 200)

@@ -1,5 +1,8 @@
 """The rigs that this package names: the paper's, and the same with crossed fringes."""
 
+from collections.abc import Callable
+from functools import partial
+
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.optics.pinhole import Pinhole
@@ -8,11 +11,15 @@ from fpp_ml_bench.optics.rig import Rig
 FIRST_SHIFTED_DEG = ((0.0, 0.0), (120.0, 0.0), (240.0, 0.0))
 """Phase shifts of three crossed frames: the first is the single shot; the three together shift the first carrier and
 keep the second still, so that the first is also measured pixel by pixel, and their mean holds the second."""
-CROSSED = Crossed((18.0, 18.0), (144.6, 54.6), shifts_deg=FIRST_SHIFTED_DEG)
-"""The crossed rig's frames. The first carrier is turned 16 degrees from across the epipolar lines, where its phase
-changes fastest with depth, and the second is square to it: it changes 2 / 7 as much, so that rivals are 1.7 rad
-away but for the ends of the range, and the background 0.9 rad and more. 18 px survive a defocus that leaves
-nothing of finer fringes (docs/results/crossed.md)."""
+CROSSED = {
+    "crossed-18": Crossed((18.0, 18.0), (144.6, 54.6), shifts_deg=FIRST_SHIFTED_DEG),
+    "crossed-12": Crossed((12.0, 12.0), (140.0, 50.0), shifts_deg=FIRST_SHIFTED_DEG),
+    "crossed-10": Crossed((10.0, 10.0), (138.1, 48.1), shifts_deg=FIRST_SHIFTED_DEG),
+}
+"""Crossed fringes by the name of the rig that shows them. The first carrier is turned a little from across the epipolar
+lines, where its phase changes fastest with depth, and the second is square to it: the finer the fringes, the further,
+so that rivals stay 1.4 to 1.7 rad away but for the ends of the range (docs/results/crossed.md)."""
+DEFAULT_CROSSED = "crossed-12"
 
 
 def paper_rig(size: int = FULL_SIZE) -> Rig:
@@ -25,10 +32,14 @@ def paper_rig(size: int = FULL_SIZE) -> Rig:
     return rig if size == FULL_SIZE else rig.scaled(size)
 
 
-def crossed_rig(size: int = FULL_SIZE) -> Rig:
+def crossed_rig(size: int = FULL_SIZE, name: str = DEFAULT_CROSSED) -> Rig:
     """The paper's rig with the frames of `CROSSED` before its own, from which the ground truth is decoded."""
-    return paper_rig(size).with_crossed(CROSSED)
+    return paper_rig(size).with_crossed(CROSSED[name])
 
 
-NAMED_RIGS = {"paper": paper_rig, "crossed": crossed_rig}
-"""By the name that a command takes in place of a rig file."""
+NAMED_RIGS: dict[str, Callable[..., Rig]] = {
+    "paper": paper_rig,
+    "crossed": crossed_rig,
+    **{name: partial(crossed_rig, name=name) for name in CROSSED},
+}
+"""By the name that a command takes in place of a rig file; ``crossed`` is `DEFAULT_CROSSED`."""

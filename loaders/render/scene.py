@@ -155,9 +155,9 @@ def preset_settings(preset: str, size: int | None = None, light: str = "paper", 
 
 
 def default_frames(rig: str) -> str:
-    """The configuration that ``fpp-bench build --rig RIG`` stores unless ``--config`` says otherwise: of the crossed
+    """The configuration that ``fpp-bench build --rig RIG`` stores unless ``--config`` says otherwise: of a crossed
     rig its crossed frames, of any other all frames."""
-    return "crossed" if rig == "crossed" else "all"
+    return "crossed" if rig in NAMED_RIGS and rig != "paper" else "all"
 
 
 def modulation_at(rig: Rig, depth_mm: float, light: Light | None = None) -> float:

@@ -144,8 +144,8 @@ def test_the_search_reaches_far_and_proposes_the_finest_of_the_safe():
 
 
 def test_the_pair_of_the_crossed_rig_is_far_from_its_rivals_but_for_the_ends_of_the_range():
-    (whole,) = describe(PAPER, [CROSSED], Assumptions())
-    (most,) = describe(PAPER.with_range((1500.0, 2050.0)), [CROSSED], Assumptions())
+    (whole,) = describe(PAPER, [CROSSED["crossed-18"]], Assumptions())
+    (most,) = describe(PAPER.with_range((1500.0, 2050.0)), [CROSSED["crossed-18"]], Assumptions())
     (paper,) = describe(PAPER, [Crossed((18.0, 18.0))], Assumptions())
     assert most.rival_rad > 1.7 and whole.rival_rad > 0.95 and whole.background_rad > 0.85
     assert whole.noise_mm == pytest.approx(paper.noise_mm, rel=0.01) and whole.wrong_share < paper.wrong_share / 4
@@ -157,7 +157,7 @@ def test_what_can_not_be_searched_is_said():
     with pytest.raises(RigError, match=r"all 4 pairs show the background at 3\.2 m"):
         search(PAPER, Assumptions(phase_sigma=1.0), (18, 18.5), (0, 90))
     with pytest.raises(RigError, match="surfaces: expected a part of the working range 1500 to 2100 mm"):
-        describe(PAPER, [CROSSED], Assumptions(surfaces_mm=(1400.0, 1900.0)))
+        describe(PAPER, [CROSSED["crossed-18"]], Assumptions(surfaces_mm=(1400.0, 1900.0)))
     away = replace(PAPER, rotation=((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)), background_m=None)
     with pytest.raises(RigError, match="no pixel sees the pattern"):
         EpipolarLines.of(away)

@@ -34,13 +34,13 @@ STILL = CrossedVariation(near_edge=0.5, wrong_window=0, wrong_patch=0, no_plane=
 
 @cache
 def route() -> CrossedRoute:
-    return CrossedRoute(crossed_rig(SIZE))
+    return CrossedRoute(crossed_rig(SIZE, "crossed-18"))
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("views")
-    render_views(GROUPS, crossed_rig(SIZE), (0,), out, workers=1)
+    render_views(GROUPS, crossed_rig(SIZE, "crossed-18"), (0,), out, workers=1)
     return out
 
 
@@ -90,7 +90,7 @@ def test_windows_mean_the_same_in_every_orientation(samples: list[Sample], turn:
 def test_labels_say_which_candidate_and_how_far(samples: list[Sample]) -> None:
     rng = np.random.default_rng(5)
     for vary in (STILL, replace(STILL, wrong_window=1.0)):
-        seen, task = [], CrossedRecipe(window=64, vary=vary).task(crossed_rig(SIZE))
+        seen, task = [], CrossedRecipe(window=64, vary=vary).task(crossed_rig(SIZE, "crossed-18"))
         for _ in range(12):
             window = task.draw(samples, rng)
             assert np.isfinite(window["x"]).all() and window["x"].shape == (len(CROSSED_CHANNELS), 64, 64)
@@ -113,7 +113,7 @@ def test_a_training_in_small_is_resumed_and_predicts(
     recipe = CrossedRecipe(
         steps=2, validate_every=1, batch=1, window=64, widths=(4, 4), order_widths=(4, 4), fine=4, squeezed=4
     )
-    out, rig = tmp_path / "run", crossed_rig(SIZE)
+    out, rig = tmp_path / "run", crossed_rig(SIZE, "crossed-18")
     first = train_net(recipe, out, rig=rig, minutes=1e-9)
     assert first.weights is None and first.steps == 1
     trained = train_net(recipe, out, rig=rig)
@@ -134,7 +134,7 @@ def test_a_training_in_small_is_resumed_and_predicts(
 
 def test_depths_lie_on_measured_candidates_whatever_the_network_says(folder: Path) -> None:
     recipe = CrossedRecipe(widths=(4, 4), order_widths=(4, 4), fine=4, squeezed=4)
-    learned = CrossedNetRoute(crossed_rig(SIZE), recipe.network().eval(), threshold=0.0, lead=0.0)
+    learned = CrossedNetRoute(crossed_rig(SIZE, "crossed-18"), recipe.network().eval(), threshold=0.0, lead=0.0)
     view = next(read_views(folder, GROUPS, "train"))
     seen = learned.fitted(learned.observe(view.frames[0]))
     scene = CrossedScene.of(seen)

@@ -19,7 +19,7 @@ from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
 from fpp_ml_bench.optics.rig import Rig
 
-WHOLE = crossed_rig(960)
+WHOLE = crossed_rig(960, "crossed-18")
 CUT = replace(WHOLE, camera=replace(WHOLE.camera, width=320, height=320, cx=159.5, cy=159.5))
 """The middle of the benchmark's images, whose pixels are not resampled."""
 

@@ -59,7 +59,7 @@ def test_light_is_the_image_through_response_and_blur(response, defocus_px):
 
 
 def test_a_dataset_of_crossed_frames_has_the_depth_of_the_other_frames(tmp_path):
-    family = Crossed((18.0, 14.0), (0.0, 75.0), shifts_deg=CROSSED.shifts_deg)
+    family = Crossed((18.0, 14.0), (0.0, 75.0), shifts_deg=CROSSED["crossed-18"].shifts_deg)
     settings = BuildSettings(paper_rig(240).with_crossed(family), ("cork",), stored="crossed")
     build(tmp_path / "crossed", settings, 1)
     build(tmp_path / "paper", BuildSettings(paper_rig(240), ("cork",), stored="single_shot"), 1)

@@ -18,7 +18,7 @@ from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.sensor import camera_noise
 from fpp_ml_bench.loaders.render.view import Studio, ground_truth_error
 from fpp_ml_bench.loaders.sample import WEAK_GREY, Flag
-from fpp_ml_bench.optics.named_rigs import crossed_rig
+from fpp_ml_bench.optics.named_rigs import CROSSED
 from fpp_ml_bench.optics.sequence import Sequence
 from fpp_ml_bench.skipping import skipping
 
@@ -283,7 +283,7 @@ def test_weak_light_is_flagged_by_half_of_what_white_adds_to_black():
 
 
 def test_the_flags_are_the_same_whatever_is_projected():
-    crossed = RIG.with_crossed(crossed_rig().crossed)
+    crossed = RIG.with_crossed(CROSSED["crossed-18"])
     rows = [studio(PAPER, rig=rig).photograph(GROOVE, "A60") for rig in (RIG, crossed)]
     np.testing.assert_array_equal(rows[0].flags, rows[1].flags)
     np.testing.assert_array_equal(rows[0].depth_exact_mm, rows[1].depth_exact_mm)
