@@ -36,6 +36,7 @@ be seen misfits no prediction; a plane that is there explains 0.8 and more even 
 SAME_STRENGTH = 1.35  # ratio of strengths within which tiles show the same surface: sheen changes slowly over a plane
 SAME_RAD = 0.4  # distance of a phase pair from the plane's within which a pixel may show it
 MARGIN_PERIODS = 0.4  # eroded from those pixels: a window beside an object covers it too
+PLAIN_SIGMAS = 5.0  # spread of the plane's fitted light, over the noise, below which it shows no fringe
 TEXTURED = 3.0
 """Misfit of the plane over the frame's noise from which on its albedo is taken to change from place to place."""
 ALBEDO_PERIODS, ALBEDO_SIDES = 0.27, 0.5
@@ -236,15 +237,17 @@ class CrossedEmptyScene:
         samples = grey[row, column].astype(np.float64)
         terms = np.stack([term[row, column] for term in self._terms], axis=1).astype(np.float64)
         light, weights = _least_squares(terms, samples)
+        # Horner's rule on whole images, in single precision: 1e-5 of a grey level is enough here.
+        first = sum((np.float32(w) * term for w, term in zip(weights, self._terms, strict=True)), np.float32(0))
+        own_noise = max(image_noise_grey(grey), DEFAULT_NOISE_GREY)
+        if np.subtract(*np.percentile(light, [95, 5])) < PLAIN_SIGMAS * own_noise:  # no fringe for a gamma to bend
+            return Background(dark, np.nan, max(_noise_of(samples - light), noise), grey - first, share, ())
         curve = np.stack([light**power for power in CURVE_POWERS] + [np.ones_like(light)], axis=1)
         scale = np.maximum(np.abs(curve).max(axis=0), 1e-6)
         fitted, bend = _least_squares(curve / scale, samples)
-        noise = _noise_of(samples - fitted)
-        # Horner's rule on whole images, in single precision: 1e-5 of a grey level is enough here.
-        first = sum((np.float32(w) * term for w, term in zip(weights, self._terms, strict=True)), np.float32(0))
-        bend = (bend / scale).astype(np.float32)
+        noise, bend = _noise_of(samples - fitted), (bend / scale).astype(np.float32)
         plane = ((bend[2] * first + bend[1]) * first + bend[0]) * first + bend[3]
-        if noise > TEXTURED * (own_noise := max(image_noise_grey(grey), DEFAULT_NOISE_GREY)):
+        if noise > TEXTURED * own_noise:
             return Background(dark, np.nan, own_noise, self._of_any_albedo(grey, plane, dark, own_noise), share, ())
         return Background(dark, np.nan, noise, grey - plane, share, ())
 

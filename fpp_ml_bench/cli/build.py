@@ -43,7 +43,9 @@ class BuildCommandSettings(Explain, Pool):
     )
     seed: int = option(42, "seed of noise and placement (default: 42)", "N")
     rig: str = option(
-        "paper", "the paper's, the same with crossed fringes, or a rig file (default: paper)", "paper|crossed|FILE"
+        "paper",
+        "the paper's, the same with crossed fringes (also crossed-10, crossed-18), or a rig file (default: paper)",
+        "paper|crossed|FILE",
     )
     decode_with: Path | None = option(
         None,

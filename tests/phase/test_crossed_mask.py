@@ -1,0 +1,82 @@
+"""The mask of one crossed frame where the wall or the object is hard to see, and edges between surfaces."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from crossed_scenes import frame, route, slab
+from numpy.typing import NDArray
+
+from fpp_ml_bench.baselines.phase import empty_scene, local_fit, object_mask
+from fpp_ml_bench.optics.named_rigs import crossed_rig
+
+WHOLE = crossed_rig(960)
+CUT = replace(WHOLE, camera=replace(WHOLE.camera, width=320, height=320, cx=159.5, cy=159.5))
+FAMILY = WHOLE.crossed
+DEPTH_MM = slab(CUT)
+INSIDE = DEPTH_MM > 0
+Y, X = np.indices(DEPTH_MM.shape)
+CHECKS = np.where((X // 32 + Y // 32) % 2, 1.0, 0.35)
+
+
+def shares(image: NDArray[np.uint8]) -> tuple[float, float]:
+    """Of the object without a depth, and of the background with one."""
+    answered = route(CUT, FAMILY).measure(image).depth_mm > 0
+    return float((~answered[INSIDE]).mean()), float(answered[~INSIDE].mean())
+
+
+def shown(noise_grey: float = 0.7, **light: object) -> NDArray[np.uint8]:
+    return frame(DEPTH_MM, CUT, FAMILY, noise_grey=noise_grey, **light)  # type: ignore[arg-type]
+
+
+def test_a_plain_slab() -> None:
+    missed, invented = shares(shown())
+    assert missed < 1e-3 and invented < 5e-3
+
+
+@pytest.mark.parametrize("wall_grey", [4.0, 40.0, 90.0])
+def test_a_wall_without_visible_fringes(wall_grey: float) -> None:
+    """Blurred out, or no wall: half of the slab has less modulation than would count as a fringe by itself."""
+    image = shown(white_grey=np.where(X < 160, 14.0, 150.0))
+    plain = wall_grey + np.random.default_rng(3).normal(0, 0.7, image.shape)
+    missed, invented = shares(np.where(INSIDE, image, np.clip(np.rint(plain), 0, 255)).astype(np.uint8))
+    assert missed < 0.02 and invented < 0.01
+
+
+def test_texture_over_wall_and_object(monkeypatch: pytest.MonkeyPatch) -> None:
+    painted = np.rint(6 + CHECKS * (shown(noise_grey=0.0).astype(float) - 6))
+    image = np.clip(np.rint(painted + np.random.default_rng(5).normal(0, 0.7, painted.shape)), 0, 255).astype(np.uint8)
+    missed, invented = shares(image)
+    assert missed < 0.01 and invented < 0.06
+    monkeypatch.setattr(empty_scene, "TEXTURED", np.inf)
+    assert shares(image)[0] > 0.2
+
+
+def test_noise_hides_no_dark_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    dark = (np.abs(X - 160) < 20) & (np.abs(Y - 160) < 20)
+    image = shown(noise_grey=4.0, white_grey=np.where(dark, 55.0, 160.0))
+    missed, invented = shares(image)
+    assert missed < 1e-3 and invented < 1e-2
+    monkeypatch.setattr(object_mask, "ENCLOSED_EXCESS", np.inf)
+    assert shares(image)[0] >= missed
+
+
+def test_dark_paint_is_not_unlit(monkeypatch: pytest.MonkeyPatch) -> None:
+    image = shown(white_grey=4.5, noise_grey=1.2)
+    assert shares(image)[0] < 0.05
+    monkeypatch.setattr("fpp_ml_bench.baselines.phase.observe.UNLIT_PX", 1)
+    assert shares(image)[0] > 0.2
+
+
+def test_a_step_between_two_surfaces_is_sharp(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the neighbours' offers switched off, the control, the error beside the step is larger."""
+    step_mm = np.where(INSIDE, np.where(X < 160, 1760.0, 1800.0), 0.0)
+    image = frame(step_mm, CUT, FAMILY)
+    beside = INSIDE & (np.abs(X - 159.5) < 6) & (np.abs(Y - 160) < 70)
+
+    def error_mm() -> float:
+        return float(np.abs(route(CUT, FAMILY).measure(image).depth_mm - step_mm)[beside].mean())
+
+    sharp = error_mm()
+    monkeypatch.setattr(local_fit, "SIDE_PERIODS", (0.0,))
+    assert sharp < 0.8 * error_mm()
