@@ -165,7 +165,7 @@ def write_measured(row: Path, words: Sequence[str]) -> None:
 def _method_of(entry: Entry) -> tuple[object, ...]:
     about = entry.row.submission
     settings = {key: value for key, value in about.settings.items() if key != "threads"}
-    return about.method, about.frames_used, about.units, settings
+    return about.method, about.frames_used, about.units, settings, about.name
 
 
 def filled(path: Path, blocks: Mapping[str, str]) -> str:
