@@ -24,9 +24,9 @@ PROGRAMS = {"fpp-bench": main, "fpp-eval": main_eval}
 
 @pytest.fixture(scope="module")
 def small():
-    """The demo's preset with images of 200 px, so that the test takes seconds."""
+    """The demo's preset with images of 256 px, so that the test takes seconds."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "mini", (PRESETS["mini"][0], 200))
+        patch.setitem(PRESETS, "mini", (PRESETS["mini"][0], 256))
         yield
 
 
@@ -130,7 +130,7 @@ def test_every_command_and_block_of_readme_runs(out, published_hub, tmp_path, mo
     monkeypatch.chdir(tmp_path)
     Path("demo").symlink_to(out)
     captures_in(tmp_path)
-    monkeypatch.setitem(PRESETS, "mini", (("mug", "cork", "power_drill"), 200))
+    monkeypatch.setitem(PRESETS, "mini", (("mug", "cork", "power_drill"), 256))
     blocks = re.findall(r"^```(bash|python)\n(.*?)^```$", (ROOT / "README.md").read_text(), re.DOTALL | re.MULTILINE)
     ran = []
     for language, text in blocks:

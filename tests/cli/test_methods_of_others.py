@@ -59,7 +59,7 @@ def test_every_built_in_method_under_another_name(work, monkeypatch, capsys):
         assert main(["predict", method.name, "data", "--out", out]) == 0, capsys.readouterr().err
         assert evaluate([out, "--target", "depth_exact", "--json", f"{method.name}.json"]) == 0
         assert json.loads(Path(f"{method.name}.json").read_text())["submission"]["method"] == method.name
-    axis = ["--axes", "ambient-light", "--quick", "--size", "240", "--out", "robust-new", "--no-cache"]
+    axis = ["--axes", "ambient-light", "--quick", "--size", "256", "--out", "robust-new", "--no-cache"]
     assert main(["robustness", "new-crossed", *axis]) == 0
     assert main(["predict", "new-phas", "data", "--out", "none"]) == 2
     assert "did you mean 'new-phase'?" in capsys.readouterr().err

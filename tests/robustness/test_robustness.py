@@ -80,7 +80,7 @@ def test_a_frame_is_that_of_the_dataset_whatever_else_is_asked_for():
 
 
 def test_frames_of_two_rigs_are_kept_apart(tmp_path):
-    plain, crossed = condition(CLEAN, 0), Condition(CLEAN, 0, (OBJECT,), SIZE, "crossed")
+    plain, crossed = condition(CLEAN, 0), Condition(CLEAN, 0, (OBJECT,), SIZE, "crossed-18")
     assert plain.key(ONE_FRAME) != crossed.key(ONE_FRAME)
     cache = FrameCache(tmp_path)
     first, second = (cache.frames(one, OBJECT, "A0", ONE_FRAME)[0] for one in (plain, crossed))
