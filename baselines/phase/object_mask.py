@@ -20,7 +20,7 @@ from fpp_ml_bench.coding.phase_shift import phase_weights
 CLOSING_PERIODS = 0.27
 ENCLOSED_PERIODS, ENCLOSED_WINDOW_PERIODS, ENCLOSED_EXCESS = 0.6, 0.2, 1.0
 """Radius of the closing whose pixels join the object where the mean square of the plane's misfit, in a window of this
-sigma, exceeds that of noise by this multiple: ten standard deviations of such a mean."""
+sigma, exceeds that of noise by this multiple: seven standard deviations of such a mean at 15 px a period."""
 RING_PERIODS = 0.14
 """Distance from the first mask's silhouette within which a pixel may change between object and background."""
 LARGEST_MISFIT = 0.35  # of a fringe that is there, squared, as a share of its own square

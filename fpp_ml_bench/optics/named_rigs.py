@@ -17,8 +17,10 @@ CROSSED = {
     "crossed-10": Crossed((10.0, 10.0), (138.1, 48.1), shifts_deg=FIRST_SHIFTED_DEG),
 }
 """Crossed fringes by the name of the rig that shows them. The first carrier is turned a little from across the epipolar
-lines, where its phase changes fastest with depth, and the second is square to it: the finer the fringes, the further,
-so that rivals stay 1.4 to 1.7 rad away but for the ends of the range (docs/results/crossed.md)."""
+lines, where its phase changes fastest with depth, and the second is square to it. The nearest rival is 0.97, 1.22 and
+1.03 rad away (with 18 px 1.73 but for the ends of the range). With 18 px the background is 0.86 rad and more from every
+depth in range; with 12 and 10 px it looks like one of them in a part of the image, where its brightness alone tells it
+(docs/results/crossed.md)."""
 DEFAULT_CROSSED = "crossed-12"
 
 

@@ -151,6 +151,14 @@ def test_the_pair_of_the_crossed_rig_is_far_from_its_rivals_but_for_the_ends_of_
     assert whole.noise_mm == pytest.approx(paper.noise_mm, rel=0.01) and whole.wrong_share < paper.wrong_share / 4
 
 
+def test_the_finer_crossed_rigs_have_farther_rivals_and_less_noise_but_a_wall_that_looks_like_a_depth():
+    found = {name: describe(PAPER, [family], Assumptions())[0] for name, family in CROSSED.items()}
+    coarse, finer, finest = (found[f"crossed-{period}"] for period in (18, 12, 10))
+    assert finer.rival_rad > 1.2 > finest.rival_rad > coarse.rival_rad > 0.95
+    assert coarse.noise_mm > finer.noise_mm > finest.noise_mm
+    assert max(finer.background_rad, finest.background_rad) < 0.05 < coarse.background_rad
+
+
 def test_what_can_not_be_searched_is_said():
     with pytest.raises(RigError, match="no two of 0 carriers have periods"):
         search(PAPER, Assumptions(), (3.0, 200.0))
