@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.api import load_method
+from fpp_ml_bench.baselines.robustness.axes import corruptions
 from fpp_ml_bench.depth import object_mask, object_near_edges
 from fpp_ml_bench.loaders.sample import DEPTH_EXACT
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -30,7 +31,6 @@ Image = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 PATCH_PX, CHECK_PX = 48, 32  # side of a patch of texture, and of a check
 NEAR_PX = 8
-WRONG_ORDER_MM = 150.0
 EMPTY_GREY = 3.0  # of a scene without a wall
 
 
@@ -102,13 +102,11 @@ def measured(name: str, kind: str, dataset: DatasetFolder, samples: list[str], *
     for number, sample in enumerate(samples):
         exact = dataset.target_mm(sample, DEPTH_EXACT)
         inside, void = object_mask(exact), dataset.void(sample, DEPTH_EXACT)
-        frames = [dataset.frame(sample, 0)] if len(method.frames_used) == 1 else None
-        if frames is None:
-            raise SystemExit(f"{name}: needs a rig with crossed frames")
-        grey = KINDS[kind](frames[0].astype(np.float64), inside, np.random.default_rng([7, number]))
+        (used,) = method.frames_used  # one frame: a rig with crossed frames
+        grey = KINDS[kind](dataset.frame(sample, used).astype(np.float64), inside, np.random.default_rng([7, number]))
         image = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
         whole: list[Any] = [None] * len(dataset.sequence)
-        whole[method.frames_used[0]] = image
+        whole[used] = image
         began = perf_counter()
         depth = method.predict(whole).astype(np.float64)
         seconds = perf_counter() - began
@@ -130,7 +128,7 @@ def measured(name: str, kind: str, dataset: DatasetFolder, samples: list[str], *
         )
         edges = object_near_edges(exact, [NEAR_PX])[0]
         where = {"missed": true & (depth == 0)}
-        where["wrong order"] = answered & (error > WRONG_ORDER_MM)
+        where["wrong order"] = answered & (error > corruptions().wrong_order_mm)
         taken = where["missed"] | where["wrong order"]
         where[f"within {NEAR_PX} px of an edge"] = true & edges & ~taken
         where["the rest"] = true & ~edges & ~taken

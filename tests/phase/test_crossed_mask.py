@@ -53,12 +53,12 @@ def test_texture_over_wall_and_object(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_noise_hides_no_dark_part(monkeypatch: pytest.MonkeyPatch) -> None:
-    dark = (np.abs(X - 160) < 20) & (np.abs(Y - 160) < 20)
-    image = shown(noise_grey=4.0, white_grey=np.where(dark, 55.0, 160.0))
+    dark = (np.abs(X - 160) < 40) & (np.abs(Y - 160) < 40)
+    image = shown(noise_grey=6.0, white_grey=np.where(dark, 30.0, 160.0))
     missed, invented = shares(image)
-    assert missed < 1e-3 and invented < 1e-2
+    assert missed < 5e-3 and invented < 5e-3
     monkeypatch.setattr(object_mask, "ENCLOSED_EXCESS", np.inf)
-    assert shares(image)[0] >= missed
+    assert shares(image)[0] > 0.03
 
 
 def test_dark_paint_is_not_unlit(monkeypatch: pytest.MonkeyPatch) -> None:
