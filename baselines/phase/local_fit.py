@@ -34,6 +34,8 @@ DEMODULATION_PERIODS = 0.4  # sigma of the demodulator's window, in periods of t
 FLOOR_NOISE_GREY = 0.3  # noise of rounding to whole grey levels
 REACH_PX = 2  # of the pairs that are averaged
 SAME_PLANE_SIGMAS = 3.0
+WEAK_SIGMAS = 10.0  # modulation around a pixel, in sigmas of its noise, below which it is not measured alone
+WEAK_PHASE_PX, WEAK_LIGHT_PX = 2.0, 1.25  # sigmas of the averages, for phase and order, and for the mask
 SIDES, SIDE_PERIODS = 8, (0.25, 0.5, 0.75)  # neighbours that are asked: directions, and distances in periods
 SIDE_WINDOW_PX, SIDE_SLOPE_PX = 2.0, 3.0  # sigmas of the window in which offers are compared, and of their slopes
 SIDE_SHARE = 0.08  # of the brightness that counts as noise there
@@ -310,6 +312,26 @@ def window_kernels(step_rad: NDArray[np.float64], sigma_px: float) -> list[NDArr
     # A cos + B sin is the real part of (A - i B) exp(i k x).
     pairs = [solution[n] - 1j * solution[n + 1] for n in (first, first + 2)]
     return [*pairs, solution[0] + 0j]
+
+
+def steadied(
+    phase_rad: Image, modulation: Image, carrier_rad: Image, noise_grey: float, inside: Mask, sigma_px: float
+) -> tuple[Image, Image, Image]:
+    """Phase and modulation (h, w) of shifted frames and the modulation's noise, ``noise_grey`` for a pixel alone. Where
+    noise hides its phase, they are those of an average over its neighbours ``inside``, from which the carrier, whose
+    phase is ``carrier_rad``, is taken out first."""
+    weight = inside.astype(np.float32)
+    carrier, own = (np.exp(1j * rad).astype(np.complex64) for rad in (carrier_rad, phase_rad))
+    slow = weight * modulation * own / carrier
+    maps = (weight, weight * modulation * modulation, slow.real, slow.imag)
+    share, power, real, imaginary = (cv2.GaussianBlur(np.ascontiguousarray(one), (0, 0), sigma_px) for one in maps)
+    share = np.maximum(share, np.float32(1e-6))
+    weak = inside & (power < (WEAK_SIGMAS * noise_grey) ** 2 * share)
+    average = (real + np.complex64(1j) * imaginary) / share
+    phase = np.where(weak, np.angle(average * carrier), phase_rad).astype(np.float32)
+    # The mean of white noise under a Gaussian of sigma s has 1 / (2 s sqrt(pi)) of its standard deviation.
+    noise = np.where(weak, noise_grey / (2 * sigma_px * np.sqrt(np.pi)), noise_grey).astype(np.float32)
+    return phase, np.where(weak, np.abs(average), modulation).astype(np.float32), noise
 
 
 def phase_noise_grey(psi: Image, modulation: Image, inside: Mask) -> float:

@@ -6,7 +6,7 @@ silhouette, a pixel is assigned to the better of two predictions of its grey lev
 the object's fringe, extrapolated from the local fit beside it. Of several frames every pixel is tested by itself.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import cv2
 import numpy as np
@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.phase.calibration_layer import Crop, Image, Mask, wrapped
 from fpp_ml_bench.baselines.phase.empty_scene import Background
 from fpp_ml_bench.coding.code import MIN_MODULATION
-from fpp_ml_bench.coding.phase_shift import phase_weights
 
 CLOSING_PERIODS = 0.27
 ENCLOSED_PERIODS, ENCLOSED_WINDOW_PERIODS, ENCLOSED_EXCESS = 0.6, 0.2, 1.0
@@ -171,18 +170,16 @@ def lit_object(
     different: Mask,
     region: Mask,
     modulation: Image,
-    background: Background,
-    shifts_rad: Sequence[float],
+    noise_grey: Image | float,
+    shown: bool,
     period_px: float,
 ) -> Mask:
     """Object pixels (h, w): those of ``region`` (`first_mask`) that are ``different`` (`differs`) and modulated by more
-    than noise. Pixels that only closing has added must be as bright as the object around them, otherwise they are the
-    plane beside a corner."""
-    _, cosine, sine = phase_weights(shifts_rad)
-    sigma = background.noise_grey * np.sqrt(max(cosine @ cosine, sine @ sine))
-    least_grey = min(max(DARKEST_GREY, DARK_SIGMAS * float(sigma)), MIN_MODULATION)
-    if not background.shown:  # nothing else tells the object
-        least_grey = MIN_MODULATION
+    than the noise of their modulation; ``shown``: whether the background is. Pixels that only closing has added must be
+    as bright as the object around them, otherwise they are the plane beside a corner."""
+    least_grey: Image | np.float32 = np.float32(MIN_MODULATION)
+    if shown:  # otherwise nothing else tells the object
+        least_grey = np.minimum(np.maximum(np.float32(DARK_SIGMAS) * noise_grey, np.float32(DARKEST_GREY)), least_grey)
     certain = region & different & (modulation > least_grey)
     side = 2 * round(PIXELWISE_CLOSING_PERIODS * period_px) + 1
     weight = cv2.blur(certain.astype(np.float32), (side, side))

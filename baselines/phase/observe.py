@@ -29,6 +29,8 @@ from fpp_ml_bench.baselines.phase.calibration_layer import (
 from fpp_ml_bench.baselines.phase.empty_scene import Background, CrossedEmptyScene, EmptyScene
 from fpp_ml_bench.baselines.phase.local_fit import (
     CURVED,
+    WEAK_LIGHT_PX,
+    WEAK_PHASE_PX,
     Demodulator,
     FringeFit,
     GaussianWindow,
@@ -36,6 +38,7 @@ from fpp_ml_bench.baselines.phase.local_fit import (
     fringe_fit,
     measured_contrast,
     phase_slopes,
+    steadied,
 )
 from fpp_ml_bench.baselines.phase.object_mask import (
     DARKEST_GREY,
@@ -57,13 +60,14 @@ from fpp_ml_bench.baselines.phase.resampling import Periods, Resampling, nearest
 from fpp_ml_bench.baselines.phase.settings import PIXELWISE, Settings, steps_of
 from fpp_ml_bench.coding.code import MIN_MODULATION
 from fpp_ml_bench.coding.crossed import Crossed
-from fpp_ml_bench.coding.phase_shift import wrapped_phase
+from fpp_ml_bench.coding.phase_shift import phase_weights, wrapped_phase
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
 from fpp_ml_bench.decoding.decode import grey_levels
 from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.optics.rig import Rig
 
 Frames = NDArray | Sequence[NDArray]
+EVERYWHERE = (slice(None), slice(None))
 CROSSED_FRAMES = 3  # that shift one carrier
 MARGIN_PERIODS = 0.5  # of the crop around the object: covers the windows, and the mask may grow into it
 FRINGE_NOISE = 0.03  # uncertainty of a fringe extrapolated beyond its window, as a share of its brightness
@@ -155,6 +159,12 @@ class CrossedObservation(Capture):
     def light(self) -> Image:
         """Grey levels less ambient light."""
         return self.grey - np.float32(self.background.ambient_grey)
+
+
+def modulation_noise_grey(shifts_rad: Sequence[float], noise_grey: float) -> float:
+    """Noise of the modulation that frames of the noise ``noise_grey`` measure."""
+    _, cosine, sine = phase_weights(shifts_rad)
+    return noise_grey * float(np.sqrt(max(cosine @ cosine, sine @ sine)))
 
 
 class MeasurementModel:
@@ -250,7 +260,8 @@ class OneCarrier(MeasurementModel):
             fitted = wrapped_phase(greys, self.shifts_rad, np.float32)
             phase, modulation, mean_grey = (np.asarray(values, np.float32) for values in fitted)
             if mask is None:
-                inside = lit_object(different, region, modulation, background, self.shifts_rad, self.period_px)
+                noise = modulation_noise_grey(self.shifts_rad, background.noise_grey)
+                inside = lit_object(different, region, modulation, noise, background.shown, self.period_px)
             # The share of a window on the object is what the use of slopes needs.
             fit = FringeFit(phase, modulation, self.windows[1].moment(inside.astype(np.float32)))
         else:
@@ -342,6 +353,8 @@ class TwoCarriers(MeasurementModel):
             return
         shifted = self.family.shifts_deg[:CROSSED_FRAMES]
         self.shifts_rad = [float(np.radians(pair[moved])) for pair in shifted]
+        standoff = self.carriers.nearness(self.rig.standoff_m * MM_PER_M)
+        self._standoff_rad = self.carriers.phases(standoff)[moved].astype(np.float32)
         near_q, far_q = (float(np.median(self.carriers.nearness(end))) for end in self.rig.working_range_mm)
         span = float(np.median(np.abs(self.carriers.gain[moved]))) * abs(near_q - far_q)
         if not span >= LEAST_RANGE_RAD:
@@ -385,7 +398,8 @@ class TwoCarriers(MeasurementModel):
         else:
             different = differs([plane.residual for plane in planes], background.noise_grey)
             closed = first_mask(different, period_px)
-            region = lit_object(different, closed, own_modulation, background, self.shifts_rad, period_px)
+            lit_grey, lit_noise = self._steadied(own_phase, own_modulation, background, WEAK_LIGHT_PX)[1:]
+            region = lit_object(different, closed, lit_grey, lit_noise, background.shown, period_px)
             residual = wrapped(own_phase - self.carriers.infinity_rad[moved])
             region = continued(region, closed, different, residual)
         crop = crop_around(region, int(np.ceil(MARGIN_PERIODS * period_px)), stride)
@@ -399,9 +413,11 @@ class TwoCarriers(MeasurementModel):
         if moved is None:
             whole = repeated(modulation[..., *nearest_inside(points)], stride, (2, *inside.shape))
         else:
-            phases[moved], modulation[moved] = own_phase[crop], own_modulation[crop][::stride, ::stride]
+            own = own_phase[crop], own_modulation[crop]
+            phases[moved], own_grey, _ = self._steadied(*own, background, WEAK_PHASE_PX, inside, crop)
+            modulation[moved] = own_grey[::stride, ::stride]
             whole = repeated(modulation, stride, (2, *inside.shape))
-            whole[moved] = own_modulation[crop]
+            whole[moved] = own_grey
         return CrossedObservation(
             rig=self.rig,
             period_px=period_px,
@@ -421,6 +437,20 @@ class TwoCarriers(MeasurementModel):
             modulation=whole,
             contrast=self._contrast(modulation, mean_grey, points),
         )
+
+    def _steadied(
+        self,
+        phase_rad: Image,
+        modulation: Image,
+        background: Background,
+        sigma_px: float,
+        inside: Mask | None = None,
+        crop: Crop = EVERYWHERE,
+    ) -> tuple[Image, Image, Image]:
+        """`steadied` phase and modulation of the shifted carrier."""
+        noise_grey = modulation_noise_grey(self.shifts_rad, background.noise_grey)
+        whole = np.ones(phase_rad.shape, bool) if inside is None else inside
+        return steadied(phase_rad, modulation, self._standoff_rad[crop], noise_grey, whole, sigma_px)
 
     def _contrast(self, modulation: Image, mean_grey: Image, points: Mask) -> tuple[float, float]:
         """Modulation over mean of both carriers on the object; as projected where too little of it is seen."""

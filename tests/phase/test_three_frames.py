@@ -9,6 +9,7 @@ from crossed_scenes import FAMILY, NO_PLANE, RIG, frame, slab
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from fpp_ml_bench.baselines.phase import local_fit
 from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Measurement
 from fpp_ml_bench.baselines.phase.local_fit import phase_noise_grey, same_plane_mean
 from fpp_ml_bench.baselines.phase.object_mask import continued
@@ -77,6 +78,23 @@ def test_a_bar_much_narrower_than_a_window_has_the_right_order(indirect_grey: fl
     ambient = np.where(depth_mm > 0, 6.0 + indirect_grey, 6.0)
     found = measured([depth_mm] * 3, ambient_grey=ambient)  # type: ignore[arg-type]
     assert (np.abs(found.depth_mm - depth_mm) > 20)[bar].mean() < 0.01
+
+
+def test_a_surface_whose_fringe_noise_hides_is_measured_by_averages(monkeypatch: pytest.MonkeyPatch) -> None:
+    depth_mm = slab(CUT)
+    inside = depth_mm > 0
+
+    def missed_wrong_invented() -> tuple[float, float, float]:
+        found = measured([depth_mm] * 3, noise_grey=2.0, white_grey=12.0).depth_mm
+        answered = inside & (found > 0)
+        wrong = np.abs(found - depth_mm)[answered] > 20
+        return (inside & ~answered).sum() / inside.sum(), float(wrong.mean()), float((found[~inside] > 0).mean())
+
+    missed, wrong, invented = missed_wrong_invented()
+    assert missed < 1e-3 and wrong < 1e-3 and invented < 1e-3
+    monkeypatch.setattr(local_fit, "WEAK_SIGMAS", 0.0)  # every pixel for itself
+    missed, wrong, _ = missed_wrong_invented()
+    assert missed > 0.5 and wrong > 0.05
 
 
 def test_the_local_median_is_that_of_the_object_and_of_its_nearest_pixel_beyond() -> None:
