@@ -239,7 +239,8 @@ class Demodulator:
     def __init__(self, carriers: Carriers, stride: int) -> None:
         camera = carriers.rig.camera
         self.stride, self.shape = stride, (camera.height, camera.width)
-        kernels = window_kernels(carriers.step_rad, DEMODULATION_PERIODS * carriers.period_px)
+        self._sigma_px = DEMODULATION_PERIODS * carriers.period_px
+        kernels = window_kernels(carriers.step_rad, self._sigma_px)
         self._reach = kernels[0].shape[0] // 2
         # A length that the stride divides, so that every stride-th sample is a whole number of samples apart.
         self._coarse = [fft.next_fast_len(-(-(length + 2 * self._reach) // stride)) for length in self.shape]
@@ -263,6 +264,10 @@ class Demodulator:
     @staticmethod
     def _band(centre: int, length: int, coarse: int) -> NDArray[np.intp]:
         return (centre + np.rint(fft.fftfreq(coarse, 1 / coarse)).astype(np.intp)) % length
+
+    def noise(self, noise_grey: float) -> float:
+        """Noise of a modulation where pixels have ``noise_grey``."""
+        return noise_grey / (self._sigma_px * float(np.sqrt(TAU)))
 
     def phases_at(self, seen: Demodulated, carriers: Carriers) -> Image:
         """Wrapped phases float32 (2, h, w) of all pixels of ``carriers``, from those on the grid: the carrier itself

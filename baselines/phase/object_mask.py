@@ -32,6 +32,7 @@ LEAST_AREA_PERIODS = 0.1  # smallest object, and largest hole that is closed, in
 PLANE_CHANCE_SIGMAS = 4.0
 """How far, in sigmas of its own spread, the squared misfit of N frames must exceed N not to be the empty plane."""
 PLANE_TOLERANCE_GREY = 0.3  # error of the fitted empty scene, grey levels, beside noise
+SEAM_PX = 2  # half the width of a seam along a shadow
 UNLIT_PX = 3  # side of the square that is averaged to tell faint light
 SQUARE_PX = 5  # side of the square over which faint differences are averaged
 PIXELWISE_CLOSING_PERIODS = 0.2
@@ -113,6 +114,15 @@ def unlit(grey: Image, background: Background, period_px: float, side_px: int = 
         return stripes_filled(grey, period_px) < background.ambient_grey + limit_grey
     means: Image = cv2.blur(grey, (side_px, side_px))  # type: ignore[assignment]
     return stripes_filled(means, period_px) < background.ambient_grey + limit_grey + PLANE_TOLERANCE_GREY
+
+
+def lit_part(inside: Mask, dark: Mask) -> Mask:
+    """Pixels (h, w) ``inside`` that are not ``dark``, and not a seam between these and the background either: along a
+    shadow's border the camera's blur mixes shadow and plane, which the empty scene does not explain."""
+    left = inside & ~dark
+    core = cv2.morphologyEx(left.astype(np.uint8), cv2.MORPH_OPEN, disk(SEAM_PX)) > 0
+    beside = cv2.dilate((inside & dark).astype(np.uint8), disk(2 * SEAM_PX)) > 0
+    return left & (core | ~beside)
 
 
 def explained(grey: Image, predicted: Image, ambient_grey: float, period_px: float) -> Mask:

@@ -51,6 +51,7 @@ from fpp_ml_bench.baselines.phase.object_mask import (
     explained,
     first_mask,
     lit_object,
+    lit_part,
     modulated_region,
     object_region,
     refined,
@@ -77,6 +78,7 @@ MOST_SLACK_PERIODS = 0.07
 """Largest slack of the working range, in periods at its middle: 17 mm of the paper's rig, whose `Settings.slack_mm` is
 15, and 4 mm of a rig whose period is 57 mm deep, where 15 mm would let almost every pixel have a second order."""
 LEAST_CONTRAST = 0.08
+FAINT_SIGMAS = 6.0  # modulation of a window below which light shows no fringe: a shadow that other light reaches
 CONTRAST_RIM_PERIODS = 0.5  # grid points this near to the silhouette don't measure the contrast
 
 
@@ -404,9 +406,11 @@ class TwoCarriers(MeasurementModel):
             region = continued(region, closed, different, residual)
         crop = crop_around(region, int(np.ceil(MARGIN_PERIODS * period_px)), stride)
         background, inside = replace(background, residual=background.residual[crop]), region[crop]
-        if mask is None and moved is None:
-            inside = inside & ~unlit(grey[crop], background, period_px, UNLIT_PX)
         grid = tuple(slice(part.start // stride, -(-part.stop // stride)) for part in crop)
+        if mask is None and moved is None:
+            faint = seen.modulation[:, *grid].max(axis=0) < FAINT_SIGMAS * self.demodulator.noise(background.noise_grey)
+            dark = unlit(grey[crop], background, period_px, UNLIT_PX)
+            inside = lit_part(inside, dark | repeated(faint, stride, inside.shape))
         carriers = self.carriers.at(crop)
         points, mean_grey = inside[::stride, ::stride], seen.mean_grey[grid] - background.ambient_grey
         phases, modulation = self.demodulator.phases_at(seen, carriers), seen.modulation[:, *grid]

@@ -7,7 +7,7 @@ import pytest
 from crossed_scenes import frame, route, slab
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase import empty_scene, local_fit, object_mask
+from fpp_ml_bench.baselines.phase import empty_scene, local_fit, object_mask, observe
 from fpp_ml_bench.optics.named_rigs import crossed_rig
 
 WHOLE = crossed_rig(960)
@@ -66,6 +66,30 @@ def test_dark_paint_is_not_unlit(monkeypatch: pytest.MonkeyPatch) -> None:
     assert shares(image)[0] < 0.05
     monkeypatch.setattr("fpp_ml_bench.baselines.phase.observe.UNLIT_PX", 1)
     assert shares(image)[0] > 0.2
+
+
+def test_a_shadow_that_other_light_reaches_is_no_object(monkeypatch: pytest.MonkeyPatch) -> None:
+    shadow = (X < 60) & ~INSIDE
+    plain = 14.0 + np.random.default_rng(8).normal(0, 0.7, shadow.shape)
+    image = np.where(shadow, np.rint(plain), shown()).astype(np.uint8)
+
+    def answered() -> float:
+        return float((route(CUT, FAMILY).measure(image).depth_mm > 0)[shadow].mean())
+
+    assert answered() < 0.5 and shares(image)[0] < 2e-3  # a window beside the wall sees the wall's fringes
+    monkeypatch.setattr(observe, "FAINT_SIGMAS", 0.0)
+    assert answered() > 0.95
+
+
+def test_seams_along_a_shadow_are_no_object() -> None:
+    inside = np.zeros((80, 80), bool)
+    inside[10:70, 10:70] = True
+    dark = np.zeros_like(inside)
+    dark[13:67, 13:40] = True  # a shadow with a seam of 3 px around it, beside an object
+    twig = np.zeros_like(inside)
+    twig[38:41, 70:80] = True  # a thin part of the object, far from the shadow
+    kept = object_mask.lit_part(inside | twig, dark)
+    assert not kept[:, :38].any() and kept[12:68, 44:70].all() and kept[twig].all()
 
 
 def test_a_step_between_two_surfaces_is_sharp(monkeypatch: pytest.MonkeyPatch) -> None:
