@@ -65,7 +65,7 @@ from fpp_ml_bench.leaderboard.row_file import row_json, write_row
 from fpp_ml_bench.leaderboard.rows import VOUCHED, Entry, read_entry, vouching_line
 from fpp_ml_bench.leaderboard.tables import ranking_table
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.style import percent
+from fpp_ml_bench.style import millimetres, percent
 from fpp_ml_bench.tables import Table, markdown_text
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -250,15 +250,17 @@ DRAWN = (
     "Classical 18+Gray, vertical",
 )
 """The rows whose curves are drawn: four methods of one frame, and the classical one; more lines can't be told apart."""
-SCORES = ("wrong_share", "unanswered_share", "confident_share", "coverage")
+SCORES = ("wrong_share", "confident_share", "coverage")
 TITLES = (
     "method",
     "mean, mm",
     "95% interval",
     "clean, mm",
     "ratio",
+    "missed",
+    "invented",
+    "answered, mm",
     "wrong orders",
-    "unanswered",
     "confident errors",
     "coverage",
 )
@@ -278,17 +280,19 @@ def of_set(name: SetName, results: Sequence[Result]) -> list[Row]:
 
 def robustness_tables(rows: Sequence[Row]) -> str:
     """Both tables in Markdown: means over all axes, then each axis by itself."""
-    axes = [axis for axis in corruptions().axes if any(axis in block.axes for _, block in rows)]
+    axes = [axis for axis in corruptions().axes if any(axis in block.axes | block.beside for _, block in rows)]
     overall, by_axis = Table(TITLES[0], numbers=TITLES[1:]), Table("method", numbers=axes)
     for name, block in rows:
         low, high = block.interval
         interval = "-" if low is None or high is None else f"{low:.1f} to {high:.1f}"
         ratio = "-" if block.ratio is None else f"{block.ratio:.1f}"
         numbers = [f"{block.mae_mm:.1f}", interval, f"{block.clean.mae_mm:.1f}", ratio]
-        overall.add_row(name, *numbers, *(percent(block.mean(key)) for key in SCORES))
+        mask = [percent(block.mean(key), 2) for key in ("unanswered_share", "invented_share")]
+        answered = millimetres(block.mean("answered_mae_mm"))
+        overall.add_row(name, *numbers, *mask, answered, *(percent(block.mean(key)) for key in SCORES))
         means = []
         for axis in axes:
-            errors = [scores.mae_mm for scores in block.axes.get(axis, [])]
+            errors = [scores.mae_mm for scores in (block.axes | block.beside).get(axis, [])]
             means.append(f"{sum(errors) / len(errors):.1f}, {errors[-1]:.1f}" if errors else "")
         by_axis.add_row(name, *means)
     between = ["", "By axis, mean over the five severities and the last one, mm:", ""]
@@ -299,7 +303,10 @@ def curves(rows: Sequence[Row]) -> bytes:
     """The curves of `DRAWN` on the test objects as the page of ``fpp-bench robustness`` draws them; PNG."""
     measured = []
     for title, block in sorted((row for row in rows if row[0] in DRAWN), key=lambda row: DRAWN.index(row[0])):
-        means = {axis: dict(enumerate((s.model_dump() for s in found), 1)) for axis, found in block.axes.items()}
+        means = {
+            axis: dict(enumerate((s.model_dump() for s in found), 1))
+            for axis, found in (block.axes | block.beside).items()
+        }
         setup = {"title": title, "set": "test", "quick": False}
         measured.append(Measured(Path(), setup, {CLEAN: {0: block.clean.model_dump()}, **means}))
     return draw_curves(measured)

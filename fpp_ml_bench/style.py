@@ -165,9 +165,9 @@ def millimetres(value: float | None) -> str:
     return f"{value:.3f}" if 5e-4 <= value < 1e6 else f"{value:.2e}"
 
 
-def percent(share: float | None) -> str:
-    """A share as per cent with one decimal, a dash where there is none."""
-    return "-" if share is None else f"{100 * share:.1f}%"
+def percent(share: float | None, decimals: int = 1) -> str:
+    """A share as per cent, a dash where there is none."""
+    return "-" if share is None else f"{100 * share:.{decimals}f}%"
 
 
 def three_digits(value: float | None) -> str:

@@ -60,7 +60,8 @@ Above0 = Annotated[float, Field(gt=0)]
 class Axis(StrictModel):
     """One corruption: ``key`` of the light's ``stage`` (the light itself with none) takes the values ``severities``,
     in ``unit``, and ``also`` holds what else the stage needs. ``electrons``: the values are grey levels, the key wants
-    electrons. ``several_frames``: it does nothing to one frame. ``objects``: only these are disturbed by it."""
+    electrons. ``several_frames``: it does nothing to one frame. ``objects``: only these are disturbed by it.
+    ``beside``: it does not count in the mean over axes."""
 
     unit: Text
     stage: Literal["", "projector", "surface", "bounces", "camera"] = ""
@@ -70,6 +71,7 @@ class Axis(StrictModel):
     electrons: bool = False
     several_frames: bool = False
     objects: list[str] = Field(default_factory=list)
+    beside: bool = False
 
     def light(self, clean: Light, severity: int) -> Light:
         """The light at a severity from 0, which is ``clean`` itself, to 5."""
@@ -126,10 +128,12 @@ SCORES = tuple(SeverityScores.model_fields)
 
 
 class Truth(NamedTuple):
-    """``depth_mm`` float32 (H, W) and ``scored`` bool (H, W) of an undisturbed view."""
+    """``depth_mm`` float32 (H, W) of an undisturbed view; bool (H, W): the object pixels ``scored``, and the background
+    pixels ``empty``; void ones are neither."""
 
     depth_mm: NDArray[np.float32]
     scored: NDArray[np.bool_]
+    empty: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -188,14 +192,15 @@ class FrameCache:
     def truth(self, clean: Condition, name: str, view: str) -> Truth:
         """Exact depth and scored pixels of an undisturbed view."""
         studio = _studio(clean)
-        file = self._file(clean, (), f"{sample_name(name, view)}-truth")
+        file = self._file(clean, (), f"{sample_name(name, view)}-truth-2")
         kept = _load(file)
         if kept is None:
             scene = studio.trace(_mesh(name), view)
             depth_mm = studio.exact_mm(scene)
-            kept = np.stack([depth_mm, object_mask(depth_mm) & ~void_pixels(studio.flags(scene)[0])])
+            inside, valid = object_mask(depth_mm), ~void_pixels(studio.flags(scene)[0])
+            kept = np.stack([depth_mm, inside & valid, ~inside & valid])
             _save(file, kept)
-        return Truth(kept[0], kept[1] > 0)
+        return Truth(kept[0], kept[1] > 0, kept[2] > 0)
 
     def make_room(self, needed_bytes: int, limit_bytes: int = LIMIT_BYTES) -> None:
         """Remove the folders that were used longest ago until ``needed_bytes`` more stay below the limit."""
@@ -273,6 +278,8 @@ def score(
         "protocol_mae_mm": float(error.mean()),
         "wrong_share": float(wrong.mean()),
         "unanswered_share": float((~answered).mean()),
+        "invented_share": float((truth.empty & (depth_mm > 0)).mean()),
+        "answered_mae_mm": float(error[answered].mean()) if answered.any() else None,
         "confident_share": None,
         "coverage": None,
     }

@@ -183,8 +183,10 @@ def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
         axis: [SeverityScores.model_validate(scores) for scores in severity_means(found).values()]
         for axis, found in rows.items()
     }
-    (clean,), axes = means[CLEAN], {axis: scores for axis, scores in means.items() if axis != CLEAN}
-    found = object_interval(*_shares_of_the_mean(rows))
+    (clean,) = means.pop(CLEAN)
+    beside = {name: means.pop(name) for name, axis in corruptions().axes.items() if axis.beside and name in means}
+    axes = means
+    found = object_interval(*_shares_of_the_mean({axis: rows[axis] for axis in (CLEAN, *axes)}))
     every = [scores.mae_mm for severities in axes.values() for scores in severities]
     return Robustness(
         version=corruptions().version,
@@ -193,6 +195,7 @@ def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
         interval=[None, None] if found is None else [max(found[0], 0.0), found[1]],
         clean=clean,
         axes=axes,
+        beside=beside,
         samples=len(rows[CLEAN]),
         objects=len({row["object"] for row in rows[CLEAN]}),
         size_px=setup.size,
@@ -221,8 +224,10 @@ class Measured:
     means: dict[str, dict[int, dict[str, float | None]]]
 
     def mean(self, key: str = "mae_mm", axis: str | None = None) -> float | None:
-        """Mean of a score over the severities of an axis, or of all, that were measured; None where one is unknown."""
-        axes = self.means.keys() - {CLEAN} if axis is None else {axis}
+        """Mean of a score over the severities of an axis, or of all that count, that were measured; None where one is
+        unknown."""
+        counted = (name for name, one in corruptions().axes.items() if not one.beside)
+        axes = set(counted) if axis is None else {axis}
         values = [scores[key] for name, by in self.means.items() if name in axes for scores in by.values()]
         return None if None in values else mean_of(values)
 

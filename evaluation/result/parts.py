@@ -294,28 +294,35 @@ class Reliance(StrictModel):
 
 class SeverityScores(StrictModel):
     """Means over the views of a severity. ``mae_mm`` charges a fixed error for a pixel without an answer,
-    ``protocol_mae_mm`` its whole depth. Shares of the scored pixels: of wrong orders, of pixels without an answer, of
-    confident errors and of pixels that state a sigma (null both where a method states none)."""
+    ``protocol_mae_mm`` its whole depth; ``answered_mae_mm`` is of the others alone. Shares of the scored pixels: of
+    wrong orders, of pixels without an answer, of confident errors and of pixels that state a sigma (null both where a
+    method states none). ``invented_share`` of the image is background with an answer; null in version 1 of the axes."""
 
     mae_mm: NonNegative
     protocol_mae_mm: NonNegative
     wrong_share: Share
     unanswered_share: Share
+    invented_share: Share | None = None
+    answered_mae_mm: NonNegative | None = None
     confident_share: Share | None
     coverage: Share | None
 
 
+FiveSeverities = Annotated[list[SeverityScores], Field(min_length=5, max_length=5)]
+
+
 class Robustness(StrictModel):
     """What disturbed scenes do to a method: ``mae_mm`` is the mean over ``axes`` and their five severities, with its
-    95% interval (bootstrap over objects; nulls below two objects); ``clean`` is the undisturbed scene. ``version`` is
-    that of the axes."""
+    95% interval (bootstrap over objects; nulls below two objects); ``clean`` is the undisturbed scene. ``beside``: axes
+    that do not count in the mean. ``version`` is that of the axes."""
 
     version: Whole
     set: Literal["test", "unseen"]
     mae_mm: NonNegative
     interval: Interval
     clean: SeverityScores
-    axes: Annotated[dict[Text, Annotated[list[SeverityScores], Field(min_length=5, max_length=5)]], Field(min_length=1)]
+    axes: Annotated[dict[Text, FiveSeverities], Field(min_length=1)]
+    beside: dict[Text, FiveSeverities] = Field(default_factory=dict)
     samples: Whole
     objects: Whole
     size_px: Whole

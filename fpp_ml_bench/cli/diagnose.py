@@ -274,12 +274,12 @@ def _table(setup: Setup, rows: dict[str, list[View]]) -> Table:
     """Errors by axis, clean and at each severity; shares at the last severity."""
     severities = (0, *setup.severities)
     columns = [f"severity {severity}" if severity else "clean" for severity in severities]
-    columns += ["wrong orders", "unanswered", "confident errors"]
+    columns += ["wrong orders", "missed", "invented", "answered, mm", "confident errors"]
     table = Table("axis", numbers=columns, title=f"{setup.method.title}: object MAE in mm")
     for axis, found in rows.items():
         means = severity_means(found)
         last = means[max(means)]
         cells = [millimetres(means[severity]["mae_mm"]) if severity in means else "" for severity in severities]
-        shares = [percent(last[key]) for key in ("wrong_share", "unanswered_share", "confident_share")]
-        table.add_row(axis, *cells, *shares)
+        shares = [percent(last[key], 2) for key in ("wrong_share", "unanswered_share", "invented_share")]
+        table.add_row(axis, *cells, *shares, millimetres(last["answered_mae_mm"]), percent(last["confident_share"]))
     return table

@@ -62,9 +62,10 @@ class PlaneLight(NamedTuple):
         points = np.column_stack([grid, np.full(len(grid), rig.background)])
         arriving = shine(points, np.tile([0.0, 0.0, -1.0], (len(points), 1)), rig, light, pattern)
         table = pattern.read(arriving.place, arriving.irradiance)
-        albedo = (1.0 - light.surface.gloss) * light.surface.albedo
         cells = table.reshape(frames, rows, PLANE_POINTS, columns, PLANE_POINTS).mean(axis=(2, 4))
-        return cls(np.ascontiguousarray(np.moveaxis(cells, 0, 2)) * albedo, corner, cell, rig.background)
+        return cls(
+            np.ascontiguousarray(np.moveaxis(cells, 0, 2)) * light.surface.wall_albedo, corner, cell, rig.background
+        )
 
     def upon(self, surfels: Surfels, degrees: float, offset_m: NDArray[np.float64]) -> NDArray[np.float64]:
         """Irradiance of an object's surfels from the plane, float64 (K, F), the object turned and then moved."""

@@ -125,7 +125,7 @@ def light_surface(
 ) -> LitPixels:
     """Direct and ambient light of surface points (n, 3) with unit ``normals`` (n, 3) that face the camera."""
     surface = light.surface
-    material = material or Material((1.0 - surface.gloss) * surface.albedo, 0.0)  # a matte wall
+    material = material or Material(surface.wall_albedo, 0.0)
     arriving = shine(points_m, normals, rig, light, pattern, occluder)
     x, y, z = (np.ascontiguousarray(axis) for axis in points_m.T)
     nx, ny, nz = (np.ascontiguousarray(axis) for axis in normals.T)

@@ -10,7 +10,14 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BeforeValidator, Field, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    SerializerFunctionWrapHandler,
+    model_serializer,
+    model_validator,
+)
 
 from fpp_ml_bench.errors import BuildError
 from fpp_ml_bench.files import read_yaml
@@ -49,16 +56,33 @@ class ProjectorLight(StrictModel):
     flicker: Annotated[float, Field(ge=0, le=0.2)] = 0.0
 
 
+SHARES = ("object_share", "wall_share")
+
+
 class SurfaceLight(StrictModel):
     """``albedo`` of the diffuse part; ``gloss``: weight of a GGX microfacet lobe of ``roughness`` (its alpha is the
     square). ``textures``: none, or albedo maps by the object's kind, whose dark parts have (1 - ``contrast``) of the
-    albedo; with them ``gloss`` is the most, and each object has its share of it."""
+    albedo; with them ``gloss`` is the most, and each object has its share of it. ``object_share`` and ``wall_share`` of
+    the albedo are what the object and the background plane have: dark paint, a dark wall, none."""
 
     albedo: Annotated[float, Field(gt=0, le=0.95)] = 0.8
     gloss: Annotated[float, Field(ge=0, le=0.95)] = 0.0
     roughness: Annotated[float, Field(ge=0.05, le=1)] = 0.95
     textures: Literal["none", "by_kind", "checks"] = "none"
     contrast: Annotated[float, Field(ge=0, le=0.95)] = 0.0
+    object_share: Annotated[float, Field(ge=0.02, le=1)] = 1.0
+    wall_share: Share = 1.0
+
+    @property
+    def wall_albedo(self) -> float:
+        """Of the background plane, which is matte."""
+        return (1.0 - self.gloss) * self.albedo * self.wall_share
+
+    @model_serializer(mode="wrap")
+    def _described(self, described: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """A share of 1 is left out, so that lights of version 0.3 keep their fingerprints."""
+        content: dict[str, Any] = described(self)
+        return {key: value for key, value in content.items() if not (key in SHARES and value == 1.0)}
 
 
 class BounceLight(StrictModel):

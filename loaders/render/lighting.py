@@ -100,7 +100,7 @@ class ObjectLight:
         position, facing = unturned(points_m[own] - self.offset_m, self.degrees), unturned(normals[own], self.degrees)
         material = material_of(self.mesh, position, facing, light.surface, triangle[own])
         if len(own) < len(points_m):
-            albedo = np.full(len(points_m), (1.0 - light.surface.gloss) * light.surface.albedo)
+            albedo = np.full(len(points_m), light.surface.wall_albedo)
             gloss = np.zeros(len(points_m))
             albedo[own], gloss[own] = material.albedo, material.gloss
             material = Material(albedo, gloss)

@@ -97,15 +97,16 @@ def material_of(
 ) -> Material:
     """Albedo and gloss of a mesh at surface points (n, 3) with unit normals (n, 3), object coordinates, on triangles
     ``triangle`` (n,) of it. Where a light has textures, a mesh with colours of its own has those and no map."""
+    albedo = surface.albedo * surface.object_share
     if surface.textures == "none":
-        return Material(surface.albedo, surface.gloss)
+        return Material(albedo, surface.gloss)
     gloss = surface.gloss * uniform("gloss", mesh.name)
     if mesh.paint is not None and triangle is not None:
         weights = barycentric(mesh.vertices_m[mesh.faces[triangle]], position_m)
-        return Material(surface.albedo * np.maximum(mesh.paint.at(triangle, weights), DARKEST), gloss)
+        return Material(albedo * np.maximum(mesh.paint.at(triangle, weights), DARKEST), gloss)
     kind = _KIND_OF.get(mesh.name, "stains") if surface.textures == "by_kind" else surface.textures
     dark = MAPS[kind](position_m * MM_PER_M, normal, mesh.name)
-    return Material(surface.albedo * (1.0 - surface.contrast * dark), gloss)
+    return Material(albedo * (1.0 - surface.contrast * dark), gloss)
 
 
 def checks(position_mm: Values, normal: Values, name: str) -> Values:

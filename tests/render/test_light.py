@@ -113,6 +113,14 @@ def test_names_and_files_that_are_not_there(tmp_path):
         load_light(tmp_path / "bytes.yaml")
 
 
+def test_shares_of_the_albedo_leave_the_description_of_other_lights_as_it_was():
+    light = named_light("paper")
+    assert not {"object_share", "wall_share"} & light.model_dump()["surface"].keys()
+    painted = light.changed("surface", object_share=0.2)
+    assert painted.model_dump(mode="json")["surface"]["object_share"] == 0.2 and painted != light
+    assert Light.model_validate(painted.model_dump()) == painted
+
+
 def test_changed_copies_are_checked_like_a_file():
     light = named_light("paper")
     brighter = light.changed("camera", exposure=2.0, bits=10)

@@ -61,7 +61,8 @@ def test_the_issues_severities_are_those_of_the_file():
     severities = {name: list(axis.severities) for name, axis in RULES.axes.items()}
     assert severities["under-exposure"] == [0.7, 0.5, 0.35, 0.25, 0.15]
     assert severities["motion"] == [0.1, 0.25, 0.5, 1, 2]
-    assert len(severities) == 12 and RULES.unanswered_mm == 150
+    assert len(severities) == 14 and [name for name, axis in RULES.axes.items() if axis.beside] == list(severities)[12:]
+    assert RULES.unanswered_mm == 150
     assert all(set(views) <= set(VIEWS) for views in corruptions.__wrapped__().views.values())
 
 
@@ -87,6 +88,15 @@ def test_frames_of_two_rigs_are_kept_apart(tmp_path):
     assert not np.array_equal(first, second)
 
 
+def test_dark_paint_is_on_the_object_and_a_dark_wall_behind_it():
+    inside = FrameCache(None).truth(condition(CLEAN, 0), OBJECT, "A0").depth_mm > 0
+    clean, painted, dark = (frames(*of)[0].astype(float) for of in ((CLEAN, 0), ("dark-paint", 5), ("dark-wall", 5)))
+    assert painted[inside].mean() < 0.2 * clean[inside].mean()
+    assert painted[~inside].mean() == pytest.approx(clean[~inside].mean(), rel=0.02)
+    assert dark[inside].mean() == pytest.approx(clean[inside].mean(), rel=0.1)  # the wall lights the object a little
+    assert dark[~inside].mean() < 1.0
+
+
 def test_read_noise_is_in_grey_levels():
     camera = RULES.axes["read-noise"].light(RULES.clean, 3).camera
     assert camera.read_noise_e / (camera.full_well_e / 255) == pytest.approx(4)
@@ -107,13 +117,24 @@ def test_motion_is_nothing_to_one_frame_and_interreflection_to_convex_objects():
 def truth() -> Truth:
     depth = np.zeros((SIZE, SIZE), dtype=np.float32)
     depth[20:60, 20:60] = 1700
-    return Truth(depth, depth > 0)
+    return Truth(depth, depth > 0, depth == 0)
 
 
 def test_silence_costs_half_an_order():
     scores = score(np.zeros((SIZE, SIZE)), None, truth(), RULES)
     assert scores["mae_mm"] == 150 and scores["protocol_mae_mm"] == 1700
     assert scores["unanswered_share"] == 1 and scores["wrong_share"] == 0 and scores["coverage"] is None
+
+
+def test_missed_invented_and_the_error_of_what_is_answered_are_told_apart():
+    true, depth = truth(), truth().depth_mm + 3
+    depth[20:30, 20:60] = 0  # a quarter of the object
+    depth[~true.scored] = 0
+    depth[:10] = 1500  # an eighth of the image
+    scores = score(depth, None, true, RULES)
+    assert scores["unanswered_share"] == 0.25 and scores["answered_mae_mm"] == pytest.approx(3)
+    assert scores["invented_share"] == pytest.approx(10 / SIZE)
+    assert scores["mae_mm"] == pytest.approx(0.25 * 150 + 0.75 * 3)
 
 
 def test_a_right_answer_is_better_than_silence_and_silence_than_a_wrong_order():
@@ -251,6 +272,9 @@ def test_the_headline_is_the_mean_over_axes_and_severities_also_of_axes_of_few_o
         }
     )
     block = robustness(setup, rows)
+    assert (
+        robustness(setup, rows | rows_of({"dark-wall": [[900.0] * 4] * 5})).mae_mm == block.mae_mm
+    )  # beside the others
     assert block.mae_mm == pytest.approx(((1 + 2 + 3 + 4 + 5) * 1.5 + 5 * 20) / 10)
     assert block.ratio == pytest.approx(block.mae_mm / 1.5)
     assert block.interval[0] < block.mae_mm < block.interval[1]
