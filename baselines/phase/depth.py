@@ -77,7 +77,7 @@ TEXTURE_RAD = 0.5  # distance of both phases from the depth's at which something
 AMBIGUOUS_CHANCE = 0.3  # of a wrong order
 WINDOW_PERIODS = 0.27  # sigma of the window of the nearness, in periods of the longer carrier
 LEAST_GREY = 0.5  # least brightness that a change is divided by
-SYSTEMATIC_SHARE, RIM_SHARE = 0.06, 0.6
+SYSTEMATIC_SHARE, RIM_SHARE = 0.08, 0.6
 """Of the power of a misfit that is no noise, what acts as an error of the phase: everywhere, and more by the share of
 the window that lies beyond the object. So that 68% intervals hold 68% of the pixels of validation views."""
 NOT_AVERAGED = 0.2
