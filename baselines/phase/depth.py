@@ -48,6 +48,7 @@ from fpp_ml_bench.baselines.phase.observe import (
 from fpp_ml_bench.baselines.phase.order import CrossedOrder, crossed_order, fringe_order, margin_by_range
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.coding.code import MIN_MODULATION
+from fpp_ml_bench.coding.crossed import WINDOW_PERIODS
 from fpp_ml_bench.coding.phase_shift import phase_weights
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DecodeError
@@ -75,7 +76,6 @@ LOST_SHARE, LOST_CHANCE = 0.25, 0.6
 TEXTURE_SHARE = 0.35  # rms misfit over brightness of a window that shows no crossed fringe
 TEXTURE_RAD = 0.5  # distance of both phases from the depth's at which something else than its fringes was seen
 AMBIGUOUS_CHANCE = 0.3  # of a wrong order
-WINDOW_PERIODS = 0.27  # sigma of the window of the nearness, in periods of the longer carrier
 LEAST_GREY = 0.5  # least brightness that a change is divided by
 SYSTEMATIC_SHARE, RIM_SHARE = 0.08, 0.6
 """Of the power of a misfit that is no noise, what acts as an error of the phase: everywhere, and more by the share of

@@ -8,7 +8,7 @@ from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.cli.options import command, given, value
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.design.rivals import EpipolarLines
-from fpp_ml_bench.design.search import ANGLES_DEG, Assumptions, Candidate, Design, describe, draw_design, search
+from fpp_ml_bench.design.search import LEFT_WRONG, Assumptions, Candidate, Design, describe, draw_design, search
 from fpp_ml_bench.errors import CaptureError, RigError
 from fpp_ml_bench.files import write_atomically
 from fpp_ml_bench.optics.named_rigs import FIRST_SHIFTED_DEG, NAMED_RIGS
@@ -19,9 +19,7 @@ from fpp_ml_bench.options import argument, option
 from fpp_ml_bench.tables import Table
 
 ROWS = 8
-"""Pairs of the front that are shown, evenly spread, beside the proposed one."""
-MOST_WRONG = 0.05
-"""Share of wrong orders beyond which a pair of the front is not shown."""
+"""Pairs that are shown, evenly spread over their periods, beside the proposed one."""
 
 
 def _numbers(text: str) -> tuple[float, ...]:
@@ -55,12 +53,6 @@ class DesignSettings(Assumptions):
     pitches: tuple[float, ...] | None = option(
         None, "periods to search, projector px (default: all whole ones that fit the image)", "A,B|A-B", parse=PERIODS
     )
-    angles: tuple[float, ...] | None = option(
-        None,
-        "angles to search, 0: as horizontal fringes, 90: as vertical ones (default: 0, 15, ... 165)",
-        "A,B|A-B",
-        parse=PERIODS,
-    )
     pair: "tuple[Crossed, ...]" = option(
         (),
         "also describe these periods and angles (0 and 90 degrees unless said); repeatable",
@@ -83,8 +75,7 @@ class PatternSettings(DesignSettings):
     )
     design: bool = option(
         False,
-        "write no images: find two carriers for crossed fringes whose phases agree only at the true depth, and say "
-        "what they cost",
+        "write no images: find two carriers of crossed fringes with the least expected error, and say what they cost",
     )
 
 
@@ -99,16 +90,16 @@ since patterns come before the calibration. Project them without scaling; captur
 
 fpp-bench patterns paper --design
 fpp-bench patterns rig.yaml --design --out crossed.yaml --picture design.png     the rig with the proposed pair
-fpp-bench patterns rig.yaml --design --pitches 12-30 --angles 0,45,90            these periods and angles only
+fpp-bench patterns rig.yaml --design --pitches 12-30                             these periods only
 fpp-bench patterns paper --design --pair 18,18 --pair 18,14 --pair 24,13,0,45    beside pairs of yours (px, deg)
 
 Rival: another depth in the working range at which both phases are nearly those of the true depth. Phase errors of
-more than half of this distance choose the rival. Finer fringes have less depth noise and more rivals.
+more than half of this distance choose the rival. With finer fringes a phase error is less depth, and rivals are nearer.
 """
 )
 def patterns(settings: PatternSettings) -> None:
-    """Write the images that a rig's projector shows, in order, and a manifest of what each of them is. Or find two
-    carriers for crossed fringes whose phases agree only at the true depth, and say what they cost.
+    """Write the images that a rig's projector shows, in order, and a manifest of what each of them is. Or find the
+    two carriers for crossed fringes of the least expected error, and say what they cost.
 
     Raises FppBenchError for an unusable rig file or folder."""
     if settings.design:
@@ -143,7 +134,7 @@ def _design(settings: PatternSettings) -> None:
     """Search, print, and write what is asked for. Raises `RigError` for a rig that can't be used."""
     named = settings.rig in NAMED_RIGS
     rig = NAMED_RIGS[settings.rig]() if named else load_rig(settings.rig)
-    found = search(rig, settings, settings.pitches, settings.angles or ANGLES_DEG)
+    found = search(rig, settings, settings.pitches)
     families = dict.fromkeys(settings.pair, "asked for")
     if len(rig.fringe_directions) == 2:
         families.setdefault(replace(Crossed.of_pair(rig), shifts_deg=((0.0, 0.0),)), "its pair")
@@ -153,7 +144,7 @@ def _design(settings: PatternSettings) -> None:
     _print_design(rig, settings, found, list(zip(others, families.values(), strict=True)))
     if settings.picture is not None:
         beside = others[0] if others else describe(rig, [Crossed((18.0, 18.0))], settings)[0]
-        write_atomically(settings.picture, draw_design(rig, found.proposed, beside, settings))
+        write_atomically(settings.picture, draw_design(rig, found, beside))
         print(f"wrote {settings.picture}")
     if settings.out is not None:
         family = replace(found.proposed.crossed, shifts_deg=FIRST_SHIFTED_DEG)
@@ -168,12 +159,13 @@ def _print_design(rig: Rig, assumed: Assumptions, found: Design, others: list[tu
         "epipolar lines and tells no depth"
     )
     print(
-        f"orders          by a phase error of {assumed.phase_sigma:g} rad at 20 image px a period, before neighbours "
-        "help"
+        f"phases          a mean error of {assumed.phase_error:g} rad along the line of depths; camera noise of "
+        f"{assumed.noise_grey:g} grey levels, white {assumed.white_grey:g} at {near_mm:g} mm; projector blur "
+        f"{assumed.blur_px:g} px"
     )
     print(
-        f"depth noise     at {far_mm:g} mm, of {assumed.noise_grey:g} grey levels, white {assumed.white_grey:g} at "
-        f"{near_mm:g} mm, window {assumed.window_px:g} px, projector blur {assumed.blur_px:g} px"
+        f"wrong orders    {100 * assumed.edge_share:g}% of the pixels are near edges and texture, where the phases are "
+        f"off by {assumed.edge_sigma:g} rad across that line; in mm, of the {100 * LEFT_WRONG:g}% that neighbours leave"
     )
     names = (
         "projector px",
@@ -181,17 +173,17 @@ def _print_design(rig: Rig, assumed: Assumptions, found: Design, others: list[tu
         "image px",
         "rival, rad",
         "background",
-        "error",
-        "noise, mm",
-        "wrong orders",
         "periods in range",
+        "wrong orders",
+        "phases, mm",
+        "orders, mm",
+        "expected, mm",
     )
     table = Table("", numbers=names, names=3)
-    front = [candidate for candidate in found.front if candidate.wrong_share <= MOST_WRONG]
-    every = max(-(-len(front) // ROWS), 1)
-    shown = {id(candidate): candidate for candidate in (*front[::every], found.proposed)}
+    every = max(-(-len(found.searched) // ROWS), 1)
+    shown = {id(candidate): candidate for candidate in (*found.searched[::every], found.proposed)}
     rows = [(candidate, "proposed" if candidate is found.proposed else "") for candidate in shown.values()]
-    for candidate, about in sorted(rows, key=lambda row: -row[0].noise_mm) + others:
+    for candidate, about in sorted(rows, key=lambda row: -row[0].crossed.pitches_px[0]) + others:
         crossed = candidate.crossed
         background = "-" if candidate.background_rad is None else f"{candidate.background_rad:.2f}"
         table.add_row(
@@ -201,10 +193,11 @@ def _print_design(rig: Rig, assumed: Assumptions, found: Design, others: list[tu
             _two(candidate.image_px, ".1f"),
             f"{candidate.rival_rad:.2f}",
             background,
-            f"{candidate.sigma_rad:.2f}",
-            f"{candidate.noise_mm:.3f}",
-            f"{100 * candidate.wrong_share:.3f}%",
             _two(candidate.turns, ".2f"),
+            f"{100 * candidate.wrong_share:.2f}%",
+            f"{candidate.phase_mm:.2f}",
+            f"{candidate.wrong_mm:.2f}",
+            f"{candidate.expected_mm:.2f}",
         )
     show(table)
     for candidate, about in others:
@@ -213,8 +206,8 @@ def _print_design(rig: Rig, assumed: Assumptions, found: Design, others: list[tu
             print(f"note: {about}: the carrier of {pitch:g} px at {angle:g} degrees tells no depth")
     crossed = found.proposed.crossed
     print(
-        f"proposed        {_two(crossed.pitches_px, 'g')} px at {_two(crossed.angles_deg, 'g')} degrees, out of "
-        f"{found.searched:,} pairs: {found.reason}"
+        f"proposed        {_two(crossed.pitches_px, 'g')} px at {_two(crossed.angles_deg, 'g')} degrees: the least "
+        f"expected error of {len(found.searched)} periods; a guess of the model, measure it on frames of your scenes"
     )
 
 

@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from fpp_ml_bench.optics.rig import Rig
 
 Pair = tuple[float, float]
+WINDOW_PERIODS = 0.27  # sigma of the window in which a depth is fitted to one frame, in periods of the longer carrier
 LEAST_ANGLE_DEG = 5.0
 """Between the two carriers. Spectra of a window must be apart, and nearly parallel carriers are apart by their periods
 alone."""

@@ -98,16 +98,16 @@ def nearest(
     (m, n); with ``own`` (0, 0) counts too. ``turns`` float64 (..., 2), ``low`` and ``high`` that broadcast to (...);
     returns (...)."""
     least = np.full(np.broadcast_shapes(turns.shape[:-1], np.shape(low), np.shape(high)), np.inf)
-    for distance in _distances(turns, low, high, own):
+    for distance, _ in _distances(turns, low, high, own):
         np.minimum(least, distance, out=least)
     return least
 
 
 def _distances(
     turns: NDArray[np.float64], low: NDArray[np.float64] | float, high: NDArray[np.float64] | float, own: bool
-) -> Iterator[NDArray[np.float64]]:
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Distances in rad from the line, as in `nearest`, to the whole numbers beside it: along the axis that grows
-    faster all that the line passes, and across the three next to it."""
+    faster all that the line passes, and across the three next to it; and the places on the line that are nearest."""
     steep = np.abs(turns[..., 1]) > np.abs(turns[..., 0])
     fast, slow = np.where(steep, turns[..., 1], turns[..., 0]), np.where(steep, turns[..., 0], turns[..., 1])
     fast, slow = np.abs(fast), np.where(fast < 0, -slow, slow)  # (m, n) and (-m, -n) are alike
@@ -119,7 +119,7 @@ def _distances(
         for n in (middle - 1, middle, middle + 1):
             place = np.clip((m * fast + n * slow) / np.maximum(square, _TINY), low, high)
             distance = TAU * np.hypot(m - fast * place, n - slow * place)
-            yield np.where(n == 0, np.inf, distance) if m == 0 and not own else distance
+            yield np.where(n == 0, np.inf, distance) if m == 0 and not own else distance, place
 
 
 def rival_distance(turns: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -134,20 +134,28 @@ def background_distance(turns: NDArray[np.float64], background: NDArray[np.float
     return nearest(turns, background - 1.0, background, own=True)
 
 
-def wrong_order_rate(
-    turns: NDArray[np.float64], sigma: NDArray[np.float64] | float, surfaces: tuple[float, float] = (0.0, 1.0)
-) -> NDArray[np.float64]:
-    """Expected share of pixels with a wrong order, for ``turns`` (..., 2), where no neighbour helps: the mean over
-    depths at ``surfaces`` of the range (places on the line, evenly) and the sum over rivals.
+def wrong_orders(
+    lines: EpipolarLines,
+    turns: NDArray[np.float64],
+    sigma: NDArray[np.float64] | float,
+    share: float = 1.0,
+    surfaces: tuple[float, float] = (0.0, 1.0),
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Expected share of pixels with a wrong order, for ``turns`` (..., 2) on ``lines``, where no neighbour helps, and
+    the error in mm that they add to the mean: means over depths at ``surfaces`` of the range (places on the line,
+    evenly) and sums over rivals.
 
     Errors of a single frame's phase are mostly edges, texture and the other carrier, with heavy tails: across the line
-    they are taken as two-sided exponential with a standard deviation of ``sigma`` rad, (...) or one for all. A rival at
-    distance d is chosen with the probability of an error above d / 2, ``exp(-sqrt(2) d / (2 sigma)) / 2``.
+    a ``share`` of the pixels has two-sided exponential ones with a standard deviation of ``sigma`` rad, (...) or one
+    for all. A rival at distance d is chosen with the probability of an error above d / 2, ``share exp(-sqrt(2) d / (2
+    sigma)) / 2``.
     """
     places = np.linspace(*surfaces, 41)
-    low, high = -places, 1.0 - places
+    true_mm = lines.depths_mm(places)
     line, spread = turns[..., None, :], 2 * np.asarray(sigma, dtype=np.float64)[..., None]
-    total = np.zeros(np.broadcast_shapes(line.shape[:-1], places.shape))
-    for distance in _distances(line, low, high, own=False):
-        total += np.exp(-math.sqrt(2) * distance / spread) / 2
-    return np.minimum(total, 1.0).mean(axis=-1)  # type: ignore[no-any-return]
+    rate, error_mm = np.zeros((2, *np.broadcast_shapes(line.shape[:-1], places.shape)))
+    for distance, away in _distances(line, -places, 1.0 - places, own=False):
+        chance = share * np.exp(-math.sqrt(2) * distance / spread) / 2
+        rate += chance
+        error_mm += chance * np.abs(lines.depths_mm(np.clip(places + away, 0.0, 1.0)) - true_mm)
+    return np.minimum(rate, 1.0).mean(axis=-1), error_mm.mean(axis=-1)

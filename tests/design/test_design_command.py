@@ -13,7 +13,7 @@ def call(*arguments):
 
 def test_a_rig_gets_the_proposed_pair(tmp_path, capsys):
     written, picture = tmp_path / "crossed.yaml", tmp_path / "design.png"
-    assert call("paper", "--angles", "0,30,60,90", "--pair", "18,14", "--out", written, "--picture", picture) == 0
+    assert call("paper", "--pitches", "9-20", "--pair", "18,14", "--out", written, "--picture", picture) == 0
     said = capsys.readouterr().out
     assert "39 degrees runs along the epipolar lines" in said and "asked for" in said and "its pair" in said
     assert "18 / 14" in said and "0.71" in said and "0.98" in said and picture.read_bytes().startswith(b"\x89PNG")
@@ -31,7 +31,7 @@ def test_a_rig_of_one_direction_keeps_its_code(tmp_path, capsys):
     wave = {"scheme": "phase-shift", "pitches_px": [114, 912], "steps": 3}
     save_rig(rig_from_dict({**data, "sequence": {"vertical": wave}}), tmp_path / "rig.yaml")
     written = tmp_path / "crossed.yaml"
-    assert call(tmp_path / "rig.yaml", "--angles", "45,90,135", "--pair", "30,30", "--out", written) == 0
+    assert call(tmp_path / "rig.yaml", "--pair", "30,30", "--out", written) == 0
     said = capsys.readouterr().out
     assert "a carrier at 0 degrees runs along" in said and "the carrier of 30 px at 0 degrees tells no depth" in said
     assert load_rig(written).sequence.order == ("crossed", "vertical") and load_rig(written).directions == ("vertical",)
@@ -42,12 +42,12 @@ def test_a_rig_of_one_direction_keeps_its_code(tmp_path, capsys):
     [
         (["none.yaml"], "none.yaml"),
         (["paper", "--pitches", "x"], "expected numbers such as 12,14,18"),
-        (["paper", "--pitches", "2-3"], "no two of 0 carriers"),
+        (["paper", "--pitches", "2-3"], "none of 2 periods covers 6 to 40 px"),
         (["paper", "--pair", "18"], "two periods, or two periods and two angles"),
         (["paper", "--pair", "18,2"], "4 px and more"),
         (["paper", "--pair", "18,14,30,31"], "parallel"),
         (["paper", "--image-px", "40,10"], "LEAST,MOST"),
-        (["paper", "--phase-sigma", "0"], "expected a number above 0"),
+        (["paper", "--phase-error", "0"], "expected a number above 0"),
         (["paper", "--noise", "nan"], "expected a number above 0"),
         (["paper", "--surfaces", "1000,1900"], "a part of the working range"),
         (["paper", "--out", "rig.txt"], "expected a rig file ending in"),

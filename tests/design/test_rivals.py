@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from fpp_ml_bench.coding.crossed import Crossed
-from fpp_ml_bench.design.rivals import EpipolarLines, background_distance, rival_distance, wrong_order_rate
-from fpp_ml_bench.design.search import Assumptions, describe, draw_design, search
+from fpp_ml_bench.design.rivals import EpipolarLines, background_distance, rival_distance, wrong_orders
+from fpp_ml_bench.design.search import Assumptions, describe, draw_design, search, square_pair
 from fpp_ml_bench.errors import RigError
 from fpp_ml_bench.optics.named_rigs import CROSSED, paper_rig
 
@@ -74,15 +74,15 @@ def test_the_papers_pair_by_hand():
     assert float(rival_distance(turns)[0]) == pytest.approx(2 * np.pi * (across[1] - across[0]) / np.hypot(*across))
 
 
-def test_wrong_orders_are_about_those_measured():
-    """Measured on rendered objects near the middle of the range, before any smoothing: 2.5, 0.7, 0.7, 7 to 9 and 7 to
-    9 percent."""
-    families = [Crossed(pair) for pair in ((18.0, 18.0), (18.0, 14.0), (16.0, 13.0), (18.0, 25.0), (12.0, 17.0))]
-    near_the_middle = Assumptions(surfaces_mm=(1700.0, 1900.0))
-    shares = [100 * candidate.wrong_share for candidate in describe(PAPER, families, near_the_middle)]
-    for share, measured in zip(shares, (2.5, 0.7, 0.7, 8.0, 8.0), strict=True):
-        assert measured / 3 < share < measured * 3
-    assert max(shares[1:3]) < shares[0] < min(shares[3:])
+def test_the_expected_errors_are_about_those_measured():
+    """Measured by `benchmarks/crossed_sweep.py` on 15 validation views, the mean of both lights, with the right mask:
+    share of wrong orders before neighbours help, and mean error in mm."""
+    measured = {6: (5.0, 2.22), 8: (2.9, 2.35), 10: (1.7, 2.30), 12: (1.4, 2.87), 14: (1.3, 3.70), 18: (0.9, 4.52)}
+    lines = EpipolarLines.of(PAPER)
+    found = describe(PAPER, [square_pair(lines, pitch) for pitch in measured], Assumptions())
+    for candidate, (wrong_percent, mean_mm) in zip(found, measured.values(), strict=True):
+        assert wrong_percent / 7 < 100 * candidate.wrong_share < 2 * wrong_percent
+        assert candidate.expected_mm == pytest.approx(mean_mm, rel=0.25)
 
 
 def test_wrong_orders_of_drawn_errors():
@@ -95,8 +95,13 @@ def test_wrong_orders_of_drawn_errors():
     apart = (true[:, None] * turns + error)[:, None] - places[:, None] * turns
     order = np.rint(apart)
     best = np.argmin(((apart - order) ** 2).sum(axis=-1), axis=1)
-    wrong = (order[np.arange(4000), best] != 0).any(axis=-1).mean()
-    assert float(wrong_order_rate(turns, sigma)) == pytest.approx(wrong, rel=0.12)
+    wrong = (order[np.arange(4000), best] != 0).any(axis=-1)
+    lines = EpipolarLines.of(PAPER)
+    rate, error_mm = wrong_orders(lines, turns, sigma)
+    assert float(rate) == pytest.approx(wrong.mean(), rel=0.12)
+    off_mm = np.abs(lines.depths_mm(places[best]) - lines.depths_mm(true)) * wrong
+    assert float(error_mm) == pytest.approx(off_mm.mean(), rel=0.12)
+    assert float(wrong_orders(lines, turns, sigma, 0.25)[0]) == pytest.approx(rate / 4)
 
 
 def test_a_carrier_along_the_epipolar_lines_tells_no_depth():
@@ -104,16 +109,17 @@ def test_a_carrier_along_the_epipolar_lines_tells_no_depth():
     assert lines.flat_angle_deg == pytest.approx(0, abs=1e-6)
     straight, tilted = describe(SIDEWAYS, [Crossed((18.0, 18.0)), Crossed((18.0, 14.0), (45.0, 120.0))], Assumptions())
     assert straight.flat == (0,) and straight.rival_rad < 1e-9 and tilted.flat == ()
-    found = search(SIDEWAYS, Assumptions(), angles_deg=(0, 30, 60, 90, 120, 150))
-    assert found.proposed.rival_rad > 1.3
+    found = search(SIDEWAYS, Assumptions(), (12.0, 18.0))
+    assert found.proposed.rival_rad > 0.9 and found.proposed.flat == ()
 
 
-def test_depth_noise_is_that_of_drawn_noise():
+def test_noise_alone_is_that_of_drawn_noise():
     """Of both phases together, by least squares along the line at the far end."""
-    crossed, assumed = Crossed((18.0, 14.0)), Assumptions()
+    crossed, assumed = Crossed((18.0, 14.0)), Assumptions(phase_error=1e-6)
     slopes = 2 * np.pi * EpipolarLines.of(PAPER).far_px_per_mm[0] @ np.array(crossed.cycles_per_px).T
     rows, columns = np.mgrid[-40:41, -40:41]
-    window = np.exp(-(rows**2 + columns**2) / (2 * assumed.window_px**2))
+    (found,) = describe(PAPER, [crossed], replace(assumed, surfaces_mm=(2099.999, 2100.0)))
+    window = np.exp(-(rows**2 + columns**2) / (2 * (0.27 * max(found.image_px)) ** 2))
     window /= window.sum()
     kept = np.exp(-2 * (np.pi * assumed.blur_px / np.array([18, 14])) ** 2)
     modulations = 0.5 * assumed.white_grey / 2 * (1500 / 2100) ** 2 * kept
@@ -124,23 +130,32 @@ def test_depth_noise_is_that_of_drawn_noise():
         waves = np.exp(-2j * np.pi * np.stack([rows / 22.6, columns / 17.5]))
         values = modulations / 2 + (window * noise * waves).sum(axis=(1, 2))
         errors.append(weights @ np.angle(values))
-    assert describe(PAPER, [crossed], assumed)[0].noise_mm == pytest.approx(np.std(errors), rel=0.1)
+    assert found.phase_mm == pytest.approx(np.std(errors), rel=0.1)
 
 
-def test_the_search_reaches_far_and_proposes_the_finest_of_the_safe():
-    found = search(PAPER, Assumptions())
-    assert found.front[0].rival_rad > 3 and found.proposed.rival_rad > 1.7
-    assert found.proposed.wrong_share <= 0.0002 and "at most 0.02% wrong orders" in found.reason
-    safe = [candidate for candidate in found.front if candidate.wrong_share <= 0.0002]
-    assert found.proposed.noise_mm == min(candidate.noise_mm for candidate in safe)
-    for candidate in found.front:
-        assert all(12 <= seen <= 40 for seen in candidate.image_px)
-        assert candidate.background_rad >= 3 * candidate.sigma_rad
-    for first, second in zip(found.front, found.front[1:], strict=False):
-        assert first.rival_rad / first.sigma_rad >= second.rival_rad / second.sigma_rad
-        assert first.noise_mm > second.noise_mm
-    none = search(PAPER, Assumptions(wrong_percent=1e-7), (18, 20), (0, 90))
-    assert "none has at most" in none.reason and none.proposed is none.front[0]
+@pytest.mark.parametrize("rig", [PAPER, TURNED, SIDEWAYS], ids=["paper", "turned", "sideways"])
+def test_the_search_proposes_the_least_expected_error(rig):
+    found = search(rig, Assumptions())
+    pitches = [candidate.crossed.pitches_px[0] for candidate in found.searched]
+    assert pitches == sorted(pitches) and len(pitches) > 5
+    assert found.proposed.expected_mm == min(candidate.expected_mm for candidate in found.searched)
+    for candidate in found.searched:
+        assert all(6 <= seen <= 40 for seen in candidate.image_px)
+        assert candidate.expected_mm == candidate.phase_mm + candidate.wrong_mm
+        assert max(candidate.turns) == pytest.approx(candidate.turns[0]) and candidate.turns[1] < 1.5
+    phases, orders = (np.array([getattr(one, f"{name}_mm") for one in found.searched]) for name in ("phase", "wrong"))
+    assert phases[0] < phases[-1] and orders[0] > orders[-1]
+    blurred = search(rig, Assumptions(blur_px=2.0)).proposed
+    assert blurred.crossed.pitches_px[0] > found.proposed.crossed.pitches_px[0]
+
+
+def test_no_angle_near_that_of_a_square_pair_has_less_expected_error():
+    lines = EpipolarLines.of(PAPER)
+    pair = square_pair(lines, 12.0)
+    turned = [replace(pair, angles_deg=tuple(a + by for a in pair.angles_deg)) for by in (0, -10, -5, 5, 10, 90)]
+    first, *others = describe(PAPER, turned, Assumptions())
+    assert first.expected_mm < min(other.expected_mm for other in others) * 1.01
+    assert first.wrong_share < min(other.wrong_share for other in others) * 1.01
 
 
 def test_the_pair_of_the_crossed_rig_is_far_from_its_rivals_but_for_the_ends_of_the_range():
@@ -148,22 +163,20 @@ def test_the_pair_of_the_crossed_rig_is_far_from_its_rivals_but_for_the_ends_of_
     (most,) = describe(PAPER.with_range((1500.0, 2050.0)), [CROSSED["crossed-18"]], Assumptions())
     (paper,) = describe(PAPER, [Crossed((18.0, 18.0))], Assumptions())
     assert most.rival_rad > 1.7 and whole.rival_rad > 0.95 and whole.background_rad > 0.85
-    assert whole.noise_mm == pytest.approx(paper.noise_mm, rel=0.01) and whole.wrong_share < paper.wrong_share / 4
+    assert whole.phase_mm == pytest.approx(paper.phase_mm, rel=0.01) and whole.wrong_share < paper.wrong_share / 3
 
 
-def test_the_finer_crossed_rigs_have_farther_rivals_and_less_noise_but_a_wall_that_looks_like_a_depth():
+def test_the_finer_crossed_rigs_have_farther_rivals_and_less_error_but_a_wall_that_looks_like_a_depth():
     found = {name: describe(PAPER, [family], Assumptions())[0] for name, family in CROSSED.items()}
     coarse, finer, finest = (found[f"crossed-{period}"] for period in (18, 12, 10))
     assert finer.rival_rad > 1.2 > finest.rival_rad > coarse.rival_rad > 0.95
-    assert coarse.noise_mm > finer.noise_mm > finest.noise_mm
+    assert coarse.phase_mm > finer.phase_mm > finest.phase_mm
     assert max(finer.background_rad, finest.background_rad) < 0.05 < coarse.background_rad
 
 
 def test_what_can_not_be_searched_is_said():
-    with pytest.raises(RigError, match="no two of 0 carriers have periods"):
+    with pytest.raises(RigError, match="none of 2 periods covers 6 to 40 px"):
         search(PAPER, Assumptions(), (3.0, 200.0))
-    with pytest.raises(RigError, match=r"all 4 pairs show the background at 3\.2 m"):
-        search(PAPER, Assumptions(phase_sigma=1.0), (18, 18.5), (0, 90))
     with pytest.raises(RigError, match="surfaces: expected a part of the working range 1500 to 2100 mm"):
         describe(PAPER, [CROSSED["crossed-18"]], Assumptions(surfaces_mm=(1400.0, 1900.0)))
     away = replace(PAPER, rotation=((-1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, -1.0)), background_m=None)
@@ -172,5 +185,6 @@ def test_what_can_not_be_searched_is_said():
 
 
 def test_the_picture_is_a_png():
-    pair = describe(SIDEWAYS, [Crossed((18.0, 18.0)), Crossed((18.0, 14.0), (45.0, 120.0))], Assumptions())
-    assert draw_design(replace(SIDEWAYS, background_m=None), pair[1], pair[0], Assumptions()).startswith(b"\x89PNG")
+    rig = replace(SIDEWAYS, background_m=None)
+    (straight,) = describe(rig, [Crossed((18.0, 18.0))], Assumptions())
+    assert draw_design(rig, search(rig, Assumptions(), (12.0, 18.0)), straight).startswith(b"\x89PNG")
