@@ -301,6 +301,7 @@ class CrossedTask(CandidateTask):
 
     thresholds = tuple(float(value) for value in np.arange(-6, 2.01, 0.5))
     leads = tuple(float(value) for value in range(6))
+    growth = 1.25
     chosen_share = 8
 
     wrong_rad = np.pi / 2

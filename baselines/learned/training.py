@@ -331,11 +331,13 @@ class Task(ABC):
 class CandidateTask(Task):
     """That of a `PhaseNet`. ``thresholds`` of the mask's logit and ``leads`` of the base order are tried on the
     validation samples, thresholds also on every ``chosen_share``-th training sample; sums of errors ``tolerance_mm``
-    from the least count as equal. An order is wrong where the phase is more than ``wrong_rad`` off."""
+    from the least count as equal, and for fewer missed pixels the background error may grow by ``growth``. An order is
+    wrong where the phase is more than ``wrong_rad`` off."""
 
     thresholds: ClassVar[tuple[float, ...]]
     leads: ClassVar[tuple[float, ...]]
     tolerance_mm: ClassVar[float] = 0.0
+    growth: ClassVar[float] = 1.0
     chosen_share: ClassVar[int | None] = None
     wrong_rad: ClassVar[float]
 
@@ -402,7 +404,7 @@ class CandidateTask(Task):
             (sample, partial(decided_mask, one, sample.scene.single()))
             for one, sample in zip(masked, validation + further, strict=True)
         ]
-        threshold = chosen_threshold(masks, self.thresholds, self.image_px, self.tolerance_mm)
+        threshold = chosen_threshold(masks, self.thresholds, self.image_px, self.tolerance_mm, self.growth)
         with_leads = ([one.with_lead(lead) for one in answers] for lead in self.leads)
         wrong = [self.scores_of(shifted, validation)["wrong_percent"] for shifted in with_leads]
         lead = self.leads[int(np.argmin(wrong))]
