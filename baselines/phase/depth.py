@@ -35,7 +35,7 @@ from fpp_ml_bench.baselines.phase.local_fit import (
     same_plane_mean,
     tied_fit,
 )
-from fpp_ml_bench.baselines.phase.object_mask import disk
+from fpp_ml_bench.baselines.phase.object_mask import disk, gaps
 from fpp_ml_bench.baselines.phase.observe import (
     CROSSED_FRAMES,
     Capture,
@@ -444,8 +444,10 @@ class CrossedRoute(TwoCarriers):
             fit = _of_best_sides(seen, _window_fit(seen, nearness))
         else:
             fit = _own_fit(seen, nearness, seen.moved)
-        if seen.moved is None and not seen.given and not seen.background.shown:
-            seen = replace(seen, inside=seen.inside & (fit.brightness > MIN_MODULATION))
+        if seen.moved is None and not seen.given:
+            shown = seen.background.shown
+            found = ~gaps(seen.background, fit.misfit_grey) if shown else fit.brightness > MIN_MODULATION
+            seen = replace(seen, inside=seen.inside & found)
         known = {entry.name: getattr(seen, entry.name) for entry in fields(seen)}
         return Fitted(**known, **vars(order), fit=fit)
 

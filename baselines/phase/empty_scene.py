@@ -53,7 +53,8 @@ CURVE_POWERS = (1, 2, 3)
 class Background:
     """Fit of the empty scene to one image, grey levels; ``strength``: what a white pattern gives per 1/m^2 of
     irradiance, NaN where neither image nor user tells; ``residual`` float32 (H, W): image minus prediction; ``share``:
-    of the tiles that show the plane, 0 for none; ``weights``: of the lamp's terms 1, x, y, x^2, xy, y^2."""
+    of the tiles that show the plane, 0 for none; ``weights``: of the lamp's terms 1, x, y, x^2, xy, y^2; ``textured``:
+    the plane's albedo is taken to change from place to place."""
 
     ambient_grey: float
     strength: float
@@ -61,6 +62,7 @@ class Background:
     residual: Image
     share: float
     weights: tuple[float, ...]
+    textured: bool = False
 
     @property
     def calibrated(self) -> bool:
@@ -248,7 +250,8 @@ class CrossedEmptyScene:
         noise, bend = _noise_of(samples - fitted), (bend / scale).astype(np.float32)
         plane = ((bend[2] * first + bend[1]) * first + bend[0]) * first + bend[3]
         if noise > TEXTURED * own_noise:
-            return Background(dark, np.nan, own_noise, self._of_any_albedo(grey, plane, dark, own_noise), share, ())
+            residual = self._of_any_albedo(grey, plane, dark, own_noise)
+            return Background(dark, np.nan, own_noise, residual, share, (), textured=True)
         return Background(dark, np.nan, noise, grey - plane, share, ())
 
     def _of_any_albedo(self, grey: Image, plane: Image, dark: float, noise_grey: float) -> Image:

@@ -20,6 +20,9 @@ CLOSING_PERIODS = 0.27
 ENCLOSED_PERIODS, ENCLOSED_WINDOW_PERIODS, ENCLOSED_EXCESS = 0.6, 0.2, 1.0
 """Radius of the closing whose pixels join the object where the mean square of the plane's misfit, in a window of this
 sigma, exceeds that of noise by this multiple: seven standard deviations of such a mean at 15 px a period."""
+GAP_PX, GAP_PLANE, GAP_OBJECT = 0.8, 4.0, 16.0
+"""Sigma of the average in which a gap in the object is told, the largest mean square of the plane's misfit there over
+that of noise, and the least of the object's."""
 RING_PERIODS = 0.14
 """Distance from the first mask's silhouette within which a pixel may change between object and background."""
 LARGEST_MISFIT = 0.35  # of a fringe that is there, squared, as a share of its own square
@@ -88,6 +91,17 @@ def enclosed(region: Mask, background: Background, period_px: float) -> Mask:
     around = cv2.morphologyEx(region.astype(np.uint8), cv2.MORPH_CLOSE, disk(ENCLOSED_PERIODS * period_px)) > 0
     power = cv2.GaussianBlur(background.residual**2, (0, 0), ENCLOSED_WINDOW_PERIODS * period_px)
     return around & (power > (1 + ENCLOSED_EXCESS) * background.noise_grey**2)
+
+
+def gaps(background: Background, misfit_grey: Image) -> Mask:
+    """Pixels (h, w) of a closed mask that show the plane, through a hole or beside a rim: it explains them and their
+    nearest neighbours, and the object's fringe, which leaves ``misfit_grey``, does not. None on a plane of any albedo,
+    which explains too much."""
+    if background.textured:
+        return np.zeros(misfit_grey.shape, bool)
+    as_plane, as_object = (cv2.GaussianBlur(misfit**2, (0, 0), GAP_PX) for misfit in (background.residual, misfit_grey))
+    noise = background.noise_grey**2
+    return ~background.different & (as_plane < GAP_PLANE * noise) & (as_object > GAP_OBJECT * noise)
 
 
 def modulated_region(grey: Image, modulation: Image, background: Background, period_px: float) -> Mask:

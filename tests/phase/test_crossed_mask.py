@@ -92,6 +92,20 @@ def test_seams_along_a_shadow_are_no_object() -> None:
     assert not kept[:, :38].any() and kept[12:68, 44:70].all() and kept[twig].all()
 
 
+def test_the_wall_is_seen_through_narrow_gaps(monkeypatch: pytest.MonkeyPatch) -> None:
+    bars = INSIDE & (X % 24 >= 10)  # gaps of 10 px, which closing fills for the most part
+    image = frame(np.where(bars, DEPTH_MM, 0.0), CUT, FAMILY)
+
+    def filled() -> tuple[float, float]:
+        answered = route(CUT, FAMILY).measure(image).depth_mm > 0
+        return float(answered[INSIDE & ~bars].mean()), float((~answered[bars]).mean())
+
+    (seen, missed), allowed = filled(), 1e-3
+    monkeypatch.setattr(object_mask, "GAP_OBJECT", np.inf)
+    closed, missed_before = filled()
+    assert closed > 0.4 and seen < 0.7 * closed and missed < missed_before + allowed
+
+
 def test_a_step_between_two_surfaces_is_sharp(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the neighbours' offers switched off, the control, the error beside the step is larger."""
     step_mm = np.where(INSIDE, np.where(X < 160, 1760.0, 1800.0), 0.0)
