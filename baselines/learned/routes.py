@@ -170,7 +170,8 @@ class CrossedNetRoute(CrossedRoute):
         np.put_along_axis(chances, choice[None], -1, axis=0)
         rival = (scene.nearness + chosen_values(offers, chances.argmax(axis=0)) / joint).astype(np.float32)
         fit = replace(seen.fit, nearness=nearness.astype(np.float32), uncertainty_rad=answers.sigma_rad)
-        return self.conclude(replace(seen, fit=fit, inside=inside, rival=rival), wrong)
+        wall = inside & (answers.object_logit < 0)  # likelier than the object
+        return self.conclude(replace(seen, fit=fit, inside=inside, rival=rival, wall=wall), wrong)
 
 
 @dataclass(frozen=True)

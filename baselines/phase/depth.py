@@ -93,8 +93,8 @@ class Reason(IntEnum):
     OUT_OF_RANGE: its depth is not in the working range, and is left out. THIN: the object is thinner than half a period
     there. TOO_STEEP: the fringe is compressed or stretched beyond what a window resolves. ONE_DIRECTION: one carrier is
     not to be seen, so that nothing decides the order. TEXTURE: what the window shows is no crossed fringe: stripes near
-    a carrier's period, or a depth edge. AMBIGUOUS: the candidate orders can't be told apart. UNSURE: the expected error
-    alone is too large."""
+    a carrier's period, or a depth edge. AMBIGUOUS: the candidate orders can't be told apart. WALL: the wall explains it
+    as well, or better; its uncertainty reaches the wall. UNSURE: the expected error alone is too large."""
 
     MEASURED = 0
     BACKGROUND = 1
@@ -106,7 +106,8 @@ class Reason(IntEnum):
     ONE_DIRECTION = 7
     TEXTURE = 8
     AMBIGUOUS = 9
-    UNSURE = 10
+    WALL = 10
+    UNSURE = 11
 
 
 @dataclass(frozen=True)
@@ -161,9 +162,11 @@ class NearnessFit:
 
 @dataclass(frozen=True)
 class Fitted(CrossedObservation, CrossedOrder):
-    """Crossed fringes with their order and the ``fit`` of the nearness."""
+    """Crossed fringes with their order and the ``fit`` of the nearness; ``wall`` bool (h, w): pixels that count as
+    object although the wall explains them as well, or better."""
 
     fit: NearnessFit
+    wall: Mask
 
 
 def _uncertainty_rad(seen: Observation, window: GaussianWindow) -> Image:
@@ -444,12 +447,14 @@ class CrossedRoute(TwoCarriers):
             fit = _of_best_sides(seen, _window_fit(seen, nearness))
         else:
             fit = _own_fit(seen, nearness, seen.moved)
+        wall = np.zeros_like(seen.inside)
         if seen.moved is None and not seen.given:
-            shown = seen.background.shown
-            found = ~gaps(seen.background, fit.misfit_grey) if shown else fit.brightness > MIN_MODULATION
-            seen = replace(seen, inside=seen.inside & found)
+            dropped, wall = gaps(seen.inside, seen.background, fit.misfit_grey)
+            if not seen.background.shown:
+                dropped = fit.brightness <= MIN_MODULATION
+            seen = replace(seen, inside=seen.inside & ~dropped)
         known = {entry.name: getattr(seen, entry.name) for entry in fields(seen)}
-        return Fitted(**known, **vars(order), fit=fit)
+        return Fitted(**known, **vars(order), fit=fit, wall=wall)
 
     def conclude(self, seen: Fitted, wrong_chance: Image | None = None) -> Measurement:
         """The measurement that follows from a fit. ``wrong_chance`` (h, w): probability of a wrong order, by default
@@ -469,6 +474,8 @@ class CrossedRoute(TwoCarriers):
         mm_per_rad = carriers.mm_per_rad(np.maximum(depth_mm, 1.0))
         doubt_rad = reaching(np.abs(seen.rival - fit.nearness) * carriers.joint_gain, wrong_chance)
         sigma_mm = mm_per_rad * np.hypot(fit.uncertainty_rad, doubt_rad)
+        if seen.rig.background_m is not None:
+            sigma_mm = np.where(seen.wall, np.hypot(sigma_mm, seen.rig.background_m * MM_PER_M - depth_mm), sigma_mm)
         window = GaussianWindow(WINDOW_PERIODS * seen.period_px)
         misfit = window.moment((fit.misfit_grey**2 * seen.inside).astype(np.float32)) / np.maximum(fit.weight, 1e-3)
         texture = (np.sqrt(misfit) > TEXTURE_SHARE * bright) | (seen.candidates.misfit_rad[1] > TEXTURE_RAD)
@@ -476,6 +483,7 @@ class CrossedRoute(TwoCarriers):
             Reason.ONE_DIRECTION: lost,
             Reason.TEXTURE: texture,
             Reason.AMBIGUOUS: wrong_chance > AMBIGUOUS_CHANCE,
+            Reason.WALL: seen.wall,
         }
         maps = _judged(
             seen, self.settings, depth_mm, sigma_mm, fit, None if seen.moved is not None else window, reasons

@@ -35,7 +35,7 @@ LEAST_AREA_PERIODS = 0.1  # smallest object, and largest hole that is closed, in
 PLANE_CHANCE_SIGMAS = 4.0
 """How far, in sigmas of its own spread, the squared misfit of N frames must exceed N not to be the empty plane."""
 PLANE_TOLERANCE_GREY = 0.3  # error of the fitted empty scene, grey levels, beside noise
-SEAM_PX = 2  # half the width of a seam along a shadow
+SEAM_PX = 2  # half the width of a seam along a shadow, and of a rim
 UNLIT_PX = 3  # side of the square that is averaged to tell faint light
 SQUARE_PX = 5  # side of the square over which faint differences are averaged
 PIXELWISE_CLOSING_PERIODS = 0.2
@@ -93,15 +93,18 @@ def enclosed(region: Mask, background: Background, period_px: float) -> Mask:
     return around & (power > (1 + ENCLOSED_EXCESS) * background.noise_grey**2)
 
 
-def gaps(background: Background, misfit_grey: Image) -> Mask:
-    """Pixels (h, w) of a closed mask that show the plane, through a hole or beside a rim: it explains them and their
-    nearest neighbours, and the object's fringe, which leaves ``misfit_grey``, does not. None on a plane of any albedo,
-    which explains too much."""
-    if background.textured:
-        return np.zeros(misfit_grey.shape, bool)
+def gaps(inside: Mask, background: Background, misfit_grey: Image) -> tuple[Mask, Mask]:
+    """Pixels (h, w) of a closed mask ``inside`` that show the plane, through a hole or beside a rim: it explains them
+    and their nearest neighbours, and the object's fringe, which leaves ``misfit_grey``, does not. And those at its rim
+    that both explain. None on a plane of any albedo, which explains too much."""
+    if background.textured or not background.shown:
+        return np.zeros_like(inside), np.zeros_like(inside)
     as_plane, as_object = (cv2.GaussianBlur(misfit**2, (0, 0), GAP_PX) for misfit in (background.residual, misfit_grey))
     noise = background.noise_grey**2
-    return ~background.different & (as_plane < GAP_PLANE * noise) & (as_object > GAP_OBJECT * noise)
+    plane = inside & ~background.different & (as_plane < GAP_PLANE * noise)
+    found = plane & (as_object > GAP_OBJECT * noise)
+    rim = cv2.dilate((~inside | found).astype(np.uint8), disk(SEAM_PX)) > 0
+    return found, plane & rim & ~found
 
 
 def modulated_region(grey: Image, modulation: Image, background: Background, period_px: float) -> Mask:

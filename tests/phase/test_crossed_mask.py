@@ -8,6 +8,8 @@ from crossed_scenes import frame, route, slab
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.phase import empty_scene, local_fit, object_mask, observe
+from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Reason
+from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.optics.named_rigs import crossed_rig
 
 WHOLE = crossed_rig(960)
@@ -104,6 +106,17 @@ def test_the_wall_is_seen_through_narrow_gaps(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(object_mask, "GAP_OBJECT", np.inf)
     closed, missed_before = filled()
     assert closed > 0.4 and seen < 0.7 * closed and missed < missed_before + allowed
+
+
+def test_a_pixel_that_the_wall_explains_too_is_answered_and_said_to_be_in_doubt() -> None:
+    bars = INSIDE & (X % 24 >= 6)
+    image = frame(np.where(bars, DEPTH_MM, 0.0), CUT, FAMILY)
+    found = route(CUT, FAMILY).measure(image)
+    doubted = found.sigma_mm > 1000  # the wall is 1.4 m behind
+    assert 50 < doubted.sum() < 0.02 * INSIDE.sum() and (found.reason == Reason.WALL)[doubted].any()
+    assert (found.depth_mm[doubted] > 0).all() and doubted[bars].mean() < 0.002
+    strict = CrossedRoute(CUT, Settings(min_confidence=0.02), FAMILY).measure(image)
+    assert not (strict.depth_mm[doubted] > 0).any() and (strict.depth_mm > 0).sum() > 0.9 * (found.depth_mm > 0).sum()
 
 
 def test_a_step_between_two_surfaces_is_sharp(monkeypatch: pytest.MonkeyPatch) -> None:
