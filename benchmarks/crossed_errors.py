@@ -64,10 +64,6 @@ def _gamma(grey: Image, inside: Mask, draw: np.random.Generator) -> Image:
     return 255 * (grey / 255) ** 2.2
 
 
-def _blur(grey: Image, inside: Mask, draw: np.random.Generator) -> Image:
-    return np.asarray(cv2.GaussianBlur(grey, (0, 0), 1.5))
-
-
 def _paint(grey: Image, inside: Mask, draw: np.random.Generator) -> Image:
     return np.where(inside, 0.15 * grey, grey) + draw.normal(0, 1, grey.shape)
 
@@ -88,7 +84,6 @@ KINDS: dict[str, Callable[[Image, Mask, np.random.Generator], Image]] = {
     "the same texture, on the wall too": _patches_everywhere,
     "the same checks, on the wall too": _checks_everywhere,
     "gamma 2.2": _gamma,
-    "blur of 1.5 px": _blur,
     "dark paint, 0.15": _paint,
     "dark wall, 0.15": _dark_wall,
     "no wall": _no_wall,
