@@ -80,7 +80,7 @@ class SurfaceLight(StrictModel):
 
     @model_serializer(mode="wrap")
     def _described(self, described: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """A share of 1 is left out, so that lights of version 0.3 keep their fingerprints."""
+        """A share of 1 is left out, so that lights from before there were shares keep their fingerprints."""
         content: dict[str, Any] = described(self)
         return {key: value for key, value in content.items() if not (key in SHARES and value == 1.0)}
 
