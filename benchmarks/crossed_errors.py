@@ -16,7 +16,6 @@ from collections.abc import Callable
 from time import perf_counter
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
