@@ -50,7 +50,7 @@ import os, time
 from fpp_ml_bench.pool import mapping
 
 def sleep(work, number):
-    print(os.getpid(), flush=True)
+    os.write(1, b"%d\\n" % os.getpid())  # a line at once: both workers write to one pipe
     time.sleep(120)
 
 if __name__ == "__main__":
