@@ -33,7 +33,7 @@ from fpp_ml_bench.optics.named_rigs import FIRST_SHIFTED_DEG, paper_rig
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.tables import Table
 
-APART_DEG = 20.0
+ANGLES_DEG, APART_DEG = np.arange(0, 180, 2.5), 20.0
 Wave = tuple[float, float]  # period in px, angle in degrees
 
 
@@ -50,9 +50,8 @@ def rival_rad(lines: EpipolarLines, waves: list[Wave]) -> float:
 
 def third(lines: EpipolarLines, pair: list[Wave]) -> tuple[float, Wave]:
     """The third carrier, and the distance of the nearest rival with it."""
-    angles = [
-        a for a in np.arange(0, 180, 2.5) if all(abs((a - b + 90) % 180 - 90) >= APART_DEG for _, b in pair)
-    ]  # fmt: skip
+    apart = [np.abs((ANGLES_DEG - angle + 90) % 180 - 90) >= APART_DEG for _, angle in pair]
+    angles = ANGLES_DEG[np.logical_and(*apart)]
     return max((rival_rad(lines, [*pair, (pair[0][0], a)]), (pair[0][0], float(a))) for a in angles)
 
 

@@ -179,13 +179,12 @@ def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
     if setup.quick or missing:
         lacking = "a --quick look" if setup.quick else f"without {', '.join(missing)}"
         raise PredictionError(f"robustness is a mean over all axes and severities, and this is {lacking}")
-    means = {
+    axes = {
         axis: [SeverityScores.model_validate(scores) for scores in severity_means(found).values()]
         for axis, found in rows.items()
     }
-    (clean,) = means.pop(CLEAN)
-    beside = {name: means.pop(name) for name, axis in corruptions().axes.items() if axis.beside and name in means}
-    axes = means
+    (clean,) = axes.pop(CLEAN)
+    beside = {name: axes.pop(name) for name, axis in corruptions().axes.items() if axis.beside and name in axes}
     found = object_interval(*_shares_of_the_mean({axis: rows[axis] for axis in (CLEAN, *axes)}))
     every = [scores.mae_mm for severities in axes.values() for scores in severities]
     return Robustness(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fpp_ml_bench.coding.code import SMALLEST_PITCH_PX
 from fpp_ml_bench.coding.crossed import WINDOW_PERIODS, Crossed
 from fpp_ml_bench.design.rivals import (
     TAU,
@@ -30,7 +31,6 @@ FLAT_TURNS = 0.05
 """A carrier that turns less over the whole range tells no depth."""
 LEFT_WRONG = 0.2
 """Of the wrong orders of single pixels, those that neighbours leave: measured 0.1 to 0.4 (docs/results/crossed.md)."""
-LEAST_PITCH_PX = 4
 _PLACES = np.linspace(0.0, 1.0, 400)
 
 
@@ -185,8 +185,11 @@ def search(rig: Rig, assumed: Assumptions, pitches_px: Iterable[float] | None = 
     the least expected error. Raises `RigError` where the limits leave none."""
     lines, (least, most) = EpipolarLines.of(rig), assumed.image_px
     longest = int(math.hypot(rig.projector.width, rig.projector.height))
-    pitches = [float(pitch) for pitch in (range(LEAST_PITCH_PX, longest + 1) if pitches_px is None else pitches_px)]
-    families = [square_pair(lines, pitch) for pitch in sorted(set(pitches)) if pitch >= LEAST_PITCH_PX]
+    pitches = [
+        float(pitch)
+        for pitch in (range(math.ceil(SMALLEST_PITCH_PX), longest + 1) if pitches_px is None else pitches_px)
+    ]
+    families = [square_pair(lines, pitch) for pitch in sorted(set(pitches)) if pitch >= SMALLEST_PITCH_PX]
 
     def fits(family: Crossed) -> bool:
         return all(least <= rig.image_px_of_carrier(carrier) <= most for carrier in family.cycles_per_px)
