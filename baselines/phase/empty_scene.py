@@ -35,6 +35,10 @@ LEAST_EXPLAINED = 0.5
 be seen misfits no prediction; a plane that is there explains 0.8 and more even where it is as dim as noise."""
 SAME_STRENGTH = 1.35  # ratio of strengths within which tiles show the same surface: sheen changes slowly over a plane
 SAME_RAD = 0.4  # distance of a phase pair from the plane's within which a pixel may show it
+MOVED_RAD, MOVED_CELLS, MOVED_SHARE = 1.0, 10, 0.1
+"""Farthest distance, along each axis, of the plane's phases from those of the rig: a calibration that is off, or a wall
+that stands elsewhere. Cells along each axis in which it is looked for; share of the image that must agree on it."""
+EXACT_RAD = 0.05  # distance that is not corrected
 MARGIN_PERIODS = 0.4  # eroded from those pixels: a window beside an object covers it too
 PLAIN_SIGMAS = 5.0  # spread of the plane's fitted light, over the noise, below which it shows no fringe
 TEXTURED = 3.0
@@ -45,6 +49,7 @@ ALBEDO_SHARE = 0.03  # of the plane's light that counts as noise where its albed
 SAMPLES = 4000  # points to which the plane is fitted, about
 ROUNDS = 4
 OUTLIER_SIGMAS = 4.0
+RESPONSE_POWERS = (2, 3)  # of the pattern, whose sum is what a projector of any gamma shows
 CURVE_POWERS = (1, 2, 3)
 """Powers of the fitted light whose sum is the plane's grey level: a gamma of projector or camera bends it."""
 
@@ -209,19 +214,26 @@ class CrossedEmptyScene:
         rig, self._stride = carriers.rig, stride
         # Without a known background nothing is predicted, and no image shows it.
         depth_m = np.nan if rig.background_m is None else rig.background_m
-        phases = carriers.phases(carriers.nearness(depth_m * MM_PER_M))
-        self._phases, self._known = wrapped(phases[:, ::stride, ::stride]), rig.background_m is not None
+        self._known, self._weights = rig.background_m is not None, carriers.family.weights
+        self._phases = carriers.phases(carriers.nearness(depth_m * MM_PER_M))
         x, y = (axis.astype(np.float32) for axis in rig.camera.rays())
+        self._places = np.stack([np.ones_like(x), x, y])
         fall_off = plane_irradiance(rig, depth_m).astype(np.float32)
-        fall_off /= np.float32(np.median(fall_off))
-        first, second = (
-            np.float32(w) * np.cos(phase) for w, phase in zip(carriers.family.weights, phases, strict=True)
-        )
-        terms = [fall_off * term * (1 + first + second) for term in _quadratic(x, y)]
-        terms += [fall_off * first, fall_off * second, np.ones_like(x)]
-        self._terms = [term.astype(np.float32) for term in terms]
+        self._fall_off = fall_off / np.float32(np.median(fall_off))
+        self._terms = self._light(self._phases)
         self._period_px = carriers.period_px
         self._margin = 2 * max(1, round(MARGIN_PERIODS * carriers.period_px / stride)) + 1
+
+    def _light(self, phases: NDArray) -> list[Image]:
+        """Terms (H, W) whose weighted sum is the plane's light at ``phases`` (2, H, W): a lamp of uneven brightness,
+        carriers of any contrast, a projector's response, which bends the pattern before the light falls off, and
+        ambient light."""
+        waves = (weight * np.cos(phase) for weight, phase in zip(self._weights, phases, strict=True))
+        first, second = (wave.astype(np.float32) for wave in waves)
+        pattern, fall_off = 1 + first + second, self._fall_off
+        terms = [fall_off * term * pattern for term in _quadratic(*self._places[1:])]
+        terms += [fall_off * pattern**power for power in RESPONSE_POWERS]
+        return [*terms, fall_off * first, fall_off * second, np.ones_like(fall_off)]
 
     def __call__(self, grey: Image, seen: Demodulated) -> Background:
         """Fit the plane to an image float32 (H, W), demodulated as ``seen``: its ``residual`` float32 (H, W), ambient
@@ -230,17 +242,17 @@ class CrossedEmptyScene:
         smooth = cv2.blur(grey, (3, 3))[::SAMPLE_STEP_PX, ::SAMPLE_STEP_PX]
         dark = float(np.percentile(smooth, DARK_PERCENTILE))
         noise = max(image_noise_grey(grey), FLOOR_NOISE_GREY)
-        plane_points = self._plane(seen, noise)
+        plane_points, moved_rad = self._plane(seen, noise)
         share = float(plane_points.mean())
         if share < LEAST_SHARE:
             return Background(dark, np.nan, max(noise, DEFAULT_NOISE_GREY), np.zeros_like(grey), 0.0, ())
-        places = np.argwhere(plane_points)
-        row, column = self._stride * places[:: max(1, len(places) // SAMPLES)].T
+        row, column = self._stride * _spread(plane_points)
         samples = grey[row, column].astype(np.float64)
-        terms = np.stack([term[row, column] for term in self._terms], axis=1).astype(np.float64)
+        all_terms = self._terms if moved_rad is None else self._light(self._phases + moved_rad)
+        terms = np.stack([term[row, column] for term in all_terms], axis=1).astype(np.float64)
         light, weights = _least_squares(terms, samples)
         # Horner's rule on whole images, in single precision: 1e-5 of a grey level is enough here.
-        first = sum((np.float32(w) * term for w, term in zip(weights, self._terms, strict=True)), np.float32(0))
+        first = sum((np.float32(w) * term for w, term in zip(weights, all_terms, strict=True)), np.float32(0))
         own_noise = max(image_noise_grey(grey), DEFAULT_NOISE_GREY)
         if np.subtract(*np.percentile(light, [95, 5])) < PLAIN_SIGMAS * own_noise:  # no fringe for a gamma to bend
             return Background(dark, np.nan, max(_noise_of(samples - light), noise), grey - first, share, ())
@@ -271,18 +283,52 @@ class CrossedEmptyScene:
             least = np.where(np.abs(misfit) < np.abs(least), misfit, least)
         return least / np.hypot(1, np.float32(ALBEDO_SHARE / noise_grey) * light)
 
-    def _plane(self, seen: Demodulated, noise_grey: float) -> Mask:
-        """Grid points (h', w') whose windows show the plane alone; where its fringes are nowhere to be seen, those
+    def _plane(self, seen: Demodulated, noise_grey: float) -> tuple[Mask, Image | None]:
+        """Grid points (h', w') whose windows show the plane alone, and by how much its phases are beside the rig's,
+        float32 (2, H, W) in rad, None for at most `EXACT_RAD`. Where its fringes are nowhere to be seen, the points
         without any fringe: they are blurred out, or there is no wall."""
-        modulation, square = seen.modulation, np.ones((self._margin, self._margin), np.uint8)
-        same = np.hypot(*wrapped(seen.phase_rad - self._phases)) < SAME_RAD
+        modulation, step = seen.modulation, self._stride
         fringed, plain = modulation.min(axis=0) > noise_grey / 4, modulation.max(axis=0) < noise_grey / 2
-        alone: Mask = np.zeros(plain.shape, bool)
-        for points in (same & fringed, plain & self._known):
-            alone = cv2.erode(points.astype(np.uint8), square, borderValue=1) > 0  # type: ignore[call-overload]
-            if alone.mean() >= LEAST_SHARE:
-                break
-        return alone
+        off_rad = wrapped(seen.phase_rad - self._phases[:, ::step, ::step])
+        grid = self._places[:, ::step, ::step]
+        moved_rad = np.zeros((2, 1, 1), np.float32)
+        points = self._alone(fringed & (np.hypot(*off_rad) < SAME_RAD))
+        if points.mean() < LEAST_SHARE:
+            if self._known and fringed.any():
+                moved_rad = _most_common(off_rad[:, fringed])[:, None, None]
+                points = self._alone(fringed & (np.hypot(*wrapped(off_rad - moved_rad)) < SAME_RAD))
+            if points.mean() < MOVED_SHARE:
+                return self._alone(plain & self._known), None
+        for _ in range(ROUNDS):
+            row, column = _spread(points)
+            terms = grid[:, row, column].T.astype(np.float64)
+            left_rad = (moved_rad + wrapped(off_rad - moved_rad))[:, row, column]
+            slopes = np.linalg.lstsq(terms, left_rad.T, rcond=None)[0].T
+            moved_rad = np.tensordot(slopes, grid, 1).astype(np.float32)
+            if np.abs(moved_rad).max() < EXACT_RAD:
+                return points, None
+            points = self._alone(fringed & (np.hypot(*wrapped(off_rad - moved_rad)) < SAME_RAD))
+        return points, np.tensordot(slopes, self._places, 1).astype(np.float32)
+
+    def _alone(self, points: Mask) -> Mask:
+        """``points`` (h', w') whose windows show these alone."""
+        square = np.ones((self._margin, self._margin), np.uint8)
+        return cv2.erode(points.astype(np.uint8), square, borderValue=1) > 0  # type: ignore[call-overload]
+
+
+def _spread(points: Mask) -> NDArray[np.intp]:
+    """Rows and columns (2, N) of about `SAMPLES` of the ``points``, evenly among them."""
+    places = np.argwhere(points)
+    return places[:: max(1, len(places) // SAMPLES)].T
+
+
+def _most_common(off_rad: NDArray) -> NDArray[np.float32]:
+    """The distance (2,) in rad, up to `MOVED_RAD`, that most of ``off_rad`` (2, N) are near to."""
+    edges = np.linspace(-MOVED_RAD, MOVED_RAD, MOVED_CELLS + 1)
+    count = np.histogram2d(off_rad[0], off_rad[1], bins=[edges, edges])[0]
+    around = cv2.blur(count, (3, 3), borderType=cv2.BORDER_CONSTANT)
+    best = np.stack(np.unravel_index(around.argmax(), around.shape))
+    return ((edges[best] + edges[best + 1]) / 2).astype(np.float32)
 
 
 def _least_squares(

@@ -20,6 +20,7 @@ CLOSING_PERIODS = 0.27
 ENCLOSED_PERIODS, ENCLOSED_WINDOW_PERIODS, ENCLOSED_EXCESS = 0.6, 0.2, 1.0
 """Radius of the closing whose pixels join the object where the mean square of the plane's misfit, in a window of this
 sigma, exceeds that of noise by this multiple: seven standard deviations of such a mean at 15 px a period."""
+BORDER_PERIODS = 0.6  # width of the image's border, where blur mixes in what no pixel shows; no object is there alone
 GAP_PX, GAP_PLANE, GAP_OBJECT = 0.8, 4.0, 16.0
 """Sigma of the average in which a gap in the object is told, the largest mean square of the plane's misfit there over
 that of noise, and the least of the object's."""
@@ -83,6 +84,16 @@ def without_small(mask: Mask, least_px: float) -> Mask:
 def object_region(background: Background, period_px: float) -> Mask:
     """First mask (H, W): pixels that differ, closed over the stripes where object and plane are equally bright."""
     return closed(background.different, CLOSING_PERIODS * period_px, LEAST_AREA_PERIODS * period_px**2)
+
+
+def beyond_border(region: Mask, period_px: float) -> Mask:
+    """``region`` (H, W) without its components that lie in the image's border alone."""
+    width = max(1, round(BORDER_PERIODS * period_px))
+    count, labels = cv2.connectedComponents(region.astype(np.uint8), connectivity=8)
+    keep = np.zeros(count, bool)
+    keep[labels[width:-width, width:-width]] = True
+    keep[0] = False
+    return keep[labels]
 
 
 def enclosed(region: Mask, background: Background, period_px: float) -> Mask:

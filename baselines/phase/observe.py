@@ -44,6 +44,7 @@ from fpp_ml_bench.baselines.phase.object_mask import (
     DARKEST_GREY,
     RING_PERIODS,
     UNLIT_PX,
+    beyond_border,
     continued,
     crop_around,
     differs,
@@ -404,6 +405,8 @@ class TwoCarriers(MeasurementModel):
             region = lit_object(different, closed, lit_grey, lit_noise, background.shown, period_px)
             residual = wrapped(own_phase - self.carriers.infinity_rad[moved])
             region = continued(region, closed, different, residual)
+        if mask is None:
+            region = beyond_border(region, period_px)
         crop = crop_around(region, int(np.ceil(MARGIN_PERIODS * period_px)), stride)
         background, inside = replace(background, residual=background.residual[crop]), region[crop]
         grid = tuple(slice(part.start // stride, -(-part.stop // stride)) for part in crop)

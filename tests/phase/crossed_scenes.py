@@ -29,10 +29,12 @@ def frame(
     white_grey: NDArray | float = 160.0,
     ambient_grey: float = 6.0,
     noise_grey: float = 0.7,
-    background_grey: float = 50.0,
+    background_grey: NDArray | float = 50.0,
     number: int = 0,
+    gamma: float = 1.0,
 ) -> NDArray[np.uint8]:
-    """Crossed frame ``number`` uint8 (H, W) of a surface at ``depth_mm`` (H, W), 0 where the background is."""
+    """Crossed frame ``number`` uint8 (H, W) of a surface at ``depth_mm`` (H, W), 0 where the background is; ``gamma``:
+    of the projector."""
     x, y = rig.camera.rays()
     z = np.where(depth_mm > 0, depth_mm / 1000, rig.background_m or 3.2)
     u, v = rig.project(np.stack([x * z, y * z, z], axis=-1))
@@ -43,7 +45,7 @@ def frame(
         )
     ]
     white = np.where(depth_mm > 0, white_grey, background_grey)
-    grey = ambient_grey + white * (0.5 + 0.5 * (waves[0] + waves[1]))
+    grey = ambient_grey + white * (0.5 + 0.5 * (waves[0] + waves[1])) ** gamma
     noise = np.random.default_rng(7 + number).normal(0, noise_grey, grey.shape)
     return np.clip(np.rint(grey + noise), 0, 255).astype(np.uint8)
 

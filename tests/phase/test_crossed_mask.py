@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from crossed_scenes import frame, route, slab
@@ -11,6 +12,7 @@ from fpp_ml_bench.baselines.phase import empty_scene, local_fit, object_mask, ob
 from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Reason
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.optics.named_rigs import crossed_rig
+from fpp_ml_bench.optics.rig import Rig
 
 WHOLE = crossed_rig(960)
 CUT = replace(WHOLE, camera=replace(WHOLE.camera, width=320, height=320, cx=159.5, cy=159.5))
@@ -131,3 +133,58 @@ def test_a_step_between_two_surfaces_is_sharp(monkeypatch: pytest.MonkeyPatch) -
     sharp = error_mm()
     monkeypatch.setattr(local_fit, "SIDE_PERIODS", (0.0,))
     assert sharp < 0.8 * error_mm()
+
+
+def moved_rig(projector_px: float) -> Rig:
+    """What photographs where `CUT` is its calibration: its projector's image is shifted and a little turned."""
+    turn = 0.3 * projector_px / CUT.projector.fx
+    first, second, third = np.array([[1, -turn, 0], [turn, 1, 0], [0, 0, 1]]) @ CUT.R
+    projector = replace(CUT.projector, cx=CUT.projector.cx + projector_px, cy=CUT.projector.cy - projector_px / 2)
+    return replace(CUT, projector=projector, rotation=(tuple(first), tuple(second), tuple(third)))
+
+
+@pytest.mark.parametrize("moved_px", [-1.0, 0.5, 1.0])
+def test_the_wall_is_found_where_the_calibration_is_off(moved_px: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    image = frame(DEPTH_MM, moved_rig(moved_px), FAMILY)
+    missed, invented = shares(image)
+    assert missed < 2e-3 and invented < 5e-3
+    monkeypatch.setattr(empty_scene, "MOVED_SHARE", np.inf)
+    monkeypatch.setattr(empty_scene, "EXACT_RAD", np.inf)
+    assert shares(image)[1] > 0.05
+
+
+def test_a_surface_far_from_the_walls_phases_is_no_wall() -> None:
+    image = frame(np.full(DEPTH_MM.shape, 1800.0), CUT, FAMILY)
+    assert (route(CUT, FAMILY).measure(image).depth_mm > 0).mean() > 0.95
+
+
+def test_a_projectors_gamma_does_not_bend_the_corners_of_the_wall(monkeypatch: pytest.MonkeyPatch) -> None:
+    corner = replace(
+        WHOLE, camera=replace(WHOLE.camera, width=320, height=320)
+    )  # where the wall's light falls off most
+    light = empty_scene.plane_irradiance(corner, corner.background_m)
+    image = frame(DEPTH_MM, corner, FAMILY, background_grey=150 * light / light.max(), gamma=2.6)
+
+    def invented() -> float:
+        return float((CrossedRoute(corner, family=FAMILY).measure(image).depth_mm > 0)[~INSIDE].mean())
+
+    assert invented() < 5e-3
+    monkeypatch.setattr(empty_scene, "RESPONSE_POWERS", ())
+    assert invented() > 0.02
+
+
+@pytest.mark.parametrize("frames", [1, 3])
+def test_what_is_in_the_images_border_alone_is_no_object(frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A blurred image: beyond its border the blur has nothing to mix."""
+    method = CrossedRoute(CUT, family=FAMILY, moved=0 if frames == 3 else None)
+    images = [frame(DEPTH_MM, CUT, FAMILY, number=number) for number in range(frames)]
+    images = [cv2.GaussianBlur(image, (0, 0), 2.0, borderType=cv2.BORDER_REPLICATE) for image in images]
+    border = np.ones(DEPTH_MM.shape, bool)
+    border[9:-9, 9:-9] = False
+
+    def answered() -> float:
+        return float((method.measure(images).depth_mm > 0)[border].mean())
+
+    assert answered() == 0
+    monkeypatch.setattr(observe, "beyond_border", lambda region, period_px: region)
+    assert answered() > 0.01
