@@ -34,6 +34,7 @@ from fpp_ml_bench.baselines.learned.odds import (
 from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Carriers, Image, Mask, wrapped
 from fpp_ml_bench.baselines.phase.candidates import chosen_values
 from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Fitted, FringeMeasurement, Measurement
+from fpp_ml_bench.baselines.phase.object_mask import gaps
 from fpp_ml_bench.baselines.phase.observe import Frames
 from fpp_ml_bench.baselines.phase.order import JUMP_RAD
 from fpp_ml_bench.baselines.phase.resampling import Periods, nearest_inside, stride_of
@@ -43,6 +44,7 @@ from fpp_ml_bench.optics.rig import Rig
 OPEN_MARGIN = 1e-6
 """Least margin of an order that gets a depth where brightness can't tell it: a wrong one is less likely than not."""
 EXPECTED_SHARE = float(np.sqrt(2 / np.pi))  # expected size of a normal error, in standard deviations
+CLEAR = 1.0  # logit of the mask from which on the network is believed where the background explains a pixel better
 PERHAPS = 4.0  # a pixel whose logit is this far below the threshold still takes part in the labelling of orders
 STATED_FLOOR_RAD, STATED_SHARE, LEAST_STATED = 0.02, 0.8, 0.45
 """Of the network's scale as a sigma: what it states even where its error is a third of that, since it learned in lights
@@ -156,6 +158,9 @@ class CrossedNetRoute(CrossedRoute):
         """The measurement from the network's answers."""
         joint, offers = seen.carriers.joint_gain, scene.offers_rad
         inside = decided_mask(answers, scene, self.threshold)
+        if not seen.given:
+            plane, _ = gaps(inside, seen.background, seen.fit.misfit_grey)
+            inside &= ~plane | (answers.object_logit > CLEAR)
         # Orders are labelled on all that may be object: a hole in the mask must not part a surface.
         perhaps = scene.inside | (answers.object_logit > threshold_at(scene.strength, self.threshold) - PERHAPS)
         psi = scene.nearness * joint
