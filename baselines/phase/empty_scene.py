@@ -207,33 +207,44 @@ def _quadratic(x: NDArray, y: NDArray) -> tuple[NDArray, ...]:
     return np.ones_like(x), x, y, x * x, x * y, y * y
 
 
+def _linear(rig: Rig) -> NDArray[np.float32]:
+    """1, x and y (3, H, W) of the camera's rays."""
+    x, y = rig.camera.rays()
+    return np.stack([np.ones_like(x), x, y]).astype(np.float32)
+
+
 class CrossedEmptyScene:
     """The plane of a rig in the light of a carrier pair; computed once, then fitted to every image."""
 
     def __init__(self, carriers: Carriers, stride: int) -> None:
-        rig, self._stride = carriers.rig, stride
-        # Without a known background nothing is predicted, and no image shows it.
-        depth_m = np.nan if rig.background_m is None else rig.background_m
-        self._known, self._weights = rig.background_m is not None, carriers.family.weights
-        self._phases = carriers.phases(carriers.nearness(depth_m * MM_PER_M))
-        x, y = (axis.astype(np.float32) for axis in rig.camera.rays())
-        self._places = np.stack([np.ones_like(x), x, y])
-        fall_off = plane_irradiance(rig, depth_m).astype(np.float32)
-        self._fall_off = fall_off / np.float32(np.median(fall_off))
-        self._terms = self._light(self._phases)
+        self._carriers, self._stride, self._known = carriers, stride, carriers.rig.background_m is not None
         self._period_px = carriers.period_px
         self._margin = 2 * max(1, round(MARGIN_PERIODS * carriers.period_px / stride)) + 1
+        self._grid_rad = wrapped(self._phases()[:, ::stride, ::stride]).astype(np.float32)
+        self._grid = _linear(carriers.rig)[:, ::stride, ::stride].copy()
+        self._terms = self._light(self._phases())
+
+    @property
+    def _depth_m(self) -> float:
+        """NaN without a known background: nothing is predicted, and no image shows it."""
+        return self._carriers.rig.background_m or np.nan
+
+    def _phases(self) -> NDArray:
+        """Phases (2, H, W) of the plane in rad, not wrapped."""
+        return self._carriers.phases(self._carriers.nearness(self._depth_m * MM_PER_M))
 
     def _light(self, phases: NDArray) -> list[Image]:
         """Terms (H, W) whose weighted sum is the plane's light at ``phases`` (2, H, W): a lamp of uneven brightness,
         carriers of any contrast, a projector's response, which bends the pattern before the light falls off, and
         ambient light."""
-        waves = (weight * np.cos(phase) for weight, phase in zip(self._weights, phases, strict=True))
+        waves = (weight * np.cos(phase) for weight, phase in zip(self._carriers.family.weights, phases, strict=True))
         first, second = (wave.astype(np.float32) for wave in waves)
-        pattern, fall_off = 1 + first + second, self._fall_off
-        terms = [fall_off * term * pattern for term in _quadratic(*self._places[1:])]
+        fall_off = plane_irradiance(self._carriers.rig, self._depth_m).astype(np.float32)
+        fall_off /= np.float32(np.median(fall_off))
+        pattern, (_, x, y) = 1 + first + second, _linear(self._carriers.rig)
+        terms = [fall_off * term * pattern for term in _quadratic(x, y)]
         terms += [fall_off * pattern**power for power in RESPONSE_POWERS]
-        return [*terms, fall_off * first, fall_off * second, np.ones_like(fall_off)]
+        return [*terms, fall_off * first, fall_off * second, np.ones_like(x)]
 
     def __call__(self, grey: Image, seen: Demodulated) -> Background:
         """Fit the plane to an image float32 (H, W), demodulated as ``seen``: its ``residual`` float32 (H, W), ambient
@@ -248,7 +259,7 @@ class CrossedEmptyScene:
             return Background(dark, np.nan, max(noise, DEFAULT_NOISE_GREY), np.zeros_like(grey), 0.0, ())
         row, column = self._stride * _spread(plane_points)
         samples = grey[row, column].astype(np.float64)
-        all_terms = self._terms if moved_rad is None else self._light(self._phases + moved_rad)
+        all_terms = self._terms if moved_rad is None else self._light(self._phases() + moved_rad)
         terms = np.stack([term[row, column] for term in all_terms], axis=1).astype(np.float64)
         light, weights = _least_squares(terms, samples)
         # Horner's rule on whole images, in single precision: 1e-5 of a grey level is enough here.
@@ -287,10 +298,9 @@ class CrossedEmptyScene:
         """Grid points (h', w') whose windows show the plane alone, and by how much its phases are beside the rig's,
         float32 (2, H, W) in rad, None for at most `EXACT_RAD`. Where its fringes are nowhere to be seen, the points
         without any fringe: they are blurred out, or there is no wall."""
-        modulation, step = seen.modulation, self._stride
+        modulation = seen.modulation
         fringed, plain = modulation.min(axis=0) > noise_grey / 4, modulation.max(axis=0) < noise_grey / 2
-        off_rad = wrapped(seen.phase_rad - self._phases[:, ::step, ::step])
-        grid = self._places[:, ::step, ::step]
+        off_rad = wrapped(seen.phase_rad - self._grid_rad)
         moved_rad = np.zeros((2, 1, 1), np.float32)
         points = self._alone(fringed & (np.hypot(*off_rad) < SAME_RAD))
         if points.mean() < LEAST_SHARE:
@@ -301,14 +311,14 @@ class CrossedEmptyScene:
                 return self._alone(plain & self._known), None
         for _ in range(ROUNDS):
             row, column = _spread(points)
-            terms = grid[:, row, column].T.astype(np.float64)
+            terms = self._grid[:, row, column].T.astype(np.float64)
             left_rad = (moved_rad + wrapped(off_rad - moved_rad))[:, row, column]
             slopes = np.linalg.lstsq(terms, left_rad.T, rcond=None)[0].T
-            moved_rad = np.tensordot(slopes, grid, 1).astype(np.float32)
+            moved_rad = np.tensordot(slopes, self._grid, 1).astype(np.float32)
             if np.abs(moved_rad).max() < EXACT_RAD:
                 return points, None
             points = self._alone(fringed & (np.hypot(*wrapped(off_rad - moved_rad)) < SAME_RAD))
-        return points, np.tensordot(slopes, self._places, 1).astype(np.float32)
+        return points, np.tensordot(slopes, _linear(self._carriers.rig), 1).astype(np.float32)
 
     def _alone(self, points: Mask) -> Mask:
         """``points`` (h', w') whose windows show these alone."""
