@@ -164,9 +164,13 @@ def moved_rig(projector_px: float) -> Rig:
     return replace(CUT, projector=projector, rotation=(tuple(first), tuple(second), tuple(third)))
 
 
-@pytest.mark.parametrize("moved_px", [-1.0, 0.5, 1.0])
-def test_the_wall_is_found_where_the_calibration_is_off(moved_px: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    image = frame(DEPTH_MM, moved_rig(moved_px), FAMILY)
+BESIDE = {f"calibration {px} px": moved_rig(px) for px in (-1.0, 0.5, 1.0)}
+BESIDE |= {f"wall at {depth_m} m": replace(CUT, background_m=depth_m) for depth_m in (3.14, 3.26)}
+
+
+@pytest.mark.parametrize("true", BESIDE.values(), ids=BESIDE)
+def test_the_wall_is_found_beside_its_place(true: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    image = frame(DEPTH_MM, true, FAMILY)
     missed, invented = shares(image)
     assert missed < 2e-3 and invented < 5e-3
     monkeypatch.setattr(empty_scene, "MOVED_SHARE", np.inf)
