@@ -38,7 +38,12 @@ SAME_RAD = 0.4  # distance of a phase pair from the plane's within which a pixel
 MOVED_RAD, MOVED_CELLS, MOVED_SHARE = 1.0, 10, 0.1
 """Farthest distance, along each axis, of the plane's phases from those of the rig: a calibration that is off, or a wall
 that stands elsewhere. Cells along each axis in which it is looked for; share of the image that must agree on it."""
+CLEAR_SHARE, MORE = 0.5, 1.5
+"""Share of the image that has the rig's own phases from which on no other place is looked for; how many times as many
+points another place must have."""
 EXACT_RAD = 0.05  # distance that is not corrected
+NARROWING_RAD = (0.3, 0.2, 0.2, 0.2)
+"""Distances from the corrected phases, in place of `SAME_RAD`, round by round: a flat object may be near the plane."""
 MARGIN_PERIODS = 0.4  # eroded from those pixels: a window beside an object covers it too
 PLAIN_SIGMAS = 5.0  # spread of the plane's fitted light, over the noise, below which it shows no fringe
 TEXTURED = 3.0
@@ -303,13 +308,15 @@ class CrossedEmptyScene:
         off_rad = wrapped(seen.phase_rad - self._grid_rad)
         moved_rad = np.zeros((2, 1, 1), np.float32)
         points = self._alone(fringed & (np.hypot(*off_rad) < SAME_RAD))
-        if points.mean() < LEAST_SHARE:
-            if self._known and fringed.any():
-                moved_rad = _most_common(off_rad[:, fringed])[:, None, None]
-                points = self._alone(fringed & (np.hypot(*wrapped(off_rad - moved_rad)) < SAME_RAD))
-            if points.mean() < MOVED_SHARE:
-                return self._alone(plain & self._known), None
-        for _ in range(ROUNDS):
+        if self._known and fringed.any() and points.mean() < CLEAR_SHARE:
+            # A flat object may have the phases where the wall should be.
+            common_rad = _most_common(off_rad[:, fringed])[:, None, None]
+            others = self._alone(fringed & (np.hypot(*wrapped(off_rad - common_rad)) < SAME_RAD))
+            if others.mean() > max(MOVED_SHARE, MORE * points.mean()):
+                points, moved_rad = others, common_rad
+        if points.mean() < max(LEAST_SHARE, self._alone(plain & ~fringed & self._known).mean()):
+            return self._alone(plain & self._known), None
+        for tolerance_rad in NARROWING_RAD:
             row, column = _spread(points)
             terms = self._grid[:, row, column].T.astype(np.float64)
             left_rad = (moved_rad + wrapped(off_rad - moved_rad))[:, row, column]
@@ -317,7 +324,7 @@ class CrossedEmptyScene:
             moved_rad = np.tensordot(slopes, self._grid, 1).astype(np.float32)
             if np.abs(moved_rad).max() < EXACT_RAD:
                 return points, None
-            points = self._alone(fringed & (np.hypot(*wrapped(off_rad - moved_rad)) < SAME_RAD))
+            points = self._alone(fringed & (np.hypot(*wrapped(off_rad - moved_rad)) < tolerance_rad))
         return points, np.tensordot(slopes, _linear(self._carriers.rig), 1).astype(np.float32)
 
     def _alone(self, points: Mask) -> Mask:

@@ -13,6 +13,7 @@ from fpp_ml_bench.baselines.learned.odds import Answers
 from fpp_ml_bench.baselines.learned.recipes import CrossedRecipe
 from fpp_ml_bench.baselines.learned.routes import CrossedNetRoute
 from fpp_ml_bench.baselines.phase import empty_scene, local_fit, object_mask, observe
+from fpp_ml_bench.baselines.phase.calibration_layer import Carriers, wrapped
 from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Reason
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.optics.named_rigs import crossed_rig
@@ -181,6 +182,25 @@ def test_the_wall_is_found_beside_its_place(true: Rig, monkeypatch: pytest.Monke
 def test_a_surface_far_from_the_walls_phases_is_no_wall() -> None:
     image = frame(np.full(DEPTH_MM.shape, 1800.0), CUT, FAMILY)
     assert (route(CUT, FAMILY).measure(image).depth_mm > 0).mean() > 0.95
+
+
+def like_the_wall(true: Rig) -> NDArray[np.float64]:
+    """A slab that shows ``true`` all but the phases that `CUT` expects of its wall: its depth in mm (H, W)."""
+    expected, carriers = route(CUT, FAMILY).carriers, Carriers.of(true, FAMILY)
+    wall = expected.phases(expected.nearness(3200.0))
+    depths_mm = np.arange(1500.0, 2100.0, 1.0)
+    off_rad = [np.hypot(*wrapped(carriers.phases(carriers.nearness(depth)) - wall)).mean() for depth in depths_mm]
+    return np.where(INSIDE, depths_mm[np.argmin(off_rad)], 0.0)
+
+
+@pytest.mark.parametrize("true", [CUT, BESIDE["calibration 1.0 px"]], ids=["no wall", "calibration 1 px"])
+def test_a_flat_object_is_not_taken_for_the_wall(true: Rig) -> None:
+    image = frame(like_the_wall(true), true, FAMILY)
+    if true is CUT:
+        empty = 3.0 + np.random.default_rng(4).normal(0, 0.7, image.shape)
+        image = np.where(INSIDE, image, np.clip(np.rint(empty), 0, 255)).astype(np.uint8)
+    missed, invented = shares(image)
+    assert missed < 0.1 and invented < 5e-3
 
 
 def test_a_projectors_gamma_does_not_bend_the_corners_of_the_wall(monkeypatch: pytest.MonkeyPatch) -> None:
