@@ -225,9 +225,10 @@ class CrossedEmptyScene:
         self._carriers, self._stride, self._known = carriers, stride, carriers.rig.background_m is not None
         self._period_px = carriers.period_px
         self._margin = 2 * max(1, round(MARGIN_PERIODS * carriers.period_px / stride)) + 1
-        self._grid_rad = wrapped(self._phases()[:, ::stride, ::stride]).astype(np.float32)
-        self._grid = _linear(carriers.rig)[:, ::stride, ::stride].copy()
-        self._terms = self._light(self._phases())
+        phases = self._phases()
+        self._grid_rad = wrapped(phases[:, ::stride, ::stride]).astype(np.float32)
+        self._grid = _linear(carriers.rig)[:, ::stride, ::stride].copy()  # a view would keep the whole image
+        self._terms = self._light(phases)
 
     @property
     def _depth_m(self) -> float:

@@ -204,9 +204,8 @@ def test_a_flat_object_is_not_taken_for_the_wall(true: Rig) -> None:
 
 
 def test_a_projectors_gamma_does_not_bend_the_corners_of_the_wall(monkeypatch: pytest.MonkeyPatch) -> None:
-    corner = replace(
-        WHOLE, camera=replace(WHOLE.camera, width=320, height=320)
-    )  # where the wall's light falls off most
+    # A corner of the whole image, where the wall's light falls off most.
+    corner = replace(WHOLE, camera=replace(WHOLE.camera, width=320, height=320))
     light = empty_scene.plane_irradiance(corner, corner.background_m)
     image = frame(DEPTH_MM, corner, FAMILY, background_grey=150 * light / light.max(), gamma=2.6)
 
