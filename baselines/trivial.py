@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Frames, Method, Photographed
 from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.depth import depth_range_mm, object_mask
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.rig import Rig
@@ -82,6 +83,21 @@ class ConstantMethod(Method):
 
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         return np.full(self.shape, self.value, dtype=np.float32)
+
+
+def best_range_share(dataset: DatasetFolder, samples: Sequence[str]) -> float:
+    """The constant share of each sample's depth range with the least mean object MAE over ``samples``: the median over
+    their object pixels, each weighted by range over pixels. Ranges are those of pixels that are not void."""
+    shares, weights = [], []
+    for sample in samples:
+        depth_mm = dataset.depth_mm(sample).astype(np.float64)
+        low, high = depth_range_mm(depth_mm, dataset.void(sample))
+        inside = (depth_mm[object_mask(depth_mm)] - low) / (high - low)
+        shares.append(inside)
+        weights.append(np.full(inside.size, (high - low) / inside.size))
+    order = np.argsort(values := np.concatenate(shares))
+    weight = np.cumsum(np.concatenate(weights)[order])
+    return float(values[order][np.searchsorted(weight, weight[-1] / 2)])
 
 
 @dataclass(frozen=True)

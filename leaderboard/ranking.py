@@ -237,9 +237,9 @@ def set_ratios(groups: Sequence[Group]) -> None:
     trivial: dict[GroupKey, list[tuple[set[str], dict[str, float]]]] = {}
     for group in groups:
         for row in filter(is_trivial, group.rows):
-            trivial.setdefault(_alike(group.key), []).append((_given(group.key), row.object_means(RANK_KEY)))
+            trivial.setdefault(_alike(group.key), []).append((given_words(group.key.track), row.object_means(RANK_KEY)))
     for group in groups:
-        means = [own for given, own in trivial.get(_alike(group.key), []) if given <= _given(group.key)]
+        means = [own for given, own in trivial.get(_alike(group.key), []) if given <= given_words(group.key.track)]
         for row in group.rows:
             row.ratio = _ratio(row, means)
 
@@ -249,9 +249,9 @@ def _alike(key: GroupKey) -> GroupKey:
     return replace(key, frames=FRAMES_CLASSES[0], track="metric")
 
 
-def _given(key: GroupKey) -> set[str]:
+def given_words(track: Track) -> set[str]:
     """What of the ground truth the track's methods are given, in the words of `Track`."""
-    return set(key.track.removeprefix("oracle ").split(" + ")) - {"metric"}
+    return set(track.removeprefix("oracle ").split(" + ")) - {"metric"}
 
 
 def _ratio(row: Ranked, trivial: Sequence[Mapping[str, float]]) -> float | None:

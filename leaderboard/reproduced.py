@@ -1,38 +1,50 @@
 """A table of `fpp-bench reproduce`: rows that were measured here, kept as rows of the leaderboard, beside the numbers
-that the paper reports; which of the paper's orderings hold; and the page of it all, in Markdown and for a terminal.
+that the paper reports and the best trivial method; which of the paper's orderings hold; and the page of it all, in
+Markdown and for a terminal.
 
 An ordering *holds* where the paired difference has the paper's sign and its 95% interval leaves 0 out, is *reversed*
-where it has the opposite sign and leaves 0 out, and is *not decided* by these objects otherwise. The interval is
-that of `fpp-eval compare`: differences sample by sample, resampled over objects.
+where it has the opposite sign and leaves 0 out, and is *not decided* by these objects otherwise. The interval is over
+objects, and over the seeds with which both rows were trained (`interval_over_seeds`).
 """
 
 import statistics
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
 from typing import Literal
 
-from fpp_ml_bench.baselines.reproduce.plan import Folders, Job, variants
+import numpy as np
+
+from fpp_ml_bench.baselines.registry import methods
+from fpp_ml_bench.baselines.reproduce.plan import FOLDS, Folders, Job, variants
 from fpp_ml_bench.baselines.reproduce.work import (
     MAIN_KEY,
-    AllFrames,
+    TARGET,
     Outcome,
     ReproduceSettings,
-    all_frames_that_hold,
+    Scores,
     current_weights,
     file_sha256,
+    score_frames,
+    scores_that_hold,
     state_of,
 )
-from fpp_ml_bench.baselines.training.recipe import Recipe, table_rows
+from fpp_ml_bench.baselines.training.depth_training import fold_samples
+from fpp_ml_bench.baselines.training.recipe import Recipe, about_preset, table_rows
+from fpp_ml_bench.baselines.trivial import best_range_share
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.report.comparison import Difference, paired_difference
+from fpp_ml_bench.evaluation.metrics import RANGE_KEY
+from fpp_ml_bench.evaluation.protocol import Track
 from fpp_ml_bench.evaluation.result.file import write_file
 from fpp_ml_bench.evaluation.result.model import Result
+from fpp_ml_bench.evaluation.score.check import Rules
+from fpp_ml_bench.evaluation.score.uncertainty import Interval, interval_over_seeds
 from fpp_ml_bench.leaderboard.columns import device
-from fpp_ml_bench.leaderboard.row_file import Row, row_of, view_means, write_row
-from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEASURED_HERE, Entry, read_entry
+from fpp_ml_bench.leaderboard.ranking import given_words
+from fpp_ml_bench.leaderboard.row_file import Row, row_of, write_row
+from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEASURED_HERE, SHIPPED_ROWS, Entry, read_entry
 from fpp_ml_bench.leaderboard.tables import PAPER_DEPTHS, paper_tables
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.style import percent, three_digits
@@ -45,9 +57,13 @@ _NOT_IN_THE_PAPER = {
     "guided": "guided by phase",
     "physics": "re-projection of depth to phase as a loss",
 }
-_TITLES = {"further": "Further directions of the paper (UNet, global normalisation, RMSE loss, frame 0)"}
+_TITLES = {
+    "further": "Further directions of the paper (UNet, global normalisation, RMSE loss, frame 0)",
+    FOLDS: "Cross-validation over all objects",
+}
 """Of the tables that the paper does not have."""
-_TRACKS_DIFFER = "*"
+_TRACKS_DIFFER, _EACH_SEED = "*", "Object MAE of each seed"
+Errors = Mapping[str, float | None]
 
 
 def write_measured(result: Result, path: Path) -> None:
@@ -86,45 +102,140 @@ def _sound_row(path: Path) -> Entry | None:
 
 @dataclass(frozen=True)
 class Line:
-    """A line of a table. ``scores``, those of the row or over all frames, and ``entry`` are None where nothing
-    has been measured; ``twins``: rows by depth range; ``paper_mm``: the paper's errors by the keys of `HEADLINE`, None
-    where it reports none."""
+    """A line of a table. ``found``: the row of each seed, the recipe's own first, or its scores where they are of every
+    frame or of a cross-validation; empty where nothing has been measured. ``entry``: the row of the recipe's own seed;
+    ``twins``: rows by depth range; ``paper_mm``: the paper's errors by the keys of `HEADLINE`, None where it reports
+    none; ``recipe``: None of a trivial method."""
 
     row: str
     label: str
-    recipe: Recipe
-    scores: Row | AllFrames | None
+    recipe: Recipe | None
+    found: Mapping[int, Row | Scores]
     entry: Entry | None
-    paper_mm: dict[str, float] | None
-    twins: dict[str, Entry] = field(default_factory=dict)
+    paper_mm: Mapping[str, float] | None = None
+    twins: Mapping[str, Entry] = field(default_factory=dict)
+
+    def error(self, key: str) -> float | None:
+        """A score, mean over the seeds; None where it is unknown."""
+        values = [_errors(found).get(key) for found in self.found.values()]
+        known = [value for value in values if value is not None]
+        return statistics.fmean(known) if known else None
+
+    @property
+    def by_seed(self) -> dict[int, dict[str, float]]:
+        """The object MAE in mm of each object, for each seed."""
+        return {seed: _by_object(found) for seed, found in self.found.items()}
+
+
+def _errors(found: Row | Scores) -> Errors:
+    return found.errors if isinstance(found, Scores) else found.metrics.model_dump()
+
+
+def _by_object(found: Row | Scores) -> dict[str, float]:
+    if isinstance(found, Scores):
+        return dict(found.per_object)
+    return {part.object: value for part in found.per_object if (value := getattr(part, MAIN_KEY)) is not None}
 
 
 def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) -> list[Line]:
-    """Lines of ``table`` in the paper's order. Rows of other weights or another dataset are left empty. Where a
-    training was not begun below ``folders``, its rows may be of another machine: those of the same recipe are shown.
-    Where the paper scores every frame (multi-frame), a training's first line does too, and a second line is its row in
-    the leaderboard: the first frame only, without a number of the paper."""
+    """Lines of ``table`` in the paper's order, below those of trivial methods. Rows of other weights or another dataset
+    are left empty. Where a training was not begun below ``folders``, its rows may be of another machine: those of the
+    same recipe are shown. Where the paper scores every frame (multi-frame), a training's first line does too, and a
+    second line is its row in the leaderboard: the first frame only, without a number of the paper."""
+    if table == FOLDS:
+        return _fold_lines(jobs, folders, opened)
     reported = {row.row: row for row in paper_tables()[table].rows} if table in paper_tables() else {}
-    recipes = {name: job.recipe for job in jobs for name in job.rows}
     lines = []
     for row in table_rows(table):
-        recipe, paper = recipes[f"{table}/{row}"], reported.get(row)
+        recipes = [job.recipe for job in jobs if f"{table}/{row}" in job.rows]
+        recipe, paper = recipes[0], reported.get(row)
         label, paper_mm = (paper.label, paper.errors_mm) if paper else (_NOT_IN_THE_PAPER.get(row, row), None)
-        sha256 = _weights_sha256(recipe, folders, opened)
-        if sha256 is None:
-            lines.append(Line(row, label, recipe, None, None, paper_mm))
+        weights = {one.seed: _weights_sha256(one, folders, opened) for one in recipes}
+        rows = {
+            (one.seed, depth_range): row_that_holds(folders.row(one, depth_range), opened, sha256)
+            for one in recipes
+            for depth_range in variants(one)
+            if (sha256 := weights[one.seed]) is not None
+        }
+        main = variants(recipe)[0]
+        own = {name: entry for (seed, name), entry in rows.items() if seed == recipe.seed and entry is not None}
+        held = {seed: entry.row for (seed, name), entry in rows.items() if name == main and entry is not None}
+        found = held if main in own else {}
+        entry, twins = own.get(main), {str(name): twin for name, twin in own.items() if name != main}
+        if table != "multi_frame" or recipe.frames == "single_shot" or weights[recipe.seed] is None:
+            lines.append(Line(row, label, recipe, found, entry, paper_mm, twins))
             continue
-        rows = {name: row_that_holds(folders.row(recipe, name), opened, sha256) for name in variants(recipe)}
-        entry, *_ = rows.values()
-        twins = {str(name): twin for name, twin in list(rows.items())[1:] if twin is not None}
-        first = None if entry is None else entry.row
-        if table != "multi_frame" or len(opened.sequence.config(recipe.frames)) == 1:
-            lines.append(Line(row, label, recipe, first, entry, paper_mm, twins))
-            continue
-        every = all_frames_that_hold(folders.all_frames(recipe), opened.fingerprint, sha256)
-        lines.append(Line(row, label, recipe, every, entry, paper_mm))
-        lines.append(Line(row, f"{label}, its first frame only", recipe, first, entry, None, twins))
+        every = scores_that_hold(folders.scores(recipe), opened.fingerprint, recipe, weights[recipe.seed])
+        lines.append(Line(row, label, recipe, {recipe.seed: every} if every else {}, entry, paper_mm))
+        lines.append(Line(row, f"{label}, its first frame only", recipe, found, entry, None, twins))
+    return [*_trivial_lines({line.entry.row.track for line in lines if line.entry is not None}, opened), *lines]
+
+
+def _trivial_lines(tracks: set[Track], opened: DatasetFolder) -> list[Line]:
+    """A line for the best trivial method of each of ``tracks``: of those that come with the package, were scored on
+    these data, and are given no more of the ground truth."""
+    entries = [
+        entry
+        for entry in map(read_entry, sorted(SHIPPED_ROWS.glob("*.json")) if tracks else ())
+        if _is_of(entry, opened)
+        and entry.all_checked
+        and getattr(methods().get(entry.row.submission.method), "trivial", False)
+    ]
+    best = {}
+    for track in sorted(tracks):
+        known = [entry for entry in entries if given_words(entry.row.track) <= given_words(track)]
+        if known:
+            entry = min(known, key=lambda entry: entry.value(MAIN_KEY) or 0.0)
+            best[entry.path.stem] = Line(entry.path.stem, f"{entry.name} (trivial)", None, {0: entry.row}, entry)
+    return list(best.values())
+
+
+def _fold_lines(jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) -> list[Line]:
+    """The rows of a cross-validation, over the objects of the parts that all of them were trained for, below the best
+    constant share of the given range, chosen on the training objects of each part."""
+    recipes_of = [job.recipe for job in jobs]
+    held = {one.name: scores_that_hold(folders.scores(one), opened.fingerprint, one) for one in recipes_of}
+    names = dict.fromkeys(row for job in jobs for row in job.rows)
+    parts = {one.fold for one in recipes_of} - {one.fold for one in recipes_of if held[one.name] is None}
+    lines = []
+    for name in names:
+        table, _, row = name.partition("/")
+        reported = {paper.row: paper for paper in paper_tables()[table].rows}
+        recipes = [job.recipe for job in jobs if name in job.rows]
+        scores = [one for recipe in recipes if recipe.fold in parts and (one := held[recipe.name]) is not None]
+        found = {recipes[0].seed: _joined(scores)} if scores else {}
+        label = f"{reported[row].label} ({table})" if row in reported else name
+        lines.append(Line(name, label, recipes[0], found, None, reported[row].errors_mm if row in reported else None))
+    constants = [_constant_scores(opened, part) for part in sorted(part for part in parts if part is not None)]
+    if constants:
+        label = "best constant in the given range (trivial)"
+        lines.insert(0, Line("constant", label, None, {0: _joined(constants)}, None))
     return lines
+
+
+def _constant_scores(opened: DatasetFolder, fold: tuple[int, int]) -> Scores:
+    """Of the same share of each sample's range at every pixel."""
+    splits = fold_samples(opened, fold)
+    answer = np.full(opened.size, best_range_share(opened, splits["train"]), np.float32)
+    rules = Rules(TARGET, "normalised", "valid", "paper")
+    identity = dict.fromkeys(("recipe_digest", "weights_sha256"), "0" * 64)
+    return score_frames(opened, lambda frame: answer, [0], rules, splits["test"], **identity)
+
+
+def _joined(parts: Sequence[Scores]) -> Scores:
+    """The scores of several parts of the objects as one; each pair counts the same."""
+    pairs = sum(part.pairs for part in parts)
+    sums = {
+        key: [part.pairs * value for part in parts if (value := part.errors[key]) is not None]
+        for key in parts[0].errors
+    }
+    return parts[0].model_copy(
+        update={
+            "pairs": pairs,
+            "errors": {key: sum(values) / pairs if len(values) == len(parts) else None for key, values in sums.items()},
+            "per_object": {name: value for part in parts for name, value in part.per_object.items()},
+        }
+    )
 
 
 def _weights_sha256(recipe: Recipe, folders: Folders, opened: DatasetFolder) -> str | None:
@@ -142,6 +253,26 @@ def _weights_sha256(recipe: Recipe, folders: Folders, opened: DatasetFolder) -> 
 
 
 @dataclass(frozen=True)
+class Gap:
+    """Mean difference in object MAE, mm, its 95% interval, and how many objects and seeds it is over."""
+
+    mean_mm: float
+    interval: Interval | None
+    objects: int
+    seeds: int
+
+    @property
+    def decided(self) -> bool:
+        """Whether 0 is outside the interval."""
+        return self.interval is not None and not self.interval[0] <= 0 <= self.interval[1]
+
+    @property
+    def between(self) -> str:
+        """Both ends of the interval, with their signs; a dash where there is none."""
+        return "-" if self.interval is None else " to ".join(f"{end:+.2f}" for end in self.interval)
+
+
+@dataclass(frozen=True)
 class Ordering:
     """The paper reports a smaller object MAE for ``better`` than for ``worse``, by ``paper_gap_mm``; ``here``: worse
     minus better. ``same_track`` is False where the rows were given different ground truth of the samples."""
@@ -149,72 +280,52 @@ class Ordering:
     better: str
     worse: str
     paper_gap_mm: float
-    here: Difference
+    here: Gap
     same_track: bool
 
     @property
     def verdict(self) -> Literal["holds", "not decided", "reversed"]:
-        if not self.here.distinguishable:
+        if not self.here.decided:
             return "not decided"
-        return "holds" if (self.here.mean_mm or 0) > 0 else "reversed"
+        return "holds" if self.here.mean_mm > 0 else "reversed"
 
 
 def orderings(lines: Sequence[Line]) -> list[Ordering]:
     """Every pair of measured lines whose numbers in the paper differ, the paper's best first."""
-    compared = [
-        (line.paper_mm[MAIN_KEY], line) for line in lines if line.scores is not None and line.paper_mm is not None
-    ]
+    compared = [(line.paper_mm[MAIN_KEY], line) for line in lines if line.found and line.paper_mm is not None]
     judged = []
     for (better_mm, better), (worse_mm, worse) in combinations(sorted(compared, key=lambda c: c[0]), 2):
-        here = _difference(worse, better)
-        if worse_mm > better_mm and here.samples:
+        here = gap(worse, better)
+        if worse_mm > better_mm and here is not None:
             tracks = {line.entry.row.track for line in (better, worse) if line.entry is not None}
-            judged.append(Ordering(better.label, worse.label, worse_mm - better_mm, here, len(tracks) == 1))
+            judged.append(Ordering(better.label, worse.label, worse_mm - better_mm, here, len(tracks) <= 1))
     return judged
 
 
-def _difference(line: Line, other: Line) -> Difference:
-    """Object MAE of ``line`` minus that of ``other`` over the samples of both."""
-    first, second = _errors(line), _errors(other)
-    gaps = [
-        (name, statistics.fmean(views) - statistics.fmean(second[name]))
-        for name, views in first.items()
-        if name in second
-        for _ in views
-    ]
-    return paired_difference([gap for _, gap in gaps], [name for name, _ in gaps])
-
-
-def _errors(line: Line) -> dict[str, list[float]]:
-    """Object MAE of the views of each object; of a row, their mean for each view."""
-    scores, errors = line.scores, dict[str, list[float]]()
-    if isinstance(scores, AllFrames):
-        views = [(sample.object, sample.metrics.object_mae_mm) for sample in scores.per_sample]
-    else:
-        views = list(view_means(scores.per_object, MAIN_KEY)) if scores is not None else []
-    for name, mae_mm in views:
-        if mae_mm is not None:
-            errors.setdefault(name, []).append(mae_mm)
-    return errors
+def gap(line: Line, other: Line) -> Gap | None:
+    """Object MAE of ``line`` minus that of ``other``, over the objects and seeds of both; None without any."""
+    first, second = line.by_seed, other.by_seed
+    seeds = [seed for seed in first if seed in second]
+    names = [name for name in (first[seeds[0]] if seeds else ()) if all(name in second[s] for s in seeds)]
+    if not names:
+        return None
+    gaps = [{name: first[seed][name] - second[seed][name] for name in names} for seed in seeds]
+    mean_mm = statistics.fmean(value for of_seed in gaps for value in of_seed.values())
+    return Gap(mean_mm, interval_over_seeds(gaps), len(names), len(seeds))
 
 
 def conclusion(table: str, lines: Sequence[Line]) -> str:
     """What the lines say, in a sentence: how many of the paper's orderings hold, or, in a table that the paper does not
     have, how far each line is from the first; "" where that is not known."""
-    if table in paper_tables():
+    lines = [line for line in lines if line.recipe is not None]
+    if table in paper_tables() or table == FOLDS:
         return orderings_sentence(orderings(lines))
     said = []
     for line in lines[1:]:
-        here = _difference(line, lines[0])
-        if here.samples:
-            ends = f" (95% interval over {here.objects} objects {_between(here)})" if here.interval else ""
+        if here := gap(line, lines[0]):
+            ends = f" (95% interval over {here.objects} objects {here.between})" if here.interval else ""
             said.append(f"{line.label} {here.mean_mm:+.2f} mm{ends}")
     return f"Object MAE against {lines[0].label}, sample by sample: {'; '.join(said)}." if said else ""
-
-
-def _between(difference: Difference) -> str:
-    """Both ends of its interval, with their signs; a dash where there is none."""
-    return "-" if difference.interval is None else " to ".join(f"{end:+.2f}" for end in difference.interval)
 
 
 def orderings_sentence(judged: Sequence[Ordering]) -> str:
@@ -232,23 +343,27 @@ def orderings_sentence(judged: Sequence[Ordering]) -> str:
 
 def _cells(line: Line, preset: str) -> dict[str, str]:
     """Each cell by the title of its column: a dash where nothing is known, errors with the paper's two decimals."""
-    entry, scores = line.entry, line.scores
-    here = scores.metrics.model_dump() if scores else None
-    interval = scores.intervals.of(MAIN_KEY) if scores else None
+    entry, by_seed = line.entry, line.by_seed
+    here = _pair if line.found else lambda error, pixels: "-"
+    ends = interval_over_seeds(list(by_seed.values()))
     settings = entry.row.submission.settings if entry else {}
     timing, latency_ms = (entry.row.timing, entry.latency_ms) if entry else (None, None)
     cells = {"Row": line.label, "Track": entry.row.track if entry else "-"}
+    paper = line.paper_mm or {}
     for pixels in ("object", "overall", "background"):
         title = f"{pixels.capitalize()} MAE / RMSE"
-        cells[f"{title}, {MEASURED_HERE}, {preset} preset"] = _pair(here, pixels)
+        cells[f"{title}, {MEASURED_HERE}, {preset} preset"] = here(line.error, pixels)
         if pixels == "object":
-            ends = " - ".join(map(_mm, interval)) if interval else "-"
-            cells[f"95% interval of the object MAE, {MEASURED_HERE}"] = ends
-        cells[f"{title}, {BY_THE_PAPER}"] = _pair(line.paper_mm, pixels)
-    for name, title in (("predicted", "Range predicted"), ("mean", "Range of the training mean")):
-        cells[f"{title}: object MAE / of its measured pixels / missing pixels, {MEASURED_HERE}"] = _twin(line, name)
+            interval = " - ".join(map(_mm, ends)) if ends else "-"
+            cells[f"95% interval of the object MAE, {MEASURED_HERE}"] = interval
+            each = [_mm(statistics.fmean(errors.values())) for errors in by_seed.values()]
+            cells[_EACH_SEED] = ", ".join(each) if len(each) > 1 else "-"
+            cells["Of depth range"] = percent(line.error(RANGE_KEY))
+        cells[f"{title}, {BY_THE_PAPER}"] = _pair(paper.get, pixels) if paper else "-"
+    title = f"Range predicted: object MAE / of its measured pixels / missing pixels, {MEASURED_HERE}"
     return {
         **cells,
+        title: _twin(line.twins.get("predicted")),
         "Parameters": _count(timing and timing.parameters),
         "Epochs": _count(settings.get("epochs_trained")),
         "Training, s": _count(settings.get("training_seconds")),
@@ -261,17 +376,16 @@ def _mm(value: float | None) -> str:
 
 
 def _count(value: object) -> str:
-    return f"{value:,.0f}" if isinstance(value, int | float) else "-"
+    return f"{value:,.0f}" if isinstance(value, int | float) and value else "-"
 
 
-def _pair(errors_mm: Mapping[str, float] | None, pixels: str) -> str:
+def _pair(error: Callable[[str], float | None], pixels: str) -> str:
     """MAE and RMSE."""
-    return "-" if errors_mm is None else " / ".join(_mm(errors_mm[f"{pixels}_{kind}_mm"]) for kind in ("mae", "rmse"))
+    return " / ".join(_mm(error(f"{pixels}_{kind}_mm")) for kind in ("mae", "rmse"))
 
 
-def _twin(line: Line, depth_range: str) -> str:
+def _twin(entry: Entry | None) -> str:
     """Object MAE, the MAE over the pixels that the twin measured, and the share of missing pixels."""
-    entry = line.twins.get(depth_range)
     if entry is None:
         return "-"
     errors = [_mm(entry.value(key)) for key in (MAIN_KEY, "object_valid_mae_mm")]
@@ -282,7 +396,8 @@ def line_table(table: str, lines: Sequence[Line], preset: str) -> Table:
     """The lines as a table. One that the paper does not have has no empty columns."""
     title = _TITLES[table] if table in _TITLES else paper_tables()[table].title
     rows = [_cells(line, preset) for line in lines]
-    shown = [name for name in rows[0] if table in paper_tables() or {row[name] for row in rows} != {"-"}]
+    optional = (_EACH_SEED,) if table in paper_tables() else tuple(rows[0])
+    shown = [name for name in rows[0] if name not in optional or {row[name] for row in rows} != {"-"}]
     return Table.of(title, [{name: row[name] for name in shown} for row in rows], elsewhere="the page below")
 
 
@@ -302,14 +417,14 @@ def table_markdown(table: str, lines: Sequence[Line], preset: str, command: str,
     parts = [
         f"# {markdown_text(str(shown.title))}",
         "",
-        f"Made by `{command}`. Errors in mm, mean over samples.",
+        f"Made by `{command}`. {about_preset(preset)} Errors in mm, mean over samples (and seeds).",
         *_about(lines, table in paper_tables()),
         "",
         *shown.markdown(),
         "",
         *_missing(lines, command, failed),
         *_twins_explained(lines),
-        *(_orderings(orderings(lines)) if table in paper_tables() else [conclusion(table, lines)]),
+        *(_orderings(orderings(lines)) if table in paper_tables() or table == FOLDS else [conclusion(table, lines)]),
     ]
     return "\n".join(parts).rstrip("\n") + "\n"
 
@@ -344,10 +459,10 @@ def _devices(lines: Sequence[Line]) -> str:
 
 
 def _missing(lines: Sequence[Line], command: str, failed: dict[str, str]) -> list[str]:
-    empty = [line for line in lines if line.scores is None]
+    empty = [line for line in lines if not line.found]
     if not empty:
         return []
-    why = [(line.label, failed[line.recipe.name]) for line in empty if line.recipe.name in failed]
+    why = [(line.label, failed[line.recipe.name]) for line in empty if line.recipe and line.recipe.name in failed]
     reasons = [f"- {markdown_text(label)}: {markdown_text(reason)}" for label, reason in why]
     names = ", ".join(dict.fromkeys(line.row for line in empty))
     return [f"Not measured here: {markdown_text(names)}. To fill: `{command}`", *reasons, ""]
@@ -355,14 +470,14 @@ def _missing(lines: Sequence[Line], command: str, failed: dict[str, str]) -> lis
 
 def _twins_explained(lines: Sequence[Line]) -> list[str]:
     twins = (
-        "The two columns on the range are metric twins of an oracle-range row: the same network's output, brought to "
-        "mm with a range predicted by a small head from the image, or with the mean range of the training samples. The "
-        "difference between their object MAE and the row's own is what the oracle gave: the range, and also the mask, "
-        "because a twin must find the object itself, and an object pixel that it misses costs its whole depth."
+        "The column on the range is the metric twin of an oracle-range row: the same network's output, brought to mm "
+        "with a range predicted by a small head from the image. The difference between its object MAE and the row's "
+        "own is what the oracle gave: the range, and also the mask, because a twin must find the object itself, and an "
+        "object pixel that it misses costs its whole depth."
     )
     removed = "With the background removed the input shows the test sample's object mask; no twins there."
     parts = [twins, ""] if any(line.twins for line in lines) else []
-    return parts + ([removed, ""] if any(line.recipe.background_removed for line in lines) else [])
+    return parts + ([removed, ""] if any(line.recipe and line.recipe.background_removed for line in lines) else [])
 
 
 def _orderings(judged: Sequence[Ordering]) -> list[str]:
@@ -375,13 +490,14 @@ def _orderings(judged: Sequence[Ordering]) -> list[str]:
             "Worse in the paper": ordering.worse + ("" if ordering.same_track else f" {_TRACKS_DIFFER}"),
             f"Worse minus better, mm, {BY_THE_PAPER}": f"{ordering.paper_gap_mm:+.2f}",
             f"Worse minus better, mm, {MEASURED_HERE}": f"{ordering.here.mean_mm:+.2f}",
-            "95% interval": _between(ordering.here),
+            "95% interval": ordering.here.between,
+            "Seeds": str(ordering.here.seeds),
             "Here": ordering.verdict,
         }
         for ordering in judged
     ]
-    parts += [*Table.of("", rows, (0, 1, 5)).markdown(), ""]
-    parts += ["Differences sample by sample; intervals by bootstrap over objects."]
+    parts += [*Table.of("", rows, (0, 1, 6)).markdown(), ""]
+    parts += ["Differences object by object; intervals by bootstrap over objects and the seeds that both rows have."]
     if not all(ordering.same_track for ordering in judged):
         difference = "one of the two was given the test sample's range, which is part of the difference."
         parts += ["", f"\\{_TRACKS_DIFFER} of different tracks: {difference}"]

@@ -37,6 +37,7 @@ class FringeDepthDataset(Dataset[FringeDepth]):
     ``range_rule``: D_min and D_max are those of the object's pixels that are not void (``valid``), or of all of them
     (``object``: the stored columns, and the paper's). Void pixels often are wrong by centimetres, and an end of the
     range is then; by ``valid``, individual depth beyond it is cut to [0, 1].
+    ``samples``: these, of any split, instead of those of ``split``.
 
     Works with ``torch.utils.data.DataLoader`` and any number of workers: each maps the files itself, and sends batches
     through shared memory (/dev/shm), which must be writable and hold some. In a single process `batches` is faster, as
@@ -51,13 +52,14 @@ class FringeDepthDataset(Dataset[FringeDepth]):
         normalisation: Normalisation = "individual",
         background_removed: bool = False,
         range_rule: RangeRule = "valid",
+        samples: Sequence[str] | None = None,
     ) -> None:
         self.source = DatasetFolder(folder)
         if config not in self.source.configs:
             raise DatasetError(f"{folder}: no configuration {config!r}; there are {', '.join(self.source.configs)}")
         if normalisation not in NORMALISATIONS:
             raise DatasetError(f"unknown normalisation {normalisation!r}; there are {', '.join(NORMALISATIONS)}")
-        self.samples = self.source.samples(split)
+        self.samples = self.source.samples(split) if samples is None else list(samples)
         self.frames = self.source.sequence.config(config)
         self.normalisation: Normalisation = normalisation
         self.background_removed = background_removed

@@ -20,7 +20,7 @@ SMALL: dict[str, dict[str, int | float]] = {
     "pix2pix_unet": {"width": 4, "levels": 3},
 }
 RECIPE: dict[str, Any] = {
-    "preset": "cpu",
+    "preset": "small",
     "seed": 42,
     "max_epochs": 3,
     "loss": {"name": "hybrid_l1", "alpha": 0.7},

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Frames, Method, Photographed, Setting
-from fpp_ml_bench.baselines.training.recipe import NETWORK_TITLES, PRESETS, Loss, load_recipe
+from fpp_ml_bench.baselines.training.recipe import NETWORK_TITLES, PRESETS, SEED, Loss, load_recipe
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.errors import PredictionError, RecipeError, WeightsError
 from fpp_ml_bench.optics.rig import Rig
@@ -114,6 +114,7 @@ class NetworkMethod(Method):
         parts = [f"{network}{normalisation} {loss}{frames}"]
         parts += [word for words, word in _SHORT_OPTIONS.items() if f", {words}" in submission.name]
         parts.append("no background" if settings["background_removed"] else "")
+        parts.append("" if settings.get("seed") in (None, SEED) else f"seed {settings['seed']}")
         parts.append(_SHORT_RANGES[settings.get("depth_range")])  # type: ignore[index]
         return ", ".join(filter(None, parts))
 

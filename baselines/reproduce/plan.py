@@ -1,14 +1,16 @@
 """The work for a table of the paper: which trainings fill which of its rows, the paths of their files, and the dataset,
 which is built where it is missing and is the same for every row of a run. Rows that resolve to one recipe
 (``normalization/individual``, ``loss/rmse``, ``multi_frame/frame0``) are one training and one row of the leaderboard.
+Some rows are trained with several seeds. Under cross-validation a row is trained once for each part of the objects.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from fpp_ml_bench.baselines.networks.network_method import DepthRange
-from fpp_ml_bench.baselines.training.recipe import Recipe, load_recipe, table_rows
+from fpp_ml_bench.baselines.training.recipe import SEED, Recipe, further_seeds, load_recipe
 from fpp_ml_bench.constants import FULL_SIZE, OBJECTS
 from fpp_ml_bench.errors import DatasetError, RecipeError
 from fpp_ml_bench.loaders.render.builder import build as build_dataset
@@ -20,6 +22,10 @@ from fpp_ml_bench.optics.named_rigs import paper_rig
 
 Report = Callable[[str], object]
 RUNS = Path("runs")
+FOLDS = "folds"
+"""The table of a cross-validation."""
+FOLD_ROWS = ("loss/rmse", "loss/hybrid_l1_0.7", "architecture/resunet")
+"""What is cross-validated where no row is named."""
 
 
 @dataclass(frozen=True)
@@ -30,18 +36,23 @@ class Job:
     rows: tuple[str, ...]
 
     @property
-    def all_frames(self) -> bool:
-        """Whether the paper scores this training on more frames than the first (Section 5.4)."""
-        return any(row.startswith("multi_frame/") for row in self.rows)
+    def scored_frames(self) -> str | None:
+        """The configuration whose frames its `Scores` are of, beside its rows; None where it has rows alone. The paper
+        scores the multi-frame table on every frame (Section 5.4)."""
+        every = any(row.startswith("multi_frame/") for row in self.rows)
+        return self.recipe.frames if every or self.recipe.fold is not None else None
 
 
 def variants(recipe: Recipe) -> tuple[DepthRange | None, ...]:
     """The rows that a training gives, by the depth range that turns its output into mm (see `NetworkMethod`). Under
-    individual normalisation it is given the test sample's range, as in the paper; its metric twins are not. With the
-    background removed the object's mask is given anyway, and there are no twins."""
+    individual normalisation it is given the test sample's range, as in the paper; its metric twin is not. With the
+    background removed the object's mask is given anyway, and there is no twin. A training of a cross-validation has
+    seen objects of the test split, so it is no row."""
+    if recipe.fold is not None:
+        return ()
     if recipe.normalisation != "individual":
         return (None,)
-    return ("oracle",) if recipe.background_removed else ("oracle", "predicted", "mean")
+    return ("oracle",) if recipe.background_removed else ("oracle", "predicted")
 
 
 @dataclass(frozen=True)
@@ -63,28 +74,34 @@ class Folders:
         twin = "" if depth_range in (None, "oracle") else f"-range-{depth_range}"
         return self.rows / f"{self.preset}-{recipe.name}{twin}.json"
 
-    def all_frames(self, recipe: Recipe) -> Path:
+    def scores(self, recipe: Recipe) -> Path:
         # Not in the folder of the rows: there every .json is a row.
-        return self.runs / "all-frames" / f"{self.preset}-{recipe.name}-all-frames.json"
+        return self.rows.with_name("scores") / f"{self.preset}-{recipe.name}.json"
 
     def table(self, table: str) -> Path:
         return self.runs / f"{table}.md"
 
 
-def planned(tables: Sequence[str], preset: str) -> list[Job]:
-    """The trainings of ``tables``, each once, in the order of their first row. Raises RecipeError for an unknown table,
-    an unsound recipe, or two recipes that differ under one name."""
+def planned(names: Sequence[str], preset: str, folds: int | None = None) -> list[Job]:
+    """The trainings of the rows ``names``, each once: UNets first, and further seeds last. ``folds``: of a
+    cross-validation with so many parts. Raises RecipeError for an unknown row, an unsound recipe, or two recipes that
+    differ under one name."""
     jobs: dict[str, Job] = {}
-    for name in (f"{table}/{row}" for table in tables for row in table_rows(table)):
+    for name in names:
         recipe = load_recipe(name, preset)
-        job = jobs.get(recipe.name, Job(recipe, ()))
-        if job.recipe.digest != recipe.digest:
-            raise RecipeError(
-                f"{job.rows[0]} and {name} differ in {differing(job.recipe.to_dict(), recipe.to_dict())}, "
-                f"but both are called {recipe.name}; give one of them a different name"
-            )
-        jobs[recipe.name] = Job(recipe, (*job.rows, name))
-    return list(jobs.values())
+        changes: list[dict[str, Any]] = [{}, *({"seed": seed} for seed in further_seeds(recipe))]
+        if folds is not None:
+            changes = [{"fold": (part, folds)} for part in range(folds)]
+        for change in changes:
+            changed = recipe.model_copy(update=change)
+            job = jobs.get(changed.name, Job(changed, ()))
+            if job.recipe.digest != changed.digest:
+                raise RecipeError(
+                    f"{job.rows[0]} and {name} differ in {differing(job.recipe.to_dict(), changed.to_dict())}, "
+                    f"but both are called {changed.name}; give one of them a different name"
+                )
+            jobs[changed.name] = Job(changed, (*job.rows, name))
+    return sorted(jobs.values(), key=lambda job: (job.recipe.seed != SEED, job.recipe.network != "unet"))
 
 
 def differing(first: dict, second: dict, words: str = "{} and {}") -> str:
@@ -94,8 +111,8 @@ def differing(first: dict, second: dict, words: str = "{} and {}") -> str:
 
 
 def default_folder(preset: str, size: int) -> Path:
-    """``data/full`` for the benchmark's own size, else named after machine and size, like ``data/cpu224``."""
-    return Path("data") / ("full" if size == FULL_SIZE else f"{preset.partition('-')[0]}{size}")
+    """``data/full`` for the benchmark's own size, else named after preset and size, like ``data/small224``."""
+    return Path("data") / ("full" if size == FULL_SIZE else f"{preset}{size}")
 
 
 def open_dataset(folder: Path | None, jobs: list[Job], folders: Folders, report: Report) -> DatasetFolder:

@@ -1,6 +1,8 @@
 """Regenerating the paper's tables: train, predict, time, score, write rows and a Markdown table; skip what is done.
 
-No training is ever deleted: a finished training is used, a stopped one continued, one of another recipe refused.
+Trainings run beside each other, one on each core. Then all is scored, one after the other: a time that is taken beside
+a training is wrong. No training is ever deleted: a finished training is used, a stopped one continued, one of another
+recipe refused. Weights that come with the package stand for the training of their recipe.
 
 In the paper's multi-frame table (Section 5.4) scores are averages over all (view, frame) pairs of a condition's test
 set. Here each sample's score is the mean over its frames, and the headline the mean over samples: the same number, for
@@ -11,12 +13,15 @@ every sample has the same frames, and the interval can then be taken over object
 import json
 import shlex
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from hashlib import sha256
 from pathlib import Path
+from statistics import fmean
 from textwrap import shorten
-from time import perf_counter
+from threading import Event, Thread
+from time import time
 from types import ModuleType
 from typing import Annotated, Any, Literal
 
@@ -27,31 +32,33 @@ from pydantic import Field
 
 from fpp_ml_bench.baselines.method import Setting
 from fpp_ml_bench.baselines.networks.base import torch_threads
-from fpp_ml_bench.baselines.networks.model import Model, load
+from fpp_ml_bench.baselines.networks.model import load
 from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
 from fpp_ml_bench.baselines.networks.range_heads import save_with_heads
 from fpp_ml_bench.baselines.reproduce import plan
 from fpp_ml_bench.baselines.reproduce.plan import Folders, Job, Report, variants
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.baselines.timing import time_method, write_timing
-from fpp_ml_bench.baselines.training.depth_training import DONE, SCORING, WEIGHTS, TrainingRun, train
-from fpp_ml_bench.baselines.training.engine import RECIPE
-from fpp_ml_bench.baselines.training.recipe import Recipe
+from fpp_ml_bench.baselines.training.depth_training import DONE, SCORING, WEIGHTS, TrainingRun, fold_samples, train
+from fpp_ml_bench.baselines.training.engine import LOG_FILE, RECIPE, Display
+from fpp_ml_bench.baselines.training.recipe import Recipe, table_rows
+from fpp_ml_bench.baselines.training.weights import SHIPPED, SUFFIX, open_weights
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError, TrainingError, WeightsError
-from fpp_ml_bench.evaluation.metrics import HEADLINE
+from fpp_ml_bench.evaluation.metrics import HEADLINE, RANGE_KEY
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.result.file import write_json, write_result
 from fpp_ml_bench.evaluation.result.model import Result
-from fpp_ml_bench.evaluation.result.parts import Headline, Intervals, Sha256
+from fpp_ml_bench.evaluation.result.parts import Sha256
 from fpp_ml_bench.evaluation.score.check import Rules
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
-from fpp_ml_bench.evaluation.score.uncertainty import intervals_over_objects, mean_of
+from fpp_ml_bench.evaluation.score.uncertainty import mean_of
 from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE
 from fpp_ml_bench.files import exclusive, read_json, write_atomically
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.schema import Count, StrictModel, Text, validate
+from fpp_ml_bench.pool import mapping
+from fpp_ml_bench.schema import Count, NonNegative, StrictModel, Text, validate
 from fpp_ml_bench.style import millimetres
 
 PAPER_PRESET = "paper"
@@ -59,14 +66,17 @@ REASON_LENGTH = 400
 MAIN_KEY = "object_mae_mm"
 SPLIT, TARGET = "test", "depth"
 REPEATS = 20
-Scores = dict[str, float | None]
+LOOK_EVERY_S = 2.0
+"""How often the bar of several trainings reads their logs."""
 
 
 @dataclass(frozen=True)
 class ReproduceSettings:
     """Settings of a run. ``leaderboard`` (`fpp_ml_bench.leaderboard.reproduced`) keeps the rows; ``minutes`` limits the
-    whole run; ``command`` continues it; ``anyway`` trains the paper's preset without a GPU; ``only_missing`` keeps rows
-    that are up to date; ``report`` takes a line of progress; ``row``: the only row of the table to make, "" for all."""
+    trainings; ``command`` continues it; ``anyway`` trains the paper's preset without a GPU; ``only_missing`` keeps rows
+    that are up to date; ``report`` takes a line of progress; ``row``: the only row of the table to make, "" for all;
+    ``from_scratch``: train even where weights come with the package; ``workers``: trainings beside each other;
+    ``folds``: cross-validate the rows of the tables, with so many parts."""
 
     tables: Sequence[str]
     folders: Folders
@@ -78,11 +88,15 @@ class ReproduceSettings:
     anyway: bool = False
     report: Report = print
     row: str = ""
+    from_scratch: bool = False
+    workers: int = 1
+    folds: int | None = None
 
 
 @dataclass
 class Outcome:
-    """``stopped``: the recipe at which the minutes ran out, None when all was done; ``failed``: recipe name to why."""
+    """``stopped``: the first recipe whose training is not at its end, None when all was done; ``failed``: recipe name
+    to why."""
 
     opened: DatasetFolder
     jobs: list[Job]
@@ -98,9 +112,14 @@ def reproduce(settings: ReproduceSettings) -> Outcome:
     (`Outcome.failed`). Raises TrainingError for a training folder of another recipe, or the paper's preset without a
     GPU; DatasetError for a dataset of another size or fingerprint; BuildError when another process works in the same
     folder; and what predicting and scoring raise."""
-    folders = settings.folders
-    jobs = plan.planned(settings.tables, folders.preset)
-    wanted = [job for job in jobs if not settings.row or f"{settings.tables[0]}/{settings.row}" in job.rows]
+    folders, tables = settings.folders, list(settings.tables)
+    names = [f"{table}/{row}" for table in tables for row in table_rows(table)]
+    chosen = [f"{tables[0]}/{settings.row}"] if settings.row else names
+    if settings.folds is not None:
+        names = chosen = chosen if len(tables) == 1 else list(plan.FOLD_ROWS)
+        tables = [plan.FOLDS]
+    jobs = plan.planned(names, folders.preset, settings.folds)
+    wanted = [job for job in jobs if not set(chosen).isdisjoint(job.rows)]
     check_run_folders(wanted, folders)
     check_machine(wanted, folders, settings.anyway, settings.command)
     with exclusive(folders.runs / "lock", folders.runs, "reproducing into this folder"):
@@ -110,50 +129,171 @@ def reproduce(settings: ReproduceSettings) -> Outcome:
         try:
             _work(settings, outcome, wanted)
         finally:
-            for table in settings.tables:
+            for table in tables:
                 outcome.tables.append(settings.leaderboard.write_table(table, settings, outcome))
     return outcome
 
 
 def _work(settings: ReproduceSettings, outcome: Outcome, jobs: Sequence[Job]) -> None:
-    """Every job in turn, until the minutes run out."""
-    started = perf_counter()
-    for number, job in enumerate(jobs, 1):
-        name, out = job.recipe.name, settings.folders.training(job.recipe)
-        minutes_left = None if settings.minutes is None else settings.minutes - (perf_counter() - started) / 60
-        if minutes_left is not None and minutes_left <= 0:
-            outcome.stopped = name
-            return
-        settings.report(f"[{number}/{len(jobs)}] {name} ({', '.join(job.rows)})")
+    """Train what has no weights, until the minutes run out; score what has."""
+    opened, folders = outcome.opened, settings.folders
+    untouched = (
+        [] if settings.from_scratch else [job for job in jobs if state_of(folders.training(job.recipe)) == MISSING]
+    )
+    done = [job for job in untouched if settings.only_missing and _rows_hold(job, settings, opened)]
+    shipped = {job.recipe.name: path for job in untouched if (path := shipped_weights(job.recipe, opened)) is not None}
+    left = [job for job in jobs if job not in done]
+    to_train = [job for job in left if job.recipe.name not in shipped]
+    runs = dict(zip((job.recipe.name for job in to_train), _trained(to_train, settings, opened.path), strict=True))
+    for number, job in enumerate(left, 1):
+        name, run = job.recipe.name, runs.get(job.recipe.name)
+        settings.report(f"[{number}/{len(left)}] {name} ({', '.join(job.rows)})")
         try:
-            run = train(job.recipe, outcome.opened.path, out, minutes=minutes_left)
-            if not run.finished:
-                outcome.stopped = name
-                return
-            _score(job, run, settings, outcome.opened)
+            if isinstance(run, TrainingError):
+                raise run
+            if run is not None and run.finished:
+                weights = finished_weights(job.recipe, run, opened, folders, settings.only_missing)
+                about: dict[str, Setting] = {"epochs_trained": run.epochs, "training_seconds": round(run.seconds, 1)}
+                _score(job, weights, about, settings, opened)
+            elif name in shipped:
+                _score(job, shipped[name], {}, settings, opened)
+            else:
+                outcome.stopped = outcome.stopped or name
+                settings.report("  not at its end yet")
         except (TrainingError, PredictionError, WeightsError) as error:
             # The other trainings, which take hours, may still succeed.
             outcome.failed[name] = shorten(" ".join(str(error).split()), REASON_LENGTH, placeholder=" ...")
             settings.report(f"  failed, its rows stay as they are: {error}")
 
 
-def _score(job: Job, run: TrainingRun, settings: ReproduceSettings, opened: DatasetFolder) -> None:
-    """Weights with range heads, rows, and scores on all frames of a training; up-to-date rows are kept with
-    ``only_missing``."""
-    folders, recipe = settings.folders, job.recipe
-    model = load(finished_weights(recipe, run, opened, folders, settings.only_missing))
-    if job.all_frames:
-        _score_all_frames(recipe, model, settings, opened)
-    about: dict[str, Setting] = {"recipe_digest": recipe.digest, "epochs_trained": run.epochs}
-    about["training_seconds"] = round(run.seconds, 1)
+def _rows_hold(job: Job, settings: ReproduceSettings, opened: DatasetFolder) -> bool:
+    """Whether all that the job gives is there already, made elsewhere by the same recipe on the same data."""
+    recipe, folders = job.recipe, settings.folders
+    paths = [folders.row(recipe, depth_range) for depth_range in variants(recipe)]
+    rows = [settings.leaderboard.row_that_holds(path, opened, recipe.digest, "recipe_digest") for path in paths]
+    scored = not job.scored_frames or scores_that_hold(folders.scores(recipe), opened.fingerprint, recipe) is not None
+    return scored and None not in rows
+
+
+def shipped_weights(recipe: Recipe, opened: DatasetFolder) -> Path | None:
+    """The weights that come with the package and are of exactly this recipe and dataset; None without."""
+    path = SHIPPED / f"{recipe.name}{SUFFIX}"
+    if not path.is_file():
+        return None
+    config = open_weights(path).config
+    same = (config.recipe, config.dataset_fingerprint) == (recipe.to_dict(), opened.fingerprint)
+    return path if same else None
+
+
+@dataclass(frozen=True)
+class Trainings:
+    """What a process that trains is given. ``deadline``: seconds since 1970 at which it stops; ``show``: progress."""
+
+    dataset: Path
+    deadline: float | None
+    show: bool
+
+    def train(self, recipe: Recipe, out: Path) -> TrainingRun | TrainingError | None:
+        """Train; None where no time is left for it, an error where it fails."""
+        minutes = None if self.deadline is None else (self.deadline - time()) / 60
+        if minutes is not None and minutes <= 0 and not is_trained(out):
+            return None
+        try:
+            return train(recipe, self.dataset, out, minutes=minutes, show=self.show)
+        except (TrainingError, PredictionError, WeightsError) as error:
+            return TrainingError(str(error))
+
+
+def _trained(
+    jobs: Sequence[Job], settings: ReproduceSettings, dataset: Path
+) -> list[TrainingRun | TrainingError | None]:
+    """The trainings of ``jobs``, one on each core, or one after the other in this process for one worker."""
+    if not jobs:
+        return []
+    recipes, folders = [job.recipe for job in jobs], [settings.folders.training(job.recipe) for job in jobs]
+    workers = min(settings.workers, len(jobs))
+    deadline = None if settings.minutes is None else time() + 60 * settings.minutes
+    with (
+        mapping(Trainings(dataset, deadline, workers == 1), workers) as mapped,
+        _progress(recipes, folders, workers),
+    ):
+        return list(mapped(Trainings.train, recipes, folders))
+
+
+@contextmanager
+def _progress(recipes: Sequence[Recipe], folders: Sequence[Path], workers: int) -> Iterator[None]:
+    """A bar over the epochs of trainings in other processes, read from their logs, with the time that is left. With
+    one worker each training shows its own."""
+    if workers == 1:
+        yield
+        return
+    ended = Event()
+    with Display(f"{len(recipes)} trainings", sum(recipe.epochs for recipe in recipes), True) as display:
+        display.columns = display.columns[:-2]
+
+        def follow() -> None:
+            while not ended.wait(LOOK_EVERY_S):
+                epochs, seconds = plan_state(recipes, folders)
+                display.at(epochs, f"{sum(map(is_trained, folders))} finished, {seconds / workers / 3600:.1f} h left")
+
+        thread = Thread(target=follow, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+
+
+def plan_state(recipes: Sequence[Recipe], folders: Sequence[Path]) -> tuple[int, float]:
+    """Epochs done of all trainings, and the seconds on one core that the others take: as long as those of the same
+    training, else of the same network, else of all so far; 0 before the first."""
+    logs = [_epoch_seconds(folder) for folder in folders]
+    done, left_s = 0, 0.0
+    for recipe, folder, own in zip(recipes, folders, logs, strict=True):
+        left = 0 if is_trained(folder) else max(recipe.epochs - len(own), 0)
+        alike = [s for other, log in zip(recipes, logs, strict=True) if other.network == recipe.network for s in log]
+        known = own or alike or [s for log in logs for s in log]
+        done, left_s = done + recipe.epochs - left, left_s + left * (fmean(known) if known else 0.0)
+    return done, left_s
+
+
+def _epoch_seconds(folder: Path) -> list[float]:
+    log = folder / LOG_FILE
+    return [json.loads(line)["seconds"] for line in log.read_text().splitlines()] if log.is_file() else []
+
+
+def _score(
+    job: Job, weights: Path, about: dict[str, Setting], settings: ReproduceSettings, opened: DatasetFolder
+) -> None:
+    """Rows of a training's weights, and its scores beside them; with ``only_missing`` what is up to date is kept."""
+    folders, recipe, model = settings.folders, job.recipe, load(weights)
+    path = folders.scores(recipe)
+    if job.scored_frames and not (
+        settings.only_missing and scores_that_hold(path, opened.fingerprint, recipe, model.sha256)
+    ):
+        units, mode = SCORING[recipe.normalisation]
+        scores = score_frames(
+            opened,
+            lambda frame: model.predict_representation([frame])[0],
+            opened.sequence.config(job.scored_frames),
+            Rules(TARGET, units, model.config.range_rule, mode),
+            opened.samples(SPLIT) if recipe.fold is None else fold_samples(opened, recipe.fold)[SPLIT],
+            recipe_digest=recipe.digest,
+            weights_sha256=model.sha256,
+        )
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_json(scores.model_dump(mode="json"), path)
+        settings.report(f"  {path.stem}: object MAE {millimetres(scores.errors[MAIN_KEY])} mm on {scores.pairs} pairs")
     for depth_range in variants(recipe):
         path = folders.row(recipe, depth_range)
         if settings.only_missing and settings.leaderboard.row_that_holds(path, opened, model.sha256) is not None:
             settings.report(f"  {path.stem}: holds, kept")
             continue
-        # A network's method sets torch's threads for the whole process; the next training needs its own.
+        # A network's method sets torch's threads for the whole process; the next one needs its own.
         with torch_threads(torch.get_num_threads()):
-            method = NetworkMethod(model, depth_range, remark=f"{recipe.preset} preset", about=about)
+            told = {"recipe_digest": recipe.digest, **about}
+            method = NetworkMethod(model, depth_range, remark=f"{recipe.preset} preset", about=told)
             settings.leaderboard.check_row_is_of(path, opened)
             result = score_method(opened, method, path, folders)
         settings.leaderboard.write_measured(result, path)
@@ -162,32 +302,17 @@ def _score(job: Job, run: TrainingRun, settings: ReproduceSettings, opened: Data
         )
 
 
-def _score_all_frames(recipe: Recipe, model: Model, settings: ReproduceSettings, opened: DatasetFolder) -> None:
-    """All frames of the training's configuration, by the rule of the oracle range, as in the paper."""
-    path = settings.folders.all_frames(recipe)
-    if settings.only_missing and all_frames_that_hold(path, opened.fingerprint, model.sha256) is not None:
-        return
-    units, mode = SCORING[recipe.normalisation]
-    scores = score_all_frames(
-        opened,
-        lambda frame: model.predict_representation([frame])[0],
-        opened.sequence.config(recipe.frames),
-        Rules(TARGET, units, model.config.range_rule, mode),
-        model.sha256,
-    )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    write_json(scores.model_dump(mode="json"), path)
-    settings.report(f"  {path.stem}: object MAE {millimetres(scores.metrics.object_mae_mm)} mm on {scores.pairs} pairs")
-
-
 def is_trained(out: Path) -> bool:
     """Whether a training folder holds a finished training."""
     return (out / DONE).is_file()
 
 
+MISSING = "missing"
+
+
 def state_of(out: Path) -> str:
     """``trained``, ``begun`` or ``missing``."""
-    return "trained" if is_trained(out) else "begun" if out.is_dir() and any(out.iterdir()) else "missing"
+    return "trained" if is_trained(out) else "begun" if out.is_dir() and any(out.iterdir()) else MISSING
 
 
 def check_run_folders(jobs: Sequence[Job], folders: Folders, opened: DatasetFolder | None = None) -> None:
@@ -294,82 +419,69 @@ def score_method(opened: DatasetFolder, method: NetworkMethod, row: Path, folder
     return result
 
 
-class SampleMean(StrictModel):
-    """Mean over frames for one sample."""
+class Scores(StrictModel):
+    """Errors of a training that are no row of the leaderboard: over every frame that it was trained on, or over the
+    objects that a cross-validation kept from it. ``errors``: means over ``pairs`` of ``frames`` and samples, of the six
+    errors in mm and of the share of the depth range; ``per_object``: the object MAE in mm of each object."""
 
-    sample: Text
-    object: Text
-    metrics: Headline
-
-
-class AllFrames(StrictModel):
-    """The six errors over all ``pairs`` of ``frames`` and test samples, with what they were computed from."""
-
-    schema_version: Literal["2.0.0"] = "2.0.0"
+    schema_version: Literal["3.0.0"] = "3.0.0"
     protocol_version: Text = PROTOCOL_VERSION
     fingerprint: Sha256
+    recipe_digest: Sha256
     weights_sha256: Sha256
     frames: list[Count]
     pairs: Annotated[int, Field(gt=0)]
-    metrics: Headline
-    intervals: Intervals
-    per_sample: list[SampleMean]
+    errors: dict[Text, NonNegative | None]
+    per_object: Annotated[dict[Text, NonNegative], Field(min_length=1)]
 
 
-def score_all_frames(
+def score_frames(
     opened: DatasetFolder,
     predict: Callable[[NDArray[np.uint8]], NDArray[np.float32]],
     frames: Sequence[int],
     rules: Rules,
-    weights_sha256: str,
-) -> AllFrames:
-    """Score ``predict`` (a frame (H, W) in, depth (H, W) out) by ``rules`` on every test sample and frame;
-    ``weights_sha256``: of the network. Raises PredictionError for a prediction that is not finite, and what
+    samples: Sequence[str],
+    **identity: str,
+) -> Scores:
+    """Score ``predict`` (a frame (H, W) in, depth (H, W) out) by ``rules`` on every one of ``samples`` and frames;
+    ``identity``: the hashes of recipe and weights. Raises PredictionError for a prediction that is not finite, and what
     `Rules.pair` raises."""
-    samples = opened.samples(SPLIT)
-    rows: list[Scores] = []
+    keys = (*HEADLINE, RANGE_KEY)
+    rows: list[dict[str, float | None]] = []
+    by_object: dict[str, list[float | None]] = {}
     for sample in samples:
         void = rules.void(opened, sample)
-        scores: list[Scores] = []
+        scores = []
         for frame in frames:
             values = predict(opened.frame(sample, frame))
             if not np.isfinite(values).all():
                 raise PredictionError(f"{sample}, frame {frame}: the network gave values that are not finite")
             scores.append(score_sample(*rules.pair(values, opened, sample), void=void).metrics())
-        rows.append(_mean(scores))
-    objects = [split_sample_name(sample)[0] for sample in samples]
-    ends = intervals_over_objects(rows, objects, HEADLINE)
-    return AllFrames(
+        rows.append({key: mean_of(score.get(key) for score in scores) for key in keys})
+        by_object.setdefault(split_sample_name(sample)[0], []).append(rows[-1][MAIN_KEY])
+    means = {name: mean_of(errors) for name, errors in by_object.items()}
+    return Scores(
         fingerprint=opened.fingerprint,
-        weights_sha256=weights_sha256,
         frames=list(frames),
         pairs=len(samples) * len(frames),
-        metrics=Headline(**_mean(rows)),
-        intervals=Intervals(**{key: list(interval or (None, None)) for key, interval in ends.items()}),
-        per_sample=[
-            SampleMean(sample=sample, object=name, metrics=Headline(**row))
-            for sample, name, row in zip(samples, objects, rows, strict=True)
-        ],
+        errors={key: mean_of(row[key] for row in rows) for key in keys},
+        per_object={name: mean for name, mean in means.items() if mean is not None},
+        **identity,  # type: ignore[arg-type]
     )
 
 
-def _mean(rows: Sequence[Scores]) -> Scores:
-    """Plain mean of each headline score over the rows that have it."""
-    return {key: mean_of(row[key] for row in rows) for key in HEADLINE}
-
-
-def read_all_frames(path: Path) -> AllFrames:
+def read_scores(path: Path) -> Scores:
     """Read strictly; SubmissionError names the file and what is wrong with it."""
-    return validate(
-        AllFrames, read_json(path, SubmissionError, "run the command again"), path, "file of scores on all frames"
-    )
+    return validate(Scores, read_json(path, SubmissionError, "run the command again"), path, "file of scores")
 
 
-def all_frames_that_hold(path: Path, fingerprint: str, weights_sha256: str) -> AllFrames | None:
-    """The scores in ``path`` if valid and of this dataset, these weights and the current protocol; else None."""
+def scores_that_hold(path: Path, fingerprint: str, recipe: Recipe, weights_sha256: str | None = None) -> Scores | None:
+    """The scores in ``path`` if valid and of this dataset, this recipe, the current protocol, and these weights where
+    they are given; else None."""
     try:
-        scores = read_all_frames(path)
+        scores = read_scores(path)
     except SubmissionError:
         return None
-    key = (fingerprint, weights_sha256, PROTOCOL_VERSION)
-    return scores if (scores.fingerprint, scores.weights_sha256, scores.protocol_version) == key else None
+    found = scores.fingerprint, scores.recipe_digest, scores.protocol_version
+    same = found == (fingerprint, recipe.digest, PROTOCOL_VERSION)
+    return scores if same and weights_sha256 in (None, scores.weights_sha256) else None

@@ -13,6 +13,7 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -43,14 +44,14 @@ from fpp_ml_bench.baselines.training.engine import (
 from fpp_ml_bench.baselines.training.losses import Adversarial, AdversarialSettings, Regression
 from fpp_ml_bench.baselines.training.recipe import GAN, Linear, Plateau, Recipe
 from fpp_ml_bench.baselines.training.weights import ModelConfig, save_weights, training_benchmark
-from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.constants import MM_PER_M, SPLITS, split_sample_name
 from fpp_ml_bench.depth import Normalisation
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.evaluation.protocol import Mode, Units
 from fpp_ml_bench.evaluation.score.check import scored_pair
 from fpp_ml_bench.evaluation.score.torch_metric import DepthScores
 from fpp_ml_bench.files import read_json, write_atomically
-from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import ALL_SPLITS, DatasetFolder
 from fpp_ml_bench.loaders.training import FringeDepth, FringeDepthDataset
 
 WEIGHTS, DONE = "weights.safetensors", "done.json"
@@ -153,8 +154,11 @@ def spread(pairs: int, drawn: int | None) -> list[int]:
 def open_data(recipe: Recipe, dataset: Path) -> tuple[FringeDepthDataset, FringeDepthDataset]:
     """Training and validation pairs. TrainingError for another image size than the recipe's, or an empty split."""
     datasets = []
+    parts = {} if recipe.fold is None else fold_samples(DatasetFolder(dataset), recipe.fold)
     for split in ("train", "validation"):
-        data = FringeDepthDataset(dataset, split, recipe.frames, recipe.normalisation, recipe.background_removed)
+        data = FringeDepthDataset(
+            dataset, split, recipe.frames, recipe.normalisation, recipe.background_removed, samples=parts.get(split)
+        )
         if data.source.size != (recipe.size, recipe.size):
             height, width = data.source.size
             raise TrainingError(
@@ -166,6 +170,18 @@ def open_data(recipe: Recipe, dataset: Path) -> tuple[FringeDepthDataset, Fringe
             raise TrainingError(f"{dataset}: split {split} holds no sample; training needs train and validation")
         datasets.append(data)
     return datasets[0], datasets[1]
+
+
+def fold_samples(data: DatasetFolder, fold: tuple[int, int]) -> dict[str, list[str]]:
+    """The samples of each split for part k of n of a cross-validation over all objects of ``data``, whatever their
+    split: part k is ``test``, every second object of the next part ``validation``, all others ``train``. The objects
+    are dealt in the order of their names' hashes, which is as good as shuffled and the same everywhere."""
+    part, parts = fold
+    owners = {sample: split_sample_name(sample)[0] for sample in data.samples(ALL_SPLITS)}
+    objects = sorted(set(owners.values()), key=lambda name: sha256(name.encode()).digest())
+    test, validation = objects[part::parts], objects[(part + 1) % parts :: parts][::2]
+    splits = {name: "test" if name in test else "validation" if name in validation else "train" for name in objects}
+    return {split: [sample for sample in owners if splits[owners[sample]] == split] for split in SPLITS}
 
 
 def rate_after(rule: Plateau | Linear, rate: float, losses: Sequence[float]) -> float:
@@ -202,8 +218,7 @@ class DepthTraining(Training):
         super().__init__(out, identity, recipe.seed, recipe.precision)
         self.recipe, self.data, self.validation = recipe, data, validation
         self.name, self.title = recipe.name, recipe.title
-        schedule, most = recipe.schedule, recipe.max_epochs
-        self.epochs = min(schedule.constant + schedule.decay, most) if isinstance(schedule, Linear) else most
+        self.epochs = recipe.epochs
         self.interval_steps = len(self._indices())
         self.total_steps = self.epochs * self.interval_steps
         network = build_network(recipe.network, width=recipe.width, **recipe.options)

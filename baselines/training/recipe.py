@@ -41,7 +41,9 @@ ROWS: dict[str, tuple[str, ...]] = {
 """The paper's order; ``pix2pixhd`` is the authors' code, ``hformer`` the conference version's. ``further`` is no table
 of the paper: two of its further directions, and the network without them."""
 TABLES = tuple(ROWS)
-PRESETS = ("cpu", "cpu-long", "paper")
+PRESETS = ("small", "paper")
+SEED = 42
+"""Of the shipped recipes; a preset may name further ones."""
 LOSSES = ("rmse", "l1", "masked_rmse", "masked_l1", "hybrid_rmse", "hybrid_l1")
 GAN = "gan"
 NETWORK_TITLES = {
@@ -121,7 +123,8 @@ class Loss(StrictModel):
 class Recipe(StrictModel):
     """Everything that a training depends on. ``size``: the image's width and height in px. ``pairs_per_epoch`` are
     drawn for each epoch, ``validation_pairs`` evenly over the validation split; null takes all. ``frames``: those that
-    are training pairs of their own, one of `CONFIGS`. ``options`` go to `networks.build`."""
+    are training pairs of their own, one of `CONFIGS`. ``options`` go to `networks.build`. ``fold``: k of n, for a
+    training without the objects of part k (from 0) of all, dealt into n parts; null trains on the training split."""
 
     preset: Text
     size: Annotated[int, Field(ge=16)]
@@ -134,6 +137,7 @@ class Recipe(StrictModel):
     loss: Loss
     optimizer: RmsProp
     schedule: Annotated[Plateau | Linear, Field(discriminator="name")]
+    fold: Annotated[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=3)]], Field(strict=False)] | None = None
     batch: Annotated[int, Field(ge=1)]
     seed: Annotated[int, Field(ge=0, lt=2**31)]
     max_epochs: Annotated[int, Field(ge=1)]
@@ -152,6 +156,8 @@ class Recipe(StrictModel):
             raise ValueError(f"frames: expected one of {', '.join(CONFIGS)}, got {self.frames!r}")
         if (self.loss.name == GAN) != (self.network in GENERATORS):
             raise ValueError(f"loss gan and network {' or '.join(GENERATORS)} belong together")
+        if self.fold is not None and self.fold[0] >= self.fold[1]:
+            raise ValueError(f"fold: expected a part from 0 to {self.fold[1] - 1}, got {self.fold[0]}")
         if self.loss.physics is not None and (self.normalisation == "individual" or self.frames != "single_shot"):
             raise ValueError(
                 "loss: physics needs depth in mm or m, of frame 0 (normalisation raw or global, frames single_shot)"
@@ -167,6 +173,8 @@ class Recipe(StrictModel):
         parts += ["bgremoved"] if self.background_removed else []
         parts += [flag for flag in _OPTION_TITLES if self.options.get(flag)]
         parts += [self.frames] if self.frames != "single_shot" else []
+        parts += [f"seed_{self.seed}"] if self.seed != SEED else []
+        parts += ["fold_{}_of_{}".format(*self.fold)] if self.fold is not None else []
         return "-".join(parts)
 
     @property
@@ -176,14 +184,18 @@ class Recipe(StrictModel):
         parts += ["background removed"] if self.background_removed else []
         parts += [title for flag, title in _OPTION_TITLES.items() if self.options.get(flag)]
         parts += [f"trained on {self.frames} frames"] if self.frames != "single_shot" else []
+        parts += [f"seed {self.seed}"] if self.seed != SEED else []
+        parts += ["fold {} of {}".format(*self.fold)] if self.fold is not None else []
         return ", ".join(parts)
 
+    @property
+    def epochs(self) -> int:
+        """At most; a plateau may end the training sooner."""
+        schedule, most = self.schedule, self.max_epochs
+        return min(schedule.constant + schedule.decay, most) if isinstance(schedule, Linear) else most
+
     def to_dict(self) -> dict[str, Any]:
-        """Without ``physics`` where there is none: digests of recipes without it stay what they were."""
-        content = self.model_dump(mode="json")
-        if content["loss"]["physics"] is None:
-            del content["loss"]["physics"]
-        return content
+        return self.model_dump(mode="json")
 
     @property
     def digest(self) -> str:
@@ -198,7 +210,17 @@ def table_rows(table: str) -> tuple[str, ...]:
     return ROWS[table]
 
 
-def load_recipe(name_or_path: str | Path, preset: str = "cpu") -> Recipe:
+def further_seeds(recipe: Recipe) -> list[int]:
+    """Seeds beside its own with which the recipe's preset trains it; none for most."""
+    return list(_preset(recipe.preset).get("seeds", {}).get(recipe.name, []))
+
+
+def about_preset(preset: str) -> str:
+    """What networks of a preset are beside the paper's, in a sentence."""
+    return str(_preset(preset)["about"])
+
+
+def load_recipe(name_or_path: str | Path, preset: str = PRESETS[0]) -> Recipe:
     """A shipped recipe by name (``loss/hybrid_l1_0.7``) or a YAML file of yours, resolved with a preset, which scales
     the shipped recipes alone. RecipeError for an unknown recipe, preset or key, an impossible value, or an endless
     chain of ``extends``."""
@@ -281,11 +303,7 @@ def _merge(below: dict[str, Any], above: dict[str, Any], pick: bool = False) -> 
 def _preset(name: str) -> dict[str, Any]:
     if name not in PRESETS:
         raise RecipeError(f"expected a preset out of {', '.join(PRESETS)}, got {printable(name)!r}")
-    content = _read(RECIPES / "presets" / f"{name}.yaml")
-    if "extends" not in content:
-        return content
-    below = _preset(content.pop("extends"))
-    return {**below, **{key: _merge(below[key], value) for key, value in content.items()}}
+    return _read(RECIPES / "presets" / f"{name}.yaml")
 
 
 def _read(path: Path) -> dict[Any, Any]:

@@ -61,6 +61,23 @@ def object_interval(values: Sequence[float | None], objects: Sequence[Hashable])
     return float(low), float(high)
 
 
+def interval_over_seeds(values: Sequence[Mapping[str, float]]) -> Interval | None:
+    """The 95% interval of the mean of ``values``, an object's for each seed of a training, resampled over objects and,
+    independently, over seeds (the pigeonhole bootstrap: Owen, Annals of Applied Statistics 1:386, 2007). With one seed
+    the `object_interval` of equally many views of each object. None with fewer than two objects."""
+    names = list(values[0]) if values else []
+    if len(names) < 2:
+        return None
+    table = np.array([[of_seed[name] for name in names] for of_seed in values])
+    means = np.zeros(BOOTSTRAP_RESAMPLES)
+    drawn = _draws(len(names))
+    raw = np.random.PCG64(BOOTSTRAP_SEED + 1).random_raw(BOOTSTRAP_RESAMPLES * len(table))
+    for seeds in (raw % np.uint64(len(table))).astype(np.intp).reshape(len(table), BOOTSTRAP_RESAMPLES):
+        means += table[seeds[:, None], drawn].mean(axis=1) / len(table)
+    low, high = np.quantile(means, _levels(len(names)))
+    return float(low), float(high)
+
+
 @cache
 def _draws(objects: int) -> NDArray[np.intp]:
     """Which objects each resample holds, (resamples, objects)."""

@@ -13,10 +13,11 @@ from fpp_ml_bench.baselines.training.recipe import PRESETS, TABLES, load_recipe,
 from fpp_ml_bench.cli import CHECK_FAILED, OK
 from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.cli.methods import MethodCommand
-from fpp_ml_bench.cli.options import MINUTES, command, command_line
+from fpp_ml_bench.cli.options import AT_LEAST_ONE, MINUTES, command, command_line, whole
 from fpp_ml_bench.errors import RecipeError, TrainingError
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, read_entry
+from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.options import REQUIRED, argument, did_you_mean, nearest, option
 from fpp_ml_bench.tables import Table
 
@@ -29,14 +30,14 @@ class TrainCommand(MethodCommand):
 
 @command(
     """\
-fpp-bench train loss/hybrid_l1_0.7 data/cpu224 --out runs/mine
+fpp-bench train loss/hybrid_l1_0.7 data/small224 --out runs/mine
 fpp-bench train phase-net --out runs/phase-net      the network of the phase route; it renders its own views
 fpp-bench train phase-net --albedo any --out runs/phase-net-any      without brightness
 fpp-bench train crossed-net --out runs/crossed-net      the network of crossed fringes; the same
 fpp-bench train classical-net --out runs/classical-net      noise and missed pixels of three steps; the same
 fpp-bench train mine.yaml data/full --preset paper --out runs/big --minutes 10     in pieces
 accelerate launch -m fpp_ml_bench train mine.yaml data/full --preset paper --out runs/big      several GPUs
-fpp-bench predict runs/mine/model.safetensors data/cpu224 --out predictions
+fpp-bench predict runs/mine/model.safetensors data/small224 --out predictions
 """,
     TrainCommand,
 )
@@ -49,7 +50,7 @@ def train(
         "dataset folder, of the preset's image size (those methods: none)", "DATASET", None
     ),
     out: Path = option(REQUIRED, "new folder, or that of a training to resume", "DIR"),
-    preset: str = option("cpu", "what a shipped recipe is scaled to (default: cpu)", choices=PRESETS),
+    preset: str = option(PRESETS[0], f"what a shipped recipe is scaled to (default: {PRESETS[0]})", choices=PRESETS),
     minutes: float | None = option(
         None, "stop before an epoch that would not finish in time, everything saved", "M", parse=MINUTES
     ),
@@ -98,9 +99,9 @@ def train(
 
 
 ALL = "all"
+PARTS = whole(3, 50)
 EMPTY_BECAUSE = {
-    "cpu": "a training takes 2 to 8 minutes on two cores; cpu-long has these networks, trained to their ends",
-    "cpu-long": "a training takes half an hour to two hours on a core",
+    "small": "a training takes 7 to 40 minutes on a core",
     "paper": "a training needs a GPU (weeks without), and none was at hand",
 }
 
@@ -109,32 +110,45 @@ EMPTY_BECAUSE = {
     """\
 fpp-bench reproduce --list
 fpp-bench reproduce normalization                      the small preset: 224 px, for a laptop
-fpp-bench reproduce loss/hybrid_l1_0.7 --preset cpu-long      one row, to the paper's stopping rule
+fpp-bench reproduce loss/hybrid_l1_0.7 --train         one row, trained here although its weights come with the package
 fpp-bench reproduce all --only-missing                 every table; up-to-date rows are kept
+fpp-bench reproduce --folds 5                          UNets and ResUNet over all 50 objects, each left out once
 fpp-bench reproduce loss --preset paper --minutes 10   the paper's own settings, on a GPU, in pieces
 """
 )
 def reproduce_tables(
     *,
     table: str | None = argument(f"{', '.join(TABLES)} or {ALL}; or one row, like loss/l1", "TABLE", None),
-    dataset: Path | None = argument("dataset, built when missing (default: data/cpu224 or data/full)", "DATASET", None),
+    dataset: Path | None = argument(
+        "dataset, built when missing (default: data/small224 or data/full)", "DATASET", None
+    ),
     preset: str = option(
-        "cpu",
-        "cpu: 224 px, narrow networks, 8 epochs (default); cpu-long: the same until the rate is at its minimum; paper: "
-        "960 px and full width, needs a GPU",
+        PRESETS[0],
+        "small: 224 px, narrow networks, 48 epochs (default); paper: 960 px and full width, needs a GPU",
         choices=PRESETS,
     ),
     out: Path = option(Path("runs"), "trainings, predictions and tables go below DIR/PRESET (default: runs)", "DIR"),
     rows: Path | None = option(None, "leaderboard rows (default: OUT/PRESET/rows)", "DIR"),
     only_missing: bool = option(
         False,
-        "keep rows that are up to date with the dataset and the weights; without it, all rows are made again. Finished "
-        "trainings are always kept",
+        "keep rows that are up to date with the dataset and the recipe, and train nothing for them; without it, all "
+        "rows are made again. Finished trainings are always kept",
+    ),
+    from_scratch: bool = option(False, "train even where weights come with the package", flag="--train"),
+    folds: int | None = option(
+        None,
+        "cross-validate instead: train each row of TABLE (default: RMSE, hybrid L1 0.7 and ResUNet) N times, each "
+        "without a part of all objects, and score it on that part",
+        "N",
+        parse=PARTS,
+    ),
+    workers: int | None = option(
+        None, "trainings beside each other, one core each (default: all cores; 1 with a GPU)", "N", parse=AT_LEAST_ONE
     ),
     minutes: float | None = option(
         None,
-        "stop before an epoch that would exceed M minutes, everything saved (exit status 1); the same command "
-        "continues",
+        "stop trainings before an epoch that would exceed M minutes, everything saved, and score what is at its end "
+        "(exit status 1); the same command continues",
         "M",
         parse=MINUTES,
     ),
@@ -156,9 +170,11 @@ def reproduce_tables(
     if listed:
         _list(tables, folders)
         return OK
-    if table is None:
+    if table is None and folds is None:
         raise RecipeError(f"expected a table: {', '.join(TABLES)} or {ALL}; --list shows their rows")
-    from fpp_ml_bench.leaderboard import reproduced  # imports torch, which --help and --list do without
+    import torch  # which --help and --list do without
+
+    from fpp_ml_bench.leaderboard import reproduced
 
     def report(line: str) -> None:  # with the time, where the engine's progress is too
         print(f"{datetime.now():%H:%M:%S} {line}", file=sys.stderr, flush=True)
@@ -168,21 +184,38 @@ def reproduce_tables(
         again = re.sub(r"(?= --)|$", f" --preset {preset}", again, count=1)
     if not only_missing:
         again = re.sub(r"--preset[ =]\S+", r"\g<0> --only-missing", again, count=1)
+    if workers is None:
+        workers = 1 if torch.cuda.is_available() else usable_cores()
     outcome = run_reproduce(
-        ReproduceSettings(tables, folders, again, reproduced, dataset, only_missing, minutes, anyway, report, row)
+        ReproduceSettings(
+            tables,
+            folders,
+            again,
+            reproduced,
+            dataset,
+            only_missing=only_missing,
+            minutes=minutes,
+            anyway=anyway,
+            report=report,
+            row=row,
+            from_scratch=from_scratch,
+            workers=workers,
+            folds=folds,
+        )
     )
-    for name, path in zip(tables, outcome.tables, strict=True):
-        lines = reproduced.table_lines(name, outcome.jobs, folders, outcome.opened)
+    for path in outcome.tables:
+        lines = reproduced.table_lines(path.stem, outcome.jobs, folders, outcome.opened)
         show(
-            reproduced.line_table(name, lines, preset),
-            reproduced.conclusion(name, lines),
+            reproduced.line_table(path.stem, lines, preset),
+            reproduced.conclusion(path.stem, lines),
         )
         print(f"Written: {path}")
     if outcome.failed:
         each = "\n".join(f"  {name}: {why}" for name, why in outcome.failed.items())
         raise TrainingError(f"{len(outcome.failed)} of {len(outcome.jobs)} rows could not be made:\n{each}")
     if outcome.stopped is not None:
-        print(f"Stopped at {outcome.stopped} after {minutes:g} minutes. Continue with: {again}")
+        print(f"Stopped after {minutes:g} minutes; the first that is not at its end: {outcome.stopped}.")
+        print(f"Continue with: {again}")
         return CHECK_FAILED
     return OK
 
@@ -190,7 +223,7 @@ def reproduce_tables(
 def _list(tables: tuple[str, ...], folders: "Folders") -> None:
     from fpp_ml_bench.baselines.reproduce.work import state_of
 
-    jobs = planned(tables, folders.preset)
+    jobs = planned([f"{table}/{row}" for table in tables for row in table_rows(table)], folders.preset)
     titles = "Row", "Training", "State", "Rows written", "Published: object MAE"
     first_out = "Rows written", "Published: object MAE", "Training"
     table = Table(*titles, first_out=first_out, title=f"preset {folders.preset}, {folders.runs}")
@@ -199,14 +232,14 @@ def _list(tables: tuple[str, ...], folders: "Folders") -> None:
         row_files = [folders.row(job.recipe, depth_range) for depth_range in variants(job.recipe)]
         written = f"{sum(path.is_file() for path in row_files)} of {len(row_files)}"
         published = _published(SHIPPED_ROWS / row_files[0].name)
-        empty += len(job.rows) if published is None else 0
+        empty += published is None
         state = state_of(folders.training(job.recipe))
         table.add_row("\n".join(job.rows), job.recipe.name, state, written, published or "-")
     show(table)
-    rows = sum(len(job.rows) for job in jobs)
-    print(f"{len(jobs)} trainings fill {rows} rows; {rows - empty} of them come with the package.")
+    rows = len({row for job in jobs for row in job.rows})
+    print(f"{len(jobs)} trainings fill {rows} rows; the rows of {len(jobs) - empty} trainings come with the package.")
     if empty:
-        print(f"The other {empty} are not measured yet: {EMPTY_BECAUSE[folders.preset]}.")
+        print(f"Those of the other {empty} are not measured yet: {EMPTY_BECAUSE[folders.preset]}.")
 
 
 def _published(path: Path) -> str | None:

@@ -98,7 +98,7 @@ def test_what_a_submission_says(dataset, weights, tmp_path, name, depth_range, u
     assert {"torch", "numpy", "fpp_ml_bench"} <= set(about.software) and "numba" not in about.software
     settings = about.settings
     assert (settings["network"], settings["width"], settings["loss"]) == ("unet", 2, "hybrid_l1_0.7")
-    assert (settings["preset"], settings["seed"], settings["epochs"]) == ("cpu", 42, 2)
+    assert (settings["preset"], settings["seed"], settings["epochs"]) == ("small", 42, 2)
     assert (
         len(settings["weights_sha256"]) == 64 and settings["normalisation"] == network_method.model.config.normalisation
     )

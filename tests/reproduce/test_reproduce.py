@@ -12,18 +12,14 @@ import torch
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.networks.model import build
 from fpp_ml_bench.baselines.reproduce import plan, work
-from fpp_ml_bench.baselines.reproduce.work import (
-    SPLIT,
-    all_frames_that_hold,
-    read_all_frames,
-    score_all_frames,
-)
+from fpp_ml_bench.baselines.reproduce.work import SPLIT, plan_state, read_scores, score_frames, scores_that_hold
 from fpp_ml_bench.baselines.timing import time_method
 from fpp_ml_bench.baselines.training import depth_training
 from fpp_ml_bench.baselines.training.depth_training import model_config
 from fpp_ml_bench.baselines.training.engine import claim_folder
 from fpp_ml_bench.baselines.training.recipe import load_recipe
 from fpp_ml_bench.baselines.training.weights import save_weights
+from fpp_ml_bench.baselines.trivial import best_range_share
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.errors import PredictionError, SubmissionError, TrainingError
@@ -35,8 +31,9 @@ from fpp_ml_bench.leaderboard.rows import read_entry
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 TABLE = "normalization"
-NAMES = ("cpu-unet-raw-rmse", "cpu-unet-global-rmse", "cpu-unet-individual-rmse")
-TWINS = tuple(f"cpu-unet-individual-rmse-range-{source}" for source in ("predicted", "mean"))
+NAMES = ("small-unet-raw-rmse", "small-unet-global-rmse", "small-unet-individual-rmse")
+TWIN = "small-unet-individual-rmse-range-predicted"
+SEEDED = [f"{name}-seed_{seed}" for name in NAMES for seed in (1, 2)]
 
 
 @cache
@@ -54,7 +51,7 @@ def reused_timing(opened, method, split, repeats):
 def small(monkeypatch, opened, request):
     """Recipes at the tiny dataset's size, networks of width 1, 2 timed runs a method, heads of few pairs."""
 
-    def tiny_recipe(name, preset="cpu"):
+    def tiny_recipe(name, preset="small"):
         recipe = load_recipe(name, preset)
         return recipe.model_copy(update={"size": opened.size[0], "width": 1})
 
@@ -91,7 +88,7 @@ class Trainer:
         if outcome == "out of time":
             return depth_training.TrainingRun(out, 1, 1, 1.0, finished=False)
         self.trained.append(recipe.name)
-        torch.manual_seed(self.seed)
+        torch.manual_seed(self.seed + recipe.seed)
         network = build(recipe.network, width=recipe.width)
         # Untrained, its output would be refused for its unit: a little around a depth that can be.
         with torch.no_grad():
@@ -119,22 +116,23 @@ def unscored(monkeypatch):
 def run(tiny, tmp_path, trainer):
     """Run the command on the tiny dataset below ``tmp_path``."""
     return lambda *words: main(
-        ["reproduce", words[0], str(tiny), *map(str, words[1:]), "--out", str(tmp_path / "runs")]
+        ["reproduce", words[0], str(tiny), *map(str, words[1:]), "--out", str(tmp_path / "runs"), "--workers", "1"]
     )
 
 
 def test_from_trainings_to_a_table(run, trainer, tmp_path, tiny, capsys):
     assert run(TABLE) == 0
-    below = tmp_path / "runs" / "cpu"
-    assert trainer.trained == [name.removeprefix("cpu-") for name in NAMES]
-    assert sorted(path.stem for path in (below / "rows").glob("*.json")) == sorted((*NAMES, *TWINS))
+    below = tmp_path / "runs" / "small"
+    assert trainer.trained == [name.removeprefix("small-") for name in (*NAMES, *SEEDED)]
+    twins = [TWIN, *(f"{name}-range-predicted" for name in SEEDED[-2:])]
+    assert sorted(path.stem for path in (below / "rows").glob("*.json")) == sorted((*NAMES, *SEEDED, *twins))
     entries = {path.stem: read_entry(path) for path in (below / "rows").glob("*.json")}
     assert all(entry.is_row_file for entry in entries.values())
     tracks = {name: (entry.row.track, entry.row.mode, entry.row.target) for name, entry in entries.items()}
     assert tracks[NAMES[2]] == ("oracle range", "paper", "depth")
-    assert {tracks[name] for name in (*NAMES[:2], *TWINS)} == {("metric", "standard", "depth")}
-    assert all(entry.name.endswith("(cpu preset)") for entry in entries.values())
-    assert [len(group.rows) for group in rank(entries.values())] == [4, 1]
+    assert {tracks[name] for name in (*NAMES[:2], *SEEDED[:4], *twins)} == {("metric", "standard", "depth")}
+    assert all(entry.name.endswith("(small preset)") for entry in entries.values())
+    assert [len(group.rows) for group in rank(entries.values())] == [8, 3]  # two twins find no object
     for name, entry in entries.items():
         assert entry.row.timing.parameters == sum(p.numel() for p in build("unet", width=1).parameters())
         for folder in ("results", "rows"):
@@ -144,9 +142,11 @@ def test_from_trainings_to_a_table(run, trainer, tmp_path, tiny, capsys):
     lines = {
         line.split(" | ")[0].strip("| "): line for line in text.split("## ")[0].splitlines() if line.startswith("| ")
     }
-    mae = entries[NAMES[2]].row.metrics.object_mae_mm
-    assert f"| oracle range | {mae:.2f} / " in lines["individual"] and "| 16.20 / 21.19 |" in lines["individual"]
-    assert f" {entries[TWINS[0]].row.metrics.object_mae_mm:.2f} / " in lines["individual"]
+    each = [entries[name].row.metrics.object_mae_mm for name in (NAMES[2], *SEEDED[-2:])]
+    assert f"| oracle range | {np.mean(each):.2f} / " in lines["individual"]
+    assert f"| {', '.join(f'{mae:.2f}' for mae in each)} |" in lines["individual"]
+    assert "| 16.20 / 21.19 |" in lines["individual"]
+    assert f" {entries[TWIN].row.metrics.object_mae_mm:.2f} / " in lines["individual"]
     assert "| 5 | 61 |" in lines["raw (mm)"]
     assert "3 among the rows measured here" in text and "of different tracks" in text
     assert "reported by the paper" in capsys.readouterr().out
@@ -158,45 +158,43 @@ def stamps(folder):
 
 def test_only_missing_keeps_what_holds(run, trainer, tmp_path, capsys):
     assert run(TABLE) == 0
-    rows = tmp_path / "runs" / "cpu" / "rows"
+    rows = tmp_path / "runs" / "small" / "rows"
     first = stamps(rows)
     assert run(TABLE, "--only-missing") == 0 and stamps(rows) == first
-    assert len(trainer.trained) == 3
+    assert len(trainer.trained) == 9
     (rows / f"{NAMES[1]}.json").unlink()
-    (rows / f"{TWINS[0]}.json").write_text("{")
+    (rows / f"{TWIN}.json").write_text("{")
     assert run(TABLE, "--only-missing") == 0
     changed = {name.removesuffix(".json") for name, stamp in stamps(rows).items() if first[name] != stamp}
-    assert changed == {NAMES[1], TWINS[0]}
-    assert run(TABLE) == 0 and len(trainer.trained) == 3
+    assert changed == {NAMES[1], TWIN}
+    assert run(TABLE) == 0 and len(trainer.trained) == 9
     assert not set(stamps(rows).items()) & set(first.items())
 
 
 def test_rows_of_other_weights_are_made_again_and_not_shown(run, trainer, tmp_path):
     assert run(TABLE) == 0
-    below = tmp_path / "runs" / "cpu"
-    weights_before = read_entry(below / "rows" / f"{TWINS[0]}.json").row.submission.settings["weights_sha256"]
-    training = below / "unet-individual-rmse"
-    for path in training.iterdir():
-        path.unlink()
+    below = tmp_path / "runs" / "small"
+    weights_before = read_entry(below / "rows" / f"{TWIN}.json").row.submission.settings["weights_sha256"]
+    (below / "unet-individual-rmse" / "done.json").unlink()
     trainer.says["unet-individual-rmse"] = "out of time"
     trainer.seed = 1
     assert run(TABLE, "--only-missing", "--minutes", "5") == 1
     assert "Not measured here: individual. To fill" in (below / f"{TABLE}.md").read_text()
     trainer.says.clear()
     assert run(TABLE, "--only-missing") == 0
-    weights_after = read_entry(below / "rows" / f"{TWINS[0]}.json").row.submission.settings["weights_sha256"]
-    assert weights_before != weights_after and len(trainer.trained) == 4
+    weights_after = read_entry(below / "rows" / f"{TWIN}.json").row.submission.settings["weights_sha256"]
+    assert weights_before != weights_after and len(trainer.trained) == 10
 
 
 def test_rows_of_another_machine_are_shown_if_of_the_same_recipe(run, trainer, tmp_path):
     def lines():
         return [line for line in (below / f"{TABLE}.md").read_text().splitlines() if line.startswith("| individual |")]
 
-    below = tmp_path / "runs" / "cpu"
+    below = tmp_path / "runs" / "small"
     assert run(TABLE) == 0
     made_here = lines()
     shutil.rmtree(below / "unet-individual-rmse")
-    assert run(f"{TABLE}/raw") == 0 and len(trainer.trained) == 3
+    assert run(f"{TABLE}/raw") == 0 and len(trainer.trained) == 9
     assert len(made_here) == 3 and lines() == made_here
     row = below / "rows" / f"{NAMES[2]}.json"
     digest = read_entry(row).row.submission.settings["recipe_digest"]
@@ -209,9 +207,10 @@ def test_when_minutes_run_out_the_same_command_goes_on(run, trainer, unscored, t
     trainer.says["unet-global-rmse"] = "out of time"
     assert run(TABLE, "--minutes", "5") == 1
     out = capsys.readouterr().out
-    assert "Stopped at unet-global-rmse after 5 minutes. Continue with: fpp-bench reproduce normalization" in out
+    assert "Stopped after 5 minutes; the first that is not at its end: unet-global-rmse." in out
+    assert "Continue with: fpp-bench reproduce normalization" in out
     assert "--only-missing --minutes 5" in out
-    text = (tmp_path / "runs" / "cpu" / f"{TABLE}.md").read_text()
+    text = (tmp_path / "runs" / "small" / f"{TABLE}.md").read_text()
     assert "Not measured here: raw, global, individual. To fill: `fpp-bench reproduce normalization" in text
     trainer.says.clear()
     assert run(TABLE, "--only-missing", "--minutes", "5") == 0
@@ -220,25 +219,25 @@ def test_when_minutes_run_out_the_same_command_goes_on(run, trainer, unscored, t
 def test_a_training_that_fails_does_not_stop_the_others(run, trainer, unscored, tmp_path, capsys):
     trainer.says["unet-global-rmse"] = TrainingError("training diverged: loss is not finite in batch 3")
     assert run(TABLE) == 2
-    assert "1 of 3 rows could not be made:\n  unet-global-rmse: training diverged" in capsys.readouterr().err
-    text = (tmp_path / "runs" / "cpu" / f"{TABLE}.md").read_text()
+    assert "1 of 9 rows could not be made:\n  unet-global-rmse: training diverged" in capsys.readouterr().err
+    text = (tmp_path / "runs" / "small" / f"{TABLE}.md").read_text()
     assert "- global: training diverged" in text
-    assert len(trainer.trained) == 2
+    assert len(trainer.trained) == 8
 
 
 def test_ctrl_c_leaves_what_is_done_and_a_table(run, trainer, unscored, tmp_path):
     trainer.says["unet-global-rmse"] = KeyboardInterrupt()
     assert run(TABLE) == 130
-    assert (tmp_path / "runs" / "cpu" / f"{TABLE}.md").is_file()
+    assert (tmp_path / "runs" / "small" / f"{TABLE}.md").is_file()
     trainer.says.clear()
     assert run(TABLE, "--only-missing") == 0
     assert trainer.trained.count("unet-raw-rmse") == 1
 
 
 def test_a_training_of_another_recipe_is_refused_before_any_work(run, trainer, tmp_path, capsys):
-    out = tmp_path / "runs" / "cpu" / "unet-individual-rmse"
+    out = tmp_path / "runs" / "small" / "unet-individual-rmse"
     out.mkdir(parents=True)
-    recipe = plan.load_recipe("normalization/individual", "cpu")
+    recipe = plan.load_recipe("normalization/individual", "small")
     other = {**recipe.to_dict(), "batch": 8, "seed": 1}
     (out / "recipe.json").write_text(json.dumps({"recipe": other, "fingerprint": 64 * "0"}))
     assert run(TABLE) == 2
@@ -251,7 +250,7 @@ def test_a_training_of_another_recipe_is_refused_before_any_work(run, trainer, t
 
 def test_a_training_on_another_dataset_is_refused(run, trainer, unscored, tmp_path, capsys):
     assert run(TABLE) == 0 and run(TABLE) == 0
-    path = tmp_path / "runs" / "cpu" / "unet-individual-rmse" / "recipe.json"
+    path = tmp_path / "runs" / "small" / "unet-individual-rmse" / "recipe.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"fingerprint": 64 * "a"}))
     assert run(TABLE) == 2
     assert "is of aaaaaaaa; give that dataset as DATASET, or another --out" in capsys.readouterr().err
@@ -273,41 +272,49 @@ def test_the_papers_preset_needs_a_gpu(run, trainer, unscored, monkeypatch, caps
 
 def test_every_frame_is_scored_for_the_multi_frame_table(run, trainer, tmp_path, opened):
     assert run("multi_frame/vertical") == 0
-    below = tmp_path / "runs" / "cpu"
-    scores = read_all_frames(below / "all-frames" / "cpu-unet-individual-rmse-vertical-all-frames.json")
+    below = tmp_path / "runs" / "small"
+    scores = read_scores(below / "scores" / "small-unet-individual-rmse-vertical.json")
     assert scores.frames == list(range(18, 36)) and scores.pairs == 18 * len(opened.samples("test"))
-    result = read_result(below / "results" / "cpu-unet-individual-rmse-vertical.json")
-    row = read_entry(below / "rows" / "cpu-unet-individual-rmse-vertical.json").row
+    result = read_result(below / "results" / "small-unet-individual-rmse-vertical.json")
+    row = read_entry(below / "rows" / "small-unet-individual-rmse-vertical.json").row
     assert result.submission.frames_used == row.submission.frames_used == [18]
-    for key in ("object_mae_mm", "overall_rmse_mm", "background_mae_mm"):
-        per_sample = [getattr(part.metrics, key) for part in scores.per_sample]
-        assert getattr(scores.metrics, key) == pytest.approx(np.mean(per_sample), rel=1e-9)
+    assert scores.errors["object_mae_mm"] == pytest.approx(np.mean(list(scores.per_object.values())), rel=1e-9)
     table = (below / "multi_frame.md").read_text().split("## ")[0]
     lines = [line for line in table.splitlines() if line.startswith("| 18 vertical")]
     assert len(lines) == 2 and "its first frame only" in lines[1]
-    assert f"| {scores.metrics.object_mae_mm:.2f} / " in lines[0] and "| 12.36 / 16.94 |" in lines[0]
+    assert f"| {scores.errors['object_mae_mm']:.2f} / " in lines[0] and "| 12.36 / 16.94 |" in lines[0]
     assert f"| {row.metrics.object_mae_mm:.2f} / " in lines[1] and "12.36" not in lines[1]
+    first = stamps(below / "scores")
+    shutil.rmtree(below / "unet-individual-rmse-vertical")
+    assert run("multi_frame/vertical", "--only-missing") == 0  # made elsewhere by the same recipe
+    assert stamps(below / "scores") == first and len(trainer.trained) == 1
 
 
-def test_all_frames_files_are_read_strictly(opened, tmp_path):
+RULES = Rules("depth", "mm", "object", "standard")
+IDENTITY = {"recipe_digest": 64 * "b", "weights_sha256": 64 * "a"}
+
+
+def test_files_of_scores_are_read_strictly(opened, tmp_path):
     def zeros(frame):
         return np.zeros(frame.shape, np.float32)
 
-    scores = score_all_frames(opened, zeros, [0, 3], Rules("depth", "mm", "object", "standard"), 64 * "a")
+    recipe, samples = load_recipe("loss/rmse"), opened.samples(SPLIT)
+    scores = score_frames(opened, zeros, [0, 3], RULES, samples, **IDENTITY | {"recipe_digest": recipe.digest})
     path = tmp_path / "all.json"
     write_json(scores.model_dump(mode="json"), path)
-    assert read_all_frames(path) == scores == all_frames_that_hold(path, opened.fingerprint, 64 * "a")
-    assert all_frames_that_hold(path, opened.fingerprint, 64 * "b") is None
-    assert scores.metrics.background_mae_mm == 0 and scores.metrics.object_mae_mm > 1500
+    assert read_scores(path) == scores == scores_that_hold(path, opened.fingerprint, recipe, 64 * "a")
+    assert scores_that_hold(path, opened.fingerprint, recipe, 64 * "b") is None
+    assert scores_that_hold(path, opened.fingerprint, load_recipe("loss/l1")) is None
+    assert scores.errors["background_mae_mm"] == 0 and scores.errors["object_mae_mm"] > 1500
     path.write_text(path.read_text().replace('"pairs"', '"pear"'))
     with pytest.raises(SubmissionError, match="pear"):
-        read_all_frames(path)
-    assert all_frames_that_hold(path, opened.fingerprint, 64 * "a") is None
+        read_scores(path)
+    assert scores_that_hold(path, opened.fingerprint, recipe) is None
     with pytest.raises(PredictionError, match=r"frame 0.*not finite"):
-        score_all_frames(opened, lambda f: zeros(f) + np.nan, [0], Rules("depth", "mm", "object", "standard"), 64 * "a")
+        score_frames(opened, lambda f: zeros(f) + np.nan, [0], RULES, samples, **IDENTITY)
 
 
-def test_all_frames_of_one_frame_is_the_evaluators_score(opened, tmp_path):
+def test_scores_of_one_frame_are_the_evaluators(opened, tmp_path):
     rng = np.random.default_rng(0)
     noise = {sample: rng.uniform(0.0, 1.0, opened.size).astype(np.float32) for sample in opened.samples(SPLIT)}
     waiting = iter(noise.values())
@@ -319,22 +326,71 @@ def test_all_frames_of_one_frame_is_the_evaluators_score(opened, tmp_path):
     for sample, values in noise.items():
         np.save(folder / f"{sample}.npy", values)
     result = evaluate(folder, opened, mode="paper")
-    scores = score_all_frames(
-        opened, lambda frame: next(waiting), [0], Rules("depth", "normalised", "object", "paper"), 64 * "a"
-    )
-    for key, value in scores.metrics:
+    rules = Rules("depth", "normalised", "object", "paper")
+    scores = score_frames(opened, lambda frame: next(waiting), [0], rules, list(noise), **IDENTITY)
+    assert len(scores.errors) == 7
+    for key, value in scores.errors.items():
         assert value == pytest.approx(getattr(result.metrics, key), rel=1e-12)
 
 
+def test_every_object_is_left_out_once(run, trainer, tmp_path, opened):
+    owners = {sample: sample.rpartition("_")[0] for sample in opened.samples("all")}
+    parts = [depth_training.fold_samples(opened, (part, 3)) for part in range(3)]
+    for splits in parts:
+        assert sorted(sample for samples in splits.values() for sample in samples) == sorted(owners)
+        of_split = [{owners[sample] for sample in samples} for samples in splits.values()]
+        assert sum(map(len, of_split)) == len(set(owners.values())) and all(of_split)
+    assert sorted(sample for splits in parts for sample in splits["test"]) == sorted(owners)
+    assert run("loss/hybrid_l1_0.7", "--folds", "3") == 0
+    names = [f"unet-individual-hybrid_l1_0.7-fold_{part}_of_3" for part in range(3)]
+    assert trainer.trained == names
+    below = tmp_path / "runs" / "small"
+    scores = [read_scores(below / "scores" / f"small-{name}.json") for name in names]
+    for splits, found in zip(parts, scores, strict=True):
+        assert set(found.per_object) == {owners[sample] for sample in splits["test"]}
+    assert not list((below / "rows").glob("*.json"))
+    text = (below / "folds.md").read_text()
+    mae = np.average([found.errors["object_mae_mm"] for found in scores], weights=[found.pairs for found in scores])
+    line = next(line for line in text.splitlines() if "hybrid L1" in line)
+    assert f"| {mae:.2f} / " in line and "| 14.54 / 17.88 |" in line
+    assert "best constant in the given range (trivial)" in text
+    trained_on = json.loads((below / names[1] / "recipe.json").read_text())["recipe"]["fold"]
+    assert trained_on == [1, 3]
+
+
+def test_the_best_constant_is_best(opened):
+    samples = opened.samples("train")
+    best = best_range_share(opened, samples)
+
+    def mae_mm(share):
+        answer = np.full(opened.size, share, np.float32)
+        rules = Rules("depth", "normalised", "valid", "paper")
+        return score_frames(opened, lambda frame: answer, [0], rules, samples, **IDENTITY).errors["object_mae_mm"]
+
+    assert 0 < best < 1 and mae_mm(best) < min(mae_mm(best - 0.02), mae_mm(best + 0.02))
+
+
+def test_time_left_of_a_plan(tmp_path):
+    recipes = [load_recipe(name) for name in ("loss/l1", "loss/rmse", "architecture/resunet")]
+    folders = [tmp_path / str(number) for number in range(3)]
+    assert plan_state(recipes, folders) == (0, 0.0)
+    folders[0].mkdir()
+    (folders[0] / "log.jsonl").write_text(3 * '{"seconds": 2.0}\n')
+    epochs = recipes[0].epochs
+    assert plan_state(recipes, folders) == (3, 2.0 * (3 * epochs - 3))
+    folders[2].mkdir()
+    (folders[2] / "log.jsonl").write_text('{"seconds": 5.0}\n')
+    assert plan_state(recipes, folders) == (4, 2.0 * (2 * epochs - 3) + 5.0 * (epochs - 1))
+    (folders[2] / "done.json").write_text("{}")  # a plateau ended it sooner
+    assert plan_state(recipes, folders) == (3 + epochs, 2.0 * (2 * epochs - 3))
+
+
 def test_list_and_help_do_not_train(run, trainer, capsys, tmp_path, monkeypatch):
-    assert main(["reproduce", "normalization", "--preset", "cpu-long", "--list"]) == 0
-    listed = capsys.readouterr().out
-    assert "3 trainings fill 3 rows; 3 of them come with the package" in listed and "42.2 mm, version 2" in listed
     monkeypatch.setattr("fpp_ml_bench.leaderboard.rows.SHIPPED_ROWS", tmp_path / "none")
     assert main(["reproduce", "--list"]) == 0
     listed = capsys.readouterr().out
-    assert "26 trainings fill 30 rows; 0 of them come with the package" in listed
-    assert "The other 30 are not measured yet: a training takes" in listed
+    assert "34 trainings fill 30 rows; the rows of 0 trainings come with the package" in listed
+    assert "Those of the other 34 are not measured yet: a training takes" in listed
     assert main(["reproduce"]) == 2
     assert "expected a table" in capsys.readouterr().err
     for table, problem in (("nonsense", "expected a table"), ("loss/l2", "no row 'l2'"), ("loss/", "no row ''")):
@@ -348,14 +404,14 @@ def test_list_and_help_do_not_train(run, trainer, capsys, tmp_path, monkeypatch)
 
 def test_one_row_of_a_table(run, trainer, unscored, tmp_path):
     assert run(f"{TABLE}/global") == 0
-    assert trainer.trained == ["unet-global-rmse"]
-    text = (tmp_path / "runs" / "cpu" / f"{TABLE}.md").read_text()
-    assert re.search(rf"raw, global, individual\. To fill: `fpp-bench reproduce {TABLE} \S+ --preset cpu", text)
+    assert trainer.trained == [f"unet-global-rmse{seed}" for seed in ("", "-seed_1", "-seed_2")]
+    text = (tmp_path / "runs" / "small" / f"{TABLE}.md").read_text()
+    assert re.search(rf"raw, global, individual\. To fill: `fpp-bench reproduce {TABLE} \S+ --preset small", text)
 
 
 def test_rows_of_another_dataset_are_not_overwritten(run, tmp_path, tiny, capsys, trainer):
     assert run(TABLE) == 0
-    rows = tmp_path / "runs" / "cpu" / "rows"
+    rows = tmp_path / "runs" / "small" / "rows"
     path = rows / f"{NAMES[0]}.json"
     content = json.loads(path.read_text())
     others = dict.fromkeys(content["dataset"]["content"], 32 * "b")
@@ -368,10 +424,10 @@ def test_rows_of_another_dataset_are_not_overwritten(run, tmp_path, tiny, capsys
 
 def test_names_are_unique_in_every_group(run, trainer, tmp_path):
     assert run("background_removed") == 0
-    paths = sorted((tmp_path / "runs" / "cpu" / "rows").glob("*.json"))
+    paths = sorted((tmp_path / "runs" / "small" / "rows").glob("*.json"))
     assert [path.stem for path in paths] == [
-        f"cpu-unet-{kind}-rmse-bgremoved" for kind in ("global", "individual", "raw")
+        f"small-unet-{kind}-rmse-bgremoved" for kind in ("global", "individual", "raw")
     ]
     tracks = {entry.row.track for entry in read_entries(paths)}
     assert tracks == {"oracle mask", "oracle range + mask"}
-    assert "no twins there" in (tmp_path / "runs" / "cpu" / "background_removed.md").read_text()
+    assert "no twins there" in (tmp_path / "runs" / "small" / "background_removed.md").read_text()

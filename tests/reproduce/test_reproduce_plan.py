@@ -10,12 +10,13 @@ from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.baselines.reproduce import plan
 from fpp_ml_bench.baselines.reproduce.plan import Folders, default_folder, open_dataset, planned, variants
-from fpp_ml_bench.baselines.training.recipe import PRESETS, TABLES, load_recipe
+from fpp_ml_bench.baselines.training.recipe import PRESETS, TABLES, load_recipe, table_rows
 from fpp_ml_bench.cli import train as command
 from fpp_ml_bench.errors import DatasetError, RecipeError
-from fpp_ml_bench.evaluation.report.comparison import Difference, compare
+from fpp_ml_bench.evaluation.report.comparison import compare
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.leaderboard.reproduced import (
+    Gap,
     Line,
     Ordering,
     conclusion,
@@ -34,8 +35,12 @@ def dataset(tmp_path_factory):
     return make_dataset(tmp_path_factory.mktemp("data") / "tiny", size=(224, 224))
 
 
-def folders(tmp_path, preset="cpu"):
+def folders(tmp_path, preset="small"):
     return Folders(preset, tmp_path / "runs" / preset, tmp_path / "rows")
+
+
+def rows_of(tables):
+    return [f"{table}/{row}" for table in tables for row in table_rows(table)]
 
 
 def test_the_command_knows_the_recipes_tables_and_presets():
@@ -44,15 +49,21 @@ def test_the_command_knows_the_recipes_tables_and_presets():
 
 @pytest.mark.parametrize("preset", PRESETS)
 def test_rows_of_one_recipe_are_one_training(preset):
-    jobs = planned(TABLES, preset)
-    rows = [row for job in jobs for row in job.rows]
-    assert len(rows) == len(set(rows)) == 3 + 3 + 5 + 10 + 6 + 3 and len(jobs) == 26
-    shared = [set(job.rows) for job in jobs if len(job.rows) > 1]
+    jobs = planned(rows_of(TABLES), preset)
+    first = [job for job in jobs if job.recipe.seed == 42]
+    rows = [row for job in first for row in job.rows]
+    assert len(rows) == len(set(rows)) == 3 + 3 + 5 + 10 + 6 + 3 and len(first) == 26
+    shared = [set(job.rows) for job in first if len(job.rows) > 1]
     assert shared == [
         {"normalization/global", "further/plain"},
         {"normalization/individual", "multi_frame/frame0", "loss/rmse"},
         {"loss/hybrid_l1_0.7", "architecture/unet"},
     ]
+    networks = [job.recipe.network for job in first]
+    assert first == jobs[:26] and networks[:21] == ["unet"] * 21 and "unet" not in networks[21:]
+    further = [(job.recipe.name.rpartition("-")[0], job.recipe.seed) for job in jobs[26:]]
+    seeded = ["unet-raw-rmse", "unet-global-rmse", "unet-individual-rmse", "unet-individual-hybrid_l1_0.7"]
+    assert further == ([] if preset == "paper" else [(name, seed) for name in seeded for seed in (1, 2)])
     names = [job.recipe.name for job in jobs]
     assert len(set(names)) == len(names)
     titles = [(job.recipe.title, depth_range) for job in jobs for depth_range in variants(job.recipe)]
@@ -60,7 +71,7 @@ def test_rows_of_one_recipe_are_one_training(preset):
 
 
 def test_lines_hold_the_papers_numbers(tmp_path, dataset):
-    jobs = planned(TABLES, "cpu")
+    jobs = planned(rows_of(TABLES), "small")
     for table in TABLES:
         by_row = {line.row: line for line in table_lines(table, jobs, folders(tmp_path), dataset)}
         for row in paper_tables()[table].rows if table in paper_tables() else ():
@@ -68,38 +79,41 @@ def test_lines_hold_the_papers_numbers(tmp_path, dataset):
         extra = [name for name, line in by_row.items() if line.paper_mm is None]
         not_the_papers = {"architecture": ["pix2pixhd", "hformer"], "further": ["plain", "guided", "physics"]}
         assert extra == not_the_papers.get(table, [])
-        assert all(line.scores is line.entry is None for line in by_row.values())
+        assert all(line.found == {} and line.entry is None for line in by_row.values())
 
 
 def test_two_recipes_under_one_name_are_refused(monkeypatch):
-    def other_seed(name, preset):
+    def other_batch(name, preset):
         recipe = load_recipe(name, preset)
-        return recipe.model_copy(update={"seed": 7}) if name == "loss/rmse" else recipe
+        return recipe.model_copy(update={"batch": 7}) if name == "loss/rmse" else recipe
 
-    monkeypatch.setattr(plan, "load_recipe", other_seed)
-    with pytest.raises(RecipeError, match=r"normalization/individual and loss/rmse differ in seed \(42 and 7\)"):
-        planned(["normalization", "loss"], "cpu")
+    monkeypatch.setattr(plan, "load_recipe", other_batch)
+    with pytest.raises(RecipeError, match=r"normalization/individual and loss/rmse differ in batch \(4 and 7\)"):
+        planned(rows_of(["normalization", "loss"]), "small")
 
 
 def test_variants_of_a_training(tmp_path):
     def of(name):
         recipe = load_recipe(name)
         rows = [folders(tmp_path).row(recipe, depth_range).stem for depth_range in variants(recipe)]
-        return [row.removeprefix(f"cpu-{recipe.name}") for row in rows]
+        return [row.removeprefix(f"small-{recipe.name}") for row in rows]
 
     assert of("normalization/raw") == of("background_removed/individual") == [""]
-    assert of("loss/l1") == ["", "-range-predicted", "-range-mean"]
+    assert of("loss/l1") == ["", "-range-predicted"]
+    assert variants(load_recipe("loss/l1").model_copy(update={"fold": (0, 5)})) == ()
 
 
 def test_default_folders():
-    assert {str(default_folder(preset, 224)) for preset in ("cpu", "cpu-long")} == {"data/cpu224"}
+    assert str(default_folder("small", 224)) == "data/small224"
     assert str(default_folder("paper", 960)) == "data/full"
 
 
 def test_a_dataset_of_another_size_is_refused(tmp_path):
     small = make_dataset(tmp_path / "other")
-    jobs = planned(["normalization"], "cpu")
-    with pytest.raises(DatasetError, match=r"expected images of 224 x 224 px, which preset cpu .* got 40 x 32.*--size"):
+    jobs = planned(rows_of(["normalization"]), "small")
+    with pytest.raises(
+        DatasetError, match=r"expected images of 224 x 224 px, which preset small .* got 40 x 32.*--size"
+    ):
         open_dataset(small.path, jobs, folders(tmp_path), print)
 
 
@@ -107,20 +121,20 @@ def test_a_dataset_without_the_frames_is_refused(tmp_path, dataset):
     with pytest.raises(
         DatasetError, match="multi_frame/horizontal needs the frames of horizontal, stored are those of"
     ):
-        open_dataset(dataset.path, planned(["multi_frame"], "cpu"), folders(tmp_path), print)
+        open_dataset(dataset.path, planned(rows_of(["multi_frame"]), "small"), folders(tmp_path), print)
 
 
-def line(label: str, paper_mae: float | None, errors: dict[str, float], entry: Entry | None = None) -> Line:
-    """A line with these object errors, sample ``object_view`` to mm."""
+def line(label: str, paper_mae: float | None, *seeds: dict[str, float], entry: Entry | None = None) -> Line:
+    """A line with these object errors of each seed, sample ``object_view`` to mm."""
     paper = None if paper_mae is None else {**paper_tables()["loss"].rows[0].errors_mm, "object_mae_mm": paper_mae}
-    of_objects: dict[str, list[float]] = {}
-    for sample, error in errors.items():
-        of_objects.setdefault(sample.rpartition("_")[0], []).append(error)
-    parts = [
-        SimpleNamespace(object=name, object_mae_mm=fmean(views), views={"object_mae_mm": len(views)}.__getitem__)
-        for name, views in of_objects.items()
-    ]
-    return Line(label, label, load_recipe("loss/rmse"), SimpleNamespace(per_object=parts), entry, paper)
+    found = {}
+    for seed, errors in enumerate(seeds):
+        of_objects: dict[str, list[float]] = {}
+        for sample, error in errors.items():
+            of_objects.setdefault(sample.rpartition("_")[0], []).append(error)
+        parts = [SimpleNamespace(object=name, object_mae_mm=fmean(views)) for name, views in of_objects.items()]
+        found[seed] = SimpleNamespace(per_object=parts, metrics=SimpleNamespace(model_dump=dict))
+    return Line(label, label, load_recipe("loss/rmse"), found, entry, paper)
 
 
 def views(base: float, spread: float = 0.1) -> dict[str, float]:
@@ -155,6 +169,17 @@ def test_orderings_are_judged_by_number():
     assert "none of its orderings" in orderings_sentence([])
 
 
+def test_seeds_count_beside_objects():
+    """What three seeds don't agree on isn't decided by objects that agree."""
+    base, better = views(10.0), [views(8.0), views(8.0), views(10.5)]
+    one = orderings([line("a", 1.0, better[0]), line("b", 2.0, base)])[0]
+    three = orderings([line("a", 1.0, *better), line("b", 2.0, base, base, base)])[0]
+    assert (one.verdict, one.here.seeds, three.here.seeds, three.verdict) == ("holds", 1, 3, "not decided")
+    assert three.here.mean_mm == pytest.approx((2 + 2 - 0.5) / 3)
+    agreed = orderings([line("a", 1.0, *better[:2]), line("b", 2.0, base, base, base)])[0]
+    assert (agreed.verdict, agreed.here.seeds) == ("holds", 2)
+
+
 @pytest.mark.parametrize(
     ("ends", "verdict"),
     [
@@ -167,9 +192,7 @@ def test_orderings_are_judged_by_number():
 )
 def test_an_interval_that_touches_zero_decides_nothing(ends, verdict):
     mean_mm = sum(ends or (1.0, 1.0)) / 2
-    counts = {"samples": 5, "objects": 5, "lower": 0, "higher": 5}
-    here = Difference(mean_mm=mean_mm, interval_mm=list(ends or (None, None)), sign_flip_p=0.06, **counts)
-    assert Ordering("a", "b", 1.0, here, True).verdict == verdict
+    assert Ordering("a", "b", 1.0, Gap(mean_mm, ends, 5, 1), True).verdict == verdict
 
 
 def two_results(tmp_path, dataset):
@@ -186,9 +209,7 @@ def two_results(tmp_path, dataset):
 def test_the_difference_is_that_of_compare(tmp_path, dataset):
     results = two_results(tmp_path, dataset)
     entries = [Entry(tmp_path / "x.json", row_of(result, tmp_path)) for result in results]
-    lines = [
-        replace(line(str(n), float(n), {"a_A0": 1.0}, entry), scores=entry.row) for n, entry in enumerate(entries, 1)
-    ]
+    lines = [replace(line(str(n), float(n), entry=entry), found={42: entry.row}) for n, entry in enumerate(entries, 1)]
     ordering, difference = orderings(lines)[0], compare(*results).differences["object_mae_mm"]
     expected = [difference.mean_mm, *difference.interval_mm]
     assert [ordering.here.mean_mm, *ordering.here.interval] == pytest.approx(expected, rel=1e-3)
@@ -197,14 +218,14 @@ def test_the_difference_is_that_of_compare(tmp_path, dataset):
     row = entries[1].row.model_copy(update={"submission": oracle})
     lines[1] = replace(lines[1], entry=Entry(tmp_path / "x.json", row))
     assert not orderings(lines)[0].same_track
-    text = table_markdown("loss", lines, "cpu", "fpp-bench reproduce loss", {})
+    text = table_markdown("loss", lines, "small", "fpp-bench reproduce loss", {})
     assert "of different tracks" in text
 
 
 def test_a_table_that_the_paper_does_not_have_is_compared_with_its_first_line(tmp_path, dataset):
     results = two_results(tmp_path, dataset)
     lines = [
-        replace(line(name, None, {}, Entry(tmp_path / "x.json", row)), scores=row)
+        replace(line(name, None, entry=Entry(tmp_path / "x.json", row)), found={42: row})
         for name, row in zip(("the image alone", "guided"), (row_of(r, tmp_path) for r in results), strict=True)
     ]
     difference = compare(*results).differences["object_mae_mm"]
@@ -212,18 +233,18 @@ def test_a_table_that_the_paper_does_not_have_is_compared_with_its_first_line(tm
     said = conclusion("further", lines)
     assert f"against the image alone, sample by sample: guided {difference.mean_mm:+.2f} mm" in said
     assert f"{low:+.2f} to {high:+.2f}" in said and conclusion("further", lines[:1]) == ""
-    text = table_markdown("further", lines, "cpu", "fpp-bench reproduce further", {})
+    text = table_markdown("further", lines, "small", "fpp-bench reproduce further", {})
     assert text.startswith("# Further directions") and said in text
     assert "times on first, 2 cores (the image alone)&#59; second, 2 cores (guided)." in text
     assert "reported by the paper" not in text.lower() and "Range predicted" not in text
 
 
 def test_rows_that_were_not_measured_stay_empty():
-    empty = replace(line("masked | L1", 18.0, {"a_A0": 1.0}), scores=None)
+    empty = line("masked | L1", 18.0)
     text = table_markdown(
         "loss", [empty], "paper", "fpp-bench reproduce loss --preset paper", {empty.recipe.name: "boom"}
     )
     assert "Not measured here: masked &#124; L1. To fill: `fpp-bench reproduce loss --preset paper`" in text
     assert "masked &#124; L1: boom" in text
     cells = next(row for row in text.splitlines() if row.startswith("| masked")).split(" | ")
-    assert cells[2] == cells[3] == "-" and cells[4] == "18.00 / 21.19"
+    assert cells[2] == cells[3] == "-" and "18.00 / 21.19" in cells

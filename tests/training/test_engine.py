@@ -40,7 +40,7 @@ from fpp_ml_bench.loaders.training import FringeDepthDataset
 
 def small(name="normalization/individual", **changes):
     """A shipped recipe cut down to seconds."""
-    content = load_recipe(name, "cpu").to_dict()
+    content = load_recipe(name, "small").to_dict()
     content |= {"size": TINY_SIZE, "width": 2, "max_epochs": 3, "pairs_per_epoch": 4, "validation_pairs": 2, "batch": 2}
     return recipe_from_dict({**content, **changes})
 
@@ -210,7 +210,7 @@ def test_two_processes_agree(tiny, tmp_path):
     assert names == {WEIGHTS, CHECKPOINT, DONE, CURVE_FILE, "recipe.json", "log.jsonl", "model.safetensors"}
     record = json.loads((tmp_path / "run" / "log.jsonl").read_text())
     assert math.isfinite(record["validation_loss"]) and load(tmp_path / "run" / "model.safetensors").heads is not None
-    scores = validation_of(tmp_path / "run" / WEIGHTS, tiny, load_recipe(tmp_path / "mine.yaml", "cpu"))[1]
+    scores = validation_of(tmp_path / "run" / WEIGHTS, tiny, load_recipe(tmp_path / "mine.yaml", "small"))[1]
     for key in SCORES:  # means over the three pairs of both processes
         assert record[key] == pytest.approx(scores[key], rel=FLOAT32), key
 

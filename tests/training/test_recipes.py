@@ -8,6 +8,7 @@ from fpp_ml_bench.baselines.training.recipe import (
     TABLES,
     Linear,
     Plateau,
+    further_seeds,
     load_recipe,
     recipe_from_dict,
     table_rows,
@@ -20,7 +21,6 @@ NAMES = [f"{table}/{row}" for table in TABLES for row in table_rows(table)]
 
 def test_further_directions_differ_from_the_plain_unet_in_one_thing():
     plain = load_recipe("normalization/global").to_dict()
-    assert "physics" not in plain["loss"]  # digests of earlier recipes stay
     assert load_recipe("further/plain").to_dict() == plain
     for name, changed in (("further/guided", "options"), ("further/physics", "loss")):
         other = load_recipe(name).to_dict()
@@ -79,20 +79,28 @@ def test_rows_of_a_table_differ_in_what_the_table_is_about(table, preset):
         "further": {"options", "loss"},
     }[table]
     if table in ("normalization", "background_removed"):  # raw targets need a higher rate in the small presets
-        about |= {"cpu": {"optimizer"}, "cpu-long": {"optimizer", "schedule"}, "paper": set()}[preset]
+        about |= {"small": {"optimizer"}, "paper": set()}[preset]
     rows = [load_recipe(f"{table}/{row}", preset).to_dict() for row in table_rows(table)]
     differing = {key for row in rows for key in row if row[key] != rows[0][key]}
     assert differing <= about
     assert len({load_recipe(f"{table}/{row}", preset).digest for row in table_rows(table)}) == len(rows)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_the_long_preset_differs_from_the_short_one_in_when_it_ends(name):
-    short, long = (load_recipe(name, preset).to_dict() for preset in ("cpu", "cpu-long"))
-    assert {key for key in short if short[key] != long[key]} == {"preset", "schedule", "max_epochs"}
-    rule, rate = load_recipe(name, "cpu-long").schedule, long["optimizer"]["learning_rate"]
-    if isinstance(rule, Plateau):  # as in the paper
-        assert rule.patience == 10 and rate / rule.minimum == pytest.approx(100)
+def test_all_rows_of_the_small_preset_have_one_schedule():
+    schedules = {load_recipe(name, "small").schedule for name in NAMES}
+    assert schedules == {Linear(name="linear", constant=24, decay=24)}
+    assert {load_recipe(name, "small").epochs for name in NAMES} == {48}
+    assert load_recipe("loss/l1", "paper").epochs == 1000
+
+
+def test_seeds_and_folds_have_names_of_their_own():
+    recipe = load_recipe("normalization/raw")
+    assert further_seeds(recipe) == [1, 2] and further_seeds(load_recipe("loss/l1")) == []
+    assert further_seeds(load_recipe("normalization/raw", "paper")) == []
+    other = recipe_from_dict({**recipe.to_dict(), "seed": 1, "fold": [2, 5]})
+    assert other.name == "unet-raw-rmse-seed_1-fold_2_of_5" and other.title.endswith("seed 1, fold 2 of 5")
+    with pytest.raises(RecipeError, match="expected a part from 0 to 4, got 5"):
+        recipe_from_dict({**recipe.to_dict(), "fold": [5, 5]})
 
 
 def test_rows_that_are_one_training():
@@ -112,8 +120,8 @@ def test_the_gan_has_its_own_schedule():
         recipe = load_recipe(f"architecture/{name}", "paper")
         assert recipe.schedule == Linear(name="linear", constant=100, decay=100)
     assert (recipe.network, recipe.loss.label) == ("pix2pix", "gan")
-    assert load_recipe("architecture/pix2pix", "cpu").loss.label == "gan_0.7"  # the table's caption: hybrid L1
-    assert load_recipe("architecture/pix2pix", "cpu").options == {"levels": 5}
+    assert load_recipe("architecture/pix2pix", "small").loss.label == "gan_0.7"  # the table's caption: hybrid L1
+    assert load_recipe("architecture/pix2pix", "small").options == {"levels": 5}
 
 
 def test_a_recipe_of_yours(tmp_path):
@@ -121,8 +129,8 @@ def test_a_recipe_of_yours(tmp_path):
     own_recipe = tmp_path / "mine.yaml"
     own_recipe.write_text("extends: parent.yaml\nseed: 7\nschedule: {patience: 3}\n")
     recipe = load_recipe(own_recipe, "paper")
-    assert load_recipe(own_recipe, "cpu").optimizer.learning_rate == 1e-3
-    assert load_recipe(own_recipe, "cpu").width == 8
+    assert load_recipe(tmp_path / "parent.yaml", "small").optimizer.learning_rate == 1e-3
+    assert load_recipe(tmp_path / "parent.yaml", "small").width == 8
     assert (recipe.seed, recipe.loss.name, recipe.optimizer.learning_rate) == (7, "l1", 1e-3)
     assert recipe.optimizer.weight_decay == 1e-5
     assert recipe.schedule == Plateau(name="plateau", factor=0.5, patience=3, minimum=1e-6)
@@ -168,7 +176,7 @@ def test_unknown_names():
         table_rows("normalisation")
     with pytest.raises(RecipeError, match="near it: normalization/raw"):
         load_recipe("normalisation/raw")
-    with pytest.raises(RecipeError, match="expected a preset out of cpu, cpu-long, paper"):
+    with pytest.raises(RecipeError, match="expected a preset out of small, paper"):
         load_recipe("base", "gpu")
     with pytest.raises(RecipeError, match="there is no such recipe file"):
         load_recipe("nowhere.yaml")

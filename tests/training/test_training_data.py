@@ -54,7 +54,7 @@ def phase_net_config(**changes):
 
 
 def test_a_new_weights_file_names_its_benchmark(benchmarks, opened, tmp_path):
-    recipe = load_recipe("loss/l1", "cpu")
+    recipe = load_recipe("loss/l1", "small")
     network = tiny_network()
     other = SimpleNamespace(fingerprint=OLD, content={**opened.content, "test/depth": "0" * 32})
     for data, expected in ((opened, TrainingBenchmark("tiny", 1)), (other, None)):
