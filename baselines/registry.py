@@ -32,6 +32,7 @@ BUILT_IN = (
     "learned.method:ClassicalNetMethod",
     "phase.method:PhaseMethod",
     "learned.method:PhaseNetMethod",
+    "learned.method:FringeNetMethod",
     "phase.method:CrossedMethod",
     "learned.method:CrossedNetMethod",
     "trivial:ConstantMethod",

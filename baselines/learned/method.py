@@ -3,6 +3,7 @@ a range given; classical-net averages and fills what the decoder finds."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from hashlib import sha256
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
@@ -43,6 +44,9 @@ STEPS = 3
 away."""
 WEIGHTS = "weights file of fpp-bench train (default: the weights that come with the package)"
 """Help of an option that all learned methods have."""
+SEEDS = (42, 1, 2)
+MEMBERS = len(SEEDS)
+"""Of the networks of fringe-net that come with the package."""
 Albedo = Literal["one", "any"]
 ALBEDOS: tuple[Albedo, ...] = get_args(Albedo)
 
@@ -275,6 +279,99 @@ class CrossedNetMethod(LearnedRoute):
 
     def images(self, frames: Frames) -> list[NDArray[np.uint8]]:
         return [crossed_image(super().images(frames))]
+
+
+@dataclass(frozen=True)
+class FringeNetOptions:
+    """Options of `FringeNetMethod`; ``weights``: of one network, also a file that was read."""
+
+    fringes: Literal["horizontal", "vertical", "crossed"] | None = option(
+        None, "the frame to take (default: crossed where the rig has such frames, else horizontal)"
+    )
+    members: int = option(MEMBERS, f"networks whose answers are averaged, 1 to {MEMBERS} (default: {MEMBERS})", "N")
+    weights: "str | Path | WeightsFile | None" = option(None, WEIGHTS, "FILE")
+    min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
+    threads: int = 1
+
+
+@dataclass(frozen=True)
+class FringeNetTraining(OwnViews):
+    """Training of one network of fringe-net."""
+
+    fringes: Literal["lines", "crossed"] | None = option(
+        None, "lines: fringes of one direction, either; crossed: both in one frame (default: lines)"
+    )
+    seed: int | None = option(None, "of weights, lights and windows: another network (default: 42)", "N")
+
+
+class FringeNetMethod(LearnedRoute):
+    """Depth from one frame whose wrapped phase networks give as numerator and denominator (`fringe_net`); mask, order
+    and depth as of `phase` or `crossed`. ``members`` of the shipped ensemble, or the network in ``weights`` alone. The
+    first sinusoid of a direction, or a crossed frame: ``fringes``. Raises `WeightsError` for weights that can't be
+    used, and `PredictionError` for an invalid option."""
+
+    name = "fringe-net"
+    recipe = "fringe_recipe:FringeRecipe"
+    period_tolerance = 1.4
+    purpose = "one frame, its wrapped phase learned"
+    Options = FringeNetOptions
+    Training = FringeNetTraining
+
+    @classmethod
+    def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
+        ways = ["crossed"] if rig.sequence.crossed_frames else rig.fringe_directions
+        return [{"fringes": way} for way in ways]
+
+    @classmethod
+    def short_name(cls, submission: "Submission") -> str | None:
+        return (
+            f"{cls.name}, 1 {submission.settings['fringes']}" if submission.name.startswith("Wrapped phase") else None
+        )
+
+    @classmethod
+    def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
+        return None if settings.get("fringes") == "crossed" else ONE_ALBEDO
+
+    def __init__(self, rig: Rig, **options: Any) -> None:
+        from fpp_ml_bench.baselines.learned.fringe_net import FringeNetCrossedRoute, FringeNetRoute
+        from fpp_ml_bench.baselines.training.weights import FRINGE_NETWORKS
+
+        given = self.checked_options(options)
+        crossed = bool(rig.sequence.crossed_frames) if given.fringes is None else given.fringes == "crossed"
+        fringes = given.fringes or ("crossed" if crossed else "horizontal")
+        if crossed and not rig.sequence.crossed_frames:
+            raise PredictionError(f"{self.name} --fringes crossed: this rig projects no crossed frame")
+        if not 1 <= given.members <= MEMBERS:
+            raise PredictionError(f"{self.name} --members {given.members}: expected 1 to {MEMBERS}")
+        family, names = "crossed" if crossed else "lines", [given.weights] if given.weights else None
+        networks, hashes = [], []
+        for weights in names or [f"{self.name}-{family}-{seed}" for seed in SEEDS[: given.members]]:
+            self.use(weights, FRINGE_NETWORKS)
+            networks.append(self.file.network.folded())
+            hashes.append(self.file.sha256)
+        self.parameters = len(networks) * self.parameters
+        self.rig, self.threads = rig, given.threads
+        periods = self.learned_periods(fringes)
+        if crossed:
+            self.frames_used = rig.sequence.crossed_frames[:1]
+            self.route = FringeNetCrossedRoute(rig, Settings(min_confidence=given.min_confidence), networks, periods)
+        else:
+            way: Direction = "vertical" if fringes == "vertical" else "horizontal"
+            fringe_options(self.name, rig, {"direction": way})
+            own = Settings(direction=way, min_confidence=given.min_confidence)
+            self.route, self.frames_used = (
+                FringeNetRoute(rig, own, networks, periods),
+                (rig.sequence.sinusoids(way)[0],),
+            )
+        count = "one network" if len(networks) == 1 else f"{len(networks)} networks"
+        self.title = f"Wrapped phase of one {fringes} frame by {count}; mask and order measured{self.more}"
+        self.settings = {
+            **vars(given),
+            **self.weights_settings,
+            "fringes": fringes,
+            "members": len(networks),
+            "weights_sha256": hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode()).hexdigest(),
+        }
 
 
 @dataclass(frozen=True)

@@ -161,6 +161,34 @@ class PhaseNet(Refiner):
         return order, answers[:, 3], bounded, answers[:, -1].clamp(*LOG_SCALES)
 
 
+class FringeNet(Refiner):
+    """(B, 2, H, W) -> (B, 3 K, H, W): of K ``carriers`` the numerators of the wrapped phases, then the denominators, in
+    the amplitude of the surroundings, then the logarithms of the scale in rad of the phase errors. ``widths``: channels
+    of each level, the first at half the image's resolution; ``fine``: of the maps at full resolution. H and W must be
+    multiples of ``stride``."""
+
+    channels = 2
+
+    def __init__(self, carriers: int = 1, widths: tuple[int, ...] = (32, 48, 64, 96), fine: int = 16) -> None:
+        super().__init__()
+        widths = tuple(widths)
+        if not widths or min((*widths, fine)) < 1 or carriers not in (1, 2):
+            raise NetworkError(f"expected 1 or 2 carriers and positive widths; got {carriers}, {widths}, fine {fine}")
+        self.options = {"carriers": carriers, "widths": list(widths), "fine": fine}
+        self.stride, self.carriers = BLOCK * 2 ** (len(widths) - 1), carriers
+        self.body = UNet(self.channels * BLOCK**2, widths)
+        self.spread = nn.Conv2d(widths[0], fine * BLOCK**2, 1)
+        self.fine = nn.Sequential(nn.Conv2d(fine + self.channels, fine, 3, padding=1), nn.ReLU(inplace=True))
+        self.answer = nn.Conv2d(fine, 3 * carriers, 1)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, ...]:
+        self.check(x)
+        deep = self.spread(self.body(functional.pixel_unshuffle(x, BLOCK)))
+        answers = self.answer(self.fine(torch.cat([functional.pixel_shuffle(deep, BLOCK), x], dim=1)))
+        vectors, scales = answers[:, : 2 * self.carriers], answers[:, 2 * self.carriers :]
+        return (torch.cat([vectors, scales.clamp(*LOG_SCALES)], dim=1),)
+
+
 REACH = 2  # px to the farthest neighbour along an axis
 NEIGHBOURS = (2 * REACH + 1) ** 2
 OWN_BIAS = 3.0  # start value of the bias of the pixel itself

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.training.engine import Display
+from fpp_ml_bench.coding.phase_shift import wrapped_phase
 from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M, OBJECTS, VIEWS, split_of
 from fpp_ml_bench.errors import TrainingError
 from fpp_ml_bench.files import write_atomically
@@ -30,6 +31,7 @@ from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.sample import VOID
 from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import Direction
 from fpp_ml_bench.pool import mapping
 
 VALIDATION_LIGHTS = ("paper", "workshop")
@@ -51,14 +53,14 @@ class Group:
 
 @dataclass(frozen=True)
 class View:
-    """A rendered view: ``frames`` uint8 (n, H, W), those that were asked for; ``depth_mm`` float32 (H, W), exact, 0 =
-    background; ``void`` bool (H, W): unlit or mixed pixels, which have no depth to learn; ``united``: it joins
-    several objects."""
+    """A rendered view: ``frames`` uint8 (n, H, W), those that were asked for, or float16 with the numerators and
+    denominators of decoded phases behind them, in grey levels; ``depth_mm`` float32 (H, W), exact, 0 = background;
+    ``void`` bool (H, W): unlit or mixed pixels, which have no depth to learn; ``united``: it joins several objects."""
 
     name: str
     object_name: str
     group: str
-    frames: NDArray[np.uint8]
+    frames: NDArray[np.uint8 | np.float16]
     depth_mm: NDArray[np.float32]
     void: NDArray[np.bool_]
     united: bool = False
@@ -178,25 +180,39 @@ def fingerprint_of(recipe: dict[str, Any], groups: list[Group]) -> str:
 
 
 def render_views(
-    groups: list[Group], rig: Rig, frames: tuple[int, ...], folder: Path, workers: int, show: bool = False
+    groups: list[Group],
+    rig: Rig,
+    frames: tuple[int, ...],
+    folder: Path,
+    workers: int,
+    show: bool = False,
+    decoded: tuple[Direction, ...] = (),
 ) -> None:
-    """Render what ``folder`` does not hold yet of ``frames`` (indices in the rig's sequence), a file a view. ``show``:
-    progress on stderr. Raises OSError where ``folder`` can't be written."""
+    """Render what ``folder`` does not hold yet of ``frames`` (indices in the rig's sequence), a file a view, and behind
+    them numerator and denominator of the phase that all steps of the directions ``decoded`` tell. ``show``: progress on
+    stderr. Raises OSError where ``folder`` can't be written."""
     missing = [group for group in groups if not all(_file(folder, group, *view).exists() for view in group.views)]
     with Display("rendering views", sum(len(group.views) for group in missing), show) as display:
         if missing:
             folder.mkdir(parents=True, exist_ok=True)
-            with mapping((rig, frames, folder), workers) as mapped:
+            with mapping((rig, frames, folder, decoded), workers) as mapped:
                 for count in mapped(_render_group, missing):
                     display.step(count)
 
 
-def _render_group(work: tuple[Rig, tuple[int, ...], Path], group: Group) -> int:
-    rig, frames, folder = work
+def _render_group(work: tuple[Rig, tuple[int, ...], Path, tuple[Direction, ...]], group: Group) -> int:
+    rig, frames, folder, decoded = work
+    steps = [rig.sequence.sinusoids(direction) for direction in decoded]
     objects = tuple(sorted({name for name, _ in group.views}))
     studio = Studio(BuildSettings(rig=rig, objects=objects, light=group.light))
     for name, view in group.views:
-        images, depth_mm, flags = photographed(studio, name, view, frames)
+        every = tuple(sorted({*frames, *(step for each in steps for step in each)}))
+        stack, depth_mm, flags = photographed(studio, name, view, every)
+        taken = dict(zip(every, stack, strict=True))
+        images = np.stack([taken[frame] for frame in frames])
+        for direction, each in zip(decoded, steps, strict=True):
+            phase, modulation, _ = wrapped_phase([taken[step] for step in each], rig.shifts_rad(direction), np.float32)
+            images = np.concatenate([images, modulation * [np.sin(phase), np.cos(phase)]]).astype(np.float16)
         content = BytesIO()
         np.savez_compressed(content, frames=images, depth_mm=depth_mm, void=(flags & VOID) != 0)
         write_atomically(_file(folder, group, name, view), content.getvalue(), sync=False)

@@ -66,6 +66,7 @@ from fpp_ml_bench.baselines.training.weights import (
 from fpp_ml_bench.errors import RecipeError, TrainingError
 from fpp_ml_bench.optics.named_rigs import NAMED_RIGS
 from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.sequence import Direction
 
 VIEWS = "views"
 SMALL_RAD = 0.05  # error of the phase below which its loss is quadratic
@@ -303,11 +304,12 @@ class WindowTraining(Training):
 
 class Task(ABC):
     """What a network learns from rendered views of a rig: samples of the views, windows of the samples, and what
-    is chosen on validation samples. ``frames``: those it takes; of the validation samples every ``scored_share``-th is
-    scored during training."""
+    is chosen on validation samples. ``frames``: those it takes, and behind them what the steps of the directions
+    ``decoded`` tell; of the validation samples every ``scored_share``-th is scored during training."""
 
     recipe: Any
     frames: tuple[int, ...]
+    decoded: tuple[Direction, ...] = ()
     scored_share: ClassVar[int] = 3
 
     @abstractmethod
@@ -456,7 +458,7 @@ def train_net(
         weights = out / f"{recipe.weights_name}.safetensors"
         if not weights.exists():
             task = recipe.task(rig)
-            render_views(groups, rig, task.frames, out / VIEWS, workers, show)
+            render_views(groups, rig, task.frames, out / VIEWS, workers, show, task.decoded)
             with Display("measuring views", sum(len(group.views) for group in groups), show) as display:
 
                 def measured(split: str, unions: int) -> list[Sample]:

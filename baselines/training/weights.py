@@ -136,6 +136,9 @@ DEPTH_NETWORKS = Family("fpp-ml-bench", TypeAdapter(ModelConfig), "RECIPE", _dep
 FILTER_NETWORKS = Family(
     "fpp-ml-bench classical-net", TypeAdapter(NetConfig), "classical-net", partial(_refiner, "DepthFilter")
 )
+FRINGE_NETWORKS = Family(
+    "fpp-ml-bench fringe-net", TypeAdapter(NetConfig), "fringe-net", partial(_refiner, "FringeNet")
+)
 PHASE_NETWORKS = Family("fpp-ml-bench phase-net", TypeAdapter(NetConfig), "phase-net", partial(_refiner, "PhaseNet"))
 
 
