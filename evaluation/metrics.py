@@ -345,7 +345,7 @@ _STATED = (
             "mm",
             methodcaller("sure_mm", f"{error}_mm"),
             f"{error.upper()} of the object without its 5% least sure pixels",
-            terminal="MAE of the\nsurest 95%" if error == "mae" else "",
+            terminal=f"{error.upper()} of the\nsurest 95%",
         )
         for error in ("mae", "rmse")
     ),

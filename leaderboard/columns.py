@@ -10,7 +10,7 @@ from fpp_ml_bench.evaluation.metrics import METRICS, RANGE_KEY, RANK_KEY, WIDE, 
 from fpp_ml_bench.evaluation.report.terminal import score_text
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.ranking import Ranked
-from fpp_ml_bench.leaderboard.row_file import Row, processor
+from fpp_ml_bench.leaderboard.row_file import Row, RowUncertainty, processor
 from fpp_ml_bench.leaderboard.rows import TEST, UNSEEN, Entry
 from fpp_ml_bench.style import millimetres, percent
 
@@ -107,10 +107,16 @@ def ratio(row: Ranked) -> str:
     return "-" if row.ratio is None else f"{row.ratio:.2g}" if row.ratio < 10 else f"{row.ratio:.0f}"
 
 
-def uncertainty(entry: Entry) -> tuple[float | None, float | None]:
-    """`RowUncertainty` as two values; None where no uncertainty was scored."""
-    block = entry.row.uncertainty
-    return (None, None) if block is None else (block.within_95_share, block.ause_mae_mm)
+def uncertainty(entry: Entry) -> RowUncertainty:
+    """What was scored of a stated uncertainty; all None where there is none."""
+    return entry.row.uncertainty or RowUncertainty()
+
+
+def surest(entry: Entry) -> str:
+    """MAE and RMSE of the surest 95% of the object's pixels; a dash where they are unknown."""
+    block = uncertainty(entry)
+    known = block.sure_mae_mm is not None
+    return f"{millimetres(block.sure_mae_mm)} / {millimetres(block.sure_rmse_mm)}" if known else "-"
 
 
 def time_text(row: Ranked, per_second: float = 1.0) -> str:
@@ -207,8 +213,9 @@ RATIO = _sparse("x trivial", ratio)
 RELIANCE = Column("Phase reliance", lambda row: reliance(row.entry), from_width=WIDE)
 ROBUSTNESS = Column("Disturbed, mm", lambda row: robustness(row.entry), from_width=WIDEST)
 UNCERTAINTY = (
-    _sparse("In 95%", lambda row: percent(uncertainty(row.entry)[0]), WIDEST),
-    _sparse("AUSE", lambda row: millimetres(uncertainty(row.entry)[1]), WIDEST),
+    _sparse("In 95%", lambda row: percent(uncertainty(row.entry).within_95_share), WIDEST),
+    _sparse("AUSE", lambda row: millimetres(uncertainty(row.entry).ause_mae_mm), WIDEST),
+    _sparse("Surest 95%", lambda row: surest(row.entry), WIDEST),
 )
 LEARNED = _sparse("Learned from", lambda row: learned_from(row.entry.row) or "-", WIDEST, right=False)
 PROVENANCE = Column("Provenance", lambda row: row.provenance, False, MIDDLE)

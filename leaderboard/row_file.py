@@ -83,10 +83,13 @@ class ObjectMeans(Headline, SparseModel):
 
 class RowUncertainty(StrictModel):
     """Of a stated uncertainty: share of object pixels within the stated 95% interval, to which those that state none
-    do not belong, and AUSE in mm; the rules are in PROTOCOL.md."""
+    do not belong; AUSE, and MAE and RMSE of the surest 95% of all object pixels, in mm, null in older files; the rules
+    are in PROTOCOL.md."""
 
-    within_95_share: Share | None
-    ause_mae_mm: NonNegative | None
+    within_95_share: Share | None = None
+    ause_mae_mm: NonNegative | None = None
+    sure_mae_mm: NonNegative | None = None
+    sure_rmse_mm: NonNegative | None = None
 
 
 class RowRobustness(StrictModel):
@@ -286,7 +289,8 @@ def _object_means(result: Result, part: ObjectResult) -> dict[str, Any]:
 def _uncertainty(block: Uncertainty) -> dict[str, float | None]:
     samples = [scores for scores in block.per_sample.values() if scores.unstated_share is not None]
     covered = [(scores.coverage_95 or 0.0) * (1 - (scores.unstated_share or 0.0)) for scores in samples]
-    return {"within_95_share": fmean(covered) if covered else None, "ause_mae_mm": block.metrics.ause_mae_mm}
+    errors = {key: getattr(block.metrics, key) for key in ("ause_mae_mm", "sure_mae_mm", "sure_rmse_mm")}
+    return {"within_95_share": fmean(covered) if covered else None, **errors}
 
 
 def in_brief(block: Reliance | Robustness) -> dict[str, Any]:

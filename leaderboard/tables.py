@@ -266,7 +266,7 @@ def _cells(group: Group, row: Ranked) -> dict[str, object]:
     key, entry, about = group.key, row.entry, row.entry.row
     timing, reliance, disturbed = about.timing, about.reliance, (about.robustness or {}).get("test")
     low, high = row.interval(RANK_KEY) or (None, None)
-    covered, ause_mm = uncertainty(entry)
+    stated = uncertainty(entry)
     parts = {
         f"{RANK_KEY}_{name}": part and part.value(RANK_KEY)
         for name, part in zip(("test", "unseen"), map(row.on, (TEST, UNSEEN)), strict=True)
@@ -302,8 +302,10 @@ def _cells(group: Group, row: Ranked) -> dict[str, object]:
         "frames_used": entry.frames,
         "phase_reliance": reliance and reliance.score,
         "disturbed_mae_mm": disturbed and disturbed.mae_mm,
-        "within_stated_95": covered,
-        "ause_mae_mm": ause_mm,
+        "within_stated_95": stated.within_95_share,
+        "ause_mae_mm": stated.ause_mae_mm,
+        "sure_mae_mm": stated.sure_mae_mm,
+        "sure_rmse_mm": stated.sure_rmse_mm,
         "learned_from": learned_from(about),
         "given_truth": given_truth(key.track),
         "provenance": row.provenance,

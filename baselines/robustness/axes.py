@@ -34,7 +34,7 @@ from fpp_ml_bench.constants import GREY_LEVELS, TEST_OBJECTS, UNSEEN, sample_nam
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.result.parts import SeverityScores
-from fpp_ml_bench.evaluation.score.sample_scores import states_sigma
+from fpp_ml_bench.evaluation.score.sample_scores import score_sigma, states_sigma
 from fpp_ml_bench.evaluation.score.uncertainty import mean_of
 from fpp_ml_bench.files import strict_yaml, write_atomically
 from fpp_ml_bench.loaders.render.light import Light, named_light
@@ -280,14 +280,15 @@ def score(
         "unanswered_share": float((~answered).mean()),
         "invented_share": float((truth.empty & (depth_mm > 0)).mean()),
         "answered_mae_mm": float(error[answered].mean()) if answered.any() else None,
-        "confident_share": None,
-        "coverage": None,
+        **dict.fromkeys(("confident_share", "coverage", "sure_mae_mm", "sure_rmse_mm")),
     }
     if sigma_mm is not None:
         sigma = sigma_mm[truth.scored].astype(np.float64)
         stated = states_sigma(given, sigma)
         scores["confident_share"] = float((wrong & stated & (sigma < rules.confident_below * error)).mean())
         scores["coverage"] = float(stated.mean())
+        stated_scores = score_sigma(given, target, sigma)
+        scores |= {f"sure_{name}": stated_scores.sure_mm(name) for name in ("mae_mm", "rmse_mm")}
     return scores
 
 

@@ -107,7 +107,7 @@ def _uncertainty(result: Result) -> Table | None:
     table = _table(
         "Stated uncertainty",
         numbers=[metric.terminal for metric in shown],
-        first_out=["Sigma\nmedian", "NLL", "In 99%\ninterval", "MAE of the\nsurest 95%"],
+        first_out=["Sigma\nmedian", "NLL", "In 99%\ninterval", "RMSE of the\nsurest 95%", "MAE of the\nsurest 95%"],
         caption="mm; of the pixels that state a sigma, those within its Gaussian intervals, means over samples; AUSE: "
         "area between the sparsification curves by sigma and by error, over all object pixels",
     )

@@ -296,7 +296,9 @@ class SeverityScores(StrictModel):
     """Means over the views of a severity. ``mae_mm`` charges a fixed error for a pixel without an answer,
     ``protocol_mae_mm`` its whole depth; ``answered_mae_mm`` is of the others alone. Shares of the scored pixels: of
     wrong orders, of pixels without an answer, of confident errors and of pixels that state a sigma (null both where a
-    method states none). ``invented_share`` of the image is background with an answer; null in version 1 of the axes."""
+    method states none). ``invented_share`` of the image is background with an answer; null in version 1 of the axes.
+    ``sure_mae_mm`` and ``sure_rmse_mm`` are of the surest 95% of the scored pixels, as in the protocol; null where the
+    method states no sigma, and in older files."""
 
     mae_mm: NonNegative
     protocol_mae_mm: NonNegative
@@ -306,6 +308,8 @@ class SeverityScores(StrictModel):
     answered_mae_mm: NonNegative | None = None
     confident_share: Share | None
     coverage: Share | None
+    sure_mae_mm: NonNegative | None = None
+    sure_rmse_mm: NonNegative | None = None
 
 
 FiveSeverities = Annotated[list[SeverityScores], Field(min_length=5, max_length=5)]

@@ -57,11 +57,11 @@ class DiagnoseCommand(MethodCommand):
 
 @command(
     """\
-fpp-bench diagnose unet-individual-rmse data/cpu224 --out report
-fpp-bench diagnose unet-individual-rmse data/cpu224 --probe grad-cam --out report   adds to the report
-fpp-bench diagnose phase data/cpu224 --out report-phase
-fpp-bench diagnose runs/mine.safetensors data/cpu224 --layers enc1,bottleneck,dec1 --quick --out look
-fpp-bench diagnose my_net.py:make data/cpu224 --units mm --layers encoder,decoder.2 --out report-mine
+fpp-bench diagnose unet-individual-rmse data/small224 --out report
+fpp-bench diagnose unet-individual-rmse data/small224 --probe grad-cam --out report   adds to the report
+fpp-bench diagnose phase data/small224 --out report-phase
+fpp-bench diagnose runs/mine.safetensors data/small224 --layers enc1,bottleneck,dec1 --quick --out look
+fpp-bench diagnose my_net.py:make data/small224 --units mm --layers encoder,decoder.2 --out report-mine
 """,
     DiagnoseCommand,
 )
@@ -125,9 +125,9 @@ def diagnose(
 
 @command(
     """\
-fpp-bench reliance classical data/cpu224
-fpp-bench reliance phase data/cpu224 --direction vertical
-fpp-bench reliance unet-individual-rmse data/cpu224 --range oracle --into result.json
+fpp-bench reliance classical data/small224
+fpp-bench reliance phase data/small224 --direction vertical
+fpp-bench reliance unet-individual-rmse data/small224 --range oracle --into result.json
 """,
     MethodCommand,
 )

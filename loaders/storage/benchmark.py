@@ -82,7 +82,7 @@ BENCHMARKS = (
     Benchmark("fpp-bench-test-crossed-workshop", 3, "test", FULL_SIZE, "workshop", "crossed"),
     Benchmark("fpp-bench-test-crossed-hard", 3, "test", FULL_SIZE, "hard", "crossed"),
 )
-"""The current version of each. ``fpp-bench-full-224`` is what `fpp-bench reproduce --preset cpu` trains on."""
+"""The current version of each. ``fpp-bench-full-224`` is what `fpp-bench reproduce --preset small` trains on."""
 
 
 def benchmark_of(content: Mapping[str, str]) -> Benchmark | None:

@@ -19,7 +19,7 @@ from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, Track
 from fpp_ml_bench.evaluation.score.uncertainty import behind, pairs, sign_flip_bounds, sign_flip_p
 from fpp_ml_bench.evaluation.submission.description import LearnedFrom, Submission
-from fpp_ml_bench.leaderboard.columns import columns, given_truth, learned_from, uncertainty
+from fpp_ml_bench.leaderboard.columns import columns, given_truth, learned_from, surest, uncertainty
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
 from fpp_ml_bench.leaderboard.row_file import RowUncertainty, _uncertainty, write_row
 from fpp_ml_bench.leaderboard.tables import table_json
@@ -271,10 +271,10 @@ def test_rows_of_one_data_hold_the_same_objects(base):
 def test_what_a_result_says_beyond_its_scores(base, monkeypatch):
     """Blocks that a result may have: what the method learned from, and its scored uncertainty."""
     (row,) = rank([base])[0].rows
-    assert learned_from(base.row) == "" and uncertainty(base) == (None, None)
+    assert learned_from(base.row) == "" and uncertainty(base) == RowUncertainty()
     shown = [column.title for column in columns("object_mae_mm") if column.shown_for([row])]
-    assert not {"In 95%", "AUSE", "Learned from", "Rank", "x trivial", "On unseen"} & set(shown)
-    scores = SimpleNamespace(coverage_95=0.9, ause_mae_mm=1.5, unstated_share=0.0)
+    assert not {"In 95%", "AUSE", "Surest 95%", "Learned from", "Rank", "x trivial", "On unseen"} & set(shown)
+    scores = SimpleNamespace(coverage_95=0.9, ause_mae_mm=1.5, sure_mae_mm=0.7, sure_rmse_mm=2.1, unstated_share=0.0)
     samples = {
         "all pixels state a sigma": scores,
         "half of them": SimpleNamespace(coverage_95=1.0, unstated_share=0.5),
@@ -282,7 +282,8 @@ def test_what_a_result_says_beyond_its_scores(base, monkeypatch):
         "no object": SimpleNamespace(coverage_95=None, unstated_share=None),
     }
     in_brief = _uncertainty(SimpleNamespace(metrics=scores, per_sample=samples))
-    assert in_brief == {"within_95_share": pytest.approx((0.9 + 0.5 + 0.0) / 3), "ause_mae_mm": 1.5}
+    errors = {"ause_mae_mm": 1.5, "sure_mae_mm": 0.7, "sure_rmse_mm": 2.1}
+    assert in_brief == {"within_95_share": pytest.approx((0.9 + 0.5 + 0.0) / 3), **errors}
     changes = {
         "uncertainty": RowUncertainty(**in_brief),
         "submission": base.row.submission.model_copy(update={"learned_from": LearnedFrom(data="generated")}),
@@ -290,7 +291,8 @@ def test_what_a_result_says_beyond_its_scores(base, monkeypatch):
     (row,) = rank([replace(base, row=base.row.model_copy(update=changes))])[0].rows
     assert learned_from(row.entry.row) == "generated"
     shown = [column.title for column in columns("object_mae_mm") if column.shown_for([row])]
-    assert {"In 95%", "AUSE", "Learned from"} < set(shown)
+    assert {"In 95%", "AUSE", "Surest 95%", "Learned from"} < set(shown)
+    assert surest(row.entry) == "0.700 / 2.100" and surest(base) == "-"
 
 
 def test_a_submission_may_say_that_it_was_given_the_order(base):
