@@ -32,7 +32,6 @@ BUILT_IN = (
     "learned.method:ClassicalNetMethod",
     "phase.method:PhaseMethod",
     "learned.method:PhaseNetMethod",
-    "learned.method:FringeNetMethod",
     "phase.method:CrossedMethod",
     "learned.method:CrossedNetMethod",
     "trivial:ConstantMethod",
