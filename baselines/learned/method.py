@@ -32,6 +32,7 @@ from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.optics.rig_file import rig_from_dict
 from fpp_ml_bench.optics.sequence import Direction
 from fpp_ml_bench.options import option
 
@@ -353,6 +354,16 @@ class FringeNetMethod(LearnedRoute):
         self.rig, self.threads = rig, given.threads
         periods = self.learned_periods(fringes)
         if crossed:
+            here, learned = (
+                (code.pitches_px, code.angles_deg, code.weights)
+                for one in (rig, rig_from_dict(self.weights_config.recipe["rig"]))
+                if (code := one.crossed) is not None
+            )
+            if here != learned:
+                raise PredictionError(
+                    f"{self.file.path}: learned crossed fringes of pitches, angles and weights {learned}, this rig "
+                    f"projects {here}; train networks on it, or use crossed-net or crossed, which measure any"
+                )
             self.frames_used = rig.sequence.crossed_frames[:1]
             self.route = FringeNetCrossedRoute(rig, Settings(min_confidence=given.min_confidence), networks, periods)
         else:

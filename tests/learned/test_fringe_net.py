@@ -173,6 +173,17 @@ def test_a_training_in_small_is_resumed_and_predicts(tmp_path: Path, monkeypatch
         FringeNetMethod.for_rig(LINES, members=4)
 
 
+def test_crossed_fringes_that_were_not_learned_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(training, "groups_of", lambda *args: GROUPS)
+    recipe = replace(SMALL, fringes="crossed", steps=1, validate_every=1)
+    trained = train_net(recipe, tmp_path / "run", rig=CROSSED)
+    assert trained.weights is not None
+    method = FringeNetMethod.for_rig(CROSSED, weights=trained.weights)
+    assert method.frames_used == CROSSED.sequence.crossed_frames[:1] and method.settings["fringes"] == "crossed"
+    with pytest.raises(PredictionError, match=r"learned crossed fringes .*18.*this rig projects .*12"):
+        FringeNetMethod.for_rig(crossed_rig(480, "crossed-12"), weights=trained.weights)
+
+
 def test_networks_and_recipes_that_are_refused() -> None:
     network = FringeNet(2, (8, 12), 8)
     assert network(torch.zeros(1, 2, 8, 12))[0].shape == (1, 6, 8, 12)
