@@ -67,6 +67,7 @@ _NOT_COMPARED: Any = {
     "submission": {"seconds_per_sample", "seconds_source", "hardware", "timing", "software"},
     "dataset": {"name"},
 }
+_NOT_IN_OLDER_ROWS = ("sure_mae_mm", "sure_rmse_mm")
 _OF_THE_MACHINE = ("threads", "device")
 """Settings that two runs of the same method may differ in."""
 
@@ -204,6 +205,9 @@ def differences(row: Row, folder: Path, dataset: DatasetFolder) -> list[str]:
     scored = evaluate(folder, dataset, row.dataset.split, row.target, row.edge_band_px, row.mode)
     rows = row, Row.model_validate(row_content(scored, digits=None))
     stored, computed = (each.model_dump(mode="json", exclude=_NOT_COMPARED) for each in rows)
+    for key, value in (stored.get("uncertainty") or {}).items():
+        if value is None and key in _NOT_IN_OLDER_ROWS:
+            computed["uncertainty"][key] = None
     cancelling = 1e-9 * (row.metrics.object_mae_mm or 0.0)
     found = disagreements(stored, computed, cancelling=cancelling, digits=DIGITS)
     return difference_lines(found, "row")

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from hashlib import sha256
 from pathlib import Path
 
@@ -153,6 +154,22 @@ def test_fpp_eval_compares_results_and_rows(files, tmp_path, capsys):
     assert of_rows[0].strip() == of_rows[1].strip() and "sign-flip test" in of_rows[0]
     lines = [re.search(r"object MAE.*", text)[0].split("│")[:3] for text in (of_results, of_rows[0])]
     assert lines[0] == lines[1]
+
+
+def test_a_row_from_before_the_surest_errors_verifies(files, dataset, tmp_path):
+    predictions = tmp_path / "predictions"
+    shutil.copytree(files[0].parent / "fast-predictions", predictions)
+    for sample in dataset.samples("test"):
+        np.save(predictions / f"{sample}.sigma.npy", np.full(dataset.size, 2.0, np.float32))
+    result, row = tmp_path / "result.json", tmp_path / "row.json"
+    assert fpp_eval([str(predictions), str(dataset.path), "--json", str(result)]) == 0
+    content = json.loads(write_row_of(result, row).read_text())
+    assert content["uncertainty"]["sure_mae_mm"] > 0
+    words = ["verify", str(row), str(predictions), str(dataset.path)]
+    for value, status in ((content["uncertainty"]["sure_mae_mm"], 0), (None, 0), (0.5, 1)):
+        content["uncertainty"]["sure_mae_mm"] = value
+        row.write_text(json.dumps(content))
+        assert fpp_eval(words) == status
 
 
 def test_fpp_eval_verifies_a_row_from_its_predictions(files, dataset, tmp_path, capsys):
