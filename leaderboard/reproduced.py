@@ -430,7 +430,7 @@ def table_markdown(table: str, lines: Sequence[Line], preset: str, command: str,
 
 
 def _about(lines: Sequence[Line], in_the_paper: bool) -> list[str]:
-    entry = next((line.entry for line in lines if line.entry is not None), None)
+    entry = next((line.entry for line in lines if line.entry is not None and line.recipe is not None), None)
     if entry is None:
         return []
     data = entry.row.dataset

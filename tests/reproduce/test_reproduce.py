@@ -386,7 +386,7 @@ def test_time_left_of_a_plan(tmp_path):
 
 
 def test_list_and_help_do_not_train(run, trainer, capsys, tmp_path, monkeypatch):
-    monkeypatch.setattr("fpp_ml_bench.leaderboard.rows.SHIPPED_ROWS", tmp_path / "none")
+    monkeypatch.setattr("fpp_ml_bench.cli.train.SHIPPED_ROWS", tmp_path / "none")
     assert main(["reproduce", "--list"]) == 0
     listed = capsys.readouterr().out
     assert "34 trainings fill 30 rows; the rows of 0 trainings come with the package" in listed
