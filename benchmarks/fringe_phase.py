@@ -24,6 +24,7 @@ from scipy import fft
 
 from fpp_ml_bench.api import load_method
 from fpp_ml_bench.baselines.phase.calibration_layer import TAU, wrapped
+from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask, object_near_edges
 from fpp_ml_bench.loaders.sample import DEPTH_EXACT
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -80,7 +81,7 @@ def phases(
     else:
         layer = measured.route.layer
         truth = layer.absolute_phase(depth)[None]
-        carrier = layer.absolute_phase(np.full(depth.shape, dataset.rig.standoff_m * 1000))
+        carrier = layer.absolute_phase(np.full(depth.shape, dataset.rig.standoff_m * MM_PER_M))
         steps = np.array([[np.diff(carrier, axis=axis).mean() for axis in (1, 0)]])
         local = np.zeros(truth.shape, np.float32)
         local[0][seen.crop] = seen.phase_rad

@@ -15,31 +15,23 @@ from itertools import combinations
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from fpp_ml_bench.baselines.registry import methods
 from fpp_ml_bench.baselines.reproduce.plan import FOLDS, Folders, Job, variants
+from fpp_ml_bench.baselines.reproduce.scores import MAIN_KEY, Scores, constant_scores, joined, scores_that_hold
 from fpp_ml_bench.baselines.reproduce.work import (
-    MAIN_KEY,
-    TARGET,
+    MISSING,
     Outcome,
     ReproduceSettings,
-    Scores,
     current_weights,
     file_sha256,
-    score_frames,
-    scores_that_hold,
     state_of,
 )
-from fpp_ml_bench.baselines.training.depth_training import fold_samples
 from fpp_ml_bench.baselines.training.recipe import Recipe, about_preset, table_rows
-from fpp_ml_bench.baselines.trivial import best_range_share
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import RANGE_KEY
 from fpp_ml_bench.evaluation.protocol import Track
 from fpp_ml_bench.evaluation.result.file import write_file
 from fpp_ml_bench.evaluation.result.model import Result
-from fpp_ml_bench.evaluation.score.check import Rules
 from fpp_ml_bench.evaluation.score.uncertainty import Interval, interval_over_seeds
 from fpp_ml_bench.leaderboard.columns import device
 from fpp_ml_bench.leaderboard.ranking import given_words
@@ -114,6 +106,14 @@ class Line:
     entry: Entry | None
     paper_mm: Mapping[str, float] | None = None
     twins: Mapping[str, Entry] = field(default_factory=dict)
+
+    @property
+    def track(self) -> str:
+        """Of its row, or of the rows that its recipe would have; a dash without either."""
+        if self.entry is not None or self.recipe is None:
+            return "-" if self.entry is None else self.entry.row.track
+        given = ["range"] * (self.recipe.normalisation == "individual") + ["mask"] * self.recipe.background_removed
+        return f"oracle {' + '.join(given)}" if given else "metric"
 
     def error(self, key: str) -> float | None:
         """A score, mean over the seeds; None where it is unknown."""
@@ -200,42 +200,17 @@ def _fold_lines(jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) ->
     lines = []
     for name in names:
         table, _, row = name.partition("/")
-        reported = {paper.row: paper for paper in paper_tables()[table].rows}
+        reported = {paper.row: paper for paper in paper_tables()[table].rows} if table in paper_tables() else {}
         recipes = [job.recipe for job in jobs if name in job.rows]
         scores = [one for recipe in recipes if recipe.fold in parts and (one := held[recipe.name]) is not None]
-        found = {recipes[0].seed: _joined(scores)} if scores else {}
+        found = {recipes[0].seed: joined(scores)} if scores else {}
         label = f"{reported[row].label} ({table})" if row in reported else name
         lines.append(Line(name, label, recipes[0], found, None, reported[row].errors_mm if row in reported else None))
-    constants = [_constant_scores(opened, part) for part in sorted(part for part in parts if part is not None)]
-    if constants:
+    constants = [constant_scores(opened, part) for part in sorted(part for part in parts if part is not None)]
+    if constants and any(one.normalisation == "individual" for one in recipes_of):
         label = "best constant in the given range (trivial)"
-        lines.insert(0, Line("constant", label, None, {0: _joined(constants)}, None))
+        lines.insert(0, Line("constant", label, None, {0: joined(constants)}, None))
     return lines
-
-
-def _constant_scores(opened: DatasetFolder, fold: tuple[int, int]) -> Scores:
-    """Of the same share of each sample's range at every pixel."""
-    splits = fold_samples(opened, fold)
-    answer = np.full(opened.size, best_range_share(opened, splits["train"]), np.float32)
-    rules = Rules(TARGET, "normalised", "valid", "paper")
-    identity = dict.fromkeys(("recipe_digest", "weights_sha256"), "0" * 64)
-    return score_frames(opened, lambda frame: answer, [0], rules, splits["test"], **identity)
-
-
-def _joined(parts: Sequence[Scores]) -> Scores:
-    """The scores of several parts of the objects as one; each pair counts the same."""
-    pairs = sum(part.pairs for part in parts)
-    sums = {
-        key: [part.pairs * value for part in parts if (value := part.errors[key]) is not None]
-        for key in parts[0].errors
-    }
-    return parts[0].model_copy(
-        update={
-            "pairs": pairs,
-            "errors": {key: sum(values) / pairs if len(values) == len(parts) else None for key, values in sums.items()},
-            "per_object": {name: value for part in parts for name, value in part.per_object.items()},
-        }
-    )
 
 
 def _weights_sha256(recipe: Recipe, folders: Folders, opened: DatasetFolder) -> str | None:
@@ -244,7 +219,7 @@ def _weights_sha256(recipe: Recipe, folders: Folders, opened: DatasetFolder) -> 
     weights = current_weights(recipe, folders)
     if weights is not None:
         return file_sha256(weights)
-    if state_of(folders.training(recipe)) != "missing":
+    if state_of(folders.training(recipe)) != MISSING:
         return None
     main_row = folders.row(recipe, variants(recipe)[0])
     entry = row_that_holds(main_row, opened, recipe.digest, "recipe_digest")
@@ -297,8 +272,8 @@ def orderings(lines: Sequence[Line]) -> list[Ordering]:
     for (better_mm, better), (worse_mm, worse) in combinations(sorted(compared, key=lambda c: c[0]), 2):
         here = gap(worse, better)
         if worse_mm > better_mm and here is not None:
-            tracks = {line.entry.row.track for line in (better, worse) if line.entry is not None}
-            judged.append(Ordering(better.label, worse.label, worse_mm - better_mm, here, len(tracks) <= 1))
+            same_track = better.track == worse.track
+            judged.append(Ordering(better.label, worse.label, worse_mm - better_mm, here, same_track))
     return judged
 
 
@@ -348,7 +323,7 @@ def _cells(line: Line, preset: str) -> dict[str, str]:
     ends = interval_over_seeds(list(by_seed.values()))
     settings = entry.row.submission.settings if entry else {}
     timing, latency_ms = (entry.row.timing, entry.latency_ms) if entry else (None, None)
-    cells = {"Row": line.label, "Track": entry.row.track if entry else "-"}
+    cells = {"Row": line.label, "Track": line.track}
     paper = line.paper_mm or {}
     for pixels in ("object", "overall", "background"):
         title = f"{pixels.capitalize()} MAE / RMSE"

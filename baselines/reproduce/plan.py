@@ -36,11 +36,10 @@ class Job:
     rows: tuple[str, ...]
 
     @property
-    def scored_frames(self) -> str | None:
-        """The configuration whose frames its `Scores` are of, beside its rows; None where it has rows alone. The paper
-        scores the multi-frame table on every frame (Section 5.4)."""
-        every = any(row.startswith("multi_frame/") for row in self.rows)
-        return self.recipe.frames if every or self.recipe.fold is not None else None
+    def has_scores(self) -> bool:
+        """Whether it has `Scores` beside its rows: of a cross-validation, or of every frame that it learned from, as in
+        the paper (Section 5.4), where that is more than the row's one."""
+        return self.recipe.fold is not None or self.recipe.frames != "single_shot"
 
 
 def variants(recipe: Recipe) -> tuple[DepthRange | None, ...]:

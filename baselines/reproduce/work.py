@@ -3,17 +3,12 @@
 Trainings run beside each other, one on each core. Then all is scored, one after the other: a time that is taken beside
 a training is wrong. No training is ever deleted: a finished training is used, a stopped one continued, one of another
 recipe refused. Weights that come with the package stand for the training of their recipe.
-
-In the paper's multi-frame table (Section 5.4) scores are averages over all (view, frame) pairs of a condition's test
-set. Here each sample's score is the mean over its frames, and the headline the mean over samples: the same number, for
-every sample has the same frames, and the interval can then be taken over objects. The rules are the evaluator's own
-(`Rules`, `score_sample`).
 """
 
 import json
 import shlex
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from hashlib import sha256
@@ -23,12 +18,9 @@ from textwrap import shorten
 from threading import Event, Thread
 from time import time
 from types import ModuleType
-from typing import Annotated, Any, Literal
+from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
-from pydantic import Field
 
 from fpp_ml_bench.baselines.method import Setting
 from fpp_ml_bench.baselines.networks.base import torch_threads
@@ -37,34 +29,26 @@ from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
 from fpp_ml_bench.baselines.networks.range_heads import save_with_heads
 from fpp_ml_bench.baselines.reproduce import plan
 from fpp_ml_bench.baselines.reproduce.plan import Folders, Job, Report, variants
+from fpp_ml_bench.baselines.reproduce.scores import MAIN_KEY, SPLIT, TARGET, score_frames, scores_that_hold
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.baselines.timing import time_method, write_timing
 from fpp_ml_bench.baselines.training.depth_training import DONE, SCORING, WEIGHTS, TrainingRun, fold_samples, train
 from fpp_ml_bench.baselines.training.engine import LOG_FILE, RECIPE, Display
 from fpp_ml_bench.baselines.training.recipe import Recipe, table_rows
 from fpp_ml_bench.baselines.training.weights import SHIPPED, SUFFIX, open_weights
-from fpp_ml_bench.constants import split_sample_name
-from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError, TrainingError, WeightsError
-from fpp_ml_bench.evaluation.metrics import HEADLINE, RANGE_KEY
-from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
+from fpp_ml_bench.errors import DatasetError, PredictionError, TrainingError, WeightsError
 from fpp_ml_bench.evaluation.result.file import write_json, write_result
 from fpp_ml_bench.evaluation.result.model import Result
-from fpp_ml_bench.evaluation.result.parts import Sha256
 from fpp_ml_bench.evaluation.score.check import Rules
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
-from fpp_ml_bench.evaluation.score.sample_scores import score_sample
-from fpp_ml_bench.evaluation.score.uncertainty import mean_of
 from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE
 from fpp_ml_bench.files import exclusive, read_json, write_atomically
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.pool import mapping
-from fpp_ml_bench.schema import Count, NonNegative, StrictModel, Text, validate
 from fpp_ml_bench.style import millimetres
 
 PAPER_PRESET = "paper"
 REASON_LENGTH = 400
-MAIN_KEY = "object_mae_mm"
-SPLIT, TARGET = "test", "depth"
 REPEATS = 20
 LOOK_EVERY_S = 2.0
 """How often the bar of several trainings reads their logs."""
@@ -171,7 +155,7 @@ def _rows_hold(job: Job, settings: ReproduceSettings, opened: DatasetFolder) -> 
     recipe, folders = job.recipe, settings.folders
     paths = [folders.row(recipe, depth_range) for depth_range in variants(recipe)]
     rows = [settings.leaderboard.row_that_holds(path, opened, recipe.digest, "recipe_digest") for path in paths]
-    scored = not job.scored_frames or scores_that_hold(folders.scores(recipe), opened.fingerprint, recipe) is not None
+    scored = not job.has_scores or scores_that_hold(folders.scores(recipe), opened.fingerprint, recipe) is not None
     return scored and None not in rows
 
 
@@ -269,14 +253,14 @@ def _score(
     """Rows of a training's weights, and its scores beside them; with ``only_missing`` what is up to date is kept."""
     folders, recipe, model = settings.folders, job.recipe, load(weights)
     path = folders.scores(recipe)
-    if job.scored_frames and not (
+    if job.has_scores and not (
         settings.only_missing and scores_that_hold(path, opened.fingerprint, recipe, model.sha256)
     ):
         units, mode = SCORING[recipe.normalisation]
         scores = score_frames(
             opened,
             lambda frame: model.predict_representation([frame])[0],
-            opened.sequence.config(job.scored_frames),
+            opened.sequence.config(recipe.frames),
             Rules(TARGET, units, model.config.range_rule, mode),
             opened.samples(SPLIT) if recipe.fold is None else fold_samples(opened, recipe.fold)[SPLIT],
             recipe_digest=recipe.digest,
@@ -417,71 +401,3 @@ def score_method(opened: DatasetFolder, method: NetworkMethod, row: Path, folder
     making.rename(predictions)
     write_result(result, results / f"{name}.json")
     return result
-
-
-class Scores(StrictModel):
-    """Errors of a training that are no row of the leaderboard: over every frame that it was trained on, or over the
-    objects that a cross-validation kept from it. ``errors``: means over ``pairs`` of ``frames`` and samples, of the six
-    errors in mm and of the share of the depth range; ``per_object``: the object MAE in mm of each object."""
-
-    schema_version: Literal["3.0.0"] = "3.0.0"
-    protocol_version: Text = PROTOCOL_VERSION
-    fingerprint: Sha256
-    recipe_digest: Sha256
-    weights_sha256: Sha256
-    frames: list[Count]
-    pairs: Annotated[int, Field(gt=0)]
-    errors: dict[Text, NonNegative | None]
-    per_object: Annotated[dict[Text, NonNegative], Field(min_length=1)]
-
-
-def score_frames(
-    opened: DatasetFolder,
-    predict: Callable[[NDArray[np.uint8]], NDArray[np.float32]],
-    frames: Sequence[int],
-    rules: Rules,
-    samples: Sequence[str],
-    **identity: str,
-) -> Scores:
-    """Score ``predict`` (a frame (H, W) in, depth (H, W) out) by ``rules`` on every one of ``samples`` and frames;
-    ``identity``: the hashes of recipe and weights. Raises PredictionError for a prediction that is not finite, and what
-    `Rules.pair` raises."""
-    keys = (*HEADLINE, RANGE_KEY)
-    rows: list[dict[str, float | None]] = []
-    by_object: dict[str, list[float | None]] = {}
-    for sample in samples:
-        void = rules.void(opened, sample)
-        scores = []
-        for frame in frames:
-            values = predict(opened.frame(sample, frame))
-            if not np.isfinite(values).all():
-                raise PredictionError(f"{sample}, frame {frame}: the network gave values that are not finite")
-            scores.append(score_sample(*rules.pair(values, opened, sample), void=void).metrics())
-        rows.append({key: mean_of(score.get(key) for score in scores) for key in keys})
-        by_object.setdefault(split_sample_name(sample)[0], []).append(rows[-1][MAIN_KEY])
-    means = {name: mean_of(errors) for name, errors in by_object.items()}
-    return Scores(
-        fingerprint=opened.fingerprint,
-        frames=list(frames),
-        pairs=len(samples) * len(frames),
-        errors={key: mean_of(row[key] for row in rows) for key in keys},
-        per_object={name: mean for name, mean in means.items() if mean is not None},
-        **identity,  # type: ignore[arg-type]
-    )
-
-
-def read_scores(path: Path) -> Scores:
-    """Read strictly; SubmissionError names the file and what is wrong with it."""
-    return validate(Scores, read_json(path, SubmissionError, "run the command again"), path, "file of scores")
-
-
-def scores_that_hold(path: Path, fingerprint: str, recipe: Recipe, weights_sha256: str | None = None) -> Scores | None:
-    """The scores in ``path`` if valid and of this dataset, this recipe, the current protocol, and these weights where
-    they are given; else None."""
-    try:
-        scores = read_scores(path)
-    except SubmissionError:
-        return None
-    found = scores.fingerprint, scores.recipe_digest, scores.protocol_version
-    same = found == (fingerprint, recipe.digest, PROTOCOL_VERSION)
-    return scores if same and weights_sha256 in (None, scores.weights_sha256) else None

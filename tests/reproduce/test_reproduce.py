@@ -12,7 +12,8 @@ import torch
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.networks.model import build
 from fpp_ml_bench.baselines.reproduce import plan, work
-from fpp_ml_bench.baselines.reproduce.work import SPLIT, plan_state, read_scores, score_frames, scores_that_hold
+from fpp_ml_bench.baselines.reproduce.scores import SPLIT, read_scores, score_frames, scores_that_hold
+from fpp_ml_bench.baselines.reproduce.work import plan_state
 from fpp_ml_bench.baselines.timing import time_method
 from fpp_ml_bench.baselines.training import depth_training
 from fpp_ml_bench.baselines.training.depth_training import model_config
@@ -354,6 +355,12 @@ def test_every_object_is_left_out_once(run, trainer, tmp_path, opened):
     line = next(line for line in text.splitlines() if "hybrid L1" in line)
     assert f"| {mae:.2f} / " in line and "| 14.54 / 17.88 |" in line
     assert "best constant in the given range (trivial)" in text
+    assert "| oracle range |" in line
+    # A table that the paper does not have.
+    assert run("further/plain", "--folds", "3") == 0
+    assert "| metric |" in next(
+        text for text in (below / "folds.md").read_text().splitlines() if text.startswith("| further/plain")
+    )
     trained_on = json.loads((below / names[1] / "recipe.json").read_text())["recipe"]["fold"]
     assert trained_on == [1, 3]
 
