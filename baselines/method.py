@@ -209,9 +209,7 @@ class Method(ABC):
         """What data the method learned from, as `evaluation.submission.LearnedFrom` has it."""
         if (config := self.weights_config) is None:
             return {"data": "none"}
-        from fpp_ml_bench.baselines.training.weights import trained_on
-
-        benchmark = trained_on(config)
+        benchmark = config.benchmark
         title = f"dataset {config.dataset_fingerprint[:8]}" if benchmark is None else benchmark.title
         return {"data": "train-split", "versions": [title]}
 

@@ -20,10 +20,10 @@ from fpp_ml_bench.options import option
 STANDOFF, MIDDLE, TRAINING_MEAN = "standoff", "middle", "training-mean"
 TRAINING_MEAN_MM, TRAINING_MEAN_DATA = 1743.75, "fpp-bench-full version 1"
 """Mean exact depth over the object pixels of the training split of that benchmark."""
-RANGE_SHARES = {"range-middle": 0.5, "range-training": 0.287}
-"""Constants as shares of a given depth range: its middle, and that with the least mean object MAE on the training split
-of `RANGE_DATA` (a median weighted by range over pixels)."""
-RANGE_DATA = "fpp-bench-full-224 version 1"
+RANGE_SHARES = {"range-middle": 0.5, "range-training": 0.294}
+"""Constants as shares of a given depth range, that of the pixels that are not void: its middle, and `best_range_share`
+of the training split of `RANGE_DATA`."""
+RANGE_DATA = "fpp-bench-full-224 version 2"
 BLOCKS = 60
 """Blocks along an image's shorter side, by whose means `NearestMethod` compares images."""
 
@@ -70,6 +70,7 @@ class ConstantMethod(Method):
         self.title = f"Constant depth, {at} mm" if at not in known else f"Constant depth: {at}"
         if at in RANGE_SHARES:
             self.uses_ground_truth_range, self.units, self.mode, self.target = True, "normalised", "paper", "depth"
+            self.range_rule = "valid"
         self.settings = {"at": at, "share" if at in RANGE_SHARES else "depth_mm": self.value}
 
     @classmethod

@@ -20,7 +20,7 @@ from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.depth import Normalisation, RangeRule
 from fpp_ml_bench.errors import FppBenchError, WeightsError
 from fpp_ml_bench.files import file_content, printable, write_atomically
-from fpp_ml_bench.loaders.storage.benchmark import benchmark_before, benchmark_of, intended_benchmark
+from fpp_ml_bench.loaders.storage.benchmark import benchmark_of, intended_benchmark
 from fpp_ml_bench.loaders.storage.manifest import Manifest
 from fpp_ml_bench.options import did_you_mean
 from fpp_ml_bench.schema import Count, Scalar, Text, problems_of
@@ -221,18 +221,11 @@ def training_benchmark(content: Mapping[str, str]) -> TrainingBenchmark | None:
     return None if benchmark is None else TrainingBenchmark(benchmark.name, benchmark.version)
 
 
-def trained_on(config: TrainedConfig) -> TrainingBenchmark | None:
-    """The benchmark that weights were trained on, None where it is none. Version 1 of a benchmark, which had the same
-    images and depths, counts as today's."""
-    same = benchmark_before(config.dataset_fingerprint)
-    return config.benchmark if same is None else TrainingBenchmark(same.name, same.version)
-
-
 def training_data_warning(config: TrainedConfig, manifest: Manifest) -> str | None:
     """A sentence where weights are used on another version of the benchmark that they were trained on, or where nothing
     is known about their training data; else None. Only for a named benchmark, or a dataset built with its settings: on
     imported data, a dataset with settings of its own and another benchmark the user chose so."""
-    used_on, training = training_benchmark(manifest.content), trained_on(config)
+    used_on, training = training_benchmark(manifest.content), config.benchmark
     named = used_on or intended_benchmark(manifest)
     if named is None or config.dataset_fingerprint == manifest.fingerprint:
         return None

@@ -40,7 +40,6 @@ from fpp_ml_bench.leaderboard.rows import MEANING, Entry, read_scored
 from fpp_ml_bench.leaderboard.tables import ReportedTable, table_csv, table_json
 from fpp_ml_bench.loaders.captures.exports import camera_points
 from fpp_ml_bench.loaders.cloud import cloud_html
-from fpp_ml_bench.loaders.storage.benchmark import benchmark_before
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.style import interval_text, page, signed
 
@@ -341,7 +340,6 @@ def tradeoff_section(run: Tradeoff | None) -> dict[str, Any] | None:
             svg, numbered = picture.svg(*_TRADEOFF_PICTURE, "scatter", about)
             pictures.append({"svg": svg, "numbered": sorted((mark.number, mark.name) for mark in numbered)})
     return {
-        "benchmark": benchmark_before(run.fingerprint),
         "pictures": pictures,
         "tables": [point_table(run), growth_table(run)],
     }

@@ -31,8 +31,7 @@ class Counts(NamedTuple):
 @dataclass(frozen=True)
 class Benchmark:
     """A named dataset: ``name``, ``version``, and the ``preset``, image ``size`` in px, ``light`` and ``rig`` that
-    build it. ``earlier``: start of the fingerprint of version 1, which had the same images, depths and cover, where
-    weights that come with the package name it."""
+    build it."""
 
     name: str
     version: int
@@ -40,7 +39,6 @@ class Benchmark:
     size: int
     light: str = "paper"
     rig: str = "paper"
-    earlier: str = ""
 
     @property
     def title(self) -> str:
@@ -67,7 +65,7 @@ class Benchmark:
 
 BENCHMARKS = (
     Benchmark("fpp-bench-full", 2, "full", FULL_SIZE),
-    Benchmark("fpp-bench-full-224", 2, "full", 224, earlier="a5dbf28a2e1ee5d2d772711f45a4f048"),
+    Benchmark("fpp-bench-full-224", 2, "full", 224),
     Benchmark("fpp-bench-mini", 2, "mini", MINI_SIZE),
     Benchmark("fpp-bench-unseen", 2, "unseen", FULL_SIZE),
     # The same objects and views under other lights.
@@ -89,11 +87,6 @@ def benchmark_of(content: Mapping[str, str]) -> Benchmark | None:
     """The first of `BENCHMARKS` that has all of ``content`` (``split/column`` -> hash), None without: where the columns
     are of the scenes alone, that with the paper's code."""
     return next((b for b in BENCHMARKS if content and content.items() <= b.content.items()), None)
-
-
-def benchmark_before(fingerprint: str) -> Benchmark | None:
-    """The benchmark whose version 1 had this fingerprint, which weights may name as what they were trained on."""
-    return next((b for b in BENCHMARKS if b.earlier and fingerprint.startswith(b.earlier)), None)
 
 
 def known_problem(

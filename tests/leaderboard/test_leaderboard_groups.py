@@ -123,12 +123,14 @@ def test_short_names_of_shipped_rows(shipped):
         "classical-18-both": "Classical 18+Gray, both",
         "classical-net-03-vertical": "classical-net 3+Gray, vertical",
         "classical-03-both-fewest": "Classical 3, both, no Gray",
-        "cpu-long-unet-individual-rmse-range-mean": "UNet RMSE, mean range",
-        "cpu-long-transunet-individual-hybrid_l1_0.7-range-predicted": "TransUNet hybrid L1 0.7, pred. range",
-        "cpu-long-unet-global-rmse": "UNet global RMSE",
-        "cpu-long-pix2pix_unet-individual-gan_0.7": "Pix2Pix GAN 0.7",
-        "cpu-long-unet-global-rmse-guided": "UNet global RMSE, guided",
-        "cpu-long-unet-global-rmse_physics_0.05": "UNet global RMSE + physics 0.05",
+        "small-unet-individual-rmse": "UNet RMSE",
+        "small-unet-individual-rmse-seed_1": "UNet RMSE, seed 1",
+        "small-unet-individual-rmse-horizontal": "UNet RMSE horizontal",
+        "small-transunet-individual-hybrid_l1_0.7-range-predicted": "TransUNet hybrid L1 0.7, pred. range",
+        "small-unet-global-rmse": "UNet global RMSE",
+        "small-pix2pix_unet-individual-gan_0.7": "Pix2Pix GAN 0.7",
+        "small-unet-global-rmse-guided": "UNet global RMSE, guided",
+        "small-unet-global-rmse_physics_0.05": "UNet global RMSE + physics 0.05",
     }
     assert {stem: names[stem] for stem in expected} == expected
 

@@ -16,7 +16,6 @@ from fpp_ml_bench.loaders.storage import benchmark as module
 from fpp_ml_bench.loaders.storage.benchmark import (
     BENCHMARKS,
     FACTS,
-    benchmark_before,
     benchmark_of,
     benchmark_sentence,
     intended_benchmark,
@@ -32,8 +31,6 @@ def test_names_and_contents_are_told_apart():
         assert all(len(bytes.fromhex(digest)) == 16 for digest in benchmark.content.values())
         assert (FACTS / f"{benchmark.name}.json").stat().st_size < 50_000
     assert benchmark_of({}) is None and benchmark_of({"test/depth": "0" * 32}) is None
-    assert benchmark_before("0" * 64) is None
-    assert benchmark_before(f"a5dbf28a2e1ee5d2d772711f45a4f048{'0' * 32}").name == "fpp-bench-full-224"
 
 
 def test_the_facts_are_of_the_presets_objects():
