@@ -111,10 +111,10 @@ class NetworkMethod(Method):
         frames = {"single_shot": "", "all": " all frames"}.get(trained_frames, f" {trained_frames}")
         # The other words of a loss are its weights.
         loss = " ".join(_SHORT_LOSSES.get(word) or f"{float(word):g}" for word in str(settings["loss"]).split("_"))
-        parts = [f"{network}{normalisation} {loss}{frames}"]
+        seed = "" if settings.get("seed") in (None, SEED) else f" s{settings['seed']}"
+        parts = [f"{network}{normalisation} {loss}{frames}{seed}"]
         parts += [word for words, word in _SHORT_OPTIONS.items() if f", {words}" in submission.name]
         parts.append("no background" if settings["background_removed"] else "")
-        parts.append("" if settings.get("seed") in (None, SEED) else f"seed {settings['seed']}")
         parts.append(_SHORT_RANGES[settings.get("depth_range")])  # type: ignore[index]
         return ", ".join(filter(None, parts))
 

@@ -124,7 +124,7 @@ def test_short_names_of_shipped_rows(shipped):
         "classical-net-03-vertical": "classical-net 3+Gray, vertical",
         "classical-03-both-fewest": "Classical 3, both, no Gray",
         "small-unet-individual-rmse": "UNet RMSE",
-        "small-unet-individual-rmse-seed_1": "UNet RMSE, seed 1",
+        "small-unet-individual-rmse-seed_1": "UNet RMSE s1",
         "small-unet-individual-rmse-horizontal": "UNet RMSE horizontal",
         "small-transunet-individual-hybrid_l1_0.7-range-predicted": "TransUNet hybrid L1 0.7, pred. range",
         "small-unet-global-rmse": "UNet global RMSE",

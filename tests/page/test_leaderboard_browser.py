@@ -276,7 +276,8 @@ def test_the_shipped_page_has_all_rows_and_the_papers_errors_apart(shipped_page)
     paper = index[index.index('<section id="reported">') :]
     assert "14.54" in paper and "given the test sample" in paper and "Other data, not ranked" in paper
     above = index[: index.index('<section id="reported">')]
-    assert not re.search(r"(?<![\d.])14\.54", above)  # 214.54 is a place in a picture
+    # 214.54 is a place in a picture, 14.544 an error of ours.
+    assert not re.search(r"(?<![\d.])14\.54(?!\d)", above)
 
 
 @pytest.mark.parametrize("width", [390, 1240])
