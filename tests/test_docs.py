@@ -104,8 +104,8 @@ def test_commands_are_found_in_the_pages():
     readme, commands = (list(_commands((ROOT / page).read_text())) for page in ("README.md", "docs/commands.md"))
     assert len(readme) >= 12 and ["fpp-eval", "init", "predictions"] in readme
     assert {words[1] for words in commands if words[0] == "fpp-bench"} == set(COMMANDS)
-    ((wrong,),) = [list(_commands("```bash\nx && fpp-bench predict phase d --fringes both | cat # why\n```\n"))]
-    assert wrong == ["fpp-bench", "predict", "phase", "d", "--fringes", "both"]
+    ((wrong,),) = [list(_commands("```bash\nx && fpp-bench predict phase d --stripes both | cat # why\n```\n"))]
+    assert wrong == ["fpp-bench", "predict", "phase", "d", "--stripes", "both"]
     command, rest = _command_and_words(wrong)
     with pytest.raises(click.NoSuchOption):
         command.make_context("x", rest)
@@ -135,6 +135,7 @@ def test_python_of_the_pages_runs(tiny, tmp_path, monkeypatch):
     Path("data").mkdir()
     Path("data/mini").symlink_to(tiny)
     build(Path("data/small"), tiny_settings(rig=paper_rig(224), objects=("power_drill",)), workers=1)
+    Path("data/small224").symlink_to("small")
     text = "\n".join(page.read_text() for page in PAGES if page.name != "README.md")
     blocks = [code for kind, code in FENCED.findall(text) if kind == "python"]
     assert len(blocks) >= 5
