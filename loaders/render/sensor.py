@@ -206,9 +206,10 @@ def fill_signal(signal, row, light, start):  # type: ignore[no-untyped-def]
     for k in range(signal.size):
         signal[k] = offset[k] + flash * factor[k] * signal[k]
     if light.bounced.size > 0:
+        # Without the higher harmonics of a projector's response (`PatternLight.modes`) it can be below 0.
         more = light.bounced[frame, start:stop]
         for k in range(signal.size):
-            signal[k] += flash * more[k]
+            signal[k] = max(signal[k] + flash * more[k], np.float32(0))
 
 
 @njit

@@ -280,6 +280,18 @@ def test_sigma_zero_gives_no_noise():
         assert (exposure_of().expose([WHITE], flat(99.0, 1000), PIXELS[:1000], (seed, "flat"))[0] == 99).all()
 
 
+@pytest.mark.parametrize("bits", [8, 10])
+def test_bounces_take_no_light_away(bits):
+    """Those of a response that is no line come without its higher harmonics, and can be below 0: then the square root
+    of the noise is none, and a code that is not a number would be looked up beside its table."""
+    exposure = exposure_of(bits=bits, full_well_e=23000.0, read_noise_e=12.0, black_grey=9.0)
+    dark, taken = flat(0.0), replace(flat(0.0), bounced=np.full((52, PIXELS.size), -13.0, np.float32))
+    frames = [exposure.expose([WHITE], lit, PIXELS, (1, "flat"))[0] for lit in (dark, taken)]
+    assert (frames[0] == frames[1]).all() and frames[0].mean() == pytest.approx(9, abs=0.1)
+    lit = replace(flat(0.0, 3), ambient=np.full(3, 20, np.float32), bounced=np.full((52, 3), -13, np.float32))
+    assert (exposure.radiance([WHITE], lit, (1, "flat"), np.empty((1, 3), np.float32)) == 7).all()
+
+
 # ---- flicker
 
 
