@@ -34,6 +34,7 @@ BUILT_IN = (
     "learned.method:PhaseNetMethod",
     "phase.method:CrossedMethod",
     "learned.method:CrossedNetMethod",
+    "learned.method:FringeNetMethod",
     "trivial:ConstantMethod",
     "trivial:NearestMethod",
 )

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.learned.method import ClassicalNetMethod, CrossedNetMethod
+from fpp_ml_bench.baselines.learned.method import ClassicalNetMethod, CrossedNetMethod, FringeNetMethod
 from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.phase.calibration_layer import wrapped
 from fpp_ml_bench.baselines.phase.depth import CrossedRoute
 from fpp_ml_bench.baselines.phase.method import PhaseMethod
 from fpp_ml_bench.baselines.robustness.axes import corruptions
@@ -32,6 +33,7 @@ from fpp_ml_bench.coding.crossed import crossed_from_pair
 from fpp_ml_bench.constants import MAD_TO_SIGMA
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm
+from fpp_ml_bench.depth import object_near_edges
 from fpp_ml_bench.loaders.captures.decoding import board_poses, calibrated_rig
 from fpp_ml_bench.loaders.captures.images import read_frames
 from fpp_ml_bench.loaders.render.meshes import load_user_mesh, single_mesh
@@ -53,6 +55,7 @@ SEQUENCES = {
     "board": f"{{order: [vertical, horizontal], vertical: {VERTICAL}, horizontal: {HORIZONTAL}}}",
 }
 BOARD_MARGIN_MM = 15.0  # beyond the nearest and farthest corner of a pose, for the range that a frame is measured in
+EDGE_PX = 3
 WRONG_ORDER_MM = 30.0
 """Half a period of the finer carrier is 40 mm and more of depth at these distances."""
 RANGE_MM = (300.0, 500.0)
@@ -88,7 +91,11 @@ def main() -> int:
         )
         twin(args.captures / "skull_2x3", skull, Path(scratch))
         one_frame(args.captures / "skull_2x3", rig_of(theirs, "skull_2x3", Path(scratch)), Path(scratch))
-        crossed_frames(args.captures / "calibration", rig_of(theirs, "board", Path(scratch)))
+        board = rig_of(theirs, "board", Path(scratch))
+        phase_of_one_sinusoid(args.captures / "skull_2x3", rig_of(theirs, "skull_2x3", Path(scratch)))
+        for number in range(1, 7):
+            phase_of_one_sinusoid(args.captures / "calibration" / f"calseq{number}", board)
+        crossed_frames(args.captures / "calibration", board)
     return 0
 
 
@@ -270,6 +277,31 @@ def one_frame(folder: Path, rig: "Rig", scratch: Path) -> None:
                 f"{in_range.sum():,} px, median error {median:.2f} mm, wrong orders (over {half_mm:.0f} mm) "
                 f"{100 * wrong.mean():.2f}%, confident errors {100 * confident.mean():.3f}%; outside the object "
                 f"{(given & ~on_object).sum():,} px; {seconds:.1f} s"
+            )
+
+
+def phase_of_one_sinusoid(folder: Path, rig: "Rig") -> None:
+    """The wrapped phase of the first sinusoid of each direction, by the local fit of the phase route and by
+    fringe-net, against that of all three steps. The mask is given: where all frames have a depth."""
+    frames = read_frames(folder, count=len(rig.sequence)).frames
+    decoded = decode_stack(frames, rig, details=True, threads=2)
+    on_object = decoded.depth_mm > 0
+    near = object_near_edges(decoded.depth_mm, [EDGE_PX])[0]
+    for way, details in decoded.details.items():
+        frame = frames[rig.sequence.sinusoids(way)[0]]
+        methods = {
+            "local fit": PhaseMethod(rig, direction=way),
+            "fringe-net, one": FringeNetMethod(rig, fringes=way, members=1),
+            "fringe-net, three": FringeNetMethod(rig, fringes=way),
+        }
+        for title, method in methods.items():
+            phase = method.route.measure(frame, on_object).wrapped_phase_rad
+            error = np.abs(wrapped(phase - details.phase))
+            kept, inner = on_object & np.isfinite(error), on_object & np.isfinite(error) & ~near
+            print(
+                f"phase of one {way} sinusoid, {folder.name}, {title}: interior {error[inner].mean():.3f} rad, within "
+                f"{EDGE_PX} px of depth edges {error[kept & ~inner].mean():.3f}, median {np.median(error[kept]):.3f}, "
+                f"beyond 0.3 rad {100 * (error[kept] > 0.3).mean():.1f}% of {kept.sum():,} px"
             )
 
 

@@ -114,6 +114,8 @@ METHODS = (
     "crossed mini",
     "crossed-net crossed",
     "crossed-net mini",
+    "fringe-net crossed",
+    "fringe-net mini --members 1",
     "classical-net mini",
     "classical-net mini --direction horizontal --steps 6",
     "no-such-method mini",

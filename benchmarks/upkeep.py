@@ -94,6 +94,8 @@ METHODS = {
     "phase-net-vertical": "phase-net --direction vertical",
     "phase-net-any-horizontal": "phase-net --direction horizontal --albedo any",
     "phase-net-any-vertical": "phase-net --direction vertical --albedo any",
+    "fringe-net-horizontal": "fringe-net --fringes horizontal",
+    "fringe-net-vertical": "fringe-net --fringes vertical",
     "constant-standoff": "constant --at standoff",
     "constant-training-mean": "constant --at training-mean",
     "constant-range-middle": "constant --at range-middle",
@@ -102,7 +104,12 @@ METHODS = {
 }
 """File name of a row: method and options. The trivial methods that are given the range are scored by the rules of the
 paper's networks. The middle of the working range is the standoff, so it is no row of its own."""
-CROSSED = {"crossed": "crossed", "crossed-03": "crossed --frames 3", "crossed-net": "crossed-net"}
+CROSSED = {
+    "crossed": "crossed",
+    "crossed-03": "crossed --frames 3",
+    "crossed-net": "crossed-net",
+    "fringe-net-crossed": "fringe-net",
+}
 """The same for datasets with crossed fringes. The trivial methods see no code, so theirs would be the same rows."""
 
 

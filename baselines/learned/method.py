@@ -346,7 +346,7 @@ class FringeNetMethod(LearnedRoute):
             raise PredictionError(f"{self.name} --members {given.members}: expected 1 to {MEMBERS}")
         family, names = "crossed" if crossed else "lines", [given.weights] if given.weights else None
         networks, hashes = [], []
-        for weights in names or [f"{self.name}-{family}-{seed}" for seed in SEEDS[: given.members]]:
+        for weights in names or [f"fringe-net-{family}-{seed}" for seed in SEEDS[: given.members]]:
             self.use(weights, FRINGE_NETWORKS)
             networks.append(self.file.network.folded())
             hashes.append(self.file.sha256)

@@ -279,6 +279,7 @@ def test_methods_by_name(opened):
         "phase-net",
         "crossed",
         "crossed-net",
+        "fringe-net",
         "constant",
         "nearest",
     )

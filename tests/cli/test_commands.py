@@ -199,7 +199,7 @@ def test_examples_in_the_help_are_accepted_by_their_parsers(tmp_path, monkeypatc
         (["train", "phase-net", "TINY", "--out", "OUT"], "renders what it learns from"),
         (
             ["train", "loss/l1", "TINY", "--out", "OUT", "--rate", "0.1"],
-            "--rate is an option of classical-net, phase-net, crossed-net, not of loss/l1",
+            "--rate is an option of classical-net, phase-net, crossed-net, fringe-net, not of loss/l1",
         ),
     ],
 )
