@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from fpp_ml_bench.api import load_method
+from fpp_ml_bench.baselines.learned.fringe_recipe import EDGE_PX
 from fpp_ml_bench.baselines.phase.calibration_layer import TAU, wrapped
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask, object_near_edges
@@ -30,7 +31,7 @@ from fpp_ml_bench.loaders.sample import DEPTH_EXACT
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.tables import Table
 
-EDGE_PX, FAR_RAD = 3, 0.3
+FAR_RAD = 0.3
 BAND = 0.6  # half width of Takeda's window, as a share of the carrier's frequency
 WINDOW_PERIODS, SPREAD, STEPS, SIGMAS = 0.9, 0.35, 5, 6.0
 """Of the windowed Fourier filter: its Gaussian in periods, how far its frequencies go, as a share of the carrier's, in

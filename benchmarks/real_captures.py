@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
+from fpp_ml_bench.baselines.learned.fringe_recipe import EDGE_PX
 from fpp_ml_bench.baselines.learned.method import ClassicalNetMethod, CrossedNetMethod, FringeNetMethod
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.phase.calibration_layer import wrapped
@@ -55,7 +56,6 @@ SEQUENCES = {
     "board": f"{{order: [vertical, horizontal], vertical: {VERTICAL}, horizontal: {HORIZONTAL}}}",
 }
 BOARD_MARGIN_MM = 15.0  # beyond the nearest and farthest corner of a pose, for the range that a frame is measured in
-EDGE_PX = 3
 WRONG_ORDER_MM = 30.0
 """Half a period of the finer carrier is 40 mm and more of depth at these distances."""
 RANGE_MM = (300.0, 500.0)
