@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from fpp_ml_bench.api import load_method
-from fpp_ml_bench.baselines.learned.fringe_recipe import EDGE_PX
 from fpp_ml_bench.baselines.phase.calibration_layer import TAU, wrapped
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask, object_near_edges
+from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
 from fpp_ml_bench.loaders.sample import DEPTH_EXACT
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.tables import Table
@@ -126,7 +126,7 @@ def main() -> int:
     for sample in samples:
         exact = dataset.target_mm(sample, DEPTH_EXACT)
         inside, void = object_mask(exact), dataset.void(sample, DEPTH_EXACT)
-        near = object_near_edges(exact, [EDGE_PX])[0]
+        near = object_near_edges(exact, [EDGE_BAND_PX])[0]
         truth, found = phases(dataset, sample, given.fringes, methods, inside, exact)
         for name, phase in found.items():
             error = np.abs(wrapped(phase - truth)).mean(axis=0)

@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.learned.fringe_recipe import EDGE_PX
 from fpp_ml_bench.baselines.learned.method import ClassicalNetMethod, CrossedNetMethod, FringeNetMethod
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.phase.calibration_layer import wrapped
@@ -35,6 +34,7 @@ from fpp_ml_bench.constants import MAD_TO_SIGMA
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm
 from fpp_ml_bench.depth import object_near_edges
+from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
 from fpp_ml_bench.loaders.captures.decoding import board_poses, calibrated_rig
 from fpp_ml_bench.loaders.captures.images import read_frames
 from fpp_ml_bench.loaders.render.meshes import load_user_mesh, single_mesh
@@ -286,7 +286,7 @@ def phase_of_one_sinusoid(folder: Path, rig: "Rig") -> None:
     frames = read_frames(folder, count=len(rig.sequence)).frames
     decoded = decode_stack(frames, rig, details=True, threads=2)
     on_object = decoded.depth_mm > 0
-    near = object_near_edges(decoded.depth_mm, [EDGE_PX])[0]
+    near = object_near_edges(decoded.depth_mm, [EDGE_BAND_PX])[0]
     for way, details in decoded.details.items():
         frame = frames[rig.sequence.sinusoids(way)[0]]
         methods = {
@@ -299,9 +299,9 @@ def phase_of_one_sinusoid(folder: Path, rig: "Rig") -> None:
             error = np.abs(wrapped(phase - details.phase))
             kept, inner = on_object & np.isfinite(error), on_object & np.isfinite(error) & ~near
             print(
-                f"phase of one {way} sinusoid, {folder.name}, {title}: interior {error[inner].mean():.3f} rad, within "
-                f"{EDGE_PX} px of depth edges {error[kept & ~inner].mean():.3f}, median {np.median(error[kept]):.3f}, "
-                f"beyond 0.3 rad {100 * (error[kept] > 0.3).mean():.1f}% of {kept.sum():,} px"
+                f"phase of one {way} sinusoid, {folder.name}, {title}: interior {error[inner].mean():.3f} rad, "
+                f"within {EDGE_BAND_PX} px of depth edges {error[kept & ~inner].mean():.3f}, median "
+                f"{np.median(error[kept]):.3f}, beyond 0.3 rad {100 * (error[kept] > 0.3).mean():.1f}% of {kept.sum():,} px"
             )
 
 

@@ -28,6 +28,7 @@ from fpp_ml_bench.baselines.phase.object_mask import crop_around
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.baselines.training.weights import FRINGE_NETWORKS, Family
 from fpp_ml_bench.errors import RecipeError
+from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import DIRECTIONS, Direction
 
@@ -35,7 +36,6 @@ Fringes = Literal["lines", "crossed"]
 FRINGES: tuple[Fringes, ...] = get_args(Fringes)
 SMALL = 0.05  # error of M and D below which its loss is quadratic, in the amplitude of the surroundings
 MARGIN_PERIODS = 0.5  # of the crop around the object
-EDGE_PX = 3  # of the silhouette, beyond which the phase error is shown apart
 
 
 @dataclass(frozen=True)
@@ -178,13 +178,13 @@ class FringeTask(Task):
         return phases_of([network], np.ascontiguousarray(x))
 
     def score(self, network: FringeNet, sample: Sample) -> dict[str, float | None]:
-        """Mean phase error in rad of a sample's object beyond `EDGE_PX` from its silhouette, and nearer; whether it is
-        within the stated standard uncertainty; the same error of all pixels in drawn lights."""
+        """Mean phase error in rad of a sample's object beyond `EDGE_BAND_PX` from its silhouette, and nearer; whether it
+        is within the stated standard uncertainty; the same error of all pixels in drawn lights."""
         found, truth = self.answer(network, sample), self._turned(sample, sample.missing.astype(np.float32), truth=True)
         count = len(truth) // 2
         error = np.abs(wrapped(found.phase_rad - np.arctan2(truth[:count], truth[count:]))).mean(axis=0)
         target = np.ascontiguousarray(self._turned(sample, sample.target))
-        inner = cv2.erode(target.astype(np.uint8), np.ones((2 * EDGE_PX + 1,) * 2, np.uint8)) > 0
+        inner = cv2.erode(target.astype(np.uint8), np.ones((2 * EDGE_BAND_PX + 1,) * 2, np.uint8)) > 0
         within = (error < found.sigma_rad.mean(axis=0))[target]
 
         def mean(where: NDArray) -> float | None:
