@@ -301,7 +301,8 @@ def phase_of_one_sinusoid(folder: Path, rig: "Rig") -> None:
             print(
                 f"phase of one {way} sinusoid, {folder.name}, {title}: interior {error[inner].mean():.3f} rad, "
                 f"within {EDGE_BAND_PX} px of depth edges {error[kept & ~inner].mean():.3f}, median "
-                f"{np.median(error[kept]):.3f}, beyond 0.3 rad {100 * (error[kept] > 0.3).mean():.1f}% of {kept.sum():,} px"
+                f"{np.median(error[kept]):.3f}, beyond 0.3 rad {100 * (error[kept] > 0.3).mean():.1f}% "
+                f"of {kept.sum():,} px"
             )
 
 

@@ -178,8 +178,8 @@ class FringeTask(Task):
         return phases_of([network], np.ascontiguousarray(x))
 
     def score(self, network: FringeNet, sample: Sample) -> dict[str, float | None]:
-        """Mean phase error in rad of a sample's object beyond `EDGE_BAND_PX` from its silhouette, and nearer; whether it
-        is within the stated standard uncertainty; the same error of all pixels in drawn lights."""
+        """Mean phase error in rad of a sample's object beyond `EDGE_BAND_PX` from its silhouette, and nearer; whether
+        it is within the stated standard uncertainty; the same error of all pixels in drawn lights."""
         found, truth = self.answer(network, sample), self._turned(sample, sample.missing.astype(np.float32), truth=True)
         count = len(truth) // 2
         error = np.abs(wrapped(found.phase_rad - np.arctan2(truth[:count], truth[count:]))).mean(axis=0)
