@@ -222,8 +222,9 @@ def test_metric_phase_rows_say_what_they_assume(shipped):
     for group in rank(shipped):
         for row in group.rows:
             about = row.entry.row
-            if about.submission.method in ("phase", "phase-net"):
-                one = about.submission.settings["shading"]
+            settings, one_direction = about.submission.settings, about.submission.method in ("phase", "phase-net")
+            if one_direction or settings.get("fringes") in ("horizontal", "vertical"):
+                one = settings.get("shading", True)
                 assert assumption(about) == ("one albedo, a lit background" if one else "a lit background")
                 assert ("one albedo for all surfaces and a lit background" in assumption_sentences(about)) == one
             else:
@@ -234,9 +235,9 @@ def test_metric_phase_rows_say_what_they_assume(shipped):
     own = [text.decode() for file, text in pages.items() if file.startswith("submissions/")]
     assuming = [row for row in group.rows if assumption(row.entry.row)]
     assert assuming and sum("a lit background" in text for text in own) == len(assuming)
-    others = {row.entry.row.submission.method for row in group.rows} - {"phase", "phase-net"}
+    others = {row.entry.row.submission.method for row in group.rows} - {"phase", "phase-net", "fringe-net"}
     assert {"constant", "nearest"} <= others <= {"constant", "nearest", "crossed", "crossed-net"}
-    lines = [line for line in readme_block([group]).splitlines() if line.startswith("| phase")]
+    lines = [line for line in readme_block([group]).splitlines() if re.match(r"\| [^|]+1 (horiz|vert)", line)]
     assert len(lines) >= 2 and all("| one albedo, a lit background |" in line for line in lines if "any" not in line)
 
 

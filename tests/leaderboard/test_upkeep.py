@@ -102,7 +102,7 @@ def test_readme_of_the_shipped_rows_is_one_short_table():
     ]
     frames, errors = [int(row[5]) for row in rows[2:]], [float(row[2].split()[0]) for row in rows[2:]]
     assert frames[:-1] == [1] * SHOWN and frames[-1] > 36 and errors[:-1] == sorted(errors[:-1])
-    assert rows[2][2] == "1.439 (1.089 to 1.858)" and rows[4][1] == "one albedo, a lit background"
+    assert rows[2][2] == "1.225 (0.926 to 1.572)" and rows[5][1] == "one albedo, a lit background"
     assert "150 samples of 25 objects" in text and len(text.encode()) < 2048
     assert readme_block([]).startswith("No row yet.")
 
