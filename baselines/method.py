@@ -98,7 +98,8 @@ class Method(ABC):
     Options: a frozen dataclass, whose fields made with `fpp_ml_bench.options.option` are options of every command that
     takes a method. Training: the same for ``fpp-bench train``, None where there is nothing to train. trivial: whether
     it ignores the image (a constant) or only looks up the nearest training image: a reference for other errors.
-    scenes_rig: which of `NAMED_RIGS` photographs the scenes that are rendered for it, as of ``fpp-bench robustness``.
+    scenes_rig: which of `NAMED_RIGS` photographs the scenes that are rendered for it, as of ``fpp-bench robustness``;
+    `rig_of_scenes` where options decide.
     title: name of the submission, with the settings that matter.
     frames_used: frames that must be captured, ascending. settings: everything needed to run it again.
     uses_ground_truth_range: whether it is given depth_min and depth_max of the sample it predicts.
@@ -115,7 +116,7 @@ class Method(ABC):
     Options: ClassVar[type] = NoOptions
     Training: ClassVar[type | None] = None
     trivial: ClassVar[bool] = False
-    scenes_rig: ClassVar[str] = "paper"
+    scenes_rig: str = "paper"
 
     title: str
     frames_used: tuple[int, ...]
@@ -172,6 +173,11 @@ class Method(ABC):
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
         """The options with which ``fpp-bench tradeoff`` measures it on ``rig``; none for a rig that it can't be for."""
         return [{}]
+
+    @classmethod
+    def rig_of_scenes(cls, options: Mapping[str, Any]) -> str:
+        """The ``scenes_rig`` of the method with ``options``."""
+        return cls.scenes_rig
 
     @classmethod
     def short_name(cls, submission: "Submission") -> str | None:

@@ -16,9 +16,9 @@ from fpp_ml_bench.baselines.learned.inputs import CroppedMaps, Geometry
 from fpp_ml_bench.baselines.learned.network import FringeNet
 from fpp_ml_bench.baselines.learned.odds import SCALE_TO_SIGMA
 from fpp_ml_bench.baselines.learned.routes import EXPECTED_SHARE
-from fpp_ml_bench.baselines.phase.calibration_layer import Crop, Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Crop, Image, Mask, wrapped
 from fpp_ml_bench.baselines.phase.depth import CrossedRoute, FringeMeasurement, Measurement, NearnessFit
-from fpp_ml_bench.baselines.phase.local_fit import fringes, phase_slopes
+from fpp_ml_bench.baselines.phase.local_fit import fringes
 from fpp_ml_bench.baselines.phase.observe import CrossedObservation, Frames, Observation
 from fpp_ml_bench.baselines.phase.resampling import Periods
 from fpp_ml_bench.baselines.phase.settings import Settings
@@ -81,7 +81,8 @@ def phases_of(networks: Sequence[FringeNet], x: Image) -> Phases:
 
 
 class FringeNetRoute(Geometry):
-    """Fringes of one direction, turned for the network so that phase grows downwards."""
+    """Fringes of one direction, turned for the network so that phase grows downwards. The order is that of the local
+    fit: with the exact phase larger parts hang together, and all of a part is wrong where a texture misleads it."""
 
     def __init__(
         self, rig: Rig, settings: Settings, networks: Sequence[FringeNet], periods: Periods | None = None
@@ -98,18 +99,14 @@ class FringeNetRoute(Geometry):
 
     def measure(self, image: Frames, mask: Mask | None = None) -> FringeMeasurement:
         seen = self.observe(image, mask)
+        order, margin = self.choose(seen)
         if seen.inside.any():
             found = self.phases(seen)
             phase = found.phase_rad[0]
-            residual = wrapped(phase - seen.layer.infinity_rad).astype(np.float32)
-            seen = replace(
-                seen,
-                fit=replace(seen.fit, phase_rad=phase),
-                phase_rad=phase,
-                slopes=phase_slopes(residual, seen.inside, self.settings.slope_window * self.period_px),
-                uncertainty_rad=np.float32(EXPECTED_SHARE) * found.sigma_rad[0],
-            )
-        return self.conclude(seen, *self.choose(seen))
+            order = order + np.rint((seen.phase_rad - phase) / TAU).astype(np.int32)
+            fit, expected = replace(seen.fit, phase_rad=phase), np.float32(EXPECTED_SHARE) * found.sigma_rad[0]
+            seen = replace(seen, fit=fit, phase_rad=phase, uncertainty_rad=expected)
+        return self.conclude(seen, order, margin)
 
 
 class FringeNetCrossedRoute(CrossedRoute):

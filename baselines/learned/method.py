@@ -324,6 +324,10 @@ class FringeNetMethod(LearnedRoute):
         return [{"fringes": way} for way in ways]
 
     @classmethod
+    def rig_of_scenes(cls, options: Mapping[str, Any]) -> str:
+        return "crossed" if options.get("fringes") == "crossed" else cls.scenes_rig
+
+    @classmethod
     def short_name(cls, submission: "Submission") -> str | None:
         return (
             f"{cls.name}, 1 {submission.settings['fringes']}" if submission.name.startswith("Wrapped phase") else None
@@ -340,6 +344,7 @@ class FringeNetMethod(LearnedRoute):
         given = self.checked_options(options)
         crossed = bool(rig.sequence.crossed_frames) if given.fringes is None else given.fringes == "crossed"
         fringes = given.fringes or ("crossed" if crossed else "horizontal")
+        self.scenes_rig = self.rig_of_scenes({"fringes": fringes})
         if crossed and not rig.sequence.crossed_frames:
             raise PredictionError(f"{self.name} --fringes crossed: this rig projects no crossed frame")
         if not 1 <= given.members <= MEMBERS:

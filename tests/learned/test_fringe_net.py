@@ -16,7 +16,7 @@ from fpp_ml_bench.baselines.learned.method import FringeNetMethod
 from fpp_ml_bench.baselines.learned.network import FringeNet
 from fpp_ml_bench.baselines.learned.scenes import Group, View, read_views, render_views, with_unions
 from fpp_ml_bench.baselines.learned.training import train_net
-from fpp_ml_bench.baselines.phase.calibration_layer import Carriers, wrapped
+from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Carriers, wrapped
 from fpp_ml_bench.baselines.phase.depth import CrossedRoute, PhaseRoute
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.errors import NetworkError, PredictionError, RecipeError
@@ -131,6 +131,9 @@ def test_perfect_phases_give_perfect_depth(fringes: str, tmp_path: Path) -> None
     assert both.sum() > 0.9 * view.target.sum()
     assert np.median(errors[0]) < 0.05 < np.median(errors[1])
     assert np.quantile(answer.sigma_mm[both], 0.5) < np.quantile(before.sigma_mm[both], 0.5)
+    if fringes != "crossed":  # the order is that of the local fit
+        absolute = [one.wrapped_phase_rad + TAU * one.order for one in (answer, before)]
+        assert np.nanmax(np.abs(absolute[0] - absolute[1])) < np.pi + 1e-3
 
 
 def test_an_ensemble_states_how_far_its_members_are_apart() -> None:

@@ -329,6 +329,14 @@ def test_the_command_measures_draws_and_says_where(tmp_path, capsys):
     assert write_page(out) == out / "index.html"
 
 
+def test_the_scenes_show_the_fringes_that_an_option_asks_for(tmp_path):
+    words = ["--fringes", "crossed", "--members", "1", "--size", "256", "--quick", "--axes", "gloss"]
+    assert main(["robustness", "fringe-net", *words, "--out", str(tmp_path), "--no-cache", "--workers", "1"]) == 0
+    (file,) = tmp_path.glob("*/clean.json")
+    (row,) = json.loads(file.read_text())["views"]
+    assert row["mae_mm"] < 5
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
