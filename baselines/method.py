@@ -98,8 +98,6 @@ class Method(ABC):
     Options: a frozen dataclass, whose fields made with `fpp_ml_bench.options.option` are options of every command that
     takes a method. Training: the same for ``fpp-bench train``, None where there is nothing to train. trivial: whether
     it ignores the image (a constant) or only looks up the nearest training image: a reference for other errors.
-    scenes_rig: which of `NAMED_RIGS` photographs the scenes that are rendered for it, as of ``fpp-bench robustness``;
-    `rig_of_scenes` where options decide.
     title: name of the submission, with the settings that matter.
     frames_used: frames that must be captured, ascending. settings: everything needed to run it again.
     uses_ground_truth_range: whether it is given depth_min and depth_max of the sample it predicts.
@@ -116,7 +114,6 @@ class Method(ABC):
     Options: ClassVar[type] = NoOptions
     Training: ClassVar[type | None] = None
     trivial: ClassVar[bool] = False
-    scenes_rig: str = "paper"
 
     title: str
     frames_used: tuple[int, ...]
@@ -175,9 +172,10 @@ class Method(ABC):
         return [{}]
 
     @classmethod
-    def rig_of_scenes(cls, options: Mapping[str, Any]) -> str:
-        """The ``scenes_rig`` of the method with ``options``."""
-        return cls.scenes_rig
+    def scenes_rig(cls, settings: Mapping[str, Any]) -> str:
+        """Which of `NAMED_RIGS` photographs the scenes that are rendered for it, as of ``fpp-bench robustness``, with
+        these ``settings`` (an option that is not given may be missing)."""
+        return "paper"
 
     @classmethod
     def short_name(cls, submission: "Submission") -> str | None:

@@ -104,8 +104,7 @@ class FringeNetRoute(Geometry):
             found = self.phases(seen)
             phase = found.phase_rad[0]
             order = order + np.rint((seen.phase_rad - phase) / TAU).astype(np.int32)
-            fit, expected = replace(seen.fit, phase_rad=phase), np.float32(EXPECTED_SHARE) * found.sigma_rad[0]
-            seen = replace(seen, fit=fit, phase_rad=phase, uncertainty_rad=expected)
+            seen = replace(seen, phase_rad=phase, uncertainty_rad=np.float32(EXPECTED_SHARE) * found.sigma_rad[0])
         return self.conclude(seen, order, margin)
 
 

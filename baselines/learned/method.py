@@ -249,7 +249,10 @@ class CrossedNetMethod(LearnedRoute):
     period_tolerance = 2.2
     purpose = "one crossed frame, with order, mask and correction learned"
     Options = CrossedNetOptions
-    scenes_rig = "crossed"
+
+    @classmethod
+    def scenes_rig(cls, settings: Mapping[str, Any]) -> str:
+        return "crossed"
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
@@ -324,8 +327,8 @@ class FringeNetMethod(LearnedRoute):
         return [{"fringes": way} for way in ways]
 
     @classmethod
-    def rig_of_scenes(cls, options: Mapping[str, Any]) -> str:
-        return "crossed" if options.get("fringes") == "crossed" else cls.scenes_rig
+    def scenes_rig(cls, settings: Mapping[str, Any]) -> str:
+        return "crossed" if settings.get("fringes") == "crossed" else super().scenes_rig(settings)
 
     @classmethod
     def short_name(cls, submission: "Submission") -> str | None:
@@ -344,7 +347,6 @@ class FringeNetMethod(LearnedRoute):
         given = self.checked_options(options)
         crossed = bool(rig.sequence.crossed_frames) if given.fringes is None else given.fringes == "crossed"
         fringes = given.fringes or ("crossed" if crossed else "horizontal")
-        self.scenes_rig = self.rig_of_scenes({"fringes": fringes})
         if crossed and not rig.sequence.crossed_frames:
             raise PredictionError(f"{self.name} --fringes crossed: this rig projects no crossed frame")
         if not 1 <= given.members <= MEMBERS:

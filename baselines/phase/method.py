@@ -214,7 +214,10 @@ class CrossedMethod(RouteMethod):
     name = "crossed"
     purpose = "one frame with two fringe directions, or three, nothing learned"
     Options = CrossedOptions
-    scenes_rig = "crossed"
+
+    @classmethod
+    def scenes_rig(cls, settings: Mapping[str, Any]) -> str:
+        return "crossed"
 
     def __init__(self, rig: Rig, **options: Any) -> None:
         given = self.checked_options(options)

@@ -77,7 +77,7 @@ class Setup:
             severities = (0,)
         else:
             objects = corruptions().axes[axis].seen_on(objects)
-        rig = self.method.scenes_rig
+        rig = self.method.scenes_rig(self.method.settings)
         return [Condition(axis, severity, objects, self.size, rig) for severity in severities]
 
     def key(self) -> dict[str, Any]:

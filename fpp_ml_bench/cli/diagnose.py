@@ -228,7 +228,7 @@ def robust(
     workers = pool.processes
     if into is not None and (axes or quick):
         raise PredictionError("--into: needs all axes and severities; leave out --axes and --quick")
-    rig = find(chosen.name).method.rig_of_scenes(chosen.options)
+    rig = find(chosen.name).method.scenes_rig(chosen.options)
     settings = Condition(CLEAN, 0, SETS[objects], size, rig).settings
     method = chosen.load(Scenes.of(settings), warn=False)
     entry = None if into is None else read_entry(into)
