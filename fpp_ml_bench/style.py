@@ -9,6 +9,7 @@ the given hashes: the page sends no request, and an injected script can't run. T
 
 import hashlib
 import html
+import textwrap
 from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -89,6 +90,7 @@ def figure_png(drawn: "Figure", reduced: bool = False) -> bytes:
 
 LINE = {"markersize": 4, "linewidth": 1.2}
 _GAP = 4  # px between two pictures
+_LETTERS_AN_INCH, _HANDLE_INCHES = 14, 0.65  # of a legend: its letters, and the line before them
 
 
 @dataclass(frozen=True)
@@ -126,9 +128,11 @@ def panels(titles: Sequence[str], columns: int, width_in: float, height_in: floa
 
 
 def with_legend(drawn: Any, columns: int) -> bytes:
-    """A figure with one legend of the lines of all its panels; PNG."""
+    """A figure with one legend of the lines of all its panels, in lines that fit its columns; PNG."""
     handles = {label: h for axes in drawn.axes for h, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    drawn.legend(handles.values(), handles, ncols=columns, loc="outside lower center")
+    letters = int(_LETTERS_AN_INCH * (drawn.get_figwidth() / columns - _HANDLE_INCHES))
+    labels = [textwrap.fill(label, letters) for label in handles]
+    drawn.legend(handles.values(), labels, ncols=columns, loc="outside lower center")
     return figure_png(drawn, reduced=True)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from PIL import Image
 
-from fpp_ml_bench.style import DPI, LINE_COLOURS, figure, figure_png, styled
+from fpp_ml_bench.style import DPI, LINE_COLOURS, figure, figure_png, panels, styled, with_legend
 
 
 @styled
@@ -32,6 +32,17 @@ def test_a_picture_has_the_style_and_the_settings_stay():
 def test_the_bytes_are_the_same_each_time_and_fewer_when_reduced():
     assert drawn() == drawn() and drawn(reduced=True) == drawn(reduced=True)
     assert len(drawn(reduced=True)) < len(drawn()) and b"matplotlib" not in drawn()
+
+
+def test_a_legend_of_long_titles_is_in_the_picture():
+    picture, (axes,) = panels(["one"], 1, 13, 2)
+    for number in range(6):
+        axes.plot(
+            [0, 1], [0, number], label=f"{number}: one horizontal fringe, order by range + shading, nothing learned, W"
+        )
+    styled(with_legend)(picture, 3)
+    legend, whole = picture.legends[0].get_window_extent(), picture.bbox
+    assert whole.x0 <= legend.x0 and legend.x1 <= whole.x1
 
 
 def test_line_colours_differ_to_everyone():
