@@ -37,9 +37,7 @@ def test_the_bytes_are_the_same_each_time_and_fewer_when_reduced():
 def test_a_legend_of_long_titles_is_in_the_picture():
     picture, (axes,) = panels(["one"], 1, 13, 2)
     for number in range(6):
-        axes.plot(
-            [0, 1], [0, number], label=f"{number}: one horizontal fringe, order by range + shading, nothing learned, W"
-        )
+        axes.plot([0, 1], [0, number], label=f"{number}" + 4 * ", order by range and shading, nothing learned")
     styled(with_legend)(picture, 3)
     legend, whole = picture.legends[0].get_window_extent(), picture.bbox
     assert whole.x0 <= legend.x0 and legend.x1 <= whole.x1
