@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.errors import CaptureError
 
 Severity = Literal["refuse", "warn", "note"]
@@ -11,9 +12,9 @@ Severity = Literal["refuse", "warn", "note"]
 
 @dataclass(frozen=True)
 class Finding:
-    """``severity`` "refuse": the depth can't be trusted; "warn": it is
-    doubtful; "note": it is worth knowing. ``evidence`` says what was measured,
-    ``cause`` what most likely made it, ``change`` what to do, a clause each."""
+    """``severity`` "refuse": the depth can't be trusted; "warn": it is doubtful; "note": it is worth knowing.
+    ``evidence`` says what was measured, ``cause`` what most likely made it ("": nothing that was tried fits), and
+    ``change`` what to do, a clause each."""
 
     name: str
     severity: Severity
@@ -22,19 +23,21 @@ class Finding:
     change: str
 
     def __str__(self) -> str:
-        return f"{self.name}: {self.evidence}; probably {self.cause}; {self.change}"
+        cause = f"probably {self.cause}" if self.cause else "no cause that was tried fits"
+        return f"{self.name}: {self.evidence}; {cause}; {self.change}"
 
 
 @dataclass(frozen=True)
 class Examination:
     """The ``findings``, worst first; what the frames of this rig can't tell (``not_checked``); ``measured`` figures by
     name; ``systematic_rad``, by direction, the RMS error of the finest phase that the response of projector and camera
-    causes (0 where none shows)."""
+    and an epipolar pattern cause (0 where none shows); ``full_grey``: the grey level at which pixels are saturated."""
 
     findings: tuple[Finding, ...] = ()
     not_checked: tuple[str, ...] = ()
     measured: Mapping[str, float] = field(default_factory=dict)
     systematic_rad: Mapping[str, float] = field(default_factory=dict)
+    full_grey: float = GREY_LEVELS
 
     @property
     def refused(self) -> tuple[Finding, ...]:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.coding.code import Limits, Reason
+from fpp_ml_bench.coding.code import Coordinates, Limits, Reason
 from fpp_ml_bench.coding.gray_code import GrayCells, GrayOnly
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.decoding.blocks import depth_and_reason, plan_direction
@@ -74,27 +74,34 @@ def _inverse_pose(lines: Lines, rig: Rig) -> tuple[Lines, Rig]:
 @dataclass(frozen=True)
 class Fit:
     """Shares of the lit pixels: ``coherent`` with the code and their neighbours, and so and in the range, ``fitting``;
-    ``contradicting`` the code. ``agreeing``: what neighbours say, 1 or less. ``depth_mm``: of coherent
-    pixels, whatever the range."""
+    ``contradicting`` the code. ``agreeing``: what neighbours say, 1 or less. ``depth_mm``: of coherent pixels, whatever
+    the range. ``against`` bool (n,): which of the ``lit`` pixels, bool (n,), contradict the code."""
 
     coherent: float = 0.0
     fitting: float = 0.0
     contradicting: float = 0.0
     agreeing: float = 1.0
     depth_mm: NDArray[np.float64] | None = None
+    lit: NDArray[np.bool_] | None = None
+    against: NDArray[np.bool_] | None = None
 
 
 AS_GIVEN = Reading("as the rig file says", "")
+
+
+def decoded_lines(
+    lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits
+) -> dict[Direction, Coordinates]:
+    """The projector's coordinates of the lines' pixels."""
+    plans = [plan_direction(rig, direction, None) for direction in directions]
+    return {plan.direction: plan.decode(np.ascontiguousarray(lines.levels[list(plan.rows)]), limits) for plan in plans}
 
 
 def fit(lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits, reading: Reading, solid: bool) -> Fit:
     """How well the reading fits; without ``solid`` (a rig that is not calibrated) depth and order don't count."""
     lines, rig = reading.seen(lines, rig)
     levels = lines.levels
-    measured, edges = {}, 1.0
-    for direction in directions:
-        plan = plan_direction(rig, direction, None)
-        measured[direction] = plan.decode(np.ascontiguousarray(levels[list(plan.rows)]), limits)
+    measured, edges = decoded_lines(lines, rig, directions, limits), 1.0
     reasons = np.stack([coordinates.reason for coordinates in measured.values()])
     reason = np.where(reasons == 0, np.uint8(Reason.NOT_ASKED), reasons).min(axis=0)
     reason[reason == Reason.NOT_ASKED] = 0
@@ -116,7 +123,7 @@ def fit(lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits,
         return Fit()
     if not solid:
         share = edges * float((reason[counted] == 0).mean())
-        return Fit(share, share, float(contradicting.sum()) / bright, edges)
+        return Fit(share, share, float(contradicting.sum()) / bright, edges, None, lit, contradicting)
     rays = tuple(axis[lines.row, lines.column] for axis in rig.camera.rays())
     forward = min(
         (_forward(lines, rays, measured[way].coordinate_px, reason == 0, rig, way) for way in directions), default=1.0
@@ -132,7 +139,8 @@ def fit(lines: Lines, rig: Rig, directions: Sequence[Direction], limits: Limits,
         inside |= np.abs(depth_mm - rig.background_m * MM_PER_M) < _BACKGROUND_SHARE * rig.background_m * MM_PER_M
     coherent, fitting = float(good[counted].mean()), float((good & inside)[counted].mean())
     weight, against = edges * min(1.0, 2 * forward), float(contradicting.sum()) / bright
-    return Fit(weight * coherent, weight * fitting, against, weight, depth_mm[good].astype(np.float64))
+    depths_mm = depth_mm[good].astype(np.float64)
+    return Fit(weight * coherent, weight * fitting, against, weight, depths_mm, lit, contradicting)
 
 
 def _forward(

@@ -8,10 +8,10 @@ what neighbours can't have in common with the scene: a surface is smooth within 
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,19 @@ share of what their steps would make, and their gain within this of 1."""
 _EQUAL_PX = 30_000
 SIGMAS = 6.0
 """Standard errors above which a figure is none of chance."""
+BANDS = 16
+"""Of rows and of columns, each looked at by itself: a tear is missed in the last sixteenth of the image at most."""
+ONE_PHASE = 0.7
+"""Mean resultant length of the phases in a band that fringes hardly cross: two steps may be equally bright there."""
+PILED_SHARE, PILE_DEPTH = 0.01, 0.03
+"""Levels are saturated where so many of them are the highest one exactly, more than in this part of the levels below
+it. A whole crest without noise has half as many there."""
+CLEAR_LEVELS = 0.15
+"""Median distance of a frame from the middle grey level, in spans, from which its bright and dark parts are told
+apart: a Gray frame has 0.5, a sinusoid 0.35, and blurred fringes less."""
+
+
+Side = Literal["rows", "columns"]
 
 
 @dataclass(frozen=True)
@@ -64,6 +77,23 @@ class Lines:
         joined = self.joined[picked] & np.append(np.diff(picked) == 1, False)
         others = self.column[picked], self.row[picked], joined, self.across[picked], self.lit[picked]
         return Lines(self.levels[:, picked], *others)
+
+    def banded(self, shape: tuple[int, int]) -> Iterator[tuple["Band", NDArray[np.bool_]]]:
+        """The bands of an image of ``shape`` (H, W), of rows and then of columns, and which pixels (n,) lie in each."""
+        sides: tuple[tuple[Side, NDArray[np.intp]], ...] = (("rows", self.row), ("columns", self.column))
+        for (side, position), length in zip(sides, shape, strict=True):
+            number = position * BANDS // length
+            for band in range(BANDS):
+                first, end = (-(-count * length // BANDS) for count in (band, band + 1))
+                yield Band(side, first, end - 1), number == band
+
+
+class Band(NamedTuple):
+    """Neighbouring rows or columns, ``first`` to ``last``."""
+
+    side: Side
+    first: int
+    last: int
 
 
 def _thinned(pixels: NDArray[np.bool_]) -> NDArray[np.intp]:
@@ -133,6 +163,11 @@ class FringeSet:
     def steps(self) -> int:
         return len(self.frames)
 
+    @property
+    def one_phase(self) -> bool:
+        """Whether the pixels have nearly the same phase."""
+        return not self.good.any() or bool(abs(np.exp(1j * self.phase[self.good]).mean()) > ONE_PHASE)
+
 
 def fringe_sets(lines: Lines, rig: Rig, directions: Sequence[Direction]) -> list[FringeSet]:
     """The sets of three and more steps, with what the lines show of them."""
@@ -168,12 +203,13 @@ def equal_frames(
                 found.append((one.frames[i], one.frames[j]))
     levels = lines.levels[:, _thinned(lines.lit)].astype(np.float64)
     low, high = levels.min(axis=0), levels.max(axis=0)
-    bright, span = (levels > (low + high) / 2).mean(axis=1), float(np.median(high - low))
+    from_middle, span = levels - (low + high) / 2, float(np.median(high - low))
+    bright, clear = (from_middle > 0).mean(axis=1), np.median(np.abs(from_middle), axis=1)
     coded = [frame.index for frame in rig.sequence if frame.direction is None or frame.direction in directions]
     for i, j in pairwise(coded):
         same_set = any({i, j} <= set(one.frames) for one in sets)
         # A frame that is bright or dark all over may well be followed by another one.
-        varied = all(0.05 < bright[k] < 0.95 for k in (i, j))
+        varied = all(0.05 < bright[k] < 0.95 and clear[k] > CLEAR_LEVELS * span for k in (i, j))
         apart = np.abs(levels[i] - levels[j])
         if not same_set and varied and np.median(apart) < 0.02 * span and (apart < 0.1 * span).mean() > 0.98:
             found.append((i, j))
@@ -291,6 +327,21 @@ def _wrapped(angle: NDArray) -> NDArray[np.float64]:
     return angle - TAU * np.rint(angle / TAU)
 
 
+def marked_saturated(lines: Lines, rig: Rig, directions: Sequence[Direction]) -> tuple[Lines, float]:
+    """The lines with their saturated levels at `GREY_LEVELS`, and the level at which they are saturated: below that
+    where the levels of sinusoids pile up there, as in a sum of saturated exposures."""
+    sinusoids = [index for one in fringe_sets(lines, rig, directions) for index in one.frames]
+    levels = lines.levels[sinusoids][:, lines.lit]
+    top = levels.max() if levels.size else GREY_LEVELS
+    near = levels > top - PILE_DEPTH * (top - levels.min()) if levels.size else levels
+    piled = np.count_nonzero(levels == top)
+    if top >= GREY_LEVELS or piled < PILED_SHARE * levels.size or piled < np.count_nonzero(near) / 2:
+        return lines, float(GREY_LEVELS)
+    return replace(lines, levels=np.where(lines.levels >= top, levels.dtype.type(GREY_LEVELS), lines.levels)), float(
+        top
+    )
+
+
 class Edges(NamedTuple):
     """At the edges of Gray cells: the common ``offset_turns`` of the phase there, the share of edges within an eighth
     of a period of it (``agreeing``), the share at which phase and cells grow the same way, and how many."""
@@ -299,6 +350,11 @@ class Edges(NamedTuple):
     agreeing: float
     forward: float
     edges: int
+
+    @property
+    def clear(self) -> bool:
+        """Whether nearly all edges agree, so that a common offset means something."""
+        return self.agreeing > 0.8 and self.forward > 0.8
 
 
 def gray_edges(lines: Lines, one: FringeSet, rig: Rig, limits: Limits) -> Edges | None:

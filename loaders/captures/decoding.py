@@ -102,7 +102,7 @@ def decode_capture(
     notes = [capture.note] if capture.note else []
     if noise_grey is None and measured_grey is None:
         notes.append(f"three steps can't tell their noise; {noise:g} grey level assumed, --noise sets it")
-    notes += _clipped(capture, modulation >= min_modulation)
+    notes += _clipped(capture, modulation >= min_modulation, examination.full_grey)
     if not decoded.depth_mm.any():
         reason = _main_reason(decoded)
         raise DecodeError(f"no pixel could be decoded; of most pixels: {reason.words}; probably {CAUSES[reason]}")
@@ -140,7 +140,10 @@ def _examined_and_decoded(
     )
     if examination.refused and not anyway:
         raise RefusedCapture(str(folder), examination)
-    decoded = decode_stack(capture.frames, rig, direction, mask=mask, limits=limits, details=True, threads=threads)
+    frames = capture.frames
+    if examination.full_grey < GREY_LEVELS:
+        frames = np.where(frames >= examination.full_grey, frames.dtype.type(GREY_LEVELS), frames)
+    decoded = decode_stack(frames, rig, direction, mask=mask, limits=limits, details=True, threads=threads)
     return decoded, examination
 
 
@@ -149,14 +152,15 @@ def _main_reason(decoded: Decoded) -> Reason:
     return max(CAUSES, key=lambda reason: decoded.counts[reason.name.lower()])
 
 
-def _clipped(capture: CapturedFrames, lit: NDArray[np.bool_]) -> list[str]:
+def _clipped(capture: CapturedFrames, lit: NDArray[np.bool_], full_grey: float) -> list[str]:
     shares = {
-        name: float((frame[lit] >= GREY_LEVELS).mean()) if lit.any() else 0.0
+        name: float((frame[lit] >= full_grey).mean()) if lit.any() else 0.0
         for name, frame in zip(capture.names, capture.frames, strict=True)
     }
     high = [f"{name} ({100 * share:.0f}%)" for name, share in shares.items() if share > CLIPPED_SHARE]
     more = f" and {len(high) - 4} more" if len(high) > 4 else ""
-    return [f"saturated on lit pixels: {', '.join(high[:4])}{more}; expose less"] if high else []
+    piled = f", where levels pile up at {full_grey:.0f} of {GREY_LEVELS}" if full_grey < GREY_LEVELS else ""
+    return [f"saturated on lit pixels{piled}: {', '.join(high[:4])}{more}; expose less"] if high else []
 
 
 def read_mask(file: Path, shape: tuple[int, int]) -> NDArray[np.bool_]:

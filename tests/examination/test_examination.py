@@ -239,3 +239,71 @@ def test_only_what_is_asked_for_is_looked_at():
     assert said(frames, rig) and said(frames, rig, mask=mask) == []
     dark = examine(frames // 60, rig)
     assert dark.findings == () and "pixels looked at are lit" in dark.not_checked[-1]
+
+
+@pytest.mark.parametrize("steps", [3, 4, 8])
+@pytest.mark.parametrize("torn", [1, -1, "gray"])
+@pytest.mark.parametrize("first, last", [(140, 199), (185, 199), (0, 70)])
+def test_rows_that_show_another_pattern_are_named(steps, torn, first, last):
+    rig = vertical(FOUR | {"steps": steps})
+    frames, others = frames_of(rig), frames_of(rig, seed=1)
+    index = steps + 2 if torn == "gray" else 1
+    frames[index, first : last + 1] = others[index + (1 if torn == "gray" else torn), first : last + 1]
+    ((name, text),) = said(frames, rig)
+    assert name == "torn frames" and "differ from the other rows" in text
+    start, end = text.split("rows ")[1].split(" differ")[0].split(" to ")
+    # To a sixteenth of the rows.
+    assert abs(int(start) - first) <= 13 and abs(int(end) - last) <= 13
+
+
+def test_columns_of_a_turned_camera_are_named():
+    rig = rig_of(TWO)
+    frames, others = frames_of(rig), frames_of(rig, seed=1)
+    frames[6, :, 150:] = others[5, :, 150:]
+    ((name, text),) = said(frames, rig)
+    assert name == "torn frames" and "columns 150 to" in text
+
+
+@pytest.mark.parametrize("steps", [4, 8])
+def test_a_step_that_becomes_another_one_row_by_row(steps):
+    """A rolling shutter: the frame turns into the one before it between two rows."""
+    rig = vertical(FOUR | {"steps": steps})
+    frames = frames_of(rig).astype(np.float64)
+    share = np.clip((np.arange(SIZE) - 120) / 60, 0, 1)[:, None]
+    frames[2] = (1 - share) * frames[2] + share * frames[1]
+    ((name, text),) = said(np.rint(frames).astype(np.uint8), rig)
+    assert name in ("torn frames", "wrong step") and "step" in text
+
+
+def test_rows_whose_frames_are_all_late_contradict_the_code():
+    rig = vertical(FOUR | {"steps": 3})
+    frames = frames_of(rig)
+    frames[1:, 140:] = frames_of(rig, seed=1)[:-1, 140:]
+    frames[0, 140:] = 100
+    ((name, text),) = said(frames, rig)
+    assert name == "contradictions" and "most in rows 138 to 199" in text and "no cause that was tried fits" in text
+
+
+def test_steps_that_are_equally_bright_where_fringes_hardly_run_are_no_tear():
+    """A period of the whole pattern: in a band all pixels have one phase, at which two steps may be equal."""
+    rig = vertical({"scheme": "phase-shift", "pitches_px": [912, 57], "steps": 4})
+    texture = 0.5 + 0.5 * (np.indices((SIZE, SIZE)).sum(axis=0) // 9 % 2)
+    frames = np.rint(frames_of(rig) * texture).astype(np.uint8)
+    assert said(frames, rig) == []
+
+
+@pytest.mark.parametrize("top", [200, 235])
+def test_levels_that_pile_up_are_saturated_wherever_that_is(top):
+    rig = vertical(FOUR)
+    bright = np.stack(capture(rig, tilted(rig), albedo=1.2, noise=0.0)).astype(np.float64)
+    summed = sum(np.minimum(bright + np.random.default_rng(n).normal(0, 1, bright.shape), top) for n in range(10))
+    levels = np.rint(summed).astype(np.float32) * np.float32(255 / 4095)
+    assert examine(levels, rig).full_grey == levels.max()
+    clipped = np.minimum(bright, top).astype(np.uint8)
+    assert examine(clipped, rig).full_grey == top
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.0])
+def test_a_whole_crest_is_not_saturated(noise):
+    rig = vertical(FOUR)
+    assert examine(frames_of(rig, noise=noise), rig).full_grey == 255
