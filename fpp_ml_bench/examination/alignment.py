@@ -51,7 +51,7 @@ class Seen(NamedTuple):
     translation: NDArray[np.float64]
     focal_px: tuple[float, float]
 
-    def distance_px(self) -> NDArray[np.float64]:
+    def px(self) -> NDArray[np.float64]:
         """Signed distance of the projector's points from their epipolar lines, in undistorted projector px (n,)."""
         (x, y), (u, v) = self.camera, self.projector
         line = np.cross(self.translation, np.stack([x, y, np.ones_like(x)], axis=1) @ self.rotation.T)
@@ -61,6 +61,39 @@ class Seen(NamedTuple):
         return distance
 
 
+class Change(NamedTuple):
+    """A kind of change: its number of ``parameters``, the ``terms`` that each adds to coordinates (x, y), and the
+    ``words`` for parameters and a focal length in px."""
+
+    parameters: int
+    terms: Callable[[NDArray, NDArray], list[tuple[NDArray, NDArray]]]
+    words: Callable[[NDArray, float], str]
+
+
+CHANGES: dict[Part, Change] = {
+    "shift": Change(
+        2,
+        lambda x, y: [(1 + 0 * x, 0 * y), (0 * x, 1 + 0 * y)],
+        lambda p, f: f"another window or principal point, ({-f * p[0]:+.1f}, {-f * p[1]:+.1f}) px off",
+    ),
+    "turn": Change(
+        2,
+        lambda x, y: [(1 + x * x, x * y), (x * y, 1 + y * y)],
+        lambda p, f: f"a turn by {np.rad2deg(np.hypot(*p)):.2f} degrees",
+    ),
+    "roll": Change(1, lambda x, y: [(-y, x)], lambda p, f: f"a roll by {np.rad2deg(abs(p[0])):.2f} degrees"),
+    "zoom": Change(
+        1, lambda x, y: [(x, y)], lambda p, f: f"a focal length {100 / (1 + p[0]) - 100:+.2f}% off (zoom, focus)"
+    ),
+    "keystone": Change(2, lambda x, y: [(x * x, x * y), (x * y, y * y)], lambda p, f: "a keystone correction"),
+    "barrel": Change(
+        1,
+        lambda x, y: [(x * (x * x + y * y), y * (x * x + y * y))],
+        lambda p, f: "another distortion of the lens",
+    ),
+}
+
+
 @dataclass(frozen=True)
 class Cause:
     """A change of a device, in ``parts``, that may explain a pattern."""
@@ -68,56 +101,31 @@ class Cause:
     device: Device
     parts: tuple[Part, ...]
 
-    def applied(self, seen: Seen, change: NDArray[np.float64]) -> Seen:
-        """What is seen with the ``change`` of the parameters undone."""
+    @property
+    def count(self) -> int:
+        """How many parameters: of the pose, a rotation and two of the baseline's direction."""
+        return 5 if self.device == "pose" else sum(CHANGES[part].parameters for part in self.parts)
+
+    def left_px(self, seen: Seen, change: NDArray[np.float64]) -> NDArray[np.float64]:
+        """The distances from the epipolar lines, with the ``change`` undone."""
         if self.device == "pose":
             across = np.linalg.svd(seen.translation[None])[2][1:]  # its length leaves no pattern
-            shifted = seen.translation + np.linalg.norm(seen.translation) * change[3:] @ across
-            return seen._replace(rotation=seen.rotation @ rotation_matrix(tuple(change[:3])), translation=shifted)
+            moved = seen.translation + np.linalg.norm(seen.translation) * change[3:] @ across
+            return seen._replace(rotation=seen.rotation @ rotation_matrix(tuple(change[:3])), translation=moved).px()
         x, y = seen.camera if self.device == "camera" else seen.projector
-        terms = np.array([term for part in self.parts for term in _terms(part, x, y)])
-        moved_x, moved_y = np.stack([x, y]) + np.tensordot(change, terms, axes=1)
-        moved = moved_x, moved_y
-        return seen._replace(camera=moved) if self.device == "camera" else seen._replace(projector=moved)
-
-    @property
-    def parameters(self) -> int:
-        few = np.zeros(1)
-        return 5 if self.device == "pose" else sum(len(_terms(part, few, few)) for part in self.parts)
+        terms = np.array([term for part in self.parts for term in CHANGES[part].terms(x, y)])
+        x, y = np.stack([x, y]) + np.tensordot(change, terms, axes=1)
+        return (seen._replace(camera=(x, y)) if self.device == "camera" else seen._replace(projector=(x, y))).px()
 
     def words(self, change: NDArray[np.float64], rig: Rig) -> str:
         """What the change is, with its figures."""
         if self.device == "pose":
-            turn = math.degrees(float(np.linalg.norm(change[:3])))
+            turn = np.rad2deg(np.linalg.norm(change[:3]))
             return f"camera and projector moved against each other (turned by {turn:.2f} degrees)"
-        pinhole, said, at = rig.camera if self.device == "camera" else rig.projector, [], 0
-        for part in self.parts:
-            if part == "shift":
-                across, down = (-p * f for p, f in zip(change[at : at + 2], pinhole.focal, strict=True))
-                said.append(f"another window or principal point, ({across:+.1f}, {down:+.1f}) px off")
-            elif part == "turn":
-                said.append(f"a turn by {math.degrees(math.hypot(*change[at : at + 2])):.2f} degrees")
-            elif part == "roll":
-                said.append(f"a roll by {math.degrees(abs(change[at])):.2f} degrees")
-            elif part == "zoom":
-                said.append(f"a focal length {100 * (1 / (1 + change[at]) - 1):+.2f}% off (zoom, focus)")
-            else:
-                said.append({"keystone": "a keystone correction", "barrel": "another distortion of the lens"}[part])
-            at += 2 if part in ("shift", "turn", "keystone") else 1
+        ends = np.cumsum([CHANGES[part].parameters for part in self.parts])
+        focal_px = (rig.camera if self.device == "camera" else rig.projector).fx
+        said = [CHANGES[part].words(p, focal_px) for part, p in zip(self.parts, np.split(change, ends), strict=False)]
         return f"of the {self.device}: {' and '.join(said)}"
-
-
-def _terms(part: Part, x: NDArray, y: NDArray) -> list[tuple[NDArray, NDArray]]:
-    """What a part adds to coordinates (x, y) for each of its parameters."""
-    one, none, square = np.ones_like(x), np.zeros_like(x), x * x + y * y
-    return {
-        "shift": [(one, none), (none, one)],
-        "turn": [(1 + x * x, x * y), (x * y, 1 + y * y)],
-        "roll": [(-y, x)],
-        "zoom": [(x, y)],
-        "keystone": [(x * x, x * y), (x * y, y * y)],
-        "barrel": [(x * square, y * square)],
-    }[part]
 
 
 _PARTS: tuple[tuple[Part, ...], ...] = (
@@ -152,7 +160,7 @@ def epipolar_pattern(lines: Lines, rig: Rig, measured: Mapping[Direction, Coordi
     rays = tuple(axis[lines.row[good], lines.column[good]] for axis in rig.camera.rays())
     projector = rig.projector.normalised(*(measured[direction].coordinate_px[good] for direction in AXES))
     seen = Seen((rays[0], rays[1]), projector, rig.R, rig.t, rig.projector.focal)
-    distance = seen.distance_px()
+    distance = seen.px()
     known = np.isfinite(distance)
     if known.sum() < LEAST_PX:
         return None
@@ -169,16 +177,12 @@ def epipolar_pattern(lines: Lines, rig: Rig, measured: Mapping[Direction, Coordi
     enough_px = math.hypot(ALIKE * max(rest_px, LEAST_REST_PX), UNEXPLAINED * rms_px)
     fitting = []
     for cause in CAUSES:
-        change, left_px = _fitted(partial(_left_by, cause, seen), cause.parameters)
+        change, left_px = _fitted(partial(cause.left_px, seen), cause.count)
         if left_px <= enough_px and np.abs(change).max() <= LARGEST_CHANGE:
-            fitting.append((cause.parameters, left_px, cause.words(change, rig)))
+            fitting.append((cause.count, left_px, cause.words(change, rig)))
     fewest, best_px, _ = min(fitting, default=(0, 0.0, ""))
     alike = [words for count, left_px, words in fitting if count == fewest and left_px <= ALIKE * best_px]
     return Pattern(rms_px, rest_px, tuple(alike))
-
-
-def _left_by(cause: Cause, seen: Seen, change: NDArray[np.float64]) -> NDArray[np.float64]:
-    return cause.applied(seen, change).distance_px()
 
 
 def _fitted(residual: Residual, count: int) -> tuple[NDArray[np.float64], float]:

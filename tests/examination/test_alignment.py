@@ -36,7 +36,7 @@ def test_the_signed_distance_is_that_of_the_decoder():
     u, v = LENSES.project(np.stack([rays[0] * depth_m, rays[1] * depth_m, depth_m], axis=-1))
     u, v = u + rng.normal(0, 2, 500), v + rng.normal(0, 2, 500)
     seen = Seen(rays, LENSES.projector.normalised(u, v), LENSES.R, LENSES.t, LENSES.projector.focal)
-    assert np.abs(np.abs(seen.distance_px()) - depth_from_both(rays, u, v, LENSES).disagreement_px).max() < 1e-3
+    assert np.abs(np.abs(seen.px()) - depth_from_both(rays, u, v, LENSES).disagreement_px).max() < 1e-3
 
 
 @pytest.mark.parametrize(
