@@ -311,7 +311,7 @@ def _torn(
             continue
         part = lines.at(np.flatnonzero(inside))
         sets = fringe_sets(part, rig, directions)
-        for i, j in equal_frames(part, [one for one in sets if not one.one_phase], rig, directions):
+        for i, j in equal_frames(part, [one for one in sets if not one.one_phase], rig, directions, True):
             torn[band.side].setdefault(band, []).append(f"{titles[j]} shows the image of {titles[i]}")
         for one in sets:
             name = f"the {one.direction} fringes of {one.pitch_px:g} px"

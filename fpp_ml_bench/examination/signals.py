@@ -188,15 +188,15 @@ def fringe_sets(lines: Lines, rig: Rig, directions: Sequence[Direction]) -> list
 
 
 def equal_frames(
-    lines: Lines, sets: Sequence[FringeSet], rig: Rig, directions: Sequence[Direction]
+    lines: Lines, sets: Sequence[FringeSet], rig: Rig, directions: Sequence[Direction], following: bool = False
 ) -> list[tuple[int, int]]:
     """Pairs of frames that should differ and show the same, but for noise and a few percent of brightness: within a
-    set, and one after the other."""
+    set (``following``: only if they follow one another), and one after the other."""
     found = []
     for one in sets:
         part = lines.at(_thinned(one.good))
         middle = float(np.median(one.modulation[one.good])) if one.good.any() else 0.0
-        for i, j in combinations(range(one.steps), 2):
+        for i, j in pairwise(range(one.steps)) if following else combinations(range(one.steps), 2):
             apart = one.shifts_rad[i] - one.shifts_rad[j]
             most = EQUAL_SHARE * math.sqrt(2) * abs(math.sin(apart / 2)) * middle
             if most > 0 and _same(part, one.frames[i], one.frames[j], most):
