@@ -242,9 +242,9 @@ def _steps_and_response(
         which = f"of {titles[one.frames[step[0]]]}" if one.steps > 4 else "of one of four steps"
         faults.append(f"the shift {which} is {abs(np.rad2deg(step[1].value)):.0f} degrees off")
     if (twice := waves.get(2)) is not None:
-        measured[f"{one.direction}_{one.pitch_px:g}px_ripple_rad"] = twice.value
-        if twice.exceeds(RIPPLE_RAD):
-            faults.append(f"the phase has an error of {twice.value:.3f} rad that repeats twice a period")
+        measured[f"{one.direction}_{one.pitch_px:g}px_ripple_rad"] = twice.size.value
+        if twice.size.exceeds(RIPPLE_RAD):
+            faults.append(f"the phase has an error of {twice.size.value:.3f} rad that repeats twice a period")
     if faults:
         return [
             Finding(
@@ -256,15 +256,15 @@ def _steps_and_response(
             )
         ]
     bent = waves.get(one.steps)
-    if bent is None or not bent.exceeds(RESPONSE_RAD):
+    if bent is None or not bent.size.exceeds(RESPONSE_RAD):
         return []
-    systematic[one.direction] = max(systematic.get(one.direction, 0.0), bent.value / math.sqrt(2))
+    systematic[one.direction] = max(systematic.get(one.direction, 0.0), bent.size.value / math.sqrt(2))
     return [
         Finding(
             "response",
             "note",
-            f"{name}: the phase has an error of {bent.value:.3f} rad that repeats {one.steps} times a period",
-            "the response of projector and camera is not straight (gamma)",
+            f"{name}: the phase has an error of {bent.size.value:.3f} rad that repeats {one.steps} times a period",
+            "the response of projector and camera is not straight (gamma)" if bent.symmetric else "",
             "the stated uncertainty holds it; set projector and camera to gamma 1, or use more steps",
         )
     ]

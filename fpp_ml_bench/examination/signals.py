@@ -34,6 +34,8 @@ WHITE_RATIO, EQUAL_SHARE, GAIN = 1.8, 0.35, 0.1
 """Two frames are equal where their difference is white (its mean square below so many times that of noise), below a
 share of what their steps would make, and their gain within this of 1."""
 _EQUAL_PX = 30_000
+SYMMETRIC = 0.3
+"""Largest share of the cosine in a ripple that a response can make: a response alone makes none."""
 SIGMAS = 6.0
 """Standard errors above which a figure is none of chance."""
 BANDS = 16
@@ -267,9 +269,21 @@ def step_errors(one: FringeSet) -> tuple[int, Estimate] | None:
     return worst
 
 
-def ripples(lines: Lines, one: FringeSet) -> dict[int, Estimate]:
-    """Amplitude in rad, by harmonic, of the error of the phase that goes with twice and N times the phase; none where
-    the image shows too few windows of two periods and more."""
+class Ripple(NamedTuple):
+    """Amplitude in rad of an error of the phase, and its part that goes with the cosine. With equal steps, what makes
+    the same of the same brightness at every pixel has a sine of N times the phase alone: its waves are symmetric."""
+
+    size: Estimate
+    cosine: Estimate
+
+    @property
+    def symmetric(self) -> bool:
+        return not self.cosine.exceeds(SYMMETRIC * self.size.value)
+
+
+def ripples(lines: Lines, one: FringeSet) -> dict[int, Ripple]:
+    """By harmonic, the error of the phase that goes with twice and N times the phase; none where the image shows too
+    few windows of two periods and more."""
     slopes = []
     for across in (True, False):
         pixels = one.good & (lines.across == across)
@@ -283,7 +297,7 @@ def ripples(lines: Lines, one: FringeSet) -> dict[int, Estimate]:
     windows = _windows(one.good & (lines.across == across), lines.joined, math.ceil(WINDOW_PERIODS * period))
     if len(windows) < FEWEST_WINDOWS:
         return {}
-    phase = np.unwrap(one.phase[windows], axis=1)
+    phase = np.unwrap(one.phase[windows], axis=1) + one.shifts_rad[0]
     harmonics = [1, 2, *([one.steps] if 2 < one.steps <= period / 2.5 else [])]
     place = np.linspace(-1, 1, phase.shape[1])
     surface = np.linalg.qr(np.stack([np.ones_like(place), place, place**2, place**3], axis=1))[0]
@@ -308,7 +322,7 @@ def ripples(lines: Lines, one: FringeSet) -> dict[int, Estimate]:
     for k, harmonic in enumerate(harmonics):
         pair = solution[2 * k : 2 * k + 2]
         sigma = float(np.sqrt(np.trace(covariance[2 * k : 2 * k + 2, 2 * k : 2 * k + 2]) / 2))
-        found[harmonic] = Estimate(float(np.hypot(*pair)), sigma)
+        found[harmonic] = Ripple(Estimate(float(np.hypot(*pair)), sigma), Estimate(float(pair[0]), sigma))
     return found
 
 

@@ -307,3 +307,20 @@ def test_levels_that_pile_up_are_saturated_wherever_that_is(top):
 def test_a_whole_crest_is_not_saturated(noise):
     rig = vertical(FOUR)
     assert examine(frames_of(rig, noise=noise), rig).full_grey == 255
+
+
+@pytest.mark.parametrize("turned, cause", [(0.0, "response"), (90.0, "no cause that was tried fits")])
+def test_a_wave_that_no_response_makes_has_no_cause(turned, cause):
+    """Equal brightness looks alike at every pixel, so its waves are symmetric: a second harmonic turned against the
+    first comes from elsewhere."""
+    rig = vertical(FOUR | {"steps": 3})
+    frames = frames_of(rig)
+    x, y = rig.camera.rays()
+    u, _ = rig.project(np.stack([x, y, np.ones_like(x)], axis=-1) * tilted(rig)[..., None])
+    for step in range(3):
+        phase = 2 * np.pi * (u / 57 + step / 3)
+        wave = np.cos(phase) + 0.1 * np.cos(2 * phase + np.deg2rad(turned))
+        noise = np.random.default_rng(step).standard_normal(wave.shape)
+        frames[step] = np.rint(100 + 50 * wave + noise)
+    (finding,) = (found for found in examine(frames, rig).findings if found.name == "response")
+    assert cause in str(finding) and finding.severity == "note"
