@@ -47,6 +47,8 @@ fewer fit it, or almost none lies in the range."""
 MISALIGNED_SHARE = 0.0025
 """Of the projector's larger side: an epipolar pattern (RMS) from which the depth can't be trusted, 3.2 px of 1280. The
 calibration that the authors of public captures used leaves 0.0017; depths by it are 1.2 mm off at 400 mm."""
+ALONG: dict[Direction | None, Side] = {"vertical": "rows", "horizontal": "columns"}
+"""Bands along which a code runs through many cells. Across them it has a few, which two bits may show alike."""
 TORN_SHARE, FEWEST_IN_BAND, MORE_IN_BAND = 0.8, 60, 0.4
 """Largest share of the bands that are torn, where a tear and not the capture is at fault; the lit pixels that a band
 needs; and how much more of them contradict the code than in the best band: strong noise alone makes 0.2."""
@@ -312,6 +314,8 @@ def _torn(
         part = lines.at(np.flatnonzero(inside))
         sets = fringe_sets(part, rig, directions)
         for i, j in equal_frames(part, [one for one in sets if not one.one_phase], rig, directions, True):
+            if any(ALONG.get(rig.sequence.frames[k].direction, band.side) != band.side for k in (i, j)):
+                continue
             torn[band.side].setdefault(band, []).append(f"{titles[j]} shows the image of {titles[i]}")
         for one in sets:
             name = f"the {one.direction} fringes of {one.pitch_px:g} px"
@@ -355,7 +359,8 @@ def _ranges(bands: Sequence[Band]) -> str:
 
 
 def _contradicting_bands(part: Lines, given: Fit, shape: tuple[int, int]) -> str:
-    """The rows or columns in which far more of the lit pixels contradict the code than in others; "" where none do."""
+    """The rows or columns in which far more of the lit pixels contradict the code than in others, in words; "" where
+    none do. They reach an end of the image, as those do that were read too late; what a scene does may be anywhere."""
     if given.lit is None or given.against is None:
         return ""
     shares: dict[Side, dict[Band, float]] = {"rows": {}, "columns": {}}
@@ -365,7 +370,8 @@ def _contradicting_bands(part: Lines, given: Fit, shape: tuple[int, int]) -> str
             shares[band.side][band] = float(given.against[lit].mean())
     for of_bands in shares.values():
         more = [band for band, share in of_bands.items() if share > min(of_bands.values()) + MORE_IN_BAND]
-        if 0 < len(more) <= TORN_SHARE * len(of_bands):
+        bands = list(of_bands)
+        if 0 < len(more) <= TORN_SHARE * len(bands) and more in (bands[: len(more)], bands[-len(more) :]):
             return f", most in {_ranges(more)}"
     return ""
 

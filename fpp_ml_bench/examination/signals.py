@@ -46,8 +46,8 @@ PILED_SHARE, PILE_DEPTH = 0.01, 0.03
 """Levels are saturated where so many of them are the highest one exactly, more than in this part of the levels below
 it. A whole crest without noise has half as many there."""
 CLEAR_LEVELS = 0.15
-"""Median distance of a frame from the middle grey level, in spans, from which its bright and dark parts are told
-apart: a Gray frame has 0.5, a sinusoid 0.35, and blurred fringes less."""
+"""Distance from the middle grey level, in spans, from which a pixel is bright or dark: Gray frames have 0.5, sinusoids
+0.35 in the median, and blurred fringes less."""
 
 
 Side = Literal["rows", "columns"]
@@ -206,12 +206,12 @@ def equal_frames(
     levels = lines.levels[:, _thinned(lines.lit)].astype(np.float64)
     low, high = levels.min(axis=0), levels.max(axis=0)
     from_middle, span = levels - (low + high) / 2, float(np.median(high - low))
-    bright, clear = (from_middle > 0).mean(axis=1), np.median(np.abs(from_middle), axis=1)
+    bright, dark = ((sign * from_middle > CLEAR_LEVELS * span).mean(axis=1) for sign in (1, -1))
     coded = [frame.index for frame in rig.sequence if frame.direction is None or frame.direction in directions]
     for i, j in pairwise(coded):
         same_set = any({i, j} <= set(one.frames) for one in sets)
         # A frame that is bright or dark all over may well be followed by another one.
-        varied = all(0.05 < bright[k] < 0.95 and clear[k] > CLEAR_LEVELS * span for k in (i, j))
+        varied = all(min(bright[k], dark[k]) > 0.05 for k in (i, j))
         apart = np.abs(levels[i] - levels[j])
         if not same_set and varied and np.median(apart) < 0.02 * span and (apart < 0.1 * span).mean() > 0.98:
             found.append((i, j))
