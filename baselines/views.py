@@ -187,7 +187,7 @@ def prediction_maps(
         return f"{column} of {printable(dataset.path.name)}", lambda sample: (dataset.depth_mm(sample, column), None)
     checked = check_folder(predictions, dataset, split)
     described, listing = checked.sound(), checked.listing
-    read = listing.reader(dataset.size, described.png_mm_per_level)
+    read = listing.reader(dataset.size, described.png_mm_per_level, described.nodata)
     rules = Rules(target, described.units, described.range_rule, "standard")
 
     def maps(sample: str) -> tuple[Map, Map | None]:

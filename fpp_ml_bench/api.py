@@ -169,6 +169,7 @@ def evaluate(
     sigma: "Maps | None" = None,
     objects: Sequence[str] | None = None,
     units: str | None = None,
+    nodata: float | None = None,
     edge_band_px: int = EDGE_BAND_PX,
 ) -> "ArrayScores": ...
 
@@ -185,14 +186,15 @@ def evaluate(
     sigma: Any = None,
     objects: Any = None,
     units: Any = None,
+    nodata: Any = None,
 ) -> "Result | ArrayScores":
     """Score a folder of predictions, as ``fpp-eval`` does, or arrays in memory by the same rules.
 
     Parameters
     ----------
     predictions : str or Path, or array
-        Folder with a ``submission.yaml`` and a prediction for each sample of the split. Or depth in mm, 0 = not
-        measured: floats (N, H, W), or a list of maps (H, W).
+        Folder with a ``submission.yaml`` and a prediction for each sample of the split. Or depth in mm along the
+        camera's axis (not along the ray), 0 = not measured: floats (N, H, W), or a list of maps (H, W).
     dataset : str, Path or DatasetFolder, or array
         What was predicted. For arrays, the true depth in mm, 0 = background, in the form of the predictions; pixels
         that a masked array masks count in no score.
@@ -212,6 +214,9 @@ def evaluate(
         Of arrays: what each sample shows; intervals are over objects. By default, each sample is an object of its own.
     units : {"mm", "m"}, optional
         Of arrays: the unit of all depths and sigma. Must be said where a target reaches less than 10.
+    nodata : float, optional
+        Of arrays: the value that depths have where no surface is, such as 65535 or NaN, in the unit of the arrays.
+        A folder says it in ``submission.yaml``.
 
     Returns
     -------
@@ -234,7 +239,7 @@ def evaluate(
     >>> fpp.evaluate(truth + 2.0, truth).metrics.object_mae_mm
     2.0
     """
-    in_memory = {"flags": flags, "sigma": sigma, "objects": objects, "units": units}
+    in_memory = {"flags": flags, "sigma": sigma, "objects": objects, "units": units, "nodata": nodata}
     if not isinstance(predictions, (str, Path)):
         if isinstance(dataset, (str, Path, DatasetFolder)):
             raise PredictionError("predictions in memory need the targets as arrays; or give a folder and a dataset")

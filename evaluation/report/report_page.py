@@ -104,7 +104,7 @@ def sample_maps(
     submission = result.submission
     rules = Rules(result.target, submission.units, submission.range_rule, result.mode)
     listing = list_folder(folder, dataset, result.dataset.split)
-    read = listing.reader(dataset.size, submission.png_mm_per_level)
+    read = listing.reader(dataset.size, submission.png_mm_per_level, submission.nodata)
     # The first frame that the method used; frame 0 where it used none or that frame is not stored here.
     used = [index for index in sorted(submission.frames_used) if index < len(dataset.sequence)]
     for place, row in chosen:
