@@ -11,6 +11,7 @@ when it is called.
 True
 """
 
+import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -247,7 +248,7 @@ def evaluate(
     if given := [name for name, values in in_memory.items() if values is not None]:
         raise PredictionError(f"{', '.join(given)}: belongs to arrays; a folder of predictions has its own")
     opened = dataset if isinstance(dataset, DatasetFolder) else DatasetFolder(dataset)
-    return evaluate_folder(predictions, opened, split, target, edge_band_px, mode)
+    return evaluate_folder(predictions, opened, split, target, edge_band_px, mode, say=warnings.warn)
 
 
 def compare(first: "str | Path | Result", second: "str | Path | Result") -> "Comparison":

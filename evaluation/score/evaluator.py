@@ -30,6 +30,7 @@ from fpp_ml_bench.depth import (
     shape_problem,
     without_nodata,
 )
+from fpp_ml_bench.depth_readings import MOST_GLANCES, Glance, another_reading, glance
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import Mode, Units
@@ -73,13 +74,15 @@ def evaluate(
     edge_band_px: int = protocol.EDGE_BAND_PX,
     mode: str = "standard",
     while_scoring: Callable[[], object] = lambda: None,
+    say: Callable[[str], object] = lambda note: None,
 ) -> Result:
     """Score ``folder`` (predictions in one of the accepted forms, and ``submission.yaml``) on a split of ``dataset``.
 
     ``target`` is ``depth`` (decoded, as in the paper) or ``depth_exact`` (from the ray cast); ``mode`` is ``standard``
     or ``paper`` (the paper's pixel sets, without void, and its rule for normalised depth). Memory does not grow with
     the number of samples, and the result does not depend on the number of cores. ``while_scoring`` is called once
-    while threads score: a command uses it to import what it needs afterwards.
+    while threads score: a command uses it to import what it needs afterwards. ``say`` is given a note where another
+    reading of the predictions fits far better (`another_reading`).
 
     Raises SubmissionError for the description, PredictionError (naming every file with a problem) for the predictions,
     and DatasetError for a target that is not a depth map, and for other data than was predicted."""
@@ -124,6 +127,8 @@ def evaluate(
         raise PredictionError(f"{printable(str(folder), 500)} can't be scored, {summary}:", lines)
     if refusal or description is None:
         raise refusal or SubmissionError(f"{printable(str(folder), 500)}: has no description")
+    if note := another_reading("the predictions", [sample.seen for sample in scored if sample.seen is not None]):
+        say(note)
     from fpp_ml_bench.evaluation.result.file import environment
     from fpp_ml_bench.evaluation.result.model import Result, scores_of
 
@@ -160,13 +165,14 @@ def evaluate(
 @dataclass(frozen=True)
 class Scored:
     """A scored sample of an object: its ``row`` (the other keys of `SampleResult`), the scores of its stated
-    uncertainty, None without, and the hashes of what it was scored against by column."""
+    uncertainty, None without, the hashes of what it was scored against by column, and of some samples a glance."""
 
     name: str
     object: str
     row: dict[str, Any]
     stated: SigmaSample | None
     hashes: dict[str, str]
+    seen: Glance | None = None
 
 
 def _row(scores: SampleScores, digest: str) -> dict[str, Any]:
@@ -215,6 +221,7 @@ def _scored(
     in threads, before the first outcome is taken from the iterator."""
     dataset_lock = Lock()
     columns = protocol.scored_columns(rules.target, rules.mode, dataset.has_exact)
+    glanced_at = set(listing.present[:MOST_GLANCES])
 
     def work(sample: str) -> Scored | list[str]:
         with dataset_lock:  # reading the dataset need not be thread-safe
@@ -239,7 +246,9 @@ def _scored(
             else:
                 stated = None if found.sigma_mm is None else score_sigma(*pair, found.sigma_mm, void)
                 hashes = {column: image_hash(image) for column, image in scored_on.items()}
-                outcome = Scored(sample, split_sample_name(sample)[0], _row(scores, found.digest), stated, hashes)
+                seen = glance(sample, *pair, void, dataset.rig.camera) if sample in glanced_at else None
+                row = _row(scores, found.digest)
+                outcome = Scored(sample, split_sample_name(sample)[0], row, stated, hashes, seen)
         with dataset_lock:
             dataset.release(sample)
         return outcome or problems

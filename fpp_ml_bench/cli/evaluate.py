@@ -78,6 +78,7 @@ def score_folder(
     prepare_process()
     _check_outputs(json, page, predictions)
     opened, split = scored_data(predictions, dataset, split)
+    notes: list[str] = []
     scored = evaluate_folder(
         predictions,
         opened,
@@ -86,6 +87,7 @@ def score_folder(
         edge_band,
         mode,
         while_scoring=_result_table,
+        say=notes.append,
     )
     if json is not None:
         write_result(scored, json)
@@ -102,6 +104,8 @@ def score_folder(
     has_expected_bytes, sentence = benchmark_sentence(opened.manifest)
     if not has_expected_bytes:
         print(f"fpp-eval: warning: {opened.path}: {sentence}", file=sys.stderr)
+    for note in notes:
+        print(f"fpp-eval: note: {note}", file=sys.stderr)
     account.say(lambda: explain_eval(opened, split, target, edge_band))
 
 
