@@ -70,7 +70,8 @@ def nodata_problem(depth: NDArray[np.floating], reach: float = 0.0, apart: float
         near, far = extremes(others) if others.size else (0.0, 0.0)
         far = reach or far
         if (value < 0 < near) or 0 < far * apart < value or (not reach and 0 < value * NODATA_DECADE < near):
-            return f"{100 * share:.0f}% of the pixels are exactly {value:.6g}, far from all depths; {NODATA_ADVICE}"
+            shown = f"{100 * share:.0f}% of the pixels are exactly {value:.6g}, far from all depths"
+            return f"{shown}: a value for background? {NODATA_ADVICE}"
     return None
 
 
