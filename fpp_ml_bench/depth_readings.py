@@ -13,7 +13,7 @@ from fpp_ml_bench.optics.pinhole import Pinhole
 
 MOST_GLANCES, _FEW = 48, 8
 """Samples that are compared with each other, and that are read in every way."""
-_LINES = 40
+_LINES = 20
 """Rows and columns of a glance, about; twice as many where they are not symmetric by themselves."""
 _FEWER = 4.0
 """A reading is named where its error is so many times smaller than the one that was given. Chosen by reason: a

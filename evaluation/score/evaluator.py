@@ -96,15 +96,14 @@ def evaluate(
     listing = list_folder(folder, dataset, split)
     # What is no number is refused with the description, which is checked while the first files are scored, for pydantic
     # takes long to import: `result` and `submission` are packages that load what is used of them.
-    level, nodata = (
-        value if isinstance(value, int | float) else None for value in map(content.get, ("png_mm_per_level", "nodata"))
-    )
-    rule = "valid" if content.get("range_rule") == "valid" else "object"
+    level, rule = content.get("png_mm_per_level"), "valid" if content.get("range_rule") == "valid" else "object"
     rules = Rules(target, content.get("units", "mm"), cast(RangeRule, rule), cast(Mode, mode))
     outcomes: Iterable[Scored | list[str]] = ()
     if rules.units in get_args(Units):
         read = listing.reader(
-            dataset.size, level if level is not None and 0 < level < protocol.LARGEST_MM else None, nodata
+            dataset.size,
+            level if isinstance(level, int | float) and 0 < level < protocol.LARGEST_MM else None,
+            content.get("nodata"),
         )
         outcomes = _scored(listing, read, dataset, rules, edge_band_px)
     if refusal is None:

@@ -119,23 +119,20 @@ def _result_table() -> "Callable[[Result], Any]":
 def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[DatasetFolder, str]":
     """The dataset in ``place`` and the ``split`` to score; where they are not given, those that ``folder`` was
     predicted from, by its submission.yaml. Raises `SubmissionError` where that does not say, and `DatasetError` where
-    the dataset is gone or another one now."""
+    the dataset is gone; whether it is still the same is checked when it is scored."""
     from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE, predictions_folder, read_plain
     from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
-    shown, predicted_from, content = printable(str(folder), 500), Path(), {}
+    shown, predicted_from = printable(str(folder), 500), Path()
     predictions_folder(folder)
     give = f"give the dataset: fpp-eval {shown} DATASET"
     try:  # by hand: pydantic, which takes long to import, checks the file while the first samples are scored
         predicted = read_plain(folder).get("predicted") or {}
-        predicted_from, content = Path(predicted["dataset"]), dict(predicted["content"])
-        split = split or str(predicted["split"])
-        if not content:
-            raise ValueError("no content to compare")
+        predicted_from, split = Path(predicted["dataset"]), split or str(predicted["split"])
     except SubmissionError as error:
         if place is None:
             raise SubmissionError(f"{error}; {give}") from None
-    except (AttributeError, KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, TypeError):
         if place is None:
             file = SUBMISSION_FILE
             raise SubmissionError(f"{shown}: {file} does not say (predicted:) what was predicted; {give}") from None

@@ -130,12 +130,8 @@ def frame_files(source: str | Path | Sequence[str | Path]) -> list[Path]:
     elif path.is_file():
         return [path]
     elif set("*?[") & set(str(path.relative_to(base := next(filter(Path.is_dir, path.parents), Path())))):
-        found = {file.relative_to(base): file for file in base.glob(str(path.relative_to(base)))}
-        files = [
-            file
-            for below, file in found.items()
-            if file.is_file() and not any(name.startswith(".") for name in below.parts)
-        ]
+        files = [file for file in base.glob(str(path.relative_to(base))) if file.is_file()]
+        files = [file for file in files if not re.search(r"(^|/)\.", str(file.relative_to(base)))]
         if not files:
             advice = "check it and the folder's name; it has to match files, as 'scan/*/*.png' does"
             raise CaptureError(f"{source}: no file matches this pattern; {advice}")
