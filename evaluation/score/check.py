@@ -286,7 +286,8 @@ def check_folder(folder: str | Path, dataset: DatasetFolder | None = None, split
     except (SubmissionError, DatasetError) as error:
         problems.insert(0, str(error))
     size = _declared_size(listing) if dataset is None else dataset.size
-    level_mm, nodata, units = None, None, "mm"
+    level_mm, nodata = None, None
+    units: Units = "mm"
     if description is not None:
         level_mm, nodata, units = description.png_mm_per_level, description.nodata, description.units
     largest = 0.0
