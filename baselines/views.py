@@ -29,6 +29,7 @@ from fpp_ml_bench.optics.pinhole import Pinhole
 from fpp_ml_bench.options import did_you_mean
 
 FUSION_FILE = "fusion.json"
+OBJECT_AXES = "unit m (metres); object axes: z up"
 CELL_MM = 2.0
 """Edge of a cell: 2.5 pixels of the paper's rig at 960 px and its standoff."""
 TOLERANCE_MM = 20.0
@@ -187,7 +188,7 @@ def prediction_maps(
         return f"{column} of {printable(dataset.path.name)}", lambda sample: (dataset.depth_mm(sample, column), None)
     checked = check_folder(predictions, dataset, split)
     described, listing = checked.sound(), checked.listing
-    read = listing.reader(dataset.size, described.png_mm_per_level)
+    read = listing.reader(dataset.size, described.png_mm_per_level, described.nodata)
     rules = Rules(target, described.units, described.range_rule, "standard")
 
     def maps(sample: str) -> tuple[Map, Map | None]:
@@ -241,7 +242,7 @@ def fuse_split(
                 views.append(PlacedView(depth_mm, dataset.rig.camera, *placement(dataset, sample), sigma_mm))
                 dataset.release(sample)
             cloud_m, objects[obj] = fused(views, cell_mm)
-            write_files(out, {f"{obj}.ply": ply_bytes(cloud_m)}, PredictionError)
+            write_files(out, {f"{obj}.ply": ply_bytes(cloud_m, comment=OBJECT_AXES)}, PredictionError)
             yield obj, objects[obj]
         document = {
             "method": name,

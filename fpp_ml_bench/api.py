@@ -11,6 +11,7 @@ when it is called.
 True
 """
 
+import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
@@ -169,6 +170,7 @@ def evaluate(
     sigma: "Maps | None" = None,
     objects: Sequence[str] | None = None,
     units: str | None = None,
+    nodata: float | None = None,
     edge_band_px: int = EDGE_BAND_PX,
 ) -> "ArrayScores": ...
 
@@ -185,14 +187,15 @@ def evaluate(
     sigma: Any = None,
     objects: Any = None,
     units: Any = None,
+    nodata: Any = None,
 ) -> "Result | ArrayScores":
     """Score a folder of predictions, as ``fpp-eval`` does, or arrays in memory by the same rules.
 
     Parameters
     ----------
     predictions : str or Path, or array
-        Folder with a ``submission.yaml`` and a prediction for each sample of the split. Or depth in mm, 0 = not
-        measured: floats (N, H, W), or a list of maps (H, W).
+        Folder with a ``submission.yaml`` and a prediction for each sample of the split. Or depth in mm along the
+        camera's axis (not along the ray), 0 = not measured: floats (N, H, W), or a list of maps (H, W).
     dataset : str, Path or DatasetFolder, or array
         What was predicted. For arrays, the true depth in mm, 0 = background, in the form of the predictions; pixels
         that a masked array masks count in no score.
@@ -212,6 +215,9 @@ def evaluate(
         Of arrays: what each sample shows; intervals are over objects. By default, each sample is an object of its own.
     units : {"mm", "m"}, optional
         Of arrays: the unit of all depths and sigma. Must be said where a target reaches less than 10.
+    nodata : float, optional
+        Of arrays: the value that depths have where no surface is, such as 65535 or NaN, in the unit of the arrays.
+        A folder says it in ``submission.yaml``.
 
     Returns
     -------
@@ -234,7 +240,7 @@ def evaluate(
     >>> fpp.evaluate(truth + 2.0, truth).metrics.object_mae_mm
     2.0
     """
-    in_memory = {"flags": flags, "sigma": sigma, "objects": objects, "units": units}
+    in_memory = {"flags": flags, "sigma": sigma, "objects": objects, "units": units, "nodata": nodata}
     if not isinstance(predictions, (str, Path)):
         if isinstance(dataset, (str, Path, DatasetFolder)):
             raise PredictionError("predictions in memory need the targets as arrays; or give a folder and a dataset")
@@ -242,7 +248,7 @@ def evaluate(
     if given := [name for name, values in in_memory.items() if values is not None]:
         raise PredictionError(f"{', '.join(given)}: belongs to arrays; a folder of predictions has its own")
     opened = dataset if isinstance(dataset, DatasetFolder) else DatasetFolder(dataset)
-    return evaluate_folder(predictions, opened, split, target, edge_band_px, mode)
+    return evaluate_folder(predictions, opened, split, target, edge_band_px, mode, say=warnings.warn)
 
 
 def compare(first: "str | Path | Result", second: "str | Path | Result") -> "Comparison":

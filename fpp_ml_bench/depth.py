@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import FULL_SIZE, MM_PER_M
+from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.skipping import skipping_enabled
 
 DEPTH_EDGE_JUMP_MM = 10.0
@@ -17,6 +18,13 @@ Normalisation = Literal["raw", "global", "individual"]
 NORMALISATIONS: tuple[Normalisation, ...] = ("raw", "global", "individual")
 RangeRule = Literal["object", "valid"]
 """The pixels over which a sample's depth range is taken: all of the object, as in the paper, or those not void."""
+NODATA_SHARE, NODATA_LEAST_PX = 0.01, 30
+"""Share of a map's pixels, and pixels, that must hold exactly the same value before it can be a mark for no surface. By
+reason, not by trial: wrong depths that differ from all others are single pixels."""
+NODATA_FAR, NODATA_DECADE = 3.0, 10.0
+"""How many times farther than what can be measured such a mark is, and than other depths: a wall behind a scene may be
+twice as far, and the marks of renderers and sensors (9999, 65504, 65535, 1e10) are beyond."""
+NODATA_ADVICE = "write 0 where no surface is, or give the value that says so as nodata"
 _BLOCK = 1 << 16
 _SMALLEST, _LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 
@@ -29,10 +37,58 @@ def object_mask(depth_mm: NDArray[np.floating]) -> NDArray[np.bool_]:
 def depth_problem(depth: NDArray[np.floating]) -> str | None:
     """What is wrong with a depth map (H, W) of an object, a sentence, or None: depths that are not finite or below 0,
     or none above 0."""
-    for wrong, are in ((~np.isfinite(depth), "NaN or infinite"), (depth < 0, "negative; background is 0")):
+    for wrong, are in ((~np.isfinite(depth), "NaN or infinite"), (depth < 0, "negative")):
         if wrong.any():
-            return f"{np.count_nonzero(wrong)} pixels are {are}"
+            return f"{np.count_nonzero(wrong)} pixels are {are}; {NODATA_ADVICE}"
     return None if object_mask(depth).any() else "no pixel is above 0, so there is no object"
+
+
+def without_nodata(depth: NDArray, nodata: float | None) -> NDArray:
+    """A depth map (H, W) with 0 where it holds exactly the value ``nodata`` (NaN: any NaN), rounded as the map is; the
+    map itself where that is None, or the map holds no real numbers. Raises `PredictionError` for no number."""
+    if nodata is None or depth.dtype.kind not in "fiu":
+        return depth
+    if not isinstance(nodata, int | float | np.number):
+        raise PredictionError(f"nodata: expected a number, got {type(nodata).__name__}")
+    with np.errstate(over="ignore"):
+        value = np.float64(nodata).astype(depth.dtype if depth.dtype.kind == "f" else np.float64)
+    return np.where(np.isnan(depth) if np.isnan(value) else depth == value, depth.dtype.type(0), depth)
+
+
+def nodata_problem(depth: NDArray[np.floating], reach: float = 0.0, apart: float = NODATA_DECADE) -> str | None:
+    """Why a value of a finite depth map (H, W) must be a mark for pixels without a surface, a sentence, or None. A mark
+    is exactly the same at many pixels, and negative, or ``apart`` times farther than what can be measured: ``reach`` in
+    the map's unit, or where that is not known (0) all other depths. Where it is not known, also one that is a decade
+    nearer than all others. A map of a single depth says nothing about itself."""
+    low, high = extremes(depth)
+    for value in (high, low):
+        there = depth == value
+        share = np.count_nonzero(there) / depth.size
+        if not value or share < max(NODATA_SHARE, NODATA_LEAST_PX / depth.size):
+            continue
+        others = depth[~there & object_mask(depth)]
+        near, far = extremes(others) if others.size else (0.0, 0.0)
+        far = reach or far
+        if (value < 0 < near) or 0 < far * apart < value or (not reach and 0 < value * NODATA_DECADE < near):
+            shown = f"{100 * share:.0f}% of the pixels are exactly {value:.6g}, far from all depths"
+            return f"{shown}: a value for background? {NODATA_ADVICE}"
+    return None
+
+
+def shape_problem(shape: Sequence[int], size: tuple[int, int]) -> str | None:
+    """How a ``shape`` differs from the ``size`` (H, W) of a map, and what to do, a sentence, or None."""
+    if tuple(shape) == tuple(size):
+        return None
+    # A hostile header may hold an integer too long for Python to print at all.
+    text = "(" + ", ".join(str(n) if abs(n) < 10**18 else "more than 10^18" for n in shape) + ")"
+    cure = "predict at that size"
+    if tuple(n for n in shape if n != 1) == tuple(size):
+        cure = "it has an axis too many; write np.squeeze(depth)"
+    elif len(shape) != 2:
+        cure = "write the map of depth alone, without other axes or channels"
+    elif tuple(shape) == tuple(size[::-1]):
+        cure = "it looks transposed; write depth.T"
+    return f"expected shape {tuple(size)} (H, W), got {text}; {cure}"
 
 
 def extremes(values: NDArray[np.floating]) -> tuple[float, float]:

@@ -37,13 +37,22 @@ _TURN = np.array([[0.82, 0.11, -0.56], [0.0, 0.98, 0.2], [0.57, -0.16, 0.81]])
 """Rows: where x, y and z go when points are turned by 35 degrees about y, then by 11 about x; camera coordinates."""
 
 Panel = tuple[str, NDArray, str, float, float]
-"""Title, image, colour map, and the values at its ends: lengths in mm, or grey levels."""
+"""Title, image, colour map, and the values at its ends: lengths in mm, or grey levels. NaN is not drawn, and inf a
+missing answer."""
+_MISSING_COLOUR = "#00a651"
+"""Green, which no colour map of errors holds."""
 
 
 def _draw(axes: Any, title: str, image: NDArray, colours: str, low: float, high: float) -> None:
-    """A panel; frames, of grey levels from 0 to 255, without a scale."""
-    frame = (colours, high) == (FRAME_COLOURS, GREY_LEVELS)
-    drawn = axes.imshow(image, cmap=colours, vmin=low, vmax=high, interpolation=None if frame else "nearest")
+    """A panel; frames, of grey levels from 0 to 255, without a scale. An infinite value is a missing answer."""
+    from matplotlib import colormaps
+    from matplotlib.patches import Patch
+
+    frame, shown = (colours, high) == (FRAME_COLOURS, GREY_LEVELS), colormaps[colours]
+    if (missing := np.isposinf(image)).any():
+        image, shown = np.where(missing, image, np.minimum(image, high)), shown.with_extremes(over=_MISSING_COLOUR)
+        axes.legend(handles=[Patch(color=_MISSING_COLOUR, label="missing: no answer")], loc="lower left", fontsize=7)
+    drawn = axes.imshow(image, cmap=shown, vmin=low, vmax=high, interpolation=None if frame else "nearest")
     if not frame:
         axes.figure.colorbar(drawn, ax=axes, fraction=0.046, pad=0.03).ax.tick_params(labelsize=7)
     axes.set(title=title, xticks=[], yticks=[])
@@ -198,7 +207,7 @@ def front_picture(
         maps[0], "one frame, brightened", np.clip(frame / white, 0, 1)[cut] * GREY_LEVELS, FRAME_COLOURS, 0, GREY_LEVELS
     )
     _draw(maps[1], "its depth, mm", np.where(there, depth_mm, np.nan)[cut], DEPTH_COLOURS, low, high)
-    _draw(maps[2], title_of_error, np.where(there, error_mm, np.nan)[cut], ERROR_COLOURS, -clip_mm, clip_mm)
+    _draw(maps[2], title_of_error, np.where(inside & ~there, np.inf, error_mm)[cut], ERROR_COLOURS, -clip_mm, clip_mm)
     # Shaded by the slopes of a smoothed depth: those between single pixels show noise alone.
     smooth_mm = cv2.GaussianBlur(np.where(there, depth_mm, np.median(points_mm[:, 2])), (0, 0), depth_mm.shape[1] / 320)
     pixel_mm = high / rig.camera.fx

@@ -104,7 +104,7 @@ def sample_maps(
     submission = result.submission
     rules = Rules(result.target, submission.units, submission.range_rule, result.mode)
     listing = list_folder(folder, dataset, result.dataset.split)
-    read = listing.reader(dataset.size, submission.png_mm_per_level)
+    read = listing.reader(dataset.size, submission.png_mm_per_level, submission.nodata)
     # The first frame that the method used; frame 0 where it used none or that frame is not stored here.
     used = [index for index in sorted(submission.frames_used) if index < len(dataset.sequence)]
     for place, row in chosen:
@@ -161,13 +161,14 @@ def errors_figure(errors_mm: Sequence[float], block: Uncertainty | None) -> byte
 def sample_panels(
     fringe: NDArray[np.uint8], target_mm: NDArray[np.floating], prediction_mm: NDArray[np.floating]
 ) -> list[Panel]:
-    """The five panels of a sample; all maps (H, W), depth in mm with 0 = background, which is not drawn (NaN)."""
+    """The five panels of a sample; all maps (H, W), depth in mm with 0 = background, which is not drawn (NaN). Object
+    pixels without an answer are infinite."""
     inside, predicted = object_mask(np.asarray(target_mm)), np.asarray(prediction_mm) > 0
     error_mm = np.asarray(prediction_mm, np.float64) - target_mm
     object_depth = target_mm[inside] if inside.any() else np.zeros(1)
     low, high = float(object_depth.min()), float(object_depth.max())
     clip = float(np.percentile(np.abs(error_mm[inside if inside.any() else ...]), CLIP_PERCENTILE))
-    drawn_mm = np.where(inside | predicted, error_mm, np.nan)
+    drawn_mm = np.where(predicted, error_mm, np.where(inside, np.inf, np.nan))
     return [
         ("Fringe", fringe, FRAME_COLOURS, 0, 255),
         ("Truth, mm", np.where(inside, target_mm, np.nan), DEPTH_COLOURS, low, high),

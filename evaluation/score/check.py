@@ -13,7 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import LARGEST_SIDE_PX, MM_PER_M
-from fpp_ml_bench.depth import RangeRule, depth_range_mm, extremes, object_mask
+from fpp_ml_bench.depth import (
+    NODATA_ADVICE,
+    NODATA_FAR,
+    RangeRule,
+    depth_range_mm,
+    extremes,
+    nodata_problem,
+    object_mask,
+)
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import Mode, Units
@@ -54,16 +62,18 @@ def in_mm(values: Any, units: Units) -> Any:
     return values.astype(np.float64) * MM_PER_M if units == "m" else values
 
 
-def value_problems(prediction: Depth, target_mm: Depth, reach_mm: float, units: Units) -> list[str]:
+def value_problems(
+    prediction: Depth, target_mm: Depth, reach_mm: float, units: Units, void: NDArray[np.bool_] | None = None
+) -> list[str]:
     """What is wrong with the values of a prediction (H, W) in ``units``; usually an empty list. ``reach_mm``: up to
     which depth there is something to measure, the far end of the rig's working range, or the largest target; 0 where
-    that is not known."""
+    that is not known. Pixels in ``void`` may hold any depth."""
     low, high = extremes(prediction)
     problems = []
     if not np.isfinite([low, high]).all():  # min and max carry NaN through
         nans, infinities = int(np.isnan(prediction).sum()), int(np.isinf(prediction).sum())
         counts = [f"{n} {word}" for n, word in ((nans, "NaN"), (infinities, "infinite")) if n]
-        problems.append(f"holds {' and '.join(counts)} of {prediction.size} values; write 0 where nothing was measured")
+        problems.append(f"holds {' and '.join(counts)} of {prediction.size} values; {NODATA_ADVICE}")
         if nans + infinities == prediction.size:
             return problems
         prediction = np.where(np.isfinite(prediction), prediction, prediction.dtype.type(0))
@@ -71,7 +81,12 @@ def value_problems(prediction: Depth, target_mm: Depth, reach_mm: float, units: 
     largest = protocol.LARGEST_MM / (1 if units == "mm" else MM_PER_M)  # no working range is above 1 m
     if max(high, -low) > largest:
         values = f"values up to {max(high, -low):.3g} {units} in magnitude"
-        problems.append(f"holds {values}; the limit is {largest:g}; write 0 where nothing was measured")
+        problems.append(f"holds {values}; the limit is {largest:g}; {NODATA_ADVICE}")
+    reach = {"mm": reach_mm, "m": reach_mm / MM_PER_M, "normalised": float(reach_mm > 0)}[units]
+    if reach and (low < 0 or high > NODATA_FAR * reach):
+        scored = prediction if void is None else np.where(void, prediction.dtype.type(0), prediction)
+        mark = nodata_problem(scored, reach, NODATA_FAR)
+        problems += [f"holds a mark for no surface: {mark}"] if mark else []
     wrong_unit = _unit_problem(prediction, target_mm, units, high, reach_mm)
     return [*problems, wrong_unit] if wrong_unit else problems
 
@@ -194,12 +209,13 @@ def read_prediction(
     units: Units,
     target_mm: Depth,
     reach_mm: float = 0.0,
+    void: NDArray[np.bool_] | None = None,
 ) -> Prediction:
     """A sample's prediction, by the ``read`` of its ``listing``, and its sigma, checked as `value_problems` does."""
     values, digest, sigma_mm = _NOTHING, "", None
     try:
         values, digest = read(sample)
-        problems = value_problems(values, target_mm, reach_mm, units)
+        problems = value_problems(values, target_mm, reach_mm, units, void)
     except PredictionError as error:
         problems = [str(error)]
     problems = [f"{listing.named(sample)}: {problem}" for problem in problems]
@@ -231,11 +247,17 @@ class Checked:
         return self.description
 
 
-def checked_description(folder: Path, content: dict[Any, Any], form: str, frames: int | None = None) -> Submission:
-    """The folder's description, checked against the predictions' ``form`` and a sequence of ``frames``, where known."""
+def checked_description(
+    folder: Path, content: dict[Any, Any], form: str, dataset: DatasetFolder | None = None
+) -> Submission:
+    """The folder's description, checked against the predictions' ``form`` and the ``dataset``, where known. Raises
+    SubmissionError, and DatasetError where it says that other data were predicted."""
     from fpp_ml_bench.evaluation.submission.description import check_submission  # imports pydantic
 
     description = check_submission(folder, content)
+    if dataset is not None and description.predicted is not None:
+        dataset.check_content(description.predicted.content, str(folder))
+    frames = None if dataset is None else len(dataset.sequence)
     outside = [index for index in description.frames_used if frames is not None and index >= frames]
     if frames is not None and outside:
         expected = f"expected indices from 0 to {frames - 1} of this dataset's sequence"
@@ -260,15 +282,17 @@ def check_folder(folder: str | Path, dataset: DatasetFolder | None = None, split
         raise PredictionError(f"{printable(str(folder), 500)}: {expected}; tables need DATASET")
     problems, description = list(listing.problems), None
     try:
-        frames = None if dataset is None else len(dataset.sequence)
-        description = checked_description(folder, read_plain(folder), listing.form, frames)
-    except SubmissionError as error:
+        description = checked_description(folder, read_plain(folder), listing.form, dataset)
+    except (SubmissionError, DatasetError) as error:
         problems.insert(0, str(error))
     size = _declared_size(listing) if dataset is None else dataset.size
-    level_mm, units = (None, "mm") if description is None else (description.png_mm_per_level, description.units)
+    level_mm, nodata = None, None
+    units: Units = "mm"
+    if description is not None:
+        level_mm, nodata, units = description.png_mm_per_level, description.nodata, description.units
     largest = 0.0
     if listing.form != ".png" or level_mm is not None:
-        read, unknown = listing.reader(size, level_mm), np.zeros(size)
+        read, unknown = listing.reader(size, level_mm, nodata), np.zeros(size)
         for sample in listing.present:
             prediction = read_prediction(listing, read, sample, units, unknown)
             largest = max(largest, float(prediction.values.max(initial=0.0)))

@@ -110,7 +110,7 @@ def _scores(
         list_folder(folder, dataset, split),
         Rules(target, described.units, described.range_rule, "standard"),
     )
-    read = listing.reader(dataset.size, described.png_mm_per_level)
+    read = listing.reader(dataset.size, described.png_mm_per_level, described.nodata)
     for sample in listing.present:
         pair = rules.pair(read(sample)[0], dataset, sample)
         sigma_mm = listing.sigma_mm(sample, dataset.size)

@@ -16,7 +16,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import split_sample_name
-from fpp_ml_bench.depth import RangeRule, edge_jump_mm, extremes, object_box, object_mask, object_near_edges
+from fpp_ml_bench.depth import (
+    NODATA_ADVICE,
+    NODATA_DECADE,
+    NODATA_FAR,
+    RangeRule,
+    edge_jump_mm,
+    extremes,
+    nodata_problem,
+    object_box,
+    object_mask,
+    object_near_edges,
+    shape_problem,
+    without_nodata,
+)
+from fpp_ml_bench.depth_readings import MOST_GLANCES, Glance, another_reading, glance
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.protocol import Mode, Units
@@ -60,16 +74,18 @@ def evaluate(
     edge_band_px: int = protocol.EDGE_BAND_PX,
     mode: str = "standard",
     while_scoring: Callable[[], object] = lambda: None,
+    say: Callable[[str], object] = lambda note: None,
 ) -> Result:
     """Score ``folder`` (predictions in one of the accepted forms, and ``submission.yaml``) on a split of ``dataset``.
 
     ``target`` is ``depth`` (decoded, as in the paper) or ``depth_exact`` (from the ray cast); ``mode`` is ``standard``
     or ``paper`` (the paper's pixel sets, without void, and its rule for normalised depth). Memory does not grow with
     the number of samples, and the result does not depend on the number of cores. ``while_scoring`` is called once
-    while threads score: a command uses it to import what it needs afterwards.
+    while threads score: a command uses it to import what it needs afterwards. ``say`` is given a note where another
+    reading of the predictions fits far better (`another_reading`).
 
     Raises SubmissionError for the description, PredictionError (naming every file with a problem) for the predictions,
-    and DatasetError for a target that is not a depth map."""
+    and DatasetError for a target that is not a depth map, and for other data than was predicted."""
     folder = predictions_folder(folder)
     _check_split(dataset, split, target, mode)
     content, description, refusal = {}, None, None
@@ -85,12 +101,14 @@ def evaluate(
     outcomes: Iterable[Scored | list[str]] = ()
     if rules.units in get_args(Units):
         read = listing.reader(
-            dataset.size, level if isinstance(level, int | float) and 0 < level < protocol.LARGEST_MM else None
+            dataset.size,
+            level if isinstance(level, int | float) and 0 < level < protocol.LARGEST_MM else None,
+            content.get("nodata"),
         )
         outcomes = _scored(listing, read, dataset, rules, edge_band_px)
     if refusal is None:
         try:
-            description = checked_description(folder, content, listing.form, len(dataset.sequence))
+            description = checked_description(folder, content, listing.form, dataset)
         except SubmissionError as error:
             refusal = error
         import fpp_ml_bench.evaluation.result.model  # noqa: F401  pydantic takes long: while the threads score
@@ -108,6 +126,8 @@ def evaluate(
         raise PredictionError(f"{printable(str(folder), 500)} can't be scored, {summary}:", lines)
     if refusal or description is None:
         raise refusal or SubmissionError(f"{printable(str(folder), 500)}: has no description")
+    if note := another_reading("the predictions", [sample.seen for sample in scored if sample.seen is not None]):
+        say(note)
     from fpp_ml_bench.evaluation.result.file import environment
     from fpp_ml_bench.evaluation.result.model import Result, scores_of
 
@@ -144,13 +164,14 @@ def evaluate(
 @dataclass(frozen=True)
 class Scored:
     """A scored sample of an object: its ``row`` (the other keys of `SampleResult`), the scores of its stated
-    uncertainty, None without, and the hashes of what it was scored against by column."""
+    uncertainty, None without, the hashes of what it was scored against by column, and of some samples a glance."""
 
     name: str
     object: str
     row: dict[str, Any]
     stated: SigmaSample | None
     hashes: dict[str, str]
+    seen: Glance | None = None
 
 
 def _row(scores: SampleScores, digest: str) -> dict[str, Any]:
@@ -199,6 +220,7 @@ def _scored(
     in threads, before the first outcome is taken from the iterator."""
     dataset_lock = Lock()
     columns = protocol.scored_columns(rules.target, rules.mode, dataset.has_exact)
+    glanced_at = set(listing.present[:MOST_GLANCES])
 
     def work(sample: str) -> Scored | list[str]:
         with dataset_lock:  # reading the dataset need not be thread-safe
@@ -210,9 +232,8 @@ def _scored(
         if not (low >= 0 and np.isfinite(high)):
             bad = "NaN, infinite or negative values"
             raise DatasetError(f"{sample}: the target depth holds {bad}; run: fpp-bench verify")
-        found = read_prediction(
-            listing, read, sample, rules.units, target, dataset.rig.working_range_mm[1] if high else 0.0
-        )
+        reach_mm = dataset.rig.working_range_mm[1] if high else 0.0
+        found = read_prediction(listing, read, sample, rules.units, target, reach_mm, void)
         problems, outcome = found.problems, None
         if not problems:
             with dataset_lock:
@@ -224,7 +245,9 @@ def _scored(
             else:
                 stated = None if found.sigma_mm is None else score_sigma(*pair, found.sigma_mm, void)
                 hashes = {column: image_hash(image) for column, image in scored_on.items()}
-                outcome = Scored(sample, split_sample_name(sample)[0], _row(scores, found.digest), stated, hashes)
+                seen = glance(sample, *pair, void, dataset.rig.camera) if sample in glanced_at else None
+                row = _row(scores, found.digest)
+                outcome = Scored(sample, split_sample_name(sample)[0], row, stated, hashes, seen)
         with dataset_lock:
             dataset.release(sample)
         return outcome or problems
@@ -240,17 +263,19 @@ def evaluate_arrays(
     objects: Sequence[str] | None = None,
     edge_band_px: int = protocol.EDGE_BAND_PX,
     units: str | None = None,
+    nodata: float | None = None,
 ) -> ArrayScores:
-    """Score depth in mm, 0 = background or not measured, against depth in mm, 0 = background: floats (N, H, W), or N
-    maps (H, W) that may differ in size. Pixels that a masked array of targets masks count in no set. ``flags``: whole
-    numbers, bits of `loaders.sample.Flag`, whose void pixels count in no set. ``sigma``: the standard uncertainty in
-    mm, 0 where none is stated. ``objects``: what each sample shows; samples of the same object are not independent, and
-    the intervals are over objects (by default, each sample is its own). ``units``: ``mm`` or ``m``, of all depths and
-    sigma; must be said where a target reaches less than 10.
+    """Score depth in mm along the camera's axis, 0 = background or not measured, against such depth, 0 = background:
+    floats (N, H, W), or N maps (H, W) that may differ in size. Depths of exactly ``nodata`` are read as 0. Pixels that
+    a masked array of targets masks count in no set. ``flags``: whole numbers, bits of `loaders.sample.Flag`, whose void
+    pixels count in no set. ``sigma``: the standard uncertainty in mm, 0 where none is stated. ``objects``: what each
+    sample shows; samples of the same object are not independent, and the intervals are over objects (by default, each
+    sample is its own). ``units``: ``mm`` or ``m``, of all depths and sigma; must be said where a target reaches less
+    than 10.
 
     Raises PredictionError, naming the sample by its number, for numbers or shapes that differ, for what is no real
     float or not finite, for a negative sigma or target, for masked predictions, for flags that are no such bits, and
-    for depths that look like another unit."""
+    for depths that look like another unit or like a mark for no surface."""
     count = len(_sequence("targets", targets))
     columns = {"predictions": predictions, "targets": targets, "flags": flags, "sigma": sigma, "objects": objects}
     for name, values in columns.items():
@@ -270,7 +295,7 @@ def evaluate_arrays(
             prediction, target = maps["predictions"], maps["targets"]
             void = _void(target, maps.get("flags"))
             scores, stated = score_arrays(
-                prediction, np.ma.filled(target, 0), void, units, maps.get("sigma"), edge_band_px
+                prediction, np.ma.filled(target, 0), void, units, maps.get("sigma"), edge_band_px, nodata=nodata
             )
         except PredictionError as error:
             raise PredictionError(f"sample {number}: {error}") from None
@@ -333,22 +358,30 @@ def score_arrays(
     sigma: NDArray[Any] | None = None,
     edge_band_px: int = protocol.EDGE_BAND_PX,
     check_prediction_units: bool = True,
+    nodata: float | None = None,
 ) -> tuple[SampleScores, SigmaSample | None]:
     """Score floats (H, W) in ``units``, pixels in ``void`` in no set; `evaluate_arrays` says what is refused.
     ``check_prediction_units``: whether a prediction that looks like another unit is."""
+    prediction, target = without_nodata(prediction, nodata), without_nodata(target, nodata)
     for name, values in (("predictions", prediction), ("targets", target), ("sigma", sigma)):
         if values is None:
             continue
         if values.dtype.kind != "f":
             raise PredictionError(f"{name}: expected real floats, got {values.dtype}")
-        if values.ndim != 2 or values.shape != target.shape or values.size == 0:
-            raise PredictionError(f"{name}: expected a map (H, W) of the target's size, got {values.shape}")
+        if target.ndim != 2 or target.size == 0:
+            raise PredictionError(f"targets: expected a map (H, W), got {target.shape}; np.squeeze takes axes of 1 out")
+        if problem := shape_problem(values.shape, target.shape):
+            raise PredictionError(f"{name}: expected a map (H, W) of the target's size: {problem}")
         if name != "predictions" and not (values.min() >= 0 and np.isfinite(values.max())):
-            raise PredictionError(f"{name}: expected finite mm of 0 and more")
+            raise PredictionError(f"{name}: expected finite mm of 0 and more; {NODATA_ADVICE}")
+    # What both hold exactly is hardly measured: nearer to the other depths it is a mark already.
+    shared = extremes(prediction)[1] == extremes(target)[1]
+    if problem := nodata_problem(target * ~void, apart=NODATA_FAR if shared else NODATA_DECADE):
+        raise PredictionError(f"targets: {problem}")
     declared = declared_units(float(target.max()), units)
     target_mm = in_mm(target, declared)
     reach_mm = float(target_mm.max()) if check_prediction_units else 0.0
-    if problems := value_problems(prediction, target_mm, reach_mm, declared):
+    if problems := value_problems(prediction, target_mm, reach_mm, declared, void):
         raise PredictionError(f"the prediction {problems[0]}")
     pair = in_mm(prediction, declared), target_mm
     stated = None if sigma is None else score_sigma(*pair, in_mm(sigma, declared), void)

@@ -31,8 +31,9 @@ class DepthScores(Metric):
     ``update(prediction, target, void=None)`` takes (B, H, W) or (B, 1, H, W) real floats, 0 = background, on any
     device, and bool (B, H, W), true for pixels in no set. They are in mm; ``units="m"`` takes metres. Where units are
     not said, a target below 10 and a prediction that looks like metres are refused; say ``units="mm"`` for a network
-    that may predict that early in training. ``compute()`` gives a dict of float64 scalars, NaN where no sample has the
-    pixels for a score. Samples without these pixels are left out of the mean and never count as 0.
+    that may predict that early in training. Depths of exactly ``nodata`` are read as 0. ``compute()`` gives a dict of
+    float64 scalars, NaN where no sample has the pixels for a score. Samples without these pixels are left out of the
+    mean and never count as 0.
 
     The scores have no gradient (``is_differentiable`` is False). Lower is better, except for the shares within a
     tolerance. ``half()`` and ``float()`` leave the state in float64."""
@@ -44,10 +45,10 @@ class DepthScores(Metric):
     sums: Tensor
     counts: Tensor
 
-    def __init__(self, units: str | None = None, **options: Any) -> None:
+    def __init__(self, units: str | None = None, nodata: float | None = None, **options: Any) -> None:
         super().__init__(**options)
         declared_units(0.0, units)
-        self.units = units
+        self.units, self.nodata = units, nodata
         self.add_state("sums", torch.zeros(len(KEYS), dtype=torch.float64), dist_reduce_fx="sum")
         self.add_state("counts", torch.zeros(len(KEYS), dtype=torch.float64), dist_reduce_fx="sum")
 
@@ -59,7 +60,9 @@ class DepthScores(Metric):
         for predicted, truth, pixels in zip(predictions, targets, scored, strict=True):
             # What a void pixel holds, as NaN, does not matter.
             shown, true = (np.where(pixels, depths, 0.0) for depths in (predicted, truth))
-            sample, _ = score_arrays(shown, true, ~pixels, self.units, check_prediction_units=self.units is None)
+            sample, _ = score_arrays(
+                shown, true, ~pixels, self.units, check_prediction_units=self.units is None, nodata=self.nodata
+            )
             for number, key in enumerate(KEYS):
                 if (score := METRICS[key].value(sample)) is not None:
                     self.sums[number] += score

@@ -45,7 +45,8 @@ class Predicted(StrictModel):
 class Submission(SparseModel):
     """Content of ``submission.yaml``. ``frames_used`` are indices into the dataset's frame sequence (0 based).
 
-    ``units`` of the prediction files; ``png_mm_per_level`` is what one level of a 16-bit PNG is in mm.
+    ``units`` of the prediction files; ``png_mm_per_level`` is what one level of a 16-bit PNG is in mm, ``nodata`` the
+    value of pixels without a surface where that is not 0, in the unit of the files.
     ``uses_ground_truth_range`` is true when the method was given depth_min and depth_max of the samples it is scored
     on, by ``range_rule`` (`fpp_ml_bench.depth.RangeRule`); ``uses_ground_truth_mask`` when it was given which of their
     pixels are object (for example an input that is black outside the object), ``uses_ground_truth_order`` when it was
@@ -54,12 +55,13 @@ class Submission(SparseModel):
     ``predicted`` says what ``fpp-bench predict`` read, so that fpp-eval finds it; a result does not repeat it.
     ``seconds_per_sample`` is null when unknown; a number needs ``hardware`` and ``seconds_source`` beside it."""
 
-    SPARSE = ("range_rule", "uses_ground_truth_mask", "uses_ground_truth_order", "learned_from", "predicted")
+    SPARSE = ("nodata", "range_rule", "uses_ground_truth_mask", "uses_ground_truth_order", "learned_from", "predicted")
 
     name: Text
     method: Text
     units: Units
     png_mm_per_level: Positive | None = None
+    nodata: float | None = None
     frames_used: list[Count] = Field(min_length=1)
     uses_ground_truth_range: bool
     range_rule: RangeRule = "object"
@@ -117,12 +119,14 @@ def check_submission(folder: Path, content: dict[Any, Any]) -> Submission:
 
 TEMPLATE = """\
 # Describes the predictions beside this file: one {sample}.npy for each sample, float32 (H, W), 0 = not measured.
+# Depth is along the camera's axis (Z), not the distance along the pixel's ray, and rows run from top to bottom.
 # Lines that begin with "# " and a key are optional: remove the "# " to use them. evaluation/PROTOCOL.md explains all.
 
 name: My method              # what the leaderboard shows, up to 200 characters
 method: my-method            # a short name for the kind of method
 units: mm                    # of the files: mm, m or normalised (then uses_ground_truth_range must be true)
 # png_mm_per_level: 0.05     # with 16-bit .png files only: the mm of one grey level
+# nodata: 65535              # what the files hold where no surface is, if that is not 0
 
 frames_used: [0]             # indices into the dataset's frame sequence, from 0
 uses_ground_truth_range: false   # was the method given depth_min and depth_max of the scored samples?

@@ -19,6 +19,7 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 from fpp_ml_bench.containers import PNG_GREY, parse_image, parse_matrix, parse_table, png_header
+from fpp_ml_bench.depth import shape_problem, without_nodata
 from fpp_ml_bench.errors import FppBenchError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.protocol import LARGEST_MM
 from fpp_ml_bench.files import LOCK_FILE, fill, opened, printable, read_bounded, read_yaml
@@ -82,15 +83,21 @@ class Listing:
         """The name of a sample's prediction in messages: its file."""
         return printable(f"{self.form}, sample {sample}" if self.form in TABLES else f"{sample}{self.form}")
 
-    def reader(self, size: tuple[int, int], png_mm_per_level: float | None) -> Callable[[str], MapAndHash]:
-        """A function from a sample to its map ``size`` (H, W), valid until the same thread reads again, and the SHA-256
-        of its file. It may be called from several threads, and raises PredictionError, without the file's name, for a
-        file that is refused; a table is read here, and refused with its name."""
-        if self.form in TABLES:
-            return depth_maps(self.folder / self.form, self.present, size)
+    def reader(
+        self, size: tuple[int, int], png_mm_per_level: float | None, nodata: float | None = None
+    ) -> Callable[[str], MapAndHash]:
+        """A function from a sample to its map ``size`` (H, W), 0 where the file holds ``nodata``, valid until the same
+        thread reads again, and the SHA-256 of its file. It may be called from several threads, and raises
+        PredictionError, without the file's name, for a file that is refused; a table is read here, and refused with its
+        name."""
         memory = local()
+        table = depth_maps(self.folder / self.form, self.present, size) if self.form in TABLES else None
 
         def read(sample: str) -> MapAndHash:
+            depth, digest = read_file(sample) if table is None else table(sample)
+            return without_nodata(depth, nodata), digest
+
+        def read_file(sample: str) -> MapAndHash:
             path = self.folder / f"{sample}{self.form}"
             if self.form == ".npy":
                 return read_npy(path, size, memory)
@@ -243,13 +250,8 @@ def _check_array(dtype: np.dtype[Any], shape: tuple[int, ...], size: tuple[int, 
         wrap = ": whole numbers round depth, and wrap around where it does not fit; save as float32"
         why = {"c": " (complex); save its real depth", "i": wrap, "u": wrap}.get(dtype.kind, "; save as float32")
         raise PredictionError(f"expected float16, float32 or float64, got {printable(str(dtype), 80)}{why}")
-    if tuple(shape) != tuple(size):
-        raise PredictionError(f"expected shape {tuple(size)} (H, W), got {_shape_text(shape)}; predict at that size")
-
-
-def _shape_text(shape: tuple[int, ...]) -> str:
-    # A hostile header may hold an integer too long for Python to print at all.
-    return "(" + ", ".join(str(n) if abs(n) < 10**18 else "more than 10^18" for n in shape) + ")"
+    if problem := shape_problem(shape, size):
+        raise PredictionError(problem)
 
 
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
@@ -307,8 +309,8 @@ def parse_png(content: bytes, size: tuple[int, int], mm_per_level: float | None)
     header = png_header(content)
     if header is None:
         raise PredictionError(f"is no PNG file; {_PNG_ADVICE}")
-    if header.size != size:
-        raise PredictionError(f"expected shape {size} (H, W), got {header.size}; predict at that size")
+    if problem := shape_problem(header.size, size):
+        raise PredictionError(problem)
     if header[1:] != (16, PNG_GREY, 0):
         kind = f"{header.bits} bits per channel, colour type {header.colour}, interlacing {header.interlaced}"
         raise PredictionError(f"has {kind}; expected 16, 0 and 0: {_PNG_ADVICE}")
@@ -320,7 +322,9 @@ def parse_png(content: bytes, size: tuple[int, int], mm_per_level: float | None)
         raise PredictionError(f"can't be decoded as a 16-bit grey PNG; {_PNG_ADVICE}")
     if image.levels.max() == PNG_LEVELS:
         cut_off = f"where depth above {PNG_LEVELS * mm_per_level:g} mm is cut off"
-        raise PredictionError(f"reaches level {PNG_LEVELS}, {cut_off}; use a larger png_mm_per_level")
+        raise PredictionError(
+            f"reaches level {PNG_LEVELS}, {cut_off}; use a larger png_mm_per_level, and 0 for no surface"
+        )
     return image.levels.astype(np.float64) * mm_per_level
 
 
@@ -423,7 +427,7 @@ def _depth_map(values: Any, size: tuple[int, int]) -> NDArray[Any]:
             raise PredictionError(f"expected rows of one length, got {len(lengths)} different ones; write H x W values")
         shape += lengths
         values = values.flatten()
-    if tuple(shape) not in (tuple(size), (size[0] * size[1],)):
-        raise PredictionError(f"expected shape {size} (H, W), got {tuple(shape)}; predict at that size")
+    if shape != [size[0] * size[1]] and (problem := shape_problem(shape, size)):
+        raise PredictionError(problem)
     dtype = np.dtype(values.type.to_pandas_dtype())
     return np.frombuffer(values.buffers()[1], dtype, len(values), values.offset * dtype.itemsize).reshape(size)

@@ -35,7 +35,7 @@ RIG says what was projected in which order, how the devices see, and the range i
 def decode(
     *,
     file: Path = argument("rig file (.yaml, .json)", "RIG"),
-    frames: str = argument("folder of images, or a pattern in quotes", "FRAMES"),
+    frames: str = argument("folder of images, or a pattern in quotes, 'scan/*/*.png'", "FRAMES"),
     out: Path = option(REQUIRED, "folder for the results", "DIR"),
     direction: Directions = option("both", "which of the coded directions to use (default: all there are)"),
     working_range: tuple[float, float] | None = option(
@@ -54,7 +54,8 @@ def decode(
     colour: str | None = option(None, "of colour images: luminance, mean, red, green, blue", "NAME"),
     forms: tuple[str, ...] = option(
         FORMS,
-        "what to write of npy, mat, png, ply, mesh (default: all)",
+        "what to write of npy, mat, png, ply, mesh (default: all); points and meshes are in mm, camera axes: x right, "
+        "y down, z forward",
         "A,B",
         parse=value(f"some of {', '.join(FORMS)}", names, lambda some: some != () and set(some) <= {*FORMS}),
     ),

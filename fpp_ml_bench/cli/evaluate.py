@@ -78,6 +78,7 @@ def score_folder(
     prepare_process()
     _check_outputs(json, page, predictions)
     opened, split = scored_data(predictions, dataset, split)
+    notes: list[str] = []
     scored = evaluate_folder(
         predictions,
         opened,
@@ -86,6 +87,7 @@ def score_folder(
         edge_band,
         mode,
         while_scoring=_result_table,
+        say=notes.append,
     )
     if json is not None:
         write_result(scored, json)
@@ -102,6 +104,8 @@ def score_folder(
     has_expected_bytes, sentence = benchmark_sentence(opened.manifest)
     if not has_expected_bytes:
         print(f"fpp-eval: warning: {opened.path}: {sentence}", file=sys.stderr)
+    for note in notes:
+        print(f"fpp-eval: note: {note}", file=sys.stderr)
     account.say(lambda: explain_eval(opened, split, target, edge_band))
 
 
@@ -115,23 +119,20 @@ def _result_table() -> "Callable[[Result], Any]":
 def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[DatasetFolder, str]":
     """The dataset in ``place`` and the ``split`` to score; where they are not given, those that ``folder`` was
     predicted from, by its submission.yaml. Raises `SubmissionError` where that does not say, and `DatasetError` where
-    the dataset is gone or another one now."""
+    the dataset is gone; whether it is still the same is checked when it is scored."""
     from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE, predictions_folder, read_plain
     from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
-    shown, predicted_from, content = printable(str(folder), 500), Path(), {}
+    shown, predicted_from = printable(str(folder), 500), Path()
     predictions_folder(folder)
     give = f"give the dataset: fpp-eval {shown} DATASET"
     try:  # by hand: pydantic, which takes long to import, checks the file while the first samples are scored
         predicted = read_plain(folder).get("predicted") or {}
-        predicted_from, content = Path(predicted["dataset"]), dict(predicted["content"])
-        split = split or str(predicted["split"])
-        if not content:
-            raise ValueError("no content to compare")
+        predicted_from, split = Path(predicted["dataset"]), split or str(predicted["split"])
     except SubmissionError as error:
         if place is None:
             raise SubmissionError(f"{error}; {give}") from None
-    except (AttributeError, KeyError, TypeError, ValueError):
+    except (AttributeError, KeyError, TypeError):
         if place is None:
             file = SUBMISSION_FILE
             raise SubmissionError(f"{shown}: {file} does not say (predicted:) what was predicted; {give}") from None
@@ -141,11 +142,6 @@ def scored_data(folder: Path, place: Path | None, split: str | None) -> "tuple[D
         dataset = DatasetFolder(predicted_from)
     except DatasetError as error:
         raise DatasetError(f"{error}. {shown} was predicted from there; if the data was moved, {give}") from None
-    if changed := dataset.changed_column(content):
-        raise DatasetError(
-            f"{dataset.path}: is not what {shown} was predicted from, {printable(changed)} is another now; {give}, or "
-            "predict again"
-        )
     return dataset, split or "test"
 
 

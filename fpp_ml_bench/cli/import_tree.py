@@ -22,6 +22,8 @@ from fpp_ml_bench.loaders.published.importing import (
     RowReader,
     Source,
     depth_difference_mm,
+    depth_reading,
+    holds_whole_numbers,
     import_notes,
     import_rows,
     plan_import,
@@ -86,6 +88,9 @@ class ImportSettings(HubSettings, CaptureSettings):
     frame_order: str = option(
         "auto", "order of the raw scans' files (default: auto, determined from the images)", "NAME"
     )
+    nodata: float | None = option(
+        None, "value of a tree's depth files where no surface is, in their unit (default: 0)", "VALUE"
+    )
 
 
 @command(
@@ -136,6 +141,8 @@ def _import_captures(settings: ImportSettings) -> None:
         )
     if settings.frame_order != "auto":
         raise BuildError("--frame-order belongs to published trees; captures have the order of their rig's sequence")
+    if settings.nodata is not None:
+        raise BuildError("--nodata belongs to published trees; captures have no depth yet: leave it out")
     options: dict[str, Any] = {
         "min_modulation": settings.min_modulation,
         "max_clipped_steps": settings.max_clipped_steps,
@@ -209,27 +216,29 @@ def _import_tree(settings: ImportSettings, from_hub: bool) -> None:
     if not from_hub and REPOSITORY_NAME.fullmatch(str(settings.tree)) and settings.tree.is_dir():
         print(f"{settings.tree}: reading this folder, not a dataset of that name on the Hugging Face Hub")
     tree, source = _fetch(settings) if from_hub else (settings.tree, None)
-    plan = plan_import(tree, rig, settings.frame_order, source)
+    plan = plan_import(tree, rig, settings.frame_order, source, settings.nodata)
     if settings.fit_rig:
         with progress_bar("reading", len(plan.rows.samples), "views") as advance:
             views = tree_views(plan.rows, settings.workers or usable_cores(), advance)
         rig, fit = fit_projector(views, plan.rows.rig)
         print_fit(rig, fit)
-        plan = plan_import(tree, rig, settings.frame_order, source)
+        plan = plan_import(tree, rig, settings.frame_order, source, settings.nodata)
     manifest, seconds = _written(settings, plan)
     _print_end(settings.out, manifest, seconds, import_notes(manifest))
-    if rig is None:
-        _warn_of_other_rig(tree, depth_difference_mm(plan.rows))
-
-
-def _warn_of_other_rig(tree: Path, difference_mm: float | None) -> None:
-    """Say so where the assumed rig decodes other depths than the tree has."""
+    if holds_whole_numbers(plan.rows):
+        print(
+            "warning: the depth files hold whole numbers, so depth is rounded; write single or double", file=sys.stderr
+        )
+    difference_mm = depth_difference_mm(plan.rows)
     if difference_mm is None or difference_mm <= AGREEING_MM:
         return
-    off = f"{difference_mm:.1f} mm off in the median" if difference_mm < float("inf") else "none at most pixels"
-    print(
-        f"warning: the paper's rig did not take these raw scans: the depth it decodes from the first is {off}. Find "
-        f"their rig by fpp-bench calibrate --from-depth {tree} --out rig.yaml and import with --rig rig.yaml, or "
-        "import with --fit-rig",
-        file=sys.stderr,
-    )
+    if reading := depth_reading(plan.rows):
+        print(f"warning: {reading}", file=sys.stderr)
+    elif rig is None:
+        off = f"{difference_mm:.1f} mm off in the median" if difference_mm < float("inf") else "none at most pixels"
+        print(
+            f"warning: the paper's rig did not take these raw scans: the depth it decodes from the first is {off}. "
+            f"Find their rig by fpp-bench calibrate --from-depth {tree} --out rig.yaml and import with --rig rig.yaml, "
+            "or import with --fit-rig",
+            file=sys.stderr,
+        )

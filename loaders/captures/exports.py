@@ -29,6 +29,7 @@ from fpp_ml_bench.optics.rig import Rig
 
 FORMS = ("npy", "mat", "png", "ply", "mesh")
 REPORT = "decode.json"
+CAMERA_AXES = "unit mm (millimetres); camera axes: x right, y down, z forward"
 _NAMES = (
     r"(decode\.json|(depth|sigma_mm|modulation|reason)\.npy|depth\.mat|depth_[0-9.]+mm\.png|(points|mesh)\.ply"
     r"|picture\.png)"
@@ -193,6 +194,10 @@ def camera_points(depth_mm: ArrayLike, camera: Pinhole) -> tuple[NDArray[np.floa
     Raises `CaptureError` for a map without any point, or as `export_capture`."""
     rays, depth = _rays_and_depth(depth_mm, camera)
     there = depth > 0
+    if not np.any(depth_mm):
+        raise CaptureError(
+            "depth_mm: all pixels are background (0), so there is no point to write; give a map that has a depth"
+        )
     if not there.any():
         raise CaptureError(
             "depth_mm: no pixel with depth has a ray through the camera's lens, so there is no point to write; check "
@@ -215,7 +220,7 @@ def depth_ply(
     shade = None if grey is None else _checked(grey, camera, "grey", GREY_LEVELS)[there]
     place = np.cumsum(there.ravel()) - 1
     faces = place[triangles(depth_mm, camera)] if joined else None
-    return ply_bytes(points, faces, pixel_normals(depth_mm, camera)[there], shade)
+    return ply_bytes(points, faces, pixel_normals(depth_mm, camera)[there], shade, CAMERA_AXES)
 
 
 def check_outputs(folder: Path) -> list[Path]:

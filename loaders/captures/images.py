@@ -110,7 +110,7 @@ def check_options(bits: int | None, colour: str | None) -> None:
 
 
 def frame_files(source: str | Path | Sequence[str | Path]) -> list[Path]:
-    """The image files of ``source``: a folder, a pattern for names in a folder such as ``scan/frame_*.png``, a file, or
+    """The image files of ``source``: a folder, a pattern such as ``scan/frame_*.png`` or ``scan/*/*.png``, a file, or
     a list of files, which keeps its order. The others are in natural order: frame_2 before frame_10. Hidden files, and
     in a folder those that are no images by their suffix, are left out. Raises `CaptureError` where there is none, for
     images in a folder of a form that can't be read, and for names that give no order (frame_1 and frame_01)."""
@@ -123,13 +123,18 @@ def frame_files(source: str | Path | Sequence[str | Path]) -> list[Path]:
     if path.is_dir():
         files = _images(path, (*SUFFIXES, *_OTHER_IMAGES))
         if not files:
-            raise CaptureError(f"{path}: expected a folder with images ({forms}), found none; give the frames' folder")
+            cure = "give the frames' folder"
+            if folders := _folders(path):
+                cure += f", such as {folders[0]}, or a pattern of all in their order: '{path}/*/*.png'"
+            raise CaptureError(f"{path}: expected a folder with images ({forms}), found none; {cure}")
     elif path.is_file():
         return [path]
-    elif set(path.name) & set("*?["):
-        files = [file for file in path.parent.glob(path.name) if file.is_file() and not file.name.startswith(".")]
+    elif set("*?[") & set(str(path.relative_to(base := next(filter(Path.is_dir, path.parents), Path())))):
+        files = [file for file in base.glob(str(path.relative_to(base))) if file.is_file()]
+        files = [file for file in files if not re.search(r"(^|/)\.", str(file.relative_to(base)))]
         if not files:
-            raise CaptureError(f"{source}: no file matches this pattern; check it and the folder's name")
+            advice = "check it and the folder's name; it has to match files, as 'scan/*/*.png' does"
+            raise CaptureError(f"{source}: no file matches this pattern; {advice}")
     else:
         raise CaptureError(f"{path}: expected a folder, an image or a pattern such as scan/*.png, found nothing there")
     keys = {file: natural_key(str(file.with_suffix(""))) for file in files}

@@ -4,6 +4,7 @@ depths say about the rig, whose pitch and projector are not published."""
 
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,9 +14,20 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.calibration.projection import MOST_PX, DepthView, view_from_frames
+from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.containers import from_file, parse_image, parse_matrix
 from fpp_ml_bench.decoding.decode import decode_stack
-from fpp_ml_bench.depth import Normalisation, denormalise, depth_problem, depth_range_mm, object_mask
+from fpp_ml_bench.depth import (
+    NODATA_FAR,
+    Normalisation,
+    denormalise,
+    depth_problem,
+    depth_range_mm,
+    nodata_problem,
+    object_mask,
+    without_nodata,
+)
+from fpp_ml_bench.depth_readings import UNITS_MM, another_reading, glance
 from fpp_ml_bench.errors import CaptureError, DecodeError, LayoutError, PredictionError, RigError
 from fpp_ml_bench.loaders.captures.images import listed
 from fpp_ml_bench.loaders.published import tree as published_tree
@@ -145,10 +157,12 @@ class Source:
 
 @dataclass(frozen=True)
 class SampleReader(RowReader):
-    """Reads the samples of ``tree``. ``order`` None: raw frames are only checked, not read as frames of a sequence."""
+    """Reads the samples of ``tree``. ``order`` None: raw frames are only checked, not read as frames of a sequence.
+    ``nodata``: the value of depth files where no surface is, in their unit; None where it is 0."""
 
     tree: PublishedTree
     order: FrameOrder | None
+    nodata: float | None = None
 
     def refusal(self, problems: list[str]) -> LayoutError:
         return published_tree.layout_error(self.tree.root, problems)
@@ -222,22 +236,26 @@ class SampleReader(RowReader):
         return depth_mm
 
     def _to_mm(self, path: Path, variant: Normalisation, limits: tuple[float, float]) -> NDArray[np.float64]:
-        values = read_matrix(path, VARIABLES[variant])
+        values = without_nodata(read_matrix(path, VARIABLES[variant]), self.nodata)
         height, width = self.tree.size
         if values.shape != (height, width):
             raise LayoutError(f"{path}: expected {height} x {width} like the images, got {values.shape}")
-        if problem := depth_problem(values):
+        near, far = self.rig.working_range_mm
+        reach = {"raw": far, "global": far / MM_PER_M, "individual": 1.0}[variant]
+        if problem := nodata_problem(values, reach, NODATA_FAR) or depth_problem(values):
             raise LayoutError(f"{path}: {problem}")
         if variant == "individual" and values.max() > 1 + _ROUNDING:
             raise LayoutError(f"{path}: expected values in [0, 1], got up to {values.max():g}")
         depth_mm = np.where(object_mask(values), denormalise(values, variant, *limits), 0.0)
-        near, far = self.rig.working_range_mm
         low, high = depth_range_mm(depth_mm)
-        if low < near / _UNIT_SLACK or high > far * _UNIT_SLACK:
+        outside = high < near or low > far
+        fitting = [size for size in UNITS_MM.values() if outside and near <= low * size and high * size <= far]
+        if fitting or low < near / _UNIT_SLACK or high > far * _UNIT_SLACK:
             unit = "m" if variant == "global" else "mm"
+            cure = f" (times {fitting[0]:g} it fits); write {unit}" if fitting else f"; write {unit}"
             raise LayoutError(
                 f"{path}: depths of {low:.4g} to {high:.4g} mm when {VARIABLES[variant]} is read in {unit}; the "
-                f"working range is {near:g} to {far:g} mm, so the file has another unit"
+                f"working range is {near:g} to {far:g} mm, so the file has another unit{cure}, or give the rig (--rig)"
             )
         return depth_mm
 
@@ -258,12 +276,17 @@ def _disagreement_mm(variant_mm: NDArray[np.float64], depth_mm: NDArray[np.float
 
 
 def plan_import(
-    root: Path, rig: Rig | None = None, frame_order: str = AUTO, source: Source | None = None
+    root: Path,
+    rig: Rig | None = None,
+    frame_order: str = AUTO,
+    source: Source | None = None,
+    nodata: float | None = None,
 ) -> Assembly[SampleReader]:
     """Scan the tree at ``root`` and determine how it is read. ``rig``: the rig that took the images; None assumes the
     paper's rig, scaled to the image size. ``frame_order``: see `FrameOrder`; ``auto`` determines it from the first
-    sample's images, and checks all others against it. ``source``: where the tree was downloaded from. Raises
-    `LayoutError` listing all files that break the layout, `RigError` for a rig of another image size."""
+    sample's images, and checks all others against it. ``source``: where the tree was downloaded from. ``nodata``: as
+    `SampleReader`. Raises `LayoutError` listing all files that break the layout, `RigError` for a rig of another image
+    size."""
     order = parse_order(frame_order)
     frames = len((rig or paper_rig()).sequence)
     tree = published_tree.scan_tree(root, frames, None if source is None else source.folders)
@@ -286,8 +309,9 @@ def plan_import(
         "ignored": list(tree.ignored),
         "objects": {split: list(objects) for split, objects in by_split.items()},
         **({} if source is None else {"repository": source.repository, "commit": source.commit}),
+        **({} if nodata is None else {"nodata": str(nodata)}),
     }
-    reader = SampleReader({s.sample: s for s in tree.samples}, rig_used, tree, order)
+    reader = SampleReader({s.sample: s for s in tree.samples}, rig_used, tree, order, nodata)
     return import_plan(reader, plans, IMPORTED, settings, stored)
 
 
@@ -394,6 +418,23 @@ def depth_difference_mm(reader: SampleReader) -> float | None:
     if 2 * np.count_nonzero(both) < np.count_nonzero(object_mask(row.depth_mm)):
         return float("inf")
     return float(np.median(np.abs(decoded_mm[both].astype(np.float64) - row.depth_mm[both])))
+
+
+def depth_reading(reader: SampleReader) -> str | None:
+    """`another_reading` of the depth of a tree's first samples, by what ``reader.rig`` decodes from their frames."""
+    seen = []
+    for sample in list(reader.samples.values())[:_MOST_SCANS_TRIED]:
+        row = reader.read(sample)
+        with suppress(DecodeError):
+            decoded_mm = decode_stack(_frames(row), reader.rig).depth_mm
+            seen.append(glance(sample.sample, row.depth_mm, decoded_mm, None, reader.rig.camera))
+    return another_reading("the tree's depth", seen)
+
+
+def holds_whole_numbers(reader: SampleReader) -> bool:
+    """Whether the depth of the first sample is stored as whole numbers, so that it is rounded."""
+    first = next(iter(reader.samples.values()))
+    return read_matrix(first.depths[0], VARIABLES[reader.tree.variants[0]]).dtype.kind in "iu"
 
 
 def _frames(row: Row) -> list[NDArray[np.uint8]]:

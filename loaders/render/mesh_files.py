@@ -71,9 +71,10 @@ def ply_bytes(
     faces: NDArray[np.integer] | None = None,
     normals: NDArray[np.floating] | None = None,
     grey: NDArray[np.floating | np.integer] | None = None,
+    comment: str = "",
 ) -> bytes:
     """A binary PLY file: ``points`` (N, 3), triangles ``faces`` (M, 3) as indices of points, unit ``normals`` (N, 3),
-    and ``grey`` (N,), grey levels of 0 to 255, as intensity and colour."""
+    and ``grey`` (N,), grey levels of 0 to 255, as intensity and colour. ``comment``: unit and axes, for its header."""
     # A mesh without faces: trimesh can't write a PointCloud without points.
     triangles = np.zeros((0, 3), np.int64) if faces is None else faces
     solid = trimesh.Trimesh(points, triangles, vertex_normals=normals, process=False, validate=False)
@@ -82,7 +83,8 @@ def ply_bytes(
         shade = np.rint(grey).astype(np.uint8)
         colours = np.stack([shade, shade, shade, np.full_like(shade, 255)], axis=-1)
         solid.visual = trimesh.visual.ColorVisuals(solid, vertex_colors=colours)
-    return trimesh.exchange.ply.export_ply(solid, vertex_normal=normals is not None)
+    content: bytes = trimesh.exchange.ply.export_ply(solid, vertex_normal=normals is not None)
+    return content.replace(b"\nelement", f"\ncomment {comment}\nelement".encode(), 1) if comment else content
 
 
 def content_hash(path: Path) -> str:

@@ -282,12 +282,22 @@ def place(mesh: SolidMesh, view: str, rig: Rig, rule: PlacementRule, seed: int) 
     return about_axis_m + np.array([0.0, 0.0, distance_m]), distance_m
 
 
+_OTHER_UNITS_M = (0.001, "mm"), (0.01, "cm"), (0.0254, "inches")
+_SMALLEST_PART_M = 0.02
+"""A mesh is proposed in a unit in which it is as large as this or larger: 25 pixels of the paper's rig."""
+
+
 def _misfit(mesh: SolidMesh, view: str, rig: Rig, rule: PlacementRule) -> str:
     size = " x ".join(f"{extent:.3f}" for extent in np.ptp(mesh.vertices_m, axis=0))
     near_mm, far_mm = rig.working_range_mm
     where = f"with its turning axis {rig.standoff_m} m from the camera" if rule == "fixed" else "at any distance"
     scale = _largest_scale(mesh, rig, rule)
     advice = f"scale it, offset included, by {scale:g} or less" if scale > 0 else "no scale makes it fit: move it"
+    largest_m = np.ptp(mesh.vertices_m, axis=0).max()
+    units = [(size, unit) for size, unit in _OTHER_UNITS_M if size <= scale and size * largest_m >= _SMALLEST_PART_M]
+    if units:
+        listed = " or ".join(f"{size:g} for {unit}" for size, unit in units)
+        advice += f" (if its numbers are no metres, list it in a file for --meshes with scale: {listed})"
     return (
         f"object {mesh.name!r} ({size} m) does not fit the working range {near_mm:g}-{far_mm:g} mm and the image in "
         f"view {view} {where}; {advice}, or give a rig with a wider range"

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.constants import CONFIGS, SPLITS
 from fpp_ml_bench.depth import RangeRule, object_mask
 from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders import sample as layout
 from fpp_ml_bench.loaders.sample import (
     DATA_GROUP,
@@ -77,9 +78,16 @@ class DatasetFolder:
         """``split/column`` -> hash of its decoded values, by the manifest; `fpp-bench verify` reads the images."""
         return self.manifest.content
 
-    def changed_column(self, content: Mapping[str, str]) -> str | None:
-        """The first ``split/column`` of ``content`` whose hash differs from the dataset's; None where all agree."""
-        return next((name for name, digest in content.items() if self.content.get(name) != digest), None)
+    def check_content(self, content: Mapping[str, str], made: str) -> None:
+        """Raise `DatasetError` for a ``split/column`` of ``content`` whose hash is another here; columns that are not
+        stored here don't tell. ``made``: the folder of predictions of data with that content."""
+        changed = next((name for name, digest in content.items() if self.content.get(name, digest) != digest), None)
+        if changed is not None:
+            made = printable(made, 500)
+            raise DatasetError(
+                f"{self.path}: is not what {made} was predicted from, {printable(changed)} is another now; give the "
+                f"dataset: fpp-eval {made} DATASET, or predict again"
+            )
 
     def content_hash(self, split: str, column: str, hashes: Mapping[str, str]) -> tuple[str, str]:
         """``split/column``, and the hash of its images, of which ``hashes`` are those of the samples (`image_hash`).

@@ -94,7 +94,7 @@ def test_a_stopped_demo_goes_on_and_prints_what_was_computed(demo):
 def test_predictions_are_shown_beside_the_frames_that_they_were_made_of(out, tmp_path, capsys):
     show = ["show", str(out / "mini"), SAMPLE, "--out", str(tmp_path / "shown.png"), "--predictions"]
     assert main([*show, str(out / "phase")]) == 0 and main([*show, str(out / "crossed")]) == 2
-    assert "test/frame_00 is another; give that dataset" in capsys.readouterr().err
+    assert "test/frame_00 is another now; give the dataset" in capsys.readouterr().err
     assert main(["show", str(out / "mini"), "--sheet", "--predictions", str(out / "phase")]) == 2
     assert "--predictions: expected a SAMPLE" in capsys.readouterr().err
 

@@ -274,3 +274,23 @@ def test_click_is_told_to_take_no_defaults_from_the_environment(monkeypatch):
     context = shoot.make_context("x", ["mug", "--out", "here"])
     assert shoot.values(context)["count"] == 2 and isinstance(context, click.Context)
     assert np.isfinite(shoot.values(context)["lens"].focal)
+
+
+def test_predictions_of_another_dataset_are_refused(predicted, capsys, tmp_path):
+    words = ["--objects", "mug,cork", "--size", "176", "--pitch", "24", "--config", "single_shot", "--workers", "1"]
+    assert main(["build", "--out", "other", *words]) == 0
+    capsys.readouterr()
+    assert score("other", "--split", "validation") == (2, None)
+    error = capsys.readouterr().err
+    assert "other: is not what predictions was predicted from, validation/frame_00 is another now" in error
+    assert fpp_eval(["check", "predictions", "other", "--split", "validation"]) == 1
+    assert "other: is not what predictions was predicted from" in capsys.readouterr().out
+    description = yaml.safe_load(Path("predictions/submission.yaml").read_text())
+    write_description(Path("predictions"), **{**description, "predicted": ...})
+    assert score("other", "--split", "validation")[0] == 0  # it says nothing
+
+
+def test_the_same_data_with_fewer_frames_are_scored(predicted):
+    words = ["--objects", "mug,cork,bowl,power_drill", "--size", "176", "--config", "single_shot", "--workers", "1"]
+    assert main(["build", "--out", "fewer", *words]) == 0
+    assert score("fewer", "--split", "validation")[0] == 0

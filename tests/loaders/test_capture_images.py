@@ -26,6 +26,11 @@ def put(folder, *images, suffix=".png", name="frame_{}"):
     return files
 
 
+def put_at(file):
+    file.parent.mkdir(parents=True, exist_ok=True)
+    put(file.parent, GREY[0], name=file.stem)
+
+
 @pytest.mark.parametrize("suffix", [".png", ".bmp", ".tif", ".TIFF", ".PNG"])
 def test_grey_levels_come_out_as_written(tmp_path, suffix):
     files = put(tmp_path, *GREY, suffix=suffix)
@@ -270,3 +275,19 @@ def test_damaged_files_are_read_or_refused_and_nothing_else(tmp_path):
             except CaptureError:
                 continue
             assert read.frames.ndim == 3
+
+
+def test_a_pattern_goes_across_folders(tmp_path):
+    for name in ("scan/2_gray/f_2.png", "scan/10_white/f_1.png", "scan/1_sine/f_10.png", "scan/1_sine/f_9.png"):
+        put_at(tmp_path / name)
+    put_at(tmp_path / "scan/.thumbs/f_1.png")
+    expected = ["1_sine/f_9.png", "1_sine/f_10.png", "2_gray/f_2.png", "10_white/f_1.png"]
+    for pattern in ("scan/*/*.png", "scan/**/*.png", "sc*/*/f_*"):
+        found = [str(file.relative_to(tmp_path / "scan")) for file in frame_files(tmp_path / pattern)]
+        assert found == expected, pattern
+    with pytest.raises(CaptureError, match=r"no file matches .* has to match files, as 'scan/\*/\*.png'"):
+        frame_files(tmp_path / "scan/*")
+    with pytest.raises(CaptureError, match=r"found none; .* such as .*1_sine, or a pattern .* '.*scan/\*/\*.png'"):
+        frame_files(tmp_path / "scan")
+    put_at(tmp_path / "part [1]/f_1.png")
+    assert len(frame_files(tmp_path / "part [1]/f_*.png")) == 1  # the brackets are a name

@@ -76,6 +76,7 @@ def test_files_are_read_back(tmp_path):
     read = trimesh.load(paths[0], process=False)
     np.testing.assert_allclose(read.vertices, POINTS_MM, atol=1e-3)
     np.testing.assert_array_equal(read.colors[:, 0], GREY[THERE])
+    assert b"\ncomment unit mm (millimetres); camera axes: x right, y down, z forward\n" in paths[0].read_bytes()
     data = held(paths[1].read_bytes())
     np.testing.assert_array_equal(data["greys"], GREY[THERE])
     assert "<title>A bowl</title>" in paths[1].read_text()
@@ -84,7 +85,7 @@ def test_files_are_read_back(tmp_path):
 @pytest.mark.parametrize(
     ("depth_mm", "grey", "said"),
     [
-        (DEPTH_MM * 0, GREY, "no point to write"),
+        (DEPTH_MM * 0, GREY, "all pixels are background .* no point to write"),
         (DEPTH_MM * np.nan, GREY, "expected finite numbers"),
         (-DEPTH_MM, GREY, "expected finite numbers"),
         (DEPTH_MM[:-1], GREY, "expected real numbers of shape"),

@@ -42,13 +42,26 @@ def test_no_answer_is_an_error_of_the_whole_depth(panels):
     front_picture(FRAME, depth_mm, EXACT_MM, RIG, "half")
     expected = EXACT_MM[half & (EXACT_MM > 0)].sum(dtype=np.float64) / (EXACT_MM > 0).sum()
     assert f"object MAE {expected:.2f} mm" in panels[2][0]
+    missing = np.isposinf(panels[2][1])
+    assert missing.sum() == (half & (EXACT_MM > 0)).sum()  # drawn in a colour of their own
+
+
+def test_missing_pixels_have_a_colour_and_a_legend():
+    drawn = pictures.panel_figure([("error", np.array([[np.inf, 9.0, np.nan]]), "coolwarm", -1.0, 1.0)])
+    axes = drawn.axes[0]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["missing: no answer"]
+    image = axes.images[0]
+    colours = image.to_rgba(image.get_array())[0]
+    assert not np.allclose(colours[0], colours[1]) and colours[2, 3] == 0
+    plain = pictures.panel_figure([("error", np.array([[1.0, 9.0]]), "coolwarm", -1.0, 1.0)])
+    assert plain.axes[0].get_legend() is None
 
 
 def test_an_answer_off_the_object_alone_and_none(panels):
     other = np.where(EXACT_MM > 0, 0, 1700).astype(np.float32)
     assert front_picture(FRAME, other, EXACT_MM, RIG, "off").startswith(b"\x89PNG")
     assert front_picture(FRAME, EXACT_MM, EXACT_MM * 0, RIG, "no object").startswith(b"\x89PNG")
-    with pytest.raises(CaptureError, match="no point"):
+    with pytest.raises(CaptureError, match="all pixels are background"):
         front_picture(FRAME, EXACT_MM * 0, EXACT_MM, RIG, "none")
     with pytest.raises(CaptureError, match="expected finite"):
         front_picture(FRAME, EXACT_MM * np.nan, EXACT_MM, RIG, "NaN")

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.io
 from published_trees import command, make_tree
 
 from fpp_ml_bench.calibration.from_depth import fit_projector
@@ -111,3 +112,41 @@ def test_a_missing_frame_and_frames_of_another_depth_are_refused(tree, tmp_path)
     (scans / "A120" / "A_7.png").unlink()
     with pytest.raises(LayoutError, match=r"A_7\.png: is missing"):
         plan_import(broken)
+
+
+def rewritten(tree, folder, change):
+    """A copy of the tree whose depth maps, by sample, are what ``change`` makes of all of them."""
+    shutil.copytree(tree, folder)
+    files = sorted((folder / "training_datasets/training_data_depth_raw/test/depth").glob("*.mat"))
+    for other in ("global", "individual"):
+        shutil.rmtree(folder / f"training_datasets/training_data_depth_{other}_normalized")
+    shutil.rmtree(folder / "training_datasets/info_depth_params")
+    maps = change([scipy.io.loadmat(file)["depthMap"] for file in files])
+    for file, depth in zip(files, maps, strict=True):
+        scipy.io.savemat(file, {"depthMap": depth})
+    return folder
+
+
+def rays(maps):
+    rows, columns = np.mgrid[:SIZE, :SIZE]
+    camera = HIDDEN.camera
+    along = np.hypot(1, np.hypot((columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy))
+    return [depth * along for depth in maps]
+
+
+@pytest.mark.parametrize(
+    ("words", "change"),
+    [
+        ("upside down", lambda maps: [depth[::-1] for depth in maps]),
+        ("as distances along the ray", rays),
+        ("as those of other samples", lambda maps: maps[1:] + maps[:1]),
+        ("", lambda maps: maps),
+    ],
+)
+def test_import_names_another_reading_of_the_depth(words, change, tree, tmp_path, capsys):
+    save_rig(HIDDEN, tmp_path / "rig.yaml")
+    changed = rewritten(tree, tmp_path / "tree", change)
+    assert command("import", changed, "--out", tmp_path / "data", "--workers", 1, "--rig", tmp_path / "rig.yaml") == 0
+    error = capsys.readouterr().err
+    assert (f"warning: another reading fits the tree's depth far better: {words}" in error) == bool(words), error
+    assert words or "warning" not in error

@@ -6,6 +6,7 @@ import shutil
 import cv2
 import numpy as np
 import pytest
+import scipy.io
 from published_trees import (
     FOLDERS,
     SPLITS,
@@ -26,6 +27,7 @@ from published_trees import (
 
 from fpp_ml_bench.errors import BuildError, LayoutError, RigError
 from fpp_ml_bench.loaders.published.importing import plan_import
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.rig_file import save_rig
 
@@ -216,6 +218,19 @@ BROKEN = {
     "depth infinite": (lambda t: set_pixel(depth_path(t), np.inf), f"{MAT}: 1 pixels are NaN"),
     "depth negative": (lambda t: set_pixel(depth_path(t), -1), f"{MAT}: 1 pixels are negative"),
     "depth empty": (lambda t: mat(t, depthMap=np.zeros((24, 24))), f"{MAT}: no pixel is above 0"),
+    "depth in cm": (lambda t: mat(t, depthMap=depth_of(STEM) / 10), "the file has another unit (times 10 it fits)"),
+    "depth in tenths of a mm": (
+        lambda t: mat(t, depthMap=np.uint16(10 * depth_of(STEM))),
+        "the file has another unit (times 0.1 it fits)",
+    ),
+    "depth with a mark": (
+        lambda t: mat(t, depthMap=np.where(depth_of(STEM) > 0, depth_of(STEM), 65535)),
+        f"{MAT}: 79% of the pixels are exactly 65535, far from all depths: a value for background?",
+    ),
+    "depth with -1": (
+        lambda t: mat(t, depthMap=np.where(depth_of(STEM) > 0, depth_of(STEM), -1)),
+        f"{MAT}: 79% of the pixels are exactly -1",
+    ),
     "depth in metres": (lambda t: mat(t, depthMap=depth_of(STEM) / 1000), f"{MAT}: depths of 1.7"),
 }
 
@@ -409,3 +424,24 @@ def test_grey_levels_survive_opencv_and_its_rgb(tmp_path):
     tree = make_tree(tmp_path / "tree", splits={"test": SPLITS["test"]})
     assert np.array_equal(cv2.imread(str(fringe_path(tree)), cv2.IMREAD_GRAYSCALE), fringe_of(STEM))
     assert imported(tree, tmp_path / "out").splits.keys() == {"test"}
+
+
+@pytest.mark.parametrize("mark", [1e10, 65535, -1, np.nan])
+def test_a_value_for_background_is_read_as_0(mark, tmp_path):
+    plain, marked = make_tree(tmp_path / "plain"), make_tree(tmp_path / "marked")
+    for file in (marked / RAW).rglob("*.mat"):
+        depth = scipy.io.loadmat(file)["depthMap"]
+        write_mat(file, depthMap=np.where(depth > 0, depth, np.float32(mark)))
+    assert command("import", plain, "--out", tmp_path / "a", "--workers", 1) == 0
+    assert command("import", marked, "--out", tmp_path / "b", "--workers", 1, "--nodata", mark) == 0
+    assert DatasetFolder(tmp_path / "a").content == DatasetFolder(tmp_path / "b").content
+
+
+def test_whole_numbers_are_said(tmp_path, capsys):
+    tree = make_tree(tmp_path / "tree")
+    assert command("import", tree, "--out", tmp_path / "a", "--workers", 1) == 0
+    assert "warning" not in capsys.readouterr().err
+    for file in (tree / RAW).rglob("*.mat"):
+        write_mat(file, depthMap=np.uint16(np.rint(scipy.io.loadmat(file)["depthMap"])))
+    assert command("import", tree, "--out", tmp_path / "b", "--workers", 1) == 0
+    assert "warning: the depth files hold whole numbers, so depth is rounded" in capsys.readouterr().err

@@ -174,3 +174,18 @@ def test_calibration_error_has_the_size_asked_for(calibration_px):
     assert photographing_rig(RIG, calibration_px, 1) == photographing_rig(RIG, calibration_px, 1)
     assert photographing_rig(RIG, calibration_px, 1) != photographing_rig(RIG, calibration_px, 2)
     assert photographing_rig(RIG, 0.0, 1) is RIG
+
+
+@pytest.mark.parametrize(
+    ("extents", "said"),
+    [
+        ((120.0, 200.0, 80.0), "with scale: 0.001 for mm)"),
+        ((12.0, 20.0, 8.0), "with scale: 0.001 for mm or 0.01 for cm"),
+        ((5.0, 8.0, 3.0), "0.01 for cm or 0.0254 for inches"),
+        ((0.6, 0.6, 0.7), ""),
+    ],
+)
+def test_a_misfit_by_another_unit_names_the_scale(extents, said):
+    with pytest.raises(MeshError) as caught:
+        place(solid(trimesh.creation.box(extents)), "A0", RIG, "fixed", 0)
+    assert said in str(caught.value) and ("if its numbers are no metres" in str(caught.value)) == bool(said)

@@ -122,3 +122,56 @@ def test_what_is_refused(case):
     arguments, options, message = REFUSED[case]
     with pytest.raises(PredictionError, match=message):
         fpp_ml_bench.evaluate(*arguments, **options)
+
+
+ROWS, COLUMNS = np.mgrid[0:60, 0:80]
+THERE = np.hypot(ROWS - 30, COLUMNS - 40) < 20
+DISK = np.where(THERE, 1800.0 + COLUMNS / 3, 0.0)[None]
+NEAR = DISK + 2 * (DISK > 0)
+
+
+@pytest.mark.parametrize("mark", [1e10, 65504.0, 65535.0, 9999.0, 1e6, 1.0, -1.0, np.inf, np.nan])
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_a_mark_for_no_surface_is_no_depth(mark, kind):
+    prediction, target = (np.where(DISK > 0, depth, mark).astype(kind) for depth in (NEAR, DISK))
+    with pytest.raises(PredictionError, match="nodata"):
+        fpp_ml_bench.evaluate(prediction, target)
+    scores = fpp_ml_bench.evaluate(prediction, target, nodata=mark).metrics
+    assert scores.object_mae_mm == pytest.approx(2.0, abs=1e-4) and scores.background_mae_mm == 0.0
+
+
+def test_the_message_names_the_mark_and_its_share():
+    share = round(100 * (1 - THERE.mean()))
+    with pytest.raises(PredictionError, match=f"sample 0: targets: {share}% of the pixels are exactly 65535, far from"):
+        fpp_ml_bench.evaluate(NEAR, np.where(DISK > 0, DISK, 65535.0))
+    with pytest.raises(PredictionError, match=f"prediction holds a mark .* {share}% of the pixels are exactly 65504"):
+        fpp_ml_bench.evaluate(np.where(DISK > 0, NEAR, 65504.0), DISK)
+    with pytest.raises(PredictionError, match=r"are exactly 1e\+10, far"):
+        fpp_ml_bench.evaluate(*(np.where(DISK > 0, depth / 1000, 1e10) for depth in (NEAR, DISK)), units="m")
+    with pytest.raises(PredictionError, match="nodata: expected a number, got str"):
+        fpp_ml_bench.evaluate(NEAR, DISK, nodata="65535")
+
+
+FLAT = np.full((1, 60, 80), 1800.0)
+DEPTHS = {
+    "a constant for everything": (FLAT, DISK),
+    "a constant against a flat wall": (FLAT + 5, FLAT),
+    "a wall behind the object": (NEAR, np.where(DISK > 0, DISK, 4000.0)),
+    "a far wall that was measured": (np.where(DISK > 0, NEAR, 12001.0), np.where(DISK > 0, DISK, 12000.0)),
+    "a single wrong depth": (np.where((ROWS == 3) & (COLUMNS == 3), 65504.0, NEAR), DISK),
+    "negative where nothing is": (NEAR - (DISK == 0) * (80 * ROWS + COLUMNS) / 1000, DISK),
+    "a scene of decades": (DISK * 1.01, np.where(COLUMNS < 40, DISK, DISK * 30)),
+}
+
+
+@pytest.mark.parametrize("case", DEPTHS)
+def test_depths_are_no_marks(case):
+    assert fpp_ml_bench.evaluate(*DEPTHS[case]).metrics.object_mae_mm > 0
+
+
+@pytest.mark.parametrize("shape", [(1, 60, 80), (60, 80, 1)])
+def test_an_axis_too_many_is_named(shape):
+    with pytest.raises(PredictionError, match=r"an axis too many; write np\.squeeze"):
+        fpp_ml_bench.evaluate(NEAR.reshape(1, *shape), DISK)
+    with pytest.raises(PredictionError, match=r"targets: .* np\.squeeze"):
+        fpp_ml_bench.evaluate(NEAR.reshape(1, *shape), DISK.reshape(1, *shape))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scored_dataset import disk_depth, make_dataset, write_description, write_predictions
 
+import fpp_ml_bench
 from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.depth import denormalise, normalise
 from fpp_ml_bench.errors import DatasetError, PredictionError
@@ -171,3 +172,18 @@ def test_a_range_without_void_pixels(mode, tmp_path):
     write_description(folder, range_rule="valid")
     with pytest.raises(PredictionError, match="range_rule is that of normalised depth"):
         evaluate(folder, dataset, mode=mode)
+
+
+def test_another_reading_is_said_and_changes_no_score(tmp_path, recwarn, capsys):
+    dataset = make_dataset(tmp_path / "data", size=(48, 48))
+    predictions = write_predictions(tmp_path / "p", dataset)
+    for sample in dataset.samples("test"):
+        np.save(predictions / f"{sample}.npy", dataset.depth_mm(sample)[::-1])
+    scored = fpp_ml_bench.evaluate(predictions, dataset)
+    assert "upside down" in str(recwarn.pop().message)
+    assert main([str(predictions), str(dataset.path), "--json", str(tmp_path / "r.json")]) == 0
+    assert "fpp-eval: note: another reading fits the predictions far better: upside down" in capsys.readouterr().err
+    for sample in dataset.samples("test"):
+        np.save(predictions / f"{sample}.npy", dataset.depth_mm(sample))
+    assert fpp_ml_bench.evaluate(predictions, dataset).metrics.object_mae_mm < scored.metrics.object_mae_mm
+    assert not recwarn.list

@@ -170,3 +170,17 @@ def test_what_a_void_pixel_holds_does_not_matter():
         metric.update(prediction, target)
     metric.update(prediction, target, torch.ones_like(void))  # no pixel counts
     assert float(metric.compute()["object_mae_mm"]) == 2.0
+
+
+@pytest.mark.parametrize("mark", [1e10, 65504.0, np.nan])
+def test_a_mark_for_no_surface(mark):
+    prediction, target = (torch.from_numpy(values[:1]) for values in data())
+    marked = [torch.where(target > 0, values, mark) for values in (prediction, target)]
+    with pytest.raises(PredictionError, match="as nodata"):
+        DepthScores().update(*marked)
+    metric, plain = DepthScores(nodata=mark), DepthScores()
+    metric.update(*marked)
+    plain.update(torch.where(target > 0, prediction, 0.0), target)
+    of_plain = plain.compute()
+    for key, value in metric.compute().items():
+        assert torch.allclose(value, of_plain[key], equal_nan=True), key

@@ -13,6 +13,8 @@ import yaml
 from scored_dataset import DESCRIPTION, make_dataset, write_description, write_predictions
 
 from fpp_ml_bench.cli import main_eval as main
+from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.submission.description import Submission, read_submission
 
 SAMPLE = "power_drill_A60"
@@ -99,8 +101,12 @@ ADVICE = r"\b(write|save|use|predict|give|convert|put|copy|remove|replace|check)
 FILES = {
     "missing": (lambda f: (f / FILE).unlink(), "is missing"),
     "wrong shape": (rewrite(lambda d: d[:-1]), r"expected shape \(32, 40\) \(H, W\), got \(31, 40\)"),
-    "transposed": (rewrite(lambda d: d.T), r"got \(40, 32\)"),
-    "extra axis": (rewrite(lambda d: d[None]), r"got \(1, 32, 40\)"),
+    "transposed": (rewrite(lambda d: d.T), r"got \(40, 32\); it looks transposed"),
+    "extra axis": (rewrite(lambda d: d[None]), r"got \(1, 32, 40\); it has an axis too many; write np.squeeze"),
+    "last axis": (rewrite(lambda d: d[..., None]), r"got \(32, 40, 1\); it has an axis too many; write np.squeeze"),
+    "channels": (rewrite(lambda d: np.stack([d] * 3)), r"got \(3, 32, 40\); write the map of depth alone"),
+    "a mark": (rewrite(lambda d: np.where(d > 0, d, 65504)), r"holds a mark .*% of the pixels are exactly 65504"),
+    "a negative mark": (rewrite(lambda d: np.where(d > 0, d, -1)), r"are exactly -1, far .* or give .* nodata"),
     "scalar": (rewrite(lambda d: np.float32(1)), r"got \(\)"),
     "int32": (rewrite(lambda d: d.astype(np.int32)), "got int32"),
     "uint16": (rewrite(lambda d: d.astype(np.uint16)), "got uint16"),
@@ -314,3 +320,17 @@ def test_dataset_without_exact_depth(tmp_path, capsys):
     predictions = write_predictions(tmp_path / "predictions", data)
     assert main([str(predictions), str(data.path), "--target", "depth_exact"]) == 2
     assert "no depth_exact" in capsys.readouterr().err
+
+
+def test_a_mark_that_the_description_names_is_no_surface(dataset, predictions):
+    plain = evaluate(predictions, dataset)
+    for file in predictions.glob("*.npy"):
+        depth = np.load(file)
+        np.save(file, np.where(depth > 0, depth, np.float32(65535)))
+    write_description(predictions, nodata=65535)
+    marked = evaluate(predictions, dataset)
+    assert marked.metrics == plain.metrics and marked.submission.nodata == 65535
+    assert "nodata" not in plain.submission.model_dump()
+    write_description(predictions, nodata="sky")
+    with pytest.raises(PredictionError, match=r"nodata: .*number"):
+        evaluate(predictions, dataset)

@@ -199,6 +199,7 @@ def test_fuse_writes_a_cloud_without_the_wrong_order(spheres, predictions, tmp_p
     assert counts["contradicted_px"] == 121 and counts["answered_px"] == answered
     assert counts["contradicted_share"] == 121 / answered
     cloud = trimesh.load(out / "power_drill.ply")
+    assert b"comment unit m (metres); object axes: z up" in (out / "power_drill.ply").read_bytes()
     assert counts["cloud_points"] == len(cloud.vertices) > 1000
     assert np.abs(np.linalg.norm(cloud.vertices - CENTRE_M, axis=1) - RADIUS_M).max() < 2e-3
     assert "other views contradict 121 of" in capsys.readouterr().out
