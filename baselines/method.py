@@ -14,7 +14,6 @@ A whole method, in a file ``mine.py`` of its own, for ``fpp-bench predict mine.p
 """
 
 import platform
-from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
@@ -34,8 +33,9 @@ from fpp_ml_bench.optics.sequence import AnySequence
 from fpp_ml_bench.options import did_you_mean, option
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.baselines.training.weights import ModelConfig, NetConfig
+    from fpp_ml_bench.baselines.training.weights import ModelConfig, NetConfig, TrainingBenchmark
     from fpp_ml_bench.evaluation.submission.description import Submission
+    from fpp_ml_bench.loaders.storage.benchmark import Benchmark
     from fpp_ml_bench.loaders.storage.manifest import Manifest
 
 Frames = Sequence[NDArray[np.uint8] | None]
@@ -91,8 +91,9 @@ class OwnViews:
     rate: float | None = option(None, "largest learning rate (default: as the shipped weights)", "R")
 
 
-class Method(ABC):
-    """A frame stack in, a depth map out. A subclass needs ``name``, ``title``, ``frames_used`` and `predict`.
+class Method:
+    """A frame stack in, a depth map out. A subclass needs ``name``, ``title``, ``frames_used``, and `predict` or
+    `answer`. `answer` is what is scored, timed and measured; where a class does not define it, it calls `predict`.
 
     name: what it is called on the command line and in submissions. purpose: what it does, one line of ``--help``.
     Options: a frozen dataclass, whose fields made with `fpp_ml_bench.options.option` are options of every command that
@@ -104,9 +105,12 @@ class Method(ABC):
     range_rule: by which range normalised depth is.
     uses_ground_truth_mask: whether it is given frames that are 0 outside the object.
     mode, target: what its row is scored in and against; for a network the decoded depth, which it was trained on.
-    packages: those whose versions matter. parameters: numbers that were learned. weights_config: what its weights file
-    says of the network and its training data. batched: whether `predict_batch` takes all samples at once. reports:
-    whether `answer` reports.
+    packages: those whose versions matter; `registry.load_method` adds those that a class of a file imports. parameters:
+    numbers that were learned. weights_config: what its weights file says of the network and its training data.
+    learned_from: what data it learned from, as `evaluation.submission.LearnedFrom` has it; a class outside this package
+    says so itself, like ``learned_from = {"data": "other", "versions": ["my scans"]}``, and without that it is unknown.
+    code: hashes of the files of a class outside this package. batched: whether `predict_batch` takes all samples at
+    once. reports: whether `answer` reports.
     """
 
     name: str
@@ -130,6 +134,7 @@ class Method(ABC):
     device: str = "cpu"
     parameters: int = 0
     weights_config: "ModelConfig | NetConfig | None" = None
+    code: Mapping[str, str] = MappingProxyType({})
     batched: bool = False
     reports: bool = False
 
@@ -188,16 +193,16 @@ class Method(ABC):
         """What it assumes of every scene with these settings; None where it assumes nothing."""
         return None
 
-    @abstractmethod
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in `units`, 0 = background or not measured; frames not in `frames_used` may be None."""
+        return self.answer(frames).depth
 
     def predict_batch(self, stacks: Sequence[Frames]) -> Sequence[NDArray[np.float32]] | NDArray[np.float32]:
-        """`predict` of several samples, one after another unless `batched`."""
-        return [self.predict(frames) for frames in stacks]
+        """The depth of several samples, one after another unless `batched`."""
+        return [self.answer(frames).depth for frames in stacks]
 
     def answer(self, frames: Frames) -> Answer:
-        """`predict`, and what else the method says of the sample."""
+        """The depth, and what else the method says of the sample."""
         return Answer(self.predict(frames))
 
     def crop(self, frames: Frames) -> tuple[slice, slice] | None:
@@ -209,13 +214,11 @@ class Method(ABC):
         return {}
 
     @property
-    def learned_from(self) -> dict[str, Any]:
-        """What data the method learned from, as `evaluation.submission.LearnedFrom` has it."""
-        if (config := self.weights_config) is None:
-            return {"data": "none"}
-        benchmark = config.benchmark
-        title = f"dataset {config.dataset_fingerprint[:8]}" if benchmark is None else benchmark.title
-        return {"data": "train-split", "versions": [title]}
+    def learned_from(self) -> dict[str, Any] | None:
+        """What data the method learned from; None where that is unknown."""
+        if (config := self.weights_config) is not None:
+            return training_split_of(config.benchmark, config.dataset_fingerprint)
+        return {"data": "none"} if is_built_in(type(self)) else None
 
     @property
     def settings_of_depth(self) -> dict[str, Setting]:
@@ -233,6 +236,17 @@ class Method(ABC):
         """Versions of this package, Python and the packages that the method computes with."""
         versions = {package: version(package) for package in self.packages}
         return {"fpp_ml_bench": __version__, "python": platform.python_version(), **versions}
+
+
+def training_split_of(benchmark: "Benchmark | TrainingBenchmark | None", fingerprint: str) -> dict[str, Any]:
+    """`Method.learned_from` of a method that learned from the training split of a dataset, a ``benchmark`` or not."""
+    title = f"dataset {fingerprint[:8]}" if benchmark is None else benchmark.title
+    return {"data": "train-split", "versions": [title]}
+
+
+def is_built_in(method: type[Method]) -> bool:
+    """Whether a class comes with this package."""
+    return method.__module__.startswith(f"{__package__}.")
 
 
 def plain_settings(options: Any) -> dict[str, Setting]:

@@ -7,10 +7,15 @@ An installed package offers methods by the entry point group `GROUP`:
     mine = "my_package.methods:Mine"
 """
 
+import ast
 import inspect
+import os
 import pickle
 import sys
+import sysconfig
 import traceback
+from contextlib import suppress
+from dataclasses import fields
 from functools import cache
 from hashlib import sha256
 from importlib import import_module, metadata
@@ -18,13 +23,15 @@ from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fpp_ml_bench.baselines.method import Method, Photographed
+from fpp_ml_bench.baselines.method import Method, Photographed, Setting, is_built_in
 from fpp_ml_bench.errors import FppBenchError, PredictionError, WeightsError
-from fpp_ml_bench.files import printable
+from fpp_ml_bench.files import is_file, printable
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.options import did_you_mean
 
 GROUP = "fpp_ml_bench.methods"
+PACKAGE = __name__.partition(".")[0]
 FILE_MARK = ".py:"
 """What tells ``mine.py:Mine`` from a name."""
 BUILT_IN = (
@@ -41,6 +48,10 @@ BUILT_IN = (
 """The classes of this package, below `fpp_ml_bench.baselines`. Their names are their own."""
 NETWORKS = "networks.network_method:NetworkMethod"
 """The class that trained networks from image to depth are made with, by their weights."""
+
+
+WEIGHTS = (".bin", ".ckpt", ".h5", ".joblib", ".mat", ".npy", ".npz", ".onnx", ".pkl", ".pt", ".pth", ".safetensors")
+"""How files of weights end: those that the code of a method names are a part of it."""
 
 
 class Found(NamedTuple):
@@ -101,11 +112,23 @@ def load_method(name: str | Path, source: Photographed | Rig, **options: Any) ->
     Raises `PredictionError` for an unknown name, and what the method refuses: unusable weights, invalid options.
     """
     method, preset = find(name)
-    if inspect.isabstract(method):
-        missing = ", ".join(sorted(method.__abstractmethods__))
-        raise PredictionError(f"{name}: does not define {missing}, which a method needs")
-    make = method.for_rig if isinstance(source, Rig) else method.for_dataset
-    return make(source, **preset, **options)  # type: ignore[arg-type]
+    if method.predict is Method.predict and method.answer is Method.answer:
+        raise PredictionError(f"{name}: does not define predict, or answer, which a method needs")
+    shown = source.without_truth() if isinstance(source, DatasetFolder) else source
+    make = method.for_rig if isinstance(shown, Rig) else method.for_dataset
+    made = make(shown, **preset, **options)  # type: ignore[arg-type]
+    defaults = {entry.name: entry.default for entry in fields(method.Options)}
+    files = {key: Path(value) for key, value in {**defaults, **options}.items() if isinstance(value, str | Path)}
+    settings: dict[str, Setting] = {f"{key}_sha256": _digest(path) for key, path in files.items() if is_file(path)}
+    settings |= made.settings
+    if (code := code_of(method)) is not None:
+        made.code = code.files
+        settings["source_sha256"] = code.digest(method.__qualname__)
+        imports = code.imports.difference(made.packages, sys.stdlib_module_names, (PACKAGE,))
+        offered = metadata.packages_distributions() if imports else {}
+        made.packages = (*made.packages, *sorted({name for module in imports for name in offered.get(module, ())}))
+    made.settings = settings
+    return made
 
 
 def load_from_file(text: str) -> Any:
@@ -117,6 +140,76 @@ def load_from_file(text: str) -> Any:
     except AttributeError:
         public = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
         raise PredictionError(f"{path_text}: has no {printable(name)!r}; {did_you_mean(name, public)}") from None
+
+
+class Code(NamedTuple):
+    """What a method's file is made of: ``files``, by their path from its folder their SHA-256; and the top-level names
+    of what they ``imports`` from other packages."""
+
+    files: dict[str, str]
+    imports: frozenset[str]
+
+    def digest(self, name: str) -> str:
+        """SHA-256 of all of it, and of the ``name`` of what is used of it."""
+        return sha256(f"{name} {self.files}".encode()).hexdigest()
+
+
+def code_of(method: type[Method]) -> Code | None:
+    """The code of a class; None for one of this package, whose version says what it is."""
+    file = None if is_built_in(method) else inspect.getsourcefile(method)
+    return None if file is None else code_in(Path(file), method.__module__.partition(".")[0])
+
+
+@cache
+def code_in(file: Path, package: str = "") -> Code:
+    """The code of ``file``: itself; what it imports, at whatever place, from beside it, from its own ``package`` or
+    from any folder without installed packages; and the files of `WEIGHTS` that a text in it names. A name that is put
+    together while the code runs is not seen. Read once, as the file is executed once."""
+    files, imports, waiting = dict[str, str](), set[str](), [file]
+    while waiting:
+        path = waiting.pop()
+        if (place := os.path.relpath(path, file.parent)) in files:
+            continue
+        files[place] = _digest(path)
+        for node in _nodes(path):
+            if isinstance(node, ast.Constant) and str(node.value).endswith(WEIGHTS):
+                waiting += filter(is_file, (path.parent / str(node.value), Path(str(node.value))))
+            level = getattr(node, "level", 0)
+            folders = [path.parents[level - 1]] if level else [file.parent, *map(Path, sys.path)]
+            for name in _imported(node):
+                parts = name.split(".")
+                stems = [folder.joinpath(*parts[:n]) for folder in folders for n in range(1, len(parts) + 1)]
+                sources = [stem.with_name(f"{stem.name}.py") for stem in stems] + [s / "__init__.py" for s in stems]
+                own = [s for s in filter(is_file, sources) if level or parts[0] == package or not _is_installed(s)]
+                waiting += own if parts[0] != PACKAGE else []
+                imports.update(() if own or level else parts[:1])
+    return Code(dict(sorted(files.items())), frozenset(imports))
+
+
+def _nodes(path: Path) -> list[ast.AST]:
+    """The syntax of a Python file; nothing of another file, or of one that can't be executed either."""
+    with suppress(SyntaxError, ValueError):
+        return [*ast.walk(ast.parse(path.read_bytes()))] if path.suffix == ".py" else []
+    return []
+
+
+def _imported(node: ast.AST) -> list[str]:
+    """The names, with dots, that an import statement may mean."""
+    module = [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+    return (
+        [".".join([*module, alias.name]) for alias in node.names]
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        else []
+    )
+
+
+def _is_installed(path: Path) -> bool:
+    places = {"site-packages", "dist-packages"}
+    return path.is_relative_to(sysconfig.get_path("stdlib")) or not places.isdisjoint(path.parts)
+
+
+def _digest(path: Path) -> str:
+    return sha256(path.read_bytes()).hexdigest()
 
 
 def failure_in_file(error: BaseException) -> str | None:

@@ -140,7 +140,7 @@ class SampleScenes:
     def predict(self, scene: Scene) -> NDArray[np.float32]:
         """Predicted depth (H, W) in the units of the method."""
         frames = self.renderer.frames(scene, self.method.frames_used, self.method.uses_ground_truth_mask)
-        return self.method.predict(frames)
+        return self.method.answer(frames).depth
 
     def true_depth(self, scene: Scene) -> NDArray[np.float64]:
         """True depth (H, W) in the units of the method: mm, or normalised to its range over the scene's mask."""

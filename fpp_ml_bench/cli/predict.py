@@ -44,7 +44,7 @@ def predict(
     account: Explain,
 ) -> None:
     """Run a method over a split and write predictions that fpp-eval scores."""
-    opened = DatasetFolder(dataset)
+    opened = DatasetFolder(dataset, truth=False)  # what the method sees of its caller
     method = chosen.load(opened)
     samples = len(opened.samples(split))
     bar = progress_bar(f"{chosen.name}, {split}", samples, "samples")
@@ -95,7 +95,7 @@ def time(
     ),
 ) -> None:
     """Measure a method's latency at batch 1, throughput, memory, parameters and frames, on a named machine."""
-    opened = DatasetFolder(dataset)
+    opened = DatasetFolder(dataset, truth=False)
     method = chosen.load(opened)
     for path in into:
         check_target(path, method)

@@ -50,7 +50,9 @@ def mine(tmp_path: Path) -> str:
 
 def test_a_method_of_a_file_with_its_options(mine):
     method = registry.load_method(f"{mine}:Mine", RIG, depth=900.0)
-    assert (method.name, method.settings, method.learned_from) == ("mine", {"depth": 900.0}, {"data": "none"})
+    source = method.settings["source_sha256"]
+    assert (method.name, method.settings) == ("mine", {"depth": 900.0, "source_sha256": source})
+    assert method.learned_from is None  # its author has not said it
     frame = np.full((224, 224), 61, np.uint8)
     assert (method.predict([frame]) == 900).all()
     found = registry.find(f"{mine}:Mine")

@@ -79,7 +79,7 @@ def test_a_method_that_takes_batches_gets_them_at_once(small, monkeypatch):
         def predict_batch(self, stacks):
             sizes.append(len(stacks))
             clock.now += 50.0 if len(sizes) == 1 else 0.5  # the first batch warms up
-            return [None] * len(stacks)
+            return [np.zeros(frames[0].shape, np.float32) for frames in stacks]
 
     measured = timing.time_method(small, Batched(clock, []), batch=6, repeats=12)  # more than the split's four samples
     assert measured.batched is True and set(sizes) == {6} and len(sizes) == 3

@@ -18,6 +18,7 @@ from fpp_ml_bench.baselines.diagnostics.counterfactual import (
     sample_score,
 )
 from fpp_ml_bench.baselines.diagnostics.scenes import chosen_samples
+from fpp_ml_bench.baselines.method import Answer
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.constants import split_sample_name
 from fpp_ml_bench.errors import DiagnosisError
@@ -90,14 +91,14 @@ def test_order_free_forgives_periods_and_credits_no_chance():
 class Reader:
     """A known answer to frames."""
 
-    answer: Any
+    known: Any
     frames_used: tuple[int, ...] = (0,)
     units: str = "mm"
     uses_ground_truth_mask: bool = False
     weights_sha256: str | None = None
 
-    def predict(self, frames):
-        return np.asarray(self.answer(frames), dtype=np.float32)
+    def answer(self, frames):
+        return Answer(np.asarray(self.known(frames), dtype=np.float32))
 
 
 def sobel(image):
