@@ -14,8 +14,10 @@ A whole method, in a file ``mine.py`` of its own, for ``fpp-bench predict mine.p
 """
 
 import platform
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
@@ -40,6 +42,8 @@ if TYPE_CHECKING:
 
 Frames = Sequence[NDArray[np.uint8] | None]
 """A captured sequence by frame number, with None for frames that are not needed."""
+FRAMEWORKS = ("cv2", "jax", "onnxruntime", "scipy", "skimage", "sklearn", "tensorflow", "torch", "torchvision")
+"""Modules whose versions are stated of a method of a file where they are loaded: nobody has to say so."""
 Setting = str | int | float | bool | None
 
 
@@ -105,9 +109,9 @@ class Method:
     range_rule: by which range normalised depth is.
     uses_ground_truth_mask: whether it is given frames that are 0 outside the object.
     mode, target: what its row is scored in and against; for a network the decoded depth, which it was trained on.
-    packages: those whose versions matter; `registry.load_method` adds those that a class of a file imports. parameters:
-    numbers that were learned. weights_config: what its weights file says of the network and its training data.
-    learned_from: what data it learned from, as `evaluation.submission.LearnedFrom` has it; a class outside this package
+    packages: those whose versions matter, for a class outside this package beside `FRAMEWORKS`. parameters: numbers
+    that were learned. weights_config: what its weights file says of the network and its training data. learned_from:
+    what data it learned from, as `evaluation.submission.LearnedFrom` has it; a class outside this package
     says so itself, like ``learned_from = {"data": "other", "versions": ["my scans"]}``, and without that it is unknown.
     code: hashes of the files of a class outside this package. batched: whether `predict_batch` takes all samples at
     once. reports: whether `answer` reports.
@@ -213,7 +217,7 @@ class Method:
         """Summary of a split's reports, for the settings of the submission."""
         return {}
 
-    @property
+    @cached_property  # which a class or an instance can set
     def learned_from(self) -> dict[str, Any] | None:
         """What data the method learned from; None where that is unknown."""
         if (config := self.weights_config) is not None:
@@ -235,6 +239,12 @@ class Method:
     def software(self) -> dict[str, str]:
         """Versions of this package, Python and the packages that the method computes with."""
         versions = {package: version(package) for package in self.packages}
+        if not is_built_in(type(self)):
+            versions |= {
+                name: str(getattr(sys.modules[name], "__version__", "unknown"))
+                for name in FRAMEWORKS
+                if name in sys.modules
+            }
         return {"fpp_ml_bench": __version__, "python": platform.python_version(), **versions}
 
 

@@ -14,7 +14,6 @@ import pickle
 import sys
 import sysconfig
 import traceback
-from contextlib import suppress
 from dataclasses import fields
 from functools import cache
 from hashlib import sha256
@@ -77,6 +76,8 @@ def find(name: str | Path) -> Found:
     with the package or in a ``.safetensors`` file, or a recipe that ``fpp-bench reproduce`` has trained. Raises
     `PredictionError`, for an unknown name with what it might have meant."""
     text = str(name)
+    if text.endswith(".py"):
+        text += ":"
     if FILE_MARK in text:
         method = _checked(load_from_file(text), text)
         path, _, attribute = text.rpartition(":")
@@ -117,16 +118,12 @@ def load_method(name: str | Path, source: Photographed | Rig, **options: Any) ->
     shown = source.without_truth() if isinstance(source, DatasetFolder) else source
     make = method.for_rig if isinstance(shown, Rig) else method.for_dataset
     made = make(shown, **preset, **options)  # type: ignore[arg-type]
-    defaults = {entry.name: entry.default for entry in fields(method.Options)}
-    files = {key: Path(value) for key, value in {**defaults, **options}.items() if isinstance(value, str | Path)}
-    settings: dict[str, Setting] = {f"{key}_sha256": _digest(path) for key, path in files.items() if is_file(path)}
+    given = {**{entry.name: entry.default for entry in fields(method.Options)}, **options}
+    files = {key: Path(value) for key, value in given.items() if isinstance(value, str | Path)}
+    settings: dict[str, Setting] = {f"{key}_sha256": _sha256(path) for key, path in files.items() if is_file(path)}
     settings |= made.settings
-    if (code := code_of(method)) is not None:
-        made.code = code.files
-        settings["source_sha256"] = code.digest(method.__qualname__)
-        imports = code.imports.difference(made.packages, sys.stdlib_module_names, (PACKAGE,))
-        offered = metadata.packages_distributions() if imports else {}
-        made.packages = (*made.packages, *sorted({name for module in imports for name in offered.get(module, ())}))
+    if (digest := source_sha256(method)) is not None:
+        made.code, settings["source_sha256"] = code_of(method), digest
     made.settings = settings
     return made
 
@@ -138,77 +135,43 @@ def load_from_file(text: str) -> Any:
     try:
         return getattr(module, name)
     except AttributeError:
-        public = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
-        raise PredictionError(f"{path_text}: has no {printable(name)!r}; {did_you_mean(name, public)}") from None
-
-
-class Code(NamedTuple):
-    """What a method's file is made of: ``files``, by their path from its folder their SHA-256; and the top-level names
-    of what they ``imports`` from other packages."""
-
-    files: dict[str, str]
-    imports: frozenset[str]
-
-    def digest(self, name: str) -> str:
-        """SHA-256 of all of it, and of the ``name`` of what is used of it."""
-        return sha256(f"{name} {self.files}".encode()).hexdigest()
-
-
-def code_of(method: type[Method]) -> Code | None:
-    """The code of a class; None for one of this package, whose version says what it is."""
-    file = None if is_built_in(method) else inspect.getsourcefile(method)
-    return None if file is None else code_in(Path(file), method.__module__.partition(".")[0])
+        own = [key for key, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__]
+        wrong = f"has no {printable(name)!r}" if name else f"expected {path_text}:NAME, which says what of it"
+        raise PredictionError(f"{path_text}: {wrong}; {did_you_mean(name, own)}") from None
 
 
 @cache
-def code_in(file: Path, package: str = "") -> Code:
-    """The code of ``file``: itself; what it imports, at whatever place, from beside it, from its own ``package`` or
-    from any folder without installed packages; and the files of `WEIGHTS` that a text in it names. A name that is put
-    together while the code runs is not seen. Read once, as the file is executed once."""
-    files, imports, waiting = dict[str, str](), set[str](), [file]
-    while waiting:
-        path = waiting.pop()
-        if (place := os.path.relpath(path, file.parent)) in files:
-            continue
-        files[place] = _digest(path)
-        for node in _nodes(path):
+def code_of(method: type[Method]) -> dict[str, str]:
+    """`code_in` the file of a class; empty for one of this package, whose version says what it is."""
+    file = None if is_built_in(method) else inspect.getsourcefile(method)
+    return {} if file is None else code_in(Path(file), method.__module__.partition(".")[0])
+
+
+def source_sha256(method: type[Method]) -> str | None:
+    """SHA-256 of a class's name and code; None for one of this package."""
+    code = code_of(method)
+    return sha256(f"{method.__qualname__} {code}".encode()).hexdigest() if code else None
+
+
+def code_in(file: Path, package: str = "") -> dict[str, str]:
+    """What ``file`` is made of: by their path from its folder the SHA-256 of itself, of what is imported from beside it
+    or from its ``package``, and of files of `WEIGHTS` that a text in these names. What the code puts together while it
+    runs is not seen."""
+    paths = {file}
+    for name, module in sys.modules.copy().items():
+        top, path = name.partition(".")[0], Path(getattr(module, "__file__", None) or "")
+        beside = path.is_relative_to(file.parent) and "site-packages" not in path.parts
+        beside = beside and not path.is_relative_to(sysconfig.get_path("stdlib"))
+        if top == package or (beside and top != "__main__" and not top.startswith(PACKAGE)):
+            paths.add(path)
+    for path in [path for path in paths if path.suffix == ".py"]:
+        for node in ast.walk(ast.parse(path.read_bytes())):
             if isinstance(node, ast.Constant) and str(node.value).endswith(WEIGHTS):
-                waiting += filter(is_file, (path.parent / str(node.value), Path(str(node.value))))
-            level = getattr(node, "level", 0)
-            folders = [path.parents[level - 1]] if level else [file.parent, *map(Path, sys.path)]
-            for name in _imported(node):
-                parts = name.split(".")
-                stems = [folder.joinpath(*parts[:n]) for folder in folders for n in range(1, len(parts) + 1)]
-                sources = [stem.with_name(f"{stem.name}.py") for stem in stems] + [s / "__init__.py" for s in stems]
-                own = [s for s in filter(is_file, sources) if level or parts[0] == package or not _is_installed(s)]
-                waiting += own if parts[0] != PACKAGE else []
-                imports.update(() if own or level else parts[:1])
-    return Code(dict(sorted(files.items())), frozenset(imports))
+                paths |= {path.parent / str(node.value), Path(str(node.value)).resolve()}
+    return {os.path.relpath(path, file.parent): _sha256(path) for path in sorted(paths) if is_file(path)}
 
 
-def _nodes(path: Path) -> list[ast.AST]:
-    """The syntax of a Python file; nothing of another file, or of one that can't be executed either."""
-    with suppress(SyntaxError, ValueError):
-        return [*ast.walk(ast.parse(path.read_bytes()))] if path.suffix == ".py" else []
-    return []
-
-
-def _imported(node: ast.AST) -> list[str]:
-    """The names, with dots, that an import statement may mean."""
-    module = [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
-    return (
-        [".".join([*module, alias.name]) for alias in node.names]
-        if isinstance(node, ast.Import | ast.ImportFrom)
-        else []
-    )
-
-
-def _is_installed(path: Path) -> bool:
-    places = {"site-packages", "dist-packages"}
-    return path.is_relative_to(sysconfig.get_path("stdlib")) or not places.isdisjoint(path.parts)
-
-
-def _digest(path: Path) -> str:
+def _sha256(path: Path) -> str:
     return sha256(path.read_bytes()).hexdigest()
 
 

@@ -148,15 +148,16 @@ def check_target(path: Path, method: Method) -> None:
     """Refuse, before any work, a file that is no submission or result, or that describes another method. Raises
     SubmissionError, which says what differs."""
     submission, _ = _described(path)
+    settings = {**({} if method.reports else submission.settings), **method.settings}  # a summary of reports is added
     for key, in_file, timed in (
         ("method", submission.method, method.name),
         ("frames_used", sorted(submission.frames_used), list(method.frames_used)),
-        ("settings", dict(submission.settings), dict(method.settings)),
+        *((f"settings.{key}", submission.settings.get(key), method.settings.get(key)) for key in settings),
     ):
         if in_file != timed:
             raise SubmissionError(
                 f"{printable(str(path), 500)}: {key} is {printable(in_file)}, but {printable(timed)} would be timed; a "
-                "time belongs to the method that was scored: give the same options"
+                "time belongs to the method that was scored: give the same options and code, or predict and score again"
             )
 
 

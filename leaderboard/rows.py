@@ -241,7 +241,7 @@ def check_same_method(entry: Entry, method: Method) -> None:
             raise SubmissionError(
                 f"{printable(str(entry.path), 500)}: {key} is {printable(str(of_row))}, but "
                 f"{printable(str(of_method))} for the method to measure; what is measured belongs to the very method "
-                "that was scored: give the same options"
+                "that was scored: give the same options and code, or predict and score again"
             )
 
 

@@ -286,7 +286,7 @@ def _subject_of_factory(
         raise DiagnosisError(f"frame {frame}: expected 0 to {len(dataset.sequence) - 1}, the frames of the sequence")
     network = _build_network(name, factory)
     path, normalisation = Path(name.rpartition(":")[0]), NORMALISATION_OF[units]
-    digest = hashlib.sha256(f"{units} {frame} {code_in(path.resolve()).files}".encode())
+    digest = hashlib.sha256(f"{units} {frame} {code_in(path.resolve())}".encode())
     for key, value in network.state_dict().items():
         if isinstance(value, Tensor):
             values = value.detach().cpu().contiguous().flatten().view(torch.uint8)

@@ -20,7 +20,7 @@ from pydantic import Field
 
 from fpp_ml_bench import __version__
 from fpp_ml_bench.baselines.method import Frames, Method
-from fpp_ml_bench.baselines.registry import code_of, failure_in_file, find, load_method, methods
+from fpp_ml_bench.baselines.registry import failure_in_file, find, load_method, methods, source_sha256
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.baselines.timing import added_mib, check_batch, four_digits
 from fpp_ml_bench.baselines.training.weights import open_weights, shipped_names, weights_path
@@ -208,9 +208,7 @@ def planned(
     opened, points = DatasetFolder(dataset), []
     for name in names or [*methods(), *_networks(opened.size)]:
         method, path = find(name).method, Path(name)
-        code = code_of(method)
-        own = None if code is None else code.digest(method.__qualname__)
-        digest = sha256(path.read_bytes()).hexdigest() if path.is_file() else own
+        digest = sha256(path.read_bytes()).hexdigest() if path.is_file() else source_sha256(method)
         variants = method.variants(opened.rig)
         if names and not variants:
             variants = [{}]  # it was asked for: the point says why it can't be measured

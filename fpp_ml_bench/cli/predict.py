@@ -44,16 +44,17 @@ def predict(
     account: Explain,
 ) -> None:
     """Run a method over a split and write predictions that fpp-eval scores."""
-    opened = DatasetFolder(dataset, truth=False)  # what the method sees of its caller
+    opened = DatasetFolder(dataset)
     method = chosen.load(opened)
+    opened = opened.without_truth()  # the method can look at its caller
     samples = len(opened.samples(split))
-    bar = progress_bar(f"{chosen.name}, {split}", samples, "samples")
+    bar = progress_bar(f"{chosen.name}, {split}", samples, "samples", shown=False)
     with working_copy(out) as (folder, _), bar as advance:
         seconds = predict_split(opened, method, split, folder, advance)
-    print(
-        f"{out}: {samples} predictions by {method.title}; {len(method.frames_used)} frames and "
-        f"{seconds:.3f} s a sample (median)"
-    )
+    counted = [
+        f"{n} {what}{'s' * (n != 1)}" for n, what in ((samples, "prediction"), (len(method.frames_used), "frame"))
+    ]
+    print(f"{out}: {counted[0]} by {method.title}; {counted[1]} and {seconds:.3f} s a sample (median)")
     how = f"{_scoring(method, opened)} --json result.json"
     if isinstance(out, Path):
         print(f"next: fpp-eval {out}{how}")
@@ -95,8 +96,9 @@ def time(
     ),
 ) -> None:
     """Measure a method's latency at batch 1, throughput, memory, parameters and frames, on a named machine."""
-    opened = DatasetFolder(dataset, truth=False)
+    opened = DatasetFolder(dataset)
     method = chosen.load(opened)
+    opened = opened.without_truth()
     for path in into:
         check_target(path, method)
     with progress_bar(f"timing {chosen.name}", repeats, "images") as advance:

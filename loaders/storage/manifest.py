@@ -11,12 +11,11 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin
 
-from fpp_ml_bench.constants import OBJECT_NAME, REPOSITORY_NAME, SAMPLE_NAME, SCHEMA_VERSION, SPLITS, TRAIN, VIEW_NAME
+from fpp_ml_bench.constants import OBJECT_NAME, REPOSITORY_NAME, SAMPLE_NAME, SCHEMA_VERSION, SPLITS, VIEW_NAME
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import file_hash, path_problem, printable, read_json, text_problem, write_atomically
 from fpp_ml_bench.loaders.sample import (
     DATA_GROUP,
-    NAMES,
     available_configs,
     features,
     row_columns,
@@ -133,30 +132,10 @@ class Manifest:
         """The `columns` as `sample.features`."""
         return features(self.columns(group), self.size)
 
-    def without_truth(self) -> "Manifest":
-        """The manifest that a method is given: of samples outside the training split it has names alone."""
-        samples = {
-            split: rows if split == TRAIN else [{key: row[key] for key in NAMES} for row in rows]
-            for split, rows in self.samples.items()
-        }
-        parts = {entry.name: getattr(self, entry.name) for entry in fields(self)}
-        return _Shown(**{**parts, "samples": samples}, whole=self.fingerprint)
-
     def write(self, folder: Path) -> None:
         """Write ``manifest.json`` complete or not at all."""
         content = {**asdict(self), "fingerprint": self.fingerprint}
         write_atomically(folder / MANIFEST, json.dumps(content, indent=1, allow_nan=False).encode() + b"\n")
-
-
-@dataclass(frozen=True)
-class _Shown(Manifest):
-    """A part of a manifest, with the fingerprint of the ``whole``."""
-
-    whole: str = ""
-
-    @property
-    def fingerprint(self) -> str:
-        return self.whole
 
 
 def read_manifest(folder: Path) -> Manifest:

@@ -8,6 +8,7 @@ leave columns out; `load_dataset` joins the tables of the column groups, and a f
 import mmap
 import sys
 from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from time import monotonic
@@ -26,6 +27,7 @@ from fpp_ml_bench.loaders.sample import (
     DEPTH_EXACT,
     DEPTHS,
     FLAGS,
+    NAMES,
     TRUTH,
     Flag,
     config_columns,
@@ -57,7 +59,13 @@ class DatasetFolder:
         what methods are given: of samples outside the training split no depth, flags, range and measurements."""
         self.path, self.truth = Path(path), truth
         manifest = read_manifest(self.path)
-        self.manifest = manifest if truth else manifest.without_truth()
+        self.fingerprint = manifest.fingerprint
+        """SHA-256 of the data's content, 64 hex digits."""
+        shown = {
+            split: rows if truth or split == TRAIN else [{key: row[key] for key in NAMES} for row in rows]
+            for split, rows in manifest.samples.items()
+        }
+        self.manifest = replace(manifest, samples=shown)
         self._mapped: dict[str, MappedShard] = {}
         for shard in self.manifest.shards if check else ():
             if damage := damage_of(self.path, shard, whole=False):
@@ -73,11 +81,6 @@ class DatasetFolder:
     def without_truth(self) -> "DatasetFolder":
         """The dataset as methods are given it."""
         return DatasetFolder(self.path, check=False, truth=False) if self.truth else self
-
-    @property
-    def fingerprint(self) -> str:
-        """SHA-256 of the data's content, 64 hex digits."""
-        return self.manifest.fingerprint
 
     @property
     def content(self) -> dict[str, str]:

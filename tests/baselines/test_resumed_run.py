@@ -1,16 +1,21 @@
 """`predict_split` continues a stopped run behind its last finished sample, and refuses to continue another one."""
 
 import json
+import sys
 
 import numpy as np
 import pytest
 import yaml
 from scored_dataset import make_dataset
 
+from fpp_ml_bench.baselines import registry
 from fpp_ml_bench.baselines.method import Answer, Method
 from fpp_ml_bench.baselines.run import predict_split
-from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.cli import main
+from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.machine import THREAD_COUNTS
 
 SPLIT = "test"
 
@@ -97,6 +102,72 @@ def test_another_run_is_refused_and_keeps_its_files(dataset, stopped, tmp_path):
         predict_split(dataset, Counting(), SPLIT, stopped)
     (stopped / "notes.txt").unlink()
     assert {path.name: path.read_bytes() for path in stopped.iterdir()} == before
+
+
+def test_other_code_is_refused_by_the_name_of_its_file(dataset, tmp_path):
+    method = Counting(3)
+    method.code = {"mine.py": "1", "util.py": "1"}
+    with pytest.raises(KeyboardInterrupt):
+        predict_split(dataset, method, SPLIT, tmp_path / "out")
+    changed = Counting()
+    changed.code = {"mine.py": "1", "util.py": "2"}
+    with pytest.raises(PredictionError, match=r'differs in code util\.py \(code util\.py: "1" there, "2" now\)'):
+        predict_split(dataset, changed, SPLIT, tmp_path / "out")
+    same = Counting()
+    same.code = method.code
+    predict_split(dataset, same, SPLIT, tmp_path / "out")
+
+
+def test_other_threads_are_refused(dataset, stopped, monkeypatch):
+    monkeypatch.setenv(THREAD_COUNTS[0], "7")
+    with pytest.raises(PredictionError, match="differs in threads"):
+        predict_split(dataset, Counting(), SPLIT, stopped)
+
+
+def test_a_method_that_describes_itself_wrongly_is_refused_before_its_first_sample(dataset, tmp_path):
+    method = Counting()
+    method.learned_from = {"data": "mine"}
+    with pytest.raises(SubmissionError, match="learned_from"):
+        predict_split(dataset, method, SPLIT, tmp_path / "out")
+    assert method.answers == 0
+
+
+class Looking(Method):
+    """Looks for truth in what it is given, and in all that its callers hold."""
+
+    name, title, frames_used = "looking", "Looking", (0,)
+
+    @classmethod
+    def for_dataset(cls, dataset, **options):
+        method = cls(dataset.rig)
+        method.given = dataset
+        return method
+
+    def answer(self, frames):
+        frame, held = sys._getframe(1), [self.given]
+        while frame is not None and frame.f_code.co_name != "run_it":
+            held += frame.f_locals.values()
+            frame = frame.f_back
+        assert frame is not None
+        opened = [one for one in held if isinstance(one, DatasetFolder)]
+        assert len(opened) >= 2  # of `predict_split`, and its own
+        for one in opened:
+            for sample in one.samples(SPLIT):
+                assert set(one.measured(sample)) == {"sample", "object", "view"}
+                with pytest.raises(DatasetError, match="is truth of the test split"):
+                    one.depth_mm(sample)
+        return Answer(np.zeros(frames[0].shape, np.float32))
+
+
+def test_a_method_reaches_no_truth_by_what_it_is_given_or_by_its_caller(dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(registry, "_built_in", {"looking": Looking}.get)
+    monkeypatch.setattr(registry, "BUILT_IN", ("looking",))
+    monkeypatch.setattr(registry, "NETWORKS", "looking")
+
+    def run_it():
+        return main(["predict", "looking", str(dataset.path), "--out", str(tmp_path / "out")])
+
+    assert run_it() == 0
 
 
 def test_stopped_between_the_description_and_the_end(dataset, stopped):

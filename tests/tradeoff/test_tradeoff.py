@@ -290,7 +290,7 @@ def test_a_changed_file_is_measured_again(small, tmp_path, answers, monkeypatch)
     monkeypatch.chdir(tmp_path)
     answers.variants = {"mine.py:Mine": [{}]}
     # In a process of its own, which reads the file once.
-    monkeypatch.setattr(measure, "code_of", lambda method: code_in.__wrapped__(tmp_path / "mine.py"))
+    monkeypatch.setattr(measure, "source_sha256", lambda method: str(code_in(tmp_path / "mine.py")))
     for content, times in (("1", 1), ("1", 1), ("2", 2)):
         (tmp_path / "mine.py").write_text(content)
         measure.tradeoff(plan_of(small, tmp_path / "out", "mine.py:Mine"))
