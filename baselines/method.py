@@ -15,7 +15,7 @@ A whole method, in a file ``mine.py`` of its own, for ``fpp-bench predict mine.p
 
 import platform
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import cached_property
 from importlib.metadata import version
@@ -248,15 +248,29 @@ class Method:
         return {"fpp_ml_bench": __version__, "python": platform.python_version(), **versions}
 
 
+def checked(answer: Answer, size: tuple[int, int], where: object) -> Answer:
+    """``answer`` if its maps are finite float32 of ``size`` (H, W), as `Method.answer` must give them; else
+    `PredictionError`, which begins with ``where``."""
+    if not isinstance(answer, Answer):
+        raise PredictionError(f"{where}: answer gave {type(answer).__name__}, expected Answer(depth)")
+    for values in (answer.depth, *([] if answer.sigma_mm is None else [answer.sigma_mm])):
+        found = f"{getattr(values, 'dtype', type(values).__name__)} {np.shape(values)}"
+        if found != (expected := f"float32 {size}"):
+            raise PredictionError(f"{where}: the method gave {found}, expected {expected}")
+        if not np.isfinite(values).all():
+            raise PredictionError(f"{where}: the method gave values that are not finite: a fault of the method")
+    return answer
+
+
 def training_split_of(benchmark: "Benchmark | TrainingBenchmark | None", fingerprint: str) -> dict[str, Any]:
     """`Method.learned_from` of a method that learned from the training split of a dataset, a ``benchmark`` or not."""
     title = f"dataset {fingerprint[:8]}" if benchmark is None else benchmark.title
     return {"data": "train-split", "versions": [title]}
 
 
-def is_built_in(method: type[Method]) -> bool:
-    """Whether a class comes with this package."""
-    return method.__module__.startswith(f"{__package__}.")
+def is_built_in(part: Callable[..., Any]) -> bool:
+    """Whether a class of methods, or a function of one, comes with this package."""
+    return part.__module__.startswith(f"{__package__}.")
 
 
 def plain_settings(options: Any) -> dict[str, Setting]:

@@ -113,8 +113,11 @@ def load_method(name: str | Path, source: Photographed | Rig, **options: Any) ->
     Raises `PredictionError` for an unknown name, and what the method refuses: unusable weights, invalid options.
     """
     method, preset = find(name)
-    if method.predict is Method.predict and method.answer is Method.answer:
+    own_answer = method.answer is not Method.answer
+    if method.predict is Method.predict and not own_answer:
         raise PredictionError(f"{name}: does not define predict, or answer, which a method needs")
+    if own_answer and is_built_in(method.answer) and not is_built_in(method.predict):
+        raise PredictionError(f"{name}: what it inherits answers without its predict; define answer instead")
     shown = source.without_truth() if isinstance(source, DatasetFolder) else source
     make = method.for_rig if isinstance(shown, Rig) else method.for_dataset
     made = make(shown, **preset, **options)  # type: ignore[arg-type]
@@ -124,7 +127,10 @@ def load_method(name: str | Path, source: Photographed | Rig, **options: Any) ->
     settings |= made.settings
     if (digest := source_sha256(method)) is not None:
         made.code, settings["source_sha256"] = code_of(method), digest
-    made.settings = settings
+    try:
+        made.settings = settings
+    except AttributeError:
+        raise PredictionError(f"{name}: settings is read only; set it in __init__, as a dictionary") from None
     return made
 
 
@@ -140,7 +146,6 @@ def load_from_file(text: str) -> Any:
         raise PredictionError(f"{path_text}: {wrong}; {did_you_mean(name, own)}") from None
 
 
-@cache
 def code_of(method: type[Method]) -> dict[str, str]:
     """`code_in` the file of a class; empty for one of this package, whose version says what it is."""
     file = None if is_built_in(method) else inspect.getsourcefile(method)
@@ -153,10 +158,11 @@ def source_sha256(method: type[Method]) -> str | None:
     return sha256(f"{method.__qualname__} {code}".encode()).hexdigest() if code else None
 
 
+@cache
 def code_in(file: Path, package: str = "") -> dict[str, str]:
     """What ``file`` is made of: by their path from its folder the SHA-256 of itself, of what is imported from beside it
     or from its ``package``, and of files of `WEIGHTS` that a text in these names. What the code puts together while it
-    runs is not seen."""
+    runs is not seen. Read once, as the file is executed once."""
     paths = {file}
     for name, module in sys.modules.copy().items():
         top, path = name.partition(".")[0], Path(getattr(module, "__file__", None) or "")

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.method import Method, checked
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.submission.description import check_submission
@@ -62,9 +62,11 @@ def predict_split(
                 started = perf_counter()
                 answer = method.answer(frames)
                 seconds = perf_counter() - started
-                _write_prediction(run, path, answer.depth, opened.size)
+                checked(answer, opened.size, path)
+                run.begin()
+                _write_prediction(path, answer.depth)
                 if answer.sigma_mm is not None:
-                    _write_prediction(run, out / f"{sample}{SIGMA}", answer.sigma_mm, opened.size)
+                    _write_prediction(out / f"{sample}{SIGMA}", answer.sigma_mm)
                 run.add(sample, seconds, dict(answer.report) if method.reports else {})
             progress(1)
         finished = {sample: run.finished[sample] for sample in samples}
@@ -205,12 +207,7 @@ def _prepare(out: Path, opened: DatasetFolder, method: Method, split: str) -> Un
     return run
 
 
-def _write_prediction(run: UnfinishedRun, path: Path, depth_mm: NDArray[np.float32], size: tuple[int, int]) -> None:
-    if depth_mm.shape != size or depth_mm.dtype != np.float32:
-        raise PredictionError(f"{path}: the method gave {depth_mm.dtype} {depth_mm.shape}, expected float32 {size}")
-    if not np.isfinite(depth_mm).all():
-        raise PredictionError(f"{path}: the method gave depths that are not finite: a fault of the method")
-    run.begin()
+def _write_prediction(path: Path, depth_mm: NDArray[np.float32]) -> None:
     content = BytesIO()
     np.save(content, depth_mm, allow_pickle=False)
     write_atomically(path, content.getvalue(), sync=False)  # a later run sees what is not whole

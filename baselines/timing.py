@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from fpp_ml_bench.baselines.method import Frames, Method
+from fpp_ml_bench.baselines.method import Frames, Method, checked
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.result.file import read_result, write_file, write_result
@@ -65,7 +65,7 @@ def time_method(
         return seconds(lambda: method.answer(stacks[number % len(stacks)]))
 
     for number in range(WARM_UP):
-        latency_s(number)
+        checked(method.answer(stacks[number % len(stacks)]), opened.size, method.name)
     working_mib = added_mib(lambda: latency_s(0))
     if cuda is not None:
         cuda.reset_peak_memory_stats(method.device)

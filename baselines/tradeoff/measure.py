@@ -15,16 +15,15 @@ from time import perf_counter, process_time
 from typing import Annotated, Any, Literal, get_args
 
 import cv2
-import numpy as np
 from pydantic import Field
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.method import Frames, Method
+from fpp_ml_bench.baselines.method import Frames, Method, checked
 from fpp_ml_bench.baselines.registry import failure_in_file, find, load_method, methods, source_sha256
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.baselines.timing import added_mib, check_batch, four_digits
 from fpp_ml_bench.baselines.training.weights import open_weights, shipped_names, weights_path
-from fpp_ml_bench.errors import DatasetError, FppBenchError, PredictionError, RigError, SubmissionError
+from fpp_ml_bench.errors import DatasetError, FppBenchError, RigError, SubmissionError
 from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.evaluation.result.parts import HardwareInfo
 from fpp_ml_bench.evaluation.score.check import Rules
@@ -312,12 +311,11 @@ def _figures(plan: Plan, method: Method) -> dict[str, Any]:
     memory_mib = None
     for name in plan.views:
         frames = captured_frames(opened, method, name)
-        run_s, (depth, *_) = plan.timed(method.answer, frames)
+        run_s, answer = plan.timed(method.answer, frames)
+        depth = checked(answer, opened.size, name).depth
         if not seconds:
             memory_mib = added_mib(partial(method.answer, frames))
         seconds.append(run_s)
-        if depth.shape != opened.size or not np.isfinite(depth).all():
-            raise PredictionError(f"{name}: expected finite depth (H, W) {opened.size}, the method gave another")
         scored.append(score_sample(*rules.pair(depth, opened, name), void=rules.void(opened, name)))
     batch = [captured_frames(opened, method, name) for name in plan.views[:BATCH]]
     check_batch(method, batch)

@@ -44,6 +44,20 @@ here = 3
 """
 
 
+UNHEARD = """
+from fpp_ml_bench.baselines.phase.method import PhaseMethod
+class Unheard(PhaseMethod):
+    def predict(self, frames):
+        return super().predict(frames) + 1
+"""
+FIXED = """
+class Fixed(Mine):
+    settings = property(lambda self: {})
+    def __init__(self, rig):
+        pass
+"""
+
+
 @pytest.fixture
 def mine(tmp_path: Path) -> str:
     (tmp_path / "mine.py").write_text(MINE)
@@ -70,6 +84,8 @@ def test_a_method_of_a_file_with_its_options(mine):
     [
         ("mine.py:Min", r"mine.py: has no 'Min'; did you mean 'Mine'\?"),
         ("mine.py:Half", "does not define predict"),
+        ("unheard.py:Unheard", "answers without its predict; define answer instead"),
+        ("fixed.py:Fixed", "settings is read only"),
         ("mine.py:here", "expected a subclass of fpp_ml_bench.Method, got int"),
         ("none.py:Mine", "none.py: no such file"),
         ("broken.py:Mine", r"broken.py: importing it failed: ZeroDivisionError: division by zero \(line 1\)"),
@@ -79,6 +95,8 @@ def test_a_method_of_a_file_with_its_options(mine):
 def test_files_that_hold_no_method(mine, name, says):
     folder = Path(mine).parent
     (folder / "broken.py").write_text("1 / 0\n")
+    (folder / "unheard.py").write_text(UNHEARD)
+    (folder / "fixed.py").write_text(MINE + FIXED)
     (folder / "spaces.py").write_text(MINE.replace('"mine"', '"a b"'))
     with pytest.raises(PredictionError, match=says):
         registry.load_method(str(folder / name), RIG)
@@ -94,16 +112,16 @@ def test_the_code_of_a_file_is_it_its_helpers_and_its_weights(mine, monkeypatch)
     (folder / "unused.py").write_text("")
     monkeypatch.delitem(sys.modules, "helper_of_mine", raising=False)
     registry.find(f"{mine}:Mine")
-    first = registry.code_in(Path(mine))
+    first = registry.code_in.__wrapped__(Path(mine))
     assert list(first) == ["helper_of_mine.py", "mine.py", "nets/block.py", "own.npz"]
     for name in first:
         before = (folder / name).read_bytes()
         (folder / name).write_bytes(before + b"\n")
-        changed = registry.code_in(Path(mine))
+        changed = registry.code_in.__wrapped__(Path(mine))
         assert [key for key in first if first[key] != changed[key]] == [name]
         (folder / name).write_bytes(before)
     (folder / "unused.py").write_text("2")
-    assert registry.code_in(Path(mine)) == first
+    assert registry.code_in.__wrapped__(Path(mine)) == first
 
 
 def test_the_code_and_the_files_of_options_are_settings(mine, tmp_path, monkeypatch):

@@ -21,6 +21,7 @@ def answering(dataset, answer, units="mm"):
 
     return SimpleNamespace(
         name="known",
+        title="Known",
         units=units,
         answers_normalised=units == "normalised",
         own_output=predict,
