@@ -28,6 +28,8 @@ from fpp_ml_bench.machine import describe_hardware
 
 WARM_UP = 3
 _MIB = 2.0**20
+OF_THE_MACHINE = {"threads", "device"}
+"""Settings that two runs of the same method may differ in."""
 BATCH_SHARE = 0.01
 """Share of an image's pixels, as at the edge of a mask, that rounding may turn by 1% in a batch of a network."""
 
@@ -147,17 +149,27 @@ def _status_mib(key: str) -> float:
 def check_target(path: Path, method: Method) -> None:
     """Refuse, before any work, a file that is no submission or result, or that describes another method. Raises
     SubmissionError, which says what differs."""
-    submission, _ = _described(path)
-    settings = {**({} if method.reports else submission.settings), **method.settings}  # a summary of reports is added
-    for key, in_file, timed in (
-        ("method", submission.method, method.name),
-        ("frames_used", sorted(submission.frames_used), list(method.frames_used)),
-        *((f"settings.{key}", submission.settings.get(key), method.settings.get(key)) for key in settings),
-    ):
-        if in_file != timed:
+    check_same_method(path, _described(path)[0], method, timed=True)
+
+
+def check_same_method(path: Path, about: Submission, method: Method, timed: bool = False) -> None:
+    """Refuse (SubmissionError) to measure ``method`` for the file ``path``, which is ``about`` another one: name,
+    frames, units, or a setting that both have; to be ``timed`` also threads, device, and a setting that one lacks."""
+    keys = about.settings.keys() & method.settings.keys() - OF_THE_MACHINE
+    if timed:  # a summary of reports is added to the settings of what was predicted
+        keys = method.settings.keys() | (() if method.reports else about.settings.keys())
+    pairs: dict[str, tuple[object, object]] = {
+        "method": (about.method, method.name),
+        "frames_used": (sorted(about.frames_used), sorted(method.frames_used)),
+        "units": (about.units, method.units),
+        **{f"settings.{key}": (about.settings.get(key), method.settings.get(key)) for key in sorted(keys)},
+    }
+    for key, (in_file, measured) in pairs.items():
+        if in_file != measured:
             raise SubmissionError(
-                f"{printable(str(path), 500)}: {key} is {printable(in_file)}, but {printable(timed)} would be timed; a "
-                "time belongs to the method that was scored: give the same options and code, or predict and score again"
+                f"{printable(str(path), 500)}: {key} is {printable(str(in_file))}, but {printable(str(measured))} for "
+                "the method to measure; what is measured belongs to the very method that was scored: give the same "
+                "options and code, or predict and score again"
             )
 
 

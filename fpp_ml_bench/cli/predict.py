@@ -51,10 +51,8 @@ def predict(
     bar = progress_bar(f"{chosen.name}, {split}", samples, "samples", shown=False)
     with working_copy(out) as (folder, _), bar as advance:
         seconds = predict_split(opened, method, split, folder, advance)
-    counted = [
-        f"{n} {what}{'s' * (n != 1)}" for n, what in ((samples, "prediction"), (len(method.frames_used), "frame"))
-    ]
-    print(f"{out}: {counted[0]} by {method.title}; {counted[1]} and {seconds:.3f} s a sample (median)")
+    frames = "1 frame" if len(method.frames_used) == 1 else f"{len(method.frames_used)} frames"
+    print(f"{out}: {samples} predictions by {method.title}; {frames} and {seconds:.3f} s a sample (median)")
     how = f"{_scoring(method, opened)} --json result.json"
     if isinstance(out, Path):
         print(f"next: fpp-eval {out}{how}")
