@@ -16,7 +16,7 @@ import sysconfig
 import traceback
 from dataclasses import fields
 from functools import cache
-from hashlib import sha256
+from hashlib import file_digest, sha256
 from importlib import import_module, metadata
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -178,7 +178,8 @@ def code_in(file: Path, package: str = "") -> dict[str, str]:
 
 
 def _sha256(path: Path) -> str:
-    return sha256(path.read_bytes()).hexdigest()
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()
 
 
 def failure_in_file(error: BaseException) -> str | None:
