@@ -14,9 +14,10 @@ A whole method, in a file ``mine.py`` of its own, for ``fpp-bench predict mine.p
 """
 
 import platform
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from types import MappingProxyType
@@ -34,12 +35,15 @@ from fpp_ml_bench.optics.sequence import AnySequence
 from fpp_ml_bench.options import did_you_mean, option
 
 if TYPE_CHECKING:
-    from fpp_ml_bench.baselines.training.weights import ModelConfig, NetConfig
+    from fpp_ml_bench.baselines.training.weights import ModelConfig, NetConfig, TrainingBenchmark
     from fpp_ml_bench.evaluation.submission.description import Submission
+    from fpp_ml_bench.loaders.storage.benchmark import Benchmark
     from fpp_ml_bench.loaders.storage.manifest import Manifest
 
 Frames = Sequence[NDArray[np.uint8] | None]
 """A captured sequence by frame number, with None for frames that are not needed."""
+FRAMEWORKS = ("cv2", "jax", "onnxruntime", "scipy", "skimage", "sklearn", "tensorflow", "torch", "torchvision")
+"""Modules whose versions are stated of a method of a file where they are loaded: nobody has to say so."""
 Setting = str | int | float | bool | None
 
 
@@ -91,8 +95,9 @@ class OwnViews:
     rate: float | None = option(None, "largest learning rate (default: as the shipped weights)", "R")
 
 
-class Method(ABC):
-    """A frame stack in, a depth map out. A subclass needs ``name``, ``title``, ``frames_used`` and `predict`.
+class Method:
+    """A frame stack in, a depth map out. A subclass needs ``name``, ``title``, ``frames_used``, and `predict` or
+    `answer`. `answer` is what is scored, timed and measured; where a class does not define it, it calls `predict`.
 
     name: what it is called on the command line and in submissions. purpose: what it does, one line of ``--help``.
     Options: a frozen dataclass, whose fields made with `fpp_ml_bench.options.option` are options of every command that
@@ -104,9 +109,12 @@ class Method(ABC):
     range_rule: by which range normalised depth is.
     uses_ground_truth_mask: whether it is given frames that are 0 outside the object.
     mode, target: what its row is scored in and against; for a network the decoded depth, which it was trained on.
-    packages: those whose versions matter. parameters: numbers that were learned. weights_config: what its weights file
-    says of the network and its training data. batched: whether `predict_batch` takes all samples at once. reports:
-    whether `answer` reports.
+    packages: those whose versions matter, for a class outside this package beside `FRAMEWORKS`. parameters: numbers
+    that were learned. weights_config: what its weights file says of the network and its training data. learned_from:
+    what data it learned from, as `evaluation.submission.LearnedFrom` has it; a class outside this package
+    says so itself, like ``learned_from = {"data": "other", "versions": ["my scans"]}``, and without that it is unknown.
+    code: hashes of the files of a class outside this package. batched: whether `predict_batch` takes all samples at
+    once. reports: whether `answer` reports.
     """
 
     name: str
@@ -130,6 +138,7 @@ class Method(ABC):
     device: str = "cpu"
     parameters: int = 0
     weights_config: "ModelConfig | NetConfig | None" = None
+    code: Mapping[str, str] = MappingProxyType({})
     batched: bool = False
     reports: bool = False
 
@@ -188,16 +197,16 @@ class Method(ABC):
         """What it assumes of every scene with these settings; None where it assumes nothing."""
         return None
 
-    @abstractmethod
     def predict(self, frames: Frames) -> NDArray[np.float32]:
         """Depth float32 (H, W) in `units`, 0 = background or not measured; frames not in `frames_used` may be None."""
+        return self.answer(frames).depth
 
     def predict_batch(self, stacks: Sequence[Frames]) -> Sequence[NDArray[np.float32]] | NDArray[np.float32]:
-        """`predict` of several samples, one after another unless `batched`."""
-        return [self.predict(frames) for frames in stacks]
+        """The depth of several samples, one after another unless `batched`."""
+        return [self.answer(frames).depth for frames in stacks]
 
     def answer(self, frames: Frames) -> Answer:
-        """`predict`, and what else the method says of the sample."""
+        """The depth, and what else the method says of the sample."""
         return Answer(self.predict(frames))
 
     def crop(self, frames: Frames) -> tuple[slice, slice] | None:
@@ -208,14 +217,12 @@ class Method(ABC):
         """Summary of a split's reports, for the settings of the submission."""
         return {}
 
-    @property
-    def learned_from(self) -> dict[str, Any]:
-        """What data the method learned from, as `evaluation.submission.LearnedFrom` has it."""
-        if (config := self.weights_config) is None:
-            return {"data": "none"}
-        benchmark = config.benchmark
-        title = f"dataset {config.dataset_fingerprint[:8]}" if benchmark is None else benchmark.title
-        return {"data": "train-split", "versions": [title]}
+    @cached_property  # which a class or an instance can set
+    def learned_from(self) -> dict[str, Any] | None:
+        """What data the method learned from; None where that is unknown."""
+        if (config := self.weights_config) is not None:
+            return training_split_of(config.benchmark, config.dataset_fingerprint)
+        return {"data": "none"} if is_built_in(type(self)) else None
 
     @property
     def settings_of_depth(self) -> dict[str, Setting]:
@@ -232,7 +239,38 @@ class Method(ABC):
     def software(self) -> dict[str, str]:
         """Versions of this package, Python and the packages that the method computes with."""
         versions = {package: version(package) for package in self.packages}
+        if not is_built_in(type(self)):
+            versions |= {
+                name: str(getattr(sys.modules[name], "__version__", "unknown"))
+                for name in FRAMEWORKS
+                if name in sys.modules
+            }
         return {"fpp_ml_bench": __version__, "python": platform.python_version(), **versions}
+
+
+def checked(answer: Answer, size: tuple[int, int], where: object) -> Answer:
+    """``answer`` if its maps are finite float32 of ``size`` (H, W), as `Method.answer` must give them; else
+    `PredictionError`, which begins with ``where``."""
+    if not isinstance(answer, Answer):
+        raise PredictionError(f"{where}: answer gave {type(answer).__name__}, expected Answer(depth)")
+    for values in (answer.depth, *([] if answer.sigma_mm is None else [answer.sigma_mm])):
+        found = f"{getattr(values, 'dtype', type(values).__name__)} {np.shape(values)}"
+        if found != (expected := f"float32 {size}"):
+            raise PredictionError(f"{where}: the method gave {found}, expected {expected}")
+        if not np.isfinite(values).all():
+            raise PredictionError(f"{where}: the method gave values that are not finite: a fault of the method")
+    return answer
+
+
+def training_split_of(benchmark: "Benchmark | TrainingBenchmark | None", fingerprint: str) -> dict[str, Any]:
+    """`Method.learned_from` of a method that learned from the training split of a dataset, a ``benchmark`` or not."""
+    title = f"dataset {fingerprint[:8]}" if benchmark is None else benchmark.title
+    return {"data": "train-split", "versions": [title]}
+
+
+def is_built_in(part: Callable[..., Any]) -> bool:
+    """Whether a class of methods, or a function of one, comes with this package."""
+    return part.__module__.startswith(f"{__package__}.")
 
 
 def plain_settings(options: Any) -> dict[str, Setting]:

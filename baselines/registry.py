@@ -7,24 +7,30 @@ An installed package offers methods by the entry point group `GROUP`:
     mine = "my_package.methods:Mine"
 """
 
+import ast
 import inspect
+import os
 import pickle
 import sys
+import sysconfig
 import traceback
+from dataclasses import fields
 from functools import cache
-from hashlib import sha256
+from hashlib import file_digest, sha256
 from importlib import import_module, metadata
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from fpp_ml_bench.baselines.method import Method, Photographed
+from fpp_ml_bench.baselines.method import Method, Photographed, Setting, is_built_in
 from fpp_ml_bench.errors import FppBenchError, PredictionError, WeightsError
-from fpp_ml_bench.files import printable
+from fpp_ml_bench.files import is_file, printable
+from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.options import did_you_mean
 
 GROUP = "fpp_ml_bench.methods"
+PACKAGE = __name__.partition(".")[0]
 FILE_MARK = ".py:"
 """What tells ``mine.py:Mine`` from a name."""
 BUILT_IN = (
@@ -41,6 +47,10 @@ BUILT_IN = (
 """The classes of this package, below `fpp_ml_bench.baselines`. Their names are their own."""
 NETWORKS = "networks.network_method:NetworkMethod"
 """The class that trained networks from image to depth are made with, by their weights."""
+
+
+WEIGHTS = (".bin", ".ckpt", ".h5", ".joblib", ".mat", ".npy", ".npz", ".onnx", ".pkl", ".pt", ".pth", ".safetensors")
+"""How files of weights end: those that the code of a method names are a part of it."""
 
 
 class Found(NamedTuple):
@@ -66,6 +76,8 @@ def find(name: str | Path) -> Found:
     with the package or in a ``.safetensors`` file, or a recipe that ``fpp-bench reproduce`` has trained. Raises
     `PredictionError`, for an unknown name with what it might have meant."""
     text = str(name)
+    if text.endswith(".py"):
+        text += ":"
     if FILE_MARK in text:
         method = _checked(load_from_file(text), text)
         path, _, attribute = text.rpartition(":")
@@ -101,11 +113,25 @@ def load_method(name: str | Path, source: Photographed | Rig, **options: Any) ->
     Raises `PredictionError` for an unknown name, and what the method refuses: unusable weights, invalid options.
     """
     method, preset = find(name)
-    if inspect.isabstract(method):
-        missing = ", ".join(sorted(method.__abstractmethods__))
-        raise PredictionError(f"{name}: does not define {missing}, which a method needs")
-    make = method.for_rig if isinstance(source, Rig) else method.for_dataset
-    return make(source, **preset, **options)  # type: ignore[arg-type]
+    own_answer = method.answer is not Method.answer
+    if method.predict is Method.predict and not own_answer:
+        raise PredictionError(f"{name}: does not define predict, or answer, which a method needs")
+    if own_answer and is_built_in(method.answer) and not is_built_in(method.predict):
+        raise PredictionError(f"{name}: what it inherits answers without its predict; define answer instead")
+    shown = source.without_truth() if isinstance(source, DatasetFolder) else source
+    make = method.for_rig if isinstance(shown, Rig) else method.for_dataset
+    made = make(shown, **preset, **options)  # type: ignore[arg-type]
+    given = {**{entry.name: entry.default for entry in fields(method.Options)}, **options}
+    files = {key: Path(value) for key, value in given.items() if isinstance(value, str | Path)}
+    settings: dict[str, Setting] = {f"{key}_sha256": _sha256(path) for key, path in files.items() if is_file(path)}
+    settings |= made.settings
+    if (digest := source_sha256(method)) is not None:
+        made.code, settings["source_sha256"] = code_of(method), digest
+    try:
+        made.settings = settings
+    except AttributeError:
+        raise PredictionError(f"{name}: settings is read only; set it in __init__, as a dictionary") from None
+    return made
 
 
 def load_from_file(text: str) -> Any:
@@ -115,8 +141,45 @@ def load_from_file(text: str) -> Any:
     try:
         return getattr(module, name)
     except AttributeError:
-        public = [key for key, value in vars(module).items() if callable(value) and not key.startswith("_")]
-        raise PredictionError(f"{path_text}: has no {printable(name)!r}; {did_you_mean(name, public)}") from None
+        own = [key for key, value in vars(module).items() if getattr(value, "__module__", "") == module.__name__]
+        wrong = f"has no {printable(name)!r}" if name else f"expected {path_text}:NAME, which says what of it"
+        raise PredictionError(f"{path_text}: {wrong}; {did_you_mean(name, own)}") from None
+
+
+def code_of(method: type[Method]) -> dict[str, str]:
+    """`code_in` the file of a class; empty for one of this package, whose version says what it is."""
+    file = None if is_built_in(method) else inspect.getsourcefile(method)
+    return {} if file is None else code_in(Path(file), method.__module__.partition(".")[0])
+
+
+def source_sha256(method: type[Method]) -> str | None:
+    """SHA-256 of a class's name and code; None for one of this package."""
+    code = code_of(method)
+    return sha256(f"{method.__qualname__} {code}".encode()).hexdigest() if code else None
+
+
+@cache
+def code_in(file: Path, package: str = "") -> dict[str, str]:
+    """What ``file`` is made of: by their path from its folder the SHA-256 of itself, of what is imported from beside it
+    or from its ``package``, and of files of `WEIGHTS` that a text in these names. What the code puts together while it
+    runs is not seen. Read once, as the file is executed once."""
+    paths = {file}
+    for name, module in sys.modules.copy().items():
+        top, path = name.partition(".")[0], Path(getattr(module, "__file__", None) or "")
+        beside = path.is_relative_to(file.parent) and "site-packages" not in path.parts
+        beside = beside and not path.is_relative_to(sysconfig.get_path("stdlib"))
+        if top == package or (beside and top != "__main__" and not top.startswith(PACKAGE)):
+            paths.add(path)
+    for path in [path for path in paths if path.suffix == ".py"]:
+        for node in ast.walk(ast.parse(path.read_bytes())):
+            if isinstance(node, ast.Constant) and str(node.value).endswith(WEIGHTS):
+                paths |= {path.parent / str(node.value), Path(str(node.value)).resolve()}
+    return {os.path.relpath(path, file.parent): _sha256(path) for path in sorted(paths) if is_file(path)}
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return file_digest(file, "sha256").hexdigest()
 
 
 def failure_in_file(error: BaseException) -> str | None:

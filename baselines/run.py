@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
-from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.method import Method, checked
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.submission.description import check_submission
@@ -22,7 +22,7 @@ from fpp_ml_bench.evaluation.submission.prediction_files import REPORTS_FILE, SI
 from fpp_ml_bench.files import LOCK_FILE, exclusive, file_content, naming, printable, strict_json, write_atomically
 from fpp_ml_bench.loaders.sample import row_columns
 from fpp_ml_bench.loaders.storage.store import ALL_SPLITS, DatasetFolder
-from fpp_ml_bench.machine import describe_hardware
+from fpp_ml_bench.machine import THREAD_COUNTS, describe_hardware
 from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by, seconds_of, skipping
 
 PREDICTION_SUFFIX = ".npy"
@@ -32,17 +32,18 @@ LARGEST_JOURNAL_BYTES = 1 << 28
 def predict_split(
     opened: DatasetFolder, method: Method, split: str, out: Path, progress: Callable[[int], None] = lambda samples: None
 ) -> float:
-    """Predict every sample of ``split`` into ``out``: ``{sample}.npy`` float32 (H, W) in mm or the method's own units,
-    ``{sample}.sigma.npy`` of a method that states its uncertainty, and ``submission.yaml`` last. The reports of a
-    method that ``reports`` are written beside, by sample, as `REPORTS_FILE`, and its summary of them into the
-    submission's settings. Median seconds a sample.
+    """Predict every sample of ``split`` into ``out`` by `Method.answer`: ``{sample}.npy`` float32 (H, W) in mm or the
+    method's own units, ``{sample}.sigma.npy`` of a method that states its uncertainty, and ``submission.yaml`` last.
+    The reports of a method that ``reports`` are written beside, by sample, as `REPORTS_FILE`, and its summary of them
+    into the submission's settings. Median seconds a sample.
 
     A sample's time is that of the method on frames in memory, after one run that is not counted; the submission gives
-    the median over the split. A run that was stopped continues behind its last finished sample.
+    the median over the split. A run that was stopped continues behind its last finished sample. ``opened`` should be
+    `without_truth`: the method can see it.
 
     Raises `PredictionError` for an ``out`` that another process predicts into, or that holds anything but an unfinished
-    run of the same method, settings, data and machine, and `DatasetError` when the dataset lacks a frame that the
-    method needs."""
+    run of the same method, code, settings, data and machine, `SubmissionError` for a method that describes itself
+    wrongly, and `DatasetError` when the dataset lacks a frame that the method needs."""
     samples = opened.samples(split)  # before a folder is made
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -56,14 +57,16 @@ def predict_split(
             if not run.holds(sample, path, opened.size):
                 frames = captured_frames(opened, method, sample)
                 if not warm:
-                    method.predict(frames)
+                    method.answer(frames)
                     warm = True
                 started = perf_counter()
                 answer = method.answer(frames)
                 seconds = perf_counter() - started
-                _write_prediction(run, path, answer.depth, opened.size)
+                checked(answer, opened.size, path)
+                run.begin()
+                _write_prediction(path, answer.depth)
                 if answer.sigma_mm is not None:
-                    _write_prediction(run, out / f"{sample}{SIGMA}", answer.sigma_mm, opened.size)
+                    _write_prediction(out / f"{sample}{SIGMA}", answer.sigma_mm)
                 run.add(sample, seconds, dict(answer.report) if method.reports else {})
             progress(1)
         finished = {sample: run.finished[sample] for sample in samples}
@@ -104,13 +107,14 @@ class UnfinishedRun:
         if not text.startswith("{") or not lines:
             self.path.unlink()  # stopped before the first line was whole
             return
-        earlier = lines[0]
-        if differing := [key for key in {**earlier, **self.run} if earlier.get(key) != self.run.get(key)]:
+        earlier, now = _flat(lines[0]), _flat(self.run)
+        if differing := [key for key in {**earlier, **now} if earlier.get(key) != now.get(key)]:
             key = differing[0]
-            values = [printable(json.dumps(run.get(key)), 150) for run in (earlier, self.run)]
+            values = [printable(json.dumps(run.get(key)), 150) for run in (earlier, now)]
             raise PredictionError(
                 f"{folder}: holds an unfinished run that differs in {', '.join(differing)} ({key}: {values[0]} there, "
-                f"{values[1]} now); finish it with its own options, remove the folder, or give another one"
+                f"{values[1]} now); finish it with its own options, code and data, remove the folder, or give another "
+                "one"
             )
         for entry in lines[1:]:
             with suppress(KeyError, TypeError, ValueError):  # a damaged line: its sample is predicted again
@@ -145,6 +149,15 @@ class UnfinishedRun:
             os.fsync(file.fileno())
 
 
+def _flat(run: Mapping[str, Any]) -> dict[str, Any]:
+    """The entries of ``run``, and in the place of a mapping its own entries."""
+    flat = dict(run)
+    for name, part in run.items():
+        if isinstance(part, Mapping):
+            flat |= {f"{name} {key}": value for key, value in flat.pop(name).items()}
+    return flat
+
+
 def _parsed(line: str) -> Any:
     """The line's JSON; None for one that was cut off."""
     try:
@@ -157,10 +170,13 @@ def captured_frames(opened: DatasetFolder, method: Method, sample: str) -> list[
     """The sequence with the frames that the method uses, read into memory, and None for every other frame; 0 outside
     the object for a method that uses the ground-truth mask (paper Section 5.3.4)."""
     frames: list[NDArray[np.uint8] | None] = [None] * len(opened.sequence)
+    mask = None
+    if method.uses_ground_truth_mask:  # of a folder that is closed before the method runs
+        mask = object_mask(DatasetFolder(opened.path, check=False).depth_mm(sample))
     for index in method.frames_used:
         frame = opened.frame(sample, index).copy()
-        if method.uses_ground_truth_mask:
-            frame *= object_mask(opened.depth_mm(sample))
+        if mask is not None:
+            frame *= mask
         frames[index] = frame
     opened.release(sample)
     return frames
@@ -176,11 +192,14 @@ def _prepare(out: Path, opened: DatasetFolder, method: Method, split: str) -> Un
         expected |= {UNFINISHED_FILE, REPORTS_FILE, SUBMISSION_FILE}
     foreign = [name for name in file_names if name not in expected and not name.endswith(".tmp")]
     foreign.sort(key=lambda name: name != SUBMISSION_FILE)  # of a finished run: its first name to say
-    data = {"split": split, "fingerprint": opened.fingerprint}
-    run = UnfinishedRun(out, {**_described(method), **data})
+    described = _described(method)
+    check_submission(out, {**described, "seconds_per_sample": None})  # before the first sample, not behind the last
+    data = {"split": split, "fingerprint": opened.fingerprint, "threads": os.environ.get(THREAD_COUNTS[0])}
+    run = UnfinishedRun(out, {"code": dict(method.code), **described, **data})
     if foreign:
         raise PredictionError(
-            f"{out}: already holds {foreign[0]}{' and more' if len(foreign) > 1 else ''}; give a new or empty folder"
+            f"{out}: already holds {foreign[0]}{' and more' if len(foreign) > 1 else ''}; give a new or empty folder, "
+            "or remove this one"
         )
     for name in file_names:
         if name.endswith(".tmp"):
@@ -188,12 +207,7 @@ def _prepare(out: Path, opened: DatasetFolder, method: Method, split: str) -> Un
     return run
 
 
-def _write_prediction(run: UnfinishedRun, path: Path, depth_mm: NDArray[np.float32], size: tuple[int, int]) -> None:
-    if depth_mm.shape != size or depth_mm.dtype != np.float32:
-        raise PredictionError(f"{path}: the method gave {depth_mm.dtype} {depth_mm.shape}, expected float32 {size}")
-    if not np.isfinite(depth_mm).all():
-        raise PredictionError(f"{path}: the method gave depths that are not finite: a fault of the method")
-    run.begin()
+def _write_prediction(path: Path, depth_mm: NDArray[np.float32]) -> None:
     content = BytesIO()
     np.save(content, depth_mm, allow_pickle=False)
     write_atomically(path, content.getvalue(), sync=False)  # a later run sees what is not whole
@@ -209,7 +223,7 @@ def _described(method: Method) -> dict[str, Any]:
         "uses_ground_truth_range": method.uses_ground_truth_range,
         **({"range_rule": method.range_rule} if method.range_rule != "object" else {}),
         **({"uses_ground_truth_mask": True} if method.uses_ground_truth_mask else {}),
-        "learned_from": method.learned_from,
+        **({} if method.learned_from is None else {"learned_from": method.learned_from}),
         "hardware": describe_hardware().to_dict(),
         "software": method.software,
         "settings": {**method.settings},
@@ -257,7 +271,7 @@ def explain_predict(opened: DatasetFolder, method: Method, split: str) -> Explan
         for frames in stacks:
             with skipping(True):
                 second_px = method.decode(frames).second_px
-            saved_s += saved_by(lambda: method.predict(frames), 1, 1) or 0.0  # noqa: B023  called at once
+            saved_s += saved_by(lambda: method.answer(frames), 1, 1) or 0.0  # noqa: B023  called at once
             done, left_out = done + second_px, left_out + height * width - second_px
         pixels = round(left_out * scale)
         lines.append(

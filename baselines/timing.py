@@ -5,7 +5,7 @@ import gc
 import resource
 import statistics
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from fpp_ml_bench.baselines.method import Frames, Method
+from fpp_ml_bench.baselines.method import Frames, Method, checked
 from fpp_ml_bench.baselines.run import captured_frames
-from fpp_ml_bench.errors import DatasetError, SubmissionError
+from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.result.file import read_result, write_file, write_result
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import HardwareInfo, Timing
@@ -28,6 +28,10 @@ from fpp_ml_bench.machine import describe_hardware
 
 WARM_UP = 3
 _MIB = 2.0**20
+OF_THE_MACHINE = {"threads", "device"}
+"""Settings that two runs of the same method may differ in."""
+BATCH_SHARE = 0.01
+"""Share of an image's pixels, as at the edge of a mask, that rounding may turn by 1% in a batch of a network."""
 
 
 def time_method(
@@ -38,9 +42,9 @@ def time_method(
     repeats: int = 20,
     progress: Callable[[int], None] = lambda runs: None,
 ) -> Timing:
-    """Time ``method`` on images of ``split``: see `Timing` for what each figure means. Frames are in memory before the
-    clock starts, at most ``batch`` sequences of them: no reading or writing counts. Raises `DatasetError` for an empty
-    split, or when the dataset lacks a frame that the method needs."""
+    """Time `Method.answer` on images of ``split``: see `Timing` for what each figure means. Frames are in memory before
+    the clock starts, at most ``batch`` sequences of them: no reading or writing counts. Raises `DatasetError` for an
+    empty split, or when the dataset lacks a frame that the method needs, and `PredictionError` as `check_batch`."""
     samples = opened.samples(split)
     if not samples:
         raise DatasetError(f"{opened.path}: split {split} holds no sample; there is nothing to time")
@@ -60,10 +64,10 @@ def time_method(
         return perf_counter() - started
 
     def latency_s(number: int) -> float:
-        return seconds(lambda: method.predict(stacks[number % len(stacks)]))
+        return seconds(lambda: method.answer(stacks[number % len(stacks)]))
 
     for number in range(WARM_UP):
-        latency_s(number)
+        checked(method.answer(stacks[number % len(stacks)]), opened.size, method.name)
     working_mib = added_mib(lambda: latency_s(0))
     if cuda is not None:
         cuda.reset_peak_memory_stats(method.device)
@@ -72,11 +76,10 @@ def time_method(
         latencies_ms.append(1000 * latency_s(number))
         progress(1)
     batch_stacks: list[Frames] = [stacks[number % len(stacks)] for number in range(batch)]
+    check_batch(method, batch_stacks)
     rates = []
-    for number in range(1 + max(1, -(-repeats // batch))):
-        batch_s = seconds(lambda: method.predict_batch(batch_stacks))
-        if number or not method.batched:  # the first batch warms the batched path up
-            rates.append(batch / batch_s)
+    for _ in range(max(1, -(-repeats // batch))):
+        rates.append(batch / seconds(lambda: method.predict_batch(batch_stacks)))
     low, high = (float(np.percentile(latencies_ms, q)) for q in (5, 95))
     # getrusage(2): kB on Linux, bytes on macOS
     peak_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (_MIB if sys.platform == "darwin" else 1024)
@@ -99,6 +102,22 @@ def time_method(
         hardware=HardwareInfo.model_validate(describe_hardware().to_dict()),
         software=method.software,
     )
+
+
+def check_batch(method: Method, stacks: Sequence[Frames]) -> None:
+    """Raise `PredictionError` where `predict_batch`, whose time is the throughput, gives other depths than `answer`,
+    which is scored, in more than `BATCH_SHARE` of the pixels."""
+    if type(method).predict_batch is Method.predict_batch:
+        return
+    together = method.predict_batch(stacks)
+    for number, frames in enumerate(stacks):
+        alone = method.answer(frames).depth
+        same = len(together) == len(stacks) and np.shape(together[number]) == alone.shape
+        if not same or not np.isclose(together[number], alone, rtol=0.01).mean() > 1 - BATCH_SHARE:
+            raise PredictionError(
+                f"{method.name}: predict_batch gives other depths than one image after another, which is what is "
+                "scored; make both the same, or leave predict_batch out"
+            )
 
 
 def four_digits(value: float) -> float:
@@ -130,16 +149,27 @@ def _status_mib(key: str) -> float:
 def check_target(path: Path, method: Method) -> None:
     """Refuse, before any work, a file that is no submission or result, or that describes another method. Raises
     SubmissionError, which says what differs."""
-    submission, _ = _described(path)
-    for key, in_file, timed in (
-        ("method", submission.method, method.name),
-        ("frames_used", sorted(submission.frames_used), list(method.frames_used)),
-        ("settings", dict(submission.settings), dict(method.settings)),
-    ):
-        if in_file != timed:
+    check_same_method(path, _described(path)[0], method, timed=True)
+
+
+def check_same_method(path: Path, about: Submission, method: Method, timed: bool = False) -> None:
+    """Refuse (SubmissionError) to measure ``method`` for the file ``path``, which is ``about`` another one: name,
+    frames, units, or a setting that both have; to be ``timed`` also threads, device, and a setting that one lacks."""
+    keys = about.settings.keys() & method.settings.keys() - OF_THE_MACHINE
+    if timed:  # a summary of reports is added to the settings of what was predicted
+        keys = method.settings.keys() | (() if method.reports else about.settings.keys())
+    pairs: dict[str, tuple[object, object]] = {
+        "method": (about.method, method.name),
+        "frames_used": (sorted(about.frames_used), sorted(method.frames_used)),
+        "units": (about.units, method.units),
+        **{f"settings.{key}": (about.settings.get(key), method.settings.get(key)) for key in sorted(keys)},
+    }
+    for key, (in_file, measured) in pairs.items():
+        if in_file != measured:
             raise SubmissionError(
-                f"{printable(str(path), 500)}: {key} is {printable(in_file)}, but {printable(timed)} would be timed; a "
-                "time belongs to the method that was scored: give the same options"
+                f"{printable(str(path), 500)}: {key} is {printable(str(in_file))}, but {printable(str(measured))} for "
+                "the method to measure; what is measured belongs to the very method that was scored: give the same "
+                "options and code, or predict and score again"
             )
 
 

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.method import Frames, Method, Photographed
+from fpp_ml_bench.baselines.method import Frames, Method, Photographed, training_split_of
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import depth_range_mm, object_mask
 from fpp_ml_bench.errors import PredictionError
+from fpp_ml_bench.loaders.storage.benchmark import benchmark_of
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.options import option
@@ -78,7 +79,7 @@ class ConstantMethod(Method):
         return [{}, {"at": TRAINING_MEAN}]
 
     @property
-    def learned_from(self) -> dict[str, Any]:
+    def learned_from(self) -> dict[str, Any] | None:
         data = {TRAINING_MEAN: TRAINING_MEAN_DATA, "range-training": RANGE_DATA}.get(str(self.settings["at"]))
         return {"data": "train-split", "versions": [data]} if data else super().learned_from
 
@@ -169,6 +170,10 @@ class NearestMethod(Method):
         depth_mm = self.training.depth_mm(sample).astype(np.float32)
         self.training.release(sample)
         return depth_mm
+
+    @property
+    def learned_from(self) -> dict[str, Any] | None:
+        return training_split_of(benchmark_of(self.training.content), self.training.fingerprint)
 
     def _block_sums(self, frame: NDArray[np.uint8]) -> NDArray[np.int64]:
         """Sums of grey levels over blocks, (H // block, W // block); what is left over at the ends is not looked at."""

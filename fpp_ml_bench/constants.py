@@ -19,6 +19,8 @@ STANDOFF_M = 1.8
 BACKGROUND_M = 3.2
 
 SPLITS = ("train", "validation", "test")
+TRAIN = SPLITS[0]
+"""The split that methods may learn from."""
 PUBLISHED_SPLIT_FOLDERS = {"train": "train", "validation": "val", "test": "test"}
 
 VIEW_DEGREES = (0, 60, 120, 180, 240, 300)

@@ -13,7 +13,6 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.result.file import parse_result, read_json, write_result
@@ -68,8 +67,6 @@ _NOT_COMPARED: Any = {
     "dataset": {"name"},
 }
 _NOT_IN_OLDER_ROWS = ("sure_mae_mm", "sure_rmse_mm")
-_OF_THE_MACHINE = ("threads", "device")
-"""Settings that two runs of the same method may differ in."""
 
 
 @dataclass(frozen=True)
@@ -223,26 +220,6 @@ def not_checked(about: Row | Result) -> list[str]:
         "software, code and environment": True,
     }
     return [words for words, there in present.items() if there]
-
-
-def check_same_method(entry: Entry, method: Method) -> None:
-    """Refuse (SubmissionError) a row of another method: name, frames, units, or a setting that both have."""
-    about = entry.row.submission
-    pairs: dict[str, tuple[object, object]] = {
-        "method": (about.method, method.name),
-        "frames_used": (sorted(about.frames_used), sorted(method.frames_used)),
-        "units": (about.units, method.units),
-    }
-    for key, value in method.settings.items():
-        if key in about.settings and key not in _OF_THE_MACHINE:
-            pairs[f"settings.{key}"] = about.settings[key], value
-    for key, (of_row, of_method) in pairs.items():
-        if of_row != of_method:
-            raise SubmissionError(
-                f"{printable(str(entry.path), 500)}: {key} is {printable(str(of_row))}, but "
-                f"{printable(str(of_method))} for the method to measure; what is measured belongs to the very method "
-                "that was scored: give the same options"
-            )
 
 
 def write_block(entry: Entry, block: Reliance | Robustness) -> None:

@@ -29,10 +29,13 @@ from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.optics.sequence import DIRECTIONS, AnySequence
 
 DATA_GROUP = "data"
-LABELS = ("sample", "object", "view", "split")
+NAMES = ("sample", "object", "view")
+LABELS = (*NAMES, "split")
 DEPTH, DEPTH_EXACT, FLAGS, COVER = "depth", "depth_exact", "flags", "cover"
 DEPTHS, PIXEL_MAPS = (DEPTH, DEPTH_EXACT), (FLAGS, COVER)
 RANGE = ("depth_min", "depth_max")
+TRUTH = (*DEPTHS, *PIXEL_MAPS, *RANGE)
+"""What a method must not see of the samples that it is scored on."""
 PREVIEW = "depth_preview"
 MEANINGS = {
     "sample": ("", "object and view"),
@@ -143,7 +146,7 @@ def row_columns(sequence: AnySequence, frames: tuple[int, ...], exact: bool) -> 
 
 def labels_of(row: Mapping[str, Any], split: str) -> dict[str, Any]:
     """What the columns of labels and depth range hold of a row of `Manifest.samples`."""
-    own = {key: row[key] for key in LABELS if key != "split"}
+    own = {key: row[key] for key in NAMES}
     return {**own, "split": split, **{key: row[f"{key}_mm"] for key in RANGE}}
 
 

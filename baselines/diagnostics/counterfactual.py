@@ -30,6 +30,7 @@ from fpp_ml_bench.baselines.diagnostics.scenes import (
     layer_of,
     original,
 )
+from fpp_ml_bench.baselines.method import checked
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
@@ -140,7 +141,7 @@ class SampleScenes:
     def predict(self, scene: Scene) -> NDArray[np.float32]:
         """Predicted depth (H, W) in the units of the method."""
         frames = self.renderer.frames(scene, self.method.frames_used, self.method.uses_ground_truth_mask)
-        return self.method.predict(frames)
+        return checked(self.method.answer(frames), scene.depth_mm.shape, self.method.title).depth
 
     def true_depth(self, scene: Scene) -> NDArray[np.float64]:
         """True depth (H, W) in the units of the method: mm, or normalised to its range over the scene's mask."""

@@ -72,7 +72,7 @@ class FlatPlane(Probe):
             seen.ravel()[surface.pixels] &= lit.gain > 0  # no fringe beyond the projector's field
             scene = Scene(surface, lit, seen, (0, "plane", ""))
             frames = renderer.frames(scene, subject.frames_used)
-            prediction = subject.answer(frames)
+            prediction = subject.own_output(frames)
             values = prediction[seen].astype(np.float64)
             millimetres = values * (high - low) + low if normalised else values
             row = {
@@ -133,7 +133,7 @@ def control_of(
     shares = []
     for sample in samples:
         scene = original(dataset, renderer, sample)
-        answer, true = subject.answer(renderer.frames(scene, subject.frames_used)), scene.depth_mm[scene.mask]
+        answer, true = subject.own_output(renderer.frames(scene, subject.frames_used)), scene.depth_mm[scene.mask]
         if subject.answers_normalised:
             true = (true - true.min()) / (float(np.ptp(true)) or MM_PER_M)
         shares.append([(values < limit).mean() for values in (answer[scene.mask].astype(np.float64), true)])

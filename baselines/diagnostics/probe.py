@@ -15,6 +15,7 @@ from functools import cache
 from hashlib import sha256
 from importlib import import_module
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
@@ -183,10 +184,8 @@ def diagnose(
     _prepare(out)
     with exclusive(out / LOCK_FILE, out, "writing a report there", DiagnosisError):
         results, nothing = [], cache(lambda: subject.predicts_nothing(dataset))
-        for name in PROBES:
-            if name not in probe_names and not (out / f"{name}.json").is_file():
-                continue
-            probe = make_probe(name)
+        shown = [name for name in PROBES if name in probe_names or (out / f"{name}.json").is_file()]
+        for name, probe in zip(shown, [*map(make_probe, shown)], strict=True):  # what is not installed shows now
             key = finding_key(probe, subject, dataset, settings)
             if stored := load_finding(out, name, key):
                 results.append(ProbeResult(probe, *stored, reused=True))
@@ -276,7 +275,7 @@ def _context(subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, 
         },
         "settings": asdict(settings),
         "command": command,
-        "software": {"fpp_ml_bench": __version__, **{name: version(name) for name in _PACKAGES}},
+        "software": {"fpp_ml_bench": __version__, **{name: version(name) for name in _PACKAGES if find_spec(name)}},
         "hardware": describe_hardware().to_dict(),
     }
 

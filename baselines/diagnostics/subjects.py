@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from fpp_ml_bench.baselines.diagnostics.probe import spread
-from fpp_ml_bench.baselines.method import Frames, Method
+from fpp_ml_bench.baselines.method import Answer, Frames, Method
 from fpp_ml_bench.baselines.networks.model import build, fringe_batch
 from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
-from fpp_ml_bench.baselines.registry import FILE_MARK, find, load_from_file, load_method
+from fpp_ml_bench.baselines.registry import FILE_MARK, code_in, find, load_from_file, load_method
 from fpp_ml_bench.baselines.run import captured_frames
 from fpp_ml_bench.depth import Normalisation, denormalise, object_mask
 from fpp_ml_bench.errors import DiagnosisError
@@ -86,12 +86,16 @@ class Subject:
             depth = torch.from_numpy(depth.astype(np.float32))
         return checked_output(depth, self.image_size, self.name).numpy()
 
+    def answer(self, frames: Frames) -> Answer:
+        """`predict`, in the form of `Method.answer`."""
+        return Answer(self.predict(frames))
+
     @property
     def answers_normalised(self) -> bool:
-        """Whether `answer` is normalised, and not in mm."""
+        """Whether `own_output` is normalised, and not in mm."""
         return self.units == "normalised" or self.normalisation == "individual"
 
-    def answer(self, frames: Frames) -> Depth:
+    def own_output(self, frames: Frames) -> Depth:
         """`predict`, or the network's own output where it is normalised: range heads, which would convert it to mm, are
         not part of the paper's probes."""
         if self.normalisation != "individual":
@@ -102,7 +106,9 @@ class Subject:
         """How the subject predicts nothing for `SAMPLES_ASKED` samples of all splits: background, or the same value, on
         all object pixels but stray ones. None for a subject that predicts something."""
         samples = spread(dataset.samples("all"), SAMPLES_ASKED)
-        answers = [self.answer(self.captured(dataset, name))[object_mask(dataset.depth_mm(name))] for name in samples]
+        answers = [
+            self.own_output(self.captured(dataset, name))[object_mask(dataset.depth_mm(name))] for name in samples
+        ]
         values = np.concatenate(answers)
         if not values.size:
             return None
@@ -241,7 +247,7 @@ def subject_of_method(method: Method, dataset: DatasetFolder, **network: Any) ->
         sha256=hashlib.sha256(identity.encode()).hexdigest(),
         image_size=dataset.size,
         direction=_direction_of(dataset, method.frames_used),
-        predict_frames=method.predict,
+        predict_frames=lambda frames: method.answer(frames).depth,
         **network,
     )
 
@@ -280,7 +286,7 @@ def _subject_of_factory(
         raise DiagnosisError(f"frame {frame}: expected 0 to {len(dataset.sequence) - 1}, the frames of the sequence")
     network = _build_network(name, factory)
     path, normalisation = Path(name.rpartition(":")[0]), NORMALISATION_OF[units]
-    digest = hashlib.sha256(f"{units} {frame}".encode() + path.read_bytes())
+    digest = hashlib.sha256(f"{units} {frame} {code_in(path.resolve())}".encode())
     for key, value in network.state_dict().items():
         if isinstance(value, Tensor):
             values = value.detach().cpu().contiguous().flatten().view(torch.uint8)

@@ -99,7 +99,7 @@ class LearnedMethod(Method):
         }
 
     @property
-    def learned_from(self) -> dict[str, Any]:
+    def learned_from(self) -> dict[str, Any] | None:
         recipe = self.weights_config.recipe
         lights = f"training objects in the light paper and {recipe.get('lights')} drawn ones, seed {recipe.get('seed')}"
         return {"data": "generated", "versions": [lights]}
@@ -446,9 +446,6 @@ class ClassicalNetMethod(LearnedMethod):
         self.rig, self.threads, self.frames_used = rig, given.threads, self.classical.frames_used
         self.title = f"{self.classical.title}; noise and missed pixels learned{self.more}"
         self.settings = {**self.classical.settings, **self.weights_settings}
-
-    def predict(self, frames: Frames) -> NDArray[np.float32]:
-        return self.answer(frames).depth
 
     def answer(self, frames: Frames) -> Answer:
         """Depth, and the standard uncertainty that the network expects."""

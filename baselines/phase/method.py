@@ -97,11 +97,8 @@ class RouteMethod(Method):
         """All maps of a captured sequence (`Measurement`); frames that are not in `frames_used` may be None."""
         return self.route.measure(self.images(frames), self.mask)
 
-    def predict(self, frames: Frames) -> NDArray[np.float32]:
-        """Depth float32 (H, W) in mm, 0 = background, or masked where ``min_confidence`` is above 0."""
-        return self.measure(frames).depth_mm  # type: ignore[no-any-return]
-
     def answer(self, frames: Frames) -> Answer:
+        """Depth, 0 = background, or masked where ``min_confidence`` is above 0, and its standard uncertainty."""
         measurement = self.measure(frames)
         return Answer(measurement.depth_mm, measurement.sigma_mm)
 
@@ -375,10 +372,6 @@ class FewestFrames(Method):
         ]
         last = {name: rows[-1][name] for name in ("frames", "expected_error_mm")}
         return Answer(depth_mm, report=last | {"frames_used": list(used), "looks": rows})
-
-    def predict(self, frames: Frames) -> NDArray[np.float32]:
-        """Depth float32 (H, W) in mm, 0 = background."""
-        return self.answer(frames).depth
 
     def summary(self, reports: Sequence[Mapping[str, Any]]) -> dict[str, float]:
         """Summary of a split's reports for the submission's settings: mean and largest number of frames a sample."""

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.method import Method, checked
 from fpp_ml_bench.baselines.robustness.axes import (
     CLEAN,
     SETS,
@@ -145,6 +145,7 @@ def _measure_object(work: Work, condition: Condition, name: str) -> list[View]:
         started = perf_counter()
         answer = method.answer(frames)
         seconds = perf_counter() - started
+        checked(answer, truth.depth_mm.shape, method.title)
         scores = score(answer.depth, answer.sigma_mm, truth, rules)
         place = {"sample": sample_name(name, view), "object": name, "severity": condition.severity}
         rows.append({**place, "seconds": round(seconds, 4), **scores})

@@ -15,16 +15,15 @@ from time import perf_counter, process_time
 from typing import Annotated, Any, Literal, get_args
 
 import cv2
-import numpy as np
 from pydantic import Field
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.method import Frames, Method
-from fpp_ml_bench.baselines.registry import failure_in_file, find, load_method, methods
+from fpp_ml_bench.baselines.method import Frames, Method, checked
+from fpp_ml_bench.baselines.registry import failure_in_file, find, load_method, methods, source_sha256
 from fpp_ml_bench.baselines.run import captured_frames
-from fpp_ml_bench.baselines.timing import added_mib, four_digits
+from fpp_ml_bench.baselines.timing import added_mib, check_batch, four_digits
 from fpp_ml_bench.baselines.training.weights import open_weights, shipped_names, weights_path
-from fpp_ml_bench.errors import DatasetError, FppBenchError, PredictionError, RigError, SubmissionError
+from fpp_ml_bench.errors import DatasetError, FppBenchError, RigError, SubmissionError
 from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.evaluation.result.parts import HardwareInfo
 from fpp_ml_bench.evaluation.score.check import Rules
@@ -207,9 +206,9 @@ def planned(
     `DatasetError` for a folder that is no dataset or has no test split, `PredictionError` for an unknown method."""
     opened, points = DatasetFolder(dataset), []
     for name in names or [*methods(), *_networks(opened.size)]:
-        source = Path(name.rpartition(":")[0] if ".py:" in name else name)
-        digest = sha256(source.read_bytes()).hexdigest() if source.is_file() else None
-        variants = find(name).method.variants(opened.rig)
+        method, path = find(name).method, Path(name)
+        digest = sha256(path.read_bytes()).hexdigest() if path.is_file() else source_sha256(method)
+        variants = method.variants(opened.rig)
         if names and not variants:
             variants = [{}]  # it was asked for: the point says why it can't be measured
         points += [Point(method=name, options=dict(options), source_sha256=digest) for options in variants]
@@ -294,7 +293,7 @@ def measured(plan: Plan, point: Point) -> Point:
         figures |= _figures(plan, method)
         pixel_seconds = []
         for rig, frames in zip(plan.rigs, plan.scenes, strict=True):
-            pixel_seconds.append(four_digits(plan.timed(plan.load(point, rig).predict, frames)[0]))
+            pixel_seconds.append(four_digits(plan.timed(plan.load(point, rig).answer, frames)[0]))
         figures["pixel_seconds"] = pixel_seconds
     except Exception as error:
         reason = str(error) if isinstance(error, FppBenchError) else failure_in_file(error)
@@ -312,14 +311,14 @@ def _figures(plan: Plan, method: Method) -> dict[str, Any]:
     memory_mib = None
     for name in plan.views:
         frames = captured_frames(opened, method, name)
-        run_s, depth = plan.timed(method.predict, frames)
+        run_s, answer = plan.timed(method.answer, frames)
+        depth = checked(answer, opened.size, name).depth
         if not seconds:
-            memory_mib = added_mib(partial(method.predict, frames))
+            memory_mib = added_mib(partial(method.answer, frames))
         seconds.append(run_s)
-        if depth.shape != opened.size or not np.isfinite(depth).all():
-            raise PredictionError(f"{name}: expected finite depth (H, W) {opened.size}, the method gave another")
         scored.append(score_sample(*rules.pair(depth, opened, name), void=rules.void(opened, name)))
     batch = [captured_frames(opened, method, name) for name in plan.views[:BATCH]]
+    check_batch(method, batch)
     return {
         "title": method.title,
         "software": method.software,

@@ -133,7 +133,7 @@ uses_ground_truth_range: false   # was the method given depth_min and depth_max 
 # range_rule: object         # with units: normalised only: over which pixels that range is, object or valid (not void)
 # uses_ground_truth_mask: true   # was it given which pixels of the scored samples are object?
 # uses_ground_truth_order: true  # was it given their true fringe orders?
-# learned_from:              # what data it learned from
+# learned_from:              # what data it learned from; unknown without this key
 #   data: train-split        # train-split | generated (by this package's renderer) | other | none
 #   versions: [fpp-bench-full version 1]
 # predicted:                 # what was predicted, for fpp-eval without DATASET; fpp-bench predict writes it

@@ -161,6 +161,9 @@ COMMANDS = BENCH.commands
 ONE_THREAD = "demo", "predict", "time", "reliance", "robustness", "tradeoff"
 """Commands that compute with one thread unless ``--threads`` says otherwise; `diagnose` with one for each core."""
 
+CONTINUED = "build", "import", "predict", "diagnose", "robustness", "tradeoff", "train", "reproduce"
+"""Commands that keep what a stopped run has finished."""
+
 _STREAMS = "stdout", "stderr"
 _MEANINGS = """\
 {name} COMMAND --help shows its options.
@@ -220,7 +223,7 @@ def _status_of(prog: str, load: Callable[[], Any], argv: Sequence[str]) -> int:
             raise
         return _refused(prog, f"this needs {library}, which is not installed; pip install 'fpp-ml-bench[{extra}]'")
     except KeyboardInterrupt as stop:
-        _say(f"{prog}: stopped")
+        _say(f"{prog}: stopped{'; the same command continues' * (prog.split()[-1] in CONTINUED)}")
         return TERMINATED if isinstance(stop, _Terminated) else INTERRUPTED
 
 
@@ -269,6 +272,8 @@ def _say(text: str) -> None:
 def run_program(program: Program, argv: Sequence[str] | None = None) -> int:
     """Run the command that the first word of ``argv`` (default: the process's) names, or the default one."""
     words = list(sys.argv[1:] if argv is None else argv)
+    if words[:1] == ["help"] and not Path("help").exists():
+        words = [*words[1:2], "--help"]
     name, first = program.name, words[0] if words else ""
     # A folder of predictions has any name; one that is not there and almost that of a command is a slip.
     slip = nearest(first, program.commands) and not Path(first).exists()

@@ -18,15 +18,15 @@ WIDTH_IN_PIPES = 140
 
 
 @contextmanager
-def progress_bar(title: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
+def progress_bar(title: str, total: int, unit: str, shown: bool = True) -> Iterator[Callable[[int], None]]:
     """A rich progress bar over ``total`` steps, each a ``unit``, on standard error, with the time left; yields the
-    function that advances it."""
+    function that advances it. Unless ``shown``, it appears with the first step: before, the work may be refused."""
     from rich.progress import MofNCompleteColumn, Progress, TextColumn
 
     counted = MofNCompleteColumn(), TextColumn(unit)
     with Progress(*Progress.get_default_columns(), *counted, console=Console(stderr=True)) as progress:
-        task = progress.add_task(title, total=total)
-        yield lambda steps: progress.advance(task, steps)
+        task = progress.add_task(title, total=total, visible=shown)
+        yield lambda steps: progress.update(task, advance=steps, visible=True)
 
 
 def gigabytes(count: float) -> str:

@@ -27,6 +27,7 @@ from fpp_ml_bench.baselines.robustness.axes import CACHE, CLEAN, SETS, Condition
 from fpp_ml_bench.baselines.robustness.run import Setup, View, write_page
 from fpp_ml_bench.baselines.robustness.run import measure as measure_robustness
 from fpp_ml_bench.baselines.robustness.run import robustness as robustness_block
+from fpp_ml_bench.baselines.timing import check_same_method
 from fpp_ml_bench.cli.console import progress_bar, show
 from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
 from fpp_ml_bench.cli.options import COUNT, Pool, command, command_line, names, new_file, value
@@ -34,7 +35,7 @@ from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.evaluation.result.parts import Reliance
-from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_block
+from fpp_ml_bench.leaderboard.rows import read_entry, write_block
 from fpp_ml_bench.loaders.render.builder import assembly_of
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.storage.manifest import Manifest
@@ -155,7 +156,7 @@ def reliance(
     method = chosen.load(opened)
     entry = None if into is None else read_entry(into)
     if entry is not None:
-        check_same_method(entry, method)
+        check_same_method(entry.path, entry.row.submission, method)
     samples = chosen_samples(opened, "test", views)
     with progress_bar(f"reliance of {chosen.name}", len(samples), "samples") as advance:
         # Called before each sample, so the first call is for none.
@@ -233,7 +234,7 @@ def robust(
     method = chosen.load(Scenes.of(settings), warn=False)
     entry = None if into is None else read_entry(into)
     if entry is not None:
-        check_same_method(entry, method)
+        check_same_method(entry.path, entry.row.submission, method)
     setup = Setup(method, objects, size, quick)
     # The nodes of a cluster have folders of their own, which nobody would keep small.
     cache = None if no_cache else cache or (None if pool.cluster else CACHE)

@@ -1,17 +1,21 @@
 """Commands that take a METHOD: its options on the command line are the fields of its class, whoever wrote it."""
 
+import shlex
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import Field, dataclass, field, fields
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from fpp_ml_bench.baselines import registry
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.baselines.training.weights import training_data_warning
+from fpp_ml_bench.baselines.training.weights import shipped_names, training_data_warning
 from fpp_ml_bench.cli.options import AT_LEAST_ONE, Command, Row, flags_of, parameter_of, row_of
 from fpp_ml_bench.errors import FppBenchError, PredictionError
+from fpp_ml_bench.files import is_file
+from fpp_ml_bench.loaders.storage.manifest import MANIFEST
 from fpp_ml_bench.options import argument, flag_of, option, options_of
 
 if TYPE_CHECKING:
@@ -76,7 +80,11 @@ class MethodCommand(Command):
                 made.name, made.type, made.default, made.hidden = flag, click.UNPROCESSED, None, True
         ctx.meta[_OF_METHODS] = [*of_methods.values()]
         super().parse_args(ctx, args)
-        name = str(ctx.params[str(self.params[0].name)])
+        name, *others = (str(ctx.params[str(p.name)]) for p in self.params if isinstance(p, click.Argument))
+        known = {*methods, *shipped_names()}
+        if name not in known and others and (is_file(Path(name) / MANIFEST) or others[0] in known):
+            said = shlex.join([others[0], name])
+            raise PredictionError(f"{name}: expected the method first, then the dataset: {ctx.command_path} {said}")
         method = methods.get(name, methods.get(""))
         own = {} if method is None else self.fields_of(method)
         if clash := [flag for flag in own if flag in of_command]:

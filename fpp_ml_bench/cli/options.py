@@ -331,5 +331,7 @@ def problem_of(error: click.ClickException) -> str:
     if isinstance(error, click.NoSuchOption) and ctx is not None:
         return f"unknown option {printable(error.option_name)!r}; {did_you_mean(error.option_name, flags_of(ctx))}"
     if isinstance(error, click.MissingParameter) and ctx is not None and error.param is not None:
-        return " is missing: ".join(row_of(error.param, ctx))
+        _, words, _ = ctx.command.make_parser(ctx).parse_args([*ctx.obj])  # those that no argument takes
+        meant = f"; did you mean {error.param.opts[0]} {printable(words[0])}?" if words else ""
+        return " is missing: ".join(row_of(error.param, ctx)) + meant
     return error.format_message()

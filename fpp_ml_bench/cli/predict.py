@@ -46,14 +46,13 @@ def predict(
     """Run a method over a split and write predictions that fpp-eval scores."""
     opened = DatasetFolder(dataset)
     method = chosen.load(opened)
+    opened = opened.without_truth()  # the method can look at its caller
     samples = len(opened.samples(split))
-    bar = progress_bar(f"{chosen.name}, {split}", samples, "samples")
+    bar = progress_bar(f"{chosen.name}, {split}", samples, "samples", shown=False)
     with working_copy(out) as (folder, _), bar as advance:
         seconds = predict_split(opened, method, split, folder, advance)
-    print(
-        f"{out}: {samples} predictions by {method.title}; {len(method.frames_used)} frames and "
-        f"{seconds:.3f} s a sample (median)"
-    )
+    frames = "1 frame" if len(method.frames_used) == 1 else f"{len(method.frames_used)} frames"
+    print(f"{out}: {samples} predictions by {method.title}; {frames} and {seconds:.3f} s a sample (median)")
     how = f"{_scoring(method, opened)} --json result.json"
     if isinstance(out, Path):
         print(f"next: fpp-eval {out}{how}")
@@ -97,6 +96,7 @@ def time(
     """Measure a method's latency at batch 1, throughput, memory, parameters and frames, on a named machine."""
     opened = DatasetFolder(dataset)
     method = chosen.load(opened)
+    opened = opened.without_truth()
     for path in into:
         check_target(path, method)
     with progress_bar(f"timing {chosen.name}", repeats, "images") as advance:

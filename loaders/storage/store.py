@@ -7,7 +7,8 @@ leave columns out; `load_dataset` joins the tables of the column groups, and a f
 
 import mmap
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from time import monotonic
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.constants import CONFIGS, SPLITS
+from fpp_ml_bench.constants import CONFIGS, SPLITS, TRAIN
 from fpp_ml_bench.depth import RangeRule, object_mask
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.files import printable
@@ -27,6 +28,8 @@ from fpp_ml_bench.loaders.sample import (
     DEPTH_EXACT,
     DEPTHS,
     FLAGS,
+    NAMES,
+    TRUTH,
     Flag,
     config_columns,
     exact_void,
@@ -52,10 +55,18 @@ class DatasetFolder:
     memory-mapped views: only the parts that are used are read. Instances pickle by path, so worker processes map the
     files themselves."""
 
-    def __init__(self, path: str | Path, check: bool = True) -> None:
-        """With ``check`` off, the folder opens even if some of its files are missing or cut."""
-        self.path = Path(path)
-        self.manifest = read_manifest(self.path)
+    def __init__(self, path: str | Path, check: bool = True, truth: bool = True) -> None:
+        """With ``check`` off, the folder opens even if some of its files are missing or cut. With ``truth`` off it is
+        what methods are given: of samples outside the training split no depth, flags, range and measurements."""
+        self.path, self.truth = Path(path), truth
+        manifest = read_manifest(self.path)
+        self.fingerprint = manifest.fingerprint
+        """SHA-256 of the data's content, 64 hex digits."""
+        shown = {
+            split: rows if truth or split == TRAIN else [{key: row[key] for key in NAMES} for row in rows]
+            for split, rows in manifest.samples.items()
+        }
+        self.manifest = replace(manifest, samples=shown)
         self._mapped: dict[str, MappedShard] = {}
         for shard in self.manifest.shards if check else ():
             if damage := damage_of(self.path, shard, whole=False):
@@ -65,13 +76,12 @@ class DatasetFolder:
         """Close the memory maps of a file."""
         self._mapped.pop(shard.path, None)
 
-    def __reduce__(self) -> tuple[type["DatasetFolder"], tuple[Path]]:
-        return DatasetFolder, (self.path,)
+    def __reduce__(self) -> tuple[type["DatasetFolder"], tuple[Path, bool, bool]]:
+        return DatasetFolder, (self.path, True, self.truth)
 
-    @property
-    def fingerprint(self) -> str:
-        """SHA-256 of the data's content, 64 hex digits."""
-        return self.manifest.fingerprint
+    def without_truth(self) -> "DatasetFolder":
+        """The dataset as methods are given it."""
+        return DatasetFolder(self.path, check=False, truth=False) if self.truth else self
 
     @property
     def content(self) -> dict[str, str]:
@@ -230,6 +240,11 @@ class DatasetFolder:
 
     def _image(self, sample: str, group: str, column: str) -> NDArray:
         split, row = self._find(sample)
+        if column in self._hidden(split):
+            raise DatasetError(
+                f"{self.path}: {column} of {sample} is truth of the {split} split, and methods are given that of the "
+                f"{TRAIN} split alone; open the dataset outside the method to look at it"
+            )
         for shard in self.manifest.shards:
             if shard.split == split and shard.group == group and 0 <= row - shard.first_row < shard.rows:
                 return self.mapped(shard).image(column, row - shard.first_row)
@@ -238,15 +253,19 @@ class DatasetFolder:
     def mapped(self, shard: ShardFile) -> "MappedShard":
         """A file of the dataset, memory-mapped."""
         if shard.path not in self._mapped:
-            self._mapped[shard.path] = MappedShard(self.path / shard.path, self.size)
+            self._mapped[shard.path] = MappedShard(self.path / shard.path, self.size, self._hidden(shard.split))
         return self._mapped[shard.path]
+
+    def _hidden(self, split: str) -> tuple[str, ...]:
+        """The columns of ``split`` that are not given."""
+        return () if self.truth or split == TRAIN else TRUTH
 
 
 class MappedShard:
-    """An Arrow file, memory-mapped: its record ``batches``, and their columns as images of ``size`` (H, W). Raises
-    `DatasetError` naming the file where it can't be read."""
+    """An Arrow file, memory-mapped: its record ``batches`` without ``hidden`` columns, and their columns as images of
+    ``size`` (H, W). Raises `DatasetError` naming the file where it can't be read."""
 
-    def __init__(self, path: Path, size: tuple[int, int]) -> None:
+    def __init__(self, path: Path, size: tuple[int, int], hidden: Collection[str] = ()) -> None:
         import pyarrow as pa
 
         self.path, self._size = path, size
@@ -256,6 +275,9 @@ class MappedShard:
             with path.open("rb") as file:
                 self._file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
             self.batches: list[pa.RecordBatch] = list(pa.ipc.open_stream(pa.py_buffer(self._file)))
+            if hidden:
+                names = [name for name in self.batches[0].schema.names if name not in hidden]
+                self.batches = [batch.select(names) for batch in self.batches]
         except (pa.ArrowException, OSError, ValueError) as error:
             raise DatasetError(f"{path}: can't be read as Arrow ({error}); run: fpp-bench verify") from error
 

@@ -338,6 +338,17 @@ def test_method_sees_copies_and_no_other_frame(opened, tmp_path):
     np.testing.assert_array_equal(opened.frame("mug_A0", 0), before)
 
 
+def test_an_answer_that_is_none_is_named(opened, tmp_path):
+    class Bare(Method):
+        name, title, frames_used = "x", "X", (0,)
+
+        def answer(self, frames):
+            return np.ones(opened.size, np.float32)
+
+    with pytest.raises(PredictionError, match=r"answer gave ndarray, expected Answer\(depth\)"):
+        predict_split(opened, Bare(opened.rig), "validation", tmp_path / "out")
+
+
 @pytest.mark.parametrize(
     ("depth", "says"),
     [

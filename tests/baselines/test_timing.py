@@ -9,9 +9,9 @@ import yaml
 from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.baselines import timing
-from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.method import Answer, Method
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation.result.file import read_result, write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.submission.description import read_submission
@@ -79,11 +79,32 @@ def test_a_method_that_takes_batches_gets_them_at_once(small, monkeypatch):
         def predict_batch(self, stacks):
             sizes.append(len(stacks))
             clock.now += 50.0 if len(sizes) == 1 else 0.5  # the first batch warms up
-            return [None] * len(stacks)
+            return [np.zeros(frames[0].shape, np.float32) for frames in stacks]
 
     measured = timing.time_method(small, Batched(clock, []), batch=6, repeats=12)  # more than the split's four samples
     assert measured.batched is True and set(sizes) == {6} and len(sizes) == 3
     assert measured.throughput_per_s == 12.0
+
+
+def test_what_is_timed_is_what_is_scored(small, monkeypatch):
+    """`answer`, of a class that has two faces; and a batch that gives other depths is refused."""
+    clock = Clock()
+    monkeypatch.setattr(timing, "perf_counter", clock)
+
+    class TwoFaces(Scripted):
+        def answer(self, frames):
+            clock.now += 2.0
+            return Answer(np.full(frames[0].shape, 900, np.float32))
+
+    measured = timing.time_method(small, TwoFaces(clock, [0.001] * 99), batch=2, repeats=3)
+    assert measured.latency_median_ms == 2000 and measured.throughput_per_s == 0.5
+
+    class OtherBatch(TwoFaces):
+        def predict_batch(self, stacks):
+            return [np.zeros(frames[0].shape, np.float32) for frames in stacks]
+
+    with pytest.raises(PredictionError, match="predict_batch gives other depths"):
+        timing.time_method(small, OtherBatch(clock, []), repeats=1)
 
 
 def test_working_memory_is_what_one_prediction_takes(small):

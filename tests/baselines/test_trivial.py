@@ -60,6 +60,7 @@ def test_it_runs_over_a_split_and_says_what_it_used(dataset, tmp_path):
     assert main(["predict", "nearest", str(dataset.path), "--out", str(tmp_path / "p")]) == 0
     text = (tmp_path / "p" / "submission.yaml").read_text()
     assert "method: nearest" in text and f"training_fingerprint: {dataset.fingerprint}" in text
+    assert f"learned_from:\n  data: train-split\n  versions:\n  - dataset {dataset.fingerprint[:8]}\n" in text
     predict_split(dataset, NearestMethod(dataset.rig, training=dataset.path), "test", tmp_path / "q")
     assert len(list((tmp_path / "q").glob("*.npy"))) == 8
 

@@ -237,7 +237,10 @@ def test_ctrl_c_is_130(tiny, monkeypatch, capsys):
 
     monkeypatch.setattr("fpp_ml_bench.cli.dataset.split_statistics", stop)
     assert call("info", tiny) == 130
-    assert "stopped" in capsys.readouterr().err
+    assert capsys.readouterr().err == "fpp-bench info: stopped\n"
+    monkeypatch.setattr("fpp_ml_bench.cli.predict.DatasetFolder", stop)
+    assert call("predict", "phase", tiny, "--out", "out") == 130
+    assert "fpp-bench predict: stopped; the same command continues\n" in capsys.readouterr().err
 
 
 def test_output_cut_off_by_its_reader_is_no_traceback(tiny):

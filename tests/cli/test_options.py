@@ -161,7 +161,7 @@ def mine(tmp_path, monkeypatch):
 def test_options_of_a_method_in_a_file_are_options_of_the_command(mine, tiny, capsys):
     assert main(["predict", "mine.py:Mine", str(tiny), "--out", "bright", "--lit", "200"]) == 0
     settings = yaml.safe_load(Path("bright/submission.yaml").read_text())["settings"]
-    assert settings == {"lit": 200, "steps": False}
+    assert settings == {"lit": 200, "steps": False, "source_sha256": settings["source_sha256"]}
     assert main(["predict", "mine.py:Mine", "--help"]) == 0
     out = capsys.readouterr().out
     assert "mine (everything lit):\n  --lit GREY  grey level above which a pixel is lit" in out and "classical (" in out
@@ -190,6 +190,53 @@ def test_options_of_another_method_are_refused(mine, tiny, capsys, words, messag
     assert main(["predict", words[0], str(tiny), "--out", "out", *words[1:]]) == 2
     error = capsys.readouterr().err
     assert message in error and "Traceback" not in error
+
+
+@pytest.mark.parametrize("name", ["phase", "mine.py:Mine", "unet-individual-rmse"])
+def test_the_method_comes_first(mine, tiny, capsys, name):
+    for dataset in (str(tiny), "nowhere"):
+        assert main(["predict", dataset, name, "--out", "out"]) == 2
+        assert (
+            f"expected the method first, then the dataset: fpp-bench predict {name} {dataset}"
+            in capsys.readouterr().err
+        )
+
+
+def test_a_folder_called_as_a_method_is_a_dataset(mine, tiny, capsys):
+    Path("phase").symlink_to(tiny)
+    assert main(["predict", "constant", "phase", "--out", "out"]) == 0
+    assert "1 frame and" in capsys.readouterr().out
+
+
+def test_a_used_folder_is_refused_before_the_bar(mine, tiny, capsys):
+    Path("used").mkdir()
+    Path("used/notes.txt").write_text("mine")
+    assert main(["predict", "constant", str(tiny), "--out", "used"]) == 2
+    error = capsys.readouterr().err
+    assert "already holds notes.txt; give a new or empty folder, or remove this one" in error and "0%" not in error
+
+
+def test_a_word_that_no_argument_takes_may_be_the_missing_option(mine, capsys):
+    assert main(["build", "data/mini"]) == 2
+    assert "did you mean --out data/mini?" in capsys.readouterr().err
+    assert main(["build", "--preset", "mini"]) == 2
+    assert "did you mean" not in capsys.readouterr().err
+
+
+def test_help_of_a_command_by_a_word(mine, capsys):
+    assert main(["help", "predict"]) == 0 and "usage: fpp-bench predict" in capsys.readouterr().out
+    assert main(["help"]) == 0 and "COMMAND ..." in capsys.readouterr().out
+
+
+def test_measurements_go_only_to_the_code_that_was_scored(mine, tiny, capsys):
+    Path("other.py").write_text(MINE.replace("1500", "1501"))
+    assert main(["predict", "mine.py:Mine", str(tiny), "--out", "out"]) == 0
+    assert fpp_eval(["out", "--json", "result.json"]) == 0
+    for name in ("time", "reliance"):
+        assert main([name, "other.py:Mine", str(tiny), "--into", "result.json"]) == 2
+        error = capsys.readouterr().err
+        assert "settings.source_sha256 is" in error and "give the same options and code" in error
+    assert main(["time", "mine.py:Mine", str(tiny), "--repeats", "1", "--into", "result.json"]) == 0
 
 
 # ---- scoring without naming the dataset

@@ -10,6 +10,7 @@ from fpp_ml_bench.baselines.diagnostics.counterfactual import Counterfactual
 from fpp_ml_bench.baselines.diagnostics.flat_plane import FlatPlane
 from fpp_ml_bench.baselines.diagnostics.probe import ProbeSettings, save_finding, silent
 from fpp_ml_bench.baselines.diagnostics.subjects import background_below, subject_of_method
+from fpp_ml_bench.baselines.method import Answer
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.stability.cases import U32
 
@@ -20,10 +21,11 @@ def answering(dataset, answer, units="mm"):
 
     return SimpleNamespace(
         name="known",
+        title="Known",
         units=units,
         answers_normalised=units == "normalised",
-        answer=predict,
-        predict=predict,
+        own_output=predict,
+        answer=lambda frames: Answer(predict(frames)),
         uses_ground_truth_mask=False,
         frames_used=(51,),
         image_size=dataset.size,

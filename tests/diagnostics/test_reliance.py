@@ -18,9 +18,10 @@ from fpp_ml_bench.baselines.diagnostics.counterfactual import (
     sample_score,
 )
 from fpp_ml_bench.baselines.diagnostics.scenes import chosen_samples
+from fpp_ml_bench.baselines.method import Answer
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.constants import split_sample_name
-from fpp_ml_bench.errors import DiagnosisError
+from fpp_ml_bench.errors import DiagnosisError, PredictionError
 from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 
 
@@ -90,14 +91,15 @@ def test_order_free_forgives_periods_and_credits_no_chance():
 class Reader:
     """A known answer to frames."""
 
-    answer: Any
+    known: Any
     frames_used: tuple[int, ...] = (0,)
     units: str = "mm"
     uses_ground_truth_mask: bool = False
     weights_sha256: str | None = None
+    title: str = "Reader"
 
-    def predict(self, frames):
-        return np.asarray(self.answer(frames), dtype=np.float32)
+    def answer(self, frames):
+        return Answer(np.asarray(self.known(frames), dtype=np.float32))
 
 
 def sobel(image):
@@ -155,6 +157,12 @@ def test_the_exact_decoder_is_a_pure_phase_reader(units, scene_set, exact):
         assert reliance.parts.change_other_direction is None or reliance.parts.change_other_direction > 1
     else:
         assert reliance.order_free_score is None and reliance.parts.follows_constant is None
+
+
+def test_an_answer_of_another_form_is_named(scene_set):
+    reader = Reader(lambda frames: np.zeros((3, 3)))
+    with pytest.raises(PredictionError, match=r"Reader: the method gave float32 \(3, 3\), expected float32 \("):
+        measure(reader, *scene_set)
 
 
 @pytest.mark.parametrize(

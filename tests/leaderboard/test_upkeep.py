@@ -12,12 +12,13 @@ from board_rows import timing, write_result_file
 from scored_dataset import make_dataset
 from upkeep import SHOWN, readme_block
 
+from fpp_ml_bench.baselines.timing import check_same_method
 from fpp_ml_bench.cli import BENCH, EVAL
 from fpp_ml_bench.cli.diagnose import Scenes
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result.parts import Robustness, SeverityScores
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
-from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, check_same_method, read_entry
+from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, read_entry
 from fpp_ml_bench.loaders.render.scene import preset_settings
 
 BEGIN, END = "<!-- leaderboard:begin -->", "<!-- leaderboard:end -->"
@@ -147,7 +148,8 @@ def test_a_rows_command_is_of_the_method_that_was_scored(row):
     command = BENCH.command("predict")
     chosen = command.values(command.make_context("fpp-bench predict", words))["chosen"]
     method = chosen.load(Scenes.of(preset_settings("test")), warn=False)
-    check_same_method(read_entry(SHIPPED_ROWS / f"{row}.json"), method)
+    path = SHIPPED_ROWS / f"{row}.json"
+    check_same_method(path, read_entry(path).row.submission, method)
 
 
 def test_a_row_stays_vouched_for_when_more_of_it_is_measured(files, tmp_path, monkeypatch):

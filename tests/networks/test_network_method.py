@@ -184,7 +184,7 @@ def test_predict_score_and_time_on_the_command_line(dataset, weights, tmp_path, 
         assert timing.batched and timing.parameters > 1000 and timing.frames == 1 and timing.device == "cpu"
         assert "torch" in timing.software
     assert main([*timed[:3], "--range", "mean", "--repeats", "2", "--into", result]) == 2
-    assert "settings is" in capsys.readouterr().err
+    assert "settings.depth_range is" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

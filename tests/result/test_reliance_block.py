@@ -8,13 +8,14 @@ from board_rows import reliance, write_result_file
 from scored_dataset import make_dataset
 from upkeep import readme_block
 
+from fpp_ml_bench.baselines.timing import check_same_method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result.file import json_schema, read_result, result_json
 from fpp_ml_bench.evaluation.result.parts import Reliance, RelianceParts
 from fpp_ml_bench.leaderboard.page.page import page_files
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
-from fpp_ml_bench.leaderboard.rows import check_same_method, read_entry, write_block
+from fpp_ml_bench.leaderboard.rows import read_entry, write_block
 
 SHA = "a" * 64
 
@@ -110,23 +111,27 @@ def test_it_stands_on_the_leaderboard_beside_error_and_time(file, tmp_path, data
 
 
 class Method:
+    reports = False
+
     def __init__(self):
         self.name, self.frames_used, self.units = "test", (0,), "mm"
         self.settings = {"weights_sha256": SHA, "threads": 8, "unheard_of": 1}
 
 
 def test_it_belongs_to_the_very_method_that_was_scored(file):
-    entry = read_entry(file)
-    check_same_method(entry, Method())
+    about = read_entry(file).row.submission
+    check_same_method(file, about, Method())
     for key, value in (("name", "another"), ("frames_used", (1,)), ("units", "normalised")):
         other = Method()
         setattr(other, key, value)
         with pytest.raises(SubmissionError, match="very method that was scored"):
-            check_same_method(entry, other)
+            check_same_method(file, about, other)
     other = Method()
     other.settings = {"weights_sha256": "c" * 64}
     with pytest.raises(SubmissionError, match=r"settings\.weights_sha256"):
-        check_same_method(entry, other)
+        check_same_method(file, about, other)
+    with pytest.raises(SubmissionError, match=r"settings\.\w+ is .*, but"):
+        check_same_method(file, about, Method(), timed=True)
 
 
 def test_the_command_measures_and_writes(tiny, tmp_path, capsys, dataset):

@@ -50,6 +50,31 @@ def test_depths_are_the_values_of_their_file(tiny, opened):
         assert exact.dtype == np.float32 and opened.frame(sample, 0).dtype == np.uint8
 
 
+def test_a_method_is_given_no_truth_outside_the_training_split(tiny, opened):
+    """Not by any name, also in another process; frames, names and what identifies the data stay."""
+    given = opened.without_truth()
+    assert given.without_truth() is given and given.fingerprint == opened.fingerprint and given.splits == opened.splits
+    for seen in (given, pickle.loads(pickle.dumps(given))):
+        for look in (seen.depth_mm, seen.target_mm, seen.void, seen.flags, seen.unlit_mm):
+            with pytest.raises(
+                DatasetError, match="is truth of the validation split, and methods are given that of the"
+            ):
+                look("mug_A60")
+        with pytest.raises(DatasetError, match="is truth of the test split"):
+            seen.depth_mm(opened.samples("test")[0], "depth_exact")
+        assert set(seen.measured("mug_A60")) == {"sample", "object", "view"}
+        for shard in seen.manifest.shards:
+            names = {name for batch in seen.mapped(shard).batches for name in batch.schema.names}
+            assert shard.split == "train" or not {
+                name for name in names if name.startswith(("depth", "flags", "cover"))
+            }
+        np.testing.assert_array_equal(seen.frame("mug_A60", 20), opened.frame("mug_A60", 20))
+        learned = opened.samples("train")[0]
+        np.testing.assert_array_equal(seen.depth_mm(learned), opened.depth_mm(learned))
+        assert seen.measured(learned) == opened.measured(learned)
+    assert "depth_min_mm" in opened.measured("mug_A60")
+
+
 def test_views_share_the_mapped_memory_and_are_read_only(opened):
     view, again = opened.frame("mug_A60", 20), opened.frame("mug_A60", 20)
     assert np.shares_memory(view, again)

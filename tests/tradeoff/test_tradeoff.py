@@ -16,7 +16,7 @@ from scipy import stats
 from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.baselines.registry import load_from_file
+from fpp_ml_bench.baselines.registry import code_in, load_from_file
 from fpp_ml_bench.baselines.tradeoff import measure
 from fpp_ml_bench.baselines.tradeoff.measure import (
     COST_KEYS,
@@ -96,6 +96,7 @@ def answers(small, monkeypatch):
         if name not in known.variants:
             raise PredictionError(f"unknown method {name}")
         kind = SimpleNamespace(Options=options, trivial=known.trivial, variants=lambda rig: known.variants[name])
+        kind.__module__, kind.__qualname__ = Method.__module__, name
         return SimpleNamespace(method=kind)
 
     def load_method(name, source, **options):
@@ -163,7 +164,7 @@ def test_what_cant_be_measured_says_why_and_has_no_numbers(small, tmp_path, answ
     for wrong in (np.float32([[1]]), np.full(small.size, np.nan, np.float32)):
         monkeypatch.setattr(Answer, "predict", lambda self, frames, wrong=wrong: wrong)
         (point,) = measure.tradeoff(plan_of(small, tmp_path / "wrong", "bad")).points
-        assert "expected finite depth (H, W) (32, 40)" in point.failed and point.object_mae_mm is None
+        assert "power_drill_A0: the method gave" in point.failed and point.object_mae_mm is None
 
 
 def test_told_and_trivial_methods_are_on_no_front(small, tmp_path, answers, monkeypatch):
@@ -288,6 +289,8 @@ def test_a_stopped_run_goes_on_and_failures_are_tried_again(small, tmp_path, ans
 def test_a_changed_file_is_measured_again(small, tmp_path, answers, monkeypatch):
     monkeypatch.chdir(tmp_path)
     answers.variants = {"mine.py:Mine": [{}]}
+    # In a process of its own, which reads the file once.
+    monkeypatch.setattr(measure, "source_sha256", lambda method: str(code_in.__wrapped__(tmp_path / "mine.py")))
     for content, times in (("1", 1), ("1", 1), ("2", 2)):
         (tmp_path / "mine.py").write_text(content)
         measure.tradeoff(plan_of(small, tmp_path / "out", "mine.py:Mine"))
