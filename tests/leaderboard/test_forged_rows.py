@@ -6,7 +6,7 @@ import json
 from hashlib import sha256
 
 import pytest
-from board_rows import entry_with_errors, named_benchmarks, reliance, robustness, timing, write_result_file
+from board_rows import entry_with_errors, flat_scores, named_benchmarks, reliance, robustness, timing, write_result_file
 from scored_dataset import make_dataset
 
 from fpp_ml_bench.errors import SubmissionError
@@ -14,7 +14,7 @@ from fpp_ml_bench.evaluation.metrics import HEADLINE
 from fpp_ml_bench.evaluation.result.parts import Timing
 from fpp_ml_bench.leaderboard import columns, rows
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
-from fpp_ml_bench.leaderboard.row_file import ObjectMeans, Row, interval_over, mean_over, row_json, write_row
+from fpp_ml_bench.leaderboard.row_file import ObjectMeans, Row, interval_over, row_json, write_row
 from fpp_ml_bench.leaderboard.rows import read_entry
 from fpp_ml_bench.leaderboard.tables import table_csv
 
@@ -70,8 +70,9 @@ def content_of(row):
 def consistent(content):
     """``content`` with means, intervals and samples that follow from its objects: a forger can compute, too."""
     parts = [ObjectMeans(**part) for part in content["per_object"]]
+    height, width = content["dataset"]["size"]
+    content["metrics"] |= flat_scores(parts, height * width)
     for key in HEADLINE:
-        content["metrics"][key] = mean_over(parts, key)
         content["intervals"][key] = list(interval_over(parts, key) or (None, None))
     content["dataset"]["samples"] = sum(part.samples for part in parts)
     Row.model_validate({**content, "dataset": {**content["dataset"], "content": OTHER}})  # sound but for the world
