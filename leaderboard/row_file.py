@@ -187,6 +187,10 @@ class Row(SparseModel):
             raise ValueError(f"per_object holds {samples} samples, dataset.samples says {self.dataset.samples}")
         if samples > protocol.MOST_SAMPLES:
             raise ValueError(f"dataset.samples: expected at most {protocol.MOST_SAMPLES}, got {samples}")
+        benchmark = self.dataset.known
+        if benchmark is not None and self.dataset.size != benchmark.image_size:
+            expected = f"{benchmark.title} has images of {benchmark.image_size}"
+            raise ValueError(f"dataset.size: {expected}, got {self.dataset.size}")
         pixels = self.dataset.size[0] * self.dataset.size[1]
         for part in self.per_object:
             _check_object(part, pixels)

@@ -195,7 +195,7 @@ def named_benchmarks(monkeypatch: Any, counts: Mapping[str, Any] | None = None, 
     named = []
     for name, content in contents.items():
         named.append(Benchmark(f"fpp-bench-{name}", 2, name, 960))
-        named[-1].__dict__["_facts"] = {"content": content, "counts": {}}
+        named[-1].__dict__.update(_facts={"content": content, "counts": {}}, image_size=[32, 40])
     if counts is not None:
         named[0].__dict__["_facts"]["counts"] = {"test": {"standard/depth": counts}}
     for module in (benchmark, ranking):

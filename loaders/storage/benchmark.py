@@ -48,6 +48,11 @@ class Benchmark:
         return f"{self.name} version {self.version}"
 
     @cached_property
+    def image_size(self) -> list[int]:
+        """Height and width of its images in px."""
+        return [self.size, self.size]
+
+    @cached_property
     def _facts(self) -> dict[str, Any]:
         file = FACTS / f"{self.name}.json"
         return json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {"content": {}, "counts": {}}

@@ -185,6 +185,7 @@ def named(name):
         (scores(object_interior_rmse_mm=0.01), "object_interior RMSE is below its MAE"),
         (scores(object_valid_mae_mm=0.0, object_valid_bias_mm=0.0), "its parts and object_missing_share"),
         (scores(object_median_mm=None), "null all together"),
+        (lambda content: content | {"dataset": content["dataset"] | {"size": [40, 32]}}, "has images of [32, 40], got"),
         (scores(void_share=0.5), "metrics.void_share does not follow"),
         (scores(object_mae_range_share=1e-6), "no object of the benchmark is deeper than 600 mm"),
         (scores(object_missing_share=1.1), "less than or equal to 1"),
