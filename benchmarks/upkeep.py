@@ -62,7 +62,7 @@ from fpp_ml_bench.leaderboard.ranking import (
     short_names,
 )
 from fpp_ml_bench.leaderboard.row_file import row_json, write_row
-from fpp_ml_bench.leaderboard.rows import VOUCHED, Entry, read_entry, vouching_line
+from fpp_ml_bench.leaderboard.rows import SELF_REPORTED, VOUCHED, Entry, read_entry, vouching_line
 from fpp_ml_bench.leaderboard.tables import ranking_table
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.style import millimetres, percent
@@ -213,14 +213,19 @@ _COLUMNS = (
 def readme_rows(groups: Sequence[Group]) -> list[tuple[Group, Ranked]]:
     """What README shows of the first dataset's metric track, against exact depth where a row is: the `SHOWN` methods of
     one frame with the least object MAE, without trivial ones, and the best classical method with its full sequence.
-    Where rows of a group are vouched for, only those count."""
-    first = [group for group in groups if group.key.data_title == groups[0].key.data_title]
+    Only rows that the maintainers vouch for count, and where there are none, results of this machine."""
+    first = [
+        group
+        for group in groups
+        if group.key.data_title == groups[0].key.data_title and group.vouched == groups[0].vouched
+    ]
     shown = []
     for frames, count in ((FRAMES_CLASSES[0], SHOWN), (FRAMES_CLASSES[-1], 1)):
         of_class = [group for group in first if group.key.frames == frames and group.key.track == "metric"]
         for group in of_one_target(of_class)[:1]:
-            rows = [row for row in group.rows if row.value(RANK_KEY) is not None and not is_trivial(row)]
-            rows = [row for row in rows if row.entry.vouched] or rows
+            rows = [row for row in group.rows if row.provenance != SELF_REPORTED and not is_trivial(row)]
+            rows = [row for row in rows if row.entry.vouched or not group.vouched]
+            rows = [row for row in rows if row.value(RANK_KEY) is not None]
             if frames == FRAMES_CLASSES[-1]:
                 rows = [row for row in rows if row.entry.row.submission.method == "classical"]
             best = sorted(rows, key=lambda row: (row.value(RANK_KEY), row.short_name))

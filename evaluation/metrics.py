@@ -6,11 +6,12 @@ gets a `fpp_ml_bench.evaluation.score.SampleScores`: prediction, target and mask
 and the statistics that the built-in metrics share.
 """
 
+import math
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
-from itertools import groupby
+from itertools import groupby, pairwise
 from operator import attrgetter, methodcaller
 from typing import Any, Literal
 
@@ -258,15 +259,42 @@ HEADLINE = tuple(key for key, metric in METRICS.items() if metric.headline)
 RANK_KEY, RANGE_KEY = (next(m.key for m in _ENTRIES if m.role == role) for role in ("rank", "range"))
 
 _ORDER = "object median, 95th percentile, RMSE and maximum are out of order"
-_BIAS = "object bias or shift-free MAE is above the MAE, which no error has"
+_BIAS = "bias or shift-free MAE is above the MAE, which no error has"
+_TAIL = "object median or 95th percentile is above what MAE and RMSE leave to it"
 BOUNDS = (
-    ("object_median_mm", "object_p95_mm", _ORDER),
-    ("object_p95_mm", "object_max_mm", _ORDER),
-    ("object_rmse_mm", "object_max_mm", _ORDER),
-    ("object_bias_mm", "object_mae_mm", _BIAS),
-    ("object_shift_free_mae_mm", "object_mae_mm", _BIAS),
+    ("object_median_mm", "object_p95_mm", 1.0, _ORDER),
+    ("object_p95_mm", "object_max_mm", 1.0, _ORDER),
+    ("object_rmse_mm", "object_max_mm", 1.0, _ORDER),
+    ("object_bias_mm", "object_mae_mm", 1.0, _BIAS),
+    ("object_valid_bias_mm", "object_valid_mae_mm", 1.0, _BIAS),
+    ("object_shift_free_mae_mm", "object_mae_mm", 1.0, _BIAS),
+    *(
+        (key, key.replace("_mae_", "_rmse_"), 1.0, f"{key.split('_mae')[0]} RMSE is below its MAE, which no error has")
+        for key in METRICS
+        if key.replace("_mae_", "_rmse_") in METRICS.keys() - {key}
+    ),
+    # Markov's inequality: the share 1 - q of the errors is at or above their quantile q.
+    ("object_median_mm", "object_mae_mm", 2.0, _TAIL),
+    ("object_p95_mm", "object_mae_mm", 20.0, _TAIL),
+    ("object_median_mm", "object_rmse_mm", math.sqrt(2.0), _TAIL),
+    ("object_p95_mm", "object_rmse_mm", math.sqrt(20.0), _TAIL),
+    *(
+        (f"object_within_{less}mm_share", f"object_within_{more}mm_share", 1.0, "a wider tolerance holds fewer pixels")
+        for less, more in pairwise(WITHIN_MM)
+    ),
 )
-"""Of any errors, the magnitude of the first score is at most the second; what is said where it is not."""
+"""Of any errors, and so of means over samples, the magnitude of the first score is at most so many times the second's;
+what is said where it is not."""
+MIXTURES = (
+    ("object_mae_mm", "object_edge_mae_mm", "object_interior_mae_mm", "object_edge_share"),
+    ("object_rmse_mm", "object_edge_rmse_mm", "object_interior_rmse_mm", "object_edge_share"),
+    ("object_mae_mm", "object_wide_band_mae_mm", "object_wide_interior_mae_mm", "object_wide_band_share"),
+    ("object_mae_mm", "", "object_valid_mae_mm", "object_missing_share"),
+    ("object_interior_mae_mm", "", "object_interior_valid_mae_mm", "object_interior_missing_share"),
+    ("unlit_mae_mm", "", "unlit_valid_mae_mm", "unlit_missing_share"),
+)
+"""The first score is that of a set of two parts, whose errors are the second (empty: any) and the third; the fourth is
+the second part's share of its pixels."""
 
 NOTES = (
     "Object: |error| median {object_median_mm}, 95th percentile {object_p95_mm}, maximum {object_max_mm} mm; pixels "

@@ -7,7 +7,6 @@ import os
 import re
 import shutil
 import stat
-import sys
 import unicodedata
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -24,6 +23,9 @@ NAME_LIMIT = 200
 DEEPEST, LONGEST_NUMBER, MOST_NODES, MOST_VALUES = 64, 1_000, 50_000, 1_000_000
 """Limits of a file from outside, checked before its values are built: levels of mappings and lists in each other,
 digits of a number, keys and values of YAML, values of JSON."""
+LARGEST = 1e100
+"""Magnitude of a number in a file from outside, at most: sums, products and ratios of such numbers stay finite, and no
+length, time or count comes near."""
 CORRECT = "correct the file"
 
 # Control, format (bidirectional overrides, zero-width), surrogate, and line or paragraph separators.
@@ -317,7 +319,7 @@ def _strict_loader() -> type:
 
 def strict_yaml(text: str) -> Any:
     """The plain values of a YAML text. Raises ValueError, fit to print, for anything else: also for an alias, a tag, a
-    key given twice, a number that is not finite, and for more or deeper values than `MOST_NODES` and `DEEPEST`."""
+    key given twice, a number beyond `LARGEST`, and for more or deeper values than `MOST_NODES` and `DEEPEST`."""
     import yaml
 
     try:
@@ -334,7 +336,7 @@ _JSON_TEXT = re.compile(r'"(?:[^"\\]|\\.)*+"', re.DOTALL)
 
 def strict_json(text: str) -> Any:
     """The plain values of a JSON text. Raises ValueError, fit to print, for anything else: also for a key given twice,
-    NaN, a number that no float can hold, and for more or deeper values than `MOST_VALUES` and `DEEPEST`."""
+    NaN, a number beyond `LARGEST`, and for more or deeper values than `MOST_VALUES` and `DEEPEST`."""
     if not text.strip():
         raise ValueError("it is empty")
     bare = _JSON_TEXT.sub("", text)
@@ -369,7 +371,7 @@ def _whole(text: str) -> int:
 
 
 def _check_values(value: Any, where: str = "") -> None:
-    """Refuse what neither format can say but its readers accept: NaN, numbers beyond any float, half a character."""
+    """Refuse what neither format can say but its readers accept: NaN, half a character; numbers beyond `LARGEST`."""
     if isinstance(value, dict):
         for key, entry in value.items():
             _check_values(key, where)
@@ -377,8 +379,10 @@ def _check_values(value: Any, where: str = "") -> None:
     elif isinstance(value, list):
         for index, entry in enumerate(value):
             _check_values(entry, f"{where}[{index}]")
-    elif isinstance(value, int | float) and not abs(value) <= sys.float_info.max:
+    elif isinstance(value, int | float) and not abs(value) <= LARGEST:
         number = printable(json.dumps(value), 60)
-        raise ValueError(f"{printable(where) or 'the file'}: {number} is no number; expected a finite value")
+        raise ValueError(
+            f"{printable(where) or 'the file'}: {number} is no number; expected a magnitude of at most {LARGEST:g}"
+        )
     elif isinstance(value, str) and not value.isascii() and any("\ud800" <= letter <= "\udfff" for letter in value):
         raise ValueError(f"{printable(where) or 'the file'}: half of a surrogate pair; write the character itself")

@@ -7,7 +7,7 @@ import pydantic
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_serializer
 
 from fpp_ml_bench.errors import FppBenchError, SubmissionError
-from fpp_ml_bench.files import printable, text_problem
+from fpp_ml_bench.files import LARGEST, printable, text_problem
 
 MAX_PROBLEMS = 50
 Model = TypeVar("Model", bound="StrictModel")
@@ -27,7 +27,7 @@ def as_tuple(value: Any) -> Any:
 
 Text = Annotated[str, AfterValidator(_checked)]
 Scalar = Text | bool | int | float | None
-Positive = Annotated[float, Field(gt=0)]
+Positive = Annotated[float, Field(ge=1 / LARGEST)]
 NonNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=0)]

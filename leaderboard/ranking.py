@@ -22,12 +22,12 @@ from fpp_ml_bench.baselines.registry import methods, network_method
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS, RANK_KEY, sort_keys
-from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, FramesClass, Track
+from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, FRAMES_CLASSES, FramesClass, Track
 from fpp_ml_bench.evaluation.score.uncertainty import FEWEST_OBJECTS, Interval, Pair, pairs, rank_ranges
 from fpp_ml_bench.evaluation.submission.description import Submission
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import rows
-from fpp_ml_bench.leaderboard.row_file import ObjectMeans, interval_over, mean_over, name_key
+from fpp_ml_bench.leaderboard.row_file import ROUNDED_TWICE, ObjectMeans, interval_over, looks_like, mean_over, name_key
 from fpp_ml_bench.leaderboard.rows import LOCAL, MEANING, SELF_REPORTED, TEST, UNSEEN, Entry, read_entry
 from fpp_ml_bench.loaders.storage.benchmark import BENCHMARKS, Benchmark
 
@@ -112,6 +112,12 @@ class GroupKey:
     def against(self) -> str:
         """The ground truth in words: exact depth or decoded depth."""
         return "exact depth" if self.target == "depth_exact" else "decoded depth"
+
+    @property
+    def rules(self) -> str:
+        """What of the rules is not as usual, in words after a comma; empty for the usual ones."""
+        mode = "" if self.mode == "standard" else f", mode {self.mode}"
+        return mode + ("" if self.edge_band_px == EDGE_BAND_PX else f", edge band {self.edge_band_px} px")
 
 
 @dataclass(eq=False)
@@ -214,8 +220,12 @@ class Group:
     def title(self) -> str:
         """The group's heading, the same in the terminal, in Markdown and on the page."""
         key = self.key
-        mode = "" if key.mode == "standard" else f", mode {key.mode}"
-        return f"{key.data_title}: {key.frames}, {key.track} track, {self.parts}, against {key.against}{mode}"
+        return f"{key.data_title}: {key.frames}, {key.track} track, {self.parts}, against {key.against}{key.rules}"
+
+    @property
+    def vouched(self) -> bool:
+        """Whether the maintainers vouch for any of its rows."""
+        return any(row.entry.vouched for row in self.rows)
 
 
 def is_trivial(row: Ranked) -> bool:
@@ -297,26 +307,62 @@ def read_entries(files: Sequence[Path]) -> list[Entry]:
 
 
 def rank(entries: Iterable[Entry], sort: str = DEFAULT_SORT) -> list[Group]:
-    """Groups in the order of `GroupKey.order`, their rows by rank in ``sort``, then the best value first, unknown
-    values last. Equal values are ordered by name, so the order of the files changes nothing. Raises SubmissionError
-    where rows of a group contradict each other: a name twice, other objects of the same data, a vouched part of a row
-    with one that nobody vouches for."""
+    """Groups in the order of `GroupKey.order`, those without a vouched row last; their rows by rank in ``sort``, then
+    the best value first, unknown values last. Equal values are ordered by name, so the order of the files changes
+    nothing. Raises SubmissionError where rows contradict each other: a name twice in a group, or in any what looks like
+    that of a vouched row; other objects of the same data; a vouched part of a row with one that nobody vouches for."""
     if sort in METRICS and METRICS[sort].helped_by_missing:
         raise SubmissionError(f"{sort}: a method could lead by answering few pixels; sort by {DEFAULT_SORT}")
     if sort not in sort_keys():
         raise SubmissionError(f"expected a sort key out of {', '.join(sort_keys())}, got {printable(sort)!r}")
     members: dict[GroupKey, list[Entry]] = {}
-    for entry in entries:
-        members.setdefault(GroupKey.of(entry), []).append(entry)
-    groups = [_group(key, members[key], sort) for key in sorted(members, key=lambda key: key.order)]
+    notes: dict[GroupKey, list[str]] = {}
+    vouched: dict[object, Entry] = {}
+    originals: dict[object, Entry] = {}
+    # Vouched rows first: of two copies they stay, and what others contradict is theirs.
+    for entry in sorted(entries, key=lambda e: (list(MEANING).index(e.provenance), e.is_unseen, e.name, e.path.name)):
+        key = GroupKey.of(entry)
+        predictions = entry.is_unseen, entry.row.predictions_sha256
+        # Whatever a row says of its frames and track, predictions that are vouched for are those of one method.
+        original = vouched.get((_alike(key), predictions)) or originals.setdefault((key, predictions), entry)
+        if entry.vouched:
+            vouched[_alike(key), predictions] = original
+        if original is entry:
+            members.setdefault(key, []).append(entry)
+        else:
+            notes.setdefault(GroupKey.of(original), []).append(_copy_note(entry, original))
+    groups = [_group(key, of_key, notes.get(key, []), sort) for key, of_key in members.items()]
+    groups.sort(key=lambda group: (not group.vouched, group.key.order))
+    _check_names([row for group in groups for row in group.rows])
     set_ratios(groups)
     return groups
 
 
-def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
-    # Vouched rows first: of two copies they stay, and what others contradict is theirs.
-    entries = sorted(entries, key=lambda e: (list(MEANING).index(e.provenance), e.is_unseen, e.name, e.path.name))
-    entries, notes = _without_copies(entries)
+def _copy_note(copy: Entry, original: Entry) -> str:
+    """Why ``copy`` is left out, whose predictions are those of ``original``."""
+    copied, of = (f"{printable(e.name, 80)} ({printable(e.path.name, 80)})" for e in (copy, original))
+    pairs = ([getattr(e.row.metrics, key) or 0.0 for e in (copy, original)] for key in HEADLINE)
+    agree = all(math.isclose(*pair, rel_tol=ROUNDED_TWICE) for pair in pairs)
+    contradicting = "" if agree else " but not the same errors, so one of the two files is wrong"
+    return f"Not shown, the same predictions as {of}{contradicting}: {copied}."
+
+
+def _check_names(shown: Sequence[Ranked]) -> None:
+    """Refuse (SubmissionError) a row that nobody vouches for under a name that looks like the full or the short one of
+    a vouched row, in any table. That very name is the name of a row of the same method."""
+    taken = {name: row for row in shown if row.entry.vouched for name in (row.short_name, row.entry.name)}
+    for entry in (entry for row in shown for entry in row.entries if not entry.vouched):
+        for name, row in taken.items():
+            own = name if entry.provenance == LOCAL else row.entry.name
+            of_method = entry.row.submission.method == row.entry.row.submission.method
+            if looks_like(entry.name, name) and not (entry.name == own and of_method):
+                raise SubmissionError(
+                    f"{printable(str(entry.path), 500)}: the name {printable(entry.name)!r} is {printable(name)!r}, or "
+                    f"looks like it, which is that of {printable(str(row.entry.path), 500)}; give it another name"
+                )
+
+
+def _group(key: GroupKey, entries: Sequence[Entry], notes: list[str], sort: str) -> Group:
     methods = _methods(entries)
     claims = [first.name for first, _ in methods if first.provenance == SELF_REPORTED]
     names = short_names([first.row.submission for first, _ in methods], claims)
@@ -344,18 +390,6 @@ def _group(key: GroupKey, entries: list[Entry], sort: str) -> Group:
     if len(complete) < len(shown):
         notes.insert(0, "Rows without a result on the unseen objects have no rank.")
     return Group(key, tuple(sorted(shown, key=by_rank)), sort, tuple(notes))
-
-
-def _without_copies(entries: Sequence[Entry]) -> tuple[list[Entry], list[str]]:
-    """The first of those with the same predictions of the same samples, and a note of each that is left out."""
-    kept: dict[tuple[bool, str], Entry] = {}
-    notes = []
-    for entry in entries:
-        first = kept.setdefault((entry.is_unseen, entry.row.predictions_sha256), entry)
-        if first is not entry:
-            copy, of = (f"{printable(e.name, 80)} ({printable(e.path.name, 80)})" for e in (entry, first))
-            notes.append(f"Not shown, the same predictions as {of}: {copy}.")
-    return list(kept.values()), notes
 
 
 def _methods(entries: Sequence[Entry]) -> list[tuple[Entry, Entry | None]]:

@@ -6,6 +6,7 @@ import math
 import re
 import unicodedata
 from collections.abc import Iterable, Iterator
+from functools import cache
 from hashlib import sha256
 from itertools import pairwise
 from pathlib import Path
@@ -14,6 +15,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import Field, model_validator
 
+from fpp_ml_bench.constants import WORKING_RANGE_MM
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation import protocol
 from fpp_ml_bench.evaluation.metrics import HEADLINE
@@ -34,6 +36,9 @@ from fpp_ml_bench.evaluation.result.parts import (
     Timing,
     Uncertainty,
     Whole,
+    can_mix,
+    check_measured,
+    exceeds,
 )
 from fpp_ml_bench.evaluation.score.uncertainty import object_interval
 from fpp_ml_bench.evaluation.submission.description import Submission
@@ -45,15 +50,26 @@ ROW_SCHEMA_VERSION = "2.0.0"
 LARGEST_ROW_BYTES = 12_000
 DIGITS = 5
 """Significant digits of the means of a row."""
-_ROUNDED_TWICE = 1.001e-4
+_ROUNDED = 5.005e-5
+"""Relative error of a number that is rounded to `DIGITS`, at most."""
+ROUNDED_TWICE = 2 * _ROUNDED
 """Relative difference between a rounded mean of errors and a mean of rounded errors, at most."""
 _MARKS = ("Mn", "Me")
 """Categories of the combining characters that are drawn on a letter."""
-# Default-ignorable code points that are no format characters, which no text of a submission may hold anyway.
-_IGNORABLE = re.compile(
-    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180d\u180f\u2065\u3164\ufe00-\ufe0f\uffa0\ufff0-\ufff8"
-    "\U000e0000-\U000e0fff]"
+# Default-ignorable code points that are no format characters, which no text of a submission may hold anyway, blanks
+# that are no spaces, and code points that each font shows as it likes.
+_INVISIBLE = re.compile(
+    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180d\u180f\u2065\u2800\u3164\ufe00-\ufe0f\uffa0\ufff0-\ufff8\ufffc"
+    "\ue000-\uf8ff\U00013440-\U00013455\U00016fe4\U0001d159\U000e0000-\U0010ffff]"
 )
+_DIACRITICS = re.compile("[\u0300-\u036f\u1ab0-\u1aff\u1dc0-\u1dff\u20d0-\u20ff\ufe20-\ufe2f]")
+_TWINS = (
+    "aаαɑᴀⲁ bвьβʙᏼꓐ cсϲᴄⲥᏟꓚ dԁᴅᎠꓓᏧꓒđ eеєεҽᴇᎬꓰⲉ fғꜰꓝ gɡԍցɢᏀꓖ hһнհʜᎻꓧⲏħ jјϳյᴊᎫꓙ kкκᴋᏦꓗⲕ mмᴍᎷꓟⲙ nпոɴꓠⲛ "
+    "l1i|іιıɩɪǀӏןוا∣│׀ɨłƚʟլᎥᏞꓡꓲⵏ١۱ⲓ o0оοᴏօσסهⲟⵔꓳ০०੦૦௦౦೦൦๐໐၀٥۵ø pрρᴘᏢꓑⲣ qԛզգ rгʀᏒꓣᴦⲅ sѕꜱտᏚᏕꓢ tтτᴛᎢꓔⲧŧ "
+    "uսᴜꓴ vѵᴠᏙꓦ wԝωաᴡᏔᏯꓪѡ xхχꓫⲭ yуγүʏᎩꓬⲩყ zζᴢᏃꓜ 3зӡʒ 6б -‐‒–—―−⁃˗ '’‘ʼʹ′`´ ,‚، .·•‧∙⋅ !ǃ"
+)
+"""Small characters that look the same, or whose capitals do, behind the one that stands for all of them: out of
+Unicode's confusables (UTS 39), those of a Latin letter, figure or sign."""
 
 
 class ObjectMeans(Headline, SparseModel):
@@ -106,8 +122,9 @@ class RowRobustness(StrictModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> "RowRobustness":
-        if not math.isclose(self.mae_mm, fmean(self.axes.values()), rel_tol=_ROUNDED_TWICE):
+        if not math.isclose(self.mae_mm, fmean(self.axes.values()), rel_tol=ROUNDED_TWICE):
             raise ValueError("mae_mm does not follow from axes")
+        check_measured(self.interval, self.samples, self.objects)
         return self
 
 
@@ -168,25 +185,54 @@ class Row(SparseModel):
             raise ValueError("per_object names an object twice")
         if (samples := sum(part.samples for part in self.per_object)) != self.dataset.samples:
             raise ValueError(f"per_object holds {samples} samples, dataset.samples says {self.dataset.samples}")
+        if samples > protocol.MOST_SAMPLES:
+            raise ValueError(f"dataset.samples: expected at most {protocol.MOST_SAMPLES}, got {samples}")
+        benchmark = self.dataset.known
+        if benchmark is not None and self.dataset.size != benchmark.image_size:
+            expected = f"{benchmark.title} has images of {benchmark.image_size}"
+            raise ValueError(f"dataset.size: {expected}, got {self.dataset.size}")
+        pixels = self.dataset.size[0] * self.dataset.size[1]
         for part in self.per_object:
-            _check_object(part, self.dataset.size[0] * self.dataset.size[1])
+            _check_object(part, pixels)
         for key in HEADLINE:
             _check_follows(f"metrics.{key}", getattr(self.metrics, key), mean_over(self.per_object, key))
             ends = interval_over(self.per_object, key) or (None, None)
             for stored, computed in zip(getattr(self.intervals, key), ends, strict=True):
                 _check_follows(f"intervals.{key}", stored, computed)
+        void = sum(part.void_pixels for part in self.per_object) / (samples * pixels)
+        _check_follows("metrics.void_share", self.metrics.void_share, void if self.mode == "standard" else None)
+        if problem := self.metrics.problem(samples, _ROUNDED) or self._other_problem():
+            raise ValueError(f"metrics: {problem}")
         if self.protocol_version == protocol.PROTOCOL_VERSION:
-            found = {p.object: Counts(p.samples, p.object_pixels, p.void_pixels) for p in self.per_object}
+            found = {
+                p.object: Counts(p.samples, p.object_pixels, p.void_pixels, p.without_object + p.without_background)
+                for p in self.per_object
+            }
             check_data(self.dataset, self.target, self.mode, self.submission.units, found)
         if self.reliance is not None:
             check_reliance(self.reliance, self.submission)
         return self
 
+    def _other_problem(self) -> str | None:
+        """What of a stated uncertainty, and of the error beside the depth range, contradicts the object's errors."""
+        scores, sure = self.metrics, self.uncertainty or RowUncertainty()
+        if scores.object_mae_mm is None:
+            return None
+        left_out = protocol.SURE_LEFT_OUT, 1 - protocol.SURE_LEFT_OUT
+        for power, (name, value) in enumerate((("mae", sure.sure_mae_mm), ("rmse", sure.sure_rmse_mm)), start=1):
+            whole, unsure = getattr(scores, f"object_{name}_mm"), scores.object_max_mm
+            if value is not None and not can_mix(whole, (0.0, unsure), value, left_out, power, _ROUNDED):
+                return f"object_{name}_mm does not follow from uncertainty.sure_{name}_mm and the largest error"
+        share, (near, far) = scores.object_mae_range_share, WORKING_RANGE_MM
+        if self.dataset.known and share is not None and exceeds(scores.object_mae_mm, share * (far - near), _ROUNDED):
+            return f"object_mae_range_share: no object of the benchmark is deeper than {far - near:g} mm"
+        return None
+
 
 def _check_follows(name: str, stored: float | None, computed: float | None) -> None:
     """Refuse (ValueError) a value that is not the ``computed`` one but for rounding."""
     missing = (stored is None) != (computed is None)
-    if missing or not math.isclose(stored or 0.0, computed or 0.0, rel_tol=_ROUNDED_TWICE):
+    if missing or not math.isclose(stored or 0.0, computed or 0.0, rel_tol=ROUNDED_TWICE):
         raise ValueError(f"{name} does not follow from per_object: {stored}, not {computed}")
 
 
@@ -200,8 +246,21 @@ def _check_object(part: ObjectMeans, pixels: int) -> None:
         count = getattr(part, f"{pixel_set}_pixels", part.object_pixels + part.background_pixels)
         if not (count == 0) == (mae is None) == (rmse is None):
             raise ValueError(f"{name}: {pixel_set} scores must be null exactly when the set is empty")
-        if mae is not None and (rmse < mae * (1 - _ROUNDED_TWICE) or part.views(pixel_set) < 1):
-            raise ValueError(f"{name}: {pixel_set} RMSE is below its MAE, or no view has the set")
+        if count and not part.views(pixel_set) <= count <= part.views(pixel_set) * pixels:
+            views = part.views(pixel_set)
+            raise ValueError(
+                f"{name}: {count} {pixel_set} pixels are not those of {views} views, or no view has the set"
+            )
+        if mae is not None and exceeds(mae, rmse, _ROUNDED):
+            raise ValueError(f"{name}: {pixel_set} RMSE is below its MAE, which no error has")
+    scored = max(pixels - part.void_pixels, 1)  # of a view, at least
+    shares = part.object_pixels / scored, part.background_pixels / scored
+    for power, error in enumerate(("mae", "rmse"), start=1):
+        whole, inside, outside = (getattr(part, f"{pixel_set}_{error}_mm") or 0.0 for pixel_set in protocol.PIXEL_SETS)
+        if not can_mix(whole, (inside, inside), outside, shares, power, _ROUNDED):
+            raise ValueError(
+                f"{name}: overall {error.upper()} does not follow from object, background and their pixels"
+            )
 
 
 def mean_over(objects: Iterable[ObjectMeans], key: str) -> float | None:
@@ -224,13 +283,31 @@ def view_means(objects: Iterable[ObjectMeans], key: str) -> Iterator[tuple[str, 
 
 
 def name_key(name: str) -> str:
-    """What two names share that look the same: compatible forms, ignoring letter case and spaces."""
-    return " ".join(unicodedata.normalize("NFKC", name).casefold().split())
+    """What two names share that look the same: compatible forms and twins of other scripts, ignoring diacritics, letter
+    case, spaces, and dots at the ends."""
+    key = unicodedata.normalize("NFKD", name).casefold().translate(_twins())
+    key = _DIACRITICS.sub("", key).replace("rn", "m").replace("vv", "w")
+    return " ".join(key.split()).strip(". ")
+
+
+@cache
+def _twins() -> dict[int, str]:
+    return {ord(twin): group[0] for group in _TWINS.split() for twin in group}
+
+
+def looks_like(name: str, other: str) -> bool:
+    """Whether ``name`` has the `name_key` of ``other``, or one that differs in letters only, less than half of them,
+    that are no Latin ones: `_TWINS` does not have all scripts."""
+    key, of_other = name_key(name), name_key(other)
+    if key == of_other or key.isascii() or len(key) != len(of_other):
+        return key == of_other
+    foreign = [first for first, second in zip(key, of_other, strict=True) if first != second]
+    return 2 * len(foreign) < len(key) and not any(letter.isascii() for letter in foreign)
 
 
 def name_problem(name: str) -> str | None:
     """Why a method can't be called ``name``; None where it can."""
-    if ignorable := _IGNORABLE.search(name):
+    if ignorable := _INVISIBLE.search(name):
         return f"expected visible characters, got U+{ord(ignorable[0]):04X}, which shows nothing"
     # In this form a letter that a language writes with two marks has none.
     for first, second in pairwise(unicodedata.normalize("NFC", name)):

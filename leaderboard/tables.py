@@ -11,6 +11,7 @@ import unicodedata
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cache, partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -46,8 +47,9 @@ PAIRS_FIRST_OUT = ("Objects", "p", "95% interval", "p, Holm")
 LAST_OUT = ("Frames", "s/sample", "x trivial", "Object MAE")
 """In a narrow terminal, the columns of a ranking that are left out after all others of their width, in this order."""
 _PLAIN = frozenset(" -,+()/%=.")
-_FORMULA = re.compile(r"[^\w=+@-]*[=+@-]")
-"""A sign that begins a formula, before any letter or digit: behind spaces, quotes, a byte order mark."""
+_FORMULA = re.compile(r"(?:^|[,;|\t\r\n])(?=[^\w=+@-]*[=+@-])")
+"""Where a cell may begin, at the start of a text or behind what a spreadsheet may split it at, with a sign that begins
+a formula before any letter or digit: behind spaces, quotes, a byte order mark."""
 
 
 REPORTED_HEADING = "Reported by others on other data (not measured here)"
@@ -246,7 +248,7 @@ def _part(entry: Entry) -> dict[str, Any]:
 
 def table_csv(groups: Sequence[Group]) -> str:
     """A line for each row, numbers with all digits, empty where there is none. Text that a spreadsheet would take for a
-    formula has an apostrophe before it."""
+    formula, also behind a semicolon, has an apostrophe before it."""
     lines = [_cells(group, row) for group in groups for row in group.rows]
     text = io.StringIO()
     writer = csv.DictWriter(text, list(lines[0]) if lines else [], lineterminator="\n")
@@ -257,9 +259,13 @@ def table_csv(groups: Sequence[Group]) -> str:
 
 
 def _plain(value: object) -> object:
-    """A cell that no spreadsheet runs, whatever stands before a formula, and in whichever width its sign is written."""
-    is_formula = isinstance(value, str) and _FORMULA.match(unicodedata.normalize("NFKC", value))
-    return f"'{value}" if is_formula else value
+    """A cell of which no spreadsheet runs a part, whatever it splits lines at, whatever stands before a formula, and in
+    whichever width its sign is written."""
+    if not isinstance(value, str):
+        return value
+    narrow = "".join(unicodedata.normalize("NFKC", letter)[:1] for letter in value)
+    ends = [0, *(match.end() for match in _FORMULA.finditer(narrow)), len(value)]
+    return "'".join(value[start:end] for start, end in pairwise(ends))
 
 
 def _cells(group: Group, row: Ranked) -> dict[str, object]:

@@ -1,6 +1,6 @@
 """Rows for the leaderboard's tests: results of real scoring with errors, times and names that the test chooses."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 from scored_dataset import write_predictions
 
 from fpp_ml_bench.evaluation.metrics import HEADLINE
-from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
+from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, WITHIN_MM
 from fpp_ml_bench.evaluation.result.file import write_result
 from fpp_ml_bench.evaluation.result.parts import RELIANCE_VERSION, Intervals, Metrics, Reliance, RelianceParts
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
@@ -123,8 +123,6 @@ def entry_with_errors(
                 overall_rmse_mm=whole.rmse_mm,
             )
         )
-    means = {key: mean_over(per_object, key) for key in HEADLINE}
-    keys = [key for key in Metrics.model_fields if key.startswith("object_") and key.endswith("_mm")]
     intervals = {key: list(interval_over(per_object, key) or (None, None)) for key in HEADLINE}
     data = {"samples": 2 * len(errors), "benchmark": None} | ({"content": dict(content)} if content else {})
     frames = len(about.get("frames_used", base.row.submission.frames_used))
@@ -132,13 +130,28 @@ def entry_with_errors(
         "submission": base.row.submission.model_copy(update={"name": name, **about}),
         "dataset": base.row.dataset.model_copy(update=data),
         "frames_class": FRAMES_CLASSES[(frames > 1) + (frames > 36)],
-        "metrics": base.row.metrics.model_copy(update=dict.fromkeys(keys, means["object_mae_mm"]) | means),
+        "metrics": base.row.metrics.model_copy(update=flat_scores(per_object)),
         "intervals": Intervals(**intervals),
         "per_object": per_object,
         "predictions_sha256": sha256(f"{name} {errors}".encode()).hexdigest(),
     }
     row = Row.model_validate(base.row.model_copy(update=changes).model_dump())
     return Entry(base.path.with_name(f"{name}.json"), row, provenance or base.provenance)
+
+
+def flat_scores(per_object: Sequence[ObjectMeans], pixels: int = 0) -> dict[str, float | None]:
+    """Scores of errors that are the same all over each object, of 100 mm depth; ``pixels`` of an image, 0 where no
+    pixel is void."""
+    keys = [key for key in Metrics.model_fields if key.startswith("object_") and key.endswith("_mm")]
+    means = {key: mean_over(per_object, key) for key in HEADLINE}
+    mae, samples = means["object_mae_mm"] or 0.0, sum(part.samples for part in per_object)
+    within = {
+        f"object_within_{limit}mm_share": sum(p.samples for p in per_object if (p.object_mae_mm or 0.0) <= limit)
+        / samples
+        for limit in WITHIN_MM
+    }
+    void = sum(part.void_pixels for part in per_object) / (samples * pixels) if pixels else 0.0
+    return dict.fromkeys(keys, mae) | means | within | {"void_share": void, "object_mae_range_share": mae / 100}
 
 
 def reliance(**changes: Any) -> Reliance:
@@ -182,7 +195,7 @@ def named_benchmarks(monkeypatch: Any, counts: Mapping[str, Any] | None = None, 
     named = []
     for name, content in contents.items():
         named.append(Benchmark(f"fpp-bench-{name}", 2, name, 960))
-        named[-1].__dict__["_facts"] = {"content": content, "counts": {}}
+        named[-1].__dict__.update(_facts={"content": content, "counts": {}}, image_size=[32, 40])
     if counts is not None:
         named[0].__dict__["_facts"]["counts"] = {"test": {"standard/depth": counts}}
     for module in (benchmark, ranking):

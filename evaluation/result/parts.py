@@ -3,23 +3,51 @@ robustness, a stated uncertainty."""
 
 import json
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from hashlib import sha256
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS, UNCERTAINTY, Metric
-from fpp_ml_bench.evaluation.protocol import LEFT_OUT, NOMINAL
+from fpp_ml_bench.evaluation.metrics import BOUNDS, HEADLINE, METRICS, MIXTURES, UNCERTAINTY, Metric
+from fpp_ml_bench.evaluation.protocol import LEFT_OUT, NOMINAL, WITHIN_MM
 from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats
+from fpp_ml_bench.files import LARGEST
 from fpp_ml_bench.loaders.storage import benchmark as benchmarks
 from fpp_ml_bench.schema import Count, NonNegative, Positive, Share, SparseModel, StrictModel, Text
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Whole = Annotated[int, Field(gt=0)]
 Interval = Annotated[list[float | None], Field(min_length=2, max_length=2)]
+AGREES = 1e-9
+"""Relative difference up to which two computations of an average count as the same number."""
+LEAST = 1e-300
+"""Differences below this are no contradiction: so small numbers have fewer digits."""
 OPTIONAL = tuple(key for key, metric in METRICS.items() if metric.optional)
 """Scores whose keys are not written where no sample has them."""
+
+
+def exceeds(less: float, more: float, rounding: float) -> bool:
+    """Whether ``less`` is above ``more``, both with an error of ``rounding`` times themselves."""
+    return less > more * (1 + 2 * rounding) + LEAST
+
+
+def can_mix(
+    whole: float,
+    first: tuple[float, float],
+    second: float,
+    most: tuple[float, float],
+    power: int,
+    rounding: float,
+) -> bool:
+    """Whether ``whole`` can be the mean over views of the error of a set, where those of its two parts have the means
+    ``first`` (at least, at most) and ``second``, and no view has more than the shares ``most`` of its pixels in them;
+    ``power``: 1 for MAE, 2 for RMSE."""
+    of_first, of_second = (min(share, 1.0) for share in most)
+    # The error of a view is a norm of its parts: its mean is at least the norm of their means, and at most their sum.
+    least = ((1 - of_second) * first[0] ** power + (1 - of_first) * second**power) ** (1 / power)
+    largest = of_first ** (1 / power) * first[1] + of_second ** (1 / power) * second
+    return not exceeds(least, whole, rounding) and not exceeds(whole, largest, rounding)
 
 
 def ends(interval: Sequence[float | None]) -> tuple[float, float] | None:
@@ -64,6 +92,42 @@ class Metrics(Headline, SparseModel):
 
     SPARSE = OPTIONAL
     __annotations__ = _fields(METRICS[key] for key in METRICS if key not in HEADLINE)
+
+    def problem(self, views: int, rounding: float) -> str | None:
+        """Why no errors have these scores, which are means over at most ``views`` samples, each with an error of
+        ``rounding`` times itself; None where some have."""
+        for key, metric in METRICS.items():
+            if metric.over and (getattr(self, key) is None) != (getattr(self, f"{metric.over}_mae_mm") is None):
+                return f"{metric.over} scores must be null exactly when the set is empty, and then null all together"
+        return next(self._contradictions(views, rounding), None)
+
+    def _contradictions(self, views: int, rounding: float) -> Iterator[str]:
+        known = {key: abs(value) for key in METRICS if (value := getattr(self, key)) is not None}
+        for key, bound, factor, why in BOUNDS:
+            if key in known and bound in known and exceeds(known[key], factor * known[bound], rounding):
+                yield why
+        last_digit = rounding / 10  # of a share near 1
+        for key, first, second, share in MIXTURES:
+            if key in known:
+                shares = views * known[share], views * (1 - known[share] + last_digit)
+                unknown = known["object_max_mm"] if key == "object_mae_mm" else LARGEST
+                low, high = (known.get(first, 0.0),) * 2 if first else (0.0, unknown)
+                power = 2 if "rmse" in key else 1
+                if not can_mix(known[key], (low, high), known.get(second, 0.0), shares, power, rounding):
+                    yield f"{key} does not follow from those of its parts and {share}"
+        if self.object_mae_mm is None:
+            return
+        mae, rmse, median, p95, largest = (known[f"object_{k}_mm"] for k in ("mae", "rmse", "median", "p95", "max"))
+        if exceeds(mae, 0.5 * median + 0.45 * p95 + 0.05 * largest, rounding):
+            yield "object MAE is above what median, 95th percentile and maximum allow"
+        if exceeds(rmse, math.sqrt(mae) * math.sqrt(largest), rounding):
+            yield "object RMSE is above what MAE and maximum allow"
+        for limit in WITHIN_MM:
+            beyond = 1 - known[f"object_within_{limit}mm_share"]
+            most = views * (beyond + last_digit) * largest
+            pairs = (limit * (beyond - last_digit), mae), (mae, limit + most), (median, limit + 2 * most)
+            if any(exceeds(less, more, rounding) for less, more in (*pairs, (p95, limit + 20 * most))):
+                yield f"object_within_{limit}mm_share contradicts the errors"
 
 
 class SampleResult(Metrics):
@@ -288,7 +352,7 @@ class Reliance(StrictModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> "Reliance":
-        _check_measured(self, 1.0, "0 <= low <= high <= 1")
+        check_measured(self.interval, self.samples, self.objects, 1.0)
         return self
 
 
@@ -346,17 +410,17 @@ class Robustness(StrictModel):
     def _consistent(self) -> "Robustness":
         if not math.isclose(self.mae_mm, self.mean("mae_mm") or 0.0, rel_tol=1e-9, abs_tol=1e-12):
             raise ValueError("mae_mm does not follow from axes")
-        _check_measured(self, math.inf, "0 <= low <= high")
+        check_measured(self.interval, self.samples, self.objects)
         return self
 
 
-def _check_measured(block: Reliance | Robustness, most: float, expected: str) -> None:
+def check_measured(interval: Sequence[float | None], samples: int, objects: int, most: float = math.inf) -> None:
     """Refuse (ValueError) an interval that is none, and more objects than samples."""
-    if block.interval.count(None) == 1:
+    if interval.count(None) == 1:
         raise ValueError("interval: expected two numbers or two nulls")
-    if (interval := ends(block.interval)) and not 0 <= interval[0] <= interval[1] <= most:
-        raise ValueError(f"interval: expected {expected}")
-    if block.objects > block.samples:
+    if (pair := ends(interval)) and not 0 <= pair[0] <= pair[1] <= most:
+        raise ValueError(f"interval: expected 0 <= low <= high{'' if most == math.inf else f' <= {most:g}'}")
+    if objects > samples:
         raise ValueError("objects is above samples")
 
 

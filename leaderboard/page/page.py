@@ -284,7 +284,6 @@ def _link(group: Group, of_data: Sequence[Group]) -> str:
 def _section(group: Group, link: str) -> dict[str, Any]:
     """What the template needs of a group: its heading, its rows' intervals, objects and pairs."""
     key = group.key
-    mode = "" if key.mode == "standard" else f", mode {key.mode}"
     per_object = [row.object_means(DEFAULT_SORT) for row in group.rows[:MOST_PAIRED]]
     objects = sorted({name for errors in per_object for name in errors})
     machines = sorted({columns.device(row.entry) for row in group.rows if row.entry.latency_ms is not None})
@@ -304,7 +303,7 @@ def _section(group: Group, link: str) -> dict[str, Any]:
         "clipped": any((row.interval(DEFAULT_SORT) or (scale.low,))[0] < scale.low for row in group.rows),
         "objects": objects,
         "object_cells": object_cells,
-        "title": f"{key.frames[0].upper()}{key.frames[1:]}, {key.track} track, against {key.against}{mode}",
+        "title": f"{key.frames[0].upper()}{key.frames[1:]}, {key.track} track, against {key.against}{key.rules}",
         "ranked": len(group.ranked),
         "most_paired": MOST_PAIRED,
         "matrix": _matrix(group) if group.pairs else [],

@@ -21,11 +21,13 @@ FACTS = Path(__file__).resolve().parent / "benchmarks"
 
 
 class Counts(NamedTuple):
-    """Samples of an object, and over all of them its pixels that are object, None where that is not known, and void."""
+    """Samples of an object; over all of them its pixels that are object, None where that is not known, and void; and in
+    how many of them the object or the background has no pixel, none of a benchmark's."""
 
     samples: int
     object_px: int | None
     void_px: int
+    empty: int = 0
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,11 @@ class Benchmark:
     def title(self) -> str:
         """As it is printed: ``fpp-bench-full version 2``."""
         return f"{self.name} version {self.version}"
+
+    @cached_property
+    def image_size(self) -> list[int]:
+        """Height and width of its images in px."""
+        return [self.size, self.size]
 
     @cached_property
     def _facts(self) -> dict[str, Any]:
@@ -105,7 +112,8 @@ def known_problem(
         said += [f"has the object {name!r}, which this file lacks" for name in missing[:1]]
         return f"{where} {' and '.join(said)}"
     for name, counts in expected.items():
-        for what, wanted, given in zip(("samples", "object pixels", "void pixels"), counts, found[name], strict=True):
+        words = "samples", "object pixels", "void pixels", "views without object or background"
+        for what, wanted, given in zip(words, counts, found[name], strict=True):
             if given is not None and wanted != given:
                 return f"{where} has {wanted} {what} of {name!r}, this file says {given}"
     return None

@@ -3,11 +3,14 @@
 import csv
 import io
 import json
+import re
+import unicodedata
 from hashlib import sha256
 
 import pytest
-from board_rows import entry_with_errors, named_benchmarks, reliance, robustness, timing, write_result_file
+from board_rows import entry_with_errors, flat_scores, named_benchmarks, reliance, robustness, timing, write_result_file
 from scored_dataset import make_dataset
+from upkeep import readme_rows
 
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE
@@ -70,8 +73,9 @@ def content_of(row):
 def consistent(content):
     """``content`` with means, intervals and samples that follow from its objects: a forger can compute, too."""
     parts = [ObjectMeans(**part) for part in content["per_object"]]
+    height, width = content["dataset"]["size"]
+    content["metrics"] |= flat_scores(parts, height * width)
     for key in HEADLINE:
-        content["metrics"][key] = mean_over(parts, key)
         content["intervals"][key] = list(interval_over(parts, key) or (None, None))
     content["dataset"]["samples"] = sum(part.samples for part in parts)
     Row.model_validate({**content, "dataset": {**content["dataset"], "content": OTHER}})  # sound but for the world
@@ -118,6 +122,40 @@ def another_benchmark(content):
     return content
 
 
+def a_view_left_out(content):
+    part = content["per_object"][0]
+    part |= {"without_object": 1, "background_pixels": part["background_pixels"]}
+    return consistent(content)
+
+
+def scores(**changes):
+    def act(content):
+        content["metrics"] |= changes
+        return content
+
+    return act
+
+
+def object_scores(**changes):
+    def act(content):
+        content["per_object"][0] |= changes
+        return content
+
+    return act
+
+
+def overall_above_object(content):
+    content["per_object"][0] |= {"overall_mae_mm": 9.0, "overall_rmse_mm": 9.0}
+    for key in ("overall_mae_mm", "overall_rmse_mm"):
+        parts = [ObjectMeans(**part) for part in content["per_object"]]
+        content["metrics"][key], content["intervals"][key] = mean_over(parts, key), list(interval_over(parts, key))
+    return content
+
+
+def block(name, **content):
+    return lambda row: row | {name: content}
+
+
 def named(name):
     def act(content):
         content["submission"]["name"] = name
@@ -137,7 +175,32 @@ def named(name):
         (no_error, "every error is exactly 0"),
         (another_benchmark, "benchmark says fpp-bench-mini version 2, but content is not that benchmark's"),
         (lambda content: content | {"provenance": "measured here"}, "provenance: is not a key of this file"),
+        (a_view_left_out, "has 0 views without object or background of 'object 0', this file says 1"),
+        (scores(object_median_mm=0.0, object_p95_mm=0.0, object_max_mm=0.0), "out of order"),
+        (scores(object_median_mm=0.0, object_p95_mm=0.0), "MAE is above what median, 95th percentile and maximum"),
+        (scores(object_max_mm=900.0, object_p95_mm=800.0), "above what MAE and RMSE leave to it"),
+        (scores(object_within_1mm_share=1.0, object_within_2mm_share=0.5), "a wider tolerance holds fewer pixels"),
+        (scores(**{f"object_within_{k}mm_share": 0.1 for k in (1, 2, 5, 10)}), "contradicts the errors"),
+        (scores(object_interior_mae_mm=0.0, object_edge_mae_mm=0.0), "those of its parts and object_edge_share"),
+        (scores(object_interior_rmse_mm=0.01), "object_interior RMSE is below its MAE"),
+        (scores(object_valid_mae_mm=0.0, object_valid_bias_mm=0.0), "its parts and object_missing_share"),
+        (scores(object_median_mm=None), "null all together"),
+        (lambda content: content | {"dataset": content["dataset"] | {"size": [40, 32]}}, "has images of [32, 40], got"),
+        (scores(void_share=0.5), "metrics.void_share does not follow"),
+        (scores(object_mae_range_share=1e-6), "no object of the benchmark is deeper than 600 mm"),
+        (scores(object_missing_share=1.1), "less than or equal to 1"),
+        (overall_above_object, "object 0: overall MAE does not follow from object, background and their pixels"),
+        (object_scores(object_mae_mm=1e300), "expected a magnitude of at most 1e+100"),
+        (block("uncertainty", sure_mae_mm=9.0), "does not follow from uncertainty.sure_mae_mm"),
         (named("first"), "both hold 'first' on the same data"),
+        (named("f\u0456r\u0455t"), "or what looks like it"),  # Cyrillic
+        (named("fi\u0433st"), "or what looks like it"),
+        (named("f\u03b9rst"), "or what looks like it"),  # Greek
+        (named("flrst."), "or what looks like it"),  # a small L, a dot
+        (named("fi\u0433\u0301st"), "or what looks like it"),  # a mark
+        (named("\u13e1irst"), "'\u13e1irst' is 'first', or looks like it"),  # no twin that the table has
+        (named("first\u2800"), "U+2800"),
+        (named("first\U0001d159"), "U+1D159"),
         (named("\uff26irst  "), "or what looks like it"),  # full-width, and spaces
         (named("fir\u017ft"), "or what looks like it"),  # a long s
         (named("fir\u200bst"), "U+200B"),
@@ -150,6 +213,51 @@ def test_a_forged_row_is_refused_by_name(forge, message, base, board):
     with pytest.raises(SubmissionError, match="forged-0") as raised:
         board(forge(content))
     assert message in str(raised.value)
+
+
+def test_as_many_samples_as_no_result_has_are_not_counted_out(base, board):
+    content = content_of(row_with(base, "forged", 0.5, OTHER))
+    content["dataset"] |= {"samples": 10**9, "size": [1, 2]}
+    content["per_object"] = [content["per_object"][0] | {"samples": 10**9, "object_pixels": 10**9}]
+    content["per_object"][0]["background_pixels"] = 10**9
+    with pytest.raises(SubmissionError, match="expected at most 10000, got 1000000000"):
+        board(content)
+
+
+@pytest.mark.parametrize(
+    "name", ["\u03c6-net", "\u041c\u0435\u0442\u043e\u0434", "\u4f4d\u76f8", "C++", "first!", "furst"]
+)
+def test_other_names_pass(name, base, board):
+    assert ranks(board(content_of(row_with(base, name, 0.5))))[name] == "(1)"
+
+
+@pytest.mark.parametrize("rules", [{"edge_band_px": 0}, {"submission": {"uses_ground_truth_mask": True}}])
+def test_a_strangers_table_stands_behind_those_that_are_vouched_for(rules, base, board):
+    """Also where its key sorts first; README shows nothing of it."""
+    content = content_of(row_with(base, "forged", 0.5))
+    for key, value in rules.items():
+        content[key] = content[key] | value if isinstance(value, dict) else value
+    first, second = board(content)
+    assert first.vouched and [row.entry.name for row in second.rows] == ["forged"]
+    assert first.title != second.title and ("edge band 0 px" in second.title) == ("edge_band_px" in rules)
+    assert {row.entry.name for _, row in readme_rows([first, second])} == set(HONEST)
+    assert readme_rows([second]) == []
+
+
+def test_a_vouched_rows_name_is_taken_in_every_table(base, board):
+    """But for the same method, whose results elsewhere have its name."""
+    content = content_of(row_with(base, "first", 0.5)) | {"edge_band_px": 0}
+    assert len(board(content)) == 2
+    content["submission"]["method"] = "another"
+    with pytest.raises(SubmissionError, match=r"forged-0\.json: the name 'first' is 'first'.*give it another name"):
+        board(content)
+
+
+def test_vouched_predictions_are_of_one_class(base, board):
+    copy = content_of(row_with(base, "forged", 2.0, frames_used=[0, 1]))
+    copy["predictions_sha256"] = content_of(read_entry(rows.SHIPPED_ROWS / "second.json").row)["predictions_sha256"]
+    (group,) = board(copy)
+    assert group.notes[-1] == "Not shown, the same predictions as second (second.json): forged (forged-0.json)."
 
 
 def ranks(groups):
@@ -217,7 +325,8 @@ def test_rows_with_the_same_predictions_are_one(base, board):
     (group,) = board(*(copy | {"predictions_sha256": predictions} for copy in copies))
     assert ranks([group]) == {"first": "1", "second": "2", "third": "3"}
     assert [note.partition(": ")[2] for note in group.notes] == ["a copy (forged-0.json).", "another (forged-1.json)."]
-    assert all("same predictions as second (second.json)" in note for note in group.notes)
+    wrong = "same predictions as second (second.json) but not the same errors, so one of the two files is wrong"
+    assert all(wrong in note for note in group.notes)
 
 
 def test_a_vouched_half_is_not_joined_with_a_strangers(base, board):
@@ -246,6 +355,20 @@ def test_no_spreadsheet_runs_a_cell(before, sign, base, board):
     cells = next(line for line in lines if line["source"] == "forged-0.json")
     assert [cells[key] for key in ("name", "method", "code")] == [f"'{name}"] * 3
     assert cells["short_name"].startswith("'") and next(line for line in lines if line["name"] == "first")
+
+
+@pytest.mark.parametrize("between", [";", ",", "|", '";"', ";;", "\uff1b"])
+@pytest.mark.parametrize("sign", ["=", "+", " @", "\uff1d", '"-'])
+def test_no_spreadsheet_runs_a_part_of_a_cell(between, sign, base, board):
+    """Cells end where a spreadsheet splits lines, which need not be at the commas."""
+    name = f"x{between}{sign}1+1"
+    (line,) = (line for line in table_csv(board(content_of(row_with(base, name, 0.5)))).split("\n") if "1+1" in line)
+    cells = re.split("[;,|]", unicodedata.normalize("NFKC", line))
+    assert not any(re.match(r"[\W_]*[=+@-]", cell.replace("'", "x")) for cell in cells if "1+1" in cell)
+
+
+def test_text_without_a_formula_stays(base, board):
+    assert "x; y - z|w" in table_csv(board(content_of(row_with(base, "x; y - z|w", 0.5))))
 
 
 def test_the_list_and_not_the_row_says_who_vouches(base, board):

@@ -183,7 +183,7 @@ EDITS = {
     "better headline": (["metrics", "object_mae_mm"], 0.001, "metrics.object_mae_mm does not follow from per_sample"),
     "better median": (["median", "overall_rmse_mm"], 0.001, "median.overall_rmse_mm does not follow"),
     "better pool": (["pooled", "overall_mae_mm"], 0.001, "pooled.overall_mae_mm does not follow"),
-    "better sample": (["per_sample", 0, "object_mae_mm"], 0.001, "overall scores do not follow from object"),
+    "better sample": (["per_sample", 0, "object_mae_mm"], 0.001, "bias or shift-free MAE is above the MAE"),
     "impossible RMSE": (["per_sample", 0, "object_rmse_mm"], 0.001, "RMSE is below its MAE"),
     "null score": (["per_sample", 0, "object_mae_mm"], None, "null exactly when the set is empty"),
     "pixels": (["per_sample", 0, "object_pixels"], 5, "do not add up"),
