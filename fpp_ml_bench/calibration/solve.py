@@ -13,7 +13,7 @@ from fpp_ml_bench.calibration.boards import Board
 from fpp_ml_bench.calibration.bundle import Bundle, same_labels, without_bias
 from fpp_ml_bench.calibration.projector_points import Pose
 from fpp_ml_bench.calibration.result import Calibration, Device, FittedPose, Lens, errors_px
-from fpp_ml_bench.errors import CalibrationError
+from fpp_ml_bench.errors import CalibrationError, CaptureError
 from fpp_ml_bench.optics.pinhole import Pinhole
 
 FEWEST_POSES = 3
@@ -29,41 +29,59 @@ CIRCLE_TOLERANCE_PX = 1e-7
 
 
 def check_poses(poses: Sequence[Pose], board: Board, sizes: tuple[tuple[int, int], tuple[int, int]]) -> None:
-    """Raise `CalibrationError` for poses that are too few, of another image size, with too few points or too far from
-    the projector, or in which camera and projector don't see the same side of the board."""
+    """Raise `CalibrationError` for poses that are too few, and for all poses of another image size, with too few points
+    or too far from the projector, or in which camera and projector don't see the same side of the board."""
     if len(poses) < FEWEST_POSES:
         raise CalibrationError(f"expected at least {FEWEST_POSES} poses of the board, got {len(poses)}: capture more")
-    (width, height), projector = sizes
+    unfit: list[CalibrationError] = []
     for pose in poses:
-        if tuple(pose.size) != (width, height):
-            got = f"{pose.size[0]} x {pose.size[1]}"
-            raise CalibrationError(f"pose {pose.name}: the image is {got} px, the camera's are {width} x {height} px")
-        corners, points = pose.corners_px, pose.projector.points_px
-        if not len(corners) == len(points) == board.columns * board.rows:
-            expected = board.columns * board.rows
-            raise CalibrationError(f"pose {pose.name}: expected {expected} points, got {len(corners)}")
-        both = np.isfinite(corners).all(1) & np.isfinite(points).all(1)
-        if both.sum() < FEWEST_POINTS:
-            reason = next(iter(pose.projector.reasons.items()), None)
-            why = f" (point {reason[0]}: {reason[1]})" if reason else ""
+        try:
+            _check_pose(pose, board, *sizes)
+        except CalibrationError as error:
+            unfit.append(error)
+    raise_all(unfit)
+
+
+def raise_all(unfit: Sequence[CaptureError | CalibrationError]) -> None:
+    """Raise what makes poses unfit, if there is any: one error as it is, several as a `CalibrationError` that lists
+    them."""
+    if len(unfit) == 1:
+        raise unfit[0]
+    if unfit:
+        listed = "\n  ".join(map(str, unfit))
+        raise CalibrationError(f"{len(unfit)} poses can't be used; capture them again, or remove them:\n  {listed}")
+
+
+def _check_pose(pose: Pose, board: Board, camera: tuple[int, int], projector: tuple[int, int]) -> None:
+    if tuple(pose.size) != camera:
+        got, right = (f"{width} x {height} px" for width, height in (pose.size, camera))
+        raise CalibrationError(f"pose {pose.name}: the image is {got}, the camera's are {right}")
+    corners, points = pose.corners_px, pose.projector.points_px
+    if not len(corners) == len(points) == board.columns * board.rows:
+        expected = board.columns * board.rows
+        raise CalibrationError(f"pose {pose.name}: expected {expected} points, got {len(corners)}")
+    both = np.isfinite(corners).all(1) & np.isfinite(points).all(1)
+    if both.sum() < FEWEST_POINTS:
+        reason = next(iter(pose.projector.reasons.items()), None)
+        why = f" (point {reason[0]}: {reason[1]})" if reason else ""
+        raise CalibrationError(
+            f"pose {pose.name}: only {both.sum()} of {len(points)} points have projector coordinates, expected at "
+            f"least {FEWEST_POINTS}{why}: light the whole board with the fringes"
+        )
+    for axis, (size, name) in enumerate(zip(projector, ("columns", "rows"), strict=True)):
+        low, high = points[both, axis].min(), points[both, axis].max()
+        if low < -MARGIN * size or high > (1 + MARGIN) * size:
             raise CalibrationError(
-                f"pose {pose.name}: only {both.sum()} of {len(points)} points have projector coordinates, expected at "
-                f"least {FEWEST_POINTS}{why}: light the whole board with the fringes"
+                f"pose {pose.name}: the board lies at projector {name} {low:.0f} to {high:.0f}, but the "
+                f"projector has {size}: look at its size, the pitch, and which frames code which direction"
             )
-        for axis, (size, name) in enumerate(zip(projector, ("columns", "rows"), strict=True)):
-            low, high = points[both, axis].min(), points[both, axis].max()
-            if low < -MARGIN * size or high > (1 + MARGIN) * size:
-                raise CalibrationError(
-                    f"pose {pose.name}: the board lies at projector {name} {low:.0f} to {high:.0f}, but the "
-                    f"projector has {size}: look at its size, the pitch, and which frames code which direction"
-                )
-        plane = np.column_stack([corners[both], np.ones(both.sum())])
-        affine = np.linalg.lstsq(plane, points[both], rcond=None)[0][:2]
-        if np.linalg.det(affine) < 0:
-            raise CalibrationError(
-                f"pose {pose.name}: the camera sees the board mirrored, compared with the projector; mirror the "
-                "images, or look at the direction in which the projector's columns and rows are counted"
-            )
+    plane = np.column_stack([corners[both], np.ones(both.sum())])
+    affine = np.linalg.lstsq(plane, points[both], rcond=None)[0][:2]
+    if np.linalg.det(affine) < 0:
+        raise CalibrationError(
+            f"pose {pose.name}: the camera sees the board mirrored, compared with the projector; mirror the "
+            "images, or look at the direction in which the projector's columns and rows are counted"
+        )
 
 
 def check_start(poses: Sequence[Pose], turns: Sequence[NDArray]) -> None:

@@ -136,7 +136,7 @@ fpp-bench calibrate --from-depth my-scans --out rig.yaml --camera my-rig.yaml --
 Board: CAPTURES holds a folder for each pose of the board, each with all frames of the sequence, which must code
 both directions. The sequence file is a rig file of which projector (width, height) and sequence are read.
 Boards: checker:COLUMNSxROWS:SPACING (inner corners, mm), circles:..:SPACING:RADIUS, circles-asymmetric:..,
-charuco:..:SPACING:MARKER.
+charuco:..:SPACING:MARKER[:DICTIONARY] (default: DICT_4X4_1000; its markers may lie as before OpenCV 4.6, too).
 
 Depth: TREE is a published tree with raw scans (fpp-bench import --help). Phase and depth give the projector up
 to the size of its pixels, and with it the pitch in px. The pitch is given by --pitch or --focal, or taken from
