@@ -2,6 +2,7 @@
 makes captures unfit for a calibration is answered with a sentence that names the pose."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import cv2
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from fpp_ml_bench.calibration.boards import Board
 from fpp_ml_bench.calibration.bundle import Bundle, same_labels, without_bias
+from fpp_ml_bench.calibration.doubts import doubts
 from fpp_ml_bench.calibration.projector_points import Pose
 from fpp_ml_bench.calibration.result import Calibration, Device, FittedPose, Lens, errors_px
 from fpp_ml_bench.errors import CalibrationError, CaptureError
@@ -142,7 +144,8 @@ def calibrate(
     root = bundle.spread(x)
     check_solution(bundle, x, np.linalg.norm(root, axis=1))
     held_out = _held_out(bundle, x) if hold_out and len(poses) > 3 else [float("nan")] * len(poses)
-    return _result(bundle, x, root, alone, held_out, board, sizes, baseline_mm)
+    found = _result(bundle, x, root, alone, held_out, board, sizes, baseline_mm)
+    return replace(found, doubts=tuple(doubts(found, bundle, x, root)))
 
 
 def _without_circle_bias(
@@ -205,7 +208,8 @@ def _start(
     between = second * first.inv()
     stereo = [between.mean().as_rotvec(), np.median(shifts[1] - between.apply(shifts[0]), axis=0)]
     boards = np.hstack([np.reshape(views[0][0], (-1, 3)), shifts[0]]).ravel()
-    return np.concatenate([*intrinsics, *stereo, boards, board.points_mm().ravel()]), (rms[0], rms[1])
+    start = [*intrinsics, *stereo, boards, board.points_mm().ravel(), np.zeros(2)]
+    return np.concatenate(start), (rms[0], rms[1])
 
 
 def _weighted_fit(bundle: Bundle, start: NDArray[np.float64]) -> NDArray[np.float64]:

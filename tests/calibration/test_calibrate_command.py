@@ -45,7 +45,8 @@ def test_a_second_run_photographs_nothing_and_says_how_far_it_is_from_the_truth(
     words = ("--true-rig", virtual / "true.yaml", "--poses", 5, "--out", virtual / "again.yaml", "--lens", "none")
     assert calibrate("--virtual", virtual / "boards", *words) == 0
     assert before == {path: path.stat().st_mtime_ns for path in (virtual / "boards").rglob("*.png")}
-    assert "against truth" in capsys.readouterr().out
+    printed = capsys.readouterr()
+    assert "against truth" in printed.out and "warning:" not in printed.err and "note:" not in printed.err
     first, again = (load_rig(virtual / f"{name}.yaml") for name in ("found", "again"))
     assert again.baseline_m == pytest.approx(first.baseline_m, rel=1e-9)
 
@@ -158,6 +159,17 @@ def test_poses_that_are_refused_calibrate_anyway_and_are_named(virtual, tmp_path
     assert "pose_03: equal frames: frame_01.png and frame_02.png" in capsys.readouterr().err
     assert calibrate(*words, "--anyway") == 0
     assert "warning: pose_03: equal frames" in capsys.readouterr().err
+
+
+def test_three_poses_leave_none_out_and_say_so(virtual, tmp_path, capsys):
+    for pose in ("pose_00", "pose_01", "pose_02"):
+        shutil.copytree(virtual / "boards" / pose, tmp_path / "boards" / pose)
+    board = yaml.safe_load((virtual / "boards" / "board.yaml").read_text())["board"]
+    words = ("--board", board, "--sequence", virtual / "boards" / "rig.yaml", "--out", tmp_path / "rig.yaml")
+    assert calibrate(tmp_path / "boards", *words) == 0
+    printed = capsys.readouterr()
+    assert "note: 3 poses: none can be left out" in printed.err and "the lens is radial-1. Capture four" in printed.err
+    assert "nan" not in printed.out + printed.err + (tmp_path / "rig.yaml").read_text()
 
 
 def test_all_poses_without_a_board_are_named(virtual, tmp_path, capsys):
