@@ -55,6 +55,13 @@ SHAPE = "Measure the board both ways, print without fitting to the page, glue it
 LENS = (
     "tilt the board more, at more distances, and over the whole image; this model is not for fisheyes and telecentrics"
 )
+CAUSES: tuple[tuple[str, str, *tuple[int, ...]], ...] = (
+    ("projector's pixels seem skewed by {:+.4f} px per px", PICTURE, 1),
+    ("camera's pixels seem skewed by {:+.4f} px per px", PICTURE, 0),
+    ("board's columns seem farther apart than its rows by {:+.2%}", SHAPE, 2),
+    ("board's ends seem bent by {:+.2%} of half its side", SHAPE, 3, 4, 5),
+)
+"""What they are, what to do, and which of the skews (2), the board's stretch (1) and its bend (3)."""
 
 
 def doubts(found: Calibration, bundle: Bundle, x: NDArray[np.float64], root: NDArray[np.float64]) -> Iterator[str]:
@@ -67,7 +74,8 @@ def doubts(found: Calibration, bundle: Bundle, x: NDArray[np.float64], root: NDA
     figures.append(("board's longer side in mm", board_mm, *BOARDS_MM, SPACING))
     for place, (name, part) in enumerate((("camera", bundle.camera), ("projector", bundle.projector))):
         device = (found.camera, found.projector)[place]
-        lens, sides = device.pinhole, np.array([device.pinhole.width, device.pinhole.height])
+        lens = device.pinhole
+        sides = np.array([lens.width, lens.height])
         aspect = lens.fx / lens.fy
         usual = min(ASPECTS, key=lambda ratio: abs(np.log(aspect / ratio)))
         off = SQUARE + SIGMAS * float(np.linalg.norm(root[part][0] / lens.fx - root[part][1] / lens.fy))
@@ -88,30 +96,25 @@ def doubts(found: Calibration, bundle: Bundle, x: NDArray[np.float64], root: NDA
 
 
 def _cause(bundle: Bundle, x: NDArray[np.float64]) -> str | None:
-    """A sentence on the parameter outside the model that explains the residuals best, or None."""
+    """A sentence on a parameter outside the model that explains a part of the residuals, or None."""
     points = bundle.points_mm - bundle.points_mm.mean(axis=0)
-    half_mm = float(np.abs(points).max())
-    u, v, zero = points.T / half_mm
-    stretched = np.stack([u, zero, zero], axis=1)[..., None]
-    bent = np.stack([[zero] * 3, [zero] * 3, [u * u, u * v, v * v]]).transpose(2, 0, 1)
-    unit = np.eye(bundle.size)
-    skewed, of_board = unit[:, bundle.skews], half_mm * unit[:, bundle.board]
-    causes = {
-        "projector's pixels seem skewed by {:+.4f} px per px": (skewed[:, 1:], PICTURE),
-        "camera's pixels seem skewed by {:+.4f} px per px": (skewed[:, :1], PICTURE),
-        "board's columns seem farther apart than its rows by {:+.2%}": (of_board @ stretched.reshape(-1, 1), SHAPE),
-        "board's ends seem bent by {:+.2%} of half its side": (of_board @ bent.reshape(-1, 3), SHAPE),
-    }
+    half_mm = np.abs(points).max()
+    u, v, _ = points.T / half_mm
+    shapes = np.zeros((4, *points.shape))
+    shapes[0, :, 0] = u
+    shapes[1:, :, 2] = u * u, u * v, v * v
+    unit, fitted = np.eye(bundle.size), bundle.free.shape[1]
+    columns = [bundle.free, unit[:, bundle.skews], unit[:, bundle.board] @ (half_mm * shapes.reshape(4, -1).T)]
     estimated, bundle.free_board = bundle.free_board, True  # for derivatives by the board's points
-    for sentence, (columns, cure) in list(causes.items())[: 2 if estimated else None]:
-        residuals, jacobian = bundle.system(x, range(len(bundle.poses)), np.hstack([bundle.free, columns]))
-        amounts = np.linalg.lstsq(jacobian, -residuals, rcond=None)[0]
-        explained = 1 - ((residuals + jacobian @ amounts) ** 2).sum() / (residuals**2).sum()
-        size = float(max(amounts[bundle.free.shape[1] :], key=abs))
-        if explained > LEAST_EXPLAINED and abs(size) > LEAST_CAUSE:
-            bundle.free_board = estimated
-            return f"the {sentence.format(size)}, which explains {explained:.0%} of the squared residuals. {cure}"
+    residuals, jacobian = bundle.system(x, range(len(bundle.poses)), np.hstack(columns))
     bundle.free_board = estimated
+    for sentence, cure, *places in CAUSES[: 2 if estimated else None]:
+        model = jacobian[:, [*range(fitted), *(fitted + place for place in places)]]
+        amounts = np.linalg.lstsq(model, -residuals, rcond=None)[0]
+        explained = 1 - ((residuals + model @ amounts) ** 2).sum() / (residuals**2).sum()
+        size = max(amounts[fitted:], key=abs)
+        if explained > LEAST_EXPLAINED and abs(size) > LEAST_CAUSE:
+            return f"the {sentence.format(size)}, which explains {explained:.0%} of the squared residuals. {cure}"
     return None
 
 
