@@ -21,6 +21,22 @@ SUBPIX_SHARE = 0.17
 """Half the window of a checker's corner, in squares: its edges are straight there, and enough pixels see them."""
 FEWEST_CORNERS = 8
 """Of a charuco board, of which a part may be out of sight."""
+FEWEST_MARKERS = 4
+"""Of a dictionary, to name it: noise looks like a marker or two."""
+SEEDS = (0.75, 0.5, 0.0)
+"""Sides of the part that is looked for, and grown from, where a checker is not found: shares of its own; at least 3."""
+SEED_IMAGE_PX = 800
+"""Longer side of the image for this: of a board that fills it, a square keeps 30 px and more."""
+DICTIONARIES = (
+    "DICT_4X4_1000",
+    "DICT_5X5_1000",
+    "DICT_6X6_1000",
+    "DICT_7X7_1000",
+    "DICT_ARUCO_ORIGINAL",
+    "DICT_APRILTAG_36H11",
+    "DICT_ARUCO_MIP_36H12",
+)
+"""Those that hold all markers which boards are printed with: the smaller ones are their beginnings."""
 _STOP = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 100, 1e-5)
 
 
@@ -71,7 +87,7 @@ class Board:
     def find(self, image: NDArray[np.uint8], name: str = "image") -> NDArray[np.float64]:
         """Image coordinates (n, 2) float64 px of the points in an 8-bit image (H, W); NaN for corners of a charuco
         board that are out of sight. Of a circle it is the centroid of its image, which is not the image of its centre.
-        Raises `CalibrationError` with ``name`` where the board is not found."""
+        Raises `CalibrationError` with ``name`` and what was seen where the board is not found."""
         if image.ndim != 2 or image.dtype != np.uint8:
             raise CalibrationError(f"{name}: expected an 8-bit grey image, got {image.dtype} of shape {image.shape}")
         low, high = np.percentile(image, [1, 99.5])
@@ -80,10 +96,15 @@ class Board:
         corners = find(image, stretched)
         if corners is None:
             part = "" if self.kind != "charuco" else f" (at least {FEWEST_CORNERS} of its corners)"
+            seen, places = {"checker": self._part, "charuco": self._markers}.get(self.kind, self._blobs)(stretched)
+            if len(places):
+                (left, top), (right, bottom) = places.min(axis=0), places.max(axis=0)
+                seen += f", in columns {left:.0f} to {right:.0f} and rows {top:.0f} to {bottom:.0f}"
             raise CalibrationError(
                 f"{name}: the board {self} was not found{part}; expected {self.columns} x {self.rows} "
                 f"{'circles' if self.kind.startswith('circles') else 'inner corners'}, in focus, lit, and with a "
-                "margin around them: look at the image, and give the board's numbers of points"
+                f"margin around them; seen: {seen}; the image has grey levels {low:.0f} to {high:.0f}. Look at it, and "
+                "give the board's numbers of points, columns first"
             )
         return self._right_handed(corners.reshape(-1, 2).astype(np.float64))
 
@@ -107,35 +128,77 @@ class Board:
         found, corners = cv2.findChessboardCorners(stretched, size, flags=flags)
         return _refined(image, corners) if found else None
 
-    def _circles(self, image: NDArray[np.uint8], stretched: NDArray[np.uint8]) -> NDArray | None:
+    def _part(self, stretched: NDArray[np.uint8]) -> tuple[str, NDArray[np.float64]]:
+        """The largest part of a checker that is seen, in words, and its corners (n, 2) px."""
+        scale = min(1.0, SEED_IMAGE_PX / max(stretched.shape))
+        image = cv2.resize(stretched, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+        flags = cv2.CALIB_CB_NORMALIZE_IMAGE + cv2.CALIB_CB_EXHAUSTIVE + cv2.CALIB_CB_LARGER
+        for share in SEEDS:
+            seed = [max(3, int(np.ceil(share * count))) for count in (self.columns, self.rows)]
+            found, corners, grid = cv2.findChessboardCornersSBWithMeta(image, seed, flags)
+            if found:
+                columns, rows = sorted(grid.shape, reverse=self.columns > self.rows)  # OpenCV may have turned it
+                return f"{grid.size} corners of a checker ({columns} x {rows})", (corners.reshape(-1, 2) + 0.5).astype(
+                    np.float64
+                ) / scale - 0.5
+        return "no corners of a checker", np.empty((0, 2))
+
+    def _blob_detector(self, pixels: int) -> Any:
         settings: Any = cv2.SimpleBlobDetector_Params()  # type: ignore[attr-defined]
-        settings.minArea, settings.maxArea = 12.0, image.size / (self.columns * self.rows)
+        settings.minArea, settings.maxArea = 12.0, pixels / (self.columns * self.rows)
         settings.minThreshold, settings.maxThreshold, settings.thresholdStep = 50, 220, 10
         settings.minDistBetweenBlobs, settings.filterByConvexity, settings.minInertiaRatio = 4, False, 0.05
+        return cv2.SimpleBlobDetector_create(settings)  # type: ignore[attr-defined]
+
+    def _circles(self, image: NDArray[np.uint8], stretched: NDArray[np.uint8]) -> NDArray | None:
         flags = cv2.CALIB_CB_SYMMETRIC_GRID if self.kind == "circles" else cv2.CALIB_CB_ASYMMETRIC_GRID
-        for dark in (True, False):
-            picture = stretched if dark else 255 - stretched
+        size, detector = (self.columns, self.rows), self._blob_detector(image.size)
+        for picture in (stretched, 255 - stretched):
             for clustering in (0, cv2.CALIB_CB_CLUSTERING):
-                found, centres = cv2.findCirclesGrid(
-                    picture,
-                    (self.columns, self.rows),
-                    flags=flags + clustering,
-                    blobDetector=cv2.SimpleBlobDetector_create(settings),  # type: ignore[attr-defined]
-                )
+                found, centres = cv2.findCirclesGrid(picture, size, flags=flags + clustering, blobDetector=detector)
                 if found:
                     return centres
         return None
 
+    def _blobs(self, stretched: NDArray[np.uint8]) -> tuple[str, NDArray[np.float64]]:
+        """How many dark or bright dots are seen, in words, and where, (n, 2) px."""
+        detector = self._blob_detector(stretched.size)
+        dots = max((detector.detect(picture) for picture in (stretched, 255 - stretched)), key=len)
+        return f"{len(dots)} dots", np.array([dot.pt for dot in dots]).reshape(-1, 2)
+
     def _charuco(self, image: NDArray[np.uint8], stretched: NDArray[np.uint8]) -> NDArray | None:
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         squares = (self.columns + 1, self.rows + 1)
-        board = cv2.aruco.CharucoBoard(squares, self.spacing_mm, self.detail_mm, dictionary)
-        found, labels, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(stretched)
-        if labels is None or len(labels) < FEWEST_CORNERS:
-            return None
         corners = np.full((self.columns * self.rows, 2), np.nan)
-        corners[np.ravel(labels)] = _refined(image, found).reshape(-1, 2)
-        return corners
+        most = FEWEST_CORNERS - 1
+        for before_4_6 in (False, True):  # with an even number of rows, OpenCV's markers lay on the other squares
+            board = cv2.aruco.CharucoBoard(squares, self.spacing_mm, self.detail_mm, dictionary)
+            board.setLegacyPattern(before_4_6)
+            found, labels, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(stretched)
+            if labels is not None and len(labels) > most:
+                most, corners[:] = len(labels), np.nan
+                corners[np.ravel(labels)] = _refined(image, found).reshape(-1, 2)
+        return corners if most >= FEWEST_CORNERS else None
+
+    def _markers(self, stretched: NDArray[np.uint8]) -> tuple[str, NDArray[np.float64]]:
+        """The markers that are seen, of the dictionary with the most of them, in words, and their corners (n, 2) px."""
+        mirrored = f"{self.dictionary} in the mirrored image"
+        markers = {}
+        for name in (self.dictionary, mirrored, *DICTIONARIES):
+            dictionary = getattr(cv2.aruco, name.split()[0])
+            detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(dictionary))
+            markers[name] = detector.detectMarkers(stretched[:, ::-1].copy() if name == mirrored else stretched)
+        most = max(markers, key=lambda name: len(markers[name][0]))
+        name = most if len(markers[most][0]) >= FEWEST_MARKERS else self.dictionary
+        corners, numbers, _ = markers[name]
+        if not corners:
+            return f"no markers of {name}", np.empty((0, 2))
+        board_has = (self.columns + 1) * (self.rows + 1) // 2
+        seen = (
+            f"{len(corners)} markers of {name}, numbered {numbers.min()} to {numbers.max()} (the board has {board_has}"
+        )
+        seen += ")" if name == self.dictionary else f" of {self.dictionary})"
+        return seen, np.concatenate(corners).reshape(-1, 2).astype(np.float64)
 
 
 def _refined(image: NDArray[np.uint8], corners: NDArray) -> NDArray:

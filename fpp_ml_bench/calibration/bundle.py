@@ -2,7 +2,9 @@
 own points, by least squares over all image and projector coordinates with OpenCV's model and its derivatives.
 
 The parameters are one vector: (fx, fy, cx, cy, coefficients) of the camera, the same of the projector, rotation vector
-and translation from camera to projector, the same from the board to the camera for each pose, the board's points.
+and translation from camera to projector, the same from the board to the camera for each pose, the board's points, and
+the skew of the camera's and of the projector's pixels. No fit frees the skew: it stays 0, and `doubts` asks what it
+would explain.
 
 Two things are corrected by the rig as known so far. The centroid of a circle's image is not the image of its centre:
 perspective shifts an ellipse's centre, and lens distortion shifts it further (Heikkila, Geometric camera calibration
@@ -43,9 +45,10 @@ class Bundle:
         self.poses, self.points_mm, self.lenses, self.free_board = poses, points_mm, lenses, free_board
         self.targets = [(pose.corners_px, pose.projector.points_px) for pose in poses]
         self.extra_px = (1.0, 1.0)
-        ends = np.cumsum([4 + lenses[0].coefficients, 4 + lenses[1].coefficients, 6, 6 * len(poses), points_mm.size])
+        ends = np.cumsum([4 + lenses[0].coefficients, 4 + lenses[1].coefficients, 6, 6 * len(poses), points_mm.size, 2])
         starts = [0, *ends[:-1]]
-        self.camera, self.projector, self.stereo, self.boards, self.board = map(slice, starts, ends.tolist())
+        parts = map(slice, starts, ends.tolist())
+        self.camera, self.projector, self.stereo, self.boards, self.board, self.skews = parts
         self.size = int(ends[-1])
         self.free = self.free_of(range(len(poses)))
 
@@ -76,12 +79,17 @@ class Bundle:
         of_board, of_stereo = (np.block([[*composed[k : k + 2]], [*composed[k + 4 : k + 6]]]) for k in (2, 4))
         in_camera = self.camera, board[:3], board[3:], [(self.pose(index), np.eye(6))]
         in_projector = self.projector, *composed[:2], [(self.pose(index), of_board), (self.stereo, of_stereo)]
-        projections, derivatives = [], []
+        projections: list[NDArray] = []
+        derivatives: list[tuple[NDArray, NDArray]] = []
         for part, rotation, translation, chain in (in_camera, in_projector):
             image, jacobian = cv2.projectPoints(points, rotation, translation, *opencv_lens(x[part]))[:2]
             projections.append(image.reshape(-1, 2))
             blocks = [(part, jacobian[:, 6 : 6 + part.stop - part.start])]
             blocks += [(columns, jacobian[:, :6] @ of_place) for columns, of_place in chain]
+            fx, fy, _, cy = x[part][:4]
+            skew = np.zeros((len(points), 2, 2))
+            skew[:, 0, len(derivatives)] = (image[:, 0, 1] - cy) * fx / fy
+            blocks.append((self.skews, skew.reshape(-1, 2)))
             if self.free_board:
                 of_points = np.zeros((len(points), 2, len(points), 3))
                 each = np.arange(len(points))
@@ -114,7 +122,7 @@ class Bundle:
                 seen = np.isfinite(target).ravel()
                 values.append(((image - target) / sigma).ravel()[seen])
                 rows.append((jacobian[seen] @ free[columns]) / sigma.ravel()[seen, None])
-        if free[self.board].any():  # the board's points are sought
+        if self.free[self.board].any() and free[self.board].any():  # the board's points are sought
             sigma_mm = BOARD_SHARE * np.linalg.norm(self.points_mm[1] - self.points_mm[0])
             values.append((x[self.board] - self.points_mm.ravel()) / sigma_mm)
             rows.append(free[self.board] / sigma_mm)

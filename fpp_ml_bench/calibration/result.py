@@ -124,7 +124,8 @@ class Calibration:
     vector. ``scale`` says what the lengths were taken from. ``alone_rms_px``: the RMS of cv2.calibrateCamera for camera
     and projector each on its own with a perfect board. ``noise_px``: standard deviations of camera and projector
     coordinates that the residuals show, with whose inverse squares they were weighted. ``bic``: Bayesian information
-    criterion. ``board_mm``: the board's points (n, 3), estimated or given. Uncertainties take the residuals for
+    criterion. ``board_mm``: the board's points (n, 3), estimated or given. ``doubts``: what is improbable, in sentences
+    that begin with ``warning:``, or ``note:`` where it may well be right. Uncertainties take the residuals for
     independent: errors that all poses share, such as those of a board that is taken for perfect, make them too
     small."""
 
@@ -140,6 +141,7 @@ class Calibration:
     bic: float
     board_mm: NDArray[np.float64] = field(repr=False, compare=False)
     poses: tuple[FittedPose, ...] = field(repr=False)
+    doubts: tuple[str, ...] = ()
 
     @property
     def rms_px(self) -> Errors:

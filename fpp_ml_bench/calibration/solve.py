@@ -2,6 +2,7 @@
 makes captures unfit for a calibration is answered with a sentence that names the pose."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations
 
 import cv2
@@ -11,9 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from fpp_ml_bench.calibration.boards import Board
 from fpp_ml_bench.calibration.bundle import Bundle, same_labels, without_bias
+from fpp_ml_bench.calibration.doubts import doubts
 from fpp_ml_bench.calibration.projector_points import Pose
 from fpp_ml_bench.calibration.result import Calibration, Device, FittedPose, Lens, errors_px
-from fpp_ml_bench.errors import CalibrationError
+from fpp_ml_bench.errors import CalibrationError, CaptureError
 from fpp_ml_bench.optics.pinhole import Pinhole
 
 FEWEST_POSES = 3
@@ -29,41 +31,59 @@ CIRCLE_TOLERANCE_PX = 1e-7
 
 
 def check_poses(poses: Sequence[Pose], board: Board, sizes: tuple[tuple[int, int], tuple[int, int]]) -> None:
-    """Raise `CalibrationError` for poses that are too few, of another image size, with too few points or too far from
-    the projector, or in which camera and projector don't see the same side of the board."""
+    """Raise `CalibrationError` for poses that are too few, and for all poses of another image size, with too few points
+    or too far from the projector, or in which camera and projector don't see the same side of the board."""
     if len(poses) < FEWEST_POSES:
         raise CalibrationError(f"expected at least {FEWEST_POSES} poses of the board, got {len(poses)}: capture more")
-    (width, height), projector = sizes
+    unfit: list[CalibrationError] = []
     for pose in poses:
-        if tuple(pose.size) != (width, height):
-            got = f"{pose.size[0]} x {pose.size[1]}"
-            raise CalibrationError(f"pose {pose.name}: the image is {got} px, the camera's are {width} x {height} px")
-        corners, points = pose.corners_px, pose.projector.points_px
-        if not len(corners) == len(points) == board.columns * board.rows:
-            expected = board.columns * board.rows
-            raise CalibrationError(f"pose {pose.name}: expected {expected} points, got {len(corners)}")
-        both = np.isfinite(corners).all(1) & np.isfinite(points).all(1)
-        if both.sum() < FEWEST_POINTS:
-            reason = next(iter(pose.projector.reasons.items()), None)
-            why = f" (point {reason[0]}: {reason[1]})" if reason else ""
+        try:
+            _check_pose(pose, board, *sizes)
+        except CalibrationError as error:
+            unfit.append(error)
+    raise_all(unfit)
+
+
+def raise_all(unfit: Sequence[CaptureError | CalibrationError]) -> None:
+    """Raise what makes poses unfit, if there is any: one error as it is, several as a `CalibrationError` that lists
+    them."""
+    if len(unfit) == 1:
+        raise unfit[0]
+    if unfit:
+        listed = "\n  ".join(map(str, unfit))
+        raise CalibrationError(f"{len(unfit)} poses can't be used; capture them again, or remove them:\n  {listed}")
+
+
+def _check_pose(pose: Pose, board: Board, camera: tuple[int, int], projector: tuple[int, int]) -> None:
+    if tuple(pose.size) != camera:
+        got, right = (f"{width} x {height} px" for width, height in (pose.size, camera))
+        raise CalibrationError(f"pose {pose.name}: the image is {got}, the camera's are {right}")
+    corners, points = pose.corners_px, pose.projector.points_px
+    if not len(corners) == len(points) == board.columns * board.rows:
+        expected = board.columns * board.rows
+        raise CalibrationError(f"pose {pose.name}: expected {expected} points, got {len(corners)}")
+    both = np.isfinite(corners).all(1) & np.isfinite(points).all(1)
+    if both.sum() < FEWEST_POINTS:
+        reason = next(iter(pose.projector.reasons.items()), None)
+        why = f" (point {reason[0]}: {reason[1]})" if reason else ""
+        raise CalibrationError(
+            f"pose {pose.name}: only {both.sum()} of {len(points)} points have projector coordinates, expected at "
+            f"least {FEWEST_POINTS}{why}: light the whole board with the fringes"
+        )
+    for axis, (size, name) in enumerate(zip(projector, ("columns", "rows"), strict=True)):
+        low, high = points[both, axis].min(), points[both, axis].max()
+        if low < -MARGIN * size or high > (1 + MARGIN) * size:
             raise CalibrationError(
-                f"pose {pose.name}: only {both.sum()} of {len(points)} points have projector coordinates, expected at "
-                f"least {FEWEST_POINTS}{why}: light the whole board with the fringes"
+                f"pose {pose.name}: the board lies at projector {name} {low:.0f} to {high:.0f}, but the "
+                f"projector has {size}: look at its size, the pitch, and which frames code which direction"
             )
-        for axis, (size, name) in enumerate(zip(projector, ("columns", "rows"), strict=True)):
-            low, high = points[both, axis].min(), points[both, axis].max()
-            if low < -MARGIN * size or high > (1 + MARGIN) * size:
-                raise CalibrationError(
-                    f"pose {pose.name}: the board lies at projector {name} {low:.0f} to {high:.0f}, but the "
-                    f"projector has {size}: look at its size, the pitch, and which frames code which direction"
-                )
-        plane = np.column_stack([corners[both], np.ones(both.sum())])
-        affine = np.linalg.lstsq(plane, points[both], rcond=None)[0][:2]
-        if np.linalg.det(affine) < 0:
-            raise CalibrationError(
-                f"pose {pose.name}: the camera sees the board mirrored, compared with the projector; mirror the "
-                "images, or look at the direction in which the projector's columns and rows are counted"
-            )
+    plane = np.column_stack([corners[both], np.ones(both.sum())])
+    affine = np.linalg.lstsq(plane, points[both], rcond=None)[0][:2]
+    if np.linalg.det(affine) < 0:
+        raise CalibrationError(
+            f"pose {pose.name}: the camera sees the board mirrored, compared with the projector; mirror the "
+            "images, or look at the direction in which the projector's columns and rows are counted"
+        )
 
 
 def check_start(poses: Sequence[Pose], turns: Sequence[NDArray]) -> None:
@@ -124,7 +144,8 @@ def calibrate(
     root = bundle.spread(x)
     check_solution(bundle, x, np.linalg.norm(root, axis=1))
     held_out = _held_out(bundle, x) if hold_out and len(poses) > 3 else [float("nan")] * len(poses)
-    return _result(bundle, x, root, alone, held_out, board, sizes, baseline_mm)
+    found = _result(bundle, x, root, alone, held_out, board, sizes, baseline_mm)
+    return replace(found, doubts=tuple(doubts(found, bundle, x, root)))
 
 
 def _without_circle_bias(
@@ -187,7 +208,8 @@ def _start(
     between = second * first.inv()
     stereo = [between.mean().as_rotvec(), np.median(shifts[1] - between.apply(shifts[0]), axis=0)]
     boards = np.hstack([np.reshape(views[0][0], (-1, 3)), shifts[0]]).ravel()
-    return np.concatenate([*intrinsics, *stereo, boards, board.points_mm().ravel()]), (rms[0], rms[1])
+    start = [*intrinsics, *stereo, boards, board.points_mm().ravel(), np.zeros(2)]
+    return np.concatenate(start), (rms[0], rms[1])
 
 
 def _weighted_fit(bundle: Bundle, start: NDArray[np.float64]) -> NDArray[np.float64]:

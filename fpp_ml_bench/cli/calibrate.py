@@ -1,6 +1,8 @@
 """``fpp-bench calibrate``: the rig from captures of a board, or from frames with depth."""
 
+import sys
 from dataclasses import dataclass, replace
+from math import isnan
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +138,7 @@ fpp-bench calibrate --from-depth my-scans --out rig.yaml --camera my-rig.yaml --
 Board: CAPTURES holds a folder for each pose of the board, each with all frames of the sequence, which must code
 both directions. The sequence file is a rig file of which projector (width, height) and sequence are read.
 Boards: checker:COLUMNSxROWS:SPACING (inner corners, mm), circles:..:SPACING:RADIUS, circles-asymmetric:..,
-charuco:..:SPACING:MARKER.
+charuco:..:SPACING:MARKER[:DICTIONARY] (default: DICT_4X4_1000; its markers may lie as before OpenCV 4.6, too).
 
 Depth: TREE is a published tree with raw scans (fpp-bench import --help). Phase and depth give the projector up
 to the size of its pixels, and with it the pitch in px. The pitch is given by --pitch or --focal, or taken from
@@ -263,6 +265,10 @@ def _lenses(settings: CalibrateSettings) -> list[tuple["Lens", "Lens"]]:
     return pairs
 
 
+def _four_digits(error_px: float) -> str:
+    return "-" if isnan(error_px) else f"{error_px:.4f}"
+
+
 def print_calibration(found: "Calibration") -> None:
     """Print the errors of every pose, and the rig with its standard uncertainties."""
     columns = "camera", "projector", "both", "left out"
@@ -270,9 +276,14 @@ def print_calibration(found: "Calibration") -> None:
     for pose in found.poses:
         errors = (*pose.rms_px, pose.held_out_rms_px)
         named = f"{pose.name} (!)" if pose.name in found.spoilers else pose.name
-        table.add_row(named, *(f"{error:.4f}" for error in errors), end_section=pose is found.poses[-1])
-    table.add_row("all", *(f"{error:.4f}" for error in (*found.rms_px, found.held_out_rms_px)))
+        table.add_row(named, *map(_four_digits, errors), end_section=pose is found.poses[-1])
+    table.add_row("all", *map(_four_digits, (*found.rms_px, found.held_out_rms_px)))
     show(table)
+    for doubt in found.doubts:
+        print(doubt, file=sys.stderr)
+    if isnan(found.held_out_rms_px):
+        few = f"{len(found.poses)} poses: none can be left out to compare lens models or to find a bad pose"
+        print(f"note: {few}; the lens is {found.camera.lens}. Capture four or more", file=sys.stderr)
     if found.spoilers:
         print(f"  (!) {', '.join(found.spoilers)}: fits the other poses badly; look at it, or capture it again")
     alone = ", ".join(

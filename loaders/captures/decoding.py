@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.calibration.boards import Board
 from fpp_ml_bench.calibration.projector_points import Levels, Pose, Response, fit_response, levels_of, measure_pose
 from fpp_ml_bench.calibration.result import Calibration
+from fpp_ml_bench.calibration.solve import raise_all
 from fpp_ml_bench.coding.code import MIN_MODULATION, Limits, Reason
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.decoding.decode import Decoded, Directions, check_limits, decode_stack
@@ -312,8 +313,8 @@ def board_poses(
     the rig file ``sequence`` that stands in for the one sought (`optics.load_projection`), and the response of
     projector and camera where the captures tell it. ``bits`` and ``colour`` as in `read_frames`. The
     frames of every pose are examined; ``anyway`` takes those that are refused, too, and ``examined`` is called with a
-    pose's name and what was found. Raises FppBenchError naming the
-    pose or file."""
+    pose's name and what was found. Raises FppBenchError naming the pose or file, and all poses that are refused or have
+    no board."""
     rig = load_projection(sequence)
     if len(rig.directions) < 2:
         coded = " and ".join(rig.directions) or "crossed fringes"
@@ -323,6 +324,7 @@ def board_poses(
         )
     poses: list[Pose] = []
     levels: list[Levels] = []
+    unfit: list[CaptureError | CalibrationError] = []
     seen: dict[int, tuple[Path, int]] = {}
     for folder in pose_folders(captures):
         capture = read_frames(folder, count=len(rig.sequence), bits=bits, colour=colour)
@@ -340,15 +342,20 @@ def board_poses(
                     f"{folder}: image {index} is that of {other.name} (image {of_other}), byte for byte: two poses "
                     "can't share an image; put this pose's own frames there, or remove it"
                 )
-        decoded, examination = _examined_and_decoded(capture, rig, Limits(), anyway, calibrated=False)
-        examined(folder.name, examination)
-        white = rig.sequence.white
-        lit = frames.mean(axis=0, dtype=np.float64) if white is None else frames[white]
-        u_px, v_px = (decoded.details[direction].coordinate_px for direction in AXES)
-        poses.append(measure_pose(folder.name, np.clip(np.rint(lit), 0, 255).astype(np.uint8), u_px, v_px, board))
-        measured = levels_of(list(frames), (u_px, v_px), poses[-1], rig)
-        levels += [] if measured is None else [measured]
+        try:
+            decoded, examination = _examined_and_decoded(capture, rig, Limits(), anyway, calibrated=False)
+            examined(folder.name, examination)
+            white = rig.sequence.white
+            lit = frames.mean(axis=0, dtype=np.float64) if white is None else frames[white]
+            u_px, v_px = (decoded.details[direction].coordinate_px for direction in AXES)
+            poses.append(measure_pose(folder.name, np.clip(np.rint(lit), 0, 255).astype(np.uint8), u_px, v_px, board))
+        except (RefusedCapture, CalibrationError) as error:
+            unfit.append(error)
+        else:
+            measured = levels_of(list(frames), (u_px, v_px), poses[-1], rig)
+            levels += [] if measured is None else [measured]
         progress(1)
+    raise_all(unfit)
     return poses, rig, fit_response(levels)
 
 

@@ -74,6 +74,50 @@ def test_a_charuco_board_is_found_and_may_be_partly_hidden(hidden):
     assert np.isnan(corners).any() == hidden and np.nanmax(np.abs(corners - expected)) < 0.1
 
 
+def _charuco(columns, rows, before_4_6):
+    """Squares of 40 px in a margin of 40 px, and where the inner corners are."""
+    drawn = cv2.aruco.CharucoBoard((columns + 1, rows + 1), 10.0, 7.0, cv2.aruco.getPredefinedDictionary(MARKERS))
+    drawn.setLegacyPattern(before_4_6)
+    image = drawn.generateImage((40 * (columns + 1), 40 * (rows + 1)))
+    row, column = np.divmod(np.arange(columns * rows), columns)
+    border = cv2.copyMakeBorder(image, 40, 40, 40, 40, cv2.BORDER_CONSTANT, value=255)
+    return border, np.stack([column, row], axis=1) * 40 + 79.5
+
+
+MARKERS = cv2.aruco.DICT_5X5_50
+
+
+@pytest.mark.parametrize("rows", [5, 4])
+@pytest.mark.parametrize("before_4_6", [False, True])
+def test_markers_may_lie_as_before_opencv_4_6(rows, before_4_6):
+    image, expected = _charuco(7, rows, before_4_6)
+    image[:, 300:] = 255
+    corners = parse_board(f"charuco:7x{rows}:10:7:DICT_5X5_50").find(image)
+    assert np.isfinite(corners).all(axis=1).sum() >= 8 and np.nanmax(np.abs(corners - expected)) < 0.5
+
+
+@pytest.mark.parametrize(
+    "text, change, seen",
+    [
+        ("checker:7x5:10", lambda image: image[:, :-75], r"seen: 30 corners of a checker \(6 x 5\), in columns 90"),
+        ("checker:9x5:10", lambda image: image, r"seen: 35 corners of a checker \(7 x 5\), in columns 90"),
+        ("checker:7x5:10", lambda image: image[:90], "seen: no corners of a checker; the image has grey levels"),
+        ("circles:7x5:10:2.5", lambda image: image[:, 100:], r"seen: 30 dots, in columns \d+ to \d+ and rows"),
+        ("circles:7x5:10:2.5", lambda image: 255 - image[:, 100:], "seen: 30 dots, in"),
+        ("charuco:7x5:10:7", lambda image: image, r"24 markers of DICT_5X5_1000, .* has 24 of DICT_4X4_1000\), in col"),
+        ("charuco:7x5:10:7:DICT_5X5_50", lambda image: image[:, ::-1], "24 markers of DICT_5X5_50 in the mirrored"),
+        ("charuco:8x6:10:7:DICT_5X5_50", lambda image: image, r"24 markers .* numbered 0 to 23 \(the board has 31\)"),
+        ("charuco:7x5:10:7:DICT_5X5_50", lambda image: image[:60], "seen: no markers of DICT_5X5_50; the image has"),
+    ],
+)
+def test_of_a_board_that_is_not_found_it_is_said_what_was_seen(text, change, seen):
+    kind, _, spacing, *radius = text.split(":")
+    whole = parse_board(":".join((kind, "7x5", spacing, *radius)))
+    image = _charuco(7, 5, False)[0] if kind == "charuco" else _drawn(whole)
+    with pytest.raises(CalibrationError, match=seen):
+        parse_board(text).find(np.ascontiguousarray(change(image)))
+
+
 def test_labels_are_never_mirrored():
     board = parse_board("checker:7x5:10")
     for image in (_drawn(board), np.ascontiguousarray(_drawn(board)[:, ::-1])):

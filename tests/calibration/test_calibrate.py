@@ -211,6 +211,10 @@ def test_captures_that_give_no_rig_are_refused_by_name():
     _refused([poses[0], poses[1]._replace(projector=swapped), poses[2]], "pose pose1: the board lies at projector col")
     dark = poses[1].projector._replace(points_px=np.full((63, 2), np.nan), reasons={0: "only 3 of 80 pixels"})
     _refused([poses[0], poses[1]._replace(projector=dark), poses[2]], r"pose pose1: only 0 of 63.*point 0: only 3 of")
+    all_named = (
+        r"(?s)2 poses can't be used.*  pose pose1: only 0 of 63 .*  pose pose2: the camera sees the board mirrored"
+    )
+    _refused([poses[0], poses[1]._replace(projector=dark), mirrored], all_named)
 
 
 def test_parallel_boards_are_refused():

@@ -1,6 +1,7 @@
 """``fpp-bench calibrate`` from photographed boards, and the chain that it stands in: patterns, captures, rig, depth."""
 
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -44,7 +45,8 @@ def test_a_second_run_photographs_nothing_and_says_how_far_it_is_from_the_truth(
     words = ("--true-rig", virtual / "true.yaml", "--poses", 5, "--out", virtual / "again.yaml", "--lens", "none")
     assert calibrate("--virtual", virtual / "boards", *words) == 0
     assert before == {path: path.stat().st_mtime_ns for path in (virtual / "boards").rglob("*.png")}
-    assert "against truth" in capsys.readouterr().out
+    printed = capsys.readouterr()
+    assert "against truth" in printed.out and "warning:" not in printed.err and "note:" not in printed.err
     first, again = (load_rig(virtual / f"{name}.yaml") for name in ("found", "again"))
     assert again.baseline_m == pytest.approx(first.baseline_m, rel=1e-9)
 
@@ -132,8 +134,8 @@ def test_bad_input_is_a_sentence_and_no_rig_is_written(virtual, tmp_path, monkey
     assert said in error and "Traceback" not in error and not (tmp_path / "rig.yaml").exists()
 
 
-def write(file, boards, change):
-    cv2.imwrite(str(file), change(cv2.imread(str(boards / file), cv2.IMREAD_UNCHANGED)))
+def write(file, boards, change, out=Path()):
+    cv2.imwrite(str(out / file), change(cv2.imread(str(boards / file), cv2.IMREAD_UNCHANGED)))
 
 
 def test_poses_that_are_refused_calibrate_anyway_and_are_named(virtual, tmp_path, capsys):
@@ -157,6 +159,33 @@ def test_poses_that_are_refused_calibrate_anyway_and_are_named(virtual, tmp_path
     assert "pose_03: equal frames: frame_01.png and frame_02.png" in capsys.readouterr().err
     assert calibrate(*words, "--anyway") == 0
     assert "warning: pose_03: equal frames" in capsys.readouterr().err
+
+
+def test_three_poses_leave_none_out_and_say_so(virtual, tmp_path, capsys):
+    for pose in ("pose_00", "pose_01", "pose_02"):
+        shutil.copytree(virtual / "boards" / pose, tmp_path / "boards" / pose)
+    board = yaml.safe_load((virtual / "boards" / "board.yaml").read_text())["board"]
+    words = ("--board", board, "--sequence", virtual / "boards" / "rig.yaml", "--out", tmp_path / "rig.yaml")
+    assert calibrate(tmp_path / "boards", *words) == 0
+    printed = capsys.readouterr()
+    assert "note: 3 poses: none can be left out" in printed.err and "the lens is radial-1. Capture four" in printed.err
+    assert "nan" not in printed.out + printed.err + (tmp_path / "rig.yaml").read_text()
+
+
+def test_all_poses_without_a_board_are_named(virtual, tmp_path, capsys):
+    boards = tmp_path / "boards"
+    shutil.copytree(virtual / "boards", boards)
+    for pose in (1, 3):
+        for file in (boards / f"pose_{pose:02d}").glob("*.png"):
+            write(
+                file.relative_to(boards), boards, lambda image: np.where(np.arange(SIZE) < SIZE // 2, 30, image), boards
+            )
+    board = yaml.safe_load((boards / "board.yaml").read_text())["board"]
+    words = ("--board", board, "--sequence", boards / "rig.yaml", "--out", tmp_path / "rig.yaml", "--anyway")
+    assert calibrate(boards, *words) == 2
+    error = capsys.readouterr().err
+    assert "2 poses can't be used" in error and "dots, in columns" in error
+    assert "pose_01: the board" in error and "pose_03: the board" in error and "pose_02" not in error
 
 
 def test_gray_code_alone_calibrates(tmp_path, capsys):
