@@ -37,7 +37,7 @@ from huggingface_hub.utils.sha import git_hash
 from fpp_ml_bench import __version__
 from fpp_ml_bench.constants import FULL_SIZE, REPOSITORY_NAME
 from fpp_ml_bench.errors import DatasetError, LayoutError, PublishError, RemoteError
-from fpp_ml_bench.files import check_space, printable, read_json, write_atomically
+from fpp_ml_bench.files import LOCK_FILE, check_space, exclusive, printable, read_json, write_atomically
 from fpp_ml_bench.loaders.published.importing import Source
 from fpp_ml_bench.loaders.published.tree import FRINGE, INFO, RAW_SCANS, TRAINING, VARIANT_FOLDERS
 from fpp_ml_bench.loaders.sample import DEPTHS, LABELS, PREVIEW, RANGE
@@ -327,19 +327,17 @@ def staging_folder(chosen: Path | None, identity: str) -> Iterator[Path]:
     # With the versions that the bytes of a Parquet file or a PNG depend on.
     writers = f"{__version__} {pyarrow.__version__} {cv2.__version__}"
     expected = sha256(f"{identity}\n{writers}".encode()).hexdigest()
-    if chosen.exists() and not chosen.is_dir():
-        raise PublishError(f"--staging {chosen}: is a file; give a folder")
-    chosen.mkdir(parents=True, exist_ok=True)
-    held = mark.read_text(encoding="ascii", errors="replace").strip() if mark.is_file() else None
-    if held is None and any(chosen.iterdir()):
-        raise PublishError(f"--staging {chosen}: holds files that this command did not put there; give a new folder")
-    if held != expected:
-        shutil.rmtree(files, ignore_errors=True)
-        write_atomically(mark, f"{expected}\n".encode())
-    files.mkdir(exist_ok=True)
-    for unfinished in files.rglob(".*.tmp"):  # of a run that was killed
-        unfinished.unlink()
-    yield files
+    with exclusive(chosen / LOCK_FILE, chosen, "staging there", PublishError):
+        held = mark.read_text(encoding="ascii", errors="replace").strip() if mark.is_file() else None
+        if held is None and any(path.name != LOCK_FILE for path in chosen.iterdir()):
+            raise PublishError(f"--staging {chosen}: holds files that are not of this command; give a new folder")
+        if held != expected:
+            shutil.rmtree(files, ignore_errors=True)
+            write_atomically(mark, f"{expected}\n".encode())
+        files.mkdir(exist_ok=True)
+        for unfinished in files.rglob(".*.tmp"):  # of a run that was killed
+            unfinished.unlink()
+        yield files
 
 
 def dataset_licence(dataset: DatasetFolder, license_id: str | None) -> str:

@@ -24,7 +24,7 @@ import click
 from fpp_ml_bench import __version__
 from fpp_ml_bench.cli.options import help_text, problem_of
 from fpp_ml_bench.errors import FppBenchError
-from fpp_ml_bench.files import DISK_FULL, cause_of
+from fpp_ml_bench.files import DISK_FULL, cause_of, printable
 from fpp_ml_bench.machine import limit_threads, usable_cores
 from fpp_ml_bench.options import did_you_mean, nearest
 
@@ -162,6 +162,7 @@ ONE_THREAD = "demo", "predict", "time", "reliance", "robustness", "tradeoff"
 """Commands that compute with one thread unless ``--threads`` says otherwise; `diagnose` with one for each core."""
 
 _STREAMS = "stdout", "stderr"
+_LONGEST_LINE = 10_000  # of an error message, in characters
 _MEANINGS = """\
 {name} COMMAND --help shows its options.
 Exit status: 0 done, 1 a check failed, 2 bad input or failed, 130 stopped (143 by SIGTERM), 141 nobody reads the output.
@@ -219,6 +220,9 @@ def _status_of(prog: str, load: Callable[[], Any], argv: Sequence[str]) -> int:
         if extra is None:
             raise
         return _refused(prog, f"this needs {library}, which is not installed; pip install 'fpp-ml-bench[{extra}]'")
+    except MemoryError as error:
+        reason = f" ({error})" if str(error) else ""
+        return _refused(prog, f"there is not enough memory{reason}; allow more (ulimit -v), or give less at once")
     except KeyboardInterrupt as stop:
         _say(f"{prog}: stopped")
         return TERMINATED if isinstance(stop, _Terminated) else INTERRUPTED
@@ -262,14 +266,17 @@ def _refused(prog: str, problem: object) -> int:
 
 
 def _say(text: str) -> None:
+    """Print on standard error, with what in a name or a file would steer the terminal escaped."""
     with suppress(OSError):
-        print(text, file=sys.stderr)
+        print(*(printable(line, _LONGEST_LINE) for line in text.split("\n")), sep="\n", file=sys.stderr)
 
 
 def run_program(program: Program, argv: Sequence[str] | None = None) -> int:
     """Run the command that the first word of ``argv`` (default: the process's) names, or the default one."""
     words = list(sys.argv[1:] if argv is None else argv)
     name, first = program.name, words[0] if words else ""
+    # No command depends on a user's settings of matplotlib, which may ask for what is not there or be unreadable.
+    os.environ |= {"MATPLOTLIBRC": os.devnull, "MPLBACKEND": "agg"}
     # A folder of predictions has any name; one that is not there and almost that of a command is a slip.
     slip = nearest(first, program.commands) and not Path(first).exists()
     if first in program.commands:
