@@ -56,12 +56,12 @@ Drawn = TypeVar("Drawn")
 
 
 @contextmanager
-def own_settings(settings: Mapping[Any, Any]) -> Iterator[None]:
+def own_settings(settings: dict[Any, Any]) -> Iterator[None]:
     """Draw within by matplotlib's defaults and ``settings``: a user's own settings change nothing, and are as before
     afterwards. A dollar sign in a name is no formula."""
     from matplotlib import rc_context, rcParamsDefault
 
-    defaults = {key: value for key, value in rcParamsDefault.items() if not key.startswith("backend")}
+    defaults: dict[Any, Any] = {key: value for key, value in rcParamsDefault.items() if not key.startswith("backend")}
     with rc_context(defaults | {"text.parse_math": False} | settings):
         yield
 

@@ -116,7 +116,7 @@ def write_shard(
     names = columns(dataset) if viewer else dataset.manifest.columns()
     pictures = [name for name in names if viewer and (name == PREVIEW or name.startswith("frame_"))]
     schema = arrow_schema(published_features(dataset) if viewer else dataset.manifest.features())
-    stored = _stored_columns(dataset, [shard] if viewer else parts)
+    stored = {name: file for file in map(dataset.opened, [shard] if viewer else parts) for name, _ in file.types}
     samples = dataset.splits[shard.split][shard.first_row : shard.first_row + shard.rows]
     group_bytes = _VIEWER_GROUP_BYTES if viewer else _GROUP_BYTES
     rows = max(1, min(_MOST_ROWS_PER_GROUP, group_bytes // dataset.manifest.row_bytes))
@@ -129,7 +129,7 @@ def write_shard(
         ):
             for first in range(0, len(samples), rows):
                 group = samples[first : first + rows]
-                cells = {name: column.slice(first, len(group)) for name, column in stored.items()}
+                cells = {name: file.column(name, first, len(group)) for name, file in stored.items()}
                 for name in pictures:
                     contents = pool.map(partial(_png, dataset, column=name), group)
                     encoded = [{"bytes": content, "path": None} for content in contents]
@@ -141,7 +141,7 @@ def write_shard(
         raise OSError(f"{out.name}: {error}") from error
     finally:
         for part in parts:
-            dataset.forget(part)  # else the memory maps of all shards would stay open
+            dataset.forget(part)  # else the files of all shards would stay open
 
 
 def _settings(names: list[str], pictures: list[str], viewer: bool) -> dict[str, Any]:
@@ -163,18 +163,6 @@ def _settings(names: list[str], pictures: list[str], viewer: bool) -> dict[str, 
         "write_statistics": plain,
         "write_page_index": True,
     }
-
-
-def _stored_columns(dataset: DatasetFolder, parts: list[ShardFile]) -> dict[str, pa.ChunkedArray]:
-    """Columns of shard files, memory-mapped from disk: what is written has the same bits."""
-    stored = {}
-    for part in parts:
-        batches = dataset.mapped(part).batches
-        for name in batches[0].schema.names:
-            # An Array2D extension where `datasets` has been imported; the lists it stores are the same.
-            arrays = (batch.column(name) for batch in batches)
-            stored[name] = pa.chunked_array([getattr(array, "storage", array) for array in arrays])
-    return stored
 
 
 def published_features(dataset: DatasetFolder, config: str | None = None) -> dict[str, dict[str, Any]]:

@@ -225,13 +225,13 @@ def _in_order(plan: ShardPlan, rows: Iterable[Row]) -> Iterator[Row]:
 def _record_batch(columns: list[Any], schema: pa.Schema) -> pa.RecordBatch:
     """Columns in the schema's order: images as arrays (rows, H, W), used without a copy; all others as lists."""
     arrays = [
-        pa.array(column, field.type) if isinstance(column, list) else _image_column(column, field.type)
+        pa.array(column, field.type) if isinstance(column, list) else image_column(column, field.type)
         for column, field in zip(columns, schema, strict=True)
     ]
     return pa.record_batch(arrays, schema=schema)
 
 
-def _image_column(images: NDArray, kind: pa.DataType) -> pa.Array:
+def image_column(images: NDArray, kind: pa.DataType) -> pa.Array:
     """Images (rows, H, W) as a list of lists, on the same memory."""
     rows, height, width = images.shape
     images = np.ascontiguousarray(images)
