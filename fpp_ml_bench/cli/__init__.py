@@ -220,6 +220,12 @@ def _status_of(prog: str, load: Callable[[], Any], argv: Sequence[str]) -> int:
         if extra is None:
             raise
         return _refused(prog, f"this needs {library}, which is not installed; pip install 'fpp-ml-bench[{extra}]'")
+    except ImportError as error:
+        if "shared object" not in str(error):
+            raise
+        return _refused(
+            prog, f"a library can't be loaded ({error}); allow more memory (ulimit -v), or install it again"
+        )
     except MemoryError as error:
         reason = f" ({error})" if str(error) else ""
         return _refused(prog, f"there is not enough memory{reason}; allow more (ulimit -v), or give less at once")

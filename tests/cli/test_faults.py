@@ -312,7 +312,12 @@ def test_a_folder_that_is_made_whole_does_not_begin_in_a_link(tmp_path):
 def test_too_little_memory_is_a_message(capsys):
     for error in (MemoryError(), MemoryError("Unable to allocate 3 GiB")):
         assert run_command(Mock(side_effect=error), "fpp-bench x", []) == 2
+    library = ImportError("libarrow.so: failed to map segment from shared object")
+    assert run_command(Mock(side_effect=library), "fpp-bench x", []) == 2
+    with pytest.raises(ImportError, match="cannot import name"):
+        run_command(Mock(side_effect=ImportError("cannot import name 'x'")), "fpp-bench x", [])
     said = capsys.readouterr().err
+    assert "a library can't be loaded (libarrow.so: failed" in said
     assert "there is not enough memory;" in said and "memory (Unable to allocate 3 GiB); allow more" in said
 
 
