@@ -4,7 +4,7 @@ Of a colour only the luminance counts, with the weights of ITU-R BT.709, after i
 have been made linear. In a GLB all colours but those of images are linear already (glTF 2.0, section 3.9.2).
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -105,21 +105,13 @@ def texture_of(image: Image.Image) -> NDArray[np.float32]:
         raise ValueError(f"{image.width} x {image.height} px, expected at most {MOST_TEXTURE_PX} px in all")
     if image.mode == "F":
         raise ValueError("has floating-point pixels, expected 8 or 16 bits")
-    if image.mode.startswith("I"):  # 16 bits
-        return _by_rows(_grey_luminance, np.asarray(image))
-    return _by_rows(linear_luminance, np.asarray(image.convert("RGB")))
-
-
-def _grey_luminance(levels: NDArray[Any]) -> NDArray[np.float32]:
-    grey = np.rint(levels.astype(np.float64) / 257)
-    return np.asarray(_LINEAR[np.clip(grey, 0, GREY_LEVELS).astype(np.uint8)], dtype=np.float32)
-
-
-def _by_rows(luminance: Callable[[NDArray[Any]], NDArray[np.float32]], image: NDArray[Any]) -> NDArray[np.float32]:
-    result = np.empty(image.shape[:2], np.float32)
-    for start in range(0, len(image), _ROWS_AT_ONCE):
-        rows = slice(start, start + _ROWS_AT_ONCE)
-        result[rows] = luminance(image[rows])
+    deep = image.mode.startswith("I")  # 16 bits
+    levels = np.asarray(image if deep else image.convert("RGB"))
+    result = np.empty(levels.shape[:2], np.float32)
+    for start in range(0, len(levels), _ROWS_AT_ONCE):
+        rows = levels[start : start + _ROWS_AT_ONCE]
+        grey = np.clip(np.rint(rows / 257), 0, GREY_LEVELS).astype(np.uint8) if deep else None
+        result[start : start + _ROWS_AT_ONCE] = linear_luminance(rows) if grey is None else _LINEAR[grey]
     return result
 
 

@@ -10,7 +10,6 @@ import mmap
 import os
 import weakref
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,7 +36,6 @@ from fpp_ml_bench.loaders.sample import (
     void_pixels,
 )
 from fpp_ml_bench.loaders.storage.manifest import MANIFEST, ShardFile, damage_of, read_manifest
-from fpp_ml_bench.loaders.storage.shards import image_column
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.rig_file import rig_from_dict
 from fpp_ml_bench.optics.sequence import AnySequence
@@ -241,14 +239,6 @@ class DatasetFolder:
         return self._opened[shard.path]
 
 
-@dataclass(frozen=True)
-class _Part:
-    """A column in a record batch: its rows, and the places in the file of its buffers, each a start and bytes."""
-
-    rows: int
-    buffers: list[tuple[int, int]]
-
-
 class OpenShard:
     """An Arrow file, of whose columns parts are read: ``types`` are `stored_types`, and ``rows`` are
     those of the file. Raises `DatasetError` naming the file where it can't be read.
@@ -260,7 +250,8 @@ class OpenShard:
         import pyarrow as pa
 
         self.path, self._size = path, size
-        self._parts: dict[str, list[_Part]] = {}
+        self._parts: dict[str, list[tuple[int, list[tuple[int, int]]]]] = {}
+        """Of each column and record batch its rows, and its buffers' places in the file, each a start and bytes."""
         self._starts: dict[str, list[tuple[int, int]]] = {}
         try:
             with opened(path, links=True) as (stream, _):
@@ -272,7 +263,7 @@ class OpenShard:
             for batch in batches:
                 for name, column in zip(batch.schema.names, batch.columns, strict=True):
                     buffers = [skeleton.place(buffer) for buffer in column.buffers()]
-                    self._parts.setdefault(name, []).append(_Part(batch.num_rows, buffers))
+                    self._parts.setdefault(name, []).append((batch.num_rows, buffers))
         except (pa.ArrowException, PredictionError, OSError, ValueError) as error:
             raise DatasetError(f"{path}: can't be read as Arrow ({error}); run: fpp-bench verify") from error
         self.rows = sum(batch.num_rows for batch in batches)
@@ -293,14 +284,16 @@ class OpenShard:
         """So many rows from ``first`` on of a column, as they are stored."""
         import pyarrow as pa
 
+        from fpp_ml_bench.loaders.storage.shards import image_column  # imports pyarrow, which takes 0.2 s
+
         kind = dict(self.types)[name]
         if pa.types.is_list(kind):
             return image_column(np.stack([self.image(name, row) for row in range(first, first + rows)]), kind)
         parts = []
-        for part in self._parts[name]:
-            buffers = [pa.py_buffer(self._read(start, size, np.dtype(np.uint8))) for start, size in part.buffers]
+        for count, places in self._parts[name]:
+            buffers = [pa.py_buffer(self._read(*place, np.dtype(np.uint8))) for place in places]
             try:
-                array = pa.Array.from_buffers(kind, part.rows, [buffer if buffer.size else None for buffer in buffers])
+                array = pa.Array.from_buffers(kind, count, [buffer if buffer.size else None for buffer in buffers])
                 array.validate(full=True)
             except (pa.ArrowException, ValueError) as error:
                 raise self._fault(name, f"leads behind its end or is damaged ({error})") from error
@@ -313,20 +306,21 @@ class OpenShard:
             self._images(name) if name not in (*LABELS, *RANGE) else self.column(name, 0, self.rows)
 
     def _dtype(self, column: str) -> np.dtype:
-        kind: Any = dict(self.types).get(column)
-        try:
-            return np.dtype(kind.value_type.value_type.to_pandas_dtype())
-        except AttributeError:
-            raise self._fault(column, "is missing or holds no images") from None
+        import pyarrow as pa
+
+        kind = dict(self.types).get(column)
+        for dtype in (np.dtype(np.uint8), np.dtype(np.float32)):
+            if kind == pa.list_(pa.list_(pa.from_numpy_dtype(dtype))):
+                return dtype
+        raise self._fault(column, "is missing or holds no images")
 
     def _images(self, column: str) -> list[tuple[int, int]]:
         """Rows of each batch, and where in the file the first one's pixels begin."""
         if column not in self._starts:
             (height, width), dtype, index = self._size, self._dtype(column), np.dtype(np.int32)
             starts = []
-            for part in self._parts[column]:
-                lists = ((part.buffers[1], part.rows, height), (part.buffers[3], part.rows * height, width))
-                (start, size), pixels = part.buffers[5], part.rows * height * width
+            for rows, (_, outer, _, inner, _, (start, size)) in self._parts[column]:
+                lists, pixels = ((outer, rows, height), (inner, rows * height, width)), rows * height * width
                 fits = size >= pixels * dtype.itemsize and all(
                     size >= (count + 1) * index.itemsize
                     and np.array_equal(self._read(at, count + 1, index), np.arange(count + 1) * length)
@@ -334,7 +328,7 @@ class OpenShard:
                 )
                 if not fits:
                     raise self._fault(column, f"does not hold images of {height} x {width} px")
-                starts.append((part.rows, start))
+                starts.append((rows, start))
             self._starts[column] = starts
         return self._starts[column]
 
@@ -374,8 +368,7 @@ class _Skeleton(io.RawIOBase):
         return True
 
     def read(self, count: int = -1) -> Any:
-        left = max(self._size - self._position, 0)
-        count = left if count < 0 else min(count, left)
+        count = min(count, max(self._size - self._position, 0))
         if count <= _METADATA_BYTES:
             content: Any = os.pread(self._file, count, self._position)
         else:

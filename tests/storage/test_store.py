@@ -262,9 +262,11 @@ def written_anew(path, change, **options):
         (lambda columns: {**columns, "depth": pa.nulls(len(columns["depth"]), columns["depth"].type)}, {}),
         (lambda columns: {**columns, "depth": columns["sample"].dictionary_encode()}, {}),
         (lambda columns: {**columns, "depth": columns["sample"]}, {}),
+        (lambda columns: {**columns, "depth": pa.array([[[[1.0]]]] * len(columns["sample"]))}, {}),
+        (lambda columns: {**columns, "depth": pa.array([[["a"]]] * len(columns["sample"]))}, {}),
         (lambda columns: {name: column for name, column in columns.items() if name != "depth"}, {}),
     ],
-    ids=["lz4", "zstd", "nulls", "dictionary", "text", "missing"],
+    ids=["lz4", "zstd", "nulls", "dictionary", "text", "deeper", "words", "missing"],
 )
 def test_shards_of_another_form_are_refused(tmp_path, change, options):
     path, size = shard_parts(tmp_path)
