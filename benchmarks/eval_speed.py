@@ -87,7 +87,7 @@ def depth_map(size: int, seed: int) -> NDArray[np.float32]:
 
 def prepare(data: Path, predictions: Path, targets: Path, size: int, samples: int) -> None:
     """Write a dataset of ``samples`` views, predictions with 2 mm of noise, and the targets as .npy."""
-    for path in (data / ".build", predictions, targets):
+    for path in (data, predictions, targets):
         path.mkdir(parents=True)
     names = [(f"{name}_{view}", name, view) for name in TEST_OBJECTS for view in VIEWS][:samples]
     objects: dict[str, list[tuple[str, str, str]]] = {}
@@ -104,7 +104,6 @@ def prepare(data: Path, predictions: Path, targets: Path, size: int, samples: in
             np.save(targets / f"{sample}.npy", depth)
             rows.append(Row(sample, name, view, {0: np.zeros(depth.shape, np.uint8)}, depth, None))
         receipts.append(ShardWriter(manifest).write(data, plan, rows))
-    (data / ".build").rmdir()
     Assembly(plans, lambda plan, folder: (), manifest).filled(receipts).write(data)
     (predictions / "submission.yaml").write_text(_DESCRIPTION)
 

@@ -1,9 +1,10 @@
-"""Foreign containers: MATLAB files, images, Arrow and Parquet. Libraries read them in another process.
+"""Foreign containers: MATLAB files, images, Arrow and Parquet, and, for `loaders.render.mesh_files`, meshes. Libraries
+read them in another process.
 
-The libraries that read these forms (SciPy, HDF5, Arrow) trust the lengths in a file: a damaged one may end the process
-that reads it, and a compressed page or buffer may state any unpacked size. So they run in a process of their own, with
-an upper limit of memory, which is ended when it takes too long. It goes on with the next file, so that a folder of
-files starts one process for each thread that reads.
+The libraries that read these forms (SciPy, HDF5, Arrow, trimesh) trust the lengths in a file: a damaged one may end the
+process that reads it, and a compressed page or buffer may state any unpacked size. So they run in a process of their
+own, with an upper limit of memory, which is ended when it takes too long. It goes on with the next file, so that a
+folder of files starts one process for each thread that reads.
 
 Errors of reading are `PredictionError` without a subject ("is cut off"); `from_file` makes the room's own error of it.
 """
@@ -144,15 +145,20 @@ def from_file(
         raise raised(f"{path}: {error}") from None
 
 
-def _with_array(facts: dict[str, Any], values: NDArray[Any]) -> Answer:
-    """A reader's answer that holds an array."""
-    facts |= {"dtype": values.dtype.str, "shape": values.shape}
-    return facts, np.ascontiguousarray(values).reshape(-1).view(np.uint8)
+def with_arrays(facts: dict[str, Any], *arrays: NDArray[Any]) -> Answer:
+    """A reader's answer that holds arrays."""
+    facts["arrays"] = [(values.dtype.str, values.shape) for values in arrays]
+    parts = [np.ascontiguousarray(values).reshape(-1).view(np.uint8) for values in arrays]
+    return facts, parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
-def _array(facts: dict[str, Any], content: bytes) -> NDArray[Any]:
-    """The array of such an answer, read only; taken out of ``facts``."""
-    return np.frombuffer(content, facts.pop("dtype")).reshape(facts.pop("shape"))
+def arrays_of(facts: dict[str, Any], content: bytes) -> list[NDArray[Any]]:
+    """The arrays of such an answer, read only; taken out of ``facts``."""
+    arrays, start = [], 0
+    for dtype, shape in facts.pop("arrays"):
+        arrays.append(np.frombuffer(content, dtype, math.prod(shape), start).reshape(shape))
+        start += arrays[-1].nbytes
+    return arrays
 
 
 _HDF5_AT, _HDF5_SIGNATURE = 512, b"\x89HDF\r\n\x1a\n"
@@ -166,7 +172,7 @@ def parse_matrix(content: bytes, variable: str, largest: int = LARGEST_BYTES) ->
     """Variable ``variable`` of a MATLAB v5 or v7.3 file as in MATLAB: a real numeric matrix (rows, columns) of any
     dtype. PredictionError when it can't be read, lacks the variable (the message lists its variables), or the variable
     is not a real numeric matrix or unpacks to more than ``largest`` bytes. No other file is read. v7.3 needs h5py."""
-    return _array(*guarded(_read_matrix, content, largest, variable=variable))
+    return arrays_of(*guarded(_read_matrix, content, largest, variable=variable))[0]
 
 
 def _read_matrix(content: bytes, largest: int, variable: str) -> Answer:
@@ -187,7 +193,7 @@ def _read_matrix(content: bytes, largest: int, variable: str) -> Answer:
         raise PredictionError(
             f"a data element can't be read as {form}, the file is cut off or damaged ({reason})"
         ) from None
-    return _with_array({}, values)
+    return with_arrays({}, values)
 
 
 class _WholeFile(io.BytesIO):
@@ -309,7 +315,7 @@ def parse_image(content: bytes, largest: int = LARGEST_BYTES, unpacked: int | No
     """The image in a PNG, BMP, TIFF or JPEG file, complete and with right checksums. ``unpacked``: of a PNG, the bytes
     that its pixels must unpack to, and nothing may follow it. PredictionError for any other content."""
     facts, values = guarded(_read_image, content, largest, unpacked=unpacked)
-    return StoredImage(_array(facts, values), **facts)
+    return StoredImage(arrays_of(facts, values)[0], **facts)
 
 
 def _read_image(content: bytes, largest: int, unpacked: int | None) -> Answer:
@@ -355,7 +361,7 @@ def _read_image(content: bytes, largest: int, unpacked: int | None) -> Answer:
         reason = printable(" ".join(str(error).split()), 100)
         expected = "expected a PNG, BMP or TIFF image, found a file that"
         raise PredictionError(f"{expected} is cut off, damaged or of another form ({reason})") from None
-    return _with_array(facts, levels)
+    return with_arrays(facts, levels)
 
 
 def _stored_bits(image: Any, content: bytes) -> int:

@@ -14,6 +14,7 @@ from contextlib import contextmanager, suppress
 from functools import cache
 from itertools import accumulate
 from pathlib import Path, PurePosixPath
+from secrets import token_hex
 from typing import IO, Any
 
 from fpp_ml_bench.errors import BuildError, FppBenchError, PredictionError
@@ -27,6 +28,7 @@ LARGEST = 1e100
 """Magnitude of a number in a file from outside, at most: sums, products and ratios of such numbers stay finite, and no
 length, time or count comes near."""
 CORRECT = "correct the file"
+_PIECE_BYTES = 1 << 18  # of a file that is hashed, at a time: they stay in the processor's cache
 
 # Control, format (bidirectional overrides, zero-width), surrogate, and line or paragraph separators.
 _FORBIDDEN = frozenset({"Cc", "Cf", "Cs", "Zl", "Zp"})
@@ -172,20 +174,62 @@ def naming(path: Path) -> Iterator[None]:
         raise
 
 
-def write_atomically(path: Path, content: bytes, sync: bool = True) -> None:
-    """Write a file so that it is there complete or not at all, with ``sync`` (which takes milliseconds) also after a
-    power cut. An `OSError` names it."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+UNFINISHED = r"\.[0-9a-f]{16}\.tmp"
+"""Pattern of the name of a file that is not yet complete, which a killed process may leave."""
+
+
+@contextmanager
+def whole_file(path: Path, sync: bool = True) -> Iterator[IO[bytes]]:
+    """A new file to be written within, which becomes ``path`` at the end, and is removed after an error: it is there
+    complete or not at all, with ``sync`` (which takes milliseconds) also after a power cut. Its name until then can't
+    be guessed, and no link is followed: in a folder that others write to, nobody can plant one. An `OSError` names
+    ``path``."""
+    temporary = path.with_name(f".{token_hex(8)}.tmp")
     with naming(path):
         try:
-            with temporary.open("wb") as file:
-                file.write(content)
+            with temporary.open("xb") as file:
+                yield file
                 file.flush()
                 if sync:
                     os.fsync(file.fileno())
             temporary.replace(path)
         finally:
             temporary.unlink(missing_ok=True)
+
+
+def write_atomically(path: Path, content: bytes, sync: bool = True) -> None:
+    """Write ``content`` as a `whole_file`."""
+    with whole_file(path, sync) as file:
+        file.write(content)
+
+
+@contextmanager
+def whole_folder(
+    out: Path, activity: str, error_type: type[FppBenchError], empty: str = "give a new folder"
+) -> Iterator[Path]:
+    """A folder to write into, which becomes ``out`` when the block succeeds, and is removed when it fails. What a
+    killed process left of one is removed. Raises ``error_type`` where ``out`` is not empty (with what to do then), is a
+    file, is being written by another process, or can't be written."""
+    target = out.resolve()
+    if target.is_dir() and any(target.iterdir()):
+        raise error_type(f"{out}: is not empty; {empty}")
+    staging = target.with_name(f".{target.name}.unfinished")
+    if staging.is_symlink():
+        raise error_type(f"{staging}: is a link, and this command needs a folder of that name; remove it")
+    with exclusive(staging / LOCK_FILE, out, activity, error_type):
+        content = staging / "files"
+        try:
+            shutil.rmtree(content, ignore_errors=True)
+            content.mkdir()
+            yield content
+            content.replace(target)
+        except OSError as error:
+            raise error_type(
+                f"{out}: can't be written ({error.strerror or error}); nothing was left there. Free some "
+                "space or choose another disk"
+            ) from error
+        finally:
+            shutil.rmtree(staging, ignore_errors=True)
 
 
 def write_files(folder: Path, contents: Mapping[str, bytes], error_type: type[FppBenchError]) -> list[Path]:
@@ -200,21 +244,25 @@ def write_files(folder: Path, contents: Mapping[str, bytes], error_type: type[Fp
     return [folder / name for name in contents]
 
 
-def file_hash(path: Path) -> str:
-    """XXH3 128-bit hash of a file's bytes, hex; a memory map, so a file in the page cache goes at memory speed."""
-    import mmap
+def holds(folder: Path, contents: Mapping[str, bytes]) -> bool:
+    """Whether ``folder`` holds exactly the files ``contents``, by name."""
+    if not folder.is_dir() or {path.name for path in folder.iterdir()} != contents.keys():
+        return False
+    try:
+        return all(read_bounded(folder / name, len(content)) == content for name, content in contents.items())
+    except PredictionError:  # longer, or no file
+        return False
 
+
+def file_hash(path: Path) -> str:
+    """XXH3 128-bit hash of a file's bytes, hex. Read and not mapped: a file that is cut meanwhile has another hash, and
+    would end a process that maps it."""
     import xxhash
 
-    digest = xxhash.xxh3_128()
-    if path.stat().st_size:
-        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-            view = memoryview(content)
-            for start in range(0, len(view), 1 << 24):
-                if content.size() < len(view):
-                    break  # cut meanwhile: another hash tells, and reading on would end the process
-                digest.update(view[start : start + (1 << 24)])
-            view.release()
+    digest, piece = xxhash.xxh3_128(), memoryview(bytearray(_PIECE_BYTES))
+    with path.open("rb", buffering=0) as file:
+        while count := file.readinto(piece):
+            digest.update(piece[:count])
     return digest.hexdigest()
 
 
@@ -250,7 +298,7 @@ def exclusive(
 
     if folder.exists() and not folder.is_dir():
         raise error_type(f"{folder}: is a file; give a folder")
-    lock = filelock.FileLock(lock_file, timeout=0)
+    lock, made = filelock.FileLock(lock_file, timeout=0), not lock_file.parent.exists()
     try:
         lock_file.parent.mkdir(parents=True, exist_ok=True)
         lock.acquire()
@@ -265,6 +313,8 @@ def exclusive(
         with suppress(OSError):
             if os.path.samestat(held, lock_file.stat()):  # the folder may have been moved away
                 lock_file.unlink()  # while it is held: filelock never takes a file that is gone
+                if made:
+                    lock_file.parent.rmdir()  # where nothing was written into it
         lock.release()
 
 

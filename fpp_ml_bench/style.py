@@ -11,7 +11,8 @@ import hashlib
 import html
 import textwrap
 from base64 import b64encode
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, wraps
 from io import BytesIO
@@ -54,15 +55,25 @@ Arguments = ParamSpec("Arguments")
 Drawn = TypeVar("Drawn")
 
 
+@contextmanager
+def own_settings(settings: dict[Any, Any]) -> Iterator[None]:
+    """Draw within by matplotlib's defaults and ``settings``: a user's own settings change nothing, and are as before
+    afterwards. A dollar sign in a name is no formula."""
+    from matplotlib import rc_context, rcParamsDefault
+
+    defaults: dict[Any, Any] = {key: value for key, value in rcParamsDefault.items() if not key.startswith("backend")}
+    with rc_context(defaults | {"text.parse_math": False} | settings):
+        yield
+
+
 def styled(draw: Callable[Arguments, Drawn]) -> Callable[Arguments, Drawn]:
-    """A function that draws, in this style; matplotlib's own settings stay as they were."""
+    """A function that draws, in this style, as `own_settings`."""
 
     @wraps(draw)
     def in_style(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Drawn:
-        from matplotlib import rc_context
         from matplotlib.rcsetup import cycler
 
-        with rc_context(_STYLE | {"axes.prop_cycle": cycler(color=LINE_COLOURS)}):
+        with own_settings(_STYLE | {"axes.prop_cycle": cycler(color=LINE_COLOURS)}):
             return draw(*args, **kwargs)
 
     return in_style
@@ -75,10 +86,17 @@ def figure(width_in: float, height_in: float, **settings: Any) -> "Figure":
     return Figure(figsize=(width_in, height_in), **{"dpi": DPI, "layout": "constrained", **settings})
 
 
+@styled
 def figure_png(drawn: "Figure", reduced: bool = False) -> bytes:
     """A figure as PNG, the same bytes each time; ``reduced`` to 256 colours, a third of the size."""
+    from matplotlib.ticker import LogFormatterMathtext
     from PIL import Image
 
+    for axes in drawn.axes:
+        for axis in (axes.xaxis, axes.yaxis):
+            if isinstance(axis.get_major_formatter(), LogFormatterMathtext):  # a formula, which is no text here
+                axis.set_major_formatter("{x:g}")
+                axis.set_minor_formatter("")
     content, smaller = BytesIO(), BytesIO()
     drawn.savefig(content, format="png", facecolor="white", metadata={"Software": None})
     if not reduced:

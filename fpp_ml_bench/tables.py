@@ -5,7 +5,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.measure import Measurement
@@ -13,6 +13,9 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from fpp_ml_bench.files import printable
+
+if TYPE_CHECKING:
+    from rich.progress import TextColumn
 
 _UNLIMITED = 1_000_000
 _PLAIN = frozenset(" -,+()/%=.")
@@ -108,6 +111,13 @@ class Table(RichTable):
         titles = [str(self.columns[number].header) for number in numbers]
         first = [numbers[titles.index(title)] for title in self.first_out if title in titles]
         return first + [number for number in numbers if number not in first]
+
+
+def words(form: str) -> "TextColumn":
+    """A column of a progress bar: a format of its task. What it holds is no markup."""
+    from rich.progress import TextColumn
+
+    return TextColumn(form, markup=False)
 
 
 def markdown_text(text: str) -> str:

@@ -13,11 +13,14 @@ import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from hashlib import file_digest, sha256
 from pathlib import Path
-from typing import Any, Literal
+from threading import Thread
+from typing import Any, Literal, TypeVar
 
 import cv2
 import pyarrow
@@ -37,7 +40,7 @@ from huggingface_hub.utils.sha import git_hash
 from fpp_ml_bench import __version__
 from fpp_ml_bench.constants import FULL_SIZE, REPOSITORY_NAME
 from fpp_ml_bench.errors import DatasetError, LayoutError, PublishError, RemoteError
-from fpp_ml_bench.files import check_space, printable, read_json, write_atomically
+from fpp_ml_bench.files import LOCK_FILE, check_space, exclusive, printable, read_json, write_atomically
 from fpp_ml_bench.loaders.published.importing import Source
 from fpp_ml_bench.loaders.published.tree import FRINGE, INFO, RAW_SCANS, TRAINING, VARIANT_FOLDERS
 from fpp_ml_bench.loaders.sample import DEPTHS, LABELS, PREVIEW, RANGE
@@ -48,11 +51,14 @@ from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.rig_file import save_rig
 from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
+T = TypeVar("T")
 Kind = Literal["dataset", "space", "model"]
 Status = Literal["new", "changed", "unchanged", "deleted"]
 
 MARK = "fpp-bench.json"
 """File that marks a repository as published by this command, and says what it holds: the next run may replace it."""
+ANSWER_S = 45
+"""A question to the Hub is answered within so many seconds, or nobody is there; files take as long as they take."""
 _BATCH_FILES = 8
 """Files are sent before the commit so many at a time, for the progress bar."""
 _ANSWERS = {
@@ -64,8 +70,6 @@ _ANSWERS = {
     413: "too large for the Hub (413)",
     429: "too many requests (429); wait some minutes, then run the same command again",
 }
-
-
 PICTURE = "overview.png"
 OWNED = ("data/", f"{MESH_FOLDER}/")
 _LICENCE = re.compile(r"[a-z0-9][a-z0-9.-]{0,39}")
@@ -198,8 +202,8 @@ class Hub:
     def check_token(self) -> set[str]:
         """Names that the token may publish under: its user and their organisations. `PublishError` without a token."""
         with self._explained("asking who the token belongs to"):
-            me = self._api.whoami()
-        return {str(me.get("name"))} | {str(org.get("name")) for org in me.get("orgs") or ()}
+            me = _answer(self._api.whoami)
+            return {str(me.get("name"))} | {str(org.get("name")) for org in me.get("orgs") or ()}
 
     def check_may_create(self, repo: str, names: set[str]) -> None:
         """`PublishError` where the token may not make repositories for the owner of ``repo``."""
@@ -212,7 +216,7 @@ class Hub:
         `Remote` without a commit where no repository is visible."""
         with self._explained(f"reading {kind} {repo}"):
             try:
-                info = self._api.repo_info(repo, repo_type=kind, revision=revision)
+                info = _answer(lambda: self._api.repo_info(repo, repo_type=kind, revision=revision))
             except hub_errors.RevisionNotFoundError as error:
                 raise self._error(f"{repo}: has no branch, tag or commit {printable(revision, 60)!r}") from error
             except hub_errors.GatedRepoError:
@@ -222,8 +226,10 @@ class Hub:
                 if error.response.status_code == 401 and get_token():
                     raise
                 return Remote(None)
-            tree = self._api.list_repo_tree(repo, repo_type=kind, recursive=True, revision=info.sha)
-            files = {entry.path: entry for entry in tree if isinstance(entry, RepoFile)}
+            tree = partial(self._api.list_repo_tree, repo, repo_type=kind, recursive=True, revision=info.sha)
+            files = {entry.path: entry for entry in _answer(lambda: list(tree())) if isinstance(entry, RepoFile)}
+            if not all(isinstance(name, str) and isinstance(file.size, int) for name, file in files.items()):
+                raise TypeError("files without names or sizes")
             return Remote(info.sha or "", bool(info.private), files)
 
     def download(self, repo: str, commit: str, patterns: list[str]) -> Path:
@@ -243,7 +249,8 @@ class Hub:
         if MARK not in remote.files or remote.files[MARK].size > 1 << 20:
             raise PublishError(f"{repo}: this {kind} was not published by fpp-bench (no {MARK} there)")
         with tempfile.TemporaryDirectory() as cache, self._explained(f"reading {MARK} of {kind} {repo}"):
-            path = self._api.hf_hub_download(repo, MARK, repo_type=kind, revision=remote.commit, cache_dir=cache)
+            part = {"repo_type": kind, "revision": remote.commit, "cache_dir": cache}
+            path = _answer(lambda: self._api.hf_hub_download(repo, MARK, **part))
             about = read_json(Path(path), PublishError, f"it is of {repo}: publish the {kind} again")
         return about if isinstance(about, dict) else {}
 
@@ -262,7 +269,8 @@ class Hub:
         if not remote.exists:
             with self._explained(f"making {kind} {repo}"):
                 sdk = "static" if kind == "space" else None
-                self._api.create_repo(repo, repo_type=kind, private=private or None, space_sdk=sdk)
+                made = {"repo_type": kind, "private": private or None, "space_sdk": sdk}
+                _answer(lambda: self._api.create_repo(repo, **made))
         with self._explained(f"sending to {kind} {repo}"):
             to_send = [change.path for change in changes if change.status in ("new", "changed")]
             additions = [CommitOperationAdd(path, publication.folder / path) for path in to_send]
@@ -308,10 +316,33 @@ class Hub:
                 f"{doing}: {self.endpoint} can't be reached ({printable(str(cause)) or type(cause).__name__}); check "
                 f"the network and HF_ENDPOINT, then run the same command again: {self._continues}"
             ) from error
+        except TimeoutError as error:
+            raise Unreachable(
+                f"{doing}: {self.endpoint} gave no answer within {ANSWER_S} s; check the network and HF_ENDPOINT"
+            ) from error
+        except (AttributeError, TypeError, LookupError) as error:
+            raise self._error(
+                f"{doing}: {self.endpoint} gave an answer that is not one of the Hub ({printable(str(error))}); check "
+                "HF_ENDPOINT, and whether a proxy answers in its place"
+            ) from error
         except (ValueError, RuntimeError, OSError) as error:
             # The client's refusals of an answer or a card (ValueError), and its transfer library (RuntimeError).
             lines = " ".join(printable(line) for line in str(error).splitlines())
             raise self._error(f"{doing}: {lines or type(error).__name__}; run the same command again") from error
+
+
+def _answer(question: Callable[[], T]) -> T:
+    """What the Hub answers. TimeoutError after `ANSWER_S`: the client itself would wait for ever."""
+    answer: Future[T] = Future()
+
+    def ask() -> None:
+        try:
+            answer.set_result(question())
+        except BaseException as error:  # raised where the answer is waited for
+            answer.set_exception(error)
+
+    Thread(target=ask, daemon=True).start()
+    return answer.result(ANSWER_S)
 
 
 @contextmanager
@@ -327,19 +358,17 @@ def staging_folder(chosen: Path | None, identity: str) -> Iterator[Path]:
     # With the versions that the bytes of a Parquet file or a PNG depend on.
     writers = f"{__version__} {pyarrow.__version__} {cv2.__version__}"
     expected = sha256(f"{identity}\n{writers}".encode()).hexdigest()
-    if chosen.exists() and not chosen.is_dir():
-        raise PublishError(f"--staging {chosen}: is a file; give a folder")
-    chosen.mkdir(parents=True, exist_ok=True)
-    held = mark.read_text(encoding="ascii", errors="replace").strip() if mark.is_file() else None
-    if held is None and any(chosen.iterdir()):
-        raise PublishError(f"--staging {chosen}: holds files that this command did not put there; give a new folder")
-    if held != expected:
-        shutil.rmtree(files, ignore_errors=True)
-        write_atomically(mark, f"{expected}\n".encode())
-    files.mkdir(exist_ok=True)
-    for unfinished in files.rglob(".*.tmp"):  # of a run that was killed
-        unfinished.unlink()
-    yield files
+    with exclusive(chosen / LOCK_FILE, chosen, "staging there", PublishError):
+        held = mark.read_text(encoding="ascii", errors="replace").strip() if mark.is_file() else None
+        if held is None and any(path.name != LOCK_FILE for path in chosen.iterdir()):
+            raise PublishError(f"--staging {chosen}: holds files that are not of this command; give a new folder")
+        if held != expected:
+            shutil.rmtree(files, ignore_errors=True)
+            write_atomically(mark, f"{expected}\n".encode())
+        files.mkdir(exist_ok=True)
+        for unfinished in files.rglob(".*.tmp"):  # of a run that was killed
+            unfinished.unlink()
+        yield files
 
 
 def dataset_licence(dataset: DatasetFolder, license_id: str | None) -> str:

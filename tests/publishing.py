@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -49,7 +48,6 @@ def make_all_frames(folder: Path, odd: bool = False, seed: int = 0) -> DatasetFo
                 rows.append(Row(sample, name, view, frames, depth, depth * np.float32(1.0001), {}, *maps))
             plans.append(plan)
             receipts.append(ShardWriter(manifest).write(folder, plan, rows))
-    shutil.rmtree(folder / ".build")
     mesh = folder / "meshes" / "bowl.ply"
     mesh.write_bytes(b"ply\nformat ascii 1.0\nend_header\n")
     others = [describe_file(folder, mesh)]

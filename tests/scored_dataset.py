@@ -93,7 +93,6 @@ def make_dataset(
                 )
             plans.append(plan)
             receipts.append(writer.write(folder, plan, rows))
-    (folder / ".build").rmdir()
     Assembly(plans, lambda plan, folder: (), manifest).filled(receipts).write(folder)
     return DatasetFolder(folder)
 

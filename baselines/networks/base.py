@@ -14,6 +14,9 @@ from torch.nn import functional
 
 from fpp_ml_bench.errors import NetworkError
 
+MOST = 1 << 12
+"""Of an option that is a whole number, such as a width or the side of a map: beyond all that a machine can train."""
+
 
 class FringeNetwork(nn.Module, ABC):
     """A network from one fringe image to one depth map in the training representation.
@@ -87,8 +90,8 @@ def checked_option(network: str, option: str, value: object, kind: type, rule: t
     """``value`` as a ``kind``: a float in [0, 1), or a whole number, by ``rule`` at least so much and a multiple of so
     much; else `NetworkError`."""
     least, multiple = rule
-    words = f"a whole number, at least {least}" + (f" and a multiple of {multiple}" if multiple > 1 else "")
-    allowed = isinstance(value, int) and value >= least and value % multiple == 0
+    words = f"a whole number, {least} to {MOST}" + (f" and a multiple of {multiple}" if multiple > 1 else "")
+    allowed = isinstance(value, int) and least <= value <= MOST and value % multiple == 0
     if kind is float:
         words, allowed = "a number in [0, 1)", isinstance(value, int | float) and 0 <= value < 1
     if isinstance(value, bool) or not allowed:

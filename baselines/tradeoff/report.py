@@ -40,6 +40,7 @@ from fpp_ml_bench.style import (
     figure,
     figure_png,
     millimetres,
+    own_settings,
     percent,
     styled,
     three_digits,
@@ -180,7 +181,6 @@ class Scatter:
                     ha="center",
                     va="center",
                     color=COLOURS["ink"],
-                    parse_math=False,
                     gid=f"label-{mark.number}",
                     arrowprops=line | {"gid": f"label-{mark.number}"} if gap >= _NUMBER_GAPS[1] else None,
                 )
@@ -194,7 +194,7 @@ class Scatter:
         styled by attributes and by the page, which forbids style of its own. ``css``, its classes, and ``about``, its
         description, tell it from other pictures of the page."""
         text = io.StringIO()
-        with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": css + about, "font.size": 12}):
+        with own_settings({"svg.fonttype": "none", "svg.hashsalt": css + about, "font.size": 12}):
             figure = Figure(figsize=(width / 72, height / 72), dpi=72)
             inner = width - _LEFT - _RIGHT, height - _TOP - _BOTTOM
             axes = figure.add_axes((_LEFT / width, _BOTTOM / height, inner[0] / width, inner[1] / height))

@@ -30,9 +30,10 @@ from torch.optim import Optimizer
 from fpp_ml_bench.baselines.networks.base import tiny_floats_are_zero
 from fpp_ml_bench.baselines.training.weights import Family, file_bytes, read_file
 from fpp_ml_bench.errors import TrainingError, WeightsError
-from fpp_ml_bench.files import LOCK_FILE, cause_of, exclusive, read_json, write_atomically
+from fpp_ml_bench.files import LOCK_FILE, cause_of, exclusive, printable, read_json, write_atomically
 from fpp_ml_bench.machine import keep_freed_memory
 from fpp_ml_bench.style import figure, figure_png, styled
+from fpp_ml_bench.tables import words
 
 CHECKPOINT, RECIPE = "checkpoint.safetensors", "recipe.json"
 CHECK_EVERY = 16
@@ -128,16 +129,16 @@ class Display(bar.Progress):
 
     def __init__(self, name: str, steps: int, show: bool) -> None:
         super().__init__(
-            bar.TextColumn("{task.description}"),
+            words("{task.description}"),
             bar.BarColumn(bar_width=20),
-            bar.TextColumn("{task.fields[state]}"),
+            words("{task.fields[state]}"),
             bar.TimeElapsedColumn(),
-            bar.TextColumn("left at most"),
+            words("left at most"),
             bar.TimeRemainingColumn(),
             console=Console(stderr=True, quiet=not show),
             disable=not show,
         )
-        self.bar = self.add_task(name, total=steps, state="")
+        self.bar = self.add_task(printable(name), total=steps, state="")
 
     def step(self, steps: int = 1) -> None:
         """So many more steps are done."""

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from hashlib import sha256
 from pathlib import Path
+from threading import get_ident
 from typing import TYPE_CHECKING, Annotated, Any
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
@@ -18,8 +19,8 @@ from pydantic.dataclasses import dataclass as checked_dataclass
 
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.depth import Normalisation, RangeRule
-from fpp_ml_bench.errors import FppBenchError, WeightsError
-from fpp_ml_bench.files import file_content, printable, write_atomically
+from fpp_ml_bench.errors import FppBenchError, NetworkError, PredictionError, WeightsError
+from fpp_ml_bench.files import file_content, opened, printable, strict_json, write_atomically
 from fpp_ml_bench.loaders.storage.benchmark import benchmark_of, intended_benchmark
 from fpp_ml_bench.loaders.storage.manifest import Manifest
 from fpp_ml_bench.options import did_you_mean
@@ -32,8 +33,8 @@ SHIPPED = Path(__file__).resolve().parent.parent / "weights"
 """Folder of the weights that come with the package, ``{name}.safetensors``."""
 SUFFIX = ".safetensors"
 VERSION = "1"
-LARGEST_BYTES = 1 << 32
-"""Of a weights file, in bytes."""
+LARGEST_BYTES, LARGEST_HEADER_BYTES = 1 << 32, 1 << 26
+"""Of a weights file, and of its header, in bytes."""
 HEAD_PREFIX = "range_head."
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -259,27 +260,13 @@ def read_file(path: Path, family: Family) -> "tuple[Any, dict[str, Tensor], str]
     """The checked configuration, the tensors as they are, and the SHA-256 of a file of ``family``. Raises
     `WeightsError`, naming file, expectation, finding and cure, for a file that is absent, damaged, a pickle or of
     another kind or version, or has unknown or missing keys in its configuration."""
-    from safetensors import SafetensorError, safe_open
+    from safetensors import SafetensorError
     from safetensors.torch import load
 
     if not path.is_file():
         actual = "a folder" if path.is_dir() else "no file" if path.exists() else "nothing"
         raise _fault(path, f": expected a weights file (*{SUFFIX}), found {actual} there")
-    data = file_content(path, LARGEST_BYTES, WeightsError, "give a weights file")
-    if data[:4] == b"PK\x03\x04" or (data[:1] == b"\x80" and data[1:2] in b"\x02\x03\x04\x05"):
-        raise _fault(
-            path,
-            f": expected {SUFFIX}, got a PyTorch pickle (.pt, .pth), which is never opened, because a pickle can "
-            "run code; load it where you trust it and write it with "
-            "fpp_ml_bench.baselines.training.weights.save_weights",
-        )
-    try:
-        with safe_open(path, "pt") as file:
-            metadata = file.metadata() or {}
-    except (SafetensorError, OSError, ValueError) as error:
-        raise _fault(
-            path, f": damaged or no {SUFFIX} file ({printable(str(error), 200)}); copy or train it again"
-        ) from None
+    metadata = _header(path)
     form, version = (printable(metadata.get(key), 60) for key in ("format", "version"))
     if metadata.get("format") != family.format:
         cure = f"give what fpp-bench train {family.recipe} wrote"
@@ -287,19 +274,54 @@ def read_file(path: Path, family: Family) -> "tuple[Any, dict[str, Tensor], str]
     if metadata.get("version") != VERSION:
         cure = "read it with the version of fpp-ml-bench that wrote it, or train again"
         raise _fault(path, f": expected version {VERSION}, got {version!r}; {cure}")
+    data = file_content(path, LARGEST_BYTES, WeightsError, "give a weights file")
     try:
-        tensors, config = load(data), family.config.validate_json(metadata.get("config", ""))
-    except (SafetensorError, KeyError, RuntimeError) as error:
-        raise _fault(path, f": damaged ({printable(str(error), 200)}); copy or train it again") from None
-    except ValidationError as error:
-        lines = "\n  ".join(problems_of(error))
+        text = metadata.get("config", "")
+        strict_json(text)
+        tensors, config = load(data), family.config.validate_json(text)
+    except ValueError as error:
+        lines = "\n  ".join(problems_of(error) if isinstance(error, ValidationError) else [str(error)])
         raise _fault(path, f": its configuration is not valid; train or save it again:\n  {lines}") from None
+    except (SafetensorError, KeyError, RuntimeError, TypeError) as error:
+        raise _fault(path, f": damaged ({printable(str(error), 200)}); copy or train it again") from None
     return config, tensors, sha256(data).hexdigest()
+
+
+def _header(path: Path) -> dict[str, Any]:
+    """The metadata in a file's header, which is read and compared with the file's size before anything else."""
+    try:
+        with opened(path, links=True) as (stream, size):
+            start = stream.read(8)
+            length = int.from_bytes(start, "little")
+            header = stream.read(min(length, LARGEST_HEADER_BYTES))
+    except PredictionError as error:
+        raise _fault(path, f": {error}") from None
+    if start[:4] == b"PK\x03\x04" or (start[:1] == b"\x80" and start[1:2] in (b"\x02", b"\x03", b"\x04", b"\x05")):
+        raise _fault(
+            path,
+            f": expected {SUFFIX}, got a PyTorch pickle (.pt, .pth), which is never opened, because a pickle can "
+            "run code; load it where you trust it and write it with "
+            "fpp_ml_bench.baselines.training.weights.save_weights",
+        )
+    try:
+        if len(start) < 8 or len(header) < length:
+            raise ValueError(f"a header of {length} bytes, found {len(header)}")
+        described = strict_json(header.decode("utf-8"))
+        metadata = described.pop("__metadata__", {})
+        told = 8 + length + max((entry["data_offsets"][1] for entry in described.values()), default=0)
+        if told != size or not isinstance(metadata, dict):
+            raise ValueError(f"its header tells of {told} bytes, it has {size}")
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
+        raise _fault(
+            path, f": damaged or no {SUFFIX} file ({printable(str(error), 200)}); copy or train it again"
+        ) from None
+    return metadata
 
 
 def _built(path: Path, config: Any, tensors: "Mapping[str, Tensor]", family: Family) -> "nn.Module":
     """The network that ``config`` makes, without memory. Refuses tensors that are not exactly its own."""
     import torch
+    from torch.nn.modules.module import register_module_parameter_registration_hook
     from torch.overrides import TorchFunctionMode
 
     class Undrawn(TorchFunctionMode):
@@ -310,12 +332,24 @@ def _built(path: Path, config: Any, tensors: "Mapping[str, Tensor]", family: Fam
                 return args[0] if args else kwargs["tensor"]
             return func(*args, **(kwargs or {}))
 
+    parameters, thread = 0, get_ident()
+
+    def count(*parameter: object) -> None:
+        """Ends the building of a network that can't be that of the file: of a million levels, say."""
+        nonlocal parameters
+        parameters += get_ident() == thread
+        if parameters > 2 * len(tensors):
+            raise NetworkError(f"more than twice as many parameters as the file has tensors, {len(tensors)}")
+
+    counting = register_module_parameter_registration_hook(count)
     try:
         with torch.device("meta"), Undrawn():
             network = family.build(config)
         expected = network.state_dict()
-    except (FppBenchError, TypeError, ValueError, RuntimeError) as error:
+    except (FppBenchError, TypeError, ValueError, RuntimeError, OverflowError) as error:
         raise _fault(path, f": its configuration makes no network: {printable(str(error), 300)}") from None
+    finally:
+        counting.remove()
     options = ", ".join(f"{key}={value}" for key, value in config.options.items()) or "its defaults"
     built = f"{getattr(config, 'network', family.recipe)} with {printable(options, 200)}"
     for name in tensors:

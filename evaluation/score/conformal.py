@@ -23,7 +23,7 @@ from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.sample_scores import gaussian_quantile, states_sigma
 from fpp_ml_bench.evaluation.submission.description import Submission, check_submission
 from fpp_ml_bench.evaluation.submission.prediction_files import SIGMA, SUBMISSION_FILE, list_folder
-from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.files import whole_folder, write_atomically
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 FACTOR_KEY = "conformal_factor"
@@ -151,21 +151,22 @@ def write_calibrated(calibration: Calibration, folder: Path, dataset: DatasetFol
     if out.exists():
         raise PredictionError(f"{out} is there already; give a new folder")
     left_out = shutil.ignore_patterns(f"*{SIGMA}", SUBMISSION_FILE)
-    shutil.copytree(folder, out, ignore=left_out, copy_function=shutil.copyfile)
-    for sample in checked.listing.present:
-        sigma_mm = checked.listing.sigma_mm(sample, dataset.size).astype(np.float64) * calibration.factor
-        np.save(out / f"{sample}{SIGMA}", sigma_mm.astype(np.float32))
-    settings = {
-        FACTOR_KEY: calibration.factor,
-        "conformal_coverage": calibration.coverage,
-        "conformal_split": calibration.split,
-        "conformal_objects": calibration.objects,
-        "conformal_target": calibration.target,
-    }
-    content = description.model_dump(exclude_unset=True) | {
-        "name": f"{description.name}, conformal sigma",
-        "settings": {**description.settings, **settings},
-    }
-    text = check_submission(out, content).to_yaml()
-    write_atomically(out / SUBMISSION_FILE, text.encode("utf-8"))
+    with whole_folder(out, "writing predictions there", PredictionError) as made:
+        shutil.copytree(folder, made, ignore=left_out, copy_function=shutil.copyfile, dirs_exist_ok=True)
+        for sample in checked.listing.present:
+            sigma_mm = checked.listing.sigma_mm(sample, dataset.size).astype(np.float64) * calibration.factor
+            np.save(made / f"{sample}{SIGMA}", sigma_mm.astype(np.float32))
+        settings = {
+            FACTOR_KEY: calibration.factor,
+            "conformal_coverage": calibration.coverage,
+            "conformal_split": calibration.split,
+            "conformal_objects": calibration.objects,
+            "conformal_target": calibration.target,
+        }
+        content = description.model_dump(exclude_unset=True) | {
+            "name": f"{description.name}, conformal sigma",
+            "settings": {**description.settings, **settings},
+        }
+        text = check_submission(out, content).to_yaml()
+        write_atomically(made / SUBMISSION_FILE, text.encode("utf-8"))
     return len(checked.listing.present)

@@ -24,7 +24,7 @@ import click
 from fpp_ml_bench import __version__
 from fpp_ml_bench.cli.options import help_text, problem_of
 from fpp_ml_bench.errors import FppBenchError
-from fpp_ml_bench.files import DISK_FULL, cause_of
+from fpp_ml_bench.files import DISK_FULL, cause_of, printable
 from fpp_ml_bench.machine import limit_threads, usable_cores
 from fpp_ml_bench.options import did_you_mean, nearest
 
@@ -165,6 +165,7 @@ CONTINUED = "build", "import", "predict", "diagnose", "robustness", "tradeoff", 
 """Commands that keep what a stopped run has finished."""
 
 _STREAMS = "stdout", "stderr"
+_LONGEST_LINE = 10_000  # of an error message, in characters
 _MEANINGS = """\
 {name} COMMAND --help shows its options.
 Exit status: 0 done, 1 a check failed, 2 bad input or failed, 130 stopped (143 by SIGTERM), 141 nobody reads the output.
@@ -222,6 +223,15 @@ def _status_of(prog: str, load: Callable[[], Any], argv: Sequence[str]) -> int:
         if extra is None:
             raise
         return _refused(prog, f"this needs {library}, which is not installed; pip install 'fpp-ml-bench[{extra}]'")
+    except ImportError as error:
+        if "shared object" not in str(error):
+            raise
+        return _refused(
+            prog, f"a library can't be loaded ({error}); allow more memory (ulimit -v), or install it again"
+        )
+    except MemoryError as error:
+        reason = f" ({error})" if str(error) else ""
+        return _refused(prog, f"there is not enough memory{reason}; allow more (ulimit -v), or give less at once")
     except KeyboardInterrupt as stop:
         _say(f"{prog}: stopped{'; the same command continues' * (prog.split()[-1] in CONTINUED)}")
         return TERMINATED if isinstance(stop, _Terminated) else INTERRUPTED
@@ -265,8 +275,9 @@ def _refused(prog: str, problem: object) -> int:
 
 
 def _say(text: str) -> None:
+    """Print on standard error, with what in a name or a file would steer the terminal escaped."""
     with suppress(OSError):
-        print(text, file=sys.stderr)
+        print(*(printable(line, _LONGEST_LINE) for line in text.split("\n")), sep="\n", file=sys.stderr)
 
 
 def run_program(program: Program, argv: Sequence[str] | None = None) -> int:
@@ -275,6 +286,8 @@ def run_program(program: Program, argv: Sequence[str] | None = None) -> int:
     if words[:1] == ["help"] and not Path("help").exists():
         words = [*words[1:2], "--help"]
     name, first = program.name, words[0] if words else ""
+    # No command depends on a user's settings of matplotlib, which may ask for what is not there or be unreadable.
+    os.environ |= {"MATPLOTLIBRC": os.devnull, "MPLBACKEND": "agg"}
     # A folder of predictions has any name; one that is not there and almost that of a command is a slip.
     slip = nearest(first, program.commands) and not Path(first).exists()
     if first in program.commands:

@@ -4,29 +4,41 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from rich.console import Console, RenderableType
 from rich.text import Text
 
 from fpp_ml_bench.examination.findings import Examination
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.storage.benchmark import benchmark_sentence
 from fpp_ml_bench.loaders.storage.manifest import Manifest
 from fpp_ml_bench.skipping import Explanation
-from fpp_ml_bench.tables import Table
+from fpp_ml_bench.tables import Table, words
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, ProgressColumn
 
 WIDTH_IN_PIPES = 140
 
 
 @contextmanager
 def progress_bar(title: str, total: int, unit: str, shown: bool = True) -> Iterator[Callable[[int], None]]:
-    """A rich progress bar over ``total`` steps, each a ``unit``, on standard error, with the time left; yields the
-    function that advances it. Unless ``shown``, it appears with the first step: before, the work may be refused."""
-    from rich.progress import MofNCompleteColumn, Progress, TextColumn
+    """Progress over ``total`` steps, each a ``unit``, as `bars`; yields the function that advances it. Unless
+    ``shown``, it appears with the first step: before, the work may be refused."""
+    from rich.progress import MofNCompleteColumn
 
-    counted = MofNCompleteColumn(), TextColumn(unit)
-    with Progress(*Progress.get_default_columns(), *counted, console=Console(stderr=True)) as progress:
-        task = progress.add_task(title, total=total, visible=shown)
+    with bars(MofNCompleteColumn(), words(unit)) as progress:
+        task = progress.add_task(printable(title), total=total, visible=shown)
         yield lambda steps: progress.update(task, advance=steps, visible=True)
+
+
+def bars(*columns: "ProgressColumn") -> "Progress":
+    """Progress bars on standard error with the time left and further ``columns``."""
+    from rich.progress import BarColumn, Progress, TaskProgressColumn, TimeRemainingColumn
+
+    usual = words("{task.description}"), BarColumn(), TaskProgressColumn(), TimeRemainingColumn()
+    return Progress(*usual, *columns, console=Console(stderr=True))
 
 
 def gigabytes(count: float) -> str:

@@ -10,8 +10,9 @@ from fpp_ml_bench.cli.console import progress_bar, say_findings, show
 from fpp_ml_bench.cli.options import AT_LEAST_ONE, SPLITS, WORKING_RANGE, command, names, value
 from fpp_ml_bench.coding.code import MIN_MODULATION
 from fpp_ml_bench.decoding.decode import Directions
+from fpp_ml_bench.errors import CaptureError
 from fpp_ml_bench.examination.findings import RefusedCapture
-from fpp_ml_bench.files import printable
+from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, visible
 from fpp_ml_bench.loaders.captures.decoding import DecodedCapture, decode_capture, read_mask
 from fpp_ml_bench.loaders.captures.exports import FORMS, check_outputs, clear_outputs, write_capture, write_report
 from fpp_ml_bench.loaders.captures.images import read_frames
@@ -71,7 +72,8 @@ def decode(
         rig = rig.with_range(working_range)
         check_lengths(rig, file.name)
     started = perf_counter()
-    with progress_bar("decoding", 4, "steps") as advance:
+    lock = exclusive(out / LOCK_FILE, out, "decoding into this folder", CaptureError)
+    with lock, progress_bar("decoding", 4, "steps") as advance:
         capture = read_frames(frames, count=len(rig.sequence), bits=bits, colour=colour)
         advance(1)
         object_mask = None if mask is None else read_mask(mask, capture.frames.shape[1:])
@@ -97,7 +99,7 @@ def decode(
     for note in result.notes:
         print(f"note: {note}", file=sys.stderr)
     _print(result)
-    listed = ", ".join(sorted(path.name for path in out.iterdir()))
+    listed = ", ".join(path.name for path in visible(out, CaptureError))
     print(f"{out}: {listed}; {perf_counter() - started:.1f} s")
 
 

@@ -6,8 +6,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from rich.console import Console
-from rich.progress import Progress
 from rich.text import Text
 
 from fpp_ml_bench.baselines import registry
@@ -28,13 +26,14 @@ from fpp_ml_bench.baselines.robustness.run import Setup, View, write_page
 from fpp_ml_bench.baselines.robustness.run import measure as measure_robustness
 from fpp_ml_bench.baselines.robustness.run import robustness as robustness_block
 from fpp_ml_bench.baselines.timing import check_same_method
-from fpp_ml_bench.cli.console import progress_bar, show
+from fpp_ml_bench.cli.console import bars, progress_bar, show
 from fpp_ml_bench.cli.methods import MethodCommand, MethodSettings
 from fpp_ml_bench.cli.options import COUNT, Pool, command, command_line, names, new_file, value
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.result.file import write_json
 from fpp_ml_bench.evaluation.result.parts import Reliance
+from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard.rows import read_entry, write_block
 from fpp_ml_bench.loaders.render.builder import assembly_of
 from fpp_ml_bench.loaders.render.scene import BuildSettings
@@ -107,12 +106,12 @@ def diagnose(
     subject = subject_of(model, opened, layers, units, frame, threads or usable_cores(), options)
     probing = ProbeSettings(samples, seeds, quick)
     again = re.sub(r" --threads[ =]\S+", "", command_line())
-    with Progress(console=Console(stderr=True)) as bars:
+    with bars() as shown:
 
         def progress(probe: Probe) -> Callable[[int, int, str], None]:
-            task = bars.add_task(probe.title, total=None)
-            return lambda done, total, activity: bars.update(
-                task, completed=done, total=total, description=f"{probe.title}: {activity}"
+            task = shown.add_task(probe.title, total=None)
+            return lambda done, total, activity: shown.update(
+                task, completed=done, total=total, description=printable(f"{probe.title}: {activity}")
             )
 
         results = run_diagnosis(subject, opened, probe, probing, out, progress, again)

@@ -10,9 +10,9 @@ from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.design.rivals import EpipolarLines
 from fpp_ml_bench.design.search import LEFT_WRONG, Assumptions, Candidate, Design, describe, draw_design, search
 from fpp_ml_bench.errors import CaptureError, RigError
-from fpp_ml_bench.files import write_atomically
+from fpp_ml_bench.files import holds, whole_folder, write_atomically, write_files
 from fpp_ml_bench.optics.named_rigs import FIRST_SHIFTED_DEG, NAMED_RIGS
-from fpp_ml_bench.optics.patterns import export_patterns
+from fpp_ml_bench.optics.patterns import pattern_files
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.rig_file import load_projection, load_rig, save_rig
 from fpp_ml_bench.options import argument, option
@@ -111,12 +111,11 @@ def patterns(settings: PatternSettings) -> None:
         raise CaptureError("--out DIR is missing: folder for the images")
     named = settings.rig in NAMED_RIGS
     rig = NAMED_RIGS[settings.rig]() if named else load_projection(settings.rig)
-    if out.is_dir() and any(out.iterdir()):
-        raise CaptureError(f"{out}: not empty; give a new folder, so that no old pattern is projected by mistake")
-    paths = export_patterns(rig, out)
+    files = pattern_files(rig)
+    first, *_, last = names = list(files)
     frames = [
-        {"file": path.name, "shows": frame.title.partition(": ")[2], **asdict(frame)}
-        for path, frame in zip(paths, rig.sequence, strict=True)
+        {"file": name, "shows": frame.title.partition(": ")[2], **asdict(frame)}
+        for name, frame in zip(names, rig.sequence, strict=True)
     ]
     content = {
         "projector_px": [rig.projector.width, rig.projector.height],
@@ -124,9 +123,13 @@ def patterns(settings: PatternSettings) -> None:
         "pitch_px": {direction: rig.pitch(direction) for direction in rig.fringe_directions},
         "frames": frames,
     }
-    write_atomically(out / "patterns.json", (json.dumps(content, indent=1) + "\n").encode())
+    files["patterns.json"] = (json.dumps(content, indent=1) + "\n").encode()
+    if not holds(out, files):  # written by the same command, which was killed before it said so
+        never = "give a new folder, so that no old pattern is projected by mistake"
+        with whole_folder(out, "writing patterns there", CaptureError, never) as folder:
+            write_files(folder, files, CaptureError)
     size = f"{rig.projector.width} x {rig.projector.height} px"
-    print(f"{out}: {len(paths)} images of {size}, {paths[0].name} to {paths[-1].name}, and patterns.json")
+    print(f"{out}: {len(names)} images of {size}, {first} to {last}, and patterns.json")
     print("next: project them in this order, one capture each; then fpp-bench decode RIG CAPTURE --out OUT")
 
 

@@ -16,6 +16,7 @@ from fpp_ml_bench.coding.code import Code
 from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.containers import png_bytes
 from fpp_ml_bench.errors import FppBenchError, RigError
+from fpp_ml_bench.files import write_files
 from fpp_ml_bench.optics.rig import Rig
 
 
@@ -63,16 +64,12 @@ def pattern_image(rig: Rig, index: int) -> NDArray[np.uint8]:
     return np.broadcast_to(profile[:, None] if frame.direction == "horizontal" else profile, (height, width))
 
 
+def pattern_files(rig: Rig) -> dict[str, bytes]:
+    """Every pattern as PNG (8-bit grey, lossless) by file name, ``A_{i}.png``, in frame order."""
+    return {f"A_{index}.png": png_bytes(pattern_image(rig, index)) for index in range(len(rig.sequence))}
+
+
 def export_patterns(rig: Rig, folder: str | Path) -> list[Path]:
-    """Write every pattern as ``A_{i}.png`` (8-bit grey, lossless) into ``folder`` and return the paths in frame order;
-    `FppBenchError` where the folder can't be made or a file can't be written."""
-    target = Path(folder)
-    paths = []
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-        for index in range(len(rig.sequence)):
-            paths.append(target / f"A_{index}.png")
-            paths[-1].write_bytes(png_bytes(pattern_image(rig, index)))
-    except OSError as error:
-        raise FppBenchError(f"{target}: patterns can't be written: {error.strerror or error}") from error
-    return paths
+    """Write `pattern_files` into ``folder`` and return their paths in frame order; `FppBenchError` where the folder
+    can't be made or a file can't be written."""
+    return write_files(Path(folder), pattern_files(rig), FppBenchError)

@@ -24,7 +24,7 @@ from fpp_ml_bench.evaluation.report.report_page import SampleMaps, chosen_sample
 from fpp_ml_bench.evaluation.report.terminal import score_text
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.score.uncertainty import FEWEST_OBJECTS
-from fpp_ml_bench.files import printable, write_atomically
+from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, write_atomically
 from fpp_ml_bench.leaderboard import columns, tables
 from fpp_ml_bench.leaderboard.columns import assumption, assumption_sentences, given_truth, learned_from
 from fpp_ml_bench.leaderboard.ranking import (
@@ -87,12 +87,13 @@ def write_page(
     longer ranked, and nothing else. SubmissionError where a file can't be written."""
     files = page_files(groups, papers, tradeoff, samples)
     try:
-        (out / SUBMISSIONS).mkdir(parents=True, exist_ok=True)
-        for name, content in files.items():
-            write_atomically(out / name, content)
-        for path in (out / SUBMISSIONS).iterdir():
-            if _OWN_PAGES.fullmatch(path.name) and f"{SUBMISSIONS}/{path.name}" not in files:
-                path.unlink()
+        with exclusive(out / LOCK_FILE, out, "writing a page there", SubmissionError):
+            (out / SUBMISSIONS).mkdir(exist_ok=True)
+            for name, content in files.items():
+                write_atomically(out / name, content)
+            for path in (out / SUBMISSIONS).iterdir():
+                if _OWN_PAGES.fullmatch(path.name) and f"{SUBMISSIONS}/{path.name}" not in files:
+                    path.unlink()
     except OSError as error:
         raise SubmissionError(f"{printable(str(out), 500)} can't be written: {error.strerror}") from None
     return [out / name for name in files]

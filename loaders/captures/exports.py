@@ -20,7 +20,7 @@ from fpp_ml_bench.constants import GREY_LEVELS
 from fpp_ml_bench.containers import matrix_bytes
 from fpp_ml_bench.errors import CaptureError
 from fpp_ml_bench.examination.findings import Examination
-from fpp_ml_bench.files import write_files
+from fpp_ml_bench.files import LOCK_FILE, UNFINISHED, write_files
 from fpp_ml_bench.loaders.captures.decoding import DecodedCapture
 from fpp_ml_bench.loaders.captures.images import CapturedFrames
 from fpp_ml_bench.loaders.pictures import capture_picture
@@ -30,12 +30,11 @@ from fpp_ml_bench.optics.rig import Rig
 FORMS = ("npy", "mat", "png", "ply", "mesh")
 REPORT = "decode.json"
 CAMERA_AXES = "unit mm (millimetres); camera axes: x right, y down, z forward"
-_NAMES = (
-    r"(decode\.json|(depth|sigma_mm|modulation|reason)\.npy|depth\.mat|depth_[0-9.]+mm\.png|(points|mesh)\.ply"
-    r"|picture\.png)"
+_WRITTEN = re.compile(
+    r"decode\.json|(depth|sigma_mm|modulation|reason)\.npy|depth\.mat|depth_[0-9.]+mm\.png|(points|mesh)\.ply"
+    rf"|picture\.png|{UNFINISHED}"
 )
-_WRITTEN = re.compile(rf"{_NAMES}|\.{_NAMES}\.[0-9]+\.tmp")
-"""Names that a decoding writes, and the temporary files of one that was killed."""
+"""Names that a decoding writes, and those of the files that a killed one did not finish."""
 STEEPEST = 5.0
 """Neighbouring pixels are one surface where depth changes by at most this many times their distance across the ray: a
 surface inclined by up to 79 degrees."""
@@ -228,7 +227,7 @@ def check_outputs(folder: Path) -> list[Path]:
     decoding writes, or a file in its place."""
     if folder.exists() and not folder.is_dir():
         raise CaptureError(f"{folder}: expected a folder for the results, found a file; give another name")
-    paths = sorted(folder.iterdir()) if folder.is_dir() else []
+    paths = sorted(path for path in folder.iterdir() if path.name != LOCK_FILE) if folder.is_dir() else []
     others = [path.name for path in paths if path.is_dir() or not _WRITTEN.fullmatch(path.name)]
     if others:
         listed = ", ".join(others[:4]) + (f" and {len(others) - 4} more" if len(others) > 4 else "")

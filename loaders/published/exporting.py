@@ -3,9 +3,8 @@ In the tree, depth in mm is written as float32, the same bits as in the dataset.
 written as float64, from which the same float32 mm are recovered; float32 would be off by a few 0.0001 mm."""
 
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from fpp_ml_bench.containers import matrix_bytes, png_bytes
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.depth import depth_range_mm, normalise, object_mask
 from fpp_ml_bench.errors import BuildError, DatasetError
-from fpp_ml_bench.files import LOCK_FILE, exclusive
+from fpp_ml_bench.files import whole_folder
 from fpp_ml_bench.loaders.published import tree
 from fpp_ml_bench.loaders.sample import SINGLE_SHOT_FRAME
 from fpp_ml_bench.loaders.storage.manifest import GENERATED, MESH_FOLDER
@@ -86,31 +85,6 @@ def _write(path: Path, content: bytes) -> None:
     path.write_bytes(content)
 
 
-@contextmanager
-def exporting(out: Path) -> Iterator[Path]:
-    """Yield a folder to write into; it becomes ``out`` when the block succeeds, and is removed when it fails. Remains
-    of an export that was killed are removed. Raises `BuildError` when ``out`` is not empty, is a file, is being written
-    by another process, or the disk can't be written."""
-    target = out.resolve()
-    if target.is_dir() and any(target.iterdir()):
-        raise BuildError(f"{out}: is not empty; give a new folder, an export never adds to a folder or overwrites it")
-    staging = target.with_name(f".{target.name}.export")
-    with exclusive(staging / LOCK_FILE, out, "exporting there"):
-        content = staging / "files"
-        try:
-            shutil.rmtree(content, ignore_errors=True)
-            content.mkdir()
-            yield content
-            content.replace(target)
-        except OSError as error:
-            raise BuildError(
-                f"{out}: can't be written ({error.strerror or error}); nothing was left there. Free some "
-                "space or choose another disk"
-            ) from error
-        finally:
-            shutil.rmtree(staging, ignore_errors=True)
-
-
 def chosen_splits(dataset: DatasetFolder, split: str) -> list[str]:
     """Splits that ``split`` names, in row order; raises `DatasetError` when the dataset has no such samples."""
     dataset.samples(split)
@@ -139,7 +113,8 @@ def export(
             "this dataset has others; export it as parquet"
         )
     meshes = _meshes(dataset, [row["object"] for row in rows]) if "meshes" in forms else []
-    with exporting(out) as staging:
+    never = "give a new folder, an export never adds to a folder or overwrites it"
+    with whole_folder(out, "exporting there", BuildError, never) as staging:
         for form in forms:
             folder = staging / form if len(forms) > 1 else staging
             folder.mkdir(exist_ok=True)

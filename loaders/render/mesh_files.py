@@ -3,7 +3,6 @@ meshes and point clouds as PLY."""
 
 import base64
 import io
-import logging
 import struct
 import zlib
 from pathlib import Path
@@ -15,11 +14,16 @@ import xxhash
 from numpy.typing import NDArray
 from PIL import Image
 
-from fpp_ml_bench.errors import MeshError
-from fpp_ml_bench.files import file_hash, printable, strict_json
-from fpp_ml_bench.loaders.render.paint import Paint, paint_of, texture_of
+from fpp_ml_bench.containers import LARGEST_BYTES, Answer, arrays_of, from_file, guarded, limit_memory, with_arrays
+from fpp_ml_bench.errors import MeshError, PredictionError
+from fpp_ml_bench.files import file_hash, printable, read_bounded, strict_json
+from fpp_ml_bench.loaders.render.paint import MOST_TEXTURE_PX, Paint, paint_of, texture_of
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".glb")
+MOST_PARTS = 20_000
+"""Of a GLB, each placed where it stands: trimesh takes 10 s for so many."""
+_UNPACKED_BYTES = 3 << 27
+"""What a mesh may unpack to beside its own size: its textures, whose luminance takes 4 bytes a pixel."""
 
 # What trimesh's readers let through on damaged files (found by fuzzing them; ImportError: a text that is not UTF-8
 # sends it looking for a package that guesses encodings).
@@ -41,29 +45,52 @@ _IMAGE_ERRORS = (*_READER_ERRORS, SyntaxError, Image.DecompressionBombError, zli
 
 
 class _Beside(trimesh.resolvers.FilePathResolver):
-    """Files that a mesh file names: what was ``read`` of them, and ``problems`` of the textures among them. trimesh
-    goes on without a texture that it can't read."""
+    """Files that a mesh file names: hashes of those that were ``read``, and ``problems`` of them. trimesh goes on
+    without a texture that it can't read. Only regular files below the mesh's own folder are opened."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(str(path))
-        self.read: list[bytes] = []
+        self.read: list[str] = []
         self.problems: list[str] = []
+        self.textures: dict[str, int] = {}
+        """Pixels of the images among them, by hash."""
 
     def get(self, name: str) -> bytes:
         """Bytes of the file ``name``."""
-        suffix = Path(name).suffix.lower()
-        try:
-            content = super().get(name)
-        except (OSError, ValueError):
+        suffix, folder = Path(name).suffix.lower(), Path(self.parent).resolve()
+        tries = (folder / part for part in (name.strip(), name.strip().lstrip("/"), Path(name).name))
+        place = next((path for path in tries if path.resolve().is_relative_to(folder) and path.exists()), None)
+        if place is None:
             if suffix != ".mtl":  # without its materials a mesh has no colour; many are shared like that
                 self.problems.append(f"names the file {printable(name)!r}, which is not beside it; put it there")
+            raise FileNotFoundError(name)
+        try:
+            content = read_bounded(place, LARGEST_BYTES, "make it smaller", links=True)
+        except PredictionError as error:
+            self.problems.append(f"names the file {printable(name)!r}, which {error}")
             raise
-        self.read.append(content)
+        self.read.append(xxhash.xxh3_128(content).hexdigest())
         if suffix == ".mtl":
             return content.decode("utf-8", errors="replace").encode()
         if suffix != ".bin":
-            self.problems += _image_problems(content, printable(name))
+            self.note(content, printable(name))
         return content
+
+    def note(self, content: bytes, name: str) -> None:
+        """Look at an image, at its header first."""
+        try:
+            with Image.open(io.BytesIO(content)) as image:
+                self.textures[xxhash.xxh3_128(content).hexdigest()] = image.width * image.height
+                if (total_px := sum(self.textures.values())) > 2 * MOST_TEXTURE_PX:
+                    self.problems.append(f"has textures of {total_px} px, expected {2 * MOST_TEXTURE_PX}; shrink them")
+                    return
+                texture_of(image)
+        except _IMAGE_ERRORS as error:
+            reason = printable(str(error))
+            self.problems.append(f"its texture {name!r} can't be read ({reason}); give another image, as PNG or JPEG")
+
+    def namespaced(self, namespace: str) -> "_Beside":
+        raise ValueError("a mesh names files beside it only")
 
 
 def ply_bytes(
@@ -95,64 +122,67 @@ def content_hash(path: Path) -> str:
     *_, beside = read_mesh(path)
     digest = xxhash.xxh3_128(own.encode())
     for content in beside:
-        digest.update(xxhash.xxh3_128(content).digest())
+        digest.update(bytes.fromhex(content))
     return digest.hexdigest() if beside else own
 
 
-def read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], Paint | None, list[bytes]]:
-    """Vertices float64 (V, 3) in the file's unit, faces int32 (F, 3), the mesh's paint if it has colours, and the files
-    that it names. Raises `MeshError` for a file that can't be read as a mesh, has no triangles, vertices that are not
-    finite, triangles between vertices that are not there, or a texture that is damaged or missing."""
-    # Its log would put a traceback of its own on the screen; what matters of it is in our message.
-    logging.getLogger("trimesh").addHandler(logging.NullHandler())
-    kind = path.suffix.lower().removeprefix(".")
+def read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], Paint | None, list[str]]:
+    """Vertices float64 (V, 3) in the file's unit, faces int32 (F, 3), the mesh's paint if it has colours, and hashes of
+    the files that it names. It is read in another process, as `containers` says. Raises `MeshError` for a file that
+    can't be read as a mesh, has no triangles, vertices that are not finite, triangles between vertices that are not
+    there, or a texture that is damaged or missing, and for one that takes too much memory or time."""
+
+    def parse(content: bytes) -> Answer:
+        return guarded(_read_mesh, content, len(content) + _UNPACKED_BYTES, path=str(path))
+
+    facts, values = from_file(parse, path, MeshError, cure="make the mesh smaller")
+    vertices, faces, *paint = arrays_of(facts, values)
+    painted = Paint(paint[0], paint[1], paint[2], tuple(paint[3:])) if paint else None
+    return vertices, faces, painted, facts["beside"]
+
+
+def _read_mesh(content: bytes, largest: int, path: str) -> Answer:
+    kind, beside = Path(path).suffix.lower().removeprefix("."), _Beside(Path(path))
+    limit_memory(largest)
     try:
-        beside = _Beside(path)
-        content = path.read_bytes()
         if kind == "obj":  # its comments may be in any encoding, and its numbers are ASCII
             content = content.decode("utf-8", errors="replace").encode()
+        if kind == "glb":
+            _look_into_glb(content, beside)
         loaded = trimesh.load(io.BytesIO(content), file_type=kind, resolver=beside, process=False)
         geometry = loaded.dump() if isinstance(loaded, trimesh.Scene) else [loaded]
         parts = [part for part in geometry if isinstance(part, trimesh.Trimesh) and len(part.faces)]
         vertices = [np.asarray(part.vertices, dtype=np.float64) for part in parts]
-        problems = beside.problems + (_glb_image_problems(content) if kind == "glb" else [])
+    except PredictionError as error:
+        raise PredictionError(beside.problems[0] if beside.problems else str(error)) from None
     except _READER_ERRORS as error:
         reason = "damaged, or of another format" if isinstance(error, ImportError | NameError) else error
-        raise MeshError(f"{path}: can't be read as a mesh ({reason}); expected {', '.join(MESH_SUFFIXES)}") from error
+        raise PredictionError(f"can't be read as a mesh ({reason}); expected {', '.join(MESH_SUFFIXES)}") from None
     if not parts or any(np.shape(part)[1:] != (3,) for part in vertices):
-        raise MeshError(f"{path}: holds no triangles; export it as a triangle mesh")
+        raise PredictionError("holds no triangles; export it as a triangle mesh")
     if not all(np.isfinite(part).all() for part in vertices):
-        raise MeshError(f"{path}: has vertices that are not finite numbers; repair the mesh")
+        raise PredictionError("has vertices that are not finite numbers; repair the mesh")
     if any(part.faces.min() < 0 or part.faces.max() >= len(part.vertices) for part in parts):
-        raise MeshError(f"{path}: has triangles between vertices that are not there; it is damaged, export it again")
-    if problems:
-        raise MeshError(f"{path}: {problems[0]}, or take the texture out of the file")
+        raise PredictionError("has triangles between vertices that are not there; it is damaged, export it again")
+    if beside.problems:
+        raise PredictionError(f"{beside.problems[0]}, or take the texture out of the file")
     try:
         paint = paint_of(parts, linear_colours=kind == "glb")
     except _IMAGE_ERRORS as error:
-        raise MeshError(
-            f"{path}: {printable(str(error))}; its colours or texture are damaged, export it again"
-        ) from error
+        reason = printable(str(error))
+        raise PredictionError(f"{reason}; its colours or texture are damaged, export it again") from None
     before = np.cumsum([0, *(len(part) for part in vertices[:-1])])
-    faces = np.concatenate([part.faces + first for part, first in zip(parts, before, strict=True)])
-    return np.concatenate(vertices), faces.astype(np.int32), paint, beside.read
+    faces = np.concatenate([part.faces + first for part, first in zip(parts, before, strict=True)]).astype(np.int32)
+    painted = () if paint is None else (paint.corner, paint.uv, paint.image, *paint.images)
+    return with_arrays({"beside": beside.read}, np.concatenate(vertices), faces, *painted)
 
 
-def _image_problems(content: bytes, name: str) -> list[str]:
-    """What is wrong with the bytes of an image: nothing or one sentence."""
-    try:
-        with Image.open(io.BytesIO(content)) as image:
-            texture_of(image)
-    except _IMAGE_ERRORS as error:
-        return [f"its texture {name!r} can't be read ({printable(str(error))}); give another image, as PNG or JPEG"]
-    return []
-
-
-def _glb_image_problems(content: bytes) -> list[str]:
-    """What is wrong with the images inside a GLB file."""
+def _look_into_glb(content: bytes, beside: _Beside) -> None:
+    """Refuse a GLB of too many parts, and note what is wrong with the images inside it."""
     length = struct.unpack_from("<I", content, 12)[0]
     header: dict[str, Any] = strict_json(content[20 : 20 + length].decode("utf-8"))
-    problems = []
+    if (parts := len(header.get("nodes", []))) > MOST_PARTS:
+        raise PredictionError(f"has {parts} parts, expected at most {MOST_PARTS}; join them into fewer")
     for number, image in enumerate(header.get("images", [])):
         if "bufferView" in image:
             view = header["bufferViews"][image["bufferView"]]
@@ -162,5 +192,4 @@ def _glb_image_problems(content: bytes) -> list[str]:
             data = base64.b64decode(image["uri"].partition(",")[2])
         else:
             continue  # a file beside it
-        problems += _image_problems(data, image.get("name") or f"image {number}")
-    return problems
+        beside.note(data, image.get("name") or f"image {number}")

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import trimesh
+import xxhash
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -19,6 +20,8 @@ from fpp_ml_bench.portable import power
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 """Of red, green and blue of BT.709, which are those of sRGB."""
 MOST_TEXTURE_PX = 1 << 26
+"""Of one image; all that a mesh names have at most twice as many."""
+_ROWS_AT_ONCE = 256  # of an image whose luminance is computed: eight bytes a channel and pixel
 
 
 @dataclass(frozen=True)
@@ -102,16 +105,20 @@ def texture_of(image: Image.Image) -> NDArray[np.float32]:
         raise ValueError(f"{image.width} x {image.height} px, expected at most {MOST_TEXTURE_PX} px in all")
     if image.mode == "F":
         raise ValueError("has floating-point pixels, expected 8 or 16 bits")
-    if image.mode.startswith("I"):  # 16 bits
-        grey = np.rint(np.asarray(image).astype(np.float64) / 257)
-        return np.asarray(_LINEAR[np.clip(grey, 0, GREY_LEVELS).astype(np.uint8)], dtype=np.float32)
-    return linear_luminance(np.asarray(image.convert("RGB")))
+    deep = image.mode.startswith("I")  # 16 bits
+    levels = np.asarray(image if deep else image.convert("RGB"))
+    result = np.empty(levels.shape[:2], np.float32)
+    for start in range(0, len(levels), _ROWS_AT_ONCE):
+        rows = levels[start : start + _ROWS_AT_ONCE]
+        grey = np.clip(np.rint(rows / 257), 0, GREY_LEVELS).astype(np.uint8) if deep else None
+        result[start : start + _ROWS_AT_ONCE] = linear_luminance(rows) if grey is None else _LINEAR[grey]
+    return result
 
 
 def paint_of(parts: Sequence[trimesh.Trimesh], linear_colours: bool) -> Paint | None:
     """The paint of parts that are joined in this order, or None if none of them has colours. ``linear_colours``: those
     of corners and materials are linear. Raises ``ValueError`` for colours that can't be right."""
-    images: list[NDArray[np.float32]] = []
+    images: dict[bytes, NDArray[np.float32]] = {}  # materials may share one
     corners, places, numbers = [], [], []
     painted = False
     for part in parts:
@@ -120,11 +127,14 @@ def paint_of(parts: Sequence[trimesh.Trimesh], linear_colours: bool) -> Paint | 
         faces = len(part.faces)
         corners.append(np.ones((faces, 3), dtype=np.float32) if corner is None else corner)
         places.append(np.zeros((faces, 3, 2), dtype=np.float32) if uv is None else uv)
-        numbers.append(np.full(faces, -1 if image is None else len(images), dtype=np.int32))
-        images += [] if image is None else [image]
+        number = -1
+        if image is not None:
+            images.setdefault(digest := xxhash.xxh3_128_digest(image), image)
+            number = list(images).index(digest)
+        numbers.append(np.full(faces, number, dtype=np.int32))
     if not painted:
         return None
-    return Paint(np.concatenate(corners), np.concatenate(places), np.concatenate(numbers), tuple(images))
+    return Paint(np.concatenate(corners), np.concatenate(places), np.concatenate(numbers), tuple(images.values()))
 
 
 def _of_part(part: trimesh.Trimesh, linear_colours: bool) -> tuple[Any, Any, Any]:

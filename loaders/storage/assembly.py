@@ -98,6 +98,7 @@ class ShardWork:
             receipt = self._writer.write(folder, plan, self.assembly.rows(plan, folder), row_done)
             meshes = [describe_file(folder, folder / path) for path in self.assembly.mesh_paths(receipt.rows)]
             receipt = replace(receipt, meshes=meshes)
+            (folder / WORK_FOLDER).mkdir(exist_ok=True)
             write_atomically(folder / name, json.dumps(asdict(receipt)).encode())
             if isinstance(place, RemoteFolder):
                 for path in (*(file.path for file in receipt.written), name):
@@ -184,8 +185,8 @@ def _writing(place: Path | RemoteFolder) -> Iterator[tuple[Path, Callable[[str],
         raise BuildError(f"{place}: holds other files and no dataset; give a new or empty folder")
     with exclusive(work / "lock", place, "writing this folder"):
         if not (place / MANIFEST).exists():
-            for leftover in (*work.glob("*.tmp"), *place.rglob(".*.tmp")):  # of a run that was killed while writing
-                leftover.unlink(missing_ok=True)  # the two patterns overlap
+            for leftover in place.rglob(".*.tmp"):  # of a run that was killed while writing
+                leftover.unlink()
         try:
             yield place, lambda name: (place / name).stat().st_size if (place / name).is_file() else -1
         finally:

@@ -7,7 +7,6 @@ Array2D of float32, the same bits, whose bytes are split by significance, which 
 of a file is in memory at a time.
 """
 
-import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 from fpp_ml_bench.containers import png_bytes
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError
+from fpp_ml_bench.files import whole_file, write_atomically
 from fpp_ml_bench.loaders import sample as layout
 from fpp_ml_bench.loaders.sample import DATA_GROUP, DEPTH, DEPTHS, LABELS, PIXEL_MAPS, PREVIEW, RANGE, config_columns
 from fpp_ml_bench.loaders.storage.card import card, card_config
@@ -99,7 +99,7 @@ def write_parquet(
     names = ", ".join(f"`{config}`" for config in dataset.configs)
     text = _TEXT.format(fingerprint=dataset.fingerprint, config=dataset.configs[0], split=splits[0], names=names)
     rows = sum(len(dataset.samples(split)) for split in splits)
-    (folder / "README.md").write_bytes(card(dataset.manifest, configs, ", Parquet", rows, text))
+    write_atomically(folder / "README.md", card(dataset.manifest, configs, ", Parquet", rows, text))
 
 
 def write_shard(
@@ -116,20 +116,20 @@ def write_shard(
     names = columns(dataset) if viewer else dataset.manifest.columns()
     pictures = [name for name in names if viewer and (name == PREVIEW or name.startswith("frame_"))]
     schema = arrow_schema(published_features(dataset) if viewer else dataset.manifest.features())
-    stored = _stored_columns(dataset, [shard] if viewer else parts)
+    stored = {name: file for file in map(dataset.opened, [shard] if viewer else parts) for name, _ in file.types}
     samples = dataset.splits[shard.split][shard.first_row : shard.first_row + shard.rows]
     group_bytes = _VIEWER_GROUP_BYTES if viewer else _GROUP_BYTES
     rows = max(1, min(_MOST_ROWS_PER_GROUP, group_bytes // dataset.manifest.row_bytes))
     out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = out.with_name(f".{out.name}.{os.getpid()}.tmp")
     try:
         with (
+            whole_file(out) as file,
             ThreadPoolExecutor(picture_threads) as pool,
-            pq.ParquetWriter(temporary, schema, **_settings(names, pictures, viewer)) as writer,
+            pq.ParquetWriter(file, schema, **_settings(names, pictures, viewer)) as writer,
         ):
             for first in range(0, len(samples), rows):
                 group = samples[first : first + rows]
-                cells = {name: column.slice(first, len(group)) for name, column in stored.items()}
+                cells = {name: file.column(name, first, len(group)) for name, file in stored.items()}
                 for name in pictures:
                     contents = pool.map(partial(_png, dataset, column=name), group)
                     encoded = [{"bytes": content, "path": None} for content in contents]
@@ -137,15 +137,11 @@ def write_shard(
                 table = pa.Table.from_arrays([cells[name] for name in names], schema=schema)
                 writer.write_table(table, row_group_size=len(group))
                 done(len(group))
-        with temporary.open("rb") as file:
-            os.fsync(file.fileno())
-        temporary.replace(out)
     except pa.ArrowException as error:
         raise OSError(f"{out.name}: {error}") from error
     finally:
-        temporary.unlink(missing_ok=True)
         for part in parts:
-            dataset.forget(part)  # else the memory maps of all shards would stay open
+            dataset.forget(part)  # else the files of all shards would stay open
 
 
 def _settings(names: list[str], pictures: list[str], viewer: bool) -> dict[str, Any]:
@@ -167,18 +163,6 @@ def _settings(names: list[str], pictures: list[str], viewer: bool) -> dict[str, 
         "write_statistics": plain,
         "write_page_index": True,
     }
-
-
-def _stored_columns(dataset: DatasetFolder, parts: list[ShardFile]) -> dict[str, pa.ChunkedArray]:
-    """Columns of shard files, memory-mapped from disk: what is written has the same bits."""
-    stored = {}
-    for part in parts:
-        batches = dataset.mapped(part).batches
-        for name in batches[0].schema.names:
-            # An Array2D extension where `datasets` has been imported; the lists it stores are the same.
-            arrays = (batch.column(name) for batch in batches)
-            stored[name] = pa.chunked_array([getattr(array, "storage", array) for array in arrays])
-    return stored
 
 
 def published_features(dataset: DatasetFolder, config: str | None = None) -> dict[str, dict[str, Any]]:

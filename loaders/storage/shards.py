@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import pyarrow as pa
@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.depth import depth_problem, depth_range_mm, object_mask
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.files import file_hash
+from fpp_ml_bench.files import file_hash, whole_file
 from fpp_ml_bench.loaders import sample as layout
 from fpp_ml_bench.loaders.sample import COVER, DATA_GROUP, DEPTH, DEPTH_EXACT, DEPTHS, FLAGS, LABELS, RANGE, Row
-from fpp_ml_bench.loaders.storage.manifest import WORK_FOLDER, Manifest, OtherFile, ShardFile
+from fpp_ml_bench.loaders.storage.manifest import Manifest, OtherFile, ShardFile
 
 OBJECTS_PER_SHARD = 4
 """Four objects are 24 rows: with batches of that size, batch boundaries no longer slow down reading (measured)."""
@@ -122,71 +122,67 @@ class ShardWriter:
     ) -> Receipt:
         """Write the rows of ``plan``, which come in its order, into the dataset's folder, and call ``row_done`` after
         each. Raises `BuildError` when the disk is full or can't be written; no unfinished file is left."""
-        scratch = folder / WORK_FOLDER
-        temporary = {group: scratch / f"{plan.name}.{os.getpid()}.{group}.tmp" for group in self._schemas}
         try:
-            scratch.mkdir(parents=True, exist_ok=True)
-            described = self._write_streams(plan, rows, temporary, row_done)
-            files = []
-            for group, path in temporary.items():
-                size, digest = _settled(path)
-                target = folder / plan.path(group)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                path.replace(target)
-                place = (plan.path(group), plan.split, group, plan.first_row, len(plan.samples))
-                files.append(ShardFile(*place, size, digest))
+            with ExitStack() as opened:
+                files: dict[str, IO[bytes]] = {}
+                for group in self._schemas:
+                    target = folder / plan.path(group)
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    files[group] = opened.enter_context(whole_file(target, sync=False))  # `_settled` does it
+                described = self._write_streams(plan, rows, files, row_done)
+                place = plan.first_row, len(plan.samples)
+                written = [
+                    ShardFile(plan.path(group), plan.split, group, *place, *_settled(file))
+                    for group, file in files.items()
+                ]
         except (OSError, pa.ArrowException) as error:
             number = getattr(error, "errno", None)
             reason = os.strerror(number) if number else error
             where = folder / plan.path(DATA_GROUP)
             advice = "free some space or choose another disk, then run the same command again: it resumes"
             raise BuildError(f"{where}: can't be written ({reason}); {advice}") from error
-        finally:
-            for path in temporary.values():
-                path.unlink(missing_ok=True)
-        return Receipt(files, described)
+        return Receipt(written, described)
 
     def _write_streams(
-        self, plan: ShardPlan, rows: Iterable[Row], paths: dict[str, Path], row_done: Callable[[], None]
+        self, plan: ShardPlan, rows: Iterable[Row], files: dict[str, IO[bytes]], row_done: Callable[[], None]
     ) -> list[dict[str, Any]]:
-        with ExitStack() as files:
-            writers = {}
-            for group, path in paths.items():
-                sink = files.enter_context(path.open("wb"))
-                writers[group] = pa.ipc.new_stream(pa.PythonFile(sink, mode="w"), self._schemas[group])
-            described = []
-            for number, row in enumerate(_in_order(plan, rows)):
-                low_mm, high_mm = checked_range_mm(row.depth_mm, row.sample)
-                labels = {"sample": row.sample, "object": row.object, "view": row.view}
-                object_px = int(np.count_nonzero(object_mask(row.depth_mm)))
-                measured = {"object_px": object_px, "depth_min_mm": low_mm, "depth_max_mm": high_mm, **row.measured}
-                hashes: dict[str, str] = {}
-                described.append({**labels, **measured, "hashes": hashes})
-                # The data group is one batch of all rows. All frames but the first are written at once, one row per
-                # batch, and not held in memory.
-                for group, frames in self._manifest.groups.items():
-                    images: dict[str, Any] = {self._manifest.sequence.frames[i].column: row.frames[i] for i in frames}
-                    if group == DATA_GROUP:
-                        images |= {DEPTH: row.depth_mm, DEPTH_EXACT: row.depth_exact_mm}
-                        images |= {FLAGS: row.flags, COVER: row.cover}
-                        images = {column: images[column] for column in self._images}
-                    images = {column: self._checked(image, column) for column, image in images.items()}
-                    hashes.update((column, layout.image_hash(image)) for column, image in images.items())
-                    if group != DATA_GROUP:
-                        batch = [image[None] for image in images.values()]
-                        writers[group].write_batch(_record_batch(batch, self._schemas[group]))
-                        continue
-                    for column, image in images.items():
-                        self._buffer(column, len(plan.samples))[number] = image
-                row_done()
-            labelled = [layout.labels_of(row, plan.split) for row in described]
-            columns = [
-                self._buffer(name, len(plan.samples)) if name in self._images else [row[name] for row in labelled]
-                for name in self._schemas[DATA_GROUP].names
-            ]
-            writers[DATA_GROUP].write_batch(_record_batch(columns, self._schemas[DATA_GROUP]))
-            for writer in writers.values():
-                writer.close()
+        writers = {
+            group: pa.ipc.new_stream(pa.PythonFile(file, mode="w"), self._schemas[group])
+            for group, file in files.items()
+        }
+        described = []
+        for number, row in enumerate(_in_order(plan, rows)):
+            low_mm, high_mm = checked_range_mm(row.depth_mm, row.sample)
+            labels = {"sample": row.sample, "object": row.object, "view": row.view}
+            object_px = int(np.count_nonzero(object_mask(row.depth_mm)))
+            measured = {"object_px": object_px, "depth_min_mm": low_mm, "depth_max_mm": high_mm, **row.measured}
+            hashes: dict[str, str] = {}
+            described.append({**labels, **measured, "hashes": hashes})
+            # The data group is one batch of all rows. All frames but the first are written at once, one row per
+            # batch, and not held in memory.
+            for group, frames in self._manifest.groups.items():
+                images: dict[str, Any] = {self._manifest.sequence.frames[i].column: row.frames[i] for i in frames}
+                if group == DATA_GROUP:
+                    images |= {DEPTH: row.depth_mm, DEPTH_EXACT: row.depth_exact_mm}
+                    images |= {FLAGS: row.flags, COVER: row.cover}
+                    images = {column: images[column] for column in self._images}
+                images = {column: self._checked(image, column) for column, image in images.items()}
+                hashes.update((column, layout.image_hash(image)) for column, image in images.items())
+                if group != DATA_GROUP:
+                    batch = [image[None] for image in images.values()]
+                    writers[group].write_batch(_record_batch(batch, self._schemas[group]))
+                    continue
+                for column, image in images.items():
+                    self._buffer(column, len(plan.samples))[number] = image
+            row_done()
+        labelled = [layout.labels_of(row, plan.split) for row in described]
+        columns = [
+            self._buffer(name, len(plan.samples)) if name in self._images else [row[name] for row in labelled]
+            for name in self._schemas[DATA_GROUP].names
+        ]
+        writers[DATA_GROUP].write_batch(_record_batch(columns, self._schemas[DATA_GROUP]))
+        for writer in writers.values():
+            writer.close()
         return described
 
     def _buffer(self, column: str, rows: int) -> NDArray:
@@ -202,14 +198,14 @@ class ShardWriter:
         return image
 
 
-def _settled(path: Path) -> tuple[int, str]:
+def _settled(file: IO[bytes]) -> tuple[int, str]:
     """Bytes and hash of a file just written. It is on the disk then, and no longer in the cache, where gigabytes of
     shards would push out everything else."""
-    with path.open("rb") as file:
-        os.fdatasync(file.fileno())
-        digest = file_hash(path)
-        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-        return file.seek(0, os.SEEK_END), digest
+    file.flush()
+    os.fdatasync(file.fileno())
+    digest = file_hash(Path(file.name))
+    os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+    return file.tell(), digest
 
 
 def _dtype(column: str) -> np.dtype:
@@ -229,13 +225,13 @@ def _in_order(plan: ShardPlan, rows: Iterable[Row]) -> Iterator[Row]:
 def _record_batch(columns: list[Any], schema: pa.Schema) -> pa.RecordBatch:
     """Columns in the schema's order: images as arrays (rows, H, W), used without a copy; all others as lists."""
     arrays = [
-        pa.array(column, field.type) if isinstance(column, list) else _image_column(column, field.type)
+        pa.array(column, field.type) if isinstance(column, list) else image_column(column, field.type)
         for column, field in zip(columns, schema, strict=True)
     ]
     return pa.record_batch(arrays, schema=schema)
 
 
-def _image_column(images: NDArray, kind: pa.DataType) -> pa.Array:
+def image_column(images: NDArray, kind: pa.DataType) -> pa.Array:
     """Images (rows, H, W) as a list of lists, on the same memory."""
     rows, height, width = images.shape
     images = np.ascontiguousarray(images)

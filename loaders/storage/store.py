@@ -1,17 +1,18 @@
-"""Reading a dataset folder by memory map, without a copy: single images as views, or as a ``datasets.Dataset``.
+"""Reading a dataset folder: single images, or all as a ``datasets.Dataset`` on memory maps.
 
 The evaluator, the classical method, the torch dataset and the pictures read through `DatasetFolder`, which needs only
 NumPy and pyarrow. Plain ``datasets.load_dataset`` copies what it reads into its cache, and its Arrow builder can't
 leave columns out; `load_dataset` joins the tables of the column groups, and a frame is read only when its row is.
 """
 
+import io
 import mmap
-import sys
+import os
+import weakref
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from time import monotonic
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,8 +20,8 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.constants import CONFIGS, SPLITS, TRAIN
 from fpp_ml_bench.depth import RangeRule, object_mask
-from fpp_ml_bench.errors import DatasetError
-from fpp_ml_bench.files import printable
+from fpp_ml_bench.errors import DatasetError, PredictionError
+from fpp_ml_bench.files import cause_of, opened, printable
 from fpp_ml_bench.loaders import sample as layout
 from fpp_ml_bench.loaders.sample import (
     DATA_GROUP,
@@ -28,7 +29,9 @@ from fpp_ml_bench.loaders.sample import (
     DEPTH_EXACT,
     DEPTHS,
     FLAGS,
+    LABELS,
     NAMES,
+    RANGE,
     TRUTH,
     Flag,
     config_columns,
@@ -46,14 +49,12 @@ if TYPE_CHECKING:
     from datasets import Dataset, DatasetDict
 
 ALL_SPLITS = "all"
-LOOK_EVERY_S = 0.01
-"""How often a file that is read is looked at, whether it was cut: each time would be 3% of reading 224 px images."""
+_METADATA_BYTES = 1 << 20  # what pyarrow reads at once is a body if it is larger: the metadata of a shard are 10 kB
 
 
 class DatasetFolder:
-    """A finished dataset folder, built or imported. Raises `DatasetError` for any other folder. Images are read-only
-    memory-mapped views: only the parts that are used are read. Instances pickle by path, so worker processes map the
-    files themselves."""
+    """A finished dataset folder, built or imported. Raises `DatasetError` for any other folder. Images are read-only,
+    and only those that are used are read. Instances pickle by path, so worker processes open the files themselves."""
 
     def __init__(self, path: str | Path, check: bool = True, truth: bool = True) -> None:
         """With ``check`` off, the folder opens even if some of its files are missing or cut. With ``truth`` off it is
@@ -67,14 +68,16 @@ class DatasetFolder:
             for split, rows in manifest.samples.items()
         }
         self.manifest = replace(manifest, samples=shown)
-        self._mapped: dict[str, MappedShard] = {}
+        self._opened: dict[str, OpenShard] = {}
+        self._latest: tuple[str, dict[str, NDArray]] = "", {}
+        """The sample that was read last, and its images by column: they are often asked for again."""
         for shard in self.manifest.shards if check else ():
             if damage := damage_of(self.path, shard, whole=False):
                 raise DatasetError(damage)
 
     def forget(self, shard: ShardFile) -> None:
-        """Close the memory maps of a file."""
-        self._mapped.pop(shard.path, None)
+        """Close a file."""
+        self._opened.pop(shard.path, None)
 
     def __reduce__(self) -> tuple[type["DatasetFolder"], tuple[Path, bool, bool]]:
         return DatasetFolder, (self.path, True, self.truth)
@@ -228,113 +231,190 @@ class DatasetFolder:
         return [self.frame(sample, index) for index in indices]
 
     def release(self, sample: str) -> None:
-        """Release the memory of a sample's images that were read. Views of them stay valid. Called after each sample of
-        a split, it keeps the memory from growing with the number of samples."""
-        split, row = self._find(sample)
-        for shard in self.manifest.shards:
-            if shard.path not in self._mapped or shard.split != split or not 0 <= row - shard.first_row < shard.rows:
-                continue
-            self._mapped[shard.path].release(row - shard.first_row)
-            if row - shard.first_row == shard.rows - 1:
-                self.forget(shard)  # pages between its images stay mapped as long as the file is
+        """Release the memory of a sample's images that were read. Arrays in use stay valid."""
+        if self._latest[0] == sample:
+            self._latest = "", {}
 
     def _image(self, sample: str, group: str, column: str) -> NDArray:
-        split, row = self._find(sample)
-        if column in self._hidden(split):
-            raise DatasetError(
-                f"{self.path}: {column} of {sample} is truth of the {split} split, and methods are given that of the "
-                f"{TRAIN} split alone; open the dataset outside the method to look at it"
-            )
-        for shard in self.manifest.shards:
-            if shard.split == split and shard.group == group and 0 <= row - shard.first_row < shard.rows:
-                return self.mapped(shard).image(column, row - shard.first_row)
-        raise DatasetError(f"{self.path}: no file holds row {row} of {group} in {split}; run: fpp-bench verify")
+        if self._latest[0] != sample:
+            self._latest = sample, {}
+        images = self._latest[1]  # other threads may be at other samples
+        if column not in images:
+            split, row = self._find(sample)
+            if column in self._hidden(split):
+                raise DatasetError(
+                    f"{self.path}: {column} of {sample} is truth of the {split} split, and methods are given that of "
+                    f"the {TRAIN} split alone; open the dataset outside the method to look at it"
+                )
+            for shard in self.manifest.shards:
+                if shard.split == split and shard.group == group and 0 <= row - shard.first_row < shard.rows:
+                    images[column] = self.opened(shard).image(column, row - shard.first_row)
+                    break
+            else:
+                raise DatasetError(f"{self.path}: no file holds row {row} of {group} in {split}; run: fpp-bench verify")
+        return images[column]
 
-    def mapped(self, shard: ShardFile) -> "MappedShard":
-        """A file of the dataset, memory-mapped."""
-        if shard.path not in self._mapped:
-            self._mapped[shard.path] = MappedShard(self.path / shard.path, self.size, self._hidden(shard.split))
-        return self._mapped[shard.path]
+    def opened(self, shard: ShardFile) -> "OpenShard":
+        """A file of the dataset, opened for reading."""
+        if shard.path not in self._opened:
+            self._opened[shard.path] = OpenShard(self.path / shard.path, self.size, self._hidden(shard.split))
+        return self._opened[shard.path]
 
     def _hidden(self, split: str) -> tuple[str, ...]:
         """The columns of ``split`` that are not given."""
         return () if self.truth or split == TRAIN else TRUTH
 
 
-class MappedShard:
-    """An Arrow file, memory-mapped: its record ``batches`` without ``hidden`` columns, and their columns as images of
-    ``size`` (H, W). Raises `DatasetError` naming the file where it can't be read."""
+class OpenShard:
+    """An Arrow file, of whose columns parts are read, but ``hidden`` ones: ``types`` are `stored_types`, and ``rows``
+    are those of the file. Raises `DatasetError` naming the file where it can't be read.
+
+    It is read and not mapped: a mapped file that is cut meanwhile would end the process (SIGBUS). And every length and
+    offset in it is compared with the file and the images' ``size`` (H, W) before anything follows it."""
 
     def __init__(self, path: Path, size: tuple[int, int], hidden: Collection[str] = ()) -> None:
         import pyarrow as pa
 
         self.path, self._size = path, size
-        self._images: dict[str, list[NDArray]] = {}
-        self._look_s = 0.0
+        self._parts: dict[str, list[tuple[int, list[tuple[int, int]]]]] = {}
+        """Of each column and record batch its rows, and its buffers' places in the file, each a start and bytes."""
+        self._starts: dict[str, list[tuple[int, int]]] = {}
         try:
-            with path.open("rb") as file:
-                self._file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-            self.batches: list[pa.RecordBatch] = list(pa.ipc.open_stream(pa.py_buffer(self._file)))
-            if hidden:
-                names = [name for name in self.batches[0].schema.names if name not in hidden]
-                self.batches = [batch.select(names) for batch in self.batches]
-        except (pa.ArrowException, OSError, ValueError) as error:
+            with opened(path, links=True) as (stream, _):
+                self._file = os.dup(stream.fileno())
+            weakref.finalize(self, os.close, self._file)
+            skeleton = _Skeleton(self._file)
+            plain = pa.ipc.IpcReadOptions(use_threads=False, ensure_native_endian=False)
+            batches = list(pa.ipc.open_stream(pa.PythonFile(skeleton, mode="r"), options=plain))
+            for batch in batches:
+                for name, column in zip(batch.schema.names, batch.columns, strict=True):
+                    if name in hidden:
+                        continue
+                    buffers = [skeleton.place(buffer) for buffer in column.buffers()]
+                    self._parts.setdefault(name, []).append((batch.num_rows, buffers))
+        except (pa.ArrowException, PredictionError, OSError, ValueError) as error:
             raise DatasetError(f"{path}: can't be read as Arrow ({error}); run: fpp-bench verify") from error
-
-    def images(self, column: str) -> list[NDArray]:
-        """A column as images: a read-only view (rows, H, W) per record batch."""
-        if column not in self._images:
-            try:
-                self._images[column] = [self._views(batch.column(column)) for batch in self.batches]
-            except (ValueError, KeyError, AttributeError) as error:
-                expected = f"does not hold images of {self._size[0]} x {self._size[1]} px ({error})"
-                raise DatasetError(f"{self.path}: column {column} {expected}; run: fpp-bench verify") from error
-        if (now_s := monotonic()) > self._look_s:
-            self._look_s = now_s + LOOK_EVERY_S
-            if (size := self._file.size()) < len(self._file):
-                # Reading pages that the file no longer has would end the process (SIGBUS).
-                cut = f"was cut to {size} of {len(self._file)} bytes while it was read"
-                raise DatasetError(f"{self.path}: {cut}; build or copy the dataset again")
-        return self._images[column]
+        self.rows = sum(batch.num_rows for batch in batches)
+        types = stored_types(batches[0].schema) if batches else []
+        self.types = [(name, kind) for name, kind in types if name not in hidden]
 
     def image(self, column: str, row: int) -> NDArray:
-        """The image of a row of the file."""
-        for images in self.images(column):
-            if row < len(images):
-                return images[row]
-            row -= len(images)
+        """The image of a row of the file, uint8 or float32 (H, W), read only."""
+        height, width = self._size
+        dtype = self._dtype(column)
+        for rows, start in self._images(column):
+            if row < rows:
+                pixels = self._read(start + row * height * width * dtype.itemsize, height * width, dtype)
+                return pixels.reshape(self._size)
+            row -= rows
         raise DatasetError(f"{self.path}: fewer rows than its manifest says; run: fpp-bench verify")
 
-    def release(self, row: int) -> None:
-        """Release the memory of the images of a row that were read."""
-        for column in self._images:
-            release_pages(self.image(column, row), self._file)
+    def column(self, name: str, first: int, rows: int) -> "pa.Array":
+        """So many rows from ``first`` on of a column, as they are stored."""
+        import pyarrow as pa
 
-    def _views(self, column: "pa.Array") -> NDArray:
-        storage = getattr(column, "storage", column)  # an Array2D extension where `datasets` has been imported
-        flat = storage.values.values
-        dtype = np.dtype(np.uint8 if flat.type.bit_width == 8 else np.float32)
-        # Not flat.to_numpy(): that imports pandas where it is installed, which takes longer than scoring a test split.
-        pixels = np.frombuffer(flat.buffers()[1], dtype, len(flat), flat.offset * dtype.itemsize)
-        return pixels.reshape(len(storage), *self._size)
+        from fpp_ml_bench.loaders.storage.shards import image_column  # imports pyarrow, which takes 0.2 s
+
+        kind = dict(self.types)[name]
+        if pa.types.is_list(kind):
+            return image_column(np.stack([self.image(name, row) for row in range(first, first + rows)]), kind)
+        parts = []
+        for count, places in self._parts[name]:
+            buffers = [pa.py_buffer(self._read(*place, np.dtype(np.uint8))) for place in places]
+            try:
+                array = pa.Array.from_buffers(kind, count, [buffer if buffer.size else None for buffer in buffers])
+                array.validate(full=True)
+            except (pa.ArrowException, ValueError) as error:
+                raise self._fault(name, f"leads behind its end or is damaged ({error})") from error
+            parts.append(array)
+        return pa.concat_arrays(parts).slice(first, rows)
+
+    def check(self) -> None:
+        """Raise `DatasetError` for a length or an offset that leads elsewhere, in any column."""
+        for name, _ in self.types:
+            self._images(name) if name not in (*LABELS, *RANGE) else self.column(name, 0, self.rows)
+
+    def _dtype(self, column: str) -> np.dtype:
+        import pyarrow as pa
+
+        kind = dict(self.types).get(column)
+        for dtype in (np.dtype(np.uint8), np.dtype(np.float32)):
+            if kind == pa.list_(pa.list_(pa.from_numpy_dtype(dtype))):
+                return dtype
+        raise self._fault(column, "is missing or holds no images")
+
+    def _images(self, column: str) -> list[tuple[int, int]]:
+        """Rows of each batch, and where in the file the first one's pixels begin."""
+        if column not in self._starts:
+            (height, width), dtype, index = self._size, self._dtype(column), np.dtype(np.int32)
+            starts = []
+            for rows, (_, outer, _, inner, _, (start, size)) in self._parts[column]:
+                lists, pixels = ((outer, rows, height), (inner, rows * height, width)), rows * height * width
+                fits = size >= pixels * dtype.itemsize and all(
+                    size >= (count + 1) * index.itemsize
+                    and np.array_equal(self._read(at, count + 1, index), np.arange(count + 1) * length)
+                    for (at, size), count, length in lists
+                )
+                if not fits:
+                    raise self._fault(column, f"does not hold images of {height} x {width} px")
+                starts.append((rows, start))
+            self._starts[column] = starts
+        return self._starts[column]
+
+    def _read(self, start: int, count: int, dtype: np.dtype) -> NDArray:
+        values = np.empty(count, dtype)
+        view, done = memoryview(values.view(np.uint8)), 0
+        while done < len(view):
+            try:
+                length = os.preadv(self._file, [view[done:]], start + done)
+            except OSError as error:
+                raise DatasetError(f"{self.path}: can't be read ({cause_of(error)})") from error
+            if not length:
+                cut = f"was cut to {os.fstat(self._file).st_size} bytes while it was read"
+                raise DatasetError(f"{self.path}: {cut}; build or copy the dataset again")
+            done += length
+        values.flags.writeable = False
+        return values
+
+    def _fault(self, column: str, problem: str) -> DatasetError:
+        return DatasetError(f"{self.path}: column {column} {problem}; run: fpp-bench verify")
 
 
-FAULT_AROUND_BYTES = 1 << 16
-"""A page fault on a file also maps the neighbouring pages, in aligned windows of this size (Linux's default)."""
+def stored_types(schema: "pa.Schema") -> "list[tuple[str, pa.DataType]]":
+    """Columns and what they are stored as, whether or not `datasets` has registered its array extension."""
+    return [(field.name, getattr(field.type, "storage_type", field.type)) for field in schema]
 
 
-def release_pages(view: NDArray[Any], mapped_file: mmap.mmap) -> None:
-    """Release the pages of ``view``, a contiguous array in a READ-ONLY FILE map, and the pages mapped with them. No
-    page outside is touched: on memory that is not backed by a file, the same call would erase the data. Does nothing
-    for a view of other memory (of two threads that map a file at once, one's map is kept), and on other systems than
-    Linux."""
-    address, size = np.frombuffer(mapped_file, np.uint8).ctypes.data, len(mapped_file)
-    start = view.ctypes.data - address
-    if not sys.platform.startswith("linux") or not view.nbytes or start < 0 or start + view.nbytes > size:
-        return
-    begin = max((start + address) // FAULT_AROUND_BYTES * FAULT_AROUND_BYTES - address, 0)
-    end = min(-(-(start + address + view.nbytes) // FAULT_AROUND_BYTES) * FAULT_AROUND_BYTES - address, size)
-    mapped_file.madvise(mmap.MADV_DONTNEED, begin, end - begin)
+class _Skeleton(io.RawIOBase):
+    """A file for pyarrow, which reads its metadata. In the place of a large body it gets memory that holds nothing and
+    takes none: from where the buffers of its columns begin in it, `place` tells where they are in the file."""
+
+    def __init__(self, file: int) -> None:
+        self._file, self._size, self._position = file, os.fstat(file).st_size, 0
+        self._given: list[tuple[NDArray[np.uint8], int]] = []
+
+    def readable(self) -> bool:
+        return True
+
+    def read(self, count: int = -1) -> Any:
+        count = min(count, max(self._size - self._position, 0))
+        if count <= _METADATA_BYTES:
+            content: Any = os.pread(self._file, count, self._position)
+        else:
+            content = mmap.mmap(-1, count, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS, prot=mmap.PROT_READ)
+        self._given.append((np.frombuffer(content, np.uint8), self._position))
+        self._position += len(content)
+        return content
+
+    def place(self, buffer: "pa.Buffer | None") -> tuple[int, int]:
+        """Where in the file a buffer begins, and its bytes, 0 for none. ValueError for one that the file lacks."""
+        if buffer is None or not buffer.size:
+            return 0, 0
+        for content, position in self._given:
+            start = buffer.address - content.ctypes.data
+            if start >= 0 and start + buffer.size <= len(content):
+                return position + start, buffer.size
+        raise ValueError("a buffer that is compressed, or leads elsewhere")
 
 
 def load_dataset(folder: str | Path, config: str = "single_shot", split: str | None = None) -> "Dataset | DatasetDict":
@@ -397,6 +477,8 @@ def _joined_split(dataset: DatasetFolder, config: str, split: str) -> "Dataset":
     tables = []
     for group in dataset.manifest.groups:
         shards = [s for s in dataset.manifest.shards if s.split == split and s.group == group]
+        for shard in shards:
+            dataset.opened(shard).check()  # `datasets` trusts the offsets in a file
         files = [MemoryMappedTable.from_file(str(dataset.path / shard.path)) for shard in shards]
         names = [name for name in files[0].column_names if name in columns]
         if names:

@@ -31,7 +31,7 @@ from fpp_ml_bench.loaders.storage.manifest import (
     damage_of,
 )
 from fpp_ml_bench.loaders.storage.shards import arrow_schema
-from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import DatasetFolder, stored_types
 
 Hashes = dict[tuple[str, str], dict[str, str]]
 """Of every image, by split and column and then by sample."""
@@ -84,22 +84,21 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: Hashes, uni
     if len(rows) != shard.rows:
         return [f"{path}: the manifest has no such rows"]
     expected = manifest.columns(shard.group)
-    mapped = opened.mapped(shard)
-    batches = mapped.batches
-    right = batches and _types(batches[0].schema) == _types(arrow_schema(manifest.features(shard.group)))
-    if not right or sum(len(b) for b in batches) != shard.rows:
+    file = opened.opened(shard)
+    if file.types != stored_types(arrow_schema(manifest.features(shard.group))) or file.rows != shard.rows:
         return [f"{path}: its rows or columns are not those the manifest says"]
     findings = []
     if shard.group == DATA_GROUP:
-        stored = [labels for batch in batches for labels in batch.select([*LABELS, *RANGE]).to_pylist()]
+        named = {name: file.column(name, 0, file.rows) for name in (*LABELS, *RANGE)}
+        stored = pa.table(named).to_pylist()
         wanted = [labels_of(row, shard.split) for row in rows]
         pairs = zip(wanted, stored, strict=True)
         findings += [f"{path}: expected labels {row}, found {labels}" for row, labels in pairs if labels != row]
     for column in expected:
         if column in (*LABELS, *RANGE):
             continue
-        images = (image for batch in mapped.images(column) for image in batch)
-        for row, image in zip(rows, images, strict=True):
+        for number, row in enumerate(rows):
+            image = file.image(column, number)
             problem = depth_problem(image) if column in DEPTHS else None
             if column == DEPTH and not problem and depth_range_mm(image) != (row["depth_min_mm"], row["depth_max_mm"]):
                 problem = "depth_min and depth_max do not fit its depth"
@@ -112,11 +111,6 @@ def _shard_findings(opened: DatasetFolder, shard: ShardFile, hashes: Hashes, uni
                 uniform.add(digest)
     opened.forget(shard)
     return findings
-
-
-def _types(schema: pa.Schema) -> list[tuple[str, pa.DataType]]:
-    """Columns and what they are stored as, whether or not `datasets` has registered its array extension."""
-    return [(field.name, getattr(field.type, "storage_type", field.type)) for field in schema]
 
 
 def _coverage_findings(manifest: Manifest) -> list[str]:

@@ -3,6 +3,7 @@ read, outputs that nobody reads, and SIGTERM."""
 
 import errno
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -10,6 +11,7 @@ import sys
 import time
 from contextlib import contextmanager
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -19,18 +21,19 @@ from conftest import TINY_SIZE, tiny_settings
 from disks import small_disk
 from scored_dataset import make_dataset
 
-from fpp_ml_bench import pool
+from fpp_ml_bench import files, pool
 from fpp_ml_bench.baselines.diagnostics.probe import diagnose
 from fpp_ml_bench.baselines.learned.filter_recipe import FilterRecipe
 from fpp_ml_bench.baselines.learned.recipes import CrossedRecipe, PhaseRecipe
 from fpp_ml_bench.baselines.learned.training import train_net
 from fpp_ml_bench.baselines.training.engine import CHECKPOINT, alone_in, save_checkpoint
 from fpp_ml_bench.cli import main, main_eval, run_command
+from fpp_ml_bench.cli.console import progress_bar
 from fpp_ml_bench.cli.options import command
-from fpp_ml_bench.errors import DatasetError, DiagnosisError, PoolError, RemoteError, TrainingError
-from fpp_ml_bench.files import LOCK_FILE, exclusive, file_hash, write_atomically
+from fpp_ml_bench.errors import BuildError, DatasetError, DiagnosisError, PoolError, RemoteError, TrainingError
+from fpp_ml_bench.files import LOCK_FILE, exclusive, file_hash, printable, whole_file, whole_folder, write_atomically
 from fpp_ml_bench.loaders.render.builder import build
-from fpp_ml_bench.loaders.storage import assembly, store
+from fpp_ml_bench.loaders.storage import assembly
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.remote import RemoteFolder
 
@@ -74,7 +77,7 @@ def test_of_two_that_train_in_a_folder_one_is_told(tmp_path):
         for recipe in (PhaseRecipe(), CrossedRecipe(), FilterRecipe()):
             with pytest.raises(TrainingError, match=r"another process is training in this folder; wait for it"):
                 train_net(recipe, out)
-    assert list(out.iterdir()) == []
+    assert not out.exists()  # the lock made it, and nothing was written there
 
 
 def test_of_two_reports_in_a_folder_one_is_told(tmp_path):
@@ -89,7 +92,7 @@ def test_a_lock_of_a_folder_that_was_moved_away_is_not_that_of_the_next(tmp_path
     with exclusive(tmp_path / "a" / LOCK_FILE, tmp_path, "here"):
         (tmp_path / "a").rename(tmp_path / "b")
         with exclusive(tmp_path / "a" / LOCK_FILE, tmp_path, "here"):
-            pass
+            (tmp_path / "a" / "kept").write_text("")
         (tmp_path / "a" / LOCK_FILE).write_text("")
     assert (tmp_path / "a" / LOCK_FILE).exists()
 
@@ -238,14 +241,13 @@ def test_errors_of_the_system_come_without_numbers(tmp_path, monkeypatch):
 # ---- files that are cut while they are read
 
 
-def test_a_shard_that_is_cut_while_it_is_open_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr(store, "LOOK_EVERY_S", 0)
+def test_a_shard_that_is_cut_while_it_is_open_is_named(tmp_path):
     opened = make_dataset(tmp_path / "set")
     sample = opened.samples("test")[0]
     opened.frame(sample, 0)
     shard = next(shard for shard in opened.manifest.shards if shard.split == "test")
     os.truncate(opened.path / shard.path, 4096)
-    with pytest.raises(DatasetError, match=rf"{shard.path}: was cut to 4096 of {shard.bytes} bytes while it was read"):
+    with pytest.raises(DatasetError, match=rf"{shard.path}: was cut to 4096 bytes while it was read"):
         opened.depth_mm(sample)
     with pytest.raises(DatasetError, match=rf"{shard.path}: has 4096 bytes, expected {shard.bytes}"):
         DatasetFolder(opened.path)
@@ -270,6 +272,71 @@ def test_a_file_that_is_cut_while_it_is_hashed_has_another_hash(tmp_path, monkey
 
     monkeypatch.setattr(xxhash, "xxh3_128", Cutting)
     assert file_hash(file) != whole
+
+
+# ---- names of temporary files
+
+
+def test_no_planted_link_is_followed(tmp_path, monkeypatch):
+    """Even where the name is guessed."""
+    victim = tmp_path / "victim"
+    victim.write_text("precious")
+    monkeypatch.setattr(files, "token_hex", lambda count: "0" * 16)
+    for plant in (os.symlink, os.link):
+        plant(victim, tmp_path / f".{'0' * 16}.tmp")
+        with pytest.raises(FileExistsError):
+            write_atomically(tmp_path / "result.json", b"other")
+        assert victim.read_text() == "precious" and not (tmp_path / "result.json").exists()
+    monkeypatch.undo()
+    (tmp_path / "result.json").symlink_to(victim)
+    write_atomically(tmp_path / "result.json", b"other")
+    assert victim.read_text() == "precious" and not (tmp_path / "result.json").is_symlink()
+    with pytest.raises(RuntimeError), whole_file(tmp_path / "half") as file:
+        assert re.fullmatch(files.UNFINISHED, Path(file.name).name)
+        raise RuntimeError
+    assert {path.name for path in tmp_path.iterdir()} == {"victim", "result.json"}
+
+
+def test_a_folder_that_is_made_whole_does_not_begin_in_a_link(tmp_path):
+    (tmp_path / "elsewhere" / "files").mkdir(parents=True)
+    (tmp_path / "elsewhere" / "files" / "kept").write_text("")
+    (tmp_path / ".out.unfinished").symlink_to("elsewhere")
+    with pytest.raises(BuildError, match="is a link"), whole_folder(tmp_path / "out", "here", BuildError):
+        pass
+    assert (tmp_path / "elsewhere" / "files" / "kept").exists()
+
+
+# ---- memory, names that steer a terminal
+
+
+def test_too_little_memory_is_a_message(capsys):
+    for error in (MemoryError(), MemoryError("Unable to allocate 3 GiB")):
+        assert run_command(Mock(side_effect=error), "fpp-bench x", []) == 2
+    library = ImportError("libarrow.so: failed to map segment from shared object")
+    assert run_command(Mock(side_effect=library), "fpp-bench x", []) == 2
+    with pytest.raises(ImportError, match="cannot import name"):
+        run_command(Mock(side_effect=ImportError("cannot import name 'x'")), "fpp-bench x", [])
+    said = capsys.readouterr().err
+    assert "a library can't be loaded (libarrow.so: failed" in said
+    assert "there is not enough memory;" in said and "memory (Unable to allocate 3 GiB); allow more" in said
+
+
+def test_what_would_steer_the_terminal_is_escaped_in_an_error(capsys, tmp_path):
+    assert main(["info", str(tmp_path / "a\x1b[31m\x07b")]) == 2
+    said = capsys.readouterr().err
+    assert "\x1b" not in said and "a\\x1b[31m\\x07b" in said
+
+
+@pytest.mark.parametrize("name", ["x[/b]", "[red]", "{0}", ":warning:", "a\nb", "\x1b[2J", "%s", "é" * 300, "\\"])
+def test_a_name_is_no_markup_of_a_progress_bar(name, capsys):
+    with progress_bar(name, 2, "samples") as advance:
+        advance(2)
+    with progress_bar("plain", 2, "samples") as advance:
+        advance(1)
+    said = capsys.readouterr().err
+    assert "plain" in said and "\x1b[2J" not in said
+    if len(name) < 10:
+        assert printable(name) in said
 
 
 # ---- shared memory

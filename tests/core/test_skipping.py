@@ -1,8 +1,5 @@
 """What a scene does not need is left out, and the results are the same bytes with skipping off."""
 
-import shutil
-from pathlib import Path
-
 import numpy as np
 import pytest
 import trimesh
@@ -196,41 +193,12 @@ def test_an_image_without_object_never_reads_the_second_direction():
 # ---- reading
 
 
-def mapped_bytes(folder):
-    """Bytes of files below ``folder`` that lie in this process's memory, by the kernel's count (proc(5), smaps)."""
-    total, counted = 0, False
-    for line in Path("/proc/self/smaps").read_text().splitlines():
-        if "-" in line.split(" ", 1)[0]:
-            counted = str(folder) in line
-        elif counted and line.startswith("Rss:"):
-            total += 1024 * int(line.split()[1])
-    return total
-
-
-def test_memory_of_a_split_that_is_gone_through_does_not_grow_with_its_samples(tiny, tmp_path):
-    own = tmp_path / "dataset"  # other tests of this process may have the shared one mapped
-    shutil.copytree(tiny, own)
-    opened = DatasetFolder(own)
-    size, copies, resident = TINY_SIZE**2, [], []
-    for sample in opened.samples("all"):
-        copies.append([image.copy() for image in (*opened.frames(sample, range(52)), opened.depth_mm(sample))])
-        opened.release(sample)
-        resident.append(mapped_bytes(own))
-    # Opening a file maps what stands between its images; that is there from the first sample on.
-    assert len(resident) == 24 and max(resident) <= resident[0] + 56 * size < 24 * 56 * size / 4
-    # Views of what was let go are still good, and count again.
-    for images, sample in zip(copies, opened.samples("all"), strict=True):
-        for image, again in zip(images, (*opened.frames(sample, range(52)), opened.depth_mm(sample)), strict=True):
-            np.testing.assert_array_equal(image, again)
-    assert mapped_bytes(own) > 24 * 56 * size
-
-
 def test_frames_that_a_method_does_not_use_are_not_read(tiny):
     opened = DatasetFolder(tiny)
     method = ClassicalMethod(opened.rig, direction="vertical", steps=3)
     sample = opened.samples("test")[0]
     frames = captured_frames(opened, method, sample)
     assert [i for i, frame in enumerate(frames) if frame is not None] == list(method.frames_used)
-    read = {path: mapped._images for path, mapped in opened._mapped.items()}  # no other files are mapped
+    read = {path: file._starts for path, file in opened._opened.items()}  # no other files are opened
     groups = {"/".join(path.split("/")[-2:]).split("-")[0] for path in read}
     assert groups == {"test/vertical", "test/codes"} and sum(map(len, read.values())) == len(method.frames_used) == 10

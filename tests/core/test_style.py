@@ -4,6 +4,7 @@ import io
 
 import matplotlib
 import numpy as np
+import pytest
 from matplotlib.colors import to_rgb
 from PIL import Image
 
@@ -51,3 +52,35 @@ def test_line_colours_differ_to_everyone():
     seen = linear @ np.array([[0.11238, 0.88762, 0], [0.11238, 0.88762, 0], [0.00401, -0.00401, 1]]).T
     apart = np.abs(seen[:, None] ** (1 / 2.2) - seen[None] ** (1 / 2.2)).max(axis=-1)
     assert apart[~np.eye(len(rgb), dtype=bool)].min() > 0.08
+
+
+# ---- a user's settings, and names
+
+
+@styled
+def titled(title):
+    picture = figure(3, 2)
+    axes = picture.subplots()
+    axes.plot([1, 2, 3], [1e-3, 1, 1e3], label=title)
+    axes.set(title=title, yscale="log", xlabel=title)
+    return with_legend(picture, 1)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"text.usetex": True},
+        {"font.size": 30, "axes.facecolor": "red", "savefig.bbox": "tight", "savefig.dpi": 10},
+        {"axes.formatter.use_locale": True, "figure.autolayout": True, "image.cmap": "jet"},
+    ],
+)
+def test_a_users_matplotlib_settings_change_no_picture_and_stay(settings):
+    before = titled("a title")
+    with matplotlib.rc_context(settings):
+        assert titled("a title") == before
+        assert {key: matplotlib.rcParams[key] for key in settings} == settings
+
+
+@pytest.mark.parametrize("name", ["$x^{2$ and $", "$\\frac{$", "a $ b $ c", "100%", "_", "[/b]", "x" * 300, "{0}"])
+def test_a_name_is_no_formula(name):
+    assert titled(name).startswith(b"\x89PNG")

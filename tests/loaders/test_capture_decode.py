@@ -11,6 +11,8 @@ from fpp_ml_bench.cli import main
 from fpp_ml_bench.coding.code import Reason
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm, depth_sigma_mm, noise_of_frames
+from fpp_ml_bench.errors import CaptureError
+from fpp_ml_bench.files import LOCK_FILE, exclusive, whole_folder
 from fpp_ml_bench.loaders.captures.decoding import decode_capture
 from fpp_ml_bench.loaders.captures.images import CapturedFrames
 from fpp_ml_bench.loaders.render.meshes import solid_mesh
@@ -161,11 +163,11 @@ def test_a_decoding_killed_in_the_middle_leaves_nothing_that_the_next_refuses(ca
     monkeypatch.setattr("fpp_ml_bench.loaders.captures.exports.write_report", killed)
     assert decode(folder, folder / "scan", tmp_path / "out", "--forms", "npy") == 130
     assert not (tmp_path / "out" / "decode.json").exists()  # what is there is no result
-    (tmp_path / "out" / ".mesh.ply.31.tmp").write_bytes(b"cut off")
+    (tmp_path / "out" / ".0123456789abcdef.tmp").write_bytes(b"cut off")
     monkeypatch.undo()
     assert decode(folder, folder / "scan", tmp_path / "out", "--forms", "mat") == 0
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert {"decode.json", "depth.mat"} <= names and not {"depth.npy", ".mesh.ply.31.tmp"} & names
+    assert {"decode.json", "depth.mat"} <= names and not {"depth.npy", ".0123456789abcdef.tmp"} & names
 
 
 @pytest.mark.parametrize("gamma", [1.0, 1.5, 2.2])
@@ -236,8 +238,34 @@ def test_patterns_come_with_a_manifest(tmp_path, capsys):
     assert manifest["frames"][1]["shows"] == "vertical Gray bit 0"
     white = cv2.imread(str(tmp_path / "images" / "A_0.png"), cv2.IMREAD_UNCHANGED)
     assert white.shape == (100, 200) and (white == 255).all()
-    assert main(["patterns", str(file), "--out", str(tmp_path / "images")]) == 2
-    assert "not empty" in capsys.readouterr().err
+    again = ["patterns", str(file), "--out", str(tmp_path / "images")]
+    assert main(again) == 0  # the whole set is there
+    (tmp_path / "images" / "A_1.png").write_bytes(b"other")
+    assert main(again) == 2
+    assert "is not empty; give a new folder, so that no old pattern" in capsys.readouterr().err
+
+
+def test_a_killed_writing_of_patterns_leaves_none_and_a_second_one_is_told(tmp_path, capsys, monkeypatch):
+    words = ["patterns", "paper", "--out", str(tmp_path / "images")]
+
+    def killed(*contents):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr("fpp_ml_bench.cli.patterns.write_files", killed)
+        assert main(words) == 130
+    assert not (tmp_path / "images").exists()
+    with whole_folder(tmp_path / "images", "here", CaptureError):
+        assert main(words) == 2
+    assert "another process is writing patterns there" in capsys.readouterr().err
+
+
+def test_of_two_that_decode_into_a_folder_one_is_told(capture, tmp_path, capsys):
+    folder, _ = capture
+    out = tmp_path / "out"
+    with exclusive(out / LOCK_FILE, out, "here", CaptureError):
+        assert decode(folder, folder / "scan", out) == 2
+    assert f"{out}: another process is decoding into this folder; wait for it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

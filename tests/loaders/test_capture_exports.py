@@ -205,8 +205,8 @@ def test_pixels_without_a_ray_have_no_point(tmp_path):
 def _filled(folder, *others):
     """A folder with all that a decoding writes and what a killed one leaves, and ``others``."""
     export_capture(folder, PLANE_MM, CAMERA)
-    names = ("decode.json", "sigma_mm.npy", "modulation.npy", "reason.npy", "picture.png", ".depth_0.01mm.png.31.tmp")
-    for name in (*names, ".decode.json.7.tmp", *others):
+    names = ("decode.json", "sigma_mm.npy", "modulation.npy", "reason.npy", "picture.png", ".0123456789abcdef.tmp")
+    for name in (*names, ".fedcba9876543210.tmp", *others):
         (folder / name).write_text("")
     return folder
 
@@ -223,7 +223,7 @@ def test_what_a_decoding_wrote_is_removed_the_report_first(tmp_path, monkeypatch
     assert not (tmp_path / "absent").exists()
 
 
-@pytest.mark.parametrize("name", ["notes.txt", "depth.npy.bak", ".depth.npy", "depth.npy.7.tmp", "depth_mm.npy"])
+@pytest.mark.parametrize("name", ["notes.txt", "depth.npy.bak", ".depth.npy", ".depth.npy.7.tmp", "depth_mm.npy"])
 def test_other_files_are_named_before_anything_is_removed(tmp_path, name):
     folder = _filled(tmp_path / "out", name)
     before = sorted(folder.iterdir())

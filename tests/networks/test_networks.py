@@ -179,7 +179,7 @@ def test_input_that_is_no_fringe_image(name, fringe):
     [
         ("vnet", {}, "unknown network 'vnet'; there are unet, transunet"),
         ("unet", {"widht": 8}, "'unet' has no option 'widht'; there are: width .default 64.*dropout"),
-        ("unet", {"width": 0}, "width must be a whole number, at least 1; it was 0"),
+        ("unet", {"width": 0}, "width must be a whole number, 1 to 4096; it was 0"),
         ("unet", {"width": 8.5}, "width"),
         ("unet", {"width": True}, "width"),
         ("unet", {"width": "8"}, "width"),
@@ -190,7 +190,7 @@ def test_input_that_is_no_fringe_image(name, fringe):
         ("hformer", {"width": 6}, "multiple of 4"),
         ("hformer", {"drop_path": -0.1}, "drop_path"),
         ("pix2pix", {"dropout": 0.1}, "no option"),
-        ("pix2pix_unet", {"levels": 1}, "levels must be a whole number, at least 2"),
+        ("pix2pix_unet", {"levels": 1}, "levels must be a whole number, 2 to 4096"),
     ],
 )
 def test_refused_names_and_options(name, options, match):

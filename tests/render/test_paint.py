@@ -1,7 +1,10 @@
 """Users' meshes with colours: linear luminance, interpolation and images against closed forms, and damaged files."""
 
 import json
+import os
 import struct
+import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -281,3 +284,65 @@ def test_changed_bytes_give_a_mesh_or_words(tmp_path, suffix):
                 weights = np.full((len(mesh.faces), 3), 1 / 3)
                 assert np.isfinite(mesh.paint.at(np.arange(len(mesh.faces)), weights)).all()
     assert refused > 5
+
+
+# ---- meshes of strangers
+
+
+@pytest.mark.parametrize(
+    "name, kind",
+    [
+        ("quad.mtl", "pipe"),
+        ("quad.mtl", "folder"),
+        ("quad.png", "pipe"),
+        ("quad.png", "device"),
+        ("quad.png", "folder"),
+    ],
+)
+def test_what_a_mesh_names_must_be_a_regular_file(tmp_path, name, kind):
+    path = write_quad(tmp_path, two_colours())
+    (tmp_path / name).unlink()
+    makers = {"pipe": os.mkfifo, "device": lambda at: at.symlink_to("/dev/zero"), "folder": Path.mkdir}
+    makers[kind](tmp_path / name)
+    with pytest.raises(MeshError, match=rf"^{path}: names the file '{name}', which is not (a regular file|beside it)"):
+        load_user_mesh(UserMesh("quad", str(path)))
+
+
+def test_textures_are_counted_by_their_headers_before_any_is_decoded(tmp_path):
+    path = write_quad(tmp_path, two_colours())
+    header = struct.pack(">IIBBBBB", 1 << 14, (1 << 13) + 1, 8, 2, 0, 0, 0)
+    chunks = [
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in ((b"IHDR", header), (b"IDAT", b"x"))
+    ]
+    (tmp_path / "quad.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
+    with pytest.raises(MeshError, match=r"has textures of 134234112 px, expected 134217728; shrink them"):
+        load_user_mesh(UserMesh("quad", str(path)))
+
+
+def test_a_mesh_without_end_is_refused_by_its_header(tmp_path):
+    scene = trimesh.Scene(trimesh.creation.box())
+    content = scene.export(file_type="glb")
+    length = struct.unpack_from("<I", content, 12)[0]
+    header = json.loads(content[20 : 20 + length])
+    header["nodes"] = header["nodes"][:1] + [{"mesh": 0}] * 20_001
+    header["nodes"][0] = {"children": list(range(1, len(header["nodes"])))}
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    body = struct.pack("<II", len(text), 0x4E4F534A) + text + content[20 + length :]
+    (tmp_path / "many.glb").write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body)
+    with pytest.raises(MeshError, match=r"many\.glb: has 20002 parts, expected at most 20000; join them"):
+        load_user_mesh(UserMesh("many", str(tmp_path / "many.glb")))
+
+
+def test_materials_that_share_a_texture_hold_it_once(tmp_path):
+    path = write_quad(tmp_path, two_colours())
+    once = load_user_mesh(UserMesh("quad", str(path))).paint
+    material = (tmp_path / "quad.mtl").read_text()
+    (tmp_path / "quad.mtl").write_text(material + material.replace("newmtl paint", "newmtl again"))
+    text = path.read_text().splitlines()
+    faces = [line for line in text if line.startswith("f ")]
+    path.write_text("\n".join([*text, "usemtl again", *faces]) + "\n")
+    twice = load_user_mesh(UserMesh("quad", str(path))).paint
+    assert len(once.images) == len(twice.images) == 1 and len(twice.image) == 2 * len(once.image)
+    np.testing.assert_array_equal(once.images[0], twice.images[0])

@@ -15,6 +15,7 @@ from scored_dataset import write_predictions
 
 from fpp_ml_bench.errors import BuildError, DatasetError, LayoutError
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.files import whole_folder
 from fpp_ml_bench.loaders.published import exporting as export_tree
 from fpp_ml_bench.loaders.published.exporting import chosen_splits, export
 from fpp_ml_bench.loaders.published.importing import import_notes
@@ -301,16 +302,14 @@ def test_a_full_disk_leaves_nothing_and_a_second_try_succeeds(opened, tmp_path, 
         export(opened, out, ["mat"], ["test"], threads=2)
     assert list(out.parent.iterdir()) == []
     monkeypatch.undo()
-    (out.parent / ".out.export" / "half").mkdir(parents=True)  # what a killed export leaves
+    (out.parent / ".out.unfinished" / "half").mkdir(parents=True)  # what a killed export leaves
     export(opened, out, ["mat"], ["test"])
     assert {path.name for path in out.parent.iterdir()} == {"out"}
     assert {path.name for path in out.iterdir()} == {TRAINING.name, SCANS.name}
 
 
 def test_two_exports_into_one_folder_and_folders_that_hold_something(opened, tmp_path):
-    from fpp_ml_bench.loaders.published.exporting import exporting
-
-    with exporting(tmp_path / "out"):
+    with whole_folder(tmp_path / "out", "exporting there", BuildError):
         with pytest.raises(BuildError, match="another process"):
             export(opened, tmp_path / "out", ["patterns"], ["test"])
         assert not (tmp_path / "out").exists()

@@ -142,16 +142,16 @@ def test_killed_again_and_again_and_resumed_to_the_same_bytes(tiny, tmp_path, ca
     def largest(pattern):
         """Size of the largest unfinished file of that name."""
         sizes = [0]
-        for path in work.glob(pattern):
+        for path in folder.glob(pattern):
             with contextlib.suppress(FileNotFoundError):  # finished and renamed meanwhile
                 sizes.append(path.stat().st_size)
         return max(sizes)
 
     moments = [
-        (1, lambda: largest("train*.tmp") > 1_000_000),  # in the middle of a shard
+        (1, lambda: largest("train/.*.tmp") > 1_000_000),  # in the middle of a shard
         (1, lambda: (work / "train-00000-of-00001.json").exists()),  # straight after the first
-        (2, lambda: largest("*.tmp") > 100_000),  # with two worker processes
-        (1, lambda: largest("test*.tmp") > 1_000_000),
+        (2, lambda: largest("*/.*.tmp") > 100_000),  # with two worker processes
+        (1, lambda: largest("test/.*.tmp") > 1_000_000),
     ]
     reached = 0
     for workers, moment in moments:
@@ -339,7 +339,7 @@ def test_death_of_a_worker_is_an_error_that_says_so_and_the_rest_is_kept(tmp_pat
 def test_sigterm_to_a_build_in_processes_makes_no_noise(tmp_path, uninterrupted, direct_light):
     folder = tmp_path / "set"
     process = start(folder, "--objects", "cork,mug", "--config", "single_shot", "--light", direct_light, workers=2)
-    assert wait_for(lambda: list(folder.glob(".build/*.tmp")), process)
+    assert wait_for(lambda: list(folder.glob("*/.*.tmp")), process)
     os.killpg(process.pid, signal.SIGTERM)
     errors = process.communicate(timeout=60)[1]
     assert process.returncode == 143 and errors.endswith("fpp-bench build: stopped\n")
@@ -437,15 +437,15 @@ def test_files_that_can_not_grow(tmp_path, direct_light, uninterrupted):
 def test_disk_that_is_full_at_the_very_end(tmp_path, uninterrupted, monkeypatch, name):
     """No space for a small file: the card, the manifest, a state file."""
     folder = tmp_path / "set"
-    opened = Path.open
+    replace = Path.replace
 
-    def no_space(self, mode="r", *more, **options):
-        if "w" in mode and name in self.name:
+    def no_space(self, target):
+        if name in target.name:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self))
-        return opened(self, mode, *more, **options)
+        return replace(self, target)
 
     with monkeypatch.context() as patched:
-        patched.setattr(Path, "open", no_space)
+        patched.setattr(Path, "replace", no_space)
         with pytest.raises(BuildError, match="No space left on device"):
             build(folder, half_settings(), workers=1)
     assert not (folder / "manifest.json").exists()

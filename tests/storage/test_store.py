@@ -1,7 +1,9 @@
-"""Reading images by memory map: the right pixels, without a copy, read-only, and helpful errors."""
+"""Reading images: the right pixels, read-only, and helpful errors."""
 
 import gc
+import os
 import pickle
+import random
 import shutil
 import subprocess
 import sys
@@ -10,11 +12,12 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pytest
+from scored_dataset import make_dataset
 
 from fpp_ml_bench.errors import DatasetError
 from fpp_ml_bench.loaders.sample import DATA_GROUP, column_hash, image_hash
 from fpp_ml_bench.loaders.storage.manifest import read_manifest
-from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.loaders.storage.store import DatasetFolder, OpenShard, load_dataset
 from fpp_ml_bench.optics.sequence import PAPER_SEQUENCE
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -64,10 +67,8 @@ def test_a_method_is_given_no_truth_outside_the_training_split(tiny, opened):
             seen.depth_mm(opened.samples("test")[0], "depth_exact")
         assert set(seen.measured("mug_A60")) == {"sample", "object", "view"}
         for shard in seen.manifest.shards:
-            names = {name for batch in seen.mapped(shard).batches for name in batch.schema.names}
-            assert shard.split == "train" or not {
-                name for name in names if name.startswith(("depth", "flags", "cover"))
-            }
+            names = [name for name, _ in seen.opened(shard).types]
+            assert shard.split == "train" or not any(name.startswith(("depth", "flags", "cover")) for name in names)
         np.testing.assert_array_equal(seen.frame("mug_A60", 20), opened.frame("mug_A60", 20))
         learned = opened.samples("train")[0]
         np.testing.assert_array_equal(seen.depth_mm(learned), opened.depth_mm(learned))
@@ -75,21 +76,15 @@ def test_a_method_is_given_no_truth_outside_the_training_split(tiny, opened):
     assert "depth_min_mm" in opened.measured("mug_A60")
 
 
-def test_views_share_the_mapped_memory_and_are_read_only(opened):
-    view, again = opened.frame("mug_A60", 20), opened.frame("mug_A60", 20)
-    assert np.shares_memory(view, again)
-    assert not view.flags.writeable and not view.flags.owndata
+def test_images_are_read_only_and_read_once_for_a_sample(opened):
+    view = opened.frame("mug_A60", 20)
+    assert opened.frame("mug_A60", 20) is view
     with pytest.raises(ValueError, match="read-only"):
         view[0, 0] = 1
-    depth = opened.depth_mm("mug_A60")
-    assert not depth.flags.writeable and not depth.flags.owndata
-    # The memory is that of the file's map: its address lies in a mapping of that file.
-    shard = next(s for s in opened.manifest.shards if s.split == "validation" and s.group == "vertical")
-    address = view.__array_interface__["data"][0]
-    maps = Path("/proc/self/maps").read_text().splitlines()
-    inside = [line for line in maps if str(opened.path / shard.path) in line]
-    spans = [tuple(int(x, 16) for x in line.split()[0].split("-")) for line in inside]
-    assert any(low <= address < high for low, high in spans)
+    assert not opened.depth_mm("mug_A60").flags.writeable
+    opened.depth_mm("cork_A0")
+    assert opened.frame("mug_A60", 20) is not view
+    np.testing.assert_array_equal(opened.frame("mug_A60", 20), view)
 
 
 def test_a_view_outlives_the_folder_object(tiny):
@@ -238,3 +233,94 @@ def test_content_is_of_the_decoded_values_and_not_of_the_files(tmp_path, opened)
         for split in opened.splits
         for column in (*(frame.column for frame in opened.sequence.frames), "depth", "depth_exact", "flags", "cover")
     }
+
+
+# ---- shards of strangers
+
+
+def shard_parts(tmp_path):
+    """A file of a dataset in a new folder, and the size of its images."""
+    dataset = make_dataset(tmp_path / "set")
+    shard = next(shard for shard in dataset.manifest.shards if shard.split == "test")
+    return dataset.path / shard.path, dataset.manifest.size
+
+
+def changed(path, column, buffer, place, value):
+    """Write another int32 into a buffer of offsets of a column, which pyarrow itself does not look at."""
+    content = bytearray(path.read_bytes())
+    memory = pa.py_buffer(bytes(content))
+    stored = pa.ipc.open_stream(memory).read_next_batch().column(column).buffers()[buffer]
+    offsets, start = np.frombuffer(stored, np.int32).copy(), stored.address - memory.address
+    offsets[place] = value
+    content[start : start + offsets.nbytes] = offsets.tobytes()
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize("value", [2**31 - 1, -1, 10**6])
+@pytest.mark.parametrize("column, buffer", [("sample", 1), ("depth", 1), ("depth", 3), ("frame_00", 3)])
+def test_offsets_that_lead_elsewhere_are_refused(tmp_path, column, buffer, value):
+    path, size = shard_parts(tmp_path)
+    OpenShard(path, size).check()
+    changed(path, column, buffer, -1, value)
+    with pytest.raises(DatasetError, match=rf"{path}: column {column} .*; run: fpp-bench verify"):
+        OpenShard(path, size).check()
+    with pytest.raises(DatasetError, match=f"column {column}"):
+        load_dataset(tmp_path / "set", split="test")
+
+
+def written_anew(path, change, **options):
+    """Write a shard's batch again, changed, or by other options."""
+    batch = pa.ipc.open_stream(pa.py_buffer(path.read_bytes())).read_next_batch()
+    columns = change({name: batch.column(name) for name in batch.schema.names})
+    table = pa.table(columns)
+    with pa.ipc.new_stream(path, table.schema, options=pa.ipc.IpcWriteOptions(**options)) as stream:
+        stream.write_table(table)
+
+
+@pytest.mark.parametrize(
+    "change, options",
+    [
+        (lambda columns: columns, {"compression": "lz4"}),
+        (lambda columns: columns, {"compression": "zstd"}),
+        (lambda columns: {**columns, "depth": pa.nulls(len(columns["depth"]), columns["depth"].type)}, {}),
+        (lambda columns: {**columns, "depth": columns["sample"].dictionary_encode()}, {}),
+        (lambda columns: {**columns, "depth": columns["sample"]}, {}),
+        (lambda columns: {**columns, "depth": pa.array([[[[1.0]]]] * len(columns["sample"]))}, {}),
+        (lambda columns: {**columns, "depth": pa.array([[["a"]]] * len(columns["sample"]))}, {}),
+        (lambda columns: {name: column for name, column in columns.items() if name != "depth"}, {}),
+    ],
+    ids=["lz4", "zstd", "nulls", "dictionary", "text", "deeper", "words", "missing"],
+)
+def test_shards_of_another_form_are_refused(tmp_path, change, options):
+    path, size = shard_parts(tmp_path)
+    written_anew(path, change, **options)
+    with pytest.raises(DatasetError, match=str(path)):
+        OpenShard(path, size).image("depth", 0)
+
+
+def test_damaged_metadata_are_read_or_refused(tmp_path):
+    """In one process: none of them may end it."""
+    path, size = shard_parts(tmp_path)
+    whole, chance, refused = path.read_bytes(), random.Random(0), 0
+    ends = [3000, len(whole)]
+    for number in range(200):
+        content = bytearray(whole)
+        for _ in range(chance.randrange(1, 4)):
+            content[chance.randrange(ends[number % 2])] = chance.randrange(256)
+        path.write_bytes(content)
+        try:
+            shard = OpenShard(path, size)
+            shard.check()
+            for row in range(shard.rows):
+                shard.image("depth", row)
+        except DatasetError:
+            refused += 1
+    assert 50 < refused < 200
+
+
+def test_a_pipe_in_the_place_of_a_shard_is_refused_at_once(tmp_path):
+    path, size = shard_parts(tmp_path)
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(DatasetError, match="is not a regular file"):
+        OpenShard(path, size)

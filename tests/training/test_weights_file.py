@@ -1,6 +1,7 @@
 """Weights on disk: what goes in comes out to the bit, and nothing else is read."""
 
 import json
+import os
 import struct
 
 import numpy as np
@@ -10,7 +11,14 @@ from safetensors.torch import load_file, save_file
 from tiny_network import config_of, tiny_network
 
 from fpp_ml_bench.baselines.training import weights as weights_file
-from fpp_ml_bench.baselines.training.weights import open_weights, save_weights, weights_path
+from fpp_ml_bench.baselines.training.weights import (
+    DEPTH_NETWORKS,
+    SHIPPED,
+    open_weights,
+    read_file,
+    save_weights,
+    weights_path,
+)
 from fpp_ml_bench.errors import WeightsError
 
 HEADS = {"range_mean": torch.tensor([1700.0, 1900.0], dtype=torch.float64)}
@@ -202,3 +210,38 @@ def test_names_and_paths(saved, monkeypatch, tmp_path):
     for path, words in ((tmp_path, "found a folder"), (tmp_path / "no.safetensors", "found nothing")):
         with pytest.raises(WeightsError, match=words):
             open_weights(path)
+
+
+@pytest.mark.parametrize(
+    "options, said",
+    [
+        ({"levels": 1_000_000}, "levels must be a whole number, 2 to 4096; it was 1000000"),
+        ({"levels": 3_000}, "more than twice as many parameters as the file has tensors"),
+        ({"width": 10**30}, "width must be a whole number, 1 to 4096"),
+        ({"width": int("9" * 2000)}, "a number of more than 1000 digits"),
+    ],
+    ids=["levels", "fewer levels", "width", "digits"],
+)
+def test_a_network_without_end_is_refused_before_it_is_built(tmp_path, options, said):
+    file = SHIPPED / "pix2pix_unet-individual-gan_0.7.safetensors"
+    path = tmp_path / "giant.safetensors"
+    path.write_bytes(file.read_bytes())
+    config = config_with(path, options=options)
+    with pytest.raises(WeightsError, match=said):
+        open_weights(rewrite(path, {"config": config}))
+
+
+def test_a_header_that_does_not_fit_the_file_is_refused_before_the_file_is_read(saved, tmp_path):
+    data = saved.read_bytes()
+    files = {
+        "sparse": (data, "its header tells of .* bytes, it has 3000000000"),
+        "endless": ((1 << 62).to_bytes(8, "little") + data[8:], "a header of 4611686018427387904 bytes, found"),
+        "deep": ((2 << 16).to_bytes(8, "little") + b'{"a":' + b"[" * (2 << 16), "nested too deeply"),
+    }
+    for name, (content, said) in files.items():
+        path = tmp_path / f"{name}.safetensors"
+        path.write_bytes(content)
+        if name == "sparse":
+            os.truncate(path, 3_000_000_000)
+        with pytest.raises(WeightsError, match=f"{path}: damaged or no .safetensors file .*{said}"):
+            read_file(path, DEPTH_NETWORKS)
