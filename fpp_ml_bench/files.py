@@ -432,7 +432,7 @@ def _check_values(value: Any, where: str = "") -> None:
     elif isinstance(value, int | float) and not abs(value) <= LARGEST:
         number = printable(json.dumps(value), 60)
         raise ValueError(
-            f"{printable(where) or 'the file'}: {number} is no number; expected a magnitude of at most {LARGEST:g}"
+            f"{printable(where) or 'the file'}: {number} is no number; expected a finite one up to {LARGEST:g}"
         )
     elif isinstance(value, str) and not value.isascii() and any("\ud800" <= letter <= "\udfff" for letter in value):
         raise ValueError(f"{printable(where) or 'the file'}: half of a surrogate pair; write the character itself")

@@ -25,9 +25,15 @@ def as_tuple(value: Any) -> Any:
     return tuple(value) if isinstance(value, list) else value
 
 
+def _not_tiny(value: float) -> float:
+    if value < 1 / LARGEST:
+        raise ValueError(f"expected at least {1 / LARGEST:g}")
+    return value
+
+
 Text = Annotated[str, AfterValidator(_checked)]
 Scalar = Text | bool | int | float | None
-Positive = Annotated[float, Field(ge=1 / LARGEST)]
+Positive = Annotated[float, Field(gt=0), AfterValidator(_not_tiny)]
 NonNegative = Annotated[float, Field(ge=0)]
 Share = Annotated[float, Field(ge=0, le=1)]
 Count = Annotated[int, Field(ge=0)]

@@ -133,7 +133,7 @@ def read_mesh(path: Path) -> tuple[NDArray[np.float64], NDArray[np.int32], Paint
     there, or a texture that is damaged or missing, and for one that takes too much memory or time."""
 
     def parse(content: bytes) -> Answer:
-        return guarded(_read_mesh, content, len(content) + _UNPACKED_BYTES, path=str(path))
+        return guarded(_read_mesh, content, len(content) + _UNPACKED_BYTES, path=str(path.absolute()))
 
     facts, values = from_file(parse, path, MeshError, cure="make the mesh smaller")
     vertices, faces, *paint = arrays_of(facts, values)

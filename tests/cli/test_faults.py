@@ -449,7 +449,11 @@ def test_a_prediction_that_is_terminated_resumes(tiny, tmp_path):
         time.sleep(0.001)
     process.terminate()
     errors = process.communicate(timeout=60)[1]
-    assert process.returncode == 143 and errors.endswith("fpp-bench predict: stopped\n") and "Traceback" not in errors
+    assert (
+        process.returncode == 143
+        and errors.endswith("fpp-bench predict: stopped; the same command continues\n")
+        and "Traceback" not in errors
+    )
     assert (out / "unfinished.jsonl").exists() and not (out / LOCK_FILE).exists() and not list(out.glob(".*.tmp"))
     assert main(words) == 0
     assert np.load(next(out.glob("*.npy"))).shape == (TINY_SIZE, TINY_SIZE)

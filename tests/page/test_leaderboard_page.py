@@ -298,7 +298,7 @@ def test_empty_board_says_how_to_begin(tmp_path, monkeypatch):
 def test_unwritable_page_is_an_error(files, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     assert main(["leaderboard", str(files[0]), "--page", str(tmp_path / "file")]) == 2
-    assert "can't be written" in capsys.readouterr().err
+    assert "file: is a file; give a folder" in capsys.readouterr().err
 
 
 @pytest.fixture

@@ -1,5 +1,8 @@
 """Users' own meshes: the four formats with scale and pose, and every way a file or a list of them can be wrong."""
 
+import shutil
+from pathlib import Path
+
 import numpy as np
 import pytest
 import trimesh
@@ -8,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from fpp_ml_bench.constants import OBJECTS
 from fpp_ml_bench.errors import MeshError
+from fpp_ml_bench.loaders.render.mesh_files import read_mesh
 from fpp_ml_bench.loaders.render.meshes import load_user_mesh, read_mesh_list, single_mesh, solid_mesh, write_ply
 from fpp_ml_bench.loaders.render.scene import UserMesh
 
@@ -219,3 +223,19 @@ def test_own_names_can_never_meet_the_benchmarks(part):
         path.write_bytes(part.read_bytes())
         with pytest.raises(MeshError, match="own objects"):
             single_mesh(path)
+
+
+def test_a_mesh_is_read_from_the_present_folder_by_a_process_that_started_in_another(tmp_path, monkeypatch):
+    """The process that read an earlier mesh waits for the next one, also when the folder it started in is gone."""
+    texts = ["mtllib paint.mtl\nusemtl a\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "newmtl a\nKd {} 0 0\n"]
+    hashes = []
+    for name, red in (("first", 0.2), ("second", 0.9)):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "mesh.obj").write_text(texts[0])
+        (folder / "paint.mtl").write_text(texts[1].format(red))
+        monkeypatch.chdir(folder)
+        hashes += read_mesh(Path("mesh.obj"))[3]
+        monkeypatch.chdir(tmp_path)
+        shutil.rmtree(folder)
+    assert len(set(hashes)) == 2
