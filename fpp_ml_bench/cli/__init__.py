@@ -110,10 +110,6 @@ BENCH = Program(
                 "find the rig that took captures, from poses of a board or from frames with depth",
             ),
             "decode": ("decode:decode", "decode captured frames: depth, point cloud, uncertainty, reasons"),
-            "fuse": (
-                "decode:fuse",
-                "put an object's views into one point cloud, and find the pixels that other views contradict",
-            ),
         },
         "share": {
             "export": ("dataset:export", "write Parquet, the published .mat tree, meshes or patterns"),
@@ -139,10 +135,6 @@ EVAL = Program(
             "check": ("evaluate:check", "check a submission before it is scored, without ground truth"),
             "compare": ("evaluate:compare", "compare two results of the same samples"),
             "verify": ("evaluate:verify", "score the predictions again, and compare with a result or row"),
-            "conformal": (
-                "evaluate:conformal",
-                "scale a stated uncertainty so that its intervals hold the stated share of errors",
-            ),
             "schema": ("evaluate:schema", "print the JSON Schema of result.json or submission.yaml"),
         }
     },

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from fpp_ml_bench.baselines.views import prediction_maps
 from fpp_ml_bench.calibration.result import VolumeError, volume_error_mm
 from fpp_ml_bench.cli import CHECK_FAILED
 from fpp_ml_bench.cli.console import gigabytes, millimetres, progress_bar, say_benchmark, show
@@ -14,7 +13,7 @@ from fpp_ml_bench.cli.options import SPLITS, command, new_file
 from fpp_ml_bench.constants import MM_PER_M, VIEWS
 from fpp_ml_bench.errors import BuildError, DatasetError
 from fpp_ml_bench.evaluation.result.file import write_json
-from fpp_ml_bench.evaluation.submission.description import read_submission
+from fpp_ml_bench.evaluation.score.check import predicted_mm
 from fpp_ml_bench.files import write_files
 from fpp_ml_bench.loaders.cloud import write_cloud
 from fpp_ml_bench.loaders.pictures import contact_sheet, front_picture, sample_cloud, sample_picture
@@ -189,10 +188,9 @@ def _prediction_picture(opened: DatasetFolder, sample: str, folder: Path, pictur
     PredictionError for predictions that could not be scored."""
     split = opened.split_of_sample(sample)
     target = DEPTH_EXACT if opened.has_exact else DEPTH
-    name, maps = prediction_maps(folder, opened, split, target)
-    submission, (depth_mm, _) = read_submission(folder), maps(sample)
+    submission, depth_mm = predicted_mm(folder, opened, split, sample, target)
     target_mm = np.where(opened.void(sample, target), 0, opened.target_mm(sample, target))
-    title = f"{sample}: {name}, {opened.size[1]} x {opened.size[0]} px"
+    title = f"{sample}: {submission.name}, {opened.size[1]} x {opened.size[0]} px"
     frame = opened.frame(sample, next(iter(submission.frames_used), 0))
     drawn = front_picture(frame, depth_mm, target_mm, opened.rig, title)
     written = write_files(picture.parent, {picture.name: drawn}, DatasetError)

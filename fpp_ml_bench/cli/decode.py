@@ -1,4 +1,4 @@
-"""``fpp-bench decode``: captured frames to depth; and ``fpp-bench fuse``: an object's views in one point cloud."""
+"""``fpp-bench decode``: captured frames to depth."""
 
 import sys
 from pathlib import Path
@@ -7,16 +7,15 @@ from time import perf_counter
 import numpy as np
 
 from fpp_ml_bench.cli.console import progress_bar, say_findings, show
-from fpp_ml_bench.cli.options import AT_LEAST_ONE, SPLITS, WORKING_RANGE, command, names, value
+from fpp_ml_bench.cli.options import AT_LEAST_ONE, WORKING_RANGE, command, names, value
 from fpp_ml_bench.coding.code import MIN_MODULATION
 from fpp_ml_bench.decoding.decode import Directions
 from fpp_ml_bench.errors import CaptureError
 from fpp_ml_bench.examination.findings import RefusedCapture
-from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, visible
+from fpp_ml_bench.files import LOCK_FILE, exclusive, visible
 from fpp_ml_bench.loaders.captures.decoding import DecodedCapture, decode_capture, read_mask
 from fpp_ml_bench.loaders.captures.exports import FORMS, check_outputs, clear_outputs, write_capture, write_report
 from fpp_ml_bench.loaders.captures.images import read_frames
-from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.rig_file import check_lengths, load_rig
 from fpp_ml_bench.options import REQUIRED, argument, option
@@ -120,51 +119,3 @@ def _print(result: "DecodedCapture") -> None:
     if result.examination.not_checked:
         print(f"not checked     {'; '.join(result.examination.not_checked)}")
     print(f"uncertainty     {np.median(sigmas):.3f} mm (standard, median over pixels; by {noise})")
-
-
-@command(
-    """\
-fpp-bench predict phase data/full --out predictions
-fpp-bench fuse predictions data/full --out fused
-fpp-bench fuse predictions data/full --object power_drill --out fused
-fpp-bench fuse depth_exact data/full --out fused-exact          the cloud of the exact depth
-"""
-)
-def fuse(
-    *,
-    predictions: str = argument(
-        "predictions of a split; or depth or depth_exact, the dataset's own (a folder: ./depth)", "PREDICTIONS"
-    ),
-    dataset: Path = argument("folder of a generated dataset", "DATASET"),
-    split: str = option("test", "split of PREDICTIONS (default: test)", choices=SPLITS),
-    only: str | None = option(None, "only this object (default: all of the split)", "NAME", flag="--object"),
-    cell_mm: float | None = option(None, "edge of the cells in which points are averaged (default: 2)", "MM"),
-    out: Path = option(REQUIRED, "folder for {object}.ply (metres, object coordinates) and fusion.json", "DIR"),
-) -> None:
-    """Put the views of each object into one point cloud by their known placement, and compare them with each other.
-
-    Prints what was counted. Raises FppBenchError for unusable predictions or data."""
-    from fpp_ml_bench.baselines import views  # trimesh takes 0.2 s, which decode does not need
-
-    opened = DatasetFolder(dataset)
-    size_mm = views.CELL_MM if cell_mm is None else cell_mm
-    name, count, objects = views.fuse_split(predictions, opened, split, out, only, size_mm)
-    table = Table(
-        "object", numbers=("points in the cloud", "pixels with a depth", "contradicted"), title=printable(name)
-    )
-    total = np.zeros(3, int)
-    with progress_bar("fusing", count, "objects") as advance:
-        for obj, counts in objects:
-            numbers = np.array([counts[key] for key in ("cloud_points", "answered_px", "contradicted_px")], int)
-            total += numbers
-            points, answered, wrong = numbers
-            table.add_row(obj, f"{points:,}", f"{answered:,}", f"{wrong:,} ({_percent(wrong, answered)})")
-            advance(1)
-    show(table)
-    _, answered, wrong = total
-    print(f"other views contradict {wrong:,} of {answered:,} pixels with a depth ({_percent(wrong, answered)})")
-    print(f"{out}: {{object}}.ply, {views.FUSION_FILE}")
-
-
-def _percent(part: int, whole: int) -> str:
-    return f"{100 * part / whole:.1f}%" if whole else "-"

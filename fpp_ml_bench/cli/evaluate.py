@@ -12,7 +12,7 @@ from fpp_ml_bench.errors import DatasetError, SubmissionError
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, MODES, TARGETS
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.machine import prepare_process
-from fpp_ml_bench.options import REQUIRED, argument, option
+from fpp_ml_bench.options import argument, option
 
 if TYPE_CHECKING:
     from fpp_ml_bench.evaluation.result.model import Result
@@ -271,56 +271,6 @@ def verify(
         print(f"  ... and {len(problems) - LISTED} more")
     print(unchecked)
     return CHECK_FAILED
-
-
-@command(
-    """\
-fpp-bench predict phase data/full --split validation --out predictions-validation
-fpp-bench predict phase data/full --split test --out predictions
-fpp-eval conformal predictions data/full --from predictions-validation --out predictions-conformal
-fpp-eval predictions-conformal
-"""
-)
-def conformal(
-    *,
-    predictions: Path = argument("predictions with {sample}.sigma.npy, whose sigma is scaled", "PREDICTIONS"),
-    dataset: Path = argument("folder of the dataset", "DATASET"),
-    split: str = option("test", "split of PREDICTIONS (default: test)", choices=SPLITS),
-    calibration: Path = option(
-        REQUIRED, "the same method's predictions of the split that is calibrated on", "DIR", flag="--from"
-    ),
-    calibrate: str = option(
-        "validation",
-        "split of --from (default: validation); not one that the method learned from",
-        choices=("train", "validation"),
-    ),
-    coverage: float = option(
-        0.68,
-        "share of pixels that the Gaussian interval of this share shall hold (default: 0.68); n calibration objects "
-        "support at most n / (n + 1)",
-        "SHARE",
-    ),
-    target: str = option(TARGETS[0], "depth that errors are taken against (default: depth)", choices=TARGETS),
-    out: Path = option(REQUIRED, "new folder: a copy with the scaled sigma", "DIR"),
-) -> None:
-    """Scale a method's stated sigma by split-conformal calibration over objects, from its predictions of another
-    split."""
-    from fpp_ml_bench.evaluation.score.conformal import calibrate as conformal_calibration
-    from fpp_ml_bench.evaluation.score.conformal import counted, largest_coverage, write_calibrated
-    from fpp_ml_bench.loaders.storage.store import DatasetFolder
-
-    opened = DatasetFolder(dataset)
-    found = conformal_calibration(calibration, opened, calibrate, coverage, target)
-    samples = write_calibrated(found, predictions, opened, split, out)
-    share, most = f"{100 * found.coverage:g}%", 100 * largest_coverage(found.objects)
-    print(f"{calibration}: {found.samples} samples")
-    print(f"  {counted(found.objects)} can support at most {most:.1f}%")
-    print(f"  {100 * found.before:.1f}% of the pixels are in their {share} interval as it was stated")
-    print(
-        f"  factor {found.factor:.4g}: the {share} interval of a new object's pixel holds in {share} of cases or more,"
-    )
-    print("  over objects that are like these and pixels that state a sigma")
-    print(f"{out}: {samples} predictions with the scaled sigma")
 
 
 @command(
