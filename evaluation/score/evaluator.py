@@ -26,7 +26,6 @@ from fpp_ml_bench.depth import (
     nodata_problem,
     object_box,
     object_mask,
-    object_near_edges,
     shape_problem,
     without_nodata,
 )
@@ -57,7 +56,7 @@ from fpp_ml_bench.loaders.storage.benchmark import benchmark_of
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.sequence import DIRECTIONS, AnySequence
-from fpp_ml_bench.skipping import Explanation, LeftOut, explained, saved_by
+from fpp_ml_bench.skipping import Explanation, LeftOut, explained
 
 if TYPE_CHECKING:
     from fpp_ml_bench.evaluation.result.model import ArrayScores, Result
@@ -444,7 +443,7 @@ def _value_text(value: object) -> str:
     return printable(value if isinstance(value, str) else repr(value), 80)
 
 
-def explain_eval(dataset: DatasetFolder, split: str, target: str, edge_band_px: int) -> Explanation:
+def explain_eval(dataset: DatasetFolder, split: str, target: str) -> Explanation:
     """What scoring one split skipped: columns that no score needs, and the search for depth edges far from the object.
     Reads the split's targets again."""
     samples, (height, width) = dataset.samples(split), dataset.size
@@ -453,33 +452,17 @@ def explain_eval(dataset: DatasetFolder, split: str, target: str, edge_band_px: 
         boxes[sample] = _box_px(object_mask(dataset.target_mm(sample, target)))
         dataset.release(sample)
     frames, depths = len(dataset.manifest.stored_frames), 1 + dataset.has_exact
-    read = 1 + (target != "depth")
-    median = sorted(samples, key=lambda sample: boxes[sample])[len(samples) // 2]
-    depth_mm = dataset.target_mm(median, target)
-    skipped = len(samples) * depth_mm.size - sum(boxes.values())
-    unread_bytes = len(samples) * (frames + (depths - read) * depth_mm.itemsize) * depth_mm.size
-    bands = (edge_band_px, protocol.WIDE_BAND_PX)
-    seconds = saved_by(lambda: object_near_edges(depth_mm, bands), depth_mm.size - boxes[median], skipped)
+    read, searched = 1 + (target != "depth"), sum(boxes.values())
+    pixels, depth_bytes = len(samples) * height * width, np.dtype(np.float32).itemsize
     lines = [
         LeftOut(
             "columns that no score needs",
             "images",
             len(samples) * read,
             len(samples) * (frames + depths - read),
-            unread_bytes,
-            None,
-            "not read; seconds not measured, they depend on the disk",
+            (frames + (depths - read) * depth_bytes) * pixels,
         ),
-        LeftOut(
-            "depth edges far from the object",
-            "pixels",
-            sum(boxes.values()),
-            skipped,
-            None,
-            seconds,
-            f"processor seconds of one sample ({median}) without skipping minus with it, measured now, scaled to the "
-            "pixels that all samples skipped",
-        ),
+        LeftOut("depth edges far from the object", "pixels", searched, pixels - searched),
     ]
     return explained("fpp-eval", f"{len(samples)} samples of {width}x{height} px", lines)
 

@@ -114,7 +114,7 @@ fpp-bench build --out data/test --preset test --light hard         the test obje
 fpp-bench build --out data/mine --mesh part.stl --size 960         a mesh of yours (metres)
 fpp-bench build --out data/lab --decode-with found.yaml            ground truth by the rig that a calibration found
 fpp-bench build --out s3://bucket/full --preset full --cluster ray://head:10001    on all nodes of a Ray cluster
-fpp-bench build --out data/pen --objects pen --explain             what was left out, and what it saved
+fpp-bench build --out data/pen --objects pen --explain             what was left out
 """
 )
 def build(settings: BuildCommandSettings) -> None:

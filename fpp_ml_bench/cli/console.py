@@ -89,27 +89,23 @@ def show(*parts: RenderableType) -> None:
 
 
 def explanation_table(explanation: Explanation) -> Table:
-    """What was left out, with the rules for the seconds below."""
+    """What was left out."""
     state = "left out" if explanation.skipping else "nothing left out (skipping is off); it would have been"
-    rules = list(dict.fromkeys(line.rule for line in explanation.lines))
     table = Table(
         "what",
         "unit",
-        numbers=("done", "left out", "share", "bytes", "seconds"),
+        numbers=("done", "left out", "share", "bytes"),
         title=Text(f"{explanation.command}: {state} ({explanation.subject})"),
         elsewhere="--explain-json FILE",
-        caption=Text("\n".join(f"[{number}] {rule}" for number, rule in enumerate(rules, 1))),
     )
     for line in explanation.lines:
-        saved = line.seconds_saved
-        seconds = "-" if saved is None else f"{saved:,.2g}" if abs(saved) < 10 else f"{saved:,.0f}"
+        counted = f" (counted on {line.counted})" if line.counted else ""
         table.add_row(
-            Text(line.what),
+            Text(line.what + counted),
             line.unit,
             f"{line.done:,}",
             f"{line.left_out:,}",
             f"{100 * line.share:.1f}%",
             "-" if line.bytes_saved is None else gigabytes(line.bytes_saved),
-            Text(f"{seconds} [{rules.index(line.rule) + 1}]"),
         )
     return table

@@ -106,7 +106,7 @@ def score_folder(
         print(f"fpp-eval: warning: {opened.path}: {sentence}", file=sys.stderr)
     for note in notes:
         print(f"fpp-eval: note: {note}", file=sys.stderr)
-    account.say(lambda: explain_eval(opened, split, target, edge_band))
+    account.say(lambda: explain_eval(opened, split, target))
 
 
 def _result_table() -> "Callable[[Result], Any]":

@@ -172,13 +172,13 @@ class Explain:
     """Settings of a command that tells which work it left out."""
 
     HEADING = "skipped work"
-    explain: bool = option(False, "print which work was left out and what that saved (takes a moment)")
+    explain: bool = option(False, "print which work was left out, and how much of it")
     explain_json: Path | None = option(
         None, "write the same as JSON into FILE; implies --explain", "FILE", parse=new_file
     )
 
     def say(self, account: Callable[[], "Explanation"]) -> None:
-        """Print the account as a table with the rules for the seconds below, and write it as JSON, if asked for."""
+        """Print the account as a table, and write it as JSON, if asked for."""
         if self.explain or self.explain_json:
             from fpp_ml_bench.cli.console import explanation_table, show  # imports rich, which --help must not
 
