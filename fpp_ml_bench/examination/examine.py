@@ -29,6 +29,7 @@ from fpp_ml_bench.examination.signals import (
     ripples,
     step_errors,
     take_lines,
+    turns,
 )
 from fpp_ml_bench.optics.rig import Rig
 from fpp_ml_bench.optics.sequence import Direction
@@ -49,6 +50,8 @@ MISALIGNED_SHARE = 0.0025
 calibration that the authors of public captures used leaves 0.0017; depths by it are 1.2 mm off at 400 mm."""
 ALONG: dict[Direction | None, Side] = {"vertical": "rows", "horizontal": "columns"}
 """Bands along which a code runs through many cells. Across them it has a few, which two bits may show alike."""
+FEWEST_TURNS = 3.0
+"""Turns from bright to dark along a line from which two bits can't be alike by chance: silhouettes make one or two."""
 TORN_SHARE, FEWEST_IN_BAND, MORE_IN_BAND = 0.8, 60, 0.4
 """Largest share of the bands that are torn, where a tear and not the capture is at fault; the lit pixels that a band
 needs; and how much more of them contradict the code than in the best band: strong noise alone makes 0.2."""
@@ -314,7 +317,7 @@ def _torn(
         part = lines.at(np.flatnonzero(inside))
         sets = fringe_sets(part, rig, directions)
         for i, j in equal_frames(part, [one for one in sets if not one.one_phase], rig, directions, True):
-            if any(ALONG.get(rig.sequence.frames[k].direction, band.side) != band.side for k in (i, j)):
+            if not _never_alike(part, rig, band.side, i, j):
                 continue
             torn[band.side].setdefault(band, []).append(f"{titles[j]} shows the image of {titles[i]}")
         for one in sets:
@@ -345,6 +348,15 @@ def _torn(
         "rolling shutter)",
         CAPTURE_IN_TIME + "; a rolling shutter needs exposures of whole projector frames",
     )
+
+
+def _never_alike(part: Lines, rig: Rig, side: Side, i: int, j: int) -> bool:
+    """Whether two frames that follow one another can't look alike in a band of such a ``side``, unless one is torn."""
+    first, second = rig.sequence.frames[i], rig.sequence.frames[j]
+    of_one_set = (first.kind, first.direction, first.fringe) == (second.kind, second.direction, second.fringe)
+    if of_one_set and (first.kind == "sinusoid" or first.step == second.step):  # steps of a period; a bit, its inverse
+        return True
+    return all(ALONG.get(frame.direction, side) == side for frame in (first, second)) or turns(part, j) >= FEWEST_TURNS
 
 
 def _ranges(bands: Sequence[Band]) -> str:

@@ -234,6 +234,16 @@ def _same(part: Lines, i: int, j: int, most: float) -> bool:
     return size < min(most**2, WHITE_RATIO * noise)
 
 
+def turns(lines: Lines, index: int) -> float:
+    """How often a frame turns from bright to dark or back along a line, in the mean over rows or columns, whichever
+    has more."""
+    low, high = lines.levels.min(axis=0).astype(np.float64), lines.levels.max(axis=0)
+    bright = lines.levels[index] > (low + high) / 2
+    turned = np.append((bright[1:] != bright[:-1]) & lines.joined[:-1], False)
+    ends = ~lines.joined
+    return max(float(turned[kind].sum() / max(1, ends[kind].sum())) for kind in (lines.across, ~lines.across))
+
+
 def _trimmed(values: NDArray) -> float:
     """Mean without the largest tenth: edges of the scene count for nothing."""
     return float(np.sort(values)[: -(-9 * len(values) // 10)].mean())

@@ -324,3 +324,16 @@ def test_a_wave_that_no_response_makes_has_no_cause(turned, cause):
         frames[step] = np.rint(100 + 50 * wave + noise)
     (finding,) = (found for found in examine(frames, rig).findings if found.name == "response")
     assert cause in str(finding) and finding.severity == "note"
+
+
+@pytest.mark.parametrize("index", [5, 13])
+def test_a_torn_inverse_frame_or_fine_bit_along_the_code_is_named(index):
+    """Rows of a code of the projector's rows: a band shows few cells, and is
+    named where a bit changes in it, for no bit is its own inverse."""
+    pairs = {"scheme": "gray", "cell_px": 8, "inverse": "after each"}
+    rig = rig_of({"order": ["horizontal"], "horizontal": pairs})
+    frames, others = frames_of(rig), frames_of(rig, seed=1)
+    assert said(frames, rig) == []
+    frames[index, 130:] = others[index - 1, 130:]
+    ((name, text),) = said(frames, rig)
+    assert name == "torn frames" and "differ from the other rows" in text
