@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 from conftest import TINY_SIZE
+from scored_dataset import write_predictions
 
 from fpp_ml_bench.cli import BENCH, COMMANDS, EVAL, Program, main, main_eval
 from fpp_ml_bench.constants import VIEWS
@@ -338,6 +339,36 @@ def test_show_by_default_writes_into_the_current_folder(tiny, tmp_path, monkeypa
     monkeypatch.chdir(tmp_path)
     assert call("show", tiny, "cork_A0") == 0
     assert [p.name for p in tmp_path.iterdir()] == ["cork_A0.png"]
+
+
+def test_show_reads_predictions_in_the_units_that_they_declare(tiny, tmp_path):
+    dataset, clouds = DatasetFolder(tiny), []
+    for units, per_mm in (("mm", 1), ("m", 0.001)):
+        folder = write_predictions(tmp_path / units, dataset, units=units)
+        for path in folder.glob("*.npy"):
+            np.save(path, np.load(path) * np.float32(per_mm))
+        words = "show", tiny, "power_drill_A60", "--predictions", folder, "--cloud"
+        assert call(*words, "--out", tmp_path / f"{units}.png") == 0
+        clouds.append(trimesh.load(tmp_path / f"{units}.ply").vertices)
+    assert len(clouds[0]) == np.count_nonzero(dataset.depth_mm("power_drill_A60")) > 100
+    np.testing.assert_allclose(clouds[1], clouds[0], rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "spoil, message",
+    [
+        (lambda folder: (folder / "power_drill_A60.npy").unlink(), "power_drill_A60.npy: is missing"),
+        (lambda folder: np.save(folder / "bowl_A0.npy", np.zeros((8, 8), np.float32)), "bowl_A0.npy: is extra"),
+        (lambda folder: np.save(folder / "power_drill_A0.npy", np.zeros((8, 8), np.float32)), "(8, 8)"),
+        (lambda folder: (folder / "submission.yaml").unlink(), "submission.yaml"),
+    ],
+)
+def test_show_refuses_predictions_that_could_not_be_scored(spoil, message, tiny, tmp_path, capsys):
+    folder = write_predictions(tmp_path / "predictions", DatasetFolder(tiny))
+    spoil(folder)
+    picture = tmp_path / "x.png"
+    assert call("show", tiny, "power_drill_A60", "--predictions", folder, "--out", picture) == 2
+    assert message in capsys.readouterr().err and not picture.exists()
 
 
 def test_show_works_with_one_frame_without_meshes_and_with_few_gray_bits(tmp_path):
