@@ -56,7 +56,7 @@ from fpp_ml_bench.loaders.storage.benchmark import benchmark_of
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.machine import usable_cores
 from fpp_ml_bench.optics.sequence import DIRECTIONS, AnySequence
-from fpp_ml_bench.skipping import Explanation, LeftOut, explained
+from fpp_ml_bench.skipping import Explanation, LeftOut, explained, skipping
 
 if TYPE_CHECKING:
     from fpp_ml_bench.evaluation.result.model import ArrayScores, Result
@@ -469,5 +469,6 @@ def explain_eval(dataset: DatasetFolder, split: str, target: str) -> Explanation
 
 def _box_px(inside: NDArray[np.bool_]) -> int:
     """Pixels of the box in which `object_near_edges` searches."""
-    box = object_box(inside)
+    with skipping(True):
+        box = object_box(inside)
     return 0 if box is None else int(inside[box].size)

@@ -99,7 +99,7 @@ def explanation_table(explanation: Explanation) -> Table:
         elsewhere="--explain-json FILE",
     )
     for line in explanation.lines:
-        counted = f" (counted on {line.counted})" if line.counted else ""
+        counted = f" ({line.counted})" if line.counted else ""
         table.add_row(
             Text(line.what + counted),
             line.unit,

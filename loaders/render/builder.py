@@ -93,30 +93,29 @@ def explain_build(manifest: Manifest, settings: BuildSettings) -> Explanation:
     all_px, object_px = views * view_px, sum(row["exact_px"] for row in rows)
     frames, stored, unstored = len(settings.rig.sequence), len(studio.stored), len(studio.unstored)
     decoded, mixed_rays = frames - 2, sum(row["mixed_rays"] for row in rows)
+    across = settings.light.camera.rays_across
     stages = settings.light.stages()
-    off = [name for name, on in stages.items() if not on]
+    # An object that moves is lit again in every frame that is made.
+    lit_px = all_px * (stored + unstored if settings.light.motion_mm else 1)
     if settings.light.bounces.shadows:  # a ray for every pixel of the image would be all of them
         rays = sum(row["shadow_rays"] for row in rows)
-        background = LeftOut("shadow rays past the object's box", "rays", rays, all_px - rays)
+        background = LeftOut("shadow rays past the object's box", "rays", rays, lit_px - rays)
     else:
-        background = LeftOut("empty background again", "pixels", view_px, all_px - view_px)
-    exposed = object_px * unstored + all_px * stored
+        background = LeftOut("empty background again, in one process", "pixels", view_px, lit_px - view_px)
+    # `Studio.expose` exposes every frame whole where the object moves or the lens blurs.
+    whole = settings.light.motion_mm > 0 or settings.light.camera.blur_px > 0
+    exposed = (all_px if whole else object_px) * unstored + all_px * stored
     lines = [
         background,
-        LeftOut(
-            f"exposures ({unstored} unstored frames off the object, {frames - stored - unstored} everywhere)",
-            "pixels",
-            exposed,
-            all_px * frames - exposed,
-        ),
+        LeftOut("exposures that nothing reads", "pixels", exposed, all_px * frames - exposed),
         LeftOut("ground truth off the object", "grey levels", object_px * decoded, (all_px - object_px) * decoded),
         LeftOut(
             "rays across pixels that see one surface",
             "rays",
             mixed_rays,
-            all_px * settings.light.camera.rays_across**2 - mixed_rays,
+            all_px * (across**2 if across > 1 else 0) - mixed_rays,  # the central ray alone is always lit
         ),
-        LeftOut(f"stages that are off ({', '.join(off)})", "stages", len(stages) - len(off), len(off)),
+        LeftOut("stages of the light that are off", "stages", sum(stages.values()), len(stages) - sum(stages.values())),
         LeftOut(
             "frames not asked for", "frames", stored * views, (frames - stored) * views, (frames - stored) * all_px
         ),

@@ -1,4 +1,4 @@
-"""``--explain`` counts agree with the data, and ``--no-skip`` changes no result."""
+"""``--explain`` counts agree with the data, and skipping changes no result."""
 
 import json
 from dataclasses import replace
@@ -8,8 +8,10 @@ from conftest import TINY_SIZE, file_bytes, tiny_settings
 
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli import main_eval as evaluate
+from fpp_ml_bench.cli.console import explanation_table, show
 from fpp_ml_bench.errors import BuildError
-from fpp_ml_bench.loaders.render.builder import explain_build
+from fpp_ml_bench.loaders.render.builder import build, explain_build
+from fpp_ml_bench.loaders.render.light import named_light
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.skipping import SWITCH, Explanation, LeftOut, explained, skipping
 
@@ -58,14 +60,42 @@ def test_build_and_its_account(tmp_path, capsys):
     content, lines = lines_of(account)
     rows = DatasetFolder(tmp_path / "on").manifest.samples["train"]
     assert content["skipping"] and len(rows) == 6
-    background = lines["empty background again"]
+    background = lines["empty background again, in one process"]
     assert (background["done"], background["left_out"]) == (PIXELS, 5 * PIXELS)
     truth = lines["ground truth off the object"]
     assert truth["left_out"] == 50 * sum(PIXELS - row["exact_px"] for row in rows)
     frames = lines["frames not asked for"]
     assert (frames["done"], frames["left_out"], frames["bytes_saved"]) == (6, 306, 306 * PIXELS)
-    exposures = lines["exposures (49 unstored frames off the object, 2 everywhere)"]
+    exposures = lines["exposures that nothing reads"]
     assert exposures["done"] + exposures["left_out"] == 6 * 52 * PIXELS
+
+
+def test_under_a_lens_that_blurs_only_black_and_white_are_not_exposed(tmp_path):
+    light = named_light("paper").changed("camera", blur_px=0.5)
+    settings = tiny_settings(objects=("cork",), stored="single_shot", light=light)
+    account = explain_build(build(tmp_path / "cork", settings, workers=1), settings)
+    exposures = next(line for line in account.lines if line.what == "exposures that nothing reads")
+    assert (exposures.done, exposures.left_out) == (6 * 50 * PIXELS, 6 * 2 * PIXELS)
+
+
+def test_an_object_that_moves_is_lit_and_exposed_in_each_frame(tiny):
+    light = named_light("paper").changed("bounces", shadows=True).changed("camera", rays_across=1)
+    manifest, settings = DatasetFolder(tiny).manifest, tiny_settings(stored="single_shot")
+    part = [{**row, "shadow_rays": 8 * PIXELS, "mixed_rays": 0} for row in manifest.samples["test"]]
+    moved = replace(manifest, samples={"test": part})
+    account = explain_build(moved, replace(settings, light=light.changed(motion_mm=0.2)))
+    lines = {line.what: (line.done, line.left_out) for line in account.lines}
+    assert lines["shadow rays past the object's box"] == (6 * 8 * PIXELS, 6 * 42 * PIXELS)
+    assert lines["exposures that nothing reads"] == (6 * 50 * PIXELS, 6 * 2 * PIXELS)
+    assert "rays across pixels that see one surface" not in lines  # there is one ray a pixel
+
+
+def test_the_table_shows_all_counts_in_a_pipe(tmp_path, monkeypatch, capsys):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    settings = tiny_settings(objects=("cork",))
+    show(explanation_table(explain_build(build(tmp_path / "cork", settings, workers=1), settings)))
+    printed = capsys.readouterr().out
+    assert "share" in printed and "bytes" in printed and "A wider terminal" not in printed
 
 
 def test_a_dataset_of_an_earlier_version_is_refused_in_words(tiny):
@@ -112,7 +142,11 @@ def test_predictions_scores_and_their_accounts(tiny, tmp_path, capsys):
     _, lines = lines_of(account)
     columns = lines["columns that no score needs"]
     assert (columns["done"], columns["left_out"]) == (6, 6 * 53) and columns["bytes_saved"] == 6 * PIXELS * (52 + 4)
-    assert lines["depth edges far from the object"]["done"] > object_px
+    edges = lines["depth edges far from the object"]
+    assert edges["done"] > object_px
+    with skipping(False):
+        assert evaluate([str(tmp_path / "on"), str(tiny), "--explain-json", str(account)]) == 0
+    assert lines_of(account)[1]["depth edges far from the object"] == edges
     assert "left out" in capsys.readouterr().out
 
 
