@@ -27,8 +27,8 @@ from fpp_ml_bench.evaluation.score.uncertainty import FEWEST_OBJECTS, Interval, 
 from fpp_ml_bench.evaluation.submission.description import Submission
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.leaderboard import rows
-from fpp_ml_bench.leaderboard.row_file import ROUNDED_TWICE, ObjectMeans, interval_over, looks_like, mean_over, name_key
-from fpp_ml_bench.leaderboard.rows import LOCAL, MEANING, SELF_REPORTED, TEST, UNSEEN, Entry, read_entry
+from fpp_ml_bench.leaderboard.row_file import ObjectMeans, interval_over, looks_like, mean_over, name_key
+from fpp_ml_bench.leaderboard.rows import LOCAL, MEANING, SELF_REPORTED, TEST, UNSEEN, Entry, copy_note, read_entry
 from fpp_ml_bench.loaders.storage.benchmark import BENCHMARKS, Benchmark
 
 MOST_PAIRED = 40
@@ -330,21 +330,12 @@ def rank(entries: Iterable[Entry], sort: str = DEFAULT_SORT) -> list[Group]:
         if original is entry:
             members.setdefault(key, []).append(entry)
         else:
-            notes.setdefault(GroupKey.of(original), []).append(_copy_note(entry, original))
+            notes.setdefault(GroupKey.of(original), []).append(copy_note(entry, original))
     groups = [_group(key, of_key, notes.get(key, []), sort) for key, of_key in members.items()]
     groups.sort(key=lambda group: (not group.vouched, group.key.order))
     _check_names([row for group in groups for row in group.rows])
     set_ratios(groups)
     return groups
-
-
-def _copy_note(copy: Entry, original: Entry) -> str:
-    """Why ``copy`` is left out, whose predictions are those of ``original``."""
-    copied, of = (f"{printable(e.name, 80)} ({printable(e.path.name, 80)})" for e in (copy, original))
-    pairs = ([getattr(e.row.metrics, key) or 0.0 for e in (copy, original)] for key in HEADLINE)
-    agree = all(math.isclose(*pair, rel_tol=ROUNDED_TWICE) for pair in pairs)
-    contradicting = "" if agree else " but not the same errors, so one of the two files is wrong"
-    return f"Not shown, the same predictions as {of}{contradicting}: {copied}."
 
 
 def _check_names(shown: Sequence[Ranked]) -> None:

@@ -6,6 +6,7 @@ keep ``vouched.txt``: a line for each row file that they measured themselves, or
 Nothing in a row says so, and nothing is signed: who can change the list can change the code.
 """
 
+import math
 import re
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from fpp_ml_bench.errors import SubmissionError
+from fpp_ml_bench.evaluation.metrics import HEADLINE
 from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.result.file import parse_result, read_json, write_result
 from fpp_ml_bench.evaluation.result.model import Result, disagreements
@@ -22,6 +24,7 @@ from fpp_ml_bench.evaluation.score.evaluator import difference_lines, evaluate
 from fpp_ml_bench.files import file_content, printable
 from fpp_ml_bench.leaderboard.row_file import (
     DIGITS,
+    ROUNDED_TWICE,
     ROW_SCHEMA_VERSION,
     Row,
     check_size,
@@ -235,3 +238,12 @@ def write_block(entry: Entry, block: Reliance | Robustness) -> None:
         write_row(validate(Row, content, entry.path, "leaderboard row"), entry.path)
     else:
         write_result(validate(Result, content, entry.path, "result of fpp-eval"), entry.path)
+
+
+def copy_note(copy: Entry, original: Entry) -> str:
+    """Why ``copy`` is left out, whose predictions are those of ``original``."""
+    copied, of = (f"{printable(e.name, 80)} ({printable(e.path.name, 80)})" for e in (copy, original))
+    pairs = ([getattr(e.row.metrics, key) or 0.0 for e in (copy, original)] for key in HEADLINE)
+    agree = all(math.isclose(*pair, rel_tol=ROUNDED_TWICE) for pair in pairs)
+    contradicting = "" if agree else " but not the same errors, so one of the two files is wrong"
+    return f"Not shown, the same predictions as {of}{contradicting}: {copied}."
