@@ -50,7 +50,9 @@ def _draw(axes: Any, title: str, image: NDArray, colours: str, low: float, high:
 
     frame, shown = (colours, high) == (FRAME_COLOURS, GREY_LEVELS), colormaps[colours]
     if (missing := np.isposinf(image)).any():
-        image, shown = np.where(missing, image, np.minimum(image, high)), shown.with_extremes(over=_MISSING_COLOUR)
+        # Beyond the scale, and finite: matplotlib does not draw what is infinite.
+        image = np.where(missing, 2 * high - low, np.minimum(image, high))
+        shown = shown.with_extremes(over=_MISSING_COLOUR)
         axes.legend(handles=[Patch(color=_MISSING_COLOUR, label="missing: no answer")], loc="lower left", fontsize=7)
     drawn = axes.imshow(image, cmap=shown, vmin=low, vmax=high, interpolation=None if frame else "nearest")
     if not frame:

@@ -52,6 +52,7 @@ def test_missing_pixels_have_a_colour_and_a_legend():
     assert [text.get_text() for text in axes.get_legend().get_texts()] == ["missing: no answer"]
     image = axes.images[0]
     colours = image.to_rgba(image.get_array())[0]
+    np.testing.assert_allclose(colours[0], [0, 0xA6 / 255, 0x51 / 255, 1], atol=0.005)
     assert not np.allclose(colours[0], colours[1]) and colours[2, 3] == 0
     plain = pictures.panel_figure([("error", np.array([[1.0, 9.0]]), "coolwarm", -1.0, 1.0)])
     assert plain.axes[0].get_legend() is None
