@@ -50,6 +50,8 @@ MISALIGNED_SHARE = 0.0025
 calibration that the authors of public captures used leaves 0.0017; depths by it are 1.2 mm off at 400 mm."""
 ALONG: dict[Direction | None, Side] = {"vertical": "rows", "horizontal": "columns"}
 """Bands along which a code runs through many cells. Across them it has a few, which two bits may show alike."""
+MOST_UNLIKE_STEPS = 6
+"""Up to so many steps those that follow one another are 60 degrees and more apart."""
 FEWEST_TURNS = 3.0
 """Turns from bright to dark along a line from which two bits can't be alike by chance: silhouettes make one or two."""
 TORN_SHARE, FEWEST_IN_BAND, MORE_IN_BAND = 0.8, 60, 0.4
@@ -359,10 +361,13 @@ def _torn(
 def _never_alike(part: Lines, rig: Rig, side: Side, i: int, j: int) -> bool:
     """Whether two frames that follow one another can't look alike in a band of such a ``side``, unless one is torn."""
     first, second = rig.sequence.frames[i], rig.sequence.frames[j]
+    along = all(ALONG.get(frame.direction, side) == side for frame in (first, second))
     of_one_set = (first.kind, first.direction, first.fringe) == (second.kind, second.direction, second.fringe)
-    if of_one_set and (first.kind == "sinusoid" or first.step == second.step):  # steps of a period; a bit, its inverse
-        return True
-    return all(ALONG.get(frame.direction, side) == side for frame in (first, second)) or turns(part, j) >= FEWEST_TURNS
+    if of_one_set and first.kind == "sinusoid" and first.direction is not None:
+        # Steps near each other differ little, and with many of them a torn one is a wrong step anyway.
+        return along or len(rig.sequence.period(first.direction, first.fringe)) <= MOST_UNLIKE_STEPS
+    its_inverse = of_one_set and first.step == second.step
+    return along or its_inverse or turns(part, j) >= FEWEST_TURNS
 
 
 def _ranges(bands: Sequence[Band]) -> str:
