@@ -115,14 +115,14 @@ def examine(
         measured[f"{one.direction}_offset_turns"] = found.offset_turns.value
         # A frame that is late shifts all phases, too.
         if _is_offset(found) and not any(finding.severity == "refuse" for finding in findings):
-            torn = _torn(lines, shape, rig, directions, limits, titles)
-            return Examination((torn or _offset(found, rig, one.direction),), not_checked, measured)
+            torn = _torn(lines, sets, shape, rig, directions, limits, titles)
+            return Examination(tuple(torn) or (_offset(found, rig, one.direction),), not_checked, measured)
     doubtful = given.contradicting > TRIED or given.agreeing < 1 - 2 * TRIED or given.coherent < TRIED
     doubtful = doubtful or given.fitting < IN_RANGE * given.coherent
     if doubtful and (other := search(lines, rig, directions, limits, given, calibrated)):
         return Examination((_another_reading(other, given),), not_checked, measured)
-    if torn := _torn(lines, shape, rig, directions, limits, titles):
-        return Examination((torn,), not_checked, measured)
+    if torn := _torn(lines, sets, shape, rig, directions, limits, titles):
+        return Examination(tuple(torn), not_checked, measured)
     findings += _exchanged_flat(lines, rig) or _moved(sets)
     pattern = epipolar_pattern(part, rig, decoded_lines(part, rig, directions, limits)) if calibrated else None
     where = _contradicting_bands(part, given, shape)
@@ -277,10 +277,13 @@ def _steps_and_response(
     ]
 
 
-def _moved(sets: Sequence[FringeSet]) -> list[Finding]:
-    """Sets of sinusoids whose mean images differ: all of them show the scene under the same mean light."""
+def _moved(sets: Sequence[FringeSet], torn: NDArray[np.bool_] | None = None) -> list[Finding]:
+    """Sets of sinusoids whose mean images differ: all of them show the scene under the same mean light. With ``torn``
+    pixels (n,) of the lines: the others alone are looked at."""
     for one, other in combinations(sets, 2):
         both = one.good & other.good
+        if torn is not None:
+            both &= ~torn
         if both.sum() < LEAST_PX:
             continue
         gain = float(np.median(other.mean[both]) / max(float(np.median(one.mean[both])), 1e-9))
@@ -304,25 +307,27 @@ def _moved(sets: Sequence[FringeSet]) -> list[Finding]:
 
 def _torn(
     lines: Lines,
+    sets: Sequence[FringeSet],
     shape: tuple[int, int],
     rig: Rig,
     directions: Sequence[Direction],
     limits: Limits,
     titles: Sequence[str],
-) -> Finding | None:
-    """Frames of which some rows or columns show another pattern than the rest."""
+) -> list[Finding]:
+    """Frames of which some rows or columns show another pattern than the rest; or, where the rest of the image differs
+    between the ``sets`` as well, a scene that moved: two scenes in one capture make lines look torn here and there."""
     torn: dict[Side, dict[Band, list[str]]] = {"rows": {}, "columns": {}}
     sizes: dict[tuple[Side, str, float], dict[Band, Estimate]] = {}
     for band, inside in lines.banded(shape):
         if np.count_nonzero(inside & lines.lit) < LEAST_PX:
             continue
         part = lines.at(np.flatnonzero(inside))
-        sets = fringe_sets(part, rig, directions)
-        for i, j in equal_frames(part, [one for one in sets if not one.one_phase], rig, directions, True):
+        of_band = fringe_sets(part, rig, directions)
+        for i, j in equal_frames(part, [one for one in of_band if not one.one_phase], rig, directions, True):
             if not _never_alike(part, rig, band.side, i, j):
                 continue
             torn[band.side].setdefault(band, []).append(f"{titles[j]} shows the image of {titles[i]}")
-        for one in sets:
+        for one in of_band:
             name = f"the {one.direction} fringes of {one.pitch_px:g} px"
             if (step := step_errors(one)) is not None:
                 sizes.setdefault((band.side, f"a step of {name} is wrong", STEP_RAD), {})[band] = step[1]
@@ -344,18 +349,24 @@ def _torn(
                 torn[side].setdefault(band, []).append(fault)
     fewest = min((side for side in torn if torn[side]), key=lambda side: len(torn[side]), default=None)
     if fewest is None:
-        return None
+        return []
     shown = sorted(torn[fewest], key=lambda band: band.first)
+    position = lines.row if fewest == "rows" else lines.column
+    lost = [place for band in shown for place in range(band.first, band.last + 1)]
+    if moved := _moved(sets, np.isin(position, lost)):
+        return moved
     said = list(dict.fromkeys(fault for band in shown for fault in torn[fewest][band]))
     more = f", and {len(said) - 3} more" if len(said) > 3 else ""
-    return Finding(
-        "torn frames",
-        "refuse",
-        f"{_ranges(shown)} differ from the other {fewest}: {', '.join(said[:3])}{more}",
-        f"the projector changed its picture while the camera exposed or read these {fewest} (no synchronisation, or a "
-        "rolling shutter)",
-        CAPTURE_IN_TIME + "; a rolling shutter needs exposures of whole projector frames",
-    )
+    return [
+        Finding(
+            "torn frames",
+            "refuse",
+            f"{_ranges(shown)} differ from the other {fewest}: {', '.join(said[:3])}{more}",
+            f"the projector changed its picture while the camera exposed or read these {fewest} (no synchronisation, "
+            "or a rolling shutter)",
+            CAPTURE_IN_TIME + "; a rolling shutter needs exposures of whole projector frames",
+        )
+    ]
 
 
 def _never_alike(part: Lines, rig: Rig, side: Side, i: int, j: int) -> bool:
