@@ -249,8 +249,8 @@ class Hub:
         if MARK not in remote.files or remote.files[MARK].size > 1 << 20:
             raise PublishError(f"{repo}: this {kind} was not published by fpp-bench (no {MARK} there)")
         with tempfile.TemporaryDirectory() as cache, self._explained(f"reading {MARK} of {kind} {repo}"):
-            part = {"repo_type": kind, "revision": remote.commit, "cache_dir": cache}
-            path = _answer(lambda: self._api.hf_hub_download(repo, MARK, **part))
+            download = partial(self._api.hf_hub_download, repo, MARK, repo_type=kind, revision=remote.commit)
+            path = _answer(lambda: download(cache_dir=cache))
             about = read_json(Path(path), PublishError, f"it is of {repo}: publish the {kind} again")
         return about if isinstance(about, dict) else {}
 
@@ -268,9 +268,8 @@ class Hub:
         repo, kind = publication.repo, publication.kind
         if not remote.exists:
             with self._explained(f"making {kind} {repo}"):
-                sdk = "static" if kind == "space" else None
-                made = {"repo_type": kind, "private": private or None, "space_sdk": sdk}
-                _answer(lambda: self._api.create_repo(repo, **made))
+                make = partial(self._api.create_repo, repo, repo_type=kind, private=private or None)
+                _answer(lambda: make(space_sdk="static" if kind == "space" else None))
         with self._explained(f"sending to {kind} {repo}"):
             to_send = [change.path for change in changes if change.status in ("new", "changed")]
             additions = [CommitOperationAdd(path, publication.folder / path) for path in to_send]

@@ -363,7 +363,7 @@ class OpenShard:
 
     def _read(self, start: int, count: int, dtype: np.dtype) -> NDArray:
         values = np.empty(count, dtype)
-        view, done = memoryview(values.view(np.uint8)), 0
+        view, done = memoryview(values.view(np.uint8).data), 0
         while done < len(view):
             try:
                 length = os.preadv(self._file, [view[done:]], start + done)
