@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
+import cv2
 import numpy as np
 import scipy.io
 from numpy.typing import NDArray
@@ -26,7 +27,7 @@ from fpp_ml_bench.baselines.phase.calibration_layer import wrapped
 from fpp_ml_bench.baselines.phase.method import CrossedMethod, PhaseMethod
 from fpp_ml_bench.baselines.robustness.axes import corruptions
 from fpp_ml_bench.calibration.boards import Board
-from fpp_ml_bench.calibration.result import Calibration, Lens, draw_residuals
+from fpp_ml_bench.calibration.result import Lens, draw_residuals
 from fpp_ml_bench.calibration.solve import calibrate as calibrate_rig
 from fpp_ml_bench.constants import MAD_TO_SIGMA
 from fpp_ml_bench.decoding.decode import Decoded, decode_stack
@@ -93,19 +94,19 @@ def main() -> int:
         phase_of_one_sinusoid(args.captures / "skull_2x3", skull)
         for range_mm in (WORKING_RANGE_MM, SKULL_RANGE_MM):
             one_frame(args.captures / "skull_2x3", skull.with_range(range_mm), Path(scratch))
-        for number, board in enumerate(boards, 1):
+        for number, (board, corners_px) in enumerate(boards, 1):
             capture = args.captures / "calibration" / f"calseq{number}"
             reference(capture, rig_of(theirs, "board", Path(scratch)).with_range(WORKING_RANGE_MM), "authors")
             phase_of_one_sinusoid(capture, board)
-            one_frame(capture, board, Path(scratch))
+            one_frame(capture, board, Path(scratch), corners_px)
     return 0
 
 
 def calibrate(
     folder: Path, theirs: "OpenCvCalibration", scratch: Path, out: Path | None
-) -> tuple["OpenCvCalibration", list["Rig"]]:
+) -> tuple["OpenCvCalibration", list[tuple["Rig", NDArray]]]:
     """Print errors and rigs of several models, and return the one whose held-out error is the least, and for each pose
-    the rig that this model finds from the other five."""
+    the rig that this model finds from the other five, with the pose's corners in camera px (n, 2)."""
     poses_folder, sequence = scratch / "poses", scratch / "board.yaml"
     poses_folder.mkdir()
     for number in range(1, 7):
@@ -127,7 +128,7 @@ def calibrate(
     print(f"{'authors':<50}{errors[0]:6.3f}{'':9}{errors[1]:8.3f}{'':7}{errors[2]:8.3f}")
     own = (Lens("radial-1", True, True), Lens("radial-1", True))
     radial, full = (Lens("radial-1"), Lens("radial-1")), (Lens(), Lens())
-    results: list[tuple[Calibration, tuple[Lens, Lens], bool]] = []
+    results = []
     for title, lens, free in (
         ("their model, perfect board", own, False),
         ("their model, board estimated", own, True),
@@ -159,7 +160,7 @@ def calibrate(
     for pose in poses:
         others = [other for other in poses if other is not pose]
         found = calibrate_rig(others, board, *sizes, lens, estimate_board=free, hold_out=False)
-        boards.append(calibrated_rig(found, stand_in, WORKING_RANGE_MM))
+        boards.append((calibrated_rig(found, stand_in, WORKING_RANGE_MM), pose.corners_px))
     return OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m), boards
 
 
@@ -256,12 +257,16 @@ def reference(folder: Path, rig: "Rig", who: str) -> tuple[NDArray, Decoded]:
     return frames, decoded
 
 
-def one_frame(folder: Path, rig: "Rig", scratch: Path) -> None:
+def one_frame(folder: Path, rig: "Rig", scratch: Path, corners_px: NDArray | None = None) -> None:
     """One frame in the rig's range against the depth that all of them give there: `phase` on the first fringe of each
     direction; where there are both, `crossed` and `crossed-net` on the mean of the two, which is a crossed frame; where
-    there is one, also with the mask given."""
+    there is one, also with the mask given. Of all pixels, and of those between ``corners_px`` (n, 2) of a board."""
     frames, decoded = reference(folder, rig, "ours")
     known = decoded.depth_mm > 0
+    parts = {"all": known}
+    if corners_px is not None:
+        hull = cv2.convexHull(np.rint(corners_px).astype(np.int32))
+        parts["between the corners"] = known & (cv2.fillConvexPoly(np.zeros(known.shape, np.uint8), hull, 1) > 0)
     methods = [(f"phase, {way}", PhaseMethod(rig, direction=way), way) for way in rig.directions]
     if len(rig.directions) == 2:
         # An order of the vertical fringes is the smaller step in depth.
@@ -275,20 +280,22 @@ def one_frame(folder: Path, rig: "Rig", scratch: Path) -> None:
         started = perf_counter()
         answer = method.answer(needed)
         seconds = perf_counter() - started
-        both = known & (answer.depth > 0)
-        print(f"  {title}: answered {100 * both.sum() / known.sum():.1f}% of {known.sum():,} px", end="")
-        if both.any():
-            rays = tuple(axis[both] for axis in rig.camera.rays())
-            slope = np.abs(coordinate_slope_px_per_mm(rig, decoded.depth_mm[both], way, rays))
-            error = np.abs(answer.depth[both].astype(np.float64) - decoded.depth_mm[both])
-            wrong, beyond = error * slope > rig.pitch(way) / 2, error > FAR_MM
-            confident = beyond & (answer.sigma_mm[both] < corruptions().confident_below * error)
-            print(
-                f", median error {np.median(error):.2f} mm, beyond {FAR_MM:g} mm {100 * beyond.mean():.2f}%, wrong "
-                f"orders {100 * wrong.mean():.2f}%, confident errors {100 * confident.mean():.3f}%",
-                end="",
-            )
-        print(f"; without a reference {((answer.depth > 0) & ~known).sum():,} px; {seconds:.1f} s", flush=True)
+        print(f"  {title}: {seconds:.1f} s; without a reference {((answer.depth > 0) & ~known).sum():,} px")
+        for part, asked in parts.items():
+            both = asked & (answer.depth > 0)
+            print(f"    {part}: answered {100 * both.sum() / asked.sum():.1f}% of {asked.sum():,} px", end="")
+            if both.any():
+                rays = tuple(axis[both] for axis in rig.camera.rays())
+                slope = np.abs(coordinate_slope_px_per_mm(rig, decoded.depth_mm[both], way, rays))
+                error = np.abs(answer.depth[both].astype(np.float64) - decoded.depth_mm[both])
+                wrong, beyond = error * slope > rig.pitch(way) / 2, error > FAR_MM
+                confident = beyond & (answer.sigma_mm[both] < corruptions().confident_below * error)
+                print(
+                    f", median error {np.median(error):.2f} mm, beyond {FAR_MM:g} mm {100 * beyond.mean():.2f}%, wrong "
+                    f"orders {100 * wrong.mean():.2f}%, confident errors {100 * confident.mean():.3f}%",
+                    end="",
+                )
+            print(flush=True)
 
 
 def phase_of_one_sinusoid(folder: Path, rig: "Rig") -> None:
