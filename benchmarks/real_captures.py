@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
+import cv2
 import numpy as np
 import scipy.io
 from numpy.typing import NDArray
@@ -23,15 +24,13 @@ from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.learned.method import ClassicalNetMethod, CrossedNetMethod, FringeNetMethod
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.phase.calibration_layer import wrapped
-from fpp_ml_bench.baselines.phase.depth import CrossedRoute
-from fpp_ml_bench.baselines.phase.method import PhaseMethod
+from fpp_ml_bench.baselines.phase.method import CrossedMethod, PhaseMethod
 from fpp_ml_bench.baselines.robustness.axes import corruptions
 from fpp_ml_bench.calibration.boards import Board
 from fpp_ml_bench.calibration.result import Lens, draw_residuals
 from fpp_ml_bench.calibration.solve import calibrate as calibrate_rig
-from fpp_ml_bench.coding.crossed import crossed_from_pair
 from fpp_ml_bench.constants import MAD_TO_SIGMA
-from fpp_ml_bench.decoding.decode import decode_stack
+from fpp_ml_bench.decoding.decode import Decoded, decode_stack
 from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm
 from fpp_ml_bench.depth import object_near_edges
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
@@ -55,10 +54,11 @@ SEQUENCES = {
     "skull_gray": "{order: [white, black, vertical], vertical: {scheme: gray, cell_px: 2, bits: 10}}",
     "board": f"{{order: [vertical, horizontal], vertical: {VERTICAL}, horizontal: {HORIZONTAL}}}",
 }
-BOARD_MARGIN_MM = 15.0  # beyond the nearest and farthest corner of a pose, for the range that a frame is measured in
-WRONG_ORDER_MM = 30.0
-"""Half a period of the finer carrier is 40 mm and more of depth at these distances."""
 RANGE_MM = (300.0, 500.0)
+WORKING_RANGE_MM = (250.0, 700.0)
+"""What a user would give who does not know where the object stands; boards and desk are 300 to 600 mm away."""
+SKULL_RANGE_MM = (360.0, 430.0)  # the object's own
+FAR_MM = 20.0  # an error beyond it is of no use, whatever its cause
 
 
 def main() -> int:
@@ -74,7 +74,7 @@ def main() -> int:
         return 2
     theirs = read_opencv_calibration(args.captures / "calibration" / "calibration.xml")
     with tempfile.TemporaryDirectory() as scratch:
-        ours = calibrate(args.captures / "calibration", theirs, Path(scratch), args.out)
+        ours, boards = calibrate(args.captures / "calibration", theirs, Path(scratch), args.out)
         cloud = scipy.io.loadmat(args.captures / "skull_gray" / "pointCloud.mat")["xyz"].astype(np.float64)
         for name in ("skull_2x3", "skull_gray"):
             for who, found in (("authors", theirs), ("ours", ours)):
@@ -90,17 +90,23 @@ def main() -> int:
             ClassicalNetMethod(skull),
         )
         twin(args.captures / "skull_2x3", skull, Path(scratch))
-        one_frame(args.captures / "skull_2x3", rig_of(theirs, "skull_2x3", Path(scratch)), Path(scratch))
-        board = rig_of(theirs, "board", Path(scratch))
-        phase_of_one_sinusoid(args.captures / "skull_2x3", rig_of(theirs, "skull_2x3", Path(scratch)))
-        for number in range(1, 7):
-            phase_of_one_sinusoid(args.captures / "calibration" / f"calseq{number}", board)
-        crossed_frames(args.captures / "calibration", board)
+        skull = rig_of(ours, "skull_2x3", Path(scratch))
+        phase_of_one_sinusoid(args.captures / "skull_2x3", skull)
+        for range_mm in (WORKING_RANGE_MM, SKULL_RANGE_MM):
+            one_frame(args.captures / "skull_2x3", skull.with_range(range_mm), Path(scratch))
+        for number, (board, corners_px) in enumerate(boards, 1):
+            capture = args.captures / "calibration" / f"calseq{number}"
+            reference(capture, rig_of(theirs, "board", Path(scratch)).with_range(WORKING_RANGE_MM), "authors")
+            phase_of_one_sinusoid(capture, board)
+            one_frame(capture, board, Path(scratch), corners_px)
     return 0
 
 
-def calibrate(folder: Path, theirs: "OpenCvCalibration", scratch: Path, out: Path | None) -> "OpenCvCalibration":
-    """Print errors and rigs of several models, and return the one whose held-out error is the least."""
+def calibrate(
+    folder: Path, theirs: "OpenCvCalibration", scratch: Path, out: Path | None
+) -> tuple["OpenCvCalibration", list[tuple["Rig", NDArray]]]:
+    """Print errors and rigs of several models, and return the one whose held-out error is the least, and for each pose
+    the rig that this model finds from the other five, with the pose's corners in camera px (n, 2)."""
     poses_folder, sequence = scratch / "poses", scratch / "board.yaml"
     poses_folder.mkdir()
     for number in range(1, 7):
@@ -135,8 +141,8 @@ def calibrate(folder: Path, theirs: "OpenCvCalibration", scratch: Path, out: Pat
             f"{title:<50}{found.rms_px.camera:6.3f} {alone[0]:6.3f}  {found.rms_px.projector:8.3f} {alone[1]:6.3f}"
             f"{found.rms_px.both:8.3f}{found.held_out_rms_px:10.3f}"
         )
-        results.append(found)
-    best = min(results, key=lambda found: found.held_out_rms_px)
+        results.append((found, lens, free))
+    best, lens, free = min(results, key=lambda result: result[0].held_out_rms_px)
     rig = calibrated_rig(best, stand_in)
     for name in ("camera", "projector"):
         for who, device in (("authors", getattr(theirs, name)), ("ours", getattr(rig, name))):
@@ -150,7 +156,12 @@ def calibrate(folder: Path, theirs: "OpenCvCalibration", scratch: Path, out: Pat
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         (out / "calibration.png").write_bytes(draw_residuals(best))
-    return OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m)
+    boards = []
+    for pose in poses:
+        others = [other for other in poses if other is not pose]
+        found = calibrate_rig(others, board, *sizes, lens, estimate_board=free, hold_out=False)
+        boards.append((calibrated_rig(found, stand_in, WORKING_RANGE_MM), pose.corners_px))
+    return OpenCvCalibration(rig.camera, rig.projector, rig.rotation, rig.translation_m), boards
 
 
 def rig_of(found: "OpenCvCalibration", name: str, scratch: Path) -> "Rig":
@@ -233,51 +244,58 @@ def bend_noise_mm(depth_mm: NDArray[np.float32]) -> float:
     return MAD_TO_SIGMA * float(np.median(np.abs(bends - np.median(bends)))) / float(np.sqrt(6))
 
 
-def one_frame(folder: Path, rig: "Rig", scratch: Path) -> None:
-    """The phase route with its defaults on the first frame alone, against the depth that all six frames give."""
+def reference(folder: Path, rig: "Rig", who: str) -> tuple[NDArray, Decoded]:
+    """The frames of a capture and what all of them give; prints how much of the lit pixels that is."""
     frames = read_frames(folder, count=len(rig.sequence)).frames
     decoded = decode_stack(frames, rig, threads=2)
-    on_object = decoded.depth_mm > 0
-    single: list[NDArray | None] = [frames[0], *[None] * (len(rig.sequence) - 1)]
-    for near, far in ((350.0, 450.0), (360.0, 430.0)):
-        ranged = rig.with_range((near, far))
-        in_range = on_object & (decoded.depth_mm >= near) & (decoded.depth_mm <= far)
-        half_mm = (
-            0.5
-            / float(
-                np.median(
-                    np.abs(
-                        coordinate_slope_px_per_mm(
-                            rig,
-                            decoded.depth_mm[in_range],
-                            "vertical",
-                            tuple(axis[in_range] for axis in rig.camera.rays()),
-                        )
-                    )
+    lit = decoded.depth_mm.size - decoded.counts["low_modulation"]
+    near, far = rig.working_range_mm
+    print(
+        f"{folder.name}, {near:g} to {far:g} mm, calibration: {who}: all frames give "
+        f"{100 * decoded.counts['decoded'] / lit:.1f}% of {lit:,} lit px a depth"
+    )
+    return frames, decoded
+
+
+def one_frame(folder: Path, rig: "Rig", scratch: Path, corners_px: NDArray | None = None) -> None:
+    """One frame in the rig's range against the depth that all of them give there: `phase` on the first fringe of each
+    direction; where there are both, `crossed` and `crossed-net` on the mean of the two, which is a crossed frame; where
+    there is one, also with the mask given. Of all pixels, and of those between ``corners_px`` (n, 2) of a board."""
+    frames, decoded = reference(folder, rig, "ours")
+    known = decoded.depth_mm > 0
+    parts = {"all": known}
+    if corners_px is not None:
+        hull = cv2.convexHull(np.rint(corners_px).astype(np.int32))
+        parts["between the corners"] = known & (cv2.fillConvexPoly(np.zeros(known.shape, np.uint8), hull, 1) > 0)
+    methods = [(f"phase, {way}", PhaseMethod(rig, direction=way), way) for way in rig.directions]
+    if len(rig.directions) == 2:
+        # An order of the vertical fringes is the smaller step in depth.
+        methods += [("crossed", CrossedMethod(rig), "vertical"), ("crossed-net", CrossedNetMethod(rig), "vertical")]
+    else:
+        Image.fromarray(known.astype(np.uint8) * 255).save(scratch / "mask.png")
+        given = PhaseMethod(rig, mask=scratch / "mask.png", direction=rig.directions[0])
+        methods.append((f"phase, {rig.directions[0]}, mask given", given, rig.directions[0]))
+    for title, method, way in methods:
+        needed = [frame if index in method.frames_used else None for index, frame in enumerate(frames)]
+        started = perf_counter()
+        answer = method.answer(needed)
+        seconds = perf_counter() - started
+        print(f"  {title}: {seconds:.1f} s; without a reference {((answer.depth > 0) & ~known).sum():,} px")
+        for part, asked in parts.items():
+            both = asked & (answer.depth > 0)
+            print(f"    {part}: answered {100 * both.sum() / asked.sum():.1f}% of {asked.sum():,} px", end="")
+            if both.any():
+                rays = tuple(axis[both] for axis in rig.camera.rays())
+                slope = np.abs(coordinate_slope_px_per_mm(rig, decoded.depth_mm[both], way, rays))
+                error = np.abs(answer.depth[both].astype(np.float64) - decoded.depth_mm[both])
+                wrong, beyond = error * slope > rig.pitch(way) / 2, error > FAR_MM
+                confident = beyond & (answer.sigma_mm[both] < corruptions().confident_below * error)
+                print(
+                    f", median error {np.median(error):.2f} mm, beyond {FAR_MM:g} mm {100 * beyond.mean():.2f}%, wrong "
+                    f"orders {100 * wrong.mean():.2f}%, confident errors {100 * confident.mean():.3f}%",
+                    end="",
                 )
-            )
-            * rig.pitch("vertical")
-        )
-        file = scratch / "mask.png"
-        Image.fromarray(in_range.astype(np.uint8) * 255).save(file)
-        for mask, title in ((None, "own mask"), (file, "mask given")):
-            method = PhaseMethod(ranged, mask=mask, direction="vertical")
-            started = perf_counter()
-            answer = method.answer(single)
-            seconds = perf_counter() - started
-            given = answer.depth > 0
-            error = np.abs(answer.depth[in_range].astype(np.float64) - decoded.depth_mm[in_range])
-            answered = given[in_range]
-            sigma = np.zeros_like(error) if answer.sigma_mm is None else answer.sigma_mm[in_range]
-            wrong = answered & (error > half_mm)
-            confident = wrong & (sigma > 0) & (sigma < corruptions().confident_below * error)
-            median = float(np.median(error[answered])) if answered.any() else float("nan")
-            print(
-                f"one frame, {near:g} to {far:g} mm, {title:<10} answered {100 * answered.mean():.1f}% of "
-                f"{in_range.sum():,} px, median error {median:.2f} mm, wrong orders (over {half_mm:.0f} mm) "
-                f"{100 * wrong.mean():.2f}%, confident errors {100 * confident.mean():.3f}%; outside the object "
-                f"{(given & ~on_object).sum():,} px; {seconds:.1f} s"
-            )
+            print(flush=True)
 
 
 def phase_of_one_sinusoid(folder: Path, rig: "Rig") -> None:
@@ -303,38 +321,6 @@ def phase_of_one_sinusoid(folder: Path, rig: "Rig") -> None:
                 f"within {EDGE_BAND_PX} px of depth edges {error[kept & ~inner].mean():.3f}, median "
                 f"{np.median(error[kept]):.3f}, beyond 0.3 rad {100 * (error[kept] > 0.3).mean():.1f}% "
                 f"of {kept.sum():,} px"
-            )
-
-
-def crossed_frames(folder: Path, rig: "Rig") -> None:
-    """The crossed route, and crossed-net with its own mask, on the mean of a vertical and a horizontal fringe of each
-    board pose: a frame with both, on a printed checkerboard. Against the depth that all twelve frames give, in the
-    range that the board spans."""
-    for number in range(1, 7):
-        frames = read_frames(folder / f"calseq{number}", count=len(rig.sequence)).frames
-        decoded = decode_stack(frames, rig, threads=2)
-        on_board = decoded.depth_mm > 0
-        near, far = np.percentile(decoded.depth_mm[on_board], (1, 99))
-        ranged = rig.with_range((float(near) - BOARD_MARGIN_MM, float(far) + BOARD_MARGIN_MM))
-        route = CrossedRoute(ranged)
-        vertical, horizontal = (
-            np.ascontiguousarray(frames[rig.sequence.sinusoids(way)[0]]) for way in ("vertical", "horizontal")
-        )
-        measured = route.measure(crossed_from_pair(horizontal, vertical), on_board)
-        learned = CrossedNetMethod(ranged).answer(frames)
-        for title, depth_mm, sigma_mm in (
-            ("crossed", measured.depth_mm, measured.sigma_mm),
-            ("crossed-net", learned.depth, learned.sigma_mm),
-        ):
-            both = on_board & (depth_mm > 0)
-            error = np.abs(depth_mm - decoded.depth_mm)[both]
-            wrong = error > WRONG_ORDER_MM
-            confident = wrong & (sigma_mm[both] < corruptions().confident_below * error)
-            print(
-                f"one crossed frame, pose {number}, {ranged.working_range_mm[0]:.0f} to "
-                f"{ranged.working_range_mm[1]:.0f} mm, {title}: answered {100 * both.sum() / on_board.sum():.1f}% of "
-                f"{on_board.sum():,} px, median error {np.median(error):.2f} mm, wrong orders "
-                f"{100 * wrong.mean():.2f}%, confident errors {100 * confident.mean():.3f}%"
             )
 
 
