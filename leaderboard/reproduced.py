@@ -18,7 +18,15 @@ from typing import Literal
 
 from fpp_ml_bench.baselines.registry import methods
 from fpp_ml_bench.baselines.reproduce.plan import FOLDS, Folders, Job, variants
-from fpp_ml_bench.baselines.reproduce.scores import MAIN_KEY, Scores, constant_scores, joined, scores_that_hold
+from fpp_ml_bench.baselines.reproduce.scores import (
+    BINS_MM,
+    MAIN_KEY,
+    OVERALL_KEY,
+    Scores,
+    constant_scores,
+    joined,
+    scores_that_hold,
+)
 from fpp_ml_bench.baselines.reproduce.work import (
     MISSING,
     Outcome,
@@ -27,7 +35,7 @@ from fpp_ml_bench.baselines.reproduce.work import (
     file_sha256,
     state_of,
 )
-from fpp_ml_bench.baselines.training.recipe import Recipe, about_preset, table_rows
+from fpp_ml_bench.baselines.training.recipe import SEED, Recipe, about_preset, table_rows
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import RANGE_KEY
 from fpp_ml_bench.evaluation.protocol import Track
@@ -47,7 +55,7 @@ from fpp_ml_bench.leaderboard.row_file import Row, row_of, write_row
 from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEASURED_HERE, SHIPPED_ROWS, Entry, read_entry
 from fpp_ml_bench.leaderboard.tables import PAPER_DEPTHS, paper_tables
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.style import percent, three_digits
+from fpp_ml_bench.style import panels, percent, styled, three_digits, with_legend
 from fpp_ml_bench.tables import Table, markdown_text
 
 _NOT_IN_THE_PAPER = {
@@ -389,13 +397,42 @@ def line_table(table: str, lines: Sequence[Line], preset: str) -> Table:
 
 
 def write_table(table: str, settings: ReproduceSettings, outcome: Outcome) -> Path:
-    """Write the page of a table from the rows that there are; its path. SubmissionError where it can't be written."""
+    """Write the page of a table from the rows that there are; its path. Histograms of the multi-frame table are beside
+    it. SubmissionError where it can't be written."""
     folders = settings.folders
     lines = table_lines(table, outcome.jobs, folders, outcome.opened)
     command = settings.command.replace(f"{table}/{settings.row}", table, 1) if settings.row else settings.command
     text = table_markdown(table, lines, folders.preset, command, outcome.failed)
+    if table == "multi_frame" and (counted := counted_rows(outcome.jobs, folders, outcome.opened)):
+        write_file(draw_histograms(counted), folders.table(table).with_suffix(".png"))
+        text += f"\n![Histograms of the errors of the pairs of view and frame]({table}.png)\n"
     write_file(text.encode("utf-8"), folders.table(table))
     return folders.table(table)
+
+
+def counted_rows(jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) -> dict[str, Scores]:
+    """The scores of the multi-frame table's rows, by their titles, of the weights that are shown, where the pairs have
+    been counted."""
+    counted = {}
+    for row in paper_tables()["multi_frame"].rows:
+        for recipe in (job.recipe for job in jobs if f"multi_frame/{row.row}" in job.rows and job.recipe.seed == SEED):
+            weights = _weights_sha256(recipe, folders, opened)
+            scores = weights and scores_that_hold(folders.scores(recipe), opened.fingerprint, recipe, weights)
+            if scores and scores.counts:
+                counted[f"{row.label}: {scores.pairs} pairs"] = scores
+    return counted
+
+
+@styled
+def draw_histograms(counted: Mapping[str, Scores]) -> bytes:
+    """A panel for each row: the share of its pairs by overall MAE, as in the paper's figures, and object MAE; PNG."""
+    drawn, panels_of = panels(list(counted), 3, 3.0, 2.2)
+    for axes, scores in zip(panels_of, counted.values(), strict=True):
+        for key, label, fill in ((OVERALL_KEY, "overall MAE", True), (MAIN_KEY, "object MAE", False)):
+            shares = [100 * count / scores.pairs for count in scores.counts[key]]
+            axes.stairs(shares, BINS_MM, fill=fill, label=label, linewidth=1.2)
+        axes.set(xscale="log", xlabel="mm", ylabel="% of pairs")
+    return with_legend(drawn, 2)
 
 
 def table_markdown(table: str, lines: Sequence[Line], preset: str, command: str, failed: dict[str, str]) -> str:
