@@ -403,24 +403,19 @@ def write_table(table: str, settings: ReproduceSettings, outcome: Outcome) -> Pa
     lines = table_lines(table, outcome.jobs, folders, outcome.opened)
     command = settings.command.replace(f"{table}/{settings.row}", table, 1) if settings.row else settings.command
     text = table_markdown(table, lines, folders.preset, command, outcome.failed)
-    if table == "multi_frame" and (counted := counted_rows(outcome.jobs, folders, outcome.opened)):
+    counted = {
+        f"{job.recipe.frames}: {scores.pairs} pairs": scores
+        for job in outcome.jobs
+        if table == "multi_frame" and job.has_scores and job.recipe.seed == SEED
+        if (weights := _weights_sha256(job.recipe, folders, outcome.opened))
+        if (scores := scores_that_hold(folders.scores(job.recipe), outcome.opened.fingerprint, job.recipe, weights))
+        if scores.counts
+    }
+    if counted:
         write_file(draw_histograms(counted), folders.table(table).with_suffix(".png"))
         text += f"\n![Histograms of the errors of the pairs of view and frame]({table}.png)\n"
     write_file(text.encode("utf-8"), folders.table(table))
     return folders.table(table)
-
-
-def counted_rows(jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) -> dict[str, Scores]:
-    """The scores of the multi-frame table's rows, by their titles, of the weights that are shown, where the pairs have
-    been counted."""
-    counted = {}
-    for row in paper_tables()["multi_frame"].rows:
-        for recipe in (job.recipe for job in jobs if f"multi_frame/{row.row}" in job.rows and job.recipe.seed == SEED):
-            weights = _weights_sha256(recipe, folders, opened)
-            scores = weights and scores_that_hold(folders.scores(recipe), opened.fingerprint, recipe, weights)
-            if scores and scores.counts:
-                counted[f"{row.label}: {scores.pairs} pairs"] = scores
-    return counted
 
 
 @styled

@@ -67,10 +67,8 @@ class FlatPlane(Probe):
         rows: list[Row] = []
         shown: dict[str, tuple[Row, NDArray, NDArray]] = {}
         for outline, tilt_deg, distance_m in poses:
-            surface = plane(renderer.rig, distance_m, tilt_deg, masks[outline])
-            lit, seen = renderer.light(surface), masks[outline].copy()
-            seen.ravel()[surface.pixels] &= lit.gain > 0  # no fringe beyond the projector's field
-            scene = Scene(surface, lit, seen, (0, "plane", ""))
+            scene = plane_scene(renderer, masks[outline], tilt_deg, distance_m)
+            seen = scene.mask
             frames = renderer.frames(scene, subject.frames_used)
             prediction = subject.own_output(frames)
             values = prediction[seen].astype(np.float64)
@@ -124,6 +122,14 @@ def rectangle(shape: tuple[int, int], side: float) -> Mask:
     down, across = (round(length * (1 - side) / 2) for length in shape)
     mask[down : shape[0] - down, across : shape[1] - across] = True
     return mask
+
+
+def plane_scene(renderer: SceneRenderer, mask: Mask, tilt_deg: tuple[float, float], distance_m: float) -> Scene:
+    """A `plane` in front of the background; the scene's mask is ``mask`` without what no fringe reaches."""
+    surface = plane(renderer.rig, distance_m, tilt_deg, mask)
+    lit, seen = renderer.light(surface), mask.copy()
+    seen.ravel()[surface.pixels] &= lit.gain > 0  # no fringe beyond the projector's field
+    return Scene(surface, lit, seen, (0, "plane", ""))
 
 
 def control_of(
