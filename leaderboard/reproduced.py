@@ -53,7 +53,7 @@ from fpp_ml_bench.leaderboard.columns import device
 from fpp_ml_bench.leaderboard.ranking import given_words
 from fpp_ml_bench.leaderboard.row_file import Row, row_of, write_row
 from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEASURED_HERE, SHIPPED_ROWS, Entry, read_entry
-from fpp_ml_bench.leaderboard.tables import PAPER_DEPTHS, paper_tables
+from fpp_ml_bench.leaderboard.tables import PAPER_DEPTHS, ReportedRow, paper_tables
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.style import panels, percent, styled, three_digits, with_legend
 from fpp_ml_bench.tables import Table, markdown_text
@@ -153,6 +153,10 @@ def _by_object(found: Row | Scores) -> dict[str, float]:
     return {part.object: value for part in found.per_object if (value := getattr(part, MAIN_KEY)) is not None}
 
 
+def _reported(table: str) -> dict[str, ReportedRow]:
+    return {row.row: row for row in paper_tables()[table].rows} if table in paper_tables() else {}
+
+
 def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) -> list[Line]:
     """Lines of ``table`` in the paper's order, below those of trivial methods. Rows of other weights or another dataset
     are left empty. Where a training was not begun below ``folders``, its rows may be of another machine: those of the
@@ -160,8 +164,7 @@ def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: Datas
     second line is its row in the leaderboard: the first frame only, without a number of the paper."""
     if table == FOLDS:
         return _fold_lines(jobs, folders, opened)
-    reported = {row.row: row for row in paper_tables()[table].rows} if table in paper_tables() else {}
-    lines = []
+    reported, lines = _reported(table), []
     for row in table_rows(table):
         recipes = [job.recipe for job in jobs if f"{table}/{row}" in job.rows]
         recipe, paper = recipes[0], reported.get(row)
@@ -216,12 +219,12 @@ def _fold_lines(jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) ->
     lines = []
     for name in names:
         table, _, row = name.partition("/")
-        reported = {paper.row: paper for paper in paper_tables()[table].rows} if table in paper_tables() else {}
+        paper = _reported(table).get(row)
         recipes = [job.recipe for job in jobs if name in job.rows]
         scores = [one for recipe in recipes if recipe.fold in parts and (one := held[recipe.name]) is not None]
         found = {recipes[0].seed: joined(scores)} if scores else {}
-        label = f"{reported[row].label} ({table})" if row in reported else name
-        lines.append(Line(name, label, recipes[0], found, None, reported[row].errors_mm if row in reported else None))
+        label, paper_mm = (f"{paper.label} ({table})", paper.errors_mm) if paper else (name, None)
+        lines.append(Line(name, label, recipes[0], found, None, paper_mm))
     constants = [constant_scores(opened, part) for part in sorted(part for part in parts if part is not None)]
     if constants and any(one.normalisation == "individual" for one in recipes_of):
         label = "best constant in the given range (trivial)"

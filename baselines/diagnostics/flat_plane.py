@@ -105,10 +105,10 @@ def outlines_of(dataset: DatasetFolder, settings: ProbeSettings) -> dict[str, Ma
     """Silhouettes (H, W) of a test sample of each object, by sample. Raises `DiagnosisError` without any."""
     first = [samples[0] for samples in dataset.samples_by_object("test").values()]
     names = settings.choose(first, OUTLINES, QUICK_OUTLINES)
-    masks = {name: object_mask(dataset.depth_mm(name)) for name in names}
-    if not any(mask.any() for mask in masks.values()):
+    masks = {name: mask for name in names if (mask := object_mask(dataset.depth_mm(name))).any()}
+    if not masks:
         raise DiagnosisError(f"{dataset.path}: split test holds no sample with an object, whose outline a plane gets")
-    return {name: mask for name, mask in masks.items() if mask.any()}
+    return masks
 
 
 def poses_of(outline: str, quick: bool) -> list[tuple[tuple[float, float], float]]:
