@@ -392,7 +392,7 @@ def _twin(entry: Entry | None) -> str:
 
 def line_table(table: str, lines: Sequence[Line], preset: str) -> Table:
     """The lines as a table. One that the paper does not have has no empty columns."""
-    title = _TITLES[table] if table in _TITLES else paper_tables()[table].title
+    title = _TITLES.get(table) or paper_tables()[table].title
     rows = [_cells(line, preset) for line in lines]
     optional = (_EACH_SEED,) if table in paper_tables() else tuple(rows[0])
     shown = [name for name in rows[0] if name not in optional or {row[name] for row in rows} != {"-"}]
@@ -402,7 +402,7 @@ def line_table(table: str, lines: Sequence[Line], preset: str) -> Table:
 def write_table(table: str, settings: ReproduceSettings, outcome: Outcome) -> Path:
     """Write the page of a table from the rows that there are; its path. Histograms of the multi-frame table are beside
     it. SubmissionError where it can't be written."""
-    folders = settings.folders
+    folders, path = settings.folders, settings.folders.table(table)
     lines = table_lines(table, outcome.jobs, folders, outcome.opened)
     command = settings.command.replace(f"{table}/{settings.row}", table, 1) if settings.row else settings.command
     text = table_markdown(table, lines, folders.preset, command, outcome.failed)
@@ -415,10 +415,10 @@ def write_table(table: str, settings: ReproduceSettings, outcome: Outcome) -> Pa
         if scores.counts
     }
     if counted:
-        write_file(draw_histograms(counted), folders.table(table).with_suffix(".png"))
+        write_file(draw_histograms(counted), path.with_suffix(".png"))
         text += f"\n![Histograms of the errors of the pairs of view and frame]({table}.png)\n"
-    write_file(text.encode("utf-8"), folders.table(table))
-    return folders.table(table)
+    write_file(text.encode("utf-8"), path)
+    return path
 
 
 @styled
