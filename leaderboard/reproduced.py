@@ -2,9 +2,10 @@
 that the paper reports and the best trivial method; which of the paper's orderings hold; and the page of it all, in
 Markdown and for a terminal.
 
-An ordering *holds* where the paired difference has the paper's sign and its 95% interval leaves 0 out, is *reversed*
-where it has the opposite sign and leaves 0 out, and is *not decided* by these objects otherwise. The interval is over
-objects, and over the seeds with which both rows were trained (`interval_over_seeds`).
+An ordering *holds* or is *reversed* where the objects decide it: the sign-flip test of the paired differences, with
+Holm's correction over the pairs of the table, tells the rows apart, and the 95% interval over objects, and over the
+seeds with which both rows were trained (`interval_over_seeds`), leaves 0 out. Else it is only *seen*, or *seen
+reversed*: the mean over these objects goes that way. The test split's five, fewer than `FEWEST_OBJECTS`, decide none.
 """
 
 import statistics
@@ -17,7 +18,15 @@ from typing import Literal
 
 from fpp_ml_bench.baselines.registry import methods
 from fpp_ml_bench.baselines.reproduce.plan import FOLDS, Folders, Job, variants
-from fpp_ml_bench.baselines.reproduce.scores import MAIN_KEY, Scores, constant_scores, joined, scores_that_hold
+from fpp_ml_bench.baselines.reproduce.scores import (
+    BINS_MM,
+    MAIN_KEY,
+    OVERALL_KEY,
+    Scores,
+    constant_scores,
+    joined,
+    scores_that_hold,
+)
 from fpp_ml_bench.baselines.reproduce.work import (
     MISSING,
     Outcome,
@@ -26,20 +35,27 @@ from fpp_ml_bench.baselines.reproduce.work import (
     file_sha256,
     state_of,
 )
-from fpp_ml_bench.baselines.training.recipe import Recipe, about_preset, table_rows
+from fpp_ml_bench.baselines.training.recipe import SEED, Recipe, about_preset, table_rows
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import RANGE_KEY
 from fpp_ml_bench.evaluation.protocol import Track
 from fpp_ml_bench.evaluation.result.file import write_file
 from fpp_ml_bench.evaluation.result.model import Result
-from fpp_ml_bench.evaluation.score.uncertainty import Interval, interval_over_seeds
+from fpp_ml_bench.evaluation.score.uncertainty import (
+    FEWEST_OBJECTS,
+    SIGNIFICANT,
+    Interval,
+    holm,
+    interval_over_seeds,
+    sign_flip_p,
+)
 from fpp_ml_bench.leaderboard.columns import device
 from fpp_ml_bench.leaderboard.ranking import given_words
 from fpp_ml_bench.leaderboard.row_file import Row, row_of, write_row
 from fpp_ml_bench.leaderboard.rows import BY_THE_PAPER, MEASURED_HERE, SHIPPED_ROWS, Entry, read_entry
-from fpp_ml_bench.leaderboard.tables import PAPER_DEPTHS, paper_tables
+from fpp_ml_bench.leaderboard.tables import PAPER_DEPTHS, ReportedRow, paper_tables
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-from fpp_ml_bench.style import percent, three_digits
+from fpp_ml_bench.style import panels, percent, styled, three_digits, with_legend
 from fpp_ml_bench.tables import Table, markdown_text
 
 _NOT_IN_THE_PAPER = {
@@ -137,6 +153,10 @@ def _by_object(found: Row | Scores) -> dict[str, float]:
     return {part.object: value for part in found.per_object if (value := getattr(part, MAIN_KEY)) is not None}
 
 
+def _reported(table: str) -> dict[str, ReportedRow]:
+    return {row.row: row for row in paper_tables()[table].rows} if table in paper_tables() else {}
+
+
 def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) -> list[Line]:
     """Lines of ``table`` in the paper's order, below those of trivial methods. Rows of other weights or another dataset
     are left empty. Where a training was not begun below ``folders``, its rows may be of another machine: those of the
@@ -144,8 +164,7 @@ def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: Datas
     second line is its row in the leaderboard: the first frame only, without a number of the paper."""
     if table == FOLDS:
         return _fold_lines(jobs, folders, opened)
-    reported = {row.row: row for row in paper_tables()[table].rows} if table in paper_tables() else {}
-    lines = []
+    reported, lines = _reported(table), []
     for row in table_rows(table):
         recipes = [job.recipe for job in jobs if f"{table}/{row}" in job.rows]
         recipe, paper = recipes[0], reported.get(row)
@@ -200,12 +219,12 @@ def _fold_lines(jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) ->
     lines = []
     for name in names:
         table, _, row = name.partition("/")
-        reported = {paper.row: paper for paper in paper_tables()[table].rows} if table in paper_tables() else {}
+        paper = _reported(table).get(row)
         recipes = [job.recipe for job in jobs if name in job.rows]
         scores = [one for recipe in recipes if recipe.fold in parts and (one := held[recipe.name]) is not None]
         found = {recipes[0].seed: joined(scores)} if scores else {}
-        label = f"{reported[row].label} ({table})" if row in reported else name
-        lines.append(Line(name, label, recipes[0], found, None, reported[row].errors_mm if row in reported else None))
+        label, paper_mm = (f"{paper.label} ({table})", paper.errors_mm) if paper else (name, None)
+        lines.append(Line(name, label, recipes[0], found, None, paper_mm))
     constants = [constant_scores(opened, part) for part in sorted(part for part in parts if part is not None)]
     if constants and any(one.normalisation == "individual" for one in recipes_of):
         label = "best constant in the given range (trivial)"
@@ -229,17 +248,14 @@ def _weights_sha256(recipe: Recipe, folders: Folders, opened: DatasetFolder) -> 
 
 @dataclass(frozen=True)
 class Gap:
-    """Mean difference in object MAE, mm, its 95% interval, and how many objects and seeds it is over."""
+    """Mean difference in object MAE, mm, its 95% interval, how many objects and seeds it is over, and the p value of
+    the sign-flip test over objects."""
 
     mean_mm: float
     interval: Interval | None
     objects: int
     seeds: int
-
-    @property
-    def decided(self) -> bool:
-        """Whether 0 is outside the interval."""
-        return self.interval is not None and not self.interval[0] <= 0 <= self.interval[1]
+    p: float
 
     @property
     def between(self) -> str:
@@ -250,31 +266,36 @@ class Gap:
 @dataclass(frozen=True)
 class Ordering:
     """The paper reports a smaller object MAE for ``better`` than for ``worse``, by ``paper_gap_mm``; ``here``: worse
-    minus better. ``same_track`` is False where the rows were given different ground truth of the samples."""
+    minus better; ``p_holm``: its p value after Holm's correction. ``same_track`` is False where the rows were given
+    different ground truth of the samples."""
 
     better: str
     worse: str
     paper_gap_mm: float
     here: Gap
+    p_holm: float
     same_track: bool
 
     @property
-    def verdict(self) -> Literal["holds", "not decided", "reversed"]:
-        if not self.here.decided:
-            return "not decided"
-        return "holds" if self.here.mean_mm > 0 else "reversed"
+    def verdict(self) -> Literal["holds", "reversed", "seen", "seen reversed"]:
+        ends = self.here.interval
+        if ends is not None and not ends[0] <= 0 <= ends[1] and self.p_holm <= SIGNIFICANT:
+            return "holds" if self.here.mean_mm > 0 else "reversed"
+        return "seen" if self.here.mean_mm > 0 else "seen reversed"
 
 
 def orderings(lines: Sequence[Line]) -> list[Ordering]:
     """Every pair of measured lines whose numbers in the paper differ, the paper's best first."""
     compared = [(line.paper_mm[MAIN_KEY], line) for line in lines if line.found and line.paper_mm is not None]
-    judged = []
-    for (better_mm, better), (worse_mm, worse) in combinations(sorted(compared, key=lambda c: c[0]), 2):
-        here = gap(worse, better)
-        if worse_mm > better_mm and here is not None:
-            same_track = better.track == worse.track
-            judged.append(Ordering(better.label, worse.label, worse_mm - better_mm, here, same_track))
-    return judged
+    found = [
+        (better, worse, worse_mm - better_mm, here)
+        for (better_mm, better), (worse_mm, worse) in combinations(sorted(compared, key=lambda c: c[0]), 2)
+        if worse_mm > better_mm and (here := gap(worse, better)) is not None
+    ]
+    return [
+        Ordering(better.label, worse.label, paper_gap_mm, here, p_holm, better.track == worse.track)
+        for (better, worse, paper_gap_mm, here), p_holm in zip(found, holm([here.p for *_, here in found]), strict=True)
+    ]
 
 
 def gap(line: Line, other: Line) -> Gap | None:
@@ -285,8 +306,9 @@ def gap(line: Line, other: Line) -> Gap | None:
     if not names:
         return None
     gaps = [{name: first[seed][name] - second[seed][name] for name in names} for seed in seeds]
-    mean_mm = statistics.fmean(value for of_seed in gaps for value in of_seed.values())
-    return Gap(mean_mm, interval_over_seeds(gaps), len(names), len(seeds))
+    of_object = [statistics.fmean(of_seed[name] for of_seed in gaps) for name in names]
+    mean_mm, interval = statistics.fmean(of_object), interval_over_seeds(gaps)
+    return Gap(mean_mm, interval, len(names), len(seeds), sign_flip_p(of_object))
 
 
 def conclusion(table: str, lines: Sequence[Line]) -> str:
@@ -304,15 +326,16 @@ def conclusion(table: str, lines: Sequence[Line]) -> str:
 
 
 def orderings_sentence(judged: Sequence[Ordering]) -> str:
-    """How many of the paper's orderings hold, by the intervals of the paired differences, in a sentence."""
+    """How many of the paper's orderings the objects decide, and which way the others go in the mean."""
     if not judged:
         return "No two rows of the paper's have been measured here yet, so none of its orderings can be judged."
     count = Counter(ordering.verdict for ordering in judged)
     objects = max(ordering.here.objects for ordering in judged)
+    few = f" Fewer than {FEWEST_OBJECTS} objects can decide none." if objects < FEWEST_OBJECTS else ""
     return (
-        f"The paper's pairwise orderings by object MAE, {len(judged)} among the rows measured here: {count['holds']} "
-        f"hold, {count['reversed']} reversed, {count['not decided']} not decided by {objects} objects (the 95% "
-        "interval of the paired difference holds 0)."
+        f"The paper's pairwise orderings by object MAE, {len(judged)} among the rows measured here. Decided by "
+        f"{objects} objects, with Holm's correction: {count['holds']} hold, {count['reversed']} reversed. Only seen in "
+        f"the mean over them: {count['seen']} as in the paper, {count['seen reversed']} reversed.{few}"
     )
 
 
@@ -369,7 +392,7 @@ def _twin(entry: Entry | None) -> str:
 
 def line_table(table: str, lines: Sequence[Line], preset: str) -> Table:
     """The lines as a table. One that the paper does not have has no empty columns."""
-    title = _TITLES[table] if table in _TITLES else paper_tables()[table].title
+    title = _TITLES.get(table) or paper_tables()[table].title
     rows = [_cells(line, preset) for line in lines]
     optional = (_EACH_SEED,) if table in paper_tables() else tuple(rows[0])
     shown = [name for name in rows[0] if name not in optional or {row[name] for row in rows} != {"-"}]
@@ -377,13 +400,37 @@ def line_table(table: str, lines: Sequence[Line], preset: str) -> Table:
 
 
 def write_table(table: str, settings: ReproduceSettings, outcome: Outcome) -> Path:
-    """Write the page of a table from the rows that there are; its path. SubmissionError where it can't be written."""
-    folders = settings.folders
+    """Write the page of a table from the rows that there are; its path. Histograms of the multi-frame table are beside
+    it. SubmissionError where it can't be written."""
+    folders, path = settings.folders, settings.folders.table(table)
     lines = table_lines(table, outcome.jobs, folders, outcome.opened)
     command = settings.command.replace(f"{table}/{settings.row}", table, 1) if settings.row else settings.command
     text = table_markdown(table, lines, folders.preset, command, outcome.failed)
-    write_file(text.encode("utf-8"), folders.table(table))
-    return folders.table(table)
+    counted = {
+        f"{job.recipe.frames}: {scores.pairs} pairs": scores
+        for job in outcome.jobs
+        if table == "multi_frame" and job.has_scores and job.recipe.seed == SEED
+        if (weights := _weights_sha256(job.recipe, folders, outcome.opened))
+        if (scores := scores_that_hold(folders.scores(job.recipe), outcome.opened.fingerprint, job.recipe, weights))
+        if scores.counts
+    }
+    if counted:
+        write_file(draw_histograms(counted), path.with_suffix(".png"))
+        text += f"\n![Histograms of the errors of the pairs of view and frame]({table}.png)\n"
+    write_file(text.encode("utf-8"), path)
+    return path
+
+
+@styled
+def draw_histograms(counted: Mapping[str, Scores]) -> bytes:
+    """A panel for each row: the share of its pairs by overall MAE, as in the paper's figures, and object MAE; PNG."""
+    drawn, panels_of = panels(list(counted), 3, 3.0, 2.2)
+    for axes, scores in zip(panels_of, counted.values(), strict=True):
+        for key, label, fill in ((OVERALL_KEY, "overall MAE", True), (MAIN_KEY, "object MAE", False)):
+            shares = [100 * count / scores.pairs for count in scores.counts[key]]
+            axes.stairs(shares, BINS_MM, fill=fill, label=label, linewidth=1.2)
+        axes.set(xscale="log", xlabel="mm", ylabel="% of pairs")
+    return with_legend(drawn, 2)
 
 
 def table_markdown(table: str, lines: Sequence[Line], preset: str, command: str, failed: dict[str, str]) -> str:
@@ -466,13 +513,15 @@ def _orderings(judged: Sequence[Ordering]) -> list[str]:
             f"Worse minus better, mm, {BY_THE_PAPER}": f"{ordering.paper_gap_mm:+.2f}",
             f"Worse minus better, mm, {MEASURED_HERE}": f"{ordering.here.mean_mm:+.2f}",
             "95% interval": ordering.here.between,
+            "p, Holm": three_digits(ordering.p_holm),
             "Seeds": str(ordering.here.seeds),
             "Here": ordering.verdict,
         }
         for ordering in judged
     ]
-    parts += [*Table.of("", rows, (0, 1, 6)).markdown(), ""]
-    parts += ["Differences object by object; intervals by bootstrap over objects and the seeds that both rows have."]
+    parts += [*Table.of("", rows, (0, 1, 7)).markdown(), ""]
+    how = "intervals by bootstrap over objects and the seeds that both rows have; p by sign flips of the objects'"
+    parts += [f"Differences object by object; {how} differences, with Holm's correction over these pairs."]
     if not all(ordering.same_track for ordering in judged):
         difference = "one of the two was given the test sample's range, which is part of the difference."
         parts += ["", f"\\{_TRACKS_DIFFER} of different tracks: {difference}"]

@@ -67,10 +67,8 @@ class FlatPlane(Probe):
         rows: list[Row] = []
         shown: dict[str, tuple[Row, NDArray, NDArray]] = {}
         for outline, tilt_deg, distance_m in poses:
-            surface = plane(renderer.rig, distance_m, tilt_deg, masks[outline])
-            lit, seen = renderer.light(surface), masks[outline].copy()
-            seen.ravel()[surface.pixels] &= lit.gain > 0  # no fringe beyond the projector's field
-            scene = Scene(surface, lit, seen, (0, "plane", ""))
+            scene = plane_scene(renderer, masks[outline], tilt_deg, distance_m)
+            seen = scene.mask
             frames = renderer.frames(scene, subject.frames_used)
             prediction = subject.own_output(frames)
             values = prediction[seen].astype(np.float64)
@@ -107,10 +105,10 @@ def outlines_of(dataset: DatasetFolder, settings: ProbeSettings) -> dict[str, Ma
     """Silhouettes (H, W) of a test sample of each object, by sample. Raises `DiagnosisError` without any."""
     first = [samples[0] for samples in dataset.samples_by_object("test").values()]
     names = settings.choose(first, OUTLINES, QUICK_OUTLINES)
-    masks = {name: object_mask(dataset.depth_mm(name)) for name in names}
-    if not any(mask.any() for mask in masks.values()):
+    masks = {name: mask for name in names if (mask := object_mask(dataset.depth_mm(name))).any()}
+    if not masks:
         raise DiagnosisError(f"{dataset.path}: split test holds no sample with an object, whose outline a plane gets")
-    return {name: mask for name, mask in masks.items() if mask.any()}
+    return masks
 
 
 def poses_of(outline: str, quick: bool) -> list[tuple[tuple[float, float], float]]:
@@ -124,6 +122,14 @@ def rectangle(shape: tuple[int, int], side: float) -> Mask:
     down, across = (round(length * (1 - side) / 2) for length in shape)
     mask[down : shape[0] - down, across : shape[1] - across] = True
     return mask
+
+
+def plane_scene(renderer: SceneRenderer, mask: Mask, tilt_deg: tuple[float, float], distance_m: float) -> Scene:
+    """A `plane` in front of the background; the scene's mask is ``mask`` without what no fringe reaches."""
+    surface = plane(renderer.rig, distance_m, tilt_deg, mask)
+    lit, seen = renderer.light(surface), mask.copy()
+    seen.ravel()[surface.pixels] &= lit.gain > 0  # no fringe beyond the projector's field
+    return Scene(surface, lit, seen, (0, "plane", ""))
 
 
 def control_of(

@@ -2,14 +2,14 @@
 
 The heatmap of a layer is the ReLU of its channels' sum, each weighted by the mean gradient of the mean predicted value
 with respect to that channel (Selvaraju et al. 2017), resized to the image. It is correlated (Pearson, over all pixels)
-with the edges of the true depth and with the local standard deviation of the fringe. As a sanity check (Adebayo et al.
-2018) the heatmaps of random weights are measured too: if they are the same, they do not depend on what was learned.
+with the true depth's edges, the fringe's local standard deviation and the object. As a sanity check (Adebayo et al.
+2018) the heatmaps of random weights are measured too: if they are the same, they do not depend on what was learned. The
+same is measured on flat planes, as in the paper's Section 7.3.
 """
 
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import product
 from typing import Any
 
 import cv2
@@ -18,6 +18,7 @@ from captum.attr import LayerAttribution, LayerGradCam
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from fpp_ml_bench.baselines.diagnostics.flat_plane import FACING, plane_scene, rectangle
 from fpp_ml_bench.baselines.diagnostics.probe import (
     Figure,
     Finding,
@@ -27,9 +28,10 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     table_of,
     with_interval,
 )
-from fpp_ml_bench.baselines.diagnostics.scenes import edge_map
+from fpp_ml_bench.baselines.diagnostics.scenes import SceneRenderer, edge_map
 from fpp_ml_bench.baselines.diagnostics.subjects import Subject
 from fpp_ml_bench.constants import split_sample_name
+from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.evaluation.score.uncertainty import mean_of, object_interval
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -47,7 +49,10 @@ Correlations = Mapping[tuple[str, str], Mapping[int, Sequence[float | None]]]
 PAPER = "grad_cam"
 SAMPLES, QUICK_SAMPLES = 30, 6
 SEEDS = 2
-EDGES, FRINGES, OWN = "edges", "fringes", "own"
+PLANES = {"plane_0.5": 0.5, "plane_0.8": 0.8}
+"""Facing rectangles by their side, as a share of the image's. Our UNet takes the first for an object and the second,
+like the paper's its rectangle, for background."""
+EDGES, FRINGES, OBJECT, OWN = "edges", "fringes", "object", "own"
 """References; `OWN` is the trained network's heatmap."""
 RANDOM = "random_"
 COLUMNS = {
@@ -56,6 +61,8 @@ COLUMNS = {
     RANDOM + EDGES: "random weights: r(CAM, edges)",
     RANDOM + FRINGES: "random weights: r(CAM, fringes)",
     RANDOM + OWN: "random weights: r(CAM, trained CAM)",
+    OBJECT: "r(CAM, object)",
+    RANDOM + OBJECT: "random weights: r(CAM, object)",
 }
 """Titles of what is said of each layer."""
 _LEAST_SPREAD = 1e-12
@@ -69,7 +76,7 @@ class GradCam(Probe):
     title = "Grad-CAM"
     question = "Which pixels change the mean prediction: those at edges, or those with fringes?"
     without_network = "it has no gradient to follow"
-    version = 3
+    version = 4
 
     def run(self, subject: Subject, dataset: DatasetFolder, settings: ProbeSettings, progress: Progress) -> Finding:
         samples = settings.choose(dataset.samples("test"), SAMPLES, QUICK_SAMPLES)
@@ -82,6 +89,7 @@ class GradCam(Probe):
             layers = ", ".join(subject.layer_names)
             return Finding(skipped=f"the heatmaps of every layer of {subject.name} ({layers}) are constant.")
         protocol = {"samples": len(samples), "seeds": seeds}
+        means["planes"] = {one: measure(subject, dataset, [one], seeds, progress)["layers"] for one in PLANES}
         drawn = _draw_heatmaps(subject, dataset, samples)
         return Finding(summary(means), {"protocol": protocol, **means}, table(means, len(samples)), drawn)
 
@@ -111,12 +119,21 @@ def heatmaps(network: nn.Module, layers: Mapping[str, nn.Module], fringe: Tensor
     return heatmaps_by_layer
 
 
-def references(subject: Subject, dataset: DatasetFolder, sample: str) -> dict[str, Image]:
-    """Reference maps for the heatmaps of ``sample``: edges, and the fringe's local standard deviation."""
-    frame = subject.captured(dataset, sample)[subject.frames_used[0]]
+def shown(subject: Subject, dataset: DatasetFolder, name: str) -> tuple[Tensor, dict[str, Any]]:
+    """The input (1, 1, H, W) of a sample or of one of `PLANES`, and its maps (H, W): edges, the fringe's local standard
+    deviation, and the object's mask."""
+    if name in PLANES:
+        renderer = SceneRenderer.of(dataset)
+        scene = plane_scene(renderer, rectangle(renderer.shape, PLANES[name]), *FACING)
+        frames = renderer.frames(scene, subject.frames_used, subject.uses_ground_truth_mask)
+        depth_mm: NDArray = scene.depth_mm
+    else:
+        frames, depth_mm = subject.captured(dataset, name), dataset.depth_mm(name)
     # Image px per fringe period at the standoff; of horizontal fringes where the frame has no direction.
     period_px = dataset.rig.image_px_per_period("vertical" if subject.direction == "vertical" else "horizontal")
-    return {EDGES: edge_map(dataset.depth_mm(sample)), FRINGES: fringe_variation(np.asarray(frame), period_px)}
+    variation = fringe_variation(np.asarray(frames[subject.frames_used[0]]), period_px)
+    maps = {EDGES: edge_map(depth_mm), FRINGES: variation, OBJECT: object_mask(depth_mm)}
+    return subject.input_batch([frames]), maps
 
 
 def fringe_variation(grey: NDArray[np.uint8], period_px: float) -> Image:
@@ -141,26 +158,24 @@ def measure(
     seeds: int,
     progress: Progress,
 ) -> dict[str, Any]:
-    """`means_of` the correlations of every heatmap with both references, and of random weights' heatmaps with the
+    """`means_of` the correlations of every heatmap with the references, and of random weights' heatmaps with the
     trained ones."""
     network, untrained = subject.networks()
     networks = [network, *map(untrained, range(seeds))]
     found: dict[tuple[str, str], dict[int, list[float | None]]] = defaultdict(lambda: defaultdict(list))
     edges_with_fringes: list[float | None] = []
-    done = 0
-    for names, fringe in subject.batches(dataset, samples):
-        compared = [references(subject, dataset, name) for name in names]
-        edges_with_fringes += [correlation(*maps.values()) for maps in compared]
+    for done, name in enumerate(samples):
+        fringe, compared = shown(subject, dataset, name)
+        edges_with_fringes.append(correlation(compared[EDGES], compared[FRINGES]))
         own: dict[str, Image] = {}
         for number, one_network in enumerate(networks):
             heat = heatmaps(one_network, subject.layers_of(one_network), fringe)
             own = own or heat
-            for layer, sample in product(subject.layer_names, range(len(names))):
-                for target, reference in {**compared[sample], OWN: own[layer][sample]}.items():
+            for layer in subject.layer_names:
+                for target, reference in {**compared, OWN: own[layer]}.items():
                     column = f"{RANDOM}{target}" if number else target
-                    found[column, layer][number].append(correlation(heat[layer][sample], reference))
-            done += len(names)
-            progress(done, len(samples) * len(networks), "Grad-CAM" + (" of random weights" if number else ""))
+                    found[column, layer][number].append(correlation(heat[layer], reference))
+        progress(done + 1, len(samples), f"Grad-CAM of {name}")
     objects = [split_sample_name(name)[0] for name in samples]
     return means_of(found, subject.layer_names, objects) | {"edges_with_fringes": _mean([edges_with_fringes], objects)}
 
@@ -207,17 +222,18 @@ def summary(means: Mapping[str, Any]) -> str:
 def table(means: Mapping[str, Any], samples: int) -> Table:
     """The paper's table with random weights beside it."""
     rows = means["layers"] | {"average": means["average"], "edges with fringes": {EDGES: means["edges_with_fringes"]}}
+    rows |= {f"{layer}, {plane}": row for plane, layers in means["planes"].items() for layer, row in layers.items()}
     title = f"Correlation of Grad-CAM over {samples} test samples"
     return table_of(title, "Layer", rows, COLUMNS | {"ratio": "Ratio edges / fringes"})
 
 
 def _draw_heatmaps(subject: Subject, dataset: DatasetFolder, samples: Sequence[str]) -> Figure:
     network, rows = subject.networks()[0], {}
-    for sample in dict.fromkeys(samples[round(share * (len(samples) - 1))] for share in np.linspace(0, 1, _EXAMPLES)):
-        frames = subject.captured(dataset, sample)
-        heat = heatmaps(network, subject.layers_of(network), subject.input_batch([frames]))
-        maps = frames[subject.frames_used[0]], *references(subject, dataset, sample).values()
-        rows[sample] = [Picture(np.asarray(image)) for image in maps]
-        rows[sample] += [Picture(values[0], HEAT_COLOURS) for values in heat.values()]
+    examples = [samples[round(share * (len(samples) - 1))] for share in np.linspace(0, 1, _EXAMPLES)]
+    for name in dict.fromkeys([*examples, *PLANES]):
+        fringe, maps = shown(subject, dataset, name)
+        heat = heatmaps(network, subject.layers_of(network), fringe)
+        rows[name] = [Picture(image) for image in (fringe[0, 0].numpy(), maps[EDGES], maps[FRINGES])]
+        rows[name] += [Picture(values[0], HEAT_COLOURS) for values in heat.values()]
     title, alt = "Heatmaps, each scaled to its own largest value", "Input, edges, fringes and Grad-CAM by layer"
     return Figure(title, alt, gallery(rows, ("input", EDGES, FRINGES, *subject.layer_names)))

@@ -38,8 +38,8 @@ class Job:
     @property
     def has_scores(self) -> bool:
         """Whether it has `Scores` beside its rows: of a cross-validation, or of every frame that it learned from, as in
-        the paper (Section 5.4), where that is more than the row's one."""
-        return self.recipe.fold is not None or self.recipe.frames != "single_shot"
+        the paper (Section 5.4)."""
+        return self.recipe.fold is not None or any(row.startswith("multi_frame/") for row in self.rows)
 
 
 def variants(recipe: Recipe) -> tuple[DepthRange | None, ...]:

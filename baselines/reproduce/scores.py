@@ -30,14 +30,17 @@ from fpp_ml_bench.files import read_json
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.schema import Count, NonNegative, StrictModel, Text, validate
 
-MAIN_KEY = "object_mae_mm"
+MAIN_KEY, OVERALL_KEY = "object_mae_mm", "overall_mae_mm"
+BINS_MM = np.geomspace(0.1, 1000.0, 41)
+"""Ends of a histogram's bins, mm: ten a decade, around the errors of 1 to 100 mm of the paper's tables."""
 SPLIT, TARGET = "test", "depth"
 
 
 class Scores(StrictModel):
     """Errors of a training that are no row of the leaderboard: over every frame that it was trained on, or over the
     objects that a cross-validation kept from it. ``errors``: means over ``pairs`` of ``frames`` and samples, of the six
-    errors in mm and of the share of the depth range; ``per_object``: the object MAE in mm of each object."""
+    errors in mm and of the share of the depth range; ``per_object``: the object MAE in mm of each object;
+    ``counts``: of pairs by overall and by object MAE, as the paper's histograms, by the key (`histogram`)."""
 
     schema_version: Literal["3.0.0"] = "3.0.0"
     protocol_version: Text = PROTOCOL_VERSION
@@ -48,6 +51,7 @@ class Scores(StrictModel):
     pairs: Annotated[int, Field(gt=0)]
     errors: dict[Text, NonNegative | None]
     per_object: Annotated[dict[Text, NonNegative], Field(min_length=1)]
+    counts: dict[Text, list[Count]] = Field(default_factory=dict)
 
 
 def score_frames(
@@ -63,6 +67,7 @@ def score_frames(
     `Rules.pair` raises."""
     keys = (*HEADLINE, RANGE_KEY)
     rows: list[dict[str, float | None]] = []
+    of_pairs: list[dict[str, float | None]] = []
     by_object: dict[str, list[float | None]] = {}
     for sample in samples:
         void = rules.void(opened, sample)
@@ -72,6 +77,7 @@ def score_frames(
             if not np.isfinite(values).all():
                 raise PredictionError(f"{sample}, frame {frame}: the network gave values that are not finite")
             scores.append(score_sample(*rules.pair(values, opened, sample), void=void).metrics())
+        of_pairs += scores
         rows.append({key: mean_of(score.get(key) for score in scores) for key in keys})
         by_object.setdefault(split_sample_name(sample)[0], []).append(rows[-1][MAIN_KEY])
     means = {name: mean_of(errors) for name, errors in by_object.items()}
@@ -81,8 +87,16 @@ def score_frames(
         pairs=len(samples) * len(frames),
         errors={key: mean_of(row[key] for row in rows) for key in keys},
         per_object={name: mean for name, mean in means.items() if mean is not None},
+        counts={key: histogram([score[key] for score in of_pairs]) for key in (OVERALL_KEY, MAIN_KEY)},
         **identity,  # type: ignore[arg-type]
     )
+
+
+def histogram(errors_mm: Sequence[float | None]) -> list[int]:
+    """How many errors, None left out, are in each bin of `BINS_MM`; beyond its ends they count in the end bins."""
+    known = [error for error in errors_mm if error is not None]
+    counts, _ = np.histogram(np.clip(known, BINS_MM[0], BINS_MM[-1]), BINS_MM)
+    return counts.tolist()  # type: ignore[no-any-return]
 
 
 def read_scores(path: Path) -> Scores:
@@ -112,7 +126,7 @@ def constant_scores(opened: DatasetFolder, fold: tuple[int, int]) -> Scores:
 
 
 def joined(parts: Sequence[Scores]) -> Scores:
-    """The scores of several parts of the objects as one; each pair counts the same."""
+    """The scores of several parts of the objects as one; each pair counts the same. Without counts."""
     pairs = sum(part.pairs for part in parts)
     sums = {
         key: [part.pairs * value for part in parts if (value := part.errors[key]) is not None]
@@ -121,6 +135,7 @@ def joined(parts: Sequence[Scores]) -> Scores:
     return parts[0].model_copy(
         update={
             "pairs": pairs,
+            "counts": {},
             "errors": {key: sum(values) / pairs if len(values) == len(parts) else None for key, values in sums.items()},
             "per_object": {name: value for part in parts for name, value in part.per_object.items()},
         }

@@ -5,14 +5,17 @@ from itertools import pairwise, product
 import numpy as np
 import pytest
 import torch
-from known_networks import oracle
+from known_networks import oracle, subject_with
 from torch import nn
 from torch.nn import functional
 
+from fpp_ml_bench.baselines.diagnostics.flat_plane import rectangle
 from fpp_ml_bench.baselines.diagnostics.grad_cam import (
     EDGES,
     FRINGES,
+    OBJECT,
     OWN,
+    PLANES,
     RANDOM,
     GradCam,
     cam_layers,
@@ -20,8 +23,10 @@ from fpp_ml_bench.baselines.diagnostics.grad_cam import (
     heatmaps,
     means_of,
     measure,
+    shown,
 )
 from fpp_ml_bench.baselines.diagnostics.probe import silent
+from fpp_ml_bench.baselines.diagnostics.scenes import edge_map
 from fpp_ml_bench.baselines.diagnostics.subjects import randomised
 from fpp_ml_bench.baselines.stability.cases import U32
 from fpp_ml_bench.errors import DiagnosisError
@@ -84,9 +89,9 @@ def test_correlation_is_pearsons():
 
 
 def test_means_leave_out_maps_that_are_constant_and_average_layers_as_the_paper_does():
-    correlations = {(target, layer): {0: [0.1] * 3} for layer in "ab" for target in (EDGES, FRINGES)}
+    correlations = {(target, layer): {0: [0.1] * 3} for layer in "ab" for target in (EDGES, FRINGES, OBJECT)}
     correlations[EDGES, "a"] = {0: [0.4, 0.2, None]}
-    for layer, target in product("ab", (EDGES, FRINGES, OWN)):
+    for layer, target in product("ab", (EDGES, FRINGES, OBJECT, OWN)):
         by_network = {number: [r if target == OWN else None] * 3 for number, r in ((1, 0.2), (2, 0.4))}
         correlations[RANDOM + target, layer] = by_network
     means = means_of(correlations, ("a", "b"), ["x", "x", "y"])
@@ -115,6 +120,35 @@ def test_a_reader_of_edges_looks_at_edges_and_one_of_the_lit_object_at_fringes(o
     assert layer[RANDOM + OWN]["r"] == pytest.approx(1, abs=1e-6)
     if wins == EDGES:
         assert correlations["edges_with_fringes"]["r"] == pytest.approx(fringes)
+
+
+class Painted(nn.Module):
+    """A network that outputs the same image, whatever it is shown."""
+
+    def __init__(self, image) -> None:
+        super().__init__()
+        self.out, self.image = nn.Identity(), torch.from_numpy(image.astype(np.float32))
+
+    def forward(self, fringe: torch.Tensor) -> torch.Tensor:
+        return self.out(self.image + 0 * fringe)
+
+
+@pytest.mark.parametrize(("plane", "side"), PLANES.items())
+def test_heatmaps_of_a_plane_are_compared_with_the_plane(opened, plane, side):
+    """Heat on the plane, on its edges, everywhere: the last has no correlation, which is unknown and not NaN."""
+    on_it = rectangle(opened.size, side)
+    edges = edge_map(np.where(on_it, 1800.0, 0.0))
+    for painted, target in ((on_it, OBJECT), (edges, EDGES), (np.ones(opened.size), None)):
+        subject = subject_with(Painted(painted), opened.size)
+        fringe, maps = shown(subject, opened, plane)
+        (heat,) = heatmaps(subject.network, {"out": subject.network.out}, fringe)["out"]
+        assert fringe.shape == (1, 1, *opened.size) and heat.shape == opened.size and np.isfinite(heat).all()
+        assert (maps[OBJECT] == on_it).all()
+        measured = measure(subject, opened, [plane], 1, silent)["layers"]["out"]
+        for column in (EDGES, FRINGES, OBJECT):  # the stand-in for random weights is the network itself
+            assert measured[RANDOM + column] == measured[column]
+        assert target is None or measured[target]["r"] == pytest.approx(1, abs=1e-6)
+        assert target is not None or {measured[column]["r"] for column in (EDGES, FRINGES, OBJECT)} == {None}
 
 
 def test_random_weights_come_from_the_seed_alone():

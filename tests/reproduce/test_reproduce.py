@@ -12,7 +12,14 @@ import torch
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.networks.model import build
 from fpp_ml_bench.baselines.reproduce import plan, work
-from fpp_ml_bench.baselines.reproduce.scores import SPLIT, read_scores, score_frames, scores_that_hold
+from fpp_ml_bench.baselines.reproduce.scores import (
+    BINS_MM,
+    SPLIT,
+    histogram,
+    read_scores,
+    score_frames,
+    scores_that_hold,
+)
 from fpp_ml_bench.baselines.reproduce.work import plan_state
 from fpp_ml_bench.baselines.timing import time_method
 from fpp_ml_bench.baselines.training import depth_training
@@ -285,6 +292,10 @@ def test_every_frame_is_scored_for_the_multi_frame_table(run, trainer, tmp_path,
     assert len(lines) == 2 and "its first frame only" in lines[1]
     assert f"| {scores.errors['object_mae_mm']:.2f} / " in lines[0] and "| 12.36 / 16.94 |" in lines[0]
     assert f"| {row.metrics.object_mae_mm:.2f} / " in lines[1] and "12.36" not in lines[1]
+    for key in ("overall_mae_mm", "object_mae_mm"):
+        assert sum(scores.counts[key]) == scores.pairs
+    assert "(multi_frame.png)" in (below / "multi_frame.md").read_text()
+    assert (below / "multi_frame.png").read_bytes().startswith(b"\x89PNG")
     first = stamps(below / "scores")
     shutil.rmtree(below / "unet-individual-rmse-vertical")
     assert run("multi_frame/vertical", "--only-missing") == 0  # made elsewhere by the same recipe
@@ -313,6 +324,14 @@ def test_files_of_scores_are_read_strictly(opened, tmp_path):
     assert scores_that_hold(path, opened.fingerprint, recipe) is None
     with pytest.raises(PredictionError, match=r"frame 0.*not finite"):
         score_frames(opened, lambda f: zeros(f) + np.nan, [0], RULES, samples, **IDENTITY)
+
+
+def test_histograms_are_numpys():
+    errors = [2.0, 2.1, 30.0, 31.0, 999.0, None]
+    counts = histogram(errors)
+    assert counts == np.histogram(errors[:-1], BINS_MM)[0].tolist() and sum(counts) == 5
+    assert histogram([0.0, 5000.0, None]) == [1, *[0] * 38, 1]
+    assert histogram([]) == [0] * 40
 
 
 def test_scores_of_one_frame_are_the_evaluators(opened, tmp_path):

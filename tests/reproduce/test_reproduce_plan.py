@@ -137,17 +137,17 @@ def line(label: str, paper_mae: float | None, *seeds: dict[str, float], entry: E
     return Line(label, label, load_recipe("loss/rmse"), found, entry, paper)
 
 
-def views(base: float, spread: float = 0.1) -> dict[str, float]:
+def views(base: float, spread: float = 0.1, objects: str = "abcdefghij") -> dict[str, float]:
     return {
         f"{name}_A{view}": base + spread * ((number + view) % 3)
-        for number, name in enumerate("abcde")
+        for number, name in enumerate(objects)
         for view in (0, 60)
     }
 
 
 def test_orderings_are_judged_by_number():
     noise = views(10.0)
-    swapped = {sample: value + (3.0 if sample < "c" else -2.9) for sample, value in noise.items()}
+    swapped = {sample: value + (3.0 if sample < "f" else -2.9) for sample, value in noise.items()}
     lines = [
         line("best", 1.0, noise),
         line("worse", 2.0, views(12.0)),
@@ -157,16 +157,41 @@ def test_orderings_are_judged_by_number():
     judged = orderings(lines[::-1])
     assert [(ordering.better, ordering.worse, ordering.verdict) for ordering in judged] == [
         ("best", "worse", "holds"),
-        ("best", "odd", "not decided"),
-        ("worse", "odd", "not decided"),
+        ("best", "odd", "seen"),
+        ("worse", "odd", "seen reversed"),
     ]
     assert [ordering.paper_gap_mm for ordering in judged] == [1.0, 2.0, 1.0]
     assert judged[0].here.mean_mm == pytest.approx(2.0)
     turned = orderings([line("best", 1.0, views(12.0)), line("worse", 2.0, noise)])
     assert [ordering.verdict for ordering in turned] == ["reversed"]
-    assert "measured here: 1 hold, 0 reversed, 2 not decided by 5 objects" in orderings_sentence(judged)
+    assert orderings_sentence(judged).endswith(
+        "3 among the rows measured here. Decided by 10 objects, with Holm's correction: 1 hold, 0 reversed. Only seen "
+        "in the mean over them: 1 as in the paper, 1 reversed."
+    )
     assert orderings([line("a", 1.0, noise), line("b", 1.0, views(12.0))]) == []
     assert "none of its orderings" in orderings_sentence([])
+
+
+@pytest.mark.parametrize(("count", "verdicts"), [(5, ("seen", "seen reversed")), (6, ("holds", "reversed"))])
+def test_five_objects_decide_nothing(count, verdicts):
+    """However large and equal their differences are, and although the interval leaves 0 out."""
+    near, far = (views(base, objects="abcdefghij"[:count]) for base in (1.0, 100.0))
+    for first, second, verdict in ((near, far, verdicts[0]), (far, near, verdicts[1])):
+        judged = orderings([line("a", 1.0, first), line("b", 2.0, second)])
+        assert [ordering.verdict for ordering in judged] == [verdict]
+        assert judged[0].here.interval[0] * judged[0].here.interval[1] > 0
+        assert judged[0].p_holm == 2 / 2**count
+        assert ("Fewer than 6 objects can decide none" in orderings_sentence(judged)) == (count == 5)
+
+
+def test_each_further_pair_of_a_table_makes_the_others_harder_to_decide():
+    lines = [line("a", 1.0, views(1.0, objects="abcdef")), line("b", 2.0, views(9.0, objects="abcdef"))]
+    assert [ordering.verdict for ordering in orderings(lines)] == ["holds"]
+    lines.append(line("c", 3.0, views(20.0, objects="abcdef")))
+    judged = orderings(lines)
+    assert [ordering.here.p for ordering in judged] == [2 / 2**6] * 3
+    assert [ordering.p_holm for ordering in judged] == [3 * 2 / 2**6] * 3
+    assert {ordering.verdict for ordering in judged} == {"seen"}
 
 
 def test_seeds_count_beside_objects():
@@ -174,7 +199,8 @@ def test_seeds_count_beside_objects():
     base, better = views(10.0), [views(8.0), views(8.0), views(10.5)]
     one = orderings([line("a", 1.0, better[0]), line("b", 2.0, base)])[0]
     three = orderings([line("a", 1.0, *better), line("b", 2.0, base, base, base)])[0]
-    assert (one.verdict, one.here.seeds, three.here.seeds, three.verdict) == ("holds", 1, 3, "not decided")
+    assert (one.verdict, one.here.seeds, three.here.seeds, three.verdict) == ("holds", 1, 3, "seen")
+    assert three.p_holm < 0.05
     assert three.here.mean_mm == pytest.approx((2 + 2 - 0.5) / 3)
     agreed = orderings([line("a", 1.0, *better[:2]), line("b", 2.0, base, base, base)])[0]
     assert (agreed.verdict, agreed.here.seeds) == ("holds", 2)
@@ -184,15 +210,15 @@ def test_seeds_count_beside_objects():
     ("ends", "verdict"),
     [
         ((0.1, 2.0), "holds"),
-        ((0.0, 2.0), "not decided"),
-        ((-1.0, 0.0), "not decided"),
+        ((0.0, 2.0), "seen"),
+        ((-1.0, 0.0), "seen reversed"),
         ((-2.0, -0.1), "reversed"),
-        (None, "not decided"),
+        (None, "seen"),
     ],
 )
 def test_an_interval_that_touches_zero_decides_nothing(ends, verdict):
     mean_mm = sum(ends or (1.0, 1.0)) / 2
-    assert Ordering("a", "b", 1.0, Gap(mean_mm, ends, 5, 1), True).verdict == verdict
+    assert Ordering("a", "b", 1.0, Gap(mean_mm, ends, 6, 1, 0.01), 0.05, True).verdict == verdict
 
 
 def two_results(tmp_path, dataset):
