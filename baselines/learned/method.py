@@ -16,6 +16,7 @@ from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method, Ow
 from fpp_ml_bench.baselines.phase.method import (
     LIT_BACKGROUND,
     ONE_ALBEDO,
+    RANGE_AND_WALL,
     RouteMethod,
     crossed_image,
     crossed_name,
@@ -255,6 +256,10 @@ class CrossedNetMethod(LearnedRoute):
         return "crossed"
 
     @classmethod
+    def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
+        return RANGE_AND_WALL
+
+    @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
         return [{}] if has_crossed_fringes(rig) else []
 
@@ -338,7 +343,7 @@ class FringeNetMethod(LearnedRoute):
 
     @classmethod
     def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
-        return None if settings.get("fringes") == "crossed" else ONE_ALBEDO
+        return RANGE_AND_WALL if settings.get("fringes") == "crossed" else ONE_ALBEDO
 
     def __init__(self, rig: Rig, **options: Any) -> None:
         from fpp_ml_bench.baselines.learned.fringe_net import FringeNetCrossedRoute, FringeNetRoute

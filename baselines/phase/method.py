@@ -42,6 +42,10 @@ LIT_BACKGROUND = Assumption(
     "a lit background", "Assumes a lit background; not one albedo, so that little tells the fringe order."
 )
 ONE_ALBEDO = Assumption("one albedo, a lit background", TERMS["shading"].assumes)
+RANGE_AND_WALL = Assumption(
+    "all lit in the range, or a known wall",
+    "Assumes that what is lit stands in the working range, or is the wall behind it, whose distance the rig states.",
+)
 MASK = "object mask: an image of the frames' size, above 0 on the object in every sample (default: found in each image)"
 
 
@@ -215,6 +219,10 @@ class CrossedMethod(RouteMethod):
     @classmethod
     def scenes_rig(cls, settings: Mapping[str, Any]) -> str:
         return "crossed"
+
+    @classmethod
+    def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
+        return RANGE_AND_WALL
 
     def __init__(self, rig: Rig, **options: Any) -> None:
         given = self.checked_options(options)
