@@ -171,7 +171,6 @@ def evaluate(
     objects: Sequence[str] | None = None,
     units: str | None = None,
     nodata: float | None = None,
-    charge_mm: float | None = None,
     edge_band_px: int = EDGE_BAND_PX,
 ) -> "ArrayScores": ...
 
@@ -189,7 +188,6 @@ def evaluate(
     objects: Any = None,
     units: Any = None,
     nodata: Any = None,
-    charge_mm: float | None = None,
 ) -> "Result | ArrayScores":
     """Score a folder of predictions, as ``fpp-eval`` does, or arrays in memory by the same rules.
 
@@ -220,9 +218,6 @@ def evaluate(
     nodata : float, optional
         Of arrays: the value that depths have where no surface is, such as 65535 or NaN, in the unit of the arrays.
         A folder says it in ``submission.yaml``.
-    charge_mm : float, optional
-        Of arrays: what a missing or invented pixel costs in the two-sided scores, half of the rig's working range.
-        Without it there are none. A dataset has a rig, which says it.
 
     Returns
     -------
@@ -246,7 +241,6 @@ def evaluate(
     2.0
     """
     in_memory = {"flags": flags, "sigma": sigma, "objects": objects, "units": units, "nodata": nodata}
-    in_memory["charge_mm"] = charge_mm
     if not isinstance(predictions, (str, Path)):
         if isinstance(dataset, (str, Path, DatasetFolder)):
             raise PredictionError("predictions in memory need the targets as arrays; or give a folder and a dataset")
