@@ -43,7 +43,7 @@ LIT_BACKGROUND = Assumption(
 )
 ONE_ALBEDO = Assumption("one albedo, a lit background", TERMS["shading"].assumes)
 RANGE_AND_WALL = Assumption(
-    "all lit in the range, or a known wall",
+    "known range and wall",
     "Assumes that what is lit stands in the working range, or is the wall behind it, whose distance the rig states.",
 )
 MASK = "object mask: an image of the frames' size, above 0 on the object in every sample (default: found in each image)"

@@ -228,7 +228,7 @@ def test_metric_phase_rows_say_what_they_assume(shipped):
                 assert assumption(about) == ("one albedo, a lit background" if one else "a lit background")
                 assert ("one albedo for all surfaces and a lit background" in assumption_sentences(about)) == one
             elif about.submission.method in ("crossed", "crossed-net", "fringe-net"):
-                assert assumption(about) == "all lit in the range, or a known wall"
+                assert assumption(about) == "known range and wall"
             else:
                 assert assumption(about) == ""
             assert ("Given the test sample's" in assumption_sentences(about)) == (about.track != "metric")
