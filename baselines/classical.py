@@ -6,7 +6,7 @@ shows its error.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import index
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -18,7 +18,13 @@ from fpp_ml_bench.coding.phase_shift import PhaseShift
 from fpp_ml_bench.decoding.blocks import plan_direction
 from fpp_ml_bench.decoding.decode import Decoded, Directions, decode_stack
 from fpp_ml_bench.decoding.fewest import fewest_plans, fewest_steps
-from fpp_ml_bench.decoding.triangulation import ASSUMED_NOISE_GREY, SYSTEMATIC_RAD, depth_sigma_mm, noise_by_light
+from fpp_ml_bench.decoding.triangulation import (
+    ASSUMED_NOISE_GREY,
+    STATED_SYSTEMATIC_RAD,
+    SYSTEMATIC_RAD,
+    depth_sigma_mm,
+    noise_by_light,
+)
 from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.loaders.render.light import Light
 from fpp_ml_bench.loaders.render.scene import modulation_at
@@ -142,11 +148,17 @@ class ClassicalMethod(Method):
         return self.decode(frames).depth_mm
 
     def answer(self, frames: Frames) -> Answer:
-        """Depth, and its standard uncertainty by the noise of the frames; none for a code that has none by pixel."""
-        return self.measure(frames)[0]
+        """Depth, and its standard uncertainty by the noise of the frames, light of further bounces and the calibration;
+        none for a code that has none by pixel."""
+        return self._measured(frames, self.rig, STATED_SYSTEMATIC_RAD)[0]
 
     def measure(self, frames: Frames) -> tuple[Answer, NDArray[np.float32]]:
-        """`answer`, and the modulation in grey levels (H, W), the larger of both directions; 0 where there is none."""
+        """`answer`, and the modulation in grey levels (H, W), the larger of both directions; 0 where there is none. The
+        uncertainty is that of neighbours against each other, by which networks compare them: without the calibration's
+        error, which they share."""
+        return self._measured(frames, replace(self.rig, calibration_px=0.0), SYSTEMATIC_RAD)
+
+    def _measured(self, frames: Frames, rig: Rig, systematic_rad: float) -> tuple[Answer, NDArray[np.float32]]:
         decoded = self.decode(frames, details=True)
         measured = np.stack([measured.modulation for measured in decoded.details.values()]).max(axis=0)
         modulation = np.nan_to_num(measured).astype(np.float32)
@@ -154,7 +166,7 @@ class ClassicalMethod(Method):
             return Answer(decoded.depth_mm), modulation
         dark, per_grey = noise_by_light(frames, self.rig) or (ASSUMED_NOISE_GREY**2, 0.0)
         noise_grey = np.sqrt(dark + per_grey * modulation.astype(np.float64))
-        sigma_mm = depth_sigma_mm(decoded, self.rig, noise_grey, self.steps, SYSTEMATIC_RAD)
+        sigma_mm = depth_sigma_mm(decoded, rig, noise_grey, self.steps, systematic_rad)
         return Answer(decoded.depth_mm, sigma_mm), modulation
 
 

@@ -42,7 +42,7 @@ from fpp_ml_bench.cli import main as fpp_bench
 from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import FppBenchError, SubmissionError
-from fpp_ml_bench.evaluation.metrics import RANK_KEY
+from fpp_ml_bench.evaluation.metrics import OBJECT_KEY
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
 from fpp_ml_bench.evaluation.result.file import read_result
 from fpp_ml_bench.evaluation.result.model import Result
@@ -199,20 +199,22 @@ _COLUMNS = (
     columns.METHOD,
     Column("Assumes", lambda row: assumption(row.entry.row) or "-", right=False),
     Column(
-        "Object MAE, mm (95% interval)",
-        lambda row: f"{error(RANK_KEY, row)} ({columns.interval(row, between=' to ')})",
+        "Two-sided MAE, mm (95% interval)",
+        lambda row: f"{error(row.rank_key, row)} ({columns.interval(row, between=' to ')})",
     ),
+    Column("Object MAE, mm", partial(error, OBJECT_KEY)),
     Column("Overall MAE, mm", partial(error, "overall_mae_mm")),
     Column("Time, ms", partial(columns.time_text, per_second=1000)),
     columns.FRAMES,
     columns.RELIANCE,
+    columns.ORDER_FREE,
     columns.ROBUSTNESS,
 )
 
 
 def readme_rows(groups: Sequence[Group]) -> list[tuple[Group, Ranked]]:
     """What README shows of the first dataset's metric track, against exact depth where a row is: the `SHOWN` methods of
-    one frame with the least object MAE, without trivial ones, and the best classical method with its full sequence.
+    one frame with the least two-sided MAE, without trivial ones, and the best classical method with its full sequence.
     Only rows that the maintainers vouch for count, and where there are none, results of this machine."""
     first = [
         group
@@ -225,10 +227,10 @@ def readme_rows(groups: Sequence[Group]) -> list[tuple[Group, Ranked]]:
         for group in of_one_target(of_class)[:1]:
             rows = [row for row in group.rows if row.provenance != SELF_REPORTED and not is_trivial(row)]
             rows = [row for row in rows if row.entry.vouched or not group.vouched]
-            rows = [row for row in rows if row.value(RANK_KEY) is not None]
+            rows = [row for row in rows if row.value(row.rank_key) is not None]
             if frames == FRAMES_CLASSES[-1]:
                 rows = [row for row in rows if row.entry.row.submission.method == "classical"]
-            best = sorted(rows, key=lambda row: (row.value(RANK_KEY), row.short_name))
+            best = sorted(rows, key=lambda row: (row.value(row.rank_key), row.short_name))
             shown += [(group, row) for row in best[:count]]
     return shown
 
@@ -242,9 +244,11 @@ def readme_block(groups: Sequence[Group]) -> str:
     notes = [
         f"{group.key.data_title}: {group.parts}, {sum(part.samples for part in first.objects)} samples of "
         f"{len(first.objects)} objects, against {group.key.against}.",
+        f"Two-sided MAE: {columns.TWO_SIDED_NOTE}",
         "Assumes: what must be true of the scene beside the rig's calibration.",
         f"Time: median latency of one image on {' or '.join(machines) or 'an unknown machine'}.",
-        "Phase reliance: 1 if the depth follows the fringe's phase and nothing else, 0 if it does not follow it.",
+        "Phase reliance: 1 if the depth follows the fringe's phase and nothing else, 0 if it does not follow it; then "
+        "without errors of whole periods. It does not see a bias.",
         "Disturbed: object MAE over disturbed scenes.",
     ]
     reported = [f"\\{NOT_CHECKED}: reported by the row's author."] if any(not r.entry.all_checked for r in rows) else []

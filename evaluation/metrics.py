@@ -29,7 +29,8 @@ class Metric:
     keys in a file and of all tables.
 
     ``optional``: a file leaves its key out where no sample has it, so that files from before the entry stay readable;
-    else it is null. ``cancels``: a small difference of large numbers, which two machines compute to 1e-9 of the error.
+    else it is null. ``charged``: rules without a charge for missing and invented pixels don't have it. ``cancels``: a
+    small difference of large numbers, which two machines compute to 1e-9 of the error.
 
     Roles: ``headline``: one of the paper's six numbers, which have intervals and ranks; ``role``: ``rank``, the
     leaderboard's order, and ``range``, which stands beside it; ``helped_by_missing``: a method improves it by answering
@@ -43,6 +44,7 @@ class Metric:
     of: Callable[[Any], Any] | str
     rule: str
     optional: bool = True
+    charged: bool = False
     cancels: bool = False
     better: Literal["lower", "higher", "nearer 0", "neither"] = "lower"
     headline: bool = False
@@ -85,7 +87,7 @@ _ENTRIES = (
         "object",
         "Object",
         "the object",
-        {"role": "rank", "column": "Object MAE", "terminal": "Object\nMAE"},
+        {"column": "Object MAE", "terminal": "Object\nMAE"},
         {"column": "Object RMSE", "terminal": "Object\nRMSE"},
         over="object",
     ),
@@ -225,6 +227,38 @@ _ENTRIES = (
         over="object",
     ),
     Metric(
+        "two_sided_mae_mm",
+        "Two-sided MAE",
+        "mm",
+        methodcaller("two_sided_mm"),
+        "sum of |e| over the measured pixels, and of the charge for each object pixel that is not measured and each "
+        "background pixel predicted above 0, over the object's pixels",
+        charged=True,
+        role="rank",
+        training=True,
+        column="Two-sided MAE",
+        terminal="Two-sided\nMAE",
+    ),
+    Metric(
+        "two_sided_with_void_mae_mm",
+        "Two-sided MAE, void surface in the object",
+        "mm",
+        methodcaller("two_sided_mm", True),
+        "the same, with the void pixels whose target has a depth in the object",
+        charged=True,
+    ),
+    Metric(
+        "invented_share",
+        "Background with an answer, over the object",
+        "ratio",
+        "invented_share",
+        "background pixels predicted above 0 over the object's pixels; may exceed 1",
+        charged=True,
+        training=True,
+        column="Invented",
+        column_from=WIDE,
+    ),
+    Metric(
         "void_share",
         "Void, share of the image",
         "share",
@@ -257,6 +291,10 @@ METRICS = {metric.key: metric for metric in _ENTRIES}
 HEADLINE = tuple(key for key, metric in METRICS.items() if metric.headline)
 """The paper's six numbers (Section 5.3.2): MAE and RMSE over the full grid, the object and the background, in mm."""
 RANK_KEY, RANGE_KEY = (next(m.key for m in _ENTRIES if m.role == role) for role in ("rank", "range"))
+OBJECT_KEY = "object_mae_mm"
+"""What rows are ranked by where nothing is charged: the paper's rules."""
+RANKED = (*HEADLINE, RANK_KEY)
+"""What has an interval, means of objects, and ranks."""
 
 _ORDER = "object median, 95th percentile, RMSE and maximum are out of order"
 _BIAS = "bias or shift-free MAE is above the MAE, which no error has"
@@ -359,8 +397,8 @@ _STATED = (
             f"AUSE, {error.upper()}",
             "mm",
             methodcaller("area_mm", f"{error}_mm"),
-            f"{error.upper()} of the object without the share x of least sure pixels, minus that without the share x "
-            "of largest errors; mean over x = 0, 0.05, ... 0.95",
+            f"{error.upper()} without the share x of least sure pixels, minus that without the share x of largest "
+            "errors; mean over x = 0, 0.05, ... 0.95",
             cancels=True,
             terminal="AUSE\nMAE" if error == "mae" else "",
         )
@@ -372,7 +410,7 @@ _STATED = (
             f"{error.upper()} of the surest 95%",
             "mm",
             methodcaller("sure_mm", f"{error}_mm"),
-            f"{error.upper()} of the object without its 5% least sure pixels",
+            f"{error.upper()} without the 5% of least sure pixels",
             terminal=f"{error.upper()} of the\nsurest 95%",
         )
         for error in ("mae", "rmse")
@@ -395,7 +433,11 @@ def with_column(width: int) -> list[Metric]:
     """Those with a column in the leaderboard's tables where the terminal has ``width`` characters, the most important
     and the errors over the object first."""
     shown = (metric for metric in METRICS.values() if metric.column and metric.column_from <= width)
-    return sorted(shown, key=lambda metric: (metric.column_from, not (metric.headline and metric.over == "object")))
+
+    def place(metric: Metric) -> tuple[int, bool, bool]:
+        return metric.column_from, metric.role != "rank", not (metric.headline and metric.over == "object")
+
+    return sorted(shown, key=place)
 
 
 def sort_keys() -> tuple[str, ...]:

@@ -171,6 +171,7 @@ def evaluate(
     objects: Sequence[str] | None = None,
     units: str | None = None,
     nodata: float | None = None,
+    charge_mm: float | None = None,
     edge_band_px: int = EDGE_BAND_PX,
 ) -> "ArrayScores": ...
 
@@ -188,6 +189,7 @@ def evaluate(
     objects: Any = None,
     units: Any = None,
     nodata: Any = None,
+    charge_mm: float | None = None,
 ) -> "Result | ArrayScores":
     """Score a folder of predictions, as ``fpp-eval`` does, or arrays in memory by the same rules.
 
@@ -218,6 +220,9 @@ def evaluate(
     nodata : float, optional
         Of arrays: the value that depths have where no surface is, such as 65535 or NaN, in the unit of the arrays.
         A folder says it in ``submission.yaml``.
+    charge_mm : float, optional
+        Of arrays: what a missing or invented pixel costs in the two-sided scores, half of the rig's working range.
+        Without it there are none. A dataset has a rig, which says it.
 
     Returns
     -------
@@ -241,6 +246,7 @@ def evaluate(
     2.0
     """
     in_memory = {"flags": flags, "sigma": sigma, "objects": objects, "units": units, "nodata": nodata}
+    in_memory["charge_mm"] = charge_mm
     if not isinstance(predictions, (str, Path)):
         if isinstance(dataset, (str, Path, DatasetFolder)):
             raise PredictionError("predictions in memory need the targets as arrays; or give a folder and a dataset")

@@ -21,7 +21,7 @@ import numpy as np
 from fpp_ml_bench.baselines.registry import methods, network_method
 from fpp_ml_bench.constants import FULL_SIZE
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS, RANK_KEY, sort_keys
+from fpp_ml_bench.evaluation.metrics import METRICS, OBJECT_KEY, RANK_KEY, RANKED, sort_keys
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX, FRAMES_CLASSES, FramesClass, Track
 from fpp_ml_bench.evaluation.score.uncertainty import FEWEST_OBJECTS, Interval, Pair, pairs, rank_ranges
 from fpp_ml_bench.evaluation.submission.description import Submission
@@ -49,6 +49,7 @@ class GroupKey:
     data: str
     size: tuple[int, int]
     edge_band_px: int
+    charge_mm: float
     protocol_version: str
 
     @classmethod
@@ -64,8 +65,14 @@ class GroupKey:
             data,
             (info.size[0], info.size[1]),
             row.edge_band_px,
+            row.charge_mm or 0.0,
             row.protocol_version,
         )
+
+    @property
+    def rank_key(self) -> str:
+        """By what its rows are ranked: as the paper does where nothing is charged."""
+        return RANK_KEY if self.charge_mm else OBJECT_KEY
 
     @property
     def benchmark(self) -> Benchmark | None:
@@ -143,6 +150,11 @@ class Ranked:
         return str(self.best_rank) if self.best_rank == self.worst_rank else f"{self.best_rank}-{self.worst_rank}"
 
     @property
+    def rank_key(self) -> str:
+        """By what it is ranked, as all rows of its group."""
+        return OBJECT_KEY if self.entry.row.charge_mm is None else RANK_KEY
+
+    @property
     def provenance(self) -> str:
         """The weakest of its parts' (a key of `MEANING`)."""
         return max((part.provenance for part in self.entries), key=list(MEANING).index)
@@ -159,10 +171,10 @@ class Ranked:
 
     def value(self, key: str) -> float | None:
         """Mean of a sort key over all samples of the row; None for an empty pixel set or an unknown time. Of a row with
-        two parts, scores beside `HEADLINE` are weighted by the samples of each."""
+        two parts, scores beside `RANKED` are weighted by the samples of each."""
         if self.unseen is None or key in ("seconds_per_sample", "frames_used"):
             return self.entry.value(key)
-        if key in HEADLINE:
+        if key in RANKED:
             return mean_over(self.objects, key)
         known = [(value, part.row.dataset.samples) for part in self.entries if (value := part.value(key)) is not None]
         return sum(value * samples for value, samples in known) / sum(n for _, n in known) if known else None
@@ -173,10 +185,10 @@ class Ranked:
 
     @cached_property
     def _joined(self) -> dict[str, Interval | None]:
-        return {key: interval_over(self.objects, key) for key in HEADLINE}
+        return {key: interval_over(self.objects, key) for key in RANKED}
 
     def object_means(self, key: str) -> dict[str, float]:
-        """Mean of a headline score over the views of each object that has one."""
+        """Mean of a score of `RANKED` over the views of each object that has one."""
         return {part.object: value for part in self.objects if (value := getattr(part, key)) is not None}
 
     def on(self, benchmark: str) -> Entry | None:
@@ -247,7 +259,9 @@ def set_ratios(groups: Sequence[Group]) -> None:
     trivial: dict[GroupKey, list[tuple[set[str], dict[str, float]]]] = {}
     for group in groups:
         for row in filter(is_trivial, group.rows):
-            trivial.setdefault(_alike(group.key), []).append((given_words(group.key.track), row.object_means(RANK_KEY)))
+            trivial.setdefault(_alike(group.key), []).append(
+                (given_words(group.key.track), row.object_means(OBJECT_KEY))
+            )
     for group in groups:
         means = [own for given, own in trivial.get(_alike(group.key), []) if given <= given_words(group.key.track)]
         for row in group.rows:
@@ -265,7 +279,7 @@ def given_words(track: Track) -> set[str]:
 
 
 def _ratio(row: Ranked, trivial: Sequence[Mapping[str, float]]) -> float | None:
-    errors = row.object_means(RANK_KEY)
+    errors = row.object_means(OBJECT_KEY)
     means = [fmean(means[name] for name in errors) for means in trivial if errors and means.keys() >= errors.keys()]
     return fmean(errors.values()) / min(means) if means and min(means) > 0 else None
 
@@ -307,7 +321,8 @@ def read_entries(files: Sequence[Path]) -> list[Entry]:
 
 
 def rank(entries: Iterable[Entry], sort: str = DEFAULT_SORT) -> list[Group]:
-    """Groups in the order of `GroupKey.order`, those without a vouched row last; their rows by rank in ``sort``, then
+    """Groups in the order of `GroupKey.order`, those without a vouched row last; their rows by rank in ``sort`` (by
+    default the `GroupKey.rank_key` of each), then
     the best value first, unknown values last. Equal values are ordered by name, so the order of the files changes
     nothing. Raises SubmissionError where rows contradict each other: a name twice in a group, or in any what looks like
     that of a vouched row; other objects of the same data; a vouched part of a row with one that nobody vouches for."""
@@ -354,6 +369,7 @@ def _check_names(shown: Sequence[Ranked]) -> None:
 
 
 def _group(key: GroupKey, entries: Sequence[Entry], notes: list[str], sort: str) -> Group:
+    sort = key.rank_key if sort == DEFAULT_SORT else sort
     methods = _methods(entries)
     claims = [first.name for first, _ in methods if first.provenance == SELF_REPORTED]
     names = short_names([first.row.submission for first, _ in methods], claims)
@@ -439,7 +455,7 @@ def _no_ranks(
     key: GroupKey, shown: Sequence[Ranked], complete: Sequence[Ranked], family: Sequence[Ranked], sort: str
 ) -> str:
     """Why a table has no ranks; empty where it has."""
-    if sort not in HEADLINE:
+    if sort not in RANKED:
         return f"No ranks by {sort}: the order is that of the values."
     objects = max(len(row.objects) for row in complete or shown)
     smallest = f"With {objects} object{'s' * (objects != 1)} the smallest p value of a test is {2.0 ** (1 - objects):g}"

@@ -18,11 +18,12 @@ from pydantic import Field, model_validator
 from fpp_ml_bench.constants import WORKING_RANGE_MM
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation import protocol
-from fpp_ml_bench.evaluation.metrics import HEADLINE
+from fpp_ml_bench.evaluation.metrics import RANKED
 from fpp_ml_bench.evaluation.protocol import FramesClass, Mode, Target, Track
 from fpp_ml_bench.evaluation.result.file import result_json, write_file
-from fpp_ml_bench.evaluation.result.model import Result, check_data, check_reliance
+from fpp_ml_bench.evaluation.result.model import Result, check_charge, check_data, check_reliance
 from fpp_ml_bench.evaluation.result.parts import (
+    Charge,
     DatasetInfo,
     HardwareInfo,
     Headline,
@@ -73,11 +74,12 @@ Unicode's confusables (UTS 39), those of a Latin letter, figure or sign."""
 
 
 class ObjectMeans(Headline, SparseModel):
-    """An object: means over its ``samples`` views of the six errors, in mm, and over all views how many pixels count.
-    ``without_object`` and ``without_background``: views whose set is empty, which are in no mean of it."""
+    """An object: means over its ``samples`` views of the errors of `RANKED`, in mm, and over all views how many pixels
+    count. ``without_object`` and ``without_background``: views whose set is empty, which are in no mean of it."""
 
-    SPARSE: ClassVar[tuple[str, ...]] = ("without_object", "without_background")
+    SPARSE: ClassVar[tuple[str, ...]] = ("two_sided_mae_mm", "without_object", "without_background")
 
+    two_sided_mae_mm: NonNegative | None = None
     object: Text
     samples: Whole
     object_pixels: Count
@@ -93,8 +95,9 @@ class ObjectMeans(Headline, SparseModel):
 
     def views(self, key: str) -> int:
         """How many views the mean ``key`` is over."""
-        empty = {"object": self.without_object, "background": self.without_background}
-        return self.samples - empty.get(key.partition("_")[0], 0)
+        if key.startswith("background"):
+            return self.samples - self.without_background
+        return self.samples - (0 if key.startswith("overall") else self.without_object)
 
 
 class RowUncertainty(StrictModel):
@@ -133,7 +136,7 @@ class Row(SparseModel):
     ``timing`` where that is there. ``predictions_sha256`` is over the sorted hashes of the prediction files;
     ``result_sha256`` finds the full result, wherever it is published."""
 
-    SPARSE = ("uncertainty", "reliance", "robustness")
+    SPARSE = ("uncertainty", "reliance", "robustness", "charge_mm")
 
     row_schema_version: Literal["2.0.0"]
     submission: Submission
@@ -142,6 +145,7 @@ class Row(SparseModel):
     target: Target
     mode: Mode
     edge_band_px: Annotated[int, Field(ge=0, le=1000)]
+    charge_mm: Charge = None
     protocol_version: Annotated[str, Field(pattern=r"^[0-9]{1,4}\.[0-9]{1,4}\.[0-9]{1,4}$")]
     created: Annotated[str, Field(pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9:.+Z-]{8,30}$")]
     package: Text
@@ -194,14 +198,14 @@ class Row(SparseModel):
         pixels = self.dataset.size[0] * self.dataset.size[1]
         for part in self.per_object:
             _check_object(part, pixels)
-        for key in HEADLINE:
+        for key in RANKED:
             _check_follows(f"metrics.{key}", getattr(self.metrics, key), mean_over(self.per_object, key))
             ends = interval_over(self.per_object, key) or (None, None)
-            for stored, computed in zip(getattr(self.intervals, key), ends, strict=True):
+            for stored, computed in zip(self.intervals.of(key) or (None, None), ends, strict=True):
                 _check_follows(f"intervals.{key}", stored, computed)
         void = sum(part.void_pixels for part in self.per_object) / (samples * pixels)
         _check_follows("metrics.void_share", self.metrics.void_share, void if self.mode == "standard" else None)
-        if problem := self.metrics.problem(samples, _ROUNDED) or self._other_problem():
+        if problem := self.metrics.problem(samples, _ROUNDED, self.charge_mm) or self._other_problem():
             raise ValueError(f"metrics: {problem}")
         if self.protocol_version == protocol.PROTOCOL_VERSION:
             found = {
@@ -209,6 +213,7 @@ class Row(SparseModel):
                 for p in self.per_object
             }
             check_data(self.dataset, self.target, self.mode, self.submission.units, found)
+            check_charge(self.charge_mm, self.dataset, self.mode)
         if self.reliance is not None:
             check_reliance(self.reliance, self.submission)
         return self
@@ -219,10 +224,14 @@ class Row(SparseModel):
         if scores.object_mae_mm is None:
             return None
         left_out = protocol.SURE_LEFT_OUT, 1 - protocol.SURE_LEFT_OUT
-        for power, (name, value) in enumerate((("mae", sure.sure_mae_mm), ("rmse", sure.sure_rmse_mm)), start=1):
-            whole, unsure = getattr(scores, f"object_{name}_mm"), scores.object_max_mm
-            if value is not None and not can_mix(whole, (0.0, unsure), value, left_out, power, _ROUNDED):
-                return f"object_{name}_mm does not follow from uncertainty.sure_{name}_mm and the largest error"
+        unsure = max(scores.object_max_mm, self.charge_mm or 0.0)
+        wholes = scores.object_mae_mm, scores.object_rmse_mm
+        if self.charge_mm is not None:
+            wholes = scores.two_sided_mae_mm, None
+        for power, (name, whole) in enumerate(zip(("mae", "rmse"), wholes, strict=True), start=1):
+            value = getattr(sure, f"sure_{name}_mm")
+            if None not in (whole, value) and not can_mix(whole, (0.0, unsure), value, left_out, power, _ROUNDED):
+                return f"the error of all pixels does not follow from uncertainty.sure_{name}_mm and the largest one"
         share, (near, far) = scores.object_mae_range_share, WORKING_RANGE_MM
         if self.dataset.known and share is not None and exceeds(scores.object_mae_mm, share * (far - near), _ROUNDED):
             return f"object_mae_range_share: no object of the benchmark is deeper than {far - near:g} mm"
@@ -323,7 +332,7 @@ def row_content(result: Result, digits: int | None = DIGITS) -> dict[str, Any]:
     if result.timing is not None:  # it names the same time, machine and software
         described |= dict.fromkeys(("seconds_per_sample", "seconds_source", "hardware"))
         described["software"] = {} if result.timing.software else described["software"]
-    kept = {"dataset", "frames_class", "target", "mode", "edge_band_px", "protocol_version", "created"}
+    kept = {"dataset", "frames_class", "target", "mode", "edge_band_px", "charge_mm", "protocol_version", "created"}
     hashes = sorted(sample.prediction_sha256 for sample in result.per_sample)
     content = {
         "row_schema_version": ROW_SCHEMA_VERSION,
@@ -359,7 +368,7 @@ def _object_means(result: Result, part: ObjectResult) -> dict[str, Any]:
         "samples": part.samples,
         **{f"{name}_pixels": sum(numbers) for name, numbers in counts.items()},
         **{f"without_{name}": counts[name].count(0) for name in ("object", "background")},
-        **part.metrics.model_dump(include=set(HEADLINE)),
+        **part.metrics.model_dump(include=set(RANKED)),
     }
 
 

@@ -17,7 +17,7 @@ from typing import Any
 
 from rich.text import Text
 
-from fpp_ml_bench.evaluation.metrics import HEADLINE, RANK_KEY, WIDE, with_column
+from fpp_ml_bench.evaluation.metrics import HEADLINE, WIDE, with_column
 from fpp_ml_bench.evaluation.score.uncertainty import Pair
 from fpp_ml_bench.leaderboard.columns import (
     METHOD,
@@ -170,16 +170,16 @@ def ranking_table(title: str, shown: Sequence[Column], rows: Sequence[Ranked], *
     return Table.of(title, cells, words, elsewhere="--markdown FILE", **look)
 
 
-def group_tables(groups: Sequence[Group], sort: str, with_pairs: bool = False) -> list[Table | Text]:
+def group_tables(groups: Sequence[Group], with_pairs: bool = False) -> list[Table | Text]:
     """A table for each group, ``with_pairs`` a second one of its pairs; without groups, how to begin."""
     if not groups:
         return [Text(NO_RESULTS)]
     parts: list[Table | Text] = []
     for group in groups:
-        shown = [column for column in columns(sort) if column.from_width < ONLY_IN_FILES]
+        shown = [column for column in columns(group.sort) if column.from_width < ONLY_IN_FILES]
         names = 1 + [column.title for column in shown if column.shown_for(group.rows)].index(METHOD.title)
         rightmost = shown[::-1]  # of equal importance, the rightmost is left out first
-        first_out = [_two_lines(column.title) for column in sorted(rightmost, key=partial(_importance, sort))]
+        first_out = [_two_lines(column.title) for column in sorted(rightmost, key=partial(_importance, group.sort))]
         parts += [ranking_table(group.title, shown, group.rows, names=names, first_out=first_out)]
         parts += [Text("".join(f"{note}\n" for note in group.notes))]
         if with_pairs and len(group.ranked) > MOST_PAIRED:
@@ -209,11 +209,11 @@ def paper_rich_tables(papers: Sequence[ReportedTable]) -> list[Table | Text]:
     return parts
 
 
-def markdown(groups: Sequence[Group], papers: Sequence[ReportedTable], sort: str) -> str:
+def markdown(groups: Sequence[Group], papers: Sequence[ReportedTable]) -> str:
     """The whole leaderboard as Markdown, ending in a newline."""
     lines: list[str] = []
     for group in groups:
-        table = ranking_table(group.title, columns(sort), group.rows)
+        table = ranking_table(group.title, columns(group.sort), group.rows)
         lines += [f"### {markdown_text(str(table.title))}", "", *table.markdown(), ""]
         for note in group.notes:
             lines += [markdown_text(note), ""]
@@ -225,20 +225,21 @@ def markdown(groups: Sequence[Group], papers: Sequence[ReportedTable], sort: str
     return "\n".join(lines).rstrip("\n") + "\n"
 
 
-def table_json(groups: Sequence[Group], papers: Sequence[ReportedTable], sort: str) -> str:
+def table_json(groups: Sequence[Group], papers: Sequence[ReportedTable]) -> str:
     """The whole leaderboard as JSON: groups of rows with the tests of their pairs, and the tables of others apart. A
     table of more than `MOST_PAIRED` ranked rows has no list of pairs."""
     of_groups = [
         {
             **asdict(group.key),
             "title": group.title,
+            "sorted_by": group.sort,
             "rows": [{**_cells(group, row), "parts": list(map(_part, row.entries))} for row in group.rows],
             "pairs": list(map(asdict, group.pairs)) if len(group.ranked) <= MOST_PAIRED else None,
             "notes": group.notes,
         }
         for group in groups
     ]
-    content = {"sorted_by": sort, "groups": of_groups, "reported_by_others": list(map(asdict, papers))}
+    content = {"groups": of_groups, "reported_by_others": list(map(asdict, papers))}
     return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
@@ -271,10 +272,10 @@ def _plain(value: object) -> object:
 def _cells(group: Group, row: Ranked) -> dict[str, object]:
     key, entry, about = group.key, row.entry, row.entry.row
     timing, reliance, disturbed = about.timing, about.reliance, (about.robustness or {}).get("test")
-    low, high = row.interval(RANK_KEY) or (None, None)
+    low, high = row.interval(key.rank_key) or (None, None)
     stated = uncertainty(entry)
     parts = {
-        f"{RANK_KEY}_{name}": part and part.value(RANK_KEY)
+        f"ranked_by_{name}": part and part.value(key.rank_key)
         for name, part in zip(("test", "unseen"), map(row.on, (TEST, UNSEEN)), strict=True)
     }
     errors = dict.fromkeys((*HEADLINE, *(metric.key for metric in with_column(WIDE))))
@@ -294,12 +295,13 @@ def _cells(group: Group, row: Ranked) -> dict[str, object]:
         "name": entry.name,
         "method": about.submission.method,
         "objects": len(row.objects),
-        RANK_KEY: row.value(RANK_KEY),
-        f"{RANK_KEY}_low": low,
-        f"{RANK_KEY}_high": high,
+        "charge_mm": about.charge_mm,
+        "ranked_by": key.rank_key,
+        "ranked_by_low": low,
+        "ranked_by_high": high,
         **parts,
         "ratio_to_trivial": row.ratio,
-        **{name: row.value(name) for name in errors if name != RANK_KEY},
+        **{name: row.value(name) for name in errors},
         "latency_median_ms": entry.latency_ms,
         "latency_p5_ms": timing and timing.latency_p5_ms,
         "latency_p95_ms": timing and timing.latency_p95_ms,
@@ -307,6 +309,7 @@ def _cells(group: Group, row: Ranked) -> dict[str, object]:
         "timed_on": device(entry),
         "frames_used": entry.frames,
         "phase_reliance": reliance and reliance.score,
+        "phase_reliance_without_whole_periods": reliance and reliance.order_free_score,
         "disturbed_mae_mm": disturbed and disturbed.mae_mm,
         "within_stated_95": stated.within_95_share,
         "ause_mae_mm": stated.ause_mae_mm,

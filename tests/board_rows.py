@@ -7,7 +7,7 @@ from typing import Any
 
 from scored_dataset import write_predictions
 
-from fpp_ml_bench.evaluation.metrics import HEADLINE
+from fpp_ml_bench.evaluation.metrics import RANKED
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, WITHIN_MM
 from fpp_ml_bench.evaluation.result.file import write_result
 from fpp_ml_bench.evaluation.result.parts import RELIANCE_VERSION, Intervals, Metrics, Reliance, RelianceParts
@@ -121,9 +121,10 @@ def entry_with_errors(
                 background_rmse_mm=0.0,
                 overall_mae_mm=whole.mae_mm,
                 overall_rmse_mm=whole.rmse_mm,
+                two_sided_mae_mm=error,
             )
         )
-    intervals = {key: list(interval_over(per_object, key) or (None, None)) for key in HEADLINE}
+    intervals = {key: list(interval_over(per_object, key) or (None, None)) for key in RANKED}
     data = {"samples": 2 * len(errors), "benchmark": None} | ({"content": dict(content)} if content else {})
     frames = len(about.get("frames_used", base.row.submission.frames_used))
     changes = {
@@ -143,7 +144,7 @@ def flat_scores(per_object: Sequence[ObjectMeans], pixels: int = 0) -> dict[str,
     """Scores of errors that are the same all over each object, of 100 mm depth; ``pixels`` of an image, 0 where no
     pixel is void."""
     keys = [key for key in Metrics.model_fields if key.startswith("object_") and key.endswith("_mm")]
-    means = {key: mean_over(per_object, key) for key in HEADLINE}
+    means = {key: mean_over(per_object, key) for key in RANKED}
     mae, samples = means["object_mae_mm"] or 0.0, sum(part.samples for part in per_object)
     within = {
         f"object_within_{limit}mm_share": sum(p.samples for p in per_object if (p.object_mae_mm or 0.0) <= limit)
@@ -151,6 +152,7 @@ def flat_scores(per_object: Sequence[ObjectMeans], pixels: int = 0) -> dict[str,
         for limit in WITHIN_MM
     }
     void = sum(part.void_pixels for part in per_object) / (samples * pixels) if pixels else 0.0
+    means |= {"two_sided_with_void_mae_mm": mae, "invented_share": 0.0}
     return dict.fromkeys(keys, mae) | means | within | {"void_share": void, "object_mae_range_share": mae / 100}
 
 

@@ -26,7 +26,7 @@ def edges_of(target):
     return marked
 
 
-def sample_scores(prediction, target, band, void, unlit):
+def sample_scores(prediction, target, band, void, unlit, charge=None):
     """All scores in float128 by sorting and masking; None for an empty set."""
     error = prediction.astype(LONG) - target.astype(LONG)
     inside, outside, edges = (target > 0) & ~void, (target == 0) & ~void, edges_of(target)
@@ -66,6 +66,13 @@ def sample_scores(prediction, target, band, void, unlit):
         "object_bias_mm": error[inside].mean() if inside.any() else None,
         "object_valid_bias_mm": error[valid].mean() if valid.any() else None,
     }
+    if charge is not None and inside.any():
+        cost, surface = np.where(prediction > 0, np.abs(error), LONG(charge)), target > 0
+        invented = np.count_nonzero(outside & (prediction > 0))
+        for name, pixels in (("two_sided", inside), ("two_sided_with_void", surface)):
+            total = cost[pixels].sum() + invented * LONG(charge)
+            scores[f"{name}_mae_mm"] = total / np.count_nonzero(pixels)
+        scores["invented_share"] = LONG(invented) / np.count_nonzero(inside)
     dark = unlit > 0
     far = np.abs(prediction.astype(LONG) - unlit.astype(LONG))
     lit = dark & (prediction > 0)
@@ -99,9 +106,10 @@ def gaussian_quantile(coverage):
     return LONG(mpmath.nstr(mpmath.sqrt(2) * mpmath.erfinv(mpmath.mpf(str(coverage))), 25))
 
 
-def left_out(values, order, share):
-    """Mean of ``values`` once ``share`` of them is left out, largest ``order`` first, equals in equal parts."""
-    weights, budget = np.zeros(values.size, LONG), share * values.size
+def left_out(values, order, share, pixels):
+    """Sum of ``values`` once ``share`` of ``pixels`` is left out, largest ``order`` first, equals in equal parts, over
+    the other pixels."""
+    weights, budget = np.zeros(values.size, LONG), share * pixels
     for key in sorted(set(order), reverse=True):
         group = order == key
         count = int(np.count_nonzero(group))
@@ -109,21 +117,27 @@ def left_out(values, order, share):
         budget -= taken
         kept = 1 - taken / count
         weights[group] = LONG(kept.numerator) / LONG(kept.denominator)
-    return (weights * values).sum() / weights.sum()
+    rest = (1 - share) * pixels
+    return (weights * values).sum() * rest.denominator / rest.numerator
 
 
-def sigma_scores(prediction, target, sigma, void):
+def sigma_scores(prediction, target, sigma, void, charge=None):
     """Every score in extended precision, from PROTOCOL.md."""
     inside = (target > 0) & ~void
     depth, true, spread = (values[inside].astype(LONG) for values in (prediction, target, sigma))
     error = np.abs(depth - true)
     stated = (depth > 0) & (spread > 0)
     scores = {"unstated_share": LONG(np.count_nonzero(~stated)) / stated.size}
-    unsure = np.where(stated, spread, np.inf)
-    for name, values, finish in (("mae_mm", error, lambda mean: mean), ("rmse_mm", error**2, np.sqrt)):
+    unsure, cost = np.where(stated, spread, np.inf), error
+    if charge is not None:
+        invented = sigma[(target == 0) & ~void & (prediction > 0)].astype(LONG)
+        cost = np.append(np.where(depth > 0, error, LONG(charge)), [LONG(charge)] * invented.size)
+        unsure = np.append(unsure, np.where(invented > 0, invented, np.inf))
+    for name, values, finish in (("mae_mm", cost, lambda mean: mean), ("rmse_mm", cost**2, np.sqrt)):
         gaps = []
         for step in range(20):
-            pair = [finish(left_out(values, order, Fraction(step, 20))) for order in (unsure, error)]
+            share = Fraction(step, 20)
+            pair = [finish(left_out(values, order, share, error.size)) for order in (unsure, cost)]
             gaps.append(pair[0] - pair[1])
             if step == 1:
                 scores[f"sure_{name}"] = pair[0]

@@ -3,14 +3,14 @@ Samples that are hard for both methods cancel in the difference. A comparison ca
 own intervals overlap."""
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from operator import attrgetter
 from typing import Annotated
 
 from pydantic import Field
 
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.metrics import HEADLINE, RANK_KEY
+from fpp_ml_bench.evaluation.metrics import METRICS, OBJECT_KEY, RANK_KEY, RANKED
 from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.result.parts import Interval, ends
 from fpp_ml_bench.evaluation.score.uncertainty import FEWEST_OBJECTS, SIGNIFICANT, caution, object_interval, sign_flip_p
@@ -71,13 +71,14 @@ def compare(first: Result, second: Result) -> Comparison:
     """The paired comparison of two results. SubmissionError names everything in which their data differ."""
     _check_same_data(first, second)
     second_rows = {row.sample: row for row in second.per_sample}
-    paired = []
+    paired, charged = [], all(result.metrics.two_sided_mae_mm is not None for result in (first, second))
+    keys = [key for key in RANKED if charged or not METRICS[key].charged]
     for row in first.per_sample:
-        pairs = {key: (getattr(row, key), getattr(second_rows[row.sample], key)) for key in HEADLINE}
+        pairs = {key: (getattr(row, key), getattr(second_rows[row.sample], key)) for key in keys}
         differences = {key: None if None in pair else pair[1] - pair[0] for key, pair in pairs.items()}
         paired.append(PairedSample(sample=row.sample, object=row.object, differences=differences))
     owners = [row.object for row in paired]
-    summaries = {key: paired_difference([row.differences[key] for row in paired], owners) for key in HEADLINE}
+    summaries = {key: paired_difference([row.differences[key] for row in paired], owners) for key in keys}
     names = printable(first.submission.name), printable(second.submission.name)
     if names[0] == names[1]:
         names = f"{names[0]} (first)", f"{names[1]} (second)"
@@ -88,7 +89,7 @@ def compare(first: Result, second: Result) -> Comparison:
         split=first.dataset.split,
         **{key: getattr(first, key) for key in ("target", "track", "mode")},
         differences=summaries,
-        sentence=sentence(*names, summaries[RANK_KEY]),
+        sentence=sentence(*names, *_ranked_by(summaries)),
         per_sample=paired,
     )
 
@@ -132,19 +133,26 @@ def paired_difference(values: Sequence[float | None], owners: Sequence[str]) -> 
     )
 
 
-def sentence(first: str, second: str, difference: Difference) -> str:
-    """The difference in object MAE as a sentence."""
+def _ranked_by(summaries: Mapping[str, Difference]) -> tuple[str, Difference]:
+    """What the two are ranked by, in words, and its difference."""
+    if RANK_KEY in summaries:
+        return "two-sided MAE", summaries[RANK_KEY]
+    return "object MAE", summaries[OBJECT_KEY]
+
+
+def sentence(first: str, second: str, error: str, difference: Difference) -> str:
+    """The difference in an ``error`` as a sentence."""
     if difference.mean_mm is None:
-        return "No sample has an object in it, so object MAE says nothing."
+        return f"No sample has an object in it, so the {error} says nothing."
     units = "objects" if difference.samples == difference.objects else "samples"
     if not difference.lower and not difference.higher:
-        return f"{second} and {first} have the same object MAE in all {difference.samples} {units}."
+        return f"{second} and {first} have the same {error} in all {difference.samples} {units}."
     size = f"{millimetres(abs(difference.mean_mm))} mm"
     word, count = ("lower", difference.lower) if difference.mean_mm < 0 else ("higher", difference.higher)
     views = f"{word} in {count} of {difference.samples} {units}"
     if difference.interval is None:
         no_interval = "with one object there is no interval, so nothing can be said beyond it"
-        return f"{second} has an object MAE {size} {word} than {first} on average, {views}; {no_interval}."
+        return f"The {error} of {second} is {size} {word} than that of {first} on average, {views}; {no_interval}."
     p = 1.0 if difference.sign_flip_p is None else difference.sign_flip_p
     between = f"{interval_text(difference.interval)} mm over {difference.objects} objects; sign-flip test p = {p:.3g}"
     few_objects = f" {warning}" if (warning := caution(difference.objects)) else ""
@@ -154,9 +162,9 @@ def sentence(first: str, second: str, difference: Difference) -> str:
         few_objects = f" The test does not confirm it at {level}{reach}.{few_objects}"
     if difference.distinguishable:
         by = f"by {size} on average (95% interval {between})"
-        return f"{second} has a {word} object MAE than {first}, {by}, {views}.{few_objects}"
+        return f"{second} has a {word} {error} than {first}, {by}, {views}.{few_objects}"
     return (
-        f"The object MAE of {second} and {first} can't be distinguished: "
+        f"The {error} of {second} and {first} can't be distinguished: "
         f"{second} is {size} {word} on average ({views}), "
         f"but the 95% interval holds 0 ({between}).{few_objects}"
     )

@@ -141,11 +141,11 @@ def comparison_table(compared: Comparison) -> Group:
     about = "mm; mean of second - first over samples, 95% interval and p value of a sign-flip test over objects"
     table = _table("Error", numbers=titles, caption=about)
     for key, row in compared.differences.items():
-        pixels, error = key.removesuffix("_mm").split("_")
+        pixels, error = key.removesuffix("_mm").rsplit("_", 1)
         counts = (row.lower, row.higher, row.samples, row.objects)
         p = "-" if row.sign_flip_p is None else f"{row.sign_flip_p:.3g}"
         table.add_row(
-            f"{pixels} {error.upper()}",
+            f"{pixels.replace('_', '-')} {error.upper()}",
             signed(row.mean_mm),
             interval_text(row.interval, ".."),
             p,

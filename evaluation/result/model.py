@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from fpp_ml_bench.constants import WORKING_RANGE_MM
 from fpp_ml_bench.evaluation import protocol
-from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS, UNCERTAINTY, Metric
+from fpp_ml_bench.evaluation.metrics import METRICS, RANKED, UNCERTAINTY, Metric
 from fpp_ml_bench.evaluation.protocol import (
     COVERED,
     LEFT_OUT,
@@ -62,6 +63,7 @@ class _Rules(StrictModel):
     frames_class: FramesClass
     edge_band_px: Annotated[int, Field(ge=0, le=1000)]
     edge_jump_mm: Annotated[float, Field(gt=0)]
+    charge_mm: parts.Charge = None
 
 
 class _Scores(StrictModel):
@@ -88,7 +90,7 @@ class ArrayScores(_Scores):
 class Result(SparseModel, _Scores, _Rules):
     """Everything that `fpp-eval` computes. Deterministic but for ``created`` and the machine in ``environment``."""
 
-    SPARSE = ("reliance", "robustness", "uncertainty")
+    SPARSE = ("reliance", "robustness", "uncertainty", "charge_mm")
 
     environment: parts.Environment
     reliance: Reliance | None = None
@@ -140,9 +142,11 @@ class Result(SparseModel, _Scores, _Rules):
             for name, rows in objects.items()
         }
         check_data(self.dataset, self.target, self.mode, self.submission.units, found)
+        check_charge(self.charge_mm, self.dataset, self.mode)
         void = self.mode == "standard"
         for row in self.per_sample:
-            _check_sample(row, height * width, {"void": void, "unlit": void and self.target == "depth_exact"})
+            known = {"void": void, "unlit": void and self.target == "depth_exact"}
+            _check_sample(row, height * width, known, self.charge_mm)
         follows = derived(self.per_sample)
         _check_same("", self.model_dump(include=set(follows)), follows)
         return self
@@ -163,9 +167,10 @@ def derived(per_sample: list[SampleResult]) -> dict[str, Any]:
     objects = [row.object for row in per_sample]
     inside = combine(*(row.stats("object") for row in per_sample))
     outside = combine(*(row.stats("background") for row in per_sample))
-    intervals = intervals_over_objects(rows, objects, HEADLINE)
+    means = over_samples(rows)
+    intervals = intervals_over_objects(rows, objects, [key for key in RANKED if key in means])
     return {
-        "metrics": over_samples(rows),
+        "metrics": means,
         "intervals": {key: [None, None] if ends is None else list(ends) for key, ends in intervals.items()},
         "median": over_samples(rows, statistics.median),
         "pooled": pooled(inside, outside),
@@ -214,9 +219,9 @@ def pooled(inside: ErrorStats, outside: ErrorStats) -> Scores:
     return {f"{name}_{key}": getattr(stats, key) for name, stats in sets.items() for key in ("mae_mm", "rmse_mm")}
 
 
-def _check_sample(row: SampleResult, pixels: int, known: Mapping[str, bool]) -> None:
-    """Refuse (ValueError) a sample whose sets do not make up its ``pixels`` or whose scores contradict each other or
-    its sets; ``known``: whether the rules know void and unlit pixels."""
+def _check_sample(row: SampleResult, pixels: int, known: Mapping[str, bool], charge_mm: float | None) -> None:
+    """Refuse (ValueError) a sample whose sets do not make up its ``pixels`` or whose scores contradict each other, its
+    sets or the charge; ``known``: whether the rules know void and unlit pixels."""
     counts = {name: getattr(row, f"{name}_pixels") for name in ("object", "background", *known)}
     sets = {name: count or 0 for name, count in counts.items()}
     if sets["object"] + sets["background"] + sets["void"] != pixels:
@@ -231,8 +236,10 @@ def _check_sample(row: SampleResult, pixels: int, known: Mapping[str, bool]) -> 
     for name in ("object", "background", "unlit"):
         if (getattr(row, f"{name}_mae_mm") is None) != (sets[name] == 0):
             raise ValueError(f"{row.sample}: {name} scores must be null exactly when the set is empty")
-    if problem := row.problem(1, AGREES):
+    if problem := row.problem(1, AGREES, charge_mm):
         raise ValueError(f"{row.sample}: {problem}")
+    if (row.invented_share or 0.0) * sets["object"] > sets["background"] * (1 + AGREES):
+        raise ValueError(f"{row.sample}: invented_share is of more pixels than the background has")
     overall = combine(row.stats("object"), row.stats("background"))
     if not (same(row.overall_mae_mm, overall.mae_mm) and same(row.overall_rmse_mm, overall.rmse_mm)):
         raise ValueError(f"{row.sample}: overall scores do not follow from object and background")
@@ -253,6 +260,15 @@ def check_data(data: parts.DatasetInfo, target: str, mode: str, units: str, foun
         found = {name: counts._replace(object_px=None) for name, counts in found.items()}
     if problem := known_problem(data.content, data.split, target, mode, found):
         raise ValueError(problem)
+
+
+def check_charge(charge_mm: float | None, data: parts.DatasetInfo, mode: str) -> None:
+    """Refuse (ValueError) a charge that the mode or the benchmark does not have."""
+    if (charge_mm is None) != (mode == "paper"):
+        raise ValueError(f"charge_mm: expected {'none' if mode == 'paper' else 'one'} in {mode} mode, got {charge_mm}")
+    near_mm, far_mm = WORKING_RANGE_MM
+    if charge_mm is not None and data.known is not None and charge_mm != (far_mm - near_mm) / 2:
+        raise ValueError(f"charge_mm: that of {data.known.title} is {(far_mm - near_mm) / 2:g}, got {charge_mm}")
 
 
 def check_reliance(reliance: Reliance, submission: Submission) -> None:
@@ -370,6 +386,8 @@ def _check_uncertainty(block: Uncertainty, rows: Mapping[str, SampleResult], met
         for error in ("mae_mm", "rmse_mm"):
             by_sigma, best = getattr(curves, error), getattr(curves, f"best_{error}")
             whole = getattr(metrics, f"object_{error}")
+            if metrics.two_sided_mae_mm is not None:  # which charges what the object's errors don't
+                whole = metrics.two_sided_mae_mm if error == "mae_mm" else by_sigma[0]
             sure, area = (getattr(block.metrics, f"{name}_{error}") for name in ("sure", "ause"))
             gap = math.fsum(first - second for first, second in zip(by_sigma, best, strict=True)) / len(LEFT_OUT)
             facts += [

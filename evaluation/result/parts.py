@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from fpp_ml_bench.evaluation.metrics import BOUNDS, HEADLINE, METRICS, MIXTURES, UNCERTAINTY, Metric
+from fpp_ml_bench.evaluation.metrics import BOUNDS, HEADLINE, METRICS, MIXTURES, RANKED, UNCERTAINTY, Metric
 from fpp_ml_bench.evaluation.protocol import LEFT_OUT, NOMINAL, WITHIN_MM
 from fpp_ml_bench.evaluation.score.sample_scores import ErrorStats
 from fpp_ml_bench.files import LARGEST
@@ -19,6 +19,8 @@ from fpp_ml_bench.schema import Count, NonNegative, Positive, Share, SparseModel
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 Whole = Annotated[int, Field(gt=0)]
 Interval = Annotated[list[float | None], Field(min_length=2, max_length=2)]
+Charge = Annotated[float, Field(gt=0)] | None
+"""What a missing or invented pixel costs in the two-sided scores, mm; None by rules without them."""
 AGREES = 1e-9
 """Relative difference up to which two computations of an average count as the same number."""
 LEAST = 1e-300
@@ -93,13 +95,28 @@ class Metrics(Headline, SparseModel):
     SPARSE = OPTIONAL
     __annotations__ = _fields(METRICS[key] for key in METRICS if key not in HEADLINE)
 
-    def problem(self, views: int, rounding: float) -> str | None:
+    def problem(self, views: int, rounding: float, charge_mm: float | None = None) -> str | None:
         """Why no errors have these scores, which are means over at most ``views`` samples, each with an error of
-        ``rounding`` times itself; None where some have."""
+        ``rounding`` times itself; None where some have. ``charge_mm``: that of the two-sided scores."""
         for key, metric in METRICS.items():
             if metric.over and (getattr(self, key) is None) != (getattr(self, f"{metric.over}_mae_mm") is None):
                 return f"{metric.over} scores must be null exactly when the set is empty, and then null all together"
-        return next(self._contradictions(views, rounding), None)
+        return next(self._contradictions(views, rounding), None) or self._charged_otherwise(rounding, charge_mm)
+
+    def _charged_otherwise(self, rounding: float, charge_mm: float | None) -> str | None:
+        """What of the two-sided scores does not follow from the errors and the charge. Without the charges, which are
+        the same for means, they are errors of measured pixels: less than those of all, whatever was missing."""
+        charged = [getattr(self, key) for key, metric in METRICS.items() if metric.charged]
+        known = charge_mm is not None and self.object_mae_mm is not None
+        if any((score is None) == known for score in charged):
+            return f"the two-sided scores must be there exactly where there is a charge, which is {charge_mm} mm"
+        if charge_mm is None or self.object_mae_mm is None:
+            return None
+        charge = charge_mm * (self.object_missing_share + self.invented_share)
+        measured, slack = self.two_sided_mae_mm - charge, 2 * rounding * (self.two_sided_mae_mm + charge) + LEAST
+        if measured < -slack or measured > self.object_mae_mm + slack:
+            return "two_sided_mae_mm does not follow from the charge, the missing and the invented pixels"
+        return None
 
     def _contradictions(self, views: int, rounding: float) -> Iterator[str]:
         known = {key: abs(value) for key in METRICS if (value := getattr(self, key)) is not None}
@@ -159,14 +176,18 @@ class ObjectResult(StrictModel):
     spread: dict[Text, NonNegative | None]
 
 
-class Intervals(Scores):
-    """Ends of the 95% interval of each headline mean in mm, from a bootstrap over objects; nulls below two objects."""
+class Intervals(Scores, SparseModel):
+    """Ends of the 95% interval of the means of `RANKED` in mm, from a bootstrap over objects; nulls below two
+    objects."""
 
-    __annotations__ = dict.fromkeys(HEADLINE, Interval)
+    SPARSE = tuple(key for key in RANKED if METRICS[key].optional)
+    __annotations__ = dict.fromkeys(HEADLINE, Interval) | dict.fromkeys(
+        SPARSE, Annotated[Interval | None, Field(default=None)]
+    )
 
     def of(self, key: str) -> tuple[float, float] | None:
-        """The interval of ``key``; None where there is none (not a headline key, or too few objects)."""
-        return ends(getattr(self, key, (None, None)))
+        """The interval of ``key``; None where there is none (no key of `RANKED`, no such score, or too few objects)."""
+        return ends(getattr(self, key, None) or (None, None))
 
 
 class Bootstrap(StrictModel):

@@ -37,6 +37,7 @@ from fpp_ml_bench.evaluation.submission.prediction_files import (
 )
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.rig import Rig
 
 if TYPE_CHECKING:
     from fpp_ml_bench.evaluation.submission.description import Submission
@@ -186,6 +187,10 @@ class Rules:
     def void(self, dataset: DatasetFolder, sample: str) -> NDArray[np.bool_] | None:
         """The pixels that count in no set, bool (H, W); None by rules without void."""
         return dataset.void(sample, self.target) if self.mode == "standard" else None
+
+    def charge_mm(self, rig: Rig) -> float | None:
+        """What a missing or invented pixel costs in the two-sided scores; None by rules without it."""
+        return rig.half_range_mm if self.mode == "standard" else None
 
 
 @dataclass(frozen=True)

@@ -154,6 +154,7 @@ def evaluate(
         "mode": mode,
         "frames_class": frames_class(dataset.sequence, description.frames_used),
         "edge_band_px": edge_band_px,
+        "charge_mm": rules.charge_mm(dataset.rig),
         "edge_jump_mm": edge_jump_mm(dataset.size[1]),
         "environment": environment(),
     }
@@ -237,12 +238,13 @@ def _scored(
         if not problems:
             with dataset_lock:
                 pair = rules.pair(found.values, dataset, sample)
+            charge_mm = rules.charge_mm(dataset.rig)
             try:
-                scores = score_sample(*pair, edge_band_px, void, unlit_mm)
+                scores = score_sample(*pair, edge_band_px, void, unlit_mm, charge_mm)
             except PredictionError as error:
                 problems = [f"{listing.named(sample)}: {error}"]
             else:
-                stated = None if found.sigma_mm is None else score_sigma(*pair, found.sigma_mm, void)
+                stated = None if found.sigma_mm is None else score_sigma(*pair, found.sigma_mm, void, charge_mm)
                 hashes = {column: image_hash(image) for column, image in scored_on.items()}
                 seen = glance(sample, *pair, void, dataset.rig.camera) if sample in glanced_at else None
                 row = _row(scores, found.digest)
@@ -263,6 +265,7 @@ def evaluate_arrays(
     edge_band_px: int = protocol.EDGE_BAND_PX,
     units: str | None = None,
     nodata: float | None = None,
+    charge_mm: float | None = None,
 ) -> ArrayScores:
     """Score depth in mm along the camera's axis, 0 = background or not measured, against such depth, 0 = background:
     floats (N, H, W), or N maps (H, W) that may differ in size. Depths of exactly ``nodata`` are read as 0. Pixels that
@@ -270,7 +273,8 @@ def evaluate_arrays(
     pixels count in no set. ``sigma``: the standard uncertainty in mm, 0 where none is stated. ``objects``: what each
     sample shows; samples of the same object are not independent, and the intervals are over objects (by default, each
     sample is its own). ``units``: ``mm`` or ``m``, of all depths and sigma; must be said where a target reaches less
-    than 10.
+    than 10. ``charge_mm``: what a missing or invented pixel costs in the two-sided scores, half a rig's working range;
+    without it there are none.
 
     Raises PredictionError, naming the sample by its number, for numbers or shapes that differ, for what is no real
     float or not finite, for a negative sigma or target, for masked predictions, for flags that are no such bits, and
@@ -294,7 +298,14 @@ def evaluate_arrays(
             prediction, target = maps["predictions"], maps["targets"]
             void = _void(target, maps.get("flags"))
             scores, stated = score_arrays(
-                prediction, np.ma.filled(target, 0), void, units, maps.get("sigma"), edge_band_px, nodata=nodata
+                prediction,
+                np.ma.filled(target, 0),
+                void,
+                units,
+                maps.get("sigma"),
+                edge_band_px,
+                nodata=nodata,
+                charge_mm=charge_mm,
             )
         except PredictionError as error:
             raise PredictionError(f"sample {number}: {error}") from None
@@ -358,6 +369,7 @@ def score_arrays(
     edge_band_px: int = protocol.EDGE_BAND_PX,
     check_prediction_units: bool = True,
     nodata: float | None = None,
+    charge_mm: float | None = None,
 ) -> tuple[SampleScores, SigmaSample | None]:
     """Score floats (H, W) in ``units``, pixels in ``void`` in no set; `evaluate_arrays` says what is refused.
     ``check_prediction_units``: whether a prediction that looks like another unit is."""
@@ -383,8 +395,8 @@ def score_arrays(
     if problems := value_problems(prediction, target_mm, reach_mm, declared, void):
         raise PredictionError(f"the prediction {problems[0]}")
     pair = in_mm(prediction, declared), target_mm
-    stated = None if sigma is None else score_sigma(*pair, in_mm(sigma, declared), void)
-    return score_sample(*pair, edge_band_px, void), stated
+    stated = None if sigma is None else score_sigma(*pair, in_mm(sigma, declared), void, charge_mm)
+    return score_sample(*pair, edge_band_px, void, charge_mm=charge_mm), stated
 
 
 _COMPARED: dict[str, Any] = {
@@ -422,7 +434,9 @@ def differences(scored: Result, folder: Path, dataset: DatasetFolder) -> list[st
         return [*difference_lines(found), "per_sample: other samples than the split has"]
     for sample, row in again_rows.items():
         differing = disagreements(rows[sample], row, cancelling=1e-9 * (row["object_mae_mm"] or 0.0))
-        found += [(f"{sample}: {name}", *pair) for name, *pair in differing]
+        # Other predictions explain all the rest.
+        first = sorted(differing, key=lambda difference: difference[0] != "prediction_sha256")
+        found += [(f"{sample}: {name}", *pair) for name, *pair in first]
     if (block is None) != (again_block is None):
         said = ["there is none" if part is None else "there is one" for part in (block, again_block)]
         return [*difference_lines(found), f"uncertainty: {said[0]} in the result, {said[1]} recomputed"]

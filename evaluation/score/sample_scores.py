@@ -104,14 +104,16 @@ def _from_sums(pixels: int, absolute: list[float], squares: list[float], errors:
     return ErrorStats(pixels, mae, math.sqrt(mean_square))
 
 
-def _background(prediction: Map, target: Map, void: NDArray[np.bool_] | None) -> tuple[ErrorStats, NDArray[np.bool_]]:
-    """Statistics of every pixel that is neither object nor void, by setting the errors of those to 0, and the mask of
-    the object; all (n,). Not overall minus object: that would leave rounding errors where the background is perfect.
-    Everything is done block by block, while the block is in the cache."""
+def _background(
+    prediction: Map, target: Map, void: NDArray[np.bool_] | None
+) -> tuple[ErrorStats, int, NDArray[np.bool_]]:
+    """Statistics of every pixel that is neither object nor void, by setting the errors of those to 0, how many of them
+    are predicted above 0, and the mask of the object; all (n,). Not overall minus object: that would leave rounding
+    errors where the background is perfect. Everything is done block by block, while the block is in the cache."""
     inside = np.empty(target.shape, dtype=bool)
     buffer = np.zeros((_BLOCKS_AT_ONCE, BLOCK))
     flat, step = buffer.reshape(-1), buffer.size
-    pixels = 0
+    pixels = invented = 0
     absolute: list[float] = []
     squares: list[float] = []
     for start in range(0, target.size, step):
@@ -125,6 +127,7 @@ def _background(prediction: Map, target: Map, void: NDArray[np.bool_] | None) ->
         if not target[part].min() >= 0:
             errors -= target[part]
         scored = excluded.size - int(np.count_nonzero(excluded))
+        invented += int(np.count_nonzero((prediction[part] > 0) & ~excluded))
         if scored < excluded.size:
             np.copyto(errors, 0.0, where=excluded)
         pixels += scored
@@ -137,7 +140,7 @@ def _background(prediction: Map, target: Map, void: NDArray[np.bool_] | None) ->
         outside = ~inside if void is None else ~(inside | void)
         return prediction[outside].astype(np.float64) - target[outside]
 
-    return _from_sums(pixels, absolute, squares, errors_outside), inside
+    return _from_sums(pixels, absolute, squares, errors_outside), invented, inside
 
 
 _EDGE, _WIDE, _MISSING = 1, 2, 4
@@ -159,7 +162,10 @@ class SampleScores:
     the edge band), 2 (nearer than the wide band) and 4 (not measured: predicted 0 mm or less); every MAE and RMSE of
     the object is that of a union of zones. ``unlit``: statistics of the unlit pixels, ``unlit_valid`` of those that
     were measured; ``scores_unlit``: whether the rules know them. ``range_mm``: largest minus smallest depth of the
-    object."""
+    object. ``invented``: how many background pixels are predicted above 0; ``charge_mm``: what one of them and a pixel
+    that was not measured costs in `two_sided_mm`, None by rules without it; ``void_surface`` and
+    ``void_surface_valid``: statistics of void pixels whose target has a depth, and of those of them that were
+    measured."""
 
     prediction_mm: Map
     target_mm: Map
@@ -173,6 +179,10 @@ class SampleScores:
     predicted: NDArray[np.bool_]
     zones: dict[int, ErrorStats]
     range_mm: float
+    invented: int = 0
+    charge_mm: float | None = None
+    void_surface: ErrorStats = EMPTY
+    void_surface_valid: ErrorStats = EMPTY
 
     object = _zones(0, 0)
     interior, edge = _zones(_EDGE, 0), _zones(_EDGE, _EDGE)
@@ -198,6 +208,22 @@ class SampleScores:
     @cached_property
     def overall(self) -> ErrorStats:
         return combine(self.object, self.background)
+
+    @property
+    def invented_share(self) -> float | None:
+        """Background pixels predicted above 0 over the object's pixels; None by rules without a charge."""
+        return None if self.charge_mm is None or not self.object.pixels else self.invented / self.object.pixels
+
+    def two_sided_mm(self, with_void: bool = False) -> float | None:
+        """Errors of the measured pixels of the object, and the charge for each that was not measured and for each
+        invented one, over the object's pixels; ``with_void``: void surface belongs to the object."""
+        whole, valid = self.object, self.valid
+        if with_void:
+            whole, valid = combine(whole, self.void_surface), combine(valid, self.void_surface_valid)
+        if self.charge_mm is None or not whole.pixels:
+            return None
+        charged = whole.pixels - valid.pixels + self.invented
+        return math.fsum(((valid.mae_mm or 0.0) * valid.pixels, self.charge_mm * charged)) / whole.pixels
 
     @cached_property
     def magnitudes(self) -> Errors:
@@ -247,15 +273,18 @@ def score_sample(
     edge_band_px: int = EDGE_BAND_PX,
     void: NDArray[np.bool_] | None = None,
     unlit_mm: Map | None = None,
+    charge_mm: float | None = None,
 ) -> SampleScores:
     """Score one depth map against its target.
 
     ``prediction_mm`` (H, W) float16, float32 or float64 in mm; ``target_mm`` (H, W) float in mm, 0 = background. Pixel
     sets after paper Section 5.3.2 (`fpp_ml_bench.depth`): object where the target is above 0, else background. Pixels
     in ``void`` (bool (H, W)) are in neither; they still take part in finding the depth edges. ``unlit_mm`` (H, W): true
-    depth in mm of the pixels that are scored as a set of their own, 0 elsewhere.
+    depth in mm of the pixels that are scored as a set of their own, 0 elsewhere. ``charge_mm``: what a pixel costs that
+    is missing or invented; without it the two-sided scores are None.
 
-    Raises PredictionError for shapes that differ, dtypes that are not real floats, and errors that are not finite.
+    Raises PredictionError for shapes that differ, dtypes that are not real floats, errors that are not finite, and a
+    charge that is none.
 
     >>> import numpy as np
     >>> target = np.array([[0.0, 1800.0]])
@@ -267,13 +296,18 @@ def score_sample(
         raise PredictionError(f"{expected}, got {prediction_mm.shape}")
     if prediction_mm.dtype.kind != "f" or target_mm.dtype.kind != "f":
         raise PredictionError(f"expected real floats, got {prediction_mm.dtype} against {target_mm.dtype}")
+    if charge_mm is not None and not 0 < charge_mm <= protocol.LARGEST_MM:
+        raise PredictionError(f"charge_mm: expected mm above 0, half of the rig's working range; got {charge_mm}")
     for name, part in (("void", void), ("unlit_mm", unlit_mm)):
         if part is not None and part.shape != target_mm.shape:
             raise PredictionError(f"{name}: expected a map of {target_mm.shape}, got {part.shape}")
     prediction = prediction_mm.ravel()
     flat_void = None if void is None else void.ravel()
-    background, flat_inside = _background(prediction, target_mm.ravel(), flat_void)
-    unlit, measured = (EMPTY, EMPTY) if unlit_mm is None else _unlit_stats(prediction, unlit_mm.ravel())
+    background, invented, flat_inside = _background(prediction, target_mm.ravel(), flat_void)
+    unlit, measured = (EMPTY, EMPTY) if unlit_mm is None else _surface_stats(prediction, unlit_mm.ravel())
+    void_surface = EMPTY, EMPTY
+    if charge_mm is not None and flat_void is not None:
+        void_surface = _surface_stats(prediction, np.where(flat_void, target_mm.ravel(), 0))
     inside = flat_inside.reshape(target_mm.shape)
     box = object_box(inside) or np.s_[:0, :0]
     index = np.flatnonzero(inside[box] if void is None else inside[box] & ~void[box])
@@ -300,6 +334,9 @@ def score_sample(
         predicted,
         {code: stats_of(errors[pixels]) for code, pixels in within.items() if pixels.any()},
         range_mm if range_mm > 1e-150 else 0.0,  # else an error may exceed it by more than a float64 can hold
+        invented,
+        charge_mm,
+        *void_surface,
     )
 
 
@@ -312,11 +349,11 @@ def _errors(depths: Map, true_mm: Map) -> Errors:
     return errors
 
 
-def _unlit_stats(prediction: Map, unlit_mm: Map) -> tuple[ErrorStats, ErrorStats]:
-    """Statistics of the errors (n,) where ``unlit_mm`` is above 0, and of those of them that were measured."""
-    index = np.flatnonzero(object_mask(unlit_mm))
+def _surface_stats(prediction: Map, surface_mm: Map) -> tuple[ErrorStats, ErrorStats]:
+    """Statistics of the errors (n,) where ``surface_mm`` is above 0, and of those of them that were measured."""
+    index = np.flatnonzero(object_mask(surface_mm))
     depths = prediction.take(index)
-    errors = _errors(depths, unlit_mm.take(index))
+    errors = _errors(depths, surface_mm.take(index))
     return stats_of(errors), stats_of(errors[depths > 0])
 
 
@@ -376,19 +413,32 @@ def states_sigma(depth_mm: Map, sigma_mm: Map) -> NDArray[np.bool_]:
 
 
 def score_sigma(
-    prediction_mm: Map, target_mm: Map, sigma_mm: Map, void: NDArray[np.bool_] | None = None
+    prediction_mm: Map,
+    target_mm: Map,
+    sigma_mm: Map,
+    void: NDArray[np.bool_] | None = None,
+    charge_mm: float | None = None,
 ) -> SigmaSample:
     """Score the stated standard uncertainty ``sigma_mm`` of ``prediction_mm`` over the object pixels of ``target_mm``
-    that are not ``void``; all (H, W), in mm, sigma of 0 and more. Raises PredictionError for another shape."""
+    that are not ``void``; all (H, W), in mm, sigma of 0 and more. With ``charge_mm`` that is the error of a pixel
+    without an answer, and the invented pixels of the background, whose error it is too, are left out or kept with the
+    object's. Raises PredictionError for another shape."""
     if not prediction_mm.shape == target_mm.shape == sigma_mm.shape:
         raise PredictionError(f"sigma: expected a map of {target_mm.shape}, got {sigma_mm.shape}")
-    inside = object_mask(target_mm) if void is None else object_mask(target_mm) & ~void
+    surface = object_mask(target_mm)
+    inside = surface if void is None else surface & ~void
     depth, sigma = (np.asarray(values[inside], np.float64) for values in (prediction_mm, sigma_mm))
     magnitude = np.abs(depth - target_mm[inside])
     if not magnitude.size:
         return SigmaSample()
     stated = states_sigma(depth, sigma)
-    curves = _curves(magnitude, np.where(stated, sigma, np.inf))
+    charged, unsure = magnitude, np.where(stated, sigma, np.inf)
+    if charge_mm is not None:
+        outside = ~surface & (prediction_mm > 0)
+        invented = sigma_mm[outside if void is None else outside & ~void].astype(np.float64)
+        charged = np.append(np.where(depth > 0, magnitude, charge_mm), np.full(invented.size, charge_mm))
+        unsure = np.append(unsure, np.where(invented > 0, invented, np.inf))
+    curves = _curves(charged, unsure, magnitude.size)
     unstated = 1 - np.count_nonzero(stated) / stated.size
     if not stated.any():
         return SigmaSample(curves, unstated)
@@ -406,10 +456,13 @@ def _negative_log_likelihood(magnitude: Errors, sigma: Errors) -> Errors:
     return np.log(floored) + _HALF_LOG_2_PI + 0.5 * ratio * ratio
 
 
-def _curves(magnitude: Errors, sigma: Errors) -> dict[str, list[float]]:
-    """The curves of `SigmaSample`. Of pixels of the same sigma an equal part of each is left out, so that the order of
-    the pixels does not matter; a pixel at the cut counts in part."""
-    kept = magnitude.size * (1 - np.array(protocol.LEFT_OUT))
+def _curves(magnitude: Errors, sigma: Errors, pixels: int) -> dict[str, list[float]]:
+    """The curves of `SigmaSample` of an object of so many ``pixels``, behind whose errors those of invented pixels may
+    stand: left out are shares of the object's pixels, and means are over its others. Of pixels of the same sigma an
+    equal part of each is left out, so that the order of the pixels does not matter; a pixel at the cut counts in
+    part."""
+    over = pixels * (1 - np.array(protocol.LEFT_OUT))
+    kept = over + (magnitude.size - pixels)
     curves = {}
     for prefix, key in (("", sigma), ("best_", magnitude)):
         order = np.argsort(key, kind="stable")
@@ -417,9 +470,10 @@ def _curves(magnitude: Errors, sigma: Errors) -> dict[str, list[float]]:
         last = np.flatnonzero(np.append(ascending[1:] != ascending[:-1], True))  # of each run of equal keys
         for name, values in (("mae_mm", magnitude[order]), ("rmse_mm", magnitude[order] ** 2)):
             sums = np.concatenate([[0.0], np.cumsum(values)[last]])
-            means = np.interp(kept, np.concatenate([[0], last + 1]), sums) / kept
+            means = np.interp(kept, np.concatenate([[0], last + 1]), sums) / over
             curves[prefix + name] = (np.sqrt(means) if name == "rmse_mm" else means).tolist()
-    whole = stats_of(magnitude)
-    for prefix in ("", "best_"):  # nothing left out: the object's MAE and RMSE, to the last digit
-        curves[f"{prefix}mae_mm"][0], curves[f"{prefix}rmse_mm"][0] = whole.mae_mm or 0.0, whole.rmse_mm or 0.0
+    whole, more = stats_of(magnitude), magnitude.size / pixels
+    for prefix in ("", "best_"):  # nothing left out: MAE and RMSE to the last digit
+        curves[f"{prefix}mae_mm"][0] = more * (whole.mae_mm or 0.0)
+        curves[f"{prefix}rmse_mm"][0] = math.sqrt(more) * (whole.rmse_mm or 0.0)
     return curves

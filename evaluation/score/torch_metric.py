@@ -26,14 +26,16 @@ KEYS = tuple(key for key, metric in METRICS.items() if metric.training)
 
 
 class DepthScores(Metric):
-    """Means over samples of the keys in `KEYS`, in mm and shares, as `fpp-eval` reports them.
+    """Means over samples of the keys in `KEYS`, in mm and shares, as `fpp-eval` reports them; of the two-sided ones
+    with a ``charge_mm`` alone.
 
     ``update(prediction, target, void=None)`` takes (B, H, W) or (B, 1, H, W) real floats, 0 = background, on any
     device, and bool (B, H, W), true for pixels in no set. They are in mm; ``units="m"`` takes metres. Where units are
     not said, a target below 10 and a prediction that looks like metres are refused; say ``units="mm"`` for a network
-    that may predict that early in training. Depths of exactly ``nodata`` are read as 0. ``compute()`` gives a dict of
-    float64 scalars, NaN where no sample has the pixels for a score. Samples without these pixels are left out of the
-    mean and never count as 0.
+    that may predict that early in training. Depths of exactly ``nodata`` are read as 0. ``charge_mm``, half of the
+    rig's working range, is what a missing or invented pixel costs in the two-sided scores.
+    ``compute()`` gives a dict of float64 scalars, NaN where no sample has the pixels for a score. Samples without these
+    pixels are left out of the mean and never count as 0.
 
     The scores have no gradient (``is_differentiable`` is False). Lower is better, except for the shares within a
     tolerance. ``half()`` and ``float()`` leave the state in float64."""
@@ -45,12 +47,15 @@ class DepthScores(Metric):
     sums: Tensor
     counts: Tensor
 
-    def __init__(self, units: str | None = None, nodata: float | None = None, **options: Any) -> None:
+    def __init__(
+        self, units: str | None = None, nodata: float | None = None, charge_mm: float | None = None, **options: Any
+    ) -> None:
         super().__init__(**options)
         declared_units(0.0, units)
-        self.units, self.nodata = units, nodata
-        self.add_state("sums", torch.zeros(len(KEYS), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("counts", torch.zeros(len(KEYS), dtype=torch.float64), dist_reduce_fx="sum")
+        self.units, self.nodata, self.charge_mm = units, nodata, charge_mm
+        self.keys = tuple(key for key in KEYS if charge_mm is not None or not METRICS[key].charged)
+        self.add_state("sums", torch.zeros(len(self.keys), dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("counts", torch.zeros(len(self.keys), dtype=torch.float64), dist_reduce_fx="sum")
 
     def update(self, prediction: Tensor, target: Tensor, void: Tensor | None = None) -> None:
         """Add a batch. Raises PredictionError for other shapes or dtypes, for depths that are not finite, for negative
@@ -61,17 +66,23 @@ class DepthScores(Metric):
             # What a void pixel holds, as NaN, does not matter.
             shown, true = (np.where(pixels, depths, 0.0) for depths in (predicted, truth))
             sample, _ = score_arrays(
-                shown, true, ~pixels, self.units, check_prediction_units=self.units is None, nodata=self.nodata
+                shown,
+                true,
+                ~pixels,
+                self.units,
+                check_prediction_units=self.units is None,
+                nodata=self.nodata,
+                charge_mm=self.charge_mm,
             )
-            for number, key in enumerate(KEYS):
+            for number, key in enumerate(self.keys):
                 if (score := METRICS[key].value(sample)) is not None:
                     self.sums[number] += score
                     self.counts[number] += 1
 
     def compute(self) -> dict[str, Tensor]:
-        """Mean over the samples so far, of all processes, of every key."""
+        """Mean over the samples so far, of all processes, of every one of ``keys``."""
         means = self.sums / self.counts  # 0 / 0 is NaN: no sample had the pixels
-        return dict(zip(KEYS, means, strict=True))
+        return dict(zip(self.keys, means, strict=True))
 
 
 def _maps(prediction: Tensor, target: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

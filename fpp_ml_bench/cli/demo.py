@@ -16,7 +16,7 @@ from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.constants import MINI_OBJECTS, TEST_OBJECTS
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.metrics import RANK_KEY
+from fpp_ml_bench.evaluation.metrics import OBJECT_KEY
 from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE
 from fpp_ml_bench.leaderboard.columns import assumption
 from fpp_ml_bench.leaderboard.rows import Entry, read_entry
@@ -116,7 +116,7 @@ def _table(entries: list[Entry]) -> Table:
     for entry in entries:
         row = entry.row
         reliance = None if row.reliance is None else row.reliance.score
-        values = entry.value(RANK_KEY), row.metrics.overall_mae_mm, entry.latency_ms, reliance
+        values = entry.value(OBJECT_KEY), row.metrics.overall_mae_mm, entry.latency_ms, reliance
         cells = ("-" if value is None else format(value, form) for value, form in zip(values, _FORMS, strict=True))
         table.add_row(row.submission.method, str(entry.frames), *cells)
     return table

@@ -7,7 +7,7 @@ from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.cli.evaluate import scored_data
 from fpp_ml_bench.cli.options import command
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.metrics import METRICS, RANK_KEY, sort_keys
+from fpp_ml_bench.evaluation.metrics import METRICS, OBJECT_KEY, RANK_KEY, sort_keys
 from fpp_ml_bench.evaluation.result.file import write_file
 from fpp_ml_bench.leaderboard.page.page import predicted_samples, write_page
 from fpp_ml_bench.leaderboard.ranking import discover, expand, read_entries, shipped_rows
@@ -45,7 +45,10 @@ def rank(
         many=True,
     ),
     sort: str = option(
-        RANK_KEY, f"what to rank by (default: {RANK_KEY}): {', '.join(sort_keys())}", "KEY", choices=_SORTED
+        RANK_KEY,
+        f"what to rank by (default: {RANK_KEY}, and {OBJECT_KEY} by the paper's rules): {', '.join(sort_keys())}",
+        "KEY",
+        choices=_SORTED,
     ),
     markdown: Path | None = option(None, "also write the tables as Markdown", "FILE"),
     json: Path | None = option(
@@ -111,7 +114,7 @@ def rank(
     groups, papers = rank_files(entries, sort), chosen_tables(paper)
     for path, text in ((markdown, board_markdown), (json, table_json)):
         if path is not None:
-            write_file(text(groups, papers, sort).encode("utf-8"), path)
+            write_file(text(groups, papers).encode("utf-8"), path)
     if csv is not None:
         write_file(table_csv(groups).encode("utf-8"), csv)
     if out is not None:
@@ -122,7 +125,7 @@ def rank(
         print(f"{out}: {len(written)} files; open {written[0]}")
         return
     not_shown = len(papers) if results and paper is None else 0
-    tables = group_tables(groups, sort, pairs)
+    tables = group_tables(groups, pairs)
     show(*tables, *paper_rich_tables(papers[not_shown:]))
     if not_shown:
         print(

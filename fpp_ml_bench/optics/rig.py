@@ -44,8 +44,9 @@ class Rig:
     `R` and `t` are the arrays. ``pitch_horizontal_px`` is the period of the horizontal fringes along the projector's
     rows, ``pitch_vertical_px`` that of the vertical ones along its columns; with a `CodedSequence` they are its finest
     periods, None for a direction without. ``background_m`` is the distance of a plane behind everything, None where
-    none is known. Raises `RigError` for a pose that is no rotation, a zero baseline, an impossible range, a pitch or
-    code that doesn't fit."""
+    none is known. ``calibration_px`` is the RMS error in projector px that the calibration is known to have, 0 where it
+    is not known; it goes into stated uncertainties, and two rigs may be equal without it. Raises `RigError` for a pose
+    that is no rotation, a zero baseline, an impossible range, a pitch or code that doesn't fit."""
 
     camera: Pinhole
     projector: Pinhole
@@ -57,6 +58,7 @@ class Rig:
     working_range_mm: tuple[float, float] = WORKING_RANGE_MM
     standoff_m: float = STANDOFF_M
     background_m: float | None = BACKGROUND_M
+    calibration_px: float = field(default=0.0, compare=False)
     R: NDArray[np.float64] = field(init=False, repr=False, compare=False)
     t: NDArray[np.float64] = field(init=False, repr=False, compare=False)
 
@@ -78,6 +80,8 @@ class Rig:
                 positive.append(name)
         for name in positive:
             settings[name] = number(getattr(self, name), name, positive=True)
+        settings["calibration_px"] = number(self.calibration_px, "calibration_px")
+        require(settings["calibration_px"] >= 0, f"calibration_px: expected 0 or more, got {self.calibration_px:g}")
         settings["t"] = np.array(settings["translation_m"])
         for name, value in settings.items():
             object.__setattr__(self, name, value)
@@ -199,6 +203,12 @@ class Rig:
         """Distance of the two centres of projection."""
         return math.sqrt(sum(t * t for t in self.translation_m))
 
+    @property
+    def half_range_mm(self) -> float:
+        """Half the depth of the working range: no surface in it is farther from its middle."""
+        near_mm, far_mm = self.working_range_mm
+        return (far_mm - near_mm) / 2
+
     def with_range(self, range_mm: tuple[float, float]) -> "Rig":
         """The rig with another working range, its standoff in the range's middle, and no known background."""
         return replace(self, working_range_mm=range_mm, standoff_m=middle_m(range_mm), background_m=None)
@@ -238,6 +248,8 @@ class Rig:
             "standoff_m": self.standoff_m,
             "background_m": self.background_m,
         }
+        if self.calibration_px:
+            content["calibration_px"] = self.calibration_px
         if isinstance(self.sequence, CodedSequence):
             del content["pitch_px"]
         return content

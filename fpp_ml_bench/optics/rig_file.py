@@ -9,6 +9,7 @@
     working_range_mm: [1500, 2100]
     standoff_m: 1.8                                 # by default the middle of the range
     background_m: 3.2                               # a plane behind the range; by default none is known
+    calibration_px: 0.05                            # RMS error of the calibration in projector px, if it is known
 
 The sequence above is the paper's. Any other is a code for one direction or both, which holds its own periods (no
 ``pitch_px`` then)::
@@ -52,7 +53,7 @@ from fpp_ml_bench.optics.rig import Rig, middle_m, rotation_matrix
 from fpp_ml_bench.optics.sequence import AXES, CODED_KEYS, DIRECTIONS, Direction, sequence_from_dict
 
 _RIG_KEYS = ("camera", "projector", "rotation", "translation_m", "pitch_px", "sequence", "working_range_mm")
-_OPTIONAL_RIG_KEYS = ("standoff_m", "background_m")
+_OPTIONAL_RIG_KEYS = ("standoff_m", "background_m", "calibration_px")
 BASELINES_M, LEAST_FAR_MM, MOST_NEAR_MM = (0.005, 20.0), 10.0, 1e6
 """Lengths of rigs: what lies outside is another unit. A wide limit: microscopes have 10 mm, halls 10 m."""
 CALIBRATED_PX, MOST_SHARE = 0.1, 0.05

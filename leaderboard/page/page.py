@@ -18,7 +18,7 @@ from typing import Any
 from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, Tradeoff
 from fpp_ml_bench.baselines.tradeoff.report import Mark, Scatter, growth_table, point_table, scatter
 from fpp_ml_bench.errors import CaptureError, DatasetError, FppBenchError, PredictionError, SubmissionError
-from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS, RANGE_KEY, RANK_KEY, with_column
+from fpp_ml_bench.evaluation.metrics import METRICS, RANGE_KEY, RANKED, with_column
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
 from fpp_ml_bench.evaluation.report.report_page import SampleMaps, chosen_samples, sample_maps
 from fpp_ml_bench.evaluation.report.terminal import score_text
@@ -28,7 +28,6 @@ from fpp_ml_bench.files import LOCK_FILE, exclusive, printable, write_atomically
 from fpp_ml_bench.leaderboard import columns, tables
 from fpp_ml_bench.leaderboard.columns import assumption, assumption_sentences, given_truth, learned_from
 from fpp_ml_bench.leaderboard.ranking import (
-    DEFAULT_SORT,
     MOST_PAIRED,
     Group,
     Ranked,
@@ -82,7 +81,7 @@ def write_page(
     tradeoff: Tradeoff | None = None,
     samples: Mapping[str, Samples] = MappingProxyType({}),
 ) -> list[Path]:
-    """Write the page of ``groups`` (ranked by `DEFAULT_SORT`), the paper's tables and a trade-off into folder ``out``;
+    """Write the page of ``groups`` (ranked by the key of each), the paper's tables and a trade-off into folder ``out``;
     returns the files. ``samples``: `predicted_samples` of the rows. Removes pages of submissions that are no
     longer ranked, and nothing else. SubmissionError where a file can't be written."""
     files = page_files(groups, papers, tradeoff, samples)
@@ -106,7 +105,7 @@ def page_files(
     samples: Mapping[str, Samples] = MappingProxyType({}),
 ) -> dict[str, bytes]:
     """Relative name -> content of every file of the page. Tables of trivial rows alone are in the data files only."""
-    data = {DATA: table_json(groups, papers, DEFAULT_SORT), TABLE: table_csv(groups)}
+    data = {DATA: table_json(groups, papers), TABLE: table_csv(groups)}
     groups = more_than_trivial(groups)
     style = (_HERE / "page.css").read_text("utf-8")
     rows = [(group, row) for group in groups for row in group.rows]
@@ -157,7 +156,7 @@ def _submission(group: Group, row: Ranked) -> dict[str, Any]:
     """What the template needs for the page of ``row``."""
     about = row.entry.row
     parts = [about] if row.unseen is None else [about, row.unseen.row]
-    bars = [(mean, name) for name, mean in row.object_means(DEFAULT_SORT).items()]
+    bars = [(mean, name) for name, mean in row.object_means(group.sort).items()]
     changes = about.reliance.parts.titled() if about.reliance else {}
     return {
         "row": row,
@@ -180,7 +179,7 @@ def _data_words(row: Row) -> str:
 def _score_cells(row: Row) -> list[tuple[str, str, str]]:
     """Each mean in words, its value, and its interval."""
     cells = []
-    for key in (*HEADLINE, *(key for key in METRICS if key not in HEADLINE)):
+    for key in (*RANKED, *(key for key in METRICS if key not in RANKED)):
         if (value := getattr(row.metrics, key)) is not None:
             title = key.removesuffix("_mm").replace("_", " ")
             cells.append((title, score_text(key, value), interval_text(row.intervals.of(key))))
@@ -285,7 +284,7 @@ def _link(group: Group, of_data: Sequence[Group]) -> str:
 def _section(group: Group, link: str) -> dict[str, Any]:
     """What the template needs of a group: its heading, its rows' intervals, objects and pairs."""
     key = group.key
-    per_object = [row.object_means(DEFAULT_SORT) for row in group.rows[:MOST_PAIRED]]
+    per_object = [row.object_means(group.sort) for row in group.rows[:MOST_PAIRED]]
     objects = sorted({name for errors in per_object for name in errors})
     machines = sorted({columns.device(row.entry) for row in group.rows if row.entry.latency_ms is not None})
     letters = [ascii_lowercase[number % 26] * (1 + number // 26) for number in range(len(machines))]
@@ -301,7 +300,7 @@ def _section(group: Group, link: str) -> dict[str, Any]:
         "link": link,
         "machines": dict(zip(machines, letters if len(machines) > 1 else [""], strict=False)),
         "scale": scale,
-        "clipped": any((row.interval(DEFAULT_SORT) or (scale.low,))[0] < scale.low for row in group.rows),
+        "clipped": any((row.interval(group.sort) or (scale.low,))[0] < scale.low for row in group.rows),
         "objects": objects,
         "object_cells": object_cells,
         "title": f"{key.frames[0].upper()}{key.frames[1:]}, {key.track} track, against {key.against}{key.rules}",
@@ -363,7 +362,7 @@ def overview(groups: Sequence[Group], cost: str) -> Scatter | None:
 
 
 def _mark(number: int, group: Group, row: Ranked, cost: str) -> Mark | None:
-    entry, timing, error = row.entry, row.entry.row.timing, row.value(DEFAULT_SORT)
+    entry, timing, error = row.entry, row.entry.row.timing, row.value(row.rank_key)
     seconds = entry.value("seconds_per_sample")
     x = seconds if cost == "seconds" else float(entry.frames)
     if not x or not error:
@@ -382,7 +381,7 @@ def _mark(number: int, group: Group, row: Ranked, cost: str) -> Mark | None:
         hollow=hollow,
         can_lead=group.key.track == "metric" and not is_trivial(row),
         x_span=span if cost == "seconds" else None,
-        y_span=row.interval(DEFAULT_SORT),
+        y_span=row.interval(row.rank_key),
         title=f"{entry.name}: {error:.3g} mm, {time}, {frames}, {group.key.track} track, {row.provenance}",
         css=f"p-{row.provenance.replace(' ', '-')}{' hollow' if hollow else ''}",
         row=slug(entry),
@@ -414,7 +413,8 @@ class LogScale:
     @classmethod
     def of(cls, rows: Sequence[Ranked]) -> "LogScale":
         """A scale that holds the means of ``rows``, and their intervals as far down as a part of the mean."""
-        means = [(mean, row.interval(RANK_KEY) or (mean, mean)) for row in rows if (mean := row.value(RANK_KEY))]
+        ranked_by = [(row.value(row.rank_key), row.interval(row.rank_key)) for row in rows]
+        means = [(mean, ends or (mean, mean)) for mean, ends in ranked_by if mean]
         low = min((max(ends[0], mean / _CLIP) for mean, ends in means), default=1.0)
         return cls(low / _MARGIN, max((ends[1] for _, ends in means), default=1.0) * _MARGIN)
 

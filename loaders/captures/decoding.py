@@ -361,7 +361,7 @@ def board_poses(
 
 def calibrated_rig(found: Calibration, stand_in: Rig, range_mm: tuple[float, float] | None = None) -> Rig:
     """The rig of a calibration, with the sequence of ``stand_in``; its working range is ``range_mm``, or that of the
-    boards' points and a margin."""
+    boards' points and a margin. Its error is that of the poses which did not take part, or of those which did."""
     depths = [
         found.board_mm @ rotation_matrix(pose.rotation_vector)[2] + pose.translation_mm[2] for pose in found.poses
     ]
@@ -372,4 +372,5 @@ def calibrated_rig(found: Calibration, stand_in: Rig, range_mm: tuple[float, flo
         projector=found.projector.pinhole,
         rotation=found.rotation,
         translation_m=found.translation_m,
+        calibration_px=found.held_out_rms_px if np.isfinite(found.held_out_rms_px) else found.rms_px.both,
     ).with_range((near, far))

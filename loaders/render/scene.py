@@ -7,6 +7,7 @@ z forward. At angle 0 the object's +x axis points away from the camera (paper Se
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass, field, replace
 from hashlib import blake2b
 from typing import TYPE_CHECKING, Any, Literal
@@ -105,8 +106,10 @@ class BuildSettings:
 
     @property
     def stated_rig(self) -> Rig:
-        """The rig that the dataset states: it decodes the ground truth, and methods get it."""
-        return self.rig if self.decode_with is None else self.decode_with
+        """The rig that the dataset states: it decodes the ground truth, and methods get it. As after a calibration of
+        one's own, it says how large its error is."""
+        rig = self.rig if self.decode_with is None else self.decode_with
+        return replace(rig, calibration_px=math.hypot(rig.calibration_px, self.light.calibration_px))
 
     def describe(self) -> dict[str, Any]:
         """The settings as plain data for the manifest and for comparing an interrupted build with this one."""

@@ -132,7 +132,7 @@ def intended_benchmark(manifest: Manifest) -> Benchmark | None:
             continue
         settings = preset_settings(benchmark.preset, benchmark.size, light, benchmark.rig)
         stated = manifest.settings | {"frames": settings.stored}
-        if stated == settings.describe() and manifest.rig == settings.rig.to_dict():
+        if stated == settings.describe() and manifest.rig == settings.stated_rig.to_dict():
             return benchmark
     return None
 

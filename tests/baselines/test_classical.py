@@ -1,6 +1,7 @@
 """The classical method: its error obeys the noise law over N, and it reads only the frames that it names."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,9 +15,9 @@ from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.registry import load_method, methods
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.cli import main
-from fpp_ml_bench.decoding.triangulation import noise_by_light
+from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm, noise_by_light
 from fpp_ml_bench.depth import object_mask
-from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError, PredictionError
+from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError, PredictionError, RigError
 from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.render.meshes import solid_mesh
 from fpp_ml_bench.loaders.render.scene import BuildSettings
@@ -75,12 +76,13 @@ def test_both_directions_are_better_than_either(noisy):
 
 @pytest.mark.parametrize(("direction", "steps"), [("both", 18), ("vertical", 6), ("horizontal", 4)])
 def test_the_stated_uncertainty_covers_what_it_says(noisy, direction, steps):
-    """Where noise is all there is; of grazing pixels of almost no modulation only the luckier ones are decoded."""
+    """Where noise is all there is, before what light and calibration may add; of grazing pixels of almost no modulation
+    only the luckier ones are decoded."""
     classical = ClassicalMethod(noisy.rig, direction=direction, steps=steps)
     deviations = []
     for sample in noisy.samples("all"):
         exact = noisy.depth_mm(sample, "depth_exact")
-        answer = classical.answer(noisy.frames(sample, range(len(noisy.sequence))))
+        answer, _ = classical.measure(noisy.frames(sample, range(len(noisy.sequence))))
         np.testing.assert_array_equal(answer.sigma_mm > 0, answer.depth > 0)
         white = noisy.frame(sample, noisy.sequence.white)
         inside = object_mask(exact) & (edge_distance_px(exact) >= 3) & object_mask(answer.depth) & (white > 60)
@@ -88,6 +90,22 @@ def test_the_stated_uncertainty_covers_what_it_says(noisy, direction, steps):
     found = np.concatenate(deviations)
     for sigmas, nominal in ((0.9945, 0.68), (1.96, 0.95), (2.576, 0.99)):
         assert (found < sigmas).mean() == pytest.approx(nominal, abs=0.02)
+
+
+def test_the_calibration_s_error_is_stated_and_moves_no_depth(noisy):
+    known = replace(noisy.rig, calibration_px=0.25)
+    assert known == noisy.rig and rig_from_dict(known.to_dict()).calibration_px == 0.25
+    frames = noisy.frames(noisy.samples("all")[0], range(len(noisy.sequence)))
+    plain, stated = (ClassicalMethod(rig, direction="vertical").answer(frames) for rig in (noisy.rig, known))
+    np.testing.assert_array_equal(stated.depth, plain.depth)
+    measured, _ = ClassicalMethod(known, direction="vertical").measure(frames)  # what neighbours are compared by
+    found = plain.depth > 0
+    assert (measured.sigma_mm[found] < plain.sigma_mm[found]).all()
+    rays = tuple(axis[found] for axis in noisy.rig.camera.rays())
+    of_px = 0.25 / np.abs(coordinate_slope_px_per_mm(noisy.rig, plain.depth[found], "vertical", rays))
+    np.testing.assert_allclose(stated.sigma_mm[found], np.hypot(plain.sigma_mm[found], of_px), rtol=1e-5)
+    with pytest.raises(RigError, match="calibration_px: expected 0 or more"):
+        replace(noisy.rig, calibration_px=-0.1)
 
 
 def test_noise_that_light_brings_is_told_from_noise_in_the_dark():

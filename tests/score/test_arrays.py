@@ -40,6 +40,7 @@ def test_the_same_scores_as_a_folder(form, scored):
     dataset, folder, columns = scored
     of_folder = fpp_ml_bench.evaluate(folder, dataset)
     arrays = {name: values if name == "objects" else form(values) for name, values in columns.items()}
+    arrays["charge_mm"] = dataset.rig.half_range_mm
     of_arrays = fpp_ml_bench.evaluate(arrays.pop("predictions"), arrays.pop("targets"), **arrays)
     for name in ("metrics", "intervals", "median", "pooled", "bootstrap", "seeds"):
         assert getattr(of_arrays, name) == getattr(of_folder, name), name

@@ -108,7 +108,10 @@ def test_only_the_scores_that_say_so_are_improved_by_missing_pixels():
     for pixels in (target > 0, unlit > 0):
         best = np.unravel_index(np.where(pixels, np.abs(answer - target - unlit), np.inf).argmin(), target.shape)
         single[best] = answer[best]
-    whole, few = (score_sample(values, target, void=unlit > 0, unlit_mm=unlit).metrics() for values in (answer, single))
+    whole, few = (
+        score_sample(values, target, void=unlit > 0, unlit_mm=unlit, charge_mm=300.0).metrics()
+        for values in (answer, single)
+    )
     higher = {key for key, metric in METRICS.items() if metric.better == "higher"}
     better = {key for key in METRICS if (few[key] > whole[key] if key in higher else abs(few[key]) < abs(whole[key]))}
     helped = {key for key, metric in METRICS.items() if metric.helped_by_missing}

@@ -13,7 +13,7 @@ from fpp_ml_bench.evaluation.result.model import over_samples
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 from fpp_ml_bench.evaluation.score.torch_metric import KEYS
 
-SIZE, SAMPLES = (40, 48), 11
+SIZE, SAMPLES, CHARGE_MM = (40, 48), 11, 300.0
 
 
 def data(kind=np.float32):
@@ -28,7 +28,7 @@ def data(kind=np.float32):
 
 def scored(batches, kind=np.float32, order=None):
     prediction, target = data(kind)
-    metric = DepthScores()
+    metric = DepthScores(charge_mm=CHARGE_MM)
     order = np.arange(SAMPLES) if order is None else order
     for part in np.array_split(order, batches):
         metric.update(torch.from_numpy(prediction[part]), torch.from_numpy(target[part]))
@@ -43,7 +43,7 @@ def assert_same(scores, expected, relative=1e-12):
 @pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
 def test_same_numbers_as_the_evaluator(kind):
     prediction, target = data(kind)
-    rows = [score_sample(p, t).metrics() for p, t in zip(prediction, target, strict=True)]
+    rows = [score_sample(p, t, charge_mm=CHARGE_MM).metrics() for p, t in zip(prediction, target, strict=True)]
     assert_same(scored(3, kind), over_samples(rows))
 
 
@@ -56,7 +56,7 @@ def test_batches_and_order_change_nothing(batches):
 def _process(rank, address, folder):
     dist.init_process_group("gloo", init_method=address, rank=rank, world_size=2)
     prediction, target = data()
-    metric = DepthScores()
+    metric = DepthScores(charge_mm=CHARGE_MM)
     indices = range(7) if rank == 0 else range(7, SAMPLES)  # unequal shares
     for index in indices:
         metric.update(torch.from_numpy(prediction[index : index + 1]), torch.from_numpy(target[index : index + 1]))
@@ -86,7 +86,7 @@ def test_two_processes_give_the_same_numbers(tmp_path):
 
 
 def test_state_is_declared_and_stays_in_float64():
-    metric = DepthScores().half().float()
+    metric = DepthScores(charge_mm=CHARGE_MM).half().float()
     assert set(metric._reductions) == {"sums", "counts"}
     assert all(reduce is torch.sum or reduce.__name__ == "dim_zero_sum" for reduce in metric._reductions.values())
     prediction, target = data()
@@ -106,7 +106,7 @@ def test_an_empty_set_is_no_score_and_never_zero():
 
 def test_forward_gives_the_batch_and_keeps_the_whole():
     prediction, target = map(torch.from_numpy, data())
-    metric = DepthScores()
+    metric = DepthScores(charge_mm=CHARGE_MM)
     first = metric(prediction[:2], target[:2])
     metric(prediction[2:], target[2:])
     alone = DepthScores()

@@ -9,7 +9,7 @@ from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.metrics import HEADLINE
+from fpp_ml_bench.evaluation.metrics import RANKED
 from fpp_ml_bench.evaluation.report.comparison import compare
 from fpp_ml_bench.evaluation.result.file import read_result, write_result
 from fpp_ml_bench.evaluation.score import uncertainty
@@ -149,8 +149,8 @@ def test_holm_against_its_step_down_procedure():
 
 def test_result_carries_intervals_objects_and_seeds(make, tmp_path):
     result = read_result(make("a", noise_mm=2.0))
-    assert set(type(result.intervals).model_fields) == set(HEADLINE)
-    for key in HEADLINE:
+    assert set(type(result.intervals).model_fields) == set(RANKED)
+    for key in RANKED:
         low, high = getattr(result.intervals, key)
         assert low <= getattr(result.metrics, key) <= high
     assert [(o.object, o.samples) for o in result.per_object] == [("power_drill", 2), ("wooden_boards", 2)]
@@ -206,14 +206,14 @@ def test_comparison_is_paired_and_says_so(make, capsys, tmp_path):
     main_difference = comparison.differences["object_mae_mm"]
     assert main_difference.mean_mm == pytest.approx(np.mean(rows)) and main_difference.lower == 4
     assert main_difference.distinguishable
-    assert comparison.sentence.startswith("Two has a lower object MAE than One, by 0.8")
+    assert comparison.sentence.startswith("Two has a lower two-sided MAE than One, by")
     assert "lower in 4 of 4 samples" in comparison.sentence
     assert main_difference.sign_flip_p == 0.5
     assert "sign-flip test p = 0.5" in comparison.sentence
     assert "does not confirm it at 5%: 2 objects never reach 5%" in comparison.sentence
     assert main(["compare", str(first), str(second), "--json", str(tmp_path / "d.json")]) == 0
     printed = capsys.readouterr().out
-    assert "Two has a lower object MAE than One" in " ".join(printed.split())
+    assert "Two has a lower two-sided MAE than One" in " ".join(printed.split())
     assert json.loads((tmp_path / "d.json").read_text())["differences"]["object_mae_mm"]["lower"] == 4
 
 
@@ -227,7 +227,7 @@ def test_a_comparison_with_0_in_its_interval(make, dataset, tmp_path):
     comparison = compare(read_result(first), read_result(tmp_path / "two.json"))
     assert not comparison.differences["object_mae_mm"].distinguishable
     assert "can't be distinguished" in comparison.sentence and "holds 0" in comparison.sentence
-    assert "the same object MAE in all 4 samples" in compare(read_result(first), read_result(first)).sentence
+    assert "the same two-sided MAE in all 4 samples" in compare(read_result(first), read_result(first)).sentence
 
 
 def test_results_of_other_data_are_not_compared(make, dataset, tmp_path, capsys):
@@ -251,7 +251,7 @@ def test_verify_says_verified_or_not(make, dataset, tmp_path, capsys):
     assert main(command) == 1
     printed = capsys.readouterr().out
     assert printed.startswith("not verified: ") and f"{sample}: prediction_sha256" in printed
-    assert f"{sample}: object_mae_mm" in printed
+    assert f"{sample}: overall_mae_mm" in printed
     np.save(folder / f"{sample}.npy", depth)
     assert main(command) == 0
     write_predictions(folder, dataset, noise_mm=2.0, name="Another name", frames_used=[0, 1])

@@ -66,8 +66,8 @@ def test_every_score_of_an_evaluation(target, dataset, tmp_path):
     for row in result.per_sample:
         predicted, sigma = (np.load(folder / f"{row.sample}{suffix}") for suffix in (".npy", ".sigma.npy"))
         true, void, unlit = maps_of(dataset, row.sample, target)
-        rows[row.sample] = sample_scores(predicted, true, 3, void, unlit)
-        stated[row.sample] = sigma_scores(predicted, true, sigma, void)
+        rows[row.sample] = sample_scores(predicted, true, 3, void, unlit, 300)
+        stated[row.sample] = sigma_scores(predicted, true, sigma, void, 300)
         for key in METRICS:
             expected, rounding = rows[row.sample].get(key), 1e-9 if "bias" in key else 0
             assert getattr(row, key) == (expected and pytest.approx(float(expected), rel=1e-9, abs=rounding)), key
@@ -116,7 +116,7 @@ def test_the_perfect_prediction_scores_0(mode, target, dataset, tmp_path):
         assert result.metrics.object_rmse_mm == 0
         return
     for scores in (result.metrics, result.median, result.pooled, *result.per_sample):
-        errors = {value for key, value in scores.model_dump().items() if key.endswith("_mm")}
+        errors = {value for key, value in scores.model_dump().items() if key.endswith(("_mm", "invented_share"))}
         assert errors - {None} == {0.0}
     uncertainty = result.uncertainty.metrics.model_dump()
     assert {uncertainty[key] for key in UNCERTAINTY if key.startswith(("ause", "sure"))} == {0.0}

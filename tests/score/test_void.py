@@ -105,8 +105,8 @@ def test_the_torch_metric_leaves_them_out_too(dataset):
     sample = dataset.samples("test")[0]
     target, void = dataset.depth_mm(sample), dataset.void(sample)
     prediction = target + np.random.default_rng(0).normal(0, 2, target.shape).astype(np.float32)
-    metric = DepthScores()
+    metric = DepthScores(charge_mm=300.0)
     metric.update(*(torch.tensor(pixels)[None] for pixels in (prediction, target, void)))
-    expected = score_sample(prediction, target, void=void).metrics()
+    expected = score_sample(prediction, target, void=void, charge_mm=300.0).metrics()
     for key, value in metric.compute().items():
         assert float(value) == pytest.approx(expected[key], rel=1e-12), key
