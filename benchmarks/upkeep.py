@@ -65,6 +65,7 @@ from fpp_ml_bench.leaderboard.row_file import row_json, write_row
 from fpp_ml_bench.leaderboard.rows import SELF_REPORTED, VOUCHED, Entry, read_entry, vouching_line
 from fpp_ml_bench.leaderboard.tables import ranking_table
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
+from fpp_ml_bench.optics.sequence import PAPER_PITCH_PX
 from fpp_ml_bench.style import millimetres, percent
 from fpp_ml_bench.tables import Table, markdown_text
 
@@ -111,6 +112,12 @@ CROSSED = {
     "fringe-net-crossed": "fringe-net",
 }
 """The same for datasets with crossed fringes. The trivial methods see no code, so theirs would be the same rows."""
+COARSE = {
+    "phase-horizontal-36px": "phase --direction horizontal",
+    "fringe-net-horizontal-36px": "fringe-net --fringes horizontal",
+}
+"""The same for ``--pitch 36 --config single_shot``: the finest single fringe with one period in the working range, as
+``fpp-bench patterns paper --design`` names it."""
 
 
 def run(command: str, *words: object) -> None:
@@ -125,7 +132,7 @@ def run(command: str, *words: object) -> None:
 def make_row(dataset: Path, work: Path, row: Path, name: str, repeats: int, training: Path | None) -> None:
     """Predictions, time, result and row of a setting."""
     predictions, result = work / name, work / f"{name}.json"
-    method, *options = (METHODS | CROSSED)[name].split()
+    method, *options = (METHODS | CROSSED | COARSE)[name].split()
     options += ["--training", str(training)] if training is not None and method == "nearest" else []
     settings = [method, dataset, *options]
     run("fpp-bench", "predict", *settings, "--split", "test", "--out", predictions)
@@ -373,7 +380,7 @@ def parser() -> argparse.ArgumentParser:
     add("dataset", type=Path, help="dataset folder with all frames")
     add("--work", type=Path, required=True, help="new or empty folder for predictions and results")
     add("--out", type=Path, default=ROWS, help="folder for the rows")
-    add("--only", nargs="+", choices=METHODS | CROSSED, metavar="NAME", help="only these rows")
+    add("--only", nargs="+", choices=METHODS | CROSSED | COARSE, metavar="NAME", help="only these rows")
     add("--suffix", help="of the rows' names (default: -unseen for a dataset without a training split)")
     add("--training", type=Path, help="for nearest: the dataset with the training split")
     add("--repeats", type=int, default=40, help="timed runs of each method")
@@ -400,7 +407,8 @@ def make_rows(args: argparse.Namespace) -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     opened = DatasetFolder(args.dataset)
     suffix = args.suffix if args.suffix is not None else "" if "train" in opened.splits else "-unseen"
-    for name in args.only or (METHODS if opened.rig.crossed is None else CROSSED):
+    plain = METHODS if opened.rig.pitch("horizontal") == PAPER_PITCH_PX else COARSE
+    for name in args.only or (plain if opened.rig.crossed is None else CROSSED):
         make_row(args.dataset, args.work, args.out / f"{name}{suffix}.json", name, args.repeats, args.training)
 
 

@@ -7,8 +7,8 @@ from typing import Literal, get_args
 PROTOCOL_VERSION = "4.0.0"
 """Since 4.0.0 there are two-sided scores, and unanswered and invented pixels count in what is left of the least sure;
 all other scores are those of 3.0.0."""
-SchemaVersion = Literal["3.0.0"]
-RESULT_SCHEMA_VERSION: SchemaVersion = "3.0.0"
+SchemaVersion = Literal["4.0.0"]
+RESULT_SCHEMA_VERSION: SchemaVersion = "4.0.0"
 """What is written, and the only version that is read. Since 3.0.0 ``dataset.content`` says what was scored against."""
 
 Target = Literal["depth", "depth_exact"]

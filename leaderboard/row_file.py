@@ -47,7 +47,7 @@ from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.storage.benchmark import Counts
 from fpp_ml_bench.schema import Count, NonNegative, Share, SparseModel, StrictModel, Text, validate
 
-ROW_SCHEMA_VERSION = "2.0.0"
+ROW_SCHEMA_VERSION = "3.0.0"
 LARGEST_ROW_BYTES = 12_000
 DIGITS = 5
 """Significant digits of the means of a row."""
@@ -138,7 +138,7 @@ class Row(SparseModel):
 
     SPARSE = ("uncertainty", "reliance", "robustness", "charge_mm")
 
-    row_schema_version: Literal["2.0.0"]
+    row_schema_version: Literal["3.0.0"]
     submission: Submission
     frames_class: FramesClass
     dataset: DatasetInfo

@@ -24,6 +24,8 @@ from fpp_ml_bench.baselines.phase.method import (
     frames_of,
     fringe_options,
     has_crossed_fringes,
+    pitch_setting,
+    pitch_words,
 )
 from fpp_ml_bench.baselines.phase.resampling import Periods
 from fpp_ml_bench.baselines.phase.settings import AMBIENT_GREY, DIRECTION, MIN_CONFIDENCE, WHITE_GREY, Settings
@@ -337,9 +339,9 @@ class FringeNetMethod(LearnedRoute):
 
     @classmethod
     def short_name(cls, submission: "Submission") -> str | None:
-        return (
-            f"{cls.name}, 1 {submission.settings['fringes']}" if submission.name.startswith("Wrapped phase") else None
-        )
+        if not submission.name.startswith("Wrapped phase"):
+            return None
+        return f"{cls.name}, 1 {submission.settings['fringes']}{pitch_words(submission.settings, ', ')}"
 
     @classmethod
     def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
@@ -364,7 +366,7 @@ class FringeNetMethod(LearnedRoute):
             hashes.append(self.file.sha256)
         self.parameters = len(networks) * self.parameters
         self.rig, self.threads = rig, given.threads
-        periods = self.learned_periods(fringes)
+        periods, other_pitch = self.learned_periods(fringes), {}
         if crossed:
             here, learned = (
                 (code.pitches_px, code.angles_deg, code.weights)
@@ -381,19 +383,21 @@ class FringeNetMethod(LearnedRoute):
         else:
             way: Direction = "vertical" if fringes == "vertical" else "horizontal"
             fringe_options(self.name, rig, {"direction": way})
-            own = Settings(direction=way, min_confidence=given.min_confidence)
+            own, other_pitch = Settings(direction=way, min_confidence=given.min_confidence), pitch_setting(rig, way)
             self.route, self.frames_used = (
                 FringeNetRoute(rig, own, networks, periods),
                 (rig.sequence.sinusoids(way)[0],),
             )
         count = "one network" if len(networks) == 1 else f"{len(networks)} networks"
-        self.title = f"Wrapped phase of one {fringes} frame by {count}; mask and order measured{self.more}"
+        frame = f"one {fringes} frame{pitch_words(other_pitch)}"
+        self.title = f"Wrapped phase of {frame} by {count}; mask and order measured{self.more}"
         self.settings = {
             **vars(given),
             **self.weights_settings,
             "fringes": fringes,
             "members": len(networks),
             "weights_sha256": hashes[0] if len(hashes) == 1 else sha256("".join(hashes).encode()).hexdigest(),
+            **other_pitch,
         }
 
 

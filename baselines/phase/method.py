@@ -26,7 +26,7 @@ from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.files import printable
 from fpp_ml_bench.loaders.captures.decoding import read_mask
 from fpp_ml_bench.optics.rig import Rig
-from fpp_ml_bench.optics.sequence import DIRECTIONS, PAPER_SEQUENCE
+from fpp_ml_bench.optics.sequence import DIRECTIONS, PAPER_PITCH_PX, PAPER_SEQUENCE, Direction
 from fpp_ml_bench.options import option
 
 if TYPE_CHECKING:
@@ -134,9 +134,9 @@ class PhaseMethod(RouteMethod):
         self.frames_used = tuple(sinusoids[step] for step in self.route.steps)
         frames = len(self.frames_used)
         count = f"one {settings.direction} fringe" if frames == 1 else f"{frames} {settings.direction} fringes"
-        cues = " + ".join(["range", *terms_of(settings)])
-        self.title = f"Phase route, {count}, order by {cues}, nothing learned"
-        self.settings = asdict(settings) | self.use_mask(given.mask)
+        cues, other_pitch = " + ".join(["range", *terms_of(settings)]), pitch_setting(rig, settings.direction)
+        self.title = f"Phase route, {count}{pitch_words(other_pitch)}, order by {cues}, nothing learned"
+        self.settings = asdict(settings) | self.use_mask(given.mask) | other_pitch
 
     @classmethod
     def variants(cls, rig: Rig) -> Sequence[Mapping[str, Any]]:
@@ -155,6 +155,7 @@ class PhaseMethod(RouteMethod):
             name = f"Phase, fewest {direction}, {float(settings['error_mm'] or 0):g} mm"
         else:
             name = f"Phase, {operator.index(settings['frames'])} {direction}"  # type: ignore[arg-type]
+        name += pitch_words(settings, ", ")
         standoff = settings.get("prior") == "standoff"
         if not settings["shading"]:
             return f"{name}, standoff alone" if standoff else f"{name}, no shading"
@@ -163,6 +164,17 @@ class PhaseMethod(RouteMethod):
     @classmethod
     def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
         return ONE_ALBEDO if settings.get("shading") is True else None
+
+
+def pitch_setting(rig: Rig, direction: Direction) -> dict[str, float]:
+    """What the settings of a row say of the fringes' period in projector px: nothing where it is the paper's."""
+    pitch = rig.pitch(direction)
+    return {} if pitch == PAPER_PITCH_PX else {"pitch_px": pitch}
+
+
+def pitch_words(settings: Mapping[str, Any], before: str = " of ") -> str:
+    """``" of 36 px"`` for settings with a `pitch_setting`, else nothing."""
+    return f"{before}{float(settings['pitch_px']):g} px" if "pitch_px" in settings else ""
 
 
 def frames_of(rig: Rig, name: str) -> tuple[int, ...]:

@@ -170,6 +170,12 @@ def _print_design(rig: Rig, assumed: Assumptions, found: Design, others: list[tu
         f"wrong orders    {100 * assumed.edge_share:g}% of the pixels are near edges and texture, where the phases are "
         f"off by {assumed.edge_sigma:g} rad across that line; in mm, of the {100 * LEFT_WRONG:g}% that neighbours leave"
     )
+    for direction in rig.fringe_directions:
+        whole_px = rig.periods_in_range(direction) * rig.pitch(direction)
+        print(
+            f"one fringe      {direction}: from {whole_px:.1f} px on, the range has one period at most, and the order "
+            "needs no brightness"
+        )
     names = (
         "projector px",
         "degrees",

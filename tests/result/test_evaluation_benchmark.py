@@ -207,7 +207,7 @@ def test_the_schema_describes_the_key(named, tmp_path, capsys):
 
     assert main(["schema"]) == 0
     schema = json.loads(capsys.readouterr().out)
-    assert "3.0.0" in schema["title"] and set(schema["$defs"]["BenchmarkInfo"]["required"]) == {"name", "version"}
+    assert "4.0.0" in schema["title"] and set(schema["$defs"]["BenchmarkInfo"]["required"]) == {"name", "version"}
     content = json.loads(result_file(named, tmp_path).read_text())
     jsonschema.validate(content, schema)
     del content["dataset"]["benchmark"]
