@@ -256,7 +256,7 @@ def readme_block(groups: Sequence[Group]) -> str:
         f"Time: median latency of one image on {' or '.join(machines) or 'an unknown machine'}.",
         "Phase reliance: 1 if the depth follows the fringe's phase and nothing else, 0 if it does not follow it; then "
         "without errors of whole periods. It does not see a bias.",
-        "Disturbed: object MAE over disturbed scenes.",
+        "Disturbed: two-sided MAE over disturbed scenes.",
     ]
     reported = [f"\\{NOT_CHECKED}: reported by the row's author."] if any(not r.entry.all_checked for r in rows) else []
     text = " ".join(notes + reported)
@@ -301,10 +301,16 @@ def of_set(name: SetName, results: Sequence[Result]) -> list[Row]:
     return sorted(found, key=lambda row: (row[1].mae_mm, row[0]))
 
 
+def held_out() -> list[str]:
+    """The axes that no training of today draws."""
+    return [name for name, axis in corruptions().axes.items() if axis.held_out]
+
+
 def robustness_tables(rows: Sequence[Row]) -> str:
     """Both tables in Markdown: means over all axes, then each axis by itself."""
     axes = [axis for axis in corruptions().axes if any(axis in block.axes | block.beside for _, block in rows)]
-    overall, by_axis = Table(TITLES[0], numbers=TITLES[1:]), Table("method", numbers=axes)
+    titles = [*TITLES[1:5], *held_out(), *TITLES[5:]]
+    overall, by_axis = Table(TITLES[0], numbers=titles), Table("method", numbers=axes)
     for name, block in rows:
         low, high = block.interval
         interval = "-" if low is None or high is None else f"{low:.1f} to {high:.1f}"
@@ -312,13 +318,25 @@ def robustness_tables(rows: Sequence[Row]) -> str:
         numbers = [f"{block.mae_mm:.1f}", interval, f"{block.clean.mae_mm:.1f}", ratio]
         mask = [percent(block.mean(key), 2) for key in ("unanswered_share", "invented_share")]
         answered = millimetres(block.mean("answered_mae_mm"))
-        overall.add_row(name, *numbers, *mask, answered, *(percent(block.mean(key)) for key in SCORES))
-        means = []
-        for axis in axes:
-            errors = [scores.mae_mm for scores in (block.axes | block.beside).get(axis, [])]
-            means.append(f"{sum(errors) / len(errors):.1f}, {errors[-1]:.1f}" if errors else "")
-        by_axis.add_row(name, *means)
-    between = ["", "By axis, mean over the five severities and the last one, mm:", ""]
+        errors = {axis: [one.mae_mm for one in found] for axis, found in (block.axes | block.beside).items()}
+        marks = {axis: "*" if axis in block.drawn else "" for axis in errors}
+        apart = [f"{sum(errors[axis]) / 5:.1f}{marks[axis]}" if axis in errors else "" for axis in held_out()]
+        overall.add_row(name, *numbers, *apart, *mask, answered, *(percent(block.mean(key)) for key in SCORES))
+        by_axis.add_row(
+            name,
+            *(
+                f"{sum(errors[axis]) / 5:.1f}, {errors[axis][-1]:.1f}{marks[axis]}" if axis in errors else ""
+                for axis in axes
+            ),
+        )
+    between = [
+        "",
+        f"Not in the mean: {', '.join(name for name, axis in corruptions().axes.items() if axis.beside)}. "
+        "\\*: the lights that the method learned from disturb this too.",
+        "",
+        "By axis, mean over the five severities and the last one, mm:",
+        "",
+    ]
     return "\n".join([*overall.markdown(), *between, *by_axis.markdown()]) + "\n"
 
 

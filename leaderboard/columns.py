@@ -147,7 +147,7 @@ def order_free(entry: Entry) -> str:
 
 
 def robustness(entry: Entry) -> str:
-    """Mean error over the disturbed scenes of the test set, mm with one decimal."""
+    """Mean two-sided MAE over the disturbed scenes of the test set, mm with one decimal."""
     block = (entry.row.robustness or {}).get("test")
     return NOT_MEASURED if block is None else _measured(entry, block.mae_mm, 1)
 

@@ -13,7 +13,6 @@ from urllib.parse import urlsplit
 from huggingface_hub import EvalResultEntry, eval_result_entries_to_yaml
 
 from fpp_ml_bench import __version__
-from fpp_ml_bench.baselines.tradeoff.measure import shipped_tradeoff
 from fpp_ml_bench.constants import CONFIGS
 from fpp_ml_bench.errors import PublishError
 from fpp_ml_bench.evaluation.protocol import Track
@@ -138,8 +137,7 @@ def stage_page(results: Sequence[Path], repo: str, folder: Path, dataset_repo: s
     Space's README into ``folder``; ``dataset_repo`` is linked from it. Nothing is looked for in the current folder.
     Raises SubmissionError for a file that is no sound result."""
     rows = expand(results) if results else shipped_rows()
-    settings = None if results else shipped_tradeoff()
-    write_page(rank(read_entries(rows)), chosen_tables(None), folder, settings)
+    write_page(rank(read_entries(rows)), chosen_tables(None), folder)
     head: dict[str, Any] = {
         "title": "FPP-ML-Bench leaderboard",
         "emoji": "📐",

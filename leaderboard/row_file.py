@@ -23,6 +23,7 @@ from fpp_ml_bench.evaluation.protocol import FramesClass, Mode, Target, Track
 from fpp_ml_bench.evaluation.result.file import result_json, write_file
 from fpp_ml_bench.evaluation.result.model import Result, check_charge, check_data, check_reliance
 from fpp_ml_bench.evaluation.result.parts import (
+    AxesVersion,
     Charge,
     DatasetInfo,
     HardwareInfo,
@@ -112,13 +113,16 @@ class RowUncertainty(StrictModel):
 
 
 class RowRobustness(StrictModel):
-    """`Robustness` in brief: ``clean_mae_mm`` is that of the undisturbed scene, ``axes`` are means over severities."""
+    """`Robustness` in brief: ``clean_mae_mm`` is that of the undisturbed scene, ``axes`` and ``beside`` are means over
+    severities."""
 
-    version: Whole
+    version: AxesVersion
     mae_mm: NonNegative
     interval: Interval
     clean_mae_mm: NonNegative
     axes: Annotated[dict[Text, NonNegative], Field(min_length=1)]
+    beside: dict[Text, NonNegative]
+    drawn: list[Text]
     samples: Whole
     objects: Whole
     size_px: Whole
@@ -383,8 +387,11 @@ def in_brief(block: Reliance | Robustness) -> dict[str, Any]:
     """What a row holds of a block: a reliance in four digits, of a robustness the content of a `RowRobustness`."""
     content = block.model_dump(mode="json")
     if isinstance(block, Robustness):
-        axes = {name: fmean(scores.mae_mm for scores in axis) for name, axis in block.axes.items()}
-        content |= {"clean_mae_mm": block.clean.mae_mm, "axes": axes}
+        axes, beside = (
+            {name: fmean(scores.mae_mm for scores in axis) for name, axis in part.items()}
+            for part in (block.axes, block.beside)
+        )
+        content |= {"clean_mae_mm": block.clean.mae_mm, "axes": axes, "beside": beside}
         content = {key: content[key] for key in RowRobustness.model_fields}
     return rounded(content, DIGITS if isinstance(block, Robustness) else 4)  # type: ignore[no-any-return]
 

@@ -20,7 +20,8 @@ from fpp_ml_bench.evaluation.protocol import PROTOCOL_VERSION
 from fpp_ml_bench.evaluation.result.file import parse_result, read_json, write_result
 from fpp_ml_bench.evaluation.result.model import Result, disagreements
 from fpp_ml_bench.evaluation.result.parts import Reliance, Robustness
-from fpp_ml_bench.evaluation.score.evaluator import difference_lines, evaluate
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.evaluation.score.verification import Verified, difference_lines, of_processors
 from fpp_ml_bench.files import file_content, printable
 from fpp_ml_bench.leaderboard.row_file import (
     DIGITS,
@@ -69,7 +70,6 @@ _NOT_COMPARED: Any = {
     "submission": {"seconds_per_sample", "seconds_source", "hardware", "timing", "software"},
     "dataset": {"name"},
 }
-_NOT_IN_OLDER_ROWS = ("sure_mae_mm", "sure_rmse_mm")
 
 
 @dataclass(frozen=True)
@@ -198,19 +198,15 @@ def vouching_line(row: Row, data: bytes, word: str, command: str) -> str:
     return " | ".join((sha256(data).hexdigest(), word, row.git or 40 * "0", machine, command))
 
 
-def differences(row: Row, folder: Path, dataset: DatasetFolder) -> list[str]:
-    """What of ``row`` does not follow from the predictions in ``folder`` on ``dataset``, a line for each difference.
-    Everything is scored again; means may differ by what their digits leave open, and by 1e-9. Raises what `evaluate`
-    raises."""
+def differences(row: Row, folder: Path, dataset: DatasetFolder) -> Verified:
+    """What of ``row`` does not follow from the predictions in ``folder`` on ``dataset``. Everything is scored again;
+    means may differ by what their digits leave open, and by 1e-9. Raises what `evaluate` raises."""
     scored = evaluate(folder, dataset, row.dataset.split, row.target, row.edge_band_px, row.mode)
     rows = row, Row.model_validate(row_content(scored, digits=None))
     stored, computed = (each.model_dump(mode="json", exclude=_NOT_COMPARED) for each in rows)
-    for key, value in (stored.get("uncertainty") or {}).items():
-        if value is None and key in _NOT_IN_OLDER_ROWS:
-            computed["uncertainty"][key] = None
     cancelling = 1e-9 * (row.metrics.object_mae_mm or 0.0)
-    found = disagreements(stored, computed, cancelling=cancelling, digits=DIGITS)
-    return difference_lines(found, "row")
+    found = list(disagreements(stored, computed, cancelling=cancelling, digits=DIGITS))
+    return Verified(difference_lines(found, "row"), of_processors(found, dataset.rig.working_range_mm[1]))
 
 
 def not_checked(about: Row | Result) -> list[str]:

@@ -29,6 +29,7 @@ from fpp_ml_bench.baselines.learned.inputs import PHASE_CHANNELS
 from fpp_ml_bench.baselines.learned.network import PhaseNet, load_net, mask_loss, mean_over, scale_loss
 from fpp_ml_bench.baselines.learned.odds import Answers, decided_mask
 from fpp_ml_bench.baselines.learned.scenes import (
+    HELD_OUT,
     View,
     fingerprint_of,
     groups_of,
@@ -156,7 +157,8 @@ class StepRecipe(ABC):
         return self.rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(progress, 1.0))))
 
     def to_dict(self) -> dict[str, Any]:
-        return json.loads(json.dumps(asdict(self)))
+        """All settings, and what the drawn lights leave alone."""
+        return json.loads(json.dumps(asdict(self) | {"held_out": HELD_OUT}))
 
     @property
     def digest(self) -> str:

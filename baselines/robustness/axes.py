@@ -1,13 +1,13 @@
 """The rules of FPP-C: the axes, each of which changes one stage of the image formation at five severities
-(``axes.yaml``), the disturbed views, and the scores: errors with a fixed charge for a pixel without an answer, and how
-honest the stated uncertainty is.
+(``axes.yaml``), the disturbed views, and the scores: the protocol's two-sided MAE, and how honest the stated
+uncertainty is.
 
 Of a view only the frames that a method uses are rendered, and kept in a cache: a folder for each condition with a file
 for each frame, which depends on nothing but the condition and the view, so methods share it. The folders that were used
 longest ago go where it would grow beyond its limit.
 
-Scored are the object pixels of the undisturbed scene that are not void, against its exact depth. A pixel without an
-answer is charged half an order, so that "I don't know" is better than a wrong order and worse than a right one.
+Scored are the object pixels of the undisturbed scene that are not void, against its exact depth, and what is answered
+beside the object.
 
 After Hendrycks and Dietterich 2019, Benchmarking Neural Network Robustness to Common Corruptions and Perturbations; but
 every corruption is caused in the scene, not painted on the image.
@@ -61,7 +61,8 @@ class Axis(StrictModel):
     """One corruption: ``key`` of the light's ``stage`` (the light itself with none) takes the values ``severities``,
     in ``unit``, and ``also`` holds what else the stage needs. ``electrons``: the values are grey levels, the key wants
     electrons. ``several_frames``: it does nothing to one frame. ``objects``: only these are disturbed by it.
-    ``beside``: it does not count in the mean over axes."""
+    ``beside``: it does not count in the mean over axes. ``drawn``: trainings draw it, unless their recipe holds it out;
+    ``held_out``: those of today do."""
 
     unit: Text
     stage: Literal["", "projector", "surface", "bounces", "camera"] = ""
@@ -72,6 +73,8 @@ class Axis(StrictModel):
     several_frames: bool = False
     objects: list[str] = Field(default_factory=list)
     beside: bool = False
+    drawn: bool = False
+    held_out: bool = False
 
     def light(self, clean: Light, severity: int) -> Light:
         """The light at a severity from 0, which is ``clean`` itself, to 5."""
@@ -92,14 +95,12 @@ class Axis(StrictModel):
 
 
 class Corruptions(StrictModel):
-    """``axes.yaml``. ``views`` of each object of a set are measured. A pixel without an answer is charged
-    ``unanswered_mm``; an error above ``wrong_order_mm`` is a wrong order, and a confident one where the stated sigma is
-    below ``confident_below`` of it."""
+    """``axes.yaml``. ``views`` of each object of a set are measured. An error above ``wrong_order_mm`` is a wrong
+    order, and a confident one where the stated sigma is below ``confident_below`` of it."""
 
     version: Annotated[int, Field(ge=1)]
     light: Text
     views: dict[SetName, Annotated[list[Text], Field(min_length=1)]]
-    unanswered_mm: Above0
     wrong_order_mm: Above0
     confident_below: Share
     axes: dict[str, Axis]
@@ -254,11 +255,16 @@ def _save(file: Path | None, array: NDArray) -> None:
 
 
 def score(
-    depth_mm: NDArray[np.floating], sigma_mm: NDArray[np.floating] | None, truth: Truth, rules: Corruptions
+    depth_mm: NDArray[np.floating],
+    sigma_mm: NDArray[np.floating] | None,
+    truth: Truth,
+    rules: Corruptions,
+    charge_mm: float,
 ) -> Scores:
     """`SCORES` of a prediction (H, W) in mm, 0 or less without an answer (a network may go below 0), whose standard
-    uncertainty is ``sigma_mm`` (H, W), above 0 where it is stated. Raises PredictionError for a depth that is not
-    finite, a sigma that is not finite or below 0, and for another size."""
+    uncertainty is ``sigma_mm`` (H, W), above 0 where it is stated; ``charge_mm`` is what a missed or invented pixel
+    costs. Raises PredictionError for a depth that is not finite, a sigma that is not finite or below 0, and for another
+    size."""
     for name, values in (("depth", depth_mm), ("sigma", sigma_mm)):
         if values is None:
             continue
@@ -273,12 +279,12 @@ def score(
     answered = given > 0
     error = np.abs(given - target)
     wrong = answered & (error > rules.wrong_order_mm)
+    invented_share = np.count_nonzero(truth.empty & (depth_mm > 0)) / target.size
     scores: Scores = {
-        "mae_mm": float(np.where(answered, error, rules.unanswered_mm).mean()),
-        "protocol_mae_mm": float(error.mean()),
+        "mae_mm": float(np.where(answered, error, charge_mm).mean()) + charge_mm * invented_share,
         "wrong_share": float(wrong.mean()),
         "unanswered_share": float((~answered).mean()),
-        "invented_share": float((truth.empty & (depth_mm > 0)).mean()),
+        "invented_share": invented_share,
         "answered_mae_mm": float(error[answered].mean()) if answered.any() else None,
         **dict.fromkeys(("confident_share", "coverage", "sure_mae_mm", "sure_rmse_mm")),
     }
@@ -287,7 +293,7 @@ def score(
         stated = states_sigma(given, sigma)
         scores["confident_share"] = float((wrong & stated & (sigma < rules.confident_below * error)).mean())
         scores["coverage"] = float(stated.mean())
-        stated_scores = score_sigma(given, target, sigma)
+        stated_scores = score_sigma(depth_mm, truth.depth_mm, sigma_mm, ~(truth.scored | truth.empty), charge_mm)
         scores |= {f"sure_{name}": stated_scores.sure_mm(name) for name in ("mae_mm", "rmse_mm")}
     return scores
 

@@ -80,6 +80,14 @@ class Setup:
         rig = self.method.scenes_rig(self.method.settings)
         return [Condition(axis, severity, objects, self.size, rig) for severity in severities]
 
+    @property
+    def drawn(self) -> list[str]:
+        """The axes that the lights which the method learned from disturbed too."""
+        recipe = getattr(self.method.weights_config, "recipe", {})
+        held_out = recipe.get("held_out", ())
+        axes = corruptions().axes.items() if recipe.get("lights") else ()
+        return [name for name, axis in axes if axis.drawn and name not in held_out]
+
     def key(self) -> dict[str, Any]:
         """What must be equal for two measurements to be parts of one."""
         return {
@@ -92,6 +100,7 @@ class Setup:
             "title": self.method.title,
             "frames_used": list(self.method.frames_used),
             "settings": self.method.settings_of_depth,
+            "drawn": self.drawn,
         }
 
 
@@ -137,7 +146,7 @@ def measure(
 def _measure_object(work: Work, condition: Condition, name: str) -> list[View]:
     """The rows of an object's views in a condition, in a worker process."""
     method, clean, cache, views = work
-    rules, rows = corruptions(), []
+    rules, charge_mm, rows = corruptions(), clean.settings.rig.half_range_mm, []
     for view in views:
         frames, truth = cache.frames(condition, name, view, method.frames_used), cache.truth(clean, name, view)
         if method.uses_ground_truth_mask:
@@ -146,7 +155,7 @@ def _measure_object(work: Work, condition: Condition, name: str) -> list[View]:
         answer = method.answer(frames)
         seconds = perf_counter() - started
         checked(answer, truth.depth_mm.shape, method.title)
-        scores = score(answer.depth, answer.sigma_mm, truth, rules)
+        scores = score(answer.depth, answer.sigma_mm, truth, rules, charge_mm)
         place = {"sample": sample_name(name, view), "object": name, "severity": condition.severity}
         rows.append({**place, "seconds": round(seconds, 4), **scores})
     return rows
@@ -196,6 +205,7 @@ def robustness(setup: Setup, rows: Mapping[str, Sequence[View]]) -> Robustness:
         clean=clean,
         axes=axes,
         beside=beside,
+        drawn=setup.drawn,
         samples=len(rows[CLEAN]),
         objects=len({row["object"] for row in rows[CLEAN]}),
         size_px=setup.size,
@@ -280,8 +290,6 @@ def draw_curves(measured: Sequence[Measured]) -> bytes:
             errors = np.array([scores.get("mae_mm") for scores in points.values()], dtype=float)
             colour = LINE_COLOURS[number % len(LINE_COLOURS)]
             panel.plot(list(points), errors, style, color=colour, label=label, **LINE)
-        charge = [rules.unanswered_mm] * 6
-        panel.plot(range(6), charge, ":", color="0.6", label="charge for no answer", **LINE)
         panel.set(xticks=range(6), xticklabels=["clean", *(f"{value:g}" for value in axis.severities)])
-        panel.set(yscale="log", ylim=(0.1, 1000), ylabel="object MAE, mm")
+        panel.set(yscale="log", ylim=(0.1, 1000), ylabel="two-sided MAE, mm")
     return with_legend(drawn, 3)

@@ -140,12 +140,6 @@ def read_tradeoff(path: Path) -> Tradeoff:
     return validate(Tradeoff, content, path, "file of this version's fpp-bench tradeoff (measure into another --out)")
 
 
-def shipped_tradeoff() -> Tradeoff | None:
-    """The trade-off that ships with the package and is shown on the leaderboard's page; None where none does."""
-    path = Path(__file__).with_name(TRADEOFF_FILE)
-    return read_tradeoff(path) if path.is_file() else None
-
-
 @dataclass
 class Plan:
     """The ``points`` to measure, still without numbers, on ``views`` of a dataset, and where the results go.

@@ -106,12 +106,13 @@ class Mark:
 
 @dataclass(frozen=True)
 class Scatter:
-    """``marks`` over a cost whose axis is titled ``across``. They get labels as far as there is room, those of the
-    front first: their ``names``, or else their numbers."""
+    """``marks`` of errors titled ``up`` over a cost whose axis is titled ``across``. They get labels as far as there is
+    room, those of the front first: their ``names``, or else their numbers."""
 
     marks: Sequence[Mark]
     across: str
     names: bool = True
+    up: str = "object MAE, mm"
 
     @property
     def front(self) -> list[Mark]:
@@ -121,7 +122,7 @@ class Scatter:
 
     def draw(self, axes: Axes) -> list[Mark]:
         """Draw into ``axes``, whose place in the figure is fixed. Returns the marks that are shown by a number."""
-        axes.set(xlabel=self.across, ylabel="object MAE, mm", xscale="log", yscale="log")
+        axes.set(xlabel=self.across, ylabel=self.up, xscale="log", yscale="log")
         left, right = axes.set_xlim(_ends([end for m in self.marks for end in (m.x, *(m.x_span or ()))]))
         bottom, top = axes.set_ylim(_ends([end for m in self.marks for end in (m.y, *(m.y_span or ()))]))
         _round_numbers(axes)

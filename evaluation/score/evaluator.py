@@ -43,7 +43,6 @@ from fpp_ml_bench.evaluation.score.check import (
 )
 from fpp_ml_bench.evaluation.score.sample_scores import SampleScores, SigmaSample, score_sample, score_sigma
 from fpp_ml_bench.evaluation.submission.prediction_files import (
-    SUBMISSION_FILE,
     Listing,
     MapAndHash,
     list_folder,
@@ -397,64 +396,6 @@ def score_arrays(
     pair = in_mm(prediction, declared), target_mm
     stated = None if sigma is None else score_sigma(*pair, in_mm(sigma, declared), void, charge_mm)
     return score_sample(*pair, edge_band_px, void, charge_mm=charge_mm), stated
-
-
-_COMPARED: dict[str, Any] = {
-    "dataset": {"size", "samples", "content", "code"},
-    **dict.fromkeys(("frames_class", "edge_jump_mm", "submission", "per_sample"), True),
-    "uncertainty": {"reliability", "sparsification", "per_sample"},
-}
-"""What of a result is compared; the rest follows from it, or is its time and place."""
-_RUN_TIME = {"submission": {"seconds_per_sample", "seconds_source", "hardware", "timing"}}
-"""`fpp-bench time` may write these into a result later; run times can't be recomputed from predictions."""
-
-
-def differences(scored: Result, folder: Path, dataset: DatasetFolder) -> list[str]:
-    """What of a result does not follow from the predictions in ``folder`` on ``dataset``, a line for each difference.
-    Everything is scored again. Time and place of scoring and the method's run time are not compared. Raises what
-    `evaluate` raises, and SubmissionError for a result of another protocol version, which this one can't recompute."""
-    if scored.protocol_version != protocol.PROTOCOL_VERSION:
-        raise SubmissionError(
-            f"the result was scored by protocol {scored.protocol_version}, this is {protocol.PROTOCOL_VERSION}; verify "
-            "it with the version of fpp-ml-bench that its environment names, or score the predictions again"
-        )
-    here = printable(str(dataset.path), 200)
-    for key, digest in scored.dataset.content.items():
-        if dataset.content.get(key) != digest:
-            scored_on = f"{digest} of {_value_text(scored.dataset.identity)} in the result"
-            return [f"dataset.content.{key}: {scored_on}, {dataset.content.get(key, 'none')} is what {here} has"]
-    again = evaluate(folder, dataset, scored.dataset.split, scored.target, scored.edge_band_px, scored.mode)
-    from fpp_ml_bench.evaluation.result.model import disagreements
-
-    stored, computed = (result.model_dump(include=_COMPARED, exclude=_RUN_TIME) for result in (scored, again))
-    rows, again_rows = ({row["sample"]: row for row in part.pop("per_sample")} for part in (stored, computed))
-    block, again_block = (part.pop("uncertainty", None) for part in (stored, computed))
-    found = list(disagreements(stored, computed))
-    if rows.keys() != again_rows.keys():
-        return [*difference_lines(found), "per_sample: other samples than the split has"]
-    for sample, row in again_rows.items():
-        differing = disagreements(rows[sample], row, cancelling=1e-9 * (row["object_mae_mm"] or 0.0))
-        # Other predictions explain all the rest.
-        first = sorted(differing, key=lambda difference: difference[0] != "prediction_sha256")
-        found += [(f"{sample}: {name}", *pair) for name, *pair in first]
-    if (block is None) != (again_block is None):
-        said = ["there is none" if part is None else "there is one" for part in (block, again_block)]
-        return [*difference_lines(found), f"uncertainty: {said[0]} in the result, {said[1]} recomputed"]
-    found += disagreements(block, again_block, "uncertainty", rounding=1e-12)  # nll is near 0
-    return difference_lines(found)
-
-
-def difference_lines(found: Iterable[tuple[str, Any, Any]], file: str = "result") -> list[str]:
-    """The `disagreements` of a ``file``, a line each."""
-    return [
-        f"{name}: {_value_text(stored)} in the {file}, {_value_text(value)} "
-        + (f"in {SUBMISSION_FILE}" if name.startswith("submission.") else "recomputed")
-        for name, stored, value in found
-    ]
-
-
-def _value_text(value: object) -> str:
-    return printable(value if isinstance(value, str) else repr(value), 80)
 
 
 def explain_eval(dataset: DatasetFolder, split: str, target: str) -> Explanation:

@@ -249,22 +249,32 @@ def verify(
     predictions: Path = argument("the predictions it was made from", "PREDICTIONS"),
     dataset: Path = argument("folder of the dataset", "DATASET"),
 ) -> int:
-    """Score the predictions again and say whether the result or row is verified (exit status 0) or not (1).
+    """Score the predictions again and say whether the result or row is verified, or the same within what processors
+    change (exit status 0), or not the same (1).
 
     Raises FppBenchError where nothing can be recomputed at all."""
     from fpp_ml_bench.evaluation.result.model import Result
-    from fpp_ml_bench.evaluation.score.evaluator import differences as result_differences
+    from fpp_ml_bench.evaluation.score import verification
     from fpp_ml_bench.leaderboard import rows
     from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
     scored, opened = rows.read_scored(file), DatasetFolder(dataset)
-    differences = result_differences if isinstance(scored, Result) else rows.differences
-    problems, shown = differences(scored, predictions, opened), printable(str(file), 500)  # type: ignore[arg-type]
+    differences = verification.differences if isinstance(scored, Result) else rows.differences
+    found, shown = differences(scored, predictions, opened), printable(str(file), 500)  # type: ignore[arg-type]
+    problems, samples = found.lines, scored.dataset.samples
     unchecked = f"not checked: {', '.join(rows.not_checked(scored))}: predictions don't tell them"
     if not problems:
-        print(f"verified: {shown} is what {scored.dataset.samples} predictions give\n{unchecked}")
+        print(f"verified: {shown} is what {samples} predictions give\n{unchecked}")
         return OK
-    print(f"not verified: {shown} differs from what the predictions give in {len(problems)} places")
+    if found.processors:
+        print(
+            f"the same within what processors change: {shown} and what {samples} predictions give. These are other "
+            f"predictions, but each error differs by at most {verification.PROCESSOR_ERROR:.1%} and what "
+            f"{verification.PROCESSOR_PIXELS:.2%} of the pixels can make, and their means by what "
+            f"{verification.PROCESSOR_MEAN_PIXELS:.3%} can\n{unchecked}"
+        )
+        return OK
+    print(f"not the same: {shown} differs from what the predictions give in {len(problems)} places")
     for line in problems[:LISTED]:
         print(f"  {line}")
     if len(problems) > LISTED:

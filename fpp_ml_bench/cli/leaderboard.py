@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-from fpp_ml_bench.baselines.tradeoff.measure import read_tradeoff, shipped_tradeoff
 from fpp_ml_bench.cli.console import show
 from fpp_ml_bench.cli.evaluate import scored_data
 from fpp_ml_bench.cli.options import command
@@ -69,12 +68,6 @@ def rank(
         "DIR",
         flag="--page",
     ),
-    measured: Path | None = option(
-        None,
-        "with --page: the tradeoff.json to show on it (default, for the shipped rows: the file that ships)",
-        "FILE",
-        flag="--tradeoff",
-    ),
     predictions: tuple[Path, ...] = option(
         (),
         "with --page: a folder of predictions that a named result was scored from; the row's own page then shows the "
@@ -96,8 +89,6 @@ def rank(
     Raises SubmissionError naming a file that is not valid."""
     if predictions and out is None:
         raise SubmissionError("--predictions adds pictures to a page; give it with --page DIR")
-    if measured is not None and out is None:
-        raise SubmissionError("--tradeoff adds settings to a page; give it with --page DIR")
     if out is not None and sort != RANK_KEY:
         raise SubmissionError(f"--page is by {RANK_KEY}, and a click sorts it otherwise; leave out --sort")
     if row_file is not None:
@@ -118,10 +109,8 @@ def rank(
     if csv is not None:
         write_file(table_csv(groups).encode("utf-8"), csv)
     if out is not None:
-        shipped = None if results else shipped_tradeoff()
-        settings = shipped if measured is None else read_tradeoff(measured)
         sources = [(folder, scored_data(folder, None, None)[0]) for folder in predictions]
-        written = write_page(groups, papers, out, settings, predicted_samples(entries, sources))
+        written = write_page(groups, papers, out, predicted_samples(entries, sources))
         print(f"{out}: {len(written)} files; open {written[0]}")
         return
     not_shown = len(papers) if results and paper is None else 0

@@ -15,8 +15,7 @@ from string import ascii_lowercase
 from types import MappingProxyType
 from typing import Any
 
-from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, Tradeoff
-from fpp_ml_bench.baselines.tradeoff.report import Mark, Scatter, growth_table, point_table, scatter
+from fpp_ml_bench.baselines.tradeoff.report import Mark, Scatter
 from fpp_ml_bench.errors import CaptureError, DatasetError, FppBenchError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.metrics import METRICS, RANGE_KEY, RANKED, with_column
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES
@@ -47,7 +46,6 @@ _HERE, _PACKAGE = Path(__file__).resolve().parent, "fpp_ml_bench.leaderboard.pag
 _OWN_PAGES = re.compile(r"[a-z0-9-]+-[0-9a-f]{12}(-cloud)?\.html")
 NOT_SAID = "not said"
 _SPARSE = (*columns.PARTS, columns.RATIO, columns.RANGE, *columns.UNCERTAINTY, columns.LEARNED)
-_TRADEOFF_PICTURE = 430, 380
 _SHADES = 6
 _CLIP, _MARGIN = 10, 1.05
 """An interval is drawn down to this part of its mean, and the scale goes on beyond its ends by this factor."""
@@ -78,13 +76,12 @@ def write_page(
     groups: Sequence[Group],
     papers: Sequence[ReportedTable],
     out: Path,
-    tradeoff: Tradeoff | None = None,
     samples: Mapping[str, Samples] = MappingProxyType({}),
 ) -> list[Path]:
-    """Write the page of ``groups`` (ranked by the key of each), the paper's tables and a trade-off into folder ``out``;
-    returns the files. ``samples``: `predicted_samples` of the rows. Removes pages of submissions that are no
-    longer ranked, and nothing else. SubmissionError where a file can't be written."""
-    files = page_files(groups, papers, tradeoff, samples)
+    """Write the page of ``groups`` (ranked by the key of each) and the paper's tables into folder ``out``; returns the
+    files. ``samples``: `predicted_samples` of the rows. Removes pages of submissions that are no longer ranked, and
+    nothing else. SubmissionError where a file can't be written."""
+    files = page_files(groups, papers, samples)
     try:
         with exclusive(out / LOCK_FILE, out, "writing a page there", SubmissionError):
             (out / SUBMISSIONS).mkdir(exist_ok=True)
@@ -101,7 +98,6 @@ def write_page(
 def page_files(
     groups: Sequence[Group],
     papers: Sequence[ReportedTable],
-    run: Tradeoff | None = None,
     samples: Mapping[str, Samples] = MappingProxyType({}),
 ) -> dict[str, bytes]:
     """Relative name -> content of every file of the page. Tables of trivial rows alone are in the data files only."""
@@ -133,7 +129,6 @@ def page_files(
         search=_search,
         slug=slug,
         blocks=blocks(groups),
-        tradeoff=tradeoff_section(run),
         provenances=[name for name in MEANING if name in present],
         colours=CLASS_COLOURS,
         not_said=NOT_SAID,
@@ -328,22 +323,6 @@ def _matrix(group: Group) -> list[tuple[str, list[tuple[str, str, str] | None]]]
     return [(name, [cells.get((name, other)) for other in names]) for name in names]
 
 
-def tradeoff_section(run: Tradeoff | None) -> dict[str, Any] | None:
-    """The section of a trade-off; None without one, or where no point is on a front."""
-    if run is None or not run.front("seconds"):
-        return None
-    pictures = []
-    for cost in COST_KEYS:
-        if picture := scatter(run, cost):
-            about = f"Object MAE in mm against {picture.across}, both logarithmic"
-            svg, numbered = picture.svg(*_TRADEOFF_PICTURE, "scatter", about)
-            pictures.append({"svg": svg, "numbered": sorted((mark.number, mark.name) for mark in numbered)})
-    return {
-        "pictures": pictures,
-        "tables": [point_table(run), growth_table(run)],
-    }
-
-
 def _shade(error: float | None, low: float, high: float) -> int | None:
     """The larger the error among those of a table, whose logarithms are ``low`` to ``high``, the darker its cell."""
     if error is None:
@@ -358,7 +337,13 @@ def overview(groups: Sequence[Group], cost: str) -> Scatter | None:
     rows = [(group, row) for group in groups for row in group.rows]
     drawn = [_mark(number, group, row, cost) for number, (group, row) in enumerate(rows, start=1)]
     marks = [mark for mark in drawn if mark is not None]
-    return Scatter(marks, COSTS[cost], names=len(marks) <= _MOST_NAMES) if marks else None
+    return Scatter(marks, COSTS[cost], len(marks) <= _MOST_NAMES, ranked_by(groups)) if marks else None
+
+
+def ranked_by(groups: Sequence[Group]) -> str:
+    """What the rows of ``groups`` are ranked by, as the title of an axis."""
+    titles = dict.fromkeys(METRICS[group.key.rank_key].title for group in groups)
+    return f"{' or '.join(titles)}, mm"
 
 
 def _mark(number: int, group: Group, row: Ranked, cost: str) -> Mark | None:
@@ -396,7 +381,7 @@ def overview_figures(groups: Sequence[Group]) -> list[dict[str, Any]]:
         if (picture := overview(groups, cost)) is None:
             continue
         front = [mark.name for mark in picture.front]
-        about = f"Object MAE in mm against {across}, both logarithmic. On the front, cheapest first: {', '.join(front)}"
+        about = f"{picture.up} against {across}, both logarithmic. On the front, cheapest first: {', '.join(front)}"
         about += f". {groups[0].key.data_title}"
         sizes = [picture.svg(width, height, f"{css} scatter", about)[0] for css, width, height in SIZES]
         figures.append({"cost": cost, "pictures": sizes, "front": front})

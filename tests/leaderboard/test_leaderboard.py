@@ -252,7 +252,7 @@ def test_unsound_files_are_refused_by_name(make, capsys, tmp_path):
         (whole.replace('"object_mae_mm": 2.0', '"object_mae_mm": NaN', 1), "NaN"),
         (whole.replace('"object_mae_mm": 2.0', '"object_mae_mm": -2.0', 1), "greater than or equal to 0"),
         (whole.replace('"object_mae_mm": 2.0', '"object_mae_mm": 1.0', 1), "does not follow"),
-        (whole.replace('"schema_version": "3.0.0"', '"schema_version": "7"'), "schema_version 7"),
+        (whole.replace('"schema_version": "4.0.0"', '"schema_version": "7"'), "schema_version 7"),
         ("{}", "no schema_version"),
     ):
         bad.write_text(text)

@@ -18,7 +18,8 @@ from fpp_ml_bench.cli import main
 from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.errors import DatasetError, PredictionError, PublishError
 from fpp_ml_bench.evaluation.result.file import read_result, result_json, write_result
-from fpp_ml_bench.evaluation.score.evaluator import differences, evaluate
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.evaluation.score.verification import differences
 from fpp_ml_bench.evaluation.submission.description import Submission, read_submission
 from fpp_ml_bench.leaderboard.publish import task_of
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
@@ -231,7 +232,7 @@ def test_a_given_mask_is_never_ranked_with_honest_rows(dataset, tmp_path, capsys
                 **({"uses_ground_truth_mask": True} if given_mask else {}),
             )
             result = evaluate(folder, dataset)
-            assert not differences(result, folder, dataset)
+            assert not differences(result, folder, dataset).lines
             write_result(result, tmp_path / f"{name}.json")
             assert read_result(tmp_path / f"{name}.json") == result
             paths.append(tmp_path / f"{name}.json")
@@ -248,16 +249,16 @@ def test_a_given_mask_is_never_ranked_with_honest_rows(dataset, tmp_path, capsys
 def test_the_key_changes_no_file_without_it(dataset, tmp_path):
     folder = write_predictions(tmp_path / "p", dataset)
     result = evaluate(folder, dataset)
-    assert b"uses_ground_truth_mask" not in result_json(result) and result.schema_version == "3.0.0"
+    assert b"uses_ground_truth_mask" not in result_json(result) and result.schema_version == "4.0.0"
     # A result that hides the mask, and one that claims it, both differ from their predictions.
     masked = result.model_copy(
         update={"submission": Submission(**{**result.submission.model_dump(), "uses_ground_truth_mask": True})}
     )
     assert b'"uses_ground_truth_mask": true' in result_json(masked) and masked.track == "oracle mask"
-    assert differences(masked, folder, dataset) == [
+    assert differences(masked, folder, dataset).lines == [
         "submission.uses_ground_truth_mask: True in the result, None in submission.yaml"
     ]
     write_predictions(tmp_path / "p", dataset, uses_ground_truth_mask=True)
-    assert differences(result, folder, dataset) == [
+    assert differences(result, folder, dataset).lines == [
         "submission.uses_ground_truth_mask: None in the result, True in submission.yaml"
     ]

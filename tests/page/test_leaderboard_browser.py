@@ -10,7 +10,6 @@ from board_rows import entry_with_errors, named_benchmarks, some_rows, timing, w
 from chromium import Browser
 from scored_dataset import make_dataset
 
-from fpp_ml_bench.baselines.tradeoff.measure import COST_KEYS, shipped_tradeoff
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.submission.description import LearnedFrom
 from fpp_ml_bench.leaderboard import rows
@@ -298,9 +297,7 @@ def test_labels_of_the_shipped_pictures_are_apart_and_whole(browser, shipped_pag
     browser.run("document.querySelectorAll('details').forEach(part => part.open = true)")
     pictures = browser.run(_LABEL_BOXES)
     datasets = {group.key.data_title for group in more_than_trivial(rank(read_entries(shipped_rows())))}
-    tradeoff = 0 if shipped_tradeoff() is None else len(COST_KEYS)
-    # two of each dataset, and one of each cost of a trade-off that is shipped
-    assert len(pictures) == 2 * len(datasets) + tradeoff
+    assert len(pictures) == 2 * len(datasets)
     for picture in pictures:
         left, top, right, bottom = picture["frame"]
         boxes = picture["labels"]

@@ -3,10 +3,12 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from fpp_ml_bench.baselines.learned.scenes import HELD_OUT, drawn_light
 from fpp_ml_bench.baselines.method import Answer, Method
 from fpp_ml_bench.baselines.robustness import axes, run
 from fpp_ml_bench.baselines.robustness.axes import CLEAN, SETS, Condition, FrameCache, Truth, corruptions, score
@@ -22,6 +24,7 @@ from fpp_ml_bench.schema import validate
 SIZE, OBJECT = 176, "v_groove"
 ONE_FRAME = (0,)
 RULES = corruptions()
+CHARGE_MM = paper_rig(SIZE).half_range_mm
 
 
 @pytest.fixture(autouse=True)
@@ -62,7 +65,6 @@ def test_the_issues_severities_are_those_of_the_file():
     assert severities["under-exposure"] == [0.7, 0.5, 0.35, 0.25, 0.15]
     assert severities["motion"] == [0.1, 0.25, 0.5, 1, 2]
     assert len(severities) == 14 and [name for name, axis in RULES.axes.items() if axis.beside] == list(severities)[12:]
-    assert RULES.unanswered_mm == 150
     assert all(set(views) <= set(VIEWS) for views in corruptions.__wrapped__().views.values())
 
 
@@ -120,9 +122,29 @@ def truth() -> Truth:
     return Truth(depth, depth > 0, depth == 0)
 
 
-def test_silence_costs_half_an_order():
-    scores = score(np.zeros((SIZE, SIZE)), None, truth(), RULES)
-    assert scores["mae_mm"] == 150 and scores["protocol_mae_mm"] == 1700
+def test_two_axes_are_held_out_of_all_drawn_lights_and_the_rest_is_named():
+    assert tuple(name for name, axis in RULES.axes.items() if axis.held_out) == HELD_OUT
+    random = np.random.default_rng(0)
+    for light in (drawn_light(random) for _ in range(50)):
+        assert light.camera.blur_px == RULES.clean.camera.blur_px
+        assert light.surface.object_share == RULES.clean.surface.object_share
+    assert not RULES.axes["motion"].drawn and not RULES.axes["dark-paint"].drawn
+
+
+def test_what_a_training_drew_is_said_by_its_recipe():
+    class Learned(Noisy):
+        weights_config = SimpleNamespace(recipe={"lights": 30})
+
+    before = Setup(Learned(paper_rig(SIZE)), "test", SIZE).drawn
+    assert "camera-blur" in before and "dark-paint" not in before and "motion" not in before
+    Learned.weights_config.recipe["held_out"] = list(HELD_OUT)
+    assert Setup(Learned(paper_rig(SIZE)), "test", SIZE).drawn == [name for name in before if name != "camera-blur"]
+    assert Setup(Noisy(paper_rig(SIZE)), "test", SIZE).drawn == []
+
+
+def test_silence_costs_half_the_working_range():
+    scores = score(np.zeros((SIZE, SIZE)), None, truth(), RULES, CHARGE_MM)
+    assert scores["mae_mm"] == CHARGE_MM == 300
     assert scores["unanswered_share"] == 1 and scores["wrong_share"] == 0 and scores["coverage"] is None
 
 
@@ -131,30 +153,30 @@ def test_missed_invented_and_the_error_of_what_is_answered_are_told_apart():
     depth[20:30, 20:60] = 0  # a quarter of the object
     depth[~true.scored] = 0
     depth[:10] = 1500  # an eighth of the image
-    scores = score(depth, None, true, RULES)
+    scores = score(depth, None, true, RULES, CHARGE_MM)
     assert scores["unanswered_share"] == 0.25 and scores["answered_mae_mm"] == pytest.approx(3)
-    assert scores["invented_share"] == pytest.approx(10 / SIZE)
-    assert scores["mae_mm"] == pytest.approx(0.25 * 150 + 0.75 * 3)
+    assert scores["invented_share"] == pytest.approx(10 * SIZE / 40**2)
+    assert scores["mae_mm"] == pytest.approx((0.25 + 10 * SIZE / 40**2) * CHARGE_MM + 0.75 * 3)
 
 
-def test_a_right_answer_is_better_than_silence_and_silence_than_a_wrong_order():
-    right, wrong = truth().depth_mm + 3, truth().depth_mm + 300
-    assert score(right, None, truth(), RULES)["mae_mm"] == pytest.approx(3)
-    assert score(wrong, None, truth(), RULES)["mae_mm"] == pytest.approx(300)
-    assert score(wrong, None, truth(), RULES)["wrong_share"] == 1
+def test_a_right_answer_is_better_than_silence_and_silence_than_an_error_above_the_charge():
+    right, wrong = (truth().depth_mm + error_mm * truth().scored for error_mm in (3, 400))
+    assert score(right, None, truth(), RULES, CHARGE_MM)["mae_mm"] == pytest.approx(3)
+    assert score(wrong, None, truth(), RULES, CHARGE_MM)["mae_mm"] == pytest.approx(400)
+    assert score(wrong, None, truth(), RULES, CHARGE_MM)["wrong_share"] == 1
 
 
 @pytest.mark.parametrize(("sigma_mm", "share"), [(5.0, 1.0), (74.0, 1.0), (76.0, 0.0), (300.0, 0.0)])
 def test_a_lie_about_sigma_is_a_confident_error(sigma_mm, share):
     sigma = np.full((SIZE, SIZE), sigma_mm)
-    scores = score(truth().depth_mm + 300, sigma, truth(), RULES)
+    scores = score(truth().depth_mm + 300, sigma, truth(), RULES, CHARGE_MM)
     assert scores["confident_share"] == share and scores["coverage"] == 1
-    honest = score(truth().depth_mm + 20, sigma, truth(), RULES)
+    honest = score(truth().depth_mm + 20, sigma, truth(), RULES, CHARGE_MM)
     assert honest["confident_share"] == 0
 
 
 def test_stating_no_sigma_at_all_is_no_coverage():
-    scores = score(truth().depth_mm + 300, np.zeros((SIZE, SIZE)), truth(), RULES)
+    scores = score(truth().depth_mm + 300, np.zeros((SIZE, SIZE)), truth(), RULES, CHARGE_MM)
     assert scores["confident_share"] == 0 and scores["coverage"] == 0
 
 
@@ -164,11 +186,11 @@ def test_no_number_is_refused(bad):
     depth[0, 0] = bad
     if not np.isfinite(bad):
         with pytest.raises(PredictionError, match="depth: expected finite mm"):
-            score(depth, None, truth(), RULES)
+            score(depth, None, truth(), RULES, CHARGE_MM)
     with pytest.raises(PredictionError, match="sigma: expected finite mm"):
-        score(truth().depth_mm, depth, truth(), RULES)
+        score(truth().depth_mm, depth, truth(), RULES, CHARGE_MM)
     with pytest.raises(PredictionError, match="expected a map of"):
-        score(depth[:-1], None, truth(), RULES)
+        score(depth[:-1], None, truth(), RULES, CHARGE_MM)
 
 
 def test_random_silent_and_lying_methods_land_where_they_should(tmp_path):
@@ -181,10 +203,10 @@ def test_random_silent_and_lying_methods_land_where_they_should(tmp_path):
         rows = measure(Setup(method, "test", SIZE, quick=True), tmp_path / str(number), chosen)
         assert set(rows) == {CLEAN, *chosen} and len(rows[chosen[0]]) == 3
         means[number] = rows[chosen[0]][0]
-    assert means[1]["mae_mm"] == 150 and means[1]["unanswered_share"] == 1
+    assert means[1]["mae_mm"] == CHARGE_MM and means[1]["unanswered_share"] == 1
     assert means[0]["mae_mm"] > 250 and means[0]["wrong_share"] > 0.5 and means[0]["coverage"] is None
     assert means[2]["confident_share"] == means[2]["wrong_share"] > 0.5
-    assert means[3]["mae_mm"] < 150 and means[3]["wrong_share"] < 0.1
+    assert means[3]["answered_mae_mm"] < 150 and means[3]["wrong_share"] < 0.1
 
 
 def test_measuring_resumes_axis_by_axis_and_refuses_another_methods_folder(tmp_path, monkeypatch):
@@ -249,11 +271,11 @@ def rows_of(axes_maes: dict[str, list[list[float]]]):
                 "object": f"o{k // 2}",
                 "severity": severity,
                 "mae_mm": mae,
-                "protocol_mae_mm": mae,
                 "wrong_share": 0.0,
                 "unanswered_share": 0.0,
-                "confident_share": None,
-                "coverage": None,
+                "invented_share": 0.0,
+                "answered_mae_mm": mae,
+                **dict.fromkeys(("confident_share", "coverage", "sure_mae_mm", "sure_rmse_mm")),
             }
             for severity, maes in enumerate(severities, 0 if axis == CLEAN else 1)
             for k, mae in enumerate(maes)
@@ -334,7 +356,7 @@ def test_the_scenes_show_the_fringes_that_an_option_asks_for(tmp_path):
     assert main(["robustness", "fringe-net", *words, "--out", str(tmp_path), "--no-cache", "--workers", "1"]) == 0
     (file,) = tmp_path.glob("*/clean.json")
     (row,) = json.loads(file.read_text())["views"]
-    assert row["mae_mm"] < 5
+    assert row["answered_mae_mm"] < 5
 
 
 @pytest.mark.parametrize(

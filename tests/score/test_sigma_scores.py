@@ -145,15 +145,16 @@ def test_an_edited_block_contradicts_itself(path, value, message, scored, tmp_pa
 
 
 def test_a_result_that_hides_or_improves_its_uncertainty_is_not_verified(scored):
-    from fpp_ml_bench.evaluation.score.evaluator import differences
+    from fpp_ml_bench.evaluation.score.verification import Verified, differences
 
     dataset, predictions, result = scored
     hidden = result.model_copy(update={"uncertainty": None})
-    assert differences(hidden, predictions, dataset) == [
-        "uncertainty: there is none in the result, there is one recomputed"
-    ]
+    assert differences(hidden, predictions, dataset) == Verified(
+        ["uncertainty: there is none in the result, there is one recomputed"], False
+    )
     better = {**result.uncertainty.per_sample}
     better["power_drill_A0"] = better["power_drill_A0"].model_copy(update={"nll": 0.0})
     block = result.uncertainty.model_copy(update={"per_sample": better})
     changed = result.model_copy(update={"uncertainty": block})
-    assert len(differences(changed, predictions, dataset)) == 1
+    found = differences(changed, predictions, dataset)
+    assert len(found.lines) == 1 and not found.processors
