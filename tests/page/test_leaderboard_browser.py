@@ -353,7 +353,7 @@ def page_with_samples(tmp_path_factory):
     dataset = make_dataset(work / "tiny")
     entries = read_entries([write_result_file(work / "mine.json", dataset, 1.0, 0.5)])
     samples = predicted_samples(entries, [(work / "mine-predictions", dataset)])
-    write_page(rank(entries), [], work / "page", None, samples)
+    write_page(rank(entries), [], work / "page", samples)
     return next((work / "page" / "submissions").glob("*.html"))
 
 

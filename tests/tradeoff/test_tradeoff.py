@@ -2,7 +2,6 @@
 SciPy, resuming, refusals, the page."""
 
 import json
-import re
 import subprocess
 import sys
 from dataclasses import make_dataclass
@@ -34,8 +33,6 @@ from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import BuildError, DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.files import exclusive
-from fpp_ml_bench.leaderboard.page.page import page_files
-from fpp_ml_bench.leaderboard.ranking import shipped_rows
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.optics.rig import Rig
 
@@ -354,21 +351,7 @@ def test_files_hold_what_was_measured(small, tmp_path):
         read_tradeoff(tmp_path / "broken.json")
 
 
-def test_the_page_shows_methods_as_text(small):
-    hostile = '"><script>hacked=1</script>'
-    points = [point(hostile, 1.0, 10, 2.0), point("b", 0.5, 1, 9.0)]
-    index = page_files([], [], tradeoff_of(small, points))["index.html"].decode()
-    section = re.search(r'<section id="tradeoff">.*?</section>', index, flags=re.DOTALL)[0]
-    assert "<script" not in section and "&lt;script&gt;" in section and section.count("<svg") == len(COST_KEYS)
-    assert 'href="#tradeoff"' in index and "time, frames" in section and "Power of pixels" in section
-    assert "tradeoff" not in page_files([], [])["index.html"].decode()
-    longer = points[1].model_copy(update={"frames": 0, "pixel_seconds": [1.0] * 9})
-    assert b"<svg" in page_files([], [], tradeoff_of(small, [points[0], longer]))["index.html"]
-    nothing = tradeoff_of(small, [Point(method="lost", options={}, failed="frame 7 is not stored")])
-    assert page_files([], [], nothing) == page_files([], [])
-
-
-def test_the_command_measures_and_feeds_the_page(tiny, tmp_path, capsys, monkeypatch):
+def test_the_command_measures(tiny, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "mine.py").write_text(OWN_METHOD)
     command = ["tradeoff", str(tiny), "--quick", "--method", "classical", "--method", "mine.py:Flat"]
@@ -384,8 +367,6 @@ def test_the_command_measures_and_feeds_the_page(tiny, tmp_path, capsys, monkeyp
     many, few, own = by_label["classical steps=18"], by_label["classical steps=3"], by_label["mine.py:Flat"]
     assert (many.frames, few.frames, own.frames) == (50, 20, 1) and many.object_mae_mm < few.object_mae_mm < 2
     assert many in run.front("frames") and own in run.front("frames") and len(own.pixel_seconds) == 3
-    page = ["leaderboard", str(shipped_rows()[0]), "--page", "page", "--tradeoff", "tradeoff/tradeoff.json"]
-    assert main(page) == 0 and 'id="tradeoff"' in (tmp_path / "page" / "index.html").read_text()
 
 
 def test_sizes_are_smaller_where_the_fringes_allow_it(tiny, tmp_path):
