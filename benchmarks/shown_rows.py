@@ -2,7 +2,7 @@
 
     python benchmarks/shown_rows.py [--check]
 
-- Pictures in ``docs/pictures``: ``leaderboard.png``, the first screen of the page (by chromium), and ``charge.png``, the
+- Pictures in ``docs/pictures``: ``leaderboard.png``, the first screen of the page by chromium, and ``charge.png``, the
   two-sided MAE of the methods of one frame against what a missed or invented pixel costs. Each holds the hash of the
   rows that it shows.
 - Tables between ``<!-- rows: NAME NAME; KEY KEY -->`` and ``<!-- end of rows -->``: a line for each row file, a column
