@@ -18,6 +18,7 @@ from scipy import ndimage
 
 from fpp_ml_bench import evaluate
 from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.loaders.sample import DEPTH_EXACT, Flag
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.tables import Table
 
@@ -77,12 +78,12 @@ def attacks(
     )
     yield "the wall copied into the background", lambda depth, sigma, truth: np.where(depth > 0, depth, wall_mm)
     yield "median of 5 px", lambda depth, sigma, truth: cv2.medianBlur(depth, smoothed_px)
-    for share in (0.01, 0.05, 0.2):
+    for share in (0.001, 0.01, 0.05):
         yield (
-            f"refused: {share:.0%} least sure",
+            f"refused, {share:.1%} least sure",
             lambda depth, sigma, truth, share=share: without_least_sure(depth, sigma, share),
         )
-    yield "refused: all", lambda depth, sigma, truth: np.zeros_like(depth)
+    yield "refused, all", lambda depth, sigma, truth: np.zeros_like(depth)
     yield "the true mask", lambda depth, sigma, truth: np.where(truth > 0, nearest(depth, truth > 0), 0)
 
 
@@ -94,8 +95,8 @@ def table(dataset: Path, predictions: Path) -> Table:
         depths.append(np.load(predictions / f"{sample}.npy").astype(np.float32))
         stated = predictions / f"{sample}.sigma.npy"
         sigmas.append(np.load(stated).astype(np.float32) if stated.exists() else np.zeros_like(depths[-1]))
-        truths.append(np.array(opened.target_mm(sample, "depth_exact"), np.float32))
-        flags.append(np.array(opened.flags(sample)))
+        truths.append(np.array(opened.target_mm(sample, DEPTH_EXACT), np.float32))
+        flags.append(np.where(opened.void(sample, DEPTH_EXACT), np.uint8(Flag.UNLIT), np.uint8(0)))
     rig = opened.rig
     found = Table("Attack", numbers=SHOWN)
     middle_mm, wall_mm = sum(rig.working_range_mm) / 2, (rig.background_m or 0.0) * MM_PER_M
