@@ -335,6 +335,9 @@ MIXTURES = (
 the second part's share of its pixels."""
 
 NOTES = (
+    "Two-sided MAE {two_sided_mae_mm} mm, by which the leaderboard ranks: object pixels that are not measured are "
+    "charged, and so is background with an answer, {invented_share} of the object's pixels. "
+    "{two_sided_with_void_mae_mm} mm with the void pixels of its surface.",
     "Object: |error| median {object_median_mm}, 95th percentile {object_p95_mm}, maximum {object_max_mm} mm; pixels "
     f"within {', '.join(f'{limit} mm {{object_within_{limit}mm_share}}' for limit in WITHIN_MM)}. "
     "MAE {object_mae_range_share} of each sample's depth range.",

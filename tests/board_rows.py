@@ -180,11 +180,13 @@ def reliance(**changes: Any) -> Reliance:
 def robustness() -> RowRobustness:
     """A robustness in brief, of 31 mm."""
     return RowRobustness(
-        version=1,
+        version=4,
         mae_mm=31.0,
         interval=[20.0, 40.0],
         clean_mae_mm=5.0,
         axes={"motion": 30.0, "gloss": 32.0},
+        beside={"dark-paint": 40.0},
+        drawn=["gloss"],
         samples=4,
         objects=2,
         size_px=960,

@@ -109,7 +109,7 @@ def _uncertainty(result: Result) -> Table | None:
         numbers=[metric.terminal for metric in shown],
         first_out=["Sigma\nmedian", "NLL", "In 99%\ninterval", "RMSE of the\nsurest 95%", "MAE of the\nsurest 95%"],
         caption="mm; of the pixels that state a sigma, those within its Gaussian intervals, means over samples; AUSE: "
-        "area between the sparsification curves by sigma and by error, over all object pixels",
+        "area between the sparsification curves by sigma and by error; missed and invented pixels are charged",
     )
     for name, scores in {"all": block.metrics, **block.per_object}.items():
         table.add_row(Text(printable(name)), *_cells(scores, shown), style="bold" if name == "all" else None)

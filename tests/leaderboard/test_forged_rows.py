@@ -13,7 +13,7 @@ from scored_dataset import make_dataset
 from upkeep import readme_rows
 
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.metrics import HEADLINE
+from fpp_ml_bench.evaluation.metrics import RANKED
 from fpp_ml_bench.evaluation.result.parts import Timing
 from fpp_ml_bench.leaderboard import columns, rows
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries, shipped_rows
@@ -75,7 +75,7 @@ def consistent(content):
     parts = [ObjectMeans(**part) for part in content["per_object"]]
     height, width = content["dataset"]["size"]
     content["metrics"] |= flat_scores(parts, height * width)
-    for key in HEADLINE:
+    for key in RANKED:
         content["intervals"][key] = list(interval_over(parts, key) or (None, None))
     content["dataset"]["samples"] = sum(part.samples for part in parts)
     Row.model_validate({**content, "dataset": {**content["dataset"], "content": OTHER}})  # sound but for the world
@@ -113,7 +113,7 @@ def more_views(content):
 
 def no_error(content):
     for part in content["per_object"]:
-        part |= dict.fromkeys(HEADLINE, 0.0)
+        part |= dict.fromkeys(RANKED, 0.0)
     return consistent(content)
 
 

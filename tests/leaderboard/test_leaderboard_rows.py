@@ -2,7 +2,6 @@
 
 import json
 import re
-import shutil
 from hashlib import sha256
 from pathlib import Path
 
@@ -156,23 +155,6 @@ def test_fpp_eval_compares_results_and_rows(files, tmp_path, capsys):
     assert lines[0] == lines[1]
 
 
-def test_a_row_from_before_the_surest_errors_verifies(files, dataset, tmp_path):
-    predictions = tmp_path / "predictions"
-    shutil.copytree(files[0].parent / "fast-predictions", predictions)
-    for sample in dataset.samples("test"):
-        np.save(predictions / f"{sample}.sigma.npy", np.full(dataset.size, 2.0, np.float32))
-    result, row = tmp_path / "result.json", tmp_path / "row.json"
-    assert fpp_eval([str(predictions), str(dataset.path), "--json", str(result)]) == 0
-    content = json.loads(write_row_of(result, row).read_text())
-    assert content["uncertainty"]["sure_mae_mm"] > 0
-    words = ["verify", str(row), str(predictions), str(dataset.path)]
-    surest = content["uncertainty"]["sure_mae_mm"]
-    for value, status in ((surest, 0), (None, 0), (1.01 * surest, 1), (0.5, 2)):  # 2: the MAE is 4 mm
-        content["uncertainty"]["sure_mae_mm"] = value
-        row.write_text(json.dumps(content))
-        assert fpp_eval(words) == status
-
-
 def test_fpp_eval_verifies_a_row_from_its_predictions(files, dataset, tmp_path, capsys):
     row, predictions = write_row_of(files[0], tmp_path / "row.json"), files[0].parent / "fast-predictions"
     words = ["verify", str(row), str(predictions), str(dataset.path)]
@@ -271,7 +253,7 @@ def test_what_only_its_author_measured_is_marked(
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"row_schema_version": "1.0.0"}, "row_schema_version 2.0.0"),
+        ({"row_schema_version": "1.0.0"}, "row_schema_version 3.0.0"),
         ({"provenance": "measured here"}, "provenance: is not a key"),
         ({"metrics": {}}, "metrics.overall_mae_mm: is missing"),
         ({"per_object": []}, "per_object"),

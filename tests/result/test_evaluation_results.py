@@ -173,7 +173,7 @@ def edit(path):
 
 
 EDITS = {
-    "other schema": (["schema_version"], "1.0.0", "expected .* 3.0.0, got schema_version 1.0.0"),
+    "other schema": (["schema_version"], "1.0.0", "expected .* 4.0.0, got schema_version 1.0.0"),
     "no schema": (["schema_version"], ..., "no schema_version"),
     "unknown key": (["rank"], 1, "rank: is not a key"),
     "missing key": (["target"], ..., "target: is missing"),
