@@ -22,6 +22,7 @@ from fpp_ml_bench.baselines.phase.method import (
     crossed_name,
     direction_of,
     frames_of,
+    fringe_assumption,
     fringe_options,
     has_crossed_fringes,
     pitch_setting,
@@ -345,7 +346,7 @@ class FringeNetMethod(LearnedRoute):
 
     @classmethod
     def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
-        return RANGE_AND_WALL if settings.get("fringes") == "crossed" else ONE_ALBEDO
+        return RANGE_AND_WALL if settings.get("fringes") == "crossed" else fringe_assumption(settings)
 
     def __init__(self, rig: Rig, **options: Any) -> None:
         from fpp_ml_bench.baselines.learned.fringe_net import FringeNetCrossedRoute, FringeNetRoute

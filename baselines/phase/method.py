@@ -5,6 +5,7 @@ expected error, from its phase and from its order. While that error is too large
 (more fringes for the phase, the Gray code for the order) and measure again. No captured frame is wasted.
 """
 
+import math
 import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
@@ -42,6 +43,10 @@ LIT_BACKGROUND = Assumption(
     "a lit background", "Assumes a lit background; not one albedo, so that little tells the fringe order."
 )
 ONE_ALBEDO = Assumption("one albedo, a lit background", TERMS["shading"].assumes)
+KNOWN_RANGE = Assumption(
+    "known range",
+    "Assumes that what is lit stands in the working range, in which the fringe has one period at most.",
+)
 RANGE_AND_WALL = Assumption(
     "known range and wall",
     "Assumes that what is lit stands in the working range, or is the wall behind it, whose distance the rig states.",
@@ -163,13 +168,21 @@ class PhaseMethod(RouteMethod):
 
     @classmethod
     def assumption(cls, settings: Mapping[str, Any]) -> Assumption | None:
-        return ONE_ALBEDO if settings.get("shading") is True else None
+        return fringe_assumption(settings) if settings.get("shading") is True else None
 
 
 def pitch_setting(rig: Rig, direction: Direction) -> dict[str, float]:
-    """What the settings of a row say of the fringes' period in projector px: nothing where it is the paper's."""
+    """What the settings of a row say of the fringes' period, in projector px and against the working range: nothing
+    where it is the paper's."""
     pitch = rig.pitch(direction)
-    return {} if pitch == PAPER_PITCH_PX else {"pitch_px": pitch}
+    if pitch == PAPER_PITCH_PX:
+        return {}
+    return {"pitch_px": pitch, "periods_in_range": round(rig.periods_in_range(direction), 2)}
+
+
+def fringe_assumption(settings: Mapping[str, Any]) -> Assumption:
+    """What tells the order of one fringe with a `pitch_setting`: the range alone, if it has one period at most."""
+    return KNOWN_RANGE if settings.get("periods_in_range", math.inf) <= 1 else ONE_ALBEDO
 
 
 def pitch_words(settings: Mapping[str, Any], before: str = " of ") -> str:

@@ -25,7 +25,6 @@ from fpp_ml_bench.tables import Table
 fpp-bench tradeoff data/full
 fpp-bench tradeoff data/mini --quick --method phase --method mine.py:Mine
 fpp-bench tradeoff data/full --list
-fpp-bench leaderboard --page page --tradeoff tradeoff/tradeoff.json
 """
 )
 def measure(

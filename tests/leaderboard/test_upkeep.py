@@ -94,16 +94,18 @@ def test_readme_of_the_shipped_rows_is_one_short_table():
     assert rows[0] == [
         "Method",
         "Assumes",
-        "Object MAE, mm (95% interval)",
+        "Two-sided MAE, mm (95% interval)",
+        "Object MAE, mm",
         "Overall MAE, mm",
         "Time, ms",
         "Frames",
         "Phase reliance",
+        "Without whole periods",
         "Disturbed, mm",
     ]
-    frames, errors = [int(row[5]) for row in rows[2:]], [float(row[2].split()[0]) for row in rows[2:]]
+    frames, errors = [int(row[6]) for row in rows[2:]], [float(row[2].split()[0]) for row in rows[2:]]
     assert frames[:-1] == [1] * SHOWN and frames[-1] > 36 and errors[:-1] == sorted(errors[:-1])
-    assert rows[2][2] == "1.225 (0.926 to 1.572)" and rows[5][1] == "one albedo, a lit background"
+    assert rows[2][2] == "2.588 (1.871 to 3.400)" and rows[2][3] == "1.225"
     assert "150 samples of 25 objects" in text and len(text.encode()) < 2048
     assert readme_block([]).startswith("No row yet.")
 
@@ -194,15 +196,22 @@ def test_the_tables_of_robustness_stand_between_their_markers(tmp_path):
     with pytest.raises(SubmissionError, match="expected <!-- test:begin -->"):
         upkeep.filled(page, {"test": ""})
     scores = SeverityScores(
-        mae_mm=3.0, protocol_mae_mm=3.0, wrong_share=0.1, unanswered_share=0.0, confident_share=None, coverage=None
+        mae_mm=3.0,
+        wrong_share=0.1,
+        unanswered_share=0.0,
+        invented_share=0.02,
+        answered_mae_mm=3.0,
+        **dict.fromkeys(("confident_share", "coverage", "sure_mae_mm", "sure_rmse_mm")),
     )
     block = Robustness(
-        version=1,
+        version=4,
         set="test",
         mae_mm=3.0,
         interval=[2.0, 4.0],
         clean=scores,
-        axes={"motion": [scores] * 5},
+        axes={"motion": [scores] * 5, "camera-blur": [scores] * 5},
+        beside={"dark-paint": [scores] * 5},
+        drawn=["camera-blur"],
         samples=2,
         objects=2,
         size_px=960,
@@ -215,4 +224,5 @@ def test_the_tables_of_robustness_stand_between_their_markers(tmp_path):
     ]
     assert upkeep.of_set("unseen", results) == []
     table = upkeep.robustness_tables(upkeep.of_set("test", results))
-    assert "| A &#124; method | 3.0 | 2.0 to 4.0 | 3.0 | 1.0 |" in table
+    assert "| A &#124; method | 3.0 | 2.0 to 4.0 | 3.0 | 1.0 | 3.0* | 3.0 |" in table.replace("&#42;", "*")
+    assert "Not in the mean: dark-paint, dark-wall." in table

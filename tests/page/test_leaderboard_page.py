@@ -21,6 +21,7 @@ from fpp_ml_bench.baselines.tradeoff.measure import pareto_front
 from fpp_ml_bench.baselines.tradeoff.report import Mark, Scatter, free_box
 from fpp_ml_bench.cli import leaderboard as leaderboard_command
 from fpp_ml_bench.cli import main
+from fpp_ml_bench.evaluation.metrics import RANK_KEY
 from fpp_ml_bench.evaluation.report.report_page import write_report
 from fpp_ml_bench.evaluation.result.file import parse_result, write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
@@ -362,7 +363,9 @@ def test_predictions_without_a_depth_have_no_cloud(predicted, tmp_path):
 @given(st.lists(st.floats(1e-6, 1e6), min_size=1, max_size=8))
 @settings(max_examples=100, deadline=None)
 def test_a_scale_holds_every_mean(means):
-    rows = [SimpleNamespace(value=lambda key, m=m: m, interval=lambda key, m=m: (0.0, 1.5 * m)) for m in means]
+    rows = [
+        SimpleNamespace(rank_key="", value=lambda key, m=m: m, interval=lambda key, m=m: (0.0, 1.5 * m)) for m in means
+    ]
     scale = LogScale.of(rows)
     assert all(scale.low < mean / 9 and 1.5 * mean < scale.high for mean in means)
     places = [scale.share(mean) for mean in sorted(means)]
@@ -373,7 +376,7 @@ def test_a_scale_holds_every_mean(means):
 
 def test_an_interval_that_reaches_zero_is_clipped_where_it_shows(files):
     (entry,) = read_entries(files[:1])
-    intervals = entry.row.intervals.model_copy(update={"object_mae_mm": [0.0, 9.0]})
+    intervals = entry.row.intervals.model_copy(update={RANK_KEY: [0.0, 9.0]})
     reaching = replace(entry, row=entry.row.model_copy(update={"intervals": intervals}))
     for shown, expected in ((entry, False), (reaching, True)):
         index = page_files(rank([shown]), [])["index.html"].decode()
