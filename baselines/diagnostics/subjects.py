@@ -45,9 +45,8 @@ class Subject:
     """A model under diagnosis; ``sha256`` identifies it and its settings. ``units`` of `predict`: mm, or normalised to
     the sample's own depth range. ``direction``: that of the fringes in ``frames_used``. With ``uses_ground_truth_mask``
     it expects frames that are 0 outside the object. ``network`` takes the single frame in ``frames_used`` as
-    (B, 1, H, W) in [0, 1] and outputs depth in the representation ``normalisation``. Without a network, it and the
-    following fields are None or empty. ``layer_names``: the layers to probe, in forward order. ``untrained(seed)``: the
-    same architecture with random weights."""
+    (B, 1, H, W) in [0, 1]. Without a network, it and the following fields are None or empty. ``layer_names``: the
+    layers to probe, in forward order. ``untrained(seed)``: the same architecture with random weights."""
 
     name: str
     title: str
@@ -58,7 +57,6 @@ class Subject:
     direction: Direction | Literal["both"]
     predict_frames: Callable[[Frames], Depth]
     uses_ground_truth_mask: bool = False
-    normalisation: Normalisation | None = None
     network: nn.Module | None = None
     layer_names: tuple[str, ...] = ()
     untrained: Callable[[int], nn.Module] | None = None
@@ -92,23 +90,14 @@ class Subject:
 
     @property
     def answers_normalised(self) -> bool:
-        """Whether `own_output` is normalised, and not in mm."""
-        return self.units == "normalised" or self.normalisation == "individual"
-
-    def own_output(self, frames: Frames) -> Depth:
-        """`predict`, or the network's own output where it is normalised: range heads, which would convert it to mm, are
-        not part of the paper's probes."""
-        if self.normalisation != "individual":
-            return self.predict(frames)
-        return network_output(self.networks()[0], self.input_batch([frames]), self.name)
+        """Whether `predict` gives normalised depth, and not mm."""
+        return self.units == "normalised"
 
     def predicts_nothing(self, dataset: DatasetFolder) -> str | None:
         """How the subject predicts nothing for `SAMPLES_ASKED` samples of all splits: background, or the same value, on
         all object pixels but stray ones. None for a subject that predicts something."""
         samples = spread(dataset.samples("all"), SAMPLES_ASKED)
-        answers = [
-            self.own_output(self.captured(dataset, name))[object_mask(dataset.depth_mm(name))] for name in samples
-        ]
+        answers = [self.predict(self.captured(dataset, name))[object_mask(dataset.depth_mm(name))] for name in samples]
         values = np.concatenate(answers)
         if not values.size:
             return None
@@ -229,7 +218,6 @@ def subject(
     return subject_of_method(
         method,
         dataset,
-        normalisation=config.normalisation,
         network=model.network,
         weights_sha256=model.sha256,
         layer_names=_select_layers(layers, model.network, config.name),
@@ -305,7 +293,6 @@ def _subject_of_factory(
         frames_used=(frame,),
         direction=_direction_of(dataset, (frame,)),
         predict_frames=predict,
-        normalisation=normalisation,
         network=network,
         layer_names=_select_layers(layers, network, name),
         untrained=lambda seed: randomised(_build_network(name, factory), seed),
