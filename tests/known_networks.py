@@ -32,6 +32,7 @@ def subject_with(network: nn.Module, size, layers=("out",)) -> Subject:
         frames_used=(0,),
         direction="horizontal",
         predict_frames=lambda frames: np.zeros(size, np.float32),
+        normalisation="individual",
         network=network,
         layer_names=layers,
         untrained=lambda seed: network,

@@ -45,8 +45,9 @@ class Subject:
     """A model under diagnosis; ``sha256`` identifies it and its settings. ``units`` of `predict`: mm, or normalised to
     the sample's own depth range. ``direction``: that of the fringes in ``frames_used``. With ``uses_ground_truth_mask``
     it expects frames that are 0 outside the object. ``network`` takes the single frame in ``frames_used`` as
-    (B, 1, H, W) in [0, 1]. Without a network, it and the following fields are None or empty. ``layer_names``: the
-    layers to probe, in forward order. ``untrained(seed)``: the same architecture with random weights."""
+    (B, 1, H, W) in [0, 1] and outputs depth in the representation ``normalisation``. Without a network, it and the
+    following fields are None or empty. ``layer_names``: the layers to probe, in forward order. ``untrained(seed)``: the
+    same architecture with random weights."""
 
     name: str
     title: str
@@ -57,6 +58,7 @@ class Subject:
     direction: Direction | Literal["both"]
     predict_frames: Callable[[Frames], Depth]
     uses_ground_truth_mask: bool = False
+    normalisation: Normalisation | None = None
     network: nn.Module | None = None
     layer_names: tuple[str, ...] = ()
     untrained: Callable[[int], nn.Module] | None = None
@@ -218,6 +220,7 @@ def subject(
     return subject_of_method(
         method,
         dataset,
+        normalisation=config.normalisation,
         network=model.network,
         weights_sha256=model.sha256,
         layer_names=_select_layers(layers, model.network, config.name),
@@ -293,6 +296,7 @@ def _subject_of_factory(
         frames_used=(frame,),
         direction=_direction_of(dataset, (frame,)),
         predict_frames=predict,
+        normalisation=normalisation,
         network=network,
         layer_names=_select_layers(layers, network, name),
         untrained=lambda seed: randomised(_build_network(name, factory), seed),
