@@ -100,13 +100,9 @@ METHODS = (
     "phase-net deep --min-confidence 0.5",
     "unet-global-rmse small",
     "unet-global-rmse mini",
-    "unet-global-rmse small --range mean",
     "unet-individual-rmse small",
-    "unet-individual-rmse small --range oracle",
-    "unet-individual-rmse small --range mean",
     "unet-individual-rmse three --split all --frame 20",
     "unet-individual-hybrid_l1_0.7 small",
-    "unet-individual-hybrid_l1_0.7 small --range oracle",
     "unet-individual-hybrid_l1_0.7 varied",
     "crossed crossed",
     "crossed crossed --frames 3",
@@ -284,9 +280,7 @@ def train(recorder: Recorder) -> None:
         out = f"runs/{table}-{row}"
         trained = recorder.run("train", f"fpp-bench train {table}-{row}.yaml small --out {out}", out)
         if trained and table in SCORED:
-            model = recorder.work / out / "model.safetensors"
-            weights = "model" if model.exists() else "weights"
-            recorder.predict("train", f"{out}/{weights}.safetensors small", number)
+            recorder.predict("train", f"{out}/weights.safetensors small", number)
     out = "runs/phase-net"
     recorder.run("train", f"fpp-bench train phase-net --steps 2 --lights 0 --unions 0 --out {out}", out)
     recorder.predict("train", f"phase-net small --weights {out}/phase-net-one-albedo.safetensors", 99)

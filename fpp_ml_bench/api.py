@@ -79,7 +79,7 @@ def load_method(name: str | Path, dataset: "DatasetFolder", **options: Any) -> "
         What it is to run on; see `open_dataset`.
     **options
         The method's settings: ``steps=4`` (classical), ``frames=3`` (phase), ``direction="vertical"`` (both),
-        ``depth_range="predicted"`` (networks).
+        ``frame=7`` (networks).
 
     Returns
     -------

@@ -11,13 +11,13 @@ reversed*: the mean over these objects goes that way. The test split's five, few
 import statistics
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import Literal
 
 from fpp_ml_bench.baselines.registry import methods
-from fpp_ml_bench.baselines.reproduce.plan import FOLDS, Folders, Job, variants
+from fpp_ml_bench.baselines.reproduce.plan import FOLDS, Folders, Job
 from fpp_ml_bench.baselines.reproduce.scores import (
     BINS_MM,
     MAIN_KEY,
@@ -112,8 +112,8 @@ def _sound_row(path: Path) -> Entry | None:
 class Line:
     """A line of a table. ``found``: the row of each seed, the recipe's own first, or its scores where they are of every
     frame or of a cross-validation; empty where nothing has been measured. ``entry``: the row of the recipe's own seed;
-    ``twins``: rows by depth range; ``paper_mm``: the paper's errors by the keys of `HEADLINE`, None where it reports
-    none; ``recipe``: None of a trivial method."""
+    ``paper_mm``: the paper's errors by the keys of `HEADLINE`, None where it reports none; ``recipe``: None of a
+    trivial method."""
 
     row: str
     label: str
@@ -121,7 +121,6 @@ class Line:
     found: Mapping[int, Row | Scores]
     entry: Entry | None
     paper_mm: Mapping[str, float] | None = None
-    twins: Mapping[str, Entry] = field(default_factory=dict)
 
     @property
     def track(self) -> str:
@@ -170,23 +169,20 @@ def table_lines(table: str, jobs: Sequence[Job], folders: Folders, opened: Datas
         recipe, paper = recipes[0], reported.get(row)
         label, paper_mm = (paper.label, paper.errors_mm) if paper else (_NOT_IN_THE_PAPER.get(row, row), None)
         weights = {one.seed: _weights_sha256(one, folders, opened) for one in recipes}
-        rows = {
-            (one.seed, depth_range): row_that_holds(folders.row(one, depth_range), opened, sha256)
+        entries = {
+            one.seed: held
             for one in recipes
-            for depth_range in variants(one)
             if (sha256 := weights[one.seed]) is not None
+            if (held := row_that_holds(folders.row(one), opened, sha256)) is not None
         }
-        main = variants(recipe)[0]
-        own = {name: entry for (seed, name), entry in rows.items() if seed == recipe.seed and entry is not None}
-        held = {seed: entry.row for (seed, name), entry in rows.items() if name == main and entry is not None}
-        found = held if main in own else {}
-        entry, twins = own.get(main), {str(name): twin for name, twin in own.items() if name != main}
+        entry = entries.get(recipe.seed)
+        found = {seed: held.row for seed, held in entries.items()} if entry is not None else {}
         if table != "multi_frame" or recipe.frames == "single_shot" or weights[recipe.seed] is None:
-            lines.append(Line(row, label, recipe, found, entry, paper_mm, twins))
+            lines.append(Line(row, label, recipe, found, entry, paper_mm))
             continue
         every = scores_that_hold(folders.scores(recipe), opened.fingerprint, recipe, weights[recipe.seed])
         lines.append(Line(row, label, recipe, {recipe.seed: every} if every else {}, entry, paper_mm))
-        lines.append(Line(row, f"{label}, its first frame only", recipe, found, entry, None, twins))
+        lines.append(Line(row, f"{label}, its first frame only", recipe, found, entry))
     return [*_trivial_lines({line.entry.row.track for line in lines if line.entry is not None}, opened), *lines]
 
 
@@ -234,14 +230,13 @@ def _fold_lines(jobs: Sequence[Job], folders: Folders, opened: DatasetFolder) ->
 
 def _weights_sha256(recipe: Recipe, folders: Folders, opened: DatasetFolder) -> str | None:
     """The weights whose rows are shown: those trained below ``folders``; where no training was begun there, those of
-    the main row, if that is of this recipe; else None."""
+    the row, if that is of this recipe; else None."""
     weights = current_weights(recipe, folders)
     if weights is not None:
         return file_sha256(weights)
     if state_of(folders.training(recipe)) != MISSING:
         return None
-    main_row = folders.row(recipe, variants(recipe)[0])
-    entry = row_that_holds(main_row, opened, recipe.digest, "recipe_digest")
+    entry = row_that_holds(folders.row(recipe), opened, recipe.digest, "recipe_digest")
     sha256 = None if entry is None else entry.row.submission.settings.get("weights_sha256")
     return sha256 if isinstance(sha256, str) else None
 
@@ -358,10 +353,8 @@ def _cells(line: Line, preset: str) -> dict[str, str]:
             cells[_EACH_SEED] = ", ".join(each) if len(each) > 1 else "-"
             cells["Of depth range"] = percent(line.error(RANGE_KEY))
         cells[f"{title}, {BY_THE_PAPER}"] = _pair(paper.get, pixels) if paper else "-"
-    title = f"Range predicted: object MAE / of its measured pixels / missing pixels, {MEASURED_HERE}"
     return {
         **cells,
-        title: _twin(line.twins.get("predicted")),
         "Parameters": _count(timing and timing.parameters),
         "Epochs": _count(settings.get("epochs_trained")),
         "Training, s": _count(settings.get("training_seconds")),
@@ -380,14 +373,6 @@ def _count(value: object) -> str:
 def _pair(error: Callable[[str], float | None], pixels: str) -> str:
     """MAE and RMSE."""
     return " / ".join(_mm(error(f"{pixels}_{kind}_mm")) for kind in ("mae", "rmse"))
-
-
-def _twin(entry: Entry | None) -> str:
-    """Object MAE, the MAE over the pixels that the twin measured, and the share of missing pixels."""
-    if entry is None:
-        return "-"
-    errors = [_mm(entry.value(key)) for key in (MAIN_KEY, "object_valid_mae_mm")]
-    return " / ".join([*errors, percent(entry.value("object_missing_share"))])
 
 
 def line_table(table: str, lines: Sequence[Line], preset: str) -> Table:
@@ -445,7 +430,6 @@ def table_markdown(table: str, lines: Sequence[Line], preset: str, command: str,
         *shown.markdown(),
         "",
         *_missing(lines, command, failed),
-        *_twins_explained(lines),
         *(_orderings(orderings(lines)) if table in paper_tables() or table == FOLDS else [conclusion(table, lines)]),
     ]
     return "\n".join(parts).rstrip("\n") + "\n"
@@ -488,18 +472,6 @@ def _missing(lines: Sequence[Line], command: str, failed: dict[str, str]) -> lis
     reasons = [f"- {markdown_text(label)}: {markdown_text(reason)}" for label, reason in why]
     names = ", ".join(dict.fromkeys(line.row for line in empty))
     return [f"Not measured here: {markdown_text(names)}. To fill: `{command}`", *reasons, ""]
-
-
-def _twins_explained(lines: Sequence[Line]) -> list[str]:
-    twins = (
-        "The column on the range is the metric twin of an oracle-range row: the same network's output, brought to mm "
-        "with a range predicted by a small head from the image. The difference between its object MAE and the row's "
-        "own is what the oracle gave: the range, and also the mask, because a twin must find the object itself, and an "
-        "object pixel that it misses costs its whole depth."
-    )
-    removed = "With the background removed the input shows the test sample's object mask; no twins there."
-    parts = [twins, ""] if any(line.twins for line in lines) else []
-    return parts + ([removed, ""] if any(line.recipe and line.recipe.background_removed for line in lines) else [])
 
 
 def _orderings(judged: Sequence[Ordering]) -> list[str]:

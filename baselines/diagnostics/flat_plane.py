@@ -3,8 +3,8 @@
 The paper shows a network a plane at 1.8 m in front of the background. Here planes have several distances and tilts,
 each filling the frame (no edge at all), as a rectangle in front of the background (the paper's scene), and cut to the
 silhouettes of test objects. The paper does not give the size of its rectangle, so a facing one grows until it fills the
-frame. For an individually normalised network the prediction is its own output, without range heads, converted to mm by
-the mean D_min and D_max of the test split: a facing plane has no depth range of its own.
+frame. The prediction of an individually normalised network is converted to mm by the mean D_min and D_max of the test
+split: a facing plane has no depth range of its own.
 """
 
 from collections import defaultdict
@@ -70,7 +70,7 @@ class FlatPlane(Probe):
             scene = plane_scene(renderer, masks[outline], tilt_deg, distance_m)
             seen = scene.mask
             frames = renderer.frames(scene, subject.frames_used)
-            prediction = subject.own_output(frames)
+            prediction = subject.predict(frames)
             values = prediction[seen].astype(np.float64)
             millimetres = values * (high - low) + low if normalised else values
             row = {
@@ -139,7 +139,7 @@ def control_of(
     shares = []
     for sample in samples:
         scene = original(dataset, renderer, sample)
-        answer, true = subject.own_output(renderer.frames(scene, subject.frames_used)), scene.depth_mm[scene.mask]
+        answer, true = subject.predict(renderer.frames(scene, subject.frames_used)), scene.depth_mm[scene.mask]
         if subject.answers_normalised:
             true = (true - true.min()) / (float(np.ptp(true)) or MM_PER_M)
         shares.append([(values < limit).mean() for values in (answer[scene.mask].astype(np.float64), true)])

@@ -92,23 +92,14 @@ class Subject:
 
     @property
     def answers_normalised(self) -> bool:
-        """Whether `own_output` is normalised, and not in mm."""
-        return self.units == "normalised" or self.normalisation == "individual"
-
-    def own_output(self, frames: Frames) -> Depth:
-        """`predict`, or the network's own output where it is normalised: range heads, which would convert it to mm, are
-        not part of the paper's probes."""
-        if self.normalisation != "individual":
-            return self.predict(frames)
-        return network_output(self.networks()[0], self.input_batch([frames]), self.name)
+        """Whether `predict` gives normalised depth, and not mm."""
+        return self.units == "normalised"
 
     def predicts_nothing(self, dataset: DatasetFolder) -> str | None:
         """How the subject predicts nothing for `SAMPLES_ASKED` samples of all splits: background, or the same value, on
         all object pixels but stray ones. None for a subject that predicts something."""
         samples = spread(dataset.samples("all"), SAMPLES_ASKED)
-        answers = [
-            self.own_output(self.captured(dataset, name))[object_mask(dataset.depth_mm(name))] for name in samples
-        ]
+        answers = [self.predict(self.captured(dataset, name))[object_mask(dataset.depth_mm(name))] for name in samples]
         values = np.concatenate(answers)
         if not values.size:
             return None

@@ -26,13 +26,11 @@ class FringeNetwork(nn.Module, ABC):
 
     name: what `build` calls it. options: JSON scalars with which `build` makes it again, and checks them by the type of
     their defaults and by ``rules``, where a whole number has another least value than 1, or must be a multiple.
-    last_layer: name in `probe_layers` of the last decoder layer, whose output is (B, C, H, W), before the 1x1 head.
     """
 
     name: str
     rules: ClassVar[dict[str, tuple[int, int]]] = {}
     stride: int
-    last_layer: str
 
     def __init__(self, **options: int | float) -> None:
         super().__init__()

@@ -135,7 +135,6 @@ class Hformer(FringeNetwork):
     name = "hformer"
     rules: ClassVar = {"width": (4, 4)}
     stride = 32
-    last_layer = "up2"
 
     def __init__(self, *, width: int = 32, drop_path: float = 0.4) -> None:
         super().__init__(width=width, drop_path=drop_path)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from fpp_ml_bench.baselines.networks.model import Model
     from fpp_ml_bench.evaluation.submission.description import Submission
 
-DepthRange = Literal["oracle", "predicted", "mean"]
-DEPTH_RANGES: tuple[DepthRange, ...] = get_args(DepthRange)
-_SHORT_RANGES = {"oracle": "", "mean": "mean range", "predicted": "pred. range", None: ""}
-"""By the setting ``depth_range``. That the range was given is the group's track."""
 _SHORT_OPTIONS = {
     "input standardised": "standardised",
     "guided by phase": "guided",
@@ -44,12 +40,6 @@ class NetworkOptions:
     """Options of `NetworkMethod`; the name of the method gives ``weights``, a file, or the ``recipe`` that trained
     them."""
 
-    depth_range: DepthRange | None = option(
-        None,
-        "depth range of an individually normalised network: the test sample's own (oracle track), predicted from the "
-        "image, or the training set's mean (default: predicted where the weights can, else oracle)",
-        flag="--range",
-    )
     frame: int | None = option(None, "frame to take (default: the first it was trained on)", "N")
     device: str | None = option(None, "cpu, cuda, cuda:1 (default: cuda where there is one)", "NAME")
     threads: int = 1
@@ -60,12 +50,10 @@ class NetworkOptions:
 class NetworkMethod(Method):
     """A `Model` that takes one frame of the sequence.
 
-    Under raw and global normalisation a network puts out mm, and ``depth_range`` must be None. Under individual
-    normalisation it is ``oracle`` (values go out normalised, and the scoring takes the range of the very sample), or
-    ``predicted`` or ``mean`` (the range heads of the weights file make mm). None takes ``predicted`` where the file
-    holds heads, else ``oracle``. ``frame``: its index, by default the first of those that the network was trained on.
-    ``threads`` are torch's while it predicts. ``remark`` is added to the title, ``about`` to the settings. Raises
-    `PredictionError` for an unknown range or frame."""
+    Under raw and global normalisation a network puts out mm. Under individual normalisation values go out normalised,
+    and the scoring takes the depth range of the very sample (oracle). ``frame``: its index, by default the first of
+    those that the network was trained on. ``threads`` are torch's while it predicts. ``remark`` is added to the title,
+    ``about`` to the settings. Raises `PredictionError` for a frame or a number of threads that can't be."""
 
     name = "network"  # a trained one has the name of its weights
     purpose = "trained network from image to depth"
@@ -81,7 +69,7 @@ class NetworkMethod(Method):
 
         given = cls.checked_options(options)
         path = given.weights if given.recipe is None else weights_of_recipe(given.recipe, rig.camera.width)
-        return cls(load(path, given.device), given.depth_range, given.frame, given.threads, rig.sequence)
+        return cls(load(path, given.device), given.frame, given.threads, rig.sequence)
 
     @classmethod
     def for_dataset(cls, dataset: Photographed, **options: Any) -> Method:
@@ -115,13 +103,11 @@ class NetworkMethod(Method):
         parts = [f"{network}{normalisation} {loss}{frames}{seed}"]
         parts += [word for words, word in _SHORT_OPTIONS.items() if f", {words}" in submission.name]
         parts.append("no background" if settings["background_removed"] else "")
-        parts.append(_SHORT_RANGES[settings.get("depth_range")])  # type: ignore[index]
         return ", ".join(filter(None, parts))
 
     def __init__(
         self,
         model: "Model",
-        depth_range: DepthRange | None = None,
         frame: int | None = None,
         threads: int = 1,
         sequence: AnySequence = PAPER_SEQUENCE,
@@ -131,7 +117,6 @@ class NetworkMethod(Method):
         config = self.weights_config = model.config
         self.model, self.threads = model, threads
         self.name, self.device, self.parameters = config.name, str(model.device), model.parameters
-        self.depth_range = _checked_range(model, depth_range)
         trained_frames = sequence.config(config.data_config)
         if not trained_frames:
             raise PredictionError(
@@ -146,11 +131,12 @@ class NetworkMethod(Method):
             raise PredictionError(f"threads {threads}: expected 1 or more")
         self.frames_used = (self.frame,)
         self.uses_ground_truth_mask = config.background_removed
-        if self.depth_range == "oracle":
+        given_range = config.normalisation == "individual"
+        if given_range:
             self.uses_ground_truth_range, self.units, self.mode = True, "normalised", "paper"
             self.range_rule = config.range_rule
-        of_range = "" if self.depth_range is None else f"{self.depth_range} range"
-        parts = [config.title, of_range, "" if self.frame == usual_frame else f"frame {self.frame}"]
+        parts = [config.title, "oracle range" if given_range else ""]
+        parts.append("" if self.frame == usual_frame else f"frame {self.frame}")
         self.title = ", ".join(part for part in parts if part) + (f" ({remark})" if remark else "")
         seed = config.recipe.get("seed")
         if isinstance(seed, int):
@@ -167,7 +153,7 @@ class NetworkMethod(Method):
             "seed": seed,
             "epochs": config.epoch,
             "frame": self.frame,
-            "depth_range": self.depth_range,
+            "depth_range": "oracle" if given_range else None,
             "threads": threads,
             "device": self.device,
         }
@@ -187,31 +173,7 @@ class NetworkMethod(Method):
         from fpp_ml_bench.baselines.networks.base import torch_threads
 
         with torch_threads(self.threads):
-            if self.depth_range == "oracle":
-                return self.model.predict_representation(fringes)
-            return self.model.predict_batch(fringes, self.depth_range or "predicted")
-
-
-def _checked_range(model: "Model", depth_range: str | None) -> Any:
-    """The depth range in force, one of `DEPTH_RANGES` or None."""
-    name = model.config.name
-    if model.config.normalisation != "individual":
-        if depth_range is not None:
-            raise PredictionError(
-                f"{name} was trained under {model.config.normalisation} normalisation and puts out mm on its own; "
-                f"leave out the depth range {depth_range!r}"
-            )
-        return None
-    if depth_range is None:
-        return "oracle" if model.heads is None else "predicted"
-    if depth_range not in DEPTH_RANGES:
-        raise PredictionError(f"unknown depth range {depth_range!r}; there are {', '.join(DEPTH_RANGES)}")
-    if depth_range != "oracle" and model.heads is None:
-        raise PredictionError(
-            f"{name}: this weights file holds no range heads, so its depth range can only be oracle; fit them with "
-            "fpp_ml_bench.baselines.networks.range_heads.fit_heads"
-        )
-    return depth_range
+            return self.model.predict_batch(fringes)
 
 
 def _loss(loss: Any) -> str | None:

@@ -68,7 +68,6 @@ class UnitNetwork(FringeNetwork):
     """A ``generator`` in [-1, 1] as a network in [0, 1] on both sides, which its output can't leave: it suits
     representations in that range. Convolutions start from N(0, 0.02)."""
 
-    last_layer = "up1"
     generator: Any
 
     def __init__(self, generator: nn.Module, **options: int) -> None:

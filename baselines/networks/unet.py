@@ -31,7 +31,6 @@ class Levels(FringeNetwork):
     """An encoder, a bottleneck and a decoder that joins what each level of the encoder gave; ``pooled``: every level is
     halved on its way down, else the blocks do so themselves, and the last level is no skip."""
 
-    last_layer = "dec1"
     pooled = True
     encoder: nn.ModuleList
     decoder: nn.ModuleList

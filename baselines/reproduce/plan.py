@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fpp_ml_bench.baselines.networks.network_method import DepthRange
 from fpp_ml_bench.baselines.training.recipe import SEED, Recipe, further_seeds, load_recipe
 from fpp_ml_bench.constants import FULL_SIZE, OBJECTS
 from fpp_ml_bench.errors import DatasetError, RecipeError
@@ -42,18 +41,6 @@ class Job:
         return self.recipe.fold is not None or any(row.startswith("multi_frame/") for row in self.rows)
 
 
-def variants(recipe: Recipe) -> tuple[DepthRange | None, ...]:
-    """The rows that a training gives, by the depth range that turns its output into mm (see `NetworkMethod`). Under
-    individual normalisation it is given the test sample's range, as in the paper; its metric twin is not. With the
-    background removed the object's mask is given anyway, and there is no twin. A training of a cross-validation has
-    seen objects of the test split, so it is no row."""
-    if recipe.fold is not None:
-        return ()
-    if recipe.normalisation != "individual":
-        return (None,)
-    return ("oracle",) if recipe.background_removed else ("oracle", "predicted")
-
-
 @dataclass(frozen=True)
 class Folders:
     """Paths below ``runs`` (``runs/<preset>``); ``rows`` takes the row files."""
@@ -65,13 +52,8 @@ class Folders:
     def training(self, recipe: Recipe) -> Path:
         return self.runs / recipe.name
 
-    def weights(self, recipe: Recipe) -> Path:
-        """Best weights, with range heads where the normalisation needs them: the file to ship."""
-        return self.runs / "weights" / f"{recipe.name}.safetensors"
-
-    def row(self, recipe: Recipe, depth_range: DepthRange | None) -> Path:
-        twin = "" if depth_range in (None, "oracle") else f"-range-{depth_range}"
-        return self.rows / f"{self.preset}-{recipe.name}{twin}.json"
+    def row(self, recipe: Recipe) -> Path:
+        return self.rows / f"{self.preset}-{recipe.name}.json"
 
     def scores(self, recipe: Recipe) -> Path:
         # Not in the folder of the rows: there every .json is a row.

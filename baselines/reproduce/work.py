@@ -26,9 +26,8 @@ from fpp_ml_bench.baselines.method import Setting
 from fpp_ml_bench.baselines.networks.base import torch_threads
 from fpp_ml_bench.baselines.networks.model import load
 from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
-from fpp_ml_bench.baselines.networks.range_heads import save_with_heads
 from fpp_ml_bench.baselines.reproduce import plan
-from fpp_ml_bench.baselines.reproduce.plan import Folders, Job, Report, variants
+from fpp_ml_bench.baselines.reproduce.plan import Folders, Job, Report
 from fpp_ml_bench.baselines.reproduce.scores import MAIN_KEY, SPLIT, TARGET, score_frames, scores_that_hold
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.baselines.timing import time_method, write_timing
@@ -42,7 +41,7 @@ from fpp_ml_bench.evaluation.result.model import Result
 from fpp_ml_bench.evaluation.score.check import Rules
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.submission.prediction_files import SUBMISSION_FILE
-from fpp_ml_bench.files import exclusive, read_json, write_atomically
+from fpp_ml_bench.files import exclusive, read_json
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.pool import mapping
 from fpp_ml_bench.style import millimetres
@@ -136,9 +135,8 @@ def _work(settings: ReproduceSettings, outcome: Outcome, jobs: Sequence[Job]) ->
             if isinstance(run, TrainingError):
                 raise run
             if run is not None and run.finished:
-                weights = finished_weights(job.recipe, run, opened, folders, settings.only_missing)
                 about: dict[str, Setting] = {"epochs_trained": run.epochs, "training_seconds": round(run.seconds, 1)}
-                _score(job, weights, about, settings, opened)
+                _score(job, run.weights, about, settings, opened)
             elif name in shipped:
                 _score(job, shipped[name], {}, settings, opened)
             else:
@@ -153,10 +151,13 @@ def _work(settings: ReproduceSettings, outcome: Outcome, jobs: Sequence[Job]) ->
 def _rows_hold(job: Job, settings: ReproduceSettings, opened: DatasetFolder) -> bool:
     """Whether all that the job gives is there already, made elsewhere by the same recipe on the same data."""
     recipe, folders = job.recipe, settings.folders
-    paths = [folders.row(recipe, depth_range) for depth_range in variants(recipe)]
-    rows = [settings.leaderboard.row_that_holds(path, opened, recipe.digest, "recipe_digest") for path in paths]
-    scored = not job.has_scores or scores_that_hold(folders.scores(recipe), opened.fingerprint, recipe) is not None
-    return scored and None not in rows
+    if job.has_scores and scores_that_hold(folders.scores(recipe), opened.fingerprint, recipe) is None:
+        return False
+    row = folders.row(recipe)
+    return (
+        recipe.fold is not None
+        or settings.leaderboard.row_that_holds(row, opened, recipe.digest, "recipe_digest") is not None
+    )
 
 
 def shipped_weights(recipe: Recipe, opened: DatasetFolder) -> Path | None:
@@ -250,7 +251,8 @@ def _epoch_seconds(folder: Path) -> list[float]:
 def _score(
     job: Job, weights: Path, about: dict[str, Setting], settings: ReproduceSettings, opened: DatasetFolder
 ) -> None:
-    """Rows of a training's weights, and its scores beside them; with ``only_missing`` what is up to date is kept."""
+    """The row of a training's weights, and its scores beside it; with ``only_missing`` what is up to date is kept. A
+    training of a cross-validation has seen objects of the test split, so it is no row."""
     folders, recipe, model = settings.folders, job.recipe, load(weights)
     path = folders.scores(recipe)
     if job.has_scores and not (
@@ -269,21 +271,20 @@ def _score(
         path.parent.mkdir(parents=True, exist_ok=True)
         write_json(scores.model_dump(mode="json"), path)
         settings.report(f"  {path.stem}: object MAE {millimetres(scores.errors[MAIN_KEY])} mm on {scores.pairs} pairs")
-    for depth_range in variants(recipe):
-        path = folders.row(recipe, depth_range)
-        if settings.only_missing and settings.leaderboard.row_that_holds(path, opened, model.sha256) is not None:
-            settings.report(f"  {path.stem}: holds, kept")
-            continue
-        # A network's method sets torch's threads for the whole process; the next one needs its own.
-        with torch_threads(torch.get_num_threads()):
-            told = {"recipe_digest": recipe.digest, **about}
-            method = NetworkMethod(model, depth_range, remark=f"{recipe.preset} preset", about=told)
-            settings.leaderboard.check_row_is_of(path, opened)
-            result = score_method(opened, method, path, folders)
-        settings.leaderboard.write_measured(result, path)
-        settings.report(
-            f"  {path.stem}: object MAE {millimetres(result.metrics.object_mae_mm)} mm, {result.track} track"
-        )
+    if recipe.fold is not None:
+        return
+    path = folders.row(recipe)
+    if settings.only_missing and settings.leaderboard.row_that_holds(path, opened, model.sha256) is not None:
+        settings.report(f"  {path.stem}: holds, kept")
+        return
+    # A network's method sets torch's threads for the whole process; the next one needs its own.
+    with torch_threads(torch.get_num_threads()):
+        told = {"recipe_digest": recipe.digest, **about}
+        method = NetworkMethod(model, remark=f"{recipe.preset} preset", about=told)
+        settings.leaderboard.check_row_is_of(path, opened)
+        result = score_method(opened, method, path, folders)
+    settings.leaderboard.write_measured(result, path)
+    settings.report(f"  {path.stem}: object MAE {millimetres(result.metrics.object_mae_mm)} mm, {result.track} track")
 
 
 def is_trained(out: Path) -> bool:
@@ -339,40 +340,16 @@ def check_machine(jobs: Sequence[Job], folders: Folders, anyway: bool, command: 
     )
 
 
-def finished_weights(recipe: Recipe, run: TrainingRun, opened: DatasetFolder, folders: Folders, keep: bool) -> Path:
-    """The weights file to score and to ship: the best epoch's, with range heads where a row needs them. ``keep``: one
-    that was made from the same weights is used as it is."""
-    target, source = folders.weights(recipe), file_sha256(run.weights)
-    if keep and _made_from(target, source):
-        return target
-    target.parent.mkdir(parents=True, exist_ok=True)
-    if "predicted" in variants(recipe):
-        save_with_heads(run.weights, opened.path, target)
-    else:
-        write_atomically(target, run.weights.read_bytes())
-    content = json.dumps({"made_from_sha256": source, "sha256": file_sha256(target)})
-    write_atomically(target.with_suffix(".json"), f"{content}\n".encode())
-    return target
-
-
 def current_weights(recipe: Recipe, folders: Folders) -> Path | None:
-    """The file that `finished_weights` made from the finished training; None while there is none."""
-    out, target = folders.training(recipe), folders.weights(recipe)
+    """Best weights of the finished training, the file to ship; None while there are none."""
+    out = folders.training(recipe)
     if not is_trained(out) or not (out / WEIGHTS).is_file():
         return None
     try:
         of_recipe = _stored(out / RECIPE)["recipe"] == recipe.to_dict()
     except (TrainingError, KeyError, TypeError):
         return None
-    return target if of_recipe and _made_from(target, file_sha256(out / WEIGHTS)) else None
-
-
-def _made_from(target: Path, source: str) -> bool:
-    """Whether ``target`` is what its record says was made from weights of this hash."""
-    try:
-        return bool(_stored(target.with_suffix(".json")) == {"made_from_sha256": source, "sha256": file_sha256(target)})
-    except (OSError, TrainingError):
-        return False
+    return out / WEIGHTS if of_recipe else None
 
 
 def _stored(path: Path) -> Any:

@@ -53,7 +53,8 @@ class Setup:
     def __post_init__(self) -> None:
         if self.method.units != "mm":
             raise PredictionError(
-                f"{self.method.title}: predicts normalised depth; robustness is measured in mm: give --range predicted"
+                f"{self.method.title}: predicts normalised depth; robustness is measured in mm, which networks of raw "
+                "or global normalisation predict"
             )
 
     @property

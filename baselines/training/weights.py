@@ -1,7 +1,7 @@
 """Trained weights on disk: one safetensors file with the tensors and the configuration of their network.
 
 Its metadata are ``format`` (that of a `Family`), ``version`` and ``config``, a `ModelConfig` or `NetConfig` as JSON.
-Tensors named ``range_head.*`` belong to a depth network's range heads, all others are the network's ``state_dict``.
+The tensors are the network's ``state_dict``.
 Pickles are never opened: that can run code. The same tensors and configuration give the same bytes.
 """
 
@@ -35,7 +35,8 @@ SUFFIX = ".safetensors"
 VERSION = "1"
 LARGEST_BYTES, LARGEST_HEADER_BYTES = 1 << 32, 1 << 26
 """Of a weights file, and of its header, in bytes."""
-HEAD_PREFIX = "range_head."
+RANGE_HEADS = "range_head."
+"""Tensors with this prefix are ignored: files of versions before 0.4 hold them to make mm of normalised depth."""
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Pixels = Annotated[int, Field(gt=0)]
@@ -145,13 +146,11 @@ PHASE_NETWORKS = Family("fpp-ml-bench phase-net", TypeAdapter(NetConfig), "phase
 
 @dataclass(frozen=True)
 class WeightsFile:
-    """A checked file: its ``network`` in float32, in eval mode, and the range heads' tensors without their prefix (may
-    be empty)."""
+    """A checked file: its ``network`` in float32, in eval mode."""
 
     path: Path
     config: Any
     network: Any
-    heads: "dict[str, Tensor]"
     sha256: str
 
 
@@ -159,17 +158,16 @@ def save_weights(
     path: str | Path,
     network: "nn.Module",
     config: TrainedConfig,
-    heads: "Mapping[str, Tensor] | None" = None,
     family: Family = DEPTH_NETWORKS,
 ) -> str:
-    """Write ``network`` (its ``state_dict``) and ``heads`` to ``path``, complete or not at all; the file's SHA-256.
+    """Write ``network`` (its ``state_dict``) to ``path``, complete or not at all; the file's SHA-256.
     Raises `WeightsError` for tensors that are not finite, that do not fit the network that ``config`` builds, and for a
     path that can't be written."""
     path = Path(path)
     if path.suffix != SUFFIX:
         raise _fault(path, f": expected a name that ends in {SUFFIX}; weights are saved as nothing else")
-    _built(path, config, network.state_dict(), family)
-    tensors = {**network.state_dict(), **{HEAD_PREFIX + name: tensor for name, tensor in (heads or {}).items()}}
+    tensors = network.state_dict()
+    _built(path, config, tensors, family)
     if family.half:
         tensors = {name: tensor.half() if tensor.is_floating_point() else tensor for name, tensor in tensors.items()}
     _check_finite(path, tensors)
@@ -185,14 +183,14 @@ def open_weights(path: str | Path, family: Family = DEPTH_NETWORKS) -> WeightsFi
     """Everything in a weights file of ``family``, checked. `WeightsError` as `read_file`, and for tensors that are not
     finite or that do not fit the network that the configuration builds."""
     path = Path(path)
-    config, tensors, digest = read_file(path, family)
+    config, stored, digest = read_file(path, family)
+    tensors = {name: tensor for name, tensor in stored.items() if not name.startswith(RANGE_HEADS)}
     _check_finite(path, tensors)
-    heads = {name.removeprefix(HEAD_PREFIX): tensors.pop(name) for name in [*tensors] if name.startswith(HEAD_PREFIX)}
     if family.half:
         tensors = {name: tensor.float() if tensor.is_floating_point() else tensor for name, tensor in tensors.items()}
     network = _built(path, config, tensors, family)
     network.load_state_dict(tensors, assign=True)
-    return WeightsFile(path, config, network.eval(), heads, digest)
+    return WeightsFile(path, config, network.eval(), digest)
 
 
 def shipped_names(folder: Path | None = None) -> list[str]:

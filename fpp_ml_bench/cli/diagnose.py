@@ -127,7 +127,7 @@ def diagnose(
     """\
 fpp-bench reliance classical data/small224
 fpp-bench reliance phase data/small224 --direction vertical
-fpp-bench reliance unet-individual-rmse data/small224 --range oracle --into result.json
+fpp-bench reliance unet-individual-rmse data/small224 --into result.json
 """,
     MethodCommand,
 )

@@ -22,7 +22,7 @@ from fpp_ml_bench.remote import RemoteFolder, place, working_copy
     """\
 fpp-bench predict classical data/mini --split test --out predictions
 fpp-bench predict classical data/mini --split test --steps 4 --direction vertical --out predictions-4
-fpp-bench predict unet.safetensors data/mini --range oracle --out predictions-oracle
+fpp-bench predict unet.safetensors data/mini --out predictions-unet
 fpp-bench predict phase data/mini --frames 3 --out predictions-3
 fpp-bench predict phase data/mini --error-mm 3 --out predictions-fewest     frames chosen scene by scene
 fpp-bench predict mine.py:Mine data/mini --out predictions-mine             a method of yours
@@ -73,7 +73,7 @@ def _scoring(method: Method, opened: "DatasetFolder") -> str:
     """\
 fpp-bench time classical data/mini
 fpp-bench time classical data/mini --steps 4 --direction vertical --batch 8 --json timing.json
-fpp-bench time unet.safetensors data/mini --range predicted --threads 2
+fpp-bench time unet.safetensors data/mini --threads 2
 fpp-bench time classical data/mini --into predictions/submission.yaml --into result.json
 """,
     MethodCommand,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from fpp_ml_bench.baselines import registry
-from fpp_ml_bench.baselines.reproduce.plan import Folders, planned, variants
+from fpp_ml_bench.baselines.reproduce.plan import Folders, planned
 from fpp_ml_bench.baselines.training.recipe import PRESETS, TABLES, load_recipe, table_rows
 from fpp_ml_bench.cli import CHECK_FAILED, OK
 from fpp_ml_bench.cli.console import show
@@ -38,7 +38,7 @@ fpp-bench train fringe-net --fringes lines --seed 1 --out runs/fringe-net      w
 fpp-bench train classical-net --out runs/classical-net      noise and missed pixels of three steps; the same
 fpp-bench train mine.yaml data/full --preset paper --out runs/big --minutes 10     in pieces
 accelerate launch -m fpp_ml_bench train mine.yaml data/full --preset paper --out runs/big      several GPUs
-fpp-bench predict runs/mine/model.safetensors data/small224 --out predictions
+fpp-bench predict runs/mine/weights.safetensors data/small224 --out predictions
 """,
     TrainCommand,
 )
@@ -59,8 +59,7 @@ def train(
 ) -> int:
     """Train one recipe, a shipped one or a YAML file of yours, into a weights file that predict takes.
 
-    Adds range heads where the weights need them, and prints the result. Raises FppBenchError."""
-    from fpp_ml_bench.baselines.networks.range_heads import save_with_heads
+    Raises FppBenchError where that can't be done."""
     from fpp_ml_bench.baselines.training.depth_training import train as train_recipe
 
     methods = registry.methods()
@@ -89,13 +88,10 @@ def train(
     if not trained.finished:
         print(f"{out}: stopped after {trained.epochs} epochs, everything saved; run the same command to resume")
         return CHECK_FAILED
-    weights = trained.weights
-    if "predicted" in variants(resolved):
-        weights = out / "model.safetensors"
-        save_with_heads(trained.weights, dataset, weights)
-    print(f"{weights}: {resolved.title}, epoch {trained.best_epoch} of {trained.epochs}, {trained.seconds:.0f} s")
+    epochs = f"epoch {trained.best_epoch} of {trained.epochs}"
+    print(f"{trained.weights}: {resolved.title}, {epochs}, {trained.seconds:.0f} s")
     print(f"curve: {trained.curve}")
-    print(f"next: fpp-bench predict {weights} {dataset} --out predictions")
+    print(f"next: fpp-bench predict {trained.weights} {dataset} --out predictions")
     return OK
 
 
@@ -225,14 +221,14 @@ def _list(tables: tuple[str, ...], folders: "Folders") -> None:
     from fpp_ml_bench.baselines.reproduce.work import state_of
 
     jobs = planned([f"{table}/{row}" for table in tables for row in table_rows(table)], folders.preset)
-    titles = "Row", "Training", "State", "Rows written", "Published: object MAE"
-    first_out = "Rows written", "Published: object MAE", "Training"
+    titles = "Row", "Training", "State", "Row written", "Published: object MAE"
+    first_out = "Row written", "Published: object MAE", "Training"
     table = Table(*titles, first_out=first_out, title=f"preset {folders.preset}, {folders.runs}")
     empty = 0
     for job in jobs:
-        row_files = [folders.row(job.recipe, depth_range) for depth_range in variants(job.recipe)]
-        written = f"{sum(path.is_file() for path in row_files)} of {len(row_files)}"
-        published = _published(SHIPPED_ROWS / row_files[0].name)
+        row_file = folders.row(job.recipe)
+        written = "yes" if row_file.is_file() else "no"
+        published = _published(SHIPPED_ROWS / row_file.name)
         empty += published is None
         state = state_of(folders.training(job.recipe))
         table.add_row("\n".join(job.rows), job.recipe.name, state, written, published or "-")

@@ -302,7 +302,7 @@ def test_methods_by_name(opened):
         "nearest",
     )
     assert load_method("classical", opened.rig, steps=4).title == "Classical 4-step + Gray code, both directions"
-    network = load_method("unet-individual-rmse", opened.rig, device="cpu", depth_range="oracle")
+    network = load_method("unet-individual-rmse", opened.rig, device="cpu")
     assert (network.frames_used, network.units, network.mode) == ((0,), "normalised", "paper")
     with pytest.raises(FppBenchError, match="there are classical"):
         load_method("magic", opened.rig)

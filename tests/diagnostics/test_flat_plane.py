@@ -24,7 +24,7 @@ def answering(dataset, answer, units="mm"):
         title="Known",
         units=units,
         answers_normalised=units == "normalised",
-        own_output=predict,
+        predict=predict,
         answer=lambda frames: Answer(predict(frames)),
         uses_ground_truth_mask=False,
         frames_used=(51,),

@@ -126,7 +126,7 @@ def test_short_names_of_shipped_rows(shipped):
         "small-unet-individual-rmse": "UNet RMSE",
         "small-unet-individual-rmse-seed_1": "UNet RMSE s1",
         "small-unet-individual-rmse-horizontal": "UNet RMSE horizontal",
-        "small-transunet-individual-hybrid_l1_0.7-range-predicted": "TransUNet hybrid L1 0.7, pred. range",
+        "small-transunet-individual-hybrid_l1_0.7": "TransUNet hybrid L1 0.7",
         "small-unet-global-rmse": "UNet global RMSE",
         "small-pix2pix_unet-individual-gan_0.7": "Pix2Pix GAN 0.7",
         "small-unet-global-rmse-guided": "UNet global RMSE, guided",

@@ -44,9 +44,9 @@ def test_prediction_is_the_network_on_grey_levels_over_255(folder, fringe):
         depth = load(folder / f"{normalisation}.safetensors").predict(fringe)
         assert depth.dtype == np.float32 and depth.shape == SIZE
         np.testing.assert_allclose(depth, unit * expected, rtol=0, atol=unit * tolerance)
-    values = load(folder / "individual.safetensors").predict_representation(fringe[None])
-    assert values.dtype == np.float32 and values.shape == (1, *SIZE)
-    np.testing.assert_allclose(values[0], expected, rtol=0, atol=tolerance)
+    values = load(folder / "individual.safetensors").predict(fringe)
+    assert values.dtype == np.float32 and values.shape == SIZE
+    np.testing.assert_allclose(values, expected, rtol=0, atol=tolerance)
     assert expected.std() > 100 * tolerance  # else the above compares nothing
 
 
@@ -85,13 +85,6 @@ def test_what_is_no_fringe_of_this_model(folder, fringe):
             model.predict(wrong)
     with pytest.raises(PredictionError, match="got none"):
         model.predict_batch([])
-    with pytest.raises(PredictionError, match="unknown depth_range 'oracle'; there are mean, predicted"):
-        model.predict(fringe, "oracle")
-
-
-def test_no_metres_out_of_nothing(folder, fringe):
-    with pytest.raises(WeightsError, match="holds no range heads"):
-        load(folder / "individual.safetensors").predict(fringe)
 
 
 def test_an_output_that_is_no_number(tmp_path, fringe):

@@ -11,7 +11,6 @@ from tiny_network import config_of, one_thread, rounding_error, tiny_network  # 
 
 from fpp_ml_bench.baselines.networks.model import fringe_batch, load
 from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
-from fpp_ml_bench.baselines.networks.range_heads import fit_heads
 from fpp_ml_bench.baselines.run import captured_frames, predict_split
 from fpp_ml_bench.baselines.training.weights import save_weights
 from fpp_ml_bench.cli import main
@@ -44,18 +43,17 @@ def dataset(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory, dataset):
-    """Folder of weights: raw, global, individual without and with heads, and the last with the background removed."""
+    """Folder of weights of each normalisation, and of two with the background removed."""
     folder = tmp_path_factory.mktemp("weights")
     network = tiny_network(width=2)
     network.head.weight.data.mul_(0.1)  # keeps what it says within what normalised depth can be
     network.head.bias.data.fill_(0.3)
-    for name, normalisation, heads, removed in (
-        ("raw", "raw", False, False),
-        ("global", "global", False, False),
-        ("bare", "individual", False, False),
-        ("full", "individual", True, False),
-        ("removed", "individual", True, True),
-        ("global-removed", "global", False, True),
+    for name, normalisation, removed in (
+        ("raw", "raw", False),
+        ("global", "global", False),
+        ("full", "individual", False),
+        ("removed", "individual", True),
+        ("global-removed", "global", True),
     ):
         config = config_of(
             network,
@@ -66,8 +64,7 @@ def weights(tmp_path_factory, dataset):
             image_size=SIZE,
             dataset_fingerprint=dataset.fingerprint,
         )
-        range_heads = fit_heads(network, config, dataset.path) if heads else None
-        save_weights(folder / f"{name}.safetensors", network, config, range_heads)
+        save_weights(folder / f"{name}.safetensors", network, config)
     return folder
 
 
@@ -76,22 +73,17 @@ def method(weights, name, *args, **options):
 
 
 @pytest.mark.parametrize(
-    "name, depth_range, units, track, mode, title",
+    "name, units, track, mode, title",
     [
-        ("raw", None, "mm", "metric", "standard", "UNet raw"),
-        ("global", None, "mm", "metric", "standard", "UNet global"),
-        ("bare", None, "normalised", "oracle range", "paper", "UNet bare, oracle range"),
-        ("full", None, "mm", "metric", "standard", "UNet full, predicted range"),
-        ("full", "predicted", "mm", "metric", "standard", "UNet full, predicted range"),
-        ("full", "mean", "mm", "metric", "standard", "UNet full, mean range"),
-        ("full", "oracle", "normalised", "oracle range", "paper", "UNet full, oracle range"),
-        ("removed", "oracle", "normalised", "oracle range + mask", "paper", "UNet removed, oracle range"),
-        ("removed", "mean", "mm", "oracle mask", "standard", "UNet removed, mean range"),
-        ("global-removed", None, "mm", "oracle mask", "standard", "UNet global-removed"),
+        ("raw", "mm", "metric", "standard", "UNet raw"),
+        ("global", "mm", "metric", "standard", "UNet global"),
+        ("full", "normalised", "oracle range", "paper", "UNet full, oracle range"),
+        ("removed", "normalised", "oracle range + mask", "paper", "UNet removed, oracle range"),
+        ("global-removed", "mm", "oracle mask", "standard", "UNet global-removed"),
     ],
 )
-def test_what_a_submission_says(dataset, weights, tmp_path, name, depth_range, units, track, mode, title):
-    network_method = method(weights, name, depth_range)
+def test_what_a_submission_says(dataset, weights, tmp_path, name, units, track, mode, title):
+    network_method = method(weights, name)
     predict_split(dataset, network_method, "test", tmp_path / "p")
     about = read_submission(tmp_path / "p")
     assert (about.units, about.track, network_method.mode, about.name) == (units, track, mode, title)
@@ -103,16 +95,12 @@ def test_what_a_submission_says(dataset, weights, tmp_path, name, depth_range, u
     assert (
         len(settings["weights_sha256"]) == 64 and settings["normalisation"] == network_method.model.config.normalisation
     )
+    assert settings.get("depth_range") == ("oracle" if units == "normalised" else None)
     written = yaml.safe_load((tmp_path / "p" / "submission.yaml").read_text())
     assert ("uses_ground_truth_mask" in written) == ("removed" in name)
     sample = dataset.samples("test")[0]
     fringe = captured_frames(dataset, network_method, sample)[0]
-    expected = (
-        network_method.model.predict_representation([fringe])[0]
-        if units == "normalised"
-        else network_method.model.predict(fringe, depth_range or "predicted")
-    )
-    np.testing.assert_array_equal(np.load(tmp_path / "p" / f"{sample}.npy"), expected)
+    np.testing.assert_array_equal(np.load(tmp_path / "p" / f"{sample}.npy"), network_method.model.predict(fringe))
 
 
 def test_frames_with_the_background_removed_are_those_of_training(dataset, weights):
@@ -127,8 +115,8 @@ def test_frames_with_the_background_removed_are_those_of_training(dataset, weigh
 
 
 def test_a_batch_is_its_images(dataset, weights):
-    for depth_range in ("oracle", "predicted", "mean"):
-        network_method = method(weights, "full", depth_range, threads=1)
+    for name in ("raw", "full"):
+        network_method = method(weights, name, threads=1)
         stacks = [captured_frames(dataset, network_method, sample) for sample in dataset.samples("test")]
         together = network_method.predict_batch(stacks)
         apart = [network_method.predict(stack) for stack in stacks]
@@ -139,11 +127,8 @@ def test_a_batch_is_its_images(dataset, weights):
     )
 
 
-def test_ranges_and_frames_that_there_are_not(dataset, weights):
+def test_frames_that_there_are_not(dataset, weights):
     for name, options, words in (
-        ("raw", {"depth_range": "oracle"}, "puts out mm on its own; leave out"),
-        ("bare", {"depth_range": "mean"}, "holds no range heads, so its depth range can only be oracle"),
-        ("full", {"depth_range": "guessed"}, "unknown depth range 'guessed'; there are oracle, predicted, mean"),
         ("raw", {"frame": 52}, "expected 0 to 51"),
         ("raw", {"frame": -1}, "expected 0 to 51"),
         ("raw", {"threads": 0}, "expected 1 or more"),
@@ -169,23 +154,24 @@ def test_the_frame_is_the_first_it_was_trained_on(tmp_path, dataset):
 
 
 def test_predict_score_and_time_on_the_command_line(dataset, weights, tmp_path, capsys):
-    out, data, path = str(tmp_path / "p"), str(dataset.path), str(weights / "full.safetensors")
-    for depth_range, words in (("oracle", " --mode paper --json"), ("predicted", "p-predicted --json")):
-        assert main(["predict", path, data, "--range", depth_range, "--out", f"{out}-{depth_range}"]) == 0
+    out, data = str(tmp_path / "p"), str(dataset.path)
+    for name, words in (("full", " --mode paper --json"), ("global", "p-global --json")):
+        path = str(weights / f"{name}.safetensors")
+        assert main(["predict", path, data, "--out", f"{out}-{name}"]) == 0
         printed = capsys.readouterr().out.splitlines()[-1]
         assert words in printed and "depth_exact" not in printed
         line = printed.removeprefix("next: fpp-eval ").split()
-        line[-1] = result = str(tmp_path / f"{depth_range}.json")
+        line[-1] = result = str(tmp_path / f"{name}.json")
         assert fpp_eval(line) == 0
         capsys.readouterr()
-        timed = ["time", path, data, "--range", depth_range, "--repeats", "2", "--into", result]
+        timed = ["time", path, data, "--repeats", "2", "--into", result]
         assert main(timed) == 0
         assert "parameters" in capsys.readouterr().out
-        timing = read_result(tmp_path / f"{depth_range}.json").timing
+        timing = read_result(tmp_path / f"{name}.json").timing
         assert timing.batched and timing.parameters > 1000 and timing.frames == 1 and timing.device == "cpu"
         assert "torch" in timing.software
-    assert main([*timed[:3], "--range", "mean", "--repeats", "2", "--into", result]) == 2
-    assert "settings.depth_range is" in capsys.readouterr().err
+    assert main([*timed, "--threads", "2"]) == 2
+    assert "settings.threads is" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
@@ -194,9 +180,8 @@ def test_predict_score_and_time_on_the_command_line(dataset, weights, tmp_path, 
         (["magic"], "unknown method 'magic'; there are classical, classical-net, phase"),
         (["no-such.safetensors"], "expected a weights file (*.safetensors), found nothing"),
         (["recipe.yaml"], "recipe.yaml"),
-        (["{w}/raw.safetensors", "--range", "mean"], "leave out the depth range 'mean'"),
         (["{w}/raw.safetensors", "--steps", "4"], "--steps is an option of classical, classical-net, not of"),
-        (["classical", "--range", "mean"], "--range is an option of trained networks, not of classical"),
+        (["classical", "--device", "cpu"], "--device is an option of trained networks, not of classical"),
         (["{w}/raw.safetensors", "--frame", "3"], "frame 3 is not stored here"),
         (["{w}/raw.safetensors", "--device", "abacus"], "device 'abacus' can't be used"),
         (["{w}/raw.safetensors", "--threads", "0"], "--threads 0: expected 1 or more"),

@@ -40,7 +40,6 @@ from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 TABLE = "normalization"
 NAMES = ("small-unet-raw-rmse", "small-unet-global-rmse", "small-unet-individual-rmse")
-TWIN = "small-unet-individual-rmse-range-predicted"
 SEEDED = [f"{name}-seed_{seed}" for name in NAMES for seed in (1, 2)]
 
 
@@ -57,7 +56,7 @@ def reused_timing(opened, method, split, repeats):
 
 @pytest.fixture(autouse=True)
 def small(monkeypatch, opened, request):
-    """Recipes at the tiny dataset's size, networks of width 1, 2 timed runs a method, heads of few pairs."""
+    """Recipes at the tiny dataset's size, networks of width 1, 2 timed runs a method."""
 
     def tiny_recipe(name, preset="small"):
         recipe = load_recipe(name, preset)
@@ -65,8 +64,6 @@ def small(monkeypatch, opened, request):
 
     monkeypatch.setattr(plan, "load_recipe", tiny_recipe)
     monkeypatch.setattr(work, "REPEATS", 2)
-    for constant in ("TRAIN_PAIRS", "VALIDATION_PAIRS", "PIXELS"):
-        monkeypatch.setattr(f"fpp_ml_bench.baselines.networks.range_heads.{constant}", 4)
     if "from_trainings" not in request.node.name:  # there the time is really measured
         monkeypatch.setattr(work, "time_method", reused_timing)
     threads = torch.get_num_threads()
@@ -132,15 +129,14 @@ def test_from_trainings_to_a_table(run, trainer, tmp_path, tiny, capsys):
     assert run(TABLE) == 0
     below = tmp_path / "runs" / "small"
     assert trainer.trained == [name.removeprefix("small-") for name in (*NAMES, *SEEDED)]
-    twins = [TWIN, *(f"{name}-range-predicted" for name in SEEDED[-2:])]
-    assert sorted(path.stem for path in (below / "rows").glob("*.json")) == sorted((*NAMES, *SEEDED, *twins))
+    assert sorted(path.stem for path in (below / "rows").glob("*.json")) == sorted((*NAMES, *SEEDED))
     entries = {path.stem: read_entry(path) for path in (below / "rows").glob("*.json")}
     assert all(entry.is_row_file for entry in entries.values())
     tracks = {name: (entry.row.track, entry.row.mode, entry.row.target) for name, entry in entries.items()}
     assert tracks[NAMES[2]] == ("oracle range", "paper", "depth")
-    assert {tracks[name] for name in (*NAMES[:2], *SEEDED[:4], *twins)} == {("metric", "standard", "depth")}
+    assert {tracks[name] for name in (*NAMES[:2], *SEEDED[:4])} == {("metric", "standard", "depth")}
     assert all(entry.name.endswith("(small preset)") for entry in entries.values())
-    assert [len(group.rows) for group in rank(entries.values())] == [8, 3]  # two twins find no object
+    assert [len(group.rows) for group in rank(entries.values())] == [6, 3]
     for name, entry in entries.items():
         assert entry.row.timing.parameters == sum(p.numel() for p in build("unet", width=1).parameters())
         for folder in ("results", "rows"):
@@ -154,7 +150,6 @@ def test_from_trainings_to_a_table(run, trainer, tmp_path, tiny, capsys):
     assert f"| oracle range | {np.mean(each):.2f} / " in lines["individual"]
     assert f"| {', '.join(f'{mae:.2f}' for mae in each)} |" in lines["individual"]
     assert "| 16.20 / 21.19 |" in lines["individual"]
-    assert f" {entries[TWIN].row.metrics.object_mae_mm:.2f} / " in lines["individual"]
     assert "| 5 | 61 |" in lines["raw (mm)"]
     assert "3 among the rows measured here" in text and "of different tracks" in text
     assert "reported by the paper" in capsys.readouterr().out
@@ -171,10 +166,10 @@ def test_only_missing_keeps_what_holds(run, trainer, tmp_path, capsys):
     assert run(TABLE, "--only-missing") == 0 and stamps(rows) == first
     assert len(trainer.trained) == 9
     (rows / f"{NAMES[1]}.json").unlink()
-    (rows / f"{TWIN}.json").write_text("{")
+    (rows / f"{NAMES[2]}.json").write_text("{")
     assert run(TABLE, "--only-missing") == 0
     changed = {name.removesuffix(".json") for name, stamp in stamps(rows).items() if first[name] != stamp}
-    assert changed == {NAMES[1], TWIN}
+    assert changed == {*NAMES[1:]}
     assert run(TABLE) == 0 and len(trainer.trained) == 9
     assert not set(stamps(rows).items()) & set(first.items())
 
@@ -182,7 +177,7 @@ def test_only_missing_keeps_what_holds(run, trainer, tmp_path, capsys):
 def test_rows_of_other_weights_are_made_again_and_not_shown(run, trainer, tmp_path):
     assert run(TABLE) == 0
     below = tmp_path / "runs" / "small"
-    weights_before = read_entry(below / "rows" / f"{TWIN}.json").row.submission.settings["weights_sha256"]
+    weights_before = read_entry(below / "rows" / f"{NAMES[2]}.json").row.submission.settings["weights_sha256"]
     (below / "unet-individual-rmse" / "done.json").unlink()
     trainer.says["unet-individual-rmse"] = "out of time"
     trainer.seed = 1
@@ -190,7 +185,7 @@ def test_rows_of_other_weights_are_made_again_and_not_shown(run, trainer, tmp_pa
     assert "Not measured here: individual. To fill" in (below / f"{TABLE}.md").read_text()
     trainer.says.clear()
     assert run(TABLE, "--only-missing") == 0
-    weights_after = read_entry(below / "rows" / f"{TWIN}.json").row.submission.settings["weights_sha256"]
+    weights_after = read_entry(below / "rows" / f"{NAMES[2]}.json").row.submission.settings["weights_sha256"]
     assert weights_before != weights_after and len(trainer.trained) == 10
 
 
@@ -456,4 +451,3 @@ def test_names_are_unique_in_every_group(run, trainer, tmp_path):
     ]
     tracks = {entry.row.track for entry in read_entries(paths)}
     assert tracks == {"oracle mask", "oracle range + mask"}
-    assert "no twins there" in (tmp_path / "runs" / "small" / "background_removed.md").read_text()

@@ -9,7 +9,7 @@ from board_rows import HARDWARE
 from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.baselines.reproduce import plan
-from fpp_ml_bench.baselines.reproduce.plan import Folders, default_folder, open_dataset, planned, variants
+from fpp_ml_bench.baselines.reproduce.plan import Folders, default_folder, open_dataset, planned
 from fpp_ml_bench.baselines.training.recipe import PRESETS, TABLES, load_recipe, table_rows
 from fpp_ml_bench.cli import train as command
 from fpp_ml_bench.errors import DatasetError, RecipeError
@@ -66,7 +66,7 @@ def test_rows_of_one_recipe_are_one_training(preset):
     assert further == ([] if preset == "paper" else [(name, seed) for name in seeded for seed in (1, 2)])
     names = [job.recipe.name for job in jobs]
     assert len(set(names)) == len(names)
-    titles = [(job.recipe.title, depth_range) for job in jobs for depth_range in variants(job.recipe)]
+    titles = [job.recipe.title for job in jobs]
     assert len(set(titles)) == len(titles)
 
 
@@ -90,17 +90,6 @@ def test_two_recipes_under_one_name_are_refused(monkeypatch):
     monkeypatch.setattr(plan, "load_recipe", other_batch)
     with pytest.raises(RecipeError, match=r"normalization/individual and loss/rmse differ in batch \(4 and 7\)"):
         planned(rows_of(["normalization", "loss"]), "small")
-
-
-def test_variants_of_a_training(tmp_path):
-    def of(name):
-        recipe = load_recipe(name)
-        rows = [folders(tmp_path).row(recipe, depth_range).stem for depth_range in variants(recipe)]
-        return [row.removeprefix(f"small-{recipe.name}") for row in rows]
-
-    assert of("normalization/raw") == of("background_removed/individual") == [""]
-    assert of("loss/l1") == ["", "-range-predicted"]
-    assert variants(load_recipe("loss/l1").model_copy(update={"fold": (0, 5)})) == ()
 
 
 def test_default_folders():
@@ -262,7 +251,7 @@ def test_a_table_that_the_paper_does_not_have_is_compared_with_its_first_line(tm
     text = table_markdown("further", lines, "small", "fpp-bench reproduce further", {})
     assert text.startswith("# Further directions") and said in text
     assert "times on first, 2 cores (the image alone)&#59; second, 2 cores (guided)." in text
-    assert "reported by the paper" not in text.lower() and "Range predicted" not in text
+    assert "reported by the paper" not in text.lower()
 
 
 def test_rows_that_were_not_measured_stay_empty():

@@ -314,7 +314,7 @@ def test_the_headline_is_the_mean_over_axes_and_severities_also_of_axes_of_few_o
 def test_a_normalised_answer_and_an_unknown_axis_are_refused():
     method = Noisy(paper_rig(SIZE))
     method.units = "normalised"
-    with pytest.raises(PredictionError, match="--range predicted"):
+    with pytest.raises(PredictionError, match="networks of raw or global normalisation"):
         Setup(method, "test", SIZE)
     with pytest.raises(PredictionError, match="unknown axis 'glos'; there are under-exposure"):
         corruptions().chosen(["glos"])

@@ -207,9 +207,9 @@ def test_two_processes_agree(tiny, tmp_path):
     )
     assert done.returncode == 0, done.stderr[-2000:]
     names = {path.name for path in (tmp_path / "run").iterdir()}
-    assert names == {WEIGHTS, CHECKPOINT, DONE, CURVE_FILE, "recipe.json", "log.jsonl", "model.safetensors"}
+    assert names == {WEIGHTS, CHECKPOINT, DONE, CURVE_FILE, "recipe.json", "log.jsonl"}
     record = json.loads((tmp_path / "run" / "log.jsonl").read_text())
-    assert math.isfinite(record["validation_loss"]) and load(tmp_path / "run" / "model.safetensors").heads is not None
+    assert math.isfinite(record["validation_loss"])
     scores = validation_of(tmp_path / "run" / WEIGHTS, tiny, load_recipe(tmp_path / "mine.yaml", "small"))[1]
     for key in SCORES:  # means over the three pairs of both processes
         assert record[key] == pytest.approx(scores[key], rel=FLOAT32), key

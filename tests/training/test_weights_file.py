@@ -4,7 +4,6 @@ import json
 import os
 import struct
 
-import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
@@ -21,8 +20,6 @@ from fpp_ml_bench.baselines.training.weights import (
 )
 from fpp_ml_bench.errors import WeightsError
 
-HEADS = {"range_mean": torch.tensor([1700.0, 1900.0], dtype=torch.float64)}
-
 
 @pytest.fixture(scope="module")
 def network():
@@ -32,7 +29,7 @@ def network():
 @pytest.fixture
 def saved(tmp_path, network):
     path = tmp_path / "net.safetensors"
-    save_weights(path, network, config_of(network), HEADS)
+    save_weights(path, network, config_of(network))
     return path
 
 
@@ -55,21 +52,25 @@ def config_with(path, **changes):
 
 def test_what_goes_in_comes_out(saved, network):
     file = open_weights(saved)
-    config, tensors, heads = file.config, file.network.state_dict(), file.heads
+    config, tensors = file.config, file.network.state_dict()
     assert config == config_of(network) and config.image_size == (32, 48) and config.recipe["loss"]["alpha"] == 0.7
     assert tensors.keys() == network.state_dict().keys()
     for name, tensor in network.state_dict().items():
         assert torch.equal(tensors[name], tensor) and tensors[name].dtype == tensor.dtype
-    assert heads.keys() == HEADS.keys() and torch.equal(heads["range_mean"], HEADS["range_mean"])
     network.load_state_dict(tensors)
     # Anyone's safetensors reads it, and finds the configuration as plain JSON.
-    assert set(load_file(saved)) == {*network.state_dict(), "range_head.range_mean"}
+    assert set(load_file(saved)) == set(network.state_dict())
+
+
+def test_range_heads_of_older_files_are_ignored(saved, network):
+    rewrite(saved, tensors={"range_head.mean_range_mm": torch.tensor([1700.0, float("nan")])})
+    assert open_weights(saved).network.state_dict().keys() == network.state_dict().keys()
 
 
 def test_same_content_same_bytes(saved, network, tmp_path):
     for number in range(4):
         again = tmp_path / f"again{number}.safetensors"
-        save_weights(again, network, config_of(network), HEADS)
+        save_weights(again, network, config_of(network))
         assert again.read_bytes() == saved.read_bytes()
     assert int.from_bytes(saved.read_bytes()[:8], "little") % 8 == 0
 
@@ -77,7 +78,7 @@ def test_same_content_same_bytes(saved, network, tmp_path):
 def test_training_layouts_are_saved_plainly(saved, tmp_path):
     network = tiny_network().to(memory_format=torch.channels_last).train()
     path = tmp_path / "channels-last.safetensors"
-    save_weights(path, network, config_of(network), HEADS)
+    save_weights(path, network, config_of(network))
     assert path.read_bytes() == saved.read_bytes()
 
 
@@ -127,10 +128,6 @@ def test_tensors_that_do_not_fit(saved, network, tmp_path):
     for broken, words in (
         ({**tensors, name: tensors[name].half()}, "expected float32 .*got float16"),
         ({**tensors, name: tensors[name] * float("nan")}, f"tensor {name} holds values that are not finite"),
-        (
-            {**tensors, "range_head.range_mean": torch.tensor([1.0, np.inf])},
-            "tensor range_head.range_mean holds values that are",
-        ),
         ({key: value for key, value in tensors.items() if key != name}, f"tensor {name} is missing"),
     ):
         path = tmp_path / "broken.safetensors"
@@ -173,15 +170,14 @@ def test_nothing_is_written_that_could_not_be_read(tmp_path, network):
     with torch.no_grad():
         next(diverged.parameters()).fill_(float("inf"))
     good = config_of(network)
-    for net, config, heads, path, words in (
-        (diverged, good, None, "a.safetensors", "not finite"),
-        (network, config_of(network, options={"width": 8}), None, "a.safetensors", "expected float32"),
-        (network, good, {"b": torch.tensor(float("nan"))}, "a.safetensors", "range_head.b holds values"),
-        (network, good, None, "a.pt", "expected a name that ends in .safetensors"),
-        (network, good, None, "no/such/folder/a.safetensors", "can't be written"),
+    for net, config, path, words in (
+        (diverged, good, "a.safetensors", "not finite"),
+        (network, config_of(network, options={"width": 8}), "a.safetensors", "expected float32"),
+        (network, good, "a.pt", "expected a name that ends in .safetensors"),
+        (network, good, "no/such/folder/a.safetensors", "can't be written"),
     ):
         with pytest.raises(WeightsError, match=words):
-            save_weights(tmp_path / path, net, config, heads)
+            save_weights(tmp_path / path, net, config)
     assert not any(tmp_path.iterdir())
 
 
