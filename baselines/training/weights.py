@@ -36,7 +36,7 @@ VERSION = "1"
 LARGEST_BYTES, LARGEST_HEADER_BYTES = 1 << 32, 1 << 26
 """Of a weights file, and of its header, in bytes."""
 RANGE_HEADS = "range_head."
-"""Tensors with this prefix are ignored: files of versions before 0.4 hold them to make mm of normalised depth."""
+"""Tensors with this prefix are ignored: files of earlier versions hold them to make mm of normalised depth."""
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 Pixels = Annotated[int, Field(gt=0)]
