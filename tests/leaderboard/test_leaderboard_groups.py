@@ -32,7 +32,7 @@ def shipped():
 def test_shipped_rows_stay_sorted_by_rank_and_error(shipped):
     """Of two rows that the tests don't tell apart, the one that fewer others may be ahead of comes first."""
     for group in rank(shipped):
-        keys = [(row.best_rank or 0, row.worst_rank or 0, row.value("object_mae_mm")) for row in group.rows]
+        keys = [(row.best_rank or 0, row.worst_rank or 0, row.value(row.rank_key)) for row in group.rows]
         assert keys == sorted(keys)
         unranked = [error for best, _, error in keys if not best]
         assert unranked in ([], [error for _, _, error in keys])  # all or none
@@ -223,7 +223,9 @@ def test_metric_phase_rows_say_what_they_assume(shipped):
         for row in group.rows:
             about = row.entry.row
             settings, one_direction = about.submission.settings, about.submission.method in ("phase", "phase-net")
-            if one_direction or settings.get("fringes") in ("horizontal", "vertical"):
+            if "periods_in_range" in settings:
+                assert settings["periods_in_range"] < 1 and assumption(about) == "known range"
+            elif one_direction or settings.get("fringes") in ("horizontal", "vertical"):
                 one = settings.get("shading", True)
                 assert assumption(about) == ("one albedo, a lit background" if one else "a lit background")
                 assert ("one albedo for all surfaces and a lit background" in assumption_sentences(about)) == one
@@ -236,11 +238,15 @@ def test_metric_phase_rows_say_what_they_assume(shipped):
     pages = page_files([group], [])
     own = [text.decode() for file, text in pages.items() if file.startswith("submissions/")]
     assuming = [row for row in group.rows if assumption(row.entry.row)]
-    assert assuming and sum("a lit background" in text or "the wall behind" in text for text in own) == len(assuming)
+    assert assuming and sum("a lit background" in text or "stands in the working range" in text for text in own) == len(
+        assuming
+    )
     others = {row.entry.row.submission.method for row in group.rows} - {"phase", "phase-net", "fringe-net"}
     assert {"constant", "nearest"} <= others <= {"constant", "nearest", "crossed", "crossed-net"}
     lines = [line for line in readme_block([group]).splitlines() if re.match(r"\| [^|]+1 (horiz|vert)", line)]
-    assert len(lines) >= 2 and all("| one albedo, a lit background |" in line for line in lines if "any" not in line)
+    assert lines and all(
+        "| one albedo, a lit background |" in line or ", 36 px | known range |" in line for line in lines
+    )
 
 
 def test_the_papers_errors_are_shown_apart(shipped):
