@@ -29,7 +29,7 @@ def test_named_files_and_modules_are_there(page):
     text = page.read_text(encoding="utf-8")
     for name in set(re.findall(rf"(?<![\w/.-])((?:{TOP})/[\w/.-]*[\w/])", text)) - TO_BE_WRITTEN:
         assert (ROOT / name).exists(), name
-    for link in set(re.findall(r"\]\(([^):#]+)(?:#[^)]*)?\)", text)):
+    for link in set(re.findall(r"\]\(([^):# ]+)(?:#[^)]*| \"[^\"]*\")?\)", text)):
         assert (page.parent / link).exists(), link
     for name in set(re.findall(r"fpp_ml_bench(?:\.\w+)+", text)) - {GROUP}:
         parts = name.split(".")

@@ -7,6 +7,7 @@ from hashlib import sha256
 from types import SimpleNamespace
 
 import pytest
+import shown_rows
 import upkeep
 from board_rows import timing, write_result_file
 from scored_dataset import make_dataset
@@ -226,3 +227,20 @@ def test_the_tables_of_robustness_stand_between_their_markers(tmp_path):
     table = upkeep.robustness_tables(upkeep.of_set("test", results))
     assert "| A &#124; method | 3.0 | 2.0 to 4.0 | 3.0 | 1.0 | 3.0* | 3.0 |" in table.replace("&#42;", "*")
     assert "Not in the mean: dark-paint, dark-wall." in table
+
+
+def test_nothing_that_the_documentation_shows_is_older_than_its_row(capsys):
+    status = shown_rows.main(["--check"])
+    assert status == 0, capsys.readouterr().out
+
+
+def test_what_is_older_than_its_row_is_found(tmp_path, monkeypatch):
+    figure = '[{}](../leaderboard/rows/crossed.json "object_mae_mm / two_sided_mae_mm")'
+    metrics = read_entry(SHIPPED_ROWS / "crossed.json").row.metrics
+    right = f"{metrics.object_mae_mm:.2f} / {metrics.two_sided_mae_mm:.1f}"
+    assert shown_rows.wrong_figures(figure.format(right)) == []
+    assert shown_rows.wrong_figures(figure.format("3.31 / 4.4")) == [f"3.31 / 4.4 of crossed: the row has {right}"]
+    page = "<!-- rows: crossed; frames object_mae_mm -->\nold\n<!-- end of rows -->"
+    assert "| Crossed, 1 frame | 1 | 2.42 |" in shown_rows.with_tables(page)
+    monkeypatch.setattr(shown_rows, "rows_hash", lambda: "of other rows")
+    assert len(shown_rows.older_pictures()) == 2
