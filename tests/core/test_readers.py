@@ -52,7 +52,8 @@ def test_all_sources_are_tested_and_valid(valid):
 @pytest.mark.parametrize("name", YAML + JSON + CODED)
 def test_mutations_are_read_or_refused(name, valid):
     """Some of each, or the mutations would test nothing."""
-    outcomes = [valid[name].outcome(mutation) for mutation in valid[name].mutations(MUTATIONS, seed=0)]
+    count = 2 * MUTATIONS if name == "row" else MUTATIONS  # nearly every change of a row contradicts its other numbers
+    outcomes = [valid[name].outcome(mutation) for mutation in valid[name].mutations(count, seed=0)]
     assert set(outcomes) == {"read", "refused"}
 
 

@@ -129,8 +129,6 @@ def test_short_names_of_shipped_rows(shipped):
         "small-transunet-individual-hybrid_l1_0.7": "TransUNet hybrid L1 0.7",
         "small-unet-global-rmse": "UNet global RMSE",
         "small-pix2pix_unet-individual-gan_0.7": "Pix2Pix GAN 0.7",
-        "small-unet-global-rmse-guided": "UNet global RMSE, guided",
-        "small-unet-global-rmse_physics_0.05": "UNet global RMSE + physics 0.05",
     }
     assert {stem: names[stem] for stem in expected} == expected
 
