@@ -327,10 +327,10 @@ def predicted_mm(
     folder: Path, dataset: DatasetFolder, split: str, sample: str, target: str
 ) -> tuple[Submission, NDArray[np.floating]]:
     """The description of predictions of ``split``, which are checked as a whole first, and the depth (H, W) in mm of
-    one ``sample``; a normalised one with the range of the column ``target``. Raises PredictionError for predictions
-    that could not be scored."""
+    one ``sample``, 0 where there is no answer; a normalised one with the range of the column ``target``. Raises
+    PredictionError for predictions that could not be scored."""
     checked = check_folder(folder, dataset, split)
     described = checked.sound()
     read = checked.listing.reader(dataset.size, described.png_mm_per_level, described.nodata)
     rules = Rules(target, described.units, described.range_rule, "standard")
-    return described, np.array(rules.pair(read(sample)[0], dataset, sample)[0])
+    return described, np.maximum(rules.pair(read(sample)[0], dataset, sample)[0], 0)  # a network may go below 0
