@@ -341,12 +341,13 @@ def test_show_by_default_writes_into_the_current_folder(tiny, tmp_path, monkeypa
     assert [p.name for p in tmp_path.iterdir()] == ["cork_A0.png"]
 
 
-def test_show_reads_predictions_in_the_units_that_they_declare(tiny, tmp_path):
+def test_show_reads_predictions_in_the_units_that_they_declare_and_below_0_there_is_nothing(tiny, tmp_path):
     dataset, clouds = DatasetFolder(tiny), []
     for units, per_mm in (("mm", 1), ("m", 0.001)):
         folder = write_predictions(tmp_path / units, dataset, units=units)
         for path in folder.glob("*.npy"):
-            np.save(path, np.load(path) * np.float32(per_mm))
+            depth = np.load(path)
+            np.save(path, np.where(depth > 0, depth * np.float32(per_mm), np.float32(-0.01)))  # as networks put out
         words = "show", tiny, "power_drill_A60", "--predictions", folder, "--cloud"
         assert call(*words, "--out", tmp_path / f"{units}.png") == 0
         clouds.append(trimesh.load(tmp_path / f"{units}.ply").vertices)
