@@ -31,7 +31,7 @@ RETRIES = 5
 """A task is started again so often when its process or node died."""
 CONNECTION_S = 5.0
 Map = Callable[..., Iterable[Any]]
-_DECIDE_RESULTS = "fpp-ml-bench", "manifold3d", "numpy", "torch"
+_DECIDE_RESULTS = "fpp-ml-bench", "numpy", "torch"
 """Packages that must have one version on all nodes: with others the bytes may differ."""
 _work: tuple[str, object] = "", None
 """What this process is at: the name of the run, and its work."""

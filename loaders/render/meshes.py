@@ -1,40 +1,77 @@
-"""Meshes by name: procedural objects, and users' own files (OBJ, PLY, STL, GLB) with scale and pose."""
+"""Meshes by name: the benchmark's objects, and users' own files (OBJ, PLY, STL, GLB) with scale and pose.
 
+The 50 objects and the 20 of the set ``unseen`` are data, `MESHES_FILE`. ``benchmarks/objects/draw.py`` draws them.
+"""
+
+import io
 import re
 from collections import Counter
+from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
-from fpp_ml_bench.constants import OBJECTS, UNSEEN
+from fpp_ml_bench.constants import MM_PER_M, OBJECTS, UNSEEN
 from fpp_ml_bench.errors import MeshError
 from fpp_ml_bench.files import is_file, printable, read_yaml, write_atomically
 from fpp_ml_bench.loaders.render.mesh_files import MESH_SUFFIXES, content_hash, ply_bytes, read_mesh
-from fpp_ml_bench.loaders.render.objects import object_mesh
 from fpp_ml_bench.loaders.render.scene import SolidMesh, UserMesh
+from fpp_ml_bench.options import did_you_mean
 from fpp_ml_bench.portable import cosine_of_turns, sine_of_turns
 from fpp_ml_bench.schema import Positive, StrictModel, as_tuple, validate
 
 Triple = Annotated[tuple[float, float, float], BeforeValidator(as_tuple)]
+MESHES_FILE = Path(__file__).with_name("objects.npz")
+"""For each object NAME.vertices and NAME.faces, int32 (V, 3) and (F, 3), each row less the row before it: a fifth
+smaller than the rows themselves. Deflated, since xz is a fifth smaller again and takes 16 ms a mesh, not 1."""
+MESH_GRID_MM = 2.0**-8
+"""Unit of their vertices: two hundred steps to a pixel at 1.8 m, and coarse enough to leave no sliver."""
 _KEPT = 4
-"""The benchmark's objects that a process keeps, and with them their surfels (`Lighting`, about 10 MB each): drawing and
-tracing one takes about a second."""
+"""The benchmark's objects that a process keeps, and with them their surfels (`Lighting`, about 10 MB each): tracing one
+takes half a second."""
 
 
 def solid_mesh(name: str, user_meshes: tuple[UserMesh, ...] = ()) -> SolidMesh:
     """Mesh ``name`` ready for the scene: metres, z up, about its turning axis. The same for the same name, as long as
-    it is kept."""
+    it is kept. Raises `MeshError` for an unknown name."""
     user = {mesh.name: mesh for mesh in user_meshes}
-    return load_user_mesh(user[name]) if name in user else _drawn(name)
+    return load_user_mesh(user[name]) if name in user else _benchmark_mesh(name)
 
 
 @lru_cache(maxsize=_KEPT)
-def _drawn(name: str) -> SolidMesh:
-    mesh = object_mesh(name)
-    return SolidMesh(name, np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int32))
+def _benchmark_mesh(name: str) -> SolidMesh:
+    """Centred at the origin. The camera of the first view looks along +x."""
+    steps, faces = stored_mesh(name)
+    vertices_m = steps * MESH_GRID_MM / MM_PER_M
+    low, high = vertices_m.min(axis=0), vertices_m.max(axis=0)
+    return SolidMesh(name, vertices_m - (low + high) / 2, faces)
+
+
+def stored_mesh(name: str) -> tuple[NDArray[np.int64], NDArray[np.int32]]:
+    """Vertices (V, 3) in steps of `MESH_GRID_MM`, and faces (F, 3), of one of the package's meshes. Raises `MeshError`
+    for an unknown name."""
+    names = (*OBJECTS, *UNSEEN)
+    if name not in names:
+        expected = f"expected one of the benchmark's {len(names)} objects, got {name!r}"
+        raise MeshError(f"{expected}; {did_you_mean(name, names)}")
+    with np.load(MESHES_FILE) as stored:
+        steps = np.cumsum(stored[f"{name}.vertices"], axis=0, dtype=np.int64)
+        return steps, np.cumsum(stored[f"{name}.faces"], axis=0, dtype=np.int32)
+
+
+def pack_meshes(meshes: Mapping[str, tuple[NDArray[np.integer], NDArray[np.integer]]]) -> bytes:
+    """Content of `MESHES_FILE` for vertices and faces as `stored_mesh` gives them."""
+    rows = {}
+    for name, parts in meshes.items():
+        for part, values in zip(("vertices", "faces"), parts, strict=True):
+            rows[f"{name}.{part}"] = np.diff(values, axis=0, prepend=0).astype(np.int32)
+    content = io.BytesIO()
+    np.savez_compressed(content, allow_pickle=False, **rows)
+    return content.getvalue()
 
 
 def load_user_mesh(description: UserMesh) -> SolidMesh:

@@ -1,8 +1,7 @@
 """Things of the house (bowl, mug, candles, pens, cells) and things with flat faces (cartons, books, timber). In mm."""
 
 import numpy as np
-
-from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
+from solids import (
     SMALL_SEGMENTS,
     Solid,
     angles,

@@ -1,8 +1,7 @@
 """Hand tools: hammer, scissors, clamps, boxcutter, brushes and palette knives. Drawn flat in millimetres, real size."""
 
 import numpy as np
-
-from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
+from solids import (
     Point2,
     Solid,
     around,

@@ -1,8 +1,7 @@
 """Bottles, cans, sprayers, tubes and jars: lofted or turned bodies with closures. Upright, in mm, at real size."""
 
 import numpy as np
-
-from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
+from solids import (
     SEGMENTS,
     Point2,
     Solid,

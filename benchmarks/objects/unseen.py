@@ -7,8 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 from manifold3d import CrossSection, Manifold, OpType
-
-from fpp_ml_bench.loaders.render.objects.solids import (  # isort: skip
+from solids import (
     Solid,
     angles,
     around,
