@@ -61,6 +61,7 @@ def test_a_packed_mesh_is_read_as_it_was(monkeypatch, tmp_path):
     np.testing.assert_array_equal(again_faces, faces[::-1])
 
 
+@pytest.mark.processes
 def test_the_drawings_give_the_meshes():
     """With the manifold3d that CI pins. One of each module, and one of those that are drawn by a formula."""
     names = ("banana", "lighting_candles", "power_drill", "gear", "blob")
