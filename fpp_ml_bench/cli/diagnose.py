@@ -276,7 +276,7 @@ def _table(setup: Setup, rows: dict[str, list[View]]) -> Table:
     severities = (0, *setup.severities)
     columns = [f"severity {severity}" if severity else "clean" for severity in severities]
     columns += ["wrong orders", "missed", "invented", "answered, mm", "confident errors"]
-    table = Table("axis", numbers=columns, title=f"{setup.method.title}: object MAE in mm")
+    table = Table("axis", numbers=columns, title=f"{setup.method.title}: two-sided MAE in mm")
     for axis, found in rows.items():
         means = severity_means(found)
         last = means[max(means)]
