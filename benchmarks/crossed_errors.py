@@ -14,6 +14,7 @@ error is missed, a wrong order, near a depth edge, and the rest. Void pixels cou
 import argparse
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -98,7 +99,8 @@ def measured(
     """What a method makes of ``samples`` under a kind of disturbance, means over them; ``pixels``: by what they are."""
     method = load_method(name, dataset, **options)
     if threshold is not None:
-        method.route.threshold = threshold
+        learned = replace(method.route.learned, threshold=threshold)
+        method.route = replace(method.route, learned=learned)
     rows, parts = [], []
     for number, sample in enumerate(samples):
         exact = dataset.target_mm(sample, DEPTH_EXACT)

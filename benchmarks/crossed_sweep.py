@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.learned.scenes import photographed
-from fpp_ml_bench.baselines.phase.calibration_layer import wrapped
 from fpp_ml_bench.baselines.phase.candidates import chosen_values, crossed_candidates
-from fpp_ml_bench.baselines.phase.depth import CrossedRoute
-from fpp_ml_bench.baselines.phase.resampling import grid_of
+from fpp_ml_bench.baselines.phase.geometry import grid_of, wrapped
+from fpp_ml_bench.baselines.phase.observe import TwoCarriers
+from fpp_ml_bench.baselines.phase.route import two_carriers
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.constants import OBJECTS, VIEWS, split_of
 from fpp_ml_bench.design.rivals import EpipolarLines
@@ -46,7 +46,7 @@ def measured(rig: Rig, family: Crossed, light: str, views: tuple[str, ...]) -> l
     objects = tuple(name for name in OBJECTS if split_of(name) == "validation")
     shown = rig.with_crossed(replace(family, shifts_deg=FIRST_SHIFTED_DEG))
     studio = Studio(BuildSettings(rig=shown, objects=objects, light=load_light(light)))
-    route, rows = CrossedRoute(shown), []
+    route, rows = two_carriers(TwoCarriers(shown)), []
     for name in objects:
         for view in views:
             try:
@@ -55,8 +55,8 @@ def measured(rig: Rig, family: Crossed, light: str, views: tuple[str, ...]) -> l
                 continue
             inside = exact > 0
             target = inside & ((flags & VOID) == 0)
-            seen = route.fitted(route.observe(frames[0], inside))
-            depth_mm = route.conclude(seen).depth_mm
+            fitted = route.choose(route.observe(frames[0], inside))
+            seen, depth_mm = fitted.seen, route.depth(fitted).depth_mm
             grid = grid_of(seen.stride)
             points, carriers = target[seen.crop][grid], seen.carriers.at(grid)
             truth = carriers.nearness(np.where(points, exact[seen.crop][grid], FAR))

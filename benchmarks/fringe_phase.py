@@ -23,7 +23,10 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from fpp_ml_bench.api import load_method
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, wrapped
+from fpp_ml_bench.baselines.learned.fringe_net import FringePhase
+from fpp_ml_bench.baselines.learned.method import FringeNetMethod
+from fpp_ml_bench.baselines.phase.geometry import TAU, wrapped
+from fpp_ml_bench.baselines.phase.observe import CrossedObservation, Observation
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.depth import object_mask, object_near_edges
 from fpp_ml_bench.evaluation.protocol import EDGE_BAND_PX
@@ -65,6 +68,14 @@ def windowed_fourier(grey: NDArray, step_rad: NDArray, noise_grey: float) -> NDA
     return np.angle(total)
 
 
+def learned_phases(method: FringeNetMethod, seen: Observation | CrossedObservation) -> NDArray:
+    """What the networks say of an observation, (K, h, w) rad."""
+    route = method.route
+    if isinstance(route.learned, FringePhase):
+        return route.learned.phases(seen).phase_rad
+    return route.phases(seen).phase_rad  # the observation with the phases of both carriers
+
+
 def phases(
     dataset: DatasetFolder, sample: str, fringes: str, methods: dict[str, Any], inside: NDArray, exact: NDArray
 ) -> tuple[NDArray, dict[str, NDArray]]:
@@ -75,12 +86,12 @@ def phases(
     depth = np.where(inside, exact, 1000.0)
     found: dict[str, NDArray] = {}
     if fringes == "crossed":
-        carriers = measured.route.carriers
+        carriers = measured.route.model.carriers
         truth, steps = carriers.phases(carriers.nearness(depth)), carriers.step_rad
         local = np.zeros(truth.shape, np.float32)
         local[:, *seen.crop] = seen.phase_rad
     else:
-        layer = measured.route.layer
+        layer = measured.route.model.layer
         truth = layer.absolute_phase(depth)[None]
         carrier = layer.absolute_phase(np.full(depth.shape, dataset.rig.standoff_m * MM_PER_M))
         steps = np.array([[np.diff(carrier, axis=axis).mean() for axis in (1, 0)]])
@@ -95,7 +106,7 @@ def phases(
         if name == "local fit":
             continue
         learned = np.zeros(truth.shape, np.float32)
-        learned[:, *seen.crop] = method.route.phases(seen).phase_rad
+        learned[:, *seen.crop] = learned_phases(method, seen)
         found[name] = learned
     return truth, found
 

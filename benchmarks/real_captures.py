@@ -23,7 +23,7 @@ from PIL import Image
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.learned.method import ClassicalNetMethod, CrossedNetMethod, FringeNetMethod
 from fpp_ml_bench.baselines.method import Method
-from fpp_ml_bench.baselines.phase.calibration_layer import wrapped
+from fpp_ml_bench.baselines.phase.geometry import wrapped
 from fpp_ml_bench.baselines.phase.method import CrossedMethod, PhaseMethod
 from fpp_ml_bench.baselines.robustness.axes import corruptions
 from fpp_ml_bench.calibration.boards import Board

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.signal import fftconvolve
 
 from fpp_ml_bench.baselines.learned.scenes import photographed
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Carriers, wrapped
+from fpp_ml_bench.baselines.phase.geometry import TAU, Carriers, wrapped
 from fpp_ml_bench.baselines.phase.local_fit import CURVED, DEMODULATION_PERIODS, WINDOW_SIGMAS
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.constants import OBJECTS, VIEWS, split_of

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, shift
 
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.phase.geometry import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M, VIEW_DEGREES, VIEWS
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.depth import normalise, object_mask

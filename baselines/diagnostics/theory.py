@@ -22,7 +22,7 @@ from fpp_ml_bench.baselines.diagnostics.probe import (
     with_interval,
 )
 from fpp_ml_bench.baselines.diagnostics.scenes import SceneRenderer, constant, moved, original
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.phase.geometry import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders.storage.store import DatasetFolder

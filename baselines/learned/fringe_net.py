@@ -16,14 +16,12 @@ from fpp_ml_bench.baselines.learned.inputs import CroppedMaps, Geometry
 from fpp_ml_bench.baselines.learned.network import FringeNet
 from fpp_ml_bench.baselines.learned.odds import SCALE_TO_SIGMA
 from fpp_ml_bench.baselines.learned.routes import EXPECTED_SHARE
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Crop, Image, Mask, wrapped
-from fpp_ml_bench.baselines.phase.depth import CrossedRoute, FringeMeasurement, Measurement, NearnessFit
+from fpp_ml_bench.baselines.phase.depth import Fitted, NearnessFit
+from fpp_ml_bench.baselines.phase.geometry import TAU, Crop, Image, wrapped
 from fpp_ml_bench.baselines.phase.local_fit import fringes
-from fpp_ml_bench.baselines.phase.observe import CrossedObservation, Frames, Observation
-from fpp_ml_bench.baselines.phase.resampling import Periods
-from fpp_ml_bench.baselines.phase.settings import Settings
+from fpp_ml_bench.baselines.phase.observe import CrossedObservation, Observation
+from fpp_ml_bench.baselines.phase.order import FringeOrder
 from fpp_ml_bench.constants import GREY_LEVELS
-from fpp_ml_bench.optics.rig import Rig
 
 WINDOW_PERIODS = 0.6  # sigma of the Gaussian over which mean and spread of the grey levels are taken
 LEAST_SPREAD_GREY = 1.0
@@ -80,55 +78,58 @@ def phases_of(networks: Sequence[FringeNet], x: Image) -> Phases:
     return Phases(phase.astype(np.float32), np.sqrt(variance).astype(np.float32))
 
 
-class FringeNetRoute(Geometry):
-    """Fringes of one direction, turned for the network so that phase grows downwards. The order is that of the local
-    fit: with the exact phase larger parts hang together, and all of a part is wrong where a texture misleads it."""
+@dataclass(frozen=True)
+class FringePhase:
+    """The phase of fringes of one direction by networks, for which they are turned so that phase grows downwards. The
+    order is that of the local fit: with the exact phase larger parts hang together, and all of a part is wrong where a
+    texture misleads it."""
 
-    def __init__(
-        self, rig: Rig, settings: Settings, networks: Sequence[FringeNet], periods: Periods | None = None
-    ) -> None:
-        super().__init__(rig, settings, periods)
-        self.networks = networks
+    geometry: Geometry
+    networks: Sequence[FringeNet]
 
     def phases(self, seen: Observation) -> Phases:
         """Of the one carrier."""
-        x = fringe_channels(FringeScene.of(seen.greys[0], self.period_px, seen.crop))
-        turned = phases_of(self.networks, np.ascontiguousarray(self.rotation.turn(x)))
-        phase, sigma = (np.ascontiguousarray(self.rotation.back(maps)) for maps in vars(turned).values())
-        return Phases(np.float32(self.rotation.sign) * phase, sigma)
+        rotation = self.geometry.rotation
+        x = fringe_channels(FringeScene.of(seen.greys[0], self.geometry.period_px, seen.crop))
+        turned = phases_of(self.networks, np.ascontiguousarray(rotation.turn(x)))
+        phase, sigma = (np.ascontiguousarray(rotation.back(maps)) for maps in (turned.phase_rad, turned.sigma_rad))
+        return Phases(np.float32(rotation.sign) * phase, sigma)
 
-    def measure(self, image: Frames, mask: Mask | None = None) -> FringeMeasurement:
-        seen = self.observe(image, mask)
-        order, margin = self.choose(seen)
-        if seen.inside.any():
-            found = self.phases(seen)
-            phase = found.phase_rad[0]
-            order = order + np.rint((seen.phase_rad - phase) / TAU).astype(np.int32)
-            seen = replace(seen, phase_rad=phase, uncertainty_rad=np.float32(EXPECTED_SHARE) * found.sigma_rad[0])
-        return self.conclude(seen, order, margin)
+    def __call__(self, chosen: FringeOrder) -> FringeOrder:
+        seen = chosen.seen
+        if not seen.inside.any():
+            return chosen
+        found = self.phases(seen)
+        phase, sigma = found.phase_rad[0], np.float32(EXPECTED_SHARE) * found.sigma_rad[0]
+        order = chosen.order + np.rint((seen.phase_rad - phase) / TAU).astype(np.int32)
+        return FringeOrder(replace(seen, phase_rad=phase, uncertainty_rad=sigma), order, chosen.margin)
 
 
-class FringeNetCrossedRoute(CrossedRoute):
-    """Both carriers of one crossed frame, of the rig that the networks learned from."""
+@dataclass(frozen=True)
+class CrossedPhases:
+    """The phases of both carriers of one crossed frame by networks, of the rig that they learned from: first for the
+    choice of the order (`before`), then for the nearness of every pixel (`after`)."""
 
-    def __init__(
-        self, rig: Rig, settings: Settings, networks: Sequence[FringeNet], periods: Periods | None = None
-    ) -> None:
-        super().__init__(rig, settings, periods=periods)
-        self.networks = networks
+    period_px: float
+    networks: Sequence[FringeNet]
 
     def phases(self, seen: CrossedObservation) -> Phases:
         """Of both carriers."""
         return phases_of(self.networks, fringe_channels(FringeScene.of(seen.grey, self.period_px, seen.crop)))
 
-    def measure(self, image: Frames, mask: Mask | None = None) -> Measurement:
-        seen = self.observe(image, mask)
-        if not seen.inside.any():
-            return self.conclude(self.fitted(seen))
+    def before(self, seen: CrossedObservation) -> CrossedObservation:
+        """The observation with these phases."""
         found = self.phases(seen)
         points = found.phase_rad[:, :: seen.stride, :: seen.stride]
-        fitted = self.fitted(replace(seen, phase_rad=found.phase_rad, point_phase_rad=points))
-        return self.conclude(replace(fitted, fit=_nearness_fit(fitted, fitted.fit, found.sigma_rad)))
+        return replace(seen, phase_rad=found.phase_rad, point_phase_rad=points, sigma_rad=found.sigma_rad)
+
+    @staticmethod
+    def after(fitted: Fitted) -> Fitted:
+        """The nearness that they tell."""
+        sigma_rad = fitted.seen.sigma_rad
+        if sigma_rad is None:  # no object
+            return fitted
+        return replace(fitted, fit=_nearness_fit(fitted.seen, fitted.fit, sigma_rad))
 
 
 def _nearness_fit(seen: CrossedObservation, fit: NearnessFit, sigma_rad: Image) -> NearnessFit:

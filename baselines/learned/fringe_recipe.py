@@ -23,8 +23,9 @@ from fpp_ml_bench.baselines.learned.network import FringeNet, mean_over, scale_l
 from fpp_ml_bench.baselines.learned.scenes import View
 from fpp_ml_bench.baselines.learned.training import Batch, StepRecipe, Task
 from fpp_ml_bench.baselines.learned.windows import Sample, Window, mean_scores, padded
-from fpp_ml_bench.baselines.phase.calibration_layer import Carriers, wrapped
+from fpp_ml_bench.baselines.phase.geometry import Carriers, wrapped
 from fpp_ml_bench.baselines.phase.object_mask import crop_around
+from fpp_ml_bench.baselines.phase.observe import OneCarrier
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.baselines.training.weights import FRINGE_NETWORKS, Family
 from fpp_ml_bench.errors import RecipeError
@@ -117,7 +118,7 @@ class FringeTask(Task):
             self.frames, self.decoded = (rig.sequence.crossed_frames[0],), DIRECTIONS[:1]
             self.period_px = {"crossed": self.carriers.period_px}
         else:
-            self.geometries = {way: Geometry(rig, Settings(direction=way)) for way in DIRECTIONS}
+            self.geometries = {way: Geometry(OneCarrier(rig, Settings(direction=way))) for way in DIRECTIONS}
             self.frames, self.decoded = tuple(rig.sequence.sinusoids(way)[0] for way in DIRECTIONS), DIRECTIONS
             self.period_px = {str(way): geometry.period_px for way, geometry in self.geometries.items()}
 

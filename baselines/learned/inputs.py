@@ -14,15 +14,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer, Carriers, Crop, Image, Mask, wrapped
 from fpp_ml_bench.baselines.phase.candidates import irradiance
-from fpp_ml_bench.baselines.phase.depth import Fitted, PhaseRoute
+from fpp_ml_bench.baselines.phase.depth import Fitted
+from fpp_ml_bench.baselines.phase.geometry import (
+    TAU,
+    CalibrationLayer,
+    Carriers,
+    Crop,
+    Image,
+    Mask,
+    grid_of,
+    repeated,
+    wrapped,
+)
 from fpp_ml_bench.baselines.phase.local_fit import fringes, phase_slopes
-from fpp_ml_bench.baselines.phase.observe import Observation
+from fpp_ml_bench.baselines.phase.observe import Observation, OneCarrier
 from fpp_ml_bench.baselines.phase.order import LEAST_BRIGHTNESS
-from fpp_ml_bench.baselines.phase.resampling import Periods, grid_of, repeated
-from fpp_ml_bench.baselines.phase.settings import Settings
-from fpp_ml_bench.optics.rig import Rig
 
 STEPS = (-1, 0, 1)  # the candidates: a period further than the base order, the base order, a period nearer
 SIDES = ((0.0, 1.0), (0.7, 0.7), (1.0, 0.0), (0.7, -0.7), (0.0, -1.0), (-0.7, -0.7), (-1.0, 0.0), (-0.7, 0.7))
@@ -129,21 +136,21 @@ class Rotation:
         return (-self.sign if self.reversed else self.sign) * down, self.sign * right
 
 
-class Geometry(PhaseRoute):
-    """The measured route of a rig and fringe direction, and the rotation of all its images."""
+class Geometry:
+    """A measurement model of one fringe direction, and the rotation of all its images."""
 
-    def __init__(self, rig: Rig, settings: Settings, periods: Periods | None = None) -> None:
-        super().__init__(rig, settings, periods)
-        self.rotation = Rotation.of(self.layer, settings.direction)
+    def __init__(self, model: OneCarrier) -> None:
+        self.model, self.layer, self.period_px = model, model.layer, model.period_px
+        self.rotation = Rotation.of(model.layer, model.settings.direction)
 
     @property
     def shading(self) -> bool:
         """Whether brightness is a cue for the order: one albedo for all surfaces."""
-        return self.settings.shading
+        return self.model.settings.shading
 
     def in_range(self, depth_mm: NDArray) -> Mask:
         """Whether a depth lies in the working range, or its slack."""
-        low, high = self.range_mm
+        low, high = self.model.range_mm
         return (depth_mm > low) & (depth_mm < high)
 
 
@@ -260,14 +267,14 @@ def coarse_irradiance(scene: PhaseScene, geometry: Geometry, residuals_rad: Sequ
     """`irradiance` (n, h', w') with each of ``residuals_rad`` (h, w), on every `STEP_PX`-th pixel."""
     grid, where = grid_of(STEP_PX), grid_of(STEP_PX, scene.crop)
     layer, slopes = geometry.layer.at(where), (scene.slopes[0][grid], scene.slopes[1][grid])
-    return np.stack([irradiance(layer, rad[grid], slopes, geometry.rig, where) for rad in residuals_rad])
+    return np.stack([irradiance(layer, rad[grid], slopes, geometry.model.rig, where) for rad in residuals_rad])
 
 
 def phase_channels(scene: PhaseScene, geometry: Geometry) -> tuple[Image, Mask]:
     """Input of the network (`PHASE_CHANNELS`, h', w') float32, rotated, and which candidates exist, bool (3, h', w'):
     those in the working range, so that a single one settles the order, or the base where none is. Without shading the
     maps that assume one albedo are 0."""
-    rig, rotation, layer = geometry.rig, geometry.rotation, geometry.layer.at(scene.crop)
+    rig, rotation, layer = geometry.model.rig, geometry.rotation, geometry.layer.at(scene.crop)
     residual = layer.residual_phase(scene.phase_rad, scene.order)
     candidates = [residual + rotation.sign * TAU * step for step in STEPS]
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -385,15 +392,15 @@ class CrossedScene(CandidateScene):
         return np.stack([self.step_rad[0], np.zeros_like(self.step_rad[0]), self.step_rad[1]])
 
     @classmethod
-    def of(cls, seen: Fitted) -> "CrossedScene":
+    def of(cls, fitted: Fitted) -> "CrossedScene":
         """From an observation of the measured route."""
-        fit, background, carriers = seen.fit, seen.background, seen.carriers
+        seen, fit, found = fitted.seen, fitted.fit, fitted.candidates
+        background, carriers = seen.background, seen.carriers
         lit = fit.brightness[seen.inside & (fit.brightness > 0)]
         level = np.float32(max(float(np.median(lit)), 1.0) if lit.size else 1.0)
         bright = fit.brightness / level
         floor = np.maximum(fit.brightness, LEAST_BRIGHT * level)
         modulation = [grey / (contrast * floor) for grey, contrast in zip(seen.modulation, seen.contrast, strict=True)]
-        found = seen.candidates
         steps = (found.nearness[[0, 2]] - found.nearness[1]) * carriers.joint_gain
         shown = background.shown
         plane = np.arcsinh(background.residual / np.float32(background.noise_grey)) / 4 * np.float32(shown)

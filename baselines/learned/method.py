@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method, OwnViews
+from fpp_ml_bench.baselines.phase.depth import FringeMeasurement, Measurement
+from fpp_ml_bench.baselines.phase.geometry import Periods
 from fpp_ml_bench.baselines.phase.method import (
     LIT_BACKGROUND,
     ONE_ALBEDO,
@@ -28,7 +30,8 @@ from fpp_ml_bench.baselines.phase.method import (
     pitch_setting,
     pitch_words,
 )
-from fpp_ml_bench.baselines.phase.resampling import Periods
+from fpp_ml_bench.baselines.phase.observe import OneCarrier, TwoCarriers
+from fpp_ml_bench.baselines.phase.route import Measured, one_carrier, two_carriers
 from fpp_ml_bench.baselines.phase.settings import AMBIENT_GREY, DIRECTION, MIN_CONFIDENCE, WHITE_GREY, Settings
 from fpp_ml_bench.coding.phase_shift import PhaseShift
 from fpp_ml_bench.decoding.decode import Directions
@@ -109,7 +112,7 @@ class LearnedMethod(Method):
         return {"data": "generated", "versions": [lights]}
 
 
-class LearnedRoute(LearnedMethod, RouteMethod):
+class LearnedRoute(LearnedMethod, RouteMethod[Measured]):
     """A learned method that measures every map of a sample with `route`, and its network in ``threads``. Images whose
     fringe period in px differs by more than ``period_tolerance`` from that of the training images are resampled to
     theirs."""
@@ -127,7 +130,7 @@ class LearnedRoute(LearnedMethod, RouteMethod):
             )
         return Periods(learned_px / self.period_tolerance, learned_px, learned_px * self.period_tolerance)
 
-    def measure(self, frames: Frames) -> Any:
+    def measure(self, frames: Frames) -> Measured:
         from fpp_ml_bench.baselines.networks.base import torch_threads
 
         with torch_threads(self.threads):
@@ -159,7 +162,7 @@ class PhaseNetTraining(OwnViews):
     start: Path | None = option(None, "weights to start from (default: none)", "FILE")
 
 
-class PhaseNetMethod(LearnedRoute):
+class PhaseNetMethod(LearnedRoute[FringeMeasurement]):
     """Depth from the first sinusoid of one ``direction``. ``albedo``: "one", where all surfaces have the background's,
     so that brightness tells the order, or "any", where it is ambiguous unless range and shape tell it; or
     ``weights``, a shipped name or a file, which say what they learned. ``min_confidence``: pixels below it are masked;
@@ -196,8 +199,9 @@ class PhaseNetMethod(LearnedRoute):
         return ONE_ALBEDO if shading is True else LIT_BACKGROUND if shading is False else None
 
     def __init__(self, rig: Rig, **options: Any) -> None:
+        from fpp_ml_bench.baselines.learned.inputs import Geometry
         from fpp_ml_bench.baselines.learned.odds import Odds
-        from fpp_ml_bench.baselines.learned.routes import PhaseNetRoute
+        from fpp_ml_bench.baselines.learned.routes import PhaseNetPart
 
         given = self.checked_options(options)
         if given.albedo not in (None, *ALBEDOS):
@@ -214,7 +218,9 @@ class PhaseNetMethod(LearnedRoute):
         own = {entry.name: getattr(given, entry.name) for entry in fields(Settings) if hasattr(given, entry.name)}
         self.options, self.rig, self.threads = Settings(**own, shading=learned == "one"), rig, given.threads
         odds, periods = Odds(config.temperature, config.offset, config.doubted), self.learned_periods(given.direction)
-        self.route = PhaseNetRoute(rig, self.options, self.file.network, config.threshold, config.lead, odds, periods)
+        model = OneCarrier(rig, self.options, periods)
+        part = PhaseNetPart(Geometry(model), self.file.network, config.threshold, config.lead, odds)
+        self.route = one_carrier(model, learned=part)
         self.frames_used = (rig.sequence.sinusoids(given.direction)[0],)
         # With a range under a period, most pixels have one order in it, whatever the network says.
         self.by_range = rig.periods_in_range(given.direction) < 1
@@ -243,7 +249,7 @@ class CrossedNetOptions:
     threads: int = 1
 
 
-class CrossedNetMethod(LearnedRoute):
+class CrossedNetMethod(LearnedRoute[Measurement]):
     """Depth from one crossed frame by the weights ``weights`` (a shipped name or a file), or from the mean of the first
     fringe of both directions where the rig has no crossed frame. ``min_confidence``: pixels below it are masked. Raises
     `WeightsError` for weights that can't be used, and `PredictionError` for a rig whose fringes they did not learn."""
@@ -271,20 +277,15 @@ class CrossedNetMethod(LearnedRoute):
         return crossed_name(submission, "Crossed fringes, ")
 
     def __init__(self, rig: Rig, **options: Any) -> None:
-        from fpp_ml_bench.baselines.learned.routes import CrossedNetRoute
+        from fpp_ml_bench.baselines.learned.routes import CrossedNetPart
 
         given = self.checked_options(options)
         self.use(given.weights)
         config, periods = self.weights_config, self.learned_periods("crossed")
         self.rig, self.threads, self.frames_used = rig, given.threads, frames_of(rig, self.name)
-        self.route = CrossedNetRoute(
-            rig,
-            self.file.network,
-            config.threshold,
-            config.lead,
-            Settings(min_confidence=given.min_confidence),
-            periods,
-        )
+        model = TwoCarriers(rig, Settings(min_confidence=given.min_confidence), periods=periods)
+        part = CrossedNetPart(model.carriers, self.file.network, config.threshold, config.lead)
+        self.route = two_carriers(model, learned=part)
         made = "" if len(self.frames_used) == 1 else ", the mean of two"
         self.title = f"Crossed fringes, one frame{made}; order, mask and correction learned{self.more}"
         self.settings = {**vars(given), **self.weights_settings, "order_lead": config.lead}
@@ -316,7 +317,7 @@ class FringeNetTraining(OwnViews):
     seed: int | None = option(None, "of weights, lights and windows: another network (default: 42)", "N")
 
 
-class FringeNetMethod(LearnedRoute):
+class FringeNetMethod(LearnedRoute[Measurement]):
     """Depth from one frame whose wrapped phase networks give as numerator and denominator (`fringe_net`); mask, order
     and depth as of `phase` or `crossed`. ``members`` of the shipped ensemble, or the network in ``weights`` alone. The
     first sinusoid of a direction, or a crossed frame: ``fringes``. Raises `WeightsError` for weights that can't be
@@ -349,7 +350,8 @@ class FringeNetMethod(LearnedRoute):
         return RANGE_AND_WALL if settings.get("fringes") == "crossed" else fringe_assumption(settings)
 
     def __init__(self, rig: Rig, **options: Any) -> None:
-        from fpp_ml_bench.baselines.learned.fringe_net import FringeNetCrossedRoute, FringeNetRoute
+        from fpp_ml_bench.baselines.learned.fringe_net import CrossedPhases, FringePhase
+        from fpp_ml_bench.baselines.learned.inputs import Geometry
         from fpp_ml_bench.baselines.training.weights import FRINGE_NETWORKS
 
         given = self.checked_options(options)
@@ -380,15 +382,16 @@ class FringeNetMethod(LearnedRoute):
                     f"projects {here}; train networks on it, or use crossed-net or crossed, which measure any"
                 )
             self.frames_used = rig.sequence.crossed_frames[:1]
-            self.route = FringeNetCrossedRoute(rig, Settings(min_confidence=given.min_confidence), networks, periods)
+            pair = TwoCarriers(rig, Settings(min_confidence=given.min_confidence), periods=periods)
+            phases = CrossedPhases(pair.period_px, networks)
+            self.route = two_carriers(pair, phases=phases.before, learned=phases.after)
         else:
             way: Direction = "vertical" if fringes == "vertical" else "horizontal"
             fringe_options(self.name, rig, {"direction": way})
             own, other_pitch = Settings(direction=way, min_confidence=given.min_confidence), pitch_setting(rig, way)
-            self.route, self.frames_used = (
-                FringeNetRoute(rig, own, networks, periods),
-                (rig.sequence.sinusoids(way)[0],),
-            )
+            model = OneCarrier(rig, own, periods)
+            self.route = one_carrier(model, learned=FringePhase(Geometry(model), networks))
+            self.frames_used = (rig.sequence.sinusoids(way)[0],)
         count = "one network" if len(networks) == 1 else f"{len(networks)} networks"
         frame = f"one {fringes} frame{pitch_words(other_pitch)}"
         self.title = f"Wrapped phase of {frame} by {count}; mask and order measured{self.more}"

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.learned.inputs import CandidateScene
 from fpp_ml_bench.baselines.learned.network import PhaseNet
-from fpp_ml_bench.baselines.phase.calibration_layer import Image, Mask
 from fpp_ml_bench.baselines.phase.candidates import chosen_values, links_between
 from fpp_ml_bench.baselines.phase.depth import MARGIN_SCALE
+from fpp_ml_bench.baselines.phase.geometry import Image, Mask, nearest_inside, repeated
 from fpp_ml_bench.baselines.phase.labels import least_energy
-from fpp_ml_bench.baselines.phase.order import LARGE
-from fpp_ml_bench.baselines.phase.resampling import nearest_inside, repeated
+from fpp_ml_bench.baselines.phase.order import JUMP_RAD, LARGE
 
 GRAPH = 3.0  # weight of smoothness between neighbours in the labelling of the orders, in which depth may jump
 SCALE_TO_SIGMA = float(np.sqrt(2))  # of a Laplace distribution
@@ -71,12 +70,9 @@ def answers_of_maps(network: PhaseNet, x: Image, exists: Mask) -> Answers:
     return Answers(logits, inside, correction, np.float32(SCALE_TO_SIGMA) * np.exp(scale))
 
 
-def least_energy_order(
-    logits: Image, phases_rad: Image, inside: Mask, stride: int, jump_rad: float
-) -> NDArray[np.intp]:
+def least_energy_order(logits: Image, phases_rad: Image, inside: Mask, stride: int) -> NDArray[np.intp]:
     """Index of each pixel's candidate (h, w) by least energy on a grid of every ``stride``-th pixel. ``logits`` as of
-    `Answers`; ``phases_rad`` (3, h, w): what neighbours are compared by;
-    ``jump_rad``: a jump between neighbours from which on it costs no more. A pixel takes the candidate nearest to what
+    `Answers`; ``phases_rad`` (3, h, w): what neighbours are compared by. A pixel takes the candidate nearest to what
     its grid point chose, or the nearest grid point that lies ``inside``."""
     chances = probabilities(logits)
     weight, size, grid = inside.astype(np.float32), (stride, stride), slice(None, None, stride)
@@ -85,7 +81,7 @@ def least_energy_order(
     points, phases = inside[grid, grid], phases_rad[:, grid, grid].astype(np.float32)
     link_x, link_y = (link * np.float32(GRAPH * stride) for link in links_between(points))
     cost = np.where(points, np.minimum(cost, LARGE), 0).astype(np.float32)
-    choice, _ = least_energy(cost, phases, link_x, link_y, jump_rad)
+    choice, _ = least_energy(cost, phases, link_x, link_y, JUMP_RAD)
     chosen_rad = chosen_values(phases, choice)
     chosen_rad = chosen_rad[nearest_inside(points)]
     apart = np.abs(phases_rad - repeated(chosen_rad, stride, inside.shape))

@@ -39,10 +39,10 @@ from fpp_ml_bench.baselines.learned.windows import (
     symmetric,
     wrong_place,
 )
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Image, Mask
 from fpp_ml_bench.baselines.phase.candidates import chosen_values
-from fpp_ml_bench.baselines.phase.depth import CrossedRoute
-from fpp_ml_bench.baselines.phase.resampling import repeated
+from fpp_ml_bench.baselines.phase.geometry import TAU, Image, Mask, repeated
+from fpp_ml_bench.baselines.phase.observe import OneCarrier, TwoCarriers
+from fpp_ml_bench.baselines.phase.route import CrossedRoute, one_carrier, two_carriers
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import RecipeError
@@ -111,24 +111,25 @@ def phase_sample(view: View, image: NDArray[np.uint8], geometry: Geometry) -> Sa
     """Sample of an image uint8 (H, W) of a view, whose void pixels count nowhere, in half precision; None where nothing
     calibrates its brightness, or no object is seen. What is missing: true absolute phase less that of the base order,
     in rad."""
-    observation = geometry.observe(image)
+    route = one_carrier(geometry.model)
+    observation = route.observe(image, None)
     if not observation.background.calibrated or not observation.inside.any():
         return None
-    order, _ = geometry.choose(observation)
+    order = route.choose(observation).order
     scene, part = PhaseScene.of(observation, order, geometry.shading), view.part(observation.crop)
     if not part.target.any():
         return None
     true_phase = observation.layer.absolute_phase(np.where(part.target, part.depth_mm, 1000.0))
     missing = np.where(part.target, true_phase - observation.phase_rad - TAU * order, 0.0)
     half = np.nan_to_num(missing).astype(np.float16)
-    return Sample.of(part, scene.single(np.float16), half, direction=geometry.settings.direction)
+    return Sample.of(part, scene.single(np.float16), half, direction=geometry.model.settings.direction)
 
 
 def _moved(
     scene: PhaseScene, missing: Image, target: Mask, geometry: Geometry, vary: Variation, random: np.random.Generator
 ) -> PhaseScene:
     """The object at another distance within the working range."""
-    near, far = geometry.rig.working_range_mm
+    near, far = geometry.model.rig.working_range_mm
     layer = geometry.layer.at(scene.crop)
     true_rad = (layer.residual_phase(scene.phase_rad, scene.order) + missing).astype(np.float32)
     middle = float(np.median(true_rad[target]))
@@ -184,7 +185,7 @@ class PhaseTask(CandidateTask):
     def __init__(self, recipe: PhaseRecipe, rig: Rig) -> None:
         super().__init__(recipe, rig)
         self.geometries: Geometries = {
-            direction: Geometry(rig, Settings(direction=direction, shading=recipe.albedo == "one"))
+            direction: Geometry(OneCarrier(rig, Settings(direction=direction, shading=recipe.albedo == "one")))
             for direction in recipe.directions
         }
         self.frames = tuple(rig.sequence.sinusoids(direction)[0] for direction in recipe.directions)
@@ -258,11 +259,12 @@ class PhaseTask(CandidateTask):
 def crossed_sample(view: View, route: CrossedRoute) -> Sample:
     """The sample of a view; its void pixels are no target, and no background either. What is missing: joint phase of
     the true nearness less that of the scene's, in rad."""
-    seen = route.fitted(route.observe(view.frames[0]))
-    part = view.part(seen.carriers.crop)
-    truth = seen.carriers.nearness(np.where(part.target, part.depth_mm, 1000.0))
-    missing = np.where(part.target, (truth - seen.fit.nearness) * seen.carriers.joint_gain, 0.0)
-    return Sample.of(part, CrossedScene.of(seen).single(np.float16), np.clip(missing, -100, 100).astype(np.float16))
+    fitted = route.choose(route.observe(view.frames[0], None))
+    carriers = fitted.seen.carriers
+    part = view.part(carriers.crop)
+    truth = carriers.nearness(np.where(part.target, part.depth_mm, 1000.0))
+    missing = np.where(part.target, (truth - fitted.fit.nearness) * carriers.joint_gain, 0.0)
+    return Sample.of(part, CrossedScene.of(fitted).single(np.float16), np.clip(missing, -100, 100).astype(np.float16))
 
 
 @dataclass(frozen=True)
@@ -308,7 +310,8 @@ class CrossedTask(CandidateTask):
 
     def __init__(self, recipe: CrossedRecipe, rig: Rig) -> None:
         super().__init__(recipe, rig)
-        self.route, self.frames = CrossedRoute(rig), (rig.sequence.crossed_frames[0],)
+        model = TwoCarriers(rig)
+        self.route, self.carriers, self.frames = two_carriers(model), model.carriers, rig.sequence.crossed_frames[:1]
 
     def samples(self, views: Iterable[View]) -> list[Sample]:
         return [crossed_sample(view, self.route) for view in views]
@@ -317,7 +320,7 @@ class CrossedTask(CandidateTask):
         self, sample: Sample, scene: CrossedScene, missing: Image, random: np.random.Generator, *truth: Mask
     ) -> Window:
         """In one of 8 orientations."""
-        vary, carriers, (target, void), before = self.recipe.vary, self.route.carriers, truth, scene.nearness
+        vary, carriers, (target, void), before = self.recipe.vary, self.carriers, truth, scene.nearness
         where, _ = wrong_place(scene.light.shape, vary.wrong_window, vary.wrong_patch, random)
         if where is not None:
             scene = scene.with_base(int(random.choice((0, 2))), where, carriers)
@@ -335,14 +338,14 @@ class CrossedTask(CandidateTask):
         return padded(self.recipe.window, symmetric(window, CROSSED_CHANNELS, int(random.integers(8))))
 
     def answers(self, network: PhaseNet, sample: Sample) -> Answers:
-        return crossed_answers(network, sample.scene.single(), self.route.carriers)
+        return crossed_answers(network, sample.scene.single(), self.carriers)
 
     def changes_rad(self, answers: Answers, sample: Sample) -> Image:
         return chosen_values(sample.scene.single().offers_rad, answers.logits.argmax(axis=0)) + answers.correction_rad
 
     def depth_mm(self, sample: Sample, change_rad: Image) -> NDArray:
-        part = self.route.carriers.at(sample.scene.crop)
+        part = self.carriers.at(sample.scene.crop)
         return part.depth_mm(sample.scene.nearness + change_rad / part.joint_gain)
 
     def calibrated(self, fields: dict[str, Any], answers: list[Answers], validation: list[Sample], out: Path) -> None:
-        fields["period_px"] = {"crossed": self.route.carriers.period_px}
+        fields["period_px"] = {"crossed": self.carriers.period_px}

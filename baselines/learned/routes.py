@@ -1,8 +1,8 @@
-"""The learned routes: a measured phase or two, the network's order, mask, bounded correction and its scale, and the
-measured route's depth. The network can't give any other depth. And the filter of a decoded depth: what it sees, maps
-without a distance, a direction or a grey level, and the depth that follows from its answers."""
+"""The learned parts of a phase route: the network's order, mask, bounded correction and its scale for a measured phase
+or two. The network can't give any other depth. And the filter of a decoded depth: what it sees, maps without a
+distance, a direction or a grey level, and the depth that follows from its answers."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -31,15 +31,19 @@ from fpp_ml_bench.baselines.learned.odds import (
     threshold_at,
     wrong_chance,
 )
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Carriers, Image, Mask, wrapped
 from fpp_ml_bench.baselines.phase.candidates import chosen_values
-from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Fitted, FringeMeasurement, Measurement
+from fpp_ml_bench.baselines.phase.depth import Fitted
+from fpp_ml_bench.baselines.phase.geometry import (
+    TAU,
+    Carriers,
+    Image,
+    Mask,
+    nearest_inside,
+    stride_of,
+    wrapped,
+)
 from fpp_ml_bench.baselines.phase.object_mask import gaps
-from fpp_ml_bench.baselines.phase.observe import Frames
-from fpp_ml_bench.baselines.phase.order import JUMP_RAD
-from fpp_ml_bench.baselines.phase.resampling import Periods, nearest_inside, stride_of
-from fpp_ml_bench.baselines.phase.settings import Settings
-from fpp_ml_bench.optics.rig import Rig
+from fpp_ml_bench.baselines.phase.order import FringeOrder
 
 OPEN_MARGIN = 1e-6
 """Least margin of an order that gets a depth where brightness can't tell it: a wrong one is less likely than not."""
@@ -70,7 +74,10 @@ def phase_answers(network: PhaseNet, scene: PhaseScene, geometry: Geometry, lead
     """Run ``network`` on a scene; ``lead``: see `Answers.with_lead`."""
     turned = answers_of_maps(network, *phase_channels(scene, geometry))
     back, sign = geometry.rotation.back, geometry.rotation.sign
-    logits, inside, correction, sigma = (np.ascontiguousarray(back(maps)) for maps in vars(turned).values())
+    logits, inside, correction, sigma = (
+        np.ascontiguousarray(back(maps))
+        for maps in (turned.logits, turned.object_logit, turned.correction_rad, turned.sigma_rad)
+    )
     logits = logits if sign > 0 else np.ascontiguousarray(logits[::-1])
     return Answers(logits, inside, correction * np.float32(sign), sigma).with_lead(lead)
 
@@ -79,44 +86,36 @@ def decided_order(answers: Answers, scene: PhaseScene, inside: Mask, geometry: G
     """Index of each pixel's candidate (h, w): `least_energy_order`."""
     base = geometry.layer.at(scene.crop).residual_phase(scene.phase_rad, scene.order)
     phases = np.stack([base + TAU * step for step in STEPS]).astype(np.float32)
-    stride, jump_rad = stride_of(geometry.period_px), geometry.settings.jump_rad
-    return least_energy_order(answers.logits, phases, inside, stride, jump_rad)
+    return least_energy_order(answers.logits, phases, inside, stride_of(geometry.period_px))
 
 
-class PhaseNetRoute(Geometry):
-    """One rig, one fringe direction, one network; images whose fringe period is beyond ``periods`` are resampled. An
-    image whose brightness nothing calibrates (`phase.EmptyScene`) is measured without the network: what it learnt
-    of order and mask rests on the brightness of a lit background."""
+@dataclass(frozen=True)
+class PhaseNetPart:
+    """What phase-net makes of the measured order of one fringe: mask, order, correction. An image whose brightness
+    nothing calibrates (`phase.EmptyScene`) is left as it is: what the network learnt of order and mask rests on the
+    brightness of a lit background."""
 
-    def __init__(
-        self,
-        rig: Rig,
-        settings: Settings,
-        network: PhaseNet,
-        threshold: float = 0.0,
-        lead: float = 0.0,
-        odds: Odds | None = None,
-        periods: Periods | None = None,
-    ) -> None:
-        super().__init__(rig, settings, periods)
-        self.network, self.threshold, self.lead, self.odds = network, threshold, lead, odds or Odds()
+    geometry: Geometry
+    network: PhaseNet
+    threshold: float = 0.0
+    lead: float = 0.0
+    odds: Odds = field(default_factory=Odds)
 
-    def measure(self, image: Frames, mask: Mask | None = None) -> FringeMeasurement:
-        seen = self.observe(image, mask)
-        base, margin = self.choose(seen)
+    def __call__(self, chosen: FringeOrder) -> FringeOrder:
+        seen, base = chosen.seen, chosen.order
         if not (seen.background.calibrated and seen.inside.any()):
-            return self.conclude(seen, base, margin)
-        scene = PhaseScene.of(seen, base, self.shading)
-        answers = phase_answers(self.network, scene, self, self.lead)
+            return chosen
+        scene = PhaseScene.of(seen, base, self.geometry.shading)
+        answers = phase_answers(self.network, scene, self.geometry, self.lead)
         inside = decided_mask(answers, scene, self.threshold)
-        choice = decided_order(answers, scene, inside, self)
+        choice = decided_order(answers, scene, inside, self.geometry)
         moved = seen.phase_rad + answers.correction_rad
         phase = wrapped(moved).astype(np.float32)
         order = base + np.array(STEPS, np.int32)[choice] + np.rint((moved - phase) / TAU).astype(np.int32)
         uncertainty = np.float32(EXPECTED_SHARE) * answers.sigma_rad
         seen = replace(seen, inside=inside, phase_rad=phase, uncertainty_rad=uncertainty)
         margin = margin_of(wrong_chance(answers.logits, choice, self.odds))
-        return self.conclude(seen, order, margin, -np.inf if self.shading else OPEN_MARGIN)
+        return FringeOrder(seen, order, margin, -np.inf if self.geometry.shading else OPEN_MARGIN)
 
 
 def crossed_answers(network: PhaseNet, scene: CrossedScene, carriers: Carriers, lead: float = 0.0) -> Answers:
@@ -132,40 +131,35 @@ def stated_rad(sigma_rad: Image) -> Image:
     return np.float32(STATED_SHARE) * np.sqrt(rest)  # type: ignore[no-any-return]
 
 
-class CrossedNetRoute(CrossedRoute):
-    """One rig and network; ``threshold`` on the logit of the mask."""
+@dataclass(frozen=True)
+class CrossedNetPart:
+    """What crossed-net makes of the measured nearness of one crossed frame: mask, order, correction. ``threshold`` on
+    the logit of the mask."""
 
-    def __init__(
-        self,
-        rig: Rig,
-        network: PhaseNet,
-        threshold: float,
-        lead: float,
-        settings: Settings | None = None,
-        periods: Periods | None = None,
-    ) -> None:
-        super().__init__(rig, settings, periods=periods)
-        self.network, self.threshold, self.lead = network, threshold, lead
+    carriers: Carriers
+    network: PhaseNet
+    threshold: float
+    lead: float
 
-    def measure(self, image: Frames, mask: Mask | None = None) -> Measurement:
-        seen = self.fitted(self.observe(image, mask))
-        if not seen.inside.any():
-            return self.conclude(seen)
-        scene = CrossedScene.of(seen)
-        return self.answered(seen, scene, crossed_answers(self.network, scene, self.carriers, self.lead))
+    def __call__(self, fitted: Fitted) -> Fitted:
+        if not fitted.seen.inside.any():
+            return fitted
+        scene = CrossedScene.of(fitted)
+        return self.answered(fitted, scene, crossed_answers(self.network, scene, self.carriers, self.lead))
 
-    def answered(self, seen: Fitted, scene: CrossedScene, answers: Answers) -> Measurement:
-        """The measurement from the network's answers."""
+    def answered(self, fitted: Fitted, scene: CrossedScene, answers: Answers) -> Fitted:
+        """What follows from the network's answers."""
+        seen = fitted.seen
         joint, offers = seen.carriers.joint_gain, scene.offers_rad
         inside = decided_mask(answers, scene, self.threshold)
         if not seen.given:
-            plane, _ = gaps(inside, seen.background, seen.fit.misfit_grey)
+            plane, _ = gaps(inside, seen.background, fitted.fit.misfit_grey)
             inside &= ~plane | (answers.object_logit > CLEAR)
         # Orders are labelled on all that may be object: a hole in the mask must not part a surface.
         perhaps = scene.inside | (answers.object_logit > threshold_at(scene.strength, self.threshold) - PERHAPS)
         psi = scene.nearness * joint
         candidates = np.stack([psi + scene.step_rad[0], psi, psi + scene.step_rad[1]])
-        choice = least_energy_order(answers.logits, candidates, perhaps, self.stride, JUMP_RAD)
+        choice = least_energy_order(answers.logits, candidates, perhaps, seen.stride)
         nearness = scene.nearness + (chosen_values(offers, choice) + answers.correction_rad) / joint
         known = scene.known
         if not known[inside].all():  # beyond the reach of any window: as the nearest pixel within it
@@ -174,9 +168,14 @@ class CrossedNetRoute(CrossedRoute):
         wrong = np.clip(1 - chosen_values(chances, choice), LEAST_CHANCE, 1).astype(np.float32)
         np.put_along_axis(chances, choice[None], -1, axis=0)
         rival = (scene.nearness + chosen_values(offers, chances.argmax(axis=0)) / joint).astype(np.float32)
-        fit = replace(seen.fit, nearness=nearness.astype(np.float32), uncertainty_rad=answers.sigma_rad)
-        wall = inside & (answers.object_logit < 0)  # likelier than the object
-        return self.conclude(replace(seen, fit=fit, inside=inside, rival=rival, wall=wall), wrong)
+        return replace(
+            fitted,
+            seen=replace(seen, inside=inside),
+            fit=replace(fitted.fit, nearness=nearness.astype(np.float32), uncertainty_rad=answers.sigma_rad),
+            rival=rival,
+            wrong_chance=wrong,
+            wall=inside & (answers.object_logit < 0),  # likelier than the object
+        )
 
 
 @dataclass(frozen=True)

@@ -45,7 +45,7 @@ from fpp_ml_bench.baselines.learned.windows import (
     mean_scores,
     view_scores,
 )
-from fpp_ml_bench.baselines.phase.calibration_layer import Image, Mask
+from fpp_ml_bench.baselines.phase.geometry import Image, Mask
 from fpp_ml_bench.baselines.training.engine import (
     CHECKPOINT,
     Display,

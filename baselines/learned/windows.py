@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.learned.inputs import SIDE_CHANNELS, SIDES
 from fpp_ml_bench.baselines.learned.scenes import View
-from fpp_ml_bench.baselines.phase.calibration_layer import Image, Mask
+from fpp_ml_bench.baselines.phase.geometry import Image, Mask
 from fpp_ml_bench.depth import depth_edges
 from fpp_ml_bench.optics.sequence import Direction
 

@@ -21,7 +21,7 @@ from torch.nn import functional
 
 from fpp_ml_bench.baselines.networks import base
 from fpp_ml_bench.baselines.networks.base import DoubleConvolution, FringeNetwork, Join, ResidualBlock
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.phase.geometry import TAU, CalibrationLayer
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.errors import NetworkError
 from fpp_ml_bench.optics.named_rigs import paper_rig

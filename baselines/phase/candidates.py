@@ -10,9 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer, Crop, Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase.geometry import TAU, CalibrationLayer, Crop, Image, Mask, grid_of, wrapped
 from fpp_ml_bench.baselines.phase.observe import Capture, CrossedObservation, Observation
-from fpp_ml_bench.baselines.phase.resampling import grid_of
 from fpp_ml_bench.constants import MM_PER_M
 from fpp_ml_bench.optics.rig import Rig
 

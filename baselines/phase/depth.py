@@ -1,4 +1,4 @@
-"""Last stop: depth, its uncertainty, and the reasons not to trust a pixel; and the routes, which make all four stops.
+"""Last stop: depth, its uncertainty, and the reasons not to trust a pixel.
 
 One carrier: wrapped phase and order give the depth in closed form. Its expected error has three parts. Phase: noise and
 misfit of the local fit (rms misfit divided by brightness is a phase error, and the slope of the calibration layer turns
@@ -13,17 +13,16 @@ over pairs of pixels on opposite sides, but only pairs that lie on one plane wit
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from enum import IntEnum
-from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Image, Mask, Orders, wrapped
-from fpp_ml_bench.baselines.phase.candidates import crossed_candidates, fringe_candidates
+from fpp_ml_bench.baselines.phase.candidates import CrossedCandidates
+from fpp_ml_bench.baselines.phase.geometry import TAU, Image, Mask, Orders, wrapped
 from fpp_ml_bench.baselines.phase.local_fit import (
     CURVED,
     LARGEST_STEP_RAD,
@@ -40,18 +39,16 @@ from fpp_ml_bench.baselines.phase.observe import (
     CROSSED_FRAMES,
     Capture,
     CrossedObservation,
-    Frames,
     Observation,
     OneCarrier,
     TwoCarriers,
 )
-from fpp_ml_bench.baselines.phase.order import CrossedOrder, crossed_order, fringe_order, margin_by_range
+from fpp_ml_bench.baselines.phase.order import CrossedOrder, FringeOrder, Turns, crossed_order, margin_by_range
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.coding.code import MIN_MODULATION
 from fpp_ml_bench.coding.crossed import WINDOW_PERIODS
 from fpp_ml_bench.coding.phase_shift import phase_weights
 from fpp_ml_bench.constants import MM_PER_M
-from fpp_ml_bench.errors import DecodeError
 
 HALF_CONFIDENCE_MM = 5.0  # expected error of a pixel whose confidence is a half
 SATURATED_SHARE = 0.02
@@ -143,8 +140,29 @@ class FringeMeasurement(Measurement):
     candidates: Orders
     expected_error_mm: Image
 
-
-M = TypeVar("M", bound=Measurement)
+    @classmethod
+    def of(
+        cls,
+        measured: Measurement,
+        wrapped_phase_rad: Image,
+        order: NDArray[np.int32],
+        candidates: Orders,
+        expected_error_mm: Image,
+    ) -> "FringeMeasurement":
+        """What every measurement states, and these."""
+        return cls(
+            measured.depth_mm,
+            measured.sigma_mm,
+            measured.order_doubt_mm,
+            measured.confidence,
+            measured.modulation_grey,
+            measured.reason,
+            measured.background_share,
+            wrapped_phase_rad,
+            order,
+            candidates,
+            expected_error_mm,
+        )
 
 
 @dataclass(frozen=True)
@@ -161,10 +179,15 @@ class NearnessFit:
 
 
 @dataclass(frozen=True)
-class Fitted(CrossedObservation, CrossedOrder):
-    """Crossed fringes with their order and the ``fit`` of the nearness; ``wall`` bool (h, w): pixels that count as
-    object although the wall explains them as well, or better."""
+class Fitted:
+    """Crossed fringes with the ``fit`` of the nearness in an order. ``candidates``: that order and the turns beside it;
+    ``rival``: nearness (h, w) of the order that it might be instead; ``wrong_chance`` (h, w): probability that it is;
+    ``wall`` bool (h, w): pixels that count as object although the wall explains them as well, or better."""
 
+    seen: CrossedObservation
+    candidates: Turns
+    rival: Image
+    wrong_chance: Image
     fit: NearnessFit
     wall: Mask
 
@@ -275,11 +298,11 @@ def _judged(
     window: GaussianWindow | None,
     reasons: Mapping[Reason, Mask],
     guessed: Mask | bool = False,
-) -> dict[str, Any]:
+) -> Measurement:
     """What every measurement states of a depth (h, w), 0 beyond the object and the range, whose expected size of the
-    error is ``error_mm``: confidence, reason, and what is left of depth and error where pixels are masked. ``window``:
-    what a pixel was measured in, None for itself alone; ``reasons``: those of the model's own; ``guessed``: pixels
-    without a depth, since their order is a guess."""
+    error is ``error_mm``: confidence, reason, and what is left of depth and error where pixels are masked; no doubt of
+    the order. ``window``: what a pixel was measured in, None for itself alone; ``reasons``: those of the model's own;
+    ``guessed``: pixels without a depth, since their order is a guess."""
     clipped: NDArray = seen.saturated.astype(np.float32)
     if window is not None:
         clipped = window.moment(clipped) / np.maximum(fit.weight, 1e-3)
@@ -296,27 +319,27 @@ def _judged(
     codes = [np.uint8(reason) for reason in by_reason]
     reason = np.select(list(by_reason.values()), codes, np.uint8(Reason.MEASURED))
     kept = found & ~guessed if least == 0 else found & ~guessed & (confidence >= least)
-    return {
-        "depth_mm": _pasted(seen, np.where(kept, depth_mm, 0)),
-        "sigma_mm": _pasted(seen, np.where(kept, error_mm, 0)),
-        "confidence": _pasted(seen, confidence),
-        "modulation_grey": _pasted(seen, fit.brightness),
-        "reason": _pasted(seen, reason, np.uint8, Reason.BACKGROUND),
-        "background_share": seen.background.share,
-    }
+    return Measurement(
+        depth_mm=_pasted(seen, np.where(kept, depth_mm, 0)),
+        sigma_mm=_pasted(seen, np.where(kept, error_mm, 0)),
+        order_doubt_mm=np.zeros(seen.shape, np.float32),
+        confidence=_pasted(seen, confidence),
+        modulation_grey=_pasted(seen, fit.brightness),
+        reason=_pasted(seen, reason, np.uint8, Reason.BACKGROUND),
+        background_share=seen.background.share,
+    )
 
 
 def _restored(
     model: OneCarrier | TwoCarriers,
-    measured: M,
+    measured: Measurement,
     known: Mask,
     depth_mm: NDArray,
     on_object: Mask,
     nearest: Callable[[NDArray], NDArray],
-    **maps: Any,
-) -> M:
+) -> Measurement:
     """``measured`` in the size of the captured image: its ``depth_mm`` (H, W) follows on the pixels ``on_object`` from
-    those that were ``known``. Other maps are taken from the ``nearest`` pixel, but for ``maps``."""
+    those that were ``known``. Other maps are taken from the ``nearest`` pixel."""
     in_range = model.resampling.captured.in_range(depth_mm)
     found = on_object & in_range & (nearest(measured.depth_mm) > 0)
     # The nearest depth says nothing of a pixel that has none for a reason of its own.
@@ -324,11 +347,19 @@ def _restored(
     own = cv2.resize(own, found.shape[::-1], interpolation=cv2.INTER_NEAREST_EXACT)
     reason = np.where(on_object, nearest(measured.reason), own)
     reason[on_object & ~in_range & ((reason == Reason.MEASURED) | (reason > Reason.OUT_OF_RANGE))] = Reason.OUT_OF_RANGE
-    for name in ("sigma_mm", "confidence", "order_doubt_mm"):
-        maps[name] = np.where(on_object & in_range, nearest(getattr(measured, name)), np.float32(0))
-    maps["modulation_grey"] = np.where(on_object, nearest(measured.modulation_grey), np.float32(0))
-    maps["depth_mm"] = np.where(found, depth_mm, 0).astype(np.float32)
-    return replace(measured, reason=reason.astype(np.uint8), **maps)
+
+    def taken(values: NDArray, where: Mask) -> Image:
+        return np.where(where, nearest(values), np.float32(0))
+
+    return Measurement(
+        depth_mm=np.where(found, depth_mm, 0).astype(np.float32),
+        sigma_mm=taken(measured.sigma_mm, on_object & in_range),
+        order_doubt_mm=taken(measured.order_doubt_mm, on_object & in_range),
+        confidence=taken(measured.confidence, on_object & in_range),
+        modulation_grey=taken(measured.modulation_grey, on_object),
+        reason=reason.astype(np.uint8),
+        background_share=measured.background_share,
+    )
 
 
 def _restored_fringe(model: OneCarrier, measured: FringeMeasurement) -> FringeMeasurement:
@@ -343,13 +374,8 @@ def _restored_fringe(model: OneCarrier, measured: FringeMeasurement) -> FringeMe
     phase = (absolute - TAU * order).astype(np.float32)
     with np.errstate(divide="ignore", invalid="ignore"):
         depth_mm = layer.depth_of_residual_mm(phases)
-    return _restored(
-        model,
-        measured,
-        inside,
-        depth_mm,
-        on_object,
-        nearest,
+    return FringeMeasurement.of(
+        _restored(model, measured, inside, depth_mm, on_object, nearest),
         wrapped_phase_rad=phase,
         order=np.nan_to_num(order).astype(np.int32),
         candidates=layer.orders_in_range(phase, model.range_mm),
@@ -368,125 +394,106 @@ def _restored_crossed(model: TwoCarriers, measured: Measurement) -> Measurement:
     return _restored(model, measured, known, depth_mm, on_object, nearest)
 
 
-class PhaseRoute(OneCarrier):
-    """The route of fringes of one direction: observe, candidates, order, depth. Of resampled images `rig`, `layer`,
-    `period_px` and observations are those of the resampled ones; images, masks and measurements have the captured
-    size."""
-
-    def measure(self, image: Frames, mask: Mask | None = None) -> FringeMeasurement:
-        """Depth and the maps behind it; arguments and errors as of `observe`."""
-        seen = self.observe(image, mask)
-        return self.conclude(seen, *self.choose(seen))
-
-    def choose(self, seen: Observation) -> tuple[NDArray[np.int32], Image]:
-        """The order of every pixel of the observation's crop (h, w), and its margin, without learning."""
-        return fringe_order(seen, fringe_candidates(seen), self.settings)
-
-    def conclude(
-        self, seen: Observation, order: NDArray[np.int32], margin: NDArray, least_margin: float = -np.inf
-    ) -> FringeMeasurement:
-        """The measurement that follows from an ``order`` int32 for each pixel of the observation's crop (h, w), however
-        it was chosen; ``margin`` (h, w): how clearly that order won, 0 for a tie, 1 or more for a clear choice. A pixel
-        of less than ``least_margin`` has no depth, as always a tie in light that nothing calibrates. Raises
-        `DecodeError` for shapes that are not the crop's."""
-        if np.shape(order) != seen.inside.shape or np.shape(margin) != seen.inside.shape:
-            raise DecodeError(
-                f"expected an order and a margin for each of the {seen.inside.shape} pixels (h, w) around the object, "
-                f"got {np.shape(order)} and {np.shape(margin)}"
-            )
-        guessed = margin < least_margin
-        if not seen.background.calibrated:  # no evidence about the order, whatever the choice preferred
-            margin = margin_by_range(seen, order)
-            guessed = (margin == 0) | (margin < least_margin)
-        inside, layer, settings = seen.inside, seen.layer, self.settings
-        depth_mm = np.where(inside, layer.depth_mm(seen.phase_rad, order), 0.0)
-        depth_mm[~seen.rig.in_range(depth_mm)] = 0.0
-        ahead = layer.forward * (np.maximum(depth_mm, seen.rig.working_range_mm[0]) / MM_PER_M) + layer.back_m
-        mm_per_rad = np.abs(ahead**2 / (layer.gain * layer.forward)) * MM_PER_M
-        uncertainty_rad = seen.uncertainty_rad
-        if uncertainty_rad is None:
-            uncertainty_rad = _uncertainty_rad(seen, self.windows[-1])
-        wrong_chance = 1 / (1 + np.exp(np.clip(margin / MARGIN_SCALE, 0, 50)))
-        error_mm = (mm_per_rad * (uncertainty_rad + TAU * wrong_chance)).astype(np.float32)
-        # The carrier of a plane square to the axis advances by one period every period_px; slopes come on top.
-        axis = 0 if settings.direction == "vertical" else 1
-        along = np.abs(TAU / seen.period_px + seen.slopes[axis]) * seen.period_px / TAU
-        frequency = np.hypot(along, np.abs(seen.slopes[1 - axis]) * seen.period_px / TAU)
-        widest = disk(THIN_PERIODS / 2 * seen.period_px)
-        reasons = {
-            Reason.THIN: cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_OPEN, widest) == 0,
-            Reason.TOO_STEEP: (frequency < SLOWEST) | (frequency > FASTEST),
-            Reason.AMBIGUOUS: margin < LEAST_MARGIN,
-        }
-        maps = _judged(seen, settings, depth_mm, error_mm, seen.fit, self.windows[1], reasons, guessed)
-        orders = Orders(*(_pasted(seen, part, np.int32) for part in (seen.candidates.first, seen.candidates.count)))
-        maps["sigma_mm"] *= np.float32(np.sqrt(np.pi / 2))  # of a normal error of that expected size
-        measured = FringeMeasurement(
-            **maps,
+def fringe_depth(model: OneCarrier, chosen: FringeOrder) -> FringeMeasurement:
+    """The measurement that follows from an order of every pixel, however it was chosen. A pixel whose order is a guess
+    has no depth: one of less than the least margin, and always a tie in light that nothing calibrates."""
+    seen, order, margin = chosen.seen, chosen.order, chosen.margin
+    guessed = margin < chosen.least_margin
+    if not seen.background.calibrated:  # no evidence about the order, whatever the choice preferred
+        margin = margin_by_range(seen, order)
+        guessed = (margin == 0) | (margin < chosen.least_margin)
+    inside, layer = seen.inside, seen.layer
+    depth_mm = np.where(inside, layer.depth_mm(seen.phase_rad, order), 0.0)
+    depth_mm[~seen.rig.in_range(depth_mm)] = 0.0
+    ahead = layer.forward * (np.maximum(depth_mm, seen.rig.working_range_mm[0]) / MM_PER_M) + layer.back_m
+    mm_per_rad = np.abs(ahead**2 / (layer.gain * layer.forward)) * MM_PER_M
+    uncertainty_rad = seen.uncertainty_rad
+    if uncertainty_rad is None:
+        uncertainty_rad = _uncertainty_rad(seen, model.windows[-1])
+    wrong_chance = 1 / (1 + np.exp(np.clip(margin / MARGIN_SCALE, 0, 50)))
+    error_mm = (mm_per_rad * (uncertainty_rad + TAU * wrong_chance)).astype(np.float32)
+    frequency = _frequency(seen, across=0 if model.settings.direction == "vertical" else 1)
+    widest = disk(THIN_PERIODS / 2 * seen.period_px)
+    reasons = {
+        Reason.THIN: cv2.morphologyEx(inside.astype(np.uint8), cv2.MORPH_OPEN, widest) == 0,
+        Reason.TOO_STEEP: (frequency < SLOWEST) | (frequency > FASTEST),
+        Reason.AMBIGUOUS: margin < LEAST_MARGIN,
+    }
+    judged = _judged(seen, model.settings, depth_mm, error_mm, seen.fit, model.windows[1], reasons, guessed)
+    first, count = (_pasted(seen, part, np.int32) for part in (seen.candidates.first, seen.candidates.count))
+    measured = FringeMeasurement.of(
+        replace(
+            judged,
+            sigma_mm=judged.sigma_mm * np.float32(np.sqrt(np.pi / 2)),  # of a normal error of that expected size
             order_doubt_mm=_pasted(seen, mm_per_rad * TAU * wrong_chance),
-            wrapped_phase_rad=_pasted(seen, seen.phase_rad, np.float32, np.nan),
-            order=_pasted(seen, order, np.int32),
-            candidates=orders,
-            expected_error_mm=_pasted(seen, error_mm),
-        )
-        return _restored_fringe(self, measured) if self.resampling.needed else measured
+        ),
+        wrapped_phase_rad=_pasted(seen, seen.phase_rad, np.float32, np.nan),
+        order=_pasted(seen, order, np.int32),
+        candidates=Orders(first, count),
+        expected_error_mm=_pasted(seen, error_mm),
+    )
+    return _restored_fringe(model, measured) if model.resampling.needed else measured
 
 
-class CrossedRoute(TwoCarriers):
-    """The route of fringes of two directions in one frame, or in three; sizes as of `PhaseRoute`."""
+def _frequency(seen: Observation, across: int) -> Image:
+    """Frequency of the fringe in the image, (h, w), as a multiple of that of a plane square to the camera's axis, which
+    advances by one period every ``period_px`` along the axis ``across`` of the slopes."""
+    along = np.abs(TAU / seen.period_px + seen.slopes[across]) * seen.period_px / TAU
+    frequency: Image = np.hypot(along, np.abs(seen.slopes[1 - across]) * seen.period_px / TAU)
+    return frequency
 
-    def measure(self, image: Frames, mask: Mask | None = None) -> Measurement:
-        """Depth and the maps behind it; arguments and errors as of `observe`."""
-        return self.conclude(self.fitted(self.observe(image, mask)))
 
-    def fitted(self, seen: CrossedObservation) -> Fitted:
-        """The order of every pixel, and the nearness that follows."""
-        order = crossed_order(seen, crossed_candidates(seen), self.settings)
-        nearness = order.candidates.nearness[1]
-        if seen.moved is None:
-            fit = _of_best_sides(seen, _window_fit(seen, nearness))
-        else:
-            fit = _own_fit(seen, nearness, seen.moved)
-        wall = np.zeros_like(seen.inside)
-        if seen.moved is None and not seen.given:
-            dropped, wall = gaps(seen.inside, seen.background, fit.misfit_grey)
-            if not seen.background.shown:
-                dropped = fit.brightness <= MIN_MODULATION
-            seen = replace(seen, inside=seen.inside & ~dropped)
-        known = {entry.name: getattr(seen, entry.name) for entry in fields(seen)}
-        return Fitted(**known, **vars(order), fit=fit, wall=wall)
+def crossed_nearness(settings: Settings, seen: CrossedObservation, offered: CrossedCandidates) -> Fitted:
+    """The order of every pixel, and the nearness that follows from it and the frame."""
+    order = crossed_order(settings, seen, offered)
+    nearness = order.candidates.nearness[1]
+    if seen.moved is None:
+        fit = _of_best_sides(seen, _window_fit(seen, nearness))
+    else:
+        fit = _own_fit(seen, nearness, seen.moved)
+    wall = np.zeros_like(seen.inside)
+    if seen.moved is None and not seen.given:
+        dropped, wall = gaps(seen.inside, seen.background, fit.misfit_grey)
+        if not seen.background.shown:
+            dropped = fit.brightness <= MIN_MODULATION
+        seen = replace(seen, inside=seen.inside & ~dropped)
+    return Fitted(seen, order.candidates, order.rival, chance_of_wrong(order), fit, wall)
 
-    def conclude(self, seen: Fitted, wrong_chance: Image | None = None) -> Measurement:
-        """The measurement that follows from a fit. ``wrong_chance`` (h, w): probability of a wrong order, by default
-        from evidence and margin."""
-        carriers, fit = seen.carriers, seen.fit
-        depth_mm = carriers.depth_mm(fit.nearness)
-        # A fit may leave the range that its order was chosen in.
-        depth_mm = np.where(seen.inside & seen.rig.in_range(depth_mm), depth_mm, 0.0)
-        if wrong_chance is None:
-            odds = seen.evidence / EVIDENCE_SCALE + seen.margin / ENERGY_SCALE - EVEN_ODDS
-            wrong_chance = (1 / (1 + np.exp(np.clip(odds, -50, 50)))).astype(np.float32)
-        bright = np.maximum(fit.brightness, 0.5)
-        pairs = zip(seen.modulation, carriers.family.weights, strict=True)
-        weakest = np.minimum(*(modulation / (weight * bright) for modulation, weight in pairs))
-        lost = weakest < LOST_SHARE * max(seen.contrast) / max(carriers.family.weights)
-        wrong_chance = np.where(lost, np.maximum(wrong_chance, LOST_CHANCE), wrong_chance)
-        mm_per_rad = carriers.mm_per_rad(np.maximum(depth_mm, 1.0))
-        doubt_rad = reaching(np.abs(seen.rival - fit.nearness) * carriers.joint_gain, wrong_chance)
-        sigma_mm = mm_per_rad * np.hypot(fit.uncertainty_rad, doubt_rad)
-        if seen.rig.background_m is not None:
-            sigma_mm = np.where(seen.wall, np.hypot(sigma_mm, seen.rig.background_m * MM_PER_M - depth_mm), sigma_mm)
-        window = GaussianWindow(WINDOW_PERIODS * seen.period_px)
-        misfit = window.moment((fit.misfit_grey**2 * seen.inside).astype(np.float32)) / np.maximum(fit.weight, 1e-3)
-        texture = (np.sqrt(misfit) > TEXTURE_SHARE * bright) | (seen.candidates.misfit_rad[1] > TEXTURE_RAD)
-        reasons = {
-            Reason.ONE_DIRECTION: lost,
-            Reason.TEXTURE: texture,
-            Reason.AMBIGUOUS: wrong_chance > AMBIGUOUS_CHANCE,
-            Reason.WALL: seen.wall,
-        }
-        maps = _judged(
-            seen, self.settings, depth_mm, sigma_mm, fit, None if seen.moved is not None else window, reasons
-        )
-        measured = Measurement(**maps, order_doubt_mm=_pasted(seen, mm_per_rad * doubt_rad))
-        return _restored_crossed(self, measured) if self.resampling.needed else measured
+
+def chance_of_wrong(order: CrossedOrder) -> Image:
+    """Probability of a wrong order, float32 (h, w), from evidence and margin."""
+    odds = order.evidence / EVIDENCE_SCALE + order.margin / ENERGY_SCALE - EVEN_ODDS
+    chance: Image = (1 / (1 + np.exp(np.clip(odds, -50, 50)))).astype(np.float32)
+    return chance
+
+
+def crossed_depth(model: TwoCarriers, fitted: Fitted) -> Measurement:
+    """The measurement that follows from a fit."""
+    seen, fit, carriers = fitted.seen, fitted.fit, fitted.seen.carriers
+    depth_mm = carriers.depth_mm(fit.nearness)
+    # A fit may leave the range that its order was chosen in.
+    depth_mm = np.where(seen.inside & seen.rig.in_range(depth_mm), depth_mm, 0.0)
+    bright = np.maximum(fit.brightness, 0.5)
+    pairs = zip(seen.modulation, carriers.family.weights, strict=True)
+    weakest = np.minimum(*(modulation / (weight * bright) for modulation, weight in pairs))
+    lost = weakest < LOST_SHARE * max(seen.contrast) / max(carriers.family.weights)
+    wrong_chance = np.where(lost, np.maximum(fitted.wrong_chance, LOST_CHANCE), fitted.wrong_chance)
+    mm_per_rad = carriers.mm_per_rad(np.maximum(depth_mm, 1.0))
+    doubt_rad = reaching(np.abs(fitted.rival - fit.nearness) * carriers.joint_gain, wrong_chance)
+    sigma_mm = mm_per_rad * np.hypot(fit.uncertainty_rad, doubt_rad)
+    if seen.rig.background_m is not None:
+        behind_mm = seen.rig.background_m * MM_PER_M - depth_mm
+        sigma_mm = np.where(fitted.wall, np.hypot(sigma_mm, behind_mm), sigma_mm)
+    window = GaussianWindow(WINDOW_PERIODS * seen.period_px)
+    misfit = window.moment((fit.misfit_grey**2 * seen.inside).astype(np.float32)) / np.maximum(fit.weight, 1e-3)
+    texture = (np.sqrt(misfit) > TEXTURE_SHARE * bright) | (fitted.candidates.misfit_rad[1] > TEXTURE_RAD)
+    reasons = {
+        Reason.ONE_DIRECTION: lost,
+        Reason.TEXTURE: texture,
+        Reason.AMBIGUOUS: wrong_chance > AMBIGUOUS_CHANCE,
+        Reason.WALL: fitted.wall,
+    }
+    measured_in = None if seen.moved is not None else window
+    judged = _judged(seen, model.settings, depth_mm, sigma_mm, fit, measured_in, reasons)
+    measured = replace(judged, order_doubt_mm=_pasted(seen, mm_per_rad * doubt_rad))
+    return _restored_crossed(model, measured) if model.resampling.needed else measured

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase.calibration_layer import CalibrationLayer, Carriers, Crop, Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase.geometry import CalibrationLayer, Carriers, Crop, Image, Mask, wrapped
 from fpp_ml_bench.baselines.phase.local_fit import FLOOR_NOISE_GREY, Demodulated
 from fpp_ml_bench.constants import MAD_TO_SIGMA, MM_PER_M
 from fpp_ml_bench.optics.rig import Rig

@@ -9,7 +9,7 @@ from the right, 3 from below.
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase.calibration_layer import Image
+from fpp_ml_bench.baselines.phase.geometry import Image
 from fpp_ml_bench.baselines.phase.order import LARGE
 from fpp_ml_bench.machine import njit
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Carriers, Image, Mask, wrapped
+from fpp_ml_bench.baselines.phase.geometry import TAU, Carriers, Image, Mask, wrapped
 from fpp_ml_bench.constants import MAD_TO_SIGMA
 
 WINDOW_SIGMAS = 3.0

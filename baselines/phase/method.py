@@ -10,15 +10,16 @@ import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Generic
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fpp_ml_bench.baselines.method import Answer, Assumption, Frames, Method
-from fpp_ml_bench.baselines.phase.depth import CrossedRoute, FringeMeasurement, PhaseRoute, Reason
-from fpp_ml_bench.baselines.phase.observe import CROSSED_FRAMES
+from fpp_ml_bench.baselines.phase.depth import FringeMeasurement, Measurement, Reason
+from fpp_ml_bench.baselines.phase.observe import CROSSED_FRAMES, OneCarrier, TwoCarriers
 from fpp_ml_bench.baselines.phase.order import TERMS, terms_of
+from fpp_ml_bench.baselines.phase.route import AnyRoute, Measured, one_carrier, two_carriers
 from fpp_ml_bench.baselines.phase.settings import MIN_CONFIDENCE, PIXELWISE, Settings, steps_of
 from fpp_ml_bench.coding.crossed import crossed_from_pair
 from fpp_ml_bench.coding.phase_shift import PhaseShift
@@ -77,10 +78,10 @@ class CrossedOptions:
     mask: str | Path | None = option(None, MASK, "FILE")
 
 
-class RouteMethod(Method):
-    """A method that measures every map of a sample at once by its `route`."""
+class RouteMethod(Method, Generic[Measured]):
+    """A method that measures every map of a sample at once by its `route`, which it puts together when it is made."""
 
-    route: Any
+    route: AnyRoute[Measured]
     mask: NDArray[np.bool_] | None = None
 
     def use_mask(self, mask: str | Path | None) -> dict[str, str]:
@@ -102,7 +103,7 @@ class RouteMethod(Method):
             images.append(image)
         return images
 
-    def measure(self, frames: Frames) -> Any:
+    def measure(self, frames: Frames) -> Measured:
         """All maps of a captured sequence (`Measurement`); frames that are not in `frames_used` may be None."""
         return self.route.measure(self.images(frames), self.mask)
 
@@ -113,10 +114,10 @@ class RouteMethod(Method):
 
     def crop(self, frames: Frames) -> tuple[slice, slice]:
         seen = self.route.observe(self.images(frames), self.mask)
-        return self.route.resampling.captured_crop(seen.crop)  # type: ignore[no-any-return]
+        return self.route.model.resampling.captured_crop(seen.crop)
 
 
-class PhaseMethod(RouteMethod):
+class PhaseMethod(RouteMethod[FringeMeasurement]):
     """Depth from one or more sinusoids of one direction; options are those of `Settings`. ``mask``: a file
     (`captures.read_mask`) that says where the object is in every sample, instead of the route's own mask. Raises
     `PredictionError` for an unknown option or an invalid value, `CaptureError` for a mask that can't be used."""
@@ -134,9 +135,10 @@ class PhaseMethod(RouteMethod):
     def __init__(self, rig: Rig, **options: Any) -> None:
         given = self.checked_options(options)
         settings = Settings(**{entry.name: getattr(given, entry.name) for entry in fields(Settings)})
-        self.rig, self.options, self.route = rig, settings, PhaseRoute(rig, settings)
+        model = OneCarrier(rig, settings)
+        self.rig, self.options, self.route = rig, settings, one_carrier(model)
         sinusoids = rig.sequence.sinusoids(settings.direction)
-        self.frames_used = tuple(sinusoids[step] for step in self.route.steps)
+        self.frames_used = tuple(sinusoids[step] for step in model.steps)
         frames = len(self.frames_used)
         count = f"one {settings.direction} fringe" if frames == 1 else f"{frames} {settings.direction} fringes"
         cues, other_pitch = " + ".join(["range", *terms_of(settings)]), pitch_setting(rig, settings.direction)
@@ -231,7 +233,7 @@ def shifted_carrier(rig: Rig, name: str) -> int:
     )
 
 
-class CrossedMethod(RouteMethod):
+class CrossedMethod(RouteMethod[Measurement]):
     """Depth from one crossed frame; where the rig has none, from the mean of the first fringe of both directions, which
     is one. With ``frames`` 3: from three that shift one carrier. ``mask``: a file
     (`captures.read_mask`) that says where the object is in every sample. Raises `PredictionError` for a rig without
@@ -260,8 +262,9 @@ class CrossedMethod(RouteMethod):
             count = "one frame" if len(self.frames_used) == 1 else "one frame, the mean of two"
         else:
             raise PredictionError(f"{self.name} --frames {frames}: expected 1 or {CROSSED_FRAMES} crossed frames")
-        self.route = CrossedRoute(rig, Settings(min_confidence=given.min_confidence), moved=moved)
-        pitches = " and ".join(f"{pitch:g}" for pitch in self.route.family.pitches_px)
+        model = TwoCarriers(rig, Settings(min_confidence=given.min_confidence), moved=moved)
+        self.route = two_carriers(model)
+        pitches = " and ".join(f"{pitch:g}" for pitch in model.family.pitches_px)
         self.title = f"Crossed fringes of {pitches} px, {count}, nothing learned"
         self.settings = {"min_confidence": given.min_confidence} | self.use_mask(given.mask)
         self.settings |= {} if frames == 1 else {"frames": frames}
@@ -278,7 +281,7 @@ class CrossedMethod(RouteMethod):
 
     def images(self, frames: Frames) -> list[NDArray[np.uint8]]:
         images = super().images(frames)
-        return images if self.route.moved is not None else [crossed_image(images)]
+        return images if self.settings.get("frames") == CROSSED_FRAMES else [crossed_image(images)]
 
 
 def crossed_name(submission: "Submission", begins: str) -> str | None:

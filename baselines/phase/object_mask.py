@@ -12,8 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase.calibration_layer import Crop, Image, Mask, wrapped
 from fpp_ml_bench.baselines.phase.empty_scene import Background
+from fpp_ml_bench.baselines.phase.geometry import Crop, Image, Mask, wrapped
 from fpp_ml_bench.coding.code import MIN_MODULATION
 
 CLOSING_PERIODS = 0.27

@@ -4,7 +4,7 @@ A *measurement model* is one carrier or two, in one frame or a few. With three o
 N-step least squares of `fpp_ml_bench.decoding`, pixel by pixel, so that two surfaces are never mixed at a depth edge.
 One frame has more unknowns than grey levels, and a window of neighbours is fitted (`local_fit`). Two frames have one
 equation too few, but a projected fringe goes down to black: its mean is its modulation plus ambient light. With that
-constraint a window of a few px (`Settings.pair_window`) is enough. Three crossed frames shift one carrier and keep the
+constraint a window of a few px (`PAIR_WINDOW_PERIODS`) is enough. Three crossed frames shift one carrier and keep the
 other still, which is left in their mean, where the shifted one cancels.
 """
 
@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase.calibration_layer import (
+from fpp_ml_bench.baselines.phase.empty_scene import Background, CrossedEmptyScene, EmptyScene
+from fpp_ml_bench.baselines.phase.geometry import (
     LEAST_RANGE_RAD,
     CalibrationLayer,
     Carriers,
@@ -24,9 +25,13 @@ from fpp_ml_bench.baselines.phase.calibration_layer import (
     Image,
     Mask,
     Orders,
+    Periods,
+    Resampling,
+    nearest_inside,
+    repeated,
+    stride_of,
     wrapped,
 )
-from fpp_ml_bench.baselines.phase.empty_scene import Background, CrossedEmptyScene, EmptyScene
 from fpp_ml_bench.baselines.phase.local_fit import (
     CURVED,
     WEAK_LIGHT_PX,
@@ -58,7 +63,6 @@ from fpp_ml_bench.baselines.phase.object_mask import (
     refined,
     unlit,
 )
-from fpp_ml_bench.baselines.phase.resampling import Periods, Resampling, nearest_inside, repeated, stride_of
 from fpp_ml_bench.baselines.phase.settings import PIXELWISE, Settings, steps_of
 from fpp_ml_bench.coding.code import MIN_MODULATION
 from fpp_ml_bench.coding.crossed import Crossed
@@ -72,12 +76,23 @@ Frames = NDArray | Sequence[NDArray]
 EVERYWHERE = (slice(None), slice(None))
 CROSSED_FRAMES = 3  # that shift one carrier
 MARGIN_PERIODS = 0.5  # of the crop around the object: covers the windows, and the mask may grow into it
+FIRST_WINDOW_PERIODS = 0.35
+"""Sigma of the window of the first fit, in periods. All windows were chosen on train and validation objects."""
+SECOND_WINDOW_PERIODS = 0.27
+"""Of the second fit, which starts from the phase of the first."""
+PAIR_WINDOW_PERIODS = 0.06
+"""Of the last fits to two frames, a few px."""
+SLOPE_PERIODS = 0.13
+"""Of the Gaussian under which slopes of the phase are averaged."""
+SLACK_MM = 15.0
+"""By which the range is widened in which orders are chosen, for noise at its ends: a depth beyond them is left out, and
+no other order is taken to be within."""
 FRINGE_NOISE = 0.03  # uncertainty of a fringe extrapolated beyond its window, as a share of its brightness
 CONTRAST_ROUNDS, FREE_ROUNDS = 3, 2  # fits that measure the contrast of the fringes, and that use it
 PAIR_ROUNDS = 2  # fits to two frames over the small window
 MOST_SLACK_PERIODS = 0.07
-"""Largest slack of the working range, in periods at its middle: 17 mm of the paper's rig, whose `Settings.slack_mm` is
-15, and 4 mm of a rig whose period is 57 mm deep, where 15 mm would let almost every pixel have a second order."""
+"""Largest slack of the working range, in periods at its middle: 17 mm of the paper's rig, where `SLACK_MM` is less, and
+4 mm of a rig whose period is 57 mm deep, where 15 mm would let almost every pixel have a second order."""
 LEAST_CONTRAST = 0.08
 FAINT_SIGMAS = 6.0  # modulation of a window below which light shows no fringe: a shadow that other light reaches
 CONTRAST_RIM_PERIODS = 0.5  # grid points this near to the silhouette don't measure the contrast
@@ -148,7 +163,8 @@ class CrossedObservation(Capture):
     """Fringes of two directions in ``grey``, the one frame or the mean of three that shift the carrier ``moved``.
     ``phase_rad`` and ``modulation`` float32 (2, h, w): wrapped phases and grey levels, of windows, or of the pixel
     itself for the carrier ``moved``; ``point_phase_rad`` (2, h', w'): the phases measured on the grid of orders;
-    ``contrast``: modulation over mean of each carrier, in this image."""
+    ``contrast``: modulation over mean of each carrier, in this image; ``sigma_rad`` float32 (2, h, w): standard
+    uncertainty of the phases, of networks that measured them."""
 
     carriers: Carriers
     moved: int | None
@@ -157,6 +173,7 @@ class CrossedObservation(Capture):
     point_phase_rad: Image
     modulation: Image
     contrast: tuple[float, float]
+    sigma_rad: Image | None = None
 
     @property
     def light(self) -> Image:
@@ -178,15 +195,15 @@ class MeasurementModel:
     def __init__(
         self, rig: Rig, settings: Settings, seen_px: float, periods: Periods | None, frames: tuple[int, str]
     ) -> None:
-        self.settings, self.frames = settings, frames
+        self.settings, self.frames, self.slack_mm = settings, frames, SLACK_MM
         self.resampling = Resampling.of(rig, seen_px, periods or Periods())
         self.rig = self.resampling.rig
 
     @property
     def range_mm(self) -> tuple[float, float]:
         """The working range with its slack."""
-        (near, far), slack = self.rig.working_range_mm, self.settings.slack_mm
-        return near - slack, far + slack
+        near, far = self.rig.working_range_mm
+        return near - self.slack_mm, far + self.slack_mm
 
     def images(self, given: Frames) -> list[NDArray]:
         """Grey levels of captured frames, uint8 or float32 (H, W) each, in the size of ``rig``. Raises `DecodeError`
@@ -221,15 +238,14 @@ class OneCarrier(MeasurementModel):
         self.layer = CalibrationLayer.of(rig, settings.direction)
         (near, far), periods_in_range = rig.working_range_mm, rig.periods_in_range(settings.direction)
         most_slack_mm = MOST_SLACK_PERIODS * (far - near) / periods_in_range if periods_in_range > 0 else np.inf
-        self.settings = replace(settings, slack_mm=min(settings.slack_mm, most_slack_mm))
+        self.slack_mm = min(SLACK_MM, most_slack_mm)
         self.period_px = rig.image_px_per_period(settings.direction)
         self._scene = EmptyScene(rig, self.layer, self.period_px, settings.white_grey, settings.ambient_grey)
         self._carrier = np.nan_to_num(self.layer.absolute_phase(rig.standoff_m * MM_PER_M)).astype(np.float32)
-        self.windows = [
-            GaussianWindow(share * self.period_px) for share in (settings.first_window, settings.second_window)
-        ]
+        sigmas = [FIRST_WINDOW_PERIODS, SECOND_WINDOW_PERIODS]
         if settings.frames == 2:
-            self.windows += [GaussianWindow(settings.pair_window * self.period_px)] * PAIR_ROUNDS
+            sigmas += [PAIR_WINDOW_PERIODS] * PAIR_ROUNDS
+        self.windows = [GaussianWindow(share * self.period_px) for share in sigmas]
 
     @cached_property
     def captured_layer(self) -> CalibrationLayer:
@@ -271,7 +287,7 @@ class OneCarrier(MeasurementModel):
             inside, fit = self._local_fits(greys, background, crop, inside, mask is not None)
         phase = wrapped(fit.phase_rad).astype(np.float32)
         residual = wrapped(phase - layer.infinity_rad).astype(np.float32)
-        slopes = phase_slopes(residual, inside, self.settings.slope_window * self.period_px)
+        slopes = phase_slopes(residual, inside, SLOPE_PERIODS * self.period_px)
         return Observation(
             rig=self.rig,
             period_px=self.period_px,

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Image, Mask
 from fpp_ml_bench.baselines.phase.candidates import (
     Candidates,
     CrossedCandidates,
@@ -24,11 +23,12 @@ from fpp_ml_bench.baselines.phase.candidates import (
     chosen_values,
     links_between,
 )
+from fpp_ml_bench.baselines.phase.geometry import TAU, Image, Mask, nearest_inside
 from fpp_ml_bench.baselines.phase.object_mask import disk
 from fpp_ml_bench.baselines.phase.observe import Capture, CrossedObservation, Observation
-from fpp_ml_bench.baselines.phase.resampling import nearest_inside
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.errors import DecodeError
 
 LARGE = np.float32(1e4)  # cost of a candidate that does not exist
 EVIDENCE_PERIODS = 2.0
@@ -37,7 +37,17 @@ LEAST_BRIGHTNESS = 1e-3  # least irradiance whose logarithm is taken, 1/m^2: a s
 PHASE_SIGMA_RAD = 0.35  # of a carrier's phase in a window, edges and texture included
 MOST_AGREEMENT = 2.83**2 / 2
 """Largest cost of a phase misfit: beyond it a window across an edge may show anything."""
-JUMP_RAD = 2.5  # jump of the joint phase between neighbours from which on it costs no more
+JUMP_RAD = 2.5
+"""Jump of the residual or joint phase between neighbours from which on it costs no more: a depth edge costs this,
+whatever its height. Chosen, as the costs below, on train and validation objects."""
+SHADING_COST = 0.003
+"""Cost of a pixel, in rad of a jump, for each `SHADING_SPREAD` by which a candidate's log brightness is off."""
+SHADING_SPREAD = 0.1
+"""Unit of that misfit."""
+SHADING_LIMIT = 3.0
+"""Units from which on a misfit costs no more."""
+PRIOR_COST = 0.002
+"""Cost of a pixel for each 100 mm from the standoff."""
 SMOOTHNESS = 33.0
 """Weight of the link between two pixels: a pixel's window shares most of its light with its neighbour's, and one
 pixel's light may be that of two surfaces."""
@@ -83,15 +93,15 @@ def brightness_cost(seen: Observation, offered: FringeCandidates, settings: Sett
     with np.errstate(divide="ignore", invalid="ignore"):
         expected = np.maximum(offered.irradiance, LEAST_BRIGHTNESS)
         ratio = np.maximum(offered.brightness, LEAST_BRIGHTNESS) / expected
-        misfit = np.abs(np.log(np.nan_to_num(ratio, nan=1.0))) / np.float32(settings.shading_spread)
-    cost = np.float32(settings.shading_cost) * np.minimum(misfit, settings.shading_limit)
+        misfit = np.abs(np.log(np.nan_to_num(ratio, nan=1.0))) / np.float32(SHADING_SPREAD)
+    cost = np.float32(SHADING_COST) * np.minimum(misfit, SHADING_LIMIT)
     return cost * offered.trust  # type: ignore[no-any-return]
 
 
 def standoff_cost(seen: Observation, offered: FringeCandidates, settings: Settings) -> Image:
     """By the distance from the rig's standoff."""
     offset = np.abs(offered.depth_mm - np.float32(seen.rig.standoff_m * MM_PER_M)) / 100
-    return np.float32(settings.prior_cost) * np.minimum(np.nan_to_num(offset, nan=10.0), 10)
+    return np.float32(PRIOR_COST) * np.minimum(np.nan_to_num(offset, nan=10.0), 10)
 
 
 def agreement_cost(seen: CrossedObservation, offered: CrossedCandidates, settings: Settings) -> Image:
@@ -143,27 +153,47 @@ def cost_of(names: Sequence[str], seen: Capture, offered: Candidates, settings: 
     return cost
 
 
-def solved(offered: Candidates, cost: Image, smoothness: float, jump_rad: float) -> tuple[NDArray[np.int32], Image]:
+def solved(offered: Candidates, cost: Image, smoothness: float) -> tuple[NDArray[np.int32], Image]:
     """Index of the candidate of least energy, int32 (h, w), and the margin of the energy (0 for a tie)."""
     from fpp_ml_bench.baselines.phase.labels import least_energy  # compiled when it is imported
 
     unary = np.where(offered.inside, np.where(offered.exists, cost, LARGE), np.float32(0)).astype(np.float32)
     link_x, link_y = (np.float32(smoothness) * link for link in offered.links)
-    return least_energy(unary, offered.phase_rad, link_x, link_y, jump_rad)
+    return least_energy(unary, offered.phase_rad, link_x, link_y, JUMP_RAD)
 
 
-def fringe_order(seen: Observation, offered: FringeCandidates, settings: Settings) -> tuple[NDArray[np.int32], Image]:
-    """Order of every pixel, int32 (h, w), and how clearly it won, float32: 0 for a tie, 1 or more for certain."""
+@dataclass(frozen=True)
+class FringeOrder:
+    """Fringes of one direction with the ``order`` of every pixel, int32 (h, w), and its ``margin``, float32 (h, w): how
+    clearly it won, 0 for a tie, 1 or more for certain. A pixel of less than ``least_margin`` gets no depth. Raises
+    `DecodeError` for maps that are not of the observation's crop."""
+
+    seen: Observation
+    order: NDArray[np.int32]
+    margin: Image
+    least_margin: float = -np.inf
+
+    def __post_init__(self) -> None:
+        shape = self.seen.inside.shape
+        if np.shape(self.order) != shape or np.shape(self.margin) != shape:
+            raise DecodeError(
+                f"expected an order and a margin for each of the {shape} pixels (h, w) around the object, got "
+                f"{np.shape(self.order)} and {np.shape(self.margin)}"
+            )
+
+
+def fringe_order(settings: Settings, seen: Observation, offered: FringeCandidates) -> FringeOrder:
+    """The order of every pixel, by the terms of the settings and over neighbours."""
     cost = cost_of(terms_of(settings), seen, offered, settings)
-    index, margin = solved(offered, cost * seen.stride**2, 1.0, settings.jump_rad)
-    largest = max(settings.shading_cost * settings.shading_limit * settings.shading, settings.prior_cost)
+    index, margin = solved(offered, cost * seen.stride**2, 1.0)
+    largest = max(SHADING_COST * SHADING_LIMIT * settings.shading, PRIOR_COST)
     proof = cost / np.float32(largest)
     proof[~offered.exists] = 2.0
-    margin = np.minimum(margin / np.float32(settings.jump_rad), _evidence(proof, index, seen, offered.inside))
+    margin = np.minimum(margin / np.float32(JUMP_RAD), _evidence(proof, index, seen, offered.inside))
     chosen_rad, margin = (seen.spread(values) for values in (chosen_values(offered.phase_rad, index), margin))
     # A pixel takes the order whose residual phase is nearest to that of its grid point.
     order = np.rint((chosen_rad - seen.layer.residual_phase(seen.phase_rad, 0.0)) / TAU).astype(np.int32)
-    return order, margin
+    return FringeOrder(seen, order, margin)
 
 
 def _evidence(proof: Image, choice: NDArray[np.int32], seen: Observation, inside: Mask) -> Image:
@@ -206,14 +236,14 @@ class CrossedOrder:
     rival: Image
 
 
-def crossed_order(seen: CrossedObservation, offered: CrossedCandidates, settings: Settings) -> CrossedOrder:
+def crossed_order(settings: Settings, seen: CrossedObservation, offered: CrossedCandidates) -> CrossedOrder:
     """The order of every pixel of crossed fringes."""
     terms, smoothness, evidence_weight = ["agreement"], 1.0, 1.0
     if seen.moved is not None:
         terms, smoothness, evidence_weight = ["agreement", "pixel light"], SMOOTHNESS, EVIDENCE_WEIGHT
     cost = cost_of(terms, seen, offered, settings)
     cost = np.where(offered.exists, cost * offered.trust, LARGE).astype(np.float32)
-    index, margin = solved(offered, cost, smoothness, JUMP_RAD)
+    index, margin = solved(offered, cost, smoothness)
     evidence = _rivals(cost, index, LARGE).min(axis=0) - chosen_values(cost, index)
     evidence = np.minimum(evidence, np.float32(MOST_AGREEMENT)).astype(np.float32)
     misfit = _rivals(np.where(offered.exists, offered.misfit_rad, LARGE), index, LARGE)

@@ -25,7 +25,6 @@ AMBIENT_GREY = (
     "for images without a lit background: grey level of a surface in ambient light alone (default: the image's darkest)"
 )
 """Help of options that several methods have."""
-_POSITIVE = "first_window", "second_window", "pair_window", "slope_window", "jump_rad", "shading_spread"
 
 
 @dataclass(frozen=True)
@@ -33,16 +32,10 @@ class Settings:
     """``direction`` of the fringes and how many ``frames`` of them, 1 to all that are projected; what the choice of
     the order may use: ``shading`` and ``prior`` ("standoff": objects are near the rig's standoff, true of fixed
     placement); ``min_confidence``: pixels below it are 0 (0: dense, every object pixel gets a depth). The defaults
-    were chosen on train and validation objects.
-
-    Windows, in fringe periods: of the first fit, of the second, of the last one to two frames, and of the slopes. Costs
-    (no unit): ``shading_cost`` a pixel for each ``shading_spread`` of log brightness, up to ``shading_limit`` of them;
-    ``prior_cost`` a pixel for each 100 mm; ``jump_rad``: a jump of phase between neighbours from which on it costs no
-    more. ``slack_mm`` widens the range in which orders are chosen, for noise at its ends: a depth
-    beyond them is left out, and no other order is taken to be within. ``white_grey`` and ``ambient_grey``, if given,
-    calibrate brightness (see `EmptyScene`); without them it is taken from the lit background, and where the image
-    shows none, range and continuity settle the order, or it is ambiguous and has no depth (`order.margin_by_range`).
-    Of these, crossed fringes use ``min_confidence`` and ``slack_mm`` alone.
+    were chosen on train and validation objects. ``white_grey`` and ``ambient_grey``, if given, calibrate brightness
+    (see `EmptyScene`); without them it is taken from the lit background, and where the image shows none, range and
+    continuity settle the order, or it is ambiguous and has no depth (`order.margin_by_range`). Of these, crossed
+    fringes use ``min_confidence`` alone.
     """
 
     direction: Direction = option("horizontal", DIRECTION)
@@ -53,16 +46,6 @@ class Settings:
         "standoff: assume that objects are near the rig's standoff, true of fixed placement (default: none)",
     )
     min_confidence: float = option(0.0, MIN_CONFIDENCE, "C")
-    first_window: float = 0.35
-    second_window: float = 0.27
-    pair_window: float = 0.06
-    slope_window: float = 0.13
-    shading_cost: float = 0.003
-    shading_spread: float = 0.1
-    shading_limit: float = 3.0
-    prior_cost: float = 0.002
-    jump_rad: float = 2.5
-    slack_mm: float = 15.0
     white_grey: float | None = option(None, WHITE_GREY, "GREY")
     ambient_grey: float | None = option(None, AMBIENT_GREY, "GREY")
 
@@ -73,9 +56,8 @@ class Settings:
             raise PredictionError(f"prior {self.prior!r}: expected {' or '.join(get_args(Prior))}")
         if not 0 <= self.min_confidence < 1:
             raise PredictionError(f"min_confidence {self.min_confidence!r}: expected 0 (dense) to below 1")
-        for name in (*_POSITIVE, *(["white_grey"] if self.white_grey is not None else [])):
-            if not 0 < getattr(self, name) < np.inf:
-                raise PredictionError(f"{name} {getattr(self, name)!r}: expected more than 0")
+        if self.white_grey is not None and not 0 < self.white_grey < np.inf:
+            raise PredictionError(f"white_grey {self.white_grey!r}: expected more than 0")
         if self.ambient_grey is not None and not 0 <= self.ambient_grey <= GREY_LEVELS:
             raise PredictionError(f"ambient_grey {self.ambient_grey!r}: expected 0 to {GREY_LEVELS} grey levels")
 

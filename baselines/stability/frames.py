@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase.depth import CrossedRoute
 from fpp_ml_bench.baselines.phase.depth import Reason as DepthReason
+from fpp_ml_bench.baselines.phase.observe import TwoCarriers
+from fpp_ml_bench.baselines.phase.route import two_carriers
 from fpp_ml_bench.baselines.stability.cases import (
     U64,
     Floats,
@@ -383,11 +384,11 @@ def plane_outcome(
     grey = np.clip(np.rint(AMBIENT + white * (0.5 + 0.5 * waves) + noise), 0, 255).astype(np.uint8)
     mask = np.zeros(u.shape, bool)
     mask[60:260, 60:260] = True
-    route = CrossedRoute(rig, family=measured_as or family)
-    measured = route.measure(grey, mask)
+    model = TwoCarriers(rig, family=measured_as or family)
+    measured = two_carriers(model).measure(grey, mask)
     depth_mm, exact_mm = measured.depth_mm[MIDDLE], DEPTH_M * 1000
     flagged = (depth_mm == 0) | (measured.reason[MIDDLE] != DepthReason.MEASURED)
-    bound_mm = float(np.median(route.carriers.mm_per_rad(np.full(u.shape, exact_mm)))) * math.pi / 2
+    bound_mm = float(np.median(model.carriers.mm_per_rad(np.full(u.shape, exact_mm)))) * math.pi / 2
     return worst(depth_mm - exact_mm, bound_mm, flagged)
 
 

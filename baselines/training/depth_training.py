@@ -29,7 +29,7 @@ from fpp_ml_bench.baselines.networks.base import trains_channels_last
 from fpp_ml_bench.baselines.networks.model import build as build_network
 from fpp_ml_bench.baselines.networks.model import discriminator
 from fpp_ml_bench.baselines.networks.unet import re_projection_loss
-from fpp_ml_bench.baselines.phase.calibration_layer import CalibrationLayer
+from fpp_ml_bench.baselines.phase.geometry import CalibrationLayer
 from fpp_ml_bench.baselines.training.engine import (
     CURVE_FILE,
     DIVERGED,

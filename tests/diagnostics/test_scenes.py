@@ -20,7 +20,7 @@ from fpp_ml_bench.baselines.diagnostics.scenes import (
     original,
     plane,
 )
-from fpp_ml_bench.baselines.phase.calibration_layer import Carriers
+from fpp_ml_bench.baselines.phase.geometry import Carriers
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DiagnosisError
 from fpp_ml_bench.loaders.captures.exports import pixel_normals

@@ -13,11 +13,12 @@ from fpp_ml_bench.baselines.learned.method import CrossedNetMethod
 from fpp_ml_bench.baselines.learned.network import load_net
 from fpp_ml_bench.baselines.learned.odds import Answers, decided_mask, threshold_at
 from fpp_ml_bench.baselines.learned.recipes import CrossedRecipe, CrossedVariation, crossed_sample
-from fpp_ml_bench.baselines.learned.routes import CrossedNetRoute, stated_rad
+from fpp_ml_bench.baselines.learned.routes import CrossedNetPart, stated_rad
 from fpp_ml_bench.baselines.learned.scenes import Group, View, read_views, render_views, with_unions
 from fpp_ml_bench.baselines.learned.training import train_net
 from fpp_ml_bench.baselines.learned.windows import IGNORED, Sample, symmetric
-from fpp_ml_bench.baselines.phase.depth import CrossedRoute
+from fpp_ml_bench.baselines.phase.observe import TwoCarriers
+from fpp_ml_bench.baselines.phase.route import CrossedRoute, two_carriers
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import PredictionError, TrainingError, WeightsError
@@ -34,7 +35,7 @@ STILL = CrossedVariation(near_edge=0.5, wrong_window=0, wrong_patch=0, no_plane=
 
 @cache
 def route() -> CrossedRoute:
-    return CrossedRoute(crossed_rig(SIZE, "crossed-18"))
+    return two_carriers(TwoCarriers(crossed_rig(SIZE, "crossed-18")))
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +53,7 @@ def samples(folder: Path) -> list[Sample]:
 
 def test_the_truth_of_a_sample_is_the_exact_depth(samples: list[Sample], folder: Path) -> None:
     sample, view = samples[0], next(read_views(folder, GROUPS, "train"))
-    part = route().carriers.at(sample.scene.crop)
+    part = route().model.carriers.at(sample.scene.crop)
     truth = sample.scene.nearness + sample.missing.astype(np.float32) / part.joint_gain
     exact = view.depth_mm[sample.scene.crop]
     near = sample.target & (np.abs(sample.missing) < 2)  # half precision: 1e-3 of 2 rad
@@ -73,8 +74,8 @@ def test_windows_mean_the_same_in_every_orientation(samples: list[Sample], turn:
     scene = samples[0].scene.single()
     size = min(scene.light.shape)
     scene = scene.window(slice(0, size), slice(0, size))
-    x, _ = crossed_channels(scene, route().carriers)
-    psi = scene.nearness * route().carriers.at(scene.crop).joint_gain
+    x, _ = crossed_channels(scene, route().model.carriers)
+    psi = scene.nearness * route().model.carriers.at(scene.crop).joint_gain
     window = symmetric({"x": x, "psi": psi}, CROSSED_CHANNELS, turn)
     psi, turned = window["psi"], window["x"]
     inside = turned[CROSSED_CHANNELS.index("measured mask")] > 0
@@ -134,18 +135,18 @@ def test_a_training_in_small_is_resumed_and_predicts(
 
 def test_depths_lie_on_measured_candidates_whatever_the_network_says(folder: Path) -> None:
     recipe = CrossedRecipe(widths=(4, 4), order_widths=(4, 4), fine=4, squeezed=4)
-    learned = CrossedNetRoute(crossed_rig(SIZE, "crossed-18"), recipe.network().eval(), threshold=0.0, lead=0.0)
+    learned = CrossedNetPart(route().model.carriers, recipe.network().eval(), threshold=0.0, lead=0.0)
     view = next(read_views(folder, GROUPS, "train"))
-    seen = learned.fitted(learned.observe(view.frames[0]))
-    scene = CrossedScene.of(seen)
+    fitted = route().choose(route().observe(view.frames[0], None))
+    scene = CrossedScene.of(fitted)
     shape = scene.light.shape
     rng = np.random.default_rng(0)
     logits = np.where(scene.exists, rng.normal(size=(3, *shape)), -np.inf)
     logits[1] = np.maximum(logits[1], -50)
     correction = rng.uniform(-1.5, 1.5, shape)
     answers = Answers(logits, np.full(shape, 9.0), correction, np.full(shape, 0.1))
-    measured = learned.answered(seen, scene, answers)
-    part = seen.carriers
+    measured = route().depth(learned.answered(fitted, scene, answers))
+    part = fitted.seen.carriers
     known = scene.known & (measured.depth_mm[part.crop] > 0)
     psi = part.nearness(np.where(known, measured.depth_mm[part.crop], 1000.0)) * part.joint_gain
     offers = scene.nearness * part.joint_gain + np.stack([scene.step_rad[0], np.zeros(shape), scene.step_rad[1]])

@@ -10,14 +10,16 @@ import pytest
 import torch
 
 from fpp_ml_bench.baselines.learned import training
-from fpp_ml_bench.baselines.learned.fringe_net import FringeNetCrossedRoute, FringeNetRoute, phases_of
+from fpp_ml_bench.baselines.learned.fringe_net import CrossedPhases, FringePhase, phases_of
 from fpp_ml_bench.baselines.learned.fringe_recipe import FringeRecipe, FringeTask
+from fpp_ml_bench.baselines.learned.inputs import Geometry
 from fpp_ml_bench.baselines.learned.method import FringeNetMethod
 from fpp_ml_bench.baselines.learned.network import FringeNet
 from fpp_ml_bench.baselines.learned.scenes import Group, View, read_views, render_views, with_unions
 from fpp_ml_bench.baselines.learned.training import train_net
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, Carriers, wrapped
-from fpp_ml_bench.baselines.phase.depth import CrossedRoute, PhaseRoute
+from fpp_ml_bench.baselines.phase.geometry import TAU, Carriers, wrapped
+from fpp_ml_bench.baselines.phase.observe import OneCarrier, TwoCarriers
+from fpp_ml_bench.baselines.phase.route import one_carrier, two_carriers
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.errors import NetworkError, PredictionError, RecipeError
 from fpp_ml_bench.loaders.render.light import named_light
@@ -53,7 +55,7 @@ def true_phases(rig, fringes: str, depth_mm: np.ndarray) -> np.ndarray:
     if fringes == "crossed":
         carriers = Carriers.of(rig, rig.crossed)
         return carriers.phases(carriers.nearness(depth))
-    return PhaseRoute(rig, Settings(direction=fringes)).layer.absolute_phase(depth)[None]
+    return OneCarrier(rig, Settings(direction=fringes)).layer.absolute_phase(depth)[None]
 
 
 def test_the_truth_of_a_sample_is_the_phase_of_the_exact_depth(task: FringeTask, views: list[View]) -> None:
@@ -109,20 +111,18 @@ def test_perfect_phases_give_perfect_depth(fringes: str, tmp_path: Path) -> None
     render_views(GROUPS[1:], rig, (frame,), tmp_path, 1)
     view = next(read_views(tmp_path, GROUPS, "validation"))
     truth = true_phases(rig, fringes, view.depth_mm)
-    if fringes == "crossed":
-        route, measured = FringeNetCrossedRoute(rig, Settings(), []), CrossedRoute(rig)
-    else:
-        route, measured = (
-            FringeNetRoute(rig, Settings(direction=fringes), []),
-            PhaseRoute(rig, Settings(direction=fringes)),
-        )
-    crop = measured.observe(view.frames[0]).crop
+    model = TwoCarriers(rig) if fringes == "crossed" else OneCarrier(rig, Settings(direction=fringes))
+    seen = model.observe(view.frames[0])
+    crop = seen.crop
     cut = truth[:, *crop]
-    if fringes != "crossed":
-        cut = route.rotation.turn(cut) * route.rotation.sign
-    route.networks = [Perfect(cut)]
-    seen = measured.observe(view.frames[0])
-    found = route.phases(seen)
+    if fringes == "crossed":
+        part = CrossedPhases(model.period_px, [Perfect(cut)])
+        route, measured = two_carriers(model, phases=part.before, learned=part.after), two_carriers(model)
+    else:
+        rotation = Geometry(model).rotation
+        part = FringePhase(Geometry(model), [Perfect(rotation.turn(cut) * rotation.sign)])
+        route, measured = one_carrier(model, learned=part), one_carrier(model)
+    found = part.phases(seen)
     assert np.abs(wrapped(found.phase_rad - truth[:, *crop])).max() < 1e-3
     assert found.sigma_rad == pytest.approx(0.01 * np.sqrt(2), rel=1e-4)
     answer, before = route.measure(view.frames[0]), measured.measure(view.frames[0])

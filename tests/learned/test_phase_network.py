@@ -7,12 +7,14 @@ import pytest
 import torch
 from flat_planes import FIRST, OTHER_RIG, RIG, USERS_WORD, photograph, plane_depth_m, plane_fringe
 
-from fpp_ml_bench.baselines.learned.inputs import PHASE_CHANNELS
+from fpp_ml_bench.baselines.learned.inputs import PHASE_CHANNELS, Geometry
 from fpp_ml_bench.baselines.learned.method import PhaseNetMethod
 from fpp_ml_bench.baselines.learned.network import PhaseNet, load_net
-from fpp_ml_bench.baselines.learned.routes import PhaseNetRoute
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU
+from fpp_ml_bench.baselines.learned.routes import PhaseNetPart
 from fpp_ml_bench.baselines.phase.depth import Reason
+from fpp_ml_bench.baselines.phase.geometry import TAU
+from fpp_ml_bench.baselines.phase.observe import OneCarrier
+from fpp_ml_bench.baselines.phase.route import FringeRoute, one_carrier
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.errors import DecodeError, FppBenchError, NetworkError, PredictionError
@@ -25,6 +27,13 @@ def part_of(rig: Rig, size: int) -> Rig:
     camera = rig.camera
     left, top = (camera.width - size) / 2, (camera.height - size) / 2
     return replace(rig, camera=replace(camera, width=size, height=size, cx=camera.cx - left, cy=camera.cy - top))
+
+
+def with_network(
+    rig: Rig, settings: Settings, network: PhaseNet, threshold: float = -1e9, lead: float = 0.0
+) -> FringeRoute:
+    model = OneCarrier(rig, settings)
+    return one_carrier(model, learned=PhaseNetPart(Geometry(model), network, threshold, lead))
 
 
 def wild(bound_rad: float) -> PhaseNet:
@@ -42,11 +51,11 @@ def test_random_weights_stay_on_the_candidates(direction: str) -> None:
     one candidate, its order is that one."""
     bound = 0.5
     settings = Settings(direction=direction)
-    network_route = PhaseNetRoute(RIG, settings, wild(bound), threshold=-1e9)
+    network_route = with_network(RIG, settings, wild(bound))
     image = photograph("cork", "A60").frames[FIRST[direction]]
-    measurement, measured = network_route.measure(image), network_route
-    observation = measured.observe(image)
-    base, _ = measured.choose(observation)
+    measurement = network_route.measure(image)
+    observation = network_route.observe(image, None)
+    base = network_route.choose(observation).order
     on_object = measurement.depth_mm[observation.crop] > 0
     assert on_object.sum() > 3000
     absolute = observation.layer.absolute_phase(np.where(on_object, measurement.depth_mm[observation.crop], 1000.0))
@@ -67,8 +76,8 @@ def test_a_range_under_one_period_settles_the_order(direction: str) -> None:
     short = replace(RIG, working_range_mm=(1685.0, 1915.0))
     assert short.periods_in_range(direction) < 1  # type: ignore[arg-type]
     image = photograph("cork", "A60").frames[FIRST[direction]]
-    route = PhaseNetRoute(short, Settings(direction=direction), wild(0.5), threshold=-1e9)  # type: ignore[arg-type]
-    measurement, observation = route.measure(image), route.observe(image)
+    route = with_network(short, Settings(direction=direction), wild(0.5))  # type: ignore[arg-type]
+    measurement, observation = route.measure(image), route.observe(image, None)
     crop, candidates = observation.crop, observation.candidates
     one = (candidates.count == 1) & (measurement.depth_mm[crop] > 0)
     absolute = observation.layer.absolute_phase(np.where(one, measurement.depth_mm[crop], 1000.0))
@@ -98,7 +107,7 @@ def test_brighter_or_darker_frames_have_the_same_depth() -> None:
     method = PhaseNetMethod(RIG)
     full = method.route.measure(image)
     # Light above the ambient grey level, halved; what is rounded to whole grey levels is noise of half a level.
-    background = method.route.observe(image).background
+    background = method.route.observe(image, None).background
     half_grey = background.ambient_grey + (image - background.ambient_grey) / 2
     half = method.route.measure(np.rint(half_grey).astype(np.uint8))
     both = (full.depth_mm > 0) & (half.depth_mm > 0)
@@ -108,7 +117,7 @@ def test_brighter_or_darker_frames_have_the_same_depth() -> None:
 
 def test_an_empty_scene_has_no_depth() -> None:
     empty = plane_fringe(RIG, 0, plane_depth_m(RIG, RIG.background_m))
-    assert not PhaseNetRoute(RIG, Settings(), wild(0.5), threshold=-1e9).measure(empty).depth_mm.any()
+    assert not with_network(RIG, Settings(), wild(0.5)).measure(empty).depth_mm.any()
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
@@ -119,7 +128,7 @@ def test_a_plane_that_fills_the_frame(distance_m: float, direction: str) -> None
     rig, file = part_of(paper_rig(960), 240), load_net()
     told = Settings(direction, **USERS_WORD)  # type: ignore[arg-type]
     image = plane_fringe(rig, FIRST[direction], plane_depth_m(rig, distance_m))
-    measurement = PhaseNetRoute(rig, told, file.network, file.config.threshold, lead=file.config.lead).measure(image)
+    measurement = with_network(rig, told, file.network, file.config.threshold, file.config.lead).measure(image)
     assert (measurement.depth_mm > 0).mean() > 0.98
     assert np.abs(measurement.depth_mm - 1000 * distance_m)[measurement.depth_mm > 0].mean() < 2.0
 
@@ -128,7 +137,7 @@ def test_a_plane_that_fills_the_frame(distance_m: float, direction: str) -> None
 def test_beyond_the_end_of_the_range_there_is_no_depth(translation_m: tuple[float, float, float]) -> None:
     """Whatever the network's correction, at the range's end and where the projector is on the camera's axis."""
     rig = replace(part_of(paper_rig(960), 240), translation_m=translation_m)
-    network_route = PhaseNetRoute(rig, Settings(**USERS_WORD), wild(0.5), threshold=-1e9)  # type: ignore[arg-type]
+    network_route = with_network(rig, Settings(**USERS_WORD), wild(0.5))  # type: ignore[arg-type]
     measurement = network_route.measure(plane_fringe(rig, 0, plane_depth_m(rig, 2.095, (0.06, 0.0)), (0.06, 0.0)))
     depth_mm, outside = measurement.depth_mm, measurement.reason == Reason.OUT_OF_RANGE
     assert outside.mean() > 0.05 and not depth_mm[outside].any()
@@ -174,7 +183,7 @@ def test_short_periods_are_resampled_to_those_of_training(direction: str) -> Non
     rig = paper_rig(320)
     assert rig.image_px_per_period("horizontal") < 8
     for size, resampled in ((480, True), (720, False), (960, False), (1920, True)):
-        assert PhaseNetMethod(paper_rig(size)).route.resampling.needed is resampled
+        assert PhaseNetMethod(paper_rig(size)).route.model.resampling.needed is resampled
     row = photograph("cracker_box", "A60", rig)
     measurement = PhaseNetMethod(rig, direction=direction).route.measure(row.frames[FIRST[direction]])  # type: ignore[arg-type]
     target = row.depth_mm > 0

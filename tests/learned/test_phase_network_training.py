@@ -17,6 +17,7 @@ from fpp_ml_bench.baselines.learned.recipes import PhaseRecipe, PhaseTask, Varia
 from fpp_ml_bench.baselines.learned.scenes import Group, View, read_views
 from fpp_ml_bench.baselines.learned.training import WindowTraining, train_net
 from fpp_ml_bench.baselines.learned.windows import Sample
+from fpp_ml_bench.baselines.phase.observe import OneCarrier
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.training.engine import CHECKPOINT, reproducible
@@ -53,7 +54,7 @@ CONFIG = NetConfig(
 
 def geometry(direction: str = "horizontal") -> Geometry:
     """Of a calibrated lamp: planes that fill the frame show no background to take its strength from."""
-    return Geometry(RIG, Settings(direction=direction, **USERS_WORD))  # type: ignore[arg-type]
+    return Geometry(OneCarrier(RIG, Settings(direction=direction, **USERS_WORD)))  # type: ignore[arg-type]
 
 
 def plane(distance_m: float, direction: str = "horizontal") -> Sample:

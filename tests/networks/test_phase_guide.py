@@ -7,7 +7,7 @@ from tiny_network import one_thread  # noqa: F401
 
 from fpp_ml_bench.baselines.networks.model import build
 from fpp_ml_bench.baselines.networks.unet import GUIDED_CHANNELS, ORDERS, PhaseGuide, re_projection_loss
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.phase.geometry import TAU, CalibrationLayer
 from fpp_ml_bench.baselines.stability.cases import U32
 from fpp_ml_bench.errors import NetworkError
 from fpp_ml_bench.optics.named_rigs import paper_rig

@@ -6,7 +6,8 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase.depth import CrossedRoute
+from fpp_ml_bench.baselines.phase.observe import TwoCarriers
+from fpp_ml_bench.baselines.phase.route import CrossedRoute, two_carriers
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.optics.named_rigs import crossed_rig, paper_rig
 from fpp_ml_bench.optics.rig import Rig
@@ -19,7 +20,7 @@ NO_PLANE = replace(paper_rig(SIZE), background_m=None)
 
 @cache
 def route(rig: Rig = RIG, family: Crossed = FAMILY) -> CrossedRoute:
-    return CrossedRoute(rig, family=family)
+    return two_carriers(TwoCarriers(rig, family=family))
 
 
 def frame(

@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 from fpp_ml_bench.baselines.learned.inputs import CrossedScene
 from fpp_ml_bench.baselines.learned.odds import Answers
 from fpp_ml_bench.baselines.learned.recipes import CrossedRecipe
-from fpp_ml_bench.baselines.learned.routes import CrossedNetRoute
+from fpp_ml_bench.baselines.learned.routes import CrossedNetPart
 from fpp_ml_bench.baselines.phase import empty_scene, local_fit, object_mask, observe
-from fpp_ml_bench.baselines.phase.calibration_layer import Carriers, wrapped
-from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Reason
+from fpp_ml_bench.baselines.phase.depth import Reason
+from fpp_ml_bench.baselines.phase.geometry import Carriers, wrapped
+from fpp_ml_bench.baselines.phase.observe import TwoCarriers
+from fpp_ml_bench.baselines.phase.route import two_carriers
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.optics.named_rigs import crossed_rig
 from fpp_ml_bench.optics.rig import Rig
@@ -117,15 +119,16 @@ def test_the_wall_is_seen_through_narrow_gaps(monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_network_in_doubt_does_not_fill_what_shows_the_wall() -> None:
     bars = INSIDE & (X % 24 >= 10)
-    learned = CrossedNetRoute(CUT, CrossedRecipe(widths=(4, 4)).network(), threshold=-1.5, lead=0.0)
-    seen = learned.fitted(learned.observe(frame(np.where(bars, DEPTH_MM, 0.0), CUT, FAMILY)))
-    scene = CrossedScene.of(seen)
+    measured = route(CUT, FAMILY)
+    part = CrossedNetPart(measured.model.carriers, CrossedRecipe(widths=(4, 4)).network(), threshold=-1.5, lead=0.0)
+    fitted = measured.choose(measured.observe(frame(np.where(bars, DEPTH_MM, 0.0), CUT, FAMILY), None))
+    scene = CrossedScene.of(fitted)
     shape = scene.light.shape
     logits = np.where(scene.exists, np.array([0, 9, 0])[:, None, None], -np.inf)
 
     def answered(object_logit: float) -> tuple[float, float]:
         answers = Answers(logits, np.full(shape, object_logit), np.zeros(shape), np.full(shape, 0.1))
-        found = learned.answered(seen, scene, answers).depth_mm > 0
+        found = measured.depth(part.answered(fitted, scene, answers)).depth_mm > 0
         return float(found[INSIDE & ~bars].mean()), float((~found[bars]).mean())
 
     (doubted, missed), (believed, _) = answered(0.0), answered(3.0)
@@ -139,7 +142,7 @@ def test_a_pixel_that_the_wall_explains_too_is_answered_and_said_to_be_in_doubt(
     doubted = found.sigma_mm > 1000  # the wall is 1.4 m behind
     assert 50 < doubted.sum() < 0.02 * INSIDE.sum() and (found.reason == Reason.WALL)[doubted].any()
     assert (found.depth_mm[doubted] > 0).all() and doubted[bars].mean() < 0.002
-    strict = CrossedRoute(CUT, Settings(min_confidence=0.02), FAMILY).measure(image)
+    strict = two_carriers(TwoCarriers(CUT, Settings(min_confidence=0.02), FAMILY)).measure(image)
     assert not (strict.depth_mm[doubted] > 0).any() and (strict.depth_mm > 0).sum() > 0.9 * (found.depth_mm > 0).sum()
 
 
@@ -186,7 +189,7 @@ def test_a_surface_far_from_the_walls_phases_is_no_wall() -> None:
 
 def like_the_wall(true: Rig) -> NDArray[np.float64]:
     """A slab that shows ``true`` all but the phases that `CUT` expects of its wall: its depth in mm (H, W)."""
-    expected, carriers = route(CUT, FAMILY).carriers, Carriers.of(true, FAMILY)
+    expected, carriers = route(CUT, FAMILY).model.carriers, Carriers.of(true, FAMILY)
     wall = expected.phases(expected.nearness(3200.0))
     depths_mm = np.arange(1500.0, 2100.0, 1.0)
     off_rad = [np.hypot(*wrapped(carriers.phases(carriers.nearness(depth)) - wall)).mean() for depth in depths_mm]
@@ -210,7 +213,8 @@ def test_a_projectors_gamma_does_not_bend_the_corners_of_the_wall(monkeypatch: p
     image = frame(DEPTH_MM, corner, FAMILY, background_grey=150 * light / light.max(), gamma=2.6)
 
     def invented() -> float:
-        return float((CrossedRoute(corner, family=FAMILY).measure(image).depth_mm > 0)[~INSIDE].mean())
+        anew = two_carriers(TwoCarriers(corner, family=FAMILY))
+        return float((anew.measure(image).depth_mm > 0)[~INSIDE].mean())
 
     assert invented() < 5e-3
     monkeypatch.setattr(empty_scene, "RESPONSE_POWERS", ())
@@ -220,7 +224,7 @@ def test_a_projectors_gamma_does_not_bend_the_corners_of_the_wall(monkeypatch: p
 @pytest.mark.parametrize("frames", [1, 3])
 def test_what_is_in_the_images_border_alone_is_no_object(frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A blurred image: beyond its border the blur has nothing to mix."""
-    method = CrossedRoute(CUT, family=FAMILY, moved=0 if frames == 3 else None)
+    method = two_carriers(TwoCarriers(CUT, family=FAMILY, moved=0 if frames == 3 else None))
     images = [frame(DEPTH_MM, CUT, FAMILY, number=number) for number in range(frames)]
     images = [cv2.GaussianBlur(image, (0, 0), 2.0, borderType=cv2.BORDER_REPLICATE) for image in images]
     border = np.ones(DEPTH_MM.shape, bool)

@@ -8,8 +8,8 @@ from crossed_scenes import FAMILY, NO_PLANE, RIG, frame, route, slab
 from numpy.typing import NDArray
 from skimage.filters import gabor_kernel
 
-from fpp_ml_bench.baselines.phase.calibration_layer import Carriers, wrapped
-from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Reason, reaching
+from fpp_ml_bench.baselines.phase.depth import Reason, reaching
+from fpp_ml_bench.baselines.phase.geometry import Carriers, wrapped
 from fpp_ml_bench.baselines.phase.local_fit import CURVED, DEMODULATION_PERIODS, Demodulator, window_kernels
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.coding.crossed import Crossed, crossed_from_pair
@@ -152,7 +152,7 @@ def test_a_frame_made_of_two_has_the_depth_of_one() -> None:
     assert method.frames_used == (0, 18)
     frames = [None] * len(rig.sequence)
     frames[0], frames[18] = first, second
-    direct = CrossedRoute(rig).measure(crossed_from_pair(first, second))
+    direct = route(rig, Crossed.of_pair(rig)).measure(crossed_from_pair(first, second))
     assert np.array_equal(method.predict(frames), direct.depth_mm)
     error = np.abs(direct.depth_mm - slab(rig))[(slab(rig) > 0) & (direct.depth_mm > 0)]
     assert np.median(error) < 2

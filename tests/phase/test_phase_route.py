@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from flat_planes import DIRECT, FIRST, OTHER_RIG, PAPER, RIG, USERS_WORD, photograph, plane_depth_m, plane_fringe
 
-from fpp_ml_bench.baselines.phase.depth import PhaseRoute, Reason
+from fpp_ml_bench.baselines.phase.depth import Reason
 from fpp_ml_bench.baselines.phase.empty_scene import image_noise_grey
 from fpp_ml_bench.baselines.phase.method import PhaseMethod
+from fpp_ml_bench.baselines.phase.observe import SECOND_WINDOW_PERIODS, OneCarrier
+from fpp_ml_bench.baselines.phase.order import FringeOrder
+from fpp_ml_bench.baselines.phase.route import FringeRoute, one_carrier
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.cli import main
@@ -32,8 +35,8 @@ TURNED_RIG = replace(
 
 
 @cache
-def route(direction: str, rig: Rig = RIG, **options: object) -> PhaseRoute:
-    return PhaseRoute(rig, Settings(direction=direction, **options))  # type: ignore[arg-type]
+def route(direction: str, rig: Rig = RIG, **options: object) -> FringeRoute:
+    return one_carrier(OneCarrier(rig, Settings(direction=direction, **options)))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
@@ -59,7 +62,7 @@ def test_beyond_the_end_of_the_range_there_is_no_depth(rig: Rig, frames: int) ->
     tilt = (0.025, 0.0)
     exact_m = plane_depth_m(rig, 2.1, tilt)
     method = PhaseMethod(rig, frames=frames, **USERS_WORD)
-    assert method.route.resampling.needed == (rig is not RIG)
+    assert method.route.model.resampling.needed == (rig is not RIG)
     images: list[Any] = [None] * len(rig.sequence)
     for number in method.frames_used:
         images[number] = plane_fringe(rig, number, exact_m, tilt)
@@ -92,7 +95,7 @@ def test_plane_noise_is_what_the_window_leaves_of_it() -> None:
         measurement = route("vertical", **USERS_WORD).measure(plane_fringe(RIG, 18, exact_m, noise=noise, light=DIRECT))
         error = (measurement.depth_mm - exact_m * 1000)[middle]
         spread[noise] = error.std()
-        sigma_px = Settings().second_window * RIG.image_px_per_period("vertical")
+        sigma_px = SECOND_WINDOW_PERIODS * RIG.image_px_per_period("vertical")
         averaged = int(4 * np.pi * sigma_px**2)
         predicted = depth_noise_mm(RIG, 1800.0, "vertical", averaged, measurement.modulation_grey[middle].mean(), noise)
         # Where the fringe is at its extremes a narrow window sees less of the phase: up to twice the even spread.
@@ -130,18 +133,18 @@ def test_confidence_orders_errors_and_the_strict_mode_uses_it() -> None:
 
 
 def test_depth_lies_on_the_candidates_whoever_chooses() -> None:
-    random_route = PhaseRoute(RIG, Settings())
-    seen = random_route.observe(photograph("cork", "A60").frames[0])
+    random_route = route("horizontal")
+    seen = random_route.observe(photograph("cork", "A60").frames[0], None)
     first, count = seen.candidates.first, np.maximum(seen.candidates.count, 1)
     order = first + np.random.default_rng(0).integers(0, count).astype(np.int32)
-    measurement = random_route.conclude(seen, order, np.zeros(order.shape, np.float32))
+    measurement = random_route.depth(FringeOrder(seen, order, np.zeros(order.shape, np.float32)))
     on_object = measurement.depth_mm > 0
     assert on_object.sum() > 3000 and np.array_equal(measurement.order[seen.crop][seen.inside], order[seen.inside])
-    layer = random_route.layer.at(on_object)
+    layer = random_route.model.layer.at(on_object)
     again = layer.depth_mm(measurement.wrapped_phase_rad[on_object].astype(np.float64), measurement.order[on_object])
     assert np.abs(again - measurement.depth_mm[on_object]).max() < 1e-2
     with pytest.raises(DecodeError, match="an order and a margin"):
-        random_route.conclude(seen, order[1:], np.zeros(order.shape, np.float32))
+        FringeOrder(seen, order[1:], np.zeros(order.shape, np.float32))
 
 
 def test_nothing_is_measured_where_nothing_is() -> None:
@@ -178,7 +181,7 @@ def test_without_background_brightness_needs_the_users_word(frames: int, directi
     exact_m = plane_depth_m(RIG, 1.8)
     first = FIRST[direction]
     told = route(direction, frames=frames, **USERS_WORD)
-    fringes = [plane_fringe(RIG, first + step, exact_m) for step in told.steps]
+    fringes = [plane_fringe(RIG, first + step, exact_m) for step in told.model.steps]
     blind = route(direction, frames=frames).measure(fringes)
     assert blind.background_share == 0
     several = (blind.modulation_grey > 5) & (blind.candidates.count > 1)
@@ -291,7 +294,6 @@ def test_refusals_name_what_came() -> None:
         {"direction": "both"},
         {"prior": "shape"},
         {"min_confidence": 1.0},
-        {"jump_rad": 0.0},
         {"pitch": 3},
         {"white_grey": 0.0},
         {"white_grey": float("nan")},

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from fpp_ml_bench.baselines.phase.calibration_layer import TAU, CalibrationLayer
+from fpp_ml_bench.baselines.phase.geometry import TAU, CalibrationLayer
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.triangulation import depth_from_coordinate
 from fpp_ml_bench.errors import DecodeError

@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
 from fpp_ml_bench.baselines.phase import local_fit
-from fpp_ml_bench.baselines.phase.depth import CrossedRoute, Measurement
+from fpp_ml_bench.baselines.phase.depth import Measurement
 from fpp_ml_bench.baselines.phase.local_fit import phase_noise_grey, same_plane_mean
 from fpp_ml_bench.baselines.phase.object_mask import continued
+from fpp_ml_bench.baselines.phase.observe import TwoCarriers
 from fpp_ml_bench.baselines.phase.order import local_median
+from fpp_ml_bench.baselines.phase.route import CrossedRoute, two_carriers
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.coding.crossed import Crossed
 from fpp_ml_bench.errors import DecodeError, PredictionError
@@ -27,7 +29,7 @@ CUT = replace(WHOLE, camera=replace(WHOLE.camera, width=320, height=320, cx=159.
 
 @cache
 def route(rig: Rig = CUT) -> CrossedRoute:
-    return CrossedRoute(rig, moved=0)
+    return two_carriers(TwoCarriers(rig, moved=0))
 
 
 def measured(depths_mm: list[NDArray], noise_grey: float = 0.7, rig: Rig = CUT, **light: float) -> Measurement:
@@ -49,7 +51,7 @@ def test_a_slab_is_exact_to_the_noise_up_to_its_edge(middle_mm: float) -> None:
     assert (found.depth_mm[~inside] > 0).mean() < 2e-3
     assert abs(np.median(error)) < 0.05
     # One pixel's own phase has the noise sqrt(2 / 3) s / B: that of the mean of 25 pixels is five times less.
-    carriers = route().carriers
+    carriers = route().model.carriers
     one_mm = carriers.mm_per_rad(depth_mm)[inside] * np.sqrt(2 / 3) * 0.76 / 40
     assert 0.15 < np.median(np.abs(error) / 0.6745) / np.median(one_mm) < 0.35
     assert 0.6 < (np.abs(error) < sigma).mean() < 0.85

@@ -10,9 +10,11 @@ import pytest
 from flat_planes import RIG, photograph, plane_depth_m, plane_fringe
 from numpy.typing import NDArray
 
-from fpp_ml_bench.baselines.phase.depth import PhaseRoute, Reason
+from fpp_ml_bench.baselines.phase.depth import Reason
+from fpp_ml_bench.baselines.phase.geometry import Periods
 from fpp_ml_bench.baselines.phase.method import PhaseMethod
-from fpp_ml_bench.baselines.phase.resampling import Periods
+from fpp_ml_bench.baselines.phase.observe import OneCarrier
+from fpp_ml_bench.baselines.phase.route import one_carrier
 from fpp_ml_bench.baselines.phase.settings import Settings
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.cli import main
@@ -57,7 +59,7 @@ def bowl(rig: Rig, nearest_m: float, farthest_m: float) -> NDArray[np.float64]:
 def test_range_and_continuity_settle_the_order_of_a_surface_that_fills_the_range(contrast: float) -> None:
     depth_m = bowl(NARROW, 1.62, 1.97)
     image, disk = in_the_dark(NARROW, depth_m, contrast)
-    measurement = PhaseRoute(NARROW, Settings("vertical")).measure(image)
+    measurement = one_carrier(OneCarrier(NARROW, Settings("vertical"))).measure(image)
     answered = measurement.depth_mm > 0
     error = np.abs(measurement.depth_mm - depth_m * 1000)
     assert measurement.background_share == 0
@@ -73,10 +75,10 @@ def test_range_and_continuity_settle_the_order_of_a_surface_that_fills_the_range
 @pytest.mark.parametrize("direction", ["horizontal", "vertical"])
 @pytest.mark.parametrize("frames", [1, 2, 3])
 def test_where_two_orders_fit_the_range_there_is_no_depth(frames: int, direction: str) -> None:
-    route = PhaseRoute(SMALL, Settings(direction, frames=frames))  # type: ignore[arg-type]
+    model = OneCarrier(SMALL, Settings(direction, frames=frames))  # type: ignore[arg-type]
     depth_m = plane_depth_m(SMALL, 1.8)
-    images = [plane_fringe(SMALL, (18 if direction == "vertical" else 0) + step, depth_m) for step in route.steps]
-    measurement = route.measure(images)
+    images = [plane_fringe(SMALL, (18 if direction == "vertical" else 0) + step, depth_m) for step in model.steps]
+    measurement = one_carrier(model).measure(images)
     several = (measurement.candidates.count > 1) & (measurement.modulation_grey > 5)
     assert several.mean() > 0.5
     assert (measurement.depth_mm[several] == 0).mean() > 0.95
@@ -87,7 +89,7 @@ def test_no_known_background_is_one_that_is_not_in_view() -> None:
     rig = copy.copy(NARROW)
     object.__setattr__(rig, "background_m", None)
     image, _ = in_the_dark(NARROW, bowl(NARROW, 1.62, 1.97))
-    unknown, unseen = (PhaseRoute(some, Settings("vertical")).measure(image) for some in (rig, NARROW))
+    unknown, unseen = (one_carrier(OneCarrier(some, Settings("vertical"))).measure(image) for some in (rig, NARROW))
     np.testing.assert_array_equal(unknown.depth_mm, unseen.depth_mm)
     np.testing.assert_array_equal(unknown.reason, unseen.reason)
 
@@ -95,7 +97,7 @@ def test_no_known_background_is_one_that_is_not_in_view() -> None:
 def test_a_dim_texture_is_not_taken_for_the_background() -> None:
     x, y = SMALL.camera.rays()
     grey = 3 + 1.5 * np.cos(2 * np.pi * 95 * (x + 0.4 * y)) + np.random.default_rng(0).normal(0, 0.6, x.shape)
-    measurement = PhaseRoute(SMALL).measure(np.clip(np.rint(grey), 0, 255).astype(np.uint8))
+    measurement = one_carrier(OneCarrier(SMALL)).measure(np.clip(np.rint(grey), 0, 255).astype(np.uint8))
     assert measurement.background_share == 0
     assert not measurement.depth_mm.any()
 
@@ -106,14 +108,14 @@ def test_long_periods_are_measured_on_a_smaller_image() -> None:
     assert rig.image_px_per_period("horizontal") > 60
     errors = []
     for periods in (None, Periods(longest=1e9)):  # resampled, and not
-        route = PhaseRoute(rig, Settings(), periods=periods)
-        measurement = route.measure(row.frames[0])
+        model = OneCarrier(rig, Settings(), periods=periods)
+        measurement = one_carrier(model).measure(row.frames[0])
         target = row.depth_mm > 0
         assert measurement.depth_mm.shape == target.shape
         assert (measurement.depth_mm[target] > 0).mean() > 0.95
         errors.append(np.median(np.abs(measurement.depth_mm - row.depth_mm)[target]))
         answered = measurement.depth_mm > 0
-        layer = route.captured_layer.at(answered)
+        layer = model.captured_layer.at(answered)
         again = layer.depth_mm(measurement.wrapped_phase_rad[answered].astype(float), measurement.order[answered])
         assert np.abs(again - measurement.depth_mm[answered]).max() < 0.05
         assert sum(measurement.counts.values()) == target.size
@@ -127,14 +129,15 @@ def test_what_comes_back_is_interpolated_but_not_across_a_jump() -> None:
     image[:, right] = plane_fringe(LONG, 18, depth_m + 0.25)[:, right]
     exact_mm = 1000 * (depth_m + 0.25 * right)
     told = {"white_grey": 180.0, "ambient_grey": 6.0}
-    route = PhaseRoute(LONG, Settings("vertical", **told), periods=Periods(0, 8, 9))  # type: ignore[arg-type]
-    assert route.resampling.needed and route.rig.camera.width < 60
-    assert route.resampling.captured_crop((slice(0, 10), slice(1, route.rig.camera.width)))[1].stop == 240
-    measurement = route.measure(image)
+    model = OneCarrier(LONG, Settings("vertical", **told), periods=Periods(0, 8, 9))  # type: ignore[arg-type]
+    assert model.resampling.needed and model.rig.camera.width < 60
+    assert model.resampling.captured_crop((slice(0, 10), slice(1, model.rig.camera.width)))[1].stop == 240
+    measurement = one_carrier(model).measure(image)
     away = np.abs(np.arange(240) - 119.5) > 45
     error = np.abs(measurement.depth_mm - exact_mm)[:, away][60:180]
     assert np.median(error) < 5
-    assert not PhaseRoute(LONG, periods=Periods(0, 8, 9)).measure(np.zeros((240, 240), np.uint8)).depth_mm.any()
+    empty = np.zeros((240, 240), np.uint8)
+    assert not one_carrier(OneCarrier(LONG, periods=Periods(0, 8, 9))).measure(empty).depth_mm.any()
 
 
 def test_a_mask_of_the_user(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,18 +8,26 @@ as slowly as 1 / Z does, and gives depth back without subtracting large numbers,
 Two carriers share the *nearness* ``q = 1 / (Z a_2 + t_2)``, for a projector beside the camera 1 / Z: without lens
 distortion every projector coordinate is affine in it, so that carrier k shows ``phase_k = infinity_k + gain_k q``. A
 lens bends that by a hundredth of a projector px over a working range; `Carriers.depth_mm` corrects it.
+
+Windows, steps of the grid of orders and filters of a network have a size in pixels of the fringe. So an image whose
+fringe period is far from the one that a method was made for is resampled, and what is measured is sampled back
+(`Resampling`): one with a period of 116 px is measured at 22.6 px, and a network that learnt from 22.6 px gets an image
+of 6 px enlarged. A longer period loses nothing: a local fit averages over a quarter of it anyway, and the image is
+shrunk by averaging.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt
 
 from fpp_ml_bench.coding.crossed import Crossed
-from fpp_ml_bench.constants import MM_PER_M
+from fpp_ml_bench.constants import GREY_LEVELS, MM_PER_M
 from fpp_ml_bench.decoding.triangulation import FIXED_POINT_STEPS, rotated_ray
 from fpp_ml_bench.errors import DecodeError, PredictionError
 from fpp_ml_bench.optics.pinhole import Coefficients, Maps, distortion_polynomial, is_distorted
@@ -33,6 +41,12 @@ Crop = tuple[slice, slice]
 TAU = 2 * np.pi
 LEAST_RANGE_RAD = 1.0
 """Least change of the joint phase over the working range for crossed fringes to tell a depth at all."""
+RESAMPLED_JUMP_RAD = 1.0
+"""Difference of residual phase from which on a pixel lies beside a jump, and nothing is interpolated."""
+CLIPPED_SHARE = 0.1
+"""Of an averaged pixel: what makes it saturated."""
+NODES_PER_PERIOD = 7.5
+"""Grid points along a period on which orders are chosen: every third pixel at 960 px."""
 
 
 def wrapped(phase_rad: NDArray) -> NDArray:
@@ -263,3 +277,113 @@ def _phases(rig: Rig, family: Crossed, x: NDArray, y: NDArray, depth_m: ArrayLik
     shifts = np.radians(family.shifts_deg[0])
     pairs = zip(family.cycles_per_px, shifts, strict=True)
     return np.stack([TAU * (along_u * u + along_v * v) + shift for (along_u, along_v), shift in pairs])
+
+
+def stride_of(period_px: float) -> int:
+    """Image px a step of the grid on which orders are chosen."""
+    return max(1, round(period_px / NODES_PER_PERIOD))
+
+
+def grid_of(stride: int, crop: Crop = (slice(None), slice(None))) -> Crop:
+    """Every ``stride``-th row and column of ``crop``."""
+    return slice(crop[0].start, crop[0].stop, stride), slice(crop[1].start, crop[1].stop, stride)
+
+
+def repeated(coarse: NDArray, stride: int, shape: tuple[int, ...]) -> NDArray:
+    """Maps (..., h', w') of every ``stride``-th pixel as maps of all (..., h, w); ``shape`` (..., h, w)."""
+    return coarse.repeat(stride, axis=-2).repeat(stride, axis=-1)[..., : shape[-2], : shape[-1]]
+
+
+def nearest_inside(inside: Mask) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows and columns (h, w) of the pixel of ``inside`` that is nearest to every pixel; every pixel's own where
+    ``inside`` has none."""
+    if inside.all() or not inside.any():
+        places: NDArray = np.indices(inside.shape)
+    else:
+        places = distance_transform_edt(~inside, return_distances=False, return_indices=True)
+    return places[0], places[1]
+
+
+@dataclass(frozen=True)
+class Periods:
+    """Fringe periods in image px: from ``shortest`` to ``longest`` an image stays as it is; beyond it is resampled to a
+    period of ``best``. The defaults are those of the phase route, whose constants were chosen at 22.56 px."""
+
+    shortest: float = 0.0
+    best: float = 22.56
+    longest: float = 2.2 * 22.56
+
+
+@dataclass(frozen=True)
+class Resampling:
+    """From the images of ``captured`` to those of ``rig``, the same rig with a camera of another size, and back; equal
+    rigs where nothing is to be done."""
+
+    captured: Rig
+    rig: Rig
+
+    @classmethod
+    def of(cls, rig: Rig, seen_px: float, periods: Periods) -> "Resampling":
+        """What brings fringes of ``seen_px`` image px a period into ``periods``."""
+        camera = rig.camera
+        if periods.shortest <= seen_px <= periods.longest:
+            return cls(rig, rig)
+        width, height = (max(1, round(length * periods.best / seen_px)) for length in (camera.width, camera.height))
+        # Rounding to whole pixels makes the scales of width and height a little different.
+        down = height / camera.height
+        resized = replace(camera.scaled(width), height=height, fy=camera.fy * down, cy=(camera.cy + 0.5) * down - 0.5)
+        return cls(rig, replace(rig, camera=resized))
+
+    @property
+    def needed(self) -> bool:
+        return self.captured is not self.rig
+
+    def image(self, grey: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Captured grey levels uint8 (H, W) in the size of ``rig``; a pixel stays saturated where a part of it is."""
+        if not self.needed:
+            return grey
+        size = self.rig.camera.width, self.rig.camera.height
+        if size[0] > grey.shape[1]:
+            return cv2.resize(grey, size, interpolation=cv2.INTER_CUBIC)  # type: ignore[return-value]
+        clipped = cv2.resize((grey == GREY_LEVELS).astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        resized = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+        return np.where(clipped > CLIPPED_SHARE, np.uint8(GREY_LEVELS), resized)
+
+    def mask(self, mask: Mask) -> Mask:
+        """A mask (H, W) of the captured image in the size of ``rig``."""
+        if not self.needed:
+            return mask
+        size = self.rig.camera.width, self.rig.camera.height
+        return cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5  # type: ignore[no-any-return]
+
+    def captured_crop(self, crop: Crop) -> Crop:
+        """The part of the captured image that ``crop`` of the resampled one shows."""
+        whole, part = self.captured.camera, self.rig.camera
+        rows, columns = (
+            slice(place.start * full // less, -(-place.stop * full // less))
+            for place, full, less in zip(crop, (whole.height, whole.width), (part.height, part.width), strict=True)
+        )
+        return rows, columns
+
+    def restored(
+        self, psi: NDArray[np.float64], inside: Mask
+    ) -> tuple[Mask, NDArray[np.float64], Callable[[NDArray], NDArray]]:
+        """A phase in rad without wraps, (h, w), at the captured pixels: where they are object, the phase (H, W), and
+        how any map is taken from the nearest object pixel. The phase is interpolated, but not across jumps."""
+        size = self.captured.camera.width, self.captured.camera.height
+        places = nearest_inside(inside)
+
+        def nearest(image: NDArray) -> NDArray:
+            """From the nearest object pixel."""
+            return cv2.resize(image[places], size, interpolation=cv2.INTER_NEAREST_EXACT)
+
+        psi = np.where(inside, psi, 0.0)
+        weight, total = (cv2.resize(v, size, interpolation=cv2.INTER_LINEAR) for v in (inside.astype(np.float64), psi))
+        # A pixel that mixes two surfaces takes the phase of the nearest one.
+        lowest, highest = (
+            cv2.morphologyEx(np.where(inside, psi, beyond), operation, np.ones((3, 3), np.uint8))
+            for operation, beyond in ((cv2.MORPH_ERODE, np.inf), (cv2.MORPH_DILATE, -np.inf))
+        )
+        step = np.subtract(highest, lowest, out=np.zeros_like(psi), where=inside)
+        beside_jump = nearest((step > RESAMPLED_JUMP_RAD).astype(np.uint8)) > 0
+        return weight > 0.5, np.where(beside_jump, nearest(psi), total / np.maximum(weight, 1e-6)), nearest
