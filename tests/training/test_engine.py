@@ -87,6 +87,7 @@ def test_faded_gradients_are_zero_within_a_training_only():
     assert (faded * 0.5 > 0).all()
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("batch_of_the_kill", [0, 3])
 def test_killed_and_resumed_is_uninterrupted(uninterrupted, tiny, tmp_path, monkeypatch, batch_of_the_kill):
     batches = []
@@ -179,6 +180,7 @@ def test_a_validation_loss_that_runs_away_ends_it(tiny, tmp_path):
     assert not (tmp_path / "run" / WEIGHTS).exists()
 
 
+@pytest.mark.processes
 def test_two_processes_agree(tiny, tmp_path):
     """accelerate's launcher on two processors: one set of files, and a log that both have a part in."""
     (tmp_path / "mine.yaml").write_text(
@@ -186,20 +188,10 @@ def test_two_processes_agree(tiny, tmp_path):
         "pairs_per_epoch: 4\nvalidation_pairs: 3\n"
     )
     code = "from accelerate.commands.launch import main; main()"
-    options = [
-        "--cpu",
-        "--num_processes",
-        "2",
-        "--num_machines",
-        "1",
-        "--mixed_precision",
-        "no",
-        "--dynamo_backend",
-        "no",
-    ]
+    options = "--cpu --num_processes 2 --num_machines 1 --mixed_precision no --dynamo_backend no"
     command = ["-m", "fpp_ml_bench", "train", tmp_path / "mine.yaml", tiny, "--out", tmp_path / "run"]
     done = subprocess.run(
-        [sys.executable, "-c", code, *options, "--main_process_port", "0", *map(str, command)],
+        [sys.executable, "-c", code, *options.split(), "--main_process_port", "0", *map(str, command)],
         cwd=Path(__file__).resolve().parent.parent,
         capture_output=True,
         text=True,

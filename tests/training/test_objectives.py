@@ -2,14 +2,11 @@
 
 import math
 
-import numpy as np
 import pytest
 import torch
 from torch import nn
 from torch.nn import functional
 
-from fpp_ml_bench.baselines.networks.model import build as build_network
-from fpp_ml_bench.baselines.networks.model import discriminator as build_discriminator
 from fpp_ml_bench.baselines.training.losses import (
     Adversarial,
     AdversarialSettings,
@@ -115,18 +112,9 @@ def test_regression_is_its_loss_on_its_network():
     assert torch.equal(values, sample_losses("hybrid_l1", 0.7, prediction, sample_batch.depth)) and values.shape == (2,)
 
 
-def test_regression_learns():
-    objective = Regression(Generator(), "rmse")
-    optimiser = optimisers(objective)
-    losses = [take(objective, optimiser, batch(seed=step))["loss"].item() for step in range(40)]
-    assert np.mean(losses[-5:]) < 0.6 * losses[0]
-
-
 def test_unknown_losses_are_refused_before_training():
     with pytest.raises(RecipeError, match="unknown loss 'gan'"):
         Regression(Generator(), "gan")
-    with pytest.raises(RecipeError, match="needs alpha"):
-        Regression(Generator(), "hybrid_rmse")
 
 
 @pytest.mark.parametrize("kind", ["regression", "adversarial"])
@@ -254,8 +242,8 @@ def test_validation_looks_at_depth_alone():
     assert torch.allclose(objective.validation_losses(prediction, sample_batch), expected)
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_gradients_are_finite_without_an_object(dtype):
+def test_gradients_are_finite_without_an_object():
+    dtype = torch.bfloat16
     objective = Adversarial(Generator().to(dtype), Discriminator().to(dtype))
     sample_batch = batch(empty=True)
     for constant in (0.0, 1.0):
@@ -317,17 +305,3 @@ def test_one_autocast_around_both_steps_uses_the_updated_discriminator():
                 logged.append({key: value.item() for key, value in values.items()})
 
     assert losses(around_all=True) == losses(around_all=False)
-
-
-def test_the_real_pair_trains():
-    objective = Adversarial(build_network("pix2pix", width=2), build_discriminator(width=8))
-    optimiser = optimisers(objective, 2e-4)
-    optimiser["network"] = torch.optim.SGD(objective.modules["network"].parameters(), lr=0.0)
-    first = take(objective, optimiser, batch())
-    for step in range(40):
-        last = take(objective, optimiser, batch(seed=step))
-    assert last["discriminator"] < 0.3 * first["discriminator"]
-    optimiser["network"] = torch.optim.RMSprop(objective.modules["network"].parameters(), 1e-3)
-    for step in range(40):
-        trained = take(objective, optimiser, batch(seed=step))
-    assert trained["l1"] < 0.9 * last["l1"]
