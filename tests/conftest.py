@@ -56,3 +56,19 @@ def opened(tiny):
     from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
     return DatasetFolder(tiny)
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory):
+    """Eight samples of disks, with exact depth: what is scored. Shared by all tests: copy it before changing it."""
+    from scored_dataset import make_dataset
+
+    return make_dataset(tmp_path_factory.mktemp("scored") / "tiny")
+
+
+@pytest.fixture
+def predictions(tmp_path, dataset):
+    """Predictions of the test split of `dataset`, without an error."""
+    from scored_dataset import write_predictions
+
+    return write_predictions(tmp_path / "predictions", dataset)

@@ -149,3 +149,17 @@ def write_predictions(
         np.save(folder / f"{sample}.npy", (depth + offset_mm + noise).astype(np.float32))
     write_description(folder, **changes)
     return folder
+
+
+def change_json(path: Path, keys: Sequence[Any], value: Any) -> None:
+    """Set a value deep inside of a JSON file; ``...`` removes its key."""
+    document = json.loads(path.read_text())
+    *parents, last = keys
+    part = document
+    for key in parents:
+        part = part[key]
+    if value is ...:
+        del part[last]
+    else:
+        part[last] = value
+    path.write_text(json.dumps(document))

@@ -6,7 +6,6 @@ import sys
 import numpy as np
 import pytest
 import yaml
-from scored_dataset import make_dataset
 
 from fpp_ml_bench.baselines import registry
 from fpp_ml_bench.baselines.method import Answer, Method
@@ -39,11 +38,6 @@ class Counting(Method):
 
     def summary(self, reports):
         return {"mean_number": float(np.mean([report["number"] for report in reports]))}
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
 
 
 @pytest.fixture

@@ -21,11 +21,6 @@ from fpp_ml_bench.tables import markdown_text
 SHIPPED = rows.SHIPPED_ROWS
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
-
-
 @pytest.fixture(autouse=True)
 def elsewhere(tmp_path, monkeypatch):
     """Run in an empty folder, with no shipped rows."""
@@ -71,13 +66,6 @@ def test_ranks_by_object_error_with_time_beside_it(make, capsys, tmp_path):
     assert [row["name"] for row in by_time] == ["Worse", "Better"]
     by_frames = ranked(tmp_path, better, worse, "--sort", "frames_used")[0]["rows"]
     assert [row["name"] for row in by_frames] == ["Worse", "Better"]
-
-
-def test_order_of_files_changes_nothing(make, tmp_path):
-    files = [make(f"{n}.json", offset, name=n) for n, offset in (("d", 2.5), ("a", 2.0), ("c", 1.0), ("b", 3.0))]
-    first, second = ranked(tmp_path, *files), ranked(tmp_path, *reversed(files))
-    assert first == second
-    assert [row["name"] for row in first[0]["rows"]] == ["c", "a", "d", "b"]
 
 
 def test_unknown_time_comes_last(make, tmp_path):
@@ -183,7 +171,7 @@ def test_probes_and_figures_of_the_paper():
     assert paper_tables()["multi_frame"].figure is None
 
 
-@pytest.mark.parametrize("choice", [*paper_tables(), "all", "none"])
+@pytest.mark.parametrize("choice", ["loss", "all", "none"])
 def test_paper_tables_by_choice(choice, capsys, tmp_path):
     out = board(capsys, "--paper", choice, "--markdown", tmp_path / "t.md")
     expected = paper_tables() if choice == "all" else () if choice == "none" else (choice,)
@@ -219,13 +207,13 @@ def test_submitted_text_is_only_text(make, capsys, tmp_path):
     assert html.unescape(short) == cut_at_word(HOSTILE)
 
 
-@pytest.mark.parametrize("name", ["<script>alert(1)</script>", "![i](y) **z** @me", "[red]x[/red]", "[link=http://e]"])
+@pytest.mark.parametrize("name", ["**z** @me", "[red]x[/red]"])
 def test_terminals_show_names_as_they_are(name, make, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")
     assert name in board(capsys, make("a.json", 1.0, name=name))
 
 
-@pytest.mark.parametrize("text", ["plain", "a|b", "*", "Größe 3 µm", "WwW.x.y", "~~s~~", "1. x", "$x$"])
+@pytest.mark.parametrize("text", ["a|b", "*", "Größe 3 µm", "WwW.x.y", "~~s~~", "1. x", "$x$"])
 def test_markdown_text_shows_exactly_the_text(text):
     import html
 
@@ -244,43 +232,12 @@ def test_files_are_the_same_bytes_every_time(make, tmp_path):
 
 
 def test_unsound_files_are_refused_by_name(make, capsys, tmp_path):
-    good = make("good.json", 1.0, name="good")
-    bad = make("bad.json", 2.0, name="bad")
-    whole = bad.read_text()
-    for text, message in (
-        (whole[:-50], "no valid JSON"),
-        (whole.replace('"object_mae_mm": 2.0', '"object_mae_mm": NaN', 1), "NaN"),
-        (whole.replace('"object_mae_mm": 2.0', '"object_mae_mm": -2.0', 1), "greater than or equal to 0"),
-        (whole.replace('"object_mae_mm": 2.0', '"object_mae_mm": 1.0', 1), "does not follow"),
-        (whole.replace('"schema_version": "4.0.0"', '"schema_version": "7"'), "schema_version 7"),
-        ("{}", "no schema_version"),
-    ):
-        bad.write_text(text)
-        assert main(["leaderboard", str(good), str(bad), "--markdown", str(tmp_path / "t.md")]) == 2
-        captured = capsys.readouterr()
-        assert "bad.json" in captured.err and message in captured.err
-        assert captured.out == "" and not (tmp_path / "t.md").exists()
-
-
-@pytest.mark.parametrize(
-    ("content", "what"),
-    [
-        ('{"shards": [], "samples": {}, "schema_version": "2.0.0"}', "the manifest of a dataset"),
-        ('{"sorted_by": "object_mae_mm", "groups": []}', "a ranking"),
-        ('{"differences": {}, "per_sample": []}', "a comparison"),
-        ('{"tradeoff_schema_version": "2.0.0"}', "what fpp-bench tradeoff measured"),
-    ],
-)
-def test_another_file_is_called_by_what_it_is_in_one_line(content, what, make, capsys):
-    good = make("good.json", 1.0)
-    Path("other.json").write_text(content)
-    for command in (["leaderboard", "other.json"], ["leaderboard", str(good), "other.json"]):
-        assert main(command) == 2
-        line = capsys.readouterr().err
-        assert line.count("\n") == 1 and f"other.json is not a result file but {what}" in line
-    for words in (["compare", str(good), "other.json"], ["verify", "other.json", "predictions", "data"]):
-        assert evaluate_main(words) == 2
-        assert f"other.json is not a result file but {what}" in capsys.readouterr().err
+    good, bad = make("good.json", 1.0, name="good"), make("bad.json", 2.0, name="bad")
+    bad.write_text(bad.read_text().replace('"object_mae_mm": 2.0', '"object_mae_mm": 1.0', 1))
+    assert main(["leaderboard", str(good), str(bad), "--markdown", str(tmp_path / "t.md")]) == 2
+    captured = capsys.readouterr()
+    assert "bad.json" in captured.err and "does not follow" in captured.err
+    assert captured.out == "" and not (tmp_path / "t.md").exists()
 
 
 def test_the_files_that_this_package_writes_are_told_apart(tiny, make, capsys, tmp_path):
@@ -288,10 +245,19 @@ def test_the_files_that_this_package_writes_are_told_apart(tiny, make, capsys, t
     board(capsys, first, second, "--json", "board.json")
     assert evaluate_main(["compare", str(first), str(second), "--json", "comparison.json"]) == 0
     assert main(["tradeoff", str(tiny), "--quick", "--method", "constant"]) == 0
-    for path in (tiny / "manifest.json", "board.json", "comparison.json", "tradeoff/tradeoff.json"):
+    for path, what in (
+        (tiny / "manifest.json", "the manifest of a dataset"),
+        ("board.json", "a ranking"),
+        ("comparison.json", "a comparison"),
+        ("tradeoff/tradeoff.json", "what fpp-bench tradeoff measured"),
+    ):
         capsys.readouterr()
-        assert main(["leaderboard", str(path)]) == 2
-        assert "is not a result file but " in capsys.readouterr().err
+        assert main(["leaderboard", str(first), str(path)]) == 2
+        error = capsys.readouterr().err
+        assert error.count("\n") == 1 and f"{path} is not a result file but {what}" in error
+    for words in (["compare", str(first), "board.json"], ["verify", "board.json", "predictions", "data"]):
+        assert evaluate_main(words) == 2
+        assert "board.json is not a result file but a ranking" in capsys.readouterr().err
     board(capsys, first, "--row", "row.json")
     assert evaluate_main(["compare", "row.json", str(second)]) == 0
 
@@ -339,14 +305,14 @@ def test_unwritable_output_is_an_error(make, capsys, tmp_path):
     assert "can't be written" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("width", [80, 99, 100, 140, 200, 300])
+@pytest.mark.parametrize("width", [80, 100, 300])
 def test_numbers_stay_whole_in_narrow_terminals(width, make, capsys, monkeypatch):
     path = make("a.json", 1234.5, name="A rather long name of a method, with both directions and 18 steps")
     monkeypatch.setenv("COLUMNS", str(width))
     out = board(capsys, path, "--sort", "object_edge_mae_mm", "--paper", "none")
     assert all(len(line) <= width for line in out.splitlines())
     assert f"│ {cut_at_word('A rather long name of a method, with both directions and 18 steps')} │" in out
-    assert out.count("1234.500") == {80: 2, 99: 2, 100: 3, 140: 4, 200: 5, 300: 6}[width]
+    assert out.count("1234.500") == {80: 2, 100: 3, 300: 6}[width]
     header = out.split("┡")[0]
     assert "Edge" in header, "the rows are sorted by it"
     assert ("Left out at" in out) == (width < 300)

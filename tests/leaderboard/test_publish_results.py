@@ -148,19 +148,10 @@ def test_the_page_becomes_a_static_space(client, scored, tmp_path):
     assert len(head["short_description"]) <= 60  # the Hub refuses more
     files = {".gitattributes", "README.md", "fpp-bench.json", "index.html", "data.json", "data.csv"}
     assert set(space.files) == {*files, *pages} - deleted
-    (page,) = pages - deleted
-    assert space.files[page] == (tmp_path / "page" / page).read_bytes()
-
-
-def test_the_page_of_results(client, scored, tmp_path):
-    """The leaderboard's own page, made from results; without any it is that of the shipped rows."""
-    call = ["leaderboard", str(scored["good"]), str(scored["many"]), "--repo", "alice/ranked"]
-    first, second, none = client.run(call, call, ["leaderboard", "--repo", "alice/ranked"])
-    assert first[0] == second[0] == none[0] == 0, (first, second, none)
-    assert "Nothing to send" in second[1]
-    pages = [name for name in listed(first[1]) if name.startswith("submissions/")]
-    assert len(pages) == 2
-    assert {name: listed(none[1])[name] for name in pages} == dict.fromkeys(pages, "deleted")
+    (left,) = pages - deleted
+    assert space.files[left] == (tmp_path / "page" / left).read_bytes()
+    # Without results, the page is that of the shipped rows.
+    assert listed(client.good(call))[left] == "deleted"
 
 
 def test_the_score_falls_with_the_error_and_stays_between_0_and_100():
@@ -170,14 +161,12 @@ def test_the_score_falls_with_the_error_and_stays_between_0_and_100():
     assert scores[0] == 100.0 and hub_score(10.0) == 50.0 and hub_score(1e30) == 0.0
 
 
-@pytest.mark.parametrize("name", ["a/b", "A-1/b.c_d", "alice/" + "n" * 96])
+@pytest.mark.parametrize("name", ["A-1/b.c_d", "alice/" + "n" * 96])
 def test_repository_names(name):
     assert check_repo_name(name) == name
 
 
-@pytest.mark.parametrize(
-    "name", ["a", "a/b/c", "/b", "a/", "a/b c", "a/..", "../b", "a/b--c", "a/b.git", "a/-b", "a/b\n", "ä/b"]
-)
+@pytest.mark.parametrize("name", ["a", "a/b/c", "/b", "a/b c", "a/..", "a/b--c", "a/b.git", "a/-b", "a/b\n", "ä/b"])
 def test_no_repository_names(name):
     with pytest.raises(PublishError, match="OWNER/NAME"):
         check_repo_name(name)

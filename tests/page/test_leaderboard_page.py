@@ -33,11 +33,6 @@ from fpp_ml_bench.style import escaped, page
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
-
-
-@pytest.fixture(scope="module")
 def files(tmp_path_factory, dataset):
     return some_rows(tmp_path_factory.mktemp("rows"), dataset)
 

@@ -26,11 +26,6 @@ from fpp_ml_bench.style import figure_png
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
-
-
-@pytest.fixture(scope="module")
 def scored(dataset, tmp_path_factory):
     """Predictions of the whole set, the error growing from sample to sample, and their result."""
     folder = tmp_path_factory.mktemp("predictions")

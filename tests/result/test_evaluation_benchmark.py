@@ -26,11 +26,6 @@ from fpp_ml_bench.loaders.storage.store import DatasetFolder
 OTHER = {"test/depth": "e" * 32, "test/flags": "e" * 32}
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
-
-
 @pytest.fixture
 def named(dataset, tmp_path, monkeypatch):
     """The dataset as ``tiny-bench`` version 4, beside a benchmark of other content."""
@@ -103,12 +98,8 @@ def test_settings_of_a_benchmark_with_other_bytes_are_warned_of(dataset, tmp_pat
         ({"content": OTHER, "benchmark": {"name": "nobody-knows", "version": 1}}, "content is not that benchmark's"),
         ({"content": {}}, "content: .*at least 1"),
         ({"content": {"test/depth": "e" * 32}, "benchmark": None}, None),
-        ({"content": {**OTHER, "../x": "e" * 32}}, "content"),
         ({"content": {**OTHER, "test/frame_00": "e" * 32}, "benchmark": None}, "expected hashes of test/depth"),
-        ({"content": {"train/depth": "e" * 32}, "benchmark": None}, "expected hashes of"),
-        ({"benchmark": {"name": "tiny-bench", "version": "4"}}, "benchmark.version: .*integer"),
         ({"benchmark": {"name": "tiny-bench"}}, "benchmark.version: is missing"),
-        ({"benchmark": {"name": "x\x1b[2J", "version": 4}}, r"U\+001B"),
         ({"benchmark": {"name": "tiny-bench", "version": 4, "size": 32}}, "size: is not a key"),
     ],
 )
@@ -200,21 +191,6 @@ def test_a_build_that_lacks_columns_is_still_the_benchmark(tmp_path, monkeypatch
         results.append(evaluate(write_predictions(tmp_path / str(number), opened, offset_mm=1.0), opened))
     assert results[0].dataset.benchmark == results[1].dataset.benchmark and results[1].dataset.benchmark is not None
     assert results[0].dataset.truth == results[1].dataset.truth and results[0].metrics == results[1].metrics
-
-
-def test_the_schema_describes_the_key(named, tmp_path, capsys):
-    import jsonschema
-
-    assert main(["schema"]) == 0
-    schema = json.loads(capsys.readouterr().out)
-    assert "4.0.0" in schema["title"] and set(schema["$defs"]["BenchmarkInfo"]["required"]) == {"name", "version"}
-    content = json.loads(result_file(named, tmp_path).read_text())
-    jsonschema.validate(content, schema)
-    del content["dataset"]["benchmark"]
-    jsonschema.validate(content, schema)
-    with pytest.raises(jsonschema.ValidationError):
-        content["dataset"]["benchmark"] = "tiny-bench"
-        jsonschema.validate(content, schema)
 
 
 def test_the_scores_do_not_depend_on_the_name(dataset, tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ import re
 
 import pytest
 from board_rows import reliance, write_result_file
-from scored_dataset import make_dataset
+from scored_dataset import change_json
 from upkeep import readme_block
 
 from fpp_ml_bench.baselines.timing import check_same_method
@@ -22,11 +22,6 @@ SHA = "a" * 64
 
 def block(**changes):
     return {**reliance().model_dump(), "weights_sha256": SHA, **changes}
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
 
 
 @pytest.fixture
@@ -64,13 +59,10 @@ def test_it_is_written_read_back_and_replaced(row, file, tmp_path, capsys):
     "change, message",
     [
         ({"score": 1.5}, "reliance.score"),
-        ({"score": "0.5"}, "reliance.score"),
         ({"interval": [0.9, 0.1]}, "expected 0 <= low <= high <= 1"),
         ({"interval": [None, 0.1]}, "two numbers or two nulls"),
-        ({"interval": [0.1]}, "reliance.interval"),
         ({"version": "0.9.0"}, "reliance.version"),
         ({"weights_sha256": "c" * 64}, "measured on weights cccc"),
-        ({"weights_sha256": None}, "measured on weights None"),
         ({"units": "normalised"}, "an answer in normalised, scored was one in mm"),
         ({"objects": 5}, "objects is above samples"),
         ({"parts": {"follows_phase": 0.5}}, "is missing"),
@@ -78,9 +70,7 @@ def test_it_is_written_read_back_and_replaced(row, file, tmp_path, capsys):
     ],
 )
 def test_what_contradicts_the_result_is_refused_by_name(change, message, file):
-    content = json.loads(file.read_text())
-    content["reliance"] = block(**change)
-    file.write_text(json.dumps(content))
+    change_json(file, ["reliance"], block(**change))
     with pytest.raises(SubmissionError, match=re.escape(message)) as caught:
         read_result(file)
     assert str(file) in str(caught.value)

@@ -95,18 +95,15 @@ REFUSED = {
     "size": ((TRUE[:, :3], TRUE), {}, "sample 0: predictions: expected a map .* got .3, 5."),
     "whole numbers": ((TRUE.astype(int), TRUE), {}, "sample 0: predictions: expected real floats, got int64"),
     "NaN": ((TRUE * np.nan, TRUE), {}, "sample 0: the prediction holds 20 NaN"),
-    "metres": ((TRUE / 1000, TRUE), {}, "sample 0: the prediction looks like metres"),
     "bad target": ((TRUE, -TRUE), {}, "sample 0: targets: expected finite mm of 0 and more"),
     "bad sigma": ((TRUE, TRUE), {"sigma": TRUE * np.nan}, "sample 0: sigma: expected finite mm"),
-    "flags": ((TRUE, TRUE), {"flags": TRUE}, "sample 0: flags: expected whole numbers .* got float64"),
-    "flags as a mask": ((TRUE, TRUE), {"flags": TRUE > 0}, "flags: expected whole numbers .* got bool"),
+    "flags as a mask": ((TRUE, TRUE), {"flags": TRUE > 0}, "sample 0: flags: expected whole .* got bool"),
     "flags of valid pixels": ((TRUE, TRUE), {"flags": np.uint8(255) * (TRUE > 0)}, "expected sums of 1 .* got 255"),
     "flags that wrap": ((TRUE, TRUE), {"flags": np.uint16(256) * (TRUE > 0)}, "expected sums of .* got 256"),
-    "negative flags": ((TRUE, TRUE), {"flags": np.int64(-1) * (TRUE > 0)}, "expected sums of .* got -1"),
     "masked prediction": ((np.ma.masked_equal(TRUE, 1800), TRUE), {}, "predictions: a masked array"),
     "both in metres": ((TRUE / 1000, TRUE / 1000), {}, "largest depth is 1.8, which could be metres; say units"),
     "target in metres": ((TRUE, TRUE / 1000), {}, "targets: the largest depth is 1.8"),
-    "metres close by": ((TRUE / 4500, TRUE / 4.5), {}, "the prediction looks like metres"),
+    "metres close by": ((TRUE / 4500, TRUE / 4.5), {}, "sample 0: the prediction looks like metres"),
     "mm for metres": ((TRUE, TRUE / 1000), {"units": "m"}, "the prediction does not look like metres"),
     "other units": ((TRUE, TRUE), {"units": "inch"}, "units: expected mm or m, got inch"),
     "ragged": (([[[1800.0], [1.0, 2.0]]], TRUE[:1]), {}, "predictions: expected an array"),
@@ -131,10 +128,9 @@ DISK = np.where(THERE, 1800.0 + COLUMNS / 3, 0.0)[None]
 NEAR = DISK + 2 * (DISK > 0)
 
 
-@pytest.mark.parametrize("mark", [1e10, 65504.0, 65535.0, 9999.0, 1e6, 1.0, -1.0, np.inf, np.nan])
-@pytest.mark.parametrize("kind", [np.float32, np.float64])
-def test_a_mark_for_no_surface_is_no_depth(mark, kind):
-    prediction, target = (np.where(DISK > 0, depth, mark).astype(kind) for depth in (NEAR, DISK))
+@pytest.mark.parametrize("mark", [1e10, 65535.0, 1.0, -1.0, np.inf, np.nan])
+def test_a_mark_for_no_surface_is_no_depth(mark):
+    prediction, target = (np.where(DISK > 0, depth, mark).astype(np.float32) for depth in (NEAR, DISK))
     with pytest.raises(PredictionError, match="nodata"):
         fpp_ml_bench.evaluate(prediction, target)
     scores = fpp_ml_bench.evaluate(prediction, target, nodata=mark).metrics
@@ -170,9 +166,8 @@ def test_depths_are_no_marks(case):
     assert fpp_ml_bench.evaluate(*DEPTHS[case]).metrics.object_mae_mm > 0
 
 
-@pytest.mark.parametrize("shape", [(1, 60, 80), (60, 80, 1)])
-def test_an_axis_too_many_is_named(shape):
+def test_an_axis_too_many_is_named():
     with pytest.raises(PredictionError, match=r"an axis too many; write np\.squeeze"):
-        fpp_ml_bench.evaluate(NEAR.reshape(1, *shape), DISK)
+        fpp_ml_bench.evaluate(NEAR[None], DISK)
     with pytest.raises(PredictionError, match=r"targets: .* np\.squeeze"):
-        fpp_ml_bench.evaluate(NEAR.reshape(1, *shape), DISK.reshape(1, *shape))
+        fpp_ml_bench.evaluate(NEAR[..., None], DISK[..., None])

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from scored_dataset import disk_depth
 
-from fpp_ml_bench.evaluation.metrics import METRICS
+from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 
 
@@ -37,7 +37,7 @@ def cases(draw):
 
 @given(cases())
 @settings(max_examples=200, deadline=None)
-def test_every_score_agrees_with_float128_to_1e_minus_10(case):
+def test_every_score_agrees_with_float128(case):
     scores = score_sample(*case).metrics()
     expected = sample_scores(*case)
     assert set(scores) == set(expected) and {key for key, m in METRICS.items() if not m.optional} <= set(scores) <= set(
@@ -48,9 +48,10 @@ def test_every_score_agrees_with_float128_to_1e_minus_10(case):
         if value is None:
             assert scores[key] is None, key
             continue
+        relative = 1e-12 if key in HEADLINE else 1e-10
         # Signed means and the error without an offset are small differences: accurate relative to the object's MAE.
         rounding = 1e-12 * scale if METRICS[key].cancels else 0.0
-        assert scores[key] == pytest.approx(float(value), rel=1e-10, abs=rounding), key
+        assert scores[key] == pytest.approx(float(value), rel=relative, abs=rounding), key
 
 
 @given(cases())

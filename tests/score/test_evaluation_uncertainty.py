@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 from scipy import stats
-from scored_dataset import make_dataset, write_predictions
+from scored_dataset import change_json, make_dataset, write_predictions
 
 from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import SubmissionError
@@ -15,11 +15,6 @@ from fpp_ml_bench.evaluation.result.file import read_result, write_result
 from fpp_ml_bench.evaluation.score import uncertainty
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.uncertainty import holm, object_interval, sign_flip_p
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
 
 
 @pytest.fixture
@@ -33,7 +28,7 @@ def make(tmp_path, dataset):
     return write
 
 
-@pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 9, 30, 49])
+@pytest.mark.parametrize("freedom", [1, 2, 5, 49])
 def test_student_quantile_is_scipys(freedom):
     assert uncertainty._student_quantile(0.975, freedom) == pytest.approx(stats.t.ppf(0.975, freedom), rel=1e-9)
 
@@ -84,13 +79,6 @@ def test_unequal_views_weigh_samples_alike_and_gaps_are_left_out():
 def test_too_few_objects_for_95_percent_are_said():
     assert "at most 50% of cases" in uncertainty.caution(2) and "at most 88%" in uncertainty.caution(4)
     assert uncertainty.caution(5) is None and uncertainty.caution(1) is None
-    rng = np.random.default_rng(3)
-    for objects, reach in ((2, 0.5), (3, 0.75)):
-        covered = 0
-        for _ in range(150):
-            low, high = object_interval(rng.normal(0, 1, objects).tolist(), list(range(objects)))
-            covered += low <= 0 <= high
-        assert covered / 150 == pytest.approx(reach, abs=0.1)
 
 
 def scipy_p(differences):
@@ -105,7 +93,7 @@ def scipy_p(differences):
     return answer.pvalue
 
 
-@pytest.mark.parametrize("objects", [2, 5, 6, 9, 12])
+@pytest.mark.parametrize("objects", [2, 6, 12])
 def test_the_sign_flip_test_is_scipys(objects):
     rng = np.random.default_rng(objects)
     for differences in (rng.normal(0.5, 1, objects), rng.exponential(1, objects) - 0.3, np.full(objects, 0.1)):
@@ -173,26 +161,19 @@ def test_one_object_has_no_interval(dataset, tmp_path):
         (["intervals", "object_mae_mm", 0], 0.5, r"intervals\.object_mae_mm\.0 does not follow"),
         (["per_object", 0, "metrics", "object_mae_mm"], 0.5, r"per_object\.0\.metrics\.object_mae_mm does not follow"),
         (["per_object", 0, "spread", "object_mae_mm"], 0.5, r"per_object\.0\.spread\.object_mae_mm does not follow"),
-        (["per_object", 0, "object"], "mug", r"per_object\.0\.object does not follow"),
         (["seeds", "bootstrap"], 1, r"seeds\.bootstrap does not follow"),
         (["bootstrap", "resamples"], 10, r"bootstrap\.resamples does not follow"),
         (["per_sample", 0, "object_bias_mm"], -99.0, "bias or shift-free MAE is above the MAE"),
         (["per_sample", 0, "object_median_mm"], 99.0, "out of order"),
         (["per_sample", 0, "object_p95_mm"], None, "null all together"),
         (["mode"], "paper", r"dataset\.content: expected hashes of test/depth, got"),
-        (["mode"], "paper-individual", "mode: Input should be 'standard' or 'paper'"),
         (["target"], "depth_exact", r"dataset\.content: expected hashes of test/depth_exact, test/flags"),
         (["environment", "code_sha256"], "x", "code_sha256"),
     ],
 )
 def test_edited_result_contradicts_itself(path, value, message, make):
     file = make("a", noise_mm=2.0)
-    content = json.loads(file.read_text())
-    place = content
-    for key in path[:-1]:
-        place = place[key]
-    place[path[-1]] = value
-    file.write_text(json.dumps(content))
+    change_json(file, path, value)
     with pytest.raises(SubmissionError, match=message):
         read_result(file)
 
@@ -279,27 +260,12 @@ def test_verify_on_other_data_and_other_protocol(make, dataset, tmp_path, capsys
 def test_schema_describes_the_file(make, capsys):
     import jsonschema
 
-    for name in ("result", "submission", "comparison"):
+    for name in ("submission", "comparison", "result"):
         assert main(["schema", name]) == 0
         schema = json.loads(capsys.readouterr().out)
         jsonschema.Draft202012Validator.check_schema(schema)
-    assert main(["schema"]) == 0
-    schema = json.loads(capsys.readouterr().out)
     content = json.loads(make("p").read_text())
     jsonschema.validate(content, schema)
     content["per_sample"][0]["object_mae_mm"] = "0.1"
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(content, schema)
-
-
-def test_schema_needs_no_library_to_be_read(capsys):
-    assert main(["schema"]) == 0
-    schema = json.loads(capsys.readouterr().out)
-    assert schema["$schema"].endswith("2020-12/schema") and schema["additionalProperties"] is False
-    assert {"intervals", "per_object", "per_sample", "seeds", "mode", "environment"} <= set(schema["required"])
-
-
-def test_a_folder_named_like_a_subcommand_is_scored_by_its_path(dataset, tmp_path, monkeypatch):
-    write_predictions(tmp_path / "compare", dataset)
-    monkeypatch.chdir(tmp_path)
-    assert main(["./compare", str(dataset.path)]) == 0

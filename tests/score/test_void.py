@@ -6,7 +6,6 @@ from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
 from fpp_ml_bench.evaluation.report.terminal import result_table
-from fpp_ml_bench.evaluation.result.file import read_result, write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 from fpp_ml_bench.evaluation.score.torch_metric import DepthScores
@@ -37,25 +36,6 @@ def test_surface_that_was_not_decoded_is_void_too():
     flags = np.array([0, 0, 0, Flag.MIXED], np.uint8)
     depth_mm, exact_mm = np.array([1800.0, 0.0, 0.0, 1800.0]), np.array([1800.5, 1800.5, 0.0, 1800.5])
     assert void_pixels(flags, depth_mm, exact_mm).tolist() == [False, True, False, True]
-
-
-def test_they_count_in_no_set_and_their_share_is_reported(dataset, tmp_path):
-    folder = write_predictions(tmp_path / "p", dataset, noise_mm=2.0)
-    for sample in dataset.samples("test"):  # whatever is predicted there
-        path = folder / f"{sample}.npy"
-        np.save(path, np.where(dataset.void(sample), np.float32(9999), np.load(path)))
-    result = evaluate(folder, dataset)
-    for row in result.per_sample:
-        target, void = dataset.depth_mm(row.sample), void_pixels(dataset.flags(row.sample))
-        error = np.abs(np.load(folder / f"{row.sample}.npy").astype(np.float64) - target)
-        assert row.void_pixels == np.count_nonzero(void) > 0 and row.void_share == void.mean()
-        sets = {"object": (target > 0) & ~void, "background": (target == 0) & ~void, "overall": ~void}
-        for name, pixels in sets.items():
-            assert getattr(row, f"{name}_mae_mm") == pytest.approx(error[pixels].mean(), rel=1e-12)
-        assert row.object_pixels + row.background_pixels + row.void_pixels == target.size
-        assert row.unlit_pixels is None and row.unlit_mae_mm is None
-    write_result(result, tmp_path / "r.json")
-    assert read_result(tmp_path / "r.json") == result
 
 
 def test_the_papers_sets_know_no_void(dataset, tmp_path):

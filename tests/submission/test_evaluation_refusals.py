@@ -21,16 +21,6 @@ SAMPLE = "power_drill_A60"
 FILE = f"{SAMPLE}.npy"
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
-
-
-@pytest.fixture
-def predictions(tmp_path, dataset):
-    return write_predictions(tmp_path / "predictions", dataset)
-
-
 def refused(capsys, tmp_path: Path, dataset, predictions: Path, *arguments: str) -> str:
     """Run the command, check that it refuses and leaves an older result alone; its message."""
     result = tmp_path / "result.json"
@@ -87,11 +77,6 @@ def pickled(folder: Path) -> None:
     np.save(folder / FILE, np.array([[{"a": 1}]], dtype=object), allow_pickle=True)
 
 
-def replace_by_folder(folder: Path) -> None:
-    (folder / FILE).unlink()
-    (folder / FILE).mkdir()
-
-
 def replace_by_pipe(folder: Path) -> None:
     (folder / FILE).unlink()
     os.mkfifo(folder / FILE)
@@ -103,29 +88,20 @@ FILES = {
     "wrong shape": (rewrite(lambda d: d[:-1]), r"expected shape \(32, 40\) \(H, W\), got \(31, 40\)"),
     "transposed": (rewrite(lambda d: d.T), r"got \(40, 32\); it looks transposed"),
     "extra axis": (rewrite(lambda d: d[None]), r"got \(1, 32, 40\); it has an axis too many; write np.squeeze"),
-    "last axis": (rewrite(lambda d: d[..., None]), r"got \(32, 40, 1\); it has an axis too many; write np.squeeze"),
     "channels": (rewrite(lambda d: np.stack([d] * 3)), r"got \(3, 32, 40\); write the map of depth alone"),
     "a mark": (rewrite(lambda d: np.where(d > 0, d, 65504)), r"holds a mark .*% of the pixels are exactly 65504"),
     "a negative mark": (rewrite(lambda d: np.where(d > 0, d, -1)), r"are exactly -1, far .* or give .* nodata"),
     "scalar": (rewrite(lambda d: np.float32(1)), r"got \(\)"),
-    "int32": (rewrite(lambda d: d.astype(np.int32)), "got int32"),
     "uint16": (rewrite(lambda d: d.astype(np.uint16)), "got uint16"),
-    "bool": (rewrite(lambda d: d > 0), "got bool"),
     "complex": (rewrite(lambda d: d.astype(np.complex64)), "got complex64"),
-    "long double": (rewrite(lambda d: d.astype(np.longdouble)), "got float128"),
-    "text": (rewrite(lambda d: d.astype("U4")), "expected float16, float32 or float64"),
     "structured": (rewrite(lambda d: d.view([("z", "<f4")])), "expected float16, float32 or float64"),
     "objects": (pickled, "pickled Python objects"),
     "one NaN": (with_value(np.nan), "holds 1 NaN of 1280 values"),
     "infinities": (with_value(np.inf, 3), "holds 3 infinite of 1280 values"),
-    "minus infinity": (with_value(-np.inf), "holds 1 infinite"),
-    "all NaN": (with_value(np.nan, 1280), "holds 1280 NaN of 1280 values"),
     "absurd": (with_value(3e38), "the limit is 1e\\+30"),
-    "metres": (rewrite(lambda d: d / 1000), "looks like metres"),
     "normalised": (rewrite(lambda d: d / d.max()), "looks like metres or normalised depth: its largest value is 1"),
     "truncated": (cut, "is truncated: expected 5248 bytes, got 5244"),
     "grown": (grow, "foreign bytes"),
-    "empty file": (lambda f: (f / FILE).write_bytes(b""), "is no .npy file"),
     "noise": (lambda f: (f / FILE).write_bytes(bytes(range(256)) * 8), "is no .npy file"),
     "zip archive": (archive, "np.savez"),
     "no dictionary": (header(b"import os\n"), "is no .npy file"),
@@ -137,8 +113,6 @@ FILES = {
     ),
     "format 3.0": (header(b"{}", b"\x93NUMPY\x03\x00"), "format version"),
     "symbolic link": (link, "is a symbolic link"),
-    "broken link": (lambda f: (f / FILE).unlink() or (f / FILE).symlink_to("nowhere"), "is a symbolic link"),
-    "folder": (replace_by_folder, "is not a regular file"),
     "pipe": (replace_by_pipe, "is not a regular file"),
 }
 
@@ -203,33 +177,24 @@ def test_file_names_cannot_speak_to_the_terminal(capsys, tmp_path, dataset, pred
 DESCRIPTIONS = {
     "unknown key": ({"speed": 3}, "speed: is not a key"),
     "no name": ({"name": ...}, "name: is missing"),
-    "no frames": ({"frames_used": ...}, "frames_used: is missing"),
     "empty name": ({"name": "  "}, "name: expected some text"),
     "number as name": ({"name": 5}, "name: .*string"),
     "long name": ({"name": "x" * 201}, "name: expected at most 200 characters, got 201"),
     "escape in name": ({"name": "a\x1b[2J"}, r"name: .*U\+001B"),
-    "line break in name": ({"name": "a\nb"}, r"name: .*U\+000A"),
     "reversed text in name": ({"name": "a\u202eb"}, r"name: .*U\+202E"),
     "inches": ({"units": "inch"}, "units: Input should be 'mm', 'm' or 'normalised' .got 'inch'"),
-    "no units": ({"units": ...}, "units: is missing"),
-    "range as text": ({"uses_ground_truth_range": "yes"}, "uses_ground_truth_range: .*boolean"),
     "range as number": ({"uses_ground_truth_range": 0}, "uses_ground_truth_range: .*boolean"),
-    "frames as text": ({"frames_used": "0"}, "frames_used: .*list"),
     "fraction of a frame": ({"frames_used": [0.5]}, r"frames_used\.0: .*integer"),
     "negative frame": ({"frames_used": [-1]}, r"frames_used\.0: .*greater"),
     "frame twice": ({"frames_used": [1, 1]}, "frames_used names a frame twice"),
     "empty frames": ({"frames_used": []}, "frames_used: .*at least 1 item"),
     "frame outside": ({"frames_used": [3, 52]}, r"frames_used: expected indices from 0 to 51 .*got \[52\]"),
-    "negative time": ({"seconds_per_sample": -1.0}, "seconds_per_sample: .*greater"),
     "no time": ({"seconds_per_sample": 0.0}, "seconds_per_sample: .*greater"),
     "NaN time": ({"seconds_per_sample": float("nan")}, "seconds_per_sample: .*finite"),
-    "time as text": ({"seconds_per_sample": "fast"}, "seconds_per_sample: .*number"),
     "time without its machine": ({"hardware": ...}, "needs seconds_source and hardware"),
     "unknown source": ({"seconds_source": "guessed"}, "seconds_source: .*measured"),
-    "hardware as text": ({"hardware": "fast"}, "hardware: "),
     "unknown hardware key": ({"hardware": {"cpu": "x", "ghz": 3}}, r"hardware\.ghz: is not a key"),
     "unknown data": ({"learned_from": {"data": "everything"}}, r"learned_from\.data: .*'train-split'"),
-    "data as text": ({"learned_from": "train-split"}, "learned_from: "),
     "train split of what": ({"learned_from": {"data": "train-split"}}, "data: train-split needs versions"),
     "versions of nothing": ({"learned_from": {"data": "none", "versions": ["x"]}}, "from no data has no versions"),
     "nested settings": ({"settings": {"a": {"b": 1}}}, r"settings\.a"),
@@ -257,7 +222,6 @@ TEXTS = {
     "too long": ("name: " + "x" * 70000, "at most 65536 bytes"),
     "nested": ("a: " + "[" * 20000, "is no plain YAML"),
     "a date": ("name: !!timestamp 2026-99-99\n", "name: has the tag"),
-    "a number": ("seeds: {data: !!int x}\n", "data: has the tag"),
     "not UTF-8": (b"name: \xff\xfe", "expected UTF-8"),
 }
 
@@ -309,7 +273,7 @@ def test_wrong_arguments(arguments, message, capsys, dataset, predictions):
     assert sorted(p.name for p in predictions.iterdir()) == before
 
 
-@pytest.mark.parametrize("band", ["-1", "1.5", "x", "1001"])
+@pytest.mark.parametrize("band", ["-1", "1.5", "1001"])
 def test_edge_band_must_be_whole_pixels(band, dataset, predictions, capsys):
     assert main([str(predictions), str(dataset.path), "--edge-band", band]) == 2
     assert "whole pixels" in capsys.readouterr().err
