@@ -30,10 +30,6 @@ def dataset(tmp_path_factory):
     return DatasetFolder(made.path)
 
 
-def stack(frame):
-    return [frame]
-
-
 def test_the_nearest_of_the_training_images_by_another_computation(dataset):
     method = NearestMethod(paper_rig(96), training=dataset)
     training = {sample: dataset.frame(sample, 0).astype(float) for sample in dataset.samples("train")}
@@ -41,19 +37,11 @@ def test_the_nearest_of_the_training_images_by_another_computation(dataset):
     for sample in dataset.samples("test"):
         image = dataset.frame(sample, 0).astype(float)
         nearest = min(training, key=lambda name: float(((training[name] - image) ** 2).mean()))
-        np.testing.assert_array_equal(method.predict(stack(dataset.frame(sample, 0))), dataset.depth_mm(nearest))
+        np.testing.assert_array_equal(method.predict([dataset.frame(sample, 0)]), dataset.depth_mm(nearest))
         chosen.add(nearest)
     assert len(chosen) > 1
     for sample in training:  # its own image is the nearest
-        np.testing.assert_array_equal(method.predict(stack(dataset.frame(sample, 0))), dataset.depth_mm(sample))
-
-
-def test_blocks_are_means_over_their_pixels(dataset):
-    method = NearestMethod(paper_rig(96), training=dataset)
-    method.block_px = 7  # 96 = 13 * 7 + 5
-    frame = dataset.frame(dataset.samples("test")[0], 0)
-    sums = method._block_sums(frame)
-    assert sums.shape == (13, 13) and sums[2, 3] == int(frame[14:21, 21:28].astype(int).sum())
+        np.testing.assert_array_equal(method.predict([dataset.frame(sample, 0)]), dataset.depth_mm(sample))
 
 
 def test_it_runs_over_a_split_and_says_what_it_used(dataset, tmp_path):

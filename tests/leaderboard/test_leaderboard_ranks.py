@@ -254,9 +254,10 @@ def test_what_a_row_keeps_of_a_stated_uncertainty(tmp_path, dataset):
         stated = np.where(inside <= (1, 0.5, 0, 0)[number] * inside.max(), np.float32(10), np.float32(0))
         np.save(predictions / f"{sample}.sigma.npy", stated)
     result = evaluate(predictions, dataset)
-    row = row_of(result, tmp_path / "r.json")
-    assert uncertainty(row).within_95_share == pytest.approx(1.5 / 4, abs=0.01)
-    assert uncertainty(row).sure_rmse_mm == pytest.approx(result.uncertainty.metrics.sure_rmse_mm)
+    kept = row_of(result, tmp_path / "r.json").uncertainty
+    assert kept.within_95_share == pytest.approx(1.5 / 4, abs=0.01)
+    for key in ("ause_mae_mm", "sure_mae_mm", "sure_rmse_mm"):
+        assert getattr(kept, key) == pytest.approx(getattr(result.uncertainty.metrics, key), rel=1e-4)
 
 
 def test_what_a_result_says_beyond_its_scores(base):

@@ -3,7 +3,6 @@
 import html
 import json
 import re
-from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from types import SimpleNamespace
@@ -11,14 +10,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import scored_dataset
-from board_rows import named_benchmarks, some_rows, timing, write_result_file
+from board_rows import changed, named_benchmarks, some_rows, timing, write_result_file
+from conftest import file_bytes
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from matplotlib.transforms import Bbox
-from scored_dataset import make_dataset
+from scored_dataset import change_json, make_dataset
 
 from fpp_ml_bench.baselines.tradeoff.measure import pareto_front
-from fpp_ml_bench.baselines.tradeoff.report import Mark, Scatter, free_box
+from fpp_ml_bench.baselines.tradeoff.report import Mark, Scatter
 from fpp_ml_bench.cli import leaderboard as leaderboard_command
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.metrics import RANK_KEY
@@ -60,14 +59,8 @@ def pages(paths) -> dict[str, bytes]:
 
 def test_same_rows_same_bytes_whatever_their_order(files, tmp_path):
     assert pages(files) == pages(files[::-1])
-    for out in ("first", "second"):
-        arguments = [*map(str, files if out == "first" else files[::-1]), "--page", str(tmp_path / out)]
-        assert main(["leaderboard", *arguments]) == 0
-    first, second = (
-        {str(p.relative_to(tmp_path / out)): p.read_bytes() for p in (tmp_path / out).rglob("*") if p.is_file()}
-        for out in ("first", "second")
-    )
-    assert first == second and len(first) == 3 + len(files)
+    assert main(["leaderboard", *map(str, files), "--page", str(tmp_path / "page")]) == 0
+    assert file_bytes(tmp_path / "page") == pages(files) and len(pages(files)) == 3 + len(files)
 
 
 def test_a_page_ranks_once(files, tmp_path, monkeypatch, capsys):
@@ -134,6 +127,7 @@ def test_tables_are_tables(files):
     assert sorted_by == ["ascending"] * 2  # a table for each group, by object MAE
     assert all(a.get("aria-label") for tag, a in parsed.elements if tag == "svg" and a.get("role") == "img")
     assert all("alt" in a for tag, a in parsed.elements if tag == "img")
+    assert {"main", "nav"} <= {tag for tag, _ in parsed.elements}
 
 
 HOSTILE = [
@@ -180,19 +174,12 @@ def test_a_name_is_only_a_name(name, dataset, tmp_path, files):
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [
-        ("\x1b[2Jgone", "control character U+001B"),
-        ("x" * 10_000_000, "at most 200 characters"),
-        ("a\nb", "U+000A"),
-        ("\u202egnp.exe", "U+202E"),
-        ("  ", "expected some text"),
-    ],
+    [("\x1b[2Jgone", "control character U+001B"), ("x" * 10_000_000, "at most 200 characters")],
 )
 def test_dangerous_text_is_refused_by_every_output(name, message, files, tmp_path, capsys):
-    content = json.loads(files[0].read_text())
-    content["submission"]["name"] = name
     bad = tmp_path / "bad.json"
-    bad.write_text(json.dumps(content))
+    bad.write_bytes(files[0].read_bytes())
+    change_json(bad, ["submission", "name"], name)
     for output in (["--page", str(tmp_path / "page")], ["--markdown", str(tmp_path / "t.md")], []):
         assert main(["leaderboard", str(bad), *output]) == 2
         error = capsys.readouterr().err
@@ -208,7 +195,7 @@ def test_escaping_holds_without_the_checks_before_it():
 
 def test_a_slug_is_a_file_name_of_its_own(files):
     entry = read_entries(files[:1])[0]
-    earlier = replace(entry, row=entry.row.model_copy(update={"created": "2020-01-01T00:00:00+00:00"}))
+    earlier = changed(entry, created="2020-01-01T00:00:00+00:00")
     assert re.fullmatch(r"fast-and-rough-[0-9a-f]{12}", slug(entry)) and slug(entry) != slug(earlier)
 
 
@@ -251,25 +238,6 @@ def test_every_mark_has_a_place_and_every_number_an_explanation(picture, size):
     shown_names = {name for number, name in labels if not number}
     assert shown_names <= {mark.name for mark in picture.marks} and (picture.names or not shown_names)
     assert picture.svg(*size, "wide scatter", "A picture")[0] == svg
-
-
-boxes = st.tuples(st.floats(0, 300), st.floats(0, 300), st.floats(1, 80), st.floats(1, 40))
-
-
-@given(st.lists(boxes, max_size=30), st.tuples(st.floats(0, 300), st.floats(0, 300)))
-@settings(max_examples=200, deadline=None)
-def test_a_label_covers_nothing_and_stays_inside(drawn, at):
-    avoided = [(x, y, x + width, y + height) for x, y, width, height in drawn]
-    box = free_box(
-        at, (20.0, 8.0), 7.0, [Bbox.from_extents(*box) for box in avoided], Bbox.from_extents(0, 0, 300, 300)
-    )
-    if box is None:
-        assert avoided
-        return
-    left, lower, right, upper = box.extents
-    assert left >= 0 and lower >= 0 and right <= 300 and upper <= 300
-    assert right - left == pytest.approx(40) and upper - lower == pytest.approx(16)
-    assert all(right <= b[0] or b[2] <= left or upper <= b[1] or b[3] <= lower for b in avoided)
 
 
 def test_hostile_names_are_text_in_a_picture():
@@ -371,8 +339,7 @@ def test_a_scale_holds_every_mean(means):
 
 def test_an_interval_that_reaches_zero_is_clipped_where_it_shows(files):
     (entry,) = read_entries(files[:1])
-    intervals = entry.row.intervals.model_copy(update={RANK_KEY: [0.0, 9.0]})
-    reaching = replace(entry, row=entry.row.model_copy(update={"intervals": intervals}))
+    reaching = changed(entry, intervals={RANK_KEY: [0.0, 9.0]})
     for shown, expected in ((entry, False), (reaching, True)):
         index = page_files(rank([shown]), [])["index.html"].decode()
         assert ('<path class="beyond"' in index) is expected and ("an arrow marks those" in index) is expected

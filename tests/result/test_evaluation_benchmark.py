@@ -191,11 +191,3 @@ def test_a_build_that_lacks_columns_is_still_the_benchmark(tmp_path, monkeypatch
         results.append(evaluate(write_predictions(tmp_path / str(number), opened, offset_mm=1.0), opened))
     assert results[0].dataset.benchmark == results[1].dataset.benchmark and results[1].dataset.benchmark is not None
     assert results[0].dataset.truth == results[1].dataset.truth and results[0].metrics == results[1].metrics
-
-
-def test_the_scores_do_not_depend_on_the_name(dataset, tmp_path, monkeypatch):
-    folder = write_predictions(tmp_path / "predictions", dataset, noise_mm=2.0)
-    unnamed = evaluate(folder, dataset)
-    name_benchmarks(monkeypatch, tmp_path / "facts", (Benchmark("tiny-bench", 4, "mini", 32), dataset))
-    assert evaluate(folder, dataset).metrics == unnamed.metrics
-    assert np.isfinite(unnamed.metrics.object_mae_mm)

@@ -9,6 +9,8 @@ from scipy import ndimage
 from scored_dataset import disk_depth
 
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
+from fpp_ml_bench.evaluation.result.model import over_samples
+from fpp_ml_bench.evaluation.result.parts import AGREES, Metrics
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 
 
@@ -23,9 +25,8 @@ def cases(draw):
     scale = 10.0 ** draw(st.integers(-largest, largest))
     cover = draw(st.sampled_from([0.0, 0.03, 0.5, 0.97, 1.0]))
     target = np.where(ndimage.uniform_filter(rng.random(shape), 3) < cover, rng.uniform(0.5, 1.0, shape), 0.0) * scale
-    noise = (
-        rng.normal(0, 1, shape) * scale * draw(st.sampled_from([0.0, 1e-3, 1.0, 1e3 if kind is np.float64 else 1.0]))
-    )
+    spread = draw(st.sampled_from([rng.normal(0, 1, shape), np.ones(shape), rng.random(shape) < 0.05]))
+    noise = spread * scale * draw(st.sampled_from([0.0, 1e-3, 1.0, 1e3 if kind is np.float64 else 1.0]))
     prediction = (target + noise) * (rng.random(shape) < draw(st.sampled_from([1.0, 0.8])))
     prediction = prediction.astype(kind)
     target = target.astype(draw(st.sampled_from([kind, np.float64])))
@@ -65,6 +66,17 @@ def test_identity_of_the_three_sets(case):
     share = np.count_nonzero(target[~void] > 0) / np.count_nonzero(~void)
     composed = share * (scores["object_mae_mm"] or 0.0) + (1 - share) * (scores["background_mae_mm"] or 0.0)
     assert scores["overall_mae_mm"] == pytest.approx(composed, rel=1e-12, abs=0)
+
+
+@given(st.lists(cases(), min_size=1, max_size=4))
+@settings(max_examples=150, deadline=None)
+def test_scores_of_any_errors_contradict_nothing(views):
+    """What refuses scores that no errors have refuses none that some have: of a view, and means over views."""
+    scores = [score_sample(*view).metrics() for view in views]
+    for of_a_view in scores:
+        assert Metrics(**of_a_view).problem(1, AGREES) is None
+    means = over_samples(scores)
+    assert Metrics(**means).problem(len(views), AGREES) is None
 
 
 def test_closed_forms_of_the_distribution():
