@@ -8,8 +8,7 @@ import unicodedata
 from hashlib import sha256
 
 import pytest
-from board_rows import entry_with_errors, flat_scores, named_benchmarks, write_result_file
-from scored_dataset import make_dataset
+from board_rows import entry_with_errors, flat_scores, named_benchmarks
 from upkeep import readme_rows
 
 from fpp_ml_bench.errors import SubmissionError
@@ -23,12 +22,6 @@ from fpp_ml_bench.leaderboard.tables import table_csv
 OBJECTS = [f"object {n}" for n in range(8)]
 HONEST = {"first": 1.0, "second": 2.0, "third": 3.0}
 MINI, OTHER, FULL, UNSEEN = ({"test/depth": digit * 32} for digit in "abcd")
-
-
-@pytest.fixture(scope="module")
-def base(tmp_path_factory):
-    work = tmp_path_factory.mktemp("base")
-    return read_entry(write_result_file(work / "base.json", make_dataset(work / "tiny"), 1.0))
 
 
 @pytest.fixture

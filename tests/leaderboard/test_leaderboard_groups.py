@@ -4,10 +4,9 @@ import re
 from html import unescape
 
 import pytest
-from board_rows import changed, named_benchmarks, some_rows
+from board_rows import changed, named_benchmarks
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scored_dataset import make_dataset
 from upkeep import readme_block
 
 from fpp_ml_bench.evaluation.submission.description import Submission
@@ -15,13 +14,6 @@ from fpp_ml_bench.leaderboard.columns import CODE, assumption, assumption_senten
 from fpp_ml_bench.leaderboard.page.page import page_files
 from fpp_ml_bench.leaderboard.ranking import LONGEST_NAME, cut_at_word, rank, read_entries, shipped_rows, short_names
 from fpp_ml_bench.leaderboard.rows import SHIPPED_ROWS, read_entry
-from fpp_ml_bench.leaderboard.tables import chosen_tables
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory):
-    work = tmp_path_factory.mktemp("rows")
-    return some_rows(work / "rows", make_dataset(work / "tiny"))
 
 
 @pytest.fixture(scope="module")
@@ -105,14 +97,11 @@ def test_short_names_of_shipped_rows(shipped):
     expected = {
         "phase-03-vertical": "Phase, 3 vertical",
         "phase-net-horizontal": "phase-net, 1 horizontal",
-        "classical-18-both": "Classical 18+Gray, both",
         "classical-net-03-vertical": "classical-net 3+Gray, vertical",
         "classical-03-both-fewest": "Classical 3, both, no Gray",
-        "small-unet-individual-rmse": "UNet RMSE",
         "small-unet-individual-rmse-seed_1": "UNet RMSE s1",
         "small-unet-individual-rmse-horizontal": "UNet RMSE horizontal",
         "small-transunet-individual-hybrid_l1_0.7": "TransUNet hybrid L1 0.7",
-        "small-unet-global-rmse": "UNet global RMSE",
         "small-pix2pix_unet-individual-gan_0.7": "Pix2Pix GAN 0.7",
     }
     assert {stem: names[stem] for stem in expected} == expected
@@ -220,14 +209,3 @@ def test_rows_say_what_they_assume(stem):
     pages = page_files(rank([entry]), [])
     assert words in pages["index.html"].decode()
     assert all(sentence in unescape(own.decode()) for name, own in pages.items() if "submissions" in name)
-
-
-def test_the_papers_errors_are_shown_apart(shipped):
-    """The page has them below its own tables; README has none."""
-    groups, papers = rank(shipped), chosen_tables("architecture")
-    assert "14.54" not in readme_block(groups)
-    index = unescape(page_files(groups, papers)["index.html"].decode())
-    section = index[index.index("<h2>Reported by others</h2>") :]
-    row = re.search(r'<th scope="row">UNet</th>.*?</tr>', section, re.DOTALL)
-    assert re.findall(r"<td[^>]*>(.*?)</td>", row[0])[2:5] == ["14.54", "17.88", "3.31"]
-    assert "Other data, not ranked with the rows above" in section and "given the test sample's depth range" in section

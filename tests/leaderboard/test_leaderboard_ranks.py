@@ -8,8 +8,8 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from board_rows import changed, entry_with_errors, named_benchmarks, write_result_file
-from scored_dataset import make_dataset, write_predictions
+from board_rows import changed, entry_with_errors, named_benchmarks
+from scored_dataset import write_predictions
 
 from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import SubmissionError
@@ -18,18 +18,12 @@ from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.uncertainty import behind, holm, pairs, sign_flip_bounds, sign_flip_p
 from fpp_ml_bench.evaluation.submission.description import LearnedFrom, Submission
 from fpp_ml_bench.leaderboard.columns import columns, given_truth, learned_from, surest, uncertainty
-from fpp_ml_bench.leaderboard.ranking import rank, read_entries
+from fpp_ml_bench.leaderboard.ranking import rank
 from fpp_ml_bench.leaderboard.row_file import RowUncertainty, row_of, write_row
 from fpp_ml_bench.leaderboard.tables import table_json
 
 EIGHT = [f"object {n}" for n in range(8)]
 FULL, UNSEEN = ({"test/depth": letter * 32} for letter in "fe")
-
-
-@pytest.fixture(scope="module")
-def base(tmp_path_factory):
-    work = tmp_path_factory.mktemp("base")
-    return read_entries([write_result_file(work / "base.json", make_dataset(work / "tiny"), 1.0)])[0]
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_rows import reliance, robustness, some_rows, timing, write_result_file
+from board_rows import reliance, robustness, timing, write_result_file
 from scored_dataset import disk_depth, make_dataset
 from upkeep import readme_block
 
@@ -28,11 +28,6 @@ from fpp_ml_bench.leaderboard.row_file import (
     write_row,
 )
 from fpp_ml_bench.leaderboard.rows import read_entry
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory, dataset):
-    return some_rows(tmp_path_factory.mktemp("rows"), dataset)
 
 
 @pytest.fixture(scope="module")

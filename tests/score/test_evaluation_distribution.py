@@ -6,7 +6,6 @@ from extended_precision import sample_scores
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
-from scored_dataset import disk_depth
 
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
 from fpp_ml_bench.evaluation.result.model import over_samples
@@ -55,19 +54,6 @@ def test_every_score_agrees_with_float128(case):
         assert scores[key] == pytest.approx(float(value), rel=relative, abs=rounding), key
 
 
-@given(cases())
-@settings(max_examples=150, deadline=None)
-def test_identity_of_the_three_sets(case):
-    prediction, target, band, void, _ = case
-    scores = score_sample(prediction, target, band, void).metrics()
-    if void.all():
-        assert scores["overall_mae_mm"] is None
-        return
-    share = np.count_nonzero(target[~void] > 0) / np.count_nonzero(~void)
-    composed = share * (scores["object_mae_mm"] or 0.0) + (1 - share) * (scores["background_mae_mm"] or 0.0)
-    assert scores["overall_mae_mm"] == pytest.approx(composed, rel=1e-12, abs=0)
-
-
 @given(st.lists(cases(), min_size=1, max_size=4))
 @settings(max_examples=150, deadline=None)
 def test_scores_of_any_errors_contradict_nothing(views):
@@ -89,24 +75,6 @@ def test_closed_forms_of_the_distribution():
     assert scores["object_p95_mm"] == 75.0
     assert scores["object_shift_free_mae_mm"] == pytest.approx(np.abs(np.arange(-50, 51)).mean(), rel=1e-15)
     assert [scores[f"object_within_{k}mm_share"] for k in (1, 2, 5, 10)] == [3 / 101, 5 / 101, 11 / 101, 21 / 101]
-
-
-def test_the_bias_of_measured_pixels_is_reported_beside_the_bias_of_all():
-    target = np.full((10, 10), 1800.0)
-    prediction = target + 2.0
-    prediction[0, :] = 0.0
-    scores = score_sample(prediction, target).metrics()
-    assert scores["object_valid_bias_mm"] == 2.0
-    assert scores["object_bias_mm"] == pytest.approx(0.9 * 2 - 0.1 * 1800)
-
-
-def test_wide_band_is_eight_pixels_whatever_the_edge_band_is():
-    target = disk_depth((120, 120), 3)
-    prediction = target + np.random.default_rng(0).normal(0, 1, target.shape)
-    narrow, wide = (score_sample(prediction, target, band).metrics() for band in (3, 8))
-    for key in ("object_wide_band_mae_mm", "object_wide_interior_mae_mm", "object_wide_band_share"):
-        assert narrow[key] == pytest.approx(wide[key], rel=1e-14)
-    assert wide["object_wide_band_mae_mm"] == wide["object_edge_mae_mm"] != narrow["object_edge_mae_mm"]
 
 
 def test_only_the_scores_that_say_so_are_improved_by_missing_pixels():

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scored_dataset import disk_depth
 
-from fpp_ml_bench.depth import depth_edges, object_near_edge
+from fpp_ml_bench.depth import object_near_edge
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.metrics import METRICS
 from fpp_ml_bench.evaluation.result.model import over_samples, pooled
@@ -67,31 +67,6 @@ def test_missing_pixels_are_counted_and_left_out_of_the_valid_score_only():
     assert s.object.rmse_mm == pytest.approx(math.sqrt((5 * 1800**2 + 1803**2 + 14) / 20), rel=1e-15)
 
 
-def test_missing_pixels_are_told_apart_by_the_edge_band():
-    target = disk_depth((80, 80), 7)
-    near, inside = object_near_edge(target, 3), target > 0
-    prediction = target.astype(np.float64) + np.where(near, 5.0, 0.25) * inside
-    gone = np.random.default_rng(0).random(target.shape) < 0.2
-    prediction[gone & inside] = 0.0
-    s = score_sample(prediction, target)
-    assert s.interior_valid.mae_mm == 0.25
-    metrics = s.metrics()
-    assert metrics["object_interior_valid_mae_mm"] == 0.25
-    assert metrics["object_missing_share"] == (gone & inside).sum() / inside.sum()
-    assert metrics["object_interior_missing_share"] == (gone & inside & ~near).sum() / (inside & ~near).sum()
-
-
-def test_empty_sets_have_no_score():
-    flat = np.zeros((6, 7), np.float32)
-    empty = score_sample(flat + 1, flat).metrics()
-    assert [key for key, value in empty.items() if value is None] == [key for key in empty if key.startswith("object")]
-    assert empty["overall_mae_mm"] == empty["background_mae_mm"] == 1.0
-    full = score_sample(flat + 1801, flat + 1800).metrics()
-    assert full["background_mae_mm"] is None and full["background_rmse_mm"] is None
-    assert full["overall_mae_mm"] == full["object_mae_mm"] == 1.0
-    assert full["object_edge_share"] == 0.0 and full["object_edge_mae_mm"] is None
-
-
 @given(st.integers(1, 30), st.integers(1, 30), st.integers(0, 40), st.integers(0, 2**32 - 1))
 @settings(max_examples=150, deadline=None)
 def test_edge_band_is_the_distance_rule(height, width, band, seed):
@@ -99,18 +74,6 @@ def test_edge_band_is_the_distance_rule(height, width, band, seed):
     rng = np.random.default_rng(seed)
     depth = np.where(rng.random((height, width)) < 0.9, 1800.0 + 300.0 * (rng.random((height, width)) < 0.1), 0.0)
     assert np.array_equal(object_near_edge(depth, band), (edge_distance_px(depth) < band) & (depth > 0))
-
-
-def test_interior_and_edge_are_scored_apart():
-    target = disk_depth((80, 80), 7)
-    near = object_near_edge(target, 3)
-    assert 0 < near.sum() < (target > 0).sum()
-    prediction = target.astype(np.float64) + np.where(near, 5.0, 0.25) * (target > 0)
-    s = score_sample(prediction, target, edge_band_px=3)
-    assert (s.interior.mae_mm, s.edge.mae_mm, s.background.mae_mm) == (0.25, 5.0, 0.0)
-    assert s.edge.pixels == near.sum()
-    assert score_sample(prediction, target, edge_band_px=0).edge == EMPTY
-    assert depth_edges(target).any()
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, 1e200])
