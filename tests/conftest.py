@@ -1,5 +1,6 @@
 """Shared by all tests: separate Hugging Face caches, and a tiny real dataset that is built once."""
 
+import json
 import os
 import tempfile
 from contextlib import redirect_stderr, redirect_stdout
@@ -76,6 +77,16 @@ def files(tmp_path_factory, dataset):
     return some_rows(tmp_path_factory.mktemp("rows"), dataset)
 
 
+@pytest.fixture(scope="session")
+def base(tmp_path_factory, dataset):
+    """An entry of the leaderboard, of which tests make rows with other errors."""
+    from board_rows import write_result_file
+
+    from fpp_ml_bench.leaderboard.rows import read_entry
+
+    return read_entry(write_result_file(tmp_path_factory.mktemp("base") / "base.json", dataset, 1.0))
+
+
 @pytest.fixture
 def predictions(tmp_path, dataset):
     """Predictions of the test split of `dataset`, without an error."""
@@ -110,3 +121,7 @@ def refusal(command, *words):
     with redirect_stderr(StringIO()) as err:
         assert command(*words) == 2
     return err.getvalue()
+
+
+def read_json(path):
+    return json.loads(path.read_text())

@@ -151,15 +151,15 @@ def write_predictions(
     return folder
 
 
-def change_json(path: Path, keys: Sequence[Any], value: Any) -> None:
-    """Set a value deep inside of a JSON file; ``...`` removes its key."""
+def change_json(path: Path, key: str, value: Any) -> None:
+    """Set a value deep inside of a JSON file, at a key like ``per_sample.0.object``; ``...`` removes it."""
     document = json.loads(path.read_text())
-    *parents, last = keys
-    part = document
-    for key in parents:
-        part = part[key]
+    *parents, last = (int(part) if part.isdecimal() else part for part in key.split("."))
+    place = document
+    for parent in parents:
+        place = place[parent]
     if value is ...:
-        del part[last]
+        del place[last]
     else:
-        part[last] = value
+        place[last] = value
     path.write_text(json.dumps(document))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
-from conftest import TINY_SIZE
+from conftest import TINY_SIZE, fpp_bench, printed, refusal
 from edges import edge_distance_px
 from flat_planes import DIRECT, RIG, plane_depth_m, plane_fringe
 
@@ -13,7 +13,6 @@ from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.registry import load_method, methods
 from fpp_ml_bench.baselines.run import predict_split
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm, noise_by_light
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError, PredictionError, RigError
@@ -306,13 +305,13 @@ def test_prediction_folder(opened, tmp_path):
     assert submission["seconds_per_sample"] == pytest.approx(seconds, rel=1e-4)
 
 
-def test_predictions_at_a_url(tiny, tmp_path, capsys):
+def test_predictions_at_a_url(tiny, tmp_path):
     url = (tmp_path / "there").as_uri()
     words = ["predict", "constant", str(tiny), "--split", "validation", "--out", url]
-    assert main(words) == 0 and f"next: copy {url} to a disk" in capsys.readouterr().out
+    assert f"next: copy {url} to a disk" in printed(fpp_bench, *words)
     names = sorted([*(f"mug_A{a}.npy" for a in range(0, 360, 60)), "submission.yaml"])
     assert sorted(path.name for path in (tmp_path / "there").iterdir()) == names
-    assert main(words) == 2 and f"{url}: already holds submission.yaml and more" in capsys.readouterr().err
+    assert f"{url}: already holds submission.yaml and more" in refusal(fpp_bench, *words)
 
 
 def test_method_sees_copies_and_no_other_frame(opened, tmp_path):

@@ -124,7 +124,7 @@ def test_the_code_of_a_file_is_it_its_helpers_and_its_weights(mine, monkeypatch)
     assert registry.code_in.__wrapped__(Path(mine)) == first
 
 
-def test_the_code_and_the_files_of_options_are_settings(mine, tmp_path, monkeypatch):
+def test_the_code_and_the_files_of_options_are_settings(mine, tmp_path):
     first = registry.load_method(f"{mine}:Mine", RIG).settings["source_sha256"]
     (tmp_path / "again").mkdir()
     (tmp_path / "again" / "mine.py").write_text(MINE)

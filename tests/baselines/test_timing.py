@@ -1,16 +1,15 @@
 """Timing a method: the arithmetic against a clock of our own, memory against a known array, and where it is written."""
 
-import json
 from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
 import yaml
+from conftest import fpp_bench, printed, read_json, refusal
 from scored_dataset import write_predictions
 
 from fpp_ml_bench.baselines import timing
 from fpp_ml_bench.baselines.method import Answer, Method
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.result.file import read_result, write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
@@ -130,20 +129,19 @@ def predicted(tiny, opened, tmp_path_factory):
     """Predictions of the classical method and their result."""
     work = tmp_path_factory.mktemp("timed")
     arguments = ["classical", str(tiny), "--steps", "3", "--direction", "vertical"]
-    assert main(["predict", *arguments, "--out", str(work / "predictions")]) == 0
+    assert fpp_bench("predict", *arguments, "--out", work / "predictions") == 0
     write_result(evaluate(work / "predictions", opened), work / "result.json")
     return arguments, work
 
 
-def test_command_writes_its_block_everywhere(predicted, capsys):
+def test_command_writes_its_block_everywhere(predicted):
     arguments, work = predicted
     before = read_result(work / "result.json")
     files = [work / "predictions" / "submission.yaml", work / "result.json"]
     options = ["--batch", "2", "--repeats", "3", "--json", str(work / "timing.json")]
-    assert main(["time", *arguments, *options, *(f"--into={path}" for path in files)]) == 0
-    out = capsys.readouterr().out
+    out = printed(fpp_bench, "time", *arguments, *options, *(f"--into={path}" for path in files))
     assert "measured here" in out and "frames needed" in out and "cores" in out
-    written = json.loads((work / "timing.json").read_text())
+    written = read_json(work / "timing.json")
     assert written["timing"]["frames"] == 3 + 7 and written["timing"]["parameters"] == 0
     assert written["settings"] == {"direction": "vertical", "steps": 3, "threads": 1}
     about, after = read_submission(work / "predictions"), read_result(work / "result.json")
@@ -154,26 +152,27 @@ def test_command_writes_its_block_everywhere(predicted, capsys):
     assert after.metrics == before.metrics and after.per_sample == before.per_sample
 
 
-def test_a_time_is_not_written_into_another_methods_file(predicted, dataset, tmp_path, capsys):
+def test_a_time_is_not_written_into_another_methods_file(predicted, dataset, tmp_path):
     arguments, work = predicted
     result_bytes = (work / "result.json").read_bytes()
     other_arguments = [*arguments[:3], "4", *arguments[4:]]
-    assert main(["time", *other_arguments, "--into", str(work / "result.json")]) == 2
-    assert "frames_used is" in capsys.readouterr().err
+    assert "frames_used is" in refusal(fpp_bench, "time", *other_arguments, "--into", work / "result.json")
     assert (work / "result.json").read_bytes() == result_bytes
     folder = write_predictions(tmp_path / "p", dataset)
-    assert main(["time", *arguments, "--into", str(folder / "submission.yaml")]) == 2
-    assert "method is test, but classical" in capsys.readouterr().err
-    assert main(["time", *arguments, "--into", str(tmp_path / "notes.txt")]) == 2
-    assert "expected a submission.yaml or a result file" in capsys.readouterr().err
-    assert main(["time", *arguments, "--json", str(tmp_path / "no" / "t.json")]) == 2
-    assert "does not exist" in capsys.readouterr().err
+    assert "method is test, but classical" in refusal(
+        fpp_bench, "time", *arguments, "--into", folder / "submission.yaml"
+    )
+    assert "expected a submission.yaml or a result file" in refusal(
+        fpp_bench, "time", *arguments, "--into", tmp_path / "notes.txt"
+    )
+    assert "does not exist" in refusal(fpp_bench, "time", *arguments, "--json", tmp_path / "no" / "t.json")
 
 
 @pytest.mark.parametrize("value", ["0", "1e9"])
-def test_counts_are_counts(value, predicted, capsys):
-    assert main(["time", *predicted[0], "--batch", value]) == 2
-    assert f"--batch {value}: expected a whole number from 1 to 100000" in capsys.readouterr().err
+def test_counts_are_counts(value, predicted):
+    assert f"--batch {value}: expected a whole number from 1 to 100000" in refusal(
+        fpp_bench, "time", *predicted[0], "--batch", value
+    )
 
 
 @pytest.mark.parametrize(

@@ -345,7 +345,7 @@ def test_text_without_a_formula_stays(base, board):
     assert "x; y - z|w" in table_csv(board(content_of(row_with(base, "x; y - z|w", 0.5))))
 
 
-def test_the_list_and_not_the_row_says_who_vouches(base, board):
+def test_the_list_and_not_the_row_says_who_vouches(board):
     """The same bytes are vouched for wherever they are; a changed row is not."""
     file = rows.SHIPPED_ROWS / "first.json"
     assert sha256(file.read_bytes()).hexdigest() in rows.vouched() and read_entry(file).vouched

@@ -179,16 +179,6 @@ def test_a_long_name_is_cut_at_a_word():
     assert cut_at_word("short enough") == "short enough"
 
 
-def test_the_full_name_is_in_the_title_and_on_the_rows_own_page(files):
-    entry = read_entries(files[:1])[0]
-    name = "A fringe network with attention, trained on everything there is"
-    pages = page_files(rank([changed(entry, submission={"name": name})]), [])
-    index = pages["index.html"].decode()
-    assert f'title="{name}">A fringe network with attention…</a>' in index
-    (own,) = (text.decode() for file, text in pages.items() if file.startswith("submissions/"))
-    assert f"<h1>{name}</h1>" in own
-
-
 ASSUMED = {
     "classical-18-both": ("", ""),
     "constant-range-middle-224": ("", "Given the test sample's depth range."),

@@ -9,9 +9,9 @@ from typing import get_args
 import numpy as np
 import pytest
 from board_rows import changed, entry_with_errors, named_benchmarks
+from conftest import fpp_bench, printed, read_json
 from scored_dataset import write_predictions
 
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, Track
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
@@ -77,7 +77,7 @@ def test_equal_rows_share_ranks_and_the_perfect_one_is_first(base):
     assert twins.p == twins.p_holm == 1.0 and not twins.behind
 
 
-def test_five_objects_have_no_ranks_and_say_why(base, capsys, tmp_path):
+def test_five_objects_have_no_ranks_and_say_why(base):
     objects = EIGHT[:5]
     (group,) = rank(entries_of(base, {"a": [1.0] * 5, "b": [9.0] * 5}, objects))
     assert [row.ranks for row in group.rows] == ["-", "-"] and group.pairs == ()
@@ -181,17 +181,16 @@ def test_a_track_is_compared_with_trivial_rows_that_are_told_no_more(base):
     assert [ratios[name] for name in "abde"] == [0.25, 0.5, 0.5, 0.25]
 
 
-def test_files_have_the_pairs_and_the_rows(base, tmp_path, capsys, monkeypatch):
+def test_files_have_the_pairs_and_the_rows(base, tmp_path, monkeypatch):
     entries = entries_of(base, {"=HYPERLINK(a)": [1.0] * 8, "b, c": [2.0] * 8})
     paths = [tmp_path / f"{n}.json" for n in range(2)]
     for entry, path in zip(entries, paths, strict=True):
         write_row(entry.row, path)
     monkeypatch.setenv("COLUMNS", "160")
     files = ["--csv", str(tmp_path / "t.csv"), "--json", str(tmp_path / "t.json"), "--paper", "none", "--pairs"]
-    assert main(["leaderboard", *map(str, paths), *files]) == 0
-    printed = capsys.readouterr().out
-    assert "Pairs of these rows" in printed and "second is behind" in printed
-    (group,) = json.loads((tmp_path / "t.json").read_text())["groups"]
+    output = printed(fpp_bench, "leaderboard", *paths, *files)
+    assert "Pairs of these rows" in output and "second is behind" in output
+    (group,) = read_json(tmp_path / "t.json")["groups"]
     assert [(row["best_rank"], row["object_mae_mm"]) for row in group["rows"]] == [(1, 1.0), (2, 2.0)]
     assert group["pairs"][0]["p"] == 2.0**-7 and group["pairs"][0]["behind"] and group["notes"] == []
     lines = list(csv.DictReader(io.StringIO((tmp_path / "t.csv").read_text())))
@@ -280,11 +279,10 @@ def test_a_submission_may_say_that_it_was_given_the_order(base):
     assert given_truth("oracle range + mask + order") == every
 
 
-def test_rows_of_others_say_where_they_are_from(capsys, tmp_path, monkeypatch):
+def test_rows_of_others_say_where_they_are_from(tmp_path, monkeypatch):
     monkeypatch.setattr("fpp_ml_bench.leaderboard.rows.SHIPPED_ROWS", tmp_path)
     monkeypatch.chdir(tmp_path)
-    assert main(["leaderboard", "--paper", "oracle_order"]) == 0
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "PhiCalNet, 1 frame" in printed and "4.46" in printed and "1.16" in printed
-    assert "Reported by its authors (arXiv 2607.11928)" in printed
-    assert "oracle order: given the test sample's fringe order." in printed
+    output = " ".join(printed(fpp_bench, "leaderboard", "--paper", "oracle_order").split())
+    assert "PhiCalNet, 1 frame" in output and "4.46" in output and "1.16" in output
+    assert "Reported by its authors (arXiv 2607.11928)" in output
+    assert "oracle order: given the test sample's fringe order." in output

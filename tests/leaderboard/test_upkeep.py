@@ -9,6 +9,7 @@ import pytest
 import shown_rows
 import upkeep
 from board_rows import changed, timing, write_result_file
+from conftest import read_json
 from scored_dataset import make_dataset
 from upkeep import SHOWN, readme_block
 
@@ -151,7 +152,7 @@ def test_a_row_stays_vouched_for_when_more_of_it_is_measured(files, tmp_path, mo
 
     def measure(words):
         ran.append(words)
-        row.write_text(json.dumps(json.loads(row.read_text())))
+        row.write_text(json.dumps(read_json(row)))
         return 0
 
     monkeypatch.setattr(upkeep, "fpp_bench", measure)
@@ -219,7 +220,7 @@ def test_nothing_that_the_documentation_shows_is_older_than_its_row(capsys):
     assert status == 0, capsys.readouterr().out
 
 
-def test_what_is_older_than_its_row_is_found(tmp_path, monkeypatch):
+def test_what_is_older_than_its_row_is_found(monkeypatch):
     figure = '[{}](../leaderboard/rows/crossed.json "object_mae_mm / two_sided_mae_mm")'
     metrics = read_entry(SHIPPED_ROWS / "crossed.json").row.metrics
     right = f"{metrics.object_mae_mm:.2f} / {metrics.two_sided_mae_mm:.1f}"

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from board_rows import entry_with_errors, named_benchmarks, some_rows, timing, write_result_file
 from chromium import Browser
+from conftest import fpp_bench
 from scored_dataset import make_dataset
 
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.submission.description import LearnedFrom
 from fpp_ml_bench.leaderboard import rows
 from fpp_ml_bench.leaderboard.page.page import predicted_samples, write_page
@@ -31,12 +31,12 @@ def page(tmp_path_factory):
         )
     )
     row = work / "row.json"
-    assert main(["leaderboard", str(files[0]), "--row", str(row)]) == 0
+    assert fpp_bench("leaderboard", files[0], "--row", row) == 0
     with pytest.MonkeyPatch.context() as patch:
         listed = rows.vouching_line(read_entries([row])[0].row, row.read_bytes(), "verified", "fpp-eval verify")
         (work / "vouched.txt").write_text(f"{listed}\n")
         patch.setattr(rows, "VOUCHED", work / "vouched.txt")
-        assert main(["leaderboard", str(row), *map(str, files[1:]), "--page", str(work / "page")]) == 0
+        assert fpp_bench("leaderboard", row, *files[1:], "--page", work / "page") == 0
     return work / "page" / "index.html"
 
 
@@ -245,7 +245,7 @@ def test_every_width_in_both_schemes(browser, page, width, dark):
 def shipped_page(tmp_path_factory):
     """The page of the rows that ship with the package."""
     out = tmp_path_factory.mktemp("shipped") / "page"
-    assert main(["leaderboard", "--page", str(out)]) == 0
+    assert fpp_bench("leaderboard", "--page", out) == 0
     return out / "index.html"
 
 

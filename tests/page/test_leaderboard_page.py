@@ -1,7 +1,6 @@
 """The static page as files: the same bytes, no way out of it, and nothing that a submission's text could do."""
 
 import html
-import json
 import re
 from html.parser import HTMLParser
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 import scored_dataset
 from board_rows import changed, named_benchmarks, timing, write_result_file
-from conftest import file_bytes
+from conftest import file_bytes, fpp_bench, read_json, refusal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scored_dataset import change_json, make_dataset
@@ -19,7 +18,6 @@ from scored_dataset import change_json, make_dataset
 from fpp_ml_bench.baselines.tradeoff.measure import pareto_front
 from fpp_ml_bench.baselines.tradeoff.report import Mark, Scatter
 from fpp_ml_bench.cli import leaderboard as leaderboard_command
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.metrics import RANK_KEY
 from fpp_ml_bench.evaluation.report.report_page import write_report
 from fpp_ml_bench.evaluation.result.file import parse_result, write_result
@@ -54,25 +52,25 @@ def pages(paths) -> dict[str, bytes]:
 
 def test_same_rows_same_bytes_whatever_their_order(files, tmp_path):
     assert pages(files) == pages(files[::-1])
-    assert main(["leaderboard", *map(str, files), "--page", str(tmp_path / "page")]) == 0
+    assert fpp_bench("leaderboard", *files, "--page", tmp_path / "page") == 0
     assert file_bytes(tmp_path / "page") == pages(files) and len(pages(files)) == 3 + len(files)
 
 
-def test_a_page_ranks_once(files, tmp_path, monkeypatch, capsys):
+def test_a_page_ranks_once(files, tmp_path, monkeypatch):
     ranked = []
     monkeypatch.setattr(leaderboard_command, "rank_files", lambda *given: ranked.append(given) or rank(*given))
-    assert main(["leaderboard", *map(str, files), "--page", str(tmp_path), "--csv", str(tmp_path / "t.csv")]) == 0
+    assert fpp_bench("leaderboard", *files, "--page", tmp_path, "--csv", tmp_path / "t.csv") == 0
     assert len(ranked) == 1
-    assert main(["leaderboard", *map(str, files), "--page", str(tmp_path), "--sort", "object_rmse_mm"]) == 2
-    assert "leave out --sort" in capsys.readouterr().err and len(ranked) == 1
+    words = ["leaderboard", *files, "--page", tmp_path, "--sort", "object_rmse_mm"]
+    assert "leave out --sort" in refusal(fpp_bench, *words) and len(ranked) == 1
 
 
 def test_pages_of_rows_that_left_are_removed_and_nothing_else_is(files, tmp_path):
     out = tmp_path / "page"
-    assert main(["leaderboard", *map(str, files), "--page", str(out)]) == 0
+    assert fpp_bench("leaderboard", *files, "--page", out) == 0
     (out / "submissions" / "notes.html").write_text("mine")
     (out / "CNAME").write_text("example.org")
-    assert main(["leaderboard", str(files[0]), "--page", str(out)]) == 0
+    assert fpp_bench("leaderboard", files[0], "--page", out) == 0
     remaining = sorted(path.name for path in (out / "submissions").iterdir())
     assert len(remaining) == 2 and "notes.html" in remaining and (out / "CNAME").exists()
 
@@ -174,13 +172,12 @@ def test_a_name_is_only_a_name(name, dataset, tmp_path, files):
     ("name", "message"),
     [("\x1b[2Jgone", "control character U+001B"), ("x" * 10_000_000, "at most 200 characters")],
 )
-def test_dangerous_text_is_refused_by_every_output(name, message, files, tmp_path, capsys):
+def test_dangerous_text_is_refused_by_every_output(name, message, files, tmp_path):
     bad = tmp_path / "bad.json"
     bad.write_bytes(files[0].read_bytes())
-    change_json(bad, ["submission", "name"], name)
+    change_json(bad, "submission.name", name)
     for output in (["--page", str(tmp_path / "page")], ["--markdown", str(tmp_path / "t.md")], []):
-        assert main(["leaderboard", str(bad), *output]) == 2
-        error = capsys.readouterr().err
+        error = refusal(fpp_bench, "leaderboard", bad, *output)
         assert message in error and "bad.json" in error and len(error) < 2000 and "\x1b" not in error
     assert not (tmp_path / "page").exists() and not (tmp_path / "t.md").exists()
 
@@ -253,14 +250,13 @@ def test_empty_board_says_how_to_begin(tmp_path, monkeypatch):
     from fpp_ml_bench.leaderboard import rows
 
     monkeypatch.setattr(rows, "SHIPPED_ROWS", tmp_path / "none")
-    assert main(["leaderboard", "--page", str(tmp_path / "page")]) == 0
+    assert fpp_bench("leaderboard", "--page", tmp_path / "page") == 0
     assert "No submission yet" in (tmp_path / "page" / "index.html").read_text()
 
 
-def test_unwritable_page_is_an_error(files, tmp_path, capsys):
+def test_unwritable_page_is_an_error(files, tmp_path):
     (tmp_path / "file").write_text("")
-    assert main(["leaderboard", str(files[0]), "--page", str(tmp_path / "file")]) == 2
-    assert "file: is a file; give a folder" in capsys.readouterr().err
+    assert "file: is a file; give a folder" in refusal(fpp_bench, "leaderboard", files[0], "--page", tmp_path / "file")
 
 
 @pytest.fixture
@@ -277,36 +273,34 @@ def test_a_rows_page_shows_its_predictions(predicted, files, tmp_path):
     dataset, folder, result = predicted
     out = tmp_path / "page"
     command = ["leaderboard", str(result), str(files[0]), "--page", str(out)]
-    assert main([*command, "--predictions", str(folder)]) == 0
+    assert fpp_bench(*command, "--predictions", folder) == 0
     mine = {path.name: path.read_text() for path in (out / "submissions").glob("a-method-*")}
     (name,) = (name for name in mine if not name.endswith("-cloud.html"))
     cloud = name.replace(".html", "-cloud.html")
     assert set(mine) == {name, cloud} and f'href="{cloud}"' in mine[name]
     assert "A method: " in mine[cloud] and "points in mm" in mine[cloud]
-    report = write_report(parse_result(json.loads(result.read_text()), result), dataset, folder, tmp_path / "report")
+    report = write_report(parse_result(read_json(result), result), dataset, folder, tmp_path / "report")
     pictures = re.findall(r'<img [^>]*src="(data:image/png;base64,[^"]+)"', mine[name])
     assert len(set(pictures)) == 2 and all(picture in report.read_text() for picture in pictures)
     assert "Median: " in mine[name] and "Worst: " in mine[name] and "Signed error: blue is too near" in mine[name]
-    assert main(command) == 0  # without predictions, there are no pictures and no cloud
+    assert fpp_bench(*command) == 0  # without predictions, there are no pictures and no cloud
     (left,) = (out / "submissions").glob("a-method-*")
     assert "<img" not in left.read_text()
 
 
-def test_predictions_that_no_result_is_of_are_refused(predicted, files, tmp_path, capsys):
+def test_predictions_that_no_result_is_of_are_refused(predicted, files, tmp_path):
     dataset, folder, result = predicted
     page_of = ["--page", str(tmp_path / "page"), "--predictions", str(folder)]
     row = tmp_path / "row.json"
-    assert main(["leaderboard", str(result), "--row", str(row)]) == 0
+    assert fpp_bench("leaderboard", result, "--row", row) == 0
     for given_file, why in ((files[0], "is not what was scored"), (row, "row files name no samples")):
-        assert main(["leaderboard", str(given_file), *page_of]) == 2
-        message = capsys.readouterr().err
+        message = refusal(fpp_bench, "leaderboard", given_file, *page_of)
         assert why in message and f"{folder}: no given result was scored from it" in message
     for sample in dataset.samples("test"):
         np.save(folder / f"{sample}.npy", dataset.depth_mm(sample))
-    assert main(["leaderboard", str(result), *page_of]) == 2
-    assert "is not the file that was scored" in capsys.readouterr().err
-    assert main(["leaderboard", str(result), "--predictions", str(folder)]) == 2
-    assert "give it with --page DIR" in capsys.readouterr().err and not (tmp_path / "page").exists()
+    assert "is not the file that was scored" in refusal(fpp_bench, "leaderboard", result, *page_of)
+    assert "give it with --page DIR" in refusal(fpp_bench, "leaderboard", result, "--predictions", folder)
+    assert not (tmp_path / "page").exists()
 
 
 def test_predictions_without_a_depth_have_no_cloud(predicted, tmp_path):

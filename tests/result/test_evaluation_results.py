@@ -7,10 +7,10 @@ from hashlib import sha256
 
 import numpy as np
 import pytest
+from conftest import fpp_eval, printed, read_json
 from scored_dataset import DESCRIPTION, change_json, make_dataset, write_predictions
 
 from fpp_ml_bench import machine as hardware
-from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
 from fpp_ml_bench.evaluation.result.file import read_result, write_result
@@ -26,7 +26,7 @@ def predictions(tmp_path, dataset):
 
 def scored(folder, dataset, tmp_path, *arguments):
     path = tmp_path / "result.json"
-    assert main([str(folder), str(dataset.path), "--json", str(path), *arguments]) == 0
+    assert fpp_eval(folder, dataset.path, "--json", path, *arguments) == 0
     return json.loads(path.read_text(), parse_constant=lambda name: pytest.fail(f"{name} in the JSON"))
 
 
@@ -103,7 +103,7 @@ def test_sample_without_object_has_no_object_score(dataset, tmp_path):
     folder = write_predictions(tmp_path / "predictions", data, offset_mm=3.0)
     written = tmp_path / "result.json"
     write_result(evaluate(folder, data), written)
-    result = json.loads(written.read_text())
+    result = read_json(written)
     assert read_result(written).samples_without_object == 1
     empty = [row for row in result["per_sample"] if row["object_pixels"] == 0]
     assert len(empty) == result["samples_without_object"] == 1
@@ -120,39 +120,38 @@ def test_same_result_twice_and_from_one_thread(dataset, predictions, monkeypatch
     assert first.model_copy(update={"created": ""}) == second.model_copy(update={"created": ""})
 
 
-def test_table_shows_submitted_text_as_text(dataset, tmp_path, capsys):
+def test_table_shows_submitted_text_as_text(dataset, tmp_path):
     folder = write_predictions(tmp_path / "predictions", dataset, name="[bold red]x[/] :smile: [link=http://e]y[/link]")
-    assert main([str(folder), str(dataset.path)]) == 0
-    assert "[bold red]x[/] :smile: [link=http://e]y[/link]" in capsys.readouterr().out
+    assert "[bold red]x[/] :smile: [link=http://e]y[/link]" in printed(fpp_eval, folder, dataset.path)
 
 
 EDITS = {
-    "other schema": (["schema_version"], "1.0.0", "expected .* 4.0.0, got schema_version 1.0.0"),
-    "no schema": (["schema_version"], ..., "no schema_version"),
-    "unknown key": (["rank"], 1, "rank: is not a key"),
-    "missing key": (["target"], ..., "target: is missing"),
-    "negative": (["metrics", "object_mae_mm"], -1.0, "metrics.object_mae_mm: .*greater"),
-    "text": (["metrics", "object_mae_mm"], "0.1", "metrics.object_mae_mm: .*number"),
-    "better headline": (["metrics", "object_mae_mm"], 0.001, "metrics.object_mae_mm does not follow from per_sample"),
-    "better median": (["median", "overall_rmse_mm"], 0.001, "median.overall_rmse_mm does not follow"),
-    "better pool": (["pooled", "overall_mae_mm"], 0.001, "pooled.overall_mae_mm does not follow"),
-    "better sample": (["per_sample", 0, "object_mae_mm"], 0.001, "bias or shift-free MAE is above the MAE"),
-    "impossible RMSE": (["per_sample", 0, "object_rmse_mm"], 0.001, "RMSE is below its MAE"),
-    "null score": (["per_sample", 0, "object_mae_mm"], None, "null exactly when the set is empty"),
-    "pixels": (["per_sample", 0, "object_pixels"], 5, "do not add up"),
-    "no void": (["per_sample", 0, "void_pixels"], ..., "void_pixels is missing"),
-    "void share": (["per_sample", 0, "void_share"], 0.5, "void_share does not follow from void_pixels"),
-    "unlit": (["per_sample", 0, "unlit_pixels"], 0, "unlit_pixels is extra by these rules"),
-    "sample twice": (["per_sample", 0, "sample"], "power_drill_A60", "names a sample twice"),
-    "share": (["per_sample", 0, "object_missing_share"], 1.5, "less than or equal to 1"),
-    "hash": (["per_sample", 0, "prediction_sha256"], "0" * 63, "prediction_sha256"),
-    "fingerprint": (["dataset", "fingerprint"], "x" * 64, "fingerprint"),
-    "sample count": (["dataset", "samples"], 5, "holds 4 samples, dataset.samples says 5"),
-    "empty samples": (["samples_without_object"], 1, "samples_without_object is not the number"),
-    "split": (["dataset", "split"], "tests", "dataset.split"),
-    "time": (["created"], "yesterday", "created"),
-    "name": (["submission", "name"], "x\x1b[2J", "U\\+001B"),
-    "long name": (["submission", "name"], "x" * 10_000_000, "at most 200 characters"),
+    "other schema": ("schema_version", "1.0.0", "expected .* 4.0.0, got schema_version 1.0.0"),
+    "no schema": ("schema_version", ..., "no schema_version"),
+    "unknown key": ("rank", 1, "rank: is not a key"),
+    "missing key": ("target", ..., "target: is missing"),
+    "negative": ("metrics.object_mae_mm", -1.0, "metrics.object_mae_mm: .*greater"),
+    "text": ("metrics.object_mae_mm", "0.1", "metrics.object_mae_mm: .*number"),
+    "better headline": ("metrics.object_mae_mm", 0.001, "metrics.object_mae_mm does not follow from per_sample"),
+    "better median": ("median.overall_rmse_mm", 0.001, "median.overall_rmse_mm does not follow"),
+    "better pool": ("pooled.overall_mae_mm", 0.001, "pooled.overall_mae_mm does not follow"),
+    "better sample": ("per_sample.0.object_mae_mm", 0.001, "bias or shift-free MAE is above the MAE"),
+    "impossible RMSE": ("per_sample.0.object_rmse_mm", 0.001, "RMSE is below its MAE"),
+    "null score": ("per_sample.0.object_mae_mm", None, "null exactly when the set is empty"),
+    "pixels": ("per_sample.0.object_pixels", 5, "do not add up"),
+    "no void": ("per_sample.0.void_pixels", ..., "void_pixels is missing"),
+    "void share": ("per_sample.0.void_share", 0.5, "void_share does not follow from void_pixels"),
+    "unlit": ("per_sample.0.unlit_pixels", 0, "unlit_pixels is extra by these rules"),
+    "sample twice": ("per_sample.0.sample", "power_drill_A60", "names a sample twice"),
+    "share": ("per_sample.0.object_missing_share", 1.5, "less than or equal to 1"),
+    "hash": ("per_sample.0.prediction_sha256", "0" * 63, "prediction_sha256"),
+    "fingerprint": ("dataset.fingerprint", "x" * 64, "fingerprint"),
+    "sample count": ("dataset.samples", 5, "holds 4 samples, dataset.samples says 5"),
+    "empty samples": ("samples_without_object", 1, "samples_without_object is not the number"),
+    "split": ("dataset.split", "tests", "dataset.split"),
+    "time": ("created", "yesterday", "created"),
+    "name": ("submission.name", "x\x1b[2J", "U\\+001B"),
+    "long name": ("submission.name", "x" * 10_000_000, "at most 200 characters"),
 }
 
 
@@ -190,7 +189,7 @@ def test_number_too_large_for_a_float_is_refused(dataset, predictions, tmp_path)
     path = tmp_path / "r.json"
     write_result(evaluate(predictions, dataset), path)
     for number in ("1e999", "1" + "0" * 400):
-        content = json.loads(path.read_text())
+        content = read_json(path)
         content["metrics"]["object_mae_mm"] = "HERE"
         (tmp_path / "x.json").write_text(json.dumps(content).replace('"HERE"', number))
         with pytest.raises(SubmissionError, match=r"metrics\.object_mae_mm"):
@@ -204,7 +203,7 @@ def test_unwritable_result_is_an_error(dataset, predictions, tmp_path, monkeypat
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(result_io, "write_atomically", full)
-    assert main([str(predictions), str(dataset.path), "--json", str(tmp_path / "r.json")]) == 2
+    assert fpp_eval(predictions, dataset.path, "--json", tmp_path / "r.json") == 2
     assert not (tmp_path / "r.json").exists()
 
 

@@ -5,11 +5,11 @@ import re
 
 import pytest
 from board_rows import reliance, write_result_file
+from conftest import fpp_bench, printed, read_json, refusal
 from scored_dataset import change_json
 from upkeep import readme_block
 
 from fpp_ml_bench.baselines.timing import check_same_method
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result.file import json_schema, read_result, result_json
 from fpp_ml_bench.evaluation.result.parts import Reliance, RelianceParts
@@ -30,16 +30,16 @@ def file(tmp_path, dataset):
 
 
 def test_a_result_without_it_stays_as_it_was(file):
-    assert "reliance" not in json.loads(file.read_text())
+    assert "reliance" not in read_json(file)
     assert read_result(file).reliance is None
     assert result_json(read_result(file)) == file.read_bytes()
 
 
 @pytest.mark.parametrize("row", [False, True], ids=["result", "row"])
-def test_it_is_written_read_back_and_replaced(row, file, tmp_path, capsys):
+def test_it_is_written_read_back_and_replaced(row, file, tmp_path):
     if row:
         made = tmp_path / "made.json"
-        assert main(["leaderboard", str(file), "--row", str(made)]) == 0
+        assert fpp_bench("leaderboard", file, "--row", made) == 0
         file = made
     entry = read_entry(file)
     write_block(entry, Reliance(**block(score=0.1)))
@@ -70,7 +70,7 @@ def test_it_is_written_read_back_and_replaced(row, file, tmp_path, capsys):
     ],
 )
 def test_what_contradicts_the_result_is_refused_by_name(change, message, file):
-    change_json(file, ["reliance"], block(**change))
+    change_json(file, "reliance", block(**change))
     with pytest.raises(SubmissionError, match=re.escape(message)) as caught:
         read_result(file)
     assert str(file) in str(caught.value)
@@ -132,16 +132,16 @@ def test_the_command_measures_and_writes(tiny, tmp_path, capsys, dataset):
     settings = {"direction": "horizontal", "steps": 3}
     row = write_result_file(tmp_path / "r.json", dataset, 1.0, method="classical", frames_used=used, settings=settings)
     options = ["--steps", "3", "--direction", "horizontal", "--views", "1"]
-    assert main(["reliance", "classical", str(tiny), *options, "--into", str(row), "--json", str(tmp_path / "b")]) == 0
+    assert fpp_bench("reliance", "classical", tiny, *options, "--into", row, "--json", tmp_path / "b") == 0
     written = read_result(row).reliance
     assert written is not None and written.score > 0.9 and written.interval == [None, None]  # one test object
-    assert Reliance(**json.loads((tmp_path / "b").read_text())) == written
+    assert Reliance(**read_json(tmp_path / "b")) == written
     assert "phase reliance, 0 to 1" in capsys.readouterr().out
-    assert main(["reliance", "classical", str(tiny), "--steps", "6", "--into", str(row)]) == 2
-    assert "very method that was scored" in capsys.readouterr().err
-    assert main(["reliance", "classical", str(tiny), "--views", "7"]) == 2
+    assert "very method that was scored" in refusal(
+        fpp_bench, "reliance", "classical", tiny, "--steps", "6", "--into", row
+    )
+    assert fpp_bench("reliance", "classical", tiny, "--views", "7") == 2
     capsys.readouterr()
-    assert main(["reliance", "constant", str(tiny), "--views", "1"]) == 0
-    out = capsys.readouterr().out
+    out = printed(fpp_bench, "reliance", "constant", tiny, "--views", "1")
     assert "Constant depth: standoff: gives the same answer whatever phase, light and outline" in out
     assert "follows" not in out and "changes" not in out

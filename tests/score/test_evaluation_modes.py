@@ -1,13 +1,11 @@
 """Units and modes: mm, m and normalised depth, and the paper's rule for individually normalised rows."""
 
-import json
-
 import numpy as np
 import pytest
+from conftest import fpp_eval, printed, read_json, refusal
 from scored_dataset import disk_depth, make_dataset, write_description, write_predictions
 
 import fpp_ml_bench
-from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.depth import denormalise, normalise
 from fpp_ml_bench.errors import DatasetError, PredictionError
 from fpp_ml_bench.evaluation.result.file import read_result, write_result
@@ -94,16 +92,14 @@ def test_metres_score_like_millimetres(dataset, tmp_path):
         assert in_m[key] == (value if value is None else pytest.approx(value, rel=1e-9, abs=1e-9)), key
 
 
-def test_modes_and_tracks_cannot_be_mixed_up(dataset, tmp_path, capsys):
+def test_modes_and_tracks_cannot_be_mixed_up(dataset, tmp_path):
     normalised = write_normalised(tmp_path / "n", dataset, uses_ground_truth_range=False)
-    assert main([str(normalised), str(dataset.path)]) == 2
-    assert "units: normalised needs uses_ground_truth_range: true" in capsys.readouterr().err
+    assert "units: normalised needs uses_ground_truth_range: true" in refusal(fpp_eval, normalised, dataset.path)
     write_description(normalised, **ORACLE)
     written = tmp_path / "r.json"
     command = [str(normalised), str(dataset.path), "--mode", "paper", "--json", str(written)]
-    assert main(command) == 0
-    assert "oracle range track, mode paper" in capsys.readouterr().out
-    assert json.loads(written.read_text())["mode"] == "paper"
+    assert "oracle range track, mode paper" in printed(fpp_eval, *command)
+    assert read_json(written)["mode"] == "paper"
 
 
 def test_a_target_without_range_is_refused_by_sample():
@@ -158,7 +154,7 @@ def test_another_reading_is_said_and_changes_no_score(tmp_path, recwarn, capsys)
         np.save(predictions / f"{sample}.npy", dataset.depth_mm(sample)[::-1])
     scored = fpp_ml_bench.evaluate(predictions, dataset)
     assert "upside down" in str(recwarn.pop().message)
-    assert main([str(predictions), str(dataset.path), "--json", str(tmp_path / "r.json")]) == 0
+    assert fpp_eval(predictions, dataset.path, "--json", tmp_path / "r.json") == 0
     assert "fpp-eval: note: another reading fits the predictions far better: upside down" in capsys.readouterr().err
     for sample in dataset.samples("test"):
         np.save(predictions / f"{sample}.npy", dataset.depth_mm(sample))

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+from conftest import fpp_eval, printed
 from scored_dataset import change_json, make_dataset, write_description
 
-from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.protocol import COVERED, NOMINAL
 from fpp_ml_bench.evaluation.report.report_page import write_report
@@ -87,16 +87,15 @@ def scored(tmp_path_factory):
     return dataset, predictions, evaluate(predictions, dataset)
 
 
-def test_the_block_is_written_read_verified_and_shown(scored, tmp_path, capsys):
+def test_the_block_is_written_read_verified_and_shown(scored, tmp_path):
     dataset, predictions, result = scored
     block = result.uncertainty
     views = [block.per_sample[f"power_drill_{view}"].coverage_68 for view in ("A0", "A60")]
     assert block.per_object["power_drill"].coverage_68 == pytest.approx(np.mean(views), rel=1e-12)
     write_result(result, tmp_path / "r.json")
     assert read_result(tmp_path / "r.json") == result
-    assert main(["verify", str(tmp_path / "r.json"), str(predictions), str(dataset.path)]) == 0
-    assert main([str(predictions), str(dataset.path)]) == 0
-    assert "Stated uncertainty" in capsys.readouterr().out
+    assert fpp_eval("verify", tmp_path / "r.json", predictions, dataset.path) == 0
+    assert "Stated uncertainty" in printed(fpp_eval, predictions, dataset.path)
     page = write_report(result, dataset, predictions, tmp_path / "report").read_text()
     assert "reliability and sparsification" in page and "Stated uncertainty" in page
 
@@ -104,24 +103,24 @@ def test_the_block_is_written_read_verified_and_shown(scored, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
-        (["metrics", "coverage_68"], 0.68, r"metrics\.coverage_68 does not follow"),
-        (["per_sample", "power_drill_A0", "coverage_99"], 0.1, "a wider interval holds less"),
-        (["reliability", "observed", 6], 0.68, "reliability at 68% does not follow"),
+        ("metrics.coverage_68", 0.68, r"metrics\.coverage_68 does not follow"),
+        ("per_sample.power_drill_A0.coverage_99", 0.1, "a wider interval holds less"),
+        ("reliability.observed.6", 0.68, "reliability at 68% does not follow"),
         (
-            ["reliability", "nominal", 6],
+            "reliability.nominal.6",
             0.69,
             r"reliability\.nominal\.6 does not follow from per_sample: 0\.69, not 0\.68",
         ),
-        (["sparsification", "mae_mm", 0], 0.0, r"sparsification\.mae_mm\.0 does not follow"),
-        (["sparsification", "rmse_mm", 5], 0.0, r"metrics\.ause_rmse_mm does not follow"),
-        (["sparsification"], None, "sparsification must be there"),
-        (["per_object"], {}, "other objects than per_sample"),
+        ("sparsification.mae_mm.0", 0.0, r"sparsification\.mae_mm\.0 does not follow"),
+        ("sparsification.rmse_mm.5", 0.0, r"metrics\.ause_rmse_mm does not follow"),
+        ("sparsification", None, "sparsification must be there"),
+        ("per_object", {}, "other objects than per_sample"),
     ],
 )
 def test_an_edited_block_contradicts_itself(path, value, message, scored, tmp_path):
     file = tmp_path / "r.json"
     write_result(scored[2], file)
-    change_json(file, ["uncertainty", *path], value)
+    change_json(file, f"uncertainty.{path}", value)
     with pytest.raises(SubmissionError, match=message):
         read_result(file)
 

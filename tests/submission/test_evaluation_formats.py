@@ -1,14 +1,14 @@
 """Every accepted form of prediction gives the same numbers, and every broken file is refused by name, with advice."""
 
 import io
-import json
 import os
 import re
 import struct
 import zipfile
 import zlib
+from contextlib import redirect_stdout
 from functools import partial
-from pathlib import Path
+from io import StringIO
 
 import cv2
 import h5py
@@ -16,11 +16,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from conftest import fpp_eval, read_json, refusal
 from scipy.io import savemat
 from scored_dataset import write_description, write_predictions
 
 from fpp_ml_bench import containers
-from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import PredictionError
 
 SIZE = (32, 40)
@@ -158,8 +158,8 @@ def test_every_form_gives_the_same_numbers(form, dataset, tmp_path):
     results = []
     for number, folder in enumerate((plain, converted)):
         path = tmp_path / f"{number}.json"
-        assert main([str(folder), str(dataset.path), "--json", str(path)]) == 0
-        results.append(json.loads(path.read_text()))
+        assert fpp_eval(folder, dataset.path, "--json", path) == 0
+        results.append(read_json(path))
     plain_metrics, metrics = (result["metrics"] for result in results)
     for key, value in plain_metrics.items():
         exact = value if value is None or form != "png" else pytest.approx(value, rel=1e-9, abs=1e-9)
@@ -168,11 +168,11 @@ def test_every_form_gives_the_same_numbers(form, dataset, tmp_path):
     assert len(hashes) == (1 if "arrow" in form or "parquet" in form else 4)
 
 
-def refused(capsys, dataset, folder: Path, *arguments: str) -> str:
-    status = main([str(folder), str(dataset.path), *arguments])
-    captured = capsys.readouterr()
-    assert status == 2 and captured.out == "" and "Traceback" not in captured.err, captured
-    return captured.err
+def refused(dataset, folder):
+    with redirect_stdout(StringIO()) as out:
+        error = refusal(fpp_eval, folder, dataset.path)
+    assert out.getvalue() == "" and "Traceback" not in error
+    return error
 
 
 ZEROS = np.zeros((1000, 1000))
@@ -263,14 +263,14 @@ PER_SAMPLE = {
 
 
 @pytest.mark.parametrize("case", PER_SAMPLE)
-def test_broken_file_is_refused_by_name_with_advice(case, capsys, dataset, tmp_path):
+def test_broken_file_is_refused_by_name_with_advice(case, dataset, tmp_path):
     suffix, content, message = PER_SAMPLE[case]
     depths = maps(dataset)
     encode = {".npz": npz_of, ".mat": mat_of, ".png": png_of}[suffix]
     changes = {"png_mm_per_level": LEVEL_MM} if suffix == ".png" else {}
     folder = write_each(tmp_path / "p", suffix, depths, encode, **changes)
     (folder / f"{SAMPLE}{suffix}").write_bytes(content)
-    error = refused(capsys, dataset, folder)
+    error = refused(dataset, folder)
     line = re.search(rf"^\s*{re.escape(SAMPLE + suffix)}: .*", error, flags=re.MULTILINE)
     assert line and re.search(message, line[0]), error
     advice = "write|save|use|predict at|give"
@@ -321,42 +321,40 @@ TABLES = {
 
 
 @pytest.mark.parametrize(("form", "case"), [("arrow", "ragged"), *(("parquet", case) for case in TABLES)])
-def test_broken_table_is_refused(form, case, capsys, dataset, tmp_path):
+def test_broken_table_is_refused(form, case, dataset, tmp_path):
     make, message = TABLES[case]
     encode = parquet_bytes if form == "parquet" else arrow_bytes
     folder = write_table(tmp_path / "p", f"predictions.{form}", encode(make(maps(dataset))))
-    error = refused(capsys, dataset, folder)
+    error = refused(dataset, folder)
     assert f"predictions.{form}" in error and re.search(message, error), error
 
 
-def test_tables_that_would_unpack_to_more_than_a_split_can_need(capsys, dataset, tmp_path):
+def test_tables_that_would_unpack_to_more_than_a_split_can_need(dataset, tmp_path):
     large = pa.table({"sample": ["a"] * 4, "depth": pa.array([np.zeros(400_000).tolist()] * 4, FLAT)})
     folder = write_table(tmp_path / "p", "predictions.parquet", parquet_bytes(large, compression="zstd"))
     assert (folder / "predictions.parquet").stat().st_size < 10_000
-    assert re.search(
-        r"predictions.parquet would unpack to \d+ bytes and 16000\d\d values", refused(capsys, dataset, folder)
-    )
+    assert re.search(r"predictions.parquet would unpack to \d+ bytes and 16000\d\d values", refused(dataset, folder))
     write_table(folder, "predictions.parquet", b"PAR1" + b"\0" * 60 + b"PAR1")
-    assert "can't be read as Arrow or Parquet" in refused(capsys, dataset, folder)
+    assert "can't be read as Arrow or Parquet" in refused(dataset, folder)
     (folder / "predictions.parquet").unlink()
     for cut in (100, 700, 5000):
         write_table(folder, "predictions.arrow", arrow_bytes(table(maps(dataset)))[:cut])
-        assert "predictions.arrow" in refused(capsys, dataset, folder)
+        assert "predictions.arrow" in refused(dataset, folder)
 
 
 @pytest.mark.parametrize("megabytes", [8, 400])
-def test_compressed_arrow_that_unpacks_to_more_than_a_split_can_need(megabytes, capsys, dataset, tmp_path):
+def test_compressed_arrow_that_unpacks_to_more_than_a_split_can_need(megabytes, dataset, tmp_path):
     """The larger one is stopped while it is unpacked, before it has taken as much memory as it asks for."""
     zeros = np.zeros(megabytes * 10**6 // 4, np.float32)
     large = pa.table({"sample": ["a"], "depth": pa.ListArray.from_arrays([0, zeros.size], zeros)})
     folder = write_table(tmp_path / "p", "predictions.arrow", arrow_bytes(large, compression="zstd"))
     assert (folder / "predictions.arrow").stat().st_size < 100_000
-    error = refused(capsys, dataset, folder)
+    error = refused(dataset, folder)
     expected = "unpacks to more than" if megabytes < 100 else "takes more memory than|out of memory|malloc"
     assert re.search(rf"predictions.arrow .*({expected})", error), error
 
 
-def test_page_headers_that_contradict_the_footer(capsys, dataset, tmp_path):
+def test_page_headers_that_contradict_the_footer(dataset, tmp_path):
     """A page that says it unpacks to 8 kB, in a file whose footer says 5 kB."""
     content = parquet_bytes(table({"a": DEPTH}, FLAT), compression="snappy", use_dictionary=False)
     place = pq.read_metadata(io.BytesIO(content)).row_group(0).column(1).data_page_offset
@@ -367,7 +365,7 @@ def test_page_headers_that_contradict_the_footer(capsys, dataset, tmp_path):
         content[:place] + b"\x1b" * (len(content) - place),
     ):
         folder = write_table(tmp_path / "p", "predictions.parquet", wrong)
-        assert "can't be read as Arrow or Parquet" in refused(capsys, dataset, folder)
+        assert "can't be read as Arrow or Parquet" in refused(dataset, folder)
 
 
 @pytest.mark.processes
@@ -397,19 +395,19 @@ def test_a_process_that_reads_is_bounded_and_its_end_is_a_refusal(answer, tmp_pa
     assert process.returncode is not None
 
 
-def test_forms_cannot_be_mixed_and_links_are_refused(capsys, dataset, tmp_path):
+def test_forms_cannot_be_mixed_and_links_are_refused(dataset, tmp_path):
     depths = maps(dataset)
     folder = write_each(tmp_path / "p", ".npz", depths, npz_of)
     (folder / f"{SAMPLE}.npy").write_bytes(npy_bytes(depths[SAMPLE]))
     (folder / "predictions.parquet").write_bytes(b"")
-    error = refused(capsys, dataset, folder)
+    error = refused(dataset, folder)
     assert f"{SAMPLE}.npy: is extra (the other predictions are .npz files: keep one form)" in error
     assert "predictions.parquet: is extra (the other predictions are .npz files: keep one form)" in error
     table_folder = tmp_path / "t"
     write_table(table_folder, "predictions.parquet", parquet_bytes(table(depths)))
     (table_folder / "predictions.parquet").rename(tmp_path / "elsewhere")
     (table_folder / "predictions.parquet").symlink_to(tmp_path / "elsewhere")
-    assert "predictions.parquet is a symbolic link" in refused(capsys, dataset, table_folder)
+    assert "predictions.parquet is a symbolic link" in refused(dataset, table_folder)
 
 
 UNITS = {
@@ -428,16 +426,16 @@ UNITS = {
 
 
 @pytest.mark.parametrize("case", UNITS)
-def test_declared_units_are_checked_against_the_values(case, capsys, dataset, tmp_path):
+def test_declared_units_are_checked_against_the_values(case, dataset, tmp_path):
     units, change, changes, message = UNITS[case]
     folder = write_predictions(tmp_path / "p", dataset, noise_mm=1.0, units=units, **changes)
     for path in folder.glob("*.npy"):
         np.save(path, change(np.load(path).astype(np.float64)))
-    error = refused(capsys, dataset, folder)
+    error = refused(dataset, folder)
     assert re.search(message, error), error
     assert "submission.yaml" in error or re.search(r"power_drill_A0.npy: ", error)
 
 
-def test_png_needs_its_scale(capsys, dataset, tmp_path):
+def test_png_needs_its_scale(dataset, tmp_path):
     folder = write_each(tmp_path / "p", ".png", maps(dataset), png_of)
-    assert "png_mm_per_level: expected what one level" in refused(capsys, dataset, folder)
+    assert "png_mm_per_level: expected what one level" in refused(dataset, folder)

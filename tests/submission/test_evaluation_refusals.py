@@ -1,18 +1,19 @@
 """Predictions and descriptions that must not be scored: through the real command, exit status 2, no JSON, named."""
 
-import json
 import os
 import re
 import struct
 from collections.abc import Callable
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from conftest import fpp_eval, read_json, refusal
 from scored_dataset import DESCRIPTION, make_dataset, write_description, write_predictions
 
-from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.submission.description import Submission, read_submission
@@ -21,18 +22,16 @@ SAMPLE = "power_drill_A60"
 FILE = f"{SAMPLE}.npy"
 
 
-def refused(capsys, tmp_path: Path, dataset, predictions: Path, *arguments: str) -> str:
-    """Run the command, check that it refuses and leaves an older result alone; its message."""
+def refused(tmp_path, dataset, predictions):
+    """What the command says when it refuses; it prints nothing and leaves an older result alone."""
     result = tmp_path / "result.json"
     result.write_text("older")
-    status = main([str(predictions), str(dataset.path), "--json", str(result), *arguments])
-    captured = capsys.readouterr()
-    assert status == 2
-    assert captured.out == ""
+    with redirect_stdout(StringIO()) as out:
+        error = refusal(fpp_eval, predictions, dataset.path, "--json", result)
+    assert out.getvalue() == "" and "Traceback" not in error
     assert result.read_text() == "older"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["predictions", "result.json"]
-    assert "Traceback" not in captured.err
-    return captured.err
+    return error
 
 
 def rewrite(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
@@ -118,18 +117,18 @@ FILES = {
 
 
 @pytest.mark.parametrize("case", FILES)
-def test_bad_prediction_file_is_refused_by_name(case, capsys, tmp_path, dataset, predictions):
+def test_bad_prediction_file_is_refused_by_name(case, tmp_path, dataset, predictions):
     change_folder, message = FILES[case]
     change_folder(predictions)
     if case == "symbolic link":
         (tmp_path / "elsewhere.npy").rename(predictions.parent.parent / f"{tmp_path.name}-elsewhere.npy")
-    error = refused(capsys, tmp_path, dataset, predictions)
+    error = refused(tmp_path, dataset, predictions)
     line = re.search(rf"^\s*{re.escape(FILE)}: .*{message}.*$", error, flags=re.MULTILINE)
     assert line, error
     assert re.search(ADVICE, line[0]), f"no advice in {line[0]}"
 
 
-def test_every_offender_is_named_at_once(capsys, tmp_path, dataset, predictions):
+def test_every_offender_is_named_at_once(tmp_path, dataset, predictions):
     (predictions / "wooden_boards_A0.npy").unlink()
     with_value(np.nan, 7)(predictions)
     np.save(predictions / "power_drill_A0.npy", np.zeros((2, 2), np.int8))
@@ -138,7 +137,7 @@ def test_every_offender_is_named_at_once(capsys, tmp_path, dataset, predictions)
     (predictions / ".DS_Store").write_text("")
     (predictions / "more").mkdir()
     write_description(predictions, method=..., colour="red")
-    error = refused(capsys, tmp_path, dataset, predictions)
+    error = refused(tmp_path, dataset, predictions)
     for expected in (
         "can't be scored, 7 problems",
         "wooden_boards_A0.npy: is missing",
@@ -154,22 +153,22 @@ def test_every_offender_is_named_at_once(capsys, tmp_path, dataset, predictions)
         assert expected in error
 
 
-def test_several_faults_of_one_file_are_all_named(capsys, tmp_path, dataset, predictions):
+def test_several_faults_of_one_file_are_all_named(tmp_path, dataset, predictions):
     rewrite(lambda d: np.where(np.arange(1280).reshape(32, 40) == 0, np.nan, d / 1000 - 1e-3))(predictions)
-    error = refused(capsys, tmp_path, dataset, predictions)
+    error = refused(tmp_path, dataset, predictions)
     assert f"{FILE}: holds 1 NaN" in error and "looks like metres" in error
 
 
 def test_negative_values_are_errors_like_any_other(tmp_path, dataset, predictions):
     with_value(-1.0, 3)(predictions)
     written = tmp_path / "result.json"
-    assert main([str(predictions), str(dataset.path), "--json", str(written)]) == 0
-    assert json.loads(written.read_text())["metrics"]["overall_mae_mm"] > 0
+    assert fpp_eval(predictions, dataset.path, "--json", written) == 0
+    assert read_json(written)["metrics"]["overall_mae_mm"] > 0
 
 
-def test_file_names_cannot_speak_to_the_terminal(capsys, tmp_path, dataset, predictions):
+def test_file_names_cannot_speak_to_the_terminal(tmp_path, dataset, predictions):
     (predictions / "\x1b[31mred\n.npy").write_text("")
-    error = refused(capsys, tmp_path, dataset, predictions)
+    error = refused(tmp_path, dataset, predictions)
     assert "\x1b" not in error
     assert "\\x1b[31mred\\n.npy: is extra" in error
 
@@ -202,10 +201,10 @@ DESCRIPTIONS = {
 
 
 @pytest.mark.parametrize("case", DESCRIPTIONS)
-def test_bad_description_is_refused_by_key(case, capsys, tmp_path, dataset, predictions):
+def test_bad_description_is_refused_by_key(case, tmp_path, dataset, predictions):
     changes, message = DESCRIPTIONS[case]
     write_description(predictions, **changes)
-    error = refused(capsys, tmp_path, dataset, predictions)
+    error = refused(tmp_path, dataset, predictions)
     assert "submission.yaml" in error
     assert re.search(message, error), error
 
@@ -227,13 +226,13 @@ TEXTS = {
 
 
 @pytest.mark.parametrize("case", TEXTS)
-def test_description_that_is_no_description(case, capsys, tmp_path, dataset, predictions):
+def test_description_that_is_no_description(case, tmp_path, dataset, predictions):
     text, message = TEXTS[case]
     path = predictions / "submission.yaml"
     path.unlink()
     if text is not None:
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    error = refused(capsys, tmp_path, dataset, predictions)
+    error = refused(tmp_path, dataset, predictions)
     assert "submission.yaml" in error
     assert re.search(message, error), error
 
@@ -247,10 +246,10 @@ def test_description_is_written_as_it_is_read(predictions):
     assert "mask" not in Submission(**{**DESCRIPTION, "uses_ground_truth_mask": False}).to_yaml()
 
 
-def test_description_through_a_link_is_refused(capsys, tmp_path, dataset, predictions):
+def test_description_through_a_link_is_refused(tmp_path, dataset, predictions):
     (predictions / "submission.yaml").unlink()
     (predictions / "submission.yaml").symlink_to("/etc/passwd")
-    assert "symbolic link" in refused(capsys, tmp_path, dataset, predictions)
+    assert "symbolic link" in refused(tmp_path, dataset, predictions)
 
 
 @pytest.mark.parametrize(
@@ -265,25 +264,22 @@ def test_description_through_a_link_is_refused(capsys, tmp_path, dataset, predic
         (["{pred}", "{data}", "--split", "train"], "bowl_A0.npy: is missing"),
     ],
 )
-def test_wrong_arguments(arguments, message, capsys, dataset, predictions):
+def test_wrong_arguments(arguments, message, dataset, predictions):
     before = sorted(p.name for p in predictions.iterdir())
-    status = main([a.format(data=dataset.path, pred=predictions) for a in arguments])
-    assert status == 2
-    assert message in capsys.readouterr().err
+    words = [part.format(data=dataset.path, pred=predictions) for part in arguments]
+    assert message in refusal(fpp_eval, *words)
     assert sorted(p.name for p in predictions.iterdir()) == before
 
 
 @pytest.mark.parametrize("band", ["-1", "1.5", "1001"])
-def test_edge_band_must_be_whole_pixels(band, dataset, predictions, capsys):
-    assert main([str(predictions), str(dataset.path), "--edge-band", band]) == 2
-    assert "whole pixels" in capsys.readouterr().err
+def test_edge_band_must_be_whole_pixels(band, dataset, predictions):
+    assert "whole pixels" in refusal(fpp_eval, predictions, dataset.path, "--edge-band", band)
 
 
-def test_dataset_without_exact_depth(tmp_path, capsys):
+def test_dataset_without_exact_depth(tmp_path):
     data = make_dataset(tmp_path / "published", exact=False)
     predictions = write_predictions(tmp_path / "predictions", data)
-    assert main([str(predictions), str(data.path), "--target", "depth_exact"]) == 2
-    assert "no depth_exact" in capsys.readouterr().err
+    assert "no depth_exact" in refusal(fpp_eval, predictions, data.path, "--target", "depth_exact")
 
 
 def test_a_mark_that_the_description_names_is_no_surface(dataset, predictions):

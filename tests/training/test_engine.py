@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import TINY_SIZE
+from conftest import TINY_SIZE, read_json
 
 from fpp_ml_bench.baselines.networks.model import load
 from fpp_ml_bench.baselines.training.depth_training import (
@@ -200,7 +200,7 @@ def test_two_processes_agree(tiny, tmp_path):
     assert done.returncode == 0, done.stderr[-2000:]
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert names == {WEIGHTS, CHECKPOINT, DONE, CURVE_FILE, "recipe.json", "log.jsonl"}
-    record = json.loads((tmp_path / "run" / "log.jsonl").read_text())
+    record = read_json(tmp_path / "run" / "log.jsonl")
     assert math.isfinite(record["validation_loss"])
     scores = validation_of(tmp_path / "run" / WEIGHTS, tiny, load_recipe(tmp_path / "mine.yaml", "small"))[1]
     for key in SCORES:  # means over the three pairs of both processes

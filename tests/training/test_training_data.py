@@ -5,6 +5,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+from conftest import fpp_bench
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from scored_dataset import name_benchmarks
@@ -25,7 +26,6 @@ from fpp_ml_bench.baselines.training.weights import (
     training_benchmark,
     training_data_warning,
 )
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.loaders.storage import benchmark
 from fpp_ml_bench.loaders.storage.benchmark import Benchmark
 
@@ -129,7 +129,7 @@ def test_the_commands_warn_once_and_go_on(benchmarks, opened, tiny, tmp_path, ca
         period_px = opened.rig.image_px_per_period("horizontal")
         save_phase_net(tmp_path / "net.safetensors", period_px={"horizontal": period_px}, dataset_fingerprint=OLD)
         options += ["--weights", tmp_path / "net.safetensors"]
-    assert main([str(argument) for argument in (command, method, tiny, *options)]) == 0
+    assert fpp_bench(*[str(argument) for argument in (command, method, tiny, *options)]) == 0
     warnings = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
     name = {"classical": None, "phase-net": "phase-net"}.get(str(method), "mine")
     expected = "was trained on dataset aaaaaaaa, which is no benchmark of this version; predicting on tiny version 1"
