@@ -77,16 +77,6 @@ def test_the_data_that_is_not_shown_first(shipped):
     assert "fpp-bench-full version 2" in block and not re.search("workshop|hard|224", block)
 
 
-def test_one_frame_of_either_code_stands_in_one_table(shipped):
-    """The best methods of one frame are ranked together, on the test objects and the unseen ones."""
-    group = next(group for group in rank(shipped) if group.key.takes_unseen and group.key.target == "depth_exact")
-    assert group.key.frames == "one frame" and {row.entry.row.dataset.code for row in group.ranked} == {
-        "phase shift",
-        "crossed",
-    }
-    assert {len(row.objects) for row in group.ranked} == {25}
-
-
 def test_short_names_of_shipped_rows(shipped):
     names = {}
     for group in rank(shipped):

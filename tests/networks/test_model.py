@@ -114,7 +114,7 @@ def test_every_network_comes_back_as_it_was(tmp_path, name):
 
 def test_what_can_not_be_loaded(folder):
     assert baselines.load is load and baselines.build("unet", width=1).options["width"] == 1
-    with pytest.raises(WeightsError, match="there are pix2pix"):
+    with pytest.raises(WeightsError, match="come with this package; there are hformer"):
         baselines.load("vit")
     with pytest.raises(WeightsError, match="device 'abacus' can't be used here"):
         baselines.load(folder / "raw.safetensors", device="abacus")

@@ -14,27 +14,6 @@ from fpp_ml_bench.evaluation.score.sample_scores import score_sigma
 from fpp_ml_bench.evaluation.score.verification import Verified, differences
 
 
-def case(number, pixels=(23, 31)):
-    """Prediction, target, sigma and void of a small image: missing pixels, pixels without sigma, equal sigmas."""
-    rng = np.random.default_rng(number)
-    target = np.where(rng.random(pixels) < 0.6, rng.uniform(1500, 2100, pixels), 0)
-    sigma = rng.choice([0.0, 0.001, 0.5, 2.0], pixels) if number % 2 else rng.uniform(0, 3, pixels)
-    wrong = rng.random(pixels) < 0.05
-    prediction = (target + rng.normal(0, 2, pixels) + 300 * wrong) * (rng.random(pixels) < 0.9)
-    return prediction.astype(np.float32), target.astype(np.float32), sigma.astype(np.float32), rng.random(pixels) < 0.1
-
-
-def test_the_order_of_the_pixels_does_not_matter():
-    maps = case(1)
-    shuffled = np.random.default_rng(0).permutation(maps[0].size)
-    first, second = (
-        score_sigma(*maps),
-        score_sigma(*(values.ravel()[shuffled].reshape(maps[0].shape) for values in maps)),
-    )
-    for key, value in first.scores.items():
-        assert second.scores[key] == pytest.approx(value, rel=1e-12), key
-
-
 def gaussian(stated=1.0, pixels=(300, 400)):
     """A target, and a prediction whose errors are Gaussian with the sigma that it states, times ``stated``."""
     rng = np.random.default_rng(5)

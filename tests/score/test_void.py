@@ -8,7 +8,6 @@ from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
 from fpp_ml_bench.evaluation.report.terminal import result_table
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
-from fpp_ml_bench.evaluation.score.torch_metric import DepthScores
 from fpp_ml_bench.loaders.sample import VOID, Flag, void_pixels
 
 
@@ -65,16 +64,3 @@ def test_data_without_flags_have_none(tmp_path):
     data = make_dataset(tmp_path / "data", exact=False)
     result = evaluate(write_predictions(tmp_path / "p", data), data)
     assert result.metrics.void_share == 0.0 and {row.void_pixels for row in result.per_sample} == {0}
-
-
-def test_the_torch_metric_leaves_them_out_too(dataset):
-    import torch
-
-    sample = dataset.samples("test")[0]
-    target, void = dataset.depth_mm(sample), dataset.void(sample)
-    prediction = target + np.random.default_rng(0).normal(0, 2, target.shape).astype(np.float32)
-    metric = DepthScores(charge_mm=300.0)
-    metric.update(*(torch.tensor(pixels)[None] for pixels in (prediction, target, void)))
-    expected = score_sample(prediction, target, void=void, charge_mm=300.0).metrics()
-    for key, value in metric.compute().items():
-        assert float(value) == pytest.approx(expected[key], rel=1e-12), key
