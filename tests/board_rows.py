@@ -1,6 +1,7 @@
 """Rows for the leaderboard's tests: results of real scoring with errors, times and names that the test chooses."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -138,6 +139,15 @@ def entry_with_errors(
     }
     row = Row.model_validate(base.row.model_copy(update=changes).model_dump())
     return Entry(base.path.with_name(f"{name}.json"), row, provenance or base.provenance)
+
+
+def changed(entry: Entry, **changes: Any) -> Entry:
+    """``entry`` with other values in its row; a dict changes keys of a block."""
+    values = {
+        key: getattr(entry.row, key).model_copy(update=value) if isinstance(value, dict) else value
+        for key, value in changes.items()
+    }
+    return replace(entry, row=entry.row.model_copy(update=values))
 
 
 def flat_scores(per_object: Sequence[ObjectMeans], pixels: int = 0) -> dict[str, float | None]:

@@ -1,7 +1,10 @@
 """Shared by all tests: separate Hugging Face caches, and a tiny real dataset that is built once."""
 
+import json
 import os
 import tempfile
+from contextlib import redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import pytest
@@ -56,3 +59,69 @@ def opened(tiny):
     from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
     return DatasetFolder(tiny)
+
+
+@pytest.fixture(scope="session")
+def dataset(tmp_path_factory):
+    """Eight samples of disks, with exact depth: what is scored. Shared by all tests: copy it before changing it."""
+    from scored_dataset import make_dataset
+
+    return make_dataset(tmp_path_factory.mktemp("scored") / "tiny")
+
+
+@pytest.fixture(scope="session")
+def files(tmp_path_factory, dataset):
+    """Result files of `some_rows`."""
+    from board_rows import some_rows
+
+    return some_rows(tmp_path_factory.mktemp("rows"), dataset)
+
+
+@pytest.fixture(scope="session")
+def base(tmp_path_factory, dataset):
+    """An entry of the leaderboard, of which tests make rows with other errors."""
+    from board_rows import write_result_file
+
+    from fpp_ml_bench.leaderboard.rows import read_entry
+
+    return read_entry(write_result_file(tmp_path_factory.mktemp("base") / "base.json", dataset, 1.0))
+
+
+@pytest.fixture
+def predictions(tmp_path, dataset):
+    """Predictions of the test split of `dataset`, without an error."""
+    from scored_dataset import write_predictions
+
+    return write_predictions(tmp_path / "predictions", dataset)
+
+
+def fpp_bench(*words):
+    """Exit status of ``fpp-bench``."""
+    from fpp_ml_bench.cli import main
+
+    return main([str(word) for word in words])
+
+
+def fpp_eval(*words):
+    """Exit status of ``fpp-eval``."""
+    from fpp_ml_bench.cli import main_eval
+
+    return main_eval([str(word) for word in words])
+
+
+def printed(command, *words):
+    """What a ``command`` prints that does its work."""
+    with redirect_stdout(StringIO()) as out:
+        assert command(*words) == 0
+    return out.getvalue()
+
+
+def refusal(command, *words):
+    """What a ``command`` says that refuses its arguments."""
+    with redirect_stderr(StringIO()) as err:
+        assert command(*words) == 2
+    return err.getvalue()
+
+
+def read_json(path):
+    return json.loads(path.read_text())

@@ -149,3 +149,17 @@ def write_predictions(
         np.save(folder / f"{sample}.npy", (depth + offset_mm + noise).astype(np.float32))
     write_description(folder, **changes)
     return folder
+
+
+def change_json(path: Path, key: str, value: Any) -> None:
+    """Set a value deep inside of a JSON file, at a key like ``per_sample.0.object``; ``...`` removes it."""
+    document = json.loads(path.read_text())
+    *parents, last = (int(part) if part.isdecimal() else part for part in key.split("."))
+    place = document
+    for parent in parents:
+        place = place[parent]
+    if value is ...:
+        del place[last]
+    else:
+        place[last] = value
+    path.write_text(json.dumps(document))

@@ -1,12 +1,11 @@
 """The classical method: its error obeys the noise law over N, and it reads only the frames that it names."""
 
-import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import yaml
-from conftest import TINY_SIZE
+from conftest import TINY_SIZE, fpp_bench, printed, refusal
 from edges import edge_distance_px
 from flat_planes import DIRECT, RIG, plane_depth_m, plane_fringe
 
@@ -14,15 +13,12 @@ from fpp_ml_bench.baselines.classical import ClassicalMethod
 from fpp_ml_bench.baselines.method import Method
 from fpp_ml_bench.baselines.registry import load_method, methods
 from fpp_ml_bench.baselines.run import predict_split
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.decoding.triangulation import coordinate_slope_px_per_mm, noise_by_light
 from fpp_ml_bench.depth import object_mask
 from fpp_ml_bench.errors import DatasetError, DecodeError, FppBenchError, PredictionError, RigError
 from fpp_ml_bench.loaders.render.builder import build
-from fpp_ml_bench.loaders.render.meshes import solid_mesh
 from fpp_ml_bench.loaders.render.scene import BuildSettings
 from fpp_ml_bench.loaders.render.sensor import camera_noise
-from fpp_ml_bench.loaders.render.view import Studio
 from fpp_ml_bench.loaders.sample import VOID, Flag
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 from fpp_ml_bench.optics.named_rigs import paper_rig
@@ -59,9 +55,8 @@ def interior_rmse_mm(opened, direction, steps):
     return np.sqrt(squares / count)
 
 
-@pytest.mark.parametrize("direction", ["vertical", "horizontal", "both"])
-def test_error_follows_one_over_root_n(noisy, direction):
-    errors = np.array([interior_rmse_mm(noisy, direction, steps) for steps in STEPS])
+def test_error_follows_one_over_root_n(noisy):
+    errors = np.array([interior_rmse_mm(noisy, "both", steps) for steps in STEPS])
     scaled = errors * np.sqrt(STEPS)
     assert np.abs(scaled / scaled.mean() - 1).max() < 0.10
     assert (np.diff(errors) < 0).all()
@@ -123,28 +118,8 @@ def test_noise_that_light_brings_is_told_from_noise_in_the_dark():
     assert noise_by_light([None] * len(frames), rig) is None
 
 
-@pytest.mark.parametrize("steps", [5, 7])
-def test_steps_that_do_not_divide_eighteen(noisy, steps):
-    assert interior_rmse_mm(noisy, "both", steps) < 1.5 * interior_rmse_mm(noisy, "both", 18) * np.sqrt(18 / steps)
-
-
-def interior_errors_mm(exact, depth):
-    """Decoded pixels of the object 3 px or more from an edge, and the absolute error there, 0 elsewhere."""
-    inside = object_mask(exact) & (edge_distance_px(exact) >= 3) & object_mask(depth)
-    return inside, np.where(inside, np.abs(depth.astype(np.float64) - exact), 0.0)
-
-
-def test_accepted_accuracy_at_sigma_one():
-    """The issue's bound: under 0.5 mm object MAE 3 px or more from depth edges at noise sigma 1; in direct light, which
-    is what it was stated for."""
-    rig = paper_rig(TINY_SIZE)
-    studio = Studio(BuildSettings(rig, ("power_drill",), stored="all", light=DIRECT))
-    classical = ClassicalMethod(rig)
-    for view in ("A0", "A60", "A120"):
-        row = studio.photograph(solid_mesh("power_drill"), view)
-        inside, error = interior_errors_mm(row.depth_exact_mm, classical.predict([row.frames[i] for i in range(52)]))
-        assert inside.sum() > 1000
-        assert error[inside].mean() < 0.5
+def test_steps_that_do_not_divide_eighteen(noisy):
+    assert interior_rmse_mm(noisy, "both", 7) < 1.5 * interior_rmse_mm(noisy, "both", 18) * np.sqrt(18 / 7)
 
 
 def test_accuracy_in_the_papers_light(opened):
@@ -153,33 +128,29 @@ def test_accuracy_in_the_papers_light(opened):
     classical = ClassicalMethod(opened.rig)
     for sample in opened.samples("test"):
         exact, flags = opened.depth_mm(sample, "depth_exact"), opened.flags(sample)
-        inside, error = interior_errors_mm(exact, classical.predict(opened.frames(sample, range(52))))
+        depth = classical.predict(opened.frames(sample, range(52)))
+        inside = object_mask(exact) & (edge_distance_px(exact) >= 3) & object_mask(depth)
+        error = np.abs(depth.astype(np.float64) - exact)
         plain = inside & ((flags & (VOID | Flag.INTERREFLECTION)) == 0)
         assert error[inside].mean() < 1.5
         assert plain.sum() > 0.7 * inside.sum()
         assert error[plain].mean() < 0.8
 
 
-@pytest.mark.parametrize("direction", ["vertical", "horizontal", "both"])
-@pytest.mark.parametrize("steps", [3, 4, 7, 18])
+@pytest.mark.parametrize(("direction", "steps"), [("vertical", 3), ("horizontal", 7), ("both", 18)])
 def test_only_the_frames_it_names_are_used(opened, direction, steps):
     classical = ClassicalMethod(opened.rig, direction=direction, steps=steps)
     used = classical.frames_used
     assert list(used) == sorted(set(used))
-    directions = 2 if direction == "both" else 1
-    assert len(used) == directions * (steps + 7)
-    sinusoids = [i for i in used if i < 36]
-    assert len(sinusoids) == directions * steps
-    if direction == "horizontal":
-        assert set(used) <= {*range(18), *range(36, 43)}
-    if direction == "vertical":
-        assert set(used) <= {*range(18, 36), *range(43, 50)}
+    allowed = {"horizontal": {*range(18), *range(36, 43)}, "vertical": {*range(18, 36), *range(43, 50)}}
+    named = allowed if direction == "both" else [direction]
+    for name in named:
+        assert len(allowed[name].intersection(used)) == steps + 7
+    assert len(used) == len(named) * (steps + 7)
     captured = opened.frames("mug_A0", range(52))
     everything = classical.predict(captured)
     only = classical.predict([frame if i in used else None for i, frame in enumerate(captured)])
     np.testing.assert_array_equal(everything, only)
-    spoiled = [frame if i in used else np.full_like(frame, 77) for i, frame in enumerate(captured)]
-    np.testing.assert_array_equal(everything, classical.predict(spoiled))
     for gone in (used[0], used[-1]):
         with pytest.raises(DecodeError):
             classical.predict([None if i == gone else frame for i, frame in enumerate(captured)])
@@ -218,7 +189,7 @@ def test_beyond_the_end_of_the_range_there_is_no_depth(name, options):
     assert (np.abs(answer.depth - exact_mm)[:, 60:-60][lit] < 8).mean() > 0.8
 
 
-@pytest.mark.parametrize("steps", [2, 19, 0, -3])
+@pytest.mark.parametrize("steps", [2, 19])
 def test_steps_out_of_bounds(opened, steps):
     with pytest.raises(DecodeError, match="3 to the 18"):
         ClassicalMethod(opened.rig, steps=steps)
@@ -308,7 +279,8 @@ def test_methods_by_name(opened):
         load_method("magic", opened.rig)
     assert network.learned_from == {"data": "train-split", "versions": ["fpp-bench-full-224 version 2"]}
     learned = [load_method("constant", opened.rig, at=at).learned_from["data"] for at in ("standoff", "training-mean")]
-    assert learned == ["none", "train-split"] and load_method("phase", opened.rig).learned_from == {"data": "none"}
+    assert learned == ["none", "train-split"]
+    assert load_method("phase", opened.rig).learned_from == {"data": "none"}
 
 
 # ---- predictions
@@ -333,13 +305,13 @@ def test_prediction_folder(opened, tmp_path):
     assert submission["seconds_per_sample"] == pytest.approx(seconds, rel=1e-4)
 
 
-def test_predictions_at_a_url(tiny, tmp_path, capsys):
+def test_predictions_at_a_url(tiny, tmp_path):
     url = (tmp_path / "there").as_uri()
     words = ["predict", "constant", str(tiny), "--split", "validation", "--out", url]
-    assert main(words) == 0 and f"next: copy {url} to a disk" in capsys.readouterr().out
+    assert f"next: copy {url} to a disk" in printed(fpp_bench, *words)
     names = sorted([*(f"mug_A{a}.npy" for a in range(0, 360, 60)), "submission.yaml"])
     assert sorted(path.name for path in (tmp_path / "there").iterdir()) == names
-    assert main(words) == 2 and f"{url}: already holds submission.yaml and more" in capsys.readouterr().err
+    assert f"{url}: already holds submission.yaml and more" in refusal(fpp_bench, *words)
 
 
 def test_method_sees_copies_and_no_other_frame(opened, tmp_path):
@@ -373,7 +345,6 @@ def test_an_answer_that_is_none_is_named(opened, tmp_path):
         (np.ones((TINY_SIZE, TINY_SIZE)), "expected float32"),
         (np.ones((10, 10), np.float32), "expected float32"),
         (np.full((TINY_SIZE, TINY_SIZE), np.nan, np.float32), "not finite"),
-        (np.full((TINY_SIZE, TINY_SIZE), np.inf, np.float32), "not finite"),
     ],
 )
 def test_faulty_methods_are_caught(opened, tmp_path, depth, says):
@@ -406,10 +377,6 @@ def test_foreign_folders_are_not_taken_over(opened, tmp_path):
         predict_split(opened, classical, "validation", tmp_path / "file")
 
 
-def test_dataset_without_the_frames(tmp_path):
-    settings = BuildSettings(paper_rig(TINY_SIZE), ("cork",), stored="vertical")
-    build(tmp_path / "set", settings, workers=1)
-    opened = DatasetFolder(tmp_path / "set")
-    with pytest.raises(DatasetError, match=r"frame 43 is not stored.*--config all"):
-        predict_split(opened, ClassicalMethod(opened.rig, direction="vertical"), "train", tmp_path / "out")
-    shutil.rmtree(tmp_path / "out")
+def test_dataset_without_the_frames(dataset, tmp_path):
+    with pytest.raises(DatasetError, match=r"frame 18 is not stored.*--config all"):
+        predict_split(dataset, ClassicalMethod(dataset.rig, direction="vertical"), "train", tmp_path / "out")

@@ -11,6 +11,7 @@ from PIL import Image
 
 from fpp_ml_bench.baselines import registry
 from fpp_ml_bench.baselines.method import Method
+from fpp_ml_bench.baselines.registry import find, load_method, methods
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.options import described, options_of
@@ -65,18 +66,18 @@ def mine(tmp_path: Path) -> str:
 
 
 def test_a_method_of_a_file_with_its_options(mine):
-    method = registry.load_method(f"{mine}:Mine", RIG, depth=900.0)
+    method = load_method(f"{mine}:Mine", RIG, depth=900.0)
     source = method.settings["source_sha256"]
     assert (method.name, method.settings) == ("mine", {"depth": 900.0, "source_sha256": source})
     assert method.learned_from is None  # its author has not said it
     frame = np.full((224, 224), 61, np.uint8)
     assert (method.predict([frame]) == 900).all()
-    found = registry.find(f"{mine}:Mine")
-    assert found is not registry.find(f"{mine}:Mine") and found.method is registry.find(f"{mine}:Mine").method
+    found = find(f"{mine}:Mine")
+    assert found is not find(f"{mine}:Mine") and found.method is find(f"{mine}:Mine").method
     (depth,) = options_of(found.method.Options)
     assert (depth.name, described(depth).metavar) == ("depth", "MM")
     with pytest.raises(PredictionError, match=r"mine: has no option dept; did you mean 'depth'\?"):
-        registry.load_method(f"{mine}:Mine", RIG, dept=1.0)
+        load_method(f"{mine}:Mine", RIG, dept=1.0)
 
 
 @pytest.mark.parametrize(
@@ -99,7 +100,7 @@ def test_files_that_hold_no_method(mine, name, says):
     (folder / "fixed.py").write_text(MINE + FIXED)
     (folder / "spaces.py").write_text(MINE.replace('"mine"', '"a b"'))
     with pytest.raises(PredictionError, match=says):
-        registry.load_method(str(folder / name), RIG)
+        load_method(str(folder / name), RIG)
 
 
 def test_the_code_of_a_file_is_it_its_helpers_and_its_weights(mine, monkeypatch):
@@ -111,7 +112,7 @@ def test_the_code_of_a_file_is_it_its_helpers_and_its_weights(mine, monkeypatch)
     (folder / "mine.py").write_text(f"import helper_of_mine\n{MINE}")
     (folder / "unused.py").write_text("")
     monkeypatch.delitem(sys.modules, "helper_of_mine", raising=False)
-    registry.find(f"{mine}:Mine")
+    find(f"{mine}:Mine")
     first = registry.code_in.__wrapped__(Path(mine))
     assert list(first) == ["helper_of_mine.py", "mine.py", "nets/block.py", "own.npz"]
     for name in first:
@@ -124,22 +125,22 @@ def test_the_code_of_a_file_is_it_its_helpers_and_its_weights(mine, monkeypatch)
     assert registry.code_in.__wrapped__(Path(mine)) == first
 
 
-def test_the_code_and_the_files_of_options_are_settings(mine, tmp_path, monkeypatch):
-    first = registry.load_method(f"{mine}:Mine", RIG).settings["source_sha256"]
+def test_the_code_and_the_files_of_options_are_settings(mine, tmp_path):
+    first = load_method(f"{mine}:Mine", RIG).settings["source_sha256"]
     (tmp_path / "again").mkdir()
     (tmp_path / "again" / "mine.py").write_text(MINE)
-    again = registry.load_method(tmp_path / "again" / "mine.py:Mine", RIG)
+    again = load_method(tmp_path / "again" / "mine.py:Mine", RIG)
     assert again.settings["source_sha256"] == first and list(again.code) == ["mine.py"]  # wherever it lies
     (tmp_path / "again" / "more.py").write_text(MINE + "class Other(Mine):\n    pass\n")
-    classes = [registry.load_method(tmp_path / "again" / f"more.py:{name}", RIG) for name in ("Mine", "Other")]
+    classes = [load_method(tmp_path / "again" / f"more.py:{name}", RIG) for name in ("Mine", "Other")]
     assert len({first, *(method.settings["source_sha256"] for method in classes)}) == 3
     mask = tmp_path / "mask.png"
     masks = []
     for value in (1, 255):
         Image.fromarray(np.full((224, 224), value, np.uint8)).save(mask)
-        masks.append(registry.load_method("phase", RIG, mask=mask).settings["mask_sha256"])
+        masks.append(load_method("phase", RIG, mask=mask).settings["mask_sha256"])
     assert masks[0] != masks[1]
-    assert not registry.load_method("phase", RIG).settings.keys() & {"source_sha256", "mask_sha256"}
+    assert not load_method("phase", RIG).settings.keys() & {"source_sha256", "mask_sha256"}
 
 
 STATED = """
@@ -154,22 +155,20 @@ def test_what_a_file_does_not_say_is_unknown(mine, tmp_path):
         f"import cv2\nfrom fpp_ml_bench.baselines.phase.method import PhaseMethod\n{MINE}"
         f"{STATED}class Trained(PhaseMethod):\n    name = 'trained'\n"
     )
-    silent, stated, trained = (
-        registry.load_method(tmp_path / f"stated.py:{n}", RIG) for n in ("Mine", "Stated", "Trained")
-    )
+    silent, stated, trained = (load_method(tmp_path / f"stated.py:{n}", RIG) for n in ("Mine", "Stated", "Trained"))
     assert silent.learned_from is None and trained.learned_from is None  # whatever it inherits from
     assert stated.learned_from == {"data": "other", "versions": ["my scans"]}
     assert {"numpy", "cv2"} <= silent.software.keys() and {"scipy", "cv2"} <= stated.software.keys()
-    assert registry.load_method("phase", RIG).software.keys() == {"fpp_ml_bench", "python", "numpy", "numba"}
+    assert load_method("phase", RIG).software.keys() == {"fpp_ml_bench", "python", "numpy", "numba"}
 
 
 def test_a_file_without_its_class_is_told_what_there_is(mine):
     with pytest.raises(PredictionError, match=r"mine.py:NAME, which says what of it; there are .*Mine"):
-        registry.find(mine)
+        find(mine)
 
 
 def test_where_code_of_a_file_failed(mine):
-    method = registry.load_method(f"{mine}:Mine", RIG)
+    method = load_method(f"{mine}:Mine", RIG)
     with pytest.raises(IndexError) as caught:
         method.predict([])
     assert f"{mine}, line 18, in predict: IndexError" in str(registry.failure_in_file(caught.value))
@@ -204,24 +203,24 @@ def test_methods_of_installed_packages(monkeypatch):
     monkeypatch.setattr(metadata, "entry_points", offered)
     registry._installed.cache_clear()
     try:
-        assert [*registry.methods()][-2:] == ["nearest", "installed"]
-        assert registry.load_method("installed", RIG).title == "Of a package"
-        assert registry.load_method("phase", RIG).title.startswith("Phase route")
+        assert [*methods()][-2:] == ["nearest", "installed"]
+        assert load_method("installed", RIG).title == "Of a package"
+        assert load_method("phase", RIG).title.startswith("Phase route")
         for name, says in (("broken", "ZeroDivisionError"), ("taken", "name 'phase' is taken"), ("no", "got int")):
             with pytest.raises(PredictionError, match=says):
-                registry.find(name)
+                find(name)
     finally:
         registry._installed.cache_clear()
 
 
 def test_a_name_that_is_almost_right():
     with pytest.raises(PredictionError, match=r"unknown method 'phase-nte'; did you mean 'phase-net'\?"):
-        registry.find("phase-nte")
+        find("phase-nte")
     with pytest.raises(PredictionError, match="there are classical, classical-net, phase"):
-        registry.find("something else")
+        find("something else")
 
 
-@pytest.mark.parametrize("method", registry.methods().values(), ids=str)
+@pytest.mark.parametrize("method", methods().values(), ids=str)
 def test_a_method_says_what_it_needs_to(method):
     """One line for ``--help``, and help for each option; no option that its class does not take."""
     assert method.purpose and method.name

@@ -1,17 +1,15 @@
 """`predict_split` continues a stopped run behind its last finished sample, and refuses to continue another one."""
 
-import json
 import sys
 
 import numpy as np
 import pytest
 import yaml
-from scored_dataset import make_dataset
+from conftest import fpp_bench, read_json
 
 from fpp_ml_bench.baselines import registry
 from fpp_ml_bench.baselines.method import Answer, Method
 from fpp_ml_bench.baselines.run import predict_split
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -41,11 +39,6 @@ class Counting(Method):
         return {"mean_number": float(np.mean([report["number"] for report in reports]))}
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
-
-
 @pytest.fixture
 def stopped(dataset, tmp_path):
     with pytest.raises(KeyboardInterrupt):
@@ -64,7 +57,7 @@ def test_it_goes_on_behind_the_last_finished_sample(dataset, stopped):
     assert {name: (stopped / name).stat().st_mtime_ns for name in names} == written
     assert {path.name for path in stopped.iterdir()} >= {"submission.yaml", "per_sample.json"}
     assert not list(stopped.glob("*.jsonl")) + list(stopped.glob("*.tmp"))
-    reports = json.loads((stopped / "per_sample.json").read_text())
+    reports = read_json(stopped / "per_sample.json")
     assert [report["number"] for report in reports.values()] == [2, 3, 2, 3]
     submission = yaml.safe_load((stopped / "submission.yaml").read_text())
     assert submission["settings"] == {"level": 1, "mean_number": 2.5} and "learned_from" not in submission
@@ -89,7 +82,7 @@ def test_a_line_that_was_cut_off_does_not_count(dataset, stopped):
     assert method.answers == 3
 
 
-def test_another_run_is_refused_and_keeps_its_files(dataset, stopped, tmp_path):
+def test_another_run_is_refused_and_keeps_its_files(dataset, stopped):
     before = {path.name: path.read_bytes() for path in stopped.iterdir()}
     other = Counting()
     other.settings = {"level": 2}
@@ -165,7 +158,7 @@ def test_a_method_reaches_no_truth_by_what_it_is_given_or_by_its_caller(dataset,
     monkeypatch.setattr(registry, "NETWORKS", "looking")
 
     def run_it():
-        return main(["predict", "looking", str(dataset.path), "--out", str(tmp_path / "out")])
+        return fpp_bench("predict", "looking", dataset.path, "--out", tmp_path / "out")
 
     assert run_it() == 0
 

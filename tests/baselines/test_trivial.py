@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import fpp_bench, refusal
 from scored_dataset import disk_depth, make_dataset
 
 from fpp_ml_bench.baselines.registry import load_method
 from fpp_ml_bench.baselines.run import predict_split
 from fpp_ml_bench.baselines.trivial import ConstantMethod, NearestMethod
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
@@ -30,10 +30,6 @@ def dataset(tmp_path_factory):
     return DatasetFolder(made.path)
 
 
-def stack(frame):
-    return [frame]
-
-
 def test_the_nearest_of_the_training_images_by_another_computation(dataset):
     method = NearestMethod(paper_rig(96), training=dataset)
     training = {sample: dataset.frame(sample, 0).astype(float) for sample in dataset.samples("train")}
@@ -41,23 +37,15 @@ def test_the_nearest_of_the_training_images_by_another_computation(dataset):
     for sample in dataset.samples("test"):
         image = dataset.frame(sample, 0).astype(float)
         nearest = min(training, key=lambda name: float(((training[name] - image) ** 2).mean()))
-        np.testing.assert_array_equal(method.predict(stack(dataset.frame(sample, 0))), dataset.depth_mm(nearest))
+        np.testing.assert_array_equal(method.predict([dataset.frame(sample, 0)]), dataset.depth_mm(nearest))
         chosen.add(nearest)
     assert len(chosen) > 1
     for sample in training:  # its own image is the nearest
-        np.testing.assert_array_equal(method.predict(stack(dataset.frame(sample, 0))), dataset.depth_mm(sample))
-
-
-def test_blocks_are_means_over_their_pixels(dataset):
-    method = NearestMethod(paper_rig(96), training=dataset)
-    method.block_px = 7  # 96 = 13 * 7 + 5
-    frame = dataset.frame(dataset.samples("test")[0], 0)
-    sums = method._block_sums(frame)
-    assert sums.shape == (13, 13) and sums[2, 3] == int(frame[14:21, 21:28].astype(int).sum())
+        np.testing.assert_array_equal(method.predict([dataset.frame(sample, 0)]), dataset.depth_mm(sample))
 
 
 def test_it_runs_over_a_split_and_says_what_it_used(dataset, tmp_path):
-    assert main(["predict", "nearest", str(dataset.path), "--out", str(tmp_path / "p")]) == 0
+    assert fpp_bench("predict", "nearest", dataset.path, "--out", tmp_path / "p") == 0
     text = (tmp_path / "p" / "submission.yaml").read_text()
     assert "method: nearest" in text and f"training_fingerprint: {dataset.fingerprint}" in text
     assert f"learned_from:\n  data: train-split\n  versions:\n  - dataset {dataset.fingerprint[:8]}\n" in text
@@ -65,13 +53,14 @@ def test_it_runs_over_a_split_and_says_what_it_used(dataset, tmp_path):
     assert len(list((tmp_path / "q").glob("*.npy"))) == 8
 
 
-def test_what_can_not_be_searched_is_refused(dataset, tmp_path, capsys):
+def test_what_can_not_be_searched_is_refused(dataset, tmp_path):
     with pytest.raises(PredictionError, match="needs the training split"):
         load_method("nearest", paper_rig(96))
     with pytest.raises(PredictionError, match=r"expected training images of 48x48 px"):
         load_method("nearest", paper_rig(48), training=dataset)
-    assert main(["predict", "classical", str(dataset.path), "--training", "x", "--out", str(tmp_path / "p")]) == 2
-    assert "--training is an option of nearest" in capsys.readouterr().err
+    assert "--training is an option of nearest" in refusal(
+        fpp_bench, "predict", "classical", dataset.path, "--training", "x", "--out", tmp_path / "p"
+    )
     with pytest.raises(PredictionError, match="nearest needs frame 0"):
         NearestMethod(paper_rig(96), training=dataset).predict([None])
 

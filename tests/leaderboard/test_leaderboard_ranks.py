@@ -4,34 +4,26 @@ import csv
 import io
 import json
 from dataclasses import replace
-from itertools import combinations
-from types import SimpleNamespace
 from typing import get_args
 
 import numpy as np
 import pytest
-from board_rows import entry_with_errors, named_benchmarks, write_result_file
-from scipy import stats
-from scored_dataset import make_dataset
+from board_rows import changed, entry_with_errors, named_benchmarks
+from conftest import fpp_bench, printed, read_json
+from scored_dataset import write_predictions
 
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.protocol import FRAMES_CLASSES, Track
-from fpp_ml_bench.evaluation.score.uncertainty import behind, pairs, sign_flip_bounds, sign_flip_p
+from fpp_ml_bench.evaluation.score.evaluator import evaluate
+from fpp_ml_bench.evaluation.score.uncertainty import behind, holm, pairs, sign_flip_bounds, sign_flip_p
 from fpp_ml_bench.evaluation.submission.description import LearnedFrom, Submission
 from fpp_ml_bench.leaderboard.columns import columns, given_truth, learned_from, surest, uncertainty
-from fpp_ml_bench.leaderboard.ranking import rank, read_entries
-from fpp_ml_bench.leaderboard.row_file import RowUncertainty, _uncertainty, write_row
+from fpp_ml_bench.leaderboard.ranking import rank
+from fpp_ml_bench.leaderboard.row_file import RowUncertainty, row_of, write_row
 from fpp_ml_bench.leaderboard.tables import table_json
 
 EIGHT = [f"object {n}" for n in range(8)]
 FULL, UNSEEN = ({"test/depth": letter * 32} for letter in "fe")
-
-
-@pytest.fixture(scope="module")
-def base(tmp_path_factory):
-    work = tmp_path_factory.mktemp("base")
-    return read_entries([write_result_file(work / "base.json", make_dataset(work / "tiny"), 1.0)])[0]
 
 
 @pytest.fixture
@@ -53,32 +45,21 @@ def random_errors(seed, rows=5):
     return {f"row {n}": (hard * (1 + n / 2) + rng.uniform(0, 1.5, 10)).tolist() for n in range(rows)}
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_ranks_follow_from_scipys_test_and_holms_procedure(seed, base):
-    errors = random_errors(seed)
+def test_ranks_follow_from_the_pairs_that_are_told_apart(base):
+    """The p values of pairs and Holm's procedure have tests against SciPy of their own."""
+    errors = random_errors(0)
     (group,) = rank(entries_of(base, errors, TEN))
-    values = {}
-    for first, second in combinations(errors, 2):
-        difference = np.subtract(errors[first], errors[second])
-        tested = stats.permutation_test(
-            (difference,), np.mean, permutation_type="samples", n_resamples=np.inf, vectorized=True
-        )
-        values[first, second] = (tested.pvalue, difference.mean())
-    ordered, apart = sorted(values, key=lambda pair: values[pair][0]), set()
-    for place, pair in enumerate(ordered):
-        if values[pair][0] > 0.05 / (len(ordered) - place):
-            break
-        apart.add(pair)
-    assert 0 < len(apart) < len(values)  # or the test says nothing
-    behind = {pair if values[pair][1] > 0 else pair[::-1] for pair in apart}  # (the worse, the better)
+    behind = {(pair.second, pair.first) for pair in group.pairs if pair.behind}  # (the worse, the better)
+    assert 0 < len(behind) < len(group.pairs) == 10  # or the test says nothing
     for row in group.rows:
         assert row.best_rank == 1 + sum(row.entry.name == worse for worse, _ in behind)
         assert row.worst_rank == len(errors) - sum(row.entry.name == better for _, better in behind)
-    assert {(pair.second, pair.first) for pair in group.pairs if pair.behind} == behind
-    for pair in group.pairs:
-        p, mean = values.get((pair.first, pair.second)) or values[pair.second, pair.first]
-        assert pair.p == pytest.approx(p) and pair.difference == pytest.approx(abs(mean)) and pair.objects == 10
-        assert pair.interval[0] <= pair.difference <= pair.interval[1]
+    adjusted = holm([pair.p for pair in group.pairs])
+    for pair, p_holm in zip(group.pairs, adjusted, strict=True):
+        differences = np.subtract(errors[pair.second], errors[pair.first])
+        assert pair.p == sign_flip_p(differences.tolist()) and pair.p_holm == p_holm
+        assert pair.difference == pytest.approx(differences.mean()) and pair.objects == 10
+        assert pair.behind == (p_holm <= 0.05) and pair.interval[0] <= pair.difference <= pair.interval[1]
 
 
 def test_equal_rows_share_ranks_and_the_perfect_one_is_first(base):
@@ -96,15 +77,7 @@ def test_equal_rows_share_ranks_and_the_perfect_one_is_first(base):
     assert twins.p == twins.p_holm == 1.0 and not twins.behind
 
 
-def test_hard_objects_cancel_in_a_pair(base):
-    """Intervals of the rows overlap widely, and yet one is behind the other on every object."""
-    hard = [1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0]
-    (group,) = rank(entries_of(base, {"a": hard, "b": [1.1 * error for error in hard]}))
-    first, second = (row.interval("object_mae_mm") for row in group.rows)
-    assert first[1] > second[0] and [row.ranks for row in group.rows] == ["1", "2"]
-
-
-def test_five_objects_have_no_ranks_and_say_why(base, capsys, tmp_path):
+def test_five_objects_have_no_ranks_and_say_why(base):
     objects = EIGHT[:5]
     (group,) = rank(entries_of(base, {"a": [1.0] * 5, "b": [9.0] * 5}, objects))
     assert [row.ranks for row in group.rows] == ["-", "-"] and group.pairs == ()
@@ -163,12 +136,11 @@ def test_a_row_without_the_unseen_objects_has_no_rank(base, benchmarks):
 
 def test_two_methods_of_one_name_are_not_joined(base, benchmarks):
     test, unseen = two_sets(base, "same", 1.0, 1.0)
-    about = unseen.row.submission.model_copy(update={"settings": {"weights_sha256": "1" * 64}})
-    other = replace(unseen, row=unseen.row.model_copy(update={"submission": about}))
+    other = changed(unseen, submission={"settings": {"weights_sha256": "1" * 64}})
     with pytest.raises(SubmissionError, match=r"same-unseen.json both hold 'same'.* settings.weights_sha256 is None"):
         rank([test, other])
     with pytest.raises(SubmissionError, match="on the same data"):
-        rank([test, replace(test, path=base.path, row=test.row.model_copy(update={"predictions_sha256": "0" * 64}))])
+        rank([test, replace(changed(test, predictions_sha256="0" * 64), path=base.path)])
 
 
 def test_classes_and_what_was_told_are_tables_of_their_own(base):
@@ -209,17 +181,16 @@ def test_a_track_is_compared_with_trivial_rows_that_are_told_no_more(base):
     assert [ratios[name] for name in "abde"] == [0.25, 0.5, 0.5, 0.25]
 
 
-def test_files_have_the_pairs_and_the_rows(base, tmp_path, capsys, monkeypatch):
+def test_files_have_the_pairs_and_the_rows(base, tmp_path, monkeypatch):
     entries = entries_of(base, {"=HYPERLINK(a)": [1.0] * 8, "b, c": [2.0] * 8})
     paths = [tmp_path / f"{n}.json" for n in range(2)]
     for entry, path in zip(entries, paths, strict=True):
         write_row(entry.row, path)
     monkeypatch.setenv("COLUMNS", "160")
     files = ["--csv", str(tmp_path / "t.csv"), "--json", str(tmp_path / "t.json"), "--paper", "none", "--pairs"]
-    assert main(["leaderboard", *map(str, paths), *files]) == 0
-    printed = capsys.readouterr().out
-    assert "Pairs of these rows" in printed and "second is behind" in printed
-    (group,) = json.loads((tmp_path / "t.json").read_text())["groups"]
+    output = printed(fpp_bench, "leaderboard", *paths, *files)
+    assert "Pairs of these rows" in output and "second is behind" in output
+    (group,) = read_json(tmp_path / "t.json")["groups"]
     assert [(row["best_rank"], row["object_mae_mm"]) for row in group["rows"]] == [(1, 1.0), (2, 2.0)]
     assert group["pairs"][0]["p"] == 2.0**-7 and group["pairs"][0]["behind"] and group["notes"] == []
     lines = list(csv.DictReader(io.StringIO((tmp_path / "t.csv").read_text())))
@@ -268,27 +239,29 @@ def test_rows_of_one_data_hold_the_same_objects(base):
         rank(entries)
 
 
-def test_what_a_result_says_beyond_its_scores(base, monkeypatch):
+def test_what_a_row_keeps_of_a_stated_uncertainty(tmp_path, dataset):
+    """Of pixels without a sigma none is in its interval. One view states all, one half, two nothing."""
+    predictions = write_predictions(tmp_path / "p", dataset, offset_mm=1.0)
+    for number, sample in enumerate(dataset.samples("test")):
+        inside = np.cumsum(dataset.depth_mm(sample) > 0).reshape(32, 40)
+        stated = np.where(inside <= (1, 0.5, 0, 0)[number] * inside.max(), np.float32(10), np.float32(0))
+        np.save(predictions / f"{sample}.sigma.npy", stated)
+    result = evaluate(predictions, dataset)
+    kept = row_of(result, tmp_path / "r.json").uncertainty
+    assert kept.within_95_share == pytest.approx(1.5 / 4, abs=0.01)
+    for key in ("ause_mae_mm", "sure_mae_mm", "sure_rmse_mm"):
+        assert getattr(kept, key) == pytest.approx(getattr(result.uncertainty.metrics, key), rel=1e-4)
+
+
+def test_what_a_result_says_beyond_its_scores(base):
     """Blocks that a result may have: what the method learned from, and its scored uncertainty."""
     (row,) = rank([base])[0].rows
     assert learned_from(base.row) == "" and uncertainty(base) == RowUncertainty()
     shown = [column.title for column in columns("object_mae_mm") if column.shown_for([row])]
     assert not {"In 95%", "AUSE", "Surest 95%", "Learned from", "Rank", "x trivial", "On unseen"} & set(shown)
-    scores = SimpleNamespace(coverage_95=0.9, ause_mae_mm=1.5, sure_mae_mm=0.7, sure_rmse_mm=2.1, unstated_share=0.0)
-    samples = {
-        "all pixels state a sigma": scores,
-        "half of them": SimpleNamespace(coverage_95=1.0, unstated_share=0.5),
-        "none": SimpleNamespace(coverage_95=None, unstated_share=1.0),
-        "no object": SimpleNamespace(coverage_95=None, unstated_share=None),
-    }
-    in_brief = _uncertainty(SimpleNamespace(metrics=scores, per_sample=samples))
-    errors = {"ause_mae_mm": 1.5, "sure_mae_mm": 0.7, "sure_rmse_mm": 2.1}
-    assert in_brief == {"within_95_share": pytest.approx((0.9 + 0.5 + 0.0) / 3), **errors}
-    changes = {
-        "uncertainty": RowUncertainty(**in_brief),
-        "submission": base.row.submission.model_copy(update={"learned_from": LearnedFrom(data="generated")}),
-    }
-    (row,) = rank([replace(base, row=base.row.model_copy(update=changes))])[0].rows
+    stated = RowUncertainty(within_95_share=0.9, ause_mae_mm=1.5, sure_mae_mm=0.7, sure_rmse_mm=2.1)
+    learned = {"learned_from": LearnedFrom(data="generated")}
+    (row,) = rank([changed(base, uncertainty=stated, submission=learned)])[0].rows
     assert learned_from(row.entry.row) == "generated"
     shown = [column.title for column in columns("object_mae_mm") if column.shown_for([row])]
     assert {"In 95%", "AUSE", "Surest 95%", "Learned from"} < set(shown)
@@ -298,34 +271,18 @@ def test_what_a_result_says_beyond_its_scores(base, monkeypatch):
 def test_a_submission_may_say_that_it_was_given_the_order(base):
     about = base.row.submission.model_dump(mode="json")
     assert "uses_ground_truth_order" not in about
-    tracks = {}
-    for given in range(8):
-        flags = {
-            f"uses_ground_truth_{name}": bool(given >> bit & 1) for bit, name in enumerate(("range", "mask", "order"))
-        }
-        tracks[given] = Submission.model_validate({**about, **flags}).track
-    assert tracks == {
-        0: "metric",
-        1: "oracle range",
-        2: "oracle mask",
-        3: "oracle range + mask",
-        4: "oracle order",
-        5: "oracle range + order",
-        6: "oracle mask + order",
-        7: "oracle range + mask + order",
-    }
-    assert set(tracks.values()) == set(get_args(Track))
-    assert (
-        given_truth(tracks[7]) == "the test sample's depth range, object mask and fringe order"
-        and given_truth("metric") == ""
-    )
+    for track in get_args(Track):
+        given = {f"uses_ground_truth_{name}": name in track for name in ("range", "mask", "order")}
+        assert Submission.model_validate({**about, **given}).track == track
+    assert len(get_args(Track)) == 8 and given_truth("metric") == ""
+    every = "the test sample's depth range, object mask and fringe order"
+    assert given_truth("oracle range + mask + order") == every
 
 
-def test_rows_of_others_say_where_they_are_from(capsys, tmp_path, monkeypatch):
+def test_rows_of_others_say_where_they_are_from(tmp_path, monkeypatch):
     monkeypatch.setattr("fpp_ml_bench.leaderboard.rows.SHIPPED_ROWS", tmp_path)
     monkeypatch.chdir(tmp_path)
-    assert main(["leaderboard", "--paper", "oracle_order"]) == 0
-    printed = " ".join(capsys.readouterr().out.split())
-    assert "PhiCalNet, 1 frame" in printed and "4.46" in printed and "1.16" in printed
-    assert "Reported by its authors (arXiv 2607.11928)" in printed
-    assert "oracle order: given the test sample's fringe order." in printed
+    output = " ".join(printed(fpp_bench, "leaderboard", "--paper", "oracle_order").split())
+    assert "PhiCalNet, 1 frame" in output and "4.46" in output and "1.16" in output
+    assert "Reported by its authors (arXiv 2607.11928)" in output
+    assert "oracle order: given the test sample's fringe order." in output

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_rows import reliance, robustness, some_rows, timing, write_result_file
-from scored_dataset import disk_depth, make_dataset
+from board_rows import reliance, robustness, timing, write_result_file
+from conftest import fpp_bench, fpp_eval, printed, read_json, refusal
+from scored_dataset import change_json, disk_depth, make_dataset
 from upkeep import readme_block
 
-from fpp_ml_bench.cli import main
-from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
 from fpp_ml_bench.evaluation.result.file import read_result
@@ -28,16 +27,6 @@ from fpp_ml_bench.leaderboard.row_file import (
     write_row,
 )
 from fpp_ml_bench.leaderboard.rows import read_entry
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
-
-
-@pytest.fixture(scope="module")
-def files(tmp_path_factory, dataset):
-    return some_rows(tmp_path_factory.mktemp("rows"), dataset)
 
 
 @pytest.fixture(scope="module")
@@ -65,10 +54,9 @@ def write_row_of(result: Path, path: Path) -> Path:
     return path
 
 
-def test_one_command_makes_a_row_and_prints_the_line_to_vouch_for_it(files, tmp_path, capsys, listed):
+def test_one_command_makes_a_row_and_prints_the_line_to_vouch_for_it(files, tmp_path, listed):
     row = tmp_path / "row.json"
-    assert main(["leaderboard", str(files[0]), "--row", str(row)]) == 0
-    said, line = capsys.readouterr().out.splitlines()
+    said, line = printed(fpp_bench, "leaderboard", files[0], "--row", row).splitlines()
     assert said.startswith(f"{row}: {row.stat().st_size:,} bytes, self-reported until a maintainer adds")
     entry, bare = read_entry(row), read_entry(files[0])
     assert entry.row == bare.row and entry.provenance == bare.provenance == rows.LOCAL
@@ -121,18 +109,15 @@ def test_means_weigh_objects_by_the_views_that_have_them(tmp_path):
     "line",
     [
         "measured",
-        "{sha} measured {commit} here by me",
         "{sha} | measured | {commit} | a machine | ",
         "{sha} | trusted | {commit} | a machine | a command",
         "{sha} | measured | HEAD | a machine | a command",
-        "{short} | measured | {commit} | a machine | a command",
         "{sha} | measured | {commit} | a machine | a command\r",
-        " {sha} | measured | {commit} | a machine | a command",
     ],
 )
 def test_a_bad_line_of_the_list_is_named(line, listed, files):
     listed("")
-    listed(line.format(sha="a" * 64, short="a" * 63, commit="b" * 40))
+    listed(line.format(sha="a" * 64, commit="b" * 40))
     with pytest.raises(SubmissionError, match=r"vouched\.txt, line 2: expected SHA-256 of a row file"):
         read_entry(files[0])
 
@@ -147,7 +132,7 @@ def test_a_row_is_listed_once(listed, files):
 def test_fpp_eval_compares_results_and_rows(files, tmp_path, capsys):
     row, other = (write_row_of(path, tmp_path / path.name) for path in files[:2])
     for first, second in ((files[0], files[1]), (row, files[1]), (row, other)):
-        assert fpp_eval(["compare", str(first), str(second)]) == 0
+        assert fpp_eval("compare", first, second) == 0
     of_results, *of_rows = capsys.readouterr().out.split("first:")[1:]
     assert "samples" in of_results and all("of 2 objects" in text for text in of_rows)
     assert of_rows[0].strip() == of_rows[1].strip() and "sign-flip test" in of_rows[0]
@@ -158,19 +143,18 @@ def test_fpp_eval_compares_results_and_rows(files, tmp_path, capsys):
 def test_fpp_eval_verifies_a_row_from_its_predictions(files, dataset, tmp_path, capsys):
     row, predictions = write_row_of(files[0], tmp_path / "row.json"), files[0].parent / "fast-predictions"
     words = ["verify", str(row), str(predictions), str(dataset.path)]
-    assert fpp_eval(words) == 0
-    assert capsys.readouterr().out == (
+    assert printed(fpp_eval, *words) == (
         f"verified: {row} is what 4 predictions give\n"
         "not checked: run time and its machine, software, code and environment: predictions don't tell them\n"
     )
-    content = json.loads(row.read_text())
+    content = read_json(row)
     content["metrics"]["object_median_mm"] += 2e-4
     content["submission"]["settings"]["steps"] = 3
     content["predictions_sha256"] = "0" * 64
     content["robustness"] = {"test": robustness().model_dump()}
     content["submission"]["timing"]["latency_p95_ms"] = 1e6
     row.write_text(json.dumps(content))
-    assert fpp_eval(words) == 1
+    assert fpp_eval(*words) == 1
     verdict, *lines, last = capsys.readouterr().out.splitlines()
     assert "robustness" in last and "differs from what the predictions give in 3 places" in verdict
     assert [line.split(":")[0].strip() for line in lines] == [
@@ -180,24 +164,20 @@ def test_fpp_eval_verifies_a_row_from_its_predictions(files, dataset, tmp_path, 
     ]
     content["protocol_version"] = "2.0.0"
     row.write_text(json.dumps(content))
-    for command, arguments in ((fpp_eval, words), (main, ["leaderboard", str(row)])):
-        assert command(arguments) == 2 and "was scored by protocol 2.0.0" in capsys.readouterr().err
+    for command, arguments in ((fpp_eval, words), (fpp_bench, ["leaderboard", row])):
+        assert "was scored by protocol 2.0.0" in refusal(command, *arguments)
 
 
 @pytest.mark.parametrize(
     ("stored", "computed", "agree"),
     [
-        (12.346, 12.3456, True),
         (12.346, 12.3455000001, True),
         (12.346, 12.3454999, False),
         (12.345, 12.3456, False),
         (10.0, 9.99996, True),
-        (0.0, 0.0, True),
         (1e-7, 0.0, False),
-        (-0.5, -0.500004, True),
         (0.5, -0.5, False),
         (None, 0.0, False),
-        (3, 3, True),
     ],
 )
 def test_a_mean_may_differ_by_what_five_digits_leave_open(stored, computed, agree):
@@ -209,15 +189,12 @@ def test_a_mean_may_differ_by_what_five_digits_leave_open(stored, computed, agre
     [
         (timing(2.0), "measured here", True),
         (timing(2.0), "verified", False),
-        (timing(2.0), "self-reported", False),
         (timing(2.0, provenance="self-reported"), "measured here", False),
         (None, "measured here", True),
         (None, "self-reported", False),
     ],
 )
-def test_what_only_its_author_measured_is_marked(
-    block, provenance, measured, dataset, tmp_path, capsys, listed, monkeypatch
-):
+def test_what_only_its_author_measured_is_marked(block, provenance, measured, dataset, tmp_path, listed, monkeypatch):
     """Time, phase reliance and robustness of a stranger's row, whatever the row says."""
     monkeypatch.setattr(rows, "SHIPPED_ROWS", tmp_path)
     result = write_result_file(tmp_path / "r.json", dataset, 1.0, timing=block)
@@ -229,25 +206,19 @@ def test_what_only_its_author_measured_is_marked(
     entry = read_entry(tmp_path / "row.json")
     assert entry.provenance == provenance
     assert entry.time_measured is measured
-    vouched_for_all = provenance == "measured here"
-    assert (columns.reliance(entry), columns.robustness(entry)) == (
-        ("0.62", "31.0") if vouched_for_all else ("0.62*", "31.0*")
-    )
+    mark = "" if provenance == "measured here" else "*"
+    assert (columns.reliance(entry), columns.robustness(entry)) == (f"0.62{mark}", f"31.0{mark}")
     assert entry.latency_ms == (250.0 if block is None else 2.0)
     board = rank([entry])
     index = page_files(board, [])["index.html"].decode()
     body = index.split("<tbody>")[1].split("</tbody>")[0]
     assert ('class="p-self-reported">self-reported</small>' in body) is not measured
     assert ("point p-" + provenance.replace(" ", "-") + ('"' if measured else " hollow")) in index
-    time = r"\| 250&#42; \|" if block is None else r"\| 2&#42; \|"
     readme = readme_block(board)
-    assert (
-        readme.startswith("No row yet")
-        if provenance == "self-reported"
-        else bool(re.search(time, readme)) is not measured
-    )
-    assert main(["leaderboard", str(tmp_path / "row.json"), "--paper", "none"]) == 0
-    assert (("0.25*" if block is None else "0.002*") in capsys.readouterr().out) is not measured
+    assert readme.startswith("No row yet") or ("&#42; |" in readme) is not measured
+    assert readme.startswith("No row yet") == (provenance == "self-reported")
+    table = printed(fpp_bench, "leaderboard", tmp_path / "row.json", "--paper", "none")
+    assert (("0.25*" if block is None else "0.002*") in table) is not measured
 
 
 @pytest.mark.parametrize(
@@ -257,63 +228,57 @@ def test_what_only_its_author_measured_is_marked(
         ({"provenance": "measured here"}, "provenance: is not a key"),
         ({"metrics": {}}, "metrics.overall_mae_mm: is missing"),
         ({"per_object": []}, "per_object"),
-        ({"note": "<b>"}, "note: is not a key"),
         ({"frames_class": "full sequence"}, "frames_class is full sequence, of 1 frames_used"),
         ({"created": "today"}, "created"),
         ({"predictions_sha256": "0"}, "predictions_sha256"),
     ],
 )
-def test_unsound_rows_are_refused_by_name(change, message, one_frame, tmp_path, capsys):
+def test_unsound_rows_are_refused_by_name(change, message, one_frame, tmp_path):
     path = write_row_of(one_frame, tmp_path / "odd.json")
-    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    assert main(["leaderboard", str(path)]) == 2
-    error = capsys.readouterr().err
+    path.write_text(json.dumps({**read_json(path), **change}))
+    error = refusal(fpp_bench, "leaderboard", path)
     assert "odd.json" in error and message in error
 
 
 @pytest.mark.parametrize(
-    ("part", "change", "message"),
+    ("key", "value", "message"),
     [
-        ("metrics", {"object_mae_mm": 1.0}, "metrics.object_mae_mm does not follow from per_object"),
-        ("metrics", {"object_mae_mm": None}, "metrics.object_mae_mm does not follow from per_object"),
-        ("intervals", {"object_mae_mm": [4.0, 4.1]}, "intervals.object_mae_mm does not follow from per_object"),
-        ("intervals", {"overall_rmse_mm": [None, None]}, "intervals.overall_rmse_mm does not follow"),
-        (0, {"object": "wooden_boards"}, "names an object twice"),
-        (0, {"samples": 1}, "do not add up"),
-        (0, {"void_pixels": 1}, "object, background and void pixels do not add up to 2 images"),
-        (0, {"object_mae_mm": None}, "object scores must be null exactly when the set is empty"),
-        (0, {"object_rmse_mm": 0.1}, "object RMSE is below its MAE"),
-        (0, {"without_object": 2}, "or no view has the set"),
-        ("dataset", {"samples": 5}, "per_object holds 4 samples, dataset.samples says 5"),
-        ("dataset", {"content": {"test/flags": "a" * 32}}, "dataset.content: expected hashes of"),
-        ("submission", {"name": "Fast\u3164and rough"}, "U+3164, which shows nothing"),
-        ("submission", {"name": "Fast a\u0301\u0302nd rough"}, "U+0302 on another mark"),
+        ("metrics.object_mae_mm", 1.0, "metrics.object_mae_mm does not follow from per_object"),
+        ("metrics.object_mae_mm", None, "metrics.object_mae_mm does not follow from per_object"),
+        ("intervals.object_mae_mm", [4.0, 4.1], "intervals.object_mae_mm does not follow from per_object"),
+        ("intervals.overall_rmse_mm", [None, None], "intervals.overall_rmse_mm does not follow"),
+        ("per_object.0.object", "wooden_boards", "names an object twice"),
+        ("per_object.0.samples", 1, "do not add up"),
+        ("per_object.0.void_pixels", 1, "object, background and void pixels do not add up to 2 images"),
+        ("per_object.0.object_mae_mm", None, "object scores must be null exactly when the set is empty"),
+        ("per_object.0.object_rmse_mm", 0.1, "object RMSE is below its MAE"),
+        ("per_object.0.without_object", 2, "or no view has the set"),
+        ("dataset.samples", 5, "per_object holds 4 samples, dataset.samples says 5"),
+        ("dataset.content", {"test/flags": "a" * 32}, "dataset.content: expected hashes of"),
+        ("submission.name", "Fast\u3164and rough", "U+3164, which shows nothing"),
     ],
 )
-def test_an_edited_row_contradicts_itself(part, change, message, files, tmp_path):
+def test_an_edited_row_contradicts_itself(key, value, message, files, tmp_path):
     path = write_row_of(files[0], tmp_path / "edited.json")
-    content = json.loads(path.read_text())
-    (content["per_object"][part] if part == 0 else content[part]).update(change)
-    if "samples" in change and part == 0:
-        content["dataset"]["samples"] = 3
-    path.write_text(json.dumps(content))
+    change_json(path, key, value)
+    if key == "per_object.0.samples":
+        change_json(path, "dataset.samples", 3)
     with pytest.raises(SubmissionError, match=re.escape(message)) as raised:
         read_entry(path)
     assert "edited.json" in str(raised.value)
 
 
-def test_a_row_is_of_one_result_and_small(files, dataset, tmp_path, capsys):
-    assert main(["leaderboard", *map(str, files[:2]), "--row", str(tmp_path / "r.json")]) == 2
-    assert "a row of one result, 2 were given" in capsys.readouterr().err
+def test_a_row_is_of_one_result_and_small(files, dataset, tmp_path):
+    assert "a row of one result, 2 were given" in refusal(
+        fpp_bench, "leaderboard", *files[:2], "--row", tmp_path / "r.json"
+    )
     large = write_result_file(tmp_path / "l.json", dataset, 1.0, settings={f"key {n}": "x" * 90 for n in range(150)})
-    assert main(["leaderboard", str(large), "--row", str(tmp_path / "r.json")]) == 2
-    assert "r.json: the row has" in capsys.readouterr().err and not (tmp_path / "r.json").exists()
+    assert "r.json: the row has" in refusal(fpp_bench, "leaderboard", large, "--row", tmp_path / "r.json")
+    assert not (tmp_path / "r.json").exists()
     path = write_row_of(files[0], tmp_path / "padded.json")
     path.write_bytes(path.read_bytes() + b" " * 12_000)
-    assert main(["leaderboard", str(path)]) == 2
-    assert "padded.json: the row has" in capsys.readouterr().err
-    assert main(["leaderboard", str(files[0]), "--row", str(tmp_path / "no" / "r.json")]) == 2
-    assert "can't be written" in capsys.readouterr().err
+    assert "padded.json: the row has" in refusal(fpp_bench, "leaderboard", path)
+    assert "can't be written" in refusal(fpp_bench, "leaderboard", files[0], "--row", tmp_path / "no" / "r.json")
 
 
 def test_more_within_a_tolerance_is_better(dataset, tmp_path):
@@ -323,10 +288,9 @@ def test_more_within_a_tolerance_is_better(dataset, tmp_path):
 
 
 @pytest.mark.parametrize("key", [key for key, metric in METRICS.items() if metric.helped_by_missing])
-def test_no_rank_by_what_missing_pixels_improve(key, dataset, tmp_path, capsys):
+def test_no_rank_by_what_missing_pixels_improve(key, dataset, tmp_path):
     path = write_result_file(tmp_path / "a.json", dataset, 1.0)
-    assert main(["leaderboard", str(path), "--sort", key]) == 2
-    assert "a method could lead by answering few pixels" in capsys.readouterr().err
+    assert "a method could lead by answering few pixels" in refusal(fpp_bench, "leaderboard", path, "--sort", key)
     with pytest.raises(SubmissionError, match=key):
         rank(read_entries([path]), key)
 
@@ -335,7 +299,7 @@ def test_unnamed_results_do_not_get_into_a_page(files, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(rows, "SHIPPED_ROWS", tmp_path / "none")
     (tmp_path / "result.json").write_bytes(files[0].read_bytes())
-    assert main(["leaderboard", "--page", str(tmp_path / "page")]) == 0
+    assert fpp_bench("leaderboard", "--page", tmp_path / "page") == 0
     assert "Fast and rough" not in (tmp_path / "page" / "index.html").read_text()
 
 

@@ -70,13 +70,10 @@ def test_what_is_no_fringe_of_this_model(folder, fringe):
     nan[3, 5] = np.nan
     for wrong, words in (
         (fringe[:16], r"of 32x48 px \(H x W\), the size unet-raw was trained at, got 16x48.*fringe period"),
-        (np.zeros((64, 96), np.uint8), "got 64x96"),
         (fringe.T, "got 48x32"),
         (fringe[..., None], r"one fringe image \(H, W\), got shape \(32, 48, 1\)"),
         (fringe.astype(np.uint16), "got uint16"),
-        (fringe.astype(np.int64) * 2, "got int64"),
         (fringe > 7, "got bool"),
-        (fringe.astype(np.complex64), "got complex64"),
         (fringe.astype(np.float32), r"within \[0, 1\], got values from 0 to 255"),
         (fringe / 255 - 0.1, "got values from -0.1"),
         (nan, "got values from nan"),
@@ -115,21 +112,18 @@ def test_every_network_comes_back_as_it_was(tmp_path, name):
     assert not model.network.training and not any(p.requires_grad for p in model.network.parameters())
 
 
-def test_loading_by_name_and_by_path(folder, monkeypatch):
-    from fpp_ml_bench.baselines.training import weights as weights_file
-
-    monkeypatch.setattr(weights_file, "SHIPPED", folder)
+def test_what_can_not_be_loaded(folder):
     assert baselines.load is load and baselines.build("unet", width=1).options["width"] == 1
-    by_name, by_path = baselines.load("raw"), baselines.load(folder / "raw.safetensors")
-    assert by_name.sha256 == by_path.sha256 and by_name.config.normalisation == "raw"
-    with pytest.raises(WeightsError, match="there are global, individual, raw"):
+    with pytest.raises(WeightsError, match="come with this package; there are hformer"):
         baselines.load("vit")
     with pytest.raises(WeightsError, match="device 'abacus' can't be used here"):
-        baselines.load("raw", device="abacus")
+        baselines.load(folder / "raw.safetensors", device="abacus")
     with pytest.raises(AttributeError, match="attribute 'train'"):
         baselines.train  # noqa: B018
 
 
-def test_importing_baselines_does_not_import_torch():
-    code = "import sys, fpp_ml_bench.baselines, fpp_ml_bench.baselines.method; sys.exit('torch' in sys.modules)"
+@pytest.mark.processes
+@pytest.mark.parametrize("module", ["baselines.method", "baselines.networks"])
+def test_importing_does_not_import_torch(module):
+    code = f"import sys, fpp_ml_bench.{module}; sys.exit('torch' in sys.modules)"
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from conftest import fpp_bench, fpp_eval, printed, refusal
 from scored_dataset import make_dataset, write_predictions
 from tiny_network import config_of, one_thread, rounding_error, tiny_network  # noqa: F401
 
@@ -13,8 +14,6 @@ from fpp_ml_bench.baselines.networks.model import fringe_batch, load
 from fpp_ml_bench.baselines.networks.network_method import NetworkMethod
 from fpp_ml_bench.baselines.run import captured_frames, predict_split
 from fpp_ml_bench.baselines.training.weights import save_weights
-from fpp_ml_bench.cli import main
-from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.errors import DatasetError, PredictionError, PublishError
 from fpp_ml_bench.evaluation.result.file import read_result, result_json, write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
@@ -90,11 +89,9 @@ def test_what_a_submission_says(dataset, weights, tmp_path, name, units, track, 
     assert about.method == f"unet-{name}" and about.frames_used == [0] and about.seeds == {"training": 42}
     assert {"torch", "numpy", "fpp_ml_bench"} <= set(about.software) and "numba" not in about.software
     settings = about.settings
-    assert (settings["network"], settings["width"], settings["loss"]) == ("unet", 2, "hybrid_l1_0.7")
-    assert (settings["preset"], settings["seed"], settings["epochs"]) == ("small", 42, 2)
-    assert (
-        len(settings["weights_sha256"]) == 64 and settings["normalisation"] == network_method.model.config.normalisation
-    )
+    trained = {"network": "unet", "width": 2, "loss": "hybrid_l1_0.7", "preset": "small", "seed": 42, "epochs": 2}
+    trained["normalisation"] = network_method.model.config.normalisation
+    assert trained.items() <= settings.items() and len(settings["weights_sha256"]) == 64
     assert settings.get("depth_range") == ("oracle" if units == "normalised" else None)
     written = yaml.safe_load((tmp_path / "p" / "submission.yaml").read_text())
     assert ("uses_ground_truth_mask" in written) == ("removed" in name)
@@ -114,27 +111,10 @@ def test_frames_with_the_background_removed_are_those_of_training(dataset, weigh
         assert captured_frames(dataset, method(weights, "full"), sample)[0].all()
 
 
-def test_a_batch_is_its_images(dataset, weights):
-    for name in ("raw", "full"):
-        network_method = method(weights, name, threads=1)
-        stacks = [captured_frames(dataset, network_method, sample) for sample in dataset.samples("test")]
-        together = network_method.predict_batch(stacks)
-        apart = [network_method.predict(stack) for stack in stacks]
-        tolerance = rounding_error(network_method.model.network, apart)
-        np.testing.assert_allclose(together, apart, rtol=0, atol=tolerance)
-    assert network_method.device == "cpu" and network_method.parameters == sum(
-        p.numel() for p in network_method.model.network.parameters()
-    )
-
-
 def test_frames_that_there_are_not(dataset, weights):
-    for name, options, words in (
-        ("raw", {"frame": 52}, "expected 0 to 51"),
-        ("raw", {"frame": -1}, "expected 0 to 51"),
-        ("raw", {"threads": 0}, "expected 1 or more"),
-    ):
-        with pytest.raises(PredictionError, match=words):
-            method(weights, name, **options)
+    for frame in (52, -1):
+        with pytest.raises(PredictionError, match="expected 0 to 51"):
+            method(weights, "raw", frame=frame)
     of_frame_7 = method(weights, "raw", frame=7)
     assert of_frame_7.frames_used == (7,) and of_frame_7.title == "UNet raw, frame 7"
     with pytest.raises(DatasetError, match="frame 7 is not stored here"):
@@ -143,7 +123,7 @@ def test_frames_that_there_are_not(dataset, weights):
         of_frame_7.predict([None] * 52)
 
 
-def test_the_frame_is_the_first_it_was_trained_on(tmp_path, dataset):
+def test_the_frame_is_the_first_it_was_trained_on(tmp_path):
     network = tiny_network(width=2)
     config = config_of(network, normalisation="raw", data_config="vertical", image_size=SIZE)
     save_weights(tmp_path / "v.safetensors", network, config)
@@ -157,29 +137,24 @@ def test_predict_score_and_time_on_the_command_line(dataset, weights, tmp_path, 
     out, data = str(tmp_path / "p"), str(dataset.path)
     for name, words in (("full", " --mode paper --json"), ("global", "p-global --json")):
         path = str(weights / f"{name}.safetensors")
-        assert main(["predict", path, data, "--out", f"{out}-{name}"]) == 0
-        printed = capsys.readouterr().out.splitlines()[-1]
-        assert words in printed and "depth_exact" not in printed
-        line = printed.removeprefix("next: fpp-eval ").split()
+        output = printed(fpp_bench, "predict", path, data, "--out", f"{out}-{name}").splitlines()[-1]
+        assert words in output and "depth_exact" not in output
+        line = output.removeprefix("next: fpp-eval ").split()
         line[-1] = result = str(tmp_path / f"{name}.json")
-        assert fpp_eval(line) == 0
+        assert fpp_eval(*line) == 0
         capsys.readouterr()
         timed = ["time", path, data, "--repeats", "2", "--into", result]
-        assert main(timed) == 0
-        assert "parameters" in capsys.readouterr().out
+        assert "parameters" in printed(fpp_bench, *timed)
         timing = read_result(tmp_path / f"{name}.json").timing
         assert timing.batched and timing.parameters > 1000 and timing.frames == 1 and timing.device == "cpu"
         assert "torch" in timing.software
-    assert main([*timed, "--threads", "2"]) == 2
-    assert "settings.threads is" in capsys.readouterr().err
+    assert "settings.threads is" in refusal(fpp_bench, *timed, "--threads", "2")
 
 
 @pytest.mark.parametrize(
     "arguments, words",
     [
-        (["magic"], "unknown method 'magic'; there are classical, classical-net, phase"),
         (["no-such.safetensors"], "expected a weights file (*.safetensors), found nothing"),
-        (["recipe.yaml"], "recipe.yaml"),
         (["{w}/raw.safetensors", "--steps", "4"], "--steps is an option of classical, classical-net, not of"),
         (["classical", "--device", "cpu"], "--device is an option of trained networks, not of classical"),
         (["{w}/raw.safetensors", "--frame", "3"], "frame 3 is not stored here"),
@@ -187,44 +162,39 @@ def test_predict_score_and_time_on_the_command_line(dataset, weights, tmp_path, 
         (["{w}/raw.safetensors", "--threads", "0"], "--threads 0: expected 1 or more"),
     ],
 )
-def test_refusals_on_the_command_line(dataset, weights, tmp_path, capsys, arguments, words):
+def test_refusals_on_the_command_line(dataset, weights, tmp_path, arguments, words):
     first, *rest = (part.format(w=weights) for part in arguments)
-    assert main(["predict", first, str(dataset.path), *rest, "--out", str(tmp_path / "p")]) == 2
-    assert words in capsys.readouterr().err
+    assert words in refusal(fpp_bench, "predict", first, dataset.path, *rest, "--out", tmp_path / "p")
     assert not (tmp_path / "p" / "submission.yaml").exists()
 
 
-def test_a_dataset_of_another_size(weights, tmp_path, capsys):
+def test_a_dataset_of_another_size(weights, tmp_path):
     larger = make_dataset(tmp_path / "other", (48, 48))
-    assert main(["predict", str(weights / "raw.safetensors"), str(larger.path), "--out", str(tmp_path / "p")]) == 2
-    assert "trained at 32x48 px (H x W)" in (message := capsys.readouterr().err) and "images of 48x48 px" in message
+    words = ["predict", weights / "raw.safetensors", larger.path, "--out", tmp_path / "p"]
+    message = refusal(fpp_bench, *words)
+    assert "trained at 32x48 px (H x W)" in message and "images of 48x48 px" in message
 
 
 # ---- tracks
 
 
-def test_a_given_mask_is_never_ranked_with_honest_rows(dataset, tmp_path, capsys):
+def test_a_given_mask_is_never_ranked_with_honest_rows(dataset, tmp_path):
     paths = []
-    for given_range in (False, True):
-        for given_mask in (False, True):
-            name = f"{given_range}-{given_mask}"
-            folder = write_predictions(
-                tmp_path / name,
-                dataset,
-                offset_mm=1.0,
-                name=name,
-                uses_ground_truth_range=given_range,
-                **({"uses_ground_truth_mask": True} if given_mask else {}),
-            )
-            result = evaluate(folder, dataset)
-            assert not differences(result, folder, dataset).lines
-            write_result(result, tmp_path / f"{name}.json")
-            assert read_result(tmp_path / f"{name}.json") == result
-            paths.append(tmp_path / f"{name}.json")
+    for name, given in (
+        ("honest", {}),
+        ("mask", {"uses_ground_truth_mask": True}),
+        ("both", {"uses_ground_truth_range": True, "uses_ground_truth_mask": True}),
+    ):
+        folder = write_predictions(tmp_path / name, dataset, offset_mm=1.0, name=name, **given)
+        result = evaluate(folder, dataset)
+        assert not differences(result, folder, dataset).lines
+        paths.append(tmp_path / f"{name}.json")
+        write_result(result, paths[-1])
+        assert read_result(paths[-1]) == result
     groups = rank(read_entries(paths))
-    assert [group.key.track for group in groups] == ["metric", "oracle mask", "oracle range", "oracle range + mask"]
+    assert [group.key.track for group in groups] == ["metric", "oracle mask", "oracle range + mask"]
     assert all(len(group.rows) == 1 for group in groups)
-    assert main(["leaderboard", *map(str, paths), "--page", str(tmp_path / "page")]) == 0
+    assert fpp_bench("leaderboard", *paths, "--page", tmp_path / "page") == 0
     page = unescape((tmp_path / "page" / "index.html").read_text())
     assert "oracle mask track" in page and "given the test sample's depth range and object mask" in page
     with pytest.raises(PublishError, match="no task for the oracle mask track"):

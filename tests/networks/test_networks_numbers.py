@@ -23,13 +23,11 @@ def _seed():
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-@pytest.mark.parametrize("value", [0.0, 0.5])
-@pytest.mark.parametrize("bfloat16", [False, True])
-@pytest.mark.parametrize("batch", [1, 2])
-def test_gradients_of_a_constant_image_are_finite(name, value, bfloat16, batch):
+@pytest.mark.parametrize(("value", "bfloat16"), [(0.5, False), (0.0, True)])
+def test_gradients_of_a_constant_image_are_finite(name, value, bfloat16):
     network = build(name, **SMALL[name])
     with torch.autocast("cpu", dtype=torch.bfloat16, enabled=bfloat16):
-        depth = network(torch.full((batch, 1, 64, 64), value))
+        depth = network(torch.full((1, 1, 64, 64), value))
     assert depth.isfinite().all()
     (depth.float() - 0.3).abs().mean().backward()
     for parameter in network.parameters():
@@ -62,8 +60,7 @@ def test_training_in_channels_last_has_the_gradients_of_float64(name):
     assert (gradient(torch.float32) - exact).norm() < 1e-2 * exact.norm()
 
 
-@pytest.mark.parametrize("affine", [False, True])
-@pytest.mark.parametrize("layout", [torch.contiguous_format, torch.channels_last])
+@pytest.mark.parametrize(("affine", "layout"), [(False, torch.channels_last), (True, torch.contiguous_format)])
 def test_instance_norm_is_torchs(affine, layout):
     ours, torchs = (InstanceNorm(3, affine=affine).double(), nn.InstanceNorm2d(3, affine=affine).double())
     for parameter in ours.parameters():
@@ -101,14 +98,6 @@ def test_unet_block_is_two_convolutions_normed_and_cut_at_zero():
     for convolution, norm in ((block[0], block[1]), (block[3], block[4])):
         expected = _normed(functional.conv2d(expected, convolution.weight, padding=1), norm).clamp_min(0)
     torch.testing.assert_close(block(x), expected, rtol=1e-10, atol=1e-10)
-
-
-def test_normalisation_over_the_image_does_not_see_brightness():
-    # It shows in the 1e-5 alone that is added to each map's variance.
-    fringe = 0.5 + 0.4 * torch.rand(2, 1, 64, 64, dtype=torch.float64)
-    network = build("unet", width=4).double().eval()
-    bright, dark = network(fringe), network(fringe / 2)
-    assert (bright - dark).abs().max() < 0.1 * bright.std()
 
 
 def test_attention_is_a_plain_softmax():

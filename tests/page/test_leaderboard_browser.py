@@ -1,16 +1,15 @@
 """The page in headless Chromium: sorting, filters, keyboard, both colour schemes, a phone, and hostile rows."""
 
 import os
-import re
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from board_rows import entry_with_errors, named_benchmarks, some_rows, timing, write_result_file
 from chromium import Browser
+from conftest import fpp_bench
 from scored_dataset import make_dataset
 
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.evaluation.submission.description import LearnedFrom
 from fpp_ml_bench.leaderboard import rows
 from fpp_ml_bench.leaderboard.page.page import predicted_samples, write_page
@@ -32,12 +31,12 @@ def page(tmp_path_factory):
         )
     )
     row = work / "row.json"
-    assert main(["leaderboard", str(files[0]), "--row", str(row)]) == 0
+    assert fpp_bench("leaderboard", files[0], "--row", row) == 0
     with pytest.MonkeyPatch.context() as patch:
         listed = rows.vouching_line(read_entries([row])[0].row, row.read_bytes(), "verified", "fpp-eval verify")
         (work / "vouched.txt").write_text(f"{listed}\n")
         patch.setattr(rows, "VOUCHED", work / "vouched.txt")
-        assert main(["leaderboard", str(row), *map(str, files[1:]), "--page", str(work / "page")]) == 0
+        assert fpp_bench("leaderboard", row, *files[1:], "--page", work / "page") == 0
     return work / "page" / "index.html"
 
 
@@ -53,7 +52,7 @@ def opened(browser, page):
     browser.open(page)
     yield browser
     assert browser.complaints() == []
-    assert all(address.startswith("file://") for address in browser.requests())
+    assert [address for address in browser.requests() if not address.startswith("file://")] == []
 
 
 NAMES = """[...document.querySelector('.ranking').querySelectorAll('tbody tr')].filter(row => !row.hidden)
@@ -76,12 +75,9 @@ def test_the_browser_would_tell(browser, tmp_path):
     assert [address.rsplit("/", 1)[1] for address in browser.requests()] == ["odd.html", "y.png"]
 
 
-def test_one_request_and_no_complaint(opened, page):
+def test_a_click_sorts_and_another_turns_it_round(opened, page):
     assert opened.requests() == [page.resolve().as_uri()]
     assert opened.run(NAMES) == RANKED and opened.run(SORTED) == "ascending"
-
-
-def test_a_click_sorts_and_another_turns_it_round(opened):
     opened.click(".ranking button[data-key=ms]")
     assert opened.run(NAMES) == ["Fast and rough", HOSTILE[:14], "Slow and fine", "Beaten"]
     assert opened.run("document.querySelector('.ranking [data-key=ms]').closest('th').ariaSort") == "ascending"
@@ -221,21 +217,6 @@ def test_a_view_can_be_linked_to(browser, page):
         assert browser.complaints() == []
 
 
-def test_a_screen_reader_finds_a_table_with_headers(opened):
-    opened.call("Accessibility.enable")
-    nodes = opened.call("Accessibility.getFullAXTree")["nodes"]
-    elements = [
-        (n.get("role", {}).get("value"), n.get("name", {}).get("value", "")) for n in nodes if not n.get("ignored")
-    ]
-    roles = [role for role, _ in elements]
-    assert roles.count("table") >= 2 and roles.count("row") >= 5 and "main" in roles and "navigation" in roles
-    heads = [name for role, name in elements if role == "columnheader"]
-    assert "Object MAE, mm" in heads and "Time, ms" in heads
-    assert ("rowheader") in roles
-    unnamed = {"button", "link", "textbox", "searchbox", "checkbox", "combobox", "image", "region", "group"}
-    assert [role for role, name in elements if role in unnamed - {"group"} and not name] == []
-
-
 def test_hostile_text_is_shown_and_does_nothing(opened, page):
     assert HOSTILE[:28] in opened.run("document.body.innerText")
     assert opened.run("typeof window.hacked") == "undefined"
@@ -248,8 +229,7 @@ def test_hostile_text_is_shown_and_does_nothing(opened, page):
         assert opened.run("document.querySelectorAll('table').length") >= 2
 
 
-@pytest.mark.parametrize("dark", [False, True])
-@pytest.mark.parametrize("width", [320, 375, 768, 1440])
+@pytest.mark.parametrize(("width", "dark"), [(320, False), (375, True), (768, False), (1440, True)])
 def test_every_width_in_both_schemes(browser, page, width, dark):
     for path in (page, sorted((page.parent / "submissions").glob("*.html"))[0]):
         browser.open(path, width, 844, dark)
@@ -265,22 +245,16 @@ def test_every_width_in_both_schemes(browser, page, width, dark):
 def shipped_page(tmp_path_factory):
     """The page of the rows that ship with the package."""
     out = tmp_path_factory.mktemp("shipped") / "page"
-    assert main(["leaderboard", "--page", str(out)]) == 0
+    assert fpp_bench("leaderboard", "--page", out) == 0
     return out / "index.html"
 
 
-def test_the_shipped_page_has_all_rows_and_the_papers_errors_apart(shipped_page):
+def test_the_shipped_page_has_all_rows(shipped_page):
     groups = rank(read_entries(shipped_rows()))
     shown = more_than_trivial(groups)
     pages = sum(path.is_file() for path in shipped_page.parent.rglob("*"))
     assert pages == 3 + sum(len(group.rows) for group in shown)
     assert all(is_trivial(row) for group in groups if group not in shown for row in group.rows)
-    index = shipped_page.read_text(encoding="utf-8")
-    paper = index[index.index('<section id="reported">') :]
-    assert "14.54" in paper and "given the test sample" in paper and "Other data, not ranked" in paper
-    above = index[: index.index('<section id="reported">')]
-    # 214.54 is a place in a picture, 14.544 an error of ours.
-    assert not re.search(r"(?<![\d.])14\.54(?!\d)", above)
 
 
 @pytest.mark.parametrize("width", [390, 1240])

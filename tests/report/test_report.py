@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 from chromium import Browser
+from conftest import fpp_eval
 from scored_dataset import make_dataset, write_description, write_predictions
 
-from fpp_ml_bench.cli import main_eval as fpp_eval
 from fpp_ml_bench.errors import DatasetError, PredictionError, SubmissionError
 from fpp_ml_bench.evaluation.report.report_page import (
     CLIP_PERCENTILE,
@@ -23,11 +23,6 @@ from fpp_ml_bench.evaluation.report.report_page import (
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.loaders.pictures import panel_figure
 from fpp_ml_bench.style import figure_png
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +145,7 @@ def test_command_and_browser(dataset, tmp_path):
     folder = write_predictions(
         tmp_path / "p", dataset, offset_mm=1.0, noise_mm=2.0, name="</title><script>hacked = 1</script>"
     )
-    assert fpp_eval([str(folder), str(dataset.path), "--report", str(tmp_path / "out")]) == 0
+    assert fpp_eval(folder, dataset.path, "--report", tmp_path / "out") == 0
     page = tmp_path / "out" / "index.html"
     browser = Browser()
     try:

@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import tiny_settings
+from conftest import fpp_eval, read_json, refusal, tiny_settings
 from scored_dataset import make_dataset, name_benchmarks, write_predictions
 
-from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.result import model
 from fpp_ml_bench.evaluation.result.file import read_result, result_json, write_result
@@ -24,11 +23,6 @@ from fpp_ml_bench.loaders.storage.benchmark import Benchmark
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
 
 OTHER = {"test/depth": "e" * 32, "test/flags": "e" * 32}
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
 
 
 @pytest.fixture
@@ -51,7 +45,7 @@ def result_file(dataset, folder):
 
 def change_dataset(path, **changes):
     """Change keys of the file's dataset block; ``None`` removes a key."""
-    content = json.loads(path.read_text())
+    content = read_json(path)
     for key, value in changes.items():
         content["dataset"][key] = value
         if value is None:
@@ -61,21 +55,21 @@ def change_dataset(path, **changes):
 
 def test_a_result_on_a_benchmark_says_its_name_and_version(named, tmp_path, capsys):
     path = result_file(named, tmp_path)
-    assert json.loads(path.read_text())["dataset"]["benchmark"] == {"name": "tiny-bench", "version": 4}
+    assert read_json(path)["dataset"]["benchmark"] == {"name": "tiny-bench", "version": 4}
     assert result_json(read_result(path)) == path.read_bytes()
     command = [str(tmp_path / "predictions"), str(named.path), "--report", str(tmp_path / "report")]
-    assert main(command) == 0
+    assert fpp_eval(*command) == 0
     printed = capsys.readouterr()
     truth = read_result(path).dataset.truth
     assert f"(tiny-bench version 4, content {truth[:8]})" in printed.out and printed.err == ""
     assert "tiny-bench version 4" in (tmp_path / "report" / "index.html").read_text()
-    assert main(["verify", str(path), str(tmp_path / "predictions"), str(named.path)]) == 0
+    assert fpp_eval("verify", path, tmp_path / "predictions", named.path) == 0
 
 
 def test_a_result_on_any_other_dataset_has_no_such_key(dataset, tmp_path, capsys):
     path = result_file(dataset, tmp_path)
-    assert "benchmark" not in json.loads(path.read_text())["dataset"]
-    assert main([str(tmp_path / "predictions"), str(dataset.path)]) == 0
+    assert "benchmark" not in read_json(path)["dataset"]
+    assert fpp_eval(tmp_path / "predictions", dataset.path) == 0
     printed = capsys.readouterr()
     truth = read_result(path).dataset.truth
     assert f"(no named benchmark, content {truth[:8]})" in printed.out and printed.err == ""
@@ -85,7 +79,7 @@ def test_settings_of_a_benchmark_with_other_bytes_are_warned_of(dataset, tmp_pat
     intended = Benchmark("tiny-bench", 4, "mini", 32)
     monkeypatch.setattr(benchmarks, "intended_benchmark", lambda manifest: intended)
     folder = write_predictions(tmp_path / "predictions", dataset)
-    assert main([str(folder), str(dataset.path), "--json", str(tmp_path / "r.json")]) == 0
+    assert fpp_eval(folder, dataset.path, "--json", tmp_path / "r.json") == 0
     printed = capsys.readouterr()
     assert printed.err.startswith(f"fpp-eval: warning: {dataset.path}: built with the settings of tiny-bench version 4")
     assert "warning" not in printed.out and read_result(tmp_path / "r.json").dataset.benchmark is None
@@ -103,12 +97,8 @@ def test_settings_of_a_benchmark_with_other_bytes_are_warned_of(dataset, tmp_pat
         ({"content": OTHER, "benchmark": {"name": "nobody-knows", "version": 1}}, "content is not that benchmark's"),
         ({"content": {}}, "content: .*at least 1"),
         ({"content": {"test/depth": "e" * 32}, "benchmark": None}, None),
-        ({"content": {**OTHER, "../x": "e" * 32}}, "content"),
         ({"content": {**OTHER, "test/frame_00": "e" * 32}, "benchmark": None}, "expected hashes of test/depth"),
-        ({"content": {"train/depth": "e" * 32}, "benchmark": None}, "expected hashes of"),
-        ({"benchmark": {"name": "tiny-bench", "version": "4"}}, "benchmark.version: .*integer"),
         ({"benchmark": {"name": "tiny-bench"}}, "benchmark.version: is missing"),
-        ({"benchmark": {"name": "x\x1b[2J", "version": 4}}, r"U\+001B"),
         ({"benchmark": {"name": "tiny-bench", "version": 4, "size": 32}}, "size: is not a key"),
     ],
 )
@@ -122,13 +112,13 @@ def test_a_claim_that_contradicts_the_content_is_refused(changes, message, named
         read_result(path)
 
 
-def test_compare_and_verify_name_both(named, dataset, tmp_path, capsys, monkeypatch):
+def test_compare_and_verify_name_both(named, dataset, tmp_path, capsys):
     path, other = result_file(named, tmp_path), result_file(named, tmp_path / "else")
     change_dataset(other, content=OTHER, benchmark=None)
-    assert main(["compare", str(path), str(other)]) == 2
+    assert fpp_eval("compare", path, other) == 2
     first, second = (read_result(file).dataset.identity for file in (path, other))
     assert f"dataset: {first} against {second}" in capsys.readouterr().err and first.startswith("tiny-bench version 4")
-    assert main(["verify", str(other), str(tmp_path / "predictions"), str(named.path)]) == 1
+    assert fpp_eval("verify", other, tmp_path / "predictions", named.path) == 1
     printed = capsys.readouterr().out
     assert "dataset.content.test/depth: " + "e" * 32 in printed and named.content["test/depth"] in printed
 
@@ -160,11 +150,10 @@ def test_other_counts_of_a_named_benchmark_are_refused(named, tmp_path, monkeypa
 
     refused(list(map(with_void, rows)), "object pixels of 'power_drill', this file says")
     refused(rows[:2], "has the object 'wooden_boards'")
-    refused([row | {"object": "power_drill"} for row in rows], "has the object 'wooden_boards'")
     refused([row | {"object": f"ball{number}"} for number, row in enumerate(rows)], "has no object 'ball0'")
 
 
-def test_a_dataset_that_was_changed_is_not_scored(named, tmp_path, capsys):
+def test_a_dataset_that_was_changed_is_not_scored(named, tmp_path):
     """Its depth overwritten by the predictions: an error of 0 under the benchmark's name, if it were believed."""
     copy = shutil.copytree(named.path, tmp_path / "copy")
     predictions = write_predictions(tmp_path / "p", named, offset_mm=100.0)
@@ -177,14 +166,13 @@ def test_a_dataset_that_was_changed_is_not_scored(named, tmp_path, capsys):
     assert changed != bytes_before and len(changed) == len(bytes_before)
     (copy / shard.path).write_bytes(changed)
     command = [str(predictions), str(copy), "--json", str(tmp_path / "r.json")]
-    assert main(command) == 2
-    error = capsys.readouterr().err
+    error = refusal(fpp_eval, *command)
     assert str(copy) in error and "depth of split test is not what manifest.json says" in error
     # A manifest that was made to fit: a dataset of its own, without the benchmark's name.
     hashes = {name: image_hash(DatasetFolder(copy).depth_mm(name)) for name in opened.samples("test")}
     content = {**opened.content, "test/depth": column_hash(hashes)}
     replace(opened.manifest, content=content).write(copy)
-    assert main(command) == 0
+    assert fpp_eval(*command) == 0
     assert read_result(tmp_path / "r.json").dataset.benchmark is None
 
 
@@ -200,26 +188,3 @@ def test_a_build_that_lacks_columns_is_still_the_benchmark(tmp_path, monkeypatch
         results.append(evaluate(write_predictions(tmp_path / str(number), opened, offset_mm=1.0), opened))
     assert results[0].dataset.benchmark == results[1].dataset.benchmark and results[1].dataset.benchmark is not None
     assert results[0].dataset.truth == results[1].dataset.truth and results[0].metrics == results[1].metrics
-
-
-def test_the_schema_describes_the_key(named, tmp_path, capsys):
-    import jsonschema
-
-    assert main(["schema"]) == 0
-    schema = json.loads(capsys.readouterr().out)
-    assert "4.0.0" in schema["title"] and set(schema["$defs"]["BenchmarkInfo"]["required"]) == {"name", "version"}
-    content = json.loads(result_file(named, tmp_path).read_text())
-    jsonschema.validate(content, schema)
-    del content["dataset"]["benchmark"]
-    jsonschema.validate(content, schema)
-    with pytest.raises(jsonschema.ValidationError):
-        content["dataset"]["benchmark"] = "tiny-bench"
-        jsonschema.validate(content, schema)
-
-
-def test_the_scores_do_not_depend_on_the_name(dataset, tmp_path, monkeypatch):
-    folder = write_predictions(tmp_path / "predictions", dataset, noise_mm=2.0)
-    unnamed = evaluate(folder, dataset)
-    name_benchmarks(monkeypatch, tmp_path / "facts", (Benchmark("tiny-bench", 4, "mini", 32), dataset))
-    assert evaluate(folder, dataset).metrics == unnamed.metrics
-    assert np.isfinite(unnamed.metrics.object_mae_mm)

@@ -7,21 +7,16 @@ from hashlib import sha256
 
 import numpy as np
 import pytest
-from scored_dataset import DESCRIPTION, make_dataset, write_predictions
+from conftest import fpp_eval, printed, read_json
+from scored_dataset import DESCRIPTION, change_json, make_dataset, write_predictions
 
 from fpp_ml_bench import machine as hardware
-from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
 from fpp_ml_bench.evaluation.result.file import read_result, write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.loaders.sample import column_hash
 from fpp_ml_bench.loaders.storage.store import DatasetFolder
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
 
 
 @pytest.fixture
@@ -31,24 +26,8 @@ def predictions(tmp_path, dataset):
 
 def scored(folder, dataset, tmp_path, *arguments):
     path = tmp_path / "result.json"
-    assert main([str(folder), str(dataset.path), "--json", str(path), *arguments]) == 0
+    assert fpp_eval(folder, dataset.path, "--json", path, *arguments) == 0
     return json.loads(path.read_text(), parse_constant=lambda name: pytest.fail(f"{name} in the JSON"))
-
-
-def test_scores_equal_an_independent_computation(dataset, predictions, tmp_path):
-    result = scored(predictions, dataset, tmp_path)
-    rows = []
-    for sample in dataset.samples("test"):
-        target = dataset.depth_mm(sample).astype(np.longdouble)
-        error = np.load(predictions / f"{sample}.npy").astype(np.longdouble) - target
-        sets = {"overall": target > -1, "object": target > 0, "background": target == 0}
-        row = {f"{name}_mae_mm": np.abs(error[pixels]).mean() for name, pixels in sets.items()}
-        rows.append(row | {f"{name}_rmse_mm": np.sqrt((error[pixels] ** 2).mean()) for name, pixels in sets.items()})
-    assert [row["sample"] for row in result["per_sample"]] == dataset.samples("test")
-    for key in HEADLINE:
-        assert result["metrics"][key] == pytest.approx(float(np.mean([row[key] for row in rows])), rel=1e-13)
-        for scores, expected in zip(result["per_sample"], rows, strict=True):
-            assert scores[key] == pytest.approx(float(expected[key]), rel=1e-13)
 
 
 def test_result_says_what_was_scored_on_what(dataset, predictions, tmp_path):
@@ -73,20 +52,16 @@ def test_result_says_what_was_scored_on_what(dataset, predictions, tmp_path):
     assert result["environment"]["packages"]["numpy"] == np.__version__
 
 
-def test_ground_truth_scores_zero_and_shift_scores_itself(dataset, tmp_path, capsys):
-    truth = write_predictions(tmp_path / "truth", dataset)
-    result = scored(truth, dataset, tmp_path)
-    for scores in (result["metrics"], result["median"], result["pooled"], *result["per_sample"]):
-        assert {value for key, value in scores.items() if key.endswith("_mm")} - {None} == {0.0}
-    assert "A method" in capsys.readouterr().out
-    exact = scored(truth, dataset, tmp_path, "--target", "depth_exact")
-    assert exact["metrics"]["object_mae_mm"] == 0.5 and exact["metrics"]["background_mae_mm"] == 0.0
-    shifted = scored(write_predictions(tmp_path / "shifted", dataset, offset_mm=4.0), dataset, tmp_path)
+def test_a_shift_scores_itself_against_either_depth(dataset, tmp_path, capsys):
+    folder = write_predictions(tmp_path / "p", dataset, offset_mm=4.0)
+    exact = scored(folder, dataset, tmp_path, "--target", "depth_exact")
+    assert exact["metrics"]["object_mae_mm"] == 3.5 and exact["metrics"]["background_mae_mm"] == 4.0
+    shifted = scored(folder, dataset, tmp_path)
     assert shifted["metrics"]["overall_rmse_mm"] == shifted["pooled"]["background_mae_mm"] == 4.0
+    assert "A method" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("kind", ["<f2", "<f4", ">f4", "<f8"])
-@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize(("kind", "order"), [("<f2", "C"), (">f4", "F"), ("<f8", "C")])
 def test_every_real_float_format_is_read(kind, order, dataset, tmp_path):
     folder = write_predictions(tmp_path / "predictions", dataset)
     for path in folder.glob("*.npy"):
@@ -128,7 +103,7 @@ def test_sample_without_object_has_no_object_score(dataset, tmp_path):
     folder = write_predictions(tmp_path / "predictions", data, offset_mm=3.0)
     written = tmp_path / "result.json"
     write_result(evaluate(folder, data), written)
-    result = json.loads(written.read_text())
+    result = read_json(written)
     assert read_result(written).samples_without_object == 1
     empty = [row for row in result["per_sample"] if row["object_pixels"] == 0]
     assert len(empty) == result["samples_without_object"] == 1
@@ -145,61 +120,38 @@ def test_same_result_twice_and_from_one_thread(dataset, predictions, monkeypatch
     assert first.model_copy(update={"created": ""}) == second.model_copy(update={"created": ""})
 
 
-def test_table_shows_submitted_text_as_text(dataset, tmp_path, capsys):
+def test_table_shows_submitted_text_as_text(dataset, tmp_path):
     folder = write_predictions(tmp_path / "predictions", dataset, name="[bold red]x[/] :smile: [link=http://e]y[/link]")
-    assert main([str(folder), str(dataset.path)]) == 0
-    assert "[bold red]x[/] :smile: [link=http://e]y[/link]" in capsys.readouterr().out
-
-
-def test_result_file_survives_reading(dataset, predictions, tmp_path):
-    result = evaluate(predictions, dataset)
-    write_result(result, tmp_path / "r.json")
-    assert read_result(tmp_path / "r.json") == result
-
-
-def edit(path):
-    """A function that changes a value of a JSON document; ``...`` removes the key."""
-
-    def change(content, value):
-        *parents, last = path
-        for key in parents:
-            content = content[key]
-        if value is ...:
-            del content[last]
-        else:
-            content[last] = value
-
-    return change
+    assert "[bold red]x[/] :smile: [link=http://e]y[/link]" in printed(fpp_eval, folder, dataset.path)
 
 
 EDITS = {
-    "other schema": (["schema_version"], "1.0.0", "expected .* 4.0.0, got schema_version 1.0.0"),
-    "no schema": (["schema_version"], ..., "no schema_version"),
-    "unknown key": (["rank"], 1, "rank: is not a key"),
-    "missing key": (["target"], ..., "target: is missing"),
-    "negative": (["metrics", "object_mae_mm"], -1.0, "metrics.object_mae_mm: .*greater"),
-    "text": (["metrics", "object_mae_mm"], "0.1", "metrics.object_mae_mm: .*number"),
-    "boolean": (["metrics", "object_mae_mm"], True, "metrics.object_mae_mm: .*number"),
-    "better headline": (["metrics", "object_mae_mm"], 0.001, "metrics.object_mae_mm does not follow from per_sample"),
-    "better median": (["median", "overall_rmse_mm"], 0.001, "median.overall_rmse_mm does not follow"),
-    "better pool": (["pooled", "overall_mae_mm"], 0.001, "pooled.overall_mae_mm does not follow"),
-    "better sample": (["per_sample", 0, "object_mae_mm"], 0.001, "bias or shift-free MAE is above the MAE"),
-    "impossible RMSE": (["per_sample", 0, "object_rmse_mm"], 0.001, "RMSE is below its MAE"),
-    "null score": (["per_sample", 0, "object_mae_mm"], None, "null exactly when the set is empty"),
-    "pixels": (["per_sample", 0, "object_pixels"], 5, "do not add up"),
-    "no void": (["per_sample", 0, "void_pixels"], ..., "void_pixels is missing"),
-    "void share": (["per_sample", 0, "void_share"], 0.5, "void_share does not follow from void_pixels"),
-    "unlit": (["per_sample", 0, "unlit_pixels"], 0, "unlit_pixels is extra by these rules"),
-    "sample twice": (["per_sample", 0, "sample"], "power_drill_A60", "names a sample twice"),
-    "share": (["per_sample", 0, "object_missing_share"], 1.5, "less than or equal to 1"),
-    "hash": (["per_sample", 0, "prediction_sha256"], "0" * 63, "prediction_sha256"),
-    "fingerprint": (["dataset", "fingerprint"], "x" * 64, "fingerprint"),
-    "sample count": (["dataset", "samples"], 5, "holds 4 samples, dataset.samples says 5"),
-    "empty samples": (["samples_without_object"], 1, "samples_without_object is not the number"),
-    "split": (["dataset", "split"], "tests", "dataset.split"),
-    "time": (["created"], "yesterday", "created"),
-    "name": (["submission", "name"], "x\x1b[2J", "U\\+001B"),
-    "long name": (["submission", "name"], "x" * 10_000_000, "at most 200 characters"),
+    "other schema": ("schema_version", "1.0.0", "expected .* 4.0.0, got schema_version 1.0.0"),
+    "no schema": ("schema_version", ..., "no schema_version"),
+    "unknown key": ("rank", 1, "rank: is not a key"),
+    "missing key": ("target", ..., "target: is missing"),
+    "negative": ("metrics.object_mae_mm", -1.0, "metrics.object_mae_mm: .*greater"),
+    "text": ("metrics.object_mae_mm", "0.1", "metrics.object_mae_mm: .*number"),
+    "better headline": ("metrics.object_mae_mm", 0.001, "metrics.object_mae_mm does not follow from per_sample"),
+    "better median": ("median.overall_rmse_mm", 0.001, "median.overall_rmse_mm does not follow"),
+    "better pool": ("pooled.overall_mae_mm", 0.001, "pooled.overall_mae_mm does not follow"),
+    "better sample": ("per_sample.0.object_mae_mm", 0.001, "bias or shift-free MAE is above the MAE"),
+    "impossible RMSE": ("per_sample.0.object_rmse_mm", 0.001, "RMSE is below its MAE"),
+    "null score": ("per_sample.0.object_mae_mm", None, "null exactly when the set is empty"),
+    "pixels": ("per_sample.0.object_pixels", 5, "do not add up"),
+    "no void": ("per_sample.0.void_pixels", ..., "void_pixels is missing"),
+    "void share": ("per_sample.0.void_share", 0.5, "void_share does not follow from void_pixels"),
+    "unlit": ("per_sample.0.unlit_pixels", 0, "unlit_pixels is extra by these rules"),
+    "sample twice": ("per_sample.0.sample", "power_drill_A60", "names a sample twice"),
+    "share": ("per_sample.0.object_missing_share", 1.5, "less than or equal to 1"),
+    "hash": ("per_sample.0.prediction_sha256", "0" * 63, "prediction_sha256"),
+    "fingerprint": ("dataset.fingerprint", "x" * 64, "fingerprint"),
+    "sample count": ("dataset.samples", 5, "holds 4 samples, dataset.samples says 5"),
+    "empty samples": ("samples_without_object", 1, "samples_without_object is not the number"),
+    "split": ("dataset.split", "tests", "dataset.split"),
+    "time": ("created", "yesterday", "created"),
+    "name": ("submission.name", "x\x1b[2J", "U\\+001B"),
+    "long name": ("submission.name", "x" * 10_000_000, "at most 200 characters"),
 }
 
 
@@ -207,9 +159,7 @@ EDITS = {
 def test_edited_result_is_refused(case, dataset, predictions, tmp_path):
     path, value, message = EDITS[case]
     write_result(evaluate(predictions, dataset), tmp_path / "r.json")
-    content = json.loads((tmp_path / "r.json").read_text())
-    edit(path)(content, value)
-    (tmp_path / "r.json").write_text(json.dumps(content))
+    change_json(tmp_path / "r.json", path, value)
     with pytest.raises(SubmissionError, match=message) as refusal:
         read_result(tmp_path / "r.json")
     assert str(tmp_path / "r.json") in str(refusal.value)
@@ -221,9 +171,7 @@ def test_edited_result_is_refused(case, dataset, predictions, tmp_path):
     [
         ('{"schema_version": "1.0.0", "schema_version": "1.0.0"}', "is given twice"),
         ('{"schema_version": NaN}', "NaN is no number"),
-        ('{"schema_version": -Infinity}', "-Infinity is no number"),
         ('{"a": ', "is no valid JSON"),
-        ("", "is no valid JSON"),
         ("[]", "no schema_version"),
         ("[" * 100_000, "nested too deeply"),
         (b"\xff\xfe", "expected UTF-8"),
@@ -241,7 +189,7 @@ def test_number_too_large_for_a_float_is_refused(dataset, predictions, tmp_path)
     path = tmp_path / "r.json"
     write_result(evaluate(predictions, dataset), path)
     for number in ("1e999", "1" + "0" * 400):
-        content = json.loads(path.read_text())
+        content = read_json(path)
         content["metrics"]["object_mae_mm"] = "HERE"
         (tmp_path / "x.json").write_text(json.dumps(content).replace('"HERE"', number))
         with pytest.raises(SubmissionError, match=r"metrics\.object_mae_mm"):
@@ -255,10 +203,11 @@ def test_unwritable_result_is_an_error(dataset, predictions, tmp_path, monkeypat
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(result_io, "write_atomically", full)
-    assert main([str(predictions), str(dataset.path), "--json", str(tmp_path / "r.json")]) == 2
+    assert fpp_eval(predictions, dataset.path, "--json", tmp_path / "r.json") == 2
     assert not (tmp_path / "r.json").exists()
 
 
+@pytest.mark.processes
 def test_help_is_light_and_scoring_needs_no_torch(dataset, predictions):
     """In fresh interpreters, since a command starts as fast as its imports."""
     script = "import sys\nfrom fpp_ml_bench.cli import main_eval as main\n"

@@ -5,13 +5,13 @@ import re
 
 import pytest
 from board_rows import reliance, write_result_file
-from scored_dataset import make_dataset
+from conftest import fpp_bench, printed, read_json, refusal
+from scored_dataset import change_json
 from upkeep import readme_block
 
 from fpp_ml_bench.baselines.timing import check_same_method
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.errors import SubmissionError
-from fpp_ml_bench.evaluation.result.file import json_schema, read_result, result_json
+from fpp_ml_bench.evaluation.result.file import read_result, result_json
 from fpp_ml_bench.evaluation.result.parts import Reliance, RelianceParts
 from fpp_ml_bench.leaderboard.page.page import page_files
 from fpp_ml_bench.leaderboard.ranking import rank, read_entries
@@ -24,27 +24,22 @@ def block(**changes):
     return {**reliance().model_dump(), "weights_sha256": SHA, **changes}
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
-
-
 @pytest.fixture
 def file(tmp_path, dataset):
     return write_result_file(tmp_path / "row.json", dataset, 1.0, settings={"weights_sha256": SHA})
 
 
 def test_a_result_without_it_stays_as_it_was(file):
-    assert "reliance" not in json.loads(file.read_text())
+    assert "reliance" not in read_json(file)
     assert read_result(file).reliance is None
     assert result_json(read_result(file)) == file.read_bytes()
 
 
 @pytest.mark.parametrize("row", [False, True], ids=["result", "row"])
-def test_it_is_written_read_back_and_replaced(row, file, tmp_path, capsys):
+def test_it_is_written_read_back_and_replaced(row, file, tmp_path):
     if row:
         made = tmp_path / "made.json"
-        assert main(["leaderboard", str(file), "--row", str(made)]) == 0
+        assert fpp_bench("leaderboard", file, "--row", made) == 0
         file = made
     entry = read_entry(file)
     write_block(entry, Reliance(**block(score=0.1)))
@@ -64,13 +59,10 @@ def test_it_is_written_read_back_and_replaced(row, file, tmp_path, capsys):
     "change, message",
     [
         ({"score": 1.5}, "reliance.score"),
-        ({"score": "0.5"}, "reliance.score"),
         ({"interval": [0.9, 0.1]}, "expected 0 <= low <= high <= 1"),
         ({"interval": [None, 0.1]}, "two numbers or two nulls"),
-        ({"interval": [0.1]}, "reliance.interval"),
         ({"version": "0.9.0"}, "reliance.version"),
         ({"weights_sha256": "c" * 64}, "measured on weights cccc"),
-        ({"weights_sha256": None}, "measured on weights None"),
         ({"units": "normalised"}, "an answer in normalised, scored was one in mm"),
         ({"objects": 5}, "objects is above samples"),
         ({"parts": {"follows_phase": 0.5}}, "is missing"),
@@ -78,18 +70,13 @@ def test_it_is_written_read_back_and_replaced(row, file, tmp_path, capsys):
     ],
 )
 def test_what_contradicts_the_result_is_refused_by_name(change, message, file):
-    content = json.loads(file.read_text())
-    content["reliance"] = block(**change)
-    file.write_text(json.dumps(content))
+    change_json(file, "reliance", block(**change))
     with pytest.raises(SubmissionError, match=re.escape(message)) as caught:
         read_result(file)
     assert str(file) in str(caught.value)
 
 
-def test_the_schema_knows_it_and_every_part_has_words():
-    schema = json_schema("result")
-    assert "reliance" in schema["properties"] and "reliance" not in schema["required"]
-    assert set(schema["$defs"]["Reliance"]["properties"]) == set(Reliance.model_fields)
+def test_every_part_has_words():
     parts = RelianceParts.model_construct(**dict.fromkeys(RelianceParts.model_fields))
     assert len(parts.titled()) == len(RelianceParts.model_fields) and all(parts.titled())
 
@@ -142,16 +129,16 @@ def test_the_command_measures_and_writes(tiny, tmp_path, capsys, dataset):
     settings = {"direction": "horizontal", "steps": 3}
     row = write_result_file(tmp_path / "r.json", dataset, 1.0, method="classical", frames_used=used, settings=settings)
     options = ["--steps", "3", "--direction", "horizontal", "--views", "1"]
-    assert main(["reliance", "classical", str(tiny), *options, "--into", str(row), "--json", str(tmp_path / "b")]) == 0
+    assert fpp_bench("reliance", "classical", tiny, *options, "--into", row, "--json", tmp_path / "b") == 0
     written = read_result(row).reliance
     assert written is not None and written.score > 0.9 and written.interval == [None, None]  # one test object
-    assert Reliance(**json.loads((tmp_path / "b").read_text())) == written
+    assert Reliance(**read_json(tmp_path / "b")) == written
     assert "phase reliance, 0 to 1" in capsys.readouterr().out
-    assert main(["reliance", "classical", str(tiny), "--steps", "6", "--into", str(row)]) == 2
-    assert "very method that was scored" in capsys.readouterr().err
-    assert main(["reliance", "classical", str(tiny), "--views", "7"]) == 2
+    assert "very method that was scored" in refusal(
+        fpp_bench, "reliance", "classical", tiny, "--steps", "6", "--into", row
+    )
+    assert fpp_bench("reliance", "classical", tiny, "--views", "7") == 2
     capsys.readouterr()
-    assert main(["reliance", "constant", str(tiny), "--views", "1"]) == 0
-    out = capsys.readouterr().out
+    out = printed(fpp_bench, "reliance", "constant", tiny, "--views", "1")
     assert "Constant depth: standoff: gives the same answer whatever phase, light and outline" in out
     assert "follows" not in out and "changes" not in out

@@ -6,9 +6,10 @@ from extended_precision import sample_scores
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
-from scored_dataset import disk_depth
 
-from fpp_ml_bench.evaluation.metrics import METRICS
+from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
+from fpp_ml_bench.evaluation.result.model import over_samples
+from fpp_ml_bench.evaluation.result.parts import AGREES, Metrics
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
 
 
@@ -23,9 +24,10 @@ def cases(draw):
     scale = 10.0 ** draw(st.integers(-largest, largest))
     cover = draw(st.sampled_from([0.0, 0.03, 0.5, 0.97, 1.0]))
     target = np.where(ndimage.uniform_filter(rng.random(shape), 3) < cover, rng.uniform(0.5, 1.0, shape), 0.0) * scale
-    noise = (
-        rng.normal(0, 1, shape) * scale * draw(st.sampled_from([0.0, 1e-3, 1.0, 1e3 if kind is np.float64 else 1.0]))
-    )
+    few = rng.random(shape) < 0.05
+    # An offset of 0.7 is at no power of ten one of the tolerances, where rounding would decide.
+    spread = draw(st.sampled_from([rng.normal(0, 1, shape), np.full(shape, 0.7), 0.7 * few]))
+    noise = spread * scale * draw(st.sampled_from([0.0, 1e-3, 1.0, 1e3 if kind is np.float64 else 1.0]))
     prediction = (target + noise) * (rng.random(shape) < draw(st.sampled_from([1.0, 0.8])))
     prediction = prediction.astype(kind)
     target = target.astype(draw(st.sampled_from([kind, np.float64])))
@@ -37,7 +39,7 @@ def cases(draw):
 
 @given(cases())
 @settings(max_examples=200, deadline=None)
-def test_every_score_agrees_with_float128_to_1e_minus_10(case):
+def test_every_score_agrees_with_float128(case):
     scores = score_sample(*case).metrics()
     expected = sample_scores(*case)
     assert set(scores) == set(expected) and {key for key, m in METRICS.items() if not m.optional} <= set(scores) <= set(
@@ -48,22 +50,21 @@ def test_every_score_agrees_with_float128_to_1e_minus_10(case):
         if value is None:
             assert scores[key] is None, key
             continue
+        relative = 1e-12 if key in HEADLINE else 1e-10
         # Signed means and the error without an offset are small differences: accurate relative to the object's MAE.
         rounding = 1e-12 * scale if METRICS[key].cancels else 0.0
-        assert scores[key] == pytest.approx(float(value), rel=1e-10, abs=rounding), key
+        assert scores[key] == pytest.approx(float(value), rel=relative, abs=rounding), key
 
 
-@given(cases())
+@given(st.lists(cases(), min_size=1, max_size=4))
 @settings(max_examples=150, deadline=None)
-def test_identity_of_the_three_sets(case):
-    prediction, target, band, void, _ = case
-    scores = score_sample(prediction, target, band, void).metrics()
-    if void.all():
-        assert scores["overall_mae_mm"] is None
-        return
-    share = np.count_nonzero(target[~void] > 0) / np.count_nonzero(~void)
-    composed = share * (scores["object_mae_mm"] or 0.0) + (1 - share) * (scores["background_mae_mm"] or 0.0)
-    assert scores["overall_mae_mm"] == pytest.approx(composed, rel=1e-12, abs=0)
+def test_scores_of_any_errors_contradict_nothing(views):
+    """What refuses scores that no errors have refuses none that some have: of a view, and means over views."""
+    scores = [score_sample(*view).metrics() for view in views]
+    for of_a_view in scores:
+        assert Metrics(**of_a_view).problem(1, AGREES) is None
+    means = over_samples(scores)
+    assert Metrics(**means).problem(len(views), AGREES) is None
 
 
 def test_closed_forms_of_the_distribution():
@@ -76,24 +77,6 @@ def test_closed_forms_of_the_distribution():
     assert scores["object_p95_mm"] == 75.0
     assert scores["object_shift_free_mae_mm"] == pytest.approx(np.abs(np.arange(-50, 51)).mean(), rel=1e-15)
     assert [scores[f"object_within_{k}mm_share"] for k in (1, 2, 5, 10)] == [3 / 101, 5 / 101, 11 / 101, 21 / 101]
-
-
-def test_the_bias_of_measured_pixels_is_reported_beside_the_bias_of_all():
-    target = np.full((10, 10), 1800.0)
-    prediction = target + 2.0
-    prediction[0, :] = 0.0
-    scores = score_sample(prediction, target).metrics()
-    assert scores["object_valid_bias_mm"] == 2.0
-    assert scores["object_bias_mm"] == pytest.approx(0.9 * 2 - 0.1 * 1800)
-
-
-def test_wide_band_is_eight_pixels_whatever_the_edge_band_is():
-    target = disk_depth((120, 120), 3)
-    prediction = target + np.random.default_rng(0).normal(0, 1, target.shape)
-    narrow, wide = (score_sample(prediction, target, band).metrics() for band in (3, 8))
-    for key in ("object_wide_band_mae_mm", "object_wide_interior_mae_mm", "object_wide_band_share"):
-        assert narrow[key] == pytest.approx(wide[key], rel=1e-14)
-    assert wide["object_wide_band_mae_mm"] == wide["object_edge_mae_mm"] != narrow["object_edge_mae_mm"]
 
 
 def test_only_the_scores_that_say_so_are_improved_by_missing_pixels():

@@ -1,4 +1,4 @@
-"""The scores of one sample against an independent reference in extended precision, and against closed forms."""
+"""The scores of one sample against closed forms, and the edge band against OpenCV."""
 
 import math
 import statistics
@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scored_dataset import disk_depth
 
-from fpp_ml_bench.depth import depth_edges, object_near_edge
+from fpp_ml_bench.depth import object_near_edge
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.metrics import METRICS
 from fpp_ml_bench.evaluation.result.model import over_samples, pooled
@@ -20,77 +20,12 @@ from fpp_ml_bench.evaluation.score.sample_scores import EMPTY, ErrorStats, combi
 WITHIN = [key for key in METRICS if "_within_" in key]
 
 
-def reference(prediction, target):
-    """The six headline errors by boolean masking in long double: another arithmetic, another order of summation."""
-    error = prediction.astype(np.longdouble) - target.astype(np.longdouble)
-    scores = {}
-    for name, pixels in (
-        ("overall", np.ones(target.shape, bool)),
-        ("object", target > 0),
-        ("background", ~(target > 0)),
-    ):
-        chosen = error[pixels]
-        scores[f"{name}_mae_mm"] = np.abs(chosen).mean() if chosen.size else None
-        scores[f"{name}_rmse_mm"] = np.sqrt((chosen**2).mean()) if chosen.size else None
-    return scores
-
-
-def assert_agrees(prediction, target, relative=1e-12):
-    computed = score_sample(prediction, target).metrics()
-    for key, expected in reference(prediction, target).items():
-        if expected is None:
-            assert computed[key] is None, key
-        else:
-            assert computed[key] == pytest.approx(float(expected), rel=relative, abs=0), key
-    return computed
-
-
-@st.composite
-def maps(draw):
-    """A prediction and a target of any small shape, cover, scale and dtype, with errors of either sign."""
-    shape = draw(st.tuples(st.integers(1, 40), st.integers(1, 40)))
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    cover = draw(st.sampled_from([0.0, 0.05, 0.5, 1.0]))
-    kind = draw(st.sampled_from([np.float16, np.float32, np.float64]))
-    largest = {np.float16: 4, np.float32: 30, np.float64: 30}[kind]
-    scale = 10.0 ** draw(st.integers(-largest, largest))
-    target = np.where(rng.random(shape) < cover, rng.uniform(0.5, 1.0, shape), 0.0) * scale
-    prediction = target + rng.normal(0, 1, shape) * scale * draw(st.sampled_from([0.0, 1e-3, 1.0]))
-    order = draw(st.sampled_from("CF"))
-    return np.asarray(prediction.astype(kind), order=order), target.astype(draw(st.sampled_from([kind, np.float64])))
-
-
-@given(maps())
-@settings(max_examples=300, deadline=None)
-def test_agrees_with_long_double_reference(case):
-    assert_agrees(*case)
-
-
-@given(maps())
-@settings(max_examples=200, deadline=None)
-def test_overall_is_composed_of_object_and_background(case):
-    prediction, target = case
-    s, overall = score_sample(prediction, target), reference(prediction, target)
-    share = s.object.pixels / target.size
-    inside, outside = s.object.mae_mm or 0.0, s.background.mae_mm or 0.0
-    assert share * inside + (1 - share) * outside == pytest.approx(float(overall["overall_mae_mm"]), rel=1e-12, abs=0)
-    assert s.object.pixels + s.background.pixels == target.size
-
-
-@pytest.mark.parametrize("scale", [1e-30, 1e-12, 1.0, 1e12, 1e30])
-@pytest.mark.parametrize("size", [(3, 5), (97, 101), (240, 250)])
-def test_scales_from_1e_minus_30_to_1e30(scale, size):
-    rng = np.random.default_rng(1)
-    target = np.where(rng.random(size) < 0.3, 1.0, 0.0) * scale
-    assert_agrees(target + rng.normal(0, 1, size) * scale, target, relative=1e-13)
-
-
 def test_unequal_magnitudes_are_not_lost():
     """A background of tiny errors beside an object of huge ones: float32, or overall minus object, would lose it."""
     target = disk_depth((64, 64), 3).astype(np.float64)
-    prediction = np.where(target > 0, target + 1e12, 1e-6)
-    computed = assert_agrees(prediction, target)
+    computed = score_sample(np.where(target > 0, target + 1e12, 1e-6), target).metrics()
     assert computed["background_mae_mm"] == pytest.approx(1e-6, rel=1e-14)
+    assert computed["object_mae_mm"] == pytest.approx(1e12, rel=1e-14)
 
 
 def test_block_borders_and_empty_blocks(monkeypatch):
@@ -102,16 +37,6 @@ def test_block_borders_and_empty_blocks(monkeypatch):
         blocked = score_sample(prediction, target).metrics()
         for key, value in expected.items():
             assert blocked[key] == (value if value is None else pytest.approx(value, rel=1e-12, abs=1e-13)), key
-
-
-@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
-def test_ground_truth_scores_exactly_zero(kind):
-    target = disk_depth((120, 140), 1).astype(kind)
-    computed = score_sample(target.copy(), target).metrics()
-    errors = [value for key, value in computed.items() if key.endswith("_mm")]
-    assert errors == [0.0] * len(errors)
-    assert computed["object_missing_share"] == 0.0
-    assert {computed[key] for key in WITHIN} == {1.0}
 
 
 def test_closed_forms_of_a_shift_and_of_nothing():
@@ -142,66 +67,16 @@ def test_missing_pixels_are_counted_and_left_out_of_the_valid_score_only():
     assert s.object.rmse_mm == pytest.approx(math.sqrt((5 * 1800**2 + 1803**2 + 14) / 20), rel=1e-15)
 
 
-def test_missing_pixels_are_told_apart_by_the_edge_band():
-    target = disk_depth((80, 80), 7)
-    near, inside = object_near_edge(target, 3), target > 0
-    prediction = target.astype(np.float64) + np.where(near, 5.0, 0.25) * inside
-    gone = np.random.default_rng(0).random(target.shape) < 0.2
-    prediction[gone & inside] = 0.0
-    s = score_sample(prediction, target)
-    assert s.interior_valid.mae_mm == 0.25
-    metrics = s.metrics()
-    assert metrics["object_interior_valid_mae_mm"] == 0.25
-    assert metrics["object_missing_share"] == (gone & inside).sum() / inside.sum()
-    assert metrics["object_interior_missing_share"] == (gone & inside & ~near).sum() / (inside & ~near).sum()
-    assert_agrees(prediction, target)
-
-
-def test_empty_sets_have_no_score():
-    flat = np.zeros((6, 7), np.float32)
-    empty = score_sample(flat + 1, flat).metrics()
-    assert [key for key, value in empty.items() if value is None] == [key for key in empty if key.startswith("object")]
-    assert empty["overall_mae_mm"] == empty["background_mae_mm"] == 1.0
-    full = score_sample(flat + 1801, flat + 1800).metrics()
-    assert full["background_mae_mm"] is None and full["background_rmse_mm"] is None
-    assert full["overall_mae_mm"] == full["object_mae_mm"] == 1.0
-    assert full["object_edge_share"] == 0.0 and full["object_edge_mae_mm"] is None
-
-
-def test_edge_band_is_the_distance_rule():
-    """The dilation must give the very pixels of OpenCV's exact Euclidean distance transform."""
-    for seed in range(4):
-        depth = disk_depth((70, 90), seed)
-        depth[10:14, 3:9] = 1700.0
-        for band in (0, 1, 2, 3, 5, 8, 40, 200):
-            expected = (edge_distance_px(depth) < band) & (depth > 0)
-            assert np.array_equal(object_near_edge(depth, band), expected), (seed, band)
-    border = np.full((9, 9), 1800.0)
-    border[0, 0] = 0.0
-    assert np.array_equal(object_near_edge(border, 3), (edge_distance_px(border) < 3) & (border > 0))
-
-
-@given(st.integers(1, 30), st.integers(1, 30), st.integers(0, 12), st.integers(0, 2**32 - 1))
+@given(st.integers(1, 30), st.integers(1, 30), st.integers(0, 40), st.integers(0, 2**32 - 1))
 @settings(max_examples=150, deadline=None)
-def test_edge_band_on_random_masks(height, width, band, seed):
+def test_edge_band_is_the_distance_rule(height, width, band, seed):
+    """The dilation must give the very pixels of OpenCV's exact Euclidean distance transform."""
     rng = np.random.default_rng(seed)
     depth = np.where(rng.random((height, width)) < 0.9, 1800.0 + 300.0 * (rng.random((height, width)) < 0.1), 0.0)
     assert np.array_equal(object_near_edge(depth, band), (edge_distance_px(depth) < band) & (depth > 0))
 
 
-def test_interior_and_edge_are_scored_apart():
-    target = disk_depth((80, 80), 7)
-    near = object_near_edge(target, 3)
-    assert 0 < near.sum() < (target > 0).sum()
-    prediction = target.astype(np.float64) + np.where(near, 5.0, 0.25) * (target > 0)
-    s = score_sample(prediction, target, edge_band_px=3)
-    assert (s.interior.mae_mm, s.edge.mae_mm, s.background.mae_mm) == (0.25, 5.0, 0.0)
-    assert s.edge.pixels == near.sum()
-    assert score_sample(prediction, target, edge_band_px=0).edge == EMPTY
-    assert depth_edges(target).any()
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e200])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e200])
 @pytest.mark.parametrize("inside", [True, False])
 def test_errors_that_are_not_finite_never_become_a_score(bad, inside):
     target = disk_depth((20, 20), 0)

@@ -16,18 +16,18 @@ from fpp_ml_bench.evaluation.score.torch_metric import KEYS
 SIZE, SAMPLES, CHARGE_MM = (40, 48), 11, 300.0
 
 
-def data(kind=np.float32):
+def data():
     """Predictions and targets (N, H, W), one sample without object, one without background, missing pixels."""
     rng = np.random.default_rng(5)
     target = np.stack([disk_depth(SIZE, seed) for seed in range(SAMPLES)])
     target[3] = 0.0
     target[4] = 1800.0
     prediction = (target + rng.normal(0, 3, target.shape)) * (rng.random(target.shape) < 0.95)
-    return prediction.astype(kind), target.astype(kind)
+    return prediction.astype(np.float32), target
 
 
-def scored(batches, kind=np.float32, order=None):
-    prediction, target = data(kind)
+def scored(batches, order=None):
+    prediction, target = data()
     metric = DepthScores(charge_mm=CHARGE_MM)
     order = np.arange(SAMPLES) if order is None else order
     for part in np.array_split(order, batches):
@@ -40,17 +40,19 @@ def assert_same(scores, expected, relative=1e-12):
         assert scores[key] == pytest.approx(expected[key], rel=relative, abs=1e-13), key
 
 
-@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64])
-def test_same_numbers_as_the_evaluator(kind):
-    prediction, target = data(kind)
-    rows = [score_sample(p, t, charge_mm=CHARGE_MM).metrics() for p, t in zip(prediction, target, strict=True)]
-    assert_same(scored(3, kind), over_samples(rows))
+def test_same_numbers_as_the_evaluator():
+    prediction, target = data()
+    void = np.random.default_rng(1).random(target.shape) < 0.1
+    maps = zip(prediction, target, void, strict=True)
+    rows = [score_sample(p, t, void=v, charge_mm=CHARGE_MM).metrics() for p, t, v in maps]
+    metric = DepthScores(charge_mm=CHARGE_MM)
+    metric.update(*map(torch.from_numpy, (prediction, target, void)))
+    assert_same({key: float(value) for key, value in metric.compute().items()}, over_samples(rows))
 
 
-@pytest.mark.parametrize("batches", [2, 4, 11])
-def test_batches_and_order_change_nothing(batches):
-    shuffled = np.random.default_rng(batches).permutation(SAMPLES)
-    assert_same(scored(batches, order=shuffled), scored(1))
+def test_batches_and_order_change_nothing():
+    shuffled = np.random.default_rng(4).permutation(SAMPLES)
+    assert_same(scored(4, shuffled), scored(1))
 
 
 def _process(rank, address, folder):
@@ -73,6 +75,7 @@ def _other_process(number, address, folder):
     _process(1 + number, address, folder)
 
 
+@pytest.mark.processes
 def test_two_processes_give_the_same_numbers(tmp_path):
     together = (f"file://{tmp_path}/meet", str(tmp_path))
     other = spawning.spawn(_other_process, args=together, join=False)
@@ -85,10 +88,8 @@ def test_two_processes_give_the_same_numbers(tmp_path):
         assert_same(scores_of_rank_0, expected)
 
 
-def test_state_is_declared_and_stays_in_float64():
+def test_state_stays_in_float64():
     metric = DepthScores(charge_mm=CHARGE_MM).half().float()
-    assert set(metric._reductions) == {"sums", "counts"}
-    assert all(reduce is torch.sum or reduce.__name__ == "dim_zero_sum" for reduce in metric._reductions.values())
     prediction, target = data()
     metric.update(torch.from_numpy(prediction)[:, None], torch.from_numpy(target)[:, None])
     assert metric.sums.dtype == torch.float64 and metric.compute()["object_mae_mm"].dtype == torch.float64
@@ -116,7 +117,7 @@ def test_forward_gives_the_batch_and_keeps_the_whole():
 
 
 def test_gradients_are_not_held_and_bad_batches_are_refused():
-    prediction, target = map(torch.from_numpy, data(np.float64))
+    prediction, target = map(torch.from_numpy, data())
     metric = DepthScores()
     metric.update(prediction.requires_grad_(), target)
     assert not metric.sums.requires_grad
@@ -133,12 +134,10 @@ def test_gradients_are_not_held_and_bad_batches_are_refused():
 DEPTH = torch.full((1, 4, 5), 1800.0)
 BATCHES = {
     "void as uint8": ({}, (DEPTH, DEPTH, (DEPTH > 0).to(torch.uint8)), "void: expected bool.* got torch.uint8"),
-    "void as int64": ({}, (DEPTH, DEPTH, (DEPTH > 0).long()), "void: expected bool.* got torch.int64"),
     "void of another shape": ({}, (DEPTH, DEPTH, DEPTH[0] > 0), "void: expected .1, 4, 5."),
     "an array": ({}, (DEPTH.numpy(), DEPTH), "prediction: expected a tensor, got ndarray"),
     "both in metres": ({}, (DEPTH / 1000, DEPTH / 1000), "the largest depth is 1.8, which could be metres"),
     "metres": ({}, (DEPTH / 1000, DEPTH), "the prediction looks like metres"),
-    "metres close by": ({}, (DEPTH / 5000, DEPTH / 5), "the prediction looks like metres"),
     "negative target": ({}, (DEPTH, -DEPTH), "targets: expected finite mm of 0 and more"),
     "unknown units": ({"units": "inch"}, None, "units: expected mm or m"),
 }

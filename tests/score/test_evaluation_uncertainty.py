@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from conftest import fpp_eval, printed, read_json, refusal
 from scipy import stats
-from scored_dataset import make_dataset, write_predictions
+from scored_dataset import change_json, make_dataset, write_predictions
 
-from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import SubmissionError
 from fpp_ml_bench.evaluation.metrics import RANKED
 from fpp_ml_bench.evaluation.report.comparison import compare
@@ -15,11 +15,6 @@ from fpp_ml_bench.evaluation.result.file import read_result, write_result
 from fpp_ml_bench.evaluation.score import uncertainty
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.uncertainty import holm, object_interval, sign_flip_p
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
 
 
 @pytest.fixture
@@ -33,7 +28,7 @@ def make(tmp_path, dataset):
     return write
 
 
-@pytest.mark.parametrize("freedom", [1, 2, 3, 4, 5, 9, 30, 49])
+@pytest.mark.parametrize("freedom", [1, 2, 5, 49])
 def test_student_quantile_is_scipys(freedom):
     assert uncertainty._student_quantile(0.975, freedom) == pytest.approx(stats.t.ppf(0.975, freedom), rel=1e-9)
 
@@ -84,13 +79,6 @@ def test_unequal_views_weigh_samples_alike_and_gaps_are_left_out():
 def test_too_few_objects_for_95_percent_are_said():
     assert "at most 50% of cases" in uncertainty.caution(2) and "at most 88%" in uncertainty.caution(4)
     assert uncertainty.caution(5) is None and uncertainty.caution(1) is None
-    rng = np.random.default_rng(3)
-    for objects, reach in ((2, 0.5), (3, 0.75)):
-        covered = 0
-        for _ in range(150):
-            low, high = object_interval(rng.normal(0, 1, objects).tolist(), list(range(objects)))
-            covered += low <= 0 <= high
-        assert covered / 150 == pytest.approx(reach, abs=0.1)
 
 
 def scipy_p(differences):
@@ -105,7 +93,7 @@ def scipy_p(differences):
     return answer.pvalue
 
 
-@pytest.mark.parametrize("objects", [2, 5, 6, 9, 12])
+@pytest.mark.parametrize("objects", [2, 6, 12])
 def test_the_sign_flip_test_is_scipys(objects):
     rng = np.random.default_rng(objects)
     for differences in (rng.normal(0.5, 1, objects), rng.exponential(1, objects) - 0.3, np.full(objects, 0.1)):
@@ -147,7 +135,7 @@ def test_holm_against_its_step_down_procedure():
                 assert rejected == {index for index, value in enumerate(adjusted) if value <= level}
 
 
-def test_result_carries_intervals_objects_and_seeds(make, tmp_path):
+def test_result_carries_intervals_objects_and_seeds(make):
     result = read_result(make("a", noise_mm=2.0))
     assert set(type(result.intervals).model_fields) == set(RANKED)
     for key in RANKED:
@@ -155,7 +143,6 @@ def test_result_carries_intervals_objects_and_seeds(make, tmp_path):
         assert low <= getattr(result.metrics, key) <= high
     assert [(o.object, o.samples) for o in result.per_object] == [("power_drill", 2), ("wooden_boards", 2)]
     first = [row.object_mae_mm for row in result.per_sample if row.object == "power_drill"]
-    assert result.per_object[0].metrics.object_mae_mm == pytest.approx(np.mean(first), rel=1e-14)
     assert result.per_object[0].spread["object_mae_mm"] == pytest.approx(np.std(first, ddof=1), rel=1e-12)
     assert result.seeds == {"bootstrap": 20250} and result.bootstrap.over == "objects"
     assert result.intervals.of("object_median_mm") is None
@@ -170,38 +157,31 @@ def test_one_object_has_no_interval(dataset, tmp_path):
 @pytest.mark.parametrize(
     "path, value, message",
     [
-        (["intervals", "object_mae_mm", 0], 0.5, r"intervals\.object_mae_mm\.0 does not follow"),
-        (["per_object", 0, "metrics", "object_mae_mm"], 0.5, r"per_object\.0\.metrics\.object_mae_mm does not follow"),
-        (["per_object", 0, "spread", "object_mae_mm"], 0.5, r"per_object\.0\.spread\.object_mae_mm does not follow"),
-        (["per_object", 0, "object"], "mug", r"per_object\.0\.object does not follow"),
-        (["seeds", "bootstrap"], 1, r"seeds\.bootstrap does not follow"),
-        (["bootstrap", "resamples"], 10, r"bootstrap\.resamples does not follow"),
-        (["per_sample", 0, "object_bias_mm"], -99.0, "bias or shift-free MAE is above the MAE"),
-        (["per_sample", 0, "object_median_mm"], 99.0, "out of order"),
-        (["per_sample", 0, "object_p95_mm"], None, "null all together"),
-        (["mode"], "paper", r"dataset\.content: expected hashes of test/depth, got"),
-        (["mode"], "paper-individual", "mode: Input should be 'standard' or 'paper'"),
-        (["target"], "depth_exact", r"dataset\.content: expected hashes of test/depth_exact, test/flags"),
-        (["environment", "code_sha256"], "x", "code_sha256"),
+        ("intervals.object_mae_mm.0", 0.5, r"intervals\.object_mae_mm\.0 does not follow"),
+        ("per_object.0.metrics.object_mae_mm", 0.5, r"per_object\.0\.metrics\.object_mae_mm does not follow"),
+        ("per_object.0.spread.object_mae_mm", 0.5, r"per_object\.0\.spread\.object_mae_mm does not follow"),
+        ("seeds.bootstrap", 1, r"seeds\.bootstrap does not follow"),
+        ("bootstrap.resamples", 10, r"bootstrap\.resamples does not follow"),
+        ("per_sample.0.object_bias_mm", -99.0, "bias or shift-free MAE is above the MAE"),
+        ("per_sample.0.object_median_mm", 99.0, "out of order"),
+        ("per_sample.0.object_p95_mm", None, "null all together"),
+        ("mode", "paper", r"dataset\.content: expected hashes of test/depth, got"),
+        ("target", "depth_exact", r"dataset\.content: expected hashes of test/depth_exact, test/flags"),
+        ("environment.code_sha256", "x", "code_sha256"),
     ],
 )
 def test_edited_result_contradicts_itself(path, value, message, make):
     file = make("a", noise_mm=2.0)
-    content = json.loads(file.read_text())
-    place = content
-    for key in path[:-1]:
-        place = place[key]
-    place[path[-1]] = value
-    file.write_text(json.dumps(content))
+    change_json(file, path, value)
     with pytest.raises(SubmissionError, match=message):
         read_result(file)
 
 
-def test_comparison_is_paired_and_says_so(make, capsys, tmp_path):
+def test_comparison_is_paired_and_says_so(make, tmp_path):
     first, second = make("one", noise_mm=2.0, name="One"), make("two", noise_mm=1.0, name="Two")
     comparison = compare(read_result(first), read_result(second))
     rows = [row.differences["object_mae_mm"] for row in comparison.per_sample]
-    first_rows, second_rows = (json.loads(p.read_text())["per_sample"] for p in (first, second))
+    first_rows, second_rows = (read_json(p)["per_sample"] for p in (first, second))
     assert rows == [y["object_mae_mm"] - x["object_mae_mm"] for x, y in zip(first_rows, second_rows, strict=True)]
     main_difference = comparison.differences["object_mae_mm"]
     assert main_difference.mean_mm == pytest.approx(np.mean(rows)) and main_difference.lower == 4
@@ -211,10 +191,9 @@ def test_comparison_is_paired_and_says_so(make, capsys, tmp_path):
     assert main_difference.sign_flip_p == 0.5
     assert "sign-flip test p = 0.5" in comparison.sentence
     assert "does not confirm it at 5%: 2 objects never reach 5%" in comparison.sentence
-    assert main(["compare", str(first), str(second), "--json", str(tmp_path / "d.json")]) == 0
-    printed = capsys.readouterr().out
-    assert "Two has a lower two-sided MAE than One" in " ".join(printed.split())
-    assert json.loads((tmp_path / "d.json").read_text())["differences"]["object_mae_mm"]["lower"] == 4
+    output = printed(fpp_eval, "compare", first, second, "--json", tmp_path / "d.json")
+    assert "Two has a lower two-sided MAE than One" in " ".join(output.split())
+    assert read_json(tmp_path / "d.json")["differences"]["object_mae_mm"]["lower"] == 4
 
 
 def test_a_comparison_with_0_in_its_interval(make, dataset, tmp_path):
@@ -230,76 +209,56 @@ def test_a_comparison_with_0_in_its_interval(make, dataset, tmp_path):
     assert "the same two-sided MAE in all 4 samples" in compare(read_result(first), read_result(first)).sentence
 
 
-def test_results_of_other_data_are_not_compared(make, dataset, tmp_path, capsys):
+def test_results_of_other_data_are_not_compared(make, dataset, tmp_path):
     first = make("one")
     second = tmp_path / "oracle.json"
     folder = write_predictions(tmp_path / "two", dataset, uses_ground_truth_range=True)
     write_result(evaluate(folder, dataset, target="depth_exact"), second)
-    assert main(["compare", str(first), str(second)]) == 2
-    message = capsys.readouterr().err
+    message = refusal(fpp_eval, "compare", first, second)
     assert "target: depth against depth_exact" in message and "track: metric against oracle range" in message
 
 
 def test_verify_says_verified_or_not(make, dataset, tmp_path, capsys):
     file, folder = make("p", noise_mm=2.0), tmp_path / "p"
     command = ["verify", str(file), str(folder), str(dataset.path)]
-    assert main(command) == 0
-    assert capsys.readouterr().out.startswith("verified: ")
+    assert printed(fpp_eval, *command).startswith("verified: ")
     sample = dataset.samples("test")[0]
     depth = np.load(folder / f"{sample}.npy")
     np.save(folder / f"{sample}.npy", depth + np.float32(0.001))  # as another processor adds
-    assert main(command) == 0
-    printed = capsys.readouterr().out
-    assert printed.startswith("the same within what processors change: ") and "0.01% of the pixels" in printed
+    output = printed(fpp_eval, *command)
+    assert output.startswith("the same within what processors change: ") and "0.01% of the pixels" in output
     np.save(folder / f"{sample}.npy", depth + np.float32(1.0))
-    assert main(command) == 1
-    printed = capsys.readouterr().out
-    assert printed.startswith("not the same: ") and f"{sample}: prediction_sha256" in printed
-    assert f"{sample}: overall_mae_mm" in printed
+    assert fpp_eval(*command) == 1
+    output = capsys.readouterr().out
+    assert output.startswith("not the same: ") and f"{sample}: prediction_sha256" in output
+    assert f"{sample}: overall_mae_mm" in output
     np.save(folder / f"{sample}.npy", depth)
-    assert main(command) == 0
+    assert fpp_eval(*command) == 0
     write_predictions(folder, dataset, noise_mm=2.0, name="Another name", frames_used=[0, 1])
     capsys.readouterr()
-    assert main(command) == 1
-    assert "submission.name" in (printed := capsys.readouterr().out) and "submission.frames_used" in printed
+    assert fpp_eval(*command) == 1
+    assert "submission.name" in (output := capsys.readouterr().out) and "submission.frames_used" in output
     (folder / f"{sample}.npy").unlink()
-    assert main(command) == 2
+    assert fpp_eval(*command) == 2
 
 
 def test_verify_on_other_data_and_other_protocol(make, dataset, tmp_path, capsys):
     other_dataset = make_dataset(tmp_path / "other", size=(40, 32))
     file = make("p", noise_mm=2.0)
-    assert main(["verify", str(file), str(tmp_path / "p"), str(other_dataset.path)]) == 1
+    assert fpp_eval("verify", file, tmp_path / "p", other_dataset.path) == 1
     assert "dataset.content.test/depth" in capsys.readouterr().out
     file.write_text(file.read_text().replace('"protocol_version": "', '"protocol_version": "9'))
-    assert main(["verify", str(file), str(tmp_path / "p"), str(dataset.path)]) == 2
-    assert "scored by protocol 9" in capsys.readouterr().err
+    assert "scored by protocol 9" in refusal(fpp_eval, "verify", file, tmp_path / "p", dataset.path)
 
 
-def test_schema_describes_the_file(make, capsys):
+def test_schema_describes_the_file(make):
     import jsonschema
 
-    for name in ("result", "submission", "comparison"):
-        assert main(["schema", name]) == 0
-        schema = json.loads(capsys.readouterr().out)
+    for name in ("submission", "comparison", "result"):
+        schema = json.loads(printed(fpp_eval, "schema", name))
         jsonschema.Draft202012Validator.check_schema(schema)
-    assert main(["schema"]) == 0
-    schema = json.loads(capsys.readouterr().out)
     content = json.loads(make("p").read_text())
     jsonschema.validate(content, schema)
     content["per_sample"][0]["object_mae_mm"] = "0.1"
     with pytest.raises(jsonschema.ValidationError):
         jsonschema.validate(content, schema)
-
-
-def test_schema_needs_no_library_to_be_read(capsys):
-    assert main(["schema"]) == 0
-    schema = json.loads(capsys.readouterr().out)
-    assert schema["$schema"].endswith("2020-12/schema") and schema["additionalProperties"] is False
-    assert {"intervals", "per_object", "per_sample", "seeds", "mode", "environment"} <= set(schema["required"])
-
-
-def test_a_folder_named_like_a_subcommand_is_scored_by_its_path(dataset, tmp_path, monkeypatch):
-    write_predictions(tmp_path / "compare", dataset)
-    monkeypatch.chdir(tmp_path)
-    assert main(["./compare", str(dataset.path)]) == 0

@@ -1,11 +1,11 @@
 """A metric is one entry: a toy metric is in results, schema, reports and leaderboard; PROTOCOL.md has all."""
 
-import json
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from conftest import read_json
 from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench import evaluation
@@ -72,7 +72,7 @@ def test_a_toy_metric_is_one_entry(scored):
     paths = map(str, (predictions[0], dataset.path, folder / "new.json", folder / "old.json"))
     done = subprocess.run([sys.executable, "-c", TOY, *paths], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    toy = json.loads((folder / "new.json").read_text())["metrics"]["toy_mm"]
+    toy = read_json(folder / "new.json")["metrics"]["toy_mm"]
     heads, _, *rows = (line for line in (folder / "table.md").read_text().splitlines() if line.startswith("|"))
     column = [cell.strip() for cell in heads.split("|")].index("Toy")
     assert [row.split("|")[column].strip() for row in rows[:2]] == [f"{toy:.3f}", "-"]

@@ -1,49 +1,17 @@
 """Scores of a stated uncertainty: against an independent computation in extended precision, and on known predictors."""
 
-import json
-
 import numpy as np
 import pytest
-from extended_precision import sigma_scores
-from scored_dataset import make_dataset, write_description
+from conftest import fpp_eval, printed
+from scored_dataset import change_json, make_dataset, write_description
 
-from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import PredictionError, SubmissionError
-from fpp_ml_bench.evaluation.metrics import UNCERTAINTY
 from fpp_ml_bench.evaluation.protocol import COVERED, NOMINAL
 from fpp_ml_bench.evaluation.report.report_page import write_report
-from fpp_ml_bench.evaluation.result.file import parse_result, read_result, result_content, write_result
+from fpp_ml_bench.evaluation.result.file import read_result, write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.sample_scores import score_sigma
-
-
-def case(number, pixels=(23, 31)):
-    """Prediction, target, sigma and void of a small image: missing pixels, pixels without sigma, equal sigmas."""
-    rng = np.random.default_rng(number)
-    target = np.where(rng.random(pixels) < 0.6, rng.uniform(1500, 2100, pixels), 0)
-    sigma = rng.choice([0.0, 0.001, 0.5, 2.0], pixels) if number % 2 else rng.uniform(0, 3, pixels)
-    wrong = rng.random(pixels) < 0.05
-    prediction = (target + rng.normal(0, 2, pixels) + 300 * wrong) * (rng.random(pixels) < 0.9)
-    return prediction.astype(np.float32), target.astype(np.float32), sigma.astype(np.float32), rng.random(pixels) < 0.1
-
-
-@pytest.mark.parametrize("number", range(6))
-def test_every_score_agrees_with_extended_precision(number):
-    expected, computed = sigma_scores(*case(number)), score_sigma(*case(number)).scores
-    assert set(expected) == set(computed) == set(UNCERTAINTY)
-    for key, value in expected.items():
-        assert computed[key] == pytest.approx(float(value), rel=1e-9), key
-
-
-def test_the_order_of_the_pixels_does_not_matter():
-    maps = case(1)
-    shuffled = np.random.default_rng(0).permutation(maps[0].size)
-    first, second = (
-        score_sigma(*maps),
-        score_sigma(*(values.ravel()[shuffled].reshape(maps[0].shape) for values in maps)),
-    )
-    for key, value in first.scores.items():
-        assert second.scores[key] == pytest.approx(value, rel=1e-12), key
+from fpp_ml_bench.evaluation.score.verification import Verified, differences
 
 
 def gaussian(stated=1.0, pixels=(300, 400)):
@@ -98,19 +66,15 @@ def scored(tmp_path_factory):
     return dataset, predictions, evaluate(predictions, dataset)
 
 
-def test_the_block_is_written_read_verified_and_shown(scored, tmp_path, capsys):
+def test_the_block_is_written_read_verified_and_shown(scored, tmp_path):
     dataset, predictions, result = scored
     block = result.uncertainty
-    for sample, scores in block.per_sample.items():
-        depth, sigma = (np.load(predictions / f"{sample}{suffix}") for suffix in (".npy", ".sigma.npy"))
-        assert scores.model_dump() == score_sigma(depth, dataset.depth_mm(sample), sigma).scores
     views = [block.per_sample[f"power_drill_{view}"].coverage_68 for view in ("A0", "A60")]
     assert block.per_object["power_drill"].coverage_68 == pytest.approx(np.mean(views), rel=1e-12)
     write_result(result, tmp_path / "r.json")
     assert read_result(tmp_path / "r.json") == result
-    assert main(["verify", str(tmp_path / "r.json"), str(predictions), str(dataset.path)]) == 0
-    assert main([str(predictions), str(dataset.path)]) == 0
-    assert "Stated uncertainty" in capsys.readouterr().out
+    assert fpp_eval("verify", tmp_path / "r.json", predictions, dataset.path) == 0
+    assert "Stated uncertainty" in printed(fpp_eval, predictions, dataset.path)
     page = write_report(result, dataset, predictions, tmp_path / "report").read_text()
     assert "reliability and sparsification" in page and "Stated uncertainty" in page
 
@@ -118,35 +82,29 @@ def test_the_block_is_written_read_verified_and_shown(scored, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
-        (["metrics", "coverage_68"], 0.68, r"metrics\.coverage_68 does not follow"),
-        (["metrics", "ause_mae_mm"], 0.0, r"metrics\.ause_mae_mm does not follow"),
-        (["per_object", "power_drill", "nll"], 0.0, r"per_object\.power_drill\.nll does not follow"),
-        (["per_sample", "power_drill_A0", "coverage_99"], 0.1, "a wider interval holds less"),
-        (["reliability", "observed", 6], 0.68, "reliability at 68% does not follow"),
+        ("metrics.coverage_68", 0.68, r"metrics\.coverage_68 does not follow"),
+        ("per_sample.power_drill_A0.coverage_99", 0.1, "a wider interval holds less"),
+        ("reliability.observed.6", 0.68, "reliability at 68% does not follow"),
         (
-            ["reliability", "nominal", 6],
+            "reliability.nominal.6",
             0.69,
             r"reliability\.nominal\.6 does not follow from per_sample: 0\.69, not 0\.68",
         ),
-        (["sparsification", "mae_mm", 0], 0.0, r"sparsification\.mae_mm\.0 does not follow"),
-        (["sparsification", "rmse_mm", 5], 0.0, r"metrics\.ause_rmse_mm does not follow"),
-        (["sparsification"], None, "sparsification must be there"),
-        (["per_object"], {}, "other objects than per_sample"),
+        ("sparsification.mae_mm.0", 0.0, r"sparsification\.mae_mm\.0 does not follow"),
+        ("sparsification.rmse_mm.5", 0.0, r"metrics\.ause_rmse_mm does not follow"),
+        ("sparsification", None, "sparsification must be there"),
+        ("per_object", {}, "other objects than per_sample"),
     ],
 )
 def test_an_edited_block_contradicts_itself(path, value, message, scored, tmp_path):
-    content = json.loads(json.dumps(result_content(scored[2])))
-    place = content["uncertainty"]
-    for key in path[:-1]:
-        place = place[key]
-    place[path[-1]] = value
+    file = tmp_path / "r.json"
+    write_result(scored[2], file)
+    change_json(file, f"uncertainty.{path}", value)
     with pytest.raises(SubmissionError, match=message):
-        parse_result(content, tmp_path / "r.json")
+        read_result(file)
 
 
 def test_a_result_that_hides_or_improves_its_uncertainty_is_not_verified(scored):
-    from fpp_ml_bench.evaluation.score.verification import Verified, differences
-
     dataset, predictions, result = scored
     hidden = result.model_copy(update={"uncertainty": None})
     assert differences(hidden, predictions, dataset) == Verified(

@@ -6,10 +6,8 @@ from scored_dataset import make_dataset, write_predictions
 
 from fpp_ml_bench.evaluation.metrics import HEADLINE, METRICS
 from fpp_ml_bench.evaluation.report.terminal import result_table
-from fpp_ml_bench.evaluation.result.file import read_result, write_result
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.score.sample_scores import score_sample
-from fpp_ml_bench.evaluation.score.torch_metric import DepthScores
 from fpp_ml_bench.loaders.sample import VOID, Flag, void_pixels
 
 
@@ -39,25 +37,6 @@ def test_surface_that_was_not_decoded_is_void_too():
     assert void_pixels(flags, depth_mm, exact_mm).tolist() == [False, True, False, True]
 
 
-def test_they_count_in_no_set_and_their_share_is_reported(dataset, tmp_path):
-    folder = write_predictions(tmp_path / "p", dataset, noise_mm=2.0)
-    for sample in dataset.samples("test"):  # whatever is predicted there
-        path = folder / f"{sample}.npy"
-        np.save(path, np.where(dataset.void(sample), np.float32(9999), np.load(path)))
-    result = evaluate(folder, dataset)
-    for row in result.per_sample:
-        target, void = dataset.depth_mm(row.sample), void_pixels(dataset.flags(row.sample))
-        error = np.abs(np.load(folder / f"{row.sample}.npy").astype(np.float64) - target)
-        assert row.void_pixels == np.count_nonzero(void) > 0 and row.void_share == void.mean()
-        sets = {"object": (target > 0) & ~void, "background": (target == 0) & ~void, "overall": ~void}
-        for name, pixels in sets.items():
-            assert getattr(row, f"{name}_mae_mm") == pytest.approx(error[pixels].mean(), rel=1e-12)
-        assert row.object_pixels + row.background_pixels + row.void_pixels == target.size
-        assert row.unlit_pixels is None and row.unlit_mae_mm is None
-    write_result(result, tmp_path / "r.json")
-    assert read_result(tmp_path / "r.json") == result
-
-
 def test_the_papers_sets_know_no_void(dataset, tmp_path):
     folder = write_predictions(tmp_path / "p", dataset, noise_mm=2.0)
     result = evaluate(folder, dataset, mode="paper")
@@ -70,15 +49,9 @@ def test_the_papers_sets_know_no_void(dataset, tmp_path):
 
 
 def test_unlit_pixels_are_scored_against_their_exact_depth(dataset, tmp_path):
-    folder = write_predictions(tmp_path / "p", dataset)  # predicts 0 there: not measured
-    result = evaluate(folder, dataset, target="depth_exact")
-    assert result.metrics.unlit_missing_share == 1.0 and result.metrics.unlit_valid_mae_mm is None
-    for row in result.per_sample:
-        exact = dataset.unlit_mm(row.sample)
-        assert row.unlit_pixels == np.count_nonzero(exact) and row.unlit_mae_mm == pytest.approx(
-            exact[exact > 0].mean()
-        )
-        path = folder / f"{row.sample}.npy"
+    folder = write_predictions(tmp_path / "p", dataset)
+    for sample in dataset.samples("test"):
+        exact, path = dataset.unlit_mm(sample), folder / f"{sample}.npy"
         np.save(path, np.where(exact > 0, exact + np.float32(3), np.load(path)))
     result = evaluate(folder, dataset, target="depth_exact")
     metrics = result.metrics
@@ -91,22 +64,3 @@ def test_data_without_flags_have_none(tmp_path):
     data = make_dataset(tmp_path / "data", exact=False)
     result = evaluate(write_predictions(tmp_path / "p", data), data)
     assert result.metrics.void_share == 0.0 and {row.void_pixels for row in result.per_sample} == {0}
-
-
-def test_a_view_that_is_void_all_over_has_no_score():
-    target = np.full((4, 5), 1800.0)
-    scores = score_sample(target + 1, target, void=np.ones((4, 5), bool)).metrics()
-    assert scores["void_share"] == 1.0 and {scores[key] for key in HEADLINE} == {None}
-
-
-def test_the_torch_metric_leaves_them_out_too(dataset):
-    import torch
-
-    sample = dataset.samples("test")[0]
-    target, void = dataset.depth_mm(sample), dataset.void(sample)
-    prediction = target + np.random.default_rng(0).normal(0, 2, target.shape).astype(np.float32)
-    metric = DepthScores(charge_mm=300.0)
-    metric.update(*(torch.tensor(pixels)[None] for pixels in (prediction, target, void)))
-    expected = score_sample(prediction, target, void=void, charge_mm=300.0).metrics()
-    for key, value in metric.compute().items():
-        assert float(value) == pytest.approx(expected[key], rel=1e-12), key

@@ -1,14 +1,14 @@
 """Every accepted form of prediction gives the same numbers, and every broken file is refused by name, with advice."""
 
 import io
-import json
 import os
 import re
 import struct
 import zipfile
 import zlib
+from contextlib import redirect_stdout
 from functools import partial
-from pathlib import Path
+from io import StringIO
 
 import cv2
 import h5py
@@ -16,11 +16,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from conftest import fpp_eval, read_json, refusal
 from scipy.io import savemat
-from scored_dataset import make_dataset, write_description, write_predictions
+from scored_dataset import write_description, write_predictions
 
 from fpp_ml_bench import containers
-from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import PredictionError
 
 SIZE = (32, 40)
@@ -29,11 +29,6 @@ LEVEL_MM = 0.05
 ORACLE = {"uses_ground_truth_range": True}
 NESTED_DOUBLE = pa.list_(pa.list_(pa.float64()))
 NESTED, FLAT = pa.list_(pa.list_(pa.float32())), pa.list_(pa.float32())
-
-
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny", SIZE)
 
 
 def maps(dataset, step_mm=LEVEL_MM):
@@ -85,6 +80,18 @@ def png_bytes(image):
     return cv2.imencode(".png", image)[1].tobytes()
 
 
+def png_of(depth):
+    return png_bytes(np.round(depth / LEVEL_MM).astype(np.uint16))
+
+
+def npz_of(depth):
+    return npz_bytes(depth=depth)
+
+
+def mat_of(depth):
+    return mat5_bytes(depth=depth)
+
+
 def table(depths, kind=NESTED):
     nested = kind in (NESTED,) or pa.types.is_list(getattr(kind, "value_type", pa.float32()))
     rows = [(d if nested else d.ravel()).tolist() for d in depths.values()]
@@ -120,27 +127,21 @@ def write_table(folder, name, content, **changes):
 
 
 FORMS = {
-    "npz": lambda f, m: write_each(f, ".npz", m, lambda d: npz_bytes(depth=d)),
+    "npz": lambda f, m: write_each(f, ".npz", m, npz_of),
     "npz stored": lambda f, m: write_each(
         f, ".npz", m, lambda d: zip_bytes({"d.npy": npy_bytes(d)}, zipfile.ZIP_STORED)
     ),
-    "mat v5": lambda f, m: write_each(f, ".mat", m, lambda d: mat5_bytes(depth=d)),
+    "mat v5": lambda f, m: write_each(f, ".mat", m, mat_of),
     "mat v5 plain": lambda f, m: write_each(f, ".mat", m, lambda d: mat5_bytes(False, depth=d)),
-    "mat v7.3": lambda f, m: write_each(
-        f, ".mat", m, lambda d: mat73_bytes(lambda h: h.create_dataset("depth", data=d.T))
-    ),
     "mat v7.3 deflated": lambda f, m: write_each(
         f, ".mat", m, lambda d: mat73_bytes(lambda h: h.create_dataset("depth", data=d.T, compression="gzip"))
     ),
-    "png": lambda f, m: write_each(
-        f, ".png", m, lambda d: png_bytes(np.round(d / LEVEL_MM).astype(np.uint16)), png_mm_per_level=LEVEL_MM
-    ),
+    "png": lambda f, m: write_each(f, ".png", m, png_of, png_mm_per_level=LEVEL_MM),
     "parquet": lambda f, m: write_table(f, "predictions.parquet", parquet_bytes(table(m, NESTED_DOUBLE))),
     "parquet flat zstd": lambda f, m: write_table(
         f, "predictions.parquet", parquet_bytes(table(m, pa.list_(pa.float64())), compression="zstd", row_group_size=1)
     ),
-    "arrow file": lambda f, m: write_table(f, "predictions.arrow", arrow_bytes(table(m, NESTED_DOUBLE))),
-    "arrow compressed": lambda f, m: write_table(
+    "arrow file": lambda f, m: write_table(
         f, "predictions.arrow", arrow_bytes(table(m, NESTED_DOUBLE), compression="zstd")
     ),
     "arrow stream": lambda f, m: write_table(
@@ -157,8 +158,8 @@ def test_every_form_gives_the_same_numbers(form, dataset, tmp_path):
     results = []
     for number, folder in enumerate((plain, converted)):
         path = tmp_path / f"{number}.json"
-        assert main([str(folder), str(dataset.path), "--json", str(path)]) == 0
-        results.append(json.loads(path.read_text()))
+        assert fpp_eval(folder, dataset.path, "--json", path) == 0
+        results.append(read_json(path))
     plain_metrics, metrics = (result["metrics"] for result in results)
     for key, value in plain_metrics.items():
         exact = value if value is None or form != "png" else pytest.approx(value, rel=1e-9, abs=1e-9)
@@ -167,11 +168,11 @@ def test_every_form_gives_the_same_numbers(form, dataset, tmp_path):
     assert len(hashes) == (1 if "arrow" in form or "parquet" in form else 4)
 
 
-def refused(capsys, dataset, folder: Path, *arguments: str) -> str:
-    status = main([str(folder), str(dataset.path), *arguments])
-    captured = capsys.readouterr()
-    assert status == 2 and captured.out == "" and "Traceback" not in captured.err, captured
-    return captured.err
+def refused(dataset, folder):
+    with redirect_stdout(StringIO()) as out:
+        error = refusal(fpp_eval, folder, dataset.path)
+    assert out.getvalue() == "" and "Traceback" not in error
+    return error
 
 
 ZEROS = np.zeros((1000, 1000))
@@ -210,9 +211,7 @@ def huge_chunk(h):
     h.create_dataset("depth", SIZE[::-1], "f8", maxshape=(None, None), chunks=(20000, 20000), compression="gzip")
 
 
-def bad_png(change):
-    image = np.round(DEPTH / LEVEL_MM).astype(np.uint16)
-    return change(png_bytes(image))
+PNG = png_of(DEPTH)
 
 
 def longer_png(content):
@@ -223,30 +222,21 @@ def longer_png(content):
     return head + struct.pack(">I", len(data)) + chunk + struct.pack(">I", zlib.crc32(chunk)) + content[-12:]
 
 
+NOISE = npz_bytes(a=np.random.default_rng(0).random(SIZE))
 PER_SAMPLE = {
     "npz of two": (".npz", npz_bytes(a=DEPTH, b=DEPTH), r"holds 2 arrays \(a.npy, b.npy\), expected one"),
     "npz of none": (".npz", zip_bytes({}), "holds 0 arrays"),
     "npz bomb": (".npz", zip_bytes({"depth.npy": npy_bytes(ZEROS)}), "would unpack to 8000128 bytes"),
     "npz of a wrong size": (".npz", zip_of_wrong_size(), "unpacks to more than|is no .npz|is truncated|foreign"),
     "npz path": (".npz", zip_bytes({"../depth.npy": npy_bytes(DEPTH)}), "leads out of the archive"),
-    "npz absolute path": (".npz", zip_bytes({"/tmp/depth.npy": npy_bytes(DEPTH)}), "leads out of the archive"),
     "npz of text": (".npz", zip_bytes({"readme.txt": b"x"}), "expected one .npy array"),
     "npz of bz2": (".npz", zip_bytes({"d.npy": npy_bytes(DEPTH)}, zipfile.ZIP_BZIP2), "unusual way"),
     "npz cut off": (".npz", npz_bytes(a=DEPTH)[:-30], "is no .npz archive, or damaged"),
-    "npz damaged": (
-        ".npz",
-        npz_bytes(a=np.random.default_rng(0).random(SIZE))[:300]
-        + b"xxxx"
-        + npz_bytes(a=np.random.default_rng(0).random(SIZE))[304:],
-        "damaged",
-    ),
+    "npz damaged": (".npz", NOISE[:300] + b"xxxx" + NOISE[304:], "damaged"),
     "npz of objects": (".npz", zip_bytes({"d.npy": npy_bytes(np.array([[{}]], object))}), "pickled Python objects"),
-    "npz complex": (".npz", npz_bytes(a=DEPTH.astype(complex)), r"got complex128 \(complex\)"),
     "npz integers": (".npz", npz_bytes(a=DEPTH.astype(np.uint8)), "got uint8: whole numbers .*wrap around"),
     "npz shape": (".npz", npz_bytes(a=DEPTH.T), r"expected shape \(32, 40\) .*got \(40, 32\)"),
-    "npz is npy": (".npz", npy_bytes(DEPTH), "is no .npz archive"),
     "mat name": (".mat", mat5_bytes(z=DEPTH), "expected the variable depth, got z"),
-    "mat shape": (".mat", mat5_bytes(depth=DEPTH[:-1]), r"got \(31, 40\)"),
     "mat integers": (".mat", mat5_bytes(depth=DEPTH.astype(np.int16)), "got int16"),
     "mat complex": (".mat", mat5_bytes(depth=DEPTH + 1j), "complex"),
     "mat cell": (".mat", mat5_bytes(depth=np.array([["a", 1]], object)), "expected a real numeric matrix"),
@@ -263,28 +253,24 @@ PER_SAMPLE = {
     "png colour": (".png", png_bytes(np.zeros((*SIZE, 3), np.uint16)), "colour type 2"),
     "png shape": (".png", png_bytes(np.zeros((40, 32), np.uint16)), r"got \(40, 32\)"),
     "png full": (".png", png_bytes(np.full(SIZE, 65535, np.uint16)), "where depth above 3276.75 mm is cut off"),
-    "png bomb": (".png", bad_png(longer_png), "unpacks to more than 2592 bytes"),
-    "png checksum": (".png", bad_png(lambda c: c[:60] + b"\0\0\0\0" + c[64:]), "a checksum does not match"),
-    "png cut off": (".png", bad_png(lambda c: c[:-12]), "cut off or damaged"),
-    "png grown": (".png", bad_png(lambda c: c + b"more"), "foreign bytes"),
+    "png bomb": (".png", longer_png(PNG), "unpacks to more than 2592 bytes"),
+    "png checksum": (".png", PNG[:60] + b"\0\0\0\0" + PNG[64:], "a checksum does not match"),
+    "png cut off": (".png", PNG[:-12], "cut off or damaged"),
+    "png grown": (".png", PNG + b"more", "foreign bytes"),
     "png noise": (".png", b"no picture", "is no PNG file"),
     "too large": (".npz", b"PK" + b"\0" * 200_000, "has 200002 bytes, expected at most"),
 }
 
 
 @pytest.mark.parametrize("case", PER_SAMPLE)
-def test_broken_file_is_refused_by_name_with_advice(case, capsys, dataset, tmp_path):
+def test_broken_file_is_refused_by_name_with_advice(case, dataset, tmp_path):
     suffix, content, message = PER_SAMPLE[case]
     depths = maps(dataset)
-    encode = {
-        ".npz": lambda d: npz_bytes(depth=d),
-        ".mat": lambda d: mat5_bytes(depth=d),
-        ".png": lambda d: png_bytes(np.round(d / LEVEL_MM).astype(np.uint16)),
-    }[suffix]
+    encode = {".npz": npz_of, ".mat": mat_of, ".png": png_of}[suffix]
     changes = {"png_mm_per_level": LEVEL_MM} if suffix == ".png" else {}
     folder = write_each(tmp_path / "p", suffix, depths, encode, **changes)
     (folder / f"{SAMPLE}{suffix}").write_bytes(content)
-    error = refused(capsys, dataset, folder)
+    error = refused(dataset, folder)
     line = re.search(rf"^\s*{re.escape(SAMPLE + suffix)}: .*", error, flags=re.MULTILINE)
     assert line and re.search(message, line[0]), error
     advice = "write|save|use|predict at|give"
@@ -334,44 +320,41 @@ TABLES = {
 }
 
 
-@pytest.mark.parametrize("case", TABLES)
-@pytest.mark.parametrize("form", ["parquet", "arrow"])
-def test_broken_table_is_refused(form, case, capsys, dataset, tmp_path):
+@pytest.mark.parametrize(("form", "case"), [("arrow", "ragged"), *(("parquet", case) for case in TABLES)])
+def test_broken_table_is_refused(form, case, dataset, tmp_path):
     make, message = TABLES[case]
     encode = parquet_bytes if form == "parquet" else arrow_bytes
     folder = write_table(tmp_path / "p", f"predictions.{form}", encode(make(maps(dataset))))
-    error = refused(capsys, dataset, folder)
+    error = refused(dataset, folder)
     assert f"predictions.{form}" in error and re.search(message, error), error
 
 
-def test_tables_that_would_unpack_to_more_than_a_split_can_need(capsys, dataset, tmp_path):
+def test_tables_that_would_unpack_to_more_than_a_split_can_need(dataset, tmp_path):
     large = pa.table({"sample": ["a"] * 4, "depth": pa.array([np.zeros(400_000).tolist()] * 4, FLAT)})
     folder = write_table(tmp_path / "p", "predictions.parquet", parquet_bytes(large, compression="zstd"))
     assert (folder / "predictions.parquet").stat().st_size < 10_000
-    assert re.search(
-        r"predictions.parquet would unpack to \d+ bytes and 16000\d\d values", refused(capsys, dataset, folder)
-    )
+    assert re.search(r"predictions.parquet would unpack to \d+ bytes and 16000\d\d values", refused(dataset, folder))
     write_table(folder, "predictions.parquet", b"PAR1" + b"\0" * 60 + b"PAR1")
-    assert "can't be read as Arrow or Parquet" in refused(capsys, dataset, folder)
+    assert "can't be read as Arrow or Parquet" in refused(dataset, folder)
     (folder / "predictions.parquet").unlink()
     for cut in (100, 700, 5000):
         write_table(folder, "predictions.arrow", arrow_bytes(table(maps(dataset)))[:cut])
-        assert "predictions.arrow" in refused(capsys, dataset, folder)
+        assert "predictions.arrow" in refused(dataset, folder)
 
 
 @pytest.mark.parametrize("megabytes", [8, 400])
-def test_compressed_arrow_that_unpacks_to_more_than_a_split_can_need(megabytes, capsys, dataset, tmp_path):
+def test_compressed_arrow_that_unpacks_to_more_than_a_split_can_need(megabytes, dataset, tmp_path):
     """The larger one is stopped while it is unpacked, before it has taken as much memory as it asks for."""
     zeros = np.zeros(megabytes * 10**6 // 4, np.float32)
     large = pa.table({"sample": ["a"], "depth": pa.ListArray.from_arrays([0, zeros.size], zeros)})
     folder = write_table(tmp_path / "p", "predictions.arrow", arrow_bytes(large, compression="zstd"))
     assert (folder / "predictions.arrow").stat().st_size < 100_000
-    error = refused(capsys, dataset, folder)
+    error = refused(dataset, folder)
     expected = "unpacks to more than" if megabytes < 100 else "takes more memory than|out of memory|malloc"
     assert re.search(rf"predictions.arrow .*({expected})", error), error
 
 
-def test_page_headers_that_contradict_the_footer(capsys, dataset, tmp_path):
+def test_page_headers_that_contradict_the_footer(dataset, tmp_path):
     """A page that says it unpacks to 8 kB, in a file whose footer says 5 kB."""
     content = parquet_bytes(table({"a": DEPTH}, FLAT), compression="snappy", use_dictionary=False)
     place = pq.read_metadata(io.BytesIO(content)).row_group(0).column(1).data_page_offset
@@ -382,9 +365,10 @@ def test_page_headers_that_contradict_the_footer(capsys, dataset, tmp_path):
         content[:place] + b"\x1b" * (len(content) - place),
     ):
         folder = write_table(tmp_path / "p", "predictions.parquet", wrong)
-        assert "can't be read as Arrow or Parquet" in refused(capsys, dataset, folder)
+        assert "can't be read as Arrow or Parquet" in refused(dataset, folder)
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("answer", ["os.abort()", "time.sleep(60)", "bytearray(10**9)"])
 def test_a_process_that_reads_is_bounded_and_its_end_is_a_refusal(answer, tmp_path, monkeypatch):
     (tmp_path / "reader_of_test.py").write_text(
@@ -411,19 +395,19 @@ def test_a_process_that_reads_is_bounded_and_its_end_is_a_refusal(answer, tmp_pa
     assert process.returncode is not None
 
 
-def test_forms_cannot_be_mixed_and_links_are_refused(capsys, dataset, tmp_path):
+def test_forms_cannot_be_mixed_and_links_are_refused(dataset, tmp_path):
     depths = maps(dataset)
-    folder = write_each(tmp_path / "p", ".npz", depths, lambda d: npz_bytes(depth=d))
+    folder = write_each(tmp_path / "p", ".npz", depths, npz_of)
     (folder / f"{SAMPLE}.npy").write_bytes(npy_bytes(depths[SAMPLE]))
     (folder / "predictions.parquet").write_bytes(b"")
-    error = refused(capsys, dataset, folder)
+    error = refused(dataset, folder)
     assert f"{SAMPLE}.npy: is extra (the other predictions are .npz files: keep one form)" in error
     assert "predictions.parquet: is extra (the other predictions are .npz files: keep one form)" in error
     table_folder = tmp_path / "t"
     write_table(table_folder, "predictions.parquet", parquet_bytes(table(depths)))
     (table_folder / "predictions.parquet").rename(tmp_path / "elsewhere")
     (table_folder / "predictions.parquet").symlink_to(tmp_path / "elsewhere")
-    assert "predictions.parquet is a symbolic link" in refused(capsys, dataset, table_folder)
+    assert "predictions.parquet is a symbolic link" in refused(dataset, table_folder)
 
 
 UNITS = {
@@ -442,18 +426,16 @@ UNITS = {
 
 
 @pytest.mark.parametrize("case", UNITS)
-def test_declared_units_are_checked_against_the_values(case, capsys, dataset, tmp_path):
+def test_declared_units_are_checked_against_the_values(case, dataset, tmp_path):
     units, change, changes, message = UNITS[case]
     folder = write_predictions(tmp_path / "p", dataset, noise_mm=1.0, units=units, **changes)
     for path in folder.glob("*.npy"):
         np.save(path, change(np.load(path).astype(np.float64)))
-    error = refused(capsys, dataset, folder)
+    error = refused(dataset, folder)
     assert re.search(message, error), error
     assert "submission.yaml" in error or re.search(r"power_drill_A0.npy: ", error)
 
 
-def test_png_needs_its_scale(capsys, dataset, tmp_path):
-    folder = write_each(
-        tmp_path / "p", ".png", maps(dataset), lambda d: png_bytes(np.round(d / 0.05).astype(np.uint16))
-    )
-    assert "png_mm_per_level: expected what one level" in refused(capsys, dataset, folder)
+def test_png_needs_its_scale(dataset, tmp_path):
+    folder = write_each(tmp_path / "p", ".png", maps(dataset), png_of)
+    assert "png_mm_per_level: expected what one level" in refused(dataset, folder)

@@ -1,18 +1,19 @@
 """Predictions and descriptions that must not be scored: through the real command, exit status 2, no JSON, named."""
 
-import json
 import os
 import re
 import struct
 from collections.abc import Callable
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
+from conftest import fpp_eval, read_json, refusal
 from scored_dataset import DESCRIPTION, make_dataset, write_description, write_predictions
 
-from fpp_ml_bench.cli import main_eval as main
 from fpp_ml_bench.errors import PredictionError
 from fpp_ml_bench.evaluation.score.evaluator import evaluate
 from fpp_ml_bench.evaluation.submission.description import Submission, read_submission
@@ -21,28 +22,16 @@ SAMPLE = "power_drill_A60"
 FILE = f"{SAMPLE}.npy"
 
 
-@pytest.fixture(scope="module")
-def dataset(tmp_path_factory):
-    return make_dataset(tmp_path_factory.mktemp("data") / "tiny")
-
-
-@pytest.fixture
-def predictions(tmp_path, dataset):
-    return write_predictions(tmp_path / "predictions", dataset)
-
-
-def refused(capsys, tmp_path: Path, dataset, predictions: Path, *arguments: str) -> str:
-    """Run the command, check that it refuses and leaves an older result alone; its message."""
+def refused(tmp_path, dataset, predictions):
+    """What the command says when it refuses; it prints nothing and leaves an older result alone."""
     result = tmp_path / "result.json"
     result.write_text("older")
-    status = main([str(predictions), str(dataset.path), "--json", str(result), *arguments])
-    captured = capsys.readouterr()
-    assert status == 2
-    assert captured.out == ""
+    with redirect_stdout(StringIO()) as out:
+        error = refusal(fpp_eval, predictions, dataset.path, "--json", result)
+    assert out.getvalue() == "" and "Traceback" not in error
     assert result.read_text() == "older"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["predictions", "result.json"]
-    assert "Traceback" not in captured.err
-    return captured.err
+    return error
 
 
 def rewrite(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[Path], None]:
@@ -87,11 +76,6 @@ def pickled(folder: Path) -> None:
     np.save(folder / FILE, np.array([[{"a": 1}]], dtype=object), allow_pickle=True)
 
 
-def replace_by_folder(folder: Path) -> None:
-    (folder / FILE).unlink()
-    (folder / FILE).mkdir()
-
-
 def replace_by_pipe(folder: Path) -> None:
     (folder / FILE).unlink()
     os.mkfifo(folder / FILE)
@@ -103,29 +87,20 @@ FILES = {
     "wrong shape": (rewrite(lambda d: d[:-1]), r"expected shape \(32, 40\) \(H, W\), got \(31, 40\)"),
     "transposed": (rewrite(lambda d: d.T), r"got \(40, 32\); it looks transposed"),
     "extra axis": (rewrite(lambda d: d[None]), r"got \(1, 32, 40\); it has an axis too many; write np.squeeze"),
-    "last axis": (rewrite(lambda d: d[..., None]), r"got \(32, 40, 1\); it has an axis too many; write np.squeeze"),
     "channels": (rewrite(lambda d: np.stack([d] * 3)), r"got \(3, 32, 40\); write the map of depth alone"),
     "a mark": (rewrite(lambda d: np.where(d > 0, d, 65504)), r"holds a mark .*% of the pixels are exactly 65504"),
     "a negative mark": (rewrite(lambda d: np.where(d > 0, d, -1)), r"are exactly -1, far .* or give .* nodata"),
     "scalar": (rewrite(lambda d: np.float32(1)), r"got \(\)"),
-    "int32": (rewrite(lambda d: d.astype(np.int32)), "got int32"),
     "uint16": (rewrite(lambda d: d.astype(np.uint16)), "got uint16"),
-    "bool": (rewrite(lambda d: d > 0), "got bool"),
     "complex": (rewrite(lambda d: d.astype(np.complex64)), "got complex64"),
-    "long double": (rewrite(lambda d: d.astype(np.longdouble)), "got float128"),
-    "text": (rewrite(lambda d: d.astype("U4")), "expected float16, float32 or float64"),
     "structured": (rewrite(lambda d: d.view([("z", "<f4")])), "expected float16, float32 or float64"),
     "objects": (pickled, "pickled Python objects"),
     "one NaN": (with_value(np.nan), "holds 1 NaN of 1280 values"),
     "infinities": (with_value(np.inf, 3), "holds 3 infinite of 1280 values"),
-    "minus infinity": (with_value(-np.inf), "holds 1 infinite"),
-    "all NaN": (with_value(np.nan, 1280), "holds 1280 NaN of 1280 values"),
     "absurd": (with_value(3e38), "the limit is 1e\\+30"),
-    "metres": (rewrite(lambda d: d / 1000), "looks like metres"),
     "normalised": (rewrite(lambda d: d / d.max()), "looks like metres or normalised depth: its largest value is 1"),
     "truncated": (cut, "is truncated: expected 5248 bytes, got 5244"),
     "grown": (grow, "foreign bytes"),
-    "empty file": (lambda f: (f / FILE).write_bytes(b""), "is no .npy file"),
     "noise": (lambda f: (f / FILE).write_bytes(bytes(range(256)) * 8), "is no .npy file"),
     "zip archive": (archive, "np.savez"),
     "no dictionary": (header(b"import os\n"), "is no .npy file"),
@@ -137,25 +112,23 @@ FILES = {
     ),
     "format 3.0": (header(b"{}", b"\x93NUMPY\x03\x00"), "format version"),
     "symbolic link": (link, "is a symbolic link"),
-    "broken link": (lambda f: (f / FILE).unlink() or (f / FILE).symlink_to("nowhere"), "is a symbolic link"),
-    "folder": (replace_by_folder, "is not a regular file"),
     "pipe": (replace_by_pipe, "is not a regular file"),
 }
 
 
 @pytest.mark.parametrize("case", FILES)
-def test_bad_prediction_file_is_refused_by_name(case, capsys, tmp_path, dataset, predictions):
+def test_bad_prediction_file_is_refused_by_name(case, tmp_path, dataset, predictions):
     change_folder, message = FILES[case]
     change_folder(predictions)
     if case == "symbolic link":
         (tmp_path / "elsewhere.npy").rename(predictions.parent.parent / f"{tmp_path.name}-elsewhere.npy")
-    error = refused(capsys, tmp_path, dataset, predictions)
+    error = refused(tmp_path, dataset, predictions)
     line = re.search(rf"^\s*{re.escape(FILE)}: .*{message}.*$", error, flags=re.MULTILINE)
     assert line, error
     assert re.search(ADVICE, line[0]), f"no advice in {line[0]}"
 
 
-def test_every_offender_is_named_at_once(capsys, tmp_path, dataset, predictions):
+def test_every_offender_is_named_at_once(tmp_path, dataset, predictions):
     (predictions / "wooden_boards_A0.npy").unlink()
     with_value(np.nan, 7)(predictions)
     np.save(predictions / "power_drill_A0.npy", np.zeros((2, 2), np.int8))
@@ -164,7 +137,7 @@ def test_every_offender_is_named_at_once(capsys, tmp_path, dataset, predictions)
     (predictions / ".DS_Store").write_text("")
     (predictions / "more").mkdir()
     write_description(predictions, method=..., colour="red")
-    error = refused(capsys, tmp_path, dataset, predictions)
+    error = refused(tmp_path, dataset, predictions)
     for expected in (
         "can't be scored, 7 problems",
         "wooden_boards_A0.npy: is missing",
@@ -180,22 +153,22 @@ def test_every_offender_is_named_at_once(capsys, tmp_path, dataset, predictions)
         assert expected in error
 
 
-def test_several_faults_of_one_file_are_all_named(capsys, tmp_path, dataset, predictions):
+def test_several_faults_of_one_file_are_all_named(tmp_path, dataset, predictions):
     rewrite(lambda d: np.where(np.arange(1280).reshape(32, 40) == 0, np.nan, d / 1000 - 1e-3))(predictions)
-    error = refused(capsys, tmp_path, dataset, predictions)
+    error = refused(tmp_path, dataset, predictions)
     assert f"{FILE}: holds 1 NaN" in error and "looks like metres" in error
 
 
 def test_negative_values_are_errors_like_any_other(tmp_path, dataset, predictions):
     with_value(-1.0, 3)(predictions)
     written = tmp_path / "result.json"
-    assert main([str(predictions), str(dataset.path), "--json", str(written)]) == 0
-    assert json.loads(written.read_text())["metrics"]["overall_mae_mm"] > 0
+    assert fpp_eval(predictions, dataset.path, "--json", written) == 0
+    assert read_json(written)["metrics"]["overall_mae_mm"] > 0
 
 
-def test_file_names_cannot_speak_to_the_terminal(capsys, tmp_path, dataset, predictions):
+def test_file_names_cannot_speak_to_the_terminal(tmp_path, dataset, predictions):
     (predictions / "\x1b[31mred\n.npy").write_text("")
-    error = refused(capsys, tmp_path, dataset, predictions)
+    error = refused(tmp_path, dataset, predictions)
     assert "\x1b" not in error
     assert "\\x1b[31mred\\n.npy: is extra" in error
 
@@ -203,33 +176,24 @@ def test_file_names_cannot_speak_to_the_terminal(capsys, tmp_path, dataset, pred
 DESCRIPTIONS = {
     "unknown key": ({"speed": 3}, "speed: is not a key"),
     "no name": ({"name": ...}, "name: is missing"),
-    "no frames": ({"frames_used": ...}, "frames_used: is missing"),
     "empty name": ({"name": "  "}, "name: expected some text"),
     "number as name": ({"name": 5}, "name: .*string"),
     "long name": ({"name": "x" * 201}, "name: expected at most 200 characters, got 201"),
     "escape in name": ({"name": "a\x1b[2J"}, r"name: .*U\+001B"),
-    "line break in name": ({"name": "a\nb"}, r"name: .*U\+000A"),
     "reversed text in name": ({"name": "a\u202eb"}, r"name: .*U\+202E"),
     "inches": ({"units": "inch"}, "units: Input should be 'mm', 'm' or 'normalised' .got 'inch'"),
-    "no units": ({"units": ...}, "units: is missing"),
-    "range as text": ({"uses_ground_truth_range": "yes"}, "uses_ground_truth_range: .*boolean"),
     "range as number": ({"uses_ground_truth_range": 0}, "uses_ground_truth_range: .*boolean"),
-    "frames as text": ({"frames_used": "0"}, "frames_used: .*list"),
     "fraction of a frame": ({"frames_used": [0.5]}, r"frames_used\.0: .*integer"),
     "negative frame": ({"frames_used": [-1]}, r"frames_used\.0: .*greater"),
     "frame twice": ({"frames_used": [1, 1]}, "frames_used names a frame twice"),
     "empty frames": ({"frames_used": []}, "frames_used: .*at least 1 item"),
     "frame outside": ({"frames_used": [3, 52]}, r"frames_used: expected indices from 0 to 51 .*got \[52\]"),
-    "negative time": ({"seconds_per_sample": -1.0}, "seconds_per_sample: .*greater"),
     "no time": ({"seconds_per_sample": 0.0}, "seconds_per_sample: .*greater"),
     "NaN time": ({"seconds_per_sample": float("nan")}, "seconds_per_sample: .*finite"),
-    "time as text": ({"seconds_per_sample": "fast"}, "seconds_per_sample: .*number"),
     "time without its machine": ({"hardware": ...}, "needs seconds_source and hardware"),
     "unknown source": ({"seconds_source": "guessed"}, "seconds_source: .*measured"),
-    "hardware as text": ({"hardware": "fast"}, "hardware: "),
     "unknown hardware key": ({"hardware": {"cpu": "x", "ghz": 3}}, r"hardware\.ghz: is not a key"),
     "unknown data": ({"learned_from": {"data": "everything"}}, r"learned_from\.data: .*'train-split'"),
-    "data as text": ({"learned_from": "train-split"}, "learned_from: "),
     "train split of what": ({"learned_from": {"data": "train-split"}}, "data: train-split needs versions"),
     "versions of nothing": ({"learned_from": {"data": "none", "versions": ["x"]}}, "from no data has no versions"),
     "nested settings": ({"settings": {"a": {"b": 1}}}, r"settings\.a"),
@@ -237,10 +201,10 @@ DESCRIPTIONS = {
 
 
 @pytest.mark.parametrize("case", DESCRIPTIONS)
-def test_bad_description_is_refused_by_key(case, capsys, tmp_path, dataset, predictions):
+def test_bad_description_is_refused_by_key(case, tmp_path, dataset, predictions):
     changes, message = DESCRIPTIONS[case]
     write_description(predictions, **changes)
-    error = refused(capsys, tmp_path, dataset, predictions)
+    error = refused(tmp_path, dataset, predictions)
     assert "submission.yaml" in error
     assert re.search(message, error), error
 
@@ -257,19 +221,18 @@ TEXTS = {
     "too long": ("name: " + "x" * 70000, "at most 65536 bytes"),
     "nested": ("a: " + "[" * 20000, "is no plain YAML"),
     "a date": ("name: !!timestamp 2026-99-99\n", "name: has the tag"),
-    "a number": ("seeds: {data: !!int x}\n", "data: has the tag"),
     "not UTF-8": (b"name: \xff\xfe", "expected UTF-8"),
 }
 
 
 @pytest.mark.parametrize("case", TEXTS)
-def test_description_that_is_no_description(case, capsys, tmp_path, dataset, predictions):
+def test_description_that_is_no_description(case, tmp_path, dataset, predictions):
     text, message = TEXTS[case]
     path = predictions / "submission.yaml"
     path.unlink()
     if text is not None:
         path.write_bytes(text if isinstance(text, bytes) else text.encode())
-    error = refused(capsys, tmp_path, dataset, predictions)
+    error = refused(tmp_path, dataset, predictions)
     assert "submission.yaml" in error
     assert re.search(message, error), error
 
@@ -283,10 +246,10 @@ def test_description_is_written_as_it_is_read(predictions):
     assert "mask" not in Submission(**{**DESCRIPTION, "uses_ground_truth_mask": False}).to_yaml()
 
 
-def test_description_through_a_link_is_refused(capsys, tmp_path, dataset, predictions):
+def test_description_through_a_link_is_refused(tmp_path, dataset, predictions):
     (predictions / "submission.yaml").unlink()
     (predictions / "submission.yaml").symlink_to("/etc/passwd")
-    assert "symbolic link" in refused(capsys, tmp_path, dataset, predictions)
+    assert "symbolic link" in refused(tmp_path, dataset, predictions)
 
 
 @pytest.mark.parametrize(
@@ -301,25 +264,22 @@ def test_description_through_a_link_is_refused(capsys, tmp_path, dataset, predic
         (["{pred}", "{data}", "--split", "train"], "bowl_A0.npy: is missing"),
     ],
 )
-def test_wrong_arguments(arguments, message, capsys, dataset, predictions):
+def test_wrong_arguments(arguments, message, dataset, predictions):
     before = sorted(p.name for p in predictions.iterdir())
-    status = main([a.format(data=dataset.path, pred=predictions) for a in arguments])
-    assert status == 2
-    assert message in capsys.readouterr().err
+    words = [part.format(data=dataset.path, pred=predictions) for part in arguments]
+    assert message in refusal(fpp_eval, *words)
     assert sorted(p.name for p in predictions.iterdir()) == before
 
 
-@pytest.mark.parametrize("band", ["-1", "1.5", "x", "1001"])
-def test_edge_band_must_be_whole_pixels(band, dataset, predictions, capsys):
-    assert main([str(predictions), str(dataset.path), "--edge-band", band]) == 2
-    assert "whole pixels" in capsys.readouterr().err
+@pytest.mark.parametrize("band", ["-1", "1.5", "1001"])
+def test_edge_band_must_be_whole_pixels(band, dataset, predictions):
+    assert "whole pixels" in refusal(fpp_eval, predictions, dataset.path, "--edge-band", band)
 
 
-def test_dataset_without_exact_depth(tmp_path, capsys):
+def test_dataset_without_exact_depth(tmp_path):
     data = make_dataset(tmp_path / "published", exact=False)
     predictions = write_predictions(tmp_path / "predictions", data)
-    assert main([str(predictions), str(data.path), "--target", "depth_exact"]) == 2
-    assert "no depth_exact" in capsys.readouterr().err
+    assert "no depth_exact" in refusal(fpp_eval, predictions, data.path, "--target", "depth_exact")
 
 
 def test_a_mark_that_the_description_names_is_no_surface(dataset, predictions):

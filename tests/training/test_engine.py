@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conftest import TINY_SIZE
+from conftest import TINY_SIZE, read_json
 
 from fpp_ml_bench.baselines.networks.model import load
 from fpp_ml_bench.baselines.training.depth_training import (
@@ -52,11 +52,21 @@ def curve_of(run):
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(tiny, tmp_path_factory):
-    return train(small(), tiny, tmp_path_factory.mktemp("training") / "run", show=False)
+def trained(tiny):
+    """Trains on the tiny dataset into a folder, by default by `small`."""
+
+    def act(folder, recipe=None, **options):
+        return train(recipe or small(), tiny, folder, **{"show": False, **options})
+
+    return act
 
 
-def test_what_a_training_leaves(uninterrupted, tiny):
+@pytest.fixture(scope="module")
+def uninterrupted(trained, tmp_path_factory):
+    return trained(tmp_path_factory.mktemp("training") / "run")
+
+
+def test_what_a_training_leaves(uninterrupted, trained):
     assert uninterrupted.finished and uninterrupted.epochs == 3
     names = {path.name for path in uninterrupted.weights.parent.iterdir()}
     assert names == {WEIGHTS, CHECKPOINT, DONE, CURVE_FILE, "recipe.json", "log.jsonl"}
@@ -68,14 +78,14 @@ def test_what_a_training_leaves(uninterrupted, tiny):
     assert model.config.epoch == best["epoch"]
     assert model.config.recipe == small().to_dict()
     assert uninterrupted.curve.read_bytes().startswith(b"\x89PNG")
-    assert train(small(), tiny, uninterrupted.weights.parent, show=False) == uninterrupted
+    assert trained(uninterrupted.weights.parent) == uninterrupted
 
 
-def test_the_same_bits_again(uninterrupted, tiny, tmp_path):
-    again = train(small(), tiny, tmp_path / "run", show=False)
+def test_the_same_bits_again(uninterrupted, tmp_path, trained):
+    again = trained(tmp_path / "run")
     assert again.weights.read_bytes() == uninterrupted.weights.read_bytes()
     assert curve_of(again) == curve_of(uninterrupted)
-    of_another_seed = train(small(seed=43, max_epochs=1), tiny, tmp_path / "other", show=False)
+    of_another_seed = trained(tmp_path / "other", small(seed=43, max_epochs=1))
     assert curve_of(of_another_seed) != curve_of(uninterrupted)[:1]
 
 
@@ -87,8 +97,9 @@ def test_faded_gradients_are_zero_within_a_training_only():
     assert (faded * 0.5 > 0).all()
 
 
+@pytest.mark.processes
 @pytest.mark.parametrize("batch_of_the_kill", [0, 3])
-def test_killed_and_resumed_is_uninterrupted(uninterrupted, tiny, tmp_path, monkeypatch, batch_of_the_kill):
+def test_killed_and_resumed_is_uninterrupted(uninterrupted, tmp_path, monkeypatch, batch_of_the_kill, trained):
     batches = []
 
     def kill(self):
@@ -98,26 +109,26 @@ def test_killed_and_resumed_is_uninterrupted(uninterrupted, tiny, tmp_path, monk
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(Display, "step", kill)
-        train(small(), tiny, tmp_path / "run", show=False)
-    resumed = train(small(), tiny, tmp_path / "run", show=False)
+        trained(tmp_path / "run")
+    resumed = trained(tmp_path / "run")
     assert resumed.weights.read_bytes() == uninterrupted.weights.read_bytes()
     assert curve_of(resumed) == curve_of(uninterrupted)
 
 
-def test_a_gan_paused_is_the_same_too(tiny, tmp_path):
+def test_a_gan_paused_is_the_same_too(tmp_path, trained):
     recipe = small("architecture/pix2pix", max_epochs=2, options={"levels": 4})
-    whole = train(recipe, tiny, tmp_path / "whole", show=False)
-    paused = train(recipe, tiny, tmp_path / "paused", minutes=1e-6, show=False)
+    whole = trained(tmp_path / "whole", recipe)
+    paused = trained(tmp_path / "paused", recipe, minutes=1e-6)
     assert not paused.finished and paused.epochs == 1 and not (tmp_path / "paused" / DONE).exists()
-    resumed = train(recipe, tiny, tmp_path / "paused", show=False)
+    resumed = trained(tmp_path / "paused", recipe)
     assert resumed.finished and resumed.weights.read_bytes() == whole.weights.read_bytes()
     assert curve_of(resumed) == curve_of(whole)
     assert {"discriminator", "feature_matching", "hybrid_l1"} <= set(curve_of(whole)[0])
 
 
 @pytest.mark.parametrize("name", ["guided", "physics"])
-def test_further_directions_train(name, tiny, tmp_path):
-    (record,) = curve_of(train(small(f"further/{name}", max_epochs=1), tiny, tmp_path / "run", show=False))
+def test_further_directions_train(name, tmp_path, trained):
+    (record,) = curve_of(trained(tmp_path / "run", small(f"further/{name}", max_epochs=1)))
     assert ("further" in record) == (name == "physics")
     assert all(np.isfinite(value) for value in record.values())
 
@@ -148,9 +159,9 @@ each and added up in another order, differ by about 6e-8 sqrt(300) = 1e-6 of the
 
 
 @pytest.mark.parametrize("normalisation", ["raw", "global", "individual"])
-def test_the_validation_score_is_the_evaluators(tiny, tmp_path, normalisation):
+def test_the_validation_score_is_the_evaluators(tiny, tmp_path, normalisation, trained):
     recipe = small(f"normalization/{normalisation}", max_epochs=1, validation_pairs=None)
-    run = train(recipe, tiny, tmp_path / "run", show=False)
+    run = trained(tmp_path / "run", recipe)
     loss, scores = validation_of(run.weights, tiny, recipe)
     logged = curve_of(run)[0]
     for key in SCORES:
@@ -158,27 +169,28 @@ def test_the_validation_score_is_the_evaluators(tiny, tmp_path, normalisation):
     assert logged["validation_loss"] == pytest.approx(loss, rel=FLOAT32)
 
 
-def test_many_frames_and_bf16(tiny, tmp_path):
+def test_many_frames_and_bf16(tmp_path, trained):
     recipe = small("multi_frame/vertical", precision="bf16", max_epochs=1)
-    run = train(recipe, tiny, tmp_path / "run", show=True)
+    run = trained(tmp_path / "run", recipe, show=True)
     assert run.finished and math.isfinite(curve_of(run)[0]["training_loss"])
     assert load(run.weights).config.data_config == "vertical"
 
 
-def test_divergence_names_the_batch(tiny, tmp_path):
+def test_divergence_names_the_batch(tmp_path, trained):
     rule = {"name": "rmsprop", "learning_rate": 1e30, "alpha": 0.99, "weight_decay": 1e-5}
     with pytest.raises(TrainingError, match=r"training diverged: loss .* in epoch 1, batch 2, samples \w+_A\d+"):
-        train(small(optimizer=rule), tiny, tmp_path / "run", show=False)
+        trained(tmp_path / "run", small(optimizer=rule))
 
 
-def test_a_validation_loss_that_runs_away_ends_it(tiny, tmp_path):
+def test_a_validation_loss_that_runs_away_ends_it(tmp_path, trained):
     """The step between the last look at the training loss and the validation was the fatal one."""
     rule = {"name": "rmsprop", "learning_rate": 1e9, "alpha": 0.99, "weight_decay": 1e-5}
     with pytest.raises(TrainingError, match="the validation loss after epoch 1"):
-        train(small(optimizer=rule, pairs_per_epoch=2), tiny, tmp_path / "run", show=False)
+        trained(tmp_path / "run", small(optimizer=rule, pairs_per_epoch=2))
     assert not (tmp_path / "run" / WEIGHTS).exists()
 
 
+@pytest.mark.processes
 def test_two_processes_agree(tiny, tmp_path):
     """accelerate's launcher on two processors: one set of files, and a log that both have a part in."""
     (tmp_path / "mine.yaml").write_text(
@@ -186,20 +198,10 @@ def test_two_processes_agree(tiny, tmp_path):
         "pairs_per_epoch: 4\nvalidation_pairs: 3\n"
     )
     code = "from accelerate.commands.launch import main; main()"
-    options = [
-        "--cpu",
-        "--num_processes",
-        "2",
-        "--num_machines",
-        "1",
-        "--mixed_precision",
-        "no",
-        "--dynamo_backend",
-        "no",
-    ]
+    options = "--cpu --num_processes 2 --num_machines 1 --mixed_precision no --dynamo_backend no"
     command = ["-m", "fpp_ml_bench", "train", tmp_path / "mine.yaml", tiny, "--out", tmp_path / "run"]
     done = subprocess.run(
-        [sys.executable, "-c", code, *options, "--main_process_port", "0", *map(str, command)],
+        [sys.executable, "-c", code, *options.split(), "--main_process_port", "0", *map(str, command)],
         cwd=Path(__file__).resolve().parent.parent,
         capture_output=True,
         text=True,
@@ -208,50 +210,50 @@ def test_two_processes_agree(tiny, tmp_path):
     assert done.returncode == 0, done.stderr[-2000:]
     names = {path.name for path in (tmp_path / "run").iterdir()}
     assert names == {WEIGHTS, CHECKPOINT, DONE, CURVE_FILE, "recipe.json", "log.jsonl"}
-    record = json.loads((tmp_path / "run" / "log.jsonl").read_text())
+    record = read_json(tmp_path / "run" / "log.jsonl")
     assert math.isfinite(record["validation_loss"])
     scores = validation_of(tmp_path / "run" / WEIGHTS, tiny, load_recipe(tmp_path / "mine.yaml", "small"))[1]
     for key in SCORES:  # means over the three pairs of both processes
         assert record[key] == pytest.approx(scores[key], rel=FLOAT32), key
 
 
-def test_nothing_that_is_not_finite_is_kept(tiny, tmp_path, monkeypatch):
+def test_nothing_that_is_not_finite_is_kept(tmp_path, monkeypatch, trained):
     """A network whose training looks sound and whose answer in validation is not."""
     from fpp_ml_bench.baselines.networks.unet import UNet
 
     forward = UNet.forward
     monkeypatch.setattr(UNet, "forward", lambda self, x: forward(self, x) * (1.0 if self.training else math.nan))
     with pytest.raises(TrainingError, match=r"the network's answer to \w+_A\d+ is not finite"):
-        train(small(), tiny, tmp_path / "run", show=False)
+        trained(tmp_path / "run")
     assert not (tmp_path / "run" / WEIGHTS).exists()
 
 
-def test_refusals(uninterrupted, tiny, tmp_path):
+def test_refusals(uninterrupted, tmp_path, trained):
     folder = tmp_path / "run"
     shutil.copytree(uninterrupted.weights.parent, folder)
     with pytest.raises(TrainingError, match="differs in normalisation, optimizer; give another folder"):
-        train(small("normalization/raw"), tiny, folder, show=False)
+        trained(folder, small("normalization/raw"))
     with pytest.raises(TrainingError, match=rf"{TINY_SIZE} px, recipe .* expects 192 x 192; build the size"):
-        train(small(size=192), tiny, tmp_path / "other", show=False)
+        trained(tmp_path / "other", small(size=192))
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "thesis.tex").write_text("precious")
     with pytest.raises(TrainingError, match=r"holds files but no recipe\.json"):
-        train(small(), tiny, tmp_path / "mine", show=False)
+        trained(tmp_path / "mine")
     (folder / DONE).write_text("{")
     with pytest.raises(TrainingError, match="is damaged; delete it"):
-        train(small(), tiny, folder, show=False)
+        trained(folder)
     (folder / DONE).unlink()
     content = bytearray((folder / CHECKPOINT).read_bytes())
     content[-100] ^= 1
     (folder / CHECKPOINT).write_bytes(content)
     with pytest.raises(TrainingError, match="does not match its own checksum"):
-        train(small(), tiny, folder, show=False)
+        trained(folder)
     (folder / CHECKPOINT).write_bytes(content[:1000])
     with pytest.raises(TrainingError, match=r"damaged .*delete .* to train again"):
-        train(small(), tiny, folder, show=False)
+        trained(folder)
     shutil.copy(uninterrupted.weights, folder / CHECKPOINT)
     with pytest.raises(TrainingError, match="expected weights of fpp-ml-bench training, got format 'fpp-ml-bench'"):
-        train(small(), tiny, folder, show=False)
+        trained(folder)
 
 
 def test_an_epoch_is_a_permutation_and_rounds_are_fair():
@@ -304,13 +306,13 @@ def test_a_linear_schedule_is_constant_and_then_falls_to_zero():
     assert rates == pytest.approx([1e-4, 1e-4, 1e-4, 0.75e-4, 0.5e-4, 0.25e-4])
 
 
-def test_the_rule_of_the_range_is_recorded_and_a_run_of_another_is_not_continued(tiny, tmp_path):
+def test_the_rule_of_the_range_is_recorded_and_a_run_of_another_is_not_continued(tmp_path, trained):
     """Runs of before the rule hold none; their range was that of all object pixels."""
     recipe = small("normalization/individual", max_epochs=2)
-    paused = train(recipe, tiny, tmp_path / "run", minutes=1e-6, show=False)
+    paused = trained(tmp_path / "run", recipe, minutes=1e-6)
     assert load(paused.weights).config.range_rule == "valid"
     tensors, state = read_checkpoint(tmp_path / "run" / CHECKPOINT)
     assert state.pop("range_rule") == "valid"
     save_checkpoint(tmp_path / "run" / CHECKPOINT, tensors, state)
     with pytest.raises(TrainingError, match="another recipe, dataset or depth range; give a new folder"):
-        train(recipe, tiny, tmp_path / "run", show=False)
+        trained(tmp_path / "run", recipe)

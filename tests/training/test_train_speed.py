@@ -38,7 +38,7 @@ def test_both_ways_read_the_same_images(monkeypatch, ways, data):
         train_speed.check_same(*data)
 
 
-def test_a_difference_is_noticed(ways, data, tmp_path):
+def test_a_difference_is_noticed(ways, data):
     dataset, tree = data
     reader = ways.PngAndMat(tree)
     content = reader.depths[2].read_bytes()

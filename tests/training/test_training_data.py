@@ -5,6 +5,9 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
+from conftest import fpp_bench
+from safetensors import safe_open
+from safetensors.torch import load_file, save_file
 from scored_dataset import name_benchmarks
 from tiny_network import config_of, tiny_network
 
@@ -23,7 +26,6 @@ from fpp_ml_bench.baselines.training.weights import (
     training_benchmark,
     training_data_warning,
 )
-from fpp_ml_bench.cli import main
 from fpp_ml_bench.loaders.storage import benchmark
 from fpp_ml_bench.loaders.storage.benchmark import Benchmark
 
@@ -40,7 +42,7 @@ def benchmarks(monkeypatch, opened, tmp_path):
     return named
 
 
-def phase_net_config(**changes):
+def save_phase_net(path, **changes):
     content = {
         "name": "phase-net",
         "title": "Small",
@@ -50,7 +52,7 @@ def phase_net_config(**changes):
         "dataset_fingerprint": "0" * 64,
         "recipe": {"albedo": "one"},
     }
-    return NetConfig(**{**content, **changes})
+    save_weights(path, PhaseNet(**NET_OPTIONS), NetConfig(**{**content, **changes}), family=PHASE_NETWORKS)
 
 
 def test_a_new_weights_file_names_its_benchmark(benchmarks, opened, tmp_path):
@@ -63,12 +65,7 @@ def test_a_new_weights_file_names_its_benchmark(benchmarks, opened, tmp_path):
         path = tmp_path / "net.safetensors"
         save_weights(path, network, config)
         assert open_weights(path).config.benchmark == expected
-        save_weights(
-            path,
-            PhaseNet(**NET_OPTIONS),
-            phase_net_config(benchmark=training_benchmark(data.content)),
-            family=PHASE_NETWORKS,
-        )
+        save_phase_net(path, benchmark=training_benchmark(data.content))
         assert load_net(path).config.benchmark == expected
 
 
@@ -78,25 +75,18 @@ def test_a_file_without_the_entry_is_read(tmp_path):
     assert named == {TrainingBenchmark("fpp-bench-full-224", 2)}
     assert load_net().config.benchmark == TrainingBenchmark("phase-net views", 1)
     path = tmp_path / "net.safetensors"
-    save_weights(
-        path, PhaseNet(**NET_OPTIONS), phase_net_config(benchmark=TrainingBenchmark("tiny", 1)), family=PHASE_NETWORKS
-    )
-    data = path.read_bytes()
-    length = int.from_bytes(data[:8], "little")
-    header = json.loads(data[8 : 8 + length])
-    config = json.loads(header["__metadata__"]["config"])
+    save_phase_net(path, benchmark=TrainingBenchmark("tiny", 1))
+    with safe_open(path, framework="pt") as file:
+        metadata = file.metadata()
+    config = json.loads(metadata["config"])
     del config["benchmark"]
-    header["__metadata__"]["config"] = json.dumps(config)
-    older = json.dumps(header).encode()
-    older += b" " * (-len(older) % 8)
-    path.write_bytes(len(older).to_bytes(8, "little") + older + data[8 + length :])
+    save_file(load_file(path), path, metadata | {"config": json.dumps(config)})
     assert load_net(path).config.benchmark is None
 
 
 @pytest.mark.parametrize(
     "fingerprint, trained_on, words",
     [
-        ("same", None, None),
         ("same", TrainingBenchmark("tiny", 0), None),
         (OLD, None, "trained on dataset aaaaaaaa, which is no benchmark of this version; predicting on tiny version 1"),
         (OLD, TrainingBenchmark("tiny", 0), "trained on tiny version 0; predicting on tiny version 1"),
@@ -111,9 +101,8 @@ def test_what_is_said_on_a_named_benchmark(benchmarks, opened, fingerprint, trai
 
 def test_other_bytes_of_a_benchmarks_settings_are_said(benchmarks, opened, monkeypatch):
     """A dataset that was built with a benchmark's settings, and differs from it: on another processor, say."""
-    built = replace(benchmarks[0])
     manifest = replace(opened.manifest, content={**opened.content, "test/depth": "0" * 32})
-    monkeypatch.setattr(training_data, "intended_benchmark", lambda manifest: built)
+    monkeypatch.setattr(training_data, "intended_benchmark", lambda manifest: benchmarks[0])
     config = config_of(tiny_network(), dataset_fingerprint="d" * 64, benchmark=TrainingBenchmark("tiny", 1))
     dataset = f"dataset {manifest.fingerprint[:8]}, which has the settings of tiny version 1 but other content"
     assert training_data_warning(config, manifest) == f"trained on tiny version 1; predicting on {dataset}"
@@ -121,13 +110,12 @@ def test_other_bytes_of_a_benchmarks_settings_are_said(benchmarks, opened, monke
 
 def test_nothing_is_said_on_data_of_the_users_own(opened):
     config = config_of(tiny_network(), dataset_fingerprint=OLD)
-    assert training_data_warning(config, opened.manifest) is None
-    imported = replace(opened.manifest, origin="imported")
-    assert training_data_warning(config, imported) is None
+    assert training_data_warning(config, replace(opened.manifest, origin="imported")) is None
 
 
-@pytest.mark.parametrize("command", ["predict", "time"])
-@pytest.mark.parametrize("method", ["network", "phase-net", "classical"])
+@pytest.mark.parametrize(
+    ("command", "method"), [("predict", "network"), ("time", "phase-net"), ("predict", "classical")]
+)
 def test_the_commands_warn_once_and_go_on(benchmarks, opened, tiny, tmp_path, capsys, command, method):
     options = ["--out", tmp_path / "predictions"] if command == "predict" else ["--repeats", 1, "--batch", 1]
     if method == "network":
@@ -138,10 +126,9 @@ def test_the_commands_warn_once_and_go_on(benchmarks, opened, tiny, tmp_path, ca
         method = tmp_path / "mine.safetensors"
     if method == "phase-net":
         period_px = opened.rig.image_px_per_period("horizontal")
-        config = phase_net_config(period_px={"horizontal": period_px}, dataset_fingerprint=OLD)
-        save_weights(tmp_path / "net.safetensors", PhaseNet(**NET_OPTIONS), config, family=PHASE_NETWORKS)
+        save_phase_net(tmp_path / "net.safetensors", period_px={"horizontal": period_px}, dataset_fingerprint=OLD)
         options += ["--weights", tmp_path / "net.safetensors"]
-    assert main([str(argument) for argument in (command, method, tiny, *options)]) == 0
+    assert fpp_bench(*[str(argument) for argument in (command, method, tiny, *options)]) == 0
     warnings = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning: ")]
     name = {"classical": None, "phase-net": "phase-net"}.get(str(method), "mine")
     expected = "was trained on dataset aaaaaaaa, which is no benchmark of this version; predicting on tiny version 1"
