@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import trimesh
 from captures import LENSES, PAPER, TURNED, capture, tilted
 from conftest import TINY_SIZE, tiny_settings
 
@@ -12,12 +11,8 @@ from fpp_ml_bench.coding.code import Limits
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.loaders.render.builder import build
 from fpp_ml_bench.loaders.render.light import named_light
-from fpp_ml_bench.loaders.render.lighting import Lighting
-from fpp_ml_bench.loaders.render.projector import PatternLight
-from fpp_ml_bench.loaders.render.raycast import PixelRays, TracedObject
-from fpp_ml_bench.loaders.render.scene import SolidMesh, place
+from fpp_ml_bench.loaders.render.raycast import TracedObject
 from fpp_ml_bench.loaders.render.sensor import Exposure
-from fpp_ml_bench.optics.named_rigs import paper_rig
 from fpp_ml_bench.skipping import SWITCH, skipping, skipping_enabled
 
 
@@ -72,26 +67,6 @@ def test_what_the_manifest_says_is_what_was_traced_and_exposed(tmp_path, monkeyp
     assert counts["exposed"] == sum(52 * (pixels + row["exact_px"]) for row in rows)
 
 
-def test_a_shadow_ray_is_left_out_only_where_it_meets_nothing(monkeypatch):
-    rig = paper_rig(TINY_SIZE)
-    pattern = PatternLight.of(rig, SHADY.projector)
-    ball = trimesh.creation.icosphere(3, 0.15)
-    mesh = SolidMesh("ball", np.asarray(ball.vertices), np.asarray(ball.faces, dtype=np.int32))
-    traced = TracedObject(mesh, place(mesh, "A0", rig, "fixed", 1)[0])
-    covered = traced.primary(PixelRays.of(rig.camera)).pixels
-    backdrop, counts = Lighting(rig, SHADY, pattern), counting(monkeypatch)
-    fewer = backdrop.behind(traced, covered)
-    traced_rays = counts["rays"]
-    with skipping(False):
-        every = backdrop.behind(traced, covered)
-    assert 0 < traced_rays == fewer.shadow_rays == every.shadow_rays < 0.3 * (counts["rays"] - traced_rays)
-    elsewhere = np.ones(TINY_SIZE**2, dtype=bool)
-    elsewhere[covered] = False
-    np.testing.assert_array_equal(fewer.gain[elsewhere], every.gain[elsewhere])
-    unshaded = Lighting(rig, named_light("paper"), pattern).behind(traced, covered).gain
-    assert ((fewer.gain == 0) & (unshaded > 0))[elsewhere].sum() > 100
-
-
 # ---- decoding
 
 RIGS = pytest.mark.parametrize("rig", [PAPER, TURNED, LENSES], ids=["paper", "turned", "lenses"])
@@ -142,20 +117,6 @@ def test_no_pixel_near_the_ends_of_the_range_is_lost(disagreement):
         alone = decode_stack(frames, PAPER, steps=3, limits=limits, reasons=False)
         assert 0.01 < (everything.depth_mm > 0).mean() < 0.9
         np.testing.assert_array_equal(alone.depth_mm, everything.depth_mm)
-
-
-def test_inside_a_mask_the_bytes_are_those_of_the_whole_image():
-    frames, seen = sparse(PAPER)
-    mask = seen.copy()
-    mask[:, ::3] = False
-    whole = decode_stack(frames, PAPER)
-    for reasons in (True, False):
-        part = decode_stack(frames, PAPER, mask=mask, reasons=reasons)
-        np.testing.assert_array_equal(part.depth_mm, np.where(mask, whole.depth_mm, 0))
-        assert part.counts["not_asked"] == (~mask).sum()
-    # Frames in which everything outside the mask is destroyed: nothing there is looked at.
-    destroyed = [np.where(mask, frame, 255 - frame).astype(np.uint8) for frame in frames]
-    np.testing.assert_array_equal(decode_stack(destroyed, PAPER, mask=mask).depth_mm, part.depth_mm)
 
 
 def test_an_image_without_object_never_reads_the_second_direction():

@@ -10,7 +10,6 @@ from scipy.special import erf
 
 from fpp_ml_bench.loaders.render.projector import (
     PatternLight,
-    defocus_variance_px2,
     response_table,
 )
 from fpp_ml_bench.optics.patterns import pattern_profiles
@@ -120,31 +119,3 @@ def test_a_camera_pixel_sees_the_mean_of_its_footprint():
         left = modulation(projector(), frame, 1.8, pixel_area=True) / modulation(projector(), frame, 1.8)
         assert left == pytest.approx(np.sinc(width / PITCH), rel=3e-3)
         assert left == pytest.approx(np.exp(-2 * np.pi**2 * width**2 / 12 / PITCH**2), rel=1e-3)
-
-
-def test_places_beyond_the_pattern_read_its_outer_pixel():
-    light = projector(defocus_px=1.5)
-    pattern = pattern_light(light)
-    u = np.array([-5.0, 0.0, 0.25, 910.5, 911.0, 2000.0, np.nan])
-    v = np.array([-5.0, 0.0, 0.25, 1138.5, 1139.0, 2000.0, np.nan])
-    place = pattern.place(u, v, np.full(7, 1.9), SMALL, light)
-    at_u = (place.u_index + place.u_weight) / pattern.per_px
-    at_v = (place.v_index + place.v_weight) / pattern.per_px
-    np.testing.assert_allclose(at_u, [0, 0, 0.25, 910.5, 911, 911, 0], atol=1e-6)
-    np.testing.assert_allclose(at_v, [0, 0, 0.25, 1138.5, 1139, 1139, 0], atol=1e-6)
-    assert place.u_index.max() < 911 * pattern.per_px and place.v_index.max() < 1139 * pattern.per_px
-    assert place.u_index.dtype == np.uint16 and place.u_weight.dtype == np.float32
-
-
-def test_distances_beyond_the_blur_table_read_its_last_level():
-    light = projector(defocus_px=1.5)
-    pattern = pattern_light(light)
-    distance = np.array([0.5, 1.5, 1.8, 2.1, 3.2, np.nan, -1.0])
-    place = pattern.place(np.zeros(7), np.zeros(7), distance, SMALL, light)
-    levels = pattern.variance_px2
-    at = levels[place.level] + place.level_weight * (levels[place.level + 1] - levels[place.level])
-    expected = np.clip(np.nan_to_num(defocus_variance_px2(SMALL, light, distance)), 0, levels[-1])
-    np.testing.assert_allclose(at, expected, rtol=1e-6)
-    assert levels[-1] >= sigma_px(light, 1.5) ** 2 and levels[-1] >= sigma_px(light, 3.2) ** 2
-    sharp = pattern_light(projector())
-    assert sharp.place(np.zeros(2), np.zeros(2), np.ones(2), SMALL, projector()).level.size == 0  # costs nothing

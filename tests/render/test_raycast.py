@@ -89,15 +89,6 @@ def test_rays_of_a_camera_with_lens_distortion():
             np.testing.assert_allclose(depth_m, expected, atol=1e-12)
 
 
-def test_rays_in_any_order():
-    """The bounds of rows and columns only save work: rays in no order at all give the same answer."""
-    order = np.random.default_rng(3).permutation(X.size)
-    mesh = SHAPES["box turned"]
-    plain = depth_image(traced_mesh(mesh).primary(RAYS)).ravel()[order]
-    hits = traced_mesh(mesh).primary(PixelRays(X.ravel()[order].reshape(X.shape), Y.ravel()[order].reshape(X.shape)))
-    np.testing.assert_array_equal(depth_image(hits).ravel(), plain)
-
-
 def test_slivers_and_large_triangles():
     """Long thin triangles at every angle: the columns of a row that they cover are computed, and none is missed."""
     rng = np.random.default_rng(4)
@@ -125,19 +116,12 @@ def test_no_ray_passes_between_neighbours():
     assert seen[inside].all()
 
 
-def test_facing_and_tilted_planes():
-    square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], dtype=float)
-    faces = [[0, 1, 2], [0, 2, 3]]
-    hits = traced(np.add(square, [0, 0, 2.0]), faces).primary(RAYS)
-    assert hits.pixels.size == X.size
-    np.testing.assert_allclose(hits.depth_m, 2.0, atol=1e-12)
-    np.testing.assert_allclose(hits.normals, [[0, 0, -1]] * X.size, atol=1e-12)
+def test_a_tilted_plane():
+    square = np.array([[-1, -1, 2], [1, -1, 2], [1, 1, 2], [-1, 1, 2]], dtype=float)
+    square[:, 2] += square[:, :2] @ [0.3, -0.2]
     normal = np.array([0.3, -0.2, -1.0])
-    tilted = np.add(square, [0, 0, 2.0])
-    tilted[:, 2] = 2.0 + 0.3 * tilted[:, 0] - 0.2 * tilted[:, 1]
-    hits = traced(tilted, faces).primary(RAYS)
-    expected = 2.0 / (1 - 0.3 * X + 0.2 * Y)  # z = 2 + 0.3 x z - 0.2 y z
-    np.testing.assert_allclose(depth_image(hits), expected, atol=1e-9)
+    hits = traced(square, [[0, 1, 2], [0, 2, 3]]).primary(RAYS)
+    np.testing.assert_allclose(depth_image(hits), 2.0 / (1 - 0.3 * X + 0.2 * Y), atol=1e-9)  # z = 2 + 0.3 x z - 0.2 y z
     np.testing.assert_allclose(hits.normals, [normal / np.linalg.norm(normal)] * X.size, atol=1e-9)
 
 
@@ -179,14 +163,6 @@ def test_edge_on_and_degenerate_triangles():
 def test_a_wall_behind_the_camera_is_not_seen():
     wall = [[-1, -1, -1.8], [1, -1, -1.8], [1, 1, -1.8], [-1, 1, -1.8]]
     assert not traced(wall, [[0, 1, 2], [0, 2, 3]]).primary(RAYS).pixels.size
-
-
-def test_camera_inside_the_object():
-    shell = trimesh.creation.icosphere(4, 2.0)
-    hits = traced(shell.vertices, shell.faces).primary(RAYS)
-    assert hits.pixels.size == X.size
-    length = hits.depth_m * np.sqrt(X.ravel() ** 2 + Y.ravel() ** 2 + 1)
-    np.testing.assert_allclose(length, 2.0, rtol=2e-3)
 
 
 def test_rays_without_a_direction_see_nothing():

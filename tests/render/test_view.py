@@ -12,7 +12,7 @@ from scipy import stats
 from fpp_ml_bench.decoding.decode import decode_stack
 from fpp_ml_bench.decoding.triangulation import depth_noise_mm
 from fpp_ml_bench.depth import object_mask
-from fpp_ml_bench.loaders.render import lighting, view
+from fpp_ml_bench.loaders.render import lighting
 from fpp_ml_bench.loaders.render.light import named_light
 from fpp_ml_bench.loaders.render.sensor import camera_noise
 from fpp_ml_bench.loaders.render.view import Studio, ground_truth_error
@@ -102,26 +102,6 @@ def test_without_noise_ground_truth_is_nearly_exact():
     assert error.max() < 1.0 and error.mean() < 0.12  # 8 bit leaves 0.29 grey levels RMS
 
 
-def test_depth_never_guesses():
-    """What the camera can't see of the pattern has no decoded depth: such pixels are 0 and counted."""
-    mesh = trimesh.util.concatenate(
-        [
-            trimesh.creation.box((0.02, 0.1, 0.1)),
-            trimesh.creation.box((0.3, 0.002, 0.3)).apply_translation([0, 0.11, 0]),
-        ]  # a fin turned away from the light
-    )
-    at = studio(noisy(1.0))
-    row = at.photograph(solid(mesh), "A0")
-    exact, depth = object_mask(row.depth_exact_mm), object_mask(row.depth_mm)
-    assert not (depth & ~exact).any()
-    assert row.measured["exact_px"] == exact.sum()
-    assert row.measured["undecoded_px"] == (exact & ~depth).sum()
-    unlit = exact & (row.frames[51].astype(int) - row.frames[50] < 4)
-    assert unlit.sum() > 10
-    assert not depth[unlit].any()
-    assert np.isfinite(row.depth_mm).all() and (row.depth_mm >= 0).all()
-
-
 def test_ground_truth_error_by_hand():
     exact = np.zeros((20, 20), np.float32)
     exact[4:16, 4:16] = 1800
@@ -209,23 +189,6 @@ def test_the_flags_are_the_same_whatever_is_projected():
     np.testing.assert_array_equal(rows[0].depth_exact_mm, rows[1].depth_exact_mm)
 
 
-def test_mixed_pixels_are_the_outline_of_a_ball():
-    ball, at = solid(trimesh.creation.icosphere(5, 0.12)), studio(PAPER)
-    row = at.photograph(ball, "A0")
-    seen, mixed = row.depth_exact_mm > 0, flagged(row, Flag.MIXED)
-    near_edge = edge_distance_px(row.depth_exact_mm) <= 2
-    assert mixed.sum() > 100 and not mixed[seen & ~near_edge].any()
-    assert (row.cover[~mixed] == 255).all()
-    # The covered area, rays counted, is that of the outline: of the cone that holds the ball.
-    covered, found = seen.astype(float), at.trace(ball, "A0").mixed
-    covered.ravel()[found.pixels] = (found.triangle >= 0).reshape(-1, 4).mean(axis=1)
-    sine = 0.12 / 1.8
-    assert covered.sum() == pytest.approx(np.pi * (RIG.camera.fx * sine) ** 2 / (1 - sine**2), rel=5e-3)
-    # Cover counts the rays on the surface of the central one: fewer where the ball curves away within the pixel.
-    assert (row.cover[seen] <= np.rint(255 * covered[seen])).all()
-    np.testing.assert_array_equal(row.cover[~seen], np.rint(255 * (1 - covered[~seen])))
-
-
 def test_bounces_add_light_and_nothing_else():
     """With all bounces off a view is direct light and the ambient: the closed form, pixel by pixel."""
     row = studio(DIRECT).photograph(BALL, "A0")
@@ -262,27 +225,6 @@ def test_ambient_occlusion_is_the_open_share_of_the_groove():
     )  # 5% at a single place: noise of 128 rays, and the width of a surfel
     assert np.abs((dark[inside] - expected).mean()) < 1.5
     assert dark[inside].min() < 120 and dark[inside].max() > 170
-
-
-def test_stages_that_are_off_are_not_asked(monkeypatch):
-    def never(*_, **__):
-        raise AssertionError("a stage that is off was asked")
-
-    for module, name in ((lighting.Surfels, "of"), (lighting.PlaneLight, "of")):
-        monkeypatch.setattr(module, name, never)
-    for name in ("mixed_pixels", "blur_image", "vignetting"):
-        monkeypatch.setattr(view, name, never)
-    ball = replace(BALL)  # nothing is kept of this one
-    studio(rig=SMALL).photograph(ball, "A0")
-    for light in (
-        DIRECT.changed("bounces", interreflection=True),
-        DIRECT.changed("bounces", ambient_occlusion=True),
-        DIRECT.changed("camera", rays_across=2),
-        DIRECT.changed("camera", blur_px=1.0),
-        DIRECT.changed("camera", falloff=2),
-    ):
-        with pytest.raises(AssertionError, match="a stage that is off"):
-            studio(light, rig=SMALL).photograph(ball, "A0")
 
 
 def test_an_object_is_cut_into_surfels_once_for_all_its_views_and_lights(monkeypatch):
