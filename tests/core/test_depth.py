@@ -173,19 +173,13 @@ def test_unknown_names():
             function(np.zeros((2, 2), np.float32), "Individual", 1.0, 2.0)
 
 
-@settings(max_examples=200, deadline=None)
-@given(
-    st.floats(1500, 2100, width=32),
-    st.floats(0, 600, width=32).filter(lambda s: s == 0 or s > 1e-3),
-    st.lists(st.floats(0, 1, width=32), min_size=1, max_size=20),
-)
-def test_individual_stays_between_zero_and_one(low, span, shares):
-    low, high = np.float32(low), np.float32(low + span)
-    depth = np.clip(np.float32(low) + np.array(shares, np.float32) * (high - low), low, high).astype(np.float32)
+@pytest.mark.parametrize("span", [0.0, 0.002, 600.0])
+def test_individual_stays_between_zero_and_one_and_in_order(span):
+    low, high = np.float32(1510.123), np.float32(1510.123 + span)
+    depth = np.sort(np.random.default_rng(0).uniform(low, high, 1000).astype(np.float32).clip(low, high))
     normalised = normalise(depth[None], "individual", float(low), float(high))
     assert ((normalised >= 0) & (normalised <= 1)).all()
-    order = np.argsort(depth, kind="stable")
-    assert (np.diff(normalised[0][order]) >= 0).all()
+    assert (np.diff(normalised[0]) >= 0).all()
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

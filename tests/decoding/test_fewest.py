@@ -95,16 +95,6 @@ def test_depth_with_the_fewest_frames_is_the_same_bytes(rig, direction, gray):
     assert set(fewest.frames_used) < set(full.frames_used) or fewest.frames_used == full.frames_used
 
 
-def test_six_noisy_frames_give_the_depth_of_twenty():
-    frames = capture(PAPER, tilted(PAPER), noise=2.0)
-    twenty, six = (decode_stack(frames, PAPER, steps=3, fewest=fewest) for fewest in (False, True))
-    assert (len(twenty.frames_used), len(six.frames_used)) == (20, 6)
-    decoded = (twenty.depth_mm > 0) & (six.depth_mm > 0)
-    assert decoded.mean() > 0.9
-    np.testing.assert_array_equal(six.depth_mm[decoded], twenty.depth_mm[decoded])
-    assert ((twenty.depth_mm > 0) & ~decoded).mean() < 1e-3
-
-
 def test_a_pair_far_from_its_epipolar_line_is_refused_and_a_tight_limit_holds():
     frames = capture(PAPER, tilted(PAPER), noise=25.0)
     loose = decode_stack(frames, PAPER, steps=3, fewest=True)

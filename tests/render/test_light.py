@@ -25,7 +25,6 @@ def test_named_lights_are_the_files_beside_the_module(name):
             expected = tuple(number) if isinstance(number, list) else number
             assert getattr(read, part) == expected
         assert isinstance(value, dict) or read == value
-    assert Light.model_validate(light.model_dump()) == light
     assert Light.model_validate(yaml.safe_load(yaml.safe_dump(light.model_dump(mode="json")))) == light
 
 
@@ -115,9 +114,7 @@ def test_changed_copies_are_checked_like_a_file():
     brighter = light.changed("camera", exposure=2.0, bits=10)
     assert (brighter.camera.exposure, brighter.camera.bits) == (2.0, 10)
     assert brighter.changed("camera", exposure=1.0, bits=8) == light
-    assert light.changed(ambient_grey=20.0).ambient_grey == 20.0 and light.ambient_grey == 6.0
-    assert light.changed("camera", exposure=[0.5, 2.0]).camera.exposure == (0.5, 2.0)
-    for stage, values in (("camera", {"bits": 9}), ("camera", {"iso": 100}), ("", {"ambient_grey": -1.0})):
+    for stage, values in (("camera", {"iso": 100}), ("", {"ambient_grey": -1.0})):
         with pytest.raises(ValueError, match="validation error"):
             light.changed(stage, **values)
     with pytest.raises(KeyError):
