@@ -161,3 +161,8 @@ def test_rays_that_are_parallel_up_to_round_off_have_no_depth():
     assert np.isnan(depth_from_coordinate(rays, infinity, rig, "vertical")).all()
     nearly = depth_from_coordinate(rays, infinity + 1e-9, rig, "vertical")
     np.testing.assert_allclose(nearly, 1824 * 125 / 1e-9, rtol=2e-3)
+
+
+def test_two_directions_without_weight_have_no_depth():
+    rays, _, u, v = scene(RIGS["paper"])
+    assert np.isnan(depth_from_both(rays, u, v, RIGS["paper"], 0.0, 0.0).depth_mm).all()
